@@ -1,0 +1,76 @@
+# Copyright 2026 The koopman_ros Authors
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""Build of the koopman_ros package, for colcon (ament_python) and for pip alike."""
+
+from glob import glob
+import os
+
+from setuptools import find_packages, setup
+
+PACKAGE = 'koopman_ros'
+
+
+def _data_files() -> list[tuple[str, list[str]]]:
+    """List what goes under share/: the ament marker, the manifest, the configuration."""
+    share = os.path.join('share', PACKAGE)
+    return [
+        (os.path.join('share', 'ament_index', 'resource_index', 'packages'),
+         [os.path.join('resource', PACKAGE)]),
+        (share, ['package.xml']),
+        (os.path.join(share, 'config'), sorted(glob('config/*.yaml'))),
+        (os.path.join(share, 'config', 'models'), sorted(glob('config/models/*'))),
+    ]
+
+
+setup(
+    name=PACKAGE,
+    version='0.1.0',
+    description='Learned linear representations (Koopman lifts) in control of a reactor, on ROS 2',
+    maintainer='koopman_ros maintainers',
+    maintainer_email='koopman-ros@users.noreply.example.org',
+    license='Apache-2.0',
+    packages=find_packages(include=[PACKAGE, PACKAGE + '.*']),
+    package_data={PACKAGE: ['py.typed']},
+    data_files=_data_files(),
+    python_requires='>=3.11',
+    zip_safe=True,
+    install_requires=['setuptools', 'numpy', 'scipy', 'PyYAML', 'mcap>=1.5', 'mcap-ros2-support'],
+    extras_require={
+        # A sourced ROS 2 installation brings these itself; elsewhere PyPI does.
+        'ros': [
+            'ros-jazzy-rclpy==7.1.6',
+            'ros-jazzy-common-interfaces==5.3.6',
+            'ros-jazzy-rmw-fastrtps-cpp==8.4.3',
+        ],
+        'plots': ['matplotlib'],
+        'train': ['torch==2.13.0', 'tqdm'],
+        'test': [
+            'colcon-common-extensions',
+            'control',
+            'pytest',
+            'rosbags',
+            'ruff',
+            'safetensors',
+            'setuptools<80',
+        ],
+    },
+    entry_points={
+        'console_scripts': [
+            'plant = koopman_ros.nodes.plant:main',
+            'controller = koopman_ros.nodes.controller:main',
+            'trainer = koopman_ros.nodes.trainer:main',
+        ],
+    },
+)
