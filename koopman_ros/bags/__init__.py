@@ -1,0 +1,49 @@
+# Copyright 2026 The koopman_ros Authors
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""
+How it is remembered: bags in the layout of rosbag2 (MCAP), written and read without ROS.
+
+Imports nothing of ours but the version, nothing of ROS and nothing that learns: a recording can
+be opened on any machine with Python.
+"""
+
+from koopman_ros.bags.qos import INFINITE_NS, QosProfile
+from koopman_ros.bags.reader import BagMessage, BagSummary, read_messages, summary
+from koopman_ros.bags.schemas import (
+    message_definition,
+    MessageDefinition,
+    MessageDefinitionError,
+    search_prefixes,
+)
+from koopman_ros.bags.series import temperature_series, TemperatureSeries
+from koopman_ros.bags.storage import BagReadError
+from koopman_ros.bags.writer import BagWriter
+
+__all__ = [
+    'INFINITE_NS',
+    'BagMessage',
+    'BagReadError',
+    'BagSummary',
+    'BagWriter',
+    'MessageDefinition',
+    'MessageDefinitionError',
+    'QosProfile',
+    'TemperatureSeries',
+    'message_definition',
+    'read_messages',
+    'search_prefixes',
+    'summary',
+    'temperature_series',
+]

@@ -1,0 +1,97 @@
+# Copyright 2026 The koopman_ros Authors
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""Offered quality of service, in the words that rosbag2 stores with a topic (Jazzy and later)."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import yaml
+
+# An unlimited duration [ns]: RMW_DURATION_INFINITE, 9223372036 s and 854775807 ns.
+INFINITE_NS = 2**63 - 1
+
+_NS_PER_S = 1_000_000_000
+# The spellings of rmw/qos_string_conversions.h; 'unknown' is what discovery reports when a
+# publisher's history is not on the wire.
+_POLICIES = {
+    'history': ('keep_last', 'keep_all', 'system_default', 'unknown'),
+    'reliability': ('reliable', 'best_effort', 'system_default', 'best_available', 'unknown'),
+    'durability': ('volatile', 'transient_local', 'system_default', 'best_available', 'unknown'),
+    'liveliness': ('automatic', 'manual_by_topic', 'system_default', 'best_available', 'unknown'),
+}
+_DURATIONS = ('deadline_ns', 'lifespan_ns', 'liveliness_lease_duration_ns')
+
+
+@dataclass(frozen=True)
+class QosProfile:
+    """
+    One publisher's offer, as plain values (durations in ns, `INFINITE_NS` for no limit).
+
+    The policies are rmw's own words, which rclpy gives as `policy.short_key`. Raises ValueError
+    for a word that rmw does not know, a negative depth and a duration outside
+    [0, INFINITE_NS] ns.
+    """
+
+    history: str = 'keep_last'
+    depth: int = 10
+    reliability: str = 'reliable'
+    durability: str = 'volatile'
+    deadline_ns: int = INFINITE_NS
+    lifespan_ns: int = INFINITE_NS
+    liveliness: str = 'automatic'
+    liveliness_lease_duration_ns: int = INFINITE_NS
+    avoid_ros_namespace_conventions: bool = False
+
+    def __post_init__(self) -> None:
+        for policy, words in _POLICIES.items():
+            if getattr(self, policy) not in words:
+                raise ValueError(
+                    f'{policy} {getattr(self, policy)!r} is not one of {", ".join(words)}')
+        if self.depth < 0:
+            raise ValueError(f'depth {self.depth} is negative: give a queue length of 0 or more')
+        for name in _DURATIONS:
+            if not 0 <= getattr(self, name) <= INFINITE_NS:
+                raise ValueError(
+                    f'{name} {getattr(self, name)} is outside [0, {INFINITE_NS}] ns: '
+                    'use INFINITE_NS for no limit')
+
+
+def qos_mappings(profiles: Sequence[QosProfile]) -> list[dict[str, Any]]:
+    """Return the profiles as rosbag2's metadata.yaml (version 9) lists them."""
+    return [
+        {
+            'history': profile.history,
+            'depth': profile.depth,
+            'reliability': profile.reliability,
+            'durability': profile.durability,
+            'deadline': _duration(profile.deadline_ns),
+            'lifespan': _duration(profile.lifespan_ns),
+            'liveliness': profile.liveliness,
+            'liveliness_lease_duration': _duration(profile.liveliness_lease_duration_ns),
+            'avoid_ros_namespace_conventions': profile.avoid_ros_namespace_conventions,
+        }
+        for profile in profiles
+    ]
+
+
+def dump_offered_qos(profiles: Sequence[QosProfile]) -> str:
+    """Return the text of the channel metadata `offered_qos_profiles`: a YAML sequence."""
+    return yaml.safe_dump(qos_mappings(profiles), sort_keys=False).rstrip('\n')
+
+
+def _duration(nanoseconds: int) -> dict[str, int]:
+    seconds, rest = divmod(nanoseconds, _NS_PER_S)
+    return {'sec': seconds, 'nsec': rest}

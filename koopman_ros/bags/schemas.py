@@ -1,0 +1,144 @@
+# Copyright 2026 The koopman_ros Authors
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""
+Message definitions of the installed ROS 2 packages, as text and as type hash.
+
+The definition text is what rosbag2 stores with each topic, so that a recording can be decoded
+on a machine that has never heard of the message type.
+"""
+
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+import json
+import os
+from pathlib import Path
+import re
+import sys
+
+_TYPE_NAME = re.compile(r'([a-zA-Z][a-zA-Z0-9_]*)/(?:msg/)?([A-Z][a-zA-Z0-9]*)')
+# The type at the start of a field line, with or without an array suffix. A bounded string
+# ('string<=10') does not match, and is a primitive anyway.
+_FIELD_TYPE = re.compile(r'^\s*([a-zA-Z0-9_/]+)(?:\[[^\]]*\])?\s+', re.MULTILINE)
+_PRIMITIVES = frozenset((
+    'bool', 'byte', 'char', 'float32', 'float64', 'int8', 'uint8', 'int16', 'uint16', 'int32',
+    'uint32', 'int64', 'uint64', 'string', 'wstring',
+))
+_DELIMITER = '\n' + '=' * 80 + '\nMSG: {name}\n'
+
+
+class MessageDefinitionError(LookupError):
+    """A message type whose name is malformed or whose definition is not installed."""
+
+
+@dataclass(frozen=True)
+class MessageDefinition:
+    """
+    What a reader needs to know of a message type to decode it without ROS.
+
+    `type_name` is the full name ('sensor_msgs/msg/Temperature'), `text` the definition followed
+    by those of all its fields (encoding 'ros2msg'), `type_hash` the REP-2016 hash
+    ('RIHS01_' and 64 hexadecimal digits).
+    """
+
+    type_name: str
+    text: str
+    type_hash: str
+
+
+def search_prefixes() -> tuple[Path, ...]:
+    """Return the installation prefixes searched: `AMENT_PREFIX_PATH`, then `sys.prefix`."""
+    listed = os.environ.get('AMENT_PREFIX_PATH', '').split(os.pathsep)
+    return tuple(dict.fromkeys(Path(entry) for entry in (*listed, sys.prefix) if entry))
+
+
+def message_definition(
+    type_name: str, prefixes: Sequence[Path] | None = None
+) -> MessageDefinition:
+    """
+    Look up an installed message type such as 'sensor_msgs/msg/Temperature'.
+
+    `prefixes` are the installation prefixes to search, in order; by default those of
+    `search_prefixes`. The text has the layout of rosbag2's LocalMessageDefinitionSource:
+    dependencies depth first, each once, in alphabetical order per definition.
+
+    Raises MessageDefinitionError for a malformed name, and where a definition or its type
+    description is not installed.
+    """
+    package, name = _split(type_name)
+    if type_name != f'{package}/msg/{name}':
+        raise MessageDefinitionError(
+            f'message type {type_name!r} is not a full name: write {package}/msg/{name}')
+    roots = search_prefixes() if prefixes is None else tuple(prefixes)
+    text = _read(package, f'{name}.msg', type_name, roots)
+    full_text = text + _dependencies(text, package, roots, seen=set())
+    return MessageDefinition(type_name, full_text, _type_hash(package, name, roots))
+
+
+def _dependencies(text: str, package: str, roots: Iterable[Path], seen: set[str]) -> str:
+    """Return the delimited definitions of all field types of `text` that are not in `seen`."""
+    parts = []
+    for dependency in _field_types(text, package):
+        if dependency in seen:
+            continue
+        seen.add(dependency)
+        inner_package, name = _split(dependency)
+        inner = _read(inner_package, f'{name}.msg', dependency, roots)
+        parts.append(_DELIMITER.format(name=dependency) + inner)
+        parts.append(_dependencies(inner, inner_package, roots, seen))
+    return ''.join(parts)
+
+
+def _field_types(text: str, package: str) -> list[str]:
+    """Return the non-primitive field types of a definition as 'package/Name', sorted."""
+    found = {match for match in _FIELD_TYPE.findall(text) if match not in _PRIMITIVES}
+    return sorted(name if '/' in name else f'{package}/{name}' for name in found)
+
+
+def _type_hash(package: str, name: str, roots: Iterable[Path]) -> str:
+    type_name = f'{package}/msg/{name}'
+    description = json.loads(_read(package, f'{name}.json', type_name, roots))
+    for entry in description.get('type_hashes', ()):
+        if entry['type_name'] == type_name:
+            return entry['hash_string']
+    raise MessageDefinitionError(
+        f'the type description {name}.json of {package} carries no hash of {type_name}: '
+        f'reinstall the package ros-jazzy-{_dashed(package)}')
+
+
+def _split(type_name: str) -> tuple[str, str]:
+    match = _TYPE_NAME.fullmatch(type_name)
+    if match is None:
+        raise MessageDefinitionError(
+            f'message type {type_name!r} is not of the form package/msg/Name, '
+            'such as sensor_msgs/msg/Temperature')
+    return match[1], match[2]
+
+
+def _read(package: str, file_name: str, type_name: str, roots: Iterable[Path]) -> str:
+    """Return a file of a package's share/<package>/msg from the first prefix that has it."""
+    searched = [root / 'share' / package / 'msg' for root in roots]
+    for folder in searched:
+        file = folder / file_name
+        if file.is_file():
+            # Bytes, so that line ends stay what they are in the installed file.
+            return file.read_bytes().decode('utf-8')
+    places = ', '.join(str(folder) for folder in searched) or 'nowhere (no prefix given)'
+    raise MessageDefinitionError(
+        f'message type {type_name!r}: no {file_name} in {places}; install '
+        f'ros-jazzy-{_dashed(package)}, or source the workspace that provides {package}')
+
+
+def _dashed(package: str) -> str:
+    return package.replace('_', '-')

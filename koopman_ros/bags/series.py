@@ -1,0 +1,77 @@
+# Copyright 2026 The koopman_ros Authors
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""Recorded signals as arrays, for plots and studies."""
+
+from dataclasses import dataclass
+import os
+
+from koopman_ros.bags.reader import read_messages, summary
+from koopman_ros.bags.storage import BagReadError
+import numpy as np
+from numpy.typing import NDArray
+
+_TEMPERATURE = 'sensor_msgs/msg/Temperature'
+_NS_PER_S = 1_000_000_000
+
+
+@dataclass(frozen=True)
+class TemperatureSeries:
+    """
+    A sensor_msgs/Temperature topic as arrays of one length n, in the order of recording.
+
+    `stamp_ns` is the header's stamp [ns] (n, int64), `stamp_s` the same relative to the chosen
+    origin [s] (n, float64), `celsius` the temperature [degC] (n, float64; REP-103), `variance`
+    its variance [K^2] (n, float64; 0 where unknown).
+    """
+
+    stamp_ns: NDArray[np.int64]
+    stamp_s: NDArray[np.float64]
+    celsius: NDArray[np.float64]
+    variance: NDArray[np.float64]
+
+
+def temperature_series(
+    path: str | os.PathLike[str], topic: str, *, origin_ns: int = 0, recover: bool = False
+) -> TemperatureSeries:
+    """
+    Return a temperature topic of a bag as arrays.
+
+    `stamp_s` is (stamp - `origin_ns`) in seconds, subtracted as integers: seconds since the
+    epoch resolve no better than 0.24 us in float64, seconds since the start of the bag are
+    exact to the nanosecond for 100 days. `recover` is that of `read_messages`.
+
+    Raises BagReadError as `read_messages` does, and for a topic that the bag does not hold or
+    that is not of type sensor_msgs/msg/Temperature.
+    """
+    entries = read_messages(path, [topic], recover=recover)
+    content = summary(path)
+    if topic not in content.types:
+        raise BagReadError(
+            f'bag {os.fspath(path)!r} has no topic {topic!r}: choose one of '
+            f'{", ".join(sorted(content.types)) or "none (it is empty)"}')
+    if content.types[topic] != _TEMPERATURE:
+        raise BagReadError(
+            f'topic {topic!r} of bag {os.fspath(path)!r} is {content.types[topic]}, not '
+            f'{_TEMPERATURE}: read it with read_messages')
+    messages = [entry.message for entry in entries]
+    stamp_ns = np.array(
+        [_NS_PER_S * m.header.stamp.sec + m.header.stamp.nanosec for m in messages],
+        dtype=np.int64)
+    return TemperatureSeries(
+        stamp_ns=stamp_ns,
+        stamp_s=(stamp_ns - origin_ns) / _NS_PER_S,
+        celsius=np.array([m.temperature for m in messages], dtype=np.float64),
+        variance=np.array([m.variance for m in messages], dtype=np.float64),
+    )

@@ -1,0 +1,77 @@
+# Copyright 2026 The koopman_ros Authors
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""The content of the bags that the tests write: four topics, their types, offers and messages."""
+
+from dataclasses import dataclass
+from typing import Any
+
+from koopman_ros.bags import QosProfile
+import pytest
+
+START_NS = 1_700_000_000_123_456_789
+PERIOD_NS = 100_000_000
+ROUNDS = 25
+
+TOPICS = {
+    '/temperature': 'sensor_msgs/msg/Temperature',
+    '/diagnostics': 'diagnostic_msgs/msg/DiagnosticArray',
+    '/joint_states': 'sensor_msgs/msg/JointState',
+    '/clock': 'rosgraph_msgs/msg/Clock',
+}
+OFFERED_QOS = {
+    '/temperature': (QosProfile(),),
+    '/diagnostics': (QosProfile(history='unknown', depth=0),),
+    '/joint_states': (
+        QosProfile(reliability='best_effort', depth=5, deadline_ns=1_500_000_000),
+        QosProfile(durability='transient_local', depth=1),
+    ),
+    '/clock': (QosProfile(reliability='best_effort', depth=1),),
+}
+
+
+@dataclass(frozen=True)
+class Sample:
+    """A message as ROS made it, its CDR bytes, and when it was sent and received."""
+
+    topic: str
+    message: Any
+    data: bytes
+    log_time_ns: int
+    publish_time_ns: int
+
+
+def messages(index: int, stamp_ns: int) -> dict[str, Any]:
+    """Return one message a topic; all fields differ from their defaults."""
+    diagnostic = pytest.importorskip('diagnostic_msgs.msg')
+    sensor = pytest.importorskip('sensor_msgs.msg')
+    rosgraph = pytest.importorskip('rosgraph_msgs.msg')
+    std = pytest.importorskip('std_msgs.msg')
+    time = pytest.importorskip('builtin_interfaces.msg').Time
+    stamp = time(sec=stamp_ns // 10**9, nanosec=stamp_ns % 10**9)
+    header = std.Header(stamp=stamp, frame_id='reactor')
+    status = diagnostic.DiagnosticStatus(
+        level=b'\x01', name='controller: loop', message='Überlauf', hardware_id='cstr',
+        values=[diagnostic.KeyValue(key='round', value=str(index))])
+    return {
+        '/temperature': sensor.Temperature(
+            header=header, temperature=51.95 + 0.1 * index, variance=0.04),
+        '/diagnostics': diagnostic.DiagnosticArray(header=header, status=[status] * (index % 3)),
+        # No empty sequence of doubles: rmw reserves room to align it and leaves the rest as
+        # trailing bytes, which ROS and mcap ignore and rosbags refuses.
+        '/joint_states': sensor.JointState(
+            header=header, name=['valve', 'pump'], position=[0.5, float(index)],
+            velocity=[-1e-300], effort=[float('nan')]),
+        '/clock': rosgraph.Clock(clock=stamp),
+    }

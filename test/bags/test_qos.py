@@ -1,0 +1,87 @@
+# Copyright 2026 The koopman_ros Authors
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+from typing import Any
+
+from koopman_ros.bags import INFINITE_NS, QosProfile
+from koopman_ros.bags.qos import dump_offered_qos, qos_mappings
+import pytest
+import yaml
+
+# As rosbag2 (Jazzy) writes a discovered publisher of the default profile.
+DISCOVERED = """\
+- history: unknown
+  depth: 0
+  reliability: reliable
+  durability: volatile
+  deadline:
+    sec: 9223372036
+    nsec: 854775807
+  lifespan:
+    sec: 9223372036
+    nsec: 854775807
+  liveliness: automatic
+  liveliness_lease_duration:
+    sec: 9223372036
+    nsec: 854775807
+  avoid_ros_namespace_conventions: false"""
+
+
+def test_text_of_one_profile() -> None:
+    assert dump_offered_qos([QosProfile(history='unknown', depth=0)]) == DISCOVERED
+
+
+def test_no_profile_is_an_empty_sequence() -> None:
+    assert dump_offered_qos([]) == '[]'
+
+
+def test_finite_duration_splits_into_seconds_and_nanoseconds() -> None:
+    mapping = qos_mappings([QosProfile(deadline_ns=2_500_000_001)])[0]
+    assert mapping['deadline'] == {'sec': 2, 'nsec': 500_000_001}
+
+
+def test_equal_profiles_are_written_out_each() -> None:
+    profile = QosProfile()
+    text = dump_offered_qos([profile, profile])
+    assert '&' not in text
+    assert '*' not in text
+    assert yaml.safe_load(text) == qos_mappings([profile, profile])
+
+
+@pytest.mark.parametrize(('field', 'value', 'sentence'), [
+    ('history', 'last', "history 'last' is not one of keep_last, keep_all"),
+    ('reliability', 1, 'reliability 1 is not one of reliable, best_effort'),
+    ('durability', 'latched', "durability 'latched' is not one of volatile, transient_local"),
+    ('liveliness', '', "liveliness '' is not one of automatic, manual_by_topic"),
+    ('depth', -1, 'depth -1 is negative'),
+    ('deadline_ns', -1, r'deadline_ns -1 is outside \[0, 9223372036854775807\] ns'),
+    ('lifespan_ns', INFINITE_NS + 1, 'use INFINITE_NS for no limit'),
+    ('liveliness_lease_duration_ns', -5, 'liveliness_lease_duration_ns -5 is outside'),
+])
+def test_bad_values(field: str, value: Any, sentence: str) -> None:
+    with pytest.raises(ValueError, match=sentence):
+        QosProfile(**{field: value})
+
+
+def test_words_are_those_of_rclpy() -> None:
+    qos = pytest.importorskip('rclpy.qos')
+    policies = {
+        'history': qos.HistoryPolicy,
+        'reliability': qos.ReliabilityPolicy,
+        'durability': qos.DurabilityPolicy,
+        'liveliness': qos.LivelinessPolicy,
+    }
+    for field, policy in policies.items():
+        for word in policy.short_keys():
+            assert getattr(QosProfile(**{field: word}), field) == word

@@ -1,0 +1,129 @@
+# Copyright 2026 The koopman_ros Authors
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+from pathlib import Path
+import sys
+
+from koopman_ros.bags import message_definition, MessageDefinitionError, search_prefixes
+import pytest
+
+RULE = '=' * 80
+HASH = 'RIHS01_' + '0' * 64
+
+
+def _install(prefix: Path, type_name: str, text: str, *, description: str | None = None) -> None:
+    package, name = type_name.split('/msg/')
+    folder = prefix / 'share' / package / 'msg'
+    folder.mkdir(parents=True, exist_ok=True)
+    (folder / f'{name}.msg').write_bytes(text.encode('utf-8'))
+    if description is None:
+        description = (
+            f'{{"type_hashes": [{{"type_name": "{type_name}", "hash_string": "{HASH}"}}]}}')
+    (folder / f'{name}.json').write_text(description, encoding='utf-8')
+
+
+def test_dependencies_follow_depth_first_and_sorted(tmp_path: Path) -> None:
+    _install(tmp_path, 'a_msgs/msg/Top', 'b_msgs/Mid mid\nLeaf[] leaves\nuint8 X=1\n')
+    _install(tmp_path, 'a_msgs/msg/Leaf', 'string<=4[<=2] names\n')
+    _install(tmp_path, 'b_msgs/msg/Mid', '# Leaf is no field here\na_msgs/Leaf leaf\nLow low\n')
+    _install(tmp_path, 'b_msgs/msg/Low', 'float64 x  # °C\n')
+    definition = message_definition('a_msgs/msg/Top', [tmp_path])
+    assert definition.type_hash == HASH
+    assert definition.text == (
+        'b_msgs/Mid mid\nLeaf[] leaves\nuint8 X=1\n'
+        f'\n{RULE}\nMSG: a_msgs/Leaf\nstring<=4[<=2] names\n'
+        f'\n{RULE}\nMSG: b_msgs/Mid\n# Leaf is no field here\na_msgs/Leaf leaf\nLow low\n'
+        f'\n{RULE}\nMSG: b_msgs/Low\nfloat64 x  # °C\n')
+
+
+def test_line_ends_stay_as_installed(tmp_path: Path) -> None:
+    _install(tmp_path, 'a_msgs/msg/Dos', 'float64 x\r\nfloat64 y\r\n')
+    assert message_definition('a_msgs/msg/Dos', [tmp_path]).text == 'float64 x\r\nfloat64 y\r\n'
+
+
+def test_first_prefix_wins(tmp_path: Path) -> None:
+    _install(tmp_path / 'overlay', 'a_msgs/msg/X', 'float64 over\n')
+    _install(tmp_path / 'underlay', 'a_msgs/msg/X', 'float64 under\n')
+    prefixes = [tmp_path / 'overlay', tmp_path / 'underlay']
+    assert message_definition('a_msgs/msg/X', prefixes).text == 'float64 over\n'
+
+
+def test_ament_prefixes_come_before_the_interpreter(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv('AMENT_PREFIX_PATH', f'{tmp_path / "ws"}::{tmp_path / "ros"}')
+    assert search_prefixes() == (tmp_path / 'ws', tmp_path / 'ros', Path(sys.prefix))
+    _install(tmp_path / 'ros', 'a_msgs/msg/X', 'float64 x\n')
+    assert message_definition('a_msgs/msg/X').text == 'float64 x\n'
+
+
+def test_without_ament_prefixes_the_interpreter_is_searched(
+    monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.delenv('AMENT_PREFIX_PATH', raising=False)
+    assert search_prefixes() == (Path(sys.prefix),)
+
+
+def test_missing_type_names_place_and_package(tmp_path: Path) -> None:
+    with pytest.raises(MessageDefinitionError, match=(
+            rf"'my_msgs/msg/Level': no Level\.msg in {tmp_path}/share/my_msgs/msg; "
+            'install ros-jazzy-my-msgs')):
+        message_definition('my_msgs/msg/Level', [tmp_path])
+
+
+def test_missing_dependency_is_named(tmp_path: Path) -> None:
+    _install(tmp_path, 'a_msgs/msg/Top', 'b_msgs/Gone gone\n')
+    with pytest.raises(MessageDefinitionError, match=r"'b_msgs/Gone': no Gone\.msg in"):
+        message_definition('a_msgs/msg/Top', [tmp_path])
+
+
+def test_description_without_the_hash(tmp_path: Path) -> None:
+    _install(tmp_path, 'a_msgs/msg/X', 'float64 x\n', description='{}')
+    with pytest.raises(MessageDefinitionError, match=r'X\.json of a_msgs carries no hash'):
+        message_definition('a_msgs/msg/X', [tmp_path])
+
+
+@pytest.mark.parametrize('type_name', [
+    'Temperature', 'sensor_msgs/srv/SetCameraInfo', '../../etc/msg/Passwd', 'sensor_msgs/msg/', '',
+])
+def test_malformed_name(type_name: str) -> None:
+    with pytest.raises(MessageDefinitionError, match='is not of the form package/msg/Name'):
+        message_definition(type_name)
+
+
+def test_short_name_is_refused_with_the_full_one() -> None:
+    with pytest.raises(MessageDefinitionError, match='write sensor_msgs/msg/Temperature'):
+        message_definition('sensor_msgs/Temperature')
+
+
+@pytest.mark.parametrize('type_name', [
+    'builtin_interfaces/msg/Time',
+    'diagnostic_msgs/msg/DiagnosticArray',
+    'geometry_msgs/msg/PoseWithCovarianceStamped',
+    'rosgraph_msgs/msg/Clock',
+    'sensor_msgs/msg/JointState',
+    'sensor_msgs/msg/PointCloud2',
+    'sensor_msgs/msg/Temperature',
+    'std_msgs/msg/Float64MultiArray',
+])
+def test_installed_hash_is_that_of_the_text(type_name: str) -> None:
+    """Check text and hash against an independent implementation of REP-2016."""
+    typesys = pytest.importorskip('rosbags.typesys')
+    try:
+        definition = message_definition(type_name)
+    except MessageDefinitionError as error:
+        pytest.skip(str(error))
+    store = typesys.get_typestore(typesys.Stores.EMPTY)
+    store.register(typesys.get_types_from_msg(definition.text, type_name))
+    assert store.hash_rihs01(type_name) == definition.type_hash
