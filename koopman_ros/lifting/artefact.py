@@ -1,0 +1,246 @@
+# Copyright 2026 The koopman_ros Authors
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""The model file: one .safetensors file, written atomically and read with numpy alone."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+import contextlib
+import json
+import math
+import os
+from pathlib import Path
+import tempfile
+from typing import Any, NoReturn
+
+from koopman_ros.lifting.model import Coordinates, LiftedModel, Provenance
+import numpy as np
+
+FORMAT = 'koopman_ros.lift'
+FORMAT_VERSION = 1
+ACTIVATION = 'tanh'
+
+# A lift is small; a header or file beyond these sizes is not one.
+_MAX_HEADER_BYTES = 1 << 20
+_MAX_FILE_BYTES = 1 << 28
+_COORDINATE_ARRAYS = ('center', 'scale', 'lower', 'upper')
+
+
+class ModelFileError(ValueError):
+    """A model file cannot be used; the message says why and what to do."""
+
+
+def save(model: LiftedModel, path: str | os.PathLike[str]) -> None:
+    """
+    Write a model as safetensors; a reader sees the old file or the new one, never a part.
+
+    :param model: what to write.
+    :param path: a file name ending in ``.safetensors``.
+    :raises OSError: when the folder cannot be written.
+    """
+    tensors = {'A': model.A, 'B': model.B, 'output': model.output}
+    for i, (weight, bias) in enumerate(model.hidden):
+        tensors[f'hidden.{i}.weight'] = weight
+        tensors[f'hidden.{i}.bias'] = bias
+    metadata = {
+        'format': FORMAT,
+        'format_version': str(FORMAT_VERSION),
+        'description': json.dumps({
+            'activation': ACTIVATION,
+            'hidden_layers': len(model.hidden),
+            'identity': model.identity,
+            'inputs': _describe(model.inputs),
+            'n_u': model.n_u,
+            'n_x': model.n_x,
+            'n_z': model.n_z,
+            'provenance': {
+                'data_digest': model.provenance.data_digest,
+                'metrics': dict(model.provenance.metrics),
+                'package_version': model.provenance.package_version,
+                'plant': model.provenance.plant,
+                'seed': model.provenance.seed,
+            },
+            'states': _describe(model.states),
+            'time_unit': model.time_unit,
+        }, sort_keys=True, allow_nan=False),
+    }
+    header: dict[str, Any] = {'__metadata__': metadata}
+    offset, chunks = 0, []
+    for name in sorted(tensors):
+        data = np.ascontiguousarray(tensors[name]).astype('<f8').tobytes()
+        header[name] = {'dtype': 'F64', 'shape': list(tensors[name].shape),
+                        'data_offsets': [offset, offset + len(data)]}
+        offset += len(data)
+        chunks.append(data)
+    text = json.dumps(header, separators=(',', ':')).encode()
+    text += b' ' * (-len(text) % 8)
+    _write_atomically(Path(path), [len(text).to_bytes(8, 'little'), text, *chunks])
+
+
+def load(path: str | os.PathLike[str]) -> LiftedModel:
+    """
+    Read a model and check every field of it.
+
+    :param path: the file.
+    :raises ModelFileError: naming the file, what is wrong and what to do.
+    """
+    path = Path(path)
+    try:
+        size = path.stat().st_size
+        if size > _MAX_FILE_BYTES:
+            _refuse(path, f'it is {size} bytes long, far more than any lift')
+        content = path.read_bytes()
+    except FileNotFoundError:
+        raise ModelFileError(
+            f'no model file at {path}: check the path, or train a model') from None
+    except OSError as error:
+        raise ModelFileError(f'cannot read the model file {path}: {error.strerror}') from error
+    header, data = _split_file(path, content)
+    metadata = header.pop('__metadata__', None)
+    if not isinstance(metadata, dict) or metadata.get('format') != FORMAT:
+        _refuse(path, 'it is a safetensors file of something else')
+    version = metadata.get('format_version')
+    if version != str(FORMAT_VERSION):
+        raise ModelFileError(
+            f'the model file {path} has format version {version!r}, this package reads '
+            f'{FORMAT_VERSION}: retrain the model, or install the matching package')
+    tensors = {name: _tensor(path, name, entry, data) for name, entry in header.items()}
+    try:
+        about = json.loads(metadata['description'])
+        model = _build(about, tensors)
+    except (KeyError, TypeError, ValueError, AttributeError) as error:
+        reason = f'{error.args[0]!r} is missing' if isinstance(error, KeyError) else str(error)
+        _refuse(path, f'its content is inconsistent ({reason})')
+    return model
+
+
+def _build(about: dict[str, Any], tensors: dict[str, np.ndarray]) -> LiftedModel:
+    """Assemble the model; whatever does not fit raises one of the errors `load` translates."""
+    if about['activation'] != ACTIVATION:
+        raise ValueError(f"activation must be {ACTIVATION!r}, got {about['activation']!r}")
+    layers = _integer(about, 'hidden_layers')
+    expected = {'A', 'B', 'output'} | {
+        f'hidden.{i}.{part}' for i in range(layers) for part in ('weight', 'bias')}
+    if set(tensors) != expected:
+        raise ValueError(f'expected the arrays {sorted(expected)}, got {sorted(tensors)}')
+    if not isinstance(about['identity'], bool):
+        raise TypeError('identity must be true or false')
+    origin = about['provenance']
+    metrics = {str(name): float(value) for name, value in origin['metrics'].items()}
+    if not all(math.isfinite(value) for value in metrics.values()):
+        raise ValueError('a metric is not finite')
+    model = LiftedModel(
+        hidden=tuple((tensors[f'hidden.{i}.weight'], tensors[f'hidden.{i}.bias'])
+                     for i in range(layers)),
+        output=tensors['output'], A=tensors['A'], B=tensors['B'], identity=about['identity'],
+        states=_coordinates(about['states']), inputs=_coordinates(about['inputs']),
+        time_unit=str(about['time_unit']),
+        provenance=Provenance(
+            plant=str(origin['plant']),
+            seed=None if origin['seed'] is None else _integer(origin, 'seed'),
+            data_digest=str(origin['data_digest']), metrics=metrics,
+            package_version=str(origin['package_version'])))
+    for name, actual in (('n_x', model.n_x), ('n_u', model.n_u), ('n_z', model.n_z)):
+        if _integer(about, name) != actual:
+            raise ValueError(f'{name} is given as {about[name]}, the arrays say {actual}')
+    return model
+
+
+def _integer(about: dict[str, Any], name: str) -> int:
+    value = about[name]
+    if not isinstance(value, int) or isinstance(value, bool) or value < 0:
+        raise TypeError(f'{name} must be an integer of at least 0, got {value!r}')
+    return value
+
+
+def _describe(coordinates: Coordinates) -> dict[str, Any]:
+    return {'names': list(coordinates.names), 'units': list(coordinates.units),
+            **{name: getattr(coordinates, name).tolist() for name in _COORDINATE_ARRAYS}}
+
+
+def _coordinates(about: dict[str, Any]) -> Coordinates:
+    return Coordinates(names=tuple(str(name) for name in about['names']),
+                       units=tuple(str(unit) for unit in about['units']),
+                       **{name: np.array(about[name], dtype=np.float64)
+                          for name in _COORDINATE_ARRAYS})
+
+
+def _split_file(path: Path, content: bytes) -> tuple[dict[str, Any], bytes]:
+    """Separate the JSON header from the data, checking that nothing is cut off."""
+    if len(content) < 8:
+        _refuse(path, f'it is only {len(content)} bytes long, so it was cut off or is empty')
+    length = int.from_bytes(content[:8], 'little')
+    if length > _MAX_HEADER_BYTES:
+        _refuse(path, 'it is not a safetensors file')
+    if len(content) < 8 + length:
+        _refuse(path, 'it ends within its header, so it was cut off')
+    try:
+        header = json.loads(content[8:8 + length])
+    except ValueError:
+        _refuse(path, 'it is not a safetensors file')
+    if not isinstance(header, dict):
+        _refuse(path, 'it is not a safetensors file')
+    data = content[8 + length:]
+    try:
+        end = max((int(entry['data_offsets'][1]) for name, entry in header.items()
+                   if name != '__metadata__'), default=0)
+    except (KeyError, TypeError, ValueError, IndexError):
+        _refuse(path, 'it is not a safetensors file')
+    if len(data) < end:
+        _refuse(path, f'{end - len(data)} bytes of its arrays are missing, so it was cut off')
+    if len(data) > end:
+        _refuse(path, f'it has {len(data) - end} bytes too many')
+    return header, data
+
+
+def _tensor(path: Path, name: str, entry: Any, data: bytes) -> np.ndarray:
+    """Decode one array, checking type, size and values."""
+    try:
+        shape = tuple(int(n) for n in entry['shape'])
+        start, end = (int(n) for n in entry['data_offsets'])
+        dtype = entry['dtype']
+    except (KeyError, TypeError, ValueError):
+        _refuse(path, f'the entry of the array {name!r} is malformed')
+    if dtype != 'F64':
+        _refuse(path, f'the array {name!r} has type {dtype!r}, expected F64')
+    if start < 0 or end < start or min(shape, default=0) < 0 or (
+            end - start != 8 * math.prod(shape)):
+        _refuse(path, f'the array {name!r} of shape {shape} does not fit its {end - start} bytes')
+    array = np.frombuffer(data[start:end], dtype='<f8').reshape(shape)
+    if not np.all(np.isfinite(array)):
+        _refuse(path, f'the array {name!r} holds values that are not finite')
+    return array
+
+
+def _refuse(path: Path, reason: str) -> NoReturn:
+    raise ModelFileError(f'{path} is not a usable model file: {reason}; '
+                         'restore it from a backup, or train the model again')
+
+
+def _write_atomically(path: Path, chunks: Iterable[bytes]) -> None:
+    descriptor, temporary = tempfile.mkstemp(dir=path.parent, prefix=path.name, suffix='.tmp')
+    try:
+        with os.fdopen(descriptor, 'wb') as file:
+            file.writelines(chunks)
+            file.flush()
+            os.fsync(file.fileno())
+        umask = os.umask(0)
+        os.umask(umask)
+        os.chmod(temporary, 0o666 & ~umask)
+        os.replace(temporary, path)
+    except BaseException:
+        with contextlib.suppress(FileNotFoundError):
+            os.unlink(temporary)
+        raise

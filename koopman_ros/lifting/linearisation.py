@@ -1,0 +1,41 @@
+# Copyright 2026 The koopman_ros Authors
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""The linearisation of a plant, as a lifted model without hidden layers."""
+
+from __future__ import annotations
+
+from koopman_ros.lifting.model import Array, Coordinates, LiftedModel, Provenance
+import numpy as np
+
+
+def linearised_model(jacobian: Array, B: Array, states: Coordinates, inputs: Coordinates,
+                     time_unit: str, provenance: Provenance) -> LiftedModel:
+    """
+    Build the linear model dx/dt = (df/dx)(x - x_0) + B (u - u_0) as a lift with N(x) = x.
+
+    Every controller and every study can then treat it as just another model.
+
+    :param jacobian: (n_x, n_x) df/dx at the nominal point, in units.
+    :param B: (n_x, n_u) input matrix, in units.
+    :param states: whose center is the nominal state.
+    :param inputs: whose center is the nominal input.
+    :param time_unit: ``'s'`` or ``'min'``.
+    :param provenance: the plant it belongs to.
+    """
+    n_x = len(states)
+    A = np.asarray(jacobian) * states.scale / states.scale[:, None]
+    scaled_B = np.asarray(B) * inputs.scale / states.scale[:, None]
+    return LiftedModel((), np.zeros((0, n_x)), A, scaled_B, True, states, inputs, time_unit,
+                       provenance)
