@@ -1,0 +1,128 @@
+# Copyright 2026 The koopman_ros Authors
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""State-dependent Riccati laws on a lifted model: the re-centred and the projected one."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from enum import Enum
+
+from koopman_ros.control.riccati import RiccatiSolution, RiccatiStatus, solve_riccati
+from koopman_ros.control.target import Target
+from koopman_ros.lifting import LiftedModel
+import numpy as np
+from numpy.typing import NDArray
+
+Array = NDArray[np.float64]
+
+
+class Law(Enum):
+    """The feedback laws; the value is the word an operator reads."""
+
+    RECENTRED = 're-centred'
+    PROJECTED = 'projected'
+
+
+@dataclass(frozen=True)
+class Weights:
+    """
+    Quadratic cost on scaled deviations from the target: e' Q e + v' R v.
+
+    :param Q: (n_x, n_x) symmetric, positive semidefinite, not zero.
+    :param R: (n_u, n_u) symmetric, positive definite.
+    """
+
+    Q: Array
+    R: Array
+
+
+@dataclass(frozen=True)
+class Feedback:
+    """
+    The outcome of one state-dependent Riccati solution.
+
+    :param u: (n_u,) u_ref - K e in scaled deviations; not to be used unless solved.
+    :param law: which law produced it.
+    :param riccati: the solution with its residual, gain and status.
+    """
+
+    u: Array
+    law: Law
+    riccati: RiccatiSolution
+
+    @property
+    def solved(self) -> bool:
+        """Whether `u` may be used."""
+        return self.riccati.status is RiccatiStatus.SOLVED
+
+
+def feedback(model: LiftedModel, x: Array, target: Target, weights: Weights, *,
+             max_gain: float, max_residual: float) -> Feedback:
+    """
+    Evaluate the law that suits the model: re-centred if A is Hurwitz, projected otherwise.
+
+    When the re-centred law's equation cannot be solved, the projected one takes over.
+
+    :param model: the lift.
+    :param x: (n_x,) scaled deviation of the measured state.
+    :param target: where to go.
+    :param weights: the cost.
+    :param max_gain: bound on the spectral norm of K.
+    :param max_residual: bound on the relative Riccati residual.
+    """
+    bounds = {'max_gain': max_gain, 'max_residual': max_residual}
+    if model.is_hurwitz:
+        result = recentred(model, x, target, weights, **bounds)
+        if result.solved:
+            return result
+    return projected(model, x, target, weights, **bounds)
+
+
+def recentred(model: LiftedModel, x: Array, target: Target, weights: Weights, *,
+              max_gain: float = np.inf, max_residual: float = 1e-6) -> Feedback:
+    """
+    Solve the Riccati equation of the lifted error e = N(x) - z_ref.
+
+    e' = A e + J(x) B v + (J(x) - J(x_ref)) B u_ref, and the last term is H C e with C e the
+    error of the state, so that A + H C takes the place of A. Only with identity coordinates
+    is C e linear in e; a free lift goes by M^+ e, exact on the manifold of the lift.
+
+    Arguments and result as in :func:`feedback`; valid where every mode of A decays.
+    """
+    z, J = model.lift_and_jacobian(x)
+    M, H = model.secants(x, target.x, model.B @ target.u)
+    n_x, n_z = model.n_x, model.n_z
+    C = np.eye(n_x, n_z) if model.identity else np.linalg.pinv(M)
+    riccati = solve_riccati(model.A + H @ C, J @ model.B, C.T @ weights.Q @ C, weights.R,
+                            max_gain=max_gain, max_residual=max_residual)
+    return Feedback(target.u - riccati.K @ (z - target.z), Law.RECENTRED, riccati)
+
+
+def projected(model: LiftedModel, x: Array, target: Target, weights: Weights, *,
+              max_gain: float = np.inf, max_residual: float = 1e-6) -> Feedback:
+    """
+    Solve the Riccati equation of the state's error e = x - x_ref under the projected dynamics.
+
+    e' = J^+ (A M + H) e + B v, with N(x) - N(x_ref) = M e. It needs no more than that (df/dx, B)
+    be stabilisable, so unstable modes of A and their products do no harm.
+
+    Arguments and result as in :func:`feedback`.
+    """
+    J = model.jacobian(x)
+    M, H = model.secants(x, target.x, model.B @ target.u)
+    A = np.linalg.pinv(J) @ (model.A @ M + H)
+    riccati = solve_riccati(A, model.B, weights.Q, weights.R,
+                            max_gain=max_gain, max_residual=max_residual)
+    return Feedback(target.u - riccati.K @ (x - target.x), Law.PROJECTED, riccati)

@@ -1,0 +1,75 @@
+# Copyright 2026 The koopman_ros Authors
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""Limits on the manipulated variable: range and rate."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class InputLimits:
+    """
+    Range and rate limits of the inputs, in physical units.
+
+    :param lower: (n_u,) smallest command.
+    :param upper: (n_u,) largest command.
+    :param rate: (n_u,) largest change per second; infinity for none.
+    """
+
+    lower: Array
+    upper: Array
+    rate: Array
+
+
+@dataclass(frozen=True)
+class LimitedInput:
+    """
+    A command within its limits.
+
+    :param u: (n_u,) command.
+    :param at_range: whether the range was active.
+    :param at_rate: whether the rate was active.
+    """
+
+    u: Array
+    at_range: bool
+    at_rate: bool
+
+
+def limit(limits: InputLimits, wanted: Array, previous: Array | None, seconds: float
+          ) -> LimitedInput:
+    """
+    Bring a command within its range, and within its rate where a previous command is known.
+
+    The range wins over the rate: a previous command from outside the range is left at once.
+
+    :param limits: the limits.
+    :param wanted: (n_u,) the law's command.
+    :param previous: (n_u,) command `seconds` ago, or None at the first.
+    :param seconds: time since the previous command, not negative.
+    """
+    within = np.clip(wanted, limits.lower, limits.upper)
+    if previous is None:
+        return LimitedInput(within, bool(np.any(within != wanted)), False)
+    reach = limits.rate * seconds if seconds > 0.0 else np.zeros_like(limits.rate)
+    reached = np.clip(np.clip(within, previous - reach, previous + reach),
+                      limits.lower, limits.upper)
+    return LimitedInput(reached, bool(np.any(within != wanted)), bool(np.any(reached != within)))

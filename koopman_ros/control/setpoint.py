@@ -1,0 +1,110 @@
+# Copyright 2026 The koopman_ros Authors
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""The set-point: requested by the operator, at once or for a later time, checked and ramped."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+from koopman_ros.lifting import LiftedModel
+import numpy as np
+from numpy.typing import NDArray
+
+Array = NDArray[np.float64]
+
+NANOSECONDS = 1_000_000_000
+
+# A stamp further ahead than this comes from another clock and is no schedule.
+HORIZON_NANOSECONDS = 3600 * NANOSECONDS
+_MAX_SCHEDULED = 1000
+
+
+@dataclass(frozen=True)
+class Setpoint:
+    """
+    The state of the set-point.
+
+    :param requested: (n_x,) where the operator wants to be, or None before the first request.
+    :param active: (n_x,) what is tracked now, on its ramp to the requested value; None at first.
+    :param scheduled: (time in ns, value) of requests that take effect later, in time order.
+    """
+
+    requested: Array | None = None
+    active: Array | None = None
+    scheduled: tuple[tuple[int, Array], ...] = ()
+
+
+def refusal(model: LiftedModel, value: Array) -> str:
+    """
+    Say why a set-point cannot be tracked, or return an empty string.
+
+    :param model: whose training box is the range of set-points.
+    :param value: (n_x,) in state units.
+    """
+    states = model.states
+    for i, (name, unit) in enumerate(zip(states.names, states.units, strict=True)):
+        if not np.isfinite(value[i]):
+            return f'{name} set-point {value[i]} is not finite: the old one is kept'
+        if not states.lower[i] <= value[i] <= states.upper[i]:
+            return (f'{name} set-point {value[i]:.6g} {unit} is outside the trained range '
+                    f'[{states.lower[i]:.6g}, {states.upper[i]:.6g}] {unit}: the old one is kept; '
+                    'choose one inside, or load a model trained over a wider range')
+    return ''
+
+
+def request(setpoint: Setpoint, value: Array, effective_ns: int, now_ns: int | None) -> Setpoint:
+    """
+    Take over an accepted request, at once or when its time has come.
+
+    :param setpoint: the present state.
+    :param value: (n_x,) accepted value, in state units.
+    :param effective_ns: time from which it holds; 0 or past means at once, and a time more than
+        an hour ahead is taken for the stamp of another clock and means at once, too.
+    :param now_ns: time of the last measurement, or None before the first.
+    """
+    start = 0 if now_ns is None else now_ns
+    if not start < effective_ns <= start + HORIZON_NANOSECONDS:
+        return replace(setpoint, requested=value)
+    # the later request for the same time replaces the earlier one
+    kept = [entry for entry in setpoint.scheduled if entry[0] != effective_ns]
+    entries = sorted([*kept, (effective_ns, value)], key=lambda entry: entry[0])
+    return replace(setpoint, scheduled=tuple(entries[:_MAX_SCHEDULED]))
+
+
+def advance(setpoint: Setpoint, measured: Array, model: LiftedModel, ramp: float, now_ns: int,
+            seconds: float) -> Setpoint:
+    """
+    Bring the set-point to the present time.
+
+    Before the first request the temperature that was first measured is held, so that a
+    controller which starts on a running plant does not disturb it.
+
+    :param setpoint: the present state.
+    :param measured: (n_x,) measured state, in state units.
+    :param model: whose training box bounds the first set-point.
+    :param ramp: largest change per second, in state units; infinity for steps.
+    :param now_ns: time of the measurement.
+    :param seconds: time since the last measurement; 0 at the first.
+    """
+    due = [entry for entry in setpoint.scheduled if entry[0] <= now_ns]
+    if due:
+        setpoint = replace(setpoint, requested=due[-1][1],
+                           scheduled=setpoint.scheduled[len(due):])
+    held = np.clip(measured, model.states.lower, model.states.upper)
+    active = held if setpoint.active is None else setpoint.active
+    requested = active if setpoint.requested is None else setpoint.requested
+    reach = np.inf if np.isinf(ramp) else ramp * seconds
+    return replace(setpoint, requested=requested,
+                   active=np.clip(requested, active - reach, active + reach))
