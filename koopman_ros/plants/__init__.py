@@ -1,0 +1,81 @@
+# Copyright 2026 The koopman_ros Authors
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""What is controlled: control-affine systems and their simulation; imports nothing of ours."""
+
+from koopman_ros.plants.equilibria import (
+    eigenvalues,
+    equilibrium,
+    equilibrium_input,
+    EquilibriumError,
+    fold,
+)
+from koopman_ros.plants.exact_lift import ExactLift
+from koopman_ros.plants.excitation import (
+    Excitation,
+    ExcitationError,
+    random_steps,
+    RandomStepDesign,
+)
+from koopman_ros.plants.integration import (
+    IntegrationError,
+    IntegrationFailure,
+    IntegratorSettings,
+)
+from koopman_ros.plants.process import Process, sensor_noise
+from koopman_ros.plants.reactor import (
+    NOMINAL_COOLANT_TEMPERATURE,
+    one_state_reactor,
+    ReactorParameters,
+    two_state_reactor,
+)
+from koopman_ros.plants.scalar import scalar_exact_lift, scalar_example
+from koopman_ros.plants.simulation import advance, simulate, simulate_many
+from koopman_ros.plants.system import ControlAffineSystem, FloatArray
+from koopman_ros.plants.trajectory import DerivativeSamples, sample_derivatives, Trajectory
+from koopman_ros.plants.two_state import two_state_exact_lift, two_state_example
+
+__all__ = [
+    'NOMINAL_COOLANT_TEMPERATURE',
+    'ControlAffineSystem',
+    'DerivativeSamples',
+    'EquilibriumError',
+    'ExactLift',
+    'Excitation',
+    'ExcitationError',
+    'FloatArray',
+    'IntegrationError',
+    'IntegrationFailure',
+    'IntegratorSettings',
+    'Process',
+    'RandomStepDesign',
+    'ReactorParameters',
+    'Trajectory',
+    'advance',
+    'eigenvalues',
+    'equilibrium',
+    'equilibrium_input',
+    'fold',
+    'one_state_reactor',
+    'random_steps',
+    'sample_derivatives',
+    'scalar_exact_lift',
+    'scalar_example',
+    'sensor_noise',
+    'simulate',
+    'simulate_many',
+    'two_state_exact_lift',
+    'two_state_example',
+    'two_state_reactor',
+]

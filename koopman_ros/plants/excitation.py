@@ -1,0 +1,230 @@
+# Copyright 2026 The koopman_ros Authors
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""Random step inputs that excite a plant without driving it out of a box of states."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+import math
+
+from koopman_ros.plants.integration import (
+    IntegrationError,
+    IntegrationFailure,
+    IntegratorSettings,
+)
+from koopman_ros.plants.simulation import simulate
+from koopman_ros.plants.system import checked_vector, ControlAffineSystem, FloatArray
+from koopman_ros.plants.trajectory import sample_times, Trajectory
+import numpy as np
+from numpy.typing import ArrayLike
+
+
+class ExcitationError(ValueError):
+    """No input level within the bounds keeps the state inside its box."""
+
+
+@dataclass(frozen=True, eq=False)
+class RandomStepDesign:
+    """
+    Steps of random height and length, and the box of states they may not leave.
+
+    :param input_lower: lowest input, a scalar or (n_u,), in input units.
+    :param input_upper: highest input, likewise; levels are uniform between the two.
+    :param state_lower: lower corner of the box, a scalar or (n_x,), in state units.
+    :param state_upper: upper corner of the box, likewise.
+    :param hold_time: how long each level is held, in time units: a number, or a shortest and a
+        longest between which whole sample periods are equally likely.
+    :param sample_period: time between samples, in time units.
+    :param max_redraws: how many other levels are tried for a step that would leave the box.
+    :param rtol: relative tolerance of the simulation, as in `IntegratorSettings`.
+    :raises ValueError: when a time is not above 0, or no whole number of sample periods fits
+        `hold_time`.
+    """
+
+    input_lower: ArrayLike
+    input_upper: ArrayLike
+    state_lower: ArrayLike
+    state_upper: ArrayLike
+    hold_time: float | tuple[float, float]
+    sample_period: float
+    max_redraws: int = 100
+    rtol: float = 1e-10
+
+    def __post_init__(self) -> None:
+        if not 0.0 < self.sample_period < math.inf:
+            raise ValueError(
+                f'sample_period is {self.sample_period}, must be finite and above 0')
+        if self.max_redraws < 0:
+            raise ValueError(f'max_redraws is {self.max_redraws}, must not be negative')
+        shortest, longest = self.hold_samples
+        if not 1 <= shortest <= longest:
+            raise ValueError(
+                f'hold_time is {self.hold_time}, must allow a whole number of sample periods of '
+                f'{self.sample_period}: choose a multiple of it, or a wider range')
+
+    @property
+    def hold_samples(self) -> tuple[int, int]:
+        """The shortest and the longest hold in whole sample periods."""
+        shortest, longest = checked_vector('hold_time', self.hold_time, 2)
+        # A multiple of the period need not divide to a whole number in floating point.
+        return (math.ceil(shortest / self.sample_period - 1e-9),
+                math.floor(longest / self.sample_period + 1e-9))
+
+
+@dataclass(frozen=True, eq=False)
+class Excitation:
+    """
+    A plant driven through random steps.
+
+    :param trajectory: what was applied and what followed, at every sample period.
+    :param step_starts: number of the sample at which each step begins (S,).
+    :param redraws: how many levels were drawn again because their step would have left the box.
+    """
+
+    trajectory: Trajectory
+    step_starts: tuple[int, ...]
+    redraws: int
+
+
+@dataclass(frozen=True, eq=False)
+class _Box:
+    """A design's bounds with one entry for each input and state of a system."""
+
+    input_lower: FloatArray
+    input_upper: FloatArray
+    settings: IntegratorSettings
+    state_lower: FloatArray
+    state_upper: FloatArray
+
+
+def random_steps(
+    system: ControlAffineSystem,
+    design: RandomStepDesign,
+    duration: float,
+    seed: int,
+    *,
+    x0: ArrayLike | None = None,
+) -> Excitation:
+    """
+    Drive a plant through random steps of its inputs (paper, section on the reactor).
+
+    Each step is simulated before it is taken. If the state would leave the box its level is drawn
+    again, its length kept. The last step is cut short at `duration`. The same seed gives the same
+    bits.
+
+    :param duration: length of the trajectory, in time units: a multiple of the sample period.
+    :param seed: seed of numpy's default generator.
+    :param x0: initial state (n_x,); the nominal one when None.
+    :raises ValueError: when the system has no input or an argument does not fit it.
+    :raises ExcitationError: when the trajectory begins outside the box, or no level that was
+        tried keeps it inside.
+    """
+    if system.n_u == 0:
+        raise ValueError(f'{system.name} has no input to step; choose initial states instead')
+    holds = _whole_samples(duration, design.sample_period, system.time_unit)
+    box = _resolved_box(system, design)
+    state = system.nominal_state if x0 is None else system.checked_state('x0', x0)
+    if not np.all((state >= box.state_lower) & (state <= box.state_upper)):
+        raise ExcitationError(
+            f'{system.name}: at the start {_violation(system, box, state)}; '
+            'choose x0 inside the box, or a box around it')
+
+    rng = np.random.default_rng(seed)
+    states, inputs = [state[None, :]], []
+    step_starts, redraws, sample = [], 0, 0
+    while sample < holds:
+        drawn = int(rng.integers(*design.hold_samples, endpoint=True))
+        piece, tries = _safe_step(system, design, box, state, sample, min(drawn, holds - sample),
+                                  rng)
+        step_starts.append(sample)
+        states.append(piece.states[1:])
+        inputs.append(piece.inputs)
+        state, sample, redraws = piece.states[-1], sample + len(piece.inputs), redraws + tries
+    trajectory = Trajectory(
+        times=sample_times(0.0, design.sample_period, holds),
+        states=np.concatenate(states),
+        inputs=np.concatenate(inputs))
+    return Excitation(trajectory=trajectory, step_starts=tuple(step_starts), redraws=redraws)
+
+
+def _safe_step(
+    system: ControlAffineSystem,
+    design: RandomStepDesign,
+    box: _Box,
+    state: FloatArray,
+    first_sample: int,
+    length: int,
+    rng: np.random.Generator,
+) -> tuple[Trajectory, int]:
+    """Draw levels until one keeps the state in the box; return its step and the redraws."""
+    start_time = first_sample * design.sample_period
+    for redraws in range(design.max_redraws + 1):
+        level = rng.uniform(box.input_lower, box.input_upper)
+        try:
+            step = simulate(
+                system, state, np.tile(level, (length, 1)), design.sample_period,
+                start_time=start_time, settings=box.settings)
+        except IntegrationError as error:
+            if error.failure is not IntegrationFailure.OUT_OF_BOUNDS:
+                raise
+            exit_time, exit_state = error.time, error.state
+        else:
+            return step, redraws
+    levels = ', '.join(
+        f'{name} in [{lower:.10g}, {upper:.10g}]' + ('' if unit == '1' else f' {unit}')
+        for name, unit, lower, upper in zip(
+            system.input_names, system.input_units, box.input_lower, box.input_upper,
+            strict=True))
+    raise ExcitationError(
+        f'{system.name}: {_violation(system, box, exit_state)} at {exit_time:.6g} '
+        f'{system.time_unit}, and so it went with each of {design.max_redraws + 1} levels of '
+        f'{levels}; narrow the input bounds, widen the box or shorten hold_time')
+
+
+def _resolved_box(system: ControlAffineSystem, design: RandomStepDesign) -> _Box:
+    """Fit a design to a system; the box shrinks to the states at which the model holds."""
+    state_lower = np.maximum(
+        system.checked_bound('state_lower', design.state_lower), system.state_lower)
+    state_upper = np.minimum(
+        system.checked_bound('state_upper', design.state_upper), system.state_upper)
+    if not np.all(state_lower < state_upper):
+        raise ValueError(f'state_lower {state_lower} must lie below state_upper {state_upper}')
+    input_lower = checked_vector('input_lower', design.input_lower, system.n_u)
+    input_upper = checked_vector('input_upper', design.input_upper, system.n_u)
+    if not np.all(input_lower < input_upper):
+        raise ValueError(f'input_lower {input_lower} must lie below input_upper {input_upper}')
+    settings = IntegratorSettings(rtol=design.rtol, lower=state_lower, upper=state_upper)
+    return _Box(
+        input_lower=input_lower, input_upper=input_upper, settings=settings,
+        state_lower=state_lower, state_upper=state_upper)
+
+
+def _whole_samples(duration: float, sample_period: float, time_unit: str) -> int:
+    count = duration / sample_period
+    if not (math.isfinite(count) and round(count) >= 1
+            and abs(count - round(count)) <= 1e-9 * count):
+        raise ValueError(
+            f'duration is {duration} {time_unit}, must be a multiple of the sample period of '
+            f'{sample_period} {time_unit}')
+    return round(count)
+
+
+def _violation(system: ControlAffineSystem, box: _Box, state: FloatArray) -> str:
+    """Name the first state variable that is outside the box, its value and its range."""
+    i = int(np.argmax((state < box.state_lower) | (state > box.state_upper)))
+    unit = '' if system.state_units[i] == '1' else f' {system.state_units[i]}'
+    return (
+        f'{system.state_names[i]} reached {state[i]:.6g}{unit}, outside the box '
+        f'[{box.state_lower[i]:.10g}, {box.state_upper[i]:.10g}]{unit}')

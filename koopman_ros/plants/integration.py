@@ -1,0 +1,230 @@
+# Copyright 2026 The koopman_ros Authors
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""Integration of a plant over one hold of its input, with its precision, bounds and failures."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from enum import Enum
+import math
+
+from koopman_ros.plants.system import ControlAffineSystem, FloatArray
+import numpy as np
+from numpy.typing import ArrayLike
+from scipy.integrate import DOP853
+
+LOOSEST_RTOL = 1e-9
+# What scipy still keeps; it takes tighter tolerances for this one, with a warning.
+TIGHTEST_RTOL = 100.0 * float(np.finfo(np.float64).eps)
+# A stiff runaway would otherwise take tiny steps for ever; a reactor needs about ten a minute.
+_MAX_STEPS_PER_HOLD = 20_000
+
+
+class IntegrationFailure(Enum):
+    """Why a simulation ended early, and what to do about it."""
+
+    OUT_OF_BOUNDS = 'it left its bounds; choose an input that keeps it inside, or widen them'
+    NON_FINITE = 'its rate is not finite there; start where the model is defined'
+    STEP_TOO_SMALL = 'it changes too fast to follow; stop before it escapes, or set bounds'
+    TOO_MANY_STEPS = 'it needs too many integration steps; simulate shorter holds'
+
+
+class IntegrationError(RuntimeError):
+    """
+    A simulation could not reach the end of its time.
+
+    :param sentence: the message: plant, state with units, time, cause and the next step.
+    :param failure: the cause.
+    :param time: when, in time units.
+    :param state: the offending state (n_x,).
+    :param trajectory: which of several trajectories simulated at once.
+    """
+
+    def __init__(
+        self,
+        sentence: str,
+        failure: IntegrationFailure,
+        time: float,
+        state: FloatArray,
+        trajectory: int = 0,
+    ) -> None:
+        # All of them as args, so that the error survives pickling between processes.
+        super().__init__(sentence, failure, time, state, trajectory)
+        self.sentence = sentence
+        self.failure = failure
+        self.time = time
+        self.state = state
+        self.trajectory = trajectory
+
+    def __str__(self) -> str:
+        return self.sentence
+
+
+@dataclass(frozen=True, eq=False)
+class IntegratorSettings:
+    """
+    How precisely to integrate, and within which states.
+
+    :param rtol: relative tolerance of each integration step, in [2.3e-14, 1e-9].
+    :param atol: absolute tolerance of each, a scalar or (n_x,), in state units and above 0; `rtol`
+        times the magnitude of each nominal state when None.
+    :param lower: lowest states allowed, a scalar or (n_x,); the system's own when None.
+    :param upper: highest states allowed, a scalar or (n_x,); the system's own when None.
+    :raises ValueError: when `rtol` is outside its range.
+    """
+
+    rtol: float = 1e-10
+    atol: ArrayLike | None = None
+    lower: ArrayLike | None = None
+    upper: ArrayLike | None = None
+
+    def __post_init__(self) -> None:
+        if not TIGHTEST_RTOL <= self.rtol <= LOOSEST_RTOL:
+            raise ValueError(
+                f'rtol is {self.rtol:.3g}, must lie in [{TIGHTEST_RTOL:.3g}, {LOOSEST_RTOL:.3g}]')
+
+
+@dataclass(frozen=True, eq=False)
+class Limits:
+    """Settings with every default filled in for one system."""
+
+    rtol: float
+    atol: FloatArray
+    lower: FloatArray
+    upper: FloatArray
+
+
+def resolved_limits(system: ControlAffineSystem, settings: IntegratorSettings) -> Limits:
+    """
+    Fill in what `settings` leaves to the system.
+
+    :raises ValueError: when a bound or a tolerance does not fit.
+    """
+    scale = settings.rtol * system.state_scale
+    atol = scale if settings.atol is None else system.checked_bound('atol', settings.atol)
+    # Zero would divide zero by zero in the error norm of a state that is exactly zero.
+    if not np.all((atol > 0.0) & (atol < np.inf)):
+        raise ValueError(f'atol is {atol}, must be finite and above 0')
+    lower, upper = system.state_lower, system.state_upper
+    if settings.lower is not None:
+        lower = system.checked_bound('lower', settings.lower)
+    if settings.upper is not None:
+        upper = system.checked_bound('upper', settings.upper)
+    return Limits(rtol=settings.rtol, atol=atol, lower=lower, upper=upper)
+
+
+def largest_stack(rtol: float) -> int:
+    """Return how many trajectories fit one stack before its tolerance is below the tightest."""
+    return max(1, int(min((rtol / TIGHTEST_RTOL) ** 2, 1e9)))
+
+
+def hold(
+    system: ControlAffineSystem,
+    starts: FloatArray,
+    inputs: FloatArray,
+    duration: float,
+    limits: Limits,
+    *,
+    start_time: float = 0.0,
+    first: int = 0,
+) -> FloatArray:
+    """
+    Integrate a stack of M states over one hold with the explicit Runge-Kutta pair DOP853.
+
+    Why not LSODA: every input step is a kink after which a multistep method has to build up its
+    history again, so that over one second it is no quicker, and its error at the same tolerance
+    is larger by orders of magnitude. The plants are not stiff within their bounds.
+
+    :param starts: states at its start (M, n_x), M > 0.
+    :param inputs: the held inputs (M, n_u).
+    :param duration: its length, in time units.
+    :param start_time: time of its start, for the message of an error.
+    :param first: number of the first trajectory of the stack, likewise.
+    :return: states at its end (M, n_x).
+    :raises IntegrationError: when the end is not reached.
+    """
+    shape = starts.shape
+    forcing = inputs @ system.B.T
+    # The error norm is a root mean square over the stack: of M trajectories, a single one could
+    # exceed its own tolerance by sqrt(M).
+    dilution = math.sqrt(shape[0])
+
+    def rate(_: float, stacked: FloatArray) -> FloatArray:
+        return (system.drift(stacked.reshape(shape)) + forcing).ravel()
+
+    def failed(
+        failure: IntegrationFailure, elapsed: float, states: FloatArray,
+    ) -> IntegrationError:
+        return _integration_error(system, limits, failure, start_time + elapsed, states, first)
+
+    # Stages of a step that is then rejected may overflow.
+    with np.errstate(all='ignore'):
+        if not _inside(starts, limits):
+            raise failed(IntegrationFailure.OUT_OF_BOUNDS, 0.0, starts)
+        # DOP853 would never return from a first step that begins with an infinite rate.
+        if not np.all(np.isfinite(rate(0.0, starts))):
+            raise failed(IntegrationFailure.NON_FINITE, 0.0, starts)
+        if duration == 0.0:
+            return starts.copy()
+        solver = DOP853(
+            rate, 0.0, starts.ravel(), duration,
+            rtol=max(limits.rtol / dilution, TIGHTEST_RTOL),
+            atol=np.tile(limits.atol / dilution, shape[0]))
+        for _ in range(_MAX_STEPS_PER_HOLD):
+            solver.step()
+            states: FloatArray = solver.y.reshape(shape)
+            if solver.status == 'failed':
+                raise failed(IntegrationFailure.STEP_TOO_SMALL, solver.t, states)
+            if not _inside(states, limits):
+                raise failed(IntegrationFailure.OUT_OF_BOUNDS, solver.t, states)
+            if solver.status == 'finished':
+                return states
+        raise failed(IntegrationFailure.TOO_MANY_STEPS, solver.t, states)
+
+
+def _inside(states: FloatArray, limits: Limits) -> bool:
+    return bool(np.all((states >= limits.lower) & (states <= limits.upper)))
+
+
+def _integration_error(
+    system: ControlAffineSystem,
+    limits: Limits,
+    failure: IntegrationFailure,
+    time: float,
+    states: FloatArray,
+    first: int,
+) -> IntegrationError:
+    row = _offender(system, limits, states)
+    state = states[row].copy()
+    which = f', trajectory {first + row}' if len(states) > 1 else ''
+    outside = ''.join(
+        f', {name} outside [{lower:.10g}, {upper:.10g}]{"" if unit == "1" else " " + unit}'
+        for name, unit, x, lower, upper in zip(
+            system.state_names, system.state_units, state, limits.lower, limits.upper,
+            strict=True)
+        if not lower <= x <= upper)
+    sentence = (
+        f'{system.name}{which}: {system.describe_state(state)} at {time:.6g} {system.time_unit}'
+        f'{outside}: {failure.value}')
+    return IntegrationError(sentence, failure, time, state, first + row)
+
+
+def _offender(system: ControlAffineSystem, limits: Limits, states: FloatArray) -> int:
+    """Return which state of a stack (M, n_x) is out of bounds, or else changes fastest."""
+    outside = ~np.all((states >= limits.lower) & (states <= limits.upper), axis=1)
+    if np.any(outside):
+        return int(np.argmax(outside))
+    speed = np.max(np.abs(system.drift(states)) / system.state_scale, axis=1)
+    return int(np.argmax(np.nan_to_num(speed, nan=np.inf)))

@@ -1,0 +1,68 @@
+# Copyright 2026 The koopman_ros Authors
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""A plant that runs in time: it is driven to instants, not by steps, under a held input."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+from koopman_ros.plants.simulation import advance
+from koopman_ros.plants.system import ControlAffineSystem, FloatArray
+import numpy as np
+
+_NANOSECONDS = 1_000_000_000
+
+
+@dataclass(frozen=True, eq=False)
+class Process:
+    """
+    A running plant: what it is, where it stands, and the input it holds.
+
+    :param system: the plant.
+    :param time_ns: present time, in integer nanoseconds so that instants repeat exactly.
+    :param x: present state (n_x,).
+    :param u: held input (n_u,).
+    """
+
+    system: ControlAffineSystem
+    time_ns: int
+    x: FloatArray
+    u: FloatArray
+
+    def until(self, time_ns: int) -> Process:
+        """
+        Return the process at a later time; an earlier one returns it unchanged.
+
+        :raises IntegrationError: when the state leaves the bounds of the system, e.g. because
+            the reactor ran away.
+        """
+        if time_ns <= self.time_ns:
+            return self
+        seconds = (time_ns - self.time_ns) / _NANOSECONDS
+        x = advance(self.system, self.x, self.u, seconds / self.system.seconds_per_time_unit)
+        return replace(self, time_ns=time_ns, x=x)
+
+
+def sensor_noise(deviation: float, seed: int, sample: int) -> float:
+    """
+    Return the noise of one sample, the same for the same seed and number.
+
+    :param deviation: standard deviation, in state units.
+    :param seed: seed of the run, not negative.
+    :param sample: number of the sample, not negative.
+    """
+    if deviation == 0.0:
+        return 0.0
+    return deviation * float(np.random.default_rng((seed, sample)).standard_normal())

@@ -1,0 +1,281 @@
+# Copyright 2026 The koopman_ros Authors
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""The continuous stirred tank reactor (CSTR) with a cooling jacket, as one state and as two."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field, fields
+from functools import partial
+
+from koopman_ros.plants.equilibria import EquilibriumError
+from koopman_ros.plants.system import ArrayFunction, ControlAffineSystem, FloatArray
+import numpy as np
+from numpy.typing import ArrayLike
+from scipy.optimize import brentq
+
+# The coolant temperature, in K, around which both reactors are run.
+NOMINAL_COOLANT_TEMPERATURE = 300.0
+# Temperatures, in K, outside which neither the liquid nor its heat of reaction is what the model
+# says; the highest that the two-state reactor can reach by itself is 559 K.
+TEMPERATURE_RANGE = (200.0, 1000.0)
+# The fold is looked for on a grid of 0.04 K, which misses its heat balance by less than 1e-4
+# K/min.
+_SCAN_POINTS = 20001
+
+
+def _constant(default: float, unit: str, lower: float, upper: float) -> float:
+    value: float = field(
+        default=default, metadata={'unit': unit, 'lower': lower, 'upper': upper})
+    return value
+
+
+@dataclass(frozen=True)
+class ReactorParameters:
+    """
+    The physical constants of the reactor; the defaults are the benchmark's.
+
+    Source of the values: the CSTR of Seborg, Edgar and Mellichamp, *Process Dynamics and Control*,
+    as in Henson and Seborg, *Nonlinear Process Control*; the paper, eq. 36, lists none.
+
+    :param flow_rate: q, feed and product flow, in L/min.
+    :param volume: V, of the liquid, in L.
+    :param density: rho, in g/L.
+    :param heat_capacity: C_p, in J/(g K).
+    :param reaction_enthalpy: Delta H_R, in J/mol, negative for this exothermic reaction.
+    :param activation_temperature: E_A/R, in K.
+    :param pre_exponential_factor: k, in 1/min.
+    :param heat_transfer_coefficient: UA, coefficient times area of the jacket, in J/(min K).
+    :param feed_temperature: T_i, in K.
+    :param feed_concentration: C_Af, in mol/L; the two-state reactor's alone.
+    :param concentration: C_A as the one-state reactor holds it, in mol/L: by default that of the
+        two-state reactor's stable steady state at a coolant of 300 K.
+    :raises ValueError: when a value is no number or outside its range.
+    """
+
+    flow_rate: float = _constant(100.0, 'L/min', 1.0, 1e4)
+    volume: float = _constant(100.0, 'L', 1.0, 1e5)
+    density: float = _constant(1000.0, 'g/L', 100.0, 1e4)
+    heat_capacity: float = _constant(0.239, 'J/(g K)', 0.01, 100.0)
+    reaction_enthalpy: float = _constant(-5e4, 'J/mol', -1e6, -1.0)
+    activation_temperature: float = _constant(8750.0, 'K', 2e3, 1e5)
+    pre_exponential_factor: float = _constant(7.2e10, '1/min', 0.0, 1e30)
+    heat_transfer_coefficient: float = _constant(5e4, 'J/(min K)', 0.0, 1e7)
+    feed_temperature: float = _constant(350.0, 'K', 250.0, 500.0)
+    feed_concentration: float = _constant(1.0, 'mol/L', 0.0, 100.0)
+    concentration: float = _constant(0.87725294608097, 'mol/L', 0.0, 100.0)
+
+    def __post_init__(self) -> None:
+        for constant in fields(self):
+            value = getattr(self, constant.name)
+            lower, upper = constant.metadata['lower'], constant.metadata['upper']
+            # Written so that NaN, which compares false with everything, is refused too.
+            if not lower <= value <= upper:
+                raise ValueError(
+                    f'{constant.name} is {value:.10g} {constant.metadata["unit"]}, must lie in '
+                    f'[{lower:.10g}, {upper:.10g}] {constant.metadata["unit"]}')
+
+    @property
+    def dilution_rate(self) -> float:
+        """The flow rate over the volume, q/V, in 1/min."""
+        return self.flow_rate / self.volume
+
+    @property
+    def cooling_rate(self) -> float:
+        """The input gain UA/(rho C_p V), in 1/min."""
+        return self.heat_transfer_coefficient / (self.density * self.heat_capacity * self.volume)
+
+    @property
+    def heating_per_conversion(self) -> float:
+        """The temperature rise by reaction, -Delta H_R/(rho C_p), in K per mol/L."""
+        return -self.reaction_enthalpy / (self.density * self.heat_capacity)
+
+
+def one_state_reactor(
+    parameters: ReactorParameters | None = None, *, nominal_state: ArrayLike | None = None,
+) -> ControlAffineSystem:
+    """
+    Build the reactor of the paper (eq. 36): temperature as state, concentration held fixed.
+
+    Its nominal input is a coolant at 300 K.
+
+    :param parameters: the physical constants; the benchmark's when None.
+    :param nominal_state: the temperature (1,) to measure deviations from; when None, the stable
+        steady state on the cold branch at the nominal input. Give it where that may not exist, as
+        when a running plant changes.
+    :raises ValueError: when `nominal_state` is not one temperature.
+    :raises EquilibriumError: when `nominal_state` is None and there is no stable steady state.
+    """
+    constants = ReactorParameters() if parameters is None else parameters
+    drift = partial(_one_state_drift, constants)
+    jacobian = partial(_one_state_jacobian, constants)
+    if nominal_state is None:
+        nominal_state = _cold_stable_state(constants, drift, jacobian, _temperature_alone)
+    return ControlAffineSystem(
+        name='one-state reactor',
+        state_names=('temperature',),
+        state_units=('K',),
+        input_names=('coolant_temperature',),
+        input_units=('K',),
+        time_unit='min',
+        drift=drift,
+        drift_jacobian=jacobian,
+        B=np.array([[constants.cooling_rate]]),
+        nominal_state=np.asarray(nominal_state, dtype=np.float64),
+        nominal_input=np.array([NOMINAL_COOLANT_TEMPERATURE]),
+        state_lower=np.array(TEMPERATURE_RANGE[:1]),
+        state_upper=np.array(TEMPERATURE_RANGE[1:]),
+    )
+
+
+def two_state_reactor(
+    parameters: ReactorParameters | None = None, *, nominal_state: ArrayLike | None = None,
+) -> ControlAffineSystem:
+    """
+    Build the benchmark reactor of Seborg and Henson: concentration and temperature as states.
+
+    dC_A/dt = q/V (C_Af - C_A) - k exp(-E_A/(R T)) C_A; the temperature as in the paper's eq. 36.
+    Its nominal input is a coolant at 300 K.
+
+    :param parameters: the physical constants; the benchmark's when None.
+    :param nominal_state: concentration and temperature (2,) to measure deviations from; when
+        None, the stable steady state on the cold branch at the nominal input. Give it where that
+        may not exist, as when a running plant changes.
+    :raises ValueError: when `nominal_state` is not one concentration and one temperature.
+    :raises EquilibriumError: when `nominal_state` is None and there is no stable steady state.
+    """
+    constants = ReactorParameters() if parameters is None else parameters
+    drift = partial(_two_state_drift, constants)
+    jacobian = partial(_two_state_jacobian, constants)
+    if nominal_state is None:
+        nominal_state = _cold_stable_state(
+            constants, drift, jacobian, partial(_with_steady_concentration, constants))
+    return ControlAffineSystem(
+        name='two-state reactor',
+        state_names=('concentration', 'temperature'),
+        state_units=('mol/L', 'K'),
+        input_names=('coolant_temperature',),
+        input_units=('K',),
+        time_unit='min',
+        drift=drift,
+        drift_jacobian=jacobian,
+        B=np.array([[0.0], [constants.cooling_rate]]),
+        nominal_state=np.asarray(nominal_state, dtype=np.float64),
+        nominal_input=np.array([NOMINAL_COOLANT_TEMPERATURE]),
+        state_lower=np.array([0.0, TEMPERATURE_RANGE[0]]),
+        state_upper=np.array([np.inf, TEMPERATURE_RANGE[1]]),
+    )
+
+
+def _one_state_drift(constants: ReactorParameters, x: FloatArray) -> FloatArray:
+    reaction = constants.concentration * _rate_constant(constants, x)
+    return _heat_flow(constants, x) + constants.heating_per_conversion * reaction
+
+
+def _one_state_jacobian(constants: ReactorParameters, x: FloatArray) -> FloatArray:
+    steepening = constants.concentration * _rate_constant_slope(constants, x)
+    slope = _heat_flow_slope(constants) + constants.heating_per_conversion * steepening
+    return slope[..., None]
+
+
+def _two_state_drift(constants: ReactorParameters, x: FloatArray) -> FloatArray:
+    concentration, temperature = x[..., 0], x[..., 1]
+    reaction = concentration * _rate_constant(constants, temperature)
+    supply = constants.dilution_rate * (constants.feed_concentration - concentration)
+    heating = constants.heating_per_conversion * reaction
+    return np.stack([supply - reaction, _heat_flow(constants, temperature) + heating], axis=-1)
+
+
+def _two_state_jacobian(constants: ReactorParameters, x: FloatArray) -> FloatArray:
+    rate = _rate_constant(constants, x[..., 1])
+    steepening = x[..., 0] * _rate_constant_slope(constants, x[..., 1])
+    jacobian = np.empty((*x.shape, 2))
+    jacobian[..., 0, 0] = -constants.dilution_rate - rate
+    jacobian[..., 0, 1] = -steepening
+    jacobian[..., 1, 0] = constants.heating_per_conversion * rate
+    jacobian[..., 1, 1] = (
+        _heat_flow_slope(constants) + constants.heating_per_conversion * steepening)
+    return jacobian
+
+
+def _rate_constant(constants: ReactorParameters, temperature: FloatArray) -> FloatArray:
+    """Evaluate the Arrhenius law k exp(-E_A/(R T)), in 1/min."""
+    return constants.pre_exponential_factor * np.exp(
+        -constants.activation_temperature / temperature)
+
+
+def _rate_constant_slope(constants: ReactorParameters, temperature: FloatArray) -> FloatArray:
+    steepness = constants.activation_temperature / (temperature * temperature)
+    return _rate_constant(constants, temperature) * steepness
+
+
+def _heat_flow(constants: ReactorParameters, temperature: FloatArray) -> FloatArray:
+    """Evaluate the heating by the feed and by a jacket at 0 K, in K/min; B u adds the coolant."""
+    feed = constants.dilution_rate * (constants.feed_temperature - temperature)
+    return feed - constants.cooling_rate * temperature
+
+
+def _heat_flow_slope(constants: ReactorParameters) -> float:
+    return -constants.dilution_rate - constants.cooling_rate
+
+
+def _temperature_alone(temperature: FloatArray) -> FloatArray:
+    return temperature[..., None]
+
+
+def _with_steady_concentration(
+    constants: ReactorParameters, temperature: FloatArray,
+) -> FloatArray:
+    supply = constants.dilution_rate * constants.feed_concentration
+    consumption = constants.dilution_rate + _rate_constant(constants, temperature)
+    return np.stack([supply / consumption, temperature], axis=-1)
+
+
+def _cold_stable_state(
+    constants: ReactorParameters,
+    drift: ArrayFunction,
+    jacobian: ArrayFunction,
+    state_at: ArrayFunction,
+) -> FloatArray:
+    """
+    Find the stable steady state at the nominal input on the cold branch of the heat balance.
+
+    From the cold end the balance falls with temperature, until at the first fold the reaction
+    steepens more than the cooling does: the state wanted lies below that fold.
+
+    :param state_at: temperatures (...) to the states (..., n_x) at which all but the last of the
+        rates, that of the temperature, vanish.
+    """
+    def heat_balance(temperature: FloatArray) -> FloatArray:
+        coolant = constants.cooling_rate * NOMINAL_COOLANT_TEMPERATURE
+        balance: FloatArray = drift(state_at(temperature))[..., -1] + coolant
+        return balance
+
+    grid = np.linspace(*TEMPERATURE_RANGE, _SCAN_POINTS)
+    balance = heat_balance(grid)
+    rising = np.flatnonzero(np.diff(balance) > 0.0)
+    end = rising[0] if rising.size else -1
+    if balance[0] > 0.0 > balance[end]:
+        temperature = brentq(
+            lambda trial: heat_balance(np.asarray(trial)), grid[0], grid[end],
+            xtol=1e-300, rtol=1e-15)
+        state = state_at(np.asarray(temperature))
+        if np.all(np.linalg.eigvals(jacobian(state)).real < 0.0):
+            return state
+    raise EquilibriumError(
+        f'the reactor has no stable steady state on its cold branch at a coolant temperature of '
+        f'{NOMINAL_COOLANT_TEMPERATURE:.10g} K: with heat_transfer_coefficient = '
+        f'{constants.heat_transfer_coefficient:.10g} J/(min K) and feed_temperature = '
+        f'{constants.feed_temperature:.10g} K the reaction outruns the cooling; '
+        'give nominal_state, or cool more')

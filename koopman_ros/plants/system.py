@@ -1,0 +1,220 @@
+# Copyright 2026 The koopman_ros Authors
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""The control-affine system dx/dt = f(x) + B u that every plant of this package is."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+FloatArray = NDArray[np.float64]
+ArrayFunction = Callable[[FloatArray], FloatArray]
+
+SECONDS_PER_TIME_UNIT = {'min': 60.0, 's': 1.0}
+
+
+def checked_array(
+    name: str, value: ArrayLike, shape: tuple[int | None, ...], *, finite: bool = True,
+) -> FloatArray:
+    """
+    Return a read-only float64 copy of `value`.
+
+    :param shape: the expected shape, None where any length will do.
+    :raises ValueError: naming the argument and both shapes, or the argument and the first entry
+        that is not a number (with `finite`, that is infinite either).
+    """
+    array = np.array(value, dtype=np.float64)
+    fits = array.ndim == len(shape) and all(
+        expected is None or length == expected
+        for length, expected in zip(array.shape, shape, strict=True))
+    if not fits:
+        raise ValueError(
+            f'incompatible {name}: expected {_shape_text(shape)}, got {_shape_text(array.shape)}')
+    refused = ~np.isfinite(array) if finite else np.isnan(array)
+    if refused.any():
+        position = tuple(int(i) for i in np.argwhere(refused)[0])
+        raise ValueError(
+            f'{name} must be finite: entry {list(position)} is {array[position]}; '
+            'check where that number was computed or measured')
+    array.flags.writeable = False
+    return array
+
+
+def checked_vector(
+    name: str, value: ArrayLike, length: int, *, finite: bool = True,
+) -> FloatArray:
+    """
+    Return a read-only float64 vector of `value`, which may be one number for all of it.
+
+    :raises ValueError: as `checked_array` does.
+    """
+    array = np.asarray(value, dtype=np.float64)
+    if array.ndim == 0:
+        array = np.broadcast_to(array, (length,))
+    return checked_array(name, array, (length,), finite=finite)
+
+
+def _shape_text(shape: tuple[int | None, ...]) -> str:
+    lengths = ['any' if length is None else str(length) for length in shape]
+    return f'({lengths[0]},)' if len(lengths) == 1 else f'({", ".join(lengths)})'
+
+
+def _unbounded_below() -> FloatArray:
+    return np.array(-np.inf)
+
+
+def _unbounded_above() -> FloatArray:
+    return np.array(np.inf)
+
+
+@dataclass(frozen=True, eq=False)
+class ControlAffineSystem:
+    """
+    A plant dx/dt = f(x) + B u (paper, eq. 22), with names, units and a nominal point.
+
+    :param name: what the plant is called in messages.
+    :param state_names: n_x names; their units, one each, in `state_units`.
+    :param input_names: n_u names (n_u may be 0); their units, one each, in `input_units`.
+    :param time_unit: 'min' or 's', the unit of every duration and of the rates.
+    :param drift: f, states (..., n_x) to rates (..., n_x).
+    :param drift_jacobian: df/dx, states (..., n_x) to (..., n_x, n_x).
+    :param B: input matrix (n_x, n_u).
+    :param nominal_state: the point (n_x,) that deviations are measured from.
+    :param nominal_input: the input (n_u,) that goes with it.
+    :param state_lower: lowest states (n_x,) at which the model means anything; none by default.
+    :param state_upper: highest such states (n_x,); none by default.
+    :raises ValueError: when a shape, a unit or a bound does not fit, naming it.
+    """
+
+    name: str
+    state_names: tuple[str, ...]
+    state_units: tuple[str, ...]
+    input_names: tuple[str, ...]
+    input_units: tuple[str, ...]
+    time_unit: str
+    drift: ArrayFunction = field(repr=False)
+    drift_jacobian: ArrayFunction = field(repr=False)
+    B: FloatArray
+    nominal_state: FloatArray
+    nominal_input: FloatArray
+    state_lower: FloatArray = field(default_factory=_unbounded_below)
+    state_upper: FloatArray = field(default_factory=_unbounded_above)
+
+    def __post_init__(self) -> None:
+        if self.time_unit not in SECONDS_PER_TIME_UNIT:
+            raise ValueError(
+                f"time_unit is {self.time_unit!r}, must be one of "
+                f"{', '.join(map(repr, SECONDS_PER_TIME_UNIT))}")
+        for names, units in (('state_names', 'state_units'), ('input_names', 'input_units')):
+            self._set(names, tuple(getattr(self, names)))
+            self._set(units, tuple(getattr(self, units)))
+            if len(getattr(self, names)) != len(getattr(self, units)):
+                raise ValueError(
+                    f'incompatible {units}: expected ({len(getattr(self, names))},), '
+                    f'got ({len(getattr(self, units))},)')
+        if not self.state_names:
+            raise ValueError('state_names is empty, a system has at least one state')
+        self._set('B', checked_array('B', self.B, (self.n_x, self.n_u)))
+        self._set('nominal_state', self.checked_state('nominal_state', self.nominal_state))
+        self._set('nominal_input', self.checked_input('nominal_input', self.nominal_input))
+        self._set('state_lower', self.checked_bound('state_lower', self.state_lower))
+        self._set('state_upper', self.checked_bound('state_upper', self.state_upper))
+        if not np.all(self.state_lower < self.state_upper):
+            raise ValueError(
+                f'state_lower {self.state_lower} must lie below state_upper {self.state_upper}')
+        self._check_functions()
+
+    def _set(self, name: str, value: object) -> None:
+        object.__setattr__(self, name, value)
+
+    def _check_functions(self) -> None:
+        """Refuse a drift or a Jacobian that does not keep its leading axes."""
+        single = self.nominal_state
+        for state in (single, np.stack([single, single])):
+            for name, function, expected in (
+                ('drift(x)', self.drift, state.shape),
+                ('drift_jacobian(x)', self.drift_jacobian, (*state.shape, self.n_x)),
+            ):
+                got = np.shape(function(state))
+                if got != expected:
+                    raise ValueError(
+                        f'incompatible {name} at x of shape {state.shape}: '
+                        f'expected {expected}, got {got}')
+
+    @property
+    def n_x(self) -> int:
+        """The number of states."""
+        return len(self.state_names)
+
+    @property
+    def n_u(self) -> int:
+        """The number of inputs."""
+        return len(self.input_names)
+
+    @property
+    def seconds_per_time_unit(self) -> float:
+        """The length of `time_unit` in seconds."""
+        return SECONDS_PER_TIME_UNIT[self.time_unit]
+
+    @property
+    def state_scale(self) -> FloatArray:
+        """The magnitude (n_x,) of each state: the nominal one, and 1 where that is zero."""
+        magnitude = np.abs(self.nominal_state)
+        return np.where(magnitude > 0.0, magnitude, 1.0)
+
+    def derivative(self, x: ArrayLike, u: ArrayLike) -> FloatArray:
+        """
+        Evaluate dx/dt = f(x) + B u.
+
+        :param x: states (..., n_x).
+        :param u: inputs (..., n_u), with leading axes that broadcast with those of `x`.
+        :return: rates (..., n_x), in state units per time unit.
+        :raises ValueError: when a last axis has the wrong length.
+        """
+        x, u = np.asarray(x, dtype=np.float64), np.asarray(u, dtype=np.float64)
+        for name, value, length in (('x', x, self.n_x), ('u', u, self.n_u)):
+            if value.ndim == 0 or value.shape[-1] != length:
+                raise ValueError(
+                    f'incompatible {name}: expected (..., {length}), got {value.shape}')
+        return self.drift(x) + u @ self.B.T
+
+    def checked_state(self, name: str, value: ArrayLike) -> FloatArray:
+        """Return `value` as a read-only state (n_x,); raise ValueError naming it if it is none."""
+        return checked_array(name, value, (self.n_x,))
+
+    def checked_input(self, name: str, value: ArrayLike) -> FloatArray:
+        """Return `value` as a read-only input (n_u,); raise ValueError naming it if it is none."""
+        return checked_array(name, value, (self.n_u,))
+
+    def checked_bound(self, name: str, value: ArrayLike) -> FloatArray:
+        """Return `value`, a scalar or (n_x,) and possibly infinite, as a bound on the states."""
+        return checked_vector(name, value, self.n_x, finite=False)
+
+    def describe_state(self, x: FloatArray) -> str:
+        """Write a state (n_x,) with names and units, for a message."""
+        return _named(self.state_names, x, self.state_units)
+
+    def describe_input(self, u: FloatArray) -> str:
+        """Write an input (n_u,) with names and units, for a message."""
+        return _named(self.input_names, u, self.input_units) or 'no input'
+
+
+def _named(names: tuple[str, ...], values: FloatArray, units: tuple[str, ...]) -> str:
+    return ', '.join(
+        f'{name} = {value:.10g}' + ('' if unit == '1' else f' {unit}')
+        for name, value, unit in zip(names, values, units, strict=True))

@@ -1,0 +1,97 @@
+# Copyright 2026 The koopman_ros Authors
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""The paper's two-state example, linear in three coordinates."""
+
+from __future__ import annotations
+
+from functools import partial
+import math
+
+from koopman_ros.plants.exact_lift import ExactLift
+from koopman_ros.plants.system import ControlAffineSystem, FloatArray
+import numpy as np
+
+# The paper's choice: a stable first state and an unstable second one.
+PAPER_MU = -0.1
+PAPER_LAMBDA = 1.0
+
+
+def two_state_example(mu: float = PAPER_MU, lambda_: float = PAPER_LAMBDA) -> ControlAffineSystem:
+    """
+    Build dx1/dt = mu x1, dx2/dt = lambda (x2 - x1^2) + u (paper, eq. 32), nominal at the origin.
+
+    :param mu: growth rate of the first state, in 1/s.
+    :param lambda_: growth rate of the second state, in 1/s.
+    :raises ValueError: when a rate is not finite.
+    """
+    _check_rates(mu, lambda_)
+    return ControlAffineSystem(
+        name='two-state example',
+        state_names=('x1', 'x2'),
+        state_units=('1', '1'),
+        input_names=('u',),
+        input_units=('1/s',),
+        time_unit='s',
+        drift=partial(_drift, mu, lambda_),
+        drift_jacobian=partial(_drift_jacobian, mu, lambda_),
+        B=np.array([[0.0], [1.0]]),
+        nominal_state=np.zeros(2),
+        nominal_input=np.zeros(1),
+    )
+
+
+def two_state_exact_lift(mu: float = PAPER_MU, lambda_: float = PAPER_LAMBDA) -> ExactLift:
+    """
+    Build the lift z = (x1, x2, x1^2) with its A (3, 3) (paper, eq. 33 and 34).
+
+    J(x) B = (0, 1, 0) at every state, so the lifted system is linear in state and input.
+
+    :raises ValueError: when a rate is not finite.
+    """
+    _check_rates(mu, lambda_)
+    A = np.array([[mu, 0.0, 0.0], [0.0, lambda_, -lambda_], [0.0, 0.0, 2.0 * mu]])
+    return ExactLift(A=A, lift=_lift, jacobian=_lift_jacobian)
+
+
+def _check_rates(mu: float, lambda_: float) -> None:
+    for name, rate in (('mu', mu), ('lambda_', lambda_)):
+        if not math.isfinite(rate):
+            raise ValueError(f'{name} is {rate} 1/s, must be finite')
+
+
+def _drift(mu: float, lambda_: float, x: FloatArray) -> FloatArray:
+    x1, x2 = x[..., 0], x[..., 1]
+    return np.stack([mu * x1, lambda_ * (x2 - x1 * x1)], axis=-1)
+
+
+def _drift_jacobian(mu: float, lambda_: float, x: FloatArray) -> FloatArray:
+    jacobian = np.zeros((*x.shape, 2))
+    jacobian[..., 0, 0] = mu
+    jacobian[..., 1, 0] = -2.0 * lambda_ * x[..., 0]
+    jacobian[..., 1, 1] = lambda_
+    return jacobian
+
+
+def _lift(x: FloatArray) -> FloatArray:
+    x1, x2 = x[..., 0], x[..., 1]
+    return np.stack([x1, x2, x1 * x1], axis=-1)
+
+
+def _lift_jacobian(x: FloatArray) -> FloatArray:
+    jacobian = np.zeros((*x.shape[:-1], 3, 2))
+    jacobian[..., 0, 0] = 1.0
+    jacobian[..., 1, 1] = 1.0
+    jacobian[..., 2, 0] = 2.0 * x[..., 0]
+    return jacobian

@@ -1,0 +1,272 @@
+# Copyright 2026 The koopman_ros Authors
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""Zero-order-hold simulation against closed forms, and its failures."""
+
+from dataclasses import replace
+import pickle
+import time
+
+from koopman_ros.plants import (
+    advance,
+    integration,
+    IntegrationError,
+    IntegrationFailure,
+    IntegratorSettings,
+    one_state_reactor,
+    scalar_example,
+    simulate,
+    simulate_many,
+    two_state_example,
+    two_state_reactor,
+)
+import numpy as np
+import pytest
+
+STRICT = IntegratorSettings(rtol=1e-13)
+UNBOUNDED = IntegratorSettings(lower=-np.inf, upper=np.inf)
+
+
+def _two_state_closed_form(x, u, t, mu, lambda_):
+    """Solve the two-state example over a time t with its input held at u."""
+    x1, x2 = x
+    slow, fast = np.exp(2.0 * mu * t), np.exp(lambda_ * t)
+    coupling = lambda_ * x1 * x1 * (slow - fast) / (2.0 * mu - lambda_)
+    return np.array([x1 * np.exp(mu * t), x2 * fast - coupling + u * (fast - 1.0) / lambda_])
+
+
+def _random_holds(count, trajectories=None):
+    shape = (count, 1) if trajectories is None else (trajectories, count, 1)
+    return np.random.default_rng(1).uniform(281.3, 300.9, shape)
+
+
+@pytest.mark.parametrize('x0', [0.05, 1.0, 3.0])
+def test_scalar_example_against_its_closed_form(x0):
+    trajectory = simulate(scalar_example(), [x0], np.zeros((9, 0)), 0.1 / x0)
+    expected = x0 / (1.0 - x0 * trajectory.times)
+    np.testing.assert_allclose(trajectory.states[:, 0], expected, rtol=1e-9)
+
+
+@pytest.mark.parametrize(('mu', 'lambda_'), [(-0.1, 1.0), (0.2, -1.5)])
+def test_two_state_example_against_its_closed_form(mu, lambda_):
+    inputs = np.array([[1.0], [-2.0], [0.5], [40.0], [3.0]])
+    trajectory = simulate(two_state_example(mu, lambda_), [5.0, 5.0], inputs, 1.0)
+    expected = [np.array([5.0, 5.0])]
+    for u in inputs[:, 0]:
+        expected.append(_two_state_closed_form(expected[-1], u, 1.0, mu, lambda_))
+    np.testing.assert_allclose(trajectory.states, expected, rtol=1e-9)
+
+
+def test_reactor_settles_at_its_steady_state():
+    system = one_state_reactor()
+    state = advance(system, [310.0], [300.0], 60.0)
+    np.testing.assert_allclose(state, system.nominal_state, rtol=1e-9)
+
+
+@pytest.mark.parametrize('rtol', [1e-9, 1e-10, 1e-11])
+def test_tolerance_is_kept(rtol):
+    system, inputs = one_state_reactor(), _random_holds(40)
+    exact = simulate(system, system.nominal_state, inputs, 0.5, settings=STRICT)
+    trajectory = simulate(
+        system, system.nominal_state, inputs, 0.5, settings=IntegratorSettings(rtol=rtol))
+    np.testing.assert_allclose(trajectory.states, exact.states, rtol=10.0 * rtol)
+
+
+def test_absolute_tolerance_matters_near_zero():
+    loose, tight = (
+        advance(two_state_example(), [1e-6, 1e-6], [0.0], 3.0,
+                settings=IntegratorSettings(atol=atol))
+        for atol in ([1e-3, 1e-3], 1e-16))
+    exact = _two_state_closed_form([1e-6, 1e-6], 0.0, 3.0, -0.1, 1.0)
+    assert abs(tight[1] / exact[1] - 1.0) < 1e-9 < abs(loose[1] / exact[1] - 1.0)
+
+
+def test_advancing_hold_by_hold_is_simulating_to_the_bit():
+    system, inputs = two_state_reactor(), _random_holds(5)
+    trajectory = simulate(system, system.nominal_state, inputs, 1.0 / 60.0)
+    state = system.nominal_state
+    for n, u in enumerate(inputs):
+        state = advance(system, state, u, 1.0 / 60.0)
+        np.testing.assert_array_equal(state, trajectory.states[n + 1])
+
+
+def test_times_are_not_summed_up():
+    trajectory = simulate(scalar_example(), [0.0], np.zeros((1000, 0)), 0.1, start_time=7.0)
+    np.testing.assert_array_equal(trajectory.times, 7.0 + 0.1 * np.arange(1001))
+
+
+def test_substeps_record_more_of_the_same_trajectory():
+    system, inputs = one_state_reactor(), _random_holds(6)
+    coarse = simulate(system, [320.0], inputs, 0.7)
+    fine = simulate(system, [320.0], inputs, 0.7, substeps=3)
+    assert fine.states.shape == (19, 1)
+    np.testing.assert_array_equal(fine.times[::3], coarse.times)
+    np.testing.assert_array_equal(fine.inputs, np.repeat(inputs, 3, axis=0))
+    np.testing.assert_allclose(fine.states[::3], coarse.states, rtol=1e-9)
+
+
+def test_many_agree_with_one_by_one():
+    system, inputs = two_state_reactor(), _random_holds(8, trajectories=20)
+    starts = np.random.default_rng(2).uniform([0.7, 305.0], [1.0, 325.0], (20, 2))
+    together = simulate_many(system, starts, inputs, 0.5, substeps=2, start_time=3.0)
+    assert together.states.shape == (20, 17, 2)
+    assert together.inputs.shape == (20, 16, 1)
+    for x0, u, states in zip(starts, inputs, together.states, strict=True):
+        alone = simulate(system, x0, u, 0.5, substeps=2, start_time=3.0)
+        np.testing.assert_array_equal(alone.times, together.times)
+        np.testing.assert_allclose(states, alone.states, rtol=1e-9)
+
+
+def test_one_moving_trajectory_among_resting_ones_keeps_its_tolerance():
+    system = one_state_reactor()
+    starts = np.tile(system.nominal_state, (2000, 1))
+    inputs = np.full((2000, 1, 1), 300.0)
+    starts[700], inputs[700] = 306.0, 285.0
+    together = simulate_many(system, starts, inputs, 1.0)
+    exact = advance(system, starts[700], inputs[700, 0], 1.0, settings=STRICT)
+    np.testing.assert_allclose(together.states[700, 1], exact, rtol=1e-11)
+
+
+def test_stacks_are_split_where_their_tolerance_would_get_too_tight():
+    settings = IntegratorSettings(rtol=4.0 * integration.TIGHTEST_RTOL)
+    assert integration.largest_stack(settings.rtol) == 16
+    system = one_state_reactor()
+    starts, inputs = np.linspace([306.0], [325.0], 40), np.full((40, 2, 1), 290.0)
+    together = simulate_many(system, starts, inputs, 0.3, settings=settings)
+    alone = [simulate(system, x, u, 0.3, settings=settings).states
+             for x, u in zip(starts, inputs, strict=True)]
+    np.testing.assert_allclose(together.states, alone, rtol=1e-12)
+
+
+def test_no_trajectories_and_no_holds():
+    system = one_state_reactor()
+    assert simulate_many(system, np.zeros((0, 1)), np.zeros((0, 3, 1)), 1.0).states.shape == (
+        0, 4, 1)
+    nothing = simulate(system, [310.0], np.zeros((0, 1)), 1.0)
+    np.testing.assert_array_equal(nothing.states, [[310.0]])
+
+
+def test_no_time_no_change():
+    np.testing.assert_array_equal(advance(one_state_reactor(), [310.0], [300.0], 0.0), [310.0])
+
+
+def test_runaway_ends_in_an_error_that_names_state_and_time():
+    system = one_state_reactor()
+    message = (r'one-state reactor: temperature = \d+\.\d+ K at 1\.\d+ min, '
+               r'temperature outside \[200, 1000\] K: it left its bounds; choose an input')
+    begin = time.monotonic()
+    with pytest.raises(IntegrationError, match=message) as caught:
+        advance(system, system.nominal_state, [310.0], 100.0)
+    assert time.monotonic() - begin < 2.0
+    assert caught.value.failure is IntegrationFailure.OUT_OF_BOUNDS
+    assert 1.0 < caught.value.time < 2.0
+    assert caught.value.state.item() > 1000.0
+
+
+@pytest.mark.parametrize(('bounds', 'outside'), [
+    ({'upper': [np.inf, 325.0]}, r'temperature outside \[200, 325\] K'),
+    ({'lower': [0.8, 200.0]}, r'concentration outside \[0\.8, inf\] mol/L'),
+    ({'lower': [0.0, 210.0], 'upper': 326.0},
+     r'temperature outside \[210, 326\] K'),
+])
+def test_bounds_of_the_caller_replace_those_of_the_system(bounds, outside):
+    system = two_state_reactor()
+    with pytest.raises(IntegrationError, match=outside):
+        advance(system, system.nominal_state, [320.0], 10.0, settings=IntegratorSettings(**bounds))
+
+
+def test_start_out_of_bounds():
+    with pytest.raises(IntegrationError, match=r'temperature = 1001 K at 0 min, .* left its bou'):
+        advance(one_state_reactor(), [1001.0], [300.0], 1.0)
+
+
+def test_time_of_a_failure_counts_from_the_start_time():
+    system = one_state_reactor()
+    with pytest.raises(IntegrationError, match=r'K at 11\.\d+ min') as caught:
+        simulate(system, system.nominal_state, np.full((20, 1), 310.0), 0.25, start_time=10.0)
+    assert 11.0 < caught.value.time < 12.0
+
+
+def test_failure_of_one_of_many_says_which():
+    inputs = np.full((4, 2, 1), 290.0)
+    inputs[2] = 310.0
+    with pytest.raises(IntegrationError, match='one-state reactor, trajectory 2: ') as caught:
+        simulate_many(one_state_reactor(), np.full((4, 1), 324.0), inputs, 5.0)
+    assert caught.value.trajectory == 2
+
+
+def test_escape_to_infinity_without_bounds():
+    begin = time.monotonic()
+    with pytest.raises(IntegrationError, match=r'at 1 s: it changes too fast') as caught:
+        advance(scalar_example(), [1.0], [], 2.0)
+    assert time.monotonic() - begin < 2.0
+    assert caught.value.failure is IntegrationFailure.STEP_TOO_SMALL
+    assert caught.value.time == pytest.approx(1.0)
+
+
+def test_infinite_rate_at_the_start():
+    with pytest.raises(IntegrationError, match='its rate is not finite') as caught:
+        advance(scalar_example(), [1e200], [], 1.0)
+    assert caught.value.failure is IntegrationFailure.NON_FINITE
+
+
+def test_runaway_without_bounds_is_no_warning():
+    state = advance(one_state_reactor(), [324.0], [310.0], 5.0, settings=UNBOUNDED)
+    assert state.item() > 1e6
+
+
+def test_stiff_plant_is_given_up(monkeypatch):
+    monkeypatch.setattr(integration, '_MAX_STEPS_PER_HOLD', 50)
+    with pytest.raises(IntegrationError, match='too many integration steps') as caught:
+        advance(two_state_example(-0.1, -1e6), [0.0, 1.0], [1.0], 1.0)
+    assert caught.value.failure is IntegrationFailure.TOO_MANY_STEPS
+
+
+def test_integration_error_survives_pickling():
+    with pytest.raises(IntegrationError) as caught:
+        advance(one_state_reactor(), [324.0], [310.0], 5.0)
+    copy = pickle.loads(pickle.dumps(caught.value))
+    assert str(copy) == str(caught.value)
+    assert (copy.failure, copy.time) == (caught.value.failure, caught.value.time)
+
+
+@pytest.mark.parametrize(('call', 'message'), [
+    (lambda s: advance(s, [1.0, 2.0], [300.0], 1.0), r'incompatible x: expected \(1,\)'),
+    (lambda s: advance(s, [np.nan], [300.0], 1.0), r'x must be finite: entry \[0\] is nan'),
+    (lambda s: advance(s, [320.0], [], 1.0), r'incompatible u: expected \(1,\), got \(0,\)'),
+    (lambda s: advance(s, [320.0], [300.0], -1.0), r'duration is -1\.0 min, must be finite'),
+    (lambda s: advance(s, [320.0], [300.0], np.nan), 'duration is nan min'),
+    (lambda s: simulate(s, [320.0], [300.0], 1.0),
+     r'incompatible inputs: expected \(any, 1\), got \(1,\)'),
+    (lambda s: simulate(s, [320.0], [[300.0]], 0.0), r'sample_period is 0\.0 min, must be'),
+    (lambda s: simulate(s, [320.0], [[300.0]], 1.0, substeps=0), 'substeps is 0, must be at'),
+    (lambda s: simulate_many(s, [320.0], [[[300.0]]], 1.0), r'incompatible x0: expected \(any'),
+    (lambda s: simulate_many(s, [[320.0]], np.zeros((2, 1, 1)), 1.0),
+     r'incompatible inputs: expected \(1, any, 1\), got \(2, 1, 1\)'),
+    (lambda s: IntegratorSettings(rtol=1e-6), r'rtol is 1e-06, must lie in \[2\.22e-14, 1e-09\]'),
+    (lambda s: IntegratorSettings(rtol=np.nan), 'rtol is nan'),
+    (lambda s: advance(s, [320.0], [300.0], 1.0, settings=IntegratorSettings(atol=0.0)),
+     'atol is .* must be finite and above 0'),
+    (lambda s: advance(s, [320.0], [300.0], 1.0, settings=IntegratorSettings(lower=[1.0, 2.0])),
+     r'incompatible lower: expected \(1,\), got \(2,\)'),
+])
+def test_arguments_that_do_not_fit(call, message):
+    with pytest.raises(ValueError, match=message):
+        call(one_state_reactor())
+
+
+def test_bounds_of_the_system_apply_by_default():
+    system = replace(two_state_example(), state_upper=[np.inf, 20.0])
+    with pytest.raises(IntegrationError, match=r'x2 outside \[-inf, 20\]: it left its bounds'):
+        advance(system, [0.0, 1.0], [1.0], 10.0)
