@@ -73,6 +73,7 @@ def locate(path: str | os.PathLike[str], *, recover: bool) -> BagFiles:
     path = Path(path)
     if not path.exists():
         raise BagReadError(f'bag {str(path)!r} does not exist: check the path')
+    files: tuple[Path, ...]
     if not path.is_dir():
         files, listed = (path,), True
     elif (path / METADATA_FILE).is_file():

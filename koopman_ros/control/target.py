@@ -53,5 +53,5 @@ def steady_state_target(model: LiftedModel, x_ref: Array) -> Target:
     :param x_ref: (n_x,) scaled deviation.
     """
     drift = model.drift(x_ref)
-    u = np.linalg.lstsq(model.B, -drift, rcond=None)[0]
+    u: Array = np.linalg.lstsq(model.B, -drift, rcond=None)[0].astype(np.float64)
     return Target(x_ref, model.lift(x_ref), u, float(np.linalg.norm(drift + model.B @ u)))

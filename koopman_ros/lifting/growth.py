@@ -18,6 +18,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
 
 from koopman_ros.lifting.levenberg_marquardt import minimise, Status
 from koopman_ros.lifting.residuals import Layout, lift, Problem
@@ -112,8 +113,7 @@ def grow(x: Tensor, f: Tensor, recipe: Recipe, seed: int, monitor: Monitor | Non
         minimum = minimise(
             Problem(layout, x, f, recipe.whitening).evaluate, start,
             max_iterations=recipe.max_iterations,
-            interrupted=None if monitor is None else (
-                lambda iteration, cost, n=n_z: monitor(n, iteration, cost)))
+            interrupted=None if monitor is None else partial(monitor, n_z))
         grown = Grown(layout, minimum.theta, minimum.status,
                       grown.iterations + minimum.iterations)
         W, b, V, _ = layout.split(minimum.theta)

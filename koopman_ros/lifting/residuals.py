@@ -53,7 +53,7 @@ class Layout:
 
     def split(self, theta: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
         """Return views of W, b, V and A in the flat vector."""
-        W, b, V, A = torch.split(theta, self.sizes)
+        W, b, V, A = torch.split(theta, list(self.sizes))
         return (W.view(self.hidden, self.n_x), b, V.view(self.n_free, self.hidden),
                 A.view(self.n_z, self.n_z))
 

@@ -18,6 +18,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from functools import partial
 import hashlib
 
 from koopman_ros import __version__
@@ -113,8 +114,8 @@ class Trained:
     starts: int
 
 
-# Called after every step with (start, n_z, iteration, cost).
-Progress = Callable[[int, int, int, float], None]
+# Called after every step with (start, n_z, iteration, cost); True ends that start early.
+Progress = Callable[[int, int, int, float], bool]
 
 
 def train(plant: Plant, samples: Samples, recipe: Recipe, *, seed: int = 0, starts: int = 4,
@@ -153,8 +154,8 @@ def train(plant: Plant, samples: Samples, recipe: Recipe, *, seed: int = 0, star
     torch.set_num_threads(1)
     try:
         for start in range(starts):
-            grown = grow(x, f, recipe, seed + start, None if progress is None else (
-                lambda n_z, iteration, cost, s=start: bool(progress(s, n_z, iteration, cost))))
+            monitor = None if progress is None else partial(progress, start)
+            grown = grow(x, f, recipe, seed + start, monitor)
             model = _assemble(grown, B, states, inputs, plant.time_unit,
                               replace(provenance, seed=seed + start))
             rw = fit(model, parts[1].x, parts[1].dxdt, parts[1].u).rw
