@@ -1,0 +1,190 @@
+# Copyright 2026 The koopman_ros Authors
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""The controller node: answers each temperature measurement with a coolant set-point."""
+
+from __future__ import annotations
+
+import sys
+
+from koopman_ros.control import Controller, Mode, Report, State
+from koopman_ros.lifting import LiftedModel, load, ModelFileError
+from koopman_ros.nodes import topics
+from koopman_ros.nodes.controller_parameters import ControllerParameters, TABLE
+from koopman_ros.nodes.diagnostics import DiagnosticsPublisher, Level, Status
+from koopman_ros.nodes.messages import (
+    stamp_nanoseconds,
+    temperature_message,
+    to_celsius,
+    to_kelvin,
+)
+from koopman_ros.nodes.process import run
+from koopman_ros.nodes.shipped import model_path
+import numpy as np
+from rclpy.node import Node
+from rclpy.qos_overriding_options import QoSOverridingOptions
+from sensor_msgs.msg import Temperature
+from std_srvs.srv import SetBool, Trigger
+
+
+class ControllerNode(Node):
+    """Carry messages to and from the control step; see the README for topics and services."""
+
+    def __init__(self) -> None:
+        super().__init__('controller', automatically_declare_parameters_from_overrides=True)
+        parameters = TABLE.declare(self)
+        self._model_name = parameters.model
+        self._controller = Controller(_load_suitable(parameters.model), parameters.settings())
+        self._state = State()
+        self._report = Report(Mode.AUTOMATIC)
+        self._refused = ''
+        self._measurements = 0
+        self._temperature = np.nan
+
+        self._commands = self.create_publisher(
+            Temperature, topics.COOLANT_SETPOINT, topics.LOOP_QOS)
+        self._active = self.create_publisher(
+            Temperature, topics.ACTIVE_SETPOINT, topics.LATCHED_QOS)
+        self._published_setpoint: float | None = None
+        self._diagnostics = DiagnosticsPublisher(self, 'control', parameters.model, self._status)
+        # volatile, so that `ros2 topic pub` matches
+        self.create_subscription(
+            Temperature, topics.SETPOINT, self._on_setpoint, topics.LOOP_QOS)
+        self.create_subscription(Temperature, topics.MANUAL_COOLANT_SETPOINT,
+                                 self._on_manual_coolant_setpoint, topics.LOOP_QOS)
+        # a sensor driver that publishes best effort needs this overridden to match
+        self.create_subscription(
+            Temperature, topics.TEMPERATURE, self._on_temperature, topics.LOOP_QOS,
+            qos_overriding_options=QoSOverridingOptions.with_default_policies())
+        self.create_service(SetBool, '~/set_automatic', self._on_set_automatic)
+        self.create_service(Trigger, '~/reload_model', self._on_reload_model)
+        TABLE.follow(self, parameters, self._on_parameters)
+        self.get_logger().info(self._about_model())
+
+    def _about_model(self) -> str:
+        states = self._controller.model.states
+        return (f'model {self._model_name}: n_z = {self._controller.model.n_z}, trained for '
+                f'{to_celsius(states.lower[0]):.2f} to {to_celsius(states.upper[0]):.2f} degC')
+
+    def _on_temperature(self, message: Temperature) -> None:
+        self._measurements += 1
+        self._temperature = message.temperature
+        self._state, command, self._report = self._controller.step(
+            self._state, np.array([to_kelvin(message.temperature)]),
+            stamp_nanoseconds(message.header.stamp))
+        self._commands.publish(temperature_message(
+            float(command[0]), message.header.stamp, message.header.frame_id))
+        active = self._report.active_setpoint
+        if active is not None and active[0] != self._published_setpoint:
+            self._published_setpoint = float(active[0])
+            self._active.publish(temperature_message(
+                float(active[0]), message.header.stamp, message.header.frame_id))
+        if self._report.clock_went_back:
+            self.get_logger().warning('the measurement is older than the last one: time starts '
+                                      'afresh')
+        self._diagnostics.publish_if_changed()
+
+    def _on_setpoint(self, message: Temperature) -> None:
+        self._state, self._refused = self._controller.request_setpoint(
+            self._state, np.array([to_kelvin(message.temperature)]),
+            stamp_nanoseconds(message.header.stamp))
+        if self._refused:
+            self.get_logger().warning(self._refused, throttle_duration_sec=1.0)
+        else:
+            self.get_logger().info(f'set-point {message.temperature:.4g} degC accepted',
+                                   throttle_duration_sec=1.0)
+        self._diagnostics.publish_if_changed()
+
+    def _on_manual_coolant_setpoint(self, message: Temperature) -> None:
+        self._state, self._refused = self._controller.request_manual_input(
+            self._state, np.array([to_kelvin(message.temperature)]))
+        if self._refused:
+            self.get_logger().warning(self._refused, throttle_duration_sec=1.0)
+
+    def _on_set_automatic(self, request: SetBool.Request, response: SetBool.Response
+                          ) -> SetBool.Response:
+        mode = Mode.AUTOMATIC if request.data else Mode.MANUAL
+        self._state = self._controller.set_mode(self._state, mode)
+        response.success, response.message = True, f'{mode.value} mode'
+        self.get_logger().info(response.message)
+        return response
+
+    def _on_reload_model(self, _: Trigger.Request, response: Trigger.Response
+                         ) -> Trigger.Response:
+        try:
+            model = _load_suitable(self._model_name)
+        except (ModelFileError, FileNotFoundError) as error:
+            response.success, response.message = False, f'the old model is kept: {error}'
+            self.get_logger().error(response.message)
+            return response
+        self._controller = Controller(model, self._controller.settings)
+        response.success, response.message = True, self._about_model()
+        self.get_logger().info(response.message)
+        return response
+
+    def _on_parameters(self, parameters: ControllerParameters) -> None:
+        self._controller = Controller(self._controller.model, parameters.settings())
+
+    def _status(self) -> Status:
+        report, model = self._report, self._controller.model
+        level, message = Level.OK, f'{report.mode.value}'
+        if not self._measurements:
+            level, message = Level.WARN, 'waiting for the first temperature measurement'
+        elif report.problem:
+            level, message = Level.ERROR, report.problem
+        elif report.outside > 0.0:
+            level, message = Level.WARN, (
+                f'temperature is outside the trained range '
+                f'[{to_celsius(model.states.lower[0]):.2f}, '
+                f'{to_celsius(model.states.upper[0]):.2f}] degC: the model extrapolates')
+        elif self._refused:
+            level, message = Level.WARN, f'request refused: {self._refused}'
+        elif report.at_range:
+            message += ', coolant at its limit'
+        elif report.at_rate:
+            message += ', coolant at its rate limit'
+        active = report.active_setpoint
+        command = self._state.command
+        return Status(level, message, {
+            'mode': report.mode.value,
+            'law': 'none' if report.law is None else report.law.value,
+            'model': self._model_name,
+            'temperature [degC]': float(self._temperature),
+            'set-point [degC]': np.nan if active is None else to_celsius(float(active[0])),
+            'coolant [degC]': np.nan if command is None else to_celsius(float(command[0])),
+            'distance outside training box [half widths]': float(report.outside),
+            'Riccati residual': float(report.residual),
+            'gain norm': float(report.gain),
+            'measurements': self._measurements,
+        })
+
+
+def _load_suitable(name: str) -> LiftedModel:
+    """Load a model and refuse one that is not for one temperature and one coolant temperature."""
+    path = model_path(name)
+    model = load(path)
+    if (model.states.units, model.inputs.units) != (('K',), ('K',)):
+        raise ModelFileError(
+            f'{path} has states in {model.states.units} and inputs in {model.inputs.units}, the '
+            "controller needs one of each in ('K',): choose a model of the one-state reactor")
+    return model
+
+
+def main(args: list[str] | None = None) -> int:
+    """Run the controller node."""
+    return run('controller', ControllerNode, args)
+
+
+if __name__ == '__main__':
+    sys.exit(main())

@@ -1,0 +1,96 @@
+# Copyright 2026 The koopman_ros Authors
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""Diagnostics of a node: once a second by the wall clock, and at once when the state changes."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+from enum import Enum
+import time
+
+from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
+from koopman_ros.nodes.messages import stamp_message
+from koopman_ros.nodes.topics import DIAGNOSTICS
+from rclpy.clock import Clock, ClockType
+from rclpy.node import Node
+
+
+class Level(Enum):
+    """Severity of a status, as one byte."""
+
+    OK = DiagnosticStatus.OK
+    WARN = DiagnosticStatus.WARN
+    ERROR = DiagnosticStatus.ERROR
+
+
+@dataclass(frozen=True)
+class Status:
+    """
+    What a node says of itself.
+
+    :param level: severity.
+    :param message: one sentence an operator reads.
+    :param values: figures with their units in the key, e.g. ``{'temperature [degC]': 51.3}``.
+    """
+
+    level: Level
+    message: str
+    values: Mapping[str, object] = field(default_factory=dict)
+
+
+class DiagnosticsPublisher:
+    """
+    Publish the status of one task of a node (diagnostic_updater's conventions).
+
+    :param node: the node.
+    :param task: name of the task; the status is named ``<node>: <task>``.
+    :param hardware_id: what the status is about.
+    :param collect: returns the present status.
+    """
+
+    def __init__(self, node: Node, task: str, hardware_id: str,
+                 collect: Callable[[], Status]) -> None:
+        self._name = f'{node.get_fully_qualified_name().lstrip("/")}: {task}'
+        self._hardware_id = hardware_id
+        self._collect = collect
+        self._last: tuple[Level, str] | None = None
+        self._publisher = node.create_publisher(DiagnosticArray, DIAGNOSTICS, 10)
+        # the wall clock: diagnostics go on while simulated time stands still
+        self._clock = Clock(clock_type=ClockType.STEADY_TIME)
+        self._timer = node.create_timer(1.0, self.publish, clock=self._clock)
+
+    def publish(self) -> None:
+        """Publish the present status."""
+        status = self._collect()
+        self._last = (status.level, status.message)
+        message = DiagnosticArray()
+        message.header.stamp = stamp_message(time.time_ns())
+        message.status.append(DiagnosticStatus(
+            level=status.level.value, name=self._name, message=status.message,
+            hardware_id=self._hardware_id,
+            values=[KeyValue(key=key, value=_text(value))
+                    for key, value in status.values.items()]))
+        self._publisher.publish(message)
+
+    def publish_if_changed(self) -> None:
+        """Publish at once when the level or the sentence differ from the last ones."""
+        status = self._collect()
+        if (status.level, status.message) != self._last:
+            self.publish()
+
+
+def _text(value: object) -> str:
+    return f'{value:.9g}' if isinstance(value, float) else str(value)

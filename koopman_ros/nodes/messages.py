@@ -1,0 +1,60 @@
+# Copyright 2026 The koopman_ros Authors
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""Conversion between messages and SI values, once, at the boundary (REP 103)."""
+
+from __future__ import annotations
+
+from builtin_interfaces.msg import Time
+from sensor_msgs.msg import Temperature
+
+NANOSECONDS = 1_000_000_000
+ZERO_CELSIUS = 273.15  # K
+
+
+def to_kelvin(celsius: float) -> float:
+    """Convert a temperature from degrees Celsius."""
+    return celsius + ZERO_CELSIUS
+
+
+def to_celsius(kelvin: float) -> float:
+    """Convert a temperature to degrees Celsius."""
+    return kelvin - ZERO_CELSIUS
+
+
+def stamp_nanoseconds(stamp: Time) -> int:
+    """Return a stamp as integer nanoseconds."""
+    return int(stamp.sec) * NANOSECONDS + int(stamp.nanosec)
+
+
+def stamp_message(nanoseconds: int) -> Time:
+    """Return integer nanoseconds as a stamp."""
+    seconds, rest = divmod(nanoseconds, NANOSECONDS)
+    return Time(sec=seconds, nanosec=rest)
+
+
+def temperature_message(kelvin: float, stamp: Time, frame_id: str, variance: float = 0.0
+                        ) -> Temperature:
+    """
+    Build a temperature message.
+
+    :param kelvin: temperature in K.
+    :param stamp: time of the sample, or of the measurement that is answered.
+    :param frame_id: where the temperature is taken.
+    :param variance: in K^2; 0 means unknown.
+    """
+    message = Temperature(temperature=to_celsius(kelvin), variance=variance)
+    message.header.stamp = stamp
+    message.header.frame_id = frame_id
+    return message

@@ -1,0 +1,55 @@
+# Copyright 2026 The koopman_ros Authors
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""
+The shipped parameter files, written from the parameter tables.
+
+Run it as ``python -m koopman_ros.nodes.parameter_files`` after a change to a table.
+"""
+
+from __future__ import annotations
+
+import argparse
+from pathlib import Path
+import sys
+
+from koopman_ros.nodes import controller_parameters, plant_parameters, trainer_parameters
+from koopman_ros.nodes.parameters import ParameterTable
+
+TABLES: dict[str, ParameterTable] = {
+    'plant': plant_parameters.TABLE,
+    'controller': controller_parameters.TABLE,
+    'trainer': trainer_parameters.TABLE,
+}
+
+
+def parameter_file(node: str) -> str:
+    """Return the text of a node's parameter file, every parameter at its default."""
+    title = (f'# Parameters of the {node} node, all at their defaults. Use a copy with\n'
+             f'#   ros2 run koopman_ros {node} --ros-args --params-file {node}.yaml\n')
+    return title + TABLES[node].yaml(node)
+
+
+def main(args: list[str] | None = None) -> int:
+    """Write all parameter files."""
+    parser = argparse.ArgumentParser(description='Write the shipped parameter files.')
+    parser.add_argument('--output', type=Path, default=Path('config'))
+    output = parser.parse_args(args).output
+    for node in TABLES:
+        (output / f'{node}.yaml').write_text(parameter_file(node))
+    return 0
+
+
+if __name__ == '__main__':
+    sys.exit(main())

@@ -1,0 +1,263 @@
+# Copyright 2026 The koopman_ros Authors
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""Parameter tables: one frozen dataclass a node gives declarations, checks, snapshot and YAML."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Mapping
+from dataclasses import dataclass, field, fields, MISSING
+import difflib
+import math
+from typing import Any, Generic, TypeVar
+
+from rcl_interfaces.msg import ParameterDescriptor, SetParametersResult
+from rclpy.exceptions import InvalidParameterTypeException
+from rclpy.node import Node
+from rclpy.parameter import Parameter
+
+T = TypeVar('T')
+
+_TYPE_WORDS = {
+    bool: ('a boolean', 'true'),
+    int: ('an integer', '1'),
+    float: ('a double', '1.0'),
+    str: ('a string', 'text'),
+    tuple: ('a list of strings', '[a, b]'),
+}
+# Parameters that rclpy itself declares or reads.
+_RCLPY_PARAMETERS = ('use_sim_time', 'start_type_description_service')
+
+
+class ConfigurationError(ValueError):
+    """A node cannot start with its parameters; the message is one line for the user."""
+
+
+@dataclass(frozen=True)
+class Specification:
+    """
+    One row of a parameter table.
+
+    :param name: name of the ROS parameter.
+    :param default: default, whose type is the parameter's type (a tuple is a string array).
+    :param unit: unit, empty for none.
+    :param description: one sentence without the unit.
+    :param minimum: smallest value.
+    :param maximum: largest value.
+    :param open_minimum: whether the minimum itself is excluded.
+    :param choices: allowed strings, empty for any.
+    :param read_only: whether it can be changed while the node runs.
+    """
+
+    name: str
+    default: Any
+    unit: str
+    description: str
+    minimum: float = -math.inf
+    maximum: float = math.inf
+    open_minimum: bool = False
+    choices: tuple[str, ...] = ()
+    read_only: bool = False
+
+    @property
+    def range_text(self) -> str:
+        """The allowed values in words, empty when all are allowed."""
+        if self.choices:
+            return 'one of ' + ', '.join(self.choices)
+        if math.isinf(self.minimum) and math.isinf(self.maximum):
+            return ''
+        unit = f' {self.unit}' if self.unit else ''
+        if math.isinf(self.maximum):
+            return f'{"above" if self.open_minimum else "at least"} {self.minimum:.10g}{unit}'
+        bracket = '(' if self.open_minimum else '['
+        return f'{bracket}{self.minimum:.10g}, {self.maximum:.10g}]{unit}'
+
+    def check(self, value: Any) -> str:
+        """Return what is wrong with a value of the right type, or an empty string."""
+        unit = f' {self.unit}' if self.unit else ''
+        if isinstance(value, float) and not math.isfinite(value):
+            return f'{self.name} = {value}{unit} is not finite'
+        if self.choices and value not in self.choices:
+            return f'{self.name} = {value!r} must be {self.range_text}'
+        if isinstance(value, (int, float)) and not isinstance(value, bool):
+            low = value <= self.minimum if self.open_minimum else value < self.minimum
+            if low or value > self.maximum:
+                return f'{self.name} = {value}{unit} must be {self._in_range_words()}'
+        return ''
+
+    def _in_range_words(self) -> str:
+        text = self.range_text
+        return f'in {text}' if text[0] in '[(' else text
+
+    def type_error(self) -> str:
+        """Return the sentence for a value of another type."""
+        word, example = _TYPE_WORDS[type(self.default)]
+        return f'{self.name} must be {word}, e.g. {example}'
+
+
+def parameter(default: Any, description: str, **details: Any) -> Any:
+    """
+    Declare a field of a parameter dataclass; `details` are those of :class:`Specification`.
+
+    :param default: default value.
+    :param description: one sentence without the unit.
+    """
+    return field(default=default, metadata={'description': description, **details})
+
+
+class ParameterTable(Generic[T]):
+    """
+    The parameters of a node, from the dataclass that is also their typed, frozen snapshot.
+
+    :param kind: a frozen dataclass whose fields come from :func:`parameter`.
+    :param cross_check: returns what is wrong with a whole snapshot, or an empty string.
+    """
+
+    def __init__(self, kind: type[T], cross_check: Callable[[T], str] = lambda _: '') -> None:
+        self.kind = kind
+        self.cross_check = cross_check
+        self.rows: dict[str, Specification] = {}
+        for item in fields(kind):  # type: ignore[arg-type]
+            assert item.default is not MISSING
+            details = {'unit': '', **item.metadata}
+            self.rows[item.name] = Specification(item.name, item.default, **details)
+
+    def check(self, snapshot: T) -> str:
+        """Return the first thing wrong with a snapshot, or an empty string."""
+        for name, row in self.rows.items():
+            reason = row.check(getattr(snapshot, name))
+            if reason:
+                return reason
+        return self.cross_check(snapshot)
+
+    def declare(self, node: Node) -> T:
+        """
+        Declare every parameter on a node that declared its overrides, and validate the whole.
+
+        :param node: created with ``automatically_declare_parameters_from_overrides``, which is
+            how names that no table knows come to light.
+        :raises ConfigurationError: naming the parameter, its value and the allowed range.
+        """
+        given = node.get_parameters_by_prefix('')
+        self._refuse_unknown(given)
+        values = {}
+        for name, row in self.rows.items():
+            if name in given:
+                node.undeclare_parameter(name)
+            values[name] = self._declare_one(node, row)
+        snapshot = self.kind(**values)
+        reason = self.check(snapshot)
+        if reason:
+            raise ConfigurationError(reason)
+        return snapshot
+
+    def _declare_one(self, node: Node, row: Specification) -> Any:
+        unit = f' [{row.unit}]' if row.unit else ''
+        default = list(row.default) if isinstance(row.default, tuple) else row.default
+        try:
+            declared = node.declare_parameter(row.name, default, ParameterDescriptor(
+                description=row.description + unit, additional_constraints=row.range_text,
+                read_only=row.read_only))
+        except InvalidParameterTypeException:
+            raise ConfigurationError(row.type_error()) from None
+        return _as_python(declared.value)
+
+    def _refuse_unknown(self, given: Iterable[str]) -> None:
+        for name in given:
+            if name in self.rows or name in _RCLPY_PARAMETERS or name.startswith('qos_overrides'):
+                continue
+            near = difflib.get_close_matches(name, self.rows, n=1)
+            hint = f': did you mean {near[0]}?' if near else ''
+            raise ConfigurationError(f'there is no parameter {name!r}{hint}')
+
+    def follow(self, node: Node, snapshot: T, apply: Callable[[T], None],
+               accept: Callable[[T], str] = lambda _: '') -> None:
+        """
+        Keep a snapshot in step with the node's parameters from now on.
+
+        :param node: the node, all parameters declared.
+        :param snapshot: the present values.
+        :param apply: called with each new snapshot, after the change took effect.
+        :param accept: further check against the node's state; returns a reason or nothing.
+        """
+        current = snapshot
+
+        def validate(changes: list[Parameter]) -> SetParametersResult:
+            reason = ''
+            known = [change for change in changes if change.name in self.rows]
+            for change in known:
+                row = self.rows[change.name]
+                if type(_as_python(change.value)) is not type(row.default):
+                    reason = reason or row.type_error()
+            if not reason:
+                proposed = self._merged(current, known)
+                reason = self.check(proposed) or accept(proposed)
+            if reason:
+                node.get_logger().warning(f'parameter change refused: {reason}')
+            return SetParametersResult(successful=not reason, reason=reason)
+
+        def take_over(changes: list[Parameter]) -> None:
+            nonlocal current
+            known = [change for change in changes if change.name in self.rows]
+            if known:
+                current = self._merged(current, known)
+                apply(current)
+
+        node.add_on_set_parameters_callback(validate)
+        node.add_post_set_parameters_callback(take_over)
+
+    def _merged(self, snapshot: T, changes: Iterable[Parameter]) -> T:
+        values = {name: getattr(snapshot, name) for name in self.rows}
+        values.update({change.name: _as_python(change.value) for change in changes})
+        return self.kind(**values)
+
+    def yaml(self, node_name: str, overrides: Mapping[str, Any] | None = None) -> str:
+        """
+        Write the table as a commented ROS parameter file.
+
+        :param node_name: the node's name; the file matches it in any namespace.
+        :param overrides: values other than the defaults.
+        """
+        lines = [f'/**/{node_name}:', '  ros__parameters:']
+        for name, row in self.rows.items():
+            notes = [row.range_text] if row.range_text else []
+            notes += ['fixed at start'] if row.read_only else []
+            lines += ['', f'    # {row.description}' + (f' [{row.unit}]' if row.unit else '')]
+            lines += [f'    #   {"; ".join(notes)}'] if notes else []
+            lines.append(f'    {name}: {_as_yaml((overrides or {}).get(name, row.default))}')
+        return '\n'.join(lines) + '\n'
+
+
+def _as_python(value: Any) -> Any:
+    """Return a parameter's value with arrays as tuples; the service hands over array.array."""
+    if isinstance(value, (str, bytes, bool, int, float)) or value is None:
+        return value
+    return tuple(value)
+
+
+def _as_yaml(value: Any) -> str:
+    """Write a value so that rcl reads back the same type."""
+    if isinstance(value, bool):
+        return 'true' if value else 'false'
+    if isinstance(value, float):
+        text = repr(value)
+        # YAML 1.1 wants a point and a sign in the exponent, else it reads a string
+        if 'e' in text:
+            mantissa, exponent = text.split('e')
+            mantissa = mantissa if '.' in mantissa else mantissa + '.0'
+            text = f'{mantissa}e{int(exponent):+03d}'
+        return text
+    if isinstance(value, tuple):
+        return '[' + ', '.join(value) + ']'
+    return repr(value) if isinstance(value, int) else f"'{value}'"

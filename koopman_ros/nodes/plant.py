@@ -1,0 +1,310 @@
+# Copyright 2026 The koopman_ros Authors
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""The plant node: a simulated reactor that publishes its temperature and takes a coolant."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from enum import Enum
+import math
+import sys
+import time
+
+from koopman_ros.nodes import topics
+from koopman_ros.nodes.diagnostics import DiagnosticsPublisher, Level, Status
+from koopman_ros.nodes.messages import (
+    NANOSECONDS,
+    stamp_message,
+    stamp_nanoseconds,
+    temperature_message,
+    to_celsius,
+    to_kelvin,
+)
+from koopman_ros.nodes.plant_parameters import PlantParameters, TABLE
+from koopman_ros.nodes.process import run
+from koopman_ros.plants import (
+    ControlAffineSystem,
+    EquilibriumError,
+    IntegrationError,
+    one_state_reactor,
+    Process,
+    sensor_noise,
+    two_state_reactor,
+)
+import numpy as np
+from rclpy.clock import Clock, ClockType
+from rclpy.node import Node
+from rosgraph_msgs.msg import Clock as ClockMessage
+from sensor_msgs.msg import JointState, Temperature
+from std_srvs.srv import Trigger
+
+_REACTORS = {'one_state': one_state_reactor, 'two_state': two_state_reactor}
+_POLL_PERIOD = 0.01  # s; for what no message announces
+_CONCENTRATION_NAME = 'reactant_concentration [mol/L]'
+
+
+class Phase(Enum):
+    """What the plant is doing; the value is the sentence an operator reads."""
+
+    WAITING = 'waiting for the loop: no controller yet'
+    RUNNING = 'running'
+    FINISHED = 'finished: the duration is over'
+    TRIPPED = 'stopped'
+
+
+class PlantNode(Node):
+    """Run a reactor in time; see the README for topics and services."""
+
+    def __init__(self) -> None:
+        super().__init__('plant', automatically_declare_parameters_from_overrides=True)
+        self._settings = parameters = TABLE.declare(self)
+        system = self._build(parameters)
+        self._real_time = parameters.speed == 1.0 and not parameters.lockstep
+        self._period_ns = round(parameters.sample_period * NANOSECONDS)
+        self._start_ns = round(parameters.start_time * NANOSECONDS)
+        self._process = self._initial(system, self._start_ns)
+        self._phase = Phase.WAITING if parameters.lockstep else Phase.RUNNING
+        self._trip = ''
+        self._sample = 0  # number of the next measurement
+        self._answered = True  # whether the last measurement has its command
+        self._commands = self._rejected = self._missed = 0
+        self._rejection = ''
+        self._wall_start = self._wall_published = time.monotonic()
+
+        # the subscription first: a controller that hears the measurement has then seen it, too
+        self._command_subscription = self.create_subscription(
+            Temperature, topics.COOLANT_SETPOINT, self._on_command, topics.LOOP_QOS)
+        self._temperature = self.create_publisher(
+            Temperature, topics.TEMPERATURE, topics.LOOP_QOS)
+        self._concentration = self.create_publisher(
+            JointState, topics.CONCENTRATION, topics.LOOP_QOS) if system.n_x == 2 else None
+        self._clock_publisher = self.create_publisher(
+            ClockMessage, topics.CLOCK, topics.CLOCK_QOS) if (
+                parameters.publish_clock and not self._real_time) else None
+        self._diagnostics = DiagnosticsPublisher(
+            self, 'simulation', parameters.reactor, self._status)
+        self.create_service(Trigger, '~/reset', self._on_reset)
+        # simulated time comes from here, so nothing in here may wait for it
+        wall_clock = Clock(clock_type=ClockType.STEADY_TIME)
+        wall_period = parameters.sample_period / parameters.speed if parameters.speed else 0.0
+        if parameters.lockstep:
+            self.create_timer(_POLL_PERIOD, self._on_poll, clock=wall_clock)
+            if parameters.speed:
+                self.create_timer(wall_period, self._step_in_lockstep, clock=wall_clock)
+        else:
+            self.create_timer(wall_period, self._step_in_time, clock=wall_clock)
+        TABLE.follow(self, parameters, self._on_parameters)
+
+    def _build(self, parameters: PlantParameters) -> ControlAffineSystem:
+        """Build the reactor, which starts from its steady state if it has one."""
+        build = _REACTORS[parameters.reactor]
+        try:
+            return build(parameters.constants())
+        except EquilibriumError as error:
+            nominal = build().nominal_state
+            self.get_logger().warning(
+                f'{error}; the plant starts at {to_celsius(float(nominal[-1])):.3f} degC instead')
+            return build(parameters.constants(), nominal_state=nominal)
+
+    def _initial(self, system: ControlAffineSystem, time_ns: int) -> Process:
+        x = system.nominal_state.copy()
+        x[-1] += self._settings.initial_temperature_offset
+        return Process(system, time_ns, x, system.nominal_input)
+
+    # Time: in lock-step by commands, otherwise by the wall clock.
+
+    def _now_ns(self) -> int:
+        """Return the plant time that the wall clock stands for."""
+        elapsed = time.monotonic() - self._wall_start
+        return self._start_ns + round(elapsed * self._settings.speed * NANOSECONDS)
+
+    def _step_in_time(self) -> None:
+        if self._sample == 0:
+            self._start_clock()
+        if self._phase is not Phase.RUNNING:
+            return
+        if self._settings.speed:
+            # a timer skips the periods that it missed, and so do the samples
+            due = round((self._now_ns() - self._start_ns) / self._period_ns)
+            self._sample = max(self._sample, due)
+        self._measure()
+
+    def _start_clock(self) -> None:
+        """Let time begin now, with the first measurement."""
+        self._wall_start = time.monotonic()
+        if self._real_time:
+            self._start_ns = time.time_ns()
+            self._process = replace(self._process, time_ns=self._start_ns)
+
+    def _on_poll(self) -> None:
+        """Start lock-step when the loop is complete, and watch for a command that is missing."""
+        if self._phase is Phase.WAITING:
+            complete = (
+                self._temperature.get_subscription_count() >= self._settings.lockstep_subscribers
+                and self._command_subscription.get_publisher_count() > 0)
+            if complete:
+                self._phase = Phase.RUNNING
+                self._measure()
+            return
+        waited = time.monotonic() - self._wall_published
+        if (self._phase is Phase.RUNNING and not self._answered
+                and waited > self._settings.lockstep_timeout):
+            self._missed += 1
+            self.get_logger().warning(
+                f'no command for the measurement at {self._process.time_ns / NANOSECONDS:.3f} s '
+                f'within {self._settings.lockstep_timeout} s: the last one is held',
+                throttle_duration_sec=10.0)
+            self._answered = True
+            self._continue_lockstep()
+
+    def _step_in_lockstep(self) -> None:
+        if self._phase is Phase.RUNNING and self._answered:
+            self._measure()
+
+    def _continue_lockstep(self) -> None:
+        """Go on after an answer: at once, or with the next tick of the pacing timer."""
+        if not self._settings.speed:
+            self._step_in_lockstep()
+
+    # The plant: measurements out, commands in.
+
+    def _measure(self) -> None:
+        """Advance to the next sample and publish it."""
+        instant = self._start_ns + self._sample * self._period_ns
+        duration_ns = round(self._settings.duration * NANOSECONDS)
+        if duration_ns and instant > self._start_ns + duration_ns:
+            self._phase = Phase.FINISHED
+            self._diagnostics.publish_if_changed()
+            return
+        if not self._advance(instant):
+            return
+        stamp = stamp_message(instant)
+        if self._clock_publisher is not None:
+            self._clock_publisher.publish(ClockMessage(clock=stamp))
+        if self._concentration is not None:
+            message = JointState(name=[_CONCENTRATION_NAME], position=[float(self._process.x[0])])
+            message.header.stamp = stamp
+            message.header.frame_id = self._settings.frame_id
+            self._concentration.publish(message)
+        noise = sensor_noise(self._settings.noise, self._settings.seed, self._sample)
+        self._sample += 1
+        self._answered = False
+        self._wall_published = time.monotonic()
+        self._temperature.publish(temperature_message(
+            float(self._process.x[-1]) + noise, stamp, self._settings.frame_id,
+            self._settings.noise ** 2))
+        self._diagnostics.publish_if_changed()
+
+    def _advance(self, time_ns: int) -> bool:
+        """Bring the process to an instant; a reactor that ran away stops the plant."""
+        try:
+            self._process = self._process.until(time_ns)
+        except IntegrationError as error:
+            self._phase, self._trip = Phase.TRIPPED, str(error)
+            self.get_logger().error(f'{error}; call ~/reset to start again')
+            self._diagnostics.publish_if_changed()
+            return False
+        return True
+
+    def _on_command(self, message: Temperature) -> None:
+        stamp_ns = stamp_nanoseconds(message.header.stamp)
+        lockstep = self._settings.lockstep
+        if math.isfinite(message.temperature):
+            self._commands += 1
+            self._rejection = ''
+            # in lock-step it acts from its measurement on, otherwise from now on
+            if lockstep or self._advance_to_now():
+                low, high = self._settings.coolant_min, self._settings.coolant_max
+                reached = min(max(message.temperature, low), high)
+                self._process = replace(self._process, u=np.array([to_kelvin(reached)]))
+        else:
+            self._rejected += 1
+            self._rejection = (f'coolant command {message.temperature} degC is not finite and '
+                               'was rejected: the last good one is held')
+            self.get_logger().warning(self._rejection, throttle_duration_sec=1.0)
+            self._diagnostics.publish_if_changed()
+        if (lockstep and self._phase is Phase.RUNNING and not self._answered
+                and stamp_ns == self._process.time_ns):
+            self._answered = True
+            self._continue_lockstep()
+
+    def _advance_to_now(self) -> bool:
+        if self._phase is not Phase.RUNNING:
+            return False
+        # never past the next sample, which is measured under the command of its time
+        ahead = self._start_ns + self._sample * self._period_ns
+        now = self._now_ns() if self._settings.speed else self._process.time_ns
+        return self._advance(min(now, ahead))
+
+    def _on_reset(self, _: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
+        """Put the reactor back to its initial state; time goes on."""
+        system = self._process.system
+        fresh = self._initial(system, self._process.time_ns)
+        self._process = fresh
+        if self._phase is Phase.TRIPPED:
+            self._phase, self._trip = Phase.RUNNING, ''
+            self._resynchronise()
+        response.success = True
+        response.message = (f'reset to {to_celsius(float(fresh.x[-1])):.3f} degC with coolant at '
+                            f'{to_celsius(float(fresh.u[0])):.3f} degC')
+        self.get_logger().info(response.message)
+        self._diagnostics.publish_if_changed()
+        return response
+
+    def _resynchronise(self) -> None:
+        """Resume after a stop: time has stood still for the plant."""
+        if self._settings.lockstep:
+            self._answered = True
+            self._continue_lockstep()
+            return
+        passed = self._now_ns() if self._settings.speed else self._process.time_ns
+        self._sample = max(self._sample, -(-(passed - self._start_ns) // self._period_ns))
+        self._process = replace(self._process, time_ns=max(passed, self._process.time_ns))
+
+    def _on_parameters(self, parameters: PlantParameters) -> None:
+        if not self._settings.lockstep:
+            self._advance_to_now()
+        self._settings = parameters
+        build = _REACTORS[parameters.reactor]
+        # the changed plant may have no steady state near; the nominal point stays what it was
+        self._process = replace(self._process, system=build(
+            parameters.constants(), nominal_state=self._process.system.nominal_state))
+
+    def _status(self) -> Status:
+        level, message = Level.OK, self._phase.value
+        if self._phase is Phase.TRIPPED:
+            level, message = Level.ERROR, f'stopped: {self._trip}; call ~/reset'
+        elif self._rejection:
+            level, message = Level.WARN, self._rejection
+        elif self._phase is Phase.WAITING:
+            level = Level.WARN
+        return Status(level, message, {
+            'time [s]': self._process.time_ns / NANOSECONDS,
+            'temperature [degC]': to_celsius(float(self._process.x[-1])),
+            'coolant [degC]': to_celsius(float(self._process.u[0])),
+            'measurements': self._sample,
+            'commands': self._commands,
+            'rejected commands': self._rejected,
+            'missed commands': self._missed,
+        })
+
+
+def main(args: list[str] | None = None) -> int:
+    """Run the plant node."""
+    return run('plant', PlantNode, args)
+
+
+if __name__ == '__main__':
+    sys.exit(main())

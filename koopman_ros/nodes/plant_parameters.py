@@ -1,0 +1,116 @@
+# Copyright 2026 The koopman_ros Authors
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""Parameters of the plant node."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, fields
+from typing import Any
+
+from koopman_ros.nodes.messages import to_kelvin
+from koopman_ros.nodes.parameters import parameter, ParameterTable
+from koopman_ros.plants import ReactorParameters
+
+_CONSTANTS = {item.name: item for item in fields(ReactorParameters)}
+
+
+def _constant(name: str, description: str, **details: Any) -> Any:
+    """Declare a physical constant with the default, unit and range of the reactor's own."""
+    item = _CONSTANTS[name]
+    return parameter(item.default, description, unit=item.metadata['unit'],
+                     minimum=item.metadata['lower'], maximum=item.metadata['upper'], **details)
+
+
+@dataclass(frozen=True)
+class PlantParameters:
+    """Snapshot of the plant's parameters, temperatures in degrees Celsius."""
+
+    reactor: str = parameter(
+        'one_state', 'one_state holds the concentration fixed, two_state lets it move',
+        choices=('one_state', 'two_state'), read_only=True)
+    sample_period: float = parameter(
+        1.0, 'time between measurements', unit='s', minimum=1e-3, maximum=3600.0, read_only=True)
+    noise: float = parameter(
+        0.0, 'standard deviation of the measured temperature', unit='K', minimum=0.0,
+        maximum=100.0)
+    seed: int = parameter(
+        0, 'seed of the measurement noise', minimum=0, maximum=2 ** 31, read_only=True)
+    initial_temperature_offset: float = parameter(
+        0.0, 'start this far from the steady state', unit='K', minimum=-100.0, maximum=100.0,
+        read_only=True)
+    speed: float = parameter(
+        1.0, 'simulated seconds per second; 0 for as fast as it can', minimum=0.0, maximum=1e6,
+        read_only=True)
+    lockstep: bool = parameter(
+        False, 'advance only when the command for the last measurement has arrived',
+        read_only=True)
+    lockstep_timeout: float = parameter(
+        5.0, 'wall time after which lock-step goes on with the command held', unit='s',
+        minimum=0.01, maximum=3600.0, read_only=True)
+    lockstep_subscribers: int = parameter(
+        1, 'subscribers of the temperature that lock-step waits for before it starts',
+        minimum=1, maximum=1000, read_only=True)
+    duration: float = parameter(
+        0.0, 'simulated time after which the plant stands still; 0 for endless', unit='s',
+        minimum=0.0, maximum=1e9, read_only=True)
+    start_time: float = parameter(
+        1.0, 'time of the first measurement when not in real time', unit='s', minimum=1e-3,
+        maximum=4e9, read_only=True)
+    publish_clock: bool = parameter(
+        True, 'publish /clock when not in real time', read_only=True)
+    frame_id: str = parameter(
+        'reactor', 'frame_id of the messages', read_only=True)
+    coolant_min: float = parameter(
+        -20.0, 'lowest coolant temperature that the actuator reaches', unit='degC',
+        minimum=-50.0, maximum=150.0, read_only=True)
+    coolant_max: float = parameter(
+        100.0, 'highest coolant temperature that the actuator reaches', unit='degC',
+        minimum=-50.0, maximum=150.0, read_only=True)
+    flow_rate: float = _constant('flow_rate', 'feed and product flow', read_only=True)
+    volume: float = _constant('volume', 'volume of the liquid', read_only=True)
+    density: float = _constant('density', 'density of the liquid', read_only=True)
+    heat_capacity: float = _constant(
+        'heat_capacity', 'heat capacity of the liquid', read_only=True)
+    reaction_enthalpy: float = _constant(
+        'reaction_enthalpy', 'enthalpy of reaction, negative as heat is released',
+        read_only=True)
+    activation_temperature: float = _constant(
+        'activation_temperature', 'activation energy over the gas constant', read_only=True)
+    pre_exponential_factor: float = _constant(
+        'pre_exponential_factor', 'rate constant at infinite temperature', read_only=True)
+    heat_transfer_coefficient: float = _constant(
+        'heat_transfer_coefficient', 'coefficient times area of the cooling jacket')
+    feed_temperature: float = parameter(
+        76.85, 'temperature of the feed', unit='degC', minimum=-20.0, maximum=200.0)
+    feed_concentration: float = _constant(
+        'feed_concentration', 'reactant in the feed (two_state)', read_only=True)
+    concentration: float = _constant(
+        'concentration', 'reactant in the reactor (one_state)', read_only=True)
+
+    def constants(self) -> ReactorParameters:
+        """Return the physical constants in the plant's units."""
+        values = {name: getattr(self, name) for name in _CONSTANTS}
+        return ReactorParameters(
+            **{**values, 'feed_temperature': to_kelvin(self.feed_temperature)})
+
+
+def _cross_check(values: PlantParameters) -> str:
+    if not values.coolant_min < values.coolant_max:
+        return (f'coolant_min = {values.coolant_min} degC must be below coolant_max = '
+                f'{values.coolant_max} degC')
+    return ''
+
+
+TABLE = ParameterTable(PlantParameters, _cross_check)

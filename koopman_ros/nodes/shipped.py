@@ -1,0 +1,53 @@
+# Copyright 2026 The koopman_ros Authors
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""Places of the shipped configuration: installed by colcon or pip, or beside the source tree."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+import sys
+
+_PACKAGE = 'koopman_ros'
+
+
+def config_directory() -> Path:
+    """
+    Return the folder of the shipped parameter files and models.
+
+    :raises FileNotFoundError: when the package was installed without them.
+    """
+    prefixes = [Path(p) for p in os.environ.get('AMENT_PREFIX_PATH', '').split(os.pathsep) if p]
+    here = Path(__file__).resolve()
+    # an install tree without its environment: <prefix>/lib/python3.x/site-packages/koopman_ros
+    prefixes += [Path(sys.prefix), *here.parents[4:6]]
+    candidates = [here.parents[2] / 'config']
+    candidates += [prefix / 'share' / _PACKAGE / 'config' for prefix in prefixes]
+    for candidate in candidates:
+        if (candidate / 'models').is_dir():
+            return candidate
+    raise FileNotFoundError(f'the folder share/{_PACKAGE}/config is missing: install the package '
+                            'again, or source the workspace it was built in')
+
+
+def model_path(model: str) -> Path:
+    """
+    Return the file of a model given by name or by path.
+
+    :param model: name of a shipped model, e.g. ``reactor_nz4``, or a path to a model file.
+    """
+    if model.endswith('.safetensors') or os.sep in model:
+        return Path(model).expanduser()
+    return config_directory() / 'models' / f'{model}.safetensors'

@@ -1,0 +1,57 @@
+# Copyright 2026 The koopman_ros Authors
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""The topics of the loop: names, types and quality of service, the same for every node."""
+
+from __future__ import annotations
+
+from diagnostic_msgs.msg import DiagnosticArray
+from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
+from rosgraph_msgs.msg import Clock
+from sensor_msgs.msg import JointState, Temperature
+
+TEMPERATURE = 'temperature'
+CONCENTRATION = 'concentration'
+SETPOINT = 'setpoint'
+ACTIVE_SETPOINT = 'active_setpoint'
+COOLANT_SETPOINT = 'coolant_setpoint'
+MANUAL_COOLANT_SETPOINT = 'manual_coolant_setpoint'
+DIAGNOSTICS = '/diagnostics'
+CLOCK = '/clock'
+
+# JointState is the one stamped type of common_interfaces that carries named float64 values, so
+# that a concentration goes on the wire with its name and unit instead of under a false meaning.
+TYPES = {
+    TEMPERATURE: Temperature,
+    CONCENTRATION: JointState,
+    SETPOINT: Temperature,
+    ACTIVE_SETPOINT: Temperature,
+    COOLANT_SETPOINT: Temperature,
+    MANUAL_COOLANT_SETPOINT: Temperature,
+    DIAGNOSTICS: DiagnosticArray,
+    CLOCK: Clock,
+}
+
+# Every message of the loop counts: reliable, with room for a receiver that falls behind.
+LOOP_QOS = QoSProfile(depth=10)
+# A late joiner learns what is tracked (REP 2003 leaves latching to the publisher).
+LATCHED_QOS = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
+CLOCK_QOS = QoSProfile(depth=1, reliability=ReliabilityPolicy.BEST_EFFORT)
+
+_QOS = {ACTIVE_SETPOINT: LATCHED_QOS, CLOCK: CLOCK_QOS}
+
+
+def qos(topic: str) -> QoSProfile:
+    """Return the quality of service of a topic of the loop, or the default for any other."""
+    return _QOS.get(topic, LOOP_QOS)
