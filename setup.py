@@ -54,11 +54,12 @@ setup(
             'ros-jazzy-common-interfaces==5.3.6',
             'ros-jazzy-rmw-fastrtps-cpp==8.4.3',
         ],
-        'plots': ['matplotlib'],
+        'demo': ['matplotlib', 'rich'],
         'train': ['torch==2.13.0', 'tqdm'],
         'test': [
             'colcon-common-extensions',
             'control',
+            'mypy',
             'pytest',
             'rosbags',
             'ruff',

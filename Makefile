@@ -1,0 +1,45 @@
+# Every target sets up what it needs in .venv by itself; results go to out/.
+PYTHON ?= python3
+VENV := .venv
+BIN := $(VENV)/bin
+# The loop stays on this machine.
+export ROS_AUTOMATIC_DISCOVERY_RANGE ?= LOCALHOST
+
+.PHONY: help demo test lint models config clean
+
+help:  ## show this list
+	@grep -E '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed 's/:.*## /\t/'
+
+$(BIN)/python:
+	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11))' || \
+	  { echo 'koopman_ros needs Python 3.11 or newer: make PYTHON=python3.12 ...'; exit 1; }
+	@$(PYTHON) -c 'import venv, ensurepip' || \
+	  { echo 'Python venv is missing: sudo apt-get install python3-venv'; exit 1; }
+	$(PYTHON) -m venv $(VENV)
+
+$(VENV)/run.stamp: setup.py | $(BIN)/python
+	$(BIN)/python -m pip install --quiet --editable '.[ros,demo]'
+	@touch $@
+
+$(VENV)/test.stamp: setup.py $(VENV)/run.stamp
+	$(BIN)/python -m pip install --quiet --editable '.[ros,demo,train,test]'
+	@touch $@
+
+demo: $(VENV)/run.stamp  ## closed loop of three processes: live table, bag, picture -> out/demo
+	$(BIN)/python -m koopman_ros.demo
+
+test: lint  ## the whole test suite
+	$(BIN)/python -m pytest
+
+lint: $(VENV)/test.stamp  ## style and type checks
+	$(BIN)/ruff check
+	$(BIN)/mypy
+
+models: $(VENV)/test.stamp  ## train the shipped lifts again -> config/models
+	$(BIN)/python -m koopman_ros.studies.shipped_models
+
+config: $(VENV)/run.stamp  ## write config/*.yaml from the parameter tables
+	$(BIN)/python -m koopman_ros.nodes.parameter_files
+
+clean:  ## remove the environment and the results
+	rm -rf $(VENV) out build install log

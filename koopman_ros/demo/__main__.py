@@ -1,0 +1,106 @@
+# Copyright 2026 The koopman_ros Authors
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""The demo: bring the reactor 10 K down with the learned lift, and with the linearisation."""
+
+from __future__ import annotations
+
+import argparse
+from dataclasses import replace
+import json
+from pathlib import Path
+import sys
+import time
+
+from koopman_ros.bags import summary
+from koopman_ros.demo.loop import LoopError, run_loop, Scenario
+from koopman_ros.demo.results import plot, read_run
+from koopman_ros.demo.table import LiveTable
+from koopman_ros.lifting import load
+from koopman_ros.nodes import topics
+from koopman_ros.nodes.controller_parameters import ControllerParameters
+from koopman_ros.nodes.shipped import model_path
+
+STEP = -10.0  # K
+LINEAR_MODEL = 'reactor_linear'
+
+
+def run_demo(output: Path, speed: float) -> dict[str, object]:
+    """
+    Run both loops and write bags, picture and summary.
+
+    :param output: folder for the results; what an earlier demo left there is replaced.
+    :param speed: simulated seconds per second of the learned loop, 0 for as fast as it can.
+    :return: the summary.
+    """
+    begin = time.monotonic()
+    parameters = ControllerParameters()
+    model = load(model_path(parameters.model))
+    scenario = Scenario(parameters.model, float(model.states.center[0]) + STEP, speed=speed)
+    logs = output / 'logs'
+    logs.mkdir(parents=True, exist_ok=True)
+    bags = [output / 'closed_loop.mcap', output / 'linearised.mcap']
+    for old in (*bags, output / 'closed_loop.png', output / 'summary.json'):
+        old.unlink(missing_ok=True)
+
+    with LiveTable(f'learned controller ({parameters.model}), set-point {STEP:+.0f} K '
+                   f'after {scenario.step_time:.0f} s') as table:
+        run_loop(scenario, bags[0], logs, table.show)
+    print('the same with the linearised controller ...', flush=True)
+    linear_scenario = replace(scenario, model=LINEAR_MODEL, speed=0.0)
+    run_loop(linear_scenario, bags[1], logs)
+
+    learned, linear = read_run(bags[0]), read_run(bags[1])
+    plot(output / 'closed_loop.png', learned, linear, scenario.setpoint, scenario.step_time,
+         model, parameters)
+    counts = summary(bags[0]).counts
+    result: dict[str, object] = {
+        'setpoint_kelvin': scenario.setpoint,
+        'final_error_kelvin': abs(learned.final_error(scenario.setpoint)),
+        'linear_final_error_kelvin': abs(linear.final_error(scenario.setpoint)),
+        'settling_time_seconds': learned.settling_time(scenario.setpoint, scenario.step_time),
+        'measurements': counts['/' + topics.TEMPERATURE],
+        'commands': counts['/' + topics.COOLANT_SETPOINT],
+        'bag_messages': sum(counts.values()),
+        'wall_seconds': round(time.monotonic() - begin, 3),
+    }
+    (output / 'summary.json').write_text(json.dumps(result, indent=2) + '\n')
+    return result
+
+
+def main(args: list[str] | None = None) -> int:
+    """Run the demo from the command line."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument('--output', type=Path, default=Path('out/demo'),
+                        help='folder for the results (default: %(default)s)')
+    parser.add_argument('--speed', type=float, default=60.0,
+                        help='simulated seconds per second, 0 for as fast as the machine can '
+                        '(default: %(default)s)')
+    options = parser.parse_args(args)
+    try:
+        result = run_demo(options.output, options.speed)
+    except LoopError as error:
+        print(f'demo: {error}', file=sys.stderr)
+        return 1
+    except KeyboardInterrupt:
+        print('demo: interrupted; what was recorded is kept', file=sys.stderr)
+        return 130
+    for key, value in result.items():
+        print(f'{key}: {value:.6g}' if isinstance(value, float) else f'{key}: {value}')
+    print(f'wrote {options.output}/closed_loop.png, closed_loop.mcap and summary.json')
+    return 0
+
+
+if __name__ == '__main__':
+    sys.exit(main())

@@ -1,0 +1,198 @@
+# Copyright 2026 The koopman_ros Authors
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""One closed loop of plant, controller and trainer in lock-step, with an operator beside it."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+import time
+
+from koopman_ros.demo.processes import isolated_domain, NodeProcess
+from koopman_ros.nodes import topics
+from koopman_ros.nodes.messages import NANOSECONDS, stamp_nanoseconds, temperature_message
+import rclpy
+from rclpy.context import Context
+from rclpy.executors import SingleThreadedExecutor
+from rclpy.node import Node
+from sensor_msgs.msg import Temperature
+
+_START_TIME = 1.0  # s of plant time at the first measurement
+_START_TIMEOUT = 30.0  # s for the processes to find each other
+_STALL_TIMEOUT = 30.0  # s without a command before the run is given up
+
+
+class LoopError(RuntimeError):
+    """A closed loop did not run to its end; the message says which process failed and how."""
+
+
+@dataclass(frozen=True)
+class Scenario:
+    """
+    What a closed loop does.
+
+    :param model: name or path of the controller's model.
+    :param setpoint: new set-point in K.
+    :param step_time: when it takes effect, in s after the first measurement.
+    :param duration: length of the run in s of plant time.
+    :param sample_period: s between measurements.
+    :param speed: simulated seconds per second, 0 for as fast as the machine can.
+    """
+
+    model: str
+    setpoint: float
+    step_time: float = 60.0
+    duration: float = 600.0
+    sample_period: float = 1.0
+    speed: float = 0.0
+
+    @property
+    def first_stamp_ns(self) -> int:
+        """Stamp of the first measurement."""
+        return round(_START_TIME * NANOSECONDS)
+
+
+@dataclass(frozen=True)
+class Row:
+    """
+    What the operator sees at one command, temperatures in degrees Celsius.
+
+    :param seconds: plant time since the first measurement.
+    :param temperature: measured.
+    :param setpoint: tracked, or None before it is known.
+    :param coolant: commanded.
+    """
+
+    seconds: float
+    temperature: float
+    setpoint: float | None
+    coolant: float
+
+
+class Operator(Node):
+    """Set the set-point through its topic and watch the loop."""
+
+    def __init__(self, scenario: Scenario, context: Context,
+                 on_row: Callable[[Row], None]) -> None:
+        super().__init__('operator', context=context)
+        self._scenario = scenario
+        self._on_row = on_row
+        self._measured: dict[int, float] = {}
+        self._active: float | None = None
+        self.last_stamp_ns = 0
+        self.setpoint = self.create_publisher(Temperature, topics.SETPOINT, topics.LOOP_QOS)
+        self.create_subscription(
+            Temperature, topics.TEMPERATURE, self._on_temperature, topics.LOOP_QOS)
+        self.create_subscription(
+            Temperature, topics.ACTIVE_SETPOINT, self._on_active, topics.LATCHED_QOS)
+        self._commands = self.create_subscription(
+            Temperature, topics.COOLANT_SETPOINT, self._on_command, topics.LOOP_QOS)
+
+    @property
+    def found_loop(self) -> bool:
+        """Whether controller and trainer are there and hear the set-point."""
+        return (self.setpoint.get_subscription_count() >= 2
+                and self._commands.get_publisher_count() >= 1)
+
+    def hears_more_than(self, stamp_ns: int) -> Callable[[], bool]:
+        """Return the condition that a command later than a stamp was heard."""
+        return lambda: self.last_stamp_ns > stamp_ns
+
+    def request_setpoint(self) -> None:
+        """Publish the set-point, stamped with the plant time from which it holds."""
+        stamp = self._scenario.first_stamp_ns + round(self._scenario.step_time * NANOSECONDS)
+        message = temperature_message(
+            self._scenario.setpoint, rclpy.time.Time(nanoseconds=stamp).to_msg(), 'operator')
+        self.setpoint.publish(message)
+
+    def _on_temperature(self, message: Temperature) -> None:
+        self._measured[stamp_nanoseconds(message.header.stamp)] = message.temperature
+
+    def _on_active(self, message: Temperature) -> None:
+        self._active = message.temperature
+
+    def _on_command(self, message: Temperature) -> None:
+        stamp = stamp_nanoseconds(message.header.stamp)
+        self.last_stamp_ns = max(self.last_stamp_ns, stamp)
+        measured = self._measured.pop(stamp, None)
+        if measured is not None:
+            self._on_row(Row((stamp - self._scenario.first_stamp_ns) / NANOSECONDS, measured,
+                             self._active, message.temperature))
+
+
+def run_loop(scenario: Scenario, bag: Path, logs: Path,
+             on_row: Callable[[Row], None] = lambda _: None) -> None:
+    """
+    Run plant, controller and trainer as three processes until the scenario's end.
+
+    :param scenario: what to do.
+    :param bag: where the trainer records; must not exist.
+    :param logs: folder for what the processes print.
+    :param on_row: called with every answered measurement.
+    :raises LoopError: when a process ends early or the loop stands still.
+    """
+    with isolated_domain() as environment:
+        context = Context()
+        rclpy.init(context=context, domain_id=int(environment['ROS_DOMAIN_ID']))
+        operator = Operator(scenario, context, on_row)
+        executor = SingleThreadedExecutor(context=context)
+        executor.add_node(operator)
+        try:
+            _run(scenario, bag, logs, environment, operator, executor)
+        finally:
+            executor.shutdown()
+            operator.destroy_node()
+            rclpy.shutdown(context=context)
+
+
+def _run(scenario: Scenario, bag: Path, logs: Path, environment: dict[str, str],
+         operator: Operator, executor: SingleThreadedExecutor) -> None:
+    with (NodeProcess('controller', {'model': scenario.model}, logs / 'controller.log',
+                      environment) as controller,
+          NodeProcess('trainer', {'output': bag}, logs / 'trainer.log', environment) as trainer):
+        processes = [controller, trainer]
+        _spin_until(executor, lambda: operator.found_loop, processes, _START_TIMEOUT,
+                    'controller and trainer did not find each other')
+        operator.request_setpoint()
+        plant = NodeProcess('plant', {
+            'lockstep': True, 'speed': scenario.speed, 'duration': scenario.duration,
+            'sample_period': scenario.sample_period, 'start_time': _START_TIME,
+            # controller, trainer and operator: nobody misses the first measurement
+            'lockstep_subscribers': 3,
+        }, logs / 'plant.log', environment)
+        with plant:
+            processes.append(plant)
+            end = scenario.first_stamp_ns + round(scenario.duration * NANOSECONDS)
+            while operator.last_stamp_ns < end:
+                _spin_until(executor, operator.hears_more_than(operator.last_stamp_ns), processes,
+                            _STALL_TIMEOUT, 'the loop stands still: no command')
+        codes = {process.name: process.stop() for process in processes}
+    for process in processes:
+        if codes[process.name] != 0:
+            raise LoopError(f'{process.name} ended with code {codes[process.name]}: '
+                            f'{process.output()[-1000:]}')
+
+
+def _spin_until(executor: SingleThreadedExecutor, done: Callable[[], bool],
+                processes: list[NodeProcess], timeout: float, complaint: str) -> None:
+    deadline = time.monotonic() + timeout
+    while not done():
+        executor.spin_once(timeout_sec=0.1)
+        for process in processes:
+            if not process.running:
+                raise LoopError(f'{process.name} ended early: {process.output()[-1000:]}')
+        if time.monotonic() > deadline:
+            raise LoopError(f'{complaint} within {timeout:.0f} s; see {processes[0].log.parent}')

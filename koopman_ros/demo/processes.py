@@ -1,0 +1,127 @@
+# Copyright 2026 The koopman_ros Authors
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""Nodes as processes of their own, in a ROS domain of their own, ended whatever happens."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+import contextlib
+import fcntl
+import os
+from pathlib import Path
+import signal
+import subprocess
+import sys
+import tempfile
+from types import TracebackType
+
+_DOMAINS = range(1, 102)
+STOP_TIMEOUT = 10.0  # s from a signal to the end of a process
+
+
+@contextlib.contextmanager
+def isolated_domain() -> Iterator[dict[str, str]]:
+    """
+    Reserve a ROS domain on loopback that no other run on this machine uses.
+
+    Yields the environment variables for the processes of the run. Shared memory is left out of
+    the transports, because a killed process would leave its segments behind.
+
+    :raises RuntimeError: when all domains are taken.
+    """
+    folder = Path(tempfile.gettempdir())
+    # runs side by side start looking at different places
+    offset = os.getpid() % len(_DOMAINS)
+    for domain in (*_DOMAINS[offset:], *_DOMAINS[:offset]):
+        with open(folder / f'koopman_ros_domain_{domain}.lock', 'a') as lock:
+            try:
+                fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            except OSError:
+                continue
+            yield {
+                'ROS_DOMAIN_ID': str(domain),
+                'ROS_AUTOMATIC_DISCOVERY_RANGE': 'LOCALHOST',
+                'FASTDDS_BUILTIN_TRANSPORTS': 'UDPv4',
+            }
+            return
+    raise RuntimeError('all ROS domains are taken by other runs: wait until one ends')
+
+
+class NodeProcess:
+    """
+    One node running as a process; leaving the context ends it.
+
+    :param name: ``plant``, ``controller`` or ``trainer``.
+    :param parameters: values other than the node's defaults.
+    :param log: file for everything the process prints.
+    :param environment: variables on top of the present ones.
+    :param arguments: further ROS arguments, e.g. ``('-r', '__ns:=/unit_1')``.
+    :param command: what to run instead of the module of this package.
+    """
+
+    def __init__(self, name: str, parameters: Mapping[str, object], log: Path,
+                 environment: Mapping[str, str], arguments: tuple[str, ...] = (),
+                 command: tuple[str, ...] | None = None) -> None:
+        self.name = name
+        self.log = log
+        given = [part for key, value in parameters.items()
+                 for part in ('-p', f'{key}:={_as_argument(value)}')]
+        program = command or (sys.executable, '-m', f'koopman_ros.nodes.{name}')
+        ros_arguments = ['--ros-args', *given, *arguments] if given or arguments else []
+        with open(log, 'wb') as output:
+            # a session of its own: an interrupt of the terminal is passed on by us, in order
+            self.process = subprocess.Popen(
+                [*program, *ros_arguments], stdout=output, stderr=subprocess.STDOUT,
+                stdin=subprocess.DEVNULL, env={**os.environ, **environment},
+                start_new_session=True)
+
+    @property
+    def running(self) -> bool:
+        """Whether the process has not ended."""
+        return self.process.poll() is None
+
+    def output(self) -> str:
+        """Return what the process has printed so far."""
+        return self.log.read_text(errors='replace')
+
+    def stop(self, number: int = signal.SIGINT) -> int:
+        """
+        End the process by a signal, and by SIGKILL if it does not end in time.
+
+        :return: its exit code; negative after a signal that it did not handle.
+        """
+        if self.running:
+            self.process.send_signal(number)
+        try:
+            return self.process.wait(STOP_TIMEOUT)
+        except subprocess.TimeoutExpired:
+            self.process.kill()
+            return self.process.wait()
+
+    def __enter__(self) -> NodeProcess:
+        return self
+
+    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None,
+                 trace: TracebackType | None) -> None:
+        self.stop()
+
+
+def _as_argument(value: object) -> str:
+    """Write a parameter value for the command line, keeping its type."""
+    if isinstance(value, bool):
+        return 'true' if value else 'false'
+    if isinstance(value, (tuple, list)):
+        return '[' + ','.join(str(item) for item in value) + ']'
+    return str(value)

@@ -1,0 +1,87 @@
+# Copyright 2026 The koopman_ros Authors
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""What the demo shows while it runs: a live table on a terminal, plain lines elsewhere."""
+
+from __future__ import annotations
+
+from types import TracebackType
+
+from koopman_ros.demo.loop import Row
+from rich.console import Console
+from rich.live import Live
+from rich.table import Table
+
+_ROW_PERIOD = 30.0  # s of plant time between rows
+_COLUMNS = ('time [min]', 'temperature [°C]', 'set-point [°C]', 'error [K]', 'coolant [°C]')
+
+
+class LiveTable:
+    """
+    Show a run as it happens.
+
+    :param title: what runs.
+    """
+
+    def __init__(self, title: str) -> None:
+        self._title = title
+        self._console = Console()
+        self._rows: list[tuple[str, ...]] = []
+        self._next = 0.0
+        self._live = Live(self._table(None), console=self._console, refresh_per_second=10,
+                          transient=False) if self._console.is_terminal else None
+
+    def show(self, row: Row) -> None:
+        """Show an answered measurement; on a terminal the last line follows every one."""
+        cells = _cells(row)
+        due = row.seconds >= self._next
+        if due:
+            self._next += _ROW_PERIOD
+            self._rows.append(cells)
+        if self._live is not None:
+            self._live.update(self._table(None if due else cells))
+        elif due:
+            print('  '.join(f'{name} {cell}' for name, cell in zip(_COLUMNS, cells, strict=True)),
+                  flush=True)
+
+    def _table(self, present: tuple[str, ...] | None) -> Table:
+        table = Table(title=self._title, title_justify='left')
+        for column in _COLUMNS:
+            table.add_column(column, justify='right')
+        for cells in self._rows:
+            table.add_row(*cells)
+        if present is not None:
+            table.add_row(*present, style='bold')
+        return table
+
+    def __enter__(self) -> LiveTable:
+        if self._live is not None:
+            self._live.start()
+        else:
+            print(self._title, flush=True)
+        return self
+
+    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None,
+                 trace: TracebackType | None) -> None:
+        if self._live is not None:
+            self._live.stop()
+
+
+def _cells(row: Row) -> tuple[str, ...]:
+    setpoint, error = '', ''
+    if row.setpoint is not None:
+        setpoint = f'{row.setpoint:.3f}'
+        error = f'{row.temperature - row.setpoint:+.4f}'
+    return (f'{row.seconds / 60.0:.1f}', f'{row.temperature:.4f}', setpoint, error,
+            f'{row.coolant:.3f}')
