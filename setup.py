@@ -29,7 +29,7 @@ def _data_files() -> list[tuple[str, list[str]]]:
         (os.path.join('share', 'ament_index', 'resource_index', 'packages'),
          [os.path.join('resource', PACKAGE)]),
         (share, ['package.xml']),
-        (os.path.join(share, 'config'), sorted(glob('config/*.yaml'))),
+        (os.path.join(share, 'config'), sorted(glob('config/*.yaml') + glob('config/*.xml'))),
         (os.path.join(share, 'config', 'models'), sorted(glob('config/models/*'))),
     ]
 

@@ -90,7 +90,9 @@ class Operator(Node):
         super().__init__('operator', context=context)
         self._scenario = scenario
         self._on_row = on_row
+        # two topics: either message of a pair may come first
         self._measured: dict[int, float] = {}
+        self._commanded: dict[int, float] = {}
         self._active: float | None = None
         self.last_stamp_ns = 0
         self.setpoint = self.create_publisher(Temperature, topics.SETPOINT, topics.LOOP_QOS)
@@ -119,7 +121,9 @@ class Operator(Node):
         self.setpoint.publish(message)
 
     def _on_temperature(self, message: Temperature) -> None:
-        self._measured[stamp_nanoseconds(message.header.stamp)] = message.temperature
+        stamp = stamp_nanoseconds(message.header.stamp)
+        self._measured[stamp] = message.temperature
+        self._show_pair(stamp)
 
     def _on_active(self, message: Temperature) -> None:
         self._active = message.temperature
@@ -127,10 +131,14 @@ class Operator(Node):
     def _on_command(self, message: Temperature) -> None:
         stamp = stamp_nanoseconds(message.header.stamp)
         self.last_stamp_ns = max(self.last_stamp_ns, stamp)
-        measured = self._measured.pop(stamp, None)
-        if measured is not None:
-            self._on_row(Row((stamp - self._scenario.first_stamp_ns) / NANOSECONDS, measured,
-                             self._active, message.temperature))
+        self._commanded[stamp] = message.temperature
+        self._show_pair(stamp)
+
+    def _show_pair(self, stamp: int) -> None:
+        if stamp in self._measured and stamp in self._commanded:
+            self._on_row(Row((stamp - self._scenario.first_stamp_ns) / NANOSECONDS,
+                             self._measured.pop(stamp), self._active,
+                             self._commanded.pop(stamp)))
 
 
 def run_loop(scenario: Scenario, bag: Path, logs: Path,

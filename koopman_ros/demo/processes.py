@@ -27,7 +27,10 @@ import sys
 import tempfile
 from types import TracebackType
 
+from koopman_ros.nodes.shipped import config_directory
+
 _DOMAINS = range(1, 102)
+_DISCOVERY_PROFILE = 'loopback_discovery.xml'
 STOP_TIMEOUT = 10.0  # s from a signal to the end of a process
 
 
@@ -36,8 +39,9 @@ def isolated_domain() -> Iterator[dict[str, str]]:
     """
     Reserve a ROS domain on loopback that no other run on this machine uses.
 
-    Yields the environment variables for the processes of the run. Shared memory is left out of
-    the transports, because a killed process would leave its segments behind.
+    Yields the environment variables of the run, which hold for this process, too, until the end.
+    Shared memory is left out of the transports, because a killed process would leave its
+    segments behind, and participants announce themselves often, to be found at once.
 
     :raises RuntimeError: when all domains are taken.
     """
@@ -50,11 +54,21 @@ def isolated_domain() -> Iterator[dict[str, str]]:
                 fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
             except OSError:
                 continue
-            yield {
+            environment = {
                 'ROS_DOMAIN_ID': str(domain),
                 'ROS_AUTOMATIC_DISCOVERY_RANGE': 'LOCALHOST',
                 'FASTDDS_BUILTIN_TRANSPORTS': 'UDPv4',
+                'FASTRTPS_DEFAULT_PROFILES_FILE': str(config_directory() / _DISCOVERY_PROFILE),
             }
+            before = {name: os.environ.get(name) for name in environment}
+            os.environ.update(environment)
+            try:
+                yield environment
+            finally:
+                for name, value in before.items():
+                    os.environ.pop(name)
+                    if value is not None:
+                        os.environ[name] = value
             return
     raise RuntimeError('all ROS domains are taken by other runs: wait until one ends')
 

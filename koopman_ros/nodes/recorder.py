@@ -28,7 +28,7 @@ from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 from rclpy.subscription import Subscription
 from rclpy.topic_endpoint_info import TopicEndpointInfo
 
-# A burst of ten seconds at 100 Hz waits here while the disk is slow.
+# Ten seconds at 100 Hz wait here while the disk is slow.
 _QUEUE_DEPTH = 1000
 
 
