@@ -215,5 +215,4 @@ class Controller:
         if law.solved and np.all(np.isfinite(wanted)):
             return wanted, report
         return held, replace(report, law=None, problem=(
-            f'no feedback at {measurement.tolist()}: {law.riccati.status.value}; the last '
-            'command is held'))
+            f'no feedback gain: {law.riccati.status.value}; the last command is held'))

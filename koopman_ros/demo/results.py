@@ -116,7 +116,7 @@ def plot(path: Path, learned: Run, linear: Run, setpoint: float, step_time: floa
     lower.set_ylabel('coolant set-point [°C]')
     lower.set_xlabel('plant time [min]')
     lower.set_xlim(0.0, float(minutes[0][-1]))
-    lower.legend(loc='center right')
+    lower.legend(loc='lower right', bbox_to_anchor=(1.0, 0.1))
     for axes in (upper, lower):
         axes.grid(alpha=0.3)
     figure.savefig(path, dpi=130)

@@ -21,6 +21,7 @@ from types import TracebackType
 from koopman_ros.demo.loop import Row
 from rich.console import Console
 from rich.live import Live
+from rich.markup import escape
 from rich.table import Table
 
 _ROW_PERIOD = 30.0  # s of plant time between rows
@@ -58,7 +59,7 @@ class LiveTable:
     def _table(self, present: tuple[str, ...] | None) -> Table:
         table = Table(title=self._title, title_justify='left')
         for column in _COLUMNS:
-            table.add_column(column, justify='right')
+            table.add_column(escape(column), justify='right')
         for cells in self._rows:
             table.add_row(*cells)
         if present is not None:

@@ -181,15 +181,13 @@ class ParameterTable(Generic[T]):
             hint = f': did you mean {near[0]}?' if near else ''
             raise ConfigurationError(f'there is no parameter {name!r}{hint}')
 
-    def follow(self, node: Node, snapshot: T, apply: Callable[[T], None],
-               accept: Callable[[T], str] = lambda _: '') -> None:
+    def follow(self, node: Node, snapshot: T, apply: Callable[[T], None]) -> None:
         """
         Keep a snapshot in step with the node's parameters from now on.
 
         :param node: the node, all parameters declared.
         :param snapshot: the present values.
         :param apply: called with each new snapshot, after the change took effect.
-        :param accept: further check against the node's state; returns a reason or nothing.
         """
         current = snapshot
 
@@ -201,8 +199,7 @@ class ParameterTable(Generic[T]):
                 if type(_as_python(change.value)) is not type(row.default):
                     reason = reason or row.type_error()
             if not reason:
-                proposed = self._merged(current, known)
-                reason = self.check(proposed) or accept(proposed)
+                reason = self.check(self._merged(current, known))
             if reason:
                 node.get_logger().warning(f'parameter change refused: {reason}')
             return SetParametersResult(successful=not reason, reason=reason)
