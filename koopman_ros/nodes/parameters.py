@@ -86,24 +86,23 @@ class Specification:
     def check(self, value: Any) -> str:
         """Return what is wrong with a value of the right type, or an empty string."""
         unit = f' {self.unit}' if self.unit else ''
-        if isinstance(value, float) and not math.isfinite(value):
-            return f'{self.name} = {value}{unit} is not finite'
         if self.choices and value not in self.choices:
             return f'{self.name} = {value!r} must be {self.range_text}'
         if isinstance(value, (int, float)) and not isinstance(value, bool):
-            low = value <= self.minimum if self.open_minimum else value < self.minimum
-            if low or value > self.maximum:
+            above = value > self.minimum if self.open_minimum else value >= self.minimum
+            # written so that NaN, which compares false with everything, is refused, too
+            if not (above and value <= self.maximum and math.isfinite(value)):
                 return f'{self.name} = {value}{unit} must be {self._in_range_words()}'
         return ''
 
     def _in_range_words(self) -> str:
-        text = self.range_text
+        text = self.range_text or 'finite'
         return f'in {text}' if text[0] in '[(' else text
 
-    def type_error(self) -> str:
+    def type_error(self, value: Any) -> str:
         """Return the sentence for a value of another type."""
         word, example = _TYPE_WORDS[type(self.default)]
-        return f'{self.name} must be {word}, e.g. {example}'
+        return f'{self.name} = {value!r} must be {word}, e.g. {example}'
 
 
 def parameter(default: Any, description: str, **details: Any) -> Any:
@@ -149,20 +148,21 @@ class ParameterTable(Generic[T]):
             how names that no table knows come to light.
         :raises ConfigurationError: naming the parameter, its value and the allowed range.
         """
-        given = node.get_parameters_by_prefix('')
+        given: dict[str, Any] = dict(node.get_parameters_by_prefix(''))
         self._refuse_unknown(given)
         values = {}
         for name, row in self.rows.items():
             if name in given:
                 node.undeclare_parameter(name)
-            values[name] = self._declare_one(node, row)
+            values[name] = self._declare_one(node, row, given[name].value if name in given
+                                             else row.default)
         snapshot = self.kind(**values)
         reason = self.check(snapshot)
         if reason:
             raise ConfigurationError(reason)
         return snapshot
 
-    def _declare_one(self, node: Node, row: Specification) -> Any:
+    def _declare_one(self, node: Node, row: Specification, given: Any) -> Any:
         unit = f' [{row.unit}]' if row.unit else ''
         default = list(row.default) if isinstance(row.default, tuple) else row.default
         try:
@@ -170,7 +170,7 @@ class ParameterTable(Generic[T]):
                 description=row.description + unit, additional_constraints=row.range_text,
                 read_only=row.read_only))
         except InvalidParameterTypeException:
-            raise ConfigurationError(row.type_error()) from None
+            raise ConfigurationError(row.type_error(given)) from None
         return _as_python(declared.value)
 
     def _refuse_unknown(self, given: Iterable[str]) -> None:
@@ -195,9 +195,9 @@ class ParameterTable(Generic[T]):
             reason = ''
             known = [change for change in changes if change.name in self.rows]
             for change in known:
-                row = self.rows[change.name]
-                if type(_as_python(change.value)) is not type(row.default):
-                    reason = reason or row.type_error()
+                row, value = self.rows[change.name], _as_python(change.value)
+                if type(value) is not type(row.default):
+                    reason = reason or row.type_error(value)
             if not reason:
                 reason = self.check(self._merged(current, known))
             if reason:
