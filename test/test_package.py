@@ -1,0 +1,115 @@
+# Copyright 2026 The koopman_ros Authors
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""Tests of the package as a whole: manifest, versions, licence headers, import directions."""
+
+import ast
+from pathlib import Path
+import re
+import subprocess
+import sys
+import xml.etree.ElementTree as ElementTree
+
+import koopman_ros
+import pytest
+
+ROOT = Path(__file__).parent.parent
+SOURCES = sorted([ROOT / 'setup.py', *ROOT.glob('koopman_ros/**/*.py'),
+                  *ROOT.glob('test/**/*.py')])
+# What each sub-package may import of the others.
+ALLOWED = {
+    'plants': set(),
+    'lifting': set(),
+    'bags': set(),
+    'control': {'lifting'},
+    'studies': {'control', 'lifting', 'plants', 'bags'},
+    'nodes': {'control', 'lifting', 'plants', 'bags'},
+    'demo': {'control', 'lifting', 'plants', 'bags', 'nodes'},
+}
+TRAINING = {'residuals', 'levenberg_marquardt', 'growth', 'training'}
+
+
+def _imports(path: Path) -> set[str]:
+    """List the modules that a file imports, wherever the import stands."""
+    names = set()
+    for node in ast.walk(ast.parse(path.read_text())):
+        if isinstance(node, ast.Import):
+            names.update(alias.name for alias in node.names)
+        elif isinstance(node, ast.ImportFrom) and node.module:
+            names.add(node.module)
+            names.update(f'{node.module}.{alias.name}' for alias in node.names)
+    return names
+
+
+def test_versions_agree() -> None:
+    manifest = ElementTree.parse(ROOT / 'package.xml').getroot()
+    setup = re.search(r"version='([^']+)'", (ROOT / 'setup.py').read_text())
+    assert setup is not None
+    assert manifest.findtext('version') == koopman_ros.__version__ == setup.group(1)
+    assert f'\n{koopman_ros.__version__} ' in (ROOT / 'CHANGELOG.rst').read_text()
+
+
+def test_manifest_is_of_format_3_and_ament_python() -> None:
+    manifest = ElementTree.parse(ROOT / 'package.xml').getroot()
+    assert manifest.get('format') == '3'
+    assert manifest.findtext('name') == 'koopman_ros'
+    assert manifest.findtext('export/build_type') == 'ament_python'
+    assert (ROOT / 'resource' / 'koopman_ros').is_file()
+
+
+@pytest.mark.parametrize('path', SOURCES, ids=lambda path: str(path.relative_to(ROOT)))
+def test_licence_header(path: Path) -> None:
+    lines = path.read_text().splitlines()
+    assert lines[0] == '# Copyright 2026 The koopman_ros Authors'
+    assert lines[2].startswith('# Licensed under the Apache License, Version 2.0')
+
+
+@pytest.mark.parametrize('package', sorted(ALLOWED))
+def test_imports_run_one_way(package: str) -> None:
+    others = set(ALLOWED) - ALLOWED[package] - {package}
+    for path in ROOT.glob(f'koopman_ros/{package}/**/*.py'):
+        used = {name.split('.')[1] for name in _imports(path) if name.startswith('koopman_ros.')}
+        assert not used & others, path
+
+
+@pytest.mark.parametrize('package', ['plants', 'lifting', 'control', 'bags', 'studies'])
+def test_numerics_do_not_import_ros(package: str) -> None:
+    for path in ROOT.glob(f'koopman_ros/{package}/**/*.py'):
+        roots = {name.split('.')[0] for name in _imports(path)}
+        assert not roots & {'rclpy', 'sensor_msgs', 'std_msgs', 'diagnostic_msgs'}, path
+
+
+def test_training_alone_imports_torch() -> None:
+    users = {path for path in ROOT.glob('koopman_ros/**/*.py')
+             if 'torch' in {name.split('.')[0] for name in _imports(path)}}
+    assert users == {ROOT / 'koopman_ros' / 'lifting' / f'{name}.py' for name in TRAINING}
+
+
+def test_numerics_import_without_ros_and_torch() -> None:
+    """Import the numerical packages in a fresh process in which ROS and torch do not exist."""
+    blocked = ('rclpy', 'rcl_interfaces', 'sensor_msgs', 'torch')
+    code = (
+        'import sys\n'
+        'class Blocker:\n'
+        '    def find_spec(self, name, path=None, target=None):\n'
+        f'        if name.split(".")[0] in {blocked!r}:\n'
+        '            raise ImportError(name + " is not here")\n'
+        'sys.meta_path.insert(0, Blocker())\n'
+        'import koopman_ros.lifting, koopman_ros.control, koopman_ros.plants, koopman_ros.bags\n'
+        'model = koopman_ros.lifting.load(sys.argv[1])\n'
+        'print(model.n_z)\n')
+    done = subprocess.run(
+        [sys.executable, '-c', code, str(ROOT / 'config/models/reactor_nz3.safetensors')],
+        capture_output=True, text=True, timeout=60, check=False)
+    assert (done.returncode, done.stdout, done.stderr) == (0, '3\n', '')
