@@ -17,8 +17,6 @@
 import ast
 from pathlib import Path
 import re
-import subprocess
-import sys
 import xml.etree.ElementTree as ElementTree
 
 import koopman_ros
@@ -94,22 +92,3 @@ def test_training_alone_imports_torch() -> None:
     users = {path for path in ROOT.glob('koopman_ros/**/*.py')
              if 'torch' in {name.split('.')[0] for name in _imports(path)}}
     assert users == {ROOT / 'koopman_ros' / 'lifting' / f'{name}.py' for name in TRAINING}
-
-
-def test_numerics_import_without_ros_and_torch() -> None:
-    """Import the numerical packages in a fresh process in which ROS and torch do not exist."""
-    blocked = ('rclpy', 'rcl_interfaces', 'sensor_msgs', 'torch')
-    code = (
-        'import sys\n'
-        'class Blocker:\n'
-        '    def find_spec(self, name, path=None, target=None):\n'
-        f'        if name.split(".")[0] in {blocked!r}:\n'
-        '            raise ImportError(name + " is not here")\n'
-        'sys.meta_path.insert(0, Blocker())\n'
-        'import koopman_ros.lifting, koopman_ros.control, koopman_ros.plants, koopman_ros.bags\n'
-        'model = koopman_ros.lifting.load(sys.argv[1])\n'
-        'print(model.n_z)\n')
-    done = subprocess.run(
-        [sys.executable, '-c', code, str(ROOT / 'config/models/reactor_nz3.safetensors')],
-        capture_output=True, text=True, timeout=60, check=False)
-    assert (done.returncode, done.stdout, done.stderr) == (0, '3\n', '')
