@@ -193,7 +193,8 @@ class Controller:
 
     def _wanted(self, state: State, measurement: Array, held: Array) -> tuple[Array, Report]:
         """Return the command before limits with what is known of it."""
-        if not np.all(np.isfinite(measurement)):
+        # finite, yet beyond what scaled deviations can hold, is no measurement either
+        if not np.all(np.isfinite(self.model.states.to_deviation(measurement))):
             if state.mode is Mode.MANUAL and state.manual_input is not None:
                 return state.manual_input, Report(state.mode, problem='measurement not finite')
             return held, Report(state.mode, problem=(

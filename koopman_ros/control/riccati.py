@@ -25,6 +25,10 @@ from scipy.linalg import lapack
 
 Array = NDArray[np.float64]
 
+# A double eigenvalue of the Hamiltonian on the imaginary axis comes out split by about the square
+# root of the rounding error: modes within that of the axis cannot be told from undamped ones.
+_AXIS_MARGIN = float(np.sqrt(np.finfo(np.float64).eps))
+
 
 class RiccatiStatus(Enum):
     """How a solution fared; the value is the sentence for the user."""
@@ -43,8 +47,8 @@ class RiccatiSolution:
     """
     Solution of A'P + PA - P B R^-1 B' P + Q = 0 with the gain K = R^-1 B' P.
 
-    :param P: (n, n) symmetric; zeros when not solved.
-    :param K: (m, n); zeros when not solved.
+    :param P: (n, n) symmetric; zeros when there is no stable subspace to take it from.
+    :param K: (m, n); zeros likewise.
     :param residual: Frobenius norm of the equation's left side over that of Q.
     :param gain: spectral norm of K.
     :param status: whether K may be used.
@@ -61,6 +65,8 @@ def _in_left_half_plane(real: float, imaginary: float) -> bool:
     return real < 0.0
 
 
+# values so large that something overflows end in a residual or a gain that is refused
+@np.errstate(all='ignore')
 def solve_riccati(A: Array, B: Array, Q: Array, R: Array, *, max_residual: float = 1e-6,
                   max_gain: float = np.inf) -> RiccatiSolution:
     """
@@ -87,11 +93,12 @@ def solve_riccati(A: Array, B: Array, Q: Array, R: Array, *, max_residual: float
     H = np.empty((2 * n, 2 * n), order='F')
     H[:n, :n], H[:n, n:] = A, -scale * G
     H[n:, :n], H[n:, n:] = -Q / scale, -A.T
-    if not np.all(np.isfinite(H)):
+    if not (np.all(np.isfinite(H)) and size_Q > 0.0):
         return _unsolved(B, RiccatiStatus.NOT_STABILISABLE)
+    margin = _AXIS_MARGIN * np.linalg.norm(H)
     _, stable, real, _, vectors, _, info = lapack.dgees(
         _in_left_half_plane, H, sort_t=1, lwork=16 * n, overwrite_a=1)
-    if info != 0 or stable != n or not np.all(real[:n] < 0.0):
+    if info != 0 or stable != n or not np.all(real[:n] < -margin):
         return _unsolved(B, RiccatiStatus.NOT_STABILISABLE)
     X, Y = vectors[:n, :n], vectors[n:, :n]
     try:

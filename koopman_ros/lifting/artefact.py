@@ -120,7 +120,8 @@ def load(path: str | os.PathLike[str]) -> LiftedModel:
     try:
         about = json.loads(metadata['description'])
         model = _build(about, tensors)
-    except (KeyError, TypeError, ValueError, AttributeError) as error:
+    except (KeyError, TypeError, ValueError, AttributeError, OverflowError,
+            RecursionError) as error:
         reason = f'{error.args[0]!r} is missing' if isinstance(error, KeyError) else str(error)
         _refuse(path, f'its content is inconsistent ({reason})')
     return model
@@ -131,6 +132,8 @@ def _build(about: dict[str, Any], tensors: dict[str, np.ndarray]) -> LiftedModel
     if about['activation'] != ACTIVATION:
         raise ValueError(f"activation must be {ACTIVATION!r}, got {about['activation']!r}")
     layers = _integer(about, 'hidden_layers')
+    if layers > len(tensors):
+        raise ValueError(f'{len(tensors)} arrays cannot make up {layers} hidden layers')
     expected = {'A', 'B', 'output'} | {
         f'hidden.{i}.{part}' for i in range(layers) for part in ('weight', 'bias')}
     if set(tensors) != expected:
@@ -188,7 +191,7 @@ def _split_file(path: Path, content: bytes) -> tuple[dict[str, Any], bytes]:
         _refuse(path, 'it ends within its header, so it was cut off')
     try:
         header = json.loads(content[8:8 + length])
-    except ValueError:
+    except (ValueError, RecursionError):
         _refuse(path, 'it is not a safetensors file')
     if not isinstance(header, dict):
         _refuse(path, 'it is not a safetensors file')
@@ -196,7 +199,7 @@ def _split_file(path: Path, content: bytes) -> tuple[dict[str, Any], bytes]:
     try:
         end = max((int(entry['data_offsets'][1]) for name, entry in header.items()
                    if name != '__metadata__'), default=0)
-    except (KeyError, TypeError, ValueError, IndexError):
+    except (KeyError, TypeError, ValueError, IndexError, OverflowError):
         _refuse(path, 'it is not a safetensors file')
     if len(data) < end:
         _refuse(path, f'{end - len(data)} bytes of its arrays are missing, so it was cut off')
@@ -208,20 +211,28 @@ def _split_file(path: Path, content: bytes) -> tuple[dict[str, Any], bytes]:
 def _tensor(path: Path, name: str, entry: Any, data: bytes) -> np.ndarray:
     """Decode one array, checking type, size and values."""
     try:
-        shape = tuple(int(n) for n in entry['shape'])
-        start, end = (int(n) for n in entry['data_offsets'])
+        shape = tuple(_size(n) for n in entry['shape'])
+        start, end = (_size(n) for n in entry['data_offsets'])
         dtype = entry['dtype']
     except (KeyError, TypeError, ValueError):
         _refuse(path, f'the entry of the array {name!r} is malformed')
     if dtype != 'F64':
         _refuse(path, f'the array {name!r} has type {dtype!r}, expected F64')
-    if start < 0 or end < start or min(shape, default=0) < 0 or (
-            end - start != 8 * math.prod(shape)):
+    if len(shape) > 2:
+        _refuse(path, f'the array {name!r} has {len(shape)} dimensions, expected at most 2')
+    if end - start != 8 * math.prod(shape):
         _refuse(path, f'the array {name!r} of shape {shape} does not fit its {end - start} bytes')
     array = np.frombuffer(data[start:end], dtype='<f8').reshape(shape)
     if not np.all(np.isfinite(array)):
         _refuse(path, f'the array {name!r} holds values that are not finite')
     return array
+
+
+def _size(value: Any) -> int:
+    if not isinstance(value, int) or isinstance(value, bool) or (
+            not 0 <= value <= _MAX_FILE_BYTES):
+        raise ValueError(f'{value!r} is no size of an array')
+    return value
 
 
 def _refuse(path: Path, reason: str) -> NoReturn:

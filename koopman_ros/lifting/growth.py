@@ -130,7 +130,15 @@ def _xavier(rows: int, columns: int, generator: torch.Generator) -> Tensor:
 
 def _drift_matrix(z: Tensor, dz: Tensor) -> Tensor:
     """Solve dz = A z for A by linear least squares."""
-    return torch.linalg.lstsq(z, dz).solution.T
+    return _least_squares(z, dz).T
+
+
+def _least_squares(a: Tensor, b: Tensor) -> Tensor:
+    """Solve a s = b for s (n, k), of least norm where a (N, n) is short of rank."""
+    # not torch.linalg.lstsq: its default driver starts from uninitialised memory, so that the
+    # same data give other bits and at times a wrong rank
+    # (https://github.com/pytorch/pytorch/issues/187411)
+    return torch.linalg.pinv(a) @ b
 
 
 def _ridge_fit(x: Tensor, W: Tensor, b: Tensor, target: Tensor, ridge: float) -> Tensor:
@@ -168,7 +176,7 @@ def _least_spanned_product(grown: Grown, x: Tensor, f: Tensor) -> Tensor:
                     continue
                 part = part / scale
                 if basis.shape[1]:
-                    part = part - basis @ torch.linalg.lstsq(basis, part[:, None]).solution[:, 0]
+                    part = part - basis @ _least_squares(basis, part[:, None])[:, 0]
                 share = float(part.square().mean())
                 if share > best_share:
                     best, best_share = part, share

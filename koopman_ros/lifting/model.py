@@ -244,8 +244,8 @@ class LiftedModel:
         Evaluate the secants of N and of J_N w between two states, exactly.
 
         With e = x - x_ref they satisfy N(x) - N(x_ref) = M e and
-        J_N(x) w - J_N(x_ref) w = H e; M is the mean of J_N along the segment. Each tanh
-        contributes its divided difference, so nothing cancels as e goes to 0.
+        J_N(x) w - J_N(x_ref) w = H e; with one hidden layer M is the mean of J_N along the
+        segment. Each tanh contributes its divided difference, so nothing cancels as e goes to 0.
 
         :param x: (n_x,) state.
         :param x_ref: (n_x,) reference.

@@ -134,7 +134,8 @@ def train(plant: Plant, samples: Samples, recipe: Recipe, *, seed: int = 0, star
     :param starts: number of starts.
     :param split_seed: seed of the split into training, validation and test episodes.
     :param progress: called after every step.
-    :raises ValueError: on too few episodes or a recipe that does not fit.
+    :raises ValueError: on too few episodes, held-out episodes that hardly move, or a recipe that
+        does not fit.
     :raises KeyboardInterrupt: when interrupted before the first start finished.
     """
     if starts < 1:
@@ -158,8 +159,15 @@ def train(plant: Plant, samples: Samples, recipe: Recipe, *, seed: int = 0, star
             grown = grow(x, f, recipe, seed + start, monitor)
             model = _assemble(grown, B, states, inputs, plant.time_unit,
                               replace(provenance, seed=seed + start))
-            rw = fit(model, parts[1].x, parts[1].dxdt, parts[1].u).rw
-            finished += 1
+            try:
+                rw = _judge(model, parts[1]).rw
+            except ValueError:
+                # its coordinates collapsed: it loses, unless every start does
+                if best is None and start == starts - 1:
+                    raise
+                continue
+            finally:
+                finished += 1
             if best is None or rw < best[0]:
                 best = (rw, model, grown)
     except KeyboardInterrupt:
@@ -169,10 +177,14 @@ def train(plant: Plant, samples: Samples, recipe: Recipe, *, seed: int = 0, star
         torch.set_num_threads(threads)
     assert best is not None
     _, model, grown = best
-    figures = fit(model, parts[2].x, parts[2].dxdt, parts[2].u)
+    figures = _judge(model, parts[2])
     metrics = {'rw': figures.rw, 'rx': figures.rx, 'cond': figures.cond}
     model = replace(model, provenance=replace(model.provenance, metrics=metrics))
     return Trained(model, figures, grown.status.value, finished)
+
+
+def _judge(model: LiftedModel, samples: Samples) -> Fit:
+    return fit(model, samples.x, samples.dxdt, samples.u)
 
 
 def split_by_episode(samples: Samples, seed: int) -> tuple[Samples, Samples, Samples]:

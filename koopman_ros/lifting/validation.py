@@ -22,6 +22,9 @@ from koopman_ros.lifting.model import Array, LiftedModel
 import numpy as np
 from scipy.integrate import solve_ivp
 
+# Beyond it S is singular to working precision, and rw is noise.
+_MAX_COND = 1e13
+
 
 @dataclass(frozen=True)
 class Fit:
@@ -47,19 +50,24 @@ def fit(model: LiftedModel, x: Array, dxdt: Array, u: Array) -> Fit:
     :param x: (N, n_x) states, in state units.
     :param dxdt: (N, n_x) their derivatives, in state units per time unit.
     :param u: (N, n_u) inputs, in input units.
+    :raises ValueError: when the samples do not tell the coordinates apart.
     """
     xi = model.states.to_deviation(x)
     f = dxdt / model.states.scale - model.inputs.to_deviation(u) @ model.B.T
     z, J = model.lift_and_jacobian(xi)
     dz = (J @ f[..., None])[..., 0]
     S = z.T @ z / len(z)
+    cond = float(np.linalg.cond(S))
+    if not cond < _MAX_COND:
+        raise ValueError(f'{len(z)} samples do not tell {model.n_z} coordinates apart: judge by '
+                         'samples that move more, or use a smaller n_z')
     factor = np.linalg.cholesky(S)
     residual = np.linalg.solve(factor, (dz - z @ model.A.T).T)
     reference = np.linalg.solve(factor, dz.T)
     error = model.drift(xi) - f
     return Fit(rw=float(np.sum(residual ** 2) / np.sum(reference ** 2)),
                rx=float(np.sum(error ** 2) / np.sum(f ** 2)),
-               cond=float(np.linalg.cond(S)))
+               cond=cond)
 
 
 def roll_out(model: LiftedModel, x0: Array, inputs: Array, sample_period: float) -> Array:
@@ -76,8 +84,10 @@ def roll_out(model: LiftedModel, x0: Array, inputs: Array, sample_period: float)
     xi = model.states.to_deviation(np.asarray(x0, dtype=np.float64))
     path = [xi]
     for nu in model.inputs.to_deviation(np.asarray(inputs, dtype=np.float64)) @ model.B.T:
-        solution = solve_ivp(lambda _, y, push=nu: model.drift(y) + push, (0.0, sample_period), xi,
-                             method='DOP853', rtol=1e-9, atol=1e-12)
+        # a prediction that overflows is reported below
+        with np.errstate(all='ignore'):
+            solution = solve_ivp(lambda _, y, push=nu: model.drift(y) + push,
+                                 (0.0, sample_period), xi, method='DOP853', rtol=1e-9, atol=1e-12)
         xi = solution.y[:, -1]
         if not solution.success or not np.all(np.isfinite(xi)):
             raise RuntimeError(f'the prediction diverged after {len(path)} samples: keep the '

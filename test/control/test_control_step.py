@@ -1,0 +1,404 @@
+# Copyright 2026 The koopman_ros Authors
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""The control step: pure, always within limits, and a loop that reaches its set-point."""
+
+from collections.abc import Iterator
+from dataclasses import fields, is_dataclass, replace
+from enum import Enum
+import math
+from typing import Any
+
+from closed_loops import COOLANT, REACTOR, SETPOINT, shipped, START, two_state_model
+from koopman_ros.control import Controller, InputLimits, Law, Mode, Settings, State
+from koopman_ros.lifting import Coordinates, LiftedModel, Provenance
+from koopman_ros.plants import advance
+import numpy as np
+import pytest
+
+SECOND = 1_000_000_000
+NOW = 1_785_000_000 * SECOND
+LOWER, UPPER, RATE = 280.0, 304.0, 0.8
+LARGEST = float(np.finfo(np.float64).max)
+
+
+def controller(name='reactor_nz4', *, input_weight=1.0, rate=RATE, **settings):
+    return Controller(shipped(name), Settings(
+        np.array([1.0]), np.array([input_weight]),
+        InputLimits(np.array([LOWER]), np.array([UPPER]), np.array([rate])), **settings))
+
+
+def started(loop=None, kelvin=START):
+    """Return a state that has seen one measurement."""
+    return (loop or controller()).step(State(), np.array([kelvin]), NOW)[0]
+
+
+def content(value: Any) -> Any:
+    """Turn a dataclass with arrays into something that compares bit for bit."""
+    if is_dataclass(value):
+        return tuple(content(getattr(value, item.name)) for item in fields(value))
+    if isinstance(value, tuple):
+        return tuple(content(item) for item in value)
+    if isinstance(value, np.ndarray):
+        return (value.shape, value.tobytes())
+    if isinstance(value, float):
+        return np.float64(value).tobytes()
+    assert value is None or isinstance(value, (bool, int, str, Enum))
+    return value
+
+
+# One step.
+
+def test_at_its_setpoint_the_loop_rests():
+    state, command, report = controller().step(State(), np.array([START]), NOW)
+    np.testing.assert_allclose(command, [300.0], rtol=0, atol=1e-9)
+    np.testing.assert_array_equal(report.active_setpoint, [START])
+    assert report.law is Law.RECENTRED
+    assert report.mode is Mode.AUTOMATIC
+    assert (report.problem, report.outside) == ('', 0.0)
+    assert 0.0 <= report.residual <= 1e-6
+    assert 0.0 < report.gain <= 1e3
+    assert (report.at_range, report.at_rate, report.clock_went_back) == (False, False, False)
+    assert state.time_ns == NOW
+    assert state.command is not None
+
+
+def test_a_start_elsewhere_holds_what_it_finds():
+    _, command, report = controller().step(State(), np.array([SETPOINT]), NOW)
+    np.testing.assert_array_equal(report.active_setpoint, [SETPOINT])
+    np.testing.assert_allclose(command, [COOLANT], rtol=0, atol=1e-3)
+
+
+def test_a_law_with_unstable_modes_is_reported_as_projected():
+    loop = Controller(two_state_model(), Settings(
+        np.ones(2), np.ones(1), InputLimits(np.array([-50.0]), np.array([50.0]),
+                                            np.array([np.inf]))))
+    state = loop.step(State(), np.array([1.0, 2.0]), NOW)[0]
+    state, refused = loop.request_setpoint(state, np.zeros(2))
+    assert refused == ''
+    report = loop.step(state, np.array([1.0, 2.0]), NOW + SECOND)[2]
+    assert (report.law, report.problem) == (Law.PROJECTED, '')
+
+
+@pytest.mark.parametrize('measurement', [312.0, 327.5, math.nan, 1e300])
+@pytest.mark.parametrize('later', [SECOND, 0, -SECOND])
+def test_a_step_is_pure(measurement, later):
+    loop = controller(setpoint_ramp=0.1)
+    before = loop.request_setpoint(started(loop), np.array([311.0]))[0]
+    before = loop.request_setpoint(before, np.array([313.0]), NOW + 9 * SECOND)[0]
+    kept, value = content(before), np.array([measurement])
+    results = [loop.step(before, value, NOW + later) for _ in range(2)]
+    # a loop built afresh has nothing cached
+    results.append(controller(setpoint_ramp=0.1).step(before, value.copy(), NOW + later))
+    assert content(before) == kept
+    np.testing.assert_array_equal(value, [measurement])
+    assert len({content(result) for result in results}) == 1
+
+
+def measurements() -> Iterator[tuple[int, float]]:
+    """Yield stamps and temperatures of a rough day: gaps, repeats, glitches, a clock set back."""
+    rng = np.random.default_rng(11)
+    glitches = (math.nan, math.inf, -math.inf, 1e300, -1e300, LARGEST, -LARGEST, 0.0, -0.0,
+                5e-324, 1e20, 305.0, 331.0)
+    time_ns = NOW
+    for _ in range(400):
+        time_ns += int(rng.choice([0, 1, SECOND, 7 * SECOND, 3600 * SECOND, -50 * SECOND]))
+        glitch = rng.random() < 0.4
+        yield time_ns, float(rng.choice(glitches) if glitch else rng.uniform(303.0, 330.0))
+
+
+@pytest.mark.parametrize('name', ['reactor_nz3', 'reactor_nz4', 'reactor_linear'])
+@pytest.mark.parametrize('mode', list(Mode))
+def test_commands_are_finite_and_within_limits_whatever_is_measured(name, mode):
+    loop = controller(name, setpoint_ramp=0.2)
+    state = loop.set_mode(started(loop), mode)
+    state = loop.request_manual_input(state, np.array([299.0]))[0]
+    state = loop.request_setpoint(state, np.array([312.0]))[0]
+    for time_ns, value in measurements():
+        previous, last_ns = state.command, state.time_ns
+        state, command, report = loop.step(state, np.array([value]), time_ns)
+        assert LOWER <= command[0] <= UPPER
+        elapsed = max(0.0, (time_ns - last_ns) / SECOND)
+        # rounded at the size of the command
+        assert abs(command[0] - previous[0]) <= RATE * elapsed + 1e-12
+        assert report.clock_went_back is (time_ns < last_ns)
+        assert bool(report.problem) is (not math.isfinite(value))
+
+
+def test_a_day_replays_bit_for_bit():
+    def replay():
+        loop, state = controller(setpoint_ramp=0.2), State()
+        for time_ns, value in measurements():
+            state, command, report = loop.step(state, np.array([value]), time_ns)
+            yield content(state), content(command), content(report)
+
+    assert list(replay()) == list(replay())
+
+
+def change_of_variable(scale: float) -> LiftedModel:
+    """Return the free lift tanh(x) of one state."""
+    c = Coordinates(('x',), ('1',), np.zeros(1), np.array([scale]), -np.ones(1), np.ones(1))
+    return LiftedModel(((np.eye(1), np.zeros(1)),), np.eye(1), -np.eye(1), np.eye(1), False, c, c,
+                       's', Provenance('change of variable'))
+
+
+@pytest.mark.parametrize('first', [math.nan, LARGEST, -LARGEST, 1e300, 0.0])
+@pytest.mark.parametrize('second', [math.inf, LARGEST, -LARGEST, -1e300, -0.0])
+def test_scaling_beyond_what_numbers_hold(first, second):
+    model = two_state_model()
+    fine = replace(model, states=replace(model.states, scale=np.array([1e-3, 0.1])))
+    bounds = InputLimits(np.array([-2.0]), np.array([1.0]), np.array([np.inf]))
+    for loop, measurement in (
+            (Controller(fine, Settings(np.ones(2), np.ones(1), bounds)), [first, second]),
+            (Controller(change_of_variable(1e-3), Settings(np.ones(1), np.ones(1), bounds)),
+             [first]),
+            (Controller(change_of_variable(1e3), Settings(np.ones(1), np.ones(1), bounds)),
+             [second])):
+        state = loop.step(State(), np.zeros(len(measurement)), NOW)[0]
+        command = loop.step(state, np.array(measurement), NOW + SECOND)[1]
+        assert -2.0 <= command[0] <= 1.0
+
+
+# Sensor failures.
+
+def test_a_failed_sensor_holds_the_last_command():
+    loop = controller()
+    state = loop.request_setpoint(started(loop), np.array([316.0]))[0]
+    state, command, _ = loop.step(state, np.array([320.0]), NOW + SECOND)
+    state, held, report = loop.step(state, np.array([math.nan]), NOW + 2 * SECOND)
+    np.testing.assert_array_equal(held, command)
+    assert report.law is None
+    assert report.problem == ('measurement [nan] is not finite: the last command is held; check '
+                              'the sensor')
+    assert math.isnan(report.outside)
+    # the set-point stays, and the loop goes on when the sensor does
+    np.testing.assert_array_equal(report.active_setpoint, [316.0])
+    report = loop.step(state, np.array([319.0]), NOW + 3 * SECOND)[2]
+    assert (report.law, report.problem) == (Law.RECENTRED, '')
+
+
+def test_a_sensor_that_fails_from_the_start_gives_the_nominal_input():
+    state, command, report = controller().step(State(), np.array([math.nan]), NOW)
+    np.testing.assert_array_equal(command, [300.0])
+    assert report.active_setpoint is None
+    assert 'is not finite' in report.problem
+    # the first valid measurement is what is held
+    report = controller().step(state, np.array([315.0]), NOW + SECOND)[2]
+    np.testing.assert_array_equal(report.active_setpoint, [315.0])
+
+
+def test_a_nominal_input_out_of_range_is_limited():
+    loop = controller()
+    loop = replace(loop, settings=replace(loop.settings, limits=InputLimits(
+        np.array([280.0]), np.array([295.0]), np.array([RATE]))))
+    _, command, report = loop.step(State(), np.array([math.nan]), NOW)
+    np.testing.assert_array_equal(command, [295.0])
+    assert report.at_range
+
+
+def test_outside_the_box_the_distance_is_reported():
+    model = shipped('reactor_nz4')
+    half = 0.5 * (model.states.upper - model.states.lower)
+    report = controller().step(started(), model.states.upper + 0.25 * half, NOW + SECOND)[2]
+    assert report.outside == pytest.approx(0.25, rel=1e-9)
+    assert report.law is Law.RECENTRED
+
+
+def test_without_a_gain_the_last_command_is_held():
+    loop = controller()
+    state, command, _ = loop.step(started(loop), np.array([323.0]), NOW + SECOND)
+    strict = replace(loop, settings=replace(loop.settings, max_gain=1e-6))
+    state, held, report = strict.step(state, np.array([315.0]), NOW + 2 * SECOND)
+    np.testing.assert_array_equal(held, command)
+    assert report.law is None
+    assert report.problem.startswith('no feedback')
+    assert 'the gain exceeds its bound' in report.problem
+    assert report.gain > 1e-6
+
+
+# Time.
+
+def test_a_repeated_stamp_repeats_the_command():
+    loop = controller(rate=np.inf)
+    state, command, _ = loop.step(started(loop), np.array([320.0]), NOW + SECOND)
+    for value in (320.0, 310.0, math.nan):
+        again, repeated, report = loop.step(state, np.array([value]), NOW + SECOND)
+        np.testing.assert_array_equal(repeated, command)
+        assert again.time_ns == NOW + SECOND
+        assert not report.clock_went_back
+
+
+def test_an_earlier_stamp_starts_time_afresh():
+    loop = controller()
+    state, command, _ = loop.step(started(loop), np.array([323.5]), NOW + 100 * SECOND)
+    state, held, report = loop.step(state, np.array([323.5]), NOW)
+    assert report.clock_went_back
+    np.testing.assert_array_equal(held, command)
+    assert state.time_ns == NOW
+    state = loop.request_setpoint(state, np.array([306.0]))[0]
+    _, moved, report = loop.step(state, np.array([323.5]), NOW + SECOND)
+    assert not report.clock_went_back
+    assert moved[0] == pytest.approx(held[0] - RATE, rel=1e-12)
+
+
+def test_the_rate_limit_counts_elapsed_time():
+    loop = controller()
+    state = loop.request_setpoint(started(loop), np.array([306.0]))[0]
+    expected = float(state.command[0])
+    time_ns = NOW
+    for milliseconds in (1000, 250, 3000, 1):
+        time_ns += milliseconds * SECOND // 1000
+        state, command, report = loop.step(state, np.array([START]), time_ns)
+        expected -= RATE * milliseconds / 1000.0
+        assert command[0] == pytest.approx(expected, rel=1e-12)
+        assert report.at_rate
+    # with time enough it ends at the range
+    _, command, report = loop.step(state, np.array([START]), time_ns + 3600 * SECOND)
+    assert command[0] == LOWER
+    assert report.at_range
+    assert not report.at_rate
+
+
+def test_a_scheduled_setpoint_takes_effect_at_its_stamp():
+    loop = controller()
+    state, refused = loop.request_setpoint(started(loop), np.array([316.0]), NOW + 3 * SECOND)
+    assert refused == ''
+    active = []
+    for second in range(1, 6):
+        state, _, report = loop.step(state, np.array([START]), NOW + second * SECOND)
+        active.append(float(report.active_setpoint[0]))
+    assert active == [START, START, 316.0, 316.0, 316.0]
+
+
+def test_a_refused_setpoint_changes_nothing():
+    loop = controller()
+    state = loop.request_setpoint(started(loop), np.array([316.0]))[0]
+    for value in (math.nan, 200.0, 400.0):
+        same, reason = loop.request_setpoint(state, np.array([value]))
+        assert same is state
+        assert 'the old one is kept' in reason
+
+
+# Manual mode.
+
+def test_manual_mode_starts_from_the_last_command():
+    loop = controller()
+    state = loop.request_setpoint(started(loop), np.array([316.0]))[0]
+    state, command, _ = loop.step(state, np.array([320.0]), NOW + SECOND)
+    state = loop.set_mode(state, Mode.MANUAL)
+    for second in range(2, 5):
+        state, manual, report = loop.step(state, np.array([310.0]), NOW + second * SECOND)
+        np.testing.assert_array_equal(manual, command)
+        assert (report.mode, report.law, report.problem) == (Mode.MANUAL, None, '')
+        assert report.outside == 0.0
+
+
+def test_manual_mode_before_the_first_command_gives_the_nominal_input():
+    loop = controller()
+    _, command, _ = loop.step(loop.set_mode(State(), Mode.MANUAL), np.array([320.0]), NOW)
+    np.testing.assert_array_equal(command, [300.0])
+
+
+def test_manual_commands_are_followed_within_the_limits():
+    loop = controller()
+    state = loop.set_mode(started(loop), Mode.MANUAL)
+    state, refused = loop.request_manual_input(state, np.array([500.0]))
+    assert refused == ''
+    state, command, report = loop.step(state, np.array([START]), NOW + SECOND)
+    assert command[0] == pytest.approx(300.0 + RATE, rel=1e-9)
+    assert report.at_range
+    assert report.at_rate
+    _, command, report = loop.step(state, np.array([START]), NOW + 3600 * SECOND)
+    assert command[0] == UPPER
+    assert report.at_range
+
+
+def test_manual_commands_outlive_a_failed_sensor():
+    loop = controller()
+    state = loop.request_manual_input(
+        loop.set_mode(started(loop), Mode.MANUAL), np.array([299.0]))[0]
+    _, command, report = loop.step(state, np.array([math.nan]), NOW + 10 * SECOND)
+    np.testing.assert_array_equal(command, [299.0])
+    assert report.problem == 'measurement not finite'
+
+
+@pytest.mark.parametrize('value', [math.nan, math.inf])
+def test_a_manual_command_that_is_not_finite_is_refused(value):
+    loop = controller()
+    state = loop.request_manual_input(
+        loop.set_mode(started(loop), Mode.MANUAL), np.array([299.0]))[0]
+    same, reason = loop.request_manual_input(state, np.array([value]))
+    assert same is state
+    assert reason == f'manual command [{value}] is not finite: the old one is kept'
+
+
+def test_a_manual_command_is_forgotten_with_the_mode():
+    loop = controller()
+    state = loop.request_manual_input(
+        loop.set_mode(started(loop), Mode.MANUAL), np.array([290.0]))[0]
+    state = loop.set_mode(loop.set_mode(state, Mode.AUTOMATIC), Mode.MANUAL)
+    _, command, _ = loop.step(state, np.array([START]), NOW + 3600 * SECOND)
+    np.testing.assert_array_equal(command, started(loop).command)
+
+
+def test_back_in_automatic_mode_the_law_acts():
+    loop = controller()
+    state = loop.request_setpoint(started(loop), np.array([316.0]))[0]
+    automatic = loop.step(state, np.array([320.0]), NOW + SECOND)
+    detour = loop.set_mode(loop.set_mode(state, Mode.MANUAL), Mode.AUTOMATIC)
+    assert content(loop.step(detour, np.array([320.0]), NOW + SECOND)) == content(automatic)
+
+
+# The loop: the true reactor, sampled every second.
+
+def drive(loop, seconds, *, plant=REACTOR, kelvin=START, setpoint=SETPOINT):
+    """Return the temperatures and commands of a closed loop after a change of set-point."""
+    state = loop.step(State(), np.array([kelvin]), NOW)[0]
+    state, refused = loop.request_setpoint(state, np.array([setpoint]))
+    assert refused == ''
+    temperature = np.array([kelvin])
+    temperatures, commands = [], []
+    for second in range(1, seconds + 1):
+        state, command, report = loop.step(state, temperature, NOW + second * SECOND)
+        assert report.problem == ''
+        temperature = advance(plant, temperature, command, 1.0 / 60.0)
+        temperatures.append(float(temperature[0]))
+        commands.append(float(command[0]))
+    return np.array(temperatures), np.array(commands)
+
+
+@pytest.mark.parametrize('name', ['reactor_nz3', 'reactor_nz4'])
+@pytest.mark.parametrize(('kelvin', 'setpoint'), [(START, SETPOINT), (308.0, 322.0)])
+@pytest.mark.parametrize('input_weight', [1.0, 0.1])
+def test_a_sampled_loop_reaches_its_setpoint(name, kelvin, setpoint, input_weight):
+    temperatures, commands = drive(
+        controller(name, input_weight=input_weight), 480, kelvin=kelvin, setpoint=setpoint)
+    assert np.max(np.abs(temperatures[-60:] - setpoint)) < 0.01
+    assert np.all((commands >= LOWER) & (commands <= UPPER))
+    assert np.max(np.abs(np.diff(commands))) <= RATE + 1e-9
+    # on its way it does not overshoot by more than a tenth of a kelvin
+    travelled = np.sign(setpoint - kelvin) * (temperatures - setpoint)
+    assert np.max(travelled) < 0.1
+
+
+def test_a_ramped_loop_follows_its_ramp():
+    temperatures, _ = drive(controller(setpoint_ramp=0.02), 900)
+    assert abs(temperatures[-1] - SETPOINT) < 0.01
+    # the ramp alone takes 500 s
+    assert temperatures[249] == pytest.approx(START - 5.0, abs=1.0)
+
+
+def test_the_linear_model_leaves_the_sampled_loop_off_target():
+    temperatures, _ = drive(controller('reactor_linear'), 480)
+    assert temperatures[-1] - SETPOINT == pytest.approx(1.9334, abs=1e-2)

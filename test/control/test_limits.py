@@ -1,0 +1,69 @@
+# Copyright 2026 The koopman_ros Authors
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""Range and rate limits of the inputs."""
+
+from koopman_ros.control import InputLimits, limit
+import numpy as np
+import pytest
+
+
+def limits(rate=2.0):
+    return InputLimits(np.array([-1.0]), np.array([5.0]), np.array([rate]))
+
+
+@pytest.mark.parametrize(('wanted', 'u', 'at_range'), [
+    (0.0, 0.0, False), (5.0, 5.0, False), (-1.0, -1.0, False), (5.1, 5.0, True),
+    (-9.0, -1.0, True), (1e308, 5.0, True), (np.inf, 5.0, True)])
+def test_the_first_command_has_no_rate(wanted, u, at_range):
+    limited = limit(limits(), np.array([wanted]), None, 0.0)
+    assert (limited.u[0], limited.at_range, limited.at_rate) == (u, at_range, False)
+
+
+@pytest.mark.parametrize(('wanted', 'seconds', 'u', 'at_range', 'at_rate'), [
+    (1.5, 1.0, 1.5, False, False),
+    (3.0, 1.0, 3.0, False, False),
+    (3.5, 1.0, 3.0, False, True),
+    (-0.9, 0.5, 0.0, False, True),
+    (9.0, 1.0, 3.0, True, True),
+    (9.0, 10.0, 5.0, True, False),
+    (3.0, 0.0, 1.0, False, True),
+    (1.0, 0.0, 1.0, False, False),
+])
+def test_the_rate_counts_from_the_last_command(wanted, seconds, u, at_range, at_rate):
+    limited = limit(limits(), np.array([wanted]), np.array([1.0]), seconds)
+    assert (limited.u[0], limited.at_range, limited.at_rate) == (u, at_range, at_rate)
+
+
+@pytest.mark.parametrize(('wanted', 'u'), [(3.0, 5.0), (9.0, 5.0), (7.0, 5.0)])
+def test_the_range_wins_over_the_rate(wanted, u):
+    limited = limit(limits(), np.array([wanted]), np.array([8.0]), 0.1)
+    assert limited.u[0] == u
+
+
+def test_no_rate_limit():
+    assert limit(limits(np.inf), np.array([4.0]), np.array([-1.0]), 1e-9).u[0] == 4.0
+
+
+def test_no_rate_limit_without_elapsed_time():
+    limited = limit(limits(np.inf), np.array([4.0]), np.array([-1.0]), 0.0)
+    assert (limited.u[0], limited.at_rate) == (-1.0, True)
+
+
+def test_each_input_has_its_own_limits():
+    both = InputLimits(np.array([0.0, -5.0]), np.array([1.0, 5.0]), np.array([9.0, 0.5]))
+    limited = limit(both, np.array([3.0, 3.0]), np.array([0.5, 0.0]), 1.0)
+    np.testing.assert_array_equal(limited.u, [1.0, 0.5])
+    assert limited.at_range
+    assert limited.at_rate

@@ -1,0 +1,232 @@
+# Copyright 2026 The koopman_ros Authors
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""The Riccati solver against independent solvers, and at the border of what can be solved."""
+
+import control
+from koopman_ros.control import RiccatiStatus, solve_riccati
+import numpy as np
+import pytest
+from scipy.linalg import block_diag, solve_continuous_are
+
+SIZES = [(n, m) for n in range(1, 9) for m in range(1, 4)]
+every_size = pytest.mark.parametrize(('n', 'm'), SIZES)
+
+
+def random_problem(n, m, seed):
+    """Return A with modes to either side of the axis, B, a singular Q = C'C and R."""
+    rng = np.random.default_rng([n, m, seed])
+    A = rng.normal(size=(n, n)) / np.sqrt(n) - 0.3 * np.eye(n)
+    C = rng.normal(size=(max(1, n // 2), n))
+    W = rng.normal(size=(m, m))
+    return A, rng.normal(size=(n, m)), C.T @ C, W @ W.T + 0.3 * np.eye(m)
+
+
+def residual(P, A, B, Q, R):
+    """Evaluate the Riccati equation as it stands in the books, relative to Q."""
+    left = A.T @ P + P @ A - P @ B @ np.linalg.inv(R) @ B.T @ P + Q
+    return np.linalg.norm(left) / np.linalg.norm(Q)
+
+
+@every_size
+@pytest.mark.parametrize('seed', range(5))
+def test_random_pairs_against_scipy(n, m, seed):
+    A, B, Q, R = random_problem(n, m, seed)
+    solution = solve_riccati(A, B, Q, R)
+    assert solution.status is RiccatiStatus.SOLVED
+    P = solve_continuous_are(A, B, Q, R)
+    K = np.linalg.solve(R, B.T @ P)
+    assert np.linalg.norm(solution.P - P) <= 1e-9 * np.linalg.norm(P)
+    assert np.linalg.norm(solution.K - K) <= 1e-9 * np.linalg.norm(K)
+    np.testing.assert_array_equal(solution.P, solution.P.T)
+    assert solution.gain == pytest.approx(np.linalg.svd(solution.K)[1][0], rel=1e-12)
+    assert solution.residual <= 1e-6
+    assert residual(solution.P, A, B, Q, R) <= 1e-6
+    assert np.all(np.linalg.eigvals(A - B @ solution.K).real < 0.0)
+    # positive semidefinite up to rounding
+    assert np.linalg.eigvalsh(solution.P)[0] >= -1e-10 * np.linalg.norm(P)
+
+
+@every_size
+def test_random_pairs_against_python_control(n, m):
+    A, B, Q, R = random_problem(n, m, seed=100)
+    K, P, poles = control.lqr(A, B, Q, R)
+    solution = solve_riccati(A, B, Q, R)
+    assert np.linalg.norm(solution.P - P) <= 1e-9 * np.linalg.norm(P)
+    assert np.linalg.norm(solution.K - K) <= 1e-9 * np.linalg.norm(K)
+    np.testing.assert_allclose(
+        np.sort_complex(np.linalg.eigvals(A - B @ solution.K)), np.sort_complex(poles),
+        rtol=1e-7)
+
+
+def test_most_random_plants_are_unstable():
+    """The comparisons above would say little of stable plants alone."""
+    unstable = [np.max(np.linalg.eigvals(random_problem(n, m, seed)[0]).real) > 0.0
+                for n, m in SIZES for seed in range(5)]
+    assert np.mean(unstable) > 0.75
+
+
+@pytest.mark.parametrize(('a', 'b', 'q', 'r'), [
+    (1.0, 2.0, 3.0, 0.5), (-1.0, 2.0, 3.0, 0.5), (0.0, 1.0, 1.0, 1.0), (5.0, 0.5, 1.0, 10.0),
+    (-0.957887316, 2.092050209, 1.0, 0.1), (1e-8, 1e4, 1e8, 1e-4)])
+def test_scalar_plants_in_closed_form(a, b, q, r):
+    solution = solve_riccati(*(np.array([[value]]) for value in (a, b, q, r)))
+    assert solution.status is RiccatiStatus.SOLVED
+    p = r / b ** 2 * (a + np.sqrt(a * a + q * b * b / r))
+    assert solution.P[0, 0] == pytest.approx(p, rel=1e-12)
+    assert solution.K[0, 0] == pytest.approx(p * b / r, rel=1e-12)
+
+
+def test_double_integrator_in_closed_form():
+    solution = solve_riccati(np.array([[0.0, 1.0], [0.0, 0.0]]), np.array([[0.0], [1.0]]),
+                             np.eye(2), np.eye(1))
+    root = np.sqrt(3.0)
+    np.testing.assert_allclose(solution.P, [[root, 1.0], [1.0, root]], rtol=1e-13)
+    np.testing.assert_allclose(solution.K, [[1.0, root]], rtol=1e-13)
+
+
+@every_size
+@pytest.mark.parametrize('factor', [1e-9, 1e9])
+def test_the_unit_of_the_cost_does_not_matter(n, m, factor):
+    A, B, Q, R = random_problem(n, m, seed=7)
+    solution, other = solve_riccati(A, B, Q, R), solve_riccati(A, B, factor * Q, factor * R)
+    assert other.status is RiccatiStatus.SOLVED
+    assert np.linalg.norm(other.K - solution.K) <= 1e-9 * solution.gain
+    assert np.linalg.norm(other.P - factor * solution.P) <= 1e-9 * np.linalg.norm(other.P)
+
+
+def nearly_uncontrollable(reach):
+    """Return a plant whose unstable mode is reached by the input no more than `reach`."""
+    return np.diag([1.0, -1.0]), np.array([[reach], [1.0]]), np.eye(2), np.eye(1)
+
+
+@pytest.mark.parametrize('reach', [1e-2, 1e-3, 1e-4])
+def test_the_residual_reported_is_that_of_the_solution(reach):
+    # here it is large enough for its own rounding errors not to matter
+    problem = nearly_uncontrollable(reach)
+    solution = solve_riccati(*problem)
+    assert solution.residual > 1e-9
+    assert solution.residual == pytest.approx(residual(solution.P, *problem), rel=1e-2)
+
+
+def test_a_bound_on_the_residual():
+    problem = nearly_uncontrollable(1e-2)
+    assert solve_riccati(*problem).status is RiccatiStatus.SOLVED
+    strict = solve_riccati(*problem, max_residual=1e-12)
+    assert strict.status is RiccatiStatus.INACCURATE
+    assert strict.residual > 1e-12
+
+
+@pytest.mark.parametrize('reach', [0.1, 0.03, 0.01])
+def test_a_bound_on_the_gain(reach):
+    problem = nearly_uncontrollable(reach)
+    # the unstable mode alone asks for 2 / reach
+    solution = solve_riccati(*problem)
+    assert solution.status is RiccatiStatus.SOLVED
+    assert solution.gain > 2.0 / reach
+    assert solve_riccati(*problem, max_gain=1.001 * solution.gain).status is RiccatiStatus.SOLVED
+    refused = solve_riccati(*problem, max_gain=0.999 * solution.gain)
+    assert refused.status is RiccatiStatus.GAIN_TOO_LARGE
+    assert refused.gain == solution.gain
+
+
+@pytest.mark.parametrize('exponent', range(3, 17))
+def test_a_nearly_uncontrollable_mode_is_never_solved_within_a_bound(exponent):
+    """Closer still, the gain computed is small again: only the residual tells that it is wrong."""
+    solution = solve_riccati(*nearly_uncontrollable(10.0 ** -exponent), max_gain=1e3)
+    assert solution.status in (RiccatiStatus.INACCURATE, RiccatiStatus.GAIN_TOO_LARGE,
+                               RiccatiStatus.NOT_STABILISABLE)
+
+
+OSCILLATOR = np.array([[0.0, 2.0], [-2.0, 0.0]])
+
+# A, B, Q in coordinates in which the fault is plain.
+BEYOND = {
+    'unstable mode out of reach': (
+        np.diag([1.0, -1.0, -2.0]), [0.0, 1.0, 1.0], np.eye(3)),
+    'unstable mode out of reach that drives another': (
+        np.array([[1.0, 0.0], [1.0, -1.0]]), [0.0, 1.0], np.eye(2)),
+    'constant mode out of reach': (np.diag([0.0, -1.0]), [0.0, 1.0], np.eye(2)),
+    'integrator without weight': (np.diag([0.0, -1.0]), [1.0, 1.0], np.diag([0.0, 1.0])),
+    'oscillator without weight': (
+        block_diag(OSCILLATOR, -1.0), [0.0, 1.0, 1.0], np.diag([0.0, 0.0, 1.0])),
+    'oscillator out of reach': (block_diag(OSCILLATOR, -1.0), [0.0, 0.0, 1.0], np.eye(3)),
+}
+
+
+@pytest.mark.parametrize('case', BEYOND)
+def test_what_has_no_stabilising_solution(case):
+    A, b, Q = BEYOND[case]
+    solution = solve_riccati(A, np.array(b)[:, None], Q, np.eye(1))
+    assert solution.status is RiccatiStatus.NOT_STABILISABLE
+    assert not np.any(solution.K)
+    assert not np.any(solution.P)
+    assert (solution.gain, solution.residual) == (np.inf, np.inf)
+
+
+@pytest.mark.parametrize('case', BEYOND)
+@pytest.mark.parametrize('seed', range(25))
+def test_what_has_no_stabilising_solution_in_other_coordinates(case, seed):
+    A, b, Q = BEYOND[case]
+    T = np.random.default_rng(seed).normal(size=A.shape)
+    inverse = np.linalg.inv(T)
+    solution = solve_riccati(T @ A @ inverse, (T @ b)[:, None], inverse.T @ Q @ inverse,
+                             np.eye(1))
+    assert solution.status is not RiccatiStatus.SOLVED
+
+
+@pytest.mark.parametrize('place', range(4), ids='ABQR'.__getitem__)
+@pytest.mark.parametrize('value', [np.nan, np.inf, -np.inf])
+def test_what_is_not_finite_is_not_solved(place, value):
+    problem = [-np.eye(2), np.eye(2), np.eye(2), np.eye(2)]
+    problem[place] = np.full((2, 2), value)
+    assert solve_riccati(*problem).status is not RiccatiStatus.SOLVED
+
+
+def test_nothing_escapes_at_any_magnitude():
+    rng = np.random.default_rng(8)
+    solved = 0
+    for _ in range(2000):
+        n, m = int(rng.integers(1, 5)), int(rng.integers(1, 3))
+        A, B, Q, R = (array * 10.0 ** rng.uniform(-300.0, 300.0)
+                      for array in random_problem(n, m, seed=1))
+        solution = solve_riccati(A, B, Q, R)
+        if solution.status is RiccatiStatus.SOLVED:
+            solved += 1
+            assert np.all(np.isfinite(solution.K))
+            assert solution.residual <= 1e-6
+    assert solved > 20
+
+
+def test_no_weight_at_all_is_not_solved():
+    solution = solve_riccati(-np.eye(2), np.eye(2), np.zeros((2, 2)), np.eye(2))
+    assert solution.status is RiccatiStatus.NOT_STABILISABLE
+
+
+def test_a_stable_plant_without_input_costs_what_it_costs():
+    solution = solve_riccati(-np.eye(2), np.zeros((2, 1)), np.eye(2), np.eye(1))
+    assert solution.status is RiccatiStatus.SOLVED
+    np.testing.assert_allclose(solution.P, 0.5 * np.eye(2), rtol=1e-14)
+    np.testing.assert_array_equal(solution.K, np.zeros((1, 2)))
+
+
+def test_a_singular_input_weight_is_an_error():
+    with pytest.raises(np.linalg.LinAlgError, match='Singular'):
+        solve_riccati(-np.eye(1), np.eye(1), np.eye(1), np.zeros((1, 1)))
+
+
+def test_every_status_says_what_to_do():
+    assert 'not stabilisable' in RiccatiStatus.NOT_STABILISABLE.value
+    assert 'nearly not stabilisable' in RiccatiStatus.INACCURATE.value
+    assert 'raise the input weight or the gain bound' in RiccatiStatus.GAIN_TOO_LARGE.value

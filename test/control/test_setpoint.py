@@ -1,0 +1,181 @@
+# Copyright 2026 The koopman_ros Authors
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""The set-point: what is refused, when a request takes effect, and its ramp."""
+
+from closed_loops import shipped
+from koopman_ros.control import Setpoint
+from koopman_ros.control.setpoint import advance, HORIZON_NANOSECONDS, refusal, request
+import numpy as np
+import pytest
+
+MODEL = shipped('reactor_nz4')
+SECOND = 1_000_000_000
+# a wall clock, far from where time starts
+NOW = 1_785_000_000 * SECOND
+
+
+def kelvin(value):
+    return np.array([value])
+
+
+def moved(setpoint, now_ns=NOW, *, measured=320.0, ramp=np.inf, seconds=1.0):
+    return advance(setpoint, kelvin(measured), MODEL, ramp, now_ns, seconds)
+
+
+def schedule(setpoint):
+    return [(time_ns, float(value[0])) for time_ns, value in setpoint.scheduled]
+
+
+@pytest.mark.parametrize('value', [306.0, 314.4, 326.5])
+def test_values_in_the_box_are_accepted(value):
+    assert refusal(MODEL, kelvin(value)) == ''
+
+
+def test_the_corners_of_the_box_are_accepted():
+    for corner in (MODEL.states.lower, MODEL.states.upper):
+        assert refusal(MODEL, corner) == ''
+
+
+@pytest.mark.parametrize(('value', 'text'), [
+    (300.0, 'temperature set-point 300 K is outside the trained range [305.696, 326.561] K: the '
+            'old one is kept; choose one inside, or load a model trained over a wider range'),
+    (330.123, 'temperature set-point 330.123 K is outside the trained range [305.696, 326.561] '
+              'K: the old one is kept; choose one inside, or load a model trained over a wider '
+              'range'),
+    (np.nan, 'temperature set-point nan is not finite: the old one is kept'),
+    (np.inf, 'temperature set-point inf is not finite: the old one is kept'),
+    (-np.inf, 'temperature set-point -inf is not finite: the old one is kept'),
+])
+def test_refusals_say_why(value, text):
+    assert refusal(MODEL, kelvin(value)) == text
+
+
+@pytest.mark.parametrize('corner', ['lower', 'upper'])
+def test_a_hair_outside_is_refused(corner):
+    edge = getattr(MODEL.states, corner)
+    outside = np.nextafter(edge, 0.0 if corner == 'lower' else np.inf)
+    assert 'is outside the trained range' in refusal(MODEL, outside)
+
+
+@pytest.mark.parametrize('effective_ns', [
+    0, 1, NOW - 1, NOW, NOW + HORIZON_NANOSECONDS + 1, 2 * NOW])
+def test_past_and_foreign_stamps_act_at_once(effective_ns):
+    setpoint = request(Setpoint(), kelvin(310.0), effective_ns, NOW)
+    np.testing.assert_array_equal(setpoint.requested, [310.0])
+    assert schedule(setpoint) == []
+
+
+@pytest.mark.parametrize('ahead', [1, SECOND, HORIZON_NANOSECONDS])
+def test_later_stamps_wait(ahead):
+    setpoint = request(Setpoint(), kelvin(310.0), NOW + ahead, NOW)
+    assert setpoint.requested is None
+    assert schedule(setpoint) == [(NOW + ahead, 310.0)]
+
+
+@pytest.mark.parametrize(('effective_ns', 'waits'), [
+    (0, False), (SECOND, True), (HORIZON_NANOSECONDS, True), (NOW, False)])
+def test_before_the_first_measurement_time_starts_at_zero(effective_ns, waits):
+    setpoint = request(Setpoint(), kelvin(310.0), effective_ns, None)
+    assert bool(setpoint.scheduled) is waits
+    assert (setpoint.requested is None) is waits
+
+
+def test_scheduled_requests_are_kept_in_time_order():
+    setpoint = Setpoint()
+    for ahead, value in ((30, 310.0), (10, 312.0), (20, 314.0), (10, 316.0)):
+        setpoint = request(setpoint, kelvin(value), NOW + ahead * SECOND, NOW)
+    # the later request for the same time replaces the earlier one
+    assert schedule(setpoint) == [
+        (NOW + 10 * SECOND, 316.0), (NOW + 20 * SECOND, 314.0), (NOW + 30 * SECOND, 310.0)]
+
+
+def test_scheduled_requests_take_effect_in_time_order():
+    setpoint = Setpoint()
+    for ahead, value in ((30, 310.0), (10, 316.0), (20, 314.0)):
+        setpoint = request(setpoint, kelvin(value), NOW + ahead * SECOND, NOW)
+    active = []
+    for elapsed in range(0, 41, 5):
+        setpoint = moved(setpoint, NOW + elapsed * SECOND)
+        active.append(float(setpoint.active[0]))
+    assert active == [320.0, 320.0, 316.0, 316.0, 314.0, 314.0, 310.0, 310.0, 310.0]
+    assert schedule(setpoint) == []
+
+
+def test_of_several_that_are_due_the_latest_counts():
+    setpoint = Setpoint()
+    for ahead, value in ((1, 310.0), (3, 316.0), (2, 314.0), (9, 312.0)):
+        setpoint = request(setpoint, kelvin(value), NOW + ahead, NOW)
+    setpoint = moved(setpoint, NOW + 5)
+    np.testing.assert_array_equal(setpoint.requested, [316.0])
+    assert schedule(setpoint) == [(NOW + 9, 312.0)]
+
+
+def test_a_request_waits_to_the_nanosecond():
+    setpoint = request(Setpoint(), kelvin(310.0), NOW + 5, NOW)
+    np.testing.assert_array_equal(moved(setpoint, NOW + 4).active, [320.0])
+    np.testing.assert_array_equal(moved(setpoint, NOW + 5).active, [310.0])
+
+
+def test_a_request_at_once_leaves_the_schedule():
+    setpoint = request(Setpoint(), kelvin(310.0), NOW + SECOND, NOW)
+    setpoint = request(setpoint, kelvin(316.0), 0, NOW)
+    assert schedule(setpoint) == [(NOW + SECOND, 310.0)]
+    np.testing.assert_array_equal(moved(setpoint, NOW).active, [316.0])
+    np.testing.assert_array_equal(moved(setpoint, NOW + SECOND).active, [310.0])
+
+
+@pytest.mark.parametrize(('measured', 'held'), [
+    (320.0, 320.0), (400.0, MODEL.states.upper[0]), (200.0, MODEL.states.lower[0])])
+def test_the_first_measurement_is_held(measured, held):
+    setpoint = moved(Setpoint(), measured=measured, seconds=0.0)
+    np.testing.assert_array_equal(setpoint.active, [held])
+    np.testing.assert_array_equal(setpoint.requested, [held])
+    # and stays when the temperature moves on
+    np.testing.assert_array_equal(moved(setpoint, NOW + SECOND, measured=310.0).active, [held])
+
+
+def test_without_a_ramp_the_setpoint_steps():
+    setpoint = moved(request(Setpoint(active=kelvin(320.0)), kelvin(310.0), 0, NOW), seconds=1e-9)
+    np.testing.assert_array_equal(setpoint.active, [310.0])
+
+
+@pytest.mark.parametrize('goal', [310.0, 324.0])
+def test_the_ramp_reaches_its_goal_and_stays(goal):
+    setpoint = request(moved(Setpoint(), seconds=0.0), kelvin(goal), 0, NOW)
+    direction = np.sign(goal - 320.0)
+    for second in range(1, 40):
+        setpoint = moved(setpoint, NOW + second * SECOND, ramp=0.5)
+        expected = 320.0 + direction * min(0.5 * second, abs(goal - 320.0))
+        assert setpoint.active[0] == pytest.approx(expected, rel=1e-12)
+    assert setpoint.active[0] == goal
+
+
+def test_the_ramp_stands_still_without_elapsed_time():
+    setpoint = request(moved(Setpoint(), seconds=0.0), kelvin(310.0), 0, NOW)
+    np.testing.assert_array_equal(moved(setpoint, ramp=0.5, seconds=0.0).active, [320.0])
+
+
+def test_the_ramp_starts_from_the_first_measurement():
+    setpoint = request(Setpoint(), kelvin(310.0), 0, None)
+    np.testing.assert_array_equal(moved(setpoint, ramp=0.5, seconds=0.0).active, [320.0])
+
+
+def test_the_states_before_are_left_alone():
+    before = request(Setpoint(), kelvin(310.0), NOW + SECOND, NOW)
+    request(before, kelvin(312.0), NOW + 2 * SECOND, NOW)
+    moved(before, NOW + 3 * SECOND)
+    assert before.requested is None
+    assert before.active is None
+    assert schedule(before) == [(NOW + SECOND, 310.0)]

@@ -1,0 +1,48 @@
+# Copyright 2026 The koopman_ros Authors
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""Lifted models with random weights, for tests of what holds for any of them."""
+
+from koopman_ros.lifting import Coordinates, LiftedModel, Provenance
+import numpy as np
+
+
+def coordinates(prefix: str, n: int) -> Coordinates:
+    """Return n coordinates with a center, a scale and a box of their own each."""
+    index = np.arange(float(n))
+    center, scale = 3.0 - 2.0 * index, 0.5 + index
+    return Coordinates(
+        tuple(f'{prefix}{i}' for i in range(n)), ('K',) * n, center, scale,
+        center - 2.0 * scale, center + scale)
+
+
+def random_lift(n_x: int = 2, widths: tuple[int, ...] = (5,), *, identity: bool = True,
+                n_u: int = 1, n_free: int = 3, seed: int = 0) -> LiftedModel:
+    """Return a lift of order one with n_free coordinates from tanh layers of these widths."""
+    rng = np.random.default_rng(seed)
+    hidden, width = [], n_x
+    for h in widths:
+        hidden.append((rng.normal(size=(h, width)) / np.sqrt(width), rng.normal(size=h)))
+        width = h
+    n_z = n_free + (n_x if identity else 0)
+    return LiftedModel(
+        hidden=tuple(hidden),
+        output=rng.normal(size=(n_free, width)) / np.sqrt(width),
+        A=0.3 * rng.normal(size=(n_z, n_z)) - np.eye(n_z),
+        B=rng.normal(size=(n_x, n_u)),
+        identity=identity,
+        states=coordinates('x', n_x),
+        inputs=coordinates('u', n_u),
+        time_unit='min',
+        provenance=Provenance('random', seed, 'ab12', {'rw': 0.25, 'cond': 1e3}, '0.1.0'))

@@ -1,0 +1,164 @@
+# Copyright 2026 The koopman_ros Authors
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""Levenberg-Marquardt on problems with known minima, and every way in which it ends."""
+
+from itertools import pairwise
+import math
+
+import numpy as np
+import pytest
+
+torch = pytest.importorskip('torch')
+
+from koopman_ros.lifting.levenberg_marquardt import minimise, Status  # noqa: E402
+from koopman_ros.lifting.residuals import NormalEquations  # noqa: E402
+
+
+def least_squares(residual):
+    """Turn a residual function into what `minimise` evaluates."""
+    def evaluate(theta, *, derivatives):
+        r = residual(theta)
+        cost = 0.5 * float(r @ r)
+        if not derivatives:
+            return NormalEquations(cost)
+        J = torch.func.jacrev(residual)(theta)
+        return NormalEquations(cost, J.T @ r, J.T @ J)
+    return evaluate
+
+
+def vector(*values):
+    return torch.tensor(values, dtype=torch.float64)
+
+
+def linear_problem(rows=30, columns=6, seed=0):
+    generator = torch.Generator().manual_seed(seed)
+    J = torch.randn(rows, columns, generator=generator, dtype=torch.float64)
+    y = torch.randn(rows, generator=generator, dtype=torch.float64)
+    return J, y
+
+
+def rosenbrock(theta):
+    return torch.stack([10.0 * (theta[1] - theta[0] ** 2), 1.0 - theta[0]])
+
+
+def test_linear_least_squares_needs_few_steps():
+    J, y = linear_problem()
+    evaluate = least_squares(lambda theta: J @ theta - y)
+    found = minimise(evaluate, vector(*[3.0] * 6), max_iterations=5)
+    expected = np.linalg.lstsq(J.numpy(), y.numpy(), rcond=None)[0]
+    np.testing.assert_allclose(found.theta.numpy(), expected, rtol=0, atol=1e-8)
+
+
+def test_linear_least_squares_converges():
+    J, y = linear_problem()
+    found = minimise(least_squares(lambda theta: J @ theta - y), vector(*[3.0] * 6),
+                     max_iterations=100)
+    expected, squares = np.linalg.lstsq(J.numpy(), y.numpy(), rcond=None)[:2]
+    assert found.status is Status.CONVERGED
+    assert found.cost == pytest.approx(0.5 * float(squares[0]), rel=1e-12)
+    # a cost that is flat to rounding locates its minimum to the square root of that
+    np.testing.assert_allclose(found.theta.numpy(), expected, rtol=0, atol=1e-8)
+
+
+@pytest.mark.parametrize('start', [(-1.2, 1.0), (0.0, 0.0), (5.0, -5.0), (-3.0, 10.0)])
+def test_rosenbrock_valley(start):
+    found = minimise(least_squares(rosenbrock), vector(*start), max_iterations=200)
+    assert found.status is Status.CONVERGED
+    assert found.iterations < 100
+    np.testing.assert_allclose(found.theta.numpy(), [1.0, 1.0], rtol=0, atol=1e-9)
+
+
+def test_a_minimum_that_is_not_zero():
+    """The residuals (x, 1 + x^2 / 4) have their least squares, 1, at x = 0."""
+    found = minimise(least_squares(lambda t: torch.cat([t, 1.0 + 0.25 * t * t])), vector(2.0),
+                     max_iterations=200)
+    assert found.status is Status.CONVERGED
+    assert found.cost == pytest.approx(0.5, rel=1e-9)
+    assert abs(float(found.theta[0])) < 1e-4
+
+
+def test_units_of_parameters_do_not_matter():
+    units = vector(1e3, 1e-3)
+    one = minimise(least_squares(rosenbrock), vector(-1.2, 1.0), max_iterations=12)
+    other = minimise(least_squares(lambda theta: rosenbrock(theta / units)),
+                     vector(-1.2, 1.0) * units, max_iterations=12)
+    assert other.cost == pytest.approx(one.cost, rel=1e-6)
+    np.testing.assert_allclose((other.theta / units).numpy(), one.theta.numpy(), rtol=1e-6)
+
+
+def test_iteration_limit_is_reported():
+    evaluate = least_squares(rosenbrock)
+    found = minimise(evaluate, vector(-1.2, 1.0), max_iterations=4)
+    assert found.status is Status.MAX_ITERATIONS
+    assert found.iterations == 4
+    assert found.cost == evaluate(found.theta, derivatives=False).cost
+    assert found.cost < evaluate(vector(-1.2, 1.0), derivatives=False).cost
+
+
+def test_not_a_number_at_the_start_stalls():
+    start = vector(1.0, 2.0)
+    found = minimise(least_squares(lambda theta: theta * math.nan), start, max_iterations=50)
+    assert found.status is Status.STALLED
+    assert (found.cost, found.iterations) == (math.inf, 0)
+    assert torch.equal(found.theta, start)
+
+
+def test_not_a_number_everywhere_else_stalls():
+    start = vector(1.0, 2.0)
+
+    def evaluate(theta, *, derivatives):
+        here = least_squares(lambda t: t + 3.0)(theta, derivatives=derivatives)
+        return here if torch.equal(theta, start) else NormalEquations(math.nan)
+
+    found = minimise(evaluate, start, max_iterations=500)
+    assert found.status is Status.STALLED
+    assert found.iterations < 100
+    assert torch.equal(found.theta, start)
+
+
+def test_a_gradient_that_is_not_a_number_stalls():
+    start = vector(1.0, 2.0)
+
+    def evaluate(theta, *, derivatives):
+        here = least_squares(lambda t: t)(theta, derivatives=derivatives)
+        return NormalEquations(here.cost, start * math.nan, torch.eye(2).to(start))
+
+    found = minimise(evaluate, start, max_iterations=500)
+    assert found.status is Status.STALLED
+    assert torch.equal(found.theta, start)
+
+
+@pytest.mark.parametrize('end', [1, 3])
+def test_interruption_keeps_the_best_so_far(end):
+    evaluate = least_squares(rosenbrock)
+    found = minimise(evaluate, vector(-1.2, 1.0), max_iterations=100,
+                     interrupted=lambda iteration, cost: iteration == end)
+    assert found.status is Status.INTERRUPTED
+    assert found.iterations == end
+    assert found.cost == evaluate(found.theta, derivatives=False).cost
+
+
+def test_cost_never_rises():
+    costs = []
+    found = minimise(least_squares(rosenbrock), vector(-1.2, 1.0), max_iterations=100,
+                     interrupted=lambda iteration, cost: costs.append(cost))
+    assert found.status is Status.CONVERGED
+    assert all(later <= earlier for earlier, later in pairwise(costs))
+
+
+def test_every_status_says_what_to_do():
+    assert 'increase `max_iterations`' in Status.MAX_ITERATIONS.value
+    assert 'check the data and try another seed' in Status.STALLED.value
+    assert 'the best parameters so far are kept' in Status.INTERRUPTED.value

@@ -1,0 +1,65 @@
+# Copyright 2026 The koopman_ros Authors
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""What the run-time packages pull in, checked in a process that has nothing loaded."""
+
+from pathlib import Path
+import subprocess
+import sys
+
+import koopman_ros
+import pytest
+
+RUNTIME = ('lifting', 'control', 'plants', 'bags')
+FOREIGN = ('rclpy', 'torch', 'matplotlib')
+
+PROGRAM = """
+import sys
+# None in its place makes the import of a module fail
+sys.modules.update(dict.fromkeys({foreign!r}))
+{statements}
+loaded = [name for name in sys.modules if name.split('.')[0] in {foreign!r}]
+assert loaded == list({foreign!r}), loaded
+"""
+
+
+def run(statements):
+    program = PROGRAM.format(foreign=FOREIGN, statements=statements)
+    return subprocess.run(
+        [sys.executable, '-W', 'error', '-c', program], capture_output=True, text=True,
+        timeout=60, check=False, cwd=Path(koopman_ros.__file__).parents[1])
+
+
+@pytest.mark.parametrize('packages', [*((name,) for name in RUNTIME), RUNTIME], ids=str)
+def test_runtime_needs_neither_ros_nor_torch(packages):
+    result = run('import ' + ', '.join(f'koopman_ros.{name}' for name in packages))
+    assert (result.returncode, result.stdout, result.stderr) == (0, '', '')
+
+
+def test_training_does_need_torch():
+    """The check above can tell: what imports torch fails in the same process."""
+    result = run('import koopman_ros.lifting.training')
+    assert result.returncode == 1
+    assert 'import of torch halted; None in sys.modules' in result.stderr
+
+
+def test_lifting_and_plants_stand_alone():
+    """Neither loads another package of ours."""
+    for name in ('lifting', 'plants'):
+        result = run(f"""
+import koopman_ros.{name}
+ours = {{module.split('.')[1] for module in sys.modules if module.startswith('koopman_ros.')}}
+assert ours == {{{name!r}}}, ours
+""")
+        assert (result.returncode, result.stderr) == (0, '')
