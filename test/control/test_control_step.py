@@ -252,6 +252,17 @@ def test_an_earlier_stamp_starts_time_afresh():
     assert moved[0] == pytest.approx(held[0] - RATE, rel=1e-12)
 
 
+def test_an_earlier_stamp_stops_the_ramp_for_one_step():
+    loop = controller(setpoint_ramp=0.1)
+    state = loop.request_setpoint(started(loop), np.array([310.0]))[0]
+    state = loop.step(state, np.array([START]), NOW + 20 * SECOND)[0]
+    active = []
+    for seconds in (0, 1, 11):
+        state, _, report = loop.step(state, np.array([START]), NOW + seconds * SECOND)
+        active.append(report.active_setpoint[0])
+    np.testing.assert_allclose(active, [START - 2.0, START - 2.1, START - 3.1], rtol=1e-12)
+
+
 def test_the_rate_limit_counts_elapsed_time():
     loop = controller()
     state = loop.request_setpoint(started(loop), np.array([306.0]))[0]

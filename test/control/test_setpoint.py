@@ -146,6 +146,11 @@ def test_the_first_measurement_is_held(measured, held):
     np.testing.assert_array_equal(moved(setpoint, NOW + SECOND, measured=310.0).active, [held])
 
 
+def test_a_setpoint_without_a_request_stays():
+    np.testing.assert_array_equal(
+        moved(Setpoint(active=kelvin(318.0)), measured=310.0).active, [318.0])
+
+
 def test_without_a_ramp_the_setpoint_steps():
     setpoint = moved(request(Setpoint(active=kelvin(320.0)), kelvin(310.0), 0, NOW), seconds=1e-9)
     np.testing.assert_array_equal(setpoint.active, [310.0])

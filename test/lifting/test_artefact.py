@@ -139,6 +139,15 @@ def test_the_official_library_reads_the_metadata(path):
     assert (about['n_x'], about['n_u'], about['n_z']) == (2, 1, 5)
 
 
+@pytest.mark.parametrize('name', MODELS)
+def test_arrays_are_aligned_to_eight_bytes(name, path):
+    save(MODELS[name], path)
+    header, _ = split(path.read_bytes())
+    assert int.from_bytes(path.read_bytes()[:8], 'little') % 8 == 0
+    assert all(entry['data_offsets'][0] % 8 == 0
+               for key, entry in header.items() if key != '__metadata__')
+
+
 def test_a_file_rewritten_by_the_official_library_loads(path):
     safetensors = pytest.importorskip('safetensors')
     numpy_format = pytest.importorskip('safetensors.numpy')

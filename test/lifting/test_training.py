@@ -168,9 +168,10 @@ def test_figures_come_from_the_untouched_episodes():
 def test_the_digest_tells_samples_apart():
     everything = samples()
     assert everything.digest() == samples().digest()
-    moved = np.array(everything.x)
-    moved[-1] = np.nextafter(moved[-1], np.inf)
-    assert replace(everything, x=moved).digest() != everything.digest()
+    for name in ('x', 'dxdt', 'u'):
+        moved = np.array(getattr(everything, name))
+        moved[-1] = np.nextafter(moved[-1], np.inf)
+        assert replace(everything, **{name: moved}).digest() != everything.digest()
     assert replace(everything, episode=everything.episode + 1).digest() != everything.digest()
 
 
@@ -281,7 +282,8 @@ def test_growth_to_the_state_alone_is_linear_least_squares():
 
 def test_growth_ends_early_when_told_to():
     x, f = scaled(samples())
-    grown = grow(x, f, Recipe(4), 0, lambda n_z, iteration, cost: n_z == 3 and iteration == 2)
+    grown = grow(x, f, Recipe(4, max_iterations=20), 0,
+                 lambda n_z, iteration, cost: n_z == 3 and iteration == 2)
     assert grown.status is Status.INTERRUPTED
     assert grown.layout.n_z == 3
 

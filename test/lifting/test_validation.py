@@ -101,9 +101,10 @@ def test_rw_is_the_residual_in_whitened_coordinates():
     assert fit(model, x, dxdt, u).rw == pytest.approx(residual / reference, rel=1e-10)
 
 
-def test_samples_that_do_not_move_are_refused():
+@pytest.mark.parametrize('movement', [0.0, 1e-12, 1e-5])
+def test_samples_that_hardly_move_are_refused(movement):
     model = random_lift(1, n_free=2)
-    still = np.full((40, 1), 3.5)
+    still = 3.5 + movement * np.random.default_rng(0).normal(size=(40, 1))
     with pytest.raises(ValueError, match='40 samples do not tell 3 coordinates apart: judge by'):
         fit(model, still, np.zeros((40, 1)), np.zeros((40, 1)))
 
