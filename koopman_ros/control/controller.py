@@ -139,6 +139,10 @@ class Controller:
         reason = setpoints.refusal(self.model, value)
         if reason:
             return state, reason
+        if (len(state.setpoint.scheduled) >= setpoints.MAX_SCHEDULED
+                and setpoints.lies_ahead(effective_ns, state.time_ns)):
+            return state, (f'{setpoints.MAX_SCHEDULED} set-points are scheduled already: wait '
+                           'until some have taken effect, or send this one with stamp 0')
         return replace(state, setpoint=setpoints.request(
             state.setpoint, value, effective_ns, state.time_ns)), ''
 
@@ -174,7 +178,8 @@ class Controller:
         """
         back = state.time_ns is not None and time_ns < state.time_ns
         if back:
-            state = replace(state, time_ns=None)
+            # what was scheduled by the old time has lost its meaning
+            state = replace(state, time_ns=None, setpoint=replace(state.setpoint, scheduled=()))
         seconds = 0.0 if state.time_ns is None else (time_ns - state.time_ns) / NANOSECONDS
         state = replace(state, time_ns=time_ns)
         if np.all(np.isfinite(measurement)):

@@ -28,7 +28,7 @@ NANOSECONDS = 1_000_000_000
 
 # A stamp further ahead than this comes from another clock and is no schedule.
 HORIZON_NANOSECONDS = 3600 * NANOSECONDS
-_MAX_SCHEDULED = 1000
+MAX_SCHEDULED = 1000
 
 
 @dataclass(frozen=True)
@@ -74,13 +74,18 @@ def request(setpoint: Setpoint, value: Array, effective_ns: int, now_ns: int | N
         an hour ahead is taken for the stamp of another clock and means at once, too.
     :param now_ns: time of the last measurement, or None before the first.
     """
-    start = 0 if now_ns is None else now_ns
-    if not start < effective_ns <= start + HORIZON_NANOSECONDS:
+    if not lies_ahead(effective_ns, now_ns):
         return replace(setpoint, requested=value)
     # the later request for the same time replaces the earlier one
     kept = [entry for entry in setpoint.scheduled if entry[0] != effective_ns]
     entries = sorted([*kept, (effective_ns, value)], key=lambda entry: entry[0])
-    return replace(setpoint, scheduled=tuple(entries[:_MAX_SCHEDULED]))
+    return replace(setpoint, scheduled=tuple(entries))
+
+
+def lies_ahead(effective_ns: int, now_ns: int | None) -> bool:
+    """Tell whether a stamp is a schedule: later than the last measurement, by at most an hour."""
+    start = 0 if now_ns is None else now_ns
+    return start < effective_ns <= start + HORIZON_NANOSECONDS
 
 
 def advance(setpoint: Setpoint, measured: Array, model: LiftedModel, ramp: float, now_ns: int,

@@ -18,6 +18,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 import contextlib
+import hashlib
 import json
 import math
 import os
@@ -49,41 +50,41 @@ def save(model: LiftedModel, path: str | os.PathLike[str]) -> None:
     :param model: what to write.
     :param path: a file name ending in ``.safetensors``.
     :raises OSError: when the folder cannot be written.
+    :raises ValueError: when a metric is not finite.
     """
     tensors = {'A': model.A, 'B': model.B, 'output': model.output}
     for i, (weight, bias) in enumerate(model.hidden):
         tensors[f'hidden.{i}.weight'] = weight
         tensors[f'hidden.{i}.bias'] = bias
-    metadata = {
-        'format': FORMAT,
-        'format_version': str(FORMAT_VERSION),
-        'description': json.dumps({
-            'activation': ACTIVATION,
-            'hidden_layers': len(model.hidden),
-            'identity': model.identity,
-            'inputs': _describe(model.inputs),
-            'n_u': model.n_u,
-            'n_x': model.n_x,
-            'n_z': model.n_z,
-            'provenance': {
-                'data_digest': model.provenance.data_digest,
-                'metrics': dict(model.provenance.metrics),
-                'package_version': model.provenance.package_version,
-                'plant': model.provenance.plant,
-                'seed': model.provenance.seed,
-            },
-            'states': _describe(model.states),
-            'time_unit': model.time_unit,
-        }, sort_keys=True, allow_nan=False),
-    }
-    header: dict[str, Any] = {'__metadata__': metadata}
+    description = json.dumps({
+        'activation': ACTIVATION,
+        'hidden_layers': len(model.hidden),
+        'identity': model.identity,
+        'inputs': _describe(model.inputs),
+        'n_u': model.n_u,
+        'n_x': model.n_x,
+        'n_z': model.n_z,
+        'provenance': {
+            'data_digest': model.provenance.data_digest,
+            'metrics': dict(model.provenance.metrics),
+            'package_version': model.provenance.package_version,
+            'plant': model.provenance.plant,
+            'seed': model.provenance.seed,
+        },
+        'states': _describe(model.states),
+        'time_unit': model.time_unit,
+    }, sort_keys=True, allow_nan=False)
+    arrays: dict[str, Any] = {}
     offset, chunks = 0, []
     for name in sorted(tensors):
         data = np.ascontiguousarray(tensors[name]).astype('<f8').tobytes()
-        header[name] = {'dtype': 'F64', 'shape': list(tensors[name].shape),
+        arrays[name] = {'dtype': 'F64', 'shape': list(tensors[name].shape),
                         'data_offsets': [offset, offset + len(data)]}
         offset += len(data)
         chunks.append(data)
+    header = {'__metadata__': {
+        'format': FORMAT, 'format_version': str(FORMAT_VERSION), 'description': description,
+        'sha256': _checksum(description, arrays, b''.join(chunks))}, **arrays}
     text = json.dumps(header, separators=(',', ':')).encode()
     text += b' ' * (-len(text) % 8)
     _write_atomically(Path(path), [len(text).to_bytes(8, 'little'), text, *chunks])
@@ -120,6 +121,9 @@ def load(path: str | os.PathLike[str]) -> LiftedModel:
     try:
         about = json.loads(metadata['description'])
         model = _build(about, tensors)
+        # last, so that whatever has a reason of its own is refused with that reason
+        if metadata['sha256'] != _checksum(metadata['description'], header, data):
+            raise ValueError('its checksum is wrong, so it was damaged or edited')
     except (KeyError, TypeError, ValueError, AttributeError, OverflowError,
             RecursionError) as error:
         reason = f'{error.args[0]!r} is missing' if isinstance(error, KeyError) else str(error)
@@ -159,6 +163,12 @@ def _build(about: dict[str, Any], tensors: dict[str, np.ndarray]) -> LiftedModel
         if _integer(about, name) != actual:
             raise ValueError(f'{name} is given as {about[name]}, the arrays say {actual}')
     return model
+
+
+def _checksum(description: str, arrays: dict[str, Any], data: bytes) -> str:
+    """Return the SHA-256 over all that a model consists of, in hexadecimal."""
+    index = json.dumps(arrays, sort_keys=True)
+    return hashlib.sha256(b'\0'.join((description.encode(), index.encode(), data))).hexdigest()
 
 
 def _integer(about: dict[str, Any], name: str) -> int:

@@ -89,8 +89,11 @@ class Coordinates:
         """
         Measure how far a physical value (n,) lies outside the training box.
 
-        :return: largest excess over a side of the box, as a fraction of half its width; 0 inside.
+        :return: largest excess over a side of the box, as a fraction of half its width; 0 inside,
+            infinity for a value that is not finite.
         """
+        if not np.all(np.isfinite(value)):
+            return float('inf')
         half = 0.5 * (self.upper - self.lower)
         excess = np.maximum(self.lower - value, value - self.upper) / half
         return max(0.0, float(np.max(excess, initial=0.0)))

@@ -413,3 +413,25 @@ def test_a_ramped_loop_follows_its_ramp():
 def test_the_linear_model_leaves_the_sampled_loop_off_target():
     temperatures, _ = drive(controller('reactor_linear'), 480)
     assert temperatures[-1] - SETPOINT == pytest.approx(1.9334, abs=1e-2)
+
+
+def test_a_full_schedule_refuses_more_but_not_what_holds_at_once():
+    loop = controller()
+    state = started(loop)
+    for n in range(1000):
+        state, refused = loop.request_setpoint(state, np.array([316.0]), NOW + (n + 1) * SECOND)
+        assert refused == ''
+    full, refused = loop.request_setpoint(state, np.array([317.0]), NOW + 2000 * SECOND)
+    assert full is state
+    assert refused.startswith('1000 set-points are scheduled already: wait')
+    state, refused = loop.request_setpoint(state, np.array([317.0]))
+    assert refused == ''
+    np.testing.assert_array_equal(state.setpoint.requested, [317.0])
+
+
+def test_a_schedule_does_not_outlive_its_clock():
+    loop = controller()
+    state = loop.request_setpoint(started(loop), np.array([316.0]), NOW + 50 * SECOND)[0]
+    state = loop.step(state, np.array([START]), NOW - 100 * SECOND)[0]
+    assert state.setpoint.scheduled == ()
+    assert loop.step(state, np.array([START]), NOW + 51 * SECOND)[2].active_setpoint == START
