@@ -90,7 +90,7 @@ def main(args: list[str] | None = None) -> int:
     options = parser.parse_args(args)
     try:
         result = run_demo(options.output, options.speed)
-    except LoopError as error:
+    except (LoopError, OSError) as error:
         print(f'demo: {error}', file=sys.stderr)
         return 1
     except KeyboardInterrupt:

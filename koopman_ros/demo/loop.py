@@ -16,9 +16,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from dataclasses import dataclass
+from collections.abc import Callable, Iterator, Mapping
+import contextlib
+from dataclasses import dataclass, field
 from pathlib import Path
+import signal
 import time
 
 from koopman_ros.demo.processes import isolated_domain, NodeProcess
@@ -50,6 +52,7 @@ class Scenario:
     :param duration: length of the run in s of plant time.
     :param sample_period: s between measurements.
     :param speed: simulated seconds per second, 0 for as fast as the machine can.
+    :param plant: further parameters of the plant node.
     """
 
     model: str
@@ -58,6 +61,7 @@ class Scenario:
     duration: float = 600.0
     sample_period: float = 1.0
     speed: float = 0.0
+    plant: Mapping[str, object] = field(default_factory=dict)
 
     @property
     def first_stamp_ns(self) -> int:
@@ -110,7 +114,7 @@ class Operator(Node):
                 and self._commands.get_publisher_count() >= 1)
 
     def hears_more_than(self, stamp_ns: int) -> Callable[[], bool]:
-        """Return the condition that a command later than a stamp was heard."""
+        """Return the condition that the answer to a later measurement than this was heard."""
         return lambda: self.last_stamp_ns > stamp_ns
 
     def request_setpoint(self) -> None:
@@ -130,12 +134,12 @@ class Operator(Node):
 
     def _on_command(self, message: Temperature) -> None:
         stamp = stamp_nanoseconds(message.header.stamp)
-        self.last_stamp_ns = max(self.last_stamp_ns, stamp)
         self._commanded[stamp] = message.temperature
         self._show_pair(stamp)
 
     def _show_pair(self, stamp: int) -> None:
         if stamp in self._measured and stamp in self._commanded:
+            self.last_stamp_ns = stamp
             self._on_row(Row((stamp - self._scenario.first_stamp_ns) / NANOSECONDS,
                              self._measured.pop(stamp), self._active,
                              self._commanded.pop(stamp)))
@@ -146,20 +150,27 @@ def run_loop(scenario: Scenario, bag: Path, logs: Path,
     """
     Run plant, controller and trainer as three processes until the scenario's end.
 
+    To be called from the main thread: it takes over Ctrl-C, so that the processes end.
+
     :param scenario: what to do.
     :param bag: where the trainer records; must not exist.
     :param logs: folder for what the processes print.
     :param on_row: called with every answered measurement.
     :raises LoopError: when a process ends early or the loop stands still.
     """
-    with isolated_domain() as environment:
+    with _deferred_interrupt() as check_interrupt, isolated_domain() as environment:
         context = Context()
         rclpy.init(context=context, domain_id=int(environment['ROS_DOMAIN_ID']))
         operator = Operator(scenario, context, on_row)
         executor = SingleThreadedExecutor(context=context)
         executor.add_node(operator)
+
+        def spin() -> None:
+            executor.spin_once(timeout_sec=0.1)
+            check_interrupt()
+
         try:
-            _run(scenario, bag, logs, environment, operator, executor)
+            _run(scenario, bag, logs, environment, operator, spin)
         finally:
             executor.shutdown()
             operator.destroy_node()
@@ -167,15 +178,16 @@ def run_loop(scenario: Scenario, bag: Path, logs: Path,
 
 
 def _run(scenario: Scenario, bag: Path, logs: Path, environment: dict[str, str],
-         operator: Operator, executor: SingleThreadedExecutor) -> None:
+         operator: Operator, spin: Callable[[], None]) -> None:
     with (NodeProcess('controller', {'model': scenario.model}, logs / 'controller.log',
                       environment) as controller,
           NodeProcess('trainer', {'output': bag}, logs / 'trainer.log', environment) as trainer):
         processes = [controller, trainer]
-        _spin_until(executor, lambda: operator.found_loop, processes, _START_TIMEOUT,
+        _spin_until(spin, lambda: operator.found_loop, processes, _START_TIMEOUT,
                     'controller and trainer did not find each other')
         operator.request_setpoint()
         plant = NodeProcess('plant', {
+            **scenario.plant,
             'lockstep': True, 'speed': scenario.speed, 'duration': scenario.duration,
             'sample_period': scenario.sample_period, 'start_time': _START_TIME,
             # controller, trainer and operator: nobody misses the first measurement
@@ -185,7 +197,7 @@ def _run(scenario: Scenario, bag: Path, logs: Path, environment: dict[str, str],
             processes.append(plant)
             end = scenario.first_stamp_ns + round(scenario.duration * NANOSECONDS)
             while operator.last_stamp_ns < end:
-                _spin_until(executor, operator.hears_more_than(operator.last_stamp_ns), processes,
+                _spin_until(spin, operator.hears_more_than(operator.last_stamp_ns), processes,
                             _STALL_TIMEOUT, 'the loop stands still: no command')
         codes = {process.name: process.stop() for process in processes}
     for process in processes:
@@ -194,11 +206,36 @@ def _run(scenario: Scenario, bag: Path, logs: Path, environment: dict[str, str],
                             f'{process.output()[-1000:]}')
 
 
-def _spin_until(executor: SingleThreadedExecutor, done: Callable[[], bool],
+@contextlib.contextmanager
+def _deferred_interrupt() -> Iterator[Callable[[], None]]:
+    """
+    Let a signal raise KeyboardInterrupt where the yielded function is called, and at the end.
+
+    One that comes while Python looks after a child leaves the child's lock taken for ever, and
+    one inside the middleware's extension comes out as another error. The processes live in
+    sessions of their own: without us nobody would end them.
+    """
+    pending: list[bool] = []
+
+    def check() -> None:
+        if pending:
+            raise KeyboardInterrupt
+
+    before = {number: signal.signal(number, lambda *_: pending.append(True))
+              for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)}
+    try:
+        yield check
+    finally:
+        for number, handler in before.items():
+            signal.signal(number, handler)
+    check()
+
+
+def _spin_until(spin: Callable[[], None], done: Callable[[], bool],
                 processes: list[NodeProcess], timeout: float, complaint: str) -> None:
     deadline = time.monotonic() + timeout
     while not done():
-        executor.spin_once(timeout_sec=0.1)
+        spin()
         for process in processes:
             if not process.running:
                 raise LoopError(f'{process.name} ended early: {process.output()[-1000:]}')

@@ -18,13 +18,12 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
 import contextlib
-import fcntl
 import os
 from pathlib import Path
 import signal
+import socket
 import subprocess
 import sys
-import tempfile
 from types import TracebackType
 
 from koopman_ros.nodes.shipped import config_directory
@@ -45,30 +44,36 @@ def isolated_domain() -> Iterator[dict[str, str]]:
 
     :raises RuntimeError: when all domains are taken.
     """
-    folder = Path(tempfile.gettempdir())
+    with _reserved_domain() as domain:
+        environment = {
+            'ROS_DOMAIN_ID': str(domain),
+            'ROS_AUTOMATIC_DISCOVERY_RANGE': 'LOCALHOST',
+            'FASTDDS_BUILTIN_TRANSPORTS': 'UDPv4',
+            'FASTRTPS_DEFAULT_PROFILES_FILE': str(config_directory() / _DISCOVERY_PROFILE),
+        }
+        before = {name: os.environ.get(name) for name in environment}
+        os.environ.update(environment)
+        try:
+            yield environment
+        finally:
+            for name, value in before.items():
+                os.environ.pop(name)
+                if value is not None:
+                    os.environ[name] = value
+
+
+@contextlib.contextmanager
+def _reserved_domain() -> Iterator[int]:
     # runs side by side start looking at different places
     offset = os.getpid() % len(_DOMAINS)
     for domain in (*_DOMAINS[offset:], *_DOMAINS[:offset]):
-        with open(folder / f'koopman_ros_domain_{domain}.lock', 'a') as lock:
+        with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as reservation:
             try:
-                fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+                # an abstract name: whoever's process holds it, it goes when the process ends
+                reservation.bind(f'\0koopman_ros_domain_{domain}')
             except OSError:
                 continue
-            environment = {
-                'ROS_DOMAIN_ID': str(domain),
-                'ROS_AUTOMATIC_DISCOVERY_RANGE': 'LOCALHOST',
-                'FASTDDS_BUILTIN_TRANSPORTS': 'UDPv4',
-                'FASTRTPS_DEFAULT_PROFILES_FILE': str(config_directory() / _DISCOVERY_PROFILE),
-            }
-            before = {name: os.environ.get(name) for name in environment}
-            os.environ.update(environment)
-            try:
-                yield environment
-            finally:
-                for name, value in before.items():
-                    os.environ.pop(name)
-                    if value is not None:
-                        os.environ[name] = value
+            yield domain
             return
     raise RuntimeError('all ROS domains are taken by other runs: wait until one ends')
 

@@ -192,14 +192,9 @@ class ParameterTable(Generic[T]):
         current = snapshot
 
         def validate(changes: list[Parameter]) -> SetParametersResult:
-            reason = ''
+            # rclpy has refused values of another type
             known = [change for change in changes if change.name in self.rows]
-            for change in known:
-                row, value = self.rows[change.name], _as_python(change.value)
-                if type(value) is not type(row.default):
-                    reason = reason or row.type_error(value)
-            if not reason:
-                reason = self.check(self._merged(current, known))
+            reason = self.check(self._merged(current, known))
             if reason:
                 node.get_logger().warning(f'parameter change refused: {reason}')
             return SetParametersResult(successful=not reason, reason=reason)

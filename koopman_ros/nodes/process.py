@@ -17,45 +17,64 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+import signal
 import sys
+import threading
 
-from koopman_ros.lifting import ModelFileError
-from koopman_ros.nodes.parameters import ConfigurationError
 import rclpy
 from rclpy.exceptions import ParameterException
-from rclpy.executors import ExternalShutdownException
+from rclpy.executors import SingleThreadedExecutor
+from rclpy.logging import LoggingSeverity, set_logger_level
 from rclpy.node import Node
+from rclpy.signals import SignalHandlerOptions
 
-# rclpy raises RCLError for an unreadable parameter file; its class is private to the extension.
-_START_ERRORS = (ConfigurationError, ModelFileError, OSError, ParameterException, RuntimeError,
-                 ValueError)
+# A parameter or a model that does not fit is a ValueError; rclpy raises RCLError for an unreadable
+# parameter file, a RuntimeError whose class is private to the extension.
+_START_ERRORS = (OSError, ParameterException, RuntimeError, ValueError)
+
+_LONGEST_WAIT = 0.1  # s from a signal to the end
 
 
 def run(name: str, create: Callable[[], Node], args: list[str] | None = None) -> int:
     """
-    Run a node until SIGINT or SIGTERM.
+    Run a node until SIGINT or SIGTERM, which end it between two callbacks.
 
     :param name: word that starts an error line.
     :param create: builds the node.
     :param args: command line, or None for the process's own.
     :return: exit code, 0 after a signal and 1 when the node could not start.
     """
+    stopping = threading.Event()
+    for number in (signal.SIGINT, signal.SIGTERM):
+        signal.signal(number, lambda *_: stopping.set())
     node = None
     try:
         try:
-            rclpy.init(args=args)
+            _init(args)
             node = create()
         except _START_ERRORS as error:
             print(f'{name}: cannot start: {_one_line(error)}', file=sys.stderr)
             return 1
-        rclpy.spin(node)
-    except (KeyboardInterrupt, ExternalShutdownException):
-        pass
+        executor = SingleThreadedExecutor()
+        executor.add_node(node)
+        while not stopping.is_set():
+            # Python handles a signal when the wait returns, so the wait is bounded
+            executor.spin_once(timeout_sec=_LONGEST_WAIT)
+        executor.shutdown()
     finally:
         if node is not None:
             node.destroy_node()
         rclpy.try_shutdown()
     return 0
+
+
+def _init(args: list[str] | None) -> None:
+    # rcl logs what it also raises, which would say it twice
+    set_logger_level('rcl', LoggingSeverity.FATAL)
+    # rclpy's own handlers end the context in the middle of a callback: what the callback then
+    # publishes or asks fails, and an interrupt inside the extension comes out as another error
+    rclpy.init(args=args, signal_handler_options=SignalHandlerOptions.NO)
+    set_logger_level('rcl', LoggingSeverity.UNSET)
 
 
 def _one_line(error: Exception) -> str:

@@ -17,6 +17,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from functools import partial
 import importlib
 import time
 from typing import Any
@@ -68,34 +69,42 @@ class Recorder:
             existing = self._subscriptions.get(topic)
             if existing is not None:
                 present = existing.qos_profile
-                if (present.reliability, present.durability) == (
+                # without publishers it waits for those that were there
+                if not publishers or (present.reliability, present.durability) == (
                         wanted.reliability, wanted.durability):
                     continue
-                self._node.destroy_subscription(existing)
+                self._end([topic])
             self._subscriptions[topic] = self._node.create_subscription(
-                message_type, topic, self._callback(topic), wanted, raw=True)
+                message_type, topic, partial(self._record, topic), wanted, raw=True)
 
     def flush(self) -> None:
         """Hand what is recorded to the operating system."""
         self._writer.flush()
 
     def close(self) -> None:
-        """Complete the bag; the subscriptions end with it."""
-        for subscription in self._subscriptions.values():
-            self._node.destroy_subscription(subscription)
-        self._subscriptions.clear()
+        """Complete the bag with all that has arrived; the subscriptions end with it."""
+        self._end(list(self._subscriptions))
         self._writer.close()
 
-    def _callback(self, topic: str) -> Any:
-        def record(data: bytes, info: Mapping[str, int]) -> None:
-            if not self.counts[topic]:
-                self._announce(topic)
-            # the middleware stamps both ends; rosbag2 logs the time of receipt
-            received = info['received_timestamp'] or time.time_ns()
-            self._writer.write(topic, data, received, info['source_timestamp'] or received)
-            self.counts[topic] += 1
+    def _end(self, ended: list[str]) -> None:
+        """End subscriptions after recording what waits in them for the executor."""
+        waiting = []
+        for topic in ended:
+            subscription = self._subscriptions.pop(topic)
+            with subscription.handle:
+                while taken := subscription.handle.take_message(self._types[topic], True):
+                    waiting.append((topic, *taken))
+            self._node.destroy_subscription(subscription)
+        for topic, data, info in sorted(waiting, key=lambda entry: entry[2]['received_timestamp']):
+            self._record(topic, data, info)
 
-        return record
+    def _record(self, topic: str, data: bytes, info: Mapping[str, int]) -> None:
+        if not self.counts[topic]:
+            self._announce(topic)
+        # the middleware stamps both ends; rosbag2 logs the time of receipt
+        received = info['received_timestamp'] or time.time_ns()
+        self._writer.write(topic, data, received, info['source_timestamp'] or received)
+        self.counts[topic] += 1
 
     def _announce(self, topic: str) -> None:
         """Add a topic to the bag with what its publishers offer now."""

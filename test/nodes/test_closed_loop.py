@@ -1,0 +1,128 @@
+# Copyright 2026 The koopman_ros Authors
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""Plant and controller as two processes: the closed loop, its order of start, and its names."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+from koopman_ros.nodes import topics
+import pytest
+from rosgraph_msgs.msg import Clock
+from sensor_msgs.msg import Temperature
+from workbench import seconds, temperature, Workbench
+
+LOCKSTEP = {'lockstep': True, 'speed': 0.0}
+
+
+class Loop:
+    """
+    What an operator hears of a loop, and the set-point that he turns.
+
+    :param ros: where plant and controller run.
+    :param prefix: of the topics, e.g. ``/unit_1/``.
+    :param measured: topic of the temperature.
+    """
+
+    def __init__(self, ros: Workbench, prefix: str = '', measured: str = 'temperature') -> None:
+        self._ros = ros
+        self.temperatures = ros.listen(Temperature, f'{prefix}{measured}')
+        self.commands = ros.listen(Temperature, f'{prefix}{topics.COOLANT_SETPOINT}')
+        self._setpoint = ros.node.create_publisher(
+            Temperature, f'{prefix}{topics.SETPOINT}', topics.LOOP_QOS)
+
+    def ask(self, celsius: float) -> None:
+        """Turn the set-point, once the controller hears it."""
+        self._ros.wait_until(self._setpoint.get_subscription_count)
+        self._setpoint.publish(temperature(celsius))
+
+    def settled(self, celsius: float, within: float) -> bool:
+        """Tell whether the last twenty temperatures are near a value."""
+        last = self.temperatures[-20:]
+        return len(last) == 20 and all(
+            abs(message.temperature - celsius) <= within for message in last)
+
+    def reach(self, celsius: float, within: float) -> None:
+        """Turn the set-point and wait until it is reached."""
+        self.ask(celsius)
+        self._ros.wait_until(lambda: self.settled(celsius, within))
+
+
+def start_loop(ros: Workbench, plant: Mapping[str, object], arguments: tuple[str, ...] = ()
+               ) -> None:
+    ros.start('controller', arguments=arguments)
+    # the bench listens, too: nobody misses the first measurement
+    ros.start('plant', {**plant, 'lockstep_subscribers': 2}, arguments)
+
+
+@pytest.mark.parametrize('first', ['controller', 'plant'])
+def test_reaches_the_setpoint_whoever_starts_first(ros: Workbench, first: str) -> None:
+    loop = Loop(ros)
+    names = ['controller', 'plant'] if first == 'controller' else ['plant', 'controller']
+    for name in names:
+        ros.start(name, {**LOCKSTEP, 'lockstep_subscribers': 2} if name == 'plant' else {})
+        ros.wait_until(lambda name=name: name in ros.node.get_node_names())
+    loop.reach(42.0, within=0.01)
+
+
+def test_follows_the_setpoint_when_it_changes_on_the_way(ros: Workbench) -> None:
+    loop = Loop(ros)
+    start_loop(ros, LOCKSTEP)
+    loop.ask(47.0)
+    ros.wait_until(lambda: loop.temperatures and loop.temperatures[-1].temperature < 49.0)
+    loop.ask(38.0)
+    ros.wait_until(lambda: loop.temperatures[-1].temperature < 45.0)
+    loop.reach(50.0, within=0.01)
+
+
+def test_converges_at_two_hundred_times_real_time(ros: Workbench) -> None:
+    """Without lock-step commands come late by whatever the machine takes, and /clock ticks."""
+    loop = Loop(ros)
+    clock = ros.listen(Clock, topics.CLOCK, topics.CLOCK_QOS)
+    start_loop(ros, {'speed': 200.0})
+    loop.reach(42.0, within=0.1)
+    ticks = [tick.clock.sec for tick in clock]
+    assert len(ticks) > 20
+    assert ticks == sorted(ticks)
+    assert abs(ticks[-1] - seconds(loop.temperatures[-1])) < 60.0
+
+
+def test_every_measurement_has_exactly_one_command(ros: Workbench) -> None:
+    loop = Loop(ros)
+    start_loop(ros, {**LOCKSTEP, 'duration': 300.0, 'sample_period': 0.7})
+    ros.wait_until(lambda: len(loop.commands) >= 429 and len(loop.temperatures) >= 429)
+    measured = [message.header.stamp for message in loop.temperatures]
+    assert [seconds(message) for message in loop.temperatures] == [
+        pytest.approx(1.0 + 0.7 * k, abs=1e-9) for k in range(429)]
+    assert [message.header.stamp for message in loop.commands] == measured
+
+
+def test_two_loops_side_by_side_in_their_namespaces(ros: Workbench) -> None:
+    loops = {unit: Loop(ros, f'/{unit}/') for unit in ('unit_1', 'unit_2')}
+    for unit in loops:
+        start_loop(ros, LOCKSTEP, ('-r', f'__ns:=/{unit}'))
+    loops['unit_1'].ask(47.0)
+    loops['unit_2'].ask(42.0)
+    ros.wait_until(lambda: loops['unit_1'].settled(47.0, 0.01))
+    ros.wait_until(lambda: loops['unit_2'].settled(42.0, 0.01))
+    assert {status.name for status in ros.statuses} >= {
+        'unit_1/plant: simulation', 'unit_2/controller: control'}
+
+
+def test_topics_can_be_remapped(ros: Workbench) -> None:
+    loop = Loop(ros, measured='reactor_temperature')
+    start_loop(ros, LOCKSTEP, ('-r', 'temperature:=reactor_temperature'))
+    loop.reach(45.0, within=0.01)
+    assert ros.node.count_publishers('temperature') == 0

@@ -1,0 +1,290 @@
+# Copyright 2026 The koopman_ros Authors
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""The controller as a process: what it answers to measurements, set-points and operators."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+import math
+from pathlib import Path
+import re
+import shutil
+import time as clock
+
+from diagnostic_msgs.msg import DiagnosticStatus
+from koopman_ros.nodes import topics
+from koopman_ros.nodes.controller_parameters import TABLE
+from koopman_ros.nodes.shipped import model_path
+import pytest
+from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
+from sensor_msgs.msg import Temperature
+from workbench import seconds, temperature, TIMEOUT, value, Workbench
+
+STATUS = 'controller: control'
+STEADY = 51.8  # degC, near the plant's steady state
+
+
+class Bench:
+    """
+    A controller with a thermometer and an operator in the test.
+
+    :param ros: where the controller runs.
+    :param parameters: of the controller.
+    :param arguments: further ROS arguments of the controller.
+    :param qos: what the thermometer offers.
+    """
+
+    def __init__(self, ros: Workbench, parameters: Mapping[str, object] | None = None,
+                 arguments: tuple[str, ...] = (), qos: QoSProfile = topics.LOOP_QOS) -> None:
+        self.ros = ros
+        self.process = ros.start('controller', parameters, arguments)
+        self.commands = ros.listen(Temperature, topics.COOLANT_SETPOINT)
+        self.tracked = ros.listen(Temperature, topics.ACTIVE_SETPOINT, topics.LATCHED_QOS)
+        self.thermometer = ros.speak(Temperature, topics.TEMPERATURE, qos, to='controller')
+        self._setpoint = ros.speak(Temperature, topics.SETPOINT, to='controller')
+        self.measure(STEADY, 1.0)
+        self.active_since(STEADY)
+
+    def start_afresh(self) -> None:
+        """Bring the controller back to its steady state at the time 1 s, and forget the rest."""
+        self.ros.set_parameters('controller', **{
+            name: row.default for name, row in TABLE.rows.items() if not row.read_only})
+        self.ros.set_bool('controller/set_automatic', True)
+        self.ask(STEADY)
+        long_after = self.measure_until_active(STEADY, 1e6) + 1e3
+        self.measure(STEADY, long_after)
+        del self.commands[:], self.tracked[:-1], self.ros.statuses[:]
+        # the clock goes back
+        self.measure(STEADY, 1.0)
+
+    def measure(self, celsius: float, time: float) -> Temperature:
+        """Send a measurement and return its command."""
+        self.thermometer.publish(temperature(celsius, time))
+        return self.ros.wait_until(
+            lambda: next((m for m in self.commands if seconds(m) == time), None))
+
+    def ask(self, celsius: float, time: float = 0.0) -> None:
+        """Turn the set-point, in force from a time."""
+        self._setpoint.publish(temperature(celsius, time))
+
+    def refusal(self) -> DiagnosticStatus:
+        """Wait until a set-point was refused."""
+        return self.ros.wait_for_status(STATUS, lambda s: 'set-point' in s.message)
+
+    def active_since(self, celsius: float) -> float:
+        """Wait until a set-point is tracked; return since when."""
+        return seconds(self.ros.wait_until(lambda: next(
+            (m for m in self.tracked if m.temperature == pytest.approx(celsius)), None)))
+
+    @property
+    def active(self) -> float:
+        """The set-point that is tracked."""
+        return float(self.tracked[-1].temperature)
+
+    def measure_until(self, condition: Callable[[Temperature], bool], time: float) -> float:
+        """Measure once a second from a time on until a command meets a condition; say when."""
+        deadline = clock.monotonic() + TIMEOUT
+        while not condition(self.measure(STEADY, time)):
+            assert clock.monotonic() < deadline
+            time += 1.0
+        return time
+
+    def measure_until_active(self, celsius: float, time: float) -> float:
+        """Measure once a second from a time on until a set-point is tracked; say when."""
+        return self.measure_until(lambda _: self.active == pytest.approx(celsius), time)
+
+
+@pytest.fixture(scope='module')
+def shared_bench(shared_ros: Workbench) -> Bench:
+    return Bench(shared_ros)
+
+
+@pytest.fixture
+def bench(shared_bench: Bench) -> Bench:
+    """Return a controller at its steady state."""
+    shared_bench.start_afresh()
+    return shared_bench
+
+
+def test_each_command_carries_the_stamp_of_its_measurement(bench: Bench) -> None:
+    times = [2.0 + 0.125 * k for k in range(50)]
+    for k, time in enumerate(times):
+        bench.thermometer.publish(temperature(STEADY - 0.01 * k, time))
+    # whatever else is still on its way would come before the answer to this
+    bench.measure(STEADY, 60.0)
+    assert [seconds(message) for message in bench.commands] == [1.0, *times, 60.0]
+
+
+def test_active_setpoint_is_latched_for_a_late_joiner(bench: Bench) -> None:
+    late = bench.ros.listen(Temperature, topics.ACTIVE_SETPOINT, topics.LATCHED_QOS)
+    bench.ros.wait_until(lambda: late)
+    assert late[0].temperature == pytest.approx(STEADY)
+
+
+def test_setpoint_of_a_volatile_publisher_is_heard(bench: Bench) -> None:
+    """`ros2 topic pub` publishes reliable and volatile."""
+    setpoint = bench.ros.speak(Temperature, topics.SETPOINT, QoSProfile(
+        depth=1, reliability=ReliabilityPolicy.RELIABLE, durability=DurabilityPolicy.VOLATILE),
+        to='controller')
+    setpoint.publish(temperature(45.0))
+    bench.measure_until_active(45.0, 2.0)
+    assert bench.active_since(45.0) >= 2.0
+
+
+@pytest.mark.parametrize(('asked', 'words'), [
+    (80.0, r'set-point 353\.15 K is outside the trained range'),
+    (math.nan, 'set-point nan is not finite'),
+])
+def test_bad_setpoint_is_refused_and_the_old_one_kept(bench: Bench, asked: float, words: str
+                                                      ) -> None:
+    bench.ask(45.0)
+    bench.measure_until_active(45.0, 2.0)
+    bench.ask(asked)
+    status = bench.refusal()
+    assert status.level == DiagnosticStatus.WARN
+    assert re.search(words, status.message)
+    assert 'the old one is kept' in status.message
+    # a change would be tracked and said with this measurement, before the next answer
+    bench.measure(STEADY, 1000.0)
+    bench.measure(STEADY, 1001.0)
+    assert bench.active == pytest.approx(45.0)
+
+
+def test_scheduled_setpoint_takes_effect_at_its_stamp(bench: Bench) -> None:
+    bench.ask(46.0, time=20.0)
+    # the later request is known when the earlier one shows
+    bench.ask(47.0, time=5.0)
+    bench.measure_until_active(47.0, 5.0)
+    assert 5.0 <= bench.active_since(47.0) < 18.0
+    bench.measure(STEADY, 19.0)
+    bench.measure(STEADY, 20.0)
+    assert bench.active_since(46.0) == 20.0
+
+
+def test_measurement_that_is_not_a_number_holds_the_command(bench: Bench) -> None:
+    before = bench.measure(STEADY, 2.0).temperature
+    assert bench.measure(math.nan, 3.0).temperature == before
+    status = bench.ros.wait_for_status(STATUS, lambda s: s.level == DiagnosticStatus.ERROR)
+    assert 'not finite' in status.message
+    assert 'check the sensor' in status.message
+    bench.measure(STEADY, 4.0)
+    bench.ros.wait_for_status(STATUS, lambda s: s.level == DiagnosticStatus.OK)
+
+
+def test_temperature_outside_the_trained_range_is_reported(bench: Bench) -> None:
+    assert math.isfinite(bench.measure(60.0, 2.0).temperature)
+    status = bench.ros.wait_for_status(STATUS, lambda s: s.level == DiagnosticStatus.WARN)
+    assert 'outside the trained range' in status.message
+
+
+def test_clock_that_goes_back_starts_time_afresh(ros: Workbench) -> None:
+    bench = Bench(ros)
+    bench.measure(STEADY, 100.0)
+    assert math.isfinite(bench.measure(STEADY, 10.0).temperature)
+    bench.ros.wait_until(lambda: 'time starts afresh' in bench.process.output())
+
+
+def test_best_effort_thermometer_is_heard_by_override(ros: Workbench) -> None:
+    best_effort = QoSProfile(depth=10, reliability=ReliabilityPolicy.BEST_EFFORT)
+    override = 'qos_overrides./temperature.subscription.reliability:=best_effort'
+    bench = Bench(ros, arguments=('-p', override), qos=best_effort)
+    assert math.isfinite(bench.measure(STEADY, 2.0).temperature)
+
+
+def test_manual_mode_commands_what_the_operator_asks(bench: Bench) -> None:
+    held = bench.measure(STEADY, 2.0).temperature
+    response = bench.ros.set_bool('controller/set_automatic', False)
+    assert (response.success, response.message) == (True, 'manual mode')
+    assert bench.measure(STEADY + 1.0, 3.0).temperature == held
+
+    manual = bench.ros.speak(Temperature, topics.MANUAL_COOLANT_SETPOINT, to='controller')
+    manual.publish(temperature(20.0))
+    time = bench.measure_until(lambda command: command.temperature == pytest.approx(20.0), 4.0)
+    status = bench.ros.wait_for_status(STATUS, lambda s: s.message.startswith('manual'))
+    assert value(status, 'law') == 'none'
+
+    assert bench.ros.set_bool('controller/set_automatic', True).message == 'automatic mode'
+    assert bench.measure(STEADY, time + 60.0).temperature == pytest.approx(held, abs=0.01)
+    assert bench.measure(STEADY + 1.0, time + 120.0).temperature < held - 0.3
+
+
+def test_manual_command_stays_within_the_limits(bench: Bench) -> None:
+    bench.ros.set_parameters('controller', coolant_max=28.0)
+    bench.ros.set_bool('controller/set_automatic', False)
+    manual = bench.ros.speak(Temperature, topics.MANUAL_COOLANT_SETPOINT, to='controller')
+    for wild in (90.0, math.nan):
+        manual.publish(temperature(wild))
+    bench.ros.wait_until(lambda: 'manual command [nan] is not finite' in bench.process.output())
+    assert bench.measure(STEADY, 1000.0).temperature == pytest.approx(28.0)
+
+
+def test_model_is_reloaded_while_the_loop_runs(bench: Bench) -> None:
+    response = bench.ros.trigger('controller/reload_model')
+    assert response.success
+    assert 'reactor_nz4: n_z = 4' in response.message
+
+
+def test_damaged_model_is_refused_and_the_old_one_kept(ros: Workbench, tmp_path: Path) -> None:
+    model = tmp_path / 'model.safetensors'
+    shutil.copy(model_path('reactor_nz3'), model)
+    bench = Bench(ros, {'model': model})
+    before = bench.measure(STEADY, 2.0).temperature
+    model.write_bytes(model.read_bytes()[:500])
+    response = bench.ros.trigger('controller/reload_model')
+    assert not response.success
+    assert response.message.startswith('the old model is kept: ')
+    assert 'model.safetensors' in response.message
+    assert bench.measure(STEADY, 3.0).temperature == pytest.approx(before, abs=1e-6)
+
+    shutil.copy(model_path('reactor_nz4'), model)
+    assert 'n_z = 4' in ros.trigger('controller/reload_model').message
+
+
+def test_coolant_limit_changes_while_the_loop_runs(bench: Bench) -> None:
+    assert bench.measure(STEADY, 2.0).temperature > 25.0
+    (result,) = bench.ros.set_parameters('controller', coolant_max=24.0)
+    assert result.successful, result.reason
+    assert bench.measure(STEADY, 3.0).temperature == pytest.approx(24.0)
+
+
+def test_rate_limit_changes_while_the_loop_runs(bench: Bench) -> None:
+    held = bench.measure(STEADY, 2.0).temperature
+    bench.ros.set_parameters('controller', coolant_rate_limit=6.0)
+    command = bench.measure(STEADY + 5.0, 3.0).temperature
+    assert command == pytest.approx(held - 0.1)
+
+
+def test_setpoint_ramp_changes_while_the_loop_runs(bench: Bench) -> None:
+    bench.ros.set_parameters('controller', setpoint_ramp=6.0)
+    bench.ask(STEADY - 10.0)
+    time = bench.measure_until(lambda _: bench.active < STEADY - 0.01, 2.0) + 30.0
+    bench.measure(STEADY, time)
+    last = bench.ros.wait_until(lambda: next(
+        (m for m in bench.tracked if seconds(m) == time), None))
+    first = next(m for m in bench.tracked if m.temperature < STEADY - 0.01)
+    fallen = first.temperature - last.temperature
+    assert fallen == pytest.approx(0.1 * (seconds(last) - seconds(first)))
+
+
+def test_weights_change_while_the_loop_runs(bench: Bench) -> None:
+    """A dear coolant moves less."""
+    hot = STEADY + 1.0
+    held = bench.measure(STEADY, 100.0).temperature
+    before = bench.measure(hot, 200.0).temperature
+    bench.ros.set_parameters('controller', coolant_weight=100.0)
+    dear = bench.measure(hot, 300.0).temperature
+    bench.ros.set_parameters('controller', temperature_weight=10000.0)
+    eager = bench.measure(hot, 400.0).temperature
+    assert eager < before < dear < held

@@ -1,0 +1,101 @@
+# Copyright 2026 The koopman_ros Authors
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""Parameters of running nodes, changed and read through their services as `ros2 param` does."""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+from koopman_ros.nodes.controller_parameters import TABLE
+import pytest
+from rcl_interfaces.srv import DescribeParameters
+from workbench import Workbench
+
+CONTROLLER = '/controller'
+
+
+@pytest.fixture(scope='module')
+def running(shared_ros: Workbench) -> Workbench:
+    """Start one controller, whose parameters every test leaves as they were."""
+    shared_ros.start('controller')
+    return shared_ros
+
+
+@pytest.mark.parametrize(('change', 'words'), [
+    ({'coolant_max': 500.0}, 'coolant_max = 500.0 degC must be in [-50, 150] degC'),
+    ({'temperature_weight': 0.0}, 'temperature_weight = 0.0 1/K^2 must be in (0, 1000000] 1/K^2'),
+    ({'temperature_weight': -1.0},
+     'temperature_weight = -1.0 1/K^2 must be in (0, 1000000] 1/K^2'),
+    ({'setpoint_ramp': math.nan}, 'setpoint_ramp = nan K/min must be in (0, 1000000] K/min'),
+    ({'coolant_min': math.inf}, 'coolant_min = inf degC must be in [-50, 150] degC'),
+    ({'coolant_weight': 1}, "expected 'Type.DOUBLE' got 'Type.INTEGER'"),
+    ({'coolant_weight': 'much'}, "expected 'Type.DOUBLE' got 'Type.STRING'"),
+    ({'coolant_min': 40.0}, 'coolant_min = 40.0 degC must be below coolant_max = 32.0 degC: '
+     'change the other one first'),
+    ({'model': 'reactor_nz3'}, 'read-only parameter: model'),
+    ({'no_such_thing': 1.0}, 'undeclared parameter'),
+])
+def test_change_that_does_not_fit_is_refused_with_the_reason(
+        running: Workbench, change: dict[str, Any], words: str) -> None:
+    (result,) = running.set_parameters(CONTROLLER, **change)
+    assert not result.successful
+    assert words in result.reason
+    (name,) = change
+    if name in TABLE.rows:
+        assert running.get_parameters(CONTROLLER, name) == [TABLE.rows[name].default]
+
+
+def test_change_is_read_back(running: Workbench) -> None:
+    for gain in (500.0, TABLE.rows['max_gain'].default):
+        (result,) = running.set_parameters(CONTROLLER, max_gain=gain)
+        assert result.successful, result.reason
+        assert running.get_parameters(CONTROLLER, 'max_gain') == [gain]
+
+
+def test_two_limits_that_cross_on_the_way_change_together(running: Workbench) -> None:
+    default = {name: TABLE.rows[name].default for name in ('coolant_min', 'coolant_max')}
+    for limits in ({'coolant_min': 40.0, 'coolant_max': 60.0}, default):
+        result = running.set_parameters_atomically(CONTROLLER, **limits)
+        assert result.successful, result.reason
+        assert running.get_parameters(CONTROLLER, *limits) == list(limits.values())
+
+
+def test_atomic_change_is_refused_as_a_whole(running: Workbench) -> None:
+    result = running.set_parameters_atomically(CONTROLLER, max_gain=7.0, coolant_max=500.0)
+    assert not result.successful
+    assert 'coolant_max = 500.0 degC' in result.reason
+    assert running.get_parameters(CONTROLLER, 'max_gain') == [TABLE.rows['max_gain'].default]
+
+
+def test_every_parameter_is_described_with_unit_and_range(running: Workbench) -> None:
+    names = list(TABLE.rows)
+    response = running.call(DescribeParameters, f'{CONTROLLER}/describe_parameters',
+                            DescribeParameters.Request(names=names))
+    described = {item.name: item for item in response.descriptors}
+    assert list(described) == names
+    for name, row in TABLE.rows.items():
+        assert described[name].description.startswith(row.description)
+        assert described[name].description.endswith(f'[{row.unit}]' if row.unit else '')
+        assert described[name].additional_constraints == row.range_text
+        assert described[name].read_only == row.read_only
+    assert described['coolant_min'].description == 'lowest coolant temperature commanded [degC]'
+    assert described['coolant_min'].additional_constraints == '[-50, 150] degC'
+    assert described['model'].read_only
+
+
+def test_refused_change_is_logged(running: Workbench) -> None:
+    running.set_parameters(CONTROLLER, max_gain=-3.0)
+    running.wait_until(lambda: 'parameter change refused: max_gain = -3.0' in running.printed())

@@ -1,0 +1,189 @@
+# Copyright 2026 The koopman_ros Authors
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""Parameter tables: words for ranges and refusals, and the shipped files that they write."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, fields
+import math
+from pathlib import Path
+from typing import Any
+
+from koopman_ros.nodes.parameter_files import main, parameter_file, TABLES
+from koopman_ros.nodes.parameters import parameter, ParameterTable, Specification
+from koopman_ros.nodes.shipped import config_directory
+import pytest
+from rclpy.node import Node
+from workbench import Workbench
+
+
+def row(default: Any, **details: Any) -> Specification:
+    return Specification('level', default, **{'unit': 'm', 'description': 'fill', **details})
+
+
+# Words.
+
+
+@pytest.mark.parametrize(('specification', 'words'), [
+    (row(1.0), ''),
+    (row(1.0, minimum=0.0), 'at least 0 m'),
+    (row(1.0, minimum=0.0, open_minimum=True), 'above 0 m'),
+    (row(1.0, minimum=0.0, maximum=5.0), '[0, 5] m'),
+    (row(1.0, minimum=0.0, maximum=5.0, open_minimum=True), '(0, 5] m'),
+    (row(1, minimum=1, maximum=1000, unit=''), '[1, 1000]'),
+    (row('low', choices=('low', 'high'), unit=''), 'one of low, high'),
+])
+def test_range_in_words(specification: Specification, words: str) -> None:
+    assert specification.range_text == words
+
+
+@pytest.mark.parametrize(('specification', 'given', 'words'), [
+    (row(1.0, minimum=0.0), -1.0, 'level = -1.0 m must be at least 0 m'),
+    (row(1.0, minimum=0.0, open_minimum=True), 0.0, 'level = 0.0 m must be above 0 m'),
+    (row(1.0, minimum=0.0, maximum=5.0), 5.5, 'level = 5.5 m must be in [0, 5] m'),
+    (row(1.0, minimum=0.0, maximum=5.0), math.nan, 'level = nan m must be in [0, 5] m'),
+    (row(1.0, minimum=0.0), math.inf, 'level = inf m must be at least 0 m'),
+    (row(1.0), math.nan, 'level = nan m must be finite'),
+    (row(1.0), -math.inf, 'level = -inf m must be finite'),
+    (row(1, minimum=1, unit=''), 0, 'level = 0 must be at least 1'),
+    (row('low', choices=('low', 'high'), unit=''), 'up', "level = 'up' must be one of low, high"),
+])
+def test_refusal_names_value_and_range_with_unit(
+        specification: Specification, given: Any, words: str) -> None:
+    assert specification.check(given) == words
+
+
+@pytest.mark.parametrize(('specification', 'given'), [
+    (row(1.0), 1e300),
+    (row(1.0, minimum=0.0, maximum=5.0), 0.0),
+    (row(1.0, minimum=0.0, maximum=5.0), 5.0),
+    (row(1.0, minimum=0.0, open_minimum=True), 1e-300),
+    (row(1, minimum=0), 0),
+    (row(True), False),
+    (row('low', choices=('low', 'high')), 'high'),
+    (row('anything'), ''),
+])
+def test_value_that_fits_has_no_refusal(specification: Specification, given: Any) -> None:
+    assert specification.check(given) == ''
+
+
+@pytest.mark.parametrize(('default', 'given', 'words'), [
+    (1.0, 1, 'level = 1 must be a double, e.g. 1.0'),
+    (1, 1.5, 'level = 1.5 must be an integer, e.g. 1'),
+    (True, 'yes', "level = 'yes' must be a boolean, e.g. true"),
+    ('low', 3, 'level = 3 must be a string, e.g. text'),
+    (('a',), 'a', "level = 'a' must be a list of strings, e.g. [a, b]"),
+])
+def test_other_type_is_named_with_an_example(default: Any, given: Any, words: str) -> None:
+    assert row(default).type_error(given) == words
+
+
+@dataclass(frozen=True)
+class Odd:
+    """A parameter of every type, with values that are hard to write."""
+
+    tiny: float = parameter(1e-6, 'a small number', unit='m', minimum=0.0, maximum=1.0)
+    huge: float = parameter(7.2e30, 'a large number')
+    whole: float = parameter(-3.0, 'a whole number that is a double')
+    exact: float = parameter(0.87725294608097, 'all digits')
+    count: int = parameter(-7, 'an integer')
+    switch: bool = parameter(True, 'a switch', read_only=True)
+    word: str = parameter('on', 'a string that YAML could take for a switch')
+    empty: str = parameter('', 'nothing')
+    names: tuple[str, ...] = parameter(('temperature', '/diagnostics'), 'a list')
+
+
+ODD = ParameterTable(Odd, lambda odd: 'count must be odd' if odd.count % 2 == 0 else '')
+
+
+def test_cross_check_comes_after_the_ranges() -> None:
+    assert ODD.check(Odd()) == ''
+    assert ODD.check(Odd(count=2)) == 'count must be odd'
+    assert ODD.check(Odd(count=2, tiny=2.0)) == 'tiny = 2.0 m must be in [0, 1] m'
+
+
+def test_rcl_reads_back_what_the_table_writes(ros: Workbench, tmp_path: Path) -> None:
+    file = tmp_path / 'odd.yaml'
+    file.write_text(ODD.yaml('odd'))
+    node = Node('odd', context=ros.node.context,
+                cli_args=['--ros-args', '--params-file', str(file)],
+                automatically_declare_parameters_from_overrides=True)
+    read = {name: node.get_parameter(name).value for name in ODD.rows}
+    node.destroy_node()
+    default = {name: item.default for name, item in ODD.rows.items()}
+    assert read == {**default, 'names': list(default['names'])}
+    assert [type(found) for found in read.values()] == [
+        float, float, float, float, int, bool, str, str, list]
+
+
+def test_yaml_of_a_table() -> None:
+    assert ODD.yaml('odd', {'count': 5}).splitlines()[:16] == [
+        '/**/odd:',
+        '  ros__parameters:',
+        '',
+        '    # a small number [m]',
+        '    #   [0, 1] m',
+        '    tiny: 1.0e-06',
+        '',
+        '    # a large number',
+        '    huge: 7.2e+30',
+        '',
+        '    # a whole number that is a double',
+        '    whole: -3.0',
+        '',
+        '    # all digits',
+        '    exact: 0.87725294608097',
+        '',
+    ]
+    assert '    count: 5\n' in ODD.yaml('odd', {'count': 5})
+    assert '    # a switch\n    #   fixed at start\n    switch: true\n' in ODD.yaml('odd')
+
+
+# The shipped files.
+
+
+@pytest.mark.parametrize('node', TABLES)
+def test_shipped_file_is_what_the_table_writes(node: str) -> None:
+    assert (config_directory() / f'{node}.yaml').read_text() == parameter_file(node)
+
+
+def test_shipped_files_are_written_by_one_command(tmp_path: Path) -> None:
+    assert main(['--output', str(tmp_path)]) == 0
+    assert {path.name: path.read_text() for path in tmp_path.iterdir()} == {
+        f'{node}.yaml': parameter_file(node) for node in TABLES}
+
+
+@pytest.mark.parametrize('node', TABLES)
+def test_every_parameter_has_a_comment(node: str) -> None:
+    lines = (config_directory() / f'{node}.yaml').read_text().splitlines()
+    for item in fields(TABLES[node].kind):
+        (index,) = (k for k, line in enumerate(lines) if line.startswith(f'    {item.name}:'))
+        assert lines[index - 1].startswith('    # ')
+
+
+@pytest.mark.parametrize('node', TABLES)
+def test_node_runs_with_its_shipped_file(ros: Workbench, tmp_path: Path, node: str) -> None:
+    file = config_directory() / f'{node}.yaml'
+    # the trainer would otherwise name its bag after the date, in the present folder
+    arguments = ('-p', f'output:={tmp_path / "bag"}') if node == 'trainer' else ()
+    ros.start(node, arguments=('--params-file', str(file), *arguments))
+    rows = dict(TABLES[node].rows)
+    rows.pop('output', None)
+    read = ros.get_parameters(node, *rows)
+    assert [tuple(found) if isinstance(found, list) else found for found in read] == [
+        item.default for item in rows.values()]
+    assert [type(found) for found in read] == [
+        list if isinstance(item.default, tuple) else type(item.default)
+        for item in rows.values()]

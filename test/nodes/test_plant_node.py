@@ -1,0 +1,292 @@
+# Copyright 2026 The koopman_ros Authors
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""The plant as a process: its measurements, its time, and what it does with commands."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from itertools import pairwise
+import math
+import time
+
+from diagnostic_msgs.msg import DiagnosticStatus
+from koopman_ros.nodes import topics
+from koopman_ros.nodes.messages import stamp_nanoseconds
+from koopman_ros.nodes.plant_parameters import TABLE
+import pytest
+from sensor_msgs.msg import JointState, Temperature
+from workbench import seconds, value, Workbench
+
+STATUS = 'plant: simulation'
+NOMINAL_COOLANT = 26.85  # degC
+
+
+class Bench:
+    """
+    A lock-step plant whose every measurement the test answers with a coolant temperature.
+
+    :param ros: where the plant runs.
+    :param parameters: of the plant.
+    """
+
+    def __init__(self, ros: Workbench, **parameters: object) -> None:
+        self.ros = ros
+        self.coolant = NOMINAL_COOLANT
+        self.answering = True
+        self.measured: list[Temperature] = []
+        self._commands = ros.node.create_publisher(
+            Temperature, topics.COOLANT_SETPOINT, topics.LOOP_QOS)
+        ros.node.create_subscription(
+            Temperature, topics.TEMPERATURE, self._answer, topics.LOOP_QOS)
+        self.process = ros.start('plant', {'lockstep': True, 'speed': 0.0, **parameters})
+
+    def _answer(self, message: Temperature) -> None:
+        self.measured.append(message)
+        if self.answering:
+            self._commands.publish(
+                Temperature(header=message.header, temperature=self.coolant))
+
+    def start_afresh(self) -> None:
+        """Bring the plant back to its steady state, and forget the rest."""
+        self.coolant = NOMINAL_COOLANT
+        self.ros.set_parameters('plant', **{
+            name: row.default for name, row in TABLE.rows.items() if not row.read_only})
+        self.ros.trigger('plant/reset')
+        self.wait_for_more(3)
+        del self.measured[:], self.ros.statuses[:]
+
+    @property
+    def celsius(self) -> float:
+        """The last measurement."""
+        return float(self.measured[-1].temperature)
+
+    def wait_for(self, condition: Callable[[float], bool]) -> None:
+        """Wait for a temperature."""
+        self.ros.wait_until(lambda: self.measured and condition(self.celsius))
+
+    def wait_for_more(self, count: int) -> list[Temperature]:
+        """Wait for so many further measurements and return them."""
+        present = len(self.measured)
+        self.ros.wait_until(lambda: len(self.measured) >= present + count)
+        return self.measured[present:present + count]
+
+
+@pytest.fixture(scope='module')
+def shared_bench(shared_ros: Workbench) -> Bench:
+    return Bench(shared_ros, lockstep_timeout=3600.0)
+
+
+@pytest.fixture
+def bench(shared_bench: Bench) -> Bench:
+    """Return a plant at its steady state."""
+    shared_bench.start_afresh()
+    return shared_bench
+
+
+# Measurements.
+
+
+def test_two_state_reactor_stays_at_its_steady_state(ros: Workbench) -> None:
+    concentrations = ros.listen(JointState, topics.CONCENTRATION)
+    bench = Bench(ros, reactor='two_state')
+    bench.wait_for_more(100)
+    ros.wait_until(lambda: len(concentrations) >= 100)
+    first = bench.celsius
+    for message in bench.measured:
+        assert message.temperature == pytest.approx(first, abs=1e-6)
+    for message in concentrations:
+        assert message.name == ['reactant_concentration [mol/L]']
+        assert list(message.position) == pytest.approx([0.87725294608097], abs=1e-8)
+    stamps = {seconds(message) for message in bench.measured}
+    assert stamps >= {seconds(message) for message in concentrations[:100]}
+
+
+def test_variance_is_the_square_of_the_noise_which_changes_while_it_runs(bench: Bench) -> None:
+    assert bench.wait_for_more(1)[0].variance == 0.0
+    (result,) = bench.ros.set_parameters('plant', noise=0.5)
+    assert result.successful, result.reason
+    bench.ros.wait_until(lambda: bench.measured[-1].variance > 0.0)
+    measured = bench.wait_for_more(200)
+    assert {message.variance for message in measured} == {0.25}
+    mean = sum(message.temperature for message in measured) / 200
+    spread = math.sqrt(sum((message.temperature - mean) ** 2 for message in measured) / 200)
+    assert 0.4 < spread < 0.6
+
+
+def test_noise_repeats_with_its_seed(ros: Workbench) -> None:
+    heard = {}
+    for name, seed in (('a', 1), ('b', 1), ('c', 2)):
+        heard[name] = ros.listen(Temperature, f'/{name}/temperature')
+        ros.start('plant', {'speed': 50.0, 'noise': 0.1, 'seed': seed}, ('-r', f'__ns:=/{name}'))
+
+    def common() -> set[float]:
+        return set.intersection(*({seconds(m) for m in messages} for messages in heard.values()))
+
+    ros.wait_until(lambda: len(common()) >= 20)
+    values = {name: [m.temperature for m in messages if seconds(m) in common()]
+              for name, messages in heard.items()}
+    assert values['a'] == values['b']
+    assert not set(values['a']) & set(values['c'])
+
+
+def test_starts_away_from_the_steady_state(ros: Workbench) -> None:
+    bench = Bench(ros, initial_temperature_offset=-5.0, start_time=10.0)
+    bench.wait_for_more(1)
+    assert seconds(bench.measured[0]) == 10.0
+    bench.wait_for(lambda celsius: celsius > bench.measured[0].temperature + 4.0)
+
+
+# Time.
+
+
+def test_real_time_stamps_are_the_wall_clock(ros: Workbench) -> None:
+    heard = ros.listen(Temperature, topics.TEMPERATURE)
+    ros.start('plant', {'sample_period': 0.1})
+    ros.wait_until(lambda: len(heard) >= 5)
+    now = time.time_ns()
+    stamps = [stamp_nanoseconds(message.header.stamp) for message in heard]
+    assert 0 <= now - stamps[-1] < 5_000_000_000
+    assert all((late - early) % 100_000_000 == 0 and late > early
+               for early, late in pairwise(stamps))
+    assert ros.node.count_publishers(topics.CLOCK) == 0
+
+
+def test_lockstep_waits_for_a_controller(ros: Workbench) -> None:
+    heard = ros.listen(Temperature, topics.TEMPERATURE)
+    ros.start('plant', {'lockstep': True, 'speed': 0.0, 'start_time': 7.0})
+    status = ros.wait_for_status(STATUS, lambda s: s.level == DiagnosticStatus.WARN)
+    assert status.message == 'waiting for the loop: no controller yet'
+    assert not heard
+    ros.node.create_publisher(Temperature, topics.COOLANT_SETPOINT, topics.LOOP_QOS)
+    ros.wait_until(lambda: heard)
+    assert seconds(heard[0]) == 7.0
+
+
+def test_lockstep_goes_on_without_an_answer_after_its_timeout(ros: Workbench) -> None:
+    bench = Bench(ros, lockstep_timeout=0.05)
+    bench.coolant = 25.0
+    bench.wait_for_more(5)
+    bench.answering = False
+    bench.wait_for_more(5)
+    status = ros.wait_for_status(STATUS, lambda s: int(value(s, 'missed commands')) >= 3)
+    assert float(value(status, 'coolant [degC]')) == pytest.approx(25.0)
+    assert 'no command for the measurement at' in bench.process.output()
+    bench.answering = True
+    bench.wait_for_more(100)
+
+
+def test_lockstep_can_be_paced(ros: Workbench) -> None:
+    sent: list[int] = []
+    ros.node.create_subscription(
+        Temperature, topics.TEMPERATURE,
+        lambda _, info: sent.append(info['source_timestamp']), topics.LOOP_QOS)
+    Bench(ros, speed=20.0, sample_period=0.5, lockstep_subscribers=2)
+    ros.wait_until(lambda: len(sent) > 20)
+    # 10 s of plant time at twenty times real time, the first tick maybe at once
+    assert sent[20] - sent[0] >= 0.47e9
+
+
+def test_stands_still_after_its_duration(ros: Workbench) -> None:
+    bench = Bench(ros, duration=20.0, sample_period=2.0)
+    ros.wait_for_status(STATUS, lambda s: s.message == 'finished: the duration is over')
+    ros.wait_until(lambda: len(bench.measured) >= 11)
+    assert [seconds(message) for message in bench.measured] == [1.0 + 2.0 * k for k in range(11)]
+
+
+# Commands.
+
+
+def test_command_that_is_not_a_number_is_rejected_and_the_last_one_held(bench: Bench) -> None:
+    bench.coolant = 25.0
+    bench.wait_for_more(5)
+    bench.coolant = math.nan
+    status = bench.ros.wait_for_status(STATUS, lambda s: s.level == DiagnosticStatus.WARN
+                                 and s.message.startswith('coolant command nan degC'))
+    assert status.message == ('coolant command nan degC is not finite and was rejected: the last '
+                              'good one is held')
+    assert int(value(status, 'rejected commands')) >= 1
+    assert float(value(status, 'coolant [degC]')) == pytest.approx(25.0)
+    bench.coolant = 25.0
+    bench.ros.wait_for_status(STATUS, lambda s: s.level == DiagnosticStatus.OK)
+
+
+def test_actuator_reaches_no_further_than_its_range(bench: Bench) -> None:
+    bench.coolant = -200.0
+    bench.wait_for_more(10)
+    status = bench.ros.wait_for_status(STATUS, lambda s: float(value(s, 'coolant [degC]')) < 26.0)
+    assert float(value(status, 'coolant [degC]')) == pytest.approx(-20.0)
+
+
+def test_reset_returns_to_the_initial_temperature(ros: Workbench) -> None:
+    bench = Bench(ros, initial_temperature_offset=2.0, sample_period=0.1)
+    bench.coolant = 10.0
+    bench.wait_for(lambda celsius: celsius < 45.0)
+    initial, before = bench.measured[0].temperature, len(bench.measured)
+    response = ros.trigger('plant/reset')
+    assert response.success
+    assert response.message == (
+        f'reset to {initial:.3f} degC with coolant at {NOMINAL_COOLANT:.3f} degC')
+
+    def after_reset() -> Temperature | None:
+        return next((m for m in bench.measured[before:] if m.temperature > 45.0), None)
+
+    assert ros.wait_until(after_reset).temperature == pytest.approx(initial, abs=0.15)
+    stamps = [seconds(message) for message in bench.measured]
+    assert stamps == pytest.approx([1.0 + 0.1 * k for k in range(len(stamps))])
+
+
+def test_runaway_stops_the_plant_and_reset_recovers_it(bench: Bench) -> None:
+    bench.coolant = 40.0
+    status = bench.ros.wait_for_status(STATUS, lambda s: s.level == DiagnosticStatus.ERROR)
+    assert status.message.startswith('stopped: ')
+    assert status.message.endswith('; call ~/reset')
+    bench.coolant = NOMINAL_COOLANT
+    assert bench.ros.trigger('plant/reset').success
+    bench.wait_for(lambda celsius: celsius < 55.0)
+    for message in bench.wait_for_more(50):
+        assert message.temperature == pytest.approx(bench.measured[0].temperature, abs=0.01)
+    bench.ros.wait_for_status(STATUS, lambda s: s.level == DiagnosticStatus.OK)
+
+
+# Parameters.
+
+
+def test_heat_transfer_changes_while_it_runs(bench: Bench) -> None:
+    steady = bench.wait_for_more(1)[0].temperature
+    (result,) = bench.ros.set_parameters('plant', heat_transfer_coefficient=48000.0)
+    assert result.successful, result.reason
+    bench.wait_for(lambda celsius: celsius > steady + 0.5)
+
+
+def test_feed_temperature_changes_while_it_runs(bench: Bench) -> None:
+    steady = bench.wait_for_more(1)[0].temperature
+    (result,) = bench.ros.set_parameters('plant', feed_temperature=75.0)
+    assert result.successful, result.reason
+    bench.wait_for(lambda celsius: celsius < steady - 0.5)
+    assert bench.ros.get_parameters('plant', 'feed_temperature') == [75.0]
+
+
+def test_what_is_fixed_at_start_is_refused(bench: Bench) -> None:
+    (result,) = bench.ros.set_parameters('plant', speed=2.0)
+    assert not result.successful
+    assert 'read-only parameter: speed' in result.reason
+
+
+def test_start_without_a_steady_state_says_so(ros: Workbench) -> None:
+    heard = ros.listen(Temperature, topics.TEMPERATURE)
+    process = ros.start('plant', {'heat_transfer_coefficient': 0.0})
+    ros.wait_until(lambda: heard)
+    assert heard[0].temperature == pytest.approx(51.7, abs=1.0)
+    assert 'the plant starts at' in process.output()

@@ -1,0 +1,213 @@
+# Copyright 2026 The koopman_ros Authors
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""Life of the processes: clean ends, bad starts in one line, imports, and how they are kept."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+import os
+from pathlib import Path
+import signal
+import sys
+
+from koopman_ros.demo import processes
+from koopman_ros.demo.processes import isolated_domain, NodeProcess
+from koopman_ros.nodes.shipped import model_path
+import pytest
+from sensor_msgs.msg import Temperature
+from workbench import temperature, Workbench
+
+# Ends.
+
+
+@pytest.mark.parametrize('number', [signal.SIGINT, signal.SIGTERM])
+@pytest.mark.parametrize('name', ['plant', 'controller', 'trainer'])
+def test_signal_ends_a_node_cleanly(ros: Workbench, tmp_path: Path, name: str, number: int
+                                    ) -> None:
+    # the plant is in the middle of a callback whenever the signal comes
+    parameters = {'plant': {'speed': 0.0}, 'controller': {},
+                  'trainer': {'output': tmp_path / 'bag'}}[name]
+    process = ros.start(name, parameters)
+    ros.meet(name)
+    assert process.stop(number) == 0
+    assert 'Traceback' not in process.output()
+
+
+@pytest.mark.parametrize('number', [signal.SIGINT, signal.SIGTERM])
+def test_signal_during_the_start_ends_a_node_cleanly(ros: Workbench, number: int) -> None:
+    program = (
+        'import os, sys\n'
+        'from koopman_ros.nodes.plant import PlantNode\n'
+        'from koopman_ros.nodes.process import run\n'
+        'def create():\n'
+        f'    os.kill(os.getpid(), {int(number)})\n'
+        '    return PlantNode()\n'
+        'sys.exit(run("plant", create))\n')
+    process = ros.start('plant', command=(sys.executable, '-c', program))
+    assert ros.wait_for_end(process) == 0
+    assert process.output() == ''
+
+
+# Bad starts.
+
+
+@dataclass(frozen=True)
+class BadStart:
+    """A node, the text of its parameter file, and the words that name what is wrong."""
+
+    node: str
+    text: str | None
+    words: str
+
+
+def _parameters(node: str, text: str) -> str:
+    return f'/**/{node}:\n  ros__parameters:\n    {text}\n'
+
+
+BAD_STARTS = {
+    'missing file': BadStart('plant', None, 'Error opening YAML file'),
+    'not YAML': BadStart('plant', 'plant: [1, 2\n foo: : bar\n', "Couldn't parse params file"),
+    'no parameters in it': BadStart(
+        'trainer', '/**:\n  speed: 1.0\n', 'Cannot have a value before ros__parameters'),
+    'unknown name': BadStart(
+        'plant', _parameters('plant', 'sped: 1.0'),
+        "there is no parameter 'sped': did you mean speed?"),
+    'another type': BadStart(
+        'plant', _parameters('plant', 'speed: 1'), 'speed = 1 must be a double, e.g. 1.0'),
+    'out of range': BadStart(
+        'controller', _parameters('controller', 'coolant_max: 500.0'),
+        'coolant_max = 500.0 degC must be in [-50, 150] degC'),
+    'not a number': BadStart(
+        'controller', _parameters('controller', 'coolant_weight: .nan'),
+        'coolant_weight = nan 1/K^2 must be in (0, 1000000] 1/K^2'),
+    'no such choice': BadStart(
+        'trainer', _parameters('trainer', 'compression: gzip'),
+        "compression = 'gzip' must be one of none, zstd, lz4"),
+    'limits crossed': BadStart(
+        'plant', _parameters('plant', 'coolant_min: 120.0'),
+        'coolant_min = 120.0 degC must be below coolant_max = 100.0 degC'),
+    'no topics': BadStart(
+        'trainer', _parameters('trainer', "topics: ['']"), 'must hold at least one name'),
+    'missing model': BadStart(
+        'controller', _parameters('controller', 'model: /nowhere/lift.safetensors'),
+        '/nowhere/lift.safetensors'),
+    'truncated model': BadStart(
+        'controller', _parameters('controller', 'model: {folder}/cut.safetensors'),
+        'cut.safetensors'),
+}
+
+
+@pytest.fixture(scope='module')
+def bad_starts(tmp_path_factory: pytest.TempPathFactory) -> Iterator[dict[str, NodeProcess]]:
+    """Start a node in each of the bad ways, all at once."""
+    folder = tmp_path_factory.mktemp('bad_starts')
+    whole = model_path('reactor_nz4').read_bytes()
+    (folder / 'cut.safetensors').write_bytes(whole[:len(whole) // 2])
+    with isolated_domain() as environment:
+        started = {}
+        for name, case in BAD_STARTS.items():
+            file = folder / f'{name}.yaml'
+            if case.text is not None:
+                file.write_text(case.text.replace('{folder}', str(folder)))
+            started[name] = NodeProcess(case.node, {}, folder / f'{name}.log', environment,
+                                        ('--params-file', str(file)))
+        yield started
+        for process in started.values():
+            process.stop(signal.SIGKILL)
+
+
+@pytest.mark.parametrize('name', BAD_STARTS)
+def test_bad_start_says_why_in_one_line(bad_starts: dict[str, NodeProcess], name: str) -> None:
+    process, case = bad_starts[name], BAD_STARTS[name]
+    assert process.process.wait(30.0) == 1
+    (line,) = process.output().splitlines()
+    assert line.startswith(f'{case.node}: cannot start: ')
+    assert case.words in line
+
+
+# What they import.
+
+
+@pytest.mark.parametrize('name', ['plant', 'controller'])
+def test_runs_where_torch_cannot_be_imported(ros: Workbench, name: str) -> None:
+    program = (
+        'import sys\n'
+        'class NoTorch:\n'
+        '    def find_spec(self, name, path=None, target=None):\n'
+        '        if name.split(".")[0] == "torch":\n'
+        '            raise AssertionError("torch is imported")\n'
+        'sys.meta_path.insert(0, NoTorch())\n'
+        f'from koopman_ros.nodes.{name} import main\n'
+        'sys.exit(main())\n')
+    parameters = {'sample_period': 0.05} if name == 'plant' else {}
+    process = ros.start(name, parameters, command=(sys.executable, '-c', program))
+    if name == 'controller':
+        commands = ros.listen(Temperature, 'coolant_setpoint')
+        ros.speak(Temperature, 'temperature', to='controller').publish(temperature(51.0, 1.0))
+        ros.wait_until(lambda: commands)
+    else:
+        measurements = ros.listen(Temperature, 'temperature')
+        ros.wait_until(lambda: measurements)
+    assert process.stop() == 0
+
+
+# How they are kept.
+
+
+def test_two_reservations_are_two_domains() -> None:
+    with isolated_domain() as first, isolated_domain() as second:
+        assert first['ROS_DOMAIN_ID'] != second['ROS_DOMAIN_ID']
+        assert first['ROS_AUTOMATIC_DISCOVERY_RANGE'] == 'LOCALHOST'
+
+
+def test_reservation_ends_with_its_context() -> None:
+    with isolated_domain() as first:
+        pass
+    with isolated_domain() as again:
+        assert again['ROS_DOMAIN_ID'] == first['ROS_DOMAIN_ID']
+
+
+def test_environment_of_the_reservation_holds_here_too(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv('ROS_DOMAIN_ID', '7')
+    monkeypatch.delenv('FASTDDS_BUILTIN_TRANSPORTS', raising=False)
+    with isolated_domain() as environment:
+        assert environment.items() <= os.environ.items()
+    assert os.environ['ROS_DOMAIN_ID'] == '7'
+    assert 'FASTDDS_BUILTIN_TRANSPORTS' not in os.environ
+
+
+def test_process_that_ignores_signals_is_killed(
+        tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(processes, 'STOP_TIMEOUT', 0.2)
+    program = ('import signal, time\n'
+               'for number in (signal.SIGINT, signal.SIGTERM):\n'
+               '    signal.signal(number, signal.SIG_IGN)\n'
+               'print("ignoring", flush=True)\n'
+               'time.sleep(60)\n')
+    process = NodeProcess('stubborn', {}, tmp_path / 'log', {},
+                          command=(sys.executable, '-c', program))
+    while 'ignoring' not in process.output():
+        assert process.running
+    assert process.stop() == -signal.SIGKILL
+    assert not process.running
+
+
+def test_process_ends_with_its_context_when_a_test_fails(tmp_path: Path) -> None:
+    with (pytest.raises(ZeroDivisionError),
+          NodeProcess('sleeper', {}, tmp_path / 'log', {},
+                      command=(sys.executable, '-c', 'import time; time.sleep(60)')) as process):
+        raise ZeroDivisionError
+    assert not process.running

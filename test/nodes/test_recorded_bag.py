@@ -1,0 +1,118 @@
+# Copyright 2026 The koopman_ros Authors
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""The bag of a closed loop, opened with readers that are not ours."""
+
+from __future__ import annotations
+
+from collections import Counter
+from pathlib import Path
+import re
+from typing import Any
+
+from koopman_ros.demo.loop import run_loop, Scenario
+from koopman_ros.nodes import topics
+from mcap.reader import make_reader
+from mcap_ros2.decoder import DecoderFactory
+import pytest
+from rosbags.highlevel import AnyReader
+from rosbags.rosbag2 import Reader
+from workbench import Workbench
+import yaml
+
+SAMPLES = 61
+SETPOINT = 315.15  # K
+TOPICS = {'/temperature', '/setpoint', '/active_setpoint', '/coolant_setpoint', '/diagnostics'}
+
+
+@pytest.fixture(scope='module')
+def bag(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Record a minute of a closed loop with a set-point step at 20 s."""
+    folder = tmp_path_factory.mktemp('recorded')
+    run_loop(Scenario('reactor_nz4', SETPOINT, step_time=20.0, duration=SAMPLES - 1.0),
+             folder / 'loop.mcap', folder)
+    return folder / 'loop.mcap'
+
+
+def stamps(messages: list[Any]) -> list[int]:
+    return [message.header.stamp.sec for message in messages]
+
+
+def test_mcap_finds_every_measurement_and_command(bag: Path) -> None:
+    heard: dict[str, list[Any]] = {topic: [] for topic in TOPICS}
+    with bag.open('rb') as stream:
+        reader = make_reader(stream, validate_crcs=True, decoder_factories=[DecoderFactory()])
+        for entry in reader.iter_decoded_messages():
+            heard[entry.channel.topic].append(entry.decoded_message)
+    assert stamps(heard['/temperature']) == list(range(1, SAMPLES + 1))
+    assert stamps(heard['/coolant_setpoint']) == list(range(1, SAMPLES + 1))
+    assert [m.temperature for m in heard['/setpoint']] == pytest.approx([SETPOINT - 273.15])
+    assert heard['/active_setpoint'][-1].temperature == pytest.approx(SETPOINT - 273.15)
+    assert stamps(heard['/active_setpoint']) == [1, 21]
+    names = {status.name for array in heard['/diagnostics'] for status in array.status}
+    assert names == {'plant: simulation', 'controller: control', 'trainer: recording'}
+
+
+def test_rosbags_finds_and_decodes_the_same(bag: Path) -> None:
+    with AnyReader([bag]) as reader:
+        assert {connection.topic for connection in reader.connections} == TOPICS
+        decoded = [(c.topic, reader.deserialize(data, c.msgtype))
+                   for c, _, data in reader.messages()]
+    counts = Counter(topic for topic, _ in decoded)
+    assert counts['/temperature'] == counts['/coolant_setpoint'] == SAMPLES
+    assert [m.header.stamp.sec for topic, m in decoded if topic == '/temperature'] == list(
+        range(1, SAMPLES + 1))
+
+
+def test_type_hashes_are_those_of_ros(ros: Workbench, bag: Path) -> None:
+    with bag.open('rb') as stream:
+        channels = make_reader(stream).get_summary().channels.values()
+        stored = {channel.topic: channel.metadata['topic_type_hash'] for channel in channels}
+    assert set(stored) == TOPICS
+    for topic, found in stored.items():
+        kind = topics.TYPES.get(topic) or topics.TYPES[topic.removeprefix('/')]
+        ros.node.create_publisher(kind, topic, 1)
+        (info, *_) = ros.node.get_publishers_info_by_topic(topic)
+        assert found == str(info.topic_type_hash)
+        assert re.fullmatch('RIHS01_[0-9a-f]{64}', found)
+
+
+def test_offered_qos_is_kept(bag: Path) -> None:
+    with bag.open('rb') as stream:
+        channels = make_reader(stream).get_summary().channels.values()
+        offered = {channel.topic: yaml.safe_load(channel.metadata['offered_qos_profiles'])
+                   for channel in channels}
+    for topic, profiles in offered.items():
+        latched = topic == '/active_setpoint'
+        assert profiles
+        for profile in profiles:
+            assert profile['reliability'] == 'reliable'
+            assert profile['durability'] == ('transient_local' if latched else 'volatile')
+    with Reader(bag) as reader:
+        parsed = {c.topic: c.ext.offered_qos_profiles for c in reader.connections}
+    assert {p.durability.name.lower() for p in parsed['/active_setpoint']} == {'transient_local'}
+
+
+def test_bare_file_describes_itself_as_rosbag2_does(bag: Path) -> None:
+    with bag.open('rb') as stream:
+        # as rosbag2 does, at the start and again, with the counts, at the end
+        *_, record = (r for r in make_reader(stream).iter_metadata() if r.name == 'rosbag2')
+        information = yaml.safe_load(record.metadata['serialized_metadata'])
+    information = information.get('rosbag2_bagfile_information', information)
+    assert information['storage_identifier'] == 'mcap'
+    counts = {entry['topic_metadata']['name']: entry['message_count']
+              for entry in information['topics_with_message_count']}
+    assert set(counts) == TOPICS
+    assert counts['/temperature'] == SAMPLES
+    assert information['message_count'] == sum(counts.values())

@@ -1,0 +1,205 @@
+# Copyright 2026 The koopman_ros Authors
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""The trainer as a process: what it records, how it starts and stops, and how the bag ends."""
+
+from __future__ import annotations
+
+from pathlib import Path
+import signal
+from typing import Any
+
+from koopman_ros.bags import BagMessage, read_messages, summary
+from koopman_ros.demo.processes import NodeProcess
+from koopman_ros.nodes import topics
+import pytest
+from rclpy.publisher import Publisher
+from rclpy.qos import QoSProfile, ReliabilityPolicy
+from sensor_msgs.msg import Temperature
+from std_msgs.msg import String
+from workbench import seconds, temperature, Workbench
+
+DEEP = QoSProfile(depth=1000)
+BEST_EFFORT = QoSProfile(depth=1000, reliability=ReliabilityPolicy.BEST_EFFORT)
+
+
+def recorded(bag: Path, topic: str = '/temperature') -> list[BagMessage]:
+    """Return the messages of a topic, of a bag that was closed."""
+    assert summary(bag).complete
+    return list(read_messages(bag, [topic]))
+
+
+def say(ros: Workbench, publisher: Publisher, count: int, first: int = 0, to: str = 'trainer'
+        ) -> None:
+    """Publish a burst of numbered temperatures and wait until the trainer has received it."""
+    for k in range(first, first + count):
+        publisher.publish(temperature(float(k), float(k)))
+    # it comes through the same socket, later
+    ros.meet(to)
+
+
+def values(messages: list[Any]) -> list[float]:
+    return [entry.message.temperature for entry in messages]
+
+
+def test_loses_nothing_at_100_hz(ros: Workbench, tmp_path: Path) -> None:
+    bag = tmp_path / 'run.mcap'
+    trainer = ros.start('trainer', {'output': bag})
+    received = ros.listen(Temperature, topics.TEMPERATURE, raw=True)
+    publisher = ros.speak(Temperature, topics.TEMPERATURE, to='trainer', subscribers=2)
+    sent: list[float] = []
+
+    def tick() -> None:
+        if len(sent) < 500:
+            sent.append(len(sent) / 7.0)
+            publisher.publish(temperature(sent[-1], len(sent) / 100.0))
+
+    ros.node.create_timer(0.01, tick)
+    ros.wait_until(lambda: len(received) == 500)
+    ros.meet('trainer')
+    assert trainer.stop() == 0
+    messages = recorded(bag)
+    assert values(messages) == sent
+    assert [seconds(entry.message) for entry in messages] == [k / 100 for k in range(1, 501)]
+    assert [entry.data for entry in messages] == received
+    logged = [entry.log_time_ns for entry in messages]
+    assert logged == sorted(logged)
+    assert all(entry.publish_time_ns <= entry.log_time_ns for entry in messages)
+
+
+@pytest.mark.parametrize('number', [signal.SIGINT, signal.SIGTERM])
+@pytest.mark.parametrize('name', ['run', 'run.mcap'])
+def test_signal_completes_the_bag_with_all_that_arrived(
+        ros: Workbench, tmp_path: Path, number: int, name: str) -> None:
+    trainer = ros.start('trainer', {'output': tmp_path / name})
+    publisher = ros.speak(Temperature, topics.TEMPERATURE, DEEP, to='trainer')
+    say(ros, publisher, 250)
+    assert trainer.stop(number) == 0
+    assert values(recorded(tmp_path / name)) == list(range(250))
+    assert (tmp_path / 'run' / 'metadata.yaml').exists() == (name == 'run')
+
+
+def test_recording_stops_and_starts_by_service(ros: Workbench, tmp_path: Path) -> None:
+    trainer = ros.start('trainer', {'output': tmp_path / 'first.mcap'})
+    publisher = ros.speak(Temperature, topics.TEMPERATURE, DEEP, to='trainer')
+    say(ros, publisher, 250)
+    response = ros.set_bool('trainer/record', False)
+    assert response.success, response.message
+    assert 'first.mcap' in response.message
+    assert values(recorded(tmp_path / 'first.mcap')) == list(range(250))
+    ros.wait_until(lambda: publisher.get_subscription_count() == 0)
+    say(ros, publisher, 10, first=250)
+
+    (result,) = ros.set_parameters('trainer', output=str(tmp_path / 'second'))
+    assert result.successful, result.reason
+    assert ros.set_bool('trainer/record', True).success
+    ros.wait_until(publisher.get_subscription_count)
+    ros.meet('trainer')
+    say(ros, publisher, 10, first=1000)
+    assert trainer.stop() == 0
+    assert values(recorded(tmp_path / 'second')) == list(range(1000, 1010))
+
+
+def test_starts_without_recording_on_request(ros: Workbench, tmp_path: Path) -> None:
+    ros.start('trainer', {'output': tmp_path / 'run.mcap', 'record_at_start': False})
+    status = ros.wait_for_status('trainer: recording', lambda _: True)
+    assert status.message == 'not recording'
+    assert not (tmp_path / 'run.mcap').exists()
+    response = ros.set_bool('trainer/record', False)
+    assert (response.success, response.message) == (False, 'not recording')
+    assert ros.set_bool('trainer/record', True).success
+    response = ros.set_bool('trainer/record', True)
+    assert (response.success, response.message) == (False, 'already recording')
+
+
+def test_running_trainer_refuses_to_overwrite(ros: Workbench, tmp_path: Path) -> None:
+    bag = tmp_path / 'run.mcap'
+    ros.start('trainer', {'output': bag})
+    assert ros.set_bool('trainer/record', False).success
+    before = bag.read_bytes()
+    response = ros.set_bool('trainer/record', True)
+    assert not response.success
+    assert 'run.mcap' in response.message
+    assert bag.read_bytes() == before
+
+
+@pytest.mark.parametrize('name', ['run', 'run.mcap'])
+def test_does_not_start_over_an_existing_recording(ros: Workbench, tmp_path: Path, name: str
+                                                   ) -> None:
+    bag = tmp_path / name
+    if name == 'run':
+        bag.mkdir()
+        (bag / 'note').write_text('precious')
+    else:
+        bag.write_text('precious')
+    trainer = ros.start('trainer', {'output': bag})
+    assert ros.wait_for_end(trainer) == 1
+    (line,) = trainer.output().splitlines()
+    assert line.startswith('trainer: cannot start: cannot record: ')
+    assert str(bag) in line
+    assert (bag / 'note' if name == 'run' else bag).read_text() == 'precious'
+
+
+def test_topic_outside_the_loop_is_recorded_by_name(ros: Workbench, tmp_path: Path) -> None:
+    bag = tmp_path / 'run.mcap'
+    trainer = ros.start('trainer', {'output': bag, 'topics': ['temperature', 'notes']})
+    notes = ros.speak(String, 'notes', to='trainer')
+    said = [f'note {k}: 51.8 °C' for k in range(10)]
+    for note in said:
+        notes.publish(String(data=note))
+    ros.meet('trainer')
+    assert trainer.stop() == 0
+    messages = recorded(bag, '/notes')
+    assert [entry.message.data for entry in messages] == said
+    assert {entry.type_name for entry in messages} == {'std_msgs/msg/String'}
+
+
+def test_best_effort_publisher_is_recorded(ros: Workbench, tmp_path: Path) -> None:
+    bag = tmp_path / 'run.mcap'
+    trainer = ros.start('trainer', {'output': bag})
+    received = ros.listen(Temperature, topics.TEMPERATURE, BEST_EFFORT)
+    publisher = ros.speak(
+        Temperature, topics.TEMPERATURE, BEST_EFFORT, to='trainer', subscribers=2)
+    for k in range(20):
+        publisher.publish(temperature(float(k)))
+        ros.wait_until(lambda k=k: len(received) > k)
+    assert _stop_after(ros, trainer, bag, 20) == 0
+    assert values(recorded(bag)) == list(range(20))
+
+
+def _stop_after(ros: Workbench, trainer: NodeProcess, bag: Path, count: int) -> int:
+    """Stop once so many messages are in the bag, which is flushed twice a second."""
+    ros.wait_until(lambda: summary(bag).message_count >= count)
+    return trainer.stop()
+
+
+def test_records_in_its_namespace(ros: Workbench, tmp_path: Path) -> None:
+    bag = tmp_path / 'run.mcap'
+    trainer = ros.start('trainer', {'output': bag}, ('-r', '__ns:=/unit_1'))
+    publisher = ros.speak(Temperature, '/unit_1/temperature', to='/unit_1/trainer')
+    say(ros, publisher, 5, to='/unit_1/trainer')
+    assert trainer.stop() == 0
+    assert values(recorded(bag, '/unit_1/temperature')) == list(range(5))
+
+
+def test_killed_trainer_leaves_what_it_flushed(ros: Workbench, tmp_path: Path) -> None:
+    bag = tmp_path / 'run.mcap'
+    trainer = ros.start('trainer', {'output': bag})
+    publisher = ros.speak(Temperature, topics.TEMPERATURE, to='trainer')
+    say(ros, publisher, 100)
+    assert ros.wait_until(lambda: bag.exists() and summary(bag).counts.get('/temperature') == 100)
+    assert trainer.stop(signal.SIGKILL) == -signal.SIGKILL
+    assert not summary(bag).complete
+    messages = list(read_messages(bag, ['/temperature'], recover=True))
+    assert values(messages) == list(range(100))
