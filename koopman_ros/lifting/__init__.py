@@ -15,24 +15,21 @@
 """
 How a lift is learned and used; imports nothing of ours.
 
-Listed here is the run-time part, in numpy alone. Training needs torch and is imported by name:
-``koopman_ros.lifting.training`` and ``koopman_ros.lifting.growth``.
+Listed here is the run-time part, in numpy alone, which a controller loads. What it does not need
+is imported by name: ``koopman_ros.lifting.validation`` (scipy's integrators) and
+``koopman_ros.lifting.training`` and ``.growth`` (torch).
 """
 
 from koopman_ros.lifting.artefact import load, ModelFileError, save
 from koopman_ros.lifting.linearisation import linearised_model
 from koopman_ros.lifting.model import Coordinates, LiftedModel, Provenance
-from koopman_ros.lifting.validation import Fit, fit, roll_out
 
 __all__ = [
     'Coordinates',
-    'Fit',
     'LiftedModel',
     'ModelFileError',
     'Provenance',
-    'fit',
     'linearised_model',
     'load',
-    'roll_out',
     'save',
 ]

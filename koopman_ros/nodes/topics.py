@@ -44,8 +44,8 @@ TYPES = {
 }
 
 # Every message of the loop counts: reliable, with room for a receiver that falls behind while
-# the plant runs hundreds of times faster than real time.
-LOOP_QOS = QoSProfile(depth=100)
+# the plant runs hundreds of times faster than real time, or is not found by all yet.
+LOOP_QOS = QoSProfile(depth=1000)
 # A late joiner learns what is tracked (REP 2003 leaves latching to the publisher).
 LATCHED_QOS = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
 CLOCK_QOS = QoSProfile(depth=1, reliability=ReliabilityPolicy.BEST_EFFORT)

@@ -26,15 +26,10 @@ from dataclasses import replace
 from pathlib import Path
 import sys
 
-from koopman_ros.lifting import (
-    LiftedModel,
-    linearised_model,
-    Provenance,
-    roll_out,
-    save,
-)
+from koopman_ros.lifting import LiftedModel, linearised_model, Provenance, save
 from koopman_ros.lifting.growth import Recipe
 from koopman_ros.lifting.training import Plant, Samples, train, Trained
+from koopman_ros.lifting.validation import roll_out
 from koopman_ros.plants import (
     ControlAffineSystem,
     one_state_reactor,

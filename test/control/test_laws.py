@@ -38,7 +38,8 @@ from koopman_ros.control import (
     steady_state_target,
     Weights,
 )
-from koopman_ros.lifting import Coordinates, fit, LiftedModel, linearised_model, Provenance
+from koopman_ros.lifting import Coordinates, LiftedModel, linearised_model, Provenance
+from koopman_ros.lifting.validation import fit
 from koopman_ros.plants import equilibrium, two_state_example, two_state_reactor
 import numpy as np
 import pytest

@@ -16,7 +16,8 @@
 
 from pathlib import Path
 
-from koopman_ros.lifting import fit, load, roll_out
+from koopman_ros.lifting import load
+from koopman_ros.lifting.validation import fit, roll_out
 from koopman_ros.plants import (
     one_state_reactor,
     random_steps,

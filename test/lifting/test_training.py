@@ -17,7 +17,7 @@
 from dataclasses import replace
 import math
 
-from koopman_ros.lifting import fit
+from koopman_ros.lifting.validation import fit
 import numpy as np
 import pytest
 

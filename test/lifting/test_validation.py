@@ -16,7 +16,8 @@
 
 from dataclasses import replace
 
-from koopman_ros.lifting import Coordinates, fit, LiftedModel, linearised_model, roll_out
+from koopman_ros.lifting import Coordinates, LiftedModel, linearised_model
+from koopman_ros.lifting.validation import fit, roll_out
 import numpy as np
 import pytest
 from random_lifts import coordinates, random_lift

@@ -24,13 +24,13 @@ from koopman_ros.bags import BagMessage, read_messages, summary
 from koopman_ros.demo.processes import NodeProcess
 from koopman_ros.nodes import topics
 import pytest
+from rclpy.duration import Duration
 from rclpy.publisher import Publisher
 from rclpy.qos import QoSProfile, ReliabilityPolicy
 from sensor_msgs.msg import Temperature
 from std_msgs.msg import String
-from workbench import seconds, temperature, Workbench
+from workbench import seconds, temperature, TIMEOUT, Workbench
 
-DEEP = QoSProfile(depth=1000)
 BEST_EFFORT = QoSProfile(depth=1000, reliability=ReliabilityPolicy.BEST_EFFORT)
 
 
@@ -40,13 +40,11 @@ def recorded(bag: Path, topic: str = '/temperature') -> list[BagMessage]:
     return list(read_messages(bag, [topic]))
 
 
-def say(ros: Workbench, publisher: Publisher, count: int, first: int = 0, to: str = 'trainer'
-        ) -> None:
+def say(publisher: Publisher, count: int, first: int = 0) -> None:
     """Publish a burst of numbered temperatures and wait until the trainer has received it."""
     for k in range(first, first + count):
         publisher.publish(temperature(float(k), float(k)))
-    # it comes through the same socket, later
-    ros.meet(to)
+    assert publisher.wait_for_all_acked(Duration(seconds=TIMEOUT))
 
 
 def values(messages: list[Any]) -> list[float]:
@@ -67,7 +65,7 @@ def test_loses_nothing_at_100_hz(ros: Workbench, tmp_path: Path) -> None:
 
     ros.node.create_timer(0.01, tick)
     ros.wait_until(lambda: len(received) == 500)
-    ros.meet('trainer')
+    assert publisher.wait_for_all_acked(Duration(seconds=TIMEOUT))
     assert trainer.stop() == 0
     messages = recorded(bag)
     assert values(messages) == sent
@@ -83,30 +81,30 @@ def test_loses_nothing_at_100_hz(ros: Workbench, tmp_path: Path) -> None:
 def test_signal_completes_the_bag_with_all_that_arrived(
         ros: Workbench, tmp_path: Path, number: int, name: str) -> None:
     trainer = ros.start('trainer', {'output': tmp_path / name})
-    publisher = ros.speak(Temperature, topics.TEMPERATURE, DEEP, to='trainer')
-    say(ros, publisher, 250)
+    publisher = ros.speak(Temperature, topics.TEMPERATURE, to='trainer')
+    say(publisher, 900)
     assert trainer.stop(number) == 0
-    assert values(recorded(tmp_path / name)) == list(range(250))
+    assert values(recorded(tmp_path / name)) == list(range(900))
     assert (tmp_path / 'run' / 'metadata.yaml').exists() == (name == 'run')
 
 
 def test_recording_stops_and_starts_by_service(ros: Workbench, tmp_path: Path) -> None:
     trainer = ros.start('trainer', {'output': tmp_path / 'first.mcap'})
-    publisher = ros.speak(Temperature, topics.TEMPERATURE, DEEP, to='trainer')
-    say(ros, publisher, 250)
+    publisher = ros.speak(Temperature, topics.TEMPERATURE, to='trainer')
+    say(publisher, 900)
     response = ros.set_bool('trainer/record', False)
     assert response.success, response.message
     assert 'first.mcap' in response.message
-    assert values(recorded(tmp_path / 'first.mcap')) == list(range(250))
+    assert values(recorded(tmp_path / 'first.mcap')) == list(range(900))
     ros.wait_until(lambda: publisher.get_subscription_count() == 0)
-    say(ros, publisher, 10, first=250)
+    say(publisher, 10, first=900)
 
     (result,) = ros.set_parameters('trainer', output=str(tmp_path / 'second'))
     assert result.successful, result.reason
     assert ros.set_bool('trainer/record', True).success
     ros.wait_until(publisher.get_subscription_count)
     ros.meet('trainer')
-    say(ros, publisher, 10, first=1000)
+    say(publisher, 10, first=1000)
     assert trainer.stop() == 0
     assert values(recorded(tmp_path / 'second')) == list(range(1000, 1010))
 
@@ -158,7 +156,7 @@ def test_topic_outside_the_loop_is_recorded_by_name(ros: Workbench, tmp_path: Pa
     said = [f'note {k}: 51.8 °C' for k in range(10)]
     for note in said:
         notes.publish(String(data=note))
-    ros.meet('trainer')
+    assert notes.wait_for_all_acked(Duration(seconds=TIMEOUT))
     assert trainer.stop() == 0
     messages = recorded(bag, '/notes')
     assert [entry.message.data for entry in messages] == said
@@ -188,7 +186,7 @@ def test_records_in_its_namespace(ros: Workbench, tmp_path: Path) -> None:
     bag = tmp_path / 'run.mcap'
     trainer = ros.start('trainer', {'output': bag}, ('-r', '__ns:=/unit_1'))
     publisher = ros.speak(Temperature, '/unit_1/temperature', to='/unit_1/trainer')
-    say(ros, publisher, 5, to='/unit_1/trainer')
+    say(publisher, 5)
     assert trainer.stop() == 0
     assert values(recorded(bag, '/unit_1/temperature')) == list(range(5))
 
@@ -197,7 +195,7 @@ def test_killed_trainer_leaves_what_it_flushed(ros: Workbench, tmp_path: Path) -
     bag = tmp_path / 'run.mcap'
     trainer = ros.start('trainer', {'output': bag})
     publisher = ros.speak(Temperature, topics.TEMPERATURE, to='trainer')
-    say(ros, publisher, 100)
+    say(publisher, 100)
     assert ros.wait_until(lambda: bag.exists() and summary(bag).counts.get('/temperature') == 100)
     assert trainer.stop(signal.SIGKILL) == -signal.SIGKILL
     assert not summary(bag).complete

@@ -104,6 +104,7 @@ class Workbench:
         deadline = time.monotonic() + TIMEOUT
         while not (found := condition()):
             assert time.monotonic() < deadline, f'not within {TIMEOUT} s\n{self.printed()}'
+            assert not any(p.process.poll() for p in self.processes), self.printed()
             self._executor.spin_once(timeout_sec=0.05)
         return found
 
