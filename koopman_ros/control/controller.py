@@ -32,6 +32,11 @@ from numpy.typing import NDArray
 Array = NDArray[np.float64]
 
 
+# A measurement earlier than the last by no more than this is out of order; one that is earlier
+# still means that time itself was set back.
+LATE_NANOSECONDS = NANOSECONDS
+
+
 class Mode(Enum):
     """Who commands the input; the value is the word an operator reads."""
 
@@ -57,7 +62,18 @@ class Settings:
     limits: InputLimits
     setpoint_ramp: float = np.inf
     max_gain: float = 1e3
-    max_residual: float = 1e-6
+    max_residual: float = 1e-8
+
+    def __post_init__(self) -> None:
+        if not (np.all(np.isfinite(self.state_weight)) and np.all(self.state_weight >= 0.0)
+                and np.any(self.state_weight > 0.0)):
+            raise ValueError('state_weight must be finite, at least 0 and not all 0, got '
+                             f'{self.state_weight.tolist()}')
+        if not (np.all(np.isfinite(self.input_weight)) and np.all(self.input_weight > 0.0)):
+            raise ValueError('input_weight must be finite and above 0, got '
+                             f'{self.input_weight.tolist()}')
+        if not self.setpoint_ramp > 0.0:
+            raise ValueError(f'setpoint_ramp must be above 0, got {self.setpoint_ramp}')
 
 
 @dataclass(frozen=True)
@@ -70,6 +86,7 @@ class State:
     :param manual_input: (n_u,) what the operator asked for in manual mode, or None.
     :param time_ns: stamp of the last measurement, or None before the first.
     :param command: (n_u,) last command, or None before the first.
+    :param interval: usual seconds between measurements; infinity before the second.
     """
 
     mode: Mode = Mode.AUTOMATIC
@@ -77,6 +94,7 @@ class State:
     manual_input: Array | None = None
     time_ns: int | None = None
     command: Array | None = None
+    interval: float = np.inf
 
 
 @dataclass(frozen=True)
@@ -93,7 +111,10 @@ class Report:
     :param gain: norm of the Riccati gain; NaN without a law.
     :param at_range: whether the input's range was active.
     :param at_rate: whether the input's rate limit was active.
-    :param clock_went_back: whether the stamp was earlier than the one before.
+    :param clock_went_back: whether the stamp was earlier than the one before, by so much that
+        time starts afresh.
+    :param late: whether the measurement was out of order and the last command repeated.
+    :param clock_stood_still: whether the stamp was the same as the one before.
     """
 
     mode: Mode
@@ -106,6 +127,8 @@ class Report:
     at_range: bool = False
     at_rate: bool = False
     clock_went_back: bool = False
+    late: bool = False
+    clock_stood_still: bool = False
 
 
 @dataclass(frozen=True)
@@ -126,17 +149,18 @@ class Controller:
         return Weights(np.diag(self.settings.state_weight * self.model.states.scale ** 2),
                        np.diag(self.settings.input_weight * self.model.inputs.scale ** 2))
 
-    def request_setpoint(self, state: State, value: Array, effective_ns: int = 0
-                         ) -> tuple[State, str]:
+    def request_setpoint(self, state: State, value: Array, effective_ns: int = 0,
+                         show: setpoints.Show = setpoints.in_state_units) -> tuple[State, str]:
         """
         Ask for a set-point, at once or from a later time on.
 
         :param state: the present state.
         :param value: (n_x,) in state units.
         :param effective_ns: stamp from which it holds; see :func:`setpoint.request`.
+        :param show: how values are written in a reason of refusal.
         :return: the new state with an empty string, or the old one with the reason of refusal.
         """
-        reason = setpoints.refusal(self.model, value)
+        reason = setpoints.refusal(self.model, value, show)
         if reason:
             return state, reason
         if (len(state.setpoint.scheduled) >= setpoints.MAX_SCHEDULED
@@ -144,31 +168,35 @@ class Controller:
             return state, (f'{setpoints.MAX_SCHEDULED} set-points are scheduled already: wait '
                            'until some have taken effect, or send this one with stamp 0')
         return replace(state, setpoint=setpoints.request(
-            state.setpoint, value, effective_ns, state.time_ns)), ''
+            state.setpoint, _kept(value), effective_ns, state.time_ns)), ''
 
     def request_manual_input(self, state: State, value: Array) -> tuple[State, str]:
         """
-        Set the input that manual mode commands.
+        Set the input that manual mode commands; refused in automatic mode.
 
         :param state: the present state.
         :param value: (n_u,) in input units; brought within the limits when commanded.
         :return: as :meth:`request_setpoint`.
         """
+        if state.mode is not Mode.MANUAL:
+            return state, 'manual command refused in automatic mode: switch to manual mode first'
         if not np.all(np.isfinite(value)):
             return state, f'manual command {value.tolist()} is not finite: the old one is kept'
-        return replace(state, manual_input=value), ''
+        return replace(state, manual_input=_kept(value)), ''
 
     def set_mode(self, state: State, mode: Mode) -> State:
         """Hand over between operator and law; manual mode starts from the last command."""
-        return replace(state, mode=mode, manual_input=None)
+        return state if mode is state.mode else replace(state, mode=mode, manual_input=None)
 
     def step(self, state: State, measurement: Array, time_ns: int
              ) -> tuple[State, Array, Report]:
         """
         Answer one measurement.
 
-        A repeated stamp returns the same command again; an earlier stamp starts time afresh.
-        When no law can act, the last command is held, or the nominal input before the first.
+        A repeated stamp and one out of order, earlier by at most a second, return the last
+        command again, within the limits of now; a still earlier stamp starts time afresh. After a gap in the measurements
+        ramp and rate limit count twice the interval before it, not the gap. When no law can act,
+        the last command is held, or the nominal input before the first.
 
         :param state: as returned by the step before.
         :param measurement: (n_x,) measured state, in state units.
@@ -176,11 +204,24 @@ class Controller:
         :return: the new state, the command (n_u,) in input units, always finite and within the
             limits, and the report.
         """
-        back = state.time_ns is not None and time_ns < state.time_ns
+        ahead = 1 if state.time_ns is None else time_ns - state.time_ns
+        if state.command is not None and -LATE_NANOSECONDS <= ahead <= 0:
+            again = limit(self.settings.limits, state.command, state.command, 0.0)
+            return replace(state, command=again.u), again.u, Report(
+                state.mode, active_setpoint=state.setpoint.active, at_range=again.at_range,
+                outside=self.model.states.violation(measurement), late=ahead < 0,
+                clock_stood_still=ahead == 0)
+        back = ahead < 0
         if back:
             # what was scheduled by the old time has lost its meaning
             state = replace(state, time_ns=None, setpoint=replace(state.setpoint, scheduled=()))
-        seconds = 0.0 if state.time_ns is None else (time_ns - state.time_ns) / NANOSECONDS
+        seconds = 0.0 if state.time_ns is None else ahead / NANOSECONDS
+        if seconds > 0.0:
+            # the plant stood under the old command all through a gap
+            seconds = min(seconds, 2.0 * state.interval)
+            # a burst of measurements does not make the next regular one a gap
+            usual = 0.0 if np.isinf(state.interval) else 0.5 * state.interval
+            state = replace(state, interval=max(seconds, usual))
         state = replace(state, time_ns=time_ns)
         if np.all(np.isfinite(measurement)):
             state = replace(state, setpoint=setpoints.advance(
@@ -222,3 +263,10 @@ class Controller:
             return wanted, report
         return held, replace(report, law=None, problem=(
             f'no feedback gain: {law.riccati.status.value}; the last command is held'))
+
+
+def _kept(value: Array) -> Array:
+    """Return a copy that nobody can change."""
+    copy = np.array(value, dtype=np.float64)
+    copy.setflags(write=False)
+    return copy

@@ -91,7 +91,7 @@ def feedback(model: LiftedModel, x: Array, target: Target, weights: Weights, *,
 
 
 def recentred(model: LiftedModel, x: Array, target: Target, weights: Weights, *,
-              max_gain: float = np.inf, max_residual: float = 1e-6) -> Feedback:
+              max_gain: float = 1e6, max_residual: float = 1e-8) -> Feedback:
     """
     Solve the Riccati equation of the lifted error e = N(x) - z_ref.
 
@@ -111,7 +111,7 @@ def recentred(model: LiftedModel, x: Array, target: Target, weights: Weights, *,
 
 
 def projected(model: LiftedModel, x: Array, target: Target, weights: Weights, *,
-              max_gain: float = np.inf, max_residual: float = 1e-6) -> Feedback:
+              max_gain: float = 1e6, max_residual: float = 1e-8) -> Feedback:
     """
     Solve the Riccati equation of the state's error e = x - x_ref under the projected dynamics.
 

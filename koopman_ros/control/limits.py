@@ -38,6 +38,13 @@ class InputLimits:
     upper: Array
     rate: Array
 
+    def __post_init__(self) -> None:
+        if not np.all(self.lower < self.upper):
+            raise ValueError(f'input limits must be lower < upper, got {self.lower.tolist()} and '
+                             f'{self.upper.tolist()}')
+        if not np.all(self.rate > 0.0):
+            raise ValueError(f'input rate must be above 0, got {self.rate.tolist()}')
+
 
 @dataclass(frozen=True)
 class LimitedInput:
@@ -68,8 +75,10 @@ def limit(limits: InputLimits, wanted: Array, previous: Array | None, seconds: f
     """
     within = np.clip(wanted, limits.lower, limits.upper)
     if previous is None:
+        within.setflags(write=False)
         return LimitedInput(within, bool(np.any(within != wanted)), False)
     reach = limits.rate * seconds if seconds > 0.0 else np.zeros_like(limits.rate)
     reached = np.clip(np.clip(within, previous - reach, previous + reach),
                       limits.lower, limits.upper)
+    reached.setflags(write=False)
     return LimitedInput(reached, bool(np.any(within != wanted)), bool(np.any(reached != within)))

@@ -49,7 +49,7 @@ class RiccatiSolution:
 
     :param P: (n, n) symmetric; zeros when there is no stable subspace to take it from.
     :param K: (m, n); zeros likewise.
-    :param residual: Frobenius norm of the equation's left side over that of Q.
+    :param residual: Frobenius norm of the equation's left side over the sum of its terms' norms.
     :param gain: spectral norm of K.
     :param status: whether K may be used.
     """
@@ -67,8 +67,8 @@ def _in_left_half_plane(real: float, imaginary: float) -> bool:
 
 # values so large that something overflows end in a residual or a gain that is refused
 @np.errstate(all='ignore')
-def solve_riccati(A: Array, B: Array, Q: Array, R: Array, *, max_residual: float = 1e-6,
-                  max_gain: float = np.inf) -> RiccatiSolution:
+def solve_riccati(A: Array, B: Array, Q: Array, R: Array, *, max_residual: float = 1e-8,
+                  max_gain: float = 1e6) -> RiccatiSolution:
     """
     Solve the Riccati equation of the infinite-horizon regulator (Laub, 1979).
 
@@ -108,7 +108,10 @@ def solve_riccati(A: Array, B: Array, Q: Array, R: Array, *, max_residual: float
     P = 0.5 * (P + P.T)
     K = R_inverse_Bt @ P
     PA = P @ A
-    residual = float(np.linalg.norm(PA + PA.T - P @ G @ P + Q)) / size_Q
+    PGP = P @ G @ P
+    # the rounding of the sum grows with its terms, so that Q alone would be too strict a measure
+    size = size_Q + 2.0 * float(np.linalg.norm(PA)) + float(np.linalg.norm(PGP))
+    residual = float(np.linalg.norm(PA + PA.T - PGP + Q)) / size
     gain = float(np.linalg.norm(K, 2))
     if not residual <= max_residual:
         status = RiccatiStatus.INACCURATE

@@ -16,6 +16,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 from koopman_ros.lifting import LiftedModel
@@ -46,27 +47,39 @@ class Setpoint:
     scheduled: tuple[tuple[int, Array], ...] = ()
 
 
-def refusal(model: LiftedModel, value: Array) -> str:
+# Words for a state's value in the units of whoever reads them: (value, unit) -> text.
+Show = Callable[[float, str], str]
+
+
+def in_state_units(value: float, unit: str) -> str:
+    """Write a value as it is."""
+    return f'{value:.6g} {unit}'
+
+
+def refusal(model: LiftedModel, value: Array, show: Show = in_state_units) -> str:
     """
     Say why a set-point cannot be tracked, or return an empty string.
 
     :param model: whose training box is the range of set-points.
     :param value: (n_x,) in state units.
+    :param show: how values are written.
     """
     states = model.states
     for i, (name, unit) in enumerate(zip(states.names, states.units, strict=True)):
         if not np.isfinite(value[i]):
-            return f'{name} set-point {value[i]} is not finite: the old one is kept'
+            return f'{name} set-point {value[i]} {unit} is not finite: the old one is kept'
         if not states.lower[i] <= value[i] <= states.upper[i]:
-            return (f'{name} set-point {value[i]:.6g} {unit} is outside the trained range '
-                    f'[{states.lower[i]:.6g}, {states.upper[i]:.6g}] {unit}: the old one is kept; '
-                    'choose one inside, or load a model trained over a wider range')
+            return (f'{name} set-point {show(value[i], unit)} is outside the trained range '
+                    f'{show(states.lower[i], unit)} to {show(states.upper[i], unit)}: the old '
+                    'one is kept; choose one inside, or load a model trained over a wider range')
     return ''
 
 
 def request(setpoint: Setpoint, value: Array, effective_ns: int, now_ns: int | None) -> Setpoint:
     """
     Take over an accepted request, at once or when its time has come.
+
+    A request that holds at once is the operator's last word: it ends every schedule.
 
     :param setpoint: the present state.
     :param value: (n_x,) accepted value, in state units.
@@ -75,7 +88,7 @@ def request(setpoint: Setpoint, value: Array, effective_ns: int, now_ns: int | N
     :param now_ns: time of the last measurement, or None before the first.
     """
     if not lies_ahead(effective_ns, now_ns):
-        return replace(setpoint, requested=value)
+        return replace(setpoint, requested=value, scheduled=())
     # the later request for the same time replaces the earlier one
     kept = [entry for entry in setpoint.scheduled if entry[0] != effective_ns]
     entries = sorted([*kept, (effective_ns, value)], key=lambda entry: entry[0])
@@ -84,8 +97,10 @@ def request(setpoint: Setpoint, value: Array, effective_ns: int, now_ns: int | N
 
 def lies_ahead(effective_ns: int, now_ns: int | None) -> bool:
     """Tell whether a stamp is a schedule: later than the last measurement, by at most an hour."""
-    start = 0 if now_ns is None else now_ns
-    return start < effective_ns <= start + HORIZON_NANOSECONDS
+    if now_ns is None:
+        # nobody knows yet; the first measurement decides
+        return effective_ns > 0
+    return now_ns < effective_ns <= now_ns + HORIZON_NANOSECONDS
 
 
 def advance(setpoint: Setpoint, measured: Array, model: LiftedModel, ramp: float, now_ns: int,
@@ -94,7 +109,7 @@ def advance(setpoint: Setpoint, measured: Array, model: LiftedModel, ramp: float
     Bring the set-point to the present time.
 
     Before the first request the temperature that was first measured is held, so that a
-    controller which starts on a running plant does not disturb it.
+    controller which starts on a running plant asks for no change.
 
     :param setpoint: the present state.
     :param measured: (n_x,) measured state, in state units.
@@ -103,10 +118,10 @@ def advance(setpoint: Setpoint, measured: Array, model: LiftedModel, ramp: float
     :param now_ns: time of the measurement.
     :param seconds: time since the last measurement; 0 at the first.
     """
-    due = [entry for entry in setpoint.scheduled if entry[0] <= now_ns]
+    due = [entry for entry in setpoint.scheduled if not lies_ahead(entry[0], now_ns)]
     if due:
-        setpoint = replace(setpoint, requested=due[-1][1],
-                           scheduled=setpoint.scheduled[len(due):])
+        kept = tuple(entry for entry in setpoint.scheduled if lies_ahead(entry[0], now_ns))
+        setpoint = replace(setpoint, requested=due[-1][1], scheduled=kept)
     held = np.clip(measured, model.states.lower, model.states.upper)
     active = held if setpoint.active is None else setpoint.active
     requested = active if setpoint.requested is None else setpoint.requested

@@ -50,10 +50,11 @@ class ControllerParameters:
         1000.0, 'fastest change of the tracked set-point; a large value makes it a step',
         unit='K/min', minimum=0.0, maximum=1e6, open_minimum=True)
     max_gain: float = parameter(
-        1000.0, 'largest Riccati gain, in scaled coordinates, that is acted on', minimum=0.0,
+        1000.0, 'largest Riccati gain, in scaled coordinates, that is acted on; small weights '
+        'need a large one', minimum=0.0,
         maximum=1e9, open_minimum=True)
     max_riccati_residual: float = parameter(
-        1e-6, 'largest relative Riccati residual that is acted on', minimum=0.0, maximum=1.0,
+        1e-8, 'largest relative Riccati residual that is acted on', minimum=0.0, maximum=1.0,
         open_minimum=True)
 
     def settings(self) -> Settings:

@@ -132,8 +132,13 @@ def test_commands_are_finite_and_within_limits_whatever_is_measured(name, mode):
         elapsed = max(0.0, (time_ns - last_ns) / SECOND)
         # rounded at the size of the command
         assert abs(command[0] - previous[0]) <= RATE * elapsed + 1e-12
-        assert report.clock_went_back is (time_ns < last_ns)
-        assert bool(report.problem) is (not math.isfinite(value))
+        assert report.clock_went_back is (time_ns < last_ns - SECOND)
+        assert report.late is (last_ns - SECOND <= time_ns < last_ns)
+        assert report.clock_stood_still is (time_ns == last_ns)
+        repeated = report.late or report.clock_stood_still
+        assert bool(report.problem) is (not math.isfinite(value) and not repeated)
+        if repeated:
+            np.testing.assert_array_equal(command, previous)
 
 
 def test_a_day_replays_bit_for_bit():
@@ -236,7 +241,28 @@ def test_a_repeated_stamp_repeats_the_command():
         again, repeated, report = loop.step(state, np.array([value]), NOW + SECOND)
         np.testing.assert_array_equal(repeated, command)
         assert again.time_ns == NOW + SECOND
+        assert report.clock_stood_still
         assert not report.clock_went_back
+
+
+def test_a_repeated_stamp_is_within_limits_that_have_changed():
+    loop = controller()
+    state = loop.step(started(loop), np.array([START]), NOW + SECOND)[0]
+    lower = replace(loop, settings=replace(loop.settings, limits=InputLimits(
+        np.array([LOWER]), np.array([290.0]), np.array([RATE]))))
+    assert lower.step(state, np.array([START]), NOW + SECOND)[1] == 290.0
+
+
+@pytest.mark.parametrize('late', [1, SECOND // 2, SECOND])
+def test_a_measurement_out_of_order_changes_nothing(late):
+    loop = controller()
+    state = loop.request_setpoint(started(loop), np.array([306.0]))[0]
+    state, command, _ = loop.step(state, np.array([START]), NOW + 10 * SECOND)
+    state = loop.request_setpoint(state, np.array([310.0]), NOW + 60 * SECOND)[0]
+    again, repeated, report = loop.step(state, np.array([START]), NOW + 10 * SECOND - late)
+    assert report.late
+    assert content(again) == content(state)
+    np.testing.assert_array_equal(repeated, command)
 
 
 def test_an_earlier_stamp_starts_time_afresh():
@@ -263,19 +289,46 @@ def test_an_earlier_stamp_stops_the_ramp_for_one_step():
     np.testing.assert_allclose(active, [START - 2.0, START - 2.1, START - 3.1], rtol=1e-12)
 
 
+@pytest.mark.parametrize(('ramp', 'read', 'per_second'), [
+    (np.inf, lambda command, report: command[0], RATE),
+    (0.1, lambda command, report: report.active_setpoint[0], 0.1),
+], ids=['rate limit', 'ramp'])
+def test_a_gap_in_the_measurements_is_no_licence_to_jump(ramp, read, per_second):
+    loop = controller(setpoint_ramp=ramp)
+    state = loop.request_setpoint(started(loop), np.array([306.0]))[0]
+    values = []
+    # an hour without measurements counts as two of the usual intervals
+    for second in (1, 2, 3, 3600, 3601):
+        state, *outcome = loop.step(state, np.array([START]), NOW + second * SECOND)
+        values.append(read(*outcome))
+    np.testing.assert_allclose(
+        np.diff(values), -per_second * np.array([1.0, 1.0, 2.0, 1.0]), rtol=1e-9)
+
+
+def test_a_burst_of_measurements_does_not_slow_the_next_ones():
+    loop = controller()
+    state = loop.request_setpoint(started(loop), np.array([306.0]))[0]
+    for milliseconds in (1000, 2000, 2001, 3000):
+        before = state.command[0]
+        state, command, _ = loop.step(
+            state, np.array([START]), NOW + milliseconds * SECOND // 1000)
+    assert command[0] == pytest.approx(before - 0.999 * RATE, rel=1e-12)
+
+
 def test_the_rate_limit_counts_elapsed_time():
     loop = controller()
     state = loop.request_setpoint(started(loop), np.array([306.0]))[0]
     expected = float(state.command[0])
     time_ns = NOW
-    for milliseconds in (1000, 250, 3000, 1):
+    for milliseconds in (1000, 250, 1000, 1):
         time_ns += milliseconds * SECOND // 1000
         state, command, report = loop.step(state, np.array([START]), time_ns)
         expected -= RATE * milliseconds / 1000.0
         assert command[0] == pytest.approx(expected, rel=1e-12)
         assert report.at_rate
     # with time enough it ends at the range
-    _, command, report = loop.step(state, np.array([START]), time_ns + 3600 * SECOND)
+    for second in range(1, 60):
+        state, command, report = loop.step(state, np.array([START]), time_ns + second * SECOND)
     assert command[0] == LOWER
     assert report.at_range
     assert not report.at_rate
@@ -330,7 +383,8 @@ def test_manual_commands_are_followed_within_the_limits():
     assert command[0] == pytest.approx(300.0 + RATE, rel=1e-9)
     assert report.at_range
     assert report.at_rate
-    _, command, report = loop.step(state, np.array([START]), NOW + 3600 * SECOND)
+    for second in range(2, 60):
+        state, command, report = loop.step(state, np.array([START]), NOW + second * SECOND)
     assert command[0] == UPPER
     assert report.at_range
 
@@ -435,3 +489,52 @@ def test_a_schedule_does_not_outlive_its_clock():
     state = loop.step(state, np.array([START]), NOW - 100 * SECOND)[0]
     assert state.setpoint.scheduled == ()
     assert loop.step(state, np.array([START]), NOW + 51 * SECOND)[2].active_setpoint == START
+
+
+def test_manual_commands_are_refused_in_automatic_mode():
+    loop = controller()
+    state = started(loop)
+    same, refused = loop.request_manual_input(state, np.array([299.0]))
+    assert same is state
+    assert refused == 'manual command refused in automatic mode: switch to manual mode first'
+
+
+def test_asking_for_the_mode_in_force_changes_nothing():
+    loop = controller()
+    state = loop.set_mode(started(loop), Mode.MANUAL)
+    state = loop.request_manual_input(state, np.array([290.0]))[0]
+    assert loop.set_mode(state, Mode.MANUAL) is state
+
+
+def test_what_a_step_returns_and_takes_cannot_be_changed_afterwards():
+    loop = controller()
+    asked = np.array([312.0])
+    state = loop.request_setpoint(started(loop), asked)[0]
+    asked[0] = 999.0
+    assert state.setpoint.requested[0] == 312.0
+    state, command, _ = loop.step(state, np.array([START]), NOW + SECOND)
+    with pytest.raises(ValueError, match='read-only'):
+        command[0] = 0.0
+    assert state.command[0] == command[0]
+
+
+@pytest.mark.parametrize(('change', 'message'), [
+    ({'state_weight': np.array([0.0])}, r'state_weight must be finite, at least 0 and not all 0'),
+    ({'state_weight': np.array([-1.0])}, 'state_weight must be'),
+    ({'input_weight': np.array([0.0])}, r'input_weight must be finite and above 0, got \[0\.0\]'),
+    ({'input_weight': np.array([np.nan])}, 'input_weight must be'),
+    ({'setpoint_ramp': 0.0}, r'setpoint_ramp must be above 0, got 0\.0'),
+])
+def test_settings_that_make_no_sense_are_refused(change, message):
+    with pytest.raises(ValueError, match=message):
+        replace(controller().settings, **change)
+
+
+@pytest.mark.parametrize(('lower', 'upper', 'rate', 'message'), [
+    (290.0, 280.0, 1.0, r'input limits must be lower < upper, got \[290\.0\] and \[280\.0\]'),
+    (280.0, 290.0, 0.0, r'input rate must be above 0, got \[0\.0\]'),
+    (280.0, 290.0, np.nan, 'input rate must be above 0'),
+])
+def test_limits_that_make_no_sense_are_refused(lower, upper, rate, message):
+    with pytest.raises(ValueError, match=message):
+        InputLimits(np.array([lower]), np.array([upper]), np.array([rate]))

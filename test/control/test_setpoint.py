@@ -49,14 +49,14 @@ def test_the_corners_of_the_box_are_accepted():
 
 
 @pytest.mark.parametrize(('value', 'text'), [
-    (300.0, 'temperature set-point 300 K is outside the trained range [305.696, 326.561] K: the '
-            'old one is kept; choose one inside, or load a model trained over a wider range'),
-    (330.123, 'temperature set-point 330.123 K is outside the trained range [305.696, 326.561] '
-              'K: the old one is kept; choose one inside, or load a model trained over a wider '
-              'range'),
-    (np.nan, 'temperature set-point nan is not finite: the old one is kept'),
-    (np.inf, 'temperature set-point inf is not finite: the old one is kept'),
-    (-np.inf, 'temperature set-point -inf is not finite: the old one is kept'),
+    (300.0, 'temperature set-point 300 K is outside the trained range 305.696 K to 326.561 K: '
+            'the old one is kept; choose one inside, or load a model trained over a wider range'),
+    (330.123, 'temperature set-point 330.123 K is outside the trained range 305.696 K to '
+              '326.561 K: the old one is kept; choose one inside, or load a model trained '
+              'over a wider range'),
+    (np.nan, 'temperature set-point nan K is not finite: the old one is kept'),
+    (np.inf, 'temperature set-point inf K is not finite: the old one is kept'),
+    (-np.inf, 'temperature set-point -inf K is not finite: the old one is kept'),
 ])
 def test_refusals_say_why(value, text):
     assert refusal(MODEL, kelvin(value)) == text
@@ -85,11 +85,13 @@ def test_later_stamps_wait(ahead):
 
 
 @pytest.mark.parametrize(('effective_ns', 'waits'), [
-    (0, False), (SECOND, True), (HORIZON_NANOSECONDS, True), (NOW, False)])
-def test_before_the_first_measurement_time_starts_at_zero(effective_ns, waits):
+    (0, False), (SECOND, False), (NOW, False), (NOW + SECOND, True),
+    (NOW + HORIZON_NANOSECONDS, True), (NOW + HORIZON_NANOSECONDS + 1, False)])
+def test_the_first_measurement_tells_what_lies_ahead(effective_ns, waits):
     setpoint = request(Setpoint(), kelvin(310.0), effective_ns, None)
+    setpoint = moved(setpoint, NOW, measured=320.0, seconds=0.0)
     assert bool(setpoint.scheduled) is waits
-    assert (setpoint.requested is None) is waits
+    np.testing.assert_array_equal(setpoint.requested, [320.0 if waits else 310.0])
 
 
 def test_scheduled_requests_are_kept_in_time_order():
@@ -128,12 +130,12 @@ def test_a_request_waits_to_the_nanosecond():
     np.testing.assert_array_equal(moved(setpoint, NOW + 5).active, [310.0])
 
 
-def test_a_request_at_once_leaves_the_schedule():
+def test_a_request_at_once_ends_the_schedule():
     setpoint = request(Setpoint(), kelvin(310.0), NOW + SECOND, NOW)
     setpoint = request(setpoint, kelvin(316.0), 0, NOW)
-    assert schedule(setpoint) == [(NOW + SECOND, 310.0)]
+    assert schedule(setpoint) == []
     np.testing.assert_array_equal(moved(setpoint, NOW).active, [316.0])
-    np.testing.assert_array_equal(moved(setpoint, NOW + SECOND).active, [310.0])
+    np.testing.assert_array_equal(moved(setpoint, NOW + SECOND).active, [316.0])
 
 
 @pytest.mark.parametrize(('measured', 'held'), [

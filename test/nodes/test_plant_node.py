@@ -286,7 +286,7 @@ def test_what_is_fixed_at_start_is_refused(bench: Bench) -> None:
 
 def test_start_without_a_steady_state_says_so(ros: Workbench) -> None:
     heard = ros.listen(Temperature, topics.TEMPERATURE)
-    process = ros.start('plant', {'heat_transfer_coefficient': 0.0})
+    process = ros.start('plant', {'heat_transfer_coefficient': 0.0, 'sample_period': 0.05})
     ros.wait_until(lambda: heard)
     assert heard[0].temperature == pytest.approx(51.7, abs=1.0)
     assert 'the plant starts at' in process.output()

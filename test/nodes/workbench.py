@@ -75,10 +75,10 @@ class Workbench:
         left = [process for process in self.processes if process.running]
         for process in left:
             process.process.send_signal(signal.SIGINT)
-        codes = {process.log.name: _code(process) for process in left}
         self._executor.shutdown()
         self.node.destroy_node()
         rclpy.shutdown(context=self._context)
+        codes = {process.log.name: _code(process) for process in left}
         if kind is None:
             assert not any(codes.values()), (codes, self.printed())
 
