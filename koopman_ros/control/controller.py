@@ -194,9 +194,9 @@ class Controller:
         Answer one measurement.
 
         A repeated stamp and one out of order, earlier by at most a second, return the last
-        command again, within the limits of now; a still earlier stamp starts time afresh. After a gap in the measurements
-        ramp and rate limit count twice the interval before it, not the gap. When no law can act,
-        the last command is held, or the nominal input before the first.
+        command again, within the limits of now; a still earlier stamp starts time afresh. After
+        a gap in the measurements ramp and rate limit count twice the interval before it, not the
+        gap. When no law can act, the last command is held, or the nominal input before the first.
 
         :param state: as returned by the step before.
         :param measurement: (n_x,) measured state, in state units.

@@ -67,7 +67,7 @@ def refusal(model: LiftedModel, value: Array, show: Show = in_state_units) -> st
     states = model.states
     for i, (name, unit) in enumerate(zip(states.names, states.units, strict=True)):
         if not np.isfinite(value[i]):
-            return f'{name} set-point {value[i]} {unit} is not finite: the old one is kept'
+            return f'{name} set-point {show(value[i], unit)} is not finite: the old one is kept'
         if not states.lower[i] <= value[i] <= states.upper[i]:
             return (f'{name} set-point {show(value[i], unit)} is outside the trained range '
                     f'{show(states.lower[i], unit)} to {show(states.upper[i], unit)}: the old '

@@ -16,7 +16,9 @@
 
 from __future__ import annotations
 
+import math
 import sys
+import time
 
 from koopman_ros.control import Controller, Mode, Report, State
 from koopman_ros.lifting import LiftedModel, load, ModelFileError
@@ -24,6 +26,7 @@ from koopman_ros.nodes import topics
 from koopman_ros.nodes.controller_parameters import ControllerParameters, TABLE
 from koopman_ros.nodes.diagnostics import DiagnosticsPublisher, Level, Status
 from koopman_ros.nodes.messages import (
+    NANOSECONDS,
     stamp_nanoseconds,
     temperature_message,
     to_celsius,
@@ -44,13 +47,16 @@ class ControllerNode(Node):
     def __init__(self) -> None:
         super().__init__('controller', automatically_declare_parameters_from_overrides=True)
         parameters = TABLE.declare(self)
+        self._settings = parameters
         self._model_name = parameters.model
         self._controller = Controller(_load_suitable(parameters.model), parameters.settings())
         self._state = State()
         self._report = Report(Mode.AUTOMATIC)
         self._refused = ''
-        self._measurements = 0
+        self._measurements = self._late = 0
         self._temperature = np.nan
+        self._last_heard = time.monotonic()
+        self._setpoint_received = False
 
         self._commands = self.create_publisher(
             Temperature, topics.COOLANT_SETPOINT, topics.LOOP_QOS)
@@ -80,9 +86,13 @@ class ControllerNode(Node):
     def _on_temperature(self, message: Temperature) -> None:
         self._measurements += 1
         self._temperature = message.temperature
+        self._last_heard = time.monotonic()
+        # below absolute zero there is nothing to measure
+        kelvin = to_kelvin(message.temperature)
         self._state, command, self._report = self._controller.step(
-            self._state, np.array([to_kelvin(message.temperature)]),
+            self._state, np.array([kelvin if kelvin >= 0.0 else math.nan]),
             stamp_nanoseconds(message.header.stamp))
+        self._late += self._report.late
         self._commands.publish(temperature_message(
             float(command[0]), message.header.stamp, message.header.frame_id))
         active = self._report.active_setpoint
@@ -92,17 +102,20 @@ class ControllerNode(Node):
                 float(active[0]), message.header.stamp, message.header.frame_id))
         if self._report.clock_went_back:
             self.get_logger().warning('the measurement is older than the last one: time starts '
-                                      'afresh')
+                                      'afresh', throttle_duration_sec=1.0)
         self._diagnostics.publish_if_changed()
 
     def _on_setpoint(self, message: Temperature) -> None:
+        stamp_ns = stamp_nanoseconds(message.header.stamp)
         self._state, self._refused = self._controller.request_setpoint(
-            self._state, np.array([to_kelvin(message.temperature)]),
-            stamp_nanoseconds(message.header.stamp))
+            self._state, np.array([to_kelvin(message.temperature)]), stamp_ns, _in_celsius)
         if self._refused:
             self.get_logger().warning(self._refused, throttle_duration_sec=1.0)
         else:
-            self.get_logger().info(f'set-point {message.temperature:.4g} degC accepted',
+            self._setpoint_received = True
+            scheduled = any(entry[0] == stamp_ns for entry in self._state.setpoint.scheduled)
+            when = f', holds from {stamp_ns / NANOSECONDS:.3f} s on' if scheduled else ''
+            self.get_logger().info(f'set-point {message.temperature:.6g} degC accepted{when}',
                                    throttle_duration_sec=1.0)
         self._diagnostics.publish_if_changed()
 
@@ -111,45 +124,74 @@ class ControllerNode(Node):
             self._state, np.array([to_kelvin(message.temperature)]))
         if self._refused:
             self.get_logger().warning(self._refused, throttle_duration_sec=1.0)
+        self._diagnostics.publish_if_changed()
 
     def _on_set_automatic(self, request: SetBool.Request, response: SetBool.Response
                           ) -> SetBool.Response:
         mode = Mode.AUTOMATIC if request.data else Mode.MANUAL
         self._state = self._controller.set_mode(self._state, mode)
+        self._refused = ''
         response.success, response.message = True, f'{mode.value} mode'
         self.get_logger().info(response.message)
+        self._diagnostics.publish_if_changed()
         return response
 
     def _on_reload_model(self, _: Trigger.Request, response: Trigger.Response
                          ) -> Trigger.Response:
         try:
             model = _load_suitable(self._model_name)
+            controller = Controller(model, self._controller.settings)
+            self._check_setpoints(controller)
         except (ModelFileError, FileNotFoundError) as error:
             response.success, response.message = False, f'the old model is kept: {error}'
             self.get_logger().error(response.message)
             return response
-        self._controller = Controller(model, self._controller.settings)
+        self._controller = controller
         response.success, response.message = True, self._about_model()
         self.get_logger().info(response.message)
+        self._diagnostics.publish_if_changed()
         return response
 
+    def _check_setpoints(self, controller: Controller) -> None:
+        """Refuse a model that cannot track what the operator asked for."""
+        setpoint = self._state.setpoint
+        asked = [value for _, value in setpoint.scheduled]
+        asked += [value for value in (setpoint.requested, setpoint.active) if value is not None]
+        for value in asked:
+            reason = controller.request_setpoint(self._state, value, 0, _in_celsius)[1]
+            if reason:
+                raise ModelFileError(reason)
+
     def _on_parameters(self, parameters: ControllerParameters) -> None:
+        self._settings = parameters
         self._controller = Controller(self._controller.model, parameters.settings())
 
     def _status(self) -> Status:
         report, model = self._report, self._controller.model
-        level, message = Level.OK, f'{report.mode.value}'
+        mode = self._state.mode
+        level, message = Level.OK, mode.value
+        silent = time.monotonic() - self._last_heard
         if not self._measurements:
             level, message = Level.WARN, 'waiting for the first temperature measurement'
+        elif silent > self._settings.measurement_timeout:
+            level, message = Level.ERROR, (
+                f'no measurement for more than {self._settings.measurement_timeout:g} s: the last '
+                'command stays in force; check sensor and plant')
         elif report.problem:
             level, message = Level.ERROR, report.problem
+        elif report.clock_stood_still:
+            level, message = Level.WARN, (
+                'the stamp of the measurement does not advance: the last command is held; stamp '
+                'measurements with their time')
+        elif self._refused:
+            level, message = Level.WARN, f'request refused: {self._refused}'
         elif report.outside > 0.0:
             level, message = Level.WARN, (
                 f'temperature is outside the trained range '
                 f'[{to_celsius(model.states.lower[0]):.2f}, '
                 f'{to_celsius(model.states.upper[0]):.2f}] degC: the model extrapolates')
-        elif self._refused:
-            level, message = Level.WARN, f'request refused: {self._refused}'
+        elif mode is Mode.AUTOMATIC and not self._setpoint_received:
+            message += ', no set-point yet: the temperature first measured is held'
         elif report.at_range:
             message += ', coolant at its limit'
         elif report.at_rate:
@@ -157,7 +199,7 @@ class ControllerNode(Node):
         active = report.active_setpoint
         command = self._state.command
         return Status(level, message, {
-            'mode': report.mode.value,
+            'mode': mode.value,
             'law': 'none' if report.law is None else report.law.value,
             'model': self._model_name,
             'temperature [degC]': float(self._temperature),
@@ -166,8 +208,15 @@ class ControllerNode(Node):
             'distance outside training box [half widths]': float(report.outside),
             'Riccati residual': float(report.residual),
             'gain norm': float(report.gain),
+            'scheduled set-points': len(self._state.setpoint.scheduled),
             'measurements': self._measurements,
+            'late measurements': self._late,
+            'since last measurement [s]': silent,
         })
+
+
+def _in_celsius(kelvin: float, unit: str) -> str:
+    return f'{to_celsius(kelvin):.2f} degC'
 
 
 def _load_suitable(name: str) -> LiftedModel:

@@ -49,6 +49,9 @@ class ControllerParameters:
     setpoint_ramp: float = parameter(
         1000.0, 'fastest change of the tracked set-point; a large value makes it a step',
         unit='K/min', minimum=0.0, maximum=1e6, open_minimum=True)
+    measurement_timeout: float = parameter(
+        10.0, 'wall time without a measurement after which diagnostics turn to ERROR', unit='s',
+        minimum=0.0, maximum=86400.0, open_minimum=True)
     max_gain: float = parameter(
         1000.0, 'largest Riccati gain, in scaled coordinates, that is acted on; small weights '
         'need a large one', minimum=0.0,

@@ -38,7 +38,7 @@ def parameter_file(node: str) -> str:
     """Return the text of a node's parameter file, every parameter at its default."""
     title = (f'# Parameters of the {node} node, all at their defaults. Use a copy with\n'
              f'#   ros2 run koopman_ros {node} --ros-args --params-file {node}.yaml\n')
-    return title + TABLES[node].yaml(node)
+    return title + TABLES[node].yaml()
 
 
 def main(args: list[str] | None = None) -> int:

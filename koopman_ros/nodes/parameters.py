@@ -214,14 +214,13 @@ class ParameterTable(Generic[T]):
         values.update({change.name: _as_python(change.value) for change in changes})
         return self.kind(**values)
 
-    def yaml(self, node_name: str, overrides: Mapping[str, Any] | None = None) -> str:
+    def yaml(self, overrides: Mapping[str, Any] | None = None) -> str:
         """
-        Write the table as a commented ROS parameter file.
+        Write the table as a commented ROS parameter file, for a node of any name and namespace.
 
-        :param node_name: the node's name; the file matches it in any namespace.
         :param overrides: values other than the defaults.
         """
-        lines = [f'/**/{node_name}:', '  ros__parameters:']
+        lines = ['/**:', '  ros__parameters:']
         for name, row in self.rows.items():
             notes = [row.range_text] if row.range_text else []
             notes += ['fixed at start'] if row.read_only else []

@@ -52,6 +52,7 @@ from std_srvs.srv import Trigger
 
 _REACTORS = {'one_state': one_state_reactor, 'two_state': two_state_reactor}
 _POLL_PERIOD = 0.01  # s; for what no message announces
+_SILENCE = 3.0  # s without a command, and five periods, after which somebody should know
 _CONCENTRATION_NAME = 'reactant_concentration [mol/L]'
 
 
@@ -79,7 +80,9 @@ class PlantNode(Node):
         self._trip = ''
         self._sample = 0  # number of the next measurement
         self._answered = True  # whether the last measurement has its command
-        self._commands = self._rejected = self._missed = 0
+        self._commands = self._rejected = self._missed = self._foreign = 0
+        self._waiting_in_vain = False
+        self._last_command = time.monotonic()
         self._rejection = ''
         self._wall_start = self._wall_published = time.monotonic()
 
@@ -162,6 +165,7 @@ class PlantNode(Node):
         if (self._phase is Phase.RUNNING and not self._answered
                 and waited > self._settings.lockstep_timeout):
             self._missed += 1
+            self._waiting_in_vain = True
             self.get_logger().warning(
                 f'no command for the measurement at {self._process.time_ns / NANOSECONDS:.3f} s '
                 f'within {self._settings.lockstep_timeout} s: the last one is held',
@@ -221,8 +225,13 @@ class PlantNode(Node):
     def _on_command(self, message: Temperature) -> None:
         stamp_ns = stamp_nanoseconds(message.header.stamp)
         lockstep = self._settings.lockstep
+        if lockstep and stamp_ns != self._process.time_ns:
+            # it answers no measurement that is open: late, or from somebody else
+            self._foreign += 1
+            return
         if math.isfinite(message.temperature):
             self._commands += 1
+            self._last_command = time.monotonic()
             self._rejection = ''
             # in lock-step it acts from its measurement on, otherwise from now on
             if lockstep or self._advance_to_now():
@@ -235,9 +244,9 @@ class PlantNode(Node):
                                'was rejected: the last good one is held')
             self.get_logger().warning(self._rejection, throttle_duration_sec=1.0)
             self._diagnostics.publish_if_changed()
-        if (lockstep and self._phase is Phase.RUNNING and not self._answered
-                and stamp_ns == self._process.time_ns):
+        if lockstep and self._phase is Phase.RUNNING and not self._answered:
             self._answered = True
+            self._waiting_in_vain = False
             self._continue_lockstep()
 
     def _advance_to_now(self) -> bool:
@@ -250,13 +259,16 @@ class PlantNode(Node):
 
     def _on_reset(self, _: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
         """Put the reactor back to its initial state; time goes on."""
+        response.success = self._phase is not Phase.FINISHED
+        if not response.success:
+            response.message = 'the duration is over: start the plant again'
+            return response
         system = self._process.system
         fresh = self._initial(system, self._process.time_ns)
         self._process = fresh
         if self._phase is Phase.TRIPPED:
             self._phase, self._trip = Phase.RUNNING, ''
             self._resynchronise()
-        response.success = True
         response.message = (f'reset to {to_celsius(float(fresh.x[-1])):.3f} degC with coolant at '
                             f'{to_celsius(float(fresh.u[0])):.3f} degC')
         self.get_logger().info(response.message)
@@ -290,6 +302,9 @@ class PlantNode(Node):
             level, message = Level.WARN, self._rejection
         elif self._phase is Phase.WAITING:
             level = Level.WARN
+        elif self._unanswered():
+            level, message = Level.WARN, (
+                'running, but no command arrives: the last one is held; is the controller alive?')
         return Status(level, message, {
             'time [s]': self._process.time_ns / NANOSECONDS,
             'temperature [degC]': to_celsius(float(self._process.x[-1])),
@@ -298,7 +313,17 @@ class PlantNode(Node):
             'commands': self._commands,
             'rejected commands': self._rejected,
             'missed commands': self._missed,
+            'foreign commands': self._foreign,
         })
+
+    def _unanswered(self) -> bool:
+        """Tell whether a controller that commanded before has fallen silent."""
+        if self._phase is not Phase.RUNNING or self._settings.lockstep:
+            return self._waiting_in_vain
+        periods = self._settings.sample_period / self._settings.speed if (
+            self._settings.speed) else 0.0
+        limit = max(_SILENCE, 5.0 * periods)
+        return bool(self._commands) and time.monotonic() - self._last_command > limit
 
 
 def main(args: list[str] | None = None) -> int:

@@ -37,7 +37,7 @@ _LONGEST_WAIT = 0.1  # s from a signal to the end
 
 def run(name: str, create: Callable[[], Node], args: list[str] | None = None) -> int:
     """
-    Run a node until SIGINT or SIGTERM, which end it between two callbacks.
+    Run a node until SIGINT, SIGTERM or SIGHUP, which end it between two callbacks.
 
     :param name: word that starts an error line.
     :param create: builds the node.
@@ -45,7 +45,7 @@ def run(name: str, create: Callable[[], Node], args: list[str] | None = None) ->
     :return: exit code, 0 after a signal and 1 when the node could not start.
     """
     stopping = threading.Event()
-    for number in (signal.SIGINT, signal.SIGTERM):
+    for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
         signal.signal(number, lambda *_: stopping.set())
     node = None
     try:

@@ -16,7 +16,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from functools import partial
 import importlib
 import time
@@ -40,9 +40,12 @@ class Recorder:
     :param node: whose executor delivers the messages.
     :param writer: the open bag; closed by :meth:`close`.
     :param names: topics, relative or absolute; types are looked up for those outside the loop.
+    :param on_failure: called, instead of an error in a callback, when nothing more can be written.
     """
 
-    def __init__(self, node: Node, writer: BagWriter, names: tuple[str, ...]) -> None:
+    def __init__(self, node: Node, writer: BagWriter, names: tuple[str, ...],
+                 on_failure: Callable[[Exception], None]) -> None:
+        self._on_failure = on_failure
         self._node = node
         self._writer = writer
         self._names = {node.resolve_topic_name(name): name for name in names}
@@ -58,10 +61,17 @@ class Recorder:
 
     def look_for_publishers(self) -> None:
         """Subscribe to what has become known, matching what its publishers offer."""
-        for topic in self._types:
+        for topic in list(self._types):
             publishers = self._node.get_publishers_info_by_topic(topic)
             if self._types[topic] is None and publishers:
-                self._types[topic] = _message_type(publishers[0].topic_type)
+                try:
+                    self._types[topic] = _message_type(publishers[0].topic_type)
+                except (ImportError, AttributeError, ValueError):
+                    self._node.get_logger().error(
+                        f'{topic} is not recorded: its type {publishers[0].topic_type} is not '
+                        'installed here')
+                    del self._types[topic]
+                    continue
             message_type = self._types[topic]
             if message_type is None:
                 continue
@@ -79,7 +89,10 @@ class Recorder:
 
     def flush(self) -> None:
         """Hand what is recorded to the operating system."""
-        self._writer.flush()
+        try:
+            self._writer.flush()
+        except OSError as error:
+            self._on_failure(error)
 
     def close(self) -> None:
         """Complete the bag with all that has arrived; the subscriptions end with it."""
@@ -99,11 +112,17 @@ class Recorder:
             self._record(topic, data, info)
 
     def _record(self, topic: str, data: bytes, info: Mapping[str, int]) -> None:
-        if not self.counts[topic]:
-            self._announce(topic)
+        if self._writer.closed:
+            return
         # the middleware stamps both ends; rosbag2 logs the time of receipt
         received = info['received_timestamp'] or time.time_ns()
-        self._writer.write(topic, data, received, info['source_timestamp'] or received)
+        try:
+            if not self.counts[topic]:
+                self._announce(topic)
+            self._writer.write(topic, data, received, info['source_timestamp'] or received)
+        except (OSError, LookupError) as error:
+            self._on_failure(error)
+            return
         self.counts[topic] += 1
 
     def _announce(self, topic: str) -> None:

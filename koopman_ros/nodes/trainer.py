@@ -56,14 +56,16 @@ class TrainerNode(Node):
     def destroy_node(self) -> None:
         """Complete the bag before the node goes; nothing is published any more by then."""
         if self._recorder is not None:
-            self._recorder.close()
+            self._close(self._recorder)
         super().destroy_node()
 
     def _start(self) -> str:
+        # to the millisecond: recordings may follow each other quickly
         output = self._settings.output or datetime.datetime.now().strftime(
-            'koopman_ros_%Y_%m_%d-%H_%M_%S')
+            'koopman_ros_%Y_%m_%d-%H_%M_%S_%f')[:-3]
         writer = BagWriter(output, compression=self._settings.compression)
-        self._recorder = Recorder(self, writer, self._settings.topics)
+        self._problem = ''
+        self._recorder = Recorder(self, writer, self._settings.topics, self._on_failure)
         said = f'recording to {output}'
         self.get_logger().info(said)
         return said
@@ -71,10 +73,27 @@ class TrainerNode(Node):
     def _stop(self) -> str:
         assert self._recorder is not None
         recorder, self._recorder = self._recorder, None
-        recorder.close()
+        self._close(recorder)
         said = f'recorded {sum(recorder.counts.values())} messages to {recorder.path}'
         self.get_logger().info(said)
         return said
+
+    def _on_failure(self, error: Exception) -> None:
+        """Give a recording up; what was flushed before stays readable."""
+        assert self._recorder is not None
+        recorder, self._recorder = self._recorder, None
+        self._problem = (f'recording to {recorder.path} stopped: {error}; free some space and '
+                         'call ~/record again')
+        self.get_logger().error(self._problem)
+        self._close(recorder)
+        self._diagnostics.publish_if_changed()
+
+    def _close(self, recorder: Recorder) -> None:
+        try:
+            recorder.close()
+        except OSError as error:
+            self._problem = f'{recorder.path} is not complete: {error}'
+            self.get_logger().error(self._problem)
 
     def _on_record(self, request: SetBool.Request, response: SetBool.Response
                    ) -> SetBool.Response:
@@ -87,7 +106,8 @@ class TrainerNode(Node):
             response.message = self._start() if request.data else self._stop()
         except (OSError, ValueError) as error:
             response.success, response.message = False, str(error)
-            self.get_logger().error(str(error))
+            self._problem = f'cannot record: {error}'
+            self.get_logger().error(self._problem)
         self._diagnostics.publish_if_changed()
         return response
 
@@ -105,7 +125,8 @@ class TrainerNode(Node):
 
     def _status(self) -> Status:
         if self._recorder is None:
-            return Status(Level.OK, 'not recording')
+            return Status(Level.ERROR, self._problem) if self._problem else Status(
+                Level.OK, 'not recording')
         counts = self._recorder.counts
         return Status(Level.OK, f'recording to {self._recorder.path}', {
             'messages': sum(counts.values()),

@@ -20,6 +20,8 @@ from dataclasses import dataclass
 
 from koopman_ros.nodes import topics
 from koopman_ros.nodes.parameters import parameter, ParameterTable
+from rclpy.exceptions import InvalidTopicNameException
+from rclpy.validate_topic_name import validate_topic_name
 
 LOOP_TOPICS = (topics.TEMPERATURE, topics.CONCENTRATION, topics.SETPOINT, topics.ACTIVE_SETPOINT,
                topics.COOLANT_SETPOINT, topics.MANUAL_COOLANT_SETPOINT, topics.DIAGNOSTICS)
@@ -46,6 +48,11 @@ class TrainerParameters:
 def _cross_check(values: TrainerParameters) -> str:
     if not values.topics or not all(values.topics):
         return f'topics = {list(values.topics)} must hold at least one name and no empty one'
+    for name in values.topics:
+        try:
+            validate_topic_name(name)
+        except InvalidTopicNameException as error:
+            return f'topics: {" ".join(str(error).split())}'
     return ''
 
 

@@ -116,7 +116,7 @@ def test_cross_check_comes_after_the_ranges() -> None:
 
 def test_rcl_reads_back_what_the_table_writes(ros: Workbench, tmp_path: Path) -> None:
     file = tmp_path / 'odd.yaml'
-    file.write_text(ODD.yaml('odd'))
+    file.write_text(ODD.yaml())
     node = Node('odd', context=ros.node.context,
                 cli_args=['--ros-args', '--params-file', str(file)],
                 automatically_declare_parameters_from_overrides=True)
@@ -129,8 +129,8 @@ def test_rcl_reads_back_what_the_table_writes(ros: Workbench, tmp_path: Path) ->
 
 
 def test_yaml_of_a_table() -> None:
-    assert ODD.yaml('odd', {'count': 5}).splitlines()[:16] == [
-        '/**/odd:',
+    assert ODD.yaml({'count': 5}).splitlines()[:16] == [
+        '/**:',
         '  ros__parameters:',
         '',
         '    # a small number [m]',
@@ -147,8 +147,8 @@ def test_yaml_of_a_table() -> None:
         '    exact: 0.87725294608097',
         '',
     ]
-    assert '    count: 5\n' in ODD.yaml('odd', {'count': 5})
-    assert '    # a switch\n    #   fixed at start\n    switch: true\n' in ODD.yaml('odd')
+    assert '    count: 5\n' in ODD.yaml({'count': 5})
+    assert '    # a switch\n    #   fixed at start\n    switch: true\n' in ODD.yaml()
 
 
 # The shipped files.

@@ -27,7 +27,7 @@ from koopman_ros.nodes.messages import stamp_nanoseconds
 from koopman_ros.nodes.plant_parameters import TABLE
 import pytest
 from sensor_msgs.msg import JointState, Temperature
-from workbench import seconds, value, Workbench
+from workbench import seconds, temperature, value, Workbench
 
 STATUS = 'plant: simulation'
 NOMINAL_COOLANT = 26.85  # degC
@@ -182,6 +182,8 @@ def test_lockstep_goes_on_without_an_answer_after_its_timeout(ros: Workbench) ->
     bench.wait_for_more(5)
     status = ros.wait_for_status(STATUS, lambda s: int(value(s, 'missed commands')) >= 3)
     assert float(value(status, 'coolant [degC]')) == pytest.approx(25.0)
+    assert status.level == DiagnosticStatus.WARN
+    assert 'no command arrives' in status.message
     assert 'no command for the measurement at' in bench.process.output()
     bench.answering = True
     bench.wait_for_more(100)
@@ -203,6 +205,9 @@ def test_stands_still_after_its_duration(ros: Workbench) -> None:
     ros.wait_for_status(STATUS, lambda s: s.message == 'finished: the duration is over')
     ros.wait_until(lambda: len(bench.measured) >= 11)
     assert [seconds(message) for message in bench.measured] == [1.0 + 2.0 * k for k in range(11)]
+    response = ros.trigger('plant/reset')
+    assert (response.success, response.message) == (
+        False, 'the duration is over: start the plant again')
 
 
 # Commands.
@@ -220,6 +225,21 @@ def test_command_that_is_not_a_number_is_rejected_and_the_last_one_held(bench: B
     assert float(value(status, 'coolant [degC]')) == pytest.approx(25.0)
     bench.coolant = 25.0
     bench.ros.wait_for_status(STATUS, lambda s: s.level == DiagnosticStatus.OK)
+
+
+def test_command_that_answers_no_open_measurement_is_not_taken(ros: Workbench) -> None:
+    bench = Bench(ros, lockstep_timeout=3600.0)
+    bench.wait_for_more(5)
+    bench.answering = False
+    ros.meet('plant')
+    stamp = seconds(bench.measured[-1])
+    strangers = ros.speak(Temperature, topics.COOLANT_SETPOINT, to='plant')
+    strangers.publish(temperature(10.0, stamp - 1.0))
+    status = ros.wait_for_status(STATUS, lambda s: value(s, 'foreign commands') == '1')
+    assert float(value(status, 'coolant [degC]')) == pytest.approx(NOMINAL_COOLANT)
+    assert seconds(bench.measured[-1]) == stamp
+    strangers.publish(temperature(25.0, stamp))
+    assert seconds(bench.wait_for_more(1)[0]) == stamp + 1.0
 
 
 def test_actuator_reaches_no_further_than_its_range(bench: Bench) -> None:

@@ -18,8 +18,10 @@ from __future__ import annotations
 
 from pathlib import Path
 import signal
+import sys
 from typing import Any
 
+from diagnostic_msgs.msg import DiagnosticStatus
 from koopman_ros.bags import BagMessage, read_messages, summary
 from koopman_ros.demo.processes import NodeProcess
 from koopman_ros.nodes import topics
@@ -201,3 +203,27 @@ def test_killed_trainer_leaves_what_it_flushed(ros: Workbench, tmp_path: Path) -
     assert not summary(bag).complete
     messages = list(read_messages(bag, ['/temperature'], recover=True))
     assert values(messages) == list(range(100))
+
+
+def test_full_disk_stops_the_recording_but_not_the_node(ros: Workbench, tmp_path: Path) -> None:
+    bag = tmp_path / 'run.mcap'
+    # no file of this process may grow beyond 60 kB
+    program = ('import resource, sys\n'
+               'from koopman_ros.nodes.trainer import main\n'
+               'resource.setrlimit(resource.RLIMIT_FSIZE, (60000, 60000))\n'
+               'sys.exit(main())\n')
+    trainer = ros.start('trainer', {'output': bag}, command=(sys.executable, '-c', program))
+    publisher = ros.speak(Temperature, topics.TEMPERATURE, to='trainer')
+    say(publisher, 900)
+    status = ros.wait_for_status(
+        'trainer: recording', lambda s: s.level == DiagnosticStatus.ERROR)
+    assert status.message.startswith(f'recording to {bag} stopped: ')
+    kept = values(list(read_messages(bag, ['/temperature'], recover=True)))
+    assert kept == list(range(len(kept)))
+
+    (tmp_path / 'next').mkdir()
+    ros.set_parameters('trainer', output=str(tmp_path / 'next' / 'run.mcap'))
+    response = ros.set_bool('trainer/record', True)
+    assert response.success, response.message
+    assert trainer.stop() == 0
+    assert 'Traceback' not in trainer.output()
