@@ -92,8 +92,10 @@ class TrainerNode(Node):
         try:
             recorder.close()
         except OSError as error:
-            self._problem = f'{recorder.path} is not complete: {error}'
-            self.get_logger().error(self._problem)
+            said = f'{recorder.path} is not complete: {error}'
+            self.get_logger().error(said)
+            # what went wrong first tells more
+            self._problem = self._problem or said
 
     def _on_record(self, request: SetBool.Request, response: SetBool.Response
                    ) -> SetBool.Response:

@@ -287,7 +287,8 @@ def test_manual_command_stays_within_the_limits(bench: Bench) -> None:
     manual = bench.ros.speak(Temperature, topics.MANUAL_COOLANT_SETPOINT, to='controller')
     for wild in (90.0, math.nan):
         manual.publish(temperature(wild))
-    bench.ros.wait_until(lambda: 'manual command [nan] is not finite' in bench.process.output())
+    bench.ros.wait_for_status(
+        STATUS, lambda s: 'manual command [nan] is not finite' in s.message)
     assert bench.measure(STEADY, 1000.0).temperature == pytest.approx(28.0)
 
 
