@@ -23,10 +23,14 @@ import hashlib
 
 from koopman_ros import __version__
 from koopman_ros.lifting.growth import grow, Grown, Recipe
+from koopman_ros.lifting.levenberg_marquardt import Status
 from koopman_ros.lifting.model import Array, Coordinates, LiftedModel, Provenance
 from koopman_ros.lifting.validation import Fit, fit
 import numpy as np
 import torch
+
+# A lift whose drift of the state is off by more than this is worse than none.
+_MAX_RX = 0.1
 
 
 @dataclass(frozen=True)
@@ -140,6 +144,11 @@ def train(plant: Plant, samples: Samples, recipe: Recipe, *, seed: int = 0, star
     """
     if starts < 1:
         raise ValueError(f'starts must be at least 1, got {starts}')
+    n_x = samples.x.shape[1]
+    if recipe.n_z < n_x + recipe.identity:
+        raise ValueError(f'n_z = {recipe.n_z} is too small for {n_x} states'
+                         + (' as its first coordinates: use linearised_model for a linear model'
+                            if recipe.identity else ''))
     parts = split_by_episode(samples, split_seed)
     states, inputs = _coordinates(plant, samples)
     B = plant.B * inputs.scale / states.scale[:, None]
@@ -160,9 +169,9 @@ def train(plant: Plant, samples: Samples, recipe: Recipe, *, seed: int = 0, star
             model = _assemble(grown, B, states, inputs, plant.time_unit,
                               replace(provenance, seed=seed + start))
             try:
-                rw = _judge(model, parts[1]).rw
+                rw = _validated_rw(grown, recipe, model, parts[1])
             except ValueError:
-                # its coordinates collapsed: it loses, unless every start does
+                # its coordinates collapsed or miss a state: it loses, unless every start does
                 if best is None and start == starts - 1:
                     raise
                 continue
@@ -181,6 +190,23 @@ def train(plant: Plant, samples: Samples, recipe: Recipe, *, seed: int = 0, star
     metrics = {'rw': figures.rw, 'rx': figures.rx, 'cond': figures.cond}
     model = replace(model, provenance=replace(model.provenance, metrics=metrics))
     return Trained(model, figures, grown.status.value, finished)
+
+
+def _validated_rw(grown: Grown, recipe: Recipe, model: LiftedModel, samples: Samples) -> float:
+    """
+    Return the rw by which starts are compared.
+
+    :raises ValueError: when the start is no candidate, whatever its rw: rw alone does not see a
+        state that the lift has lost.
+    """
+    if grown.layout.n_z < recipe.n_z and grown.status is not Status.INTERRUPTED:
+        raise ValueError(f'training ended at n_z = {grown.layout.n_z}: {grown.status.value}')
+    figures = _judge(model, samples)
+    if not figures.rx < _MAX_RX:
+        raise ValueError(f'the lift does not determine how the state moves (rx = {figures.rx:.2g} '
+                         f'on validation samples, must be below {_MAX_RX}): use identity '
+                         'coordinates, more of them, or samples that move more')
+    return figures.rw
 
 
 def _judge(model: LiftedModel, samples: Samples) -> Fit:

@@ -15,10 +15,10 @@
 """The content of the bags that the tests write: four topics, their types, offers and messages."""
 
 from dataclasses import dataclass
+import importlib
 from typing import Any
 
 from koopman_ros.bags import QosProfile
-import pytest
 
 START_NS = 1_700_000_000_123_456_789
 PERIOD_NS = 100_000_000
@@ -54,11 +54,11 @@ class Sample:
 
 def messages(index: int, stamp_ns: int) -> dict[str, Any]:
     """Return one message a topic; all fields differ from their defaults."""
-    diagnostic = pytest.importorskip('diagnostic_msgs.msg')
-    sensor = pytest.importorskip('sensor_msgs.msg')
-    rosgraph = pytest.importorskip('rosgraph_msgs.msg')
-    std = pytest.importorskip('std_msgs.msg')
-    time = pytest.importorskip('builtin_interfaces.msg').Time
+    diagnostic = importlib.import_module('diagnostic_msgs.msg')
+    sensor = importlib.import_module('sensor_msgs.msg')
+    rosgraph = importlib.import_module('rosgraph_msgs.msg')
+    std = importlib.import_module('std_msgs.msg')
+    time = importlib.import_module('builtin_interfaces.msg').Time
     stamp = time(sec=stamp_ns // 10**9, nanosec=stamp_ns % 10**9)
     header = std.Header(stamp=stamp, frame_id='reactor')
     status = diagnostic.DiagnosticStatus(

@@ -15,6 +15,7 @@
 """Bags opened by two independent readers: mcap's own, and the rosbags package."""
 
 from collections.abc import Callable
+import importlib
 from pathlib import Path
 
 from bag_samples import OFFERED_QOS, ROUNDS, Sample, TOPICS
@@ -23,8 +24,8 @@ from mcap.reader import make_reader
 from mcap_ros2.decoder import DecoderFactory
 import pytest
 
-highlevel = pytest.importorskip('rosbags.highlevel')
-rosbag2 = pytest.importorskip('rosbags.rosbag2')
+highlevel = importlib.import_module('rosbags.highlevel')
+rosbag2 = importlib.import_module('rosbags.rosbag2')
 
 WriteBag = Callable[..., Path]
 

@@ -17,13 +17,11 @@
 from itertools import pairwise
 import math
 
+from koopman_ros.lifting.levenberg_marquardt import minimise, Status
+from koopman_ros.lifting.residuals import NormalEquations
 import numpy as np
 import pytest
-
-torch = pytest.importorskip('torch')
-
-from koopman_ros.lifting.levenberg_marquardt import minimise, Status  # noqa: E402
-from koopman_ros.lifting.residuals import NormalEquations  # noqa: E402
+import torch
 
 
 def least_squares(residual):

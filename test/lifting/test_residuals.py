@@ -14,12 +14,10 @@
 
 """The hand-derived normal equations against automatic differentiation of the plain residuals."""
 
+from koopman_ros.lifting.residuals import Layout, lift, Problem
 import numpy as np
 import pytest
-
-torch = pytest.importorskip('torch')
-
-from koopman_ros.lifting.residuals import Layout, lift, Problem  # noqa: E402
+import torch
 
 LAYOUTS = [Layout(n_x, n_x * identity + n_free, h, identity)
            for n_x, n_free, h in ((1, 1, 3), (1, 3, 8), (2, 2, 5), (3, 2, 4), (3, 4, 6))

@@ -17,15 +17,14 @@
 from dataclasses import replace
 import math
 
+from koopman_ros.lifting.growth import grow, Recipe
+from koopman_ros.lifting.levenberg_marquardt import Status
+from koopman_ros.lifting.training import Plant, Samples, split_by_episode, train
 from koopman_ros.lifting.validation import fit
+from koopman_ros.plants import two_state_example
 import numpy as np
 import pytest
-
-torch = pytest.importorskip('torch')
-
-from koopman_ros.lifting.growth import grow, Recipe  # noqa: E402
-from koopman_ros.lifting.levenberg_marquardt import Status  # noqa: E402
-from koopman_ros.lifting.training import Plant, Samples, split_by_episode, train  # noqa: E402
+import torch
 
 SMALL = Recipe(2, hidden_first=3, max_iterations=40)
 
@@ -292,3 +291,23 @@ def test_a_lift_that_cannot_grow_says_so():
     x = torch.tensor([[1.0], [-1.0], [1.0], [-1.0]], dtype=torch.float64)
     with pytest.raises(ValueError, match='no new coordinate can be started: the samples are spa'):
         grow(x, -x, Recipe(4), 0)
+
+
+def test_fewer_coordinates_than_a_lift_needs():
+    with pytest.raises(ValueError, match='n_z = 1 is too small for 1 states as its first '
+                                         'coordinates: use linearised_model'):
+        train(PLANT, samples(), Recipe(1))
+
+
+def test_a_lift_that_loses_a_state_is_refused_whatever_its_rw():
+    system = two_state_example()
+    rng = np.random.default_rng(0)
+    x = np.stack([rng.uniform(-6.0, 6.0, 400), rng.uniform(-6.0, 8.0, 400)], 1)
+    u = rng.uniform(-5.0, 5.0, (400, 1))
+    plant = Plant(system.name, system.state_names, system.state_units, system.input_names,
+                  system.input_units, system.time_unit, np.zeros(2), np.zeros(1), system.B)
+    data = Samples(x, system.derivative(x, u), u, np.arange(400) // 40)
+    with pytest.raises(ValueError, match='the lift does not determine how the state moves'):
+        train(plant, data, Recipe(2, identity=False, max_iterations=150), starts=1)
+    # with the states as its first coordinates the same data are enough
+    assert train(plant, data, Recipe(3, max_iterations=150), starts=1).fit.rx < 1e-6
