@@ -16,12 +16,14 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 import contextlib
 import json
 from pathlib import Path
 import signal
 import subprocess
 import sys
+import time
 
 from koopman_ros.bags import summary
 from koopman_ros.demo.loop import LoopError, run_loop, Scenario
@@ -55,35 +57,48 @@ def test_demo_says_in_one_line_why_it_cannot_run(tmp_path: Path) -> None:
     assert str(tmp_path / 'taken') in line
 
 
-@pytest.mark.parametrize(('number', 'line'), [
-    (signal.SIGTERM, 'learned controller'),  # while the processes start
-    (signal.SIGINT, 'time [min]'),  # while the loop runs
-])
-def test_interrupted_demo_ends_its_processes(tmp_path: Path, number: int, line: str) -> None:
+@pytest.fixture
+def demo(tmp_path: Path) -> Iterator[subprocess.Popen[str]]:
+    """Start the demo as fast as it can go."""
     with subprocess.Popen(
             [sys.executable, '-u', '-m', 'koopman_ros.demo', '--speed', '0', '--output', tmp_path],
-            stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) as demo:
-        assert demo.stdout is not None
-        assert demo.stderr is not None
-        assert any(line in said for said in demo.stdout)
-        demo.send_signal(number)
-        said = demo.stderr.read()
+            stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) as process:
+        yield process
+        process.kill()
+
+
+def test_demo_interrupted_in_its_loop_keeps_what_it_recorded(
+        demo: subprocess.Popen[str], tmp_path: Path) -> None:
+    assert demo.stdout is not None
+    assert any('time [min] 1.0' in said for said in demo.stdout)
+    demo.send_signal(signal.SIGINT)
+    assert demo.communicate()[1] == 'demo: interrupted; what was recorded is kept\n'
     assert demo.returncode == 130
-    assert said == 'demo: interrupted; what was recorded is kept\n'
-    assert not [command for command in _commands() if str(tmp_path) in command]
-    if line == 'time [min]':
-        recorded = summary(tmp_path / 'closed_loop.mcap')
-        assert recorded.complete
-        assert recorded.counts['/temperature'] > 0
+    recorded = summary(tmp_path / 'closed_loop.mcap')
+    assert recorded.complete
+    assert recorded.counts['/temperature'] > 0
+    assert not _processes(tmp_path)
 
 
-def _commands() -> list[str]:
-    """Return the command lines of all processes."""
+def test_demo_terminated_at_its_start_ends_its_processes(
+        demo: subprocess.Popen[str], tmp_path: Path) -> None:
+    deadline = time.monotonic() + 30.0
+    while not _processes(tmp_path):
+        assert time.monotonic() < deadline
+        time.sleep(0.01)
+    demo.send_signal(signal.SIGTERM)
+    demo.communicate()
+    assert demo.returncode == 130
+    assert not _processes(tmp_path)
+
+
+def _processes(output: Path) -> list[str]:
+    """Return the command lines of the trainers that record into a folder."""
     found = []
     for path in Path('/proc').glob('[0-9]*/cmdline'):
         with contextlib.suppress(OSError):
             found.append(path.read_bytes().replace(b'\0', b' ').decode(errors='replace'))
-    return found
+    return [command for command in found if 'trainer' in command and str(output) in command]
 
 
 def test_loop_tells_which_process_failed(tmp_path: Path) -> None:
