@@ -32,16 +32,15 @@ from koopman_ros.nodes.messages import (
     to_celsius,
     to_kelvin,
 )
-from koopman_ros.nodes.process import run
+from koopman_ros.nodes.process import LoopNode, run
 from koopman_ros.nodes.shipped import model_path
 import numpy as np
-from rclpy.node import Node
 from rclpy.qos_overriding_options import QoSOverridingOptions
 from sensor_msgs.msg import Temperature
 from std_srvs.srv import SetBool, Trigger
 
 
-class ControllerNode(Node):
+class ControllerNode(LoopNode):
     """Carry messages to and from the control step; see the README for topics and services."""
 
     def __init__(self) -> None:

@@ -33,7 +33,7 @@ from koopman_ros.nodes.messages import (
     to_kelvin,
 )
 from koopman_ros.nodes.plant_parameters import PlantParameters, TABLE
-from koopman_ros.nodes.process import run
+from koopman_ros.nodes.process import LoopNode, run
 from koopman_ros.plants import (
     ControlAffineSystem,
     EquilibriumError,
@@ -45,7 +45,6 @@ from koopman_ros.plants import (
 )
 import numpy as np
 from rclpy.clock import Clock, ClockType
-from rclpy.node import Node
 from rosgraph_msgs.msg import Clock as ClockMessage
 from sensor_msgs.msg import JointState, Temperature
 from std_srvs.srv import Trigger
@@ -65,7 +64,7 @@ class Phase(Enum):
     TRIPPED = 'stopped'
 
 
-class PlantNode(Node):
+class PlantNode(LoopNode):
     """Run a reactor in time; see the README for topics and services."""
 
     def __init__(self) -> None:

@@ -17,6 +17,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+import os
 import signal
 import sys
 import threading
@@ -33,9 +34,17 @@ from rclpy.signals import SignalHandlerOptions
 _START_ERRORS = (OSError, ParameterException, RuntimeError, ValueError)
 
 _LONGEST_WAIT = 0.1  # s from a signal to the end
+_TAKE_DOWN_PATIENCE = 5.0  # s; taking down a participant needs some ten milliseconds
 
 
-def run(name: str, create: Callable[[], Node], args: list[str] | None = None) -> int:
+class LoopNode(Node):
+    """A node with work of its own to complete before the middleware is taken down."""
+
+    def complete(self) -> None:
+        """Complete that work; by default there is none. Nothing is published any more."""
+
+
+def run(name: str, create: Callable[[], LoopNode], args: list[str] | None = None) -> int:
     """
     Run a node until SIGINT, SIGTERM or SIGHUP, which end it between two callbacks.
 
@@ -44,9 +53,10 @@ def run(name: str, create: Callable[[], Node], args: list[str] | None = None) ->
     :param args: command line, or None for the process's own.
     :return: exit code, 0 after a signal and 1 when the node could not start.
     """
-    stopping = threading.Event()
+    # a list, because a second signal may come while the first is handled, where a lock would hang
+    arrived: list[int] = []
     for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
-        signal.signal(number, lambda *_: stopping.set())
+        signal.signal(number, lambda number, _: arrived.append(number))
     node = None
     try:
         try:
@@ -57,15 +67,33 @@ def run(name: str, create: Callable[[], Node], args: list[str] | None = None) ->
             return 1
         executor = SingleThreadedExecutor()
         executor.add_node(node)
-        while not stopping.is_set():
+        while not arrived:
             # Python handles a signal when the wait returns, so the wait is bounded
             executor.spin_once(timeout_sec=_LONGEST_WAIT)
-        executor.shutdown()
     finally:
-        if node is not None:
-            node.destroy_node()
-        rclpy.try_shutdown()
+        try:
+            if node is not None:
+                node.complete()
+        finally:
+            _take_down(name, node)
     return 0
+
+
+def _take_down(name: str, node: LoopNode | None) -> None:
+    """Take the middleware down, or leave it to the operating system when it hangs in that."""
+
+    def give_up() -> None:
+        print(f'{name}: the middleware does not shut down: left to the operating system',
+              file=sys.stderr, flush=True)
+        os._exit(0)
+
+    patience = threading.Timer(_TAKE_DOWN_PATIENCE, give_up)
+    patience.daemon = True
+    patience.start()
+    if node is not None:
+        node.destroy_node()
+    rclpy.try_shutdown()
+    patience.cancel()
 
 
 def _init(args: list[str] | None) -> None:

@@ -22,18 +22,17 @@ import sys
 from koopman_ros.bags import BagWriter
 from koopman_ros.nodes.diagnostics import DiagnosticsPublisher, Level, Status
 from koopman_ros.nodes.parameters import ConfigurationError
-from koopman_ros.nodes.process import run
+from koopman_ros.nodes.process import LoopNode, run
 from koopman_ros.nodes.recorder import Recorder
 from koopman_ros.nodes.trainer_parameters import TABLE, TrainerParameters
 from rclpy.clock import Clock, ClockType
-from rclpy.node import Node
 from std_srvs.srv import SetBool
 
 _LOOK_PERIOD = 0.2  # s, for new publishers
 _FLUSH_PERIOD = 0.5  # s; what a killed process may lose
 
 
-class TrainerNode(Node):
+class TrainerNode(LoopNode):
     """Record topics from raw subscriptions; see the README for topics and services."""
 
     def __init__(self) -> None:
@@ -53,11 +52,10 @@ class TrainerNode(Node):
             except (OSError, ValueError) as error:
                 raise ConfigurationError(f'cannot record: {error}') from error
 
-    def destroy_node(self) -> None:
-        """Complete the bag before the node goes; nothing is published any more by then."""
+    def complete(self) -> None:
+        """Complete the bag with all that has arrived."""
         if self._recorder is not None:
             self._close(self._recorder)
-        super().destroy_node()
 
     def _start(self) -> str:
         # to the millisecond: recordings may follow each other quickly

@@ -61,6 +61,25 @@ def test_signal_during_the_start_ends_a_node_cleanly(ros: Workbench, number: int
     assert process.output() == ''
 
 
+def test_middleware_that_hangs_does_not_keep_a_process(ros: Workbench) -> None:
+    program = (
+        'import os, signal, sys, time\n'
+        'from koopman_ros.nodes.plant import PlantNode\n'
+        'from koopman_ros.nodes.process import run\n'
+        'class Hanging(PlantNode):\n'
+        '    def destroy_node(self):\n'
+        '        time.sleep(3600.0)\n'
+        'def create():\n'
+        '    os.kill(os.getpid(), signal.SIGTERM)\n'
+        '    os.kill(os.getpid(), signal.SIGTERM)\n'
+        '    return Hanging()\n'
+        'sys.exit(run("plant", create))\n')
+    process = ros.start('plant', command=(sys.executable, '-c', program))
+    assert ros.wait_for_end(process) == 0
+    assert process.output() == (
+        'plant: the middleware does not shut down: left to the operating system\n')
+
+
 # Bad starts.
 
 
