@@ -39,16 +39,16 @@ def isolated_domain() -> Iterator[dict[str, str]]:
     Reserve a ROS domain on loopback that no other run on this machine uses.
 
     Yields the environment variables of the run, which hold for this process, too, until the end.
-    Shared memory is left out of the transports, because a killed process would leave its
-    segments behind, and participants announce themselves often, to be found at once.
+    The Fast DDS profile they name keeps everything on 127.0.0.1 and says what else it is for.
 
     :raises RuntimeError: when all domains are taken.
     """
     with _reserved_domain() as domain:
         environment = {
             'ROS_DOMAIN_ID': str(domain),
-            'ROS_AUTOMATIC_DISCOVERY_RANGE': 'LOCALHOST',
-            'FASTDDS_BUILTIN_TRANSPORTS': 'UDPv4',
+            'RMW_IMPLEMENTATION': 'rmw_fastrtps_cpp',
+            # the profile alone says where to look
+            'ROS_AUTOMATIC_DISCOVERY_RANGE': 'SYSTEM_DEFAULT',
             'FASTRTPS_DEFAULT_PROFILES_FILE': str(config_directory() / _DISCOVERY_PROFILE),
         }
         before = {name: os.environ.get(name) for name in environment}

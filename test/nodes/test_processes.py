@@ -18,6 +18,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass
+import ipaddress
 import os
 from pathlib import Path
 import signal
@@ -189,7 +190,6 @@ def test_runs_where_torch_cannot_be_imported(ros: Workbench, name: str) -> None:
 def test_two_reservations_are_two_domains() -> None:
     with isolated_domain() as first, isolated_domain() as second:
         assert first['ROS_DOMAIN_ID'] != second['ROS_DOMAIN_ID']
-        assert first['ROS_AUTOMATIC_DISCOVERY_RANGE'] == 'LOCALHOST'
 
 
 def test_reservation_ends_with_its_context() -> None:
@@ -199,13 +199,33 @@ def test_reservation_ends_with_its_context() -> None:
         assert again['ROS_DOMAIN_ID'] == first['ROS_DOMAIN_ID']
 
 
+def test_everything_stays_on_loopback_without_shared_memory(ros: Workbench) -> None:
+    process = ros.start('trainer', {'record_at_start': False})
+    ros.meet('trainer')
+    sockets = _udp_sockets(process.process.pid)
+    assert len(sockets) >= 2
+    assert set(sockets) == {'127.0.0.1'}
+    assert '/dev/shm/fastrtps' not in Path(f'/proc/{process.process.pid}/maps').read_text()
+
+
+def _udp_sockets(pid: int) -> list[str]:
+    """Return the local addresses of the UDP sockets of a process."""
+    links = [os.readlink(path) for path in Path(f'/proc/{pid}/fd').iterdir()]
+    own = {link[len('socket:['):-1] for link in links if link.startswith('socket:[')}
+    rows = [line.split() for table in ('udp', 'udp6')
+            for line in Path(f'/proc/{pid}/net/{table}').read_text().splitlines()[1:]]
+    # the address is written as hexadecimal in the order of the machine
+    return [str(ipaddress.ip_address(bytes.fromhex(row[1].split(':')[0])[::-1]))
+            for row in rows if row[9] in own]
+
+
 def test_environment_of_the_reservation_holds_here_too(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv('ROS_DOMAIN_ID', '7')
-    monkeypatch.delenv('FASTDDS_BUILTIN_TRANSPORTS', raising=False)
+    monkeypatch.delenv('RMW_IMPLEMENTATION', raising=False)
     with isolated_domain() as environment:
         assert environment.items() <= os.environ.items()
     assert os.environ['ROS_DOMAIN_ID'] == '7'
-    assert 'FASTDDS_BUILTIN_TRANSPORTS' not in os.environ
+    assert 'RMW_IMPLEMENTATION' not in os.environ
 
 
 def test_process_that_ignores_signals_is_killed(
