@@ -55,10 +55,13 @@ setup(
             'ros-jazzy-rmw-fastrtps-cpp==8.4.3',
         ],
         'demo': ['matplotlib', 'rich'],
-        'train': ['torch==2.13.0', 'tqdm'],
+        'train': ['torch==2.13.0', 'joblib', 'tqdm'],
+        # what the benchmark compares with, no part of the package
+        'bench': ['casadi==3.8.2'],
         'test': [
             'colcon-common-extensions',
             'control',
+            'distributed',
             'mypy',
             'pytest',
             'rosbags',

@@ -14,6 +14,7 @@
 
 """How it is controlled: one pure step on a lifted model; imports lifting's run-time part only."""
 
+from koopman_ros.control.closed_loop import ClosedLoop, run_closed_loop
 from koopman_ros.control.controller import Controller, Mode, Report, Settings, State
 from koopman_ros.control.laws import Feedback, feedback, Law, projected, recentred, Weights
 from koopman_ros.control.limits import InputLimits, limit, LimitedInput
@@ -22,6 +23,7 @@ from koopman_ros.control.setpoint import Setpoint
 from koopman_ros.control.target import steady_state_target, Target
 
 __all__ = [
+    'ClosedLoop',
     'Controller',
     'Feedback',
     'InputLimits',
@@ -40,6 +42,7 @@ __all__ = [
     'limit',
     'projected',
     'recentred',
+    'run_closed_loop',
     'solve_riccati',
     'steady_state_target',
 ]

@@ -69,7 +69,7 @@ class Feedback:
 
 
 def feedback(model: LiftedModel, x: Array, target: Target, weights: Weights, *,
-             max_gain: float, max_residual: float) -> Feedback:
+             max_gain: float = 1e6, max_residual: float = 1e-8) -> Feedback:
     """
     Evaluate the law that suits the model: re-centred if A is Hurwitz, projected otherwise.
 

@@ -12,22 +12,24 @@
 # See the License for the specific language governing permissions and
 # limitations under the License.
 
-"""
-How a lift is learned and used; imports nothing of ours.
-
-Listed here is the run-time part, in numpy alone, which a controller loads. What it does not need
-is imported by name: ``koopman_ros.lifting.validation`` (scipy's integrators) and
-``koopman_ros.lifting.training`` and ``.growth`` (torch).
-"""
+"""What a lift is: its functions, its model and the file; in numpy, imports nothing of ours."""
 
 from koopman_ros.lifting.artefact import load, ModelFileError, save
 from koopman_ros.lifting.linearisation import linearised_model
 from koopman_ros.lifting.model import Coordinates, LiftedModel, Provenance
+from koopman_ros.lifting.observables import (
+    NetworkObservables,
+    Observables,
+    PolynomialObservables,
+)
 
 __all__ = [
     'Coordinates',
     'LiftedModel',
     'ModelFileError',
+    'NetworkObservables',
+    'Observables',
+    'PolynomialObservables',
     'Provenance',
     'linearised_model',
     'load',

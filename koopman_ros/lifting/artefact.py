@@ -26,12 +26,13 @@ from pathlib import Path
 import tempfile
 from typing import Any, NoReturn
 
+from koopman_ros.lifting.activations import activation_named
 from koopman_ros.lifting.model import Coordinates, LiftedModel, Provenance
+from koopman_ros.lifting.observables import NetworkObservables
 import numpy as np
 
 FORMAT = 'koopman_ros.lift'
 FORMAT_VERSION = 1
-ACTIVATION = 'tanh'
 
 # A lift is small; a header or file beyond these sizes is not one.
 _MAX_HEADER_BYTES = 1 << 20
@@ -47,19 +48,24 @@ def save(model: LiftedModel, path: str | os.PathLike[str]) -> None:
     """
     Write a model as safetensors; a reader sees the old file or the new one, never a part.
 
-    :param model: what to write.
+    :param model: what to write, with the lift of a network.
     :param path: a file name ending in ``.safetensors``.
     :raises OSError: when the folder cannot be written.
+    :raises TypeError: when the lift is not a network's.
     :raises ValueError: when a metric is not finite.
     """
-    tensors = {'A': model.A, 'B': model.B, 'output': model.output}
-    for i, (weight, bias) in enumerate(model.hidden):
+    network = model.observables
+    if not isinstance(network, NetworkObservables):
+        raise TypeError(f'only network lifts can be saved, got {type(network).__name__}: keep the '
+                        'program that makes the model instead')
+    tensors = {'A': model.A, 'B': model.B, 'output': network.output}
+    for i, (weight, bias) in enumerate(network.hidden):
         tensors[f'hidden.{i}.weight'] = weight
         tensors[f'hidden.{i}.bias'] = bias
     description = json.dumps({
-        'activation': ACTIVATION,
-        'hidden_layers': len(model.hidden),
-        'identity': model.identity,
+        'activation': network.activation,
+        'hidden_layers': len(network.hidden),
+        'identity': network.identity,
         'inputs': _describe(model.inputs),
         'n_u': model.n_u,
         'n_x': model.n_x,
@@ -133,8 +139,7 @@ def load(path: str | os.PathLike[str]) -> LiftedModel:
 
 def _build(about: dict[str, Any], tensors: dict[str, np.ndarray]) -> LiftedModel:
     """Assemble the model; whatever does not fit raises one of the errors `load` translates."""
-    if about['activation'] != ACTIVATION:
-        raise ValueError(f"activation must be {ACTIVATION!r}, got {about['activation']!r}")
+    activation_named(about['activation'])
     layers = _integer(about, 'hidden_layers')
     if layers > len(tensors):
         raise ValueError(f'{len(tensors)} arrays cannot make up {layers} hidden layers')
@@ -149,9 +154,12 @@ def _build(about: dict[str, Any], tensors: dict[str, np.ndarray]) -> LiftedModel
     if not all(math.isfinite(value) for value in metrics.values()):
         raise ValueError('a metric is not finite')
     model = LiftedModel(
-        hidden=tuple((tensors[f'hidden.{i}.weight'], tensors[f'hidden.{i}.bias'])
-                     for i in range(layers)),
-        output=tensors['output'], A=tensors['A'], B=tensors['B'], identity=about['identity'],
+        observables=NetworkObservables(
+            hidden=tuple((tensors[f'hidden.{i}.weight'], tensors[f'hidden.{i}.bias'])
+                         for i in range(layers)),
+            output=tensors['output'], identity=about['identity'],
+            activation=about['activation']),
+        A=tensors['A'], B=tensors['B'],
         states=_coordinates(about['states']), inputs=_coordinates(about['inputs']),
         time_unit=str(about['time_unit']),
         provenance=Provenance(

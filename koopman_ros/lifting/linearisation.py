@@ -16,7 +16,9 @@
 
 from __future__ import annotations
 
-from koopman_ros.lifting.model import Array, Coordinates, LiftedModel, Provenance
+from koopman_ros.lifting.arrays import Array
+from koopman_ros.lifting.model import Coordinates, LiftedModel, Provenance
+from koopman_ros.lifting.observables import NetworkObservables
 import numpy as np
 
 
@@ -37,5 +39,5 @@ def linearised_model(jacobian: Array, B: Array, states: Coordinates, inputs: Coo
     n_x = len(states)
     A = np.asarray(jacobian) * states.scale / states.scale[:, None]
     scaled_B = np.asarray(B) * inputs.scale / states.scale[:, None]
-    return LiftedModel((), np.zeros((0, n_x)), A, scaled_B, True, states, inputs, time_unit,
-                       provenance)
+    itself = NetworkObservables((), np.zeros((0, n_x)), identity=True)
+    return LiftedModel(itself, A, scaled_B, states, inputs, time_unit, provenance)

@@ -21,6 +21,7 @@ import sys
 import time
 from types import TracebackType
 
+from koopman_ros.learning import Progress
 from tqdm import tqdm
 
 _LINE_PERIOD = 5.0  # s between plain lines
@@ -28,27 +29,31 @@ _LINE_PERIOD = 5.0  # s between plain lines
 
 class TrainingProgress:
     """
-    Show the steps of a training; give it to :func:`koopman_ros.lifting.training.train`.
+    Show the starts of a training; give it to :func:`koopman_ros.learning.train`.
 
     :param label: what is trained.
     """
 
     def __init__(self, label: str) -> None:
         self._label = label
-        self._bar = tqdm(desc=label, unit='step', disable=not sys.stderr.isatty())
+        self._bar = tqdm(desc=label, unit='start', disable=not sys.stderr.isatty())
         self._last_line = time.monotonic()
 
-    def __call__(self, start: int, n_z: int, iteration: int, cost: float) -> bool:
-        """Take note of a step and go on; `cost` is half the mean square of the residuals."""
-        rms = math.sqrt(2.0 * cost)
+    def __call__(self, now: Progress) -> bool:
+        """Take note of a step and go on."""
+        text = f'n_z {now.n_z}'
+        if not math.isnan(now.rw):
+            text += f', rw {now.rw:.1e}'
+        if now.iteration:
+            text += f', step {now.iteration}, residual {now.residual:.1e}'
         if not self._bar.disable:
-            self._bar.set_postfix_str(f'start {start + 1}, n_z {n_z}, residual {rms:.2e}',
-                                      refresh=False)
-            self._bar.update()
+            self._bar.total = now.total
+            self._bar.set_postfix_str(text, refresh=False)
+            self._bar.update(now.finished - self._bar.n)
         elif time.monotonic() - self._last_line > _LINE_PERIOD:
             self._last_line = time.monotonic()
-            print(f'{self._label}: start {start + 1}, n_z {n_z}, step {iteration}, '
-                  f'residual {rms:.2e}', file=sys.stderr, flush=True)
+            print(f'{self._label}: start {now.finished + 1} of {now.total}, {text}',
+                  file=sys.stderr, flush=True)
         return False
 
     def __enter__(self) -> TrainingProgress:

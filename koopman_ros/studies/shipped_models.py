@@ -26,17 +26,15 @@ from dataclasses import replace
 from pathlib import Path
 import sys
 
+from koopman_ros.learning import Growth, roll_out, Samples, train
 from koopman_ros.lifting import LiftedModel, linearised_model, Provenance, save
-from koopman_ros.lifting.growth import Recipe
-from koopman_ros.lifting.training import Plant, Samples, train, Trained
-from koopman_ros.lifting.validation import roll_out
 from koopman_ros.plants import (
     ControlAffineSystem,
     one_state_reactor,
     random_steps,
     RandomStepDesign,
-    sample_derivatives,
 )
+from koopman_ros.studies.datasets import describe, random_step_episodes
 from koopman_ros.studies.progress import TrainingProgress
 import numpy as np
 
@@ -54,39 +52,23 @@ LIFTED_SIZES = (3, 4)
 
 def training_samples(system: ControlAffineSystem) -> Samples:
     """Simulate the episodes of random coolant steps that the lifts are learned from."""
-    x, dxdt, u, episode = [], [], [], []
-    for number in range(EPISODES):
-        record = sample_derivatives(
-            system, random_steps(system, DESIGN, EPISODE_MINUTES, SEED + number).trajectory)
-        x.append(record.x)
-        dxdt.append(record.x_dot)
-        u.append(record.u)
-        episode.append(np.full(len(record.x), number))
-    return Samples(np.concatenate(x), np.concatenate(dxdt), np.concatenate(u),
-                   np.concatenate(episode))
+    return random_step_episodes(system, DESIGN, EPISODES, EPISODE_MINUTES, SEED)
 
 
-def describe(system: ControlAffineSystem) -> Plant:
-    """Return what training may know of a plant beside its data."""
-    return Plant(system.name, system.state_names, system.state_units, system.input_names,
-                 system.input_units, system.time_unit, system.nominal_state,
-                 system.nominal_input, system.B)
-
-
-def train_lift(n_z: int, *, seed: int = SEED, starts: int = STARTS,
-               progress: TrainingProgress | None = None) -> Trained:
+def train_lifts(progress: TrainingProgress | None = None) -> dict[int, LiftedModel]:
     """
-    Train the shipped lift of the one-state reactor with `n_z` coordinates.
+    Train the shipped lifts of the one-state reactor; the larger one is grown from the smaller.
 
-    :param n_z: number of lifted coordinates.
-    :param seed: seed of the first start; the shipped file names the seed of its winner.
-    :param starts: number of starts.
     :param progress: what shows the progress.
+    :return: models by n_z.
     """
     system = one_state_reactor()
-    trained = train(describe(system), training_samples(system), Recipe(n_z), seed=seed,
-                    starts=starts, progress=progress)
-    return replace(trained, model=_with_roll_out(trained.model, system))
+    # a fixed number of steps: where they end depends least on how a processor rounds
+    recipe = Growth(max(LIFTED_SIZES), tolerance=0.0)
+    trained = train(describe(system), training_samples(system), recipe, seed=SEED, starts=STARTS,
+                    watch=progress)
+    return {model.n_z: _with_roll_out(model, system) for model in trained.path
+            if model.n_z in LIFTED_SIZES}
 
 
 def linear_model(like: LiftedModel) -> LiftedModel:
@@ -115,14 +97,11 @@ def main(args: list[str] | None = None) -> int:
                         help='folder for the model files (default: %(default)s)')
     output = parser.parse_args(args).output
     output.mkdir(parents=True, exist_ok=True)
-    model = None
-    for n_z in LIFTED_SIZES:
-        with TrainingProgress(f'reactor, n_z = {n_z}') as progress:
-            trained = train_lift(n_z, progress=progress)
-        model = trained.model
+    with TrainingProgress('reactor') as progress:
+        models = train_lifts(progress)
+    for n_z, model in models.items():
         save(model, output / f'reactor_nz{n_z}.safetensors')
         _report(f'reactor_nz{n_z}', model)
-    assert model is not None
     linear = linear_model(model)
     save(linear, output / 'reactor_linear.safetensors')
     _report('reactor_linear', linear)

@@ -18,7 +18,7 @@ from collections.abc import Callable
 from pathlib import Path
 
 from koopman_ros.control import Feedback, steady_state_target, Weights
-from koopman_ros.lifting import Coordinates, LiftedModel, load, Provenance
+from koopman_ros.lifting import Coordinates, LiftedModel, load, NetworkObservables, Provenance
 from koopman_ros.plants import (
     ControlAffineSystem,
     equilibrium_input,
@@ -103,7 +103,8 @@ def two_state_model() -> LiftedModel:
     W[:, 0] = step * np.concatenate([k, -k])
     output = np.concatenate([w, w])[None, :] / (curvature * step ** 2)
     return LiftedModel(
-        ((W, np.full(6, 0.66)),), output, two_state_exact_lift().A, system.B, True,
+        NetworkObservables(((W, np.full(6, 0.66)),), output, identity=True),
+        two_state_exact_lift().A, system.B,
         Coordinates(('x1', 'x2'), ('1', '1'), np.zeros(2), np.ones(2), np.array([-6.0, -6.0]),
                     np.array([6.0, 8.0])),
         Coordinates(('u',), ('1/s',), np.zeros(1), np.ones(1), np.array([-50.0]),

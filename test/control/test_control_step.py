@@ -22,7 +22,7 @@ from typing import Any
 
 from closed_loops import COOLANT, REACTOR, SETPOINT, shipped, START, two_state_model
 from koopman_ros.control import Controller, InputLimits, Law, Mode, Settings, State
-from koopman_ros.lifting import Coordinates, LiftedModel, Provenance
+from koopman_ros.lifting import Coordinates, LiftedModel, NetworkObservables, Provenance
 from koopman_ros.plants import advance
 import numpy as np
 import pytest
@@ -154,8 +154,8 @@ def test_a_day_replays_bit_for_bit():
 def change_of_variable(scale: float) -> LiftedModel:
     """Return the free lift tanh(x) of one state."""
     c = Coordinates(('x',), ('1',), np.zeros(1), np.array([scale]), -np.ones(1), np.ones(1))
-    return LiftedModel(((np.eye(1), np.zeros(1)),), np.eye(1), -np.eye(1), np.eye(1), False, c, c,
-                       's', Provenance('change of variable'))
+    itself = NetworkObservables(((np.eye(1), np.zeros(1)),), np.eye(1), identity=False)
+    return LiftedModel(itself, -np.eye(1), np.eye(1), c, c, 's', Provenance('change of variable'))
 
 
 @pytest.mark.parametrize('first', [math.nan, LARGEST, -LARGEST, 1e300, 0.0])

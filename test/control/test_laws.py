@@ -38,8 +38,14 @@ from koopman_ros.control import (
     steady_state_target,
     Weights,
 )
-from koopman_ros.lifting import Coordinates, LiftedModel, linearised_model, Provenance
-from koopman_ros.lifting.validation import fit
+from koopman_ros.learning import fit
+from koopman_ros.lifting import (
+    Coordinates,
+    LiftedModel,
+    linearised_model,
+    NetworkObservables,
+    Provenance,
+)
 from koopman_ros.plants import equilibrium, two_state_example, two_state_reactor
 import numpy as np
 import pytest
@@ -287,8 +293,9 @@ def test_no_law_within_a_tiny_bound():
 
 def change_of_variable():
     c = Coordinates(('x',), ('1',), np.zeros(1), np.ones(1), -2.0 * np.ones(1), 2.0 * np.ones(1))
-    return LiftedModel(((np.eye(1), np.zeros(1)),), np.eye(1), -np.eye(1), np.array([[0.7]]),
-                       False, c, c, 's', Provenance('change of variable'))
+    itself = NetworkObservables(((np.eye(1), np.zeros(1)),), np.eye(1), identity=False)
+    return LiftedModel(itself, -np.eye(1), np.array([[0.7]]), c, c, 's',
+                       Provenance('change of variable'))
 
 
 @pytest.mark.parametrize('x', [1.3, -0.8, 1e-3])

@@ -26,15 +26,28 @@ import threading
 import time
 from typing import Any
 
-from koopman_ros.lifting import LiftedModel, linearised_model, load, ModelFileError, save
+from koopman_ros.lifting import (
+    LiftedModel,
+    linearised_model,
+    load,
+    ModelFileError,
+    NetworkObservables,
+    PolynomialObservables,
+    save,
+)
 import numpy as np
 import pytest
 from random_lifts import random_lift
+
+SHIPPED = Path(__file__).parents[2] / 'config' / 'models'
 
 MODELS = {
     'one layer': random_lift(),
     'two layers': random_lift(3, (5, 4), n_u=2),
     'free': random_lift(1, (3,), identity=False, n_free=2),
+    'sigmoid': random_lift(2, (5, 4), activation='sigmoid'),
+    'sine': random_lift(activation='sine'),
+    'softplus': random_lift(1, activation='softplus'),
     'untrained': replace(
         random_lift(), provenance=replace(random_lift().provenance, seed=None, metrics={})),
     'linear': linearised_model(
@@ -45,11 +58,18 @@ MODELS = {
 
 def arrays(model: LiftedModel) -> dict[str, np.ndarray]:
     """Name the arrays of a model as its file does."""
-    named = {'A': model.A, 'B': model.B, 'output': model.output}
-    for i, (weight, bias) in enumerate(model.hidden):
+    network = model.observables
+    assert isinstance(network, NetworkObservables)
+    named = {'A': model.A, 'B': model.B, 'output': network.output}
+    for i, (weight, bias) in enumerate(network.hidden):
         named[f'hidden.{i}.weight'] = weight
         named[f'hidden.{i}.bias'] = bias
     return named
+
+
+def activation(model: LiftedModel) -> str:
+    assert isinstance(model.observables, NetworkObservables)
+    return model.observables.activation
 
 
 def assert_same(a: LiftedModel, b: LiftedModel) -> None:
@@ -62,6 +82,7 @@ def assert_same(a: LiftedModel, b: LiftedModel) -> None:
         assert (one.names, one.units) == (other.names, other.units)
         for name in ('center', 'scale', 'lower', 'upper'):
             assert getattr(one, name).tobytes() == getattr(other, name).tobytes(), name
+    assert activation(a) == activation(b)
     assert (a.identity, a.time_unit, a.provenance) == (b.identity, b.time_unit, b.provenance)
 
 
@@ -109,6 +130,29 @@ def test_same_model_gives_the_same_bytes(name, path):
     first = path.read_bytes()
     save(load(path), path)
     assert path.read_bytes() == first
+
+
+@pytest.mark.parametrize('shipped', sorted(SHIPPED.glob('*.safetensors')), ids=lambda p: p.stem)
+def test_a_shipped_file_is_written_again_bit_for_bit(shipped, path):
+    save(load(shipped), path)
+    assert path.read_bytes() == shipped.read_bytes()
+
+
+@pytest.mark.parametrize('name', ['sigmoid', 'sine', 'softplus'])
+def test_a_network_reads_as_what_was_written(name, path):
+    save(MODELS[name], path)
+    assert activation(load(path)) == name
+    x = np.full(MODELS[name].n_x, 0.3)
+    np.testing.assert_array_equal(load(path).lift(x), MODELS[name].lift(x))
+
+
+def test_a_dictionary_has_no_file(path):
+    dictionary = replace(MODELS['one layer'],
+                         observables=PolynomialObservables.total_degree(2, 2))
+    with pytest.raises(
+            TypeError, match='only network lifts can be saved, got PolynomialObservables'):
+        save(dictionary, path)
+    assert not path.exists()
 
 
 def test_extreme_values_survive(path):
@@ -269,7 +313,8 @@ HEADER_CHANGES = {
     'entry is no object': (lambda h: h.update(A=None), 'not a safetensors file'),
     'offset beyond the end': (
         change_array('output', data_offsets=[344, 464]), '8 bytes of its arrays are missing'),
-    'wrong shape of A': (change_array('A', shape=[25]), 'A: n_z must be at least n_x = 2'),
+    'wrong shape of A': (
+        change_array('A', shape=[25]), 'incompatible A: expected (5, 5), got (25,)'),
     'wrong shape of B': (
         change_array('B', shape=[1, 2]), 'incompatible B: expected (2, 1), got (1, 2)'),
     'array under another name': (
@@ -305,10 +350,14 @@ def test_a_header_that_does_not_fit_is_refused(path, content, case):
     assert words in refusal(path, joined(json.dumps(header).encode(), data))
 
 
+ACTIVATION_WORDS = "activation must be one of 'tanh', 'sigmoid', 'sine', 'softplus', got "
 ABOUT_CHANGES = {
-    'other activation': (lambda a: a.update(activation='relu'), "must be 'tanh', got 'relu'"),
+    'other activation': (lambda a: a.update(activation='relu'), ACTIVATION_WORDS + "'relu'"),
     'activation with a line break': (
-        lambda a: a.update(activation='a\nb'), r"must be 'tanh', got 'a\nb'"),
+        lambda a: a.update(activation='a\nb'), ACTIVATION_WORDS + r"'a\nb'"),
+    'activation is a list': (
+        lambda a: a.update(activation=['tanh']), ACTIVATION_WORDS + "['tanh']"),
+    'no activation': (lambda a: a.pop('activation'), "'activation' is missing"),
     'wrong n_x': (lambda a: a.update(n_x=1), 'n_x is given as 1, the arrays say 2'),
     'wrong n_u': (lambda a: a.update(n_u=2), 'n_u is given as 2, the arrays say 1'),
     'wrong n_z': (lambda a: a.update(n_z=4), 'n_z is given as 4, the arrays say 5'),
@@ -324,7 +373,7 @@ ABOUT_CHANGES = {
     'no layers': (lambda a: a.update(hidden_layers=0), "expected the arrays ['A', 'B', 'output']"),
     'identity is a number': (lambda a: a.update(identity=1), 'identity must be true or false'),
     'not identity': (
-        lambda a: a.update(identity=False), 'incompatible output: expected (5, 5), got (3, 5)'),
+        lambda a: a.update(identity=False), 'incompatible A: expected (3, 3), got (5, 5)'),
     'unknown time unit': (lambda a: a.update(time_unit='h'), "must be 's' or 'min', got 'h'"),
     'no states': (lambda a: a.pop('states'), "'states' is missing"),
     'states is a list': (lambda a: a.update(states=[]), 'its content is inconsistent'),
@@ -447,7 +496,7 @@ def test_a_reader_sees_the_old_file_or_the_new_one(path):
     deadline = time.monotonic() + 30.0
     try:
         while (len(seen) < 200 or len(set(seen)) < 2) and time.monotonic() < deadline:
-            seen.append(load(path).output.shape[1])
+            seen.append(arrays(load(path))['output'].shape[1])
     finally:
         done.set()
         writer.join()

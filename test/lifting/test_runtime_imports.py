@@ -47,9 +47,9 @@ def test_runtime_needs_neither_ros_nor_torch(packages):
     assert (result.returncode, result.stdout, result.stderr) == (0, '', '')
 
 
-def test_training_does_need_torch():
+def test_learning_does_need_torch():
     """The check above can tell: what imports torch fails in the same process."""
-    result = run('import koopman_ros.lifting.training')
+    result = run('import koopman_ros.learning')
     assert result.returncode == 1
     assert 'import of torch halted; None in sys.modules' in result.stderr
 

@@ -14,7 +14,7 @@
 
 """Lifted models with random weights, for tests of what holds for any of them."""
 
-from koopman_ros.lifting import Coordinates, LiftedModel, Provenance
+from koopman_ros.lifting import Coordinates, LiftedModel, NetworkObservables, Provenance
 import numpy as np
 
 
@@ -27,21 +27,31 @@ def coordinates(prefix: str, n: int) -> Coordinates:
         center - 2.0 * scale, center + scale)
 
 
-def random_lift(n_x: int = 2, widths: tuple[int, ...] = (5,), *, identity: bool = True,
-                n_u: int = 1, n_free: int = 3, seed: int = 0) -> LiftedModel:
-    """Return a lift of order one with n_free coordinates from tanh layers of these widths."""
+def random_network(n_x: int = 2, widths: tuple[int, ...] = (5,), *, identity: bool = True,
+                   n_free: int = 3, activation: str = 'tanh',
+                   seed: int | np.random.Generator = 0) -> NetworkObservables:
+    """Return a network of order one with n_free outputs from hidden layers of these widths."""
     rng = np.random.default_rng(seed)
     hidden, width = [], n_x
     for h in widths:
         hidden.append((rng.normal(size=(h, width)) / np.sqrt(width), rng.normal(size=h)))
         width = h
-    n_z = n_free + (n_x if identity else 0)
+    output = rng.normal(size=(n_free, width)) / np.sqrt(width)
+    return NetworkObservables(tuple(hidden), output, identity, activation)
+
+
+def random_lift(n_x: int = 2, widths: tuple[int, ...] = (5,), *, identity: bool = True,
+                n_u: int = 1, n_free: int = 3, activation: str = 'tanh',
+                seed: int = 0) -> LiftedModel:
+    """Return a model with such a network, and A and B of order one."""
+    rng = np.random.default_rng(seed)
+    observables = random_network(
+        n_x, widths, identity=identity, n_free=n_free, activation=activation, seed=rng)
+    n_z = observables.n_z
     return LiftedModel(
-        hidden=tuple(hidden),
-        output=rng.normal(size=(n_free, width)) / np.sqrt(width),
+        observables=observables,
         A=0.3 * rng.normal(size=(n_z, n_z)) - np.eye(n_z),
         B=rng.normal(size=(n_x, n_u)),
-        identity=identity,
         states=coordinates('x', n_x),
         inputs=coordinates('u', n_u),
         time_unit='min',

@@ -17,8 +17,8 @@
 from itertools import pairwise
 import math
 
-from koopman_ros.lifting.levenberg_marquardt import minimise, Status
-from koopman_ros.lifting.residuals import NormalEquations
+from koopman_ros.learning.levenberg_marquardt import minimise, Status
+from koopman_ros.learning.residuals import NormalEquations
 import numpy as np
 import pytest
 import torch
@@ -142,7 +142,7 @@ def test_a_gradient_that_is_not_a_number_stalls():
 def test_interruption_keeps_the_best_so_far(end):
     evaluate = least_squares(rosenbrock)
     found = minimise(evaluate, vector(-1.2, 1.0), max_iterations=100,
-                     interrupted=lambda iteration, cost: iteration == end)
+                     monitor=lambda iteration, cost: iteration == end)
     assert found.status is Status.INTERRUPTED
     assert found.iterations == end
     assert found.cost == evaluate(found.theta, derivatives=False).cost
@@ -151,7 +151,7 @@ def test_interruption_keeps_the_best_so_far(end):
 def test_cost_never_rises():
     costs = []
     found = minimise(least_squares(rosenbrock), vector(-1.2, 1.0), max_iterations=100,
-                     interrupted=lambda iteration, cost: costs.append(cost))
+                     monitor=lambda iteration, cost: costs.append(cost))
     assert found.status is Status.CONVERGED
     assert all(later <= earlier for earlier, later in pairwise(costs))
 
@@ -160,3 +160,45 @@ def test_every_status_says_what_to_do():
     assert 'increase `max_iterations`' in Status.MAX_ITERATIONS.value
     assert 'check the data and try another seed' in Status.STALLED.value
     assert 'the best parameters so far are kept' in Status.INTERRUPTED.value
+
+
+def test_the_default_tolerance_is_a_thousandth_over_twenty_steps():
+    """A cost that falls by `share` in each step goes on while 20 steps lower it by 1/1000."""
+    def steps(share, limit):
+        costs = iter(range(10 * limit))
+
+        def evaluate(theta, *, derivatives):
+            # every trial is followed by an evaluation with derivatives at the same place
+            cost = (1.0 - share) ** ((next(costs) + 1) // 2)
+            return NormalEquations(cost, vector(-1e-3), torch.eye(1).double())
+
+        return minimise(evaluate, vector(0.0), max_iterations=limit)
+
+    assert steps(6e-5, 200).status is Status.MAX_ITERATIONS
+    found = steps(4e-5, 200)
+    assert (found.status, found.iterations) == (Status.CONVERGED, 20)
+
+
+@pytest.mark.parametrize('derivatives_too', [True, False])
+def test_an_interrupt_from_the_keyboard_keeps_the_best_so_far(derivatives_too):
+    residual, calls = least_squares(rosenbrock), []
+
+    def evaluate(theta, *, derivatives):
+        calls.append(derivatives)
+        if len(calls) > 6 and derivatives is derivatives_too:
+            raise KeyboardInterrupt
+        return residual(theta, derivatives=derivatives)
+
+    start = vector(-1.2, 1.0)
+    found = minimise(evaluate, start, max_iterations=100)
+    assert found.status is Status.INTERRUPTED
+    assert found.cost == residual(found.theta, derivatives=False).cost
+    assert found.cost < residual(start, derivatives=False).cost
+
+
+def test_an_interrupt_of_the_first_evaluation_passes_on():
+    def evaluate(theta, *, derivatives):
+        raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        minimise(evaluate, vector(1.0), max_iterations=10)

@@ -1,0 +1,119 @@
+# Copyright 2026 The koopman_ros Authors
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""Algorithm 1 of the paper, as printed: random start, decoder term, decreasing lambda."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from koopman_ros.learning.growth import Grown, Monitor
+from koopman_ros.learning.levenberg_marquardt import minimise, Status
+from koopman_ros.learning.network import ACTIVATIONS, Layout
+from koopman_ros.learning.residuals import Data, Problem, ResidualWeights
+import torch
+
+
+@dataclass(frozen=True)
+class Algorithm1:
+    """
+    The paper's own recipe, to compare with.
+
+    All parameters (network, A, decoder, B where it is learned) start from the standard normal
+    distribution. The dynamics residual plus lambda times the decoder residual is minimised to
+    local optimality or `max_iterations`, then lambda is divided by gamma, until the parameters
+    move by less than `tolerance` (Euclidean distance, the paper's first criterion) or after
+    `max_rounds` (its second). The paper leaves the sizes of the networks open; the solver is
+    Levenberg-Marquardt where the paper takes IPOPT.
+
+    The objective falls when z shrinks and the decoder grows, so that it does not tell a good lift
+    from a useless one; see :class:`~koopman_ros.learning.growth.Growth` for what does.
+
+    :param n_z: number of lifted coordinates.
+    :param identity: whether z starts with the state (the paper's choice in its two-state example).
+    :param hidden: units of each hidden layer of the lift.
+    :param activation: as in :class:`~koopman_ros.learning.growth.Growth`.
+    :param decoder: units of the decoder network.
+    :param lambda_initial: first weight of the decoder term.
+    :param gamma: decay rate of lambda, above 1.
+    :param tolerance: distance between successive parameter vectors taken as convergence.
+    :param max_rounds: limit of minimisations.
+    :param max_iterations: limit of steps in each.
+    """
+
+    n_z: int
+    identity: bool = False
+    hidden: tuple[int, ...] = (8,)
+    activation: str = 'tanh'
+    decoder: int = 8
+    lambda_initial: float = 10.0
+    gamma: float = 10.0
+    tolerance: float = 1e-3
+    max_rounds: int = 8
+    max_iterations: int = 300
+
+    def __post_init__(self) -> None:
+        if not self.gamma > 1.0:
+            raise ValueError(f'gamma must be above 1, got {self.gamma}')
+        if not self.lambda_initial > 0.0:
+            raise ValueError(f'lambda_initial must be above 0, got {self.lambda_initial}')
+        if not self.hidden:
+            raise ValueError('hidden must name the units of at least one layer')
+        if min(self.n_z, self.decoder, self.max_rounds, self.max_iterations, *self.hidden) < 1:
+            raise ValueError(f'sizes and limits must be at least 1: {self}')
+        if self.activation not in ACTIVATIONS:
+            raise ValueError(f'activation must be one of {", ".join(ACTIVATIONS)}, '
+                             f'got {self.activation!r}')
+
+    def rounds(self, n_x: int) -> tuple[int, ...]:
+        """
+        Return the n_z after each round of starts: there is one.
+
+        :raises ValueError: when `n_z` is too small for the states.
+        """
+        if self.n_z < n_x + self.identity:
+            raise ValueError(f'n_z = {self.n_z} is too small for {n_x} states')
+        return (self.n_z,)
+
+    def start(self, data: Data, n_z: int, parent: Grown | None, seed: int,
+              monitor: Monitor | None = None) -> Grown:
+        """
+        Run the algorithm once.
+
+        :param data: the samples.
+        :param n_z: number of lifted coordinates.
+        :param parent: has no part in it.
+        :param seed: seed of the start.
+        :param monitor: progress, and the way to end early.
+        """
+        layout = Layout(data.x.shape[1], n_z, self.hidden, self.identity, self.activation,
+                        0 if data.u is None else data.u.shape[1], self.decoder)
+        generator = torch.Generator().manual_seed(seed)
+        theta = torch.randn(layout.size, generator=generator, dtype=torch.float64).to(data.x)
+        problem = Problem(layout, data, ResidualWeights())
+        status = Status.MAX_ITERATIONS
+        for number in range(self.max_rounds):
+            weight = self.lambda_initial / self.gamma ** number
+            weighted = problem.with_weights(ResidualWeights(decoder=weight))
+            minimum = minimise(weighted.evaluate, theta, max_iterations=self.max_iterations,
+                               monitor=monitor)
+            moved = float(torch.linalg.norm(minimum.theta - theta))
+            theta, status = minimum.theta, minimum.status
+            # where the start itself cannot move it has not converged, but is of no use
+            if status is Status.INTERRUPTED or (status is Status.STALLED and number == 0):
+                break
+            if moved <= self.tolerance:
+                status = Status.CONVERGED
+                break
+        return Grown(layout, theta, status)

@@ -1,0 +1,91 @@
+# Copyright 2026 The koopman_ros Authors
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""Linear and polynomial models from the same samples, to set beside a learned lift."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from koopman_ros import __version__
+from koopman_ros.learning.samples import Array, Plant, Samples, Scaling
+from koopman_ros.lifting import LiftedModel, linearised_model, PolynomialObservables, Provenance
+import numpy as np
+
+
+@dataclass(frozen=True)
+class Linearisation:
+    """
+    The linearisation at the nominal point.
+
+    :param jacobian: (n_x, n_x) df/dx there, in units.
+    """
+
+    jacobian: Array
+
+    def learn(self, plant: Plant, samples: Samples, scaling: Scaling | None = None
+              ) -> LiftedModel:
+        """
+        Return the model.
+
+        :param scaling: its coordinates; by default from the range of the samples.
+        :raises ValueError: when B is not known.
+        """
+        if plant.B is None:
+            raise ValueError('a linearisation needs the B of the plant')
+        scaling = scaling or Scaling.of(plant, samples)
+        return linearised_model(self.jacobian, plant.B, scaling.states, scaling.inputs,
+                                scaling.time_unit, _provenance(plant, samples))
+
+
+@dataclass(frozen=True)
+class Edmd:
+    """
+    Extended dynamic mode decomposition of the generator, with inputs, on monomials.
+
+    dz/dt = A z + J(x) B u by linear least squares on J (dx/dt - B u), z all monomials of the
+    scaled states up to a degree; degree 1 is the linear model that fits the samples best. Where
+    B is not known it comes from the rows of the states alone. (Williams, Kevrekidis, Rowley 2015;
+    generator with control-affine inputs: Peitz, Otto, Rowley 2020.)
+
+    :param degree: highest total degree of the monomials.
+    """
+
+    degree: int = 3
+
+    def learn(self, plant: Plant, samples: Samples, scaling: Scaling | None = None
+              ) -> LiftedModel:
+        """
+        Fit the model.
+
+        :param scaling: its coordinates; by default from the range of the samples.
+        """
+        scaling = scaling or Scaling.of(plant, samples)
+        x, rate, u = scaling.deviations(samples)
+        observables = PolynomialObservables.total_degree(x.shape[1], self.degree)
+        z, J = observables.lift_and_jacobian(x)
+        if plant.B is None:
+            both = np.linalg.lstsq(np.hstack([z, u]), rate, rcond=None)[0]
+            B = both[z.shape[1]:].T
+        else:
+            B = scaling.input_matrix(plant.B)
+        drift = (J @ (rate - u @ B.T)[..., None])[..., 0]
+        A = np.linalg.lstsq(z, drift, rcond=None)[0].T
+        return LiftedModel(observables, A.astype(np.float64), B.astype(np.float64),
+                           scaling.states, scaling.inputs, scaling.time_unit,
+                           _provenance(plant, samples))
+
+
+def _provenance(plant: Plant, samples: Samples) -> Provenance:
+    return Provenance(plant.name, None, samples.digest(), {}, __version__)

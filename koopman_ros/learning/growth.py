@@ -1,0 +1,286 @@
+# Copyright 2026 The koopman_ros Authors
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""Growth of a lift one coordinate at a time: the recipe from which training does not collapse."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from functools import partial
+import itertools
+
+from koopman_ros.learning.levenberg_marquardt import minimise, Minimum, Status
+from koopman_ros.learning.network import ACTIVATIONS, Layout, Parameters, Pass
+from koopman_ros.learning.residuals import Data, Problem, ResidualWeights
+import torch
+from torch import Tensor
+
+# Called after every step with (iteration, cost); True ends the minimisation.
+Monitor = Callable[[int, float], bool]
+
+
+@dataclass(frozen=True)
+class Grown:
+    """
+    A trained parameter vector.
+
+    :param layout: its sizes.
+    :param theta: (p,) parameters.
+    :param status: how the last minimisation ended.
+    """
+
+    layout: Layout
+    theta: Tensor
+    status: Status
+
+
+@dataclass(frozen=True)
+class Growth:
+    """
+    The default recipe: coordinates are added one at a time, each from several starts.
+
+    A new coordinate starts as a ridge fit of the product of eigenfunctions that the present
+    coordinates span least (products of eigenfunctions are eigenfunctions themselves), on hidden
+    units of which a few are new and random. Levenberg-Marquardt then moves all parameters.
+
+    :param n_z: number of lifted coordinates.
+    :param identity: whether z starts with the state.
+    :param hidden_first: units of the first free coordinates, in each hidden layer.
+    :param hidden_more: units added with each further coordinate, in each hidden layer.
+    :param layers: number of hidden layers, 1 or 2.
+    :param activation: ``'tanh'``, ``'sigmoid'``, ``'sine'`` or ``'softplus'``.
+    :param whitening: weight of the residual that keeps E[z z'] near the identity.
+    :param decoder: units of the decoder network, which holds on to the states where they are no
+        coordinates themselves; None for 8 with two or more states in a free lift and none
+        otherwise.
+    :param decoder_weight: weight of its residual (the paper's lambda), divided by 1000 for the
+        last steps.
+    :param ridge: ridge weight in the fit that starts a new coordinate.
+    :param max_iterations: limit of Levenberg-Marquardt steps for each coordinate.
+    :param tolerance: relative decrease of the cost over 20 steps taken as convergence.
+    """
+
+    n_z: int
+    identity: bool = True
+    hidden_first: int = 8
+    hidden_more: int = 3
+    layers: int = 1
+    activation: str = 'tanh'
+    whitening: float = 1.0
+    decoder: int | None = None
+    decoder_weight: float = 0.1
+    ridge: float = 1e-6
+    max_iterations: int = 1000
+    tolerance: float = 1e-3
+
+    def __post_init__(self) -> None:
+        if self.n_z < 1:
+            raise ValueError(f'n_z must be at least 1, got {self.n_z}')
+        if self.hidden_first < 1 or self.hidden_more < 0:
+            raise ValueError(f'hidden units must be positive, got {self.hidden_first} first and '
+                             f'{self.hidden_more} more')
+        if self.layers not in (1, 2):
+            raise ValueError(f'layers must be 1 or 2, got {self.layers}')
+        if self.activation not in ACTIVATIONS:
+            raise ValueError(f'activation must be one of {", ".join(ACTIVATIONS)}, '
+                             f'got {self.activation!r}')
+
+    def rounds(self, n_x: int) -> tuple[int, ...]:
+        """
+        Return the n_z after each round of starts.
+
+        :raises ValueError: when `n_z` is too small for the states.
+        """
+        if self.n_z < n_x + self.identity:
+            raise ValueError(
+                f'n_z = {self.n_z} is too small for {n_x} states'
+                + (' as its first coordinates: use Edmd(degree=1) for a linear model'
+                   if self.identity else ''))
+        return tuple(range(n_x + self.identity, self.n_z + 1))
+
+    def start(self, data: Data, n_z: int, parent: Grown | None, seed: int,
+              monitor: Monitor | None = None) -> Grown:
+        """
+        Extend a lift to `n_z` coordinates and minimise.
+
+        :param data: the samples.
+        :param n_z: as given by :meth:`rounds`.
+        :param parent: the lift of the round before, None in the first round.
+        :param seed: seed of the random hidden units.
+        :param monitor: progress, and the way to end early.
+        """
+        if parent is None:
+            parent = self._root(data)
+        layout, theta = self._extended(data, n_z, parent, seed)
+        run = partial(minimise, max_iterations=self.max_iterations, tolerance=self.tolerance,
+                      monitor=monitor)
+        problem = Problem(layout, data, ResidualWeights(self.whitening,
+                                                self.decoder_weight * bool(layout.decoder)))
+        minimum: Minimum = run(problem.evaluate, theta)
+        if layout.decoder and minimum.status is not Status.INTERRUPTED:
+            last = problem.with_weights(replace(problem.weights,
+                                                decoder=1e-3 * self.decoder_weight))
+            minimum = run(last.evaluate, minimum.theta)
+        return Grown(layout, minimum.theta, minimum.status)
+
+    def _root(self, data: Data) -> Grown:
+        """Return the lift without a network that growth starts from."""
+        n_x = data.x.shape[1]
+        n_z = n_x if self.identity else 0
+        decoder = self.decoder
+        if decoder is None:
+            decoder = 8 if n_x > 1 and not self.identity else 0
+        layout = Layout(n_x, n_z, (), self.identity, self.activation,
+                        0 if data.u is None else data.u.shape[1], decoder)
+        drift, B = linear_drift(data)
+        empty = data.x.new_zeros
+        network = None if not decoder else (
+            empty((decoder, n_z)), empty(decoder), empty((n_x, decoder)), empty(n_x))
+        return Grown(layout, layout.join(Parameters(
+            (), empty((layout.n_free, 0)), drift if self.identity else empty((0, 0)), B,
+            network)), Status.CONVERGED)
+
+    def _extended(self, data: Data, n_z: int, parent: Grown, seed: int
+                  ) -> tuple[Layout, Tensor]:
+        """Add the coordinates up to `n_z`, started from what the present ones do not span."""
+        old = parent.layout
+        generator = torch.Generator().manual_seed(seed)
+        given = old.split(parent.theta)
+        drift = data.drift(given.B)
+        first = not old.hidden
+        count = self.hidden_first if first else self.hidden_more
+        hidden = _widened(given, old.n_x, count, self.layers, generator)
+        layout = replace(old, n_z=n_z, hidden=tuple(len(b) for _, b in hidden))
+        zero = data.x.new_zeros
+        blank = Parameters(hidden, zero((layout.n_free, layout.hidden[-1])), zero((n_z, n_z)))
+        features = Pass(replace(layout, decoder=0, n_u=0), blank, data.x, drift).features
+        V = torch.cat([given.V, zero((len(given.V), features.shape[1] - given.V.shape[1]))], 1)
+        if n_z == old.n_z + 1:
+            targets = _least_spanned_product(parent, data.x, drift)[:, None]
+        else:
+            targets = _whitened(data.x)
+        V = torch.cat([V, _ridge_fit(features, targets, self.ridge).T])
+        begun = Parameters(hidden, V, zero((n_z, n_z)), given.B)
+        lifted = Pass(layout, begun, data.x, drift)
+        A = least_squares(lifted.z, lifted.z_rate).T
+        decoder = None
+        if layout.decoder:
+            decoder = _decoder_start(lifted.z, data.x, layout.decoder, generator)
+        return layout, layout.join(replace(begun, A=A, decoder=decoder))
+
+
+def linear_drift(data: Data) -> tuple[Tensor, Tensor | None]:
+    """
+    Fit dx/dt = A x + B u by linear least squares.
+
+    :return: A (n_x, n_x), and B (n_x, n_u) where the inputs are among the data, else None.
+    """
+    n_x = data.x.shape[1]
+    if data.u is None:
+        return least_squares(data.x, data.f).T, None
+    both = least_squares(torch.cat([data.x, data.u], 1), data.f).T
+    return both[:, :n_x].contiguous(), both[:, n_x:].contiguous()
+
+
+def least_squares(a: Tensor, b: Tensor) -> Tensor:
+    """Solve a s = b for s (n, k), of least norm where a (N, n) is short of rank."""
+    # not torch.linalg.lstsq: its default driver starts from uninitialised memory, so that the
+    # same data give other bits and at times a wrong rank
+    # (https://github.com/pytorch/pytorch/issues/187411)
+    return torch.linalg.pinv(a) @ b
+
+
+def xavier(rows: int, columns: int, generator: torch.Generator) -> Tensor:
+    """Draw random weights with the variance of Glorot and Bengio (2010)."""
+    spread = (2.0 / (rows + columns)) ** 0.5
+    return spread * torch.randn((rows, columns), generator=generator, dtype=torch.float64)
+
+
+def _widened(given: Parameters, n_x: int, count: int, layers: int, generator: torch.Generator
+             ) -> tuple[tuple[Tensor, Tensor], ...]:
+    """Add `count` random units to each hidden layer; the old ones do not see the new ones."""
+    hidden = []
+    width, added = n_x, 0
+    like = given.A
+    for i in range(layers):
+        W, b = given.hidden[i] if given.hidden else (like.new_zeros((0, width)),
+                                                     like.new_zeros(0))
+        old = torch.cat([W, W.new_zeros((len(W), added))], 1) if given.hidden else W
+        new_W = xavier(count, width, generator).to(like)
+        new_b = 0.5 * torch.randn(count, generator=generator, dtype=torch.float64).to(like)
+        hidden.append((torch.cat([old, new_W]), torch.cat([b, new_b])))
+        width, added = len(b) + count, count
+    return tuple(hidden)
+
+
+def _ridge_fit(features: Tensor, targets: Tensor, ridge: float) -> Tensor:
+    """Fit `targets` (N, k) by features (N, h); return the weights (h, k)."""
+    N, h = features.shape
+    gram = features.T @ features / N + ridge * torch.eye(h).to(features)
+    return torch.linalg.solve(gram, features.T @ targets / N)
+
+
+def _whitened(x: Tensor) -> Tensor:
+    """Return linear combinations of the states (N, n_x) with E[z z'] = I."""
+    factor = torch.linalg.cholesky(x.T @ x / len(x))
+    return torch.linalg.solve_triangular(factor, x.T, upper=False).T
+
+
+def _decoder_start(z: Tensor, x: Tensor, units: int, generator: torch.Generator
+                   ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    """Draw a decoder's hidden units and fit the rest: W (g, n_z), b (g,), V (n_x, g), c (n_x,)."""
+    W = xavier(units, z.shape[1], generator).to(z)
+    b = 0.5 * torch.randn(units, generator=generator, dtype=torch.float64).to(z)
+    features = torch.cat([torch.tanh(z @ W.T + b), z.new_ones((len(z), 1))], 1)
+    fit = _ridge_fit(features, x, 1e-6).T.contiguous()
+    return W, b, fit[:, :-1].contiguous(), fit[:, -1].contiguous()
+
+
+def _least_spanned_product(grown: Grown, x: Tensor, f: Tensor) -> Tensor:
+    """
+    Return the product of slow eigenfunctions that the lift spans least, with unit variance.
+
+    :return: (N,) its component orthogonal to the present coordinates.
+    """
+    if grown.layout.n_z == 0:
+        values, vectors = torch.linalg.eig(least_squares(x, f))
+        z = x
+    else:
+        parameters = grown.layout.split(grown.theta)
+        values, vectors = torch.linalg.eig(parameters.A.T)
+        z = Pass(grown.layout, parameters, x, f).z
+    slowest = torch.argsort(values.real, descending=True)[:max(2, x.shape[1])]
+    functions = z.to(values.dtype) @ vectors[:, slowest]
+    basis = z if grown.layout.n_z else z[:, :0]
+    # degree by degree, so that the slow, smooth products come first
+    for degree in range(2 if grown.layout.n_z else 1, grown.layout.n_z + 3):
+        best, best_share = None, 0.0
+        for factors in itertools.combinations_with_replacement(
+                range(functions.shape[1]), degree):
+            product = functions[:, list(factors)].prod(1)
+            for part in (product.real, product.imag):
+                scale = part.square().mean().sqrt()
+                if scale < 1e-12:
+                    continue
+                part = part / scale
+                if basis.shape[1]:
+                    part = part - basis @ least_squares(basis, part[:, None])[:, 0]
+                share = float(part.square().mean())
+                if share > best_share:
+                    best, best_share = part, share
+        if best is not None and best_share > 1e-6:
+            return best / best_share ** 0.5
+    raise ValueError('no new coordinate can be started: the samples are spanned by the present '
+                     'lift; use a smaller n_z or samples over a wider range')

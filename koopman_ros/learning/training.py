@@ -1,0 +1,340 @@
+# Copyright 2026 The koopman_ros Authors
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""Training of a lifted model from samples: split, scaling, rounds of starts, held-out report."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Generator
+from contextlib import closing
+from dataclasses import dataclass, replace
+import math
+import warnings
+
+import joblib
+from koopman_ros import __version__
+from koopman_ros.learning.algorithm1 import Algorithm1
+from koopman_ros.learning.baselines import Edmd
+from koopman_ros.learning.growth import Grown, Growth, Monitor
+from koopman_ros.learning.levenberg_marquardt import Status
+from koopman_ros.learning.residuals import Data
+from koopman_ros.learning.samples import Plant, Samples, Scaling, split_by_episode
+from koopman_ros.learning.validation import (
+    ClosedLoopComparison,
+    compare_closed_loops,
+    Fit,
+    fit,
+    judge,
+    Report,
+)
+from koopman_ros.lifting import LiftedModel, NetworkObservables, Provenance
+import numpy as np
+import torch
+
+Recipe = Growth | Algorithm1
+RECIPES: dict[str, type[Growth] | type[Algorithm1]] = {'growth': Growth, 'paper': Algorithm1}
+
+
+@dataclass(frozen=True)
+class Progress:
+    """
+    Where a training stands.
+
+    :param n_z: coordinates being learned.
+    :param finished: starts that finished, over all rounds.
+    :param total: starts in all.
+    :param iteration: step within a start that is under way in this process, else 0.
+    :param residual: root mean square of the residuals there, else NaN.
+    :param rw: best validation figure so far, NaN before the first.
+    """
+
+    n_z: int
+    finished: int
+    total: int
+    iteration: int
+    residual: float
+    rw: float
+
+
+# Called after every step and start; True ends the training with the best so far.
+Watch = Callable[[Progress], bool]
+
+
+@dataclass(frozen=True)
+class Trained:
+    """
+    A trained model with what it took.
+
+    :param model: the winner, with its figures on the untouched test episodes in its provenance.
+    :param report: those figures.
+    :param linear: the figures of the linear model that fits the training episodes best.
+    :param closed_loop: the winner's law beside the linear one's; None without inputs, or when
+        nothing was to be refused.
+    :param status: the sentence with which its training ended.
+    :param path: the winner of every round, smallest n_z first, each with its figures.
+    :param starts: number of starts that finished.
+    """
+
+    model: LiftedModel
+    report: Report
+    linear: Report
+    closed_loop: ClosedLoopComparison | None
+    status: str
+    path: tuple[LiftedModel, ...]
+    starts: int
+
+
+class NoUsefulLift(ValueError):  # noqa: N818
+    """Training ended without a lift that is better than a linear model; the message says why."""
+
+
+@dataclass(frozen=True)
+class _Candidate:
+    grown: Grown
+    model: LiftedModel
+    fit: Fit
+
+    @property
+    def score(self) -> float:
+        """What starts are compared by: rw alone does not see a state that the lift has lost."""
+        return self.fit.rw + self.fit.rx
+
+
+def train(plant: Plant, samples: Samples, recipe: Recipe, *, seed: int = 0, starts: int = 4,
+          split_seed: int = 0, watch: Watch | None = None, refuse: bool = True,
+          device: str = 'cpu', threads: int = 1) -> Trained:
+    """
+    Learn a lifted model in rounds of starts, of which validation episodes choose the best.
+
+    A fifth of the episodes chooses the winner of each round and another fifth, touched by nothing
+    else, gives the figures reported. The starts of a round run through joblib: within
+    ``joblib.parallel_config(...)`` they run in processes, or on a Dask cluster, and give the same
+    model as one after the other. An interrupt from the keyboard ends the training and keeps the
+    best so far.
+
+    :param plant: names, units, nominal point, and B where it is known.
+    :param samples: at least three episodes.
+    :param recipe: what to learn and how.
+    :param seed: the starts' seeds are drawn from it.
+    :param starts: number of starts in each round.
+    :param split_seed: seed of the split into training, validation and test episodes.
+    :param watch: sees the progress and can end the training.
+    :param refuse: whether a lift that is no better than the linear model is refused.
+    :param device: where the residuals are evaluated, as torch names it.
+    :param threads: torch's threads for each start; the sums keep their order, and so the model
+        its bits, for a given number.
+    :raises NoUsefulLift: when no start gives a lift that can be judged, or none that beats the
+        linear model on validation episodes.
+    :raises ValueError: on too few episodes, held-out episodes that hardly move, or a recipe that
+        does not fit.
+    :raises KeyboardInterrupt: when interrupted before the first start finished.
+    """
+    if starts < 1:
+        raise ValueError(f'starts must be at least 1, got {starts}')
+    rounds = recipe.rounds(samples.x.shape[1])
+    parts = split_by_episode(samples, split_seed)
+    assembly = _Assembly(plant, Scaling.of(plant, samples), parts[0], samples.digest(), seed)
+    tracker = _Tracker(watch, starts * len(rounds))
+    path: list[_Candidate] = []
+    reasons: list[str] = []
+    for n_z in rounds:
+        tracker.n_z = n_z
+        parent = path[-1].grown if path else None
+        best: _Candidate | None = None
+        interrupted = False
+        try:
+            with closing(_run_starts(recipe, assembly, n_z, parent, seed, starts, device,
+                                     threads, tracker)) as finds:
+                for grown in finds:
+                    candidate = _judged(assembly, grown, parts[1])
+                    if isinstance(candidate, str):
+                        reasons.append(candidate)
+                    elif best is None or candidate.score < best.score:
+                        best = candidate
+                    tracker.finish(best.fit.rw if best else math.nan)
+                    if tracker.stop or (not isinstance(grown, str)
+                                        and grown.status is Status.INTERRUPTED):
+                        interrupted = True
+                        break
+        except KeyboardInterrupt:
+            if best is None and not path:
+                raise
+            interrupted = True
+        if best is None and not interrupted:
+            raise NoUsefulLift(f'no start gave a usable lift with n_z = {n_z}: {reasons[-1]}')
+        # a start that was cut short may be worse than the round before
+        if best is not None and not (interrupted and path and best.score >= path[-1].score):
+            path.append(best)
+        if interrupted:
+            break
+    if not path:
+        raise NoUsefulLift(reasons[-1] if reasons else 'stopped before a start finished')
+    return _conclude(plant, parts, path, interrupted, tracker.finished, refuse)
+
+
+def _conclude(plant: Plant, parts: tuple[Samples, Samples, Samples], path: list[_Candidate],
+              interrupted: bool, finished: int, refuse: bool) -> Trained:
+    """Compare the winner with the linear model and report on the untouched episodes."""
+    winner = path[-1]
+    scaling = Scaling(winner.model.states, winner.model.inputs, plant.time_unit)
+    linear = Edmd(degree=1).learn(plant, parts[0], scaling)
+    rx = fit(linear, parts[1].x, parts[1].dxdt, parts[1].u).rx
+    if refuse and not winner.fit.rx < rx:
+        raise NoUsefulLift(
+            f'the lift with n_z = {winner.model.n_z} does not predict the motion better than a '
+            f'linear model (relative error rx = {winner.fit.rx:.2g} against {rx:.2g} on '
+            'validation episodes): keep the linear model, or excite the plant over a wider range')
+    closed_loop = None
+    if refuse and winner.model.n_u:
+        closed_loop = compare_closed_loops(winner.model, linear, parts[1])
+        if closed_loop.arrived < closed_loop.linear_arrived:
+            raise NoUsefulLift(
+                f'the lift with n_z = {winner.model.n_z} does not bring its own drift to the '
+                f'nominal point from {closed_loop.starts - closed_loop.arrived} of '
+                f'{closed_loop.starts} states where a linear controller does: use identity '
+                'coordinates, a smaller n_z, or more starts')
+    models, reports = [], []
+    for candidate in path:
+        reports.append(judge(candidate.model, parts[2]))
+        metrics = reports[-1].metrics(candidate.model.states.names)
+        models.append(replace(candidate.model, provenance=replace(
+            candidate.model.provenance, metrics=metrics)))
+    status = Status.INTERRUPTED if interrupted else winner.grown.status
+    return Trained(models[-1], reports[-1], judge(linear, parts[2]), closed_loop, status.value,
+                   tuple(models), finished)
+
+
+def _judged(assembly: _Assembly, grown: Grown | str, validation: Samples
+            ) -> _Candidate | str:
+    """Return what a start has found, or why it is of no use."""
+    if isinstance(grown, str):
+        return grown
+    if grown.status is Status.STALLED:
+        return grown.status.value
+    try:
+        model = assembly.model(grown)
+        found = fit(model, validation.x, validation.dxdt, validation.u)
+    except (ValueError, np.linalg.LinAlgError) as error:
+        return str(error)
+    if not math.isfinite(found.rw + found.rx):
+        return 'its figures are not finite: check the data and try another seed'
+    return _Candidate(grown, model, found)
+
+
+class _Tracker:
+    """What `watch` is told, and whether it asked to stop."""
+
+    def __init__(self, watch: Watch | None, total: int) -> None:
+        self._watch, self._total = watch, total
+        self.n_z, self.finished, self.stop = 0, 0, False
+        self._rw = math.nan
+
+    def step(self, iteration: int, cost: float) -> bool:
+        return self._tell(iteration, math.sqrt(2.0 * cost))
+
+    def finish(self, rw: float) -> None:
+        self.finished += 1
+        self._rw = rw
+        self._tell(0, math.nan)
+
+    def _tell(self, iteration: int, residual: float) -> bool:
+        if self._watch is not None and not self.stop:
+            self.stop = self._watch(Progress(self.n_z, self.finished, self._total, iteration,
+                                             residual, self._rw))
+        return self.stop
+
+
+@dataclass(frozen=True)
+class _Assembly:
+    """
+    The way from samples to what is minimised, and back to a model.
+
+    Time is scaled, too: rates of order one put the residuals of the dynamics beside the others
+    whatever the plant's time unit.
+    """
+
+    plant: Plant
+    scaling: Scaling
+    samples: Samples
+    digest: str
+    seed: int
+
+    @property
+    def pace(self) -> float:
+        """Root mean square of the scaled rates, in 1/time unit."""
+        _, rate, _ = self.scaling.deviations(self.samples)
+        return float(np.sqrt(np.mean(rate ** 2))) or 1.0
+
+    def data(self, device: str) -> Data:
+        x, rate, u = self.scaling.deviations(self.samples)
+        if self.plant.B is None:
+            return Data(*(torch.from_numpy(a).to(device) for a in (x, rate / self.pace, u)))
+        f = rate - u @ self.scaling.input_matrix(self.plant.B).T
+        return Data(*(torch.from_numpy(a).to(device) for a in (x, f / self.pace)))
+
+    def model(self, grown: Grown) -> LiftedModel:
+        parts = grown.layout.split(grown.theta.cpu())
+        if self.plant.B is not None:
+            B = self.scaling.input_matrix(self.plant.B)
+        elif parts.B is not None:
+            B = self.pace * parts.B.numpy()
+        else:
+            B = np.zeros((grown.layout.n_x, 0))
+        observables = NetworkObservables(
+            tuple((W.numpy(), b.numpy()) for W, b in parts.hidden), parts.V.numpy(),
+            grown.layout.identity, grown.layout.activation)
+        return LiftedModel(
+            observables, self.pace * parts.A.numpy(), B, self.scaling.states,
+            self.scaling.inputs, self.scaling.time_unit,
+            Provenance(self.plant.name, self.seed, self.digest, {}, __version__))
+
+
+def _run_starts(recipe: Recipe, assembly: _Assembly, n_z: int, parent: Grown | None, seed: int,
+                starts: int, device: str, threads: int, tracker: _Tracker
+                ) -> Generator[Grown | str]:
+    """Run one round; yield what each start has found, in their order."""
+    data = assembly.data(device)
+    seeds = [int(n) for n in np.random.SeedSequence([seed, n_z]).generate_state(starts)]
+    monitor = tracker.step if _runs_here() else None
+    results = joblib.Parallel(return_as='generator')(
+        joblib.delayed(_start)(recipe, data, n_z, parent, number, threads, monitor)
+        for number in seeds)
+    try:
+        # not `yield from`, which would close the results where their warning is not silenced
+        for found in results:  # noqa: UP028
+            yield found
+    finally:
+        with warnings.catch_warnings():
+            # that what is under way gets cancelled is meant
+            warnings.filterwarnings('ignore', '.* tasks (have been|which were)', UserWarning)
+            results.close()
+
+
+def _runs_here() -> bool:
+    """Tell whether joblib runs the starts in this process, where they can tell of their steps."""
+    backend, jobs = joblib.parallel.get_active_backend()
+    return jobs in (None, 1) and isinstance(
+        backend, joblib.parallel.LokyBackend | joblib.parallel.SequentialBackend)
+
+
+def _start(recipe: Recipe, data: Data, n_z: int, parent: Grown | None, seed: int, threads: int,
+           monitor: Monitor | None) -> Grown | str:
+    before = torch.get_num_threads()
+    torch.set_num_threads(threads)
+    try:
+        return recipe.start(data, n_z, parent, seed, monitor)
+    except torch.linalg.LinAlgError as error:
+        return f'a start is degenerate ({error}): check that all states move on their own'
+    finally:
+        torch.set_num_threads(before)

@@ -1,0 +1,244 @@
+# Copyright 2026 The koopman_ros Authors
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""Held-out figures of a lifted model, invariant where the lift's own objective is not."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+from koopman_ros.control import run_closed_loop, solve_riccati, Weights
+from koopman_ros.learning.samples import Array, Samples
+from koopman_ros.lifting import LiftedModel
+import numpy as np
+from numpy.typing import NDArray
+from scipy.integrate import solve_ivp
+
+# Beyond it S is singular to working precision, and rw is noise.
+_MAX_COND = 1e13
+# A closed loop has arrived when it ends within this distance, in units of the states' scale.
+_ARRIVED = 0.05
+# A law that needs more to get there chatters.
+_MAX_EVALUATIONS = 5000
+
+
+@dataclass(frozen=True)
+class Fit:
+    """
+    How well a lift satisfies dz/dt = A z + J_N(x) B u on samples.
+
+    :param rw: ||(J_N f - A N) S^(-1/2)||^2 / ||J_N f S^(-1/2)||^2 with S = E[z z'], invariant
+        under linear maps of z, so that it cannot be lowered by shrinking z.
+    :param rx: relative mean-square error of the drift of x that the lift implies.
+    :param cond: condition number of S; large when coordinates have collapsed onto each other.
+    """
+
+    rw: float
+    rx: float
+    cond: float
+
+
+@dataclass(frozen=True)
+class ClosedLoopComparison:
+    """
+    The lift's controller beside the linear model's, both on the lift's own drift.
+
+    :param cost_ratio: cost with the lift's law over cost with the linear law, summed over the
+        starts; 0 when only the lift arrives, infinite when only the linear law does, NaN when
+        neither does.
+    :param arrived: number of starts from which the lift's law reaches the nominal point.
+    :param linear_arrived: the same of the linear law.
+    :param starts: number of starts.
+    """
+
+    cost_ratio: float
+    arrived: int
+    linear_arrived: int
+    starts: int
+
+
+@dataclass(frozen=True)
+class Report:
+    """
+    What held-out samples say of a model.
+
+    :param fit: its residuals.
+    :param eigenvalues: (n_z,) of A, in 1/time unit.
+    :param rollout_rmse: (n_x,) root mean square error of the prediction over the held-out
+        episodes, in state units; infinite when it diverges, None when the samples have no times.
+    """
+
+    fit: Fit
+    eigenvalues: NDArray[np.complex128] = field(compare=False)
+    rollout_rmse: Array | None = field(compare=False)
+
+    def metrics(self, names: tuple[str, ...]) -> dict[str, float]:
+        """Return the finite figures by name, as they are stored with the model."""
+        figures = {'rw': self.fit.rw, 'rx': self.fit.rx, 'cond': self.fit.cond}
+        if self.rollout_rmse is not None:
+            labels = ['rollout_rmse'] if len(names) == 1 else [
+                f'rollout_rmse_{name}' for name in names]
+            figures |= dict(zip(labels, map(float, self.rollout_rmse), strict=True))
+        return {name: value for name, value in figures.items() if np.isfinite(value)}
+
+
+def judge(model: LiftedModel, samples: Samples) -> Report:
+    """
+    Evaluate all open-loop figures of a model.
+
+    :param model: the lift.
+    :param samples: held-out episodes.
+    :raises ValueError: when the samples do not tell the coordinates apart.
+    """
+    return Report(fit(model, samples.x, samples.dxdt, samples.u), model.eigenvalues,
+                  rollout_rmse(model, samples))
+
+
+def fit(model: LiftedModel, x: Array, dxdt: Array, u: Array) -> Fit:
+    """
+    Judge a lift on samples of a plant.
+
+    :param model: the lift.
+    :param x: (N, n_x) states, in state units.
+    :param dxdt: (N, n_x) their derivatives, in state units per time unit.
+    :param u: (N, n_u) inputs, in input units.
+    :raises ValueError: when the samples do not tell the coordinates apart.
+    """
+    xi = model.states.to_deviation(x)
+    f = dxdt / model.states.scale - model.inputs.to_deviation(u) @ model.B.T
+    z, J = model.lift_and_jacobian(xi)
+    dz = (J @ f[..., None])[..., 0]
+    S = z.T @ z / len(z)
+    cond = float(np.linalg.cond(S))
+    if not cond < _MAX_COND:
+        raise ValueError(f'{len(z)} samples do not tell {model.n_z} coordinates apart: judge by '
+                         'samples that move more, or use a smaller n_z')
+    factor = np.linalg.cholesky(S)
+    residual = np.linalg.solve(factor, (dz - z @ model.A.T).T)
+    reference = np.linalg.solve(factor, dz.T)
+    error = model.drift(xi) - f
+    return Fit(rw=float(np.sum(residual ** 2) / np.sum(reference ** 2)),
+               rx=float(np.sum(error ** 2) / np.sum(f ** 2)),
+               cond=cond)
+
+
+def roll_out(model: LiftedModel, x0: Array, inputs: Array, sample_period: float | Array,
+             ) -> Array:
+    """
+    Predict the states under inputs that are held, from the projected drift J^+ A N(x) + B u.
+
+    :param model: the lift.
+    :param x0: (..., n_x) start, in state units; leading dimensions are predicted side by side.
+    :param inputs: (..., K, n_u) inputs, each held for one sample period, in input units.
+    :param sample_period: in the model's time unit, or (K,) periods.
+    :return: (..., K + 1, n_x) states at the samples, in state units.
+    :raises RuntimeError: when the prediction diverges.
+    """
+    inputs = np.asarray(inputs, dtype=np.float64)
+    holds = inputs.shape[-2]
+    xi = model.states.to_deviation(np.asarray(x0, dtype=np.float64))
+    shape = xi.shape
+    pushes = model.inputs.to_deviation(inputs) @ model.B.T
+    path = [xi]
+    for k, period in enumerate(np.broadcast_to(sample_period, (holds,))):
+        # a prediction that overflows is reported below
+        with np.errstate(all='ignore'):
+            solution = solve_ivp(
+                lambda _, y, push=pushes[..., k, :]: (
+                    model.drift(y.reshape(shape)) + push).ravel(),
+                (0.0, period), xi.ravel(), method='DOP853', rtol=1e-9, atol=1e-12)
+        xi = solution.y[:, -1].reshape(shape)
+        if not solution.success or not np.all(np.abs(xi) < 1e6):
+            raise RuntimeError(f'the prediction diverged after {len(path)} samples: keep the '
+                               'inputs within the training box')
+        path.append(xi)
+    return model.states.to_physical(np.stack(path, axis=-2))
+
+
+def rollout_rmse(model: LiftedModel, samples: Samples) -> Array | None:
+    """
+    Predict every episode from its first state and compare.
+
+    :return: (n_x,) root mean square error in state units, infinite when a prediction diverges,
+        None when the samples have no times.
+    """
+    if samples.time is None:
+        return None
+    # episodes with the same times are predicted side by side
+    alike: dict[bytes, list[np.ndarray]] = {}
+    for number in np.unique(samples.episode):
+        rows = np.flatnonzero(samples.episode == number)
+        if len(rows) > 1:
+            alike.setdefault(np.diff(samples.time[rows]).tobytes(), []).append(rows)
+    squares, count = np.zeros(model.n_x), 0
+    for group in alike.values():
+        rows = np.stack(group)
+        periods = np.diff(samples.time[rows[0]])
+        try:
+            predicted = roll_out(model, samples.x[rows[:, 0]], samples.u[rows[:, :-1]], periods)
+        except (RuntimeError, np.linalg.LinAlgError):
+            return np.full(model.n_x, np.inf)
+        squares += np.sum((predicted - samples.x[rows]) ** 2, axis=(0, 1))
+        count += rows[:, 1:].size
+    return np.sqrt(squares / count) if count else None
+
+
+def compare_closed_loops(model: LiftedModel, linear: LiftedModel, samples: Samples,
+                         starts: int = 3) -> ClosedLoopComparison:
+    """
+    Regulate the lift's own drift to the nominal point, by its law and by a linear model's.
+
+    The drift stands in for the plant, which training does not have; how close the two are is
+    what the other figures say. Weights are 1 on scaled states and inputs.
+
+    :param model: the lift.
+    :param linear: a linear model of the same plant in the same coordinates.
+    :param samples: held-out samples; the starts are taken evenly in order of their distance.
+    :param starts: number of starts.
+    :raises ValueError: for a plant without inputs.
+    """
+    if model.n_u == 0:
+        raise ValueError('a plant without inputs has no closed loop')
+    weights = Weights(np.eye(model.n_x), np.eye(model.n_u))
+    order = np.argsort(np.linalg.norm(model.states.to_deviation(samples.x), axis=1))
+    chosen = samples.x[order[np.linspace(0, len(order) - 1, starts + 1).astype(int)[1:]]]
+    duration = _settling_time(linear, weights)
+
+    def rate(x: Array, u: Array) -> Array:
+        return model.states.scale * (model.drift(model.states.to_deviation(x))
+                                     + model.B @ model.inputs.to_deviation(u))
+
+    costs, arrived = np.zeros(2), [0, 0]
+    for x0 in chosen:
+        for i, used in enumerate((model, linear)):
+            loop = run_closed_loop(used, rate, x0, model.states.center, weights, duration,
+                                   samples=2, rtol=1e-6,
+                                   max_evaluations=_MAX_EVALUATIONS)
+            end = np.linalg.norm(model.states.to_deviation(loop.states[-1]))
+            costs[i] += loop.cost
+            arrived[i] += int(not loop.failure and end < _ARRIVED)
+    if not np.isfinite(costs).any():
+        ratio = np.nan
+    else:
+        ratio = 0.0 if np.isinf(costs[1]) else costs[0] / costs[1]
+    return ClosedLoopComparison(float(ratio), arrived[0], arrived[1], starts)
+
+
+def _settling_time(linear: LiftedModel, weights: Weights) -> float:
+    """Return six time constants of the slowest mode under the linear law, in time units."""
+    # not of the open loop: an integrator never settles by itself
+    riccati = solve_riccati(linear.A, linear.B, weights.Q, weights.R)
+    rates = np.abs(np.linalg.eigvals(linear.A - linear.B @ riccati.K).real)
+    # steps are as short as the fastest mode, so that the span of rates bounds the work
+    return 6.0 / max(float(rates.min()), 1e-3 * float(rates.max()), 1e-9)

@@ -1,0 +1,66 @@
+# Copyright 2026 The koopman_ros Authors
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""
+The paper's experiments: figures, tables and a report.
+
+Run it as ``python -m koopman_ros.studies`` (needs the `train` and `demo` requirements).
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+from pathlib import Path
+import sys
+import time
+
+from koopman_ros import __version__
+from koopman_ros.studies.campaign import run_campaign
+from koopman_ros.studies.figures import draw_figures
+from koopman_ros.studies.report import write_report
+
+
+def main(args: list[str] | None = None) -> int:
+    """Run the experiments and write what they found."""
+    parser = argparse.ArgumentParser(
+        prog='python -m koopman_ros.studies',
+        description="Reproduce the paper's experiments, each from several seeds.")
+    parser.add_argument('--seeds', type=int, default=20, help='number of seeds, at least 1 '
+                        '(default: %(default)s)')
+    parser.add_argument('--output', type=Path, default=Path('out/studies'),
+                        help='folder for figures and report (default: %(default)s)')
+    options = parser.parse_args(args)
+    if options.seeds < 1:
+        parser.error(f'--seeds is {options.seeds}, must be at least 1')
+    options.output.mkdir(parents=True, exist_ok=True)
+    start = time.monotonic()
+    campaign = run_campaign(options.seeds)
+    summary = {
+        'package_version': __version__, 'seeds': options.seeds, 'complete': campaign.complete,
+        'errors': campaign.errors, 'wall_seconds': round(time.monotonic() - start, 1),
+        **campaign.summary()}
+    (options.output / 'summary.json').write_text(
+        json.dumps(summary, indent=2, allow_nan=False) + '\n')
+    figures = draw_figures(campaign, options.output)
+    write_report(summary, figures, options.output / 'report.md')
+    for line in campaign.errors:
+        print(f'failed: {line}', file=sys.stderr)
+    print(f'wrote {options.output}/report.md, summary.json and {len(figures)} figures in '
+          f'{time.monotonic() - start:.0f} s')
+    return 0 if campaign.complete and not campaign.errors else 1
+
+
+if __name__ == '__main__':
+    sys.exit(main())

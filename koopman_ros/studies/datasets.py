@@ -1,0 +1,93 @@
+# Copyright 2026 The koopman_ros Authors
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""Samples of the simulated plants, in the form that training takes."""
+
+from __future__ import annotations
+
+import contextlib
+
+from koopman_ros.learning import Plant, Samples
+from koopman_ros.plants import (
+    ControlAffineSystem,
+    ExcitationError,
+    random_steps,
+    RandomStepDesign,
+    sample_derivatives,
+    Trajectory,
+)
+import numpy as np
+
+# Share of the episodes that start in a corner of their box.
+_AT_CORNERS = 0.2
+
+
+def describe(system: ControlAffineSystem) -> Plant:
+    """Return what training may know of a plant beside its data."""
+    return Plant(system.name, system.state_names, system.state_units, system.input_names,
+                 system.input_units, system.time_unit, system.nominal_state,
+                 system.nominal_input, system.B)
+
+
+def random_step_episodes(system: ControlAffineSystem, design: RandomStepDesign, episodes: int,
+                         duration: float, seed: int) -> Samples:
+    """
+    Simulate episodes of random input steps from the nominal state, with exact derivatives.
+
+    :param system: the plant.
+    :param design: the steps and the box.
+    :param episodes: number of episodes; episode n uses `seed` + n.
+    :param duration: of each, in the plant's time unit.
+    :param seed: seed of the first.
+    """
+    return _joined(system, [
+        random_steps(system, design, duration, seed + number).trajectory
+        for number in range(episodes)])
+
+
+def box_episodes(system: ControlAffineSystem, design: RandomStepDesign, episodes: int,
+                 duration: float, seed: int) -> Samples:
+    """
+    Simulate short episodes of random input steps from random states within a box.
+
+    A fifth of them starts in corners of the box, so that no part of it is left to extrapolation.
+
+    :param system: the plant.
+    :param design: the steps and the box.
+    :param episodes: number of episodes.
+    :param duration: of each, in the plant's time unit.
+    :param seed: of the initial states and of the steps.
+    """
+    rng = np.random.default_rng(seed)
+    lower = np.broadcast_to(design.state_lower, system.n_x)
+    upper = np.broadcast_to(design.state_upper, system.n_x)
+    found: list[Trajectory] = []
+    while len(found) < episodes:
+        x0, step_seed = rng.uniform(lower, upper), int(rng.integers(2 ** 31))
+        if rng.random() < _AT_CORNERS:
+            x0 = np.where(rng.random(system.n_x) < 0.5, lower, upper)
+        # no input within the bounds keeps some states inside the box
+        with contextlib.suppress(ExcitationError):
+            found.append(random_steps(system, design, duration, step_seed, x0=x0).trajectory)
+    return _joined(system, found)
+
+
+def _joined(system: ControlAffineSystem, trajectories: list[Trajectory]) -> Samples:
+    records = [sample_derivatives(system, trajectory) for trajectory in trajectories]
+    return Samples(
+        np.concatenate([record.x for record in records]),
+        np.concatenate([record.x_dot for record in records]),
+        np.concatenate([record.u for record in records]),
+        np.repeat(np.arange(len(records)), [len(record.x) for record in records]),
+        np.concatenate([trajectory.times[:-1] for trajectory in trajectories]))

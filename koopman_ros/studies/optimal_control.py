@@ -1,0 +1,74 @@
+# Copyright 2026 The koopman_ros Authors
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""What is known exactly of the plants under control, to measure learned controllers by."""
+
+from __future__ import annotations
+
+from koopman_ros.control import solve_riccati
+from koopman_ros.plants import ControlAffineSystem, equilibrium_input, two_state_exact_lift
+import numpy as np
+from numpy.typing import NDArray
+from scipy.integrate import quad
+from scipy.linalg import solve_continuous_lyapunov
+
+Array = NDArray[np.float64]
+
+
+_Q = np.diag([1.0, 1.0, 0.0])
+_B = np.array([[0.0], [1.0], [0.0]])
+
+
+def exact_two_state_gain(R: float) -> Array:
+    """Return the gain K (1, 3) on (x1, x2, x1^2) that is optimal for x1^2 + x2^2 + R u^2."""
+    return solve_riccati(two_state_exact_lift().A, _B, _Q, np.array([[R]])).K
+
+
+def exact_two_state_cost(x0: Array, R: float) -> float:
+    """
+    Return the optimal cost of the paper's two-state example from `x0` to the origin.
+
+    The exact lift makes it a linear-quadratic problem; its cost z' P z comes from the Lyapunov
+    equation of the closed loop.
+    """
+    K = exact_two_state_gain(R)
+    closed = two_state_exact_lift().A - _B @ K
+    P = solve_continuous_lyapunov(closed.T, -(_Q + R * K.T @ K))
+    z = np.array([x0[0], x0[1], x0[0] ** 2])
+    return float(z @ P @ z)
+
+
+def scalar_optimal_cost(system: ControlAffineSystem, start: float, setpoint: float, R: float,
+                        unit: float) -> float:
+    """
+    Return the optimal cost of moving a plant of one state and one input to a set-point.
+
+    With e and v the deviations from the set-point and from the input that holds it, in `unit`s,
+    and e' = F(e) + b v, the Hamilton-Jacobi equation e^2 + V' F - (b V')^2 / (4 R) = 0 is
+    quadratic in V'; the root with the sign of e is the one whose closed loop decays.
+
+    :param system: the plant.
+    :param start: initial state.
+    :param setpoint: final state.
+    :param R: weight of v^2 against e^2.
+    :param unit: what deviations are measured in, in units of state and input.
+    """
+    b = float(system.B[0, 0])
+    held = equilibrium_input(system, [setpoint])
+
+    def slope(e: float) -> float:
+        F = float(system.derivative([setpoint + unit * e], held)[0]) / unit
+        return 2.0 * R / b ** 2 * (F + float(np.copysign(np.sqrt(F * F + (b * e) ** 2 / R), e)))
+
+    return float(quad(slope, 0.0, (start - setpoint) / unit, epsabs=1e-13, epsrel=1e-13)[0])

@@ -1,0 +1,65 @@
+# Copyright 2026 The koopman_ros Authors
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""Plants of one and two states with samples of them, small enough to learn in a second."""
+
+from dataclasses import replace
+
+from koopman_ros.learning import Growth, Plant, Samples
+from koopman_ros.plants import two_state_example
+import numpy as np
+
+# dx/dt = -x - 0.3 x^2 + 2 u, in deviations from 3 m and 0.5 m/s
+BENT = Plant('bent', ('level',), ('m',), ('flow',), ('m/s',), 's', np.array([3.0]),
+             np.array([0.5]), np.array([[2.0]]))
+# the same without its input
+UNFORCED = Plant('unforced', ('level',), ('m',), (), (), 's', np.array([3.0]), np.zeros(0),
+                 np.zeros((1, 0)))
+SMALL = Growth(2, hidden_first=3, max_iterations=40)
+
+_EXAMPLE = two_state_example()
+TWO_STATE = Plant(
+    _EXAMPLE.name, _EXAMPLE.state_names, _EXAMPLE.state_units, _EXAMPLE.input_names,
+    _EXAMPLE.input_units, _EXAMPLE.time_unit, np.zeros(2), np.zeros(1), _EXAMPLE.B)
+
+
+def bent_samples(episodes=6, length=30, seed=0):
+    """Return samples of the bent plant, scattered over its box."""
+    rng = np.random.default_rng(seed)
+    x = rng.uniform(-1.0, 1.5, (episodes * length, 1))
+    u = rng.uniform(-1.0, 1.0, (episodes * length, 1))
+    return Samples(x + 3.0, -x - 0.3 * x * x + 2.0 * u, u + 0.5,
+                   np.repeat(np.arange(episodes), length))
+
+
+def unforced_samples():
+    """Return the same samples without the input and what it does."""
+    samples = bent_samples()
+    return replace(samples, dxdt=samples.dxdt - 2.0 * (samples.u - 0.5), u=np.zeros((180, 0)))
+
+
+def two_state_samples(count=600, seed=0):
+    """Return samples of the paper's two-state example, scattered over its box."""
+    rng = np.random.default_rng(seed)
+    x = np.stack([rng.uniform(-6.0, 6.0, count), rng.uniform(-6.0, 8.0, count)], 1)
+    u = rng.uniform(-5.0, 5.0, (count, 1))
+    return Samples(x, _EXAMPLE.derivative(x, u), u, np.arange(count) // (count // 10))
+
+
+def bits(model):
+    """Return the bytes of all that was learned."""
+    network = model.observables
+    arrays = (model.A, model.B, network.output, model.states.scale,
+              *(array for layer in network.hidden for array in layer))
+    return b''.join(array.tobytes() for array in arrays)

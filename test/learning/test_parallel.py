@@ -1,0 +1,145 @@
+# Copyright 2026 The koopman_ros Authors
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""The same bits whether starts run one after the other, in processes, threads or on Dask."""
+
+import contextlib
+from dataclasses import replace
+import logging
+import os
+from pathlib import Path
+import signal
+import subprocess
+import sys
+import warnings
+
+import joblib
+import koopman_ros
+from koopman_ros.learning import train
+import numpy as np
+import pytest
+from small_plants import BENT, bent_samples, bits, SMALL
+import torch
+
+RECIPE = replace(SMALL, n_z=3)
+
+
+def trained():
+    return train(BENT, bent_samples(), RECIPE, starts=3, seed=5)
+
+
+@pytest.fixture(scope='module')
+def expected():
+    return bits(trained().model)
+
+
+@contextlib.contextmanager
+def dask():
+    """Start a Dask cluster of two threads in this process."""
+    with warnings.catch_warnings():
+        # its own imports
+        warnings.simplefilter('ignore')
+        distributed = pytest.importorskip('distributed')
+    # its ports are free ones of the loopback interface
+    with (distributed.LocalCluster(
+            n_workers=1, threads_per_worker=2, processes=False, host='127.0.0.1',
+            protocol='tcp://', dashboard_address='127.0.0.1:0',
+            silence_logs=logging.CRITICAL) as cluster,
+          distributed.Client(cluster), joblib.parallel_config('dask')):
+        yield
+
+
+@pytest.mark.parametrize('backend', [
+    lambda: joblib.parallel_config('loky', n_jobs=2),
+    lambda: joblib.parallel_config('threading', n_jobs=2),
+    lambda: joblib.parallel_config('loky', n_jobs=1),
+    dask], ids=['loky', 'threading', 'one job', 'dask'])
+def test_the_bits_do_not_depend_on_where_starts_run(backend, expected):
+    threads = torch.get_num_threads()
+    with backend():
+        assert bits(trained().model) == expected
+    assert torch.get_num_threads() == threads
+
+
+def test_the_watch_can_end_starts_in_processes():
+    seen = []
+
+    def watch(now):
+        seen.append(now)
+        return now.finished == 4
+
+    with joblib.parallel_config('loky', n_jobs=2):
+        kept = train(BENT, bent_samples(), RECIPE, starts=3, seed=5, watch=watch)
+    # processes tell of whole starts only
+    assert [(now.n_z, now.finished, now.iteration) for now in seen] == [
+        (2, 1, 0), (2, 2, 0), (2, 3, 0), (3, 4, 0)]
+    assert kept.status.startswith('interrupted')
+    assert (kept.model.n_z, kept.starts) == (3, 4)
+
+
+PROGRAM = """
+import contextlib, dataclasses, sys
+import joblib
+from koopman_ros.learning import Growth, train
+from small_plants import BENT, bent_samples
+
+def watch(now):
+    print(now.n_z, now.finished, now.iteration, flush=True)
+    return False
+
+parallel = {'loky': lambda: joblib.parallel_config('loky', n_jobs=2),
+            'sequential': contextlib.nullcontext}[sys.argv[1]]
+if __name__ == '__main__':
+    with parallel():
+        found = train(BENT, bent_samples(length=300), Growth(12, max_iterations=60, tolerance=0.0),
+                      starts=2, watch=watch)
+    print('model', found.model.n_z, found.status)
+"""
+
+
+@pytest.mark.parametrize('backend', ['sequential', 'loky'])
+def test_an_interrupt_from_the_keyboard(backend):
+    """Interrupt the whole process group, as a terminal does, once the first round is over."""
+    here = Path(__file__).parent
+    path = os.pathsep.join([str(here), str(Path(koopman_ros.__file__).parents[1])])
+    with subprocess.Popen(
+            [sys.executable, '-c', PROGRAM, backend], stdout=subprocess.PIPE,
+            stderr=subprocess.PIPE, text=True, start_new_session=True,
+            env={**os.environ, 'PYTHONPATH': path, 'OMP_NUM_THREADS': '1'}) as process:
+        try:
+            for line in process.stdout:
+                if line.startswith('3 '):
+                    break
+            os.killpg(process.pid, signal.SIGINT)
+            output, errors = process.communicate(timeout=60)
+        finally:
+            with contextlib.suppress(ProcessLookupError):
+                os.killpg(process.pid, signal.SIGKILL)
+    assert errors == ''
+    assert process.returncode == 0
+    last = output.splitlines()[-1]
+    assert last.startswith('model ')
+    assert last.endswith('interrupted: the best parameters so far are kept')
+
+
+def test_many_samples_go_to_processes():
+    """Arrays beyond a megabyte come to them mapped to memory, read-only."""
+    some = bent_samples(length=40_000)
+    assert some.x.nbytes > 1 << 20
+    recipe = replace(SMALL, max_iterations=2, tolerance=0.0)
+    one = train(BENT, some, recipe, starts=1)
+    with joblib.parallel_config('loky', n_jobs=2):
+        other = train(BENT, some, recipe, starts=1)
+    assert bits(one.model) == bits(other.model)
+    assert np.isfinite(one.report.fit.rw)

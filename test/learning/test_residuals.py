@@ -1,0 +1,195 @@
+# Copyright 2026 The koopman_ros Authors
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""The hand-derived normal equations against automatic differentiation of the plain residuals."""
+
+from dataclasses import replace
+from pathlib import Path
+import subprocess
+import sys
+
+import koopman_ros
+from koopman_ros.learning.network import Layout
+from koopman_ros.learning.residuals import Data, Problem, ResidualWeights
+import pytest
+import torch
+
+FUNCTIONS = {'tanh': torch.tanh, 'sigmoid': torch.sigmoid, 'sine': torch.sin,
+             'softplus': torch.nn.functional.softplus}
+COUNT = 11
+
+# torch's own import of its forward derivatives
+pytestmark = pytest.mark.filterwarnings('ignore:`torch.jit.script` is deprecated')
+
+every_depth = pytest.mark.parametrize('hidden', [(5,), (4, 3), (3, 4, 2)], ids=str)
+every_activation = pytest.mark.parametrize('activation', FUNCTIONS)
+identity_or_free = pytest.mark.parametrize('identity', [True, False], ids=['identity', 'free'])
+
+
+def random_problem(layout, weights, chunk=4, seed=1):
+    """Return a problem and parameters of order one; the chunk does not divide the samples."""
+    generator = torch.Generator().manual_seed(seed)
+
+    def normal(*shape):
+        return torch.randn(*shape, generator=generator, dtype=torch.float64)
+
+    data = Data(normal(COUNT, layout.n_x), normal(COUNT, layout.n_x),
+                normal(COUNT, layout.n_u) if layout.n_u else None)
+    return Problem(layout, data, weights, chunk), normal(layout.size)
+
+
+def residuals(theta, of):
+    """Write the three residuals as the paper and the docstring have them."""
+    layout, data, weights = of.layout, of.data, of.weights
+    parts, function = layout.split(theta), FUNCTIONS[layout.activation]
+
+    def network(x):
+        for W, b in parts.hidden:
+            x = function(x @ W.T + b)
+        return x @ parts.V.T if parts.hidden else x[:, :0]
+
+    def N(x):
+        free = network(x) - network(torch.zeros_like(x))
+        return torch.cat([x, free], 1) if layout.identity else free
+
+    f = data.f if parts.B is None else data.f - data.u @ parts.B.T
+    z, dz = torch.func.jvp(N, (data.x,), (f,))
+    stack = [(dz - z @ parts.A.T).flatten() / COUNT ** 0.5]
+    if weights.whitening:
+        moment = z.T @ z / COUNT - torch.eye(layout.n_z, dtype=torch.float64)
+        # entries of identity coordinates alone do not depend on the parameters
+        fixed = layout.n_z - layout.n_free
+        stack += [weights.whitening ** 0.5 * part.flatten()
+                  for part in (moment[fixed:], moment[:fixed, fixed:])]
+    if weights.decoder:
+        W, b, V, c = parts.decoder
+        back = torch.tanh(z @ W.T + b) @ V.T + c
+        stack.append(weights.decoder ** 0.5 * (data.x - back).flatten() / COUNT ** 0.5)
+    return torch.cat(stack)
+
+
+def assert_normal_equations(of, theta):
+    """Compare with automatic differentiation to 1e-12 of the largest entry."""
+    r, J = residuals(theta, of), torch.func.jacrev(residuals)(theta, of)
+    normal = of.evaluate(theta, derivatives=True)
+    assert normal.cost == pytest.approx(0.5 * float(r @ r), rel=1e-12)
+    assert_close(normal.gradient, J.T @ r)
+    assert_close(normal.matrix, J.T @ J)
+
+
+def assert_close(actual, expected, tolerance=1e-12):
+    torch.testing.assert_close(actual, expected, rtol=0,
+                               atol=tolerance * float(expected.abs().max()))
+
+
+@every_depth
+@every_activation
+@identity_or_free
+@pytest.mark.parametrize('n_u', [0, 2])
+@pytest.mark.parametrize('decoder', [0, 3])
+@pytest.mark.parametrize('n_x', [1, 2, 3])
+def test_normal_equations(hidden, activation, identity, n_u, decoder, n_x):
+    layout = Layout(n_x, n_x + 2, hidden, identity, activation, n_u, decoder)
+    assert_normal_equations(*random_problem(
+        layout, ResidualWeights(whitening=0.7, decoder=0.3 if decoder else 0.0)))
+
+
+@every_depth
+@identity_or_free
+@pytest.mark.parametrize('weights', [
+    ResidualWeights(), ResidualWeights(whitening=2.0), ResidualWeights(decoder=3.0)], ids=str)
+def test_each_term_alone(hidden, identity, weights):
+    """The term besides that of the dynamics is found as the difference from the dynamics alone."""
+    of, theta = random_problem(Layout(2, 3, hidden, identity, decoder=3), weights)
+    assert_normal_equations(of, theta)
+    alone = of.with_weights(ResidualWeights()).evaluate(theta, derivatives=True)
+    dynamics = COUNT * of.layout.n_z
+    r, J = residuals(theta, of), torch.func.jacrev(residuals)(theta, of)
+    both = of.evaluate(theta, derivatives=True)
+    assert both.cost - alone.cost == pytest.approx(0.5 * float(r[dynamics:] @ r[dynamics:]),
+                                                   rel=1e-11, abs=1e-15)
+    J = J[dynamics:]
+    torch.testing.assert_close(both.matrix - alone.matrix, J.T @ J, rtol=0,
+                               atol=1e-12 * float(both.matrix.abs().max()))
+
+
+def test_the_lift_without_a_network_is_linear_regression():
+    of, theta = random_problem(Layout(2, 2, (), True, n_u=1), ResidualWeights())
+    assert_normal_equations(of, theta)
+
+
+LAYOUT = Layout(2, 4, (5,), True, n_u=1, decoder=3)
+ALL_TERMS = ResidualWeights(whitening=0.5, decoder=0.2)
+
+
+@pytest.mark.parametrize('chunk', [1, 3, 10, 11, 12])
+def test_chunks_add_up(chunk):
+    of, theta = random_problem(LAYOUT, ALL_TERMS, chunk=4096)
+    whole = of.evaluate(theta, derivatives=True)
+    parts = replace(of, chunk=chunk).evaluate(theta, derivatives=True)
+    assert parts.cost == pytest.approx(whole.cost, rel=1e-13)
+    assert_close(parts.gradient, whole.gradient, 1e-13)
+    assert_close(parts.matrix, whole.matrix, 1e-13)
+
+
+def test_cost_alone_is_the_same_cost():
+    of, theta = random_problem(LAYOUT, ALL_TERMS)
+    alone = of.evaluate(theta, derivatives=False)
+    assert alone.gradient is None
+    assert alone.matrix is None
+    assert alone.cost == of.evaluate(theta, derivatives=True).cost
+
+
+def test_other_weights_leave_the_rest():
+    of, _ = random_problem(LAYOUT, ALL_TERMS)
+    other = of.with_weights(ResidualWeights(1.0))
+    assert (other.layout, other.chunk, other.weights) == (of.layout, 4, ResidualWeights(1.0))
+    assert other.data is of.data
+
+
+def test_b_needs_inputs():
+    with pytest.raises(ValueError, match='the inputs are needed to learn B'):
+        Problem(LAYOUT, Data(torch.zeros(3, 2), torch.zeros(3, 2)), ResidualWeights())
+
+
+def test_a_decoder_weight_needs_a_decoder():
+    with pytest.raises(ValueError, match='a decoder weight needs a decoder network'):
+        Problem(Layout(1, 2, (3,), True), Data(torch.zeros(3, 1), torch.zeros(3, 1)),
+                ResidualWeights(decoder=1.0))
+
+
+MEMORY = """
+import resource
+from koopman_ros.learning.network import Layout
+from koopman_ros.learning.residuals import Data, Problem, ResidualWeights
+import torch
+torch.set_num_threads(1)
+layout = Layout(2, 5, (8,), True)
+theta = 0.1 * torch.ones(layout.size, dtype=torch.float64)
+peaks = []
+for count in (20_000, 200_000):
+    x = torch.linspace(-1.0, 1.0, 2 * count, dtype=torch.float64).view(count, 2)
+    problem = Problem(layout, Data(x, x), ResidualWeights(1.0))
+    problem.evaluate(theta, derivatives=True)
+    peaks.append(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss)
+print(peaks[1] - peaks[0])
+"""
+
+
+def test_memory_does_not_grow_with_the_samples():
+    """The residual Jacobian of ten times the samples would take 580 MB, the samples take 3 MB."""
+    result = subprocess.run([sys.executable, '-c', MEMORY], capture_output=True, text=True,
+                            timeout=60, check=False, cwd=Path(koopman_ros.__file__).parents[1])
+    assert result.returncode == 0, result.stderr
+    assert int(result.stdout) < 32 * 1024  # KiB

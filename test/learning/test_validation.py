@@ -1,0 +1,290 @@
+# Copyright 2026 The koopman_ros Authors
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""Held-out figures and roll-outs against systems whose answers are known."""
+
+from dataclasses import replace
+
+from koopman_ros.learning import (
+    compare_closed_loops,
+    fit,
+    judge,
+    Report,
+    roll_out,
+    rollout_rmse,
+    Samples,
+)
+from koopman_ros.learning.validation import Fit
+from koopman_ros.lifting import (
+    Coordinates,
+    LiftedModel,
+    linearised_model,
+    NetworkObservables,
+    Provenance,
+)
+import numpy as np
+import pytest
+from random_lifts import coordinates, random_lift
+from scipy.linalg import block_diag, expm
+
+JACOBIAN = np.array([[-1.0, 4.0], [-2.0, -0.5]])
+B = np.array([[0.3], [2.0]])
+
+
+def linear_model(jacobian=JACOBIAN):
+    return linearised_model(jacobian, B, coordinates('x', 2), coordinates('u', 1), 's',
+                            Provenance('test'))
+
+
+def linear_samples(count=50, seed=2):
+    """Return x, dx/dt and u of the linear system around the center of its coordinates."""
+    rng = np.random.default_rng(seed)
+    states, inputs = coordinates('x', 2), coordinates('u', 1)
+    x = rng.uniform(states.lower, states.upper, (count, 2))
+    u = rng.uniform(inputs.lower, inputs.upper, (count, 1))
+    return x, (x - states.center) @ JACOBIAN.T + (u - inputs.center) @ B.T, u
+
+
+def test_a_linear_system_is_fitted_exactly():
+    figures = fit(linear_model(), *linear_samples())
+    assert figures.rw < 1e-28
+    assert figures.rx < 1e-28
+
+
+def test_a_wrong_slope_is_measured():
+    """The drift -3 x modelled as -2 x leaves a third of it: squared, 1/9."""
+    c = coordinates('x', 1)
+    model = linearised_model([[-2.0]], [[1.0]], c, coordinates('u', 1), 's',
+                             Provenance('test'))
+    x = np.linspace(c.lower, c.upper, 20)
+    u = np.linspace(-1.0, 2.0, 20)[:, None]
+    dxdt = -3.0 * (x - c.center) + (u - model.inputs.center)
+    figures = fit(model, x, dxdt, u)
+    assert figures.rw == pytest.approx(1.0 / 9.0, rel=1e-12)
+    assert figures.rx == pytest.approx(1.0 / 9.0, rel=1e-12)
+    assert figures.cond == 1.0
+
+
+def test_condition_number_of_the_second_moment():
+    x = np.array([[3.5, 1.0], [2.5, 1.0], [3.0, 31.0], [3.0, -29.0]])
+    # deviations +-1 in the first and +-20 in the second coordinate: S = diag(1/2, 200)
+    figures = fit(linear_model(), x, np.ones((4, 2)), np.zeros((4, 1)))
+    assert figures.cond == pytest.approx(400.0, rel=1e-12)
+
+
+def transformed(model: LiftedModel, T: np.ndarray) -> LiftedModel:
+    """Return the lift z -> T z of a free lift."""
+    observables = replace(model.observables, output=T @ model.observables.output)
+    return replace(model, observables=observables, A=T @ model.A @ np.linalg.inv(T))
+
+
+@pytest.mark.parametrize('n_x', [1, 2, 3])
+def test_rw_does_not_depend_on_the_coordinates_of_z(n_x):
+    model = random_lift(n_x, (8,), identity=False, n_free=4)
+    rng = np.random.default_rng(5)
+    x = rng.uniform(model.states.lower, model.states.upper, (200, n_x))
+    dxdt, u = rng.normal(size=(200, n_x)), rng.normal(size=(200, 1))
+    rw = fit(model, x, dxdt, u).rw
+    assert rw > 0.1
+    for T in (1e-6 * np.eye(4), np.diag([1.0, 30.0, 0.1, 4.0]), rng.normal(size=(4, 4))):
+        assert fit(transformed(model, T), x, dxdt, u).rw == pytest.approx(rw, rel=1e-9)
+
+
+def test_rw_is_the_residual_in_whitened_coordinates():
+    model = random_lift(2, (8,), identity=False)
+    rng = np.random.default_rng(6)
+    x, dxdt, u = rng.normal(size=(90, 2)), rng.normal(size=(90, 2)), rng.normal(size=(90, 1))
+    xi = model.states.to_deviation(x)
+    f = dxdt / model.states.scale - model.inputs.to_deviation(u) @ model.B.T
+    S = np.mean([np.outer(z, z) for z in model.lift(xi)], axis=0)
+    values, vectors = np.linalg.eigh(S)
+    whiten = vectors @ np.diag(values ** -0.5) @ vectors.T
+    residual = reference = 0.0
+    for point, slope in zip(xi, f, strict=True):
+        dz = model.jacobian(point) @ slope
+        residual += np.sum((whiten @ (dz - model.A @ model.lift(point))) ** 2)
+        reference += np.sum((whiten @ dz) ** 2)
+    assert fit(model, x, dxdt, u).rw == pytest.approx(residual / reference, rel=1e-10)
+
+
+@pytest.mark.parametrize('movement', [0.0, 1e-12, 1e-5])
+def test_samples_that_hardly_move_are_refused(movement):
+    model = random_lift(1, n_free=2)
+    still = 3.5 + movement * np.random.default_rng(0).normal(size=(40, 1))
+    with pytest.raises(ValueError, match='40 samples do not tell 3 coordinates apart: judge by'):
+        fit(model, still, np.zeros((40, 1)), np.zeros((40, 1)))
+
+
+def test_roll_out_of_a_linear_model_against_the_matrix_exponential():
+    model = linear_model()
+    inputs = np.random.default_rng(1).uniform(-3.0, 3.0, (25, 1))
+    period = 0.3
+    step = expm(period * block_diag(np.hstack([JACOBIAN, B]), np.zeros((1, 0))))
+    x0 = np.array([2.2, 1.7])
+    path = roll_out(model, x0, inputs, period)
+    assert path.shape == (26, 2)
+    np.testing.assert_array_equal(path[0], x0)
+    deviation = x0 - model.states.center
+    for state, u in zip(path[1:], inputs, strict=True):
+        held = np.concatenate([deviation, u - model.inputs.center])
+        deviation = (step @ held)[:2]
+        np.testing.assert_allclose(state - model.states.center, deviation, rtol=0, atol=1e-7)
+
+
+def test_roll_out_follows_the_projected_drift():
+    """A free lift of n_z = n_x = 1 is a change of variable: z = tanh(x) decays as exp(-t)."""
+    c = Coordinates(('x',), ('1',), np.zeros(1), np.ones(1), -np.ones(1), np.ones(1))
+    observables = NetworkObservables(((np.eye(1), np.zeros(1)),), np.eye(1), identity=False)
+    model = LiftedModel(observables, -np.eye(1), np.eye(1), c, c, 's', Provenance('test'))
+    path = roll_out(model, np.array([1.2]), np.zeros((20, 1)), 0.2)
+    expected = np.arctanh(np.tanh(1.2) * np.exp(-0.2 * np.arange(21)))
+    np.testing.assert_allclose(path[:, 0], expected, rtol=0, atol=1e-8)
+
+
+def test_roll_out_without_inputs_is_the_start():
+    x0 = np.array([2.2, 1.7])
+    np.testing.assert_array_equal(roll_out(linear_model(), x0, np.zeros((0, 1)), 0.3), [x0])
+
+
+def test_a_diverging_roll_out_is_reported():
+    with pytest.raises(RuntimeError, match=r'diverged after \d+ samples: keep the inputs within'):
+        roll_out(linear_model(50.0 * np.eye(2)), np.ones(2), np.zeros((40, 1)), 1.0)
+
+
+def test_roll_outs_side_by_side_are_those_one_by_one():
+    model, rng = random_lift(2, (6,)), np.random.default_rng(3)
+    # slow enough to stay where the lift was drawn
+    model = replace(model, A=0.1 * model.A)
+    x0 = rng.uniform(model.states.lower, model.states.upper, (2, 3, 2))
+    inputs = rng.uniform(-1.0, 1.0, (2, 3, 7, 1))
+    together = roll_out(model, x0, inputs, 0.2)
+    assert together.shape == (2, 3, 8, 2)
+    for i, j in np.ndindex(2, 3):
+        np.testing.assert_allclose(together[i, j], roll_out(model, x0[i, j], inputs[i, j], 0.2),
+                                   rtol=0, atol=1e-7)
+
+
+def test_each_input_may_be_held_for_a_time_of_its_own():
+    model, rng = linear_model(), np.random.default_rng(4)
+    inputs, ticks = rng.uniform(-3.0, 3.0, (5, 1)), np.array([1, 4, 2, 3, 1])
+    path = roll_out(model, np.array([2.2, 1.7]), inputs, 0.1 * ticks)
+    fine = roll_out(model, np.array([2.2, 1.7]), np.repeat(inputs, ticks, axis=0), 0.1)
+    np.testing.assert_allclose(path, fine[np.concatenate([[0], np.cumsum(ticks)])],
+                               rtol=0, atol=1e-7)
+
+
+def linear_episodes(jacobian=JACOBIAN, lengths=(6, 9), shift=0.0, period=0.2):
+    """Return episodes of the linear system, `shift` away from it but in their first samples."""
+    rng, model = np.random.default_rng(7), linear_model(jacobian)
+    x, u, time, episode = [], [], [], []
+    for number, length in enumerate(lengths):
+        inputs = rng.uniform(-1.0, 1.0, (length, 1))
+        path = roll_out(model, rng.uniform([2.5, 0.0], [3.5, 2.0]), inputs[:-1], period)
+        path[1:] += shift
+        x, u = [*x, path], [*u, inputs]
+        time.append(5.0 + period * np.arange(length))
+        episode.append(np.full(length, number))
+    x, u = np.concatenate(x), np.concatenate(u)
+    dxdt = (x - model.states.center) @ jacobian.T + (u - model.inputs.center) @ B.T
+    return Samples(x, dxdt, u, np.concatenate(episode), np.concatenate(time))
+
+
+def test_the_error_of_roll_outs_is_measured_over_all_episodes():
+    np.testing.assert_allclose(rollout_rmse(linear_model(), linear_episodes()), 0.0, atol=1e-8)
+    error = rollout_rmse(linear_model(), linear_episodes(shift=np.array([0.3, -0.2])))
+    np.testing.assert_allclose(error, [0.3, 0.2], rtol=1e-6)
+
+
+def test_episodes_of_one_sample_predict_nothing():
+    whole = linear_episodes(shift=np.array([0.3, -0.2]))
+    single = linear_episodes(lengths=(6, 9, 1), shift=np.array([0.3, -0.2]))
+    np.testing.assert_allclose(rollout_rmse(linear_model(), single),
+                               rollout_rmse(linear_model(), whole), rtol=1e-12)
+    assert rollout_rmse(linear_model(), linear_episodes(lengths=(1, 1))) is None
+
+
+def test_samples_without_times_have_no_roll_out():
+    assert rollout_rmse(linear_model(), replace(linear_episodes(), time=None)) is None
+
+
+def test_a_roll_out_that_diverges_has_an_infinite_error():
+    samples = linear_episodes()
+    assert np.all(np.isinf(rollout_rmse(linear_model(50.0 * np.eye(2)), samples)))
+
+
+def test_a_report_holds_all_open_loop_figures():
+    samples = linear_episodes(shift=np.array([0.3, -0.2]))
+    report = judge(linear_model(), samples)
+    assert report.fit == fit(linear_model(), samples.x, samples.dxdt, samples.u)
+    np.testing.assert_array_equal(report.eigenvalues, linear_model().eigenvalues)
+    np.testing.assert_allclose(report.rollout_rmse, [0.3, 0.2], rtol=1e-6)
+
+
+@pytest.mark.parametrize(('error', 'names', 'expected'), [
+    (None, ('T',), {}),
+    (np.array([0.5]), ('T',), {'rollout_rmse': 0.5}),
+    (np.array([0.5, 0.1]), ('T', 'c'), {'rollout_rmse_T': 0.5, 'rollout_rmse_c': 0.1}),
+    (np.array([np.inf, 0.1]), ('T', 'c'), {'rollout_rmse_c': 0.1}),
+])
+def test_figures_by_name(error, names, expected):
+    report = Report(Fit(0.1, 0.2, 3.0), np.ones(1), error)
+    assert report.metrics(names) == {'rw': 0.1, 'rx': 0.2, 'cond': 3.0, **expected}
+
+
+def test_figures_that_are_not_finite_are_left_out():
+    assert Report(Fit(0.1, np.inf, np.nan), np.ones(1), None).metrics(('T',)) == {'rw': 0.1}
+
+
+def test_closed_loops_of_the_same_model_cost_the_same():
+    found = compare_closed_loops(linear_model(), linear_model(), linear_episodes())
+    assert (found.cost_ratio, found.arrived, found.linear_arrived, found.starts) == (1.0, 3, 3, 3)
+
+
+def test_closed_loops_from_as_many_starts_as_asked_for():
+    found = compare_closed_loops(linear_model(), linear_model(), linear_episodes(), starts=2)
+    assert (found.arrived, found.starts) == (2, 2)
+
+
+def test_a_worse_law_costs_more():
+    """On the linear drift of the model its own law is the optimum."""
+    other = linear_model(np.array([[-1.0, -4.0], [2.0, -0.5]]))
+    found = compare_closed_loops(linear_model(), other, linear_episodes())
+    assert found.cost_ratio < 0.999
+
+
+def unstabilisable():
+    return replace(linear_model(np.eye(2)), B=np.zeros((2, 1)))
+
+
+def test_where_one_law_arrives_or_neither():
+    good, useless, samples = linear_model(), unstabilisable(), linear_episodes()
+    only_lift = compare_closed_loops(good, useless, samples, starts=2)
+    assert (only_lift.cost_ratio, only_lift.arrived, only_lift.linear_arrived) == (0.0, 2, 0)
+    neither = compare_closed_loops(useless, useless, samples, starts=2)
+    assert np.isnan(neither.cost_ratio)
+    only_linear = compare_closed_loops(useless, good, samples, starts=2)
+    assert (only_linear.arrived, only_linear.starts) == (0, 2)
+
+
+def test_an_integrator_does_not_make_the_comparison_endless():
+    """The open loop never settles, the closed loop does at rates of order one."""
+    double = linear_model(np.array([[0.0, 1.0], [0.0, 0.0]]))
+    found = compare_closed_loops(double, double, linear_episodes(), starts=2)
+    assert (found.cost_ratio, found.arrived) == (1.0, 2)
+
+
+def test_a_plant_without_inputs_has_no_closed_loop():
+    free = random_lift(2, n_u=0)
+    with pytest.raises(ValueError, match='a plant without inputs has no closed loop'):
+        compare_closed_loops(free, free, linear_episodes())

@@ -1,0 +1,371 @@
+# Copyright 2026 The koopman_ros Authors
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""Lifts of networks and of dictionaries: Jacobians and secants against independent derivatives."""
+
+from dataclasses import FrozenInstanceError, replace
+from fractions import Fraction
+import importlib
+from math import prod
+
+from koopman_ros.lifting import NetworkObservables, Observables, PolynomialObservables
+from koopman_ros.lifting.activations import ACTIVATIONS
+import numpy as np
+import pytest
+from random_lifts import random_network
+
+NETWORKS = {
+    f'{activation} {n_x} {widths} {identity}':
+        random_network(n_x, widths, identity=identity, activation=activation)
+    for activation in ACTIVATIONS for n_x in (1, 2, 3) for widths in ((6,), (5, 4))
+    for identity in (True, False)}
+MEANS = {name: network for name, network in NETWORKS.items()
+         if len(network.hidden) == 1 or network.n_x == 1}
+DICTIONARIES = {
+    f'{n_x} to degree {degree}': PolynomialObservables.total_degree(n_x, degree)
+    for n_x in (1, 2, 3) for degree in (1, 2, 3, 4, 5)}
+LIFTS = NETWORKS | DICTIONARIES
+every_network = pytest.mark.parametrize('network', NETWORKS.values(), ids=NETWORKS)
+every_dictionary = pytest.mark.parametrize('dictionary', DICTIONARIES.values(), ids=DICTIONARIES)
+every_lift = pytest.mark.parametrize('lift', LIFTS.values(), ids=LIFTS)
+
+SEPARATIONS = [2.0, 1e-2, 1e-5, 1e-8, 1e-9, 1e-12, 0.0]
+NODES, WEIGHTS = np.polynomial.legendre.leggauss(40)
+
+# Truncation error h^4 f'''''/30 and rounding eps/h are both near 1e-13 for functions of order 1.
+STEP = 1e-3
+
+
+def derivative(function, x):
+    """Differentiate by the five-point stencil: (..., m) -> (..., m, n_x) at one x (n_x,)."""
+    columns = []
+    for unit in np.eye(len(x)):
+        f = {k: function(x + k * STEP * unit) for k in (-2, -1, 1, 2)}
+        columns.append((f[-2] - f[2] + 8.0 * (f[1] - f[-1])) / (12.0 * STEP))
+    return np.stack(columns, axis=-1)
+
+
+def states(n_x, count=10, seed=1):
+    return np.random.default_rng(seed).uniform(-1.5, 1.5, (count, n_x))
+
+
+def jacobian(lift, x):
+    return lift.lift_and_jacobian(x)[1]
+
+
+def size(array):
+    return max(1.0, float(np.max(np.abs(array), initial=0.0)))
+
+
+# What holds for every lift
+
+@every_lift
+def test_origin_is_lifted_to_exactly_zero(lift):
+    np.testing.assert_array_equal(lift.lift(np.zeros(lift.n_x)), np.zeros(lift.n_z))
+
+
+@every_lift
+def test_identity_coordinates_are_the_state(lift):
+    for x in states(lift.n_x):
+        z, J = lift.lift_and_jacobian(x)
+        M, H = lift.secants(x, -2.0 * x, np.ones(lift.n_x))
+        assert z.shape == (lift.n_z,)
+        assert J.shape == M.shape == H.shape == (lift.n_z, lift.n_x)
+        if lift.identity:
+            np.testing.assert_array_equal(z[:lift.n_x], x)
+            for rows in (J, M):
+                np.testing.assert_array_equal(rows[:lift.n_x], np.eye(lift.n_x))
+            np.testing.assert_array_equal(H[:lift.n_x], np.zeros((lift.n_x, lift.n_x)))
+
+
+@every_lift
+def test_a_batch_is_lifted_like_its_members(lift):
+    batch = states(lift.n_x, 12)
+    z, J = lift.lift_and_jacobian(batch.reshape(3, 4, lift.n_x))
+    assert z.shape == (3, 4, lift.n_z)
+    assert J.shape == (3, 4, lift.n_z, lift.n_x)
+    for i, x in enumerate(batch):
+        place = np.unravel_index(i, (3, 4))
+        # matrix and vector products may round differently
+        np.testing.assert_allclose(z[place], lift.lift(x), rtol=1e-14, atol=1e-14)
+        np.testing.assert_allclose(J[place], jacobian(lift, x), rtol=1e-14, atol=1e-14)
+
+
+@every_lift
+def test_lift_and_jacobian_lift_as_the_single_method(lift):
+    batch = states(lift.n_x)
+    np.testing.assert_array_equal(lift.lift_and_jacobian(batch)[0], lift.lift(batch))
+
+
+@every_lift
+def test_jacobian_against_differences(lift):
+    for x in states(lift.n_x):
+        np.testing.assert_allclose(
+            jacobian(lift, x), derivative(lift.lift, x), rtol=1e-9, atol=1e-9)
+
+
+@every_lift
+@pytest.mark.parametrize('separation', SEPARATIONS)
+def test_secants_are_exact(lift, separation):
+    rng = np.random.default_rng(4)
+    for reference in states(lift.n_x, seed=2):
+        x = reference + separation * rng.normal(size=lift.n_x)
+        w = rng.normal(size=lift.n_x)
+        M, H = lift.secants(x, reference, w)
+        # x - reference is not the separation drawn: x is rounded
+        e = x - reference
+        z, J = lift.lift_and_jacobian(x)
+        z_ref, J_ref = lift.lift_and_jacobian(reference)
+        np.testing.assert_allclose(
+            M @ e, z - z_ref, rtol=1e-12, atol=1e-14 * max(size(z), size(z_ref)))
+        np.testing.assert_allclose(
+            H @ e, J @ w - J_ref @ w, rtol=1e-12, atol=2e-14 * max(size(J), size(J_ref)))
+
+
+@every_lift
+def test_secants_at_zero_separation_are_derivatives(lift):
+    w = np.random.default_rng(3).normal(size=lift.n_x)
+    for x in states(lift.n_x):
+        M, H = lift.secants(x, x, w)
+        np.testing.assert_allclose(M, jacobian(lift, x), rtol=1e-13, atol=1e-14)
+        np.testing.assert_allclose(
+            H, derivative(lambda y: jacobian(lift, y) @ w, x), rtol=1e-8, atol=1e-8)
+
+
+@every_lift
+def test_a_lift_cannot_be_changed(lift):
+    with pytest.raises(FrozenInstanceError):
+        lift.identity = not lift.identity
+    arrays = ((lift.exponents,) if isinstance(lift, PolynomialObservables)
+              else (lift.output, *lift.hidden[0], *lift.hidden[-1]))
+    for array in arrays:
+        with pytest.raises(ValueError, match='read-only'):
+            array[0] = 1
+
+
+def test_the_interface_itself_is_no_lift():
+    with pytest.raises(TypeError, match='abstract'):
+        Observables()
+
+
+# Networks
+
+@every_network
+def test_network_against_torch(network):
+    torch = importlib.import_module('torch')
+    function = {'tanh': torch.tanh, 'sigmoid': torch.sigmoid, 'sine': torch.sin,
+                'softplus': torch.nn.functional.softplus}[network.activation]
+    layers = [(torch.tensor(w), torch.tensor(b)) for w, b in network.hidden]
+    output = torch.tensor(network.output)
+
+    def outputs(x):
+        for weight, bias in layers:
+            x = function(weight @ x + bias)
+        return output @ x
+
+    def lift(x):
+        free = outputs(x) - outputs(torch.zeros_like(x))
+        return torch.cat([x, free]) if network.identity else free
+
+    for x in states(network.n_x):
+        point = torch.tensor(x)
+        z, J = network.lift_and_jacobian(x)
+        np.testing.assert_allclose(z, lift(point).numpy(), rtol=0, atol=1e-14)
+        np.testing.assert_allclose(
+            J, torch.func.jacrev(lift)(point).numpy(), rtol=0, atol=1e-13)
+
+
+@pytest.mark.parametrize('network', MEANS.values(), ids=MEANS)
+@pytest.mark.parametrize('separation', SEPARATIONS)
+def test_network_secants_are_means(network, separation):
+    """
+    At small separations only M and H themselves say whether something cancelled.
+
+    For one layer and for one state they are means of derivatives along the segment.
+    """
+    rng = np.random.default_rng(4)
+    for reference in states(network.n_x, seed=2):
+        x = reference + separation * rng.normal(size=network.n_x)
+        w = rng.normal(size=network.n_x)
+        M, H = network.secants(x, reference, w)
+
+        def along(y, w=w):
+            return jacobian(network, y) @ w
+
+        points = reference + 0.5 * (1.0 + NODES[:, None]) * (x - reference)
+        mean = np.einsum('k,kij->ij', 0.5 * WEIGHTS, jacobian(network, points))
+        np.testing.assert_allclose(M, mean, rtol=0, atol=1e-13)
+        curvature = np.stack([derivative(along, point) for point in points])
+        mean = np.einsum('k,kij->ij', 0.5 * WEIGHTS, curvature)
+        np.testing.assert_allclose(H, mean, rtol=0, atol=1e-9)
+
+
+@every_network
+@pytest.mark.parametrize('separation', [1e-4, 0.99e-8, 1.01e-8, 1e-10])
+def test_network_secants_are_continuous(network, separation):
+    """Around 1e-8 another formula takes over; nothing may jump there."""
+    w = np.ones(network.n_x)
+    for x in states(network.n_x):
+        at_zero = network.secants(x, x, w)
+        nearby = network.secants(x + separation, x, w)
+        for a, b in zip(at_zero, nearby, strict=True):
+            assert np.max(np.abs(a - b)) <= 20.0 * separation + 1e-14
+
+
+@pytest.mark.parametrize('activation', ACTIVATIONS)
+@pytest.mark.parametrize('n_x', [1, 2, 3])
+def test_a_network_without_layers_is_the_state(n_x, activation):
+    lift = NetworkObservables((), np.zeros((0, n_x)), identity=True, activation=activation)
+    assert (lift.n_x, lift.n_z) == (n_x, n_x)
+    x = states(n_x)
+    z, J = lift.lift_and_jacobian(x)
+    np.testing.assert_array_equal(z, x)
+    np.testing.assert_array_equal(J, np.broadcast_to(np.eye(n_x), (10, n_x, n_x)))
+    np.testing.assert_array_equal(lift.lift(x), x)
+    M, H = lift.secants(x[0], x[1], x[2])
+    np.testing.assert_array_equal(M, np.eye(n_x))
+    np.testing.assert_array_equal(H, np.zeros((n_x, n_x)))
+
+
+@pytest.mark.parametrize(('change', 'message'), [
+    ({'output': np.zeros((3, 4))}, r'incompatible output: expected \(3, 5\), got \(3, 4\)'),
+    ({'output': np.zeros(5)}, r'incompatible output: expected \(-1, 5\), got \(5,\)'),
+    ({'output': np.full((3, 5), np.nan)}, 'output holds values that are not finite'),
+    ({'hidden': ((np.zeros((5, 2)), np.zeros(4)),)},
+     r'incompatible weight of hidden layer 0: expected \(4, 2\), got \(5, 2\)'),
+    ({'hidden': ((np.zeros(5), np.zeros(5)),)},
+     r'incompatible weight of hidden layer 0: expected \(5, -1\), got \(5,\)'),
+    ({'hidden': ((np.zeros((5, 2)), np.zeros((5, 1))),)},
+     r'incompatible weight of hidden layer 0: expected \(-1, 2\), got \(5, 2\)'),
+    ({'hidden': ((np.zeros((5, 2)), np.zeros(5)), (np.zeros((5, 4)), np.zeros(5)))},
+     r'incompatible weight of hidden layer 1: expected \(5, 5\), got \(5, 4\)'),
+    ({'hidden': ((np.zeros((5, 2)), np.full(5, np.inf)),)},
+     'bias of hidden layer 0 holds values that are not finite'),
+    ({'hidden': ()}, 'a lift with free coordinates needs a hidden layer'),
+    ({'hidden': (), 'output': np.zeros((0, 2)), 'identity': False},
+     'a lift needs coordinates: set identity, or give rows of output'),
+    ({'output': np.zeros((0, 5)), 'identity': False}, 'a lift needs coordinates'),
+    ({'activation': 'relu'}, "must be one of 'tanh', 'sigmoid', 'sine', 'softplus', got 'relu'"),
+])
+def test_a_network_that_does_not_fit_is_refused(change, message):
+    with pytest.raises(ValueError, match=message):
+        replace(random_network(), **change)
+
+
+# Dictionaries, against their definition in rational numbers
+
+def monomial(x, exponents):
+    return prod(Fraction(v) ** int(k) for v, k in zip(x, exponents, strict=True))
+
+
+def partial(x, exponents, *by):
+    """Differentiate a monomial by the states of these indices, one after the other."""
+    factor, left = 1, list(map(int, exponents))
+    for i in by:
+        factor, left[i] = factor * left[i], left[i] - 1
+        if factor == 0:
+            return Fraction(0)
+    return factor * monomial(x, left)
+
+
+def corners(n_x):
+    """Return states of either sign, at zero and on the axes."""
+    return [*states(n_x), *np.eye(n_x), -np.eye(n_x)[0], np.zeros(n_x), np.full(n_x, -3.0)]
+
+
+@every_dictionary
+def test_dictionary_against_fractions(dictionary):
+    n_x = dictionary.n_x
+    w = states(n_x, 1, seed=3)[0]
+    for x in corners(n_x):
+        z, J = dictionary.lift_and_jacobian(x)
+        _, H = dictionary.secants(x, x, w)
+        for i, row in enumerate(dictionary.exponents):
+            assert z[i] == pytest.approx(float(monomial(x, row)), rel=1e-14, abs=0)
+            for j in range(n_x):
+                assert J[i, j] == pytest.approx(float(partial(x, row, j)), rel=1e-14, abs=0)
+                hessian = sum(partial(x, row, j, k) * Fraction(w[k]) for k in range(n_x))
+                assert H[i, j] == pytest.approx(float(hessian), rel=1e-12, abs=1e-13)
+
+
+@every_dictionary
+@pytest.mark.parametrize('separation', SEPARATIONS)
+def test_dictionary_secants_against_fractions(dictionary, separation):
+    """In rational numbers the differences are exact, so those of the smallest steps tell too."""
+    n_x = dictionary.n_x
+    rng = np.random.default_rng(4)
+    for reference in corners(n_x)[8:]:
+        x = reference + separation * rng.normal(size=n_x)
+        w = rng.normal(size=n_x)
+        M, H = dictionary.secants(x, reference, w)
+        e = [Fraction(a) - Fraction(b) for a, b in zip(x, reference, strict=True)]
+        scale = float(max(map(abs, e)))
+        for i, row in enumerate(dictionary.exponents):
+            found = sum(Fraction(M[i, j]) * e[j] for j in range(n_x))
+            exact = monomial(x, row) - monomial(reference, row)
+            assert abs(found - exact) <= 1e-14 * scale * size(M)
+            found = sum(Fraction(H[i, j]) * e[j] for j in range(n_x))
+            exact = sum((partial(x, row, k) - partial(reference, row, k)) * Fraction(w[k])
+                        for k in range(n_x))
+            assert abs(found - exact) <= 1e-14 * scale * size(H)
+
+
+@pytest.mark.parametrize(('n_x', 'degree', 'exponents'), [
+    (1, 1, [[1]]),
+    (1, 4, [[1], [2], [3], [4]]),
+    (2, 1, [[1, 0], [0, 1]]),
+    (2, 2, [[1, 0], [0, 1], [2, 0], [1, 1], [0, 2]]),
+    (2, 3, [[1, 0], [0, 1], [2, 0], [1, 1], [0, 2], [3, 0], [2, 1], [1, 2], [0, 3]]),
+    (3, 2, [[1, 0, 0], [0, 1, 0], [0, 0, 1], [2, 0, 0], [1, 1, 0], [1, 0, 1], [0, 2, 0],
+            [0, 1, 1], [0, 0, 2]]),
+])
+def test_monomials_of_a_total_degree(n_x, degree, exponents):
+    dictionary = PolynomialObservables.total_degree(n_x, degree)
+    np.testing.assert_array_equal(dictionary.exponents, exponents)
+    assert (dictionary.n_x, dictionary.n_z, dictionary.identity) == (n_x, len(exponents), True)
+
+
+def test_a_dictionary_need_not_be_complete():
+    """The exact lift of the paper's two-state example."""
+    dictionary = PolynomialObservables(np.array([[1, 0], [0, 1], [2, 0]], dtype=np.uint8))
+    x, x_ref, w = np.array([3.0, -1.0]), np.array([-2.0, 5.0]), np.array([7.0, 11.0])
+    z, J = dictionary.lift_and_jacobian(x)
+    np.testing.assert_array_equal(z, [3.0, -1.0, 9.0])
+    np.testing.assert_array_equal(J, [[1.0, 0.0], [0.0, 1.0], [6.0, 0.0]])
+    M, H = dictionary.secants(x, x_ref, w)
+    np.testing.assert_allclose(M, [[1.0, 0.0], [0.0, 1.0], [1.0, 0.0]], rtol=1e-14)
+    np.testing.assert_allclose(H, [[0.0, 0.0], [0.0, 0.0], [14.0, 0.0]], rtol=1e-14)
+
+
+@pytest.mark.parametrize(('exponents', 'error', 'message'), [
+    (np.eye(2), TypeError, 'exponents must be integers, got float64'),
+    ([[True]], TypeError, 'exponents must be integers, got bool'),
+    ([1, 2], ValueError, r'incompatible exponents: expected \(n_z, n_x\), got \(2,\)'),
+    (np.zeros((3, 0), dtype=int), ValueError, r'expected \(n_z, n_x\), got \(3, 0\)'),
+    ([[1], [-1]], ValueError, 'exponents must be at least 0, got -1'),
+    ([[2], [1]], ValueError, r'first 1 rows of exponents must be the states, .* got \[\[2\]\]'),
+    ([[0, 1], [1, 0]], ValueError, r'must be the states, .* got \[\[0, 1\], \[1, 0\]\]'),
+    ([[1, 0]], ValueError, r'must be the states, the identity matrix, got \[\[1, 0\]\]'),
+    ([[1], [2], [0]], ValueError, r'a constant, which N\(0\) = 0 rules out: drop it'),
+    ([[1], [3], [2], [3]], ValueError, r'the row \[3\] of exponents comes 2 times: keep one'),
+])
+def test_exponents_that_do_not_fit_are_refused(exponents, error, message):
+    with pytest.raises(error, match=message):
+        PolynomialObservables(exponents)
+
+
+@pytest.mark.parametrize(('n_x', 'degree'), [(0, 2), (2, 0), (-1, 3)])
+def test_a_total_degree_of_nothing_is_refused(n_x, degree):
+    with pytest.raises(ValueError, match=f'must be at least 1, got {n_x} and {degree}'):
+        PolynomialObservables.total_degree(n_x, degree)
