@@ -166,7 +166,7 @@ class Layout:
 
 
 @dataclass(frozen=True)
-class _Layer:
+class Layer:
     """What one layer keeps of a pass for the way back; N samples, widths g -> h."""
 
     W: Tensor
@@ -195,12 +195,12 @@ class Pass:
         self._layout, self._parameters = layout, parameters
         activation = ACTIVATIONS[layout.activation]
         value, rate, zero = x, f, x.new_zeros(layout.n_x)
-        self._layers: list[_Layer] = []
+        self.layers: list[Layer] = []
         for W, b in parameters.hidden:
             through = rate @ W.T
             next_value, slope, curvature = activation(torch.addmm(b, value, W.T))
             next_zero, zero_slope, _ = activation(b + W @ zero)
-            self._layers.append(_Layer(W, value, rate, slope, curvature * through, zero,
+            self.layers.append(Layer(W, value, rate, slope, curvature * through, zero,
                                        zero_slope))
             value, rate, zero = next_value, slope * through, next_zero
         # (N, h): the last layer above its value at 0, and its rate
@@ -215,9 +215,9 @@ class Pass:
         layout = self._layout
         N = len(self.z)
         T = torch.eye(layout.n_x).to(self.z).expand(N, -1, -1)
-        for layer in self._layers:
+        for layer in self.layers:
             T = layer.slope[:, :, None] * (layer.W @ T)
-        free = self._parameters.V @ T if self._layers else T[:, :0]
+        free = self._parameters.V @ T if self.layers else T[:, :0]
         if not layout.identity:
             return free
         return torch.cat([torch.eye(layout.n_x).to(self.z).expand(N, -1, -1), free], 1)
@@ -233,8 +233,8 @@ class Pass:
         slices = self._layout.slices
         S, T = of_features, of_rates
         S0 = -of_features
-        for i in range(len(self._layers) - 1, -1, -1):
-            layer = self._layers[i]
+        for i in range(len(self.layers) - 1, -1, -1):
+            layer = self.layers[i]
             h, g = layer.W.shape
             to_input = S * layer.slope[:, None, :]
             at_W = into[:, :, slices[2 * i]].unflatten(2, (h, g))

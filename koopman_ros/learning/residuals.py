@@ -18,7 +18,9 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 
+from koopman_ros.learning.deep import ProductSums
 from koopman_ros.learning.network import Layout, Parameters, Pass
+from koopman_ros.learning.shallow import FeatureMap, MomentSums
 import torch
 from torch import Tensor
 
@@ -110,8 +112,12 @@ class Problem:
         if self.weights.decoder and not self.layout.decoder:
             raise ValueError('a decoder weight needs a decoder network')
         if not self.chunk:
-            rows = self.layout.n_z + self.layout.n_x * bool(self.layout.decoder)
-            floats = rows * self.layout.size
+            shallow = len(self.layout.hidden) == 1
+            rows = self.layout.n_x if self.layout.decoder else 0
+            if not shallow:
+                rows = max(rows, self.layout.n_z)
+            floats = max(rows * self.layout.size,
+                         FeatureMap.size(self.layout) if shallow else 0)
             object.__setattr__(self, 'chunk', max(64, (1 << 18) // floats))
 
     def with_weights(self, weights: ResidualWeights) -> Problem:
@@ -122,76 +128,52 @@ class Problem:
         """Accumulate the normal equations over chunks of the data."""
         layout, N = self.layout, len(self.data)
         parameters = layout.split(theta)
-        n_z, p = layout.n_z, layout.size
-        cost = theta.new_zeros(())
-        moment = theta.new_zeros((n_z, n_z))
-        gradient, matrix = theta.new_zeros(p), theta.new_zeros((p, p))
-        moment_rate = theta.new_zeros((n_z, n_z, p))
+        sums: MomentSums | ProductSums | None = None
+        if derivatives:
+            kind = MomentSums if len(layout.hidden) == 1 else ProductSums
+            sums = kind(layout, parameters, N)
+        cost, gradient = theta.new_zeros(()), theta.new_zeros(layout.size)
+        matrix = theta.new_zeros((layout.size, layout.size) if derivatives else 0)
+        moment = theta.new_zeros((layout.n_z, layout.n_z))
         for start in range(0, N, self.chunk):
             data = self.data.part(start, self.chunk)
-            lifted = Pass(layout, parameters, data.x, data.drift(parameters.B))
-            blocks = [(lifted.z_rate - lifted.z @ parameters.A.T,
-                       _dynamics_jacobian(layout, parameters, data, lifted)
-                       if derivatives else None)]
+            f = data.drift(parameters.B)
+            lifted = Pass(layout, parameters, data.x, f)
+            r = lifted.z_rate - lifted.z @ parameters.A.T
+            cost += 0.5 * torch.sum(r * r) / N
+            moment += lifted.z.T @ lifted.z / N
+            if sums is not None:
+                sums.add(data.x, f, data.u, lifted, r)
             if self.weights.decoder:
-                blocks.append(_decoder_block(
-                    layout, parameters, data, lifted, self.weights.decoder ** 0.5, derivatives))
-            for r, J in blocks:
+                r, J = _decoder_block(layout, parameters, data.x, lifted,
+                                      self.weights.decoder ** 0.5, derivatives)
                 cost += 0.5 * torch.sum(r * r) / N
                 if J is not None:
-                    J = J.view(-1, p)
+                    J = J.view(-1, layout.size)
                     gradient += J.T @ r.reshape(-1) / N
                     matrix.addmm_(J.T, J, alpha=1.0 / N)
-            if self.weights.whitening:
-                moment += lifted.z.T @ lifted.z / N
-                if derivatives:
-                    _add_moment_rate(moment_rate, layout, parameters, lifted, N)
-        if self.weights.whitening:
-            r, J = _whitening_block(layout, moment, moment_rate, self.weights.whitening)
-            cost += 0.5 * torch.sum(r * r)
-            if derivatives:
-                gradient += J.T @ r
-                matrix += J.T @ J
-        if not derivatives:
+        i, j, scale, r = _whitening(layout, moment, self.weights.whitening)
+        cost += 0.5 * torch.sum(r * r)
+        if sums is None:
             return NormalEquations(float(cost))
-        return NormalEquations(float(cost), gradient, matrix)
+        of_dynamics, product, moment_rate = sums.result()
+        J = scale[:, None] * (moment_rate[i, j] + moment_rate[j, i])
+        return NormalEquations(float(cost), gradient + of_dynamics + J.T @ r,
+                               matrix + product + J.T @ J)
 
 
-def _dynamics_jacobian(layout: Layout, parameters: Parameters, data: Data, lifted: Pass
-                       ) -> Tensor:
-    """Differentiate J_N (dx/dt - B u) - A N in the parameters: (N, n_z, p)."""
-    A, V, first = parameters.A, parameters.V, layout.n_z - layout.n_free
-    at_V, at_A = layout.slices[2 * len(layout.hidden):][:2]
-    J = lifted.z.new_zeros((len(data), layout.n_z, layout.size))
-    if layout.hidden:
-        of_rates = torch.cat([V.new_zeros((first, V.shape[1])), V])
-        lifted.pull_back(J, -A[:, first:] @ V, of_rates)
-        # r_i holds V_k in -A_ik V_k . features, and in V_k . feature_rates where i is k
-        J[:, :, at_V] = torch.einsum(
-            'ik,nh->nikh', -A[:, first:], lifted.features).flatten(2)
-        for k, row in enumerate(J[:, first:, at_V].unflatten(2, V.shape).unbind(2)):
-            row[:, k] += lifted.feature_rates
-    at_rows = J[:, :, at_A].unflatten(2, A.shape)
-    for i in range(layout.n_z):
-        at_rows[:, i, i] = -lifted.z
-    if layout.n_u and data.u is not None:
-        at_B = layout.slices[2 * len(layout.hidden) + 2]
-        J[:, :, at_B] = -torch.einsum('nim,nk->nimk', lifted.jacobian(), data.u).flatten(2)
-    return J
-
-
-def _decoder_block(layout: Layout, parameters: Parameters, data: Data, lifted: Pass,
+def _decoder_block(layout: Layout, parameters: Parameters, x: Tensor, lifted: Pass,
                    weight: float, derivatives: bool) -> tuple[Tensor, Tensor | None]:
     """Evaluate weight (x - D(N(x))), (N, n_x), and differentiate it: (N, n_x, p)."""
     assert parameters.decoder is not None
     W, b, V, c = parameters.decoder
     t = torch.tanh(torch.addmm(b, lifted.z, W.T))
-    r = weight * (data.x - torch.addmm(c, t, V.T))
+    r = weight * (x - torch.addmm(c, t, V.T))
     if not derivatives:
         return r, None
     slope = 1.0 - t * t
     to_input = -weight * V * slope[:, None, :]  # (N, n_x, g)
-    J = r.new_zeros((len(data), layout.n_x, layout.size))
+    J = r.new_zeros((len(x), layout.n_x, layout.size))
     at_W, at_b, at_V, at_c = layout.slices[-4:]
     J[:, :, at_W] = torch.einsum('nmg,nz->nmgz', to_input, lifted.z).flatten(2)
     J[:, :, at_b] = to_input
@@ -206,30 +188,17 @@ def _decoder_block(layout: Layout, parameters: Parameters, data: Data, lifted: P
     return r, J
 
 
-def _add_moment_rate(moment_rate: Tensor, layout: Layout, parameters: Parameters, lifted: Pass,
-                     N: int) -> None:
-    """Add a chunk's share of E[z_a dz_b/dtheta] to moment_rate (n_z, n_z, p)."""
-    if not layout.hidden:
-        return
-    V, first = parameters.V, layout.n_z - layout.n_free
-    # V sits behind the hidden layers, the rest of the parameters does not move z
-    place = layout.slices[2 * len(layout.hidden)]
-    z_rate = lifted.z.new_zeros((len(lifted.z), layout.n_free, place.start))
-    lifted.pull_back(z_rate, V, None)
-    moment_rate[:, first:, :place.start] += torch.einsum('na,nbp->abp', lifted.z, z_rate) / N
-    by_features = lifted.z.T @ lifted.features / N
-    for k in range(layout.n_free):
-        moment_rate[:, first + k, place].unflatten(1, V.shape)[:, k] += by_features
+def _whitening(layout: Layout, moment: Tensor, weight: float
+               ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    """
+    Evaluate the whitening residual from E[z z'].
 
-
-def _whitening_block(layout: Layout, moment: Tensor, moment_rate: Tensor, weight: float
-                     ) -> tuple[Tensor, Tensor]:
-    """Evaluate the whitening residual and its Jacobian from E[z z'] and E[z dz'/dtheta]."""
+    :return: rows and columns of the entries that can change, their weights, the residual.
+    """
     i, j = torch.triu_indices(layout.n_z, layout.n_z, device=moment.device)
     varies = j >= layout.n_z - layout.n_free
     i, j = i[varies], j[varies]
     diagonal = (i == j).to(moment)
     # an off-diagonal entry stands twice in the matrix
     scale = torch.sqrt(weight * (2.0 - diagonal))
-    return (scale * (moment[i, j] - diagonal),
-            scale[:, None] * (moment_rate[i, j] + moment_rate[j, i]))
+    return i, j, scale, scale * (moment[i, j] - diagonal)

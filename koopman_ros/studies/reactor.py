@@ -49,7 +49,7 @@ STARTS = 2
 # Coolant and reactor in K, times in min. The coolant moves the reactor through the box from end
 # to end, short of the fold at 329.37 K beyond which a coolant held warmer lets it run away.
 TRAINING = RandomStepDesign(
-    input_lower=281.3, input_upper=300.9, state_lower=305.0, state_upper=327.0,
+    input_lower=281.3, input_upper=301.1, state_lower=305.0, state_upper=327.0,
     hold_time=(0.5, 5.0), sample_period=0.25)
 IN_RANGE = RandomStepDesign(
     input_lower=281.3, input_upper=300.9, state_lower=305.0, state_upper=327.0,

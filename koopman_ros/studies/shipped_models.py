@@ -26,33 +26,17 @@ from dataclasses import replace
 from pathlib import Path
 import sys
 
-from koopman_ros.learning import Growth, roll_out, Samples, train
+from koopman_ros.learning import Growth, roll_out, train
 from koopman_ros.lifting import LiftedModel, linearised_model, Provenance, save
-from koopman_ros.plants import (
-    ControlAffineSystem,
-    one_state_reactor,
-    random_steps,
-    RandomStepDesign,
-)
-from koopman_ros.studies.datasets import describe, random_step_episodes
+from koopman_ros.plants import ControlAffineSystem, one_state_reactor, random_steps
+from koopman_ros.studies.datasets import describe
 from koopman_ros.studies.progress import TrainingProgress
+from koopman_ros.studies.reactor import TRAINING, training_samples
 import numpy as np
 
-# The coolant moves the reactor through its training box from end to end, short of the fold at
-# 329.37 K beyond which a coolant held warmer lets it run away.
-DESIGN = RandomStepDesign(
-    input_lower=281.3, input_upper=301.1, state_lower=305.0, state_upper=329.0,
-    hold_time=(0.5, 5.0), sample_period=0.25)
-EPISODES = 20
-EPISODE_MINUTES = 15.0
 SEED = 2026
 STARTS = 3
 LIFTED_SIZES = (3, 4)
-
-
-def training_samples(system: ControlAffineSystem) -> Samples:
-    """Simulate the episodes of random coolant steps that the lifts are learned from."""
-    return random_step_episodes(system, DESIGN, EPISODES, EPISODE_MINUTES, SEED)
 
 
 def train_lifts(progress: TrainingProgress | None = None) -> dict[int, LiftedModel]:
@@ -65,7 +49,7 @@ def train_lifts(progress: TrainingProgress | None = None) -> dict[int, LiftedMod
     system = one_state_reactor()
     # a fixed number of steps: where they end depends least on how a processor rounds
     recipe = Growth(max(LIFTED_SIZES), tolerance=0.0)
-    trained = train(describe(system), training_samples(system), recipe, seed=SEED, starts=STARTS,
+    trained = train(describe(system), training_samples(SEED), recipe, seed=SEED, starts=STARTS,
                     watch=progress)
     return {model.n_z: _with_roll_out(model, system) for model in trained.path
             if model.n_z in LIFTED_SIZES}
@@ -82,9 +66,8 @@ def linear_model(like: LiftedModel) -> LiftedModel:
 
 def _with_roll_out(model: LiftedModel, system: ControlAffineSystem) -> LiftedModel:
     """Add the roll-out error, in K, over a fresh episode of random steps to the metrics."""
-    design = replace(DESIGN, state_lower=model.states.lower, state_upper=model.states.upper)
-    truth = random_steps(system, design, EPISODE_MINUTES, SEED - 1).trajectory
-    predicted = roll_out(model, truth.states[0], truth.inputs, DESIGN.sample_period)
+    truth = random_steps(system, TRAINING, 15.0, SEED - 1).trajectory
+    predicted = roll_out(model, truth.states[0], truth.inputs, TRAINING.sample_period)
     error = float(np.sqrt(np.mean((predicted - truth.states) ** 2)))
     metrics = {**model.provenance.metrics, 'rollout_rmse': error}
     return replace(model, provenance=replace(model.provenance, metrics=metrics))
