@@ -23,6 +23,7 @@ from __future__ import annotations
 import argparse
 import json
 from pathlib import Path
+import signal
 import sys
 import time
 
@@ -45,6 +46,8 @@ def main(args: list[str] | None = None) -> int:
     if options.seeds < 1:
         parser.error(f'--seeds is {options.seeds}, must be at least 1')
     options.output.mkdir(parents=True, exist_ok=True)
+    # a request to end is an interrupt: what is done is reported
+    signal.signal(signal.SIGTERM, signal.default_int_handler)
     start = time.monotonic()
     campaign = run_campaign(options.seeds)
     summary = {

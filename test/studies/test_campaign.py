@@ -1,0 +1,161 @@
+# Copyright 2026 The koopman_ros Authors
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""The campaign over seeds, its summary, figures and report."""
+
+import json
+from pathlib import Path
+import re
+
+import joblib
+from koopman_ros.learning import Growth, Linearisation, train
+from koopman_ros.lifting import load
+from koopman_ros.studies import campaign as campaigns
+from koopman_ros.studies import figures, reactor, report, scalar, two_state
+from koopman_ros.studies.campaign import Campaign, run_campaign
+from koopman_ros.studies.datasets import describe
+import matplotlib.image
+import numpy as np
+import pytest
+
+MODELS = Path(__file__).parents[2] / 'config' / 'models'
+
+
+@pytest.fixture
+def one_process():
+    with joblib.parallel_config('threading', n_jobs=1):
+        yield
+
+
+def quick(seed):
+    return {'rw': 0.5 ** seed, 'part/cond': None if seed == 1 else 2.0,
+            'ratio': {'R=1': np.inf}}, {}
+
+
+def failing(seed):
+    if seed == 1:
+        raise ValueError('no such lift')
+    return {'rw': 1.0}, {}
+
+
+@pytest.mark.usefixtures('one_process')
+def test_summary_has_one_entry_for_each_seed(monkeypatch, capsys):
+    monkeypatch.setattr(campaigns, 'EXPERIMENTS', {'a': quick, 'b/c': failing})
+    campaign = run_campaign(3)
+    assert campaign.complete
+    assert campaign.errors == ['b/c, seed 1: ValueError: no such lift']
+    assert campaign.summary() == {
+        'a': {'rw': [1.0, 0.5, 0.25], 'part': {'cond': [2.0, None, 2.0]},
+              'ratio': {'R=1': [None, None, None]}},
+        'b': {'c': {'rw': [1.0, 1.0]}}}
+    lines = capsys.readouterr().err.splitlines()
+    assert lines[0] == '1/6: a, seed 0, rw 1.0e+00'
+    assert '4/6: b/c, seed 1 failed' in lines
+
+
+@pytest.mark.usefixtures('one_process')
+def test_an_interrupt_keeps_what_is_done(monkeypatch):
+    def interrupted(seed):
+        if seed == 2:
+            raise KeyboardInterrupt
+        return {'rw': 1.0}, {}
+
+    monkeypatch.setattr(campaigns, 'EXPERIMENTS', {'a': interrupted})
+    campaign = run_campaign(4)
+    assert not campaign.complete
+    assert campaign.summary() == {'a': {'rw': [1.0, 1.0]}}
+
+
+@pytest.fixture(scope='module')
+def campaign():
+    """Return a campaign of one seed with quickly trained models and its real figures."""
+    found = Campaign(complete=True)
+
+    def add(name, outcome):
+        found.metrics[name], found.models[name] = {0: outcome[0]}, {0: outcome[1]}
+
+    add('scalar', scalar.run(0))
+    plant = describe(two_state.SYSTEM)
+    recipe = Growth(3, max_iterations=60)
+    lifts = {name: train(plant, two_state.samples(box, 0, episodes=20), recipe, starts=1,
+                         refuse=False).model
+             for name, box in (('wide', two_state.WIDE),
+                               (figures.FIGURE_NARROW_BOX,
+                                two_state.NARROW[figures.FIGURE_NARROW_BOX]))}
+    lifts['linear'] = Linearisation(two_state.SYSTEM.drift_jacobian(np.zeros(2))).learn(
+        plant, two_state.samples(two_state.WIDE, 0, episodes=20))
+    metrics = two_state._judged(lifts['wide'], two_state.samples(two_state.WIDE, 1, episodes=20))
+    metrics['linear_cost_ratio'] = {'R=1': 4.5, 'R=0.1': 1.9, 'R=0.001': 1.0}
+    metrics['edmd_cost_ratio'] = {'R=1': None}
+    add('two_state', (metrics, lifts))
+    add('narrow', ({f'{figures.FIGURE_NARROW_BOX}/{name}': value for name, value in (
+        ('rw_in', 1e-7), ('cost_ratio_to_exact', None), ('left_box', True),
+        ('final_distance', None))}, lifts))
+    models = {f'nz={n}': load(MODELS / f'reactor_nz{n}.safetensors') for n in (3, 4)}
+    models['linear'] = load(MODELS / 'reactor_linear.safetensors')
+    judge = reactor.Judge.of(0)
+    add('reactor', ({f'{name}/{figure}': value for name, model in models.items()
+                     for figure, value in judge.figures(model).items()}, models))
+    return found
+
+
+@pytest.fixture(scope='module')
+def drawn(campaign, tmp_path_factory):
+    folder = tmp_path_factory.mktemp('studies')
+    return folder, figures.draw_figures(campaign, folder)
+
+
+def test_eleven_figures(drawn):
+    folder, figures_drawn = drawn
+    assert [figure.file[:2] for figure in figures_drawn] == [
+        f'{number:02d}' for number in range(1, 12)]
+    for figure in figures_drawn:
+        image = matplotlib.image.imread(folder / figure.file)
+        assert min(image.shape[:2]) > 500
+        # neither blank nor one colour
+        assert np.std(image[..., :3]) > 0.02
+        assert figure.caption.endswith('.')
+
+
+def test_report_names_every_experiment_and_figure(campaign, drawn):
+    folder, figures_drawn = drawn
+    summary = {'package_version': '1', 'seeds': 1, 'complete': True, 'errors': [],
+               'wall_seconds': 1.0, **campaign.summary()}
+    json.dumps(summary, allow_nan=False)
+    # the quick campaign has no lifts of 2 and 5 coordinates
+    targets = tuple(target for target in report.TARGETS
+                    if 'nz=2' not in target.path and 'nz=5' not in target.path)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(report, 'TARGETS', targets)
+        report.write_report(summary, figures_drawn, folder / 'report.md')
+    text = (folder / 'report.md').read_text()
+    for heading in ('Motivating example', 'Two-state example', 'One-state reactor',
+                    'Narrow data', 'Figures'):
+        assert f'\n## {heading}' in text
+    assert len(re.findall(r'^!\[.*\]\((.*)\)$', text, re.MULTILINE)) == 11
+    assert '| `reactor/nz=3/tracking_offset_kelvin` | 0.001 |' in text
+    assert 'failed in all 1' in text
+    assert 'nan' not in text
+
+
+def test_a_missed_target_is_counted():
+    target = report.Target('a/b', 1e-6, 1.0)
+    assert target.met({'a': {'b': [1.0, 1.0 + 2e-6, None, 0.99]}}) == (2, 4)
+
+
+def test_seeds_below_one_are_refused(capsys):
+    from koopman_ros.studies.__main__ import main
+    with pytest.raises(SystemExit):
+        main(['--seeds', '0'])
+    assert '--seeds is 0, must be at least 1' in capsys.readouterr().err
