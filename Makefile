@@ -5,7 +5,10 @@ BIN := $(VENV)/bin
 # The loop stays on this machine.
 export ROS_AUTOMATIC_DISCOVERY_RANGE ?= LOCALHOST
 
-.PHONY: help demo test lint models config clean
+# How many seeds each experiment is run from: make studies SEEDS=5
+SEEDS ?= 20
+
+.PHONY: help demo test lint models studies bench config clean
 
 help:  ## show this list
 	@grep -E '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed 's/:.*## /\t/'
@@ -25,6 +28,14 @@ $(VENV)/test.stamp: setup.py $(VENV)/run.stamp
 	$(BIN)/python -m pip install --quiet --editable '.[ros,demo,train,test]'
 	@touch $@
 
+$(VENV)/train.stamp: setup.py | $(BIN)/python
+	$(BIN)/python -m pip install --quiet --editable '.[demo,train]'
+	@touch $@
+
+$(VENV)/bench.stamp: setup.py $(VENV)/run.stamp
+	$(BIN)/python -m pip install --quiet --editable '.[ros,demo,train,bench]'
+	@touch $@
+
 demo: $(VENV)/run.stamp  ## closed loop of three processes: live table, bag, picture -> out/demo
 	$(BIN)/python -m koopman_ros.demo
 
@@ -35,8 +46,14 @@ lint: $(VENV)/test.stamp  ## style and type checks
 	$(BIN)/ruff check
 	$(BIN)/mypy
 
-models: $(VENV)/test.stamp  ## train the shipped lifts again -> config/models
+models: $(VENV)/train.stamp  ## train the shipped lifts again -> config/models
 	$(BIN)/python -m koopman_ros.studies.shipped_models
+
+studies: $(VENV)/train.stamp  ## the paper's experiments from SEEDS seeds: figures, report -> out/studies
+	$(BIN)/python -m koopman_ros.studies --seeds $(SEEDS)
+
+bench: $(VENV)/bench.stamp  ## speed beside other programs, ten minutes (BENCH=--quick: one) -> out/bench
+	$(BIN)/python -m benchmarks $(BENCH)
 
 config: $(VENV)/run.stamp  ## write config/*.yaml from the parameter tables
 	$(BIN)/python -m koopman_ros.nodes.parameter_files

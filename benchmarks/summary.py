@@ -1,0 +1,50 @@
+# Copyright 2026 The koopman_ros Authors
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""The file in which the parts of the benchmark leave their figures side by side."""
+
+from __future__ import annotations
+
+import json
+import os
+from pathlib import Path
+from typing import Any
+
+
+class Summary:
+    """
+    A JSON file with one key a part; writing one part keeps the others.
+
+    :param path: the file, which need not exist.
+    """
+
+    def __init__(self, path: Path) -> None:
+        self.path = path
+
+    def read(self) -> dict[str, Any]:
+        """Return what the parts have left, nothing where there is no file."""
+        if not self.path.exists():
+            return {}
+        loaded = json.loads(self.path.read_text())
+        if not isinstance(loaded, dict):
+            raise ValueError(f'{self.path} does not hold the figures of a benchmark: move it away')
+        return loaded
+
+    def write(self, part: str, figures: dict[str, Any]) -> None:
+        """Put a part's figures in the place of its old ones."""
+        self.path.parent.mkdir(parents=True, exist_ok=True)
+        # written beside and renamed, so that an interrupt leaves the old file or the new one
+        beside = self.path.with_suffix('.part')
+        beside.write_text(json.dumps({**self.read(), part: figures}, indent=1) + '\n')
+        os.replace(beside, self.path)
