@@ -71,9 +71,12 @@ class Feedback:
 def feedback(model: LiftedModel, x: Array, target: Target, weights: Weights, *,
              max_gain: float = 1e6, max_residual: float = 1e-8) -> Feedback:
     """
-    Evaluate the law that suits the model: re-centred if A is Hurwitz, projected otherwise.
+    Evaluate the law that suits the model.
 
-    When the re-centred law's equation cannot be solved, the projected one takes over.
+    Re-centred if A is Hurwitz and the lift has identity coordinates or as many as there are
+    states; projected otherwise, and when the re-centred law's equation cannot be solved. A free
+    lift with more coordinates than states has directions of z that no state reaches, in which
+    its weight C' Q C and so the gain are not determined near the target.
 
     :param model: the lift.
     :param x: (n_x,) scaled deviation of the measured state.
@@ -83,7 +86,7 @@ def feedback(model: LiftedModel, x: Array, target: Target, weights: Weights, *,
     :param max_residual: bound on the relative Riccati residual.
     """
     bounds = {'max_gain': max_gain, 'max_residual': max_residual}
-    if model.is_hurwitz:
+    if model.is_hurwitz and (model.identity or model.n_z == model.n_x):
         result = recentred(model, x, target, weights, **bounds)
         if result.solved:
             return result

@@ -14,6 +14,7 @@
 
 """The laws against exact optima: the reactor's Hamilton-Jacobi solution, an exact lift, LQR."""
 
+from dataclasses import replace
 
 from closed_loops import (
     COOLANT,
@@ -49,6 +50,7 @@ from koopman_ros.lifting import (
 from koopman_ros.plants import equilibrium, two_state_example, two_state_reactor
 import numpy as np
 import pytest
+from random_lifts import random_lift
 from scipy.integrate import solve_ivp
 from scipy.linalg import solve_continuous_are
 from scipy.optimize import brentq
@@ -328,3 +330,15 @@ def test_projected_law_of_a_free_lift_by_hand(x):
     found = projected(model, np.array([x]), target, Weights(q * np.eye(1), r * np.eye(1)))
     assert found.solved
     assert found.u[0] == pytest.approx(-p * b / r * x, rel=1e-10)
+
+
+@pytest.mark.parametrize(('identity', 'n_free', 'law'), [
+    (True, 1, Law.RECENTRED), (False, 1, Law.RECENTRED), (False, 2, Law.PROJECTED)])
+def test_a_free_lift_with_more_coordinates_than_states_takes_the_projected_law(
+        identity, n_free, law):
+    model = random_lift(1, identity=identity, n_free=n_free)
+    model = replace(model, A=-np.eye(model.n_z), B=np.eye(1))
+    target = steady_state_target(model, np.array([0.1]))
+    found = feedback(model, np.array([0.3]), target, Weights(np.eye(1), np.eye(1)))
+    assert found.solved
+    assert found.law is law
