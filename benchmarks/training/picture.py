@@ -83,7 +83,7 @@ def _draw_traces(ax: Axes, traces: dict[str, Trace], case: dict[str, Any]) -> No
     for name, target in TARGETS.items():
         if name not in case['not_asked']:
             ax.axhline(target, color='0.5', lw=0.9, ls=':', zorder=1)
-    ax.set(xscale='log', yscale='log', xlim=(_FIRST, 10.0 * last), xlabel='time of one thread [s]',
+    ax.set(xscale='log', yscale='log', xlim=(_FIRST, 25.0 * last), xlabel='time of one thread [s]',
            ylabel='relative residual rw on the training samples')
     ax.set_title(f'{case["system"]}: N = {case["samples"]}, n$_z$ = 3, {case["hidden"]} hidden '
                  'units', fontsize=10)
@@ -108,6 +108,7 @@ def _draw_cost(ax: Axes, figures: dict[str, Any]) -> None:
                         textcoords='offset points', color='0.3')
     ax.legend(fontsize=8, loc='lower right')
     ax.set(xscale='log', yscale='log', xlim=(samples[0] / 8, samples[-1] * 3),
+           ylim=(seconds[-1] * samples[0] / samples[-1] / 5, 3 * seconds[-1]),
            xlabel='samples N', ylabel='time of an iteration [s]')
     ax.set_title('a step of ours: n$_x$ = 2, n$_z$ = 3, 16 units', fontsize=10)
     ax.grid(color='0.92', lw=0.6)
