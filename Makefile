@@ -25,7 +25,7 @@ $(VENV)/run.stamp: setup.py | $(BIN)/python
 	@touch $@
 
 $(VENV)/test.stamp: setup.py $(VENV)/run.stamp
-	$(BIN)/python -m pip install --quiet --editable '.[ros,demo,train,test]'
+	$(BIN)/python -m pip install --quiet --editable '.[ros,demo,train,test,bench]'
 	@touch $@
 
 $(VENV)/train.stamp: setup.py | $(BIN)/python

@@ -49,10 +49,10 @@ def test_the_corners_of_the_box_are_accepted():
 
 
 @pytest.mark.parametrize(('value', 'text'), [
-    (300.0, 'temperature set-point 300 K is outside the trained range 305.696 K to 326.561 K: '
+    (300.0, 'temperature set-point 300 K is outside the trained range 305 K to 327 K: '
             'the old one is kept; choose one inside, or load a model trained over a wider range'),
-    (330.123, 'temperature set-point 330.123 K is outside the trained range 305.696 K to '
-              '326.561 K: the old one is kept; choose one inside, or load a model trained '
+    (330.123, 'temperature set-point 330.123 K is outside the trained range 305 K to '
+              '327 K: the old one is kept; choose one inside, or load a model trained '
               'over a wider range'),
     (np.nan, 'temperature set-point nan K is not finite: the old one is kept'),
     (np.inf, 'temperature set-point inf K is not finite: the old one is kept'),
