@@ -45,7 +45,7 @@ UNIT = 10.0  # K, in which deviations of temperature and coolant are weighed
 INPUT_WEIGHT = 1.0
 HORIZON = 30.0  # min
 LIFTED_SIZES = (2, 3, 4, 5)
-STARTS = 3
+STARTS = 4
 # Coolant and reactor in K, times in min. The coolant moves the reactor through the box from end
 # to end, short of the fold at 329.37 K beyond which a coolant held warmer lets it run away.
 TRAINING = RandomStepDesign(
@@ -57,7 +57,7 @@ IN_RANGE = RandomStepDesign(
 OUT_OF_RANGE = RandomStepDesign(
     input_lower=270.0, input_upper=301.1, state_lower=293.0, state_upper=329.3,
     hold_time=(2.0, 10.0), sample_period=0.25)
-RECIPE = Growth(max(LIFTED_SIZES), hidden_first=6, max_iterations=600)
+RECIPE = Growth(max(LIFTED_SIZES), max_iterations=600)
 EDMD_DEGREE = 5
 
 
