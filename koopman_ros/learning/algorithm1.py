@@ -20,7 +20,7 @@ from dataclasses import dataclass
 
 from koopman_ros.learning.growth import Grown, Monitor
 from koopman_ros.learning.levenberg_marquardt import minimise, Status
-from koopman_ros.learning.network import ACTIVATIONS, Layout
+from koopman_ros.learning.network import check_activation, Layout
 from koopman_ros.learning.residuals import Data, Problem, ResidualWeights
 import torch
 
@@ -72,9 +72,7 @@ class Algorithm1:
             raise ValueError('hidden must name the units of at least one layer')
         if min(self.n_z, self.decoder, self.max_rounds, self.max_iterations, *self.hidden) < 1:
             raise ValueError(f'sizes and limits must be at least 1: {self}')
-        if self.activation not in ACTIVATIONS:
-            raise ValueError(f'activation must be one of {", ".join(ACTIVATIONS)}, '
-                             f'got {self.activation!r}')
+        check_activation(self.activation)
 
     def rounds(self, n_x: int) -> tuple[int, ...]:
         """

@@ -28,10 +28,12 @@ class ProductSums:
     :param layout: sizes.
     :param parameters: the lift's parameters.
     :param N: number of samples in all.
+    :param whitening: whether the derivatives of E[z z'] are wanted; otherwise they stay 0.
     """
 
-    def __init__(self, layout: Layout, parameters: Parameters, N: int) -> None:
+    def __init__(self, layout: Layout, parameters: Parameters, N: int, whitening: bool) -> None:
         self._layout, self._parameters, self._N = layout, parameters, N
+        self._whitening = whitening
         p, like = layout.size, parameters.A
         self._gradient, self._matrix = like.new_zeros(p), like.new_zeros((p, p))
         self._moment_rate = like.new_zeros((layout.n_z, layout.n_z, p))
@@ -42,7 +44,8 @@ class ProductSums:
             self._gradient))
         self._gradient += J.T @ r.reshape(-1) / self._N
         self._matrix.addmm_(J.T, J, alpha=1.0 / self._N)
-        _add_moment_rate(self._moment_rate, self._layout, self._parameters, lifted, self._N)
+        if self._whitening:
+            _add_moment_rate(self._moment_rate, self._layout, self._parameters, lifted, self._N)
 
     def result(self) -> tuple[Tensor, Tensor, Tensor]:
         """Return J^T r (p,), J^T J (p, p) and E[z_a dz_b/dtheta] (n_z, n_z, p)."""

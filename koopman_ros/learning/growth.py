@@ -22,7 +22,7 @@ from functools import partial
 import itertools
 
 from koopman_ros.learning.levenberg_marquardt import minimise, Minimum, Status
-from koopman_ros.learning.network import ACTIVATIONS, Layout, Parameters, Pass
+from koopman_ros.learning.network import check_activation, Layout, Parameters, Pass
 from koopman_ros.learning.residuals import Data, Problem, ResidualWeights
 import torch
 from torch import Tensor
@@ -93,9 +93,7 @@ class Growth:
                              f'{self.hidden_more} more')
         if self.layers not in (1, 2):
             raise ValueError(f'layers must be 1 or 2, got {self.layers}')
-        if self.activation not in ACTIVATIONS:
-            raise ValueError(f'activation must be one of {", ".join(ACTIVATIONS)}, '
-                             f'got {self.activation!r}')
+        check_activation(self.activation)
 
     def rounds(self, n_x: int) -> tuple[int, ...]:
         """

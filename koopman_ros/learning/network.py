@@ -56,6 +56,12 @@ ACTIVATIONS: dict[str, Activation] = {
     'tanh': _tanh, 'sigmoid': _sigmoid, 'sine': _sine, 'softplus': _softplus}
 
 
+def check_activation(name: str) -> None:
+    """Raise ValueError, listing the known names, when an activation is not one of them."""
+    if name not in ACTIVATIONS:
+        raise ValueError(f'activation must be one of {", ".join(ACTIVATIONS)}, got {name!r}')
+
+
 @dataclass(frozen=True)
 class Parameters:
     """
@@ -103,9 +109,7 @@ class Layout:
     decoder: int = 0
 
     def __post_init__(self) -> None:
-        if self.activation not in ACTIVATIONS:
-            raise ValueError(f'activation must be one of {", ".join(ACTIVATIONS)}, '
-                             f'got {self.activation!r}')
+        check_activation(self.activation)
         if self.n_free < 0 or min(self.n_x, *self.hidden, 1) < 1:
             raise ValueError(f'sizes do not fit: {self}')
 

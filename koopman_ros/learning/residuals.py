@@ -131,7 +131,7 @@ class Problem:
         sums: MomentSums | ProductSums | None = None
         if derivatives:
             kind = MomentSums if len(layout.hidden) == 1 else ProductSums
-            sums = kind(layout, parameters, N)
+            sums = kind(layout, parameters, N, self.weights.whitening > 0.0)
         cost, gradient = theta.new_zeros(()), theta.new_zeros(layout.size)
         matrix = theta.new_zeros((layout.size, layout.size) if derivatives else 0)
         moment = theta.new_zeros((layout.n_z, layout.n_z))

@@ -39,10 +39,12 @@ class MomentSums:
     :param layout: sizes, with one hidden layer.
     :param parameters: the lift's parameters.
     :param N: number of samples in all.
+    :param whitening: whether the derivatives of E[z z'] are wanted; otherwise they stay 0.
     """
 
-    def __init__(self, layout: Layout, parameters: Parameters, N: int) -> None:
+    def __init__(self, layout: Layout, parameters: Parameters, N: int, whitening: bool) -> None:
         self._map, self._N = FeatureMap(layout, parameters), N
+        self._whitening = whitening
         K, like = FeatureMap.size(layout), parameters.A
         self._moments, self._by_residual = like.new_zeros((K, K)), like.new_zeros((K, layout.n_z))
 
@@ -55,11 +57,14 @@ class MomentSums:
 
     def result(self) -> tuple[Tensor, Tensor, Tensor]:
         """Return J^T r (p,), J^T J (p, p) and E[z_a dz_b/dtheta] (n_z, n_z, p)."""
-        T, Z, U = self._map.residual_rates, self._map.coordinates, self._map.coordinate_rates
+        T = self._map.residual_rates
         n_z, p, K = T.shape
         gradient = torch.einsum('ipk,ki->p', T, self._by_residual)
         left = (T.reshape(-1, K) @ self._moments).view(T.shape).transpose(0, 1).reshape(p, -1)
         matrix = left @ T.transpose(0, 1).reshape(p, -1).T
+        if not self._whitening:
+            return gradient, matrix, T.new_zeros((n_z, n_z, p))
+        Z, U = self._map.coordinates, self._map.coordinate_rates
         moment_rate = (U.reshape(-1, K) @ (self._moments @ Z.T)).view(n_z, p, n_z)
         return gradient, matrix, moment_rate.permute(2, 0, 1)
 

@@ -19,6 +19,7 @@ from __future__ import annotations
 from collections.abc import Callable, Generator
 from contextlib import closing
 from dataclasses import dataclass, replace
+from functools import cached_property
 import math
 import warnings
 
@@ -145,6 +146,7 @@ def train(plant: Plant, samples: Samples, recipe: Recipe, *, seed: int = 0, star
     rounds = recipe.rounds(samples.x.shape[1])
     parts = split_by_episode(samples, split_seed)
     assembly = _Assembly(plant, Scaling.of(plant, samples), parts[0], samples.digest(), seed)
+    data = assembly.data(device)
     tracker = _Tracker(watch, starts * len(rounds))
     path: list[_Candidate] = []
     reasons: list[str] = []
@@ -154,7 +156,7 @@ def train(plant: Plant, samples: Samples, recipe: Recipe, *, seed: int = 0, star
         best: _Candidate | None = None
         interrupted = False
         try:
-            with closing(_run_starts(recipe, assembly, n_z, parent, seed, starts, device,
+            with closing(_run_starts(recipe, data, n_z, parent, seed, starts,
                                      threads, tracker)) as finds:
                 for grown in finds:
                     candidate = _judged(assembly, grown, parts[1])
@@ -270,7 +272,7 @@ class _Assembly:
     digest: str
     seed: int
 
-    @property
+    @cached_property
     def pace(self) -> float:
         """Root mean square of the scaled rates, in 1/time unit."""
         _, rate, _ = self.scaling.deviations(self.samples)
@@ -300,11 +302,10 @@ class _Assembly:
             Provenance(self.plant.name, self.seed, self.digest, {}, __version__))
 
 
-def _run_starts(recipe: Recipe, assembly: _Assembly, n_z: int, parent: Grown | None, seed: int,
-                starts: int, device: str, threads: int, tracker: _Tracker
+def _run_starts(recipe: Recipe, data: Data, n_z: int, parent: Grown | None, seed: int,
+                starts: int, threads: int, tracker: _Tracker
                 ) -> Generator[Grown | str]:
     """Run one round; yield what each start has found, in their order."""
-    data = assembly.data(device)
     seeds = [int(n) for n in np.random.SeedSequence([seed, n_z]).generate_state(starts)]
     monitor = tracker.step if _runs_here() else None
     results = joblib.Parallel(return_as='generator')(

@@ -14,7 +14,6 @@
 
 """The benchmark of training: its command, the figures it leaves, and solvers on one objective."""
 
-import importlib.util
 import json
 from pathlib import Path
 import subprocess
@@ -32,7 +31,6 @@ from benchmarks.training.problems import artificial, invariant_residual, two_sta
 from benchmarks.training.torch_solvers import differentiable
 
 ROOT = Path(__file__).parents[2]
-CASADI = importlib.util.find_spec('casadi') is not None
 
 
 @pytest.fixture(scope='module')
@@ -73,7 +71,6 @@ def test_every_solver_has_a_time_or_a_reason(summary):
                     assert ratio == pytest.approx(seconds / times['ours'])
 
 
-@pytest.mark.skipif(not CASADI, reason='casadi is not installed')
 def test_ipopt_starts_where_we_start(summary):
     for case in summary['training']['cases']:
         assert case['ipopt_build_seconds'] > 0.0
@@ -100,7 +97,6 @@ def test_objective_of_the_first_order_solvers_is_ours():
     torch.testing.assert_close(theta.grad, ours.gradient, rtol=1e-10, atol=1e-12)
 
 
-@pytest.mark.skipif(not CASADI, reason='casadi is not installed')
 @pytest.mark.parametrize('graph', ['expanded', 'compiled'])
 def test_objective_of_ipopt_is_ours(graph, monkeypatch):
     import casadi
