@@ -213,7 +213,7 @@ class PolynomialObservables(Observables):
         E = np.array(given, dtype=np.int64)
         n_x = E.shape[1]
         if np.any(E < 0):
-            raise ValueError(f'exponents must be at least 0, got {E.min()}')
+            raise ValueError(f'exponents must be at least 0, got {np.min(E)}')
         if not np.array_equal(E[:n_x], np.eye(n_x)):
             raise ValueError(f'the first {n_x} rows of exponents must be the states, the identity '
                              f'matrix, got {E[:n_x].tolist()}')
@@ -222,7 +222,7 @@ class PolynomialObservables(Observables):
         rows, counts = np.unique(E, axis=0, return_counts=True)
         if np.any(counts > 1):
             raise ValueError(f'the row {rows[np.argmax(counts)].tolist()} of exponents comes '
-                             f'{counts.max()} times: keep one')
+                             f'{np.max(counts)} times: keep one')
         E.setflags(write=False)
         object.__setattr__(self, 'exponents', E)
 
@@ -260,7 +260,7 @@ class PolynomialObservables(Observables):
     @cached_property
     def _quadrature(self) -> tuple[Array, Array]:
         """Return nodes on [0, 1] and weights, exact for the degree of J_N along a segment."""
-        degree = int(self.exponents.sum(axis=1).max())
+        degree = int(np.max(np.sum(self.exponents, axis=1)))
         nodes, weights = np.polynomial.legendre.leggauss((degree + 1) // 2)
         return 0.5 * (1.0 + nodes), 0.5 * weights
 
