@@ -12,7 +12,7 @@
 # See the License for the specific language governing permissions and
 # limitations under the License.
 
-"""Run parts of the benchmark: ``python -m benchmarks [training] [--quick | --full]``."""
+"""Run parts of the benchmark: ``python -m benchmarks [part ...] [--quick | --full]``."""
 
 from __future__ import annotations
 
@@ -24,11 +24,13 @@ import sys
 from typing import Any
 
 from benchmarks.options import Extent, Options
+from benchmarks.recording import part as recording
 from benchmarks.summary import Summary
 from benchmarks.training import part as training
 
 # A part is a module with a function that returns its figures.
-PARTS: dict[str, Callable[[Options], dict[str, Any]]] = {'training': training.run}
+PARTS: dict[str, Callable[[Options], dict[str, Any]]] = {
+    'training': training.run, 'recording': recording.run}
 
 
 def main(args: list[str] | None = None) -> int:
@@ -39,11 +41,11 @@ def main(args: list[str] | None = None) -> int:
                         help=f'{", ".join(PARTS)} (default: all)')
     extent = parser.add_mutually_exclusive_group()
     extent.add_argument('--quick', dest='extent', action='store_const', const=Extent.QUICK,
-                        help='the smallest cases, under a minute')
+                        help='the smallest cases, about a minute')
     extent.add_argument('--full', dest='extent', action='store_const', const=Extent.FULL,
                         help='all cases with large limits, hours')
     parser.add_argument('--limit', type=float, metavar='SECONDS',
-                        help='time limit of one solver in one case')
+                        help='time limit of one solver in one case of training')
     parser.add_argument('--output', type=Path, default=Path('out/bench'),
                         help='folder for summary.json and pictures (default: %(default)s)')
     given = parser.parse_args(args)

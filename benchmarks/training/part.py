@@ -18,17 +18,16 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 from dataclasses import dataclass, field, replace
-from importlib.metadata import PackageNotFoundError, version
 import math
 import os
 from pathlib import Path
-import platform
 import sys
 import tempfile
 from typing import Any
 
 from tqdm import tqdm
 
+from benchmarks.machine import machine
 from benchmarks.options import Options
 from benchmarks.training import picture, process, table
 from benchmarks.training.plan import (
@@ -112,7 +111,8 @@ def run(options: Options) -> dict[str, Any]:
     cases = [(system, *size) for system in SYSTEMS for size in plan.cases]
     costs = sizes_of_cost(plan)
     figures: dict[str, Any] = {
-        'machine': _machine(), 'extent': options.extent.value, 'limit_seconds': plan.limit,
+        'machine': {**machine('torch', 'casadi', 'numpy'), 'threads': 1},
+        'extent': options.extent.value, 'limit_seconds': plan.limit,
         'clock': 'processor time of one thread; wall_seconds are those on the wall', 'cases': []}
     total = len(cases) * len(SOLVERS) + len(plan.samples) + 2
     with tempfile.TemporaryDirectory() as folder, _Progress(total) as progress:
@@ -201,29 +201,6 @@ def _with_cost(figures: dict[str, Any], name: str, sizes: list[dict[str, int]], 
         figures[key] = {**figures.get(key, {}), **{
             str(event[name]): event['peak_megabytes'] for event in outcome.events}}
     return figures
-
-
-def _machine() -> dict[str, Any]:
-    return {'processor': _processor(), 'cpu_count': os.cpu_count(), 'threads': 1,
-            'system': platform.platform(), 'python': platform.python_version(),
-            **{name: _version(name) for name in ('torch', 'casadi', 'numpy')},
-            'load_at_start': os.getloadavg()[0]}
-
-
-def _processor() -> str:
-    try:
-        lines = Path('/proc/cpuinfo').read_text().splitlines()
-    except OSError:
-        return platform.processor()
-    return next((line.partition(':')[2].strip() for line in lines
-                 if line.startswith('model name')), platform.processor())
-
-
-def _version(name: str) -> str | None:
-    try:
-        return version(name)
-    except PackageNotFoundError:
-        return None
 
 
 class _Progress:

@@ -19,6 +19,9 @@ Imports nothing of ours but the version, nothing of ROS and nothing that learns:
 be opened on any machine with Python.
 """
 
+from koopman_ros.bags.episodes import Account, Episode, loop_episodes
+from koopman_ros.bags.errors import BagReadError
+from koopman_ros.bags.order import in_log_order
 from koopman_ros.bags.qos import INFINITE_NS, QosProfile
 from koopman_ros.bags.reader import BagMessage, BagSummary, read_messages, summary
 from koopman_ros.bags.schemas import (
@@ -28,19 +31,22 @@ from koopman_ros.bags.schemas import (
     search_prefixes,
 )
 from koopman_ros.bags.series import temperature_series, TemperatureSeries
-from koopman_ros.bags.storage import BagReadError
 from koopman_ros.bags.writer import BagWriter
 
 __all__ = [
     'INFINITE_NS',
+    'Account',
     'BagMessage',
     'BagReadError',
     'BagSummary',
     'BagWriter',
+    'Episode',
     'MessageDefinition',
     'MessageDefinitionError',
     'QosProfile',
     'TemperatureSeries',
+    'in_log_order',
+    'loop_episodes',
     'message_definition',
     'read_messages',
     'search_prefixes',

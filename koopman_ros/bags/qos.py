@@ -14,7 +14,7 @@
 
 """Offered quality of service, in the words that rosbag2 stores with a topic (Jazzy and later)."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -31,6 +31,14 @@ _POLICIES = {
     'reliability': ('reliable', 'best_effort', 'system_default', 'best_available', 'unknown'),
     'durability': ('volatile', 'transient_local', 'system_default', 'best_available', 'unknown'),
     'liveliness': ('automatic', 'manual_by_topic', 'system_default', 'best_available', 'unknown'),
+}
+# Before version 9 (Jazzy) rosbag2 wrote the numbers of rmw/types.h.
+_NUMBERED = {
+    'history': ('system_default', 'keep_last', 'keep_all', 'unknown'),
+    'reliability': ('system_default', 'reliable', 'best_effort', 'unknown', 'best_available'),
+    'durability': ('system_default', 'transient_local', 'volatile', 'unknown', 'best_available'),
+    'liveliness': ('system_default', 'automatic', 'manual_by_node', 'manual_by_topic', 'unknown',
+                   'best_available'),
 }
 _DURATIONS = ('deadline_ns', 'lifespan_ns', 'liveliness_lease_duration_ns')
 
@@ -90,6 +98,33 @@ def qos_mappings(profiles: Sequence[QosProfile]) -> list[dict[str, Any]]:
 def dump_offered_qos(profiles: Sequence[QosProfile]) -> str:
     """Return the text of the channel metadata `offered_qos_profiles`: a YAML sequence."""
     return yaml.safe_dump(qos_mappings(profiles), sort_keys=False).rstrip('\n')
+
+
+def parse_offered_qos(text: str) -> tuple[QosProfile, ...]:
+    """
+    Return the profiles of the channel metadata `offered_qos_profiles`, of any version of rosbag2.
+
+    What cannot be read gives no profile: a bag is of use without.
+    """
+    try:
+        return tuple(_profile(mapping) for mapping in yaml.safe_load(text) or ())
+    except (yaml.YAMLError, ValueError, KeyError, TypeError, IndexError, AttributeError,
+            RecursionError):
+        return ()
+
+
+def _profile(mapping: Mapping[str, Any]) -> QosProfile:
+    values: dict[str, Any] = {
+        policy: _NUMBERED[policy][word] if isinstance(word := mapping[policy], int) else word
+        for policy in _POLICIES}
+    values |= {name: _nanoseconds(mapping[name.removesuffix('_ns')]) for name in _DURATIONS}
+    return QosProfile(
+        **values, depth=int(mapping['depth']),
+        avoid_ros_namespace_conventions=bool(mapping['avoid_ros_namespace_conventions']))
+
+
+def _nanoseconds(duration: Mapping[str, int]) -> int:
+    return min(int(duration['sec']) * _NS_PER_S + int(duration['nsec']), INFINITE_NS)
 
 
 def _duration(nanoseconds: int) -> dict[str, int]:

@@ -15,14 +15,21 @@
 """Reading bags back: decoded messages and a summary, from rosbag2's bags as from our own."""
 
 from collections import Counter
-from collections.abc import Callable, Collection, Iterator
+from collections.abc import Callable, Collection, Iterable, Iterator
+import contextlib
 from dataclasses import dataclass
+import io
 import os
 from pathlib import Path
 from typing import Any
 
-from koopman_ros.bags.storage import BagReadError, locate, stored_messages, StoredMessage
-from mcap.reader import SeekingReader
+from koopman_ros.bags.compression import opened
+from koopman_ros.bags.errors import BagReadError, reason
+from koopman_ros.bags.qos import parse_offered_qos, QosProfile
+from koopman_ros.bags.records import stored_messages, StoredMessage, summary_section
+from koopman_ros.bags.storage import locate
+from mcap.exceptions import EndOfFile
+from mcap.records import Channel
 from mcap_ros2.decoder import DecoderFactory
 
 
@@ -45,14 +52,16 @@ class BagMessage:
 @dataclass(frozen=True)
 class BagSummary:
     """
-    What a bag holds: messages and type by topic, first and last log time [ns].
+    What a bag holds: messages, type and publishers' offers by topic, first and last log time [ns].
 
     The times are None for a bag without messages. `complete` is False when the recorder did not
-    close the bag: the counts are then those of the part that can be read.
+    close the bag: the counts are then those of the part that can be read. `offered_qos` has no
+    entry for a topic whose recorder kept none.
     """
 
     counts: dict[str, int]
     types: dict[str, str]
+    offered_qos: dict[str, tuple[QosProfile, ...]]
     start_ns: int | None
     end_ns: int | None
     complete: bool
@@ -98,14 +107,17 @@ def summary(path: str | os.PathLike[str]) -> BagSummary:
     parts = [_file_summary(file) for file in bag.files]
     counts: Counter[str] = Counter()
     types: dict[str, str] = {}
+    offered_qos: dict[str, tuple[QosProfile, ...]] = {}
     for part in parts:
         counts.update(part.counts)
         types.update(part.types)
+        offered_qos.update(part.offered_qos)
     starts = [part.start_ns for part in parts if part.start_ns is not None]
     ends = [part.end_ns for part in parts if part.end_ns is not None]
     return BagSummary(
         counts=dict(counts),
         types=types,
+        offered_qos=offered_qos,
         start_ns=min(starts, default=None),
         end_ns=max(ends, default=None),
         complete=bag.complete and all(part.complete for part in parts),
@@ -127,12 +139,12 @@ def _decode(stored: StoredMessage, factory: DecoderFactory, file: Path) -> BagMe
     topic = stored.channel.topic
     decoder = _decoder(stored, factory, file)
     try:
-        message = decoder(stored.message.data)
+        message = decoder(_WholeSlices(stored.message.data))
     except Exception as error:
         # The decoder walks over foreign bytes and fails in as many ways as they can be wrong.
         raise BagReadError(
             f'{str(file)!r}: the message on {topic!r} at {stored.message.log_time} ns does not '
-            f'decode ({type(error).__name__} {error}): read the other topics by name') from error
+            f'decode ({reason(error)}): read the other topics by name') from error
     return BagMessage(
         topic=topic,
         type_name=stored.schema.name if stored.schema else '',
@@ -143,18 +155,34 @@ def _decode(stored: StoredMessage, factory: DecoderFactory, file: Path) -> BagMe
     )
 
 
+class _WholeSlices(bytes):
+    """
+    Bytes whose slices are complete or fail.
+
+    The decoder takes whatever a slice returns for a string or a field of bytes: one cut short
+    would pass for a shorter one, and a damaged length for that many empty ones.
+    """
+
+    def __getitem__(self, key: Any) -> Any:
+        if isinstance(key, slice) and key.stop > len(self):
+            raise EndOfFile
+        return super().__getitem__(key)
+
+
 def _decoder(
     stored: StoredMessage, factory: DecoderFactory, file: Path
 ) -> Callable[[bytes], Any]:
     encoding = stored.channel.message_encoding
     schema_encoding = stored.schema.encoding if stored.schema else 'no schema'
     try:
-        decoder = factory.decoder_for(encoding, stored.schema)
+        # the definition parser prints what it also raises
+        with contextlib.redirect_stderr(io.StringIO()):
+            decoder = factory.decoder_for(encoding, stored.schema)
     except Exception as error:
         # Another recorder's schema text meets the definition parser here.
         raise BagReadError(
             f'{str(file)!r}: the definition stored for {stored.channel.topic!r} does not parse '
-            f'({type(error).__name__} {error}): read the other topics by name') from error
+            f'({reason(error)}): read the other topics by name') from error
     if decoder is None:
         raise BagReadError(
             f'{str(file)!r}: topic {stored.channel.topic!r} is encoded as {encoding!r} with '
@@ -170,14 +198,8 @@ def _file_summary(file: Path) -> BagSummary:
 
 def _indexed_summary(file: Path) -> BagSummary | None:
     """Return the summary from the statistics at the end of a closed file, None without them."""
-    with file.open('rb') as stream:
-        try:
-            reader = SeekingReader(stream, record_size_limit=file.stat().st_size)
-            content = reader.get_summary()
-        except Exception:
-            # A cut or damaged end fails in any way, a seek out of range among them. The scan
-            # tells, and meets whatever else may be wrong.
-            return None
+    with opened(file) as stream:
+        content = summary_section(stream)
     if content is None or content.statistics is None:
         return None
     statistics = content.statistics
@@ -191,6 +213,7 @@ def _indexed_summary(file: Path) -> BagSummary | None:
     return BagSummary(
         counts=dict(counts),
         types=types,
+        offered_qos=_offered_qos(content.channels.values()),
         start_ns=None if empty else statistics.message_start_time,
         end_ns=None if empty else statistics.message_end_time,
         complete=True,
@@ -201,6 +224,7 @@ def _scanned_summary(file: Path) -> BagSummary:
     """Return the summary of whatever can be read, counted message by message."""
     counts: Counter[str] = Counter()
     types: dict[str, str] = {}
+    channels: dict[str, Channel] = {}
     start_ns = end_ns = None
     complete = True
     try:
@@ -208,8 +232,17 @@ def _scanned_summary(file: Path) -> BagSummary:
             topic, time_ns = stored.channel.topic, stored.message.log_time
             counts[topic] += 1
             types[topic] = stored.schema.name if stored.schema else ''
+            channels[topic] = stored.channel
             start_ns = time_ns if start_ns is None else min(start_ns, time_ns)
             end_ns = time_ns if end_ns is None else max(end_ns, time_ns)
     except BagReadError:
         complete = False
-    return BagSummary(dict(counts), types, start_ns, end_ns, complete)
+    return BagSummary(
+        dict(counts), types, _offered_qos(channels.values()), start_ns, end_ns, complete)
+
+
+def _offered_qos(channels: Iterable[Channel]) -> dict[str, tuple[QosProfile, ...]]:
+    """Return what was offered on each topic, as far as it was kept and can be read."""
+    offers = {channel.topic: parse_offered_qos(channel.metadata.get('offered_qos_profiles', ''))
+              for channel in channels}
+    return {topic: offered for topic, offered in offers.items() if offered}

@@ -17,8 +17,8 @@
 from dataclasses import dataclass
 import os
 
+from koopman_ros.bags.errors import BagReadError, reason
 from koopman_ros.bags.reader import read_messages, summary
-from koopman_ros.bags.storage import BagReadError
 import numpy as np
 from numpy.typing import NDArray
 
@@ -62,16 +62,32 @@ def temperature_series(
             f'bag {os.fspath(path)!r} has no topic {topic!r}: choose one of '
             f'{", ".join(sorted(content.types)) or "none (it is empty)"}')
     if content.types[topic] != _TEMPERATURE:
+        raise _other_type(path, topic, content.types[topic])
+    stamps, celsius, variance = [], [], []
+    try:
+        for entry in entries:
+            if entry.type_name != _TEMPERATURE:
+                raise _other_type(path, topic, entry.type_name)
+            stamp = entry.message.header.stamp
+            stamps.append(_NS_PER_S * stamp.sec + stamp.nanosec)
+            celsius.append(entry.message.temperature)
+            variance.append(entry.message.variance)
+        stamp_ns = np.array(stamps, dtype=np.int64)
+        values = np.array([celsius, variance], dtype=np.float64)
+    except BagReadError:
+        raise
+    except (AttributeError, TypeError, ValueError, OverflowError) as error:
         raise BagReadError(
-            f'topic {topic!r} of bag {os.fspath(path)!r} is {content.types[topic]}, not '
-            f'{_TEMPERATURE}: read it with read_messages')
-    messages = [entry.message for entry in entries]
-    stamp_ns = np.array(
-        [_NS_PER_S * m.header.stamp.sec + m.header.stamp.nanosec for m in messages],
-        dtype=np.int64)
+            f'topic {topic!r} of bag {os.fspath(path)!r} calls itself {_TEMPERATURE} and is laid '
+            f'out differently ({reason(error)}): read it with read_messages') from error
     return TemperatureSeries(
         stamp_ns=stamp_ns,
         stamp_s=(stamp_ns - origin_ns) / _NS_PER_S,
-        celsius=np.array([m.temperature for m in messages], dtype=np.float64),
-        variance=np.array([m.variance for m in messages], dtype=np.float64),
+        celsius=values[0],
+        variance=values[1],
     )
+
+
+def _other_type(path: str | os.PathLike[str], topic: str, found: str) -> BagReadError:
+    return BagReadError(f'topic {topic!r} of bag {os.fspath(path)!r} is {found}, not '
+                        f'{_TEMPERATURE}: read it with read_messages')

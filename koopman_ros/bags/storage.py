@@ -13,37 +13,25 @@
 # limitations under the License.
 
 """
-Access to the records of a bag, whole or left behind by a recorder that was killed.
+The files of a bag, in reading order, of a recorder that ended well or was killed.
 
-A file counts as closed when it ends with MCAP's footer and magic. Records are read in file
-order, which is the order in which the recorder received them; sorting by time would interleave
-two runs wherever the clock was set back.
+A file counts as closed when it ends with MCAP's footer and magic.
 """
 
-from collections.abc import Iterator
 from dataclasses import dataclass
 import os
 from pathlib import Path
 import re
-import struct
-from typing import Any, BinaryIO, cast
+from typing import Any
 
+from koopman_ros.bags.errors import BagReadError
 from koopman_ros.bags.metadata import METADATA_FILE, METADATA_KEY
-from mcap.exceptions import EndOfFile
-from mcap.records import Channel, DataEnd, McapRecord, Message, Schema
-from mcap.stream_reader import StreamReader
+from koopman_ros.bags.records import is_closed, RECOVER
 import yaml
 
-# The MCAP specification's magic, and the opcode and length that begin its footer record.
-_MAGIC = b'\x89MCAP0\r\n'
-_FOOTER_HEAD = struct.pack('<BQ', 0x02, 20)
-_TAIL_SIZE = len(_FOOTER_HEAD) + 20 + len(_MAGIC)
-
-_RECOVER = 'pass recover=True to read what is whole'
-
-
-class BagReadError(ValueError):
-    """A bag that is missing, not a bag, damaged or of a kind that is not read here."""
+# The files of a bag directory: run_0.mcap, run_1.mcap, ..., or the same compressed by rosbag2.
+_COMPRESSED = '.zstd'
+_NUMBERED = re.compile(r'(.*)_\d+\.mcap(?:\.zstd)?')
 
 
 @dataclass(frozen=True)
@@ -54,21 +42,13 @@ class BagFiles:
     complete: bool
 
 
-@dataclass(frozen=True)
-class StoredMessage:
-    """A message as it lies in the file, with its channel and (where there is one) its schema."""
-
-    schema: Schema | None
-    channel: Channel
-    message: Message
-
-
 def locate(path: str | os.PathLike[str], *, recover: bool) -> BagFiles:
     """
     Return the files of a bag: a bare MCAP file, or a directory in the order of its metadata.
 
-    With `recover`, files without a footer pass, and a directory without metadata.yaml is read
-    in the order of its file numbers. Raises BagReadError for whatever else is wrong.
+    With `recover`, files without a footer pass, and a directory without metadata.yaml, or with
+    numbered files that it does not list, is read in the order of the file numbers. Raises
+    BagReadError for whatever else is wrong.
     """
     path = Path(path)
     if not path.exists():
@@ -78,99 +58,20 @@ def locate(path: str | os.PathLike[str], *, recover: bool) -> BagFiles:
         files, listed = (path,), True
     elif (path / METADATA_FILE).is_file():
         files, listed = _listed_files(path), True
+        if left_behind := _left_behind(path, files):
+            if not recover:
+                raise BagReadError(
+                    f'{str(left_behind[0])!r} is not listed in {METADATA_FILE}, its recorder did '
+                    f'not close it: {RECOVER}')
+            files, listed = tuple(sorted({*files, *left_behind}, key=_natural_order)), False
     else:
         files, listed = _numbered_files(path, recover), False
-    closed = [_is_closed(file) for file in files]
+    closed = [is_closed(file) for file in files]
     if not all(closed) and not recover:
         unclosed = files[closed.index(False)]
         raise BagReadError(
-            f'{str(unclosed)!r} is cut short, its recorder did not close it: {_RECOVER}')
+            f'{str(unclosed)!r} is cut short, its recorder did not close it: {RECOVER}')
     return BagFiles(files, complete=listed and all(closed))
-
-
-def stored_messages(file: Path, *, recover: bool) -> Iterator[StoredMessage]:
-    """
-    Yield the messages of one MCAP file in file order, with checksums verified.
-
-    With `recover`, the messages end at the first record that is damaged or cut short; without,
-    that raises BagReadError.
-    """
-    schemas: dict[int, Schema] = {}
-    channels: dict[int, Channel] = {}
-    with file.open('rb') as stream:
-        try:
-            for record in _records(stream, file.stat().st_size):
-                if isinstance(record, Schema):
-                    schemas[record.id] = record
-                elif isinstance(record, Channel):
-                    channels[record.id] = record
-                elif isinstance(record, Message):
-                    channel = channels.get(record.channel_id)
-                    if channel is None:
-                        raise _DamageError(f'no channel {record.channel_id} for a message')
-                    yield StoredMessage(schemas.get(channel.schema_id), channel, record)
-        except _DamageError as damage:
-            if not recover:
-                raise BagReadError(
-                    f'{str(file)!r} is damaged ({damage}): {_RECOVER}') from damage
-
-
-class _DamageError(Exception):
-    """The bytes of a file do not parse as MCAP records."""
-
-
-class _WholeReads:
-    """
-    A byte stream whose reads are complete or fail.
-
-    mcap's StreamReader takes whatever a short read returns for a whole record, so that the cut
-    last message of a file would come out as a shorter message.
-    """
-
-    def __init__(self, stream: BinaryIO) -> None:
-        self._stream = stream
-
-    def read(self, length: int) -> bytes:
-        data = self._stream.read(length)
-        if len(data) < length:
-            raise EndOfFile
-        return data
-
-
-def _records(stream: BinaryIO, size: int) -> Iterator[McapRecord]:
-    """Yield the records of the data section; raise _DamageError where they stop making sense."""
-    reader = StreamReader(
-        cast('BinaryIO', _WholeReads(stream)), validate_crcs=True, record_size_limit=size)
-    records = iter(reader.records)
-    while True:
-        try:
-            record = next(records)
-        except OSError:
-            raise
-        except Exception as error:
-            # Arbitrary bytes meet the parser here, and the decompressor behind it: the kinds of
-            # exception are theirs, the meaning is the same.
-            raise _DamageError(f'{type(error).__name__} {error}'.strip()) from error
-        if isinstance(record, DataEnd):
-            return
-        yield record
-
-
-def _is_closed(file: Path) -> bool:
-    """Tell a closed file from a cut one; raise BagReadError for one that is not MCAP at all."""
-    with file.open('rb') as stream:
-        head = stream.read(len(_MAGIC))
-        if not head:
-            raise BagReadError(
-                f'{str(file)!r} is empty: its recorder wrote nothing, record again')
-        if not _MAGIC.startswith(head):
-            raise BagReadError(
-                f'{str(file)!r} is not an MCAP file (it starts with {head!r}): '
-                'pass a .mcap file or a bag directory')
-        size = stream.seek(0, os.SEEK_END)
-        stream.seek(max(0, size - _TAIL_SIZE))
-        tail = stream.read()
-    return tail.startswith(_FOOTER_HEAD) and tail.endswith(_MAGIC)
 
 
 def _listed_files(folder: Path) -> tuple[Path, ...]:
@@ -178,18 +79,20 @@ def _listed_files(folder: Path) -> tuple[Path, ...]:
     source = folder / METADATA_FILE
     try:
         information: dict[str, Any] = yaml.safe_load(source.read_text('utf-8'))[METADATA_KEY]
-        storage = information['storage_identifier']
-        compression = information.get('compression_format') or ''
-        names = [str(name) for name in information['relative_file_paths']]
-    except (yaml.YAMLError, UnicodeDecodeError, KeyError, TypeError, AttributeError) as error:
+        storage = str(information['storage_identifier'])
+        compression = str(information.get('compression_format') or '')
+        names = _file_names(information['relative_file_paths'])
+    # the YAML parser itself fails in several ways, on a date without a 13th month among them
+    except (yaml.YAMLError, ValueError, KeyError, TypeError, AttributeError, RecursionError
+            ) as error:
         raise BagReadError(
             f'{str(source)!r} is not the metadata of a bag: delete it and pass recover=True '
             'to read the files beside it') from error
-    if storage != 'mcap' or compression:
+    if storage != 'mcap' or compression not in ('', 'zstd'):
         kind = f'{storage} files' + (f' compressed with {compression}' if compression else '')
         raise BagReadError(
-            f'{str(folder)!r} holds {kind}, only plain mcap is read here: '
-            "convert it with 'ros2 bag convert'")
+            f'{str(folder)!r} holds {kind}, only mcap is read here, plain or compressed with '
+            "zstd: convert it with 'ros2 bag convert'")
     files = tuple(folder / name for name in names)
     for file in files:
         if not file.is_file():
@@ -198,18 +101,52 @@ def _listed_files(folder: Path) -> tuple[Path, ...]:
     return files
 
 
+def _file_names(listed: Any) -> list[str]:
+    """Return the names of a bag's files; raise ValueError for what cannot be that."""
+    if not isinstance(listed, list) or not all(isinstance(name, str) for name in listed):
+        raise ValueError('no list of names')
+    if not listed or len(set(listed)) < len(listed) or any('\0' in name for name in listed):
+        raise ValueError('no file, or one file twice')
+    return listed
+
+
+def _left_behind(folder: Path, listed: tuple[Path, ...]) -> list[Path]:
+    """
+    Return the numbered files of a bag that metadata.yaml does not list, those with content.
+
+    A recorder that splits its bag lists each file once it is complete.
+    """
+    names = {match[1] for file in listed if (match := _NUMBERED.fullmatch(file.name))}
+    known = {_plain_name(file) for file in listed}
+    return [file for file in _files_with_content(folder)
+            if (match := _NUMBERED.fullmatch(file.name)) and match[1] in names
+            and _plain_name(file) not in known]
+
+
 def _numbered_files(folder: Path, recover: bool) -> tuple[Path, ...]:
     """Return the MCAP files of a directory without metadata.yaml, by their numbers."""
     if not recover:
         raise BagReadError(
             f'{str(folder)!r} has no {METADATA_FILE}, its recorder did not close it or it is no '
-            f'bag: {_RECOVER}')
-    files = [file for file in folder.glob('*.mcap') if file.stat().st_size > 0]
+            f'bag: {RECOVER}')
+    files = _files_with_content(folder)
     if not files:
         raise BagReadError(
             f'{str(folder)!r} has neither {METADATA_FILE} nor MCAP files with content: '
             'check the path')
-    return tuple(sorted(files, key=_natural_order))
+    return tuple(files)
+
+
+def _files_with_content(folder: Path) -> list[Path]:
+    """Return the MCAP files of a directory in the order of their numbers, each once."""
+    # of a plain file and its compressed copy, the plain one: it was there before
+    found = {_plain_name(file): file for pattern in (f'*.mcap{_COMPRESSED}', '*.mcap')
+             for file in folder.glob(pattern) if file.is_file() and file.stat().st_size > 0}
+    return sorted(found.values(), key=_natural_order)
+
+
+def _plain_name(file: Path) -> str:
+    return file.name.removesuffix(_COMPRESSED)
 
 
 def _natural_order(file: Path) -> list[tuple[int, str]]:

@@ -14,6 +14,8 @@
 
 """Recording: serialized messages into a bag that rosbag2 and every MCAP reader can open."""
 
+from __future__ import annotations
+
 from collections.abc import Callable, Mapping, Sequence
 import math
 import operator
@@ -21,27 +23,17 @@ import os
 from pathlib import Path
 import time
 from types import TracebackType
-from typing import BinaryIO, Self
+from typing import Self
 
-from koopman_ros import __version__
-from koopman_ros.bags.metadata import (
-    bag_metadata,
-    dump_metadata,
-    RecordedTopic,
-    write_metadata_file,
-)
-from koopman_ros.bags.qos import dump_offered_qos, QosProfile
+from koopman_ros.bags.file_sequence import FileSequence
+from koopman_ros.bags.mcap_file import COMPRESSIONS
+from koopman_ros.bags.metadata import RecordedTopic
+from koopman_ros.bags.qos import QosProfile
 from koopman_ros.bags.schemas import MessageDefinition
-from mcap.well_known import MessageEncoding, Profile, SchemaEncoding
-from mcap.writer import CompressionType, Writer
 
-_COMPRESSIONS = {
-    'none': CompressionType.NONE,
-    'zstd': CompressionType.ZSTD,
-    'lz4': CompressionType.LZ4,
-}
 _MAX_TIME_NS = 2**63 - 1
-_SEQUENCE_MODULUS = 2**32
+_NS_PER_S = 1_000_000_000
+_BYTES = (bytes, bytearray, memoryview)
 
 
 class BagWriter:
@@ -52,17 +44,25 @@ class BagWriter:
     directory with `<name>_0.mcap` and, at `close`, `metadata.yaml`. Missing parent folders are
     made. An existing path is never overwritten.
 
+    A bag directory is split where asked for: a message that finds `max_file_bytes` written, or
+    `max_file_duration_s` [s] passed since the first log time of the file, begins the next file
+    (`<name>_1.mcap`, ...; 0: never). The file before it is completed in the background, written
+    through to the disk and only then listed in `metadata.yaml`.
+
     `compression` of the chunks is 'none', 'zstd' or 'lz4'. The default is 'none', as in
     rosbag2: every reader can open it, and there is no codec between a damaged file and its
     messages. With 'zstd' the bag of a control loop has about a third of the size.
     A chunk ends when it exceeds `max_chunk_bytes`, or with the first `write` after it has been
     open for `max_chunk_age_s` [s of `clock`] (0: after each message, infinity: never). A
     process that is killed loses no more than the open chunk; a recorder whose topics may fall
-    silent calls `flush` from a timer.
+    silent calls `flush` from a timer. What it leaves is read by `read_messages` with `recover`,
+    and by mcap in the order of the file (`iter_messages(log_time_order=False)` of its
+    `NonSeekingReader`) until that raises `EndOfFile`.
     `custom_data` is made of pairs of strings, kept in the bag's metadata.
 
     Not thread-safe: one thread at a time may use a writer. Raises FileExistsError if `path`
-    exists, ValueError for an option out of range.
+    exists, ValueError for an option out of range and for a single file that is to be split.
+    What goes wrong in the background is raised by the next `flush` or `close`.
     """
 
     def __init__(
@@ -70,50 +70,47 @@ class BagWriter:
         path: str | os.PathLike[str],
         *,
         compression: str = 'none',
+        max_file_bytes: int = 0,
+        max_file_duration_s: float = 0.0,
         max_chunk_bytes: int = 2**20,
         max_chunk_age_s: float = 1.0,
         custom_data: Mapping[str, str] | None = None,
         clock: Callable[[], float] = time.monotonic,
     ) -> None:
-        if compression not in _COMPRESSIONS:
+        if compression not in COMPRESSIONS:
             raise ValueError(
-                f'compression {compression!r} is not one of {", ".join(_COMPRESSIONS)}')
+                f'compression {compression!r} is not one of {", ".join(COMPRESSIONS)}')
         if max_chunk_bytes < 1:
             raise ValueError(f'max_chunk_bytes {max_chunk_bytes} is below 1: give a size in bytes')
         if math.isnan(max_chunk_age_s) or max_chunk_age_s < 0:
             raise ValueError(
                 f'max_chunk_age_s {max_chunk_age_s} is not a time of 0 s or more: '
                 'use 0 to flush each message, math.inf to flush by size alone')
+        if max_file_bytes < 0:
+            raise ValueError(f'max_file_bytes {max_file_bytes} is negative: use 0 for no limit')
+        if not 0 <= max_file_duration_s < math.inf:
+            raise ValueError(
+                f'max_file_duration_s {max_file_duration_s} is not a time of 0 s or more: '
+                'use 0 for no limit')
         self.path = Path(path)
-        self._is_directory = self.path.suffix != '.mcap'
+        if (max_file_bytes or max_file_duration_s) and self.path.suffix == '.mcap':
+            raise ValueError(
+                f'{str(self.path)!r} is one file, which is not split: give the name of a folder, '
+                'without .mcap')
+        self._max_chunk_bytes = max_chunk_bytes
         self._max_chunk_age_s = max_chunk_age_s
-        self._custom_data = _string_pairs(custom_data or {})
         self._clock = clock
         self._topics: dict[str, RecordedTopic] = {}
-        self._channels: dict[str, int] = {}
-        self._schemas: dict[str, int] = {}
-        self._time_range_ns: tuple[int, int] | None = None
         self._chunk_opened_s: float | None = None
         self._closed = False
-        self._stream = self._create()
-        self._mcap = Writer(
-            self._stream,
-            chunk_size=max_chunk_bytes,
-            compression=_COMPRESSIONS[compression],
-            # Chunk checksums alone leave the bytes between chunks unchecked: a damaged record
-            # type there would make a reader skip a whole chunk without a word.
-            enable_data_crcs=True,
-        )
-        self._mcap.start(profile=Profile.ROS2, library=f'koopman_ros {__version__}')
-        # rosbag2 too writes the record at both ends. The last one counts; the first one lets a
-        # file whose recorder was killed keep its format version and custom data.
-        self._add_metadata_record()
-        self._mcap.flush()
+        self._files = FileSequence(
+            self.path, compression, _string_pairs(custom_data or {}),
+            max_file_bytes or math.inf, round(max_file_duration_s * _NS_PER_S) or math.inf)
 
     @property
     def mcap_path(self) -> Path:
         """The MCAP file that receives the messages."""
-        return self.path / f'{self.path.name}_0.mcap' if self._is_directory else self.path
+        return self._files.current.path
 
     @property
     def closed(self) -> bool:
@@ -144,17 +141,8 @@ class BagWriter:
         self._check_consistent(topic, definition)
         if topic in self._topics:
             return
-        recorded = RecordedTopic(topic, definition, tuple(offered_qos))
-        self._channels[topic] = self._mcap.register_channel(
-            topic=topic,
-            message_encoding=MessageEncoding.CDR,
-            schema_id=self._schema_id(definition),
-            metadata={
-                'offered_qos_profiles': dump_offered_qos(recorded.offered_qos),
-                'topic_type_hash': definition.type_hash,
-            },
-        )
-        self._topics[topic] = recorded
+        self._topics[topic] = RecordedTopic(topic, definition, tuple(offered_qos))
+        self._files.current.add_topic(self._topics[topic])
 
     def write(
         self,
@@ -177,24 +165,20 @@ class BagWriter:
         if recorded is None:
             raise ValueError(
                 f'topic {topic!r} is not in the bag {str(self.path)!r}: call add_topic first')
-        if not isinstance(data, bytes | bytearray | memoryview):
+        if not isinstance(data, _BYTES):
             raise TypeError(
                 f'data for {topic!r} must be serialized (bytes), got {type(data).__name__}: '
                 'subscribe with raw=True or call rclpy.serialization.serialize_message')
         log_time_ns = _checked_time('log_time_ns', log_time_ns)
-        if publish_time_ns is None:
-            publish_time_ns = log_time_ns
-        self._mcap.add_message(
-            channel_id=self._channels[topic],
-            log_time=log_time_ns,
-            data=bytes(data),
-            publish_time=_checked_time('publish_time_ns', publish_time_ns),
-            sequence=recorded.message_count % _SEQUENCE_MODULUS,
-        )
+        publish_time_ns = (log_time_ns if publish_time_ns is None
+                           else _checked_time('publish_time_ns', publish_time_ns))
+        if self._files.is_full(log_time_ns):
+            self.flush()
+            self._files.split(self._topics.values())
+        self._files.current.write(
+            topic, bytes(data), log_time_ns, publish_time_ns, recorded.message_count)
         recorded.message_count += 1
-        first, last = self._time_range_ns or (log_time_ns, log_time_ns)
-        self._time_range_ns = (min(first, log_time_ns), max(last, log_time_ns))
-        self._flush_old_chunk()
+        self._flush_full_chunk()
 
     def flush(self) -> None:
         """
@@ -204,24 +188,16 @@ class BagWriter:
         ValueError on a closed writer.
         """
         self._check_open('flush')
-        self._mcap.flush()
+        self._files.current.flush()
         self._chunk_opened_s = None
+        self._files.raise_failures()
 
     def close(self) -> None:
         """Complete the file (and `metadata.yaml`); closing a closed writer does nothing."""
         if self._closed:
             return
         self._closed = True
-        try:
-            self._mcap.flush()
-            self._add_metadata_record()
-            self._mcap.finish()
-            self._stream.flush()
-            os.fsync(self._stream.fileno())
-        finally:
-            self._stream.close()
-        if self._is_directory:
-            write_metadata_file(self.path, self._metadata())
+        self._files.complete()
 
     def __enter__(self) -> Self:
         return self
@@ -235,17 +211,13 @@ class BagWriter:
         # Also after an exception: what was recorded up to it is what one wants to look at.
         self.close()
 
-    def _create(self) -> BinaryIO:
-        """Create the file, and its directory; both calls fail on whatever exists."""
-        try:
-            self.path.parent.mkdir(parents=True, exist_ok=True)
-            if self._is_directory:
-                self.path.mkdir()
-            return self.mcap_path.open('xb')
-        except FileExistsError as error:
-            raise FileExistsError(
-                f'{str(error.filename)!r} exists already and recordings are never overwritten: '
-                'choose another name, or move the old one away') from error
+    def _flush_full_chunk(self) -> None:
+        now_s = self._clock()
+        if self._chunk_opened_s is None:
+            self._chunk_opened_s = now_s
+        if (self._files.current.open_chunk_bytes > self._max_chunk_bytes
+                or now_s - self._chunk_opened_s >= self._max_chunk_age_s):
+            self.flush()
 
     def _check_consistent(self, topic: str, definition: MessageDefinition) -> None:
         """Refuse a second type of one topic, and a second definition of one type."""
@@ -256,33 +228,6 @@ class BagWriter:
                     f'topic {topic!r} of type {definition.type_name} ({definition.type_hash}) '
                     f'contradicts topic {known.name!r} of type {known.definition.type_name} '
                     f'({known.definition.type_hash}): record it in a bag of its own')
-
-    def _schema_id(self, definition: MessageDefinition) -> int:
-        """Return the id of a type's schema, written once and shared by all its topics."""
-        name = definition.type_name
-        if name not in self._schemas:
-            self._schemas[name] = self._mcap.register_schema(
-                name=name, encoding=SchemaEncoding.ROS2, data=definition.text.encode('utf-8'))
-        return self._schemas[name]
-
-    def _flush_old_chunk(self) -> None:
-        now_s = self._clock()
-        if self._chunk_opened_s is None:
-            self._chunk_opened_s = now_s
-        if now_s - self._chunk_opened_s >= self._max_chunk_age_s:
-            self.flush()
-
-    def _metadata(self) -> dict[str, object]:
-        return bag_metadata(
-            self.mcap_path.name,
-            tuple(self._topics.values()),
-            self._time_range_ns,
-            self._custom_data,
-        )
-
-    def _add_metadata_record(self) -> None:
-        text = dump_metadata(self._metadata())
-        self._mcap.add_metadata('rosbag2', {'serialized_metadata': text})
 
     def _check_open(self, action: str) -> None:
         if self._closed:

@@ -16,40 +16,66 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
-from functools import partial
-import importlib
+from collections.abc import Iterable, Mapping
+import heapq
+import itertools
 import time
-from typing import Any
 
 from koopman_ros.bags import BagWriter, INFINITE_NS, message_definition, QosProfile
 from koopman_ros.nodes import topics
+from rclpy.callback_groups import CallbackGroup
 from rclpy.node import Node
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 from rclpy.subscription import Subscription
 from rclpy.topic_endpoint_info import TopicEndpointInfo
 
-# Ten seconds at 100 Hz wait here while the disk is slow.
-_QUEUE_DEPTH = 1000
+# Five seconds at 1 kHz wait here while the disk is slow; Fast DDS keeps no more than this.
+_QUEUE_DEPTH = 5000
+
+_LINGER = 0.1  # s
+
+_Taken = tuple[str, bytes, Mapping[str, int]]  # topic, message, times
+
+
+class _OutsideTheExecutor(CallbackGroup):
+    """
+    Keeps subscriptions out of the executor, for us to take from.
+
+    The executor builds its wait set anew for each message, which costs many times what it costs
+    to record one.
+    """
+
+    def can_execute(self, entity: object) -> bool:
+        """Let nothing be waited for or executed."""
+        return False
+
+    def beginning_execution(self, entity: object) -> bool:
+        """Let nothing be executed."""
+        return False
+
+    def ending_execution(self, entity: object) -> None:
+        """Do nothing, as nothing was executed."""
 
 
 class Recorder:
     """
     Write every message of some topics to a bag, byte for byte, from now until :meth:`close`.
 
-    :param node: whose executor delivers the messages.
+    Messages wait in the middleware until :meth:`take`, which a timer should call often. Any
+    method raises OSError where the bag cannot be written, and LookupError where the definition of
+    a type is not installed; then :meth:`close` is all that is left to do.
+
+    :param node: that subscribes.
     :param writer: the open bag; closed by :meth:`close`.
     :param names: topics, relative or absolute; types are looked up for those outside the loop.
-    :param on_failure: called, instead of an error in a callback, when nothing more can be written.
     """
 
-    def __init__(self, node: Node, writer: BagWriter, names: tuple[str, ...],
-                 on_failure: Callable[[Exception], None]) -> None:
-        self._on_failure = on_failure
+    def __init__(self, node: Node, writer: BagWriter, names: tuple[str, ...]) -> None:
         self._node = node
         self._writer = writer
         self._names = {node.resolve_topic_name(name): name for name in names}
         self._types = {topic: topics.TYPES.get(name) for topic, name in self._names.items()}
+        self._group = _OutsideTheExecutor()
         self._subscriptions: dict[str, Subscription] = {}
         self.counts: dict[str, int] = dict.fromkeys(self._types, 0)
         self.look_for_publishers()
@@ -65,11 +91,9 @@ class Recorder:
             publishers = self._node.get_publishers_info_by_topic(topic)
             if self._types[topic] is None and publishers:
                 try:
-                    self._types[topic] = _message_type(publishers[0].topic_type)
-                except (ImportError, AttributeError, ValueError):
-                    self._node.get_logger().error(
-                        f'{topic} is not recorded: its type {publishers[0].topic_type} is not '
-                        'installed here')
+                    self._types[topic] = topics.message_class(publishers[0].topic_type)
+                except LookupError as error:
+                    self._node.get_logger().error(f'{topic} is not recorded: {error}')
                     del self._types[topic]
                     continue
             message_type = self._types[topic]
@@ -85,44 +109,55 @@ class Recorder:
                     continue
                 self._end([topic])
             self._subscriptions[topic] = self._node.create_subscription(
-                message_type, topic, partial(self._record, topic), wanted, raw=True)
+                message_type, topic, lambda _: None, wanted, callback_group=self._group,
+                raw=True)
+
+    def take(self) -> None:
+        """Record what has arrived."""
+        self._record_in_order(self._waiting(topic, subscription)
+                              for topic, subscription in self._subscriptions.items())
 
     def flush(self) -> None:
         """Hand what is recorded to the operating system."""
-        try:
-            self._writer.flush()
-        except OSError as error:
-            self._on_failure(error)
+        self._writer.flush()
 
     def close(self) -> None:
-        """Complete the bag with all that has arrived; the subscriptions end with it."""
-        self._end(list(self._subscriptions))
-        self._writer.close()
+        """Complete the bag with all that was sent; the subscriptions end with it."""
+        # what others have heard already may still be on its way to us
+        time.sleep(_LINGER)
+        try:
+            self._end(list(self._subscriptions))
+        finally:
+            self._writer.close()
 
     def _end(self, ended: list[str]) -> None:
-        """End subscriptions after recording what waits in them for the executor."""
-        waiting = []
-        for topic in ended:
-            subscription = self._subscriptions.pop(topic)
-            with subscription.handle:
-                while taken := subscription.handle.take_message(self._types[topic], True):
-                    waiting.append((topic, *taken))
-            self._node.destroy_subscription(subscription)
-        for topic, data, info in sorted(waiting, key=lambda entry: entry[2]['received_timestamp']):
+        """End subscriptions after recording what waits in them."""
+        subscriptions = {topic: self._subscriptions.pop(topic) for topic in ended}
+        try:
+            self._record_in_order(self._waiting(topic, subscription)
+                                  for topic, subscription in subscriptions.items())
+        finally:
+            for subscription in subscriptions.values():
+                self._node.destroy_subscription(subscription)
+
+    def _waiting(self, topic: str, subscription: Subscription) -> list[_Taken]:
+        """Take what waits in the middleware."""
+        with (handle := subscription.handle):
+            taken = iter(lambda: handle.take_message(subscription.msg_type, True), None)
+            # no more than can wait, lest a fast publisher keeps us here
+            return [(topic, *entry) for entry in itertools.islice(taken, _QUEUE_DEPTH)]
+
+    def _record_in_order(self, waiting: Iterable[list[_Taken]]) -> None:
+        """Record in the order of receipt; the order within a topic stays whatever the clock."""
+        for topic, data, info in heapq.merge(*waiting, key=_received):
             self._record(topic, data, info)
 
     def _record(self, topic: str, data: bytes, info: Mapping[str, int]) -> None:
-        if self._writer.closed:
-            return
+        if not self.counts[topic]:
+            self._announce(topic)
         # the middleware stamps both ends; rosbag2 logs the time of receipt
         received = info['received_timestamp'] or time.time_ns()
-        try:
-            if not self.counts[topic]:
-                self._announce(topic)
-            self._writer.write(topic, data, received, info['source_timestamp'] or received)
-        except (OSError, LookupError) as error:
-            self._on_failure(error)
-            return
+        self._writer.write(topic, data, received, info['source_timestamp'] or received)
         self.counts[topic] += 1
 
     def _announce(self, topic: str) -> None:
@@ -135,6 +170,10 @@ class Recorder:
                                [_offered(info.qos_profile) for info in publishers])
 
 
+def _received(taken: _Taken) -> int:
+    return taken[2]['received_timestamp']
+
+
 def _matching_qos(topic: str, publishers: list[TopicEndpointInfo]) -> QoSProfile:
     """Ask for reliability and history only where every publisher offers them."""
     offers = [info.qos_profile for info in publishers] or [topics.qos(topic)]
@@ -144,12 +183,6 @@ def _matching_qos(topic: str, publishers: list[TopicEndpointInfo]) -> QoSProfile
         depth=_QUEUE_DEPTH,
         reliability=ReliabilityPolicy.RELIABLE if reliable else ReliabilityPolicy.BEST_EFFORT,
         durability=(DurabilityPolicy.TRANSIENT_LOCAL if latched else DurabilityPolicy.VOLATILE))
-
-
-def _message_type(name: str) -> Any:
-    """Return the class of a message type given as ``package/msg/Name``."""
-    package, kind, message = name.split('/')
-    return getattr(importlib.import_module(f'{package}.{kind}'), message)
 
 
 def _offered(profile: QoSProfile) -> QosProfile:

@@ -16,8 +16,14 @@
 
 from __future__ import annotations
 
+from collections.abc import Collection
+import importlib
+from typing import Any
+
 from diagnostic_msgs.msg import DiagnosticArray
+from rclpy.exceptions import InvalidTopicNameException
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
+from rclpy.validate_topic_name import validate_topic_name
 from rosgraph_msgs.msg import Clock
 from sensor_msgs.msg import JointState, Temperature
 
@@ -56,3 +62,29 @@ _QOS = {ACTIVE_SETPOINT: LATCHED_QOS, CLOCK: CLOCK_QOS}
 def qos(topic: str) -> QoSProfile:
     """Return the quality of service of a topic of the loop, or the default for any other."""
     return _QOS.get(topic, LOOP_QOS)
+
+
+def refusal(names: Collection[str]) -> str:
+    """Say why a list of names cannot be that of topics, or return an empty string."""
+    if not names or not all(names):
+        return f'topics = {list(names)} must hold at least one name and no empty one'
+    for name in names:
+        try:
+            validate_topic_name(name)
+        except InvalidTopicNameException as error:
+            return f'topics: {" ".join(str(error).split())}'
+    return ''
+
+
+def message_class(type_name: str) -> Any:
+    """
+    Return the class of a message type given as ``package/msg/Name``.
+
+    :raises LookupError: when it is not installed, or no such name.
+    """
+    try:
+        package, kind, name = type_name.split('/')
+        return getattr(importlib.import_module(f'{package}.{kind}'), name)
+    except (ImportError, AttributeError, ValueError) as error:
+        raise LookupError(
+            f'message type {type_name!r} is not installed here: source its workspace') from error

@@ -198,7 +198,7 @@ def test_listed_file_that_is_missing(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize(('key', 'value', 'kind'), [
     ('storage_identifier', 'sqlite3', 'sqlite3 files'),
-    ('compression_format', 'zstd', 'mcap files compressed with zstd'),
+    ('compression_format', 'lz4', 'mcap files compressed with lz4'),
 ])
 def test_storage_that_is_not_read_here(tmp_path: Path, key: str, value: str, kind: str) -> None:
     path = _numbers(tmp_path / 'run', 1)

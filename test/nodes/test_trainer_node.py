@@ -123,32 +123,28 @@ def test_starts_without_recording_on_request(ros: Workbench, tmp_path: Path) -> 
     assert (response.success, response.message) == (False, 'already recording')
 
 
-def test_running_trainer_refuses_to_overwrite(ros: Workbench, tmp_path: Path) -> None:
-    bag = tmp_path / 'run.mcap'
-    ros.start('trainer', {'output': bag})
-    assert ros.set_bool('trainer/record', False).success
-    before = bag.read_bytes()
-    response = ros.set_bool('trainer/record', True)
-    assert not response.success
-    assert 'run.mcap' in response.message
-    assert bag.read_bytes() == before
-
-
 @pytest.mark.parametrize('name', ['run', 'run.mcap'])
-def test_does_not_start_over_an_existing_recording(ros: Workbench, tmp_path: Path, name: str
-                                                   ) -> None:
+def test_takes_the_next_name_beside_an_existing_recording(ros: Workbench, tmp_path: Path, name: str
+                                                          ) -> None:
     bag = tmp_path / name
-    if name == 'run':
-        bag.mkdir()
-        (bag / 'note').write_text('precious')
-    else:
-        bag.write_text('precious')
+    precious = bag / 'note' if name == 'run' else bag
+    precious.parent.mkdir(exist_ok=True)
+    precious.write_text('precious')
+    second, third = (tmp_path / name.replace('run', word) for word in ('run_2', 'run_3'))
     trainer = ros.start('trainer', {'output': bag})
-    assert ros.wait_for_end(trainer) == 1
-    (line,) = trainer.output().splitlines()
-    assert line.startswith('trainer: cannot start: cannot record: ')
-    assert str(bag) in line
-    assert (bag / 'note' if name == 'run' else bag).read_text() == 'precious'
+    publisher = ros.speak(Temperature, topics.TEMPERATURE, to='trainer')
+    say(publisher, 5)
+    assert ros.set_bool('trainer/record', False).message.endswith(str(second))
+    response = ros.set_bool('trainer/record', True)
+    assert response.success
+    assert response.message == f'recording to {third}, because {bag} exists already'
+    assert trainer.stop() == 0
+    assert values(recorded(second)) == list(range(5))
+    assert summary(third).complete
+    assert precious.read_text() == 'precious'
+    warnings = [line for line in trainer.output().splitlines() if 'WARN' in line]
+    assert [line.partition(': ')[2] for line in warnings] == [
+        f'recording to {path}, because {bag} exists already' for path in (second, third)]
 
 
 def test_topic_outside_the_loop_is_recorded_by_name(ros: Workbench, tmp_path: Path) -> None:

@@ -1,0 +1,48 @@
+# Copyright 2026 The koopman_ros Authors
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+
+"""What the figures were measured on."""
+
+from __future__ import annotations
+
+from importlib.metadata import PackageNotFoundError, version
+import os
+from pathlib import Path
+import platform
+from typing import Any
+
+
+def machine(*packages: str) -> dict[str, Any]:
+    """Return processor, system and load of this machine, and the versions of some packages."""
+    return {'processor': _processor(), 'cpu_count': os.cpu_count(),
+            'system': platform.platform(), 'python': platform.python_version(),
+            **{name: _version(name) for name in packages},
+            'load_at_start': os.getloadavg()[0]}
+
+
+def _processor() -> str:
+    try:
+        lines = Path('/proc/cpuinfo').read_text().splitlines()
+    except OSError:
+        return platform.processor()
+    return next((line.partition(':')[2].strip() for line in lines
+                 if line.startswith('model name')), platform.processor())
+
+
+def _version(name: str) -> str | None:
+    try:
+        return version(name)
+    except PackageNotFoundError:
+        return None

@@ -1,0 +1,224 @@
+# Copyright 2026 The koopman_ros Authors
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+
+"""A loop's measurements with the coolant that acted on them, cut from bags into episodes."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, field
+import math
+import os
+
+from koopman_ros.bags.errors import BagReadError
+from koopman_ros.bags.reader import read_messages, summary
+import numpy as np
+from numpy.typing import NDArray
+
+_TEMPERATURE = 'sensor_msgs/msg/Temperature'
+_NS = 1_000_000_000
+# A stamp earlier by more than this means that time was set back, e.g. by a restart of the plant.
+_SET_BACK_NS = _NS
+# A gap is longer than this many usual periods.
+_GAP_PERIODS = 3.5
+# A clock that differs from the recorder's by more is not the wall clock.
+_SAME_CLOCK_NS = 5 * _NS
+# Delays below this share of the sample period are taken as none.
+_NO_DELAY = 0.01
+_SHORTEST = 10
+_COLDEST, _HOTTEST = -273.15, 1e4  # degC; anything else is no measurement
+
+
+@dataclass(frozen=True)
+class Episode:
+    """
+    An uninterrupted stretch of measurements; temperatures in degrees Celsius.
+
+    :param bag: where it comes from.
+    :param stamp_ns: (n,) stamps of the measurements, rising.
+    :param celsius: (n,) measured temperatures.
+    :param input_ns: (m,) times from which each coolant temperature acted, rising, the first not
+        later than the first measurement.
+    :param input_celsius: (m,) those coolant temperatures, each other than the one before.
+    """
+
+    bag: str
+    stamp_ns: NDArray[np.int64]
+    celsius: NDArray[np.float64]
+    input_ns: NDArray[np.int64]
+    input_celsius: NDArray[np.float64]
+
+
+@dataclass
+class Account:
+    """
+    What was made of some bags.
+
+    :param measurements: number of measurements read.
+    :param used: number of those in an episode.
+    :param dropped: number of messages left out, by reason.
+    :param notes: what else is worth knowing, in words.
+    """
+
+    measurements: int = 0
+    used: int = 0
+    dropped: Counter[str] = field(default_factory=Counter)
+    notes: list[str] = field(default_factory=list)
+
+    def lines(self) -> list[str]:
+        """Return the account in words."""
+        said = [f'{self.used} of {self.measurements} measurements used']
+        said += [f'{count} dropped: {reason}' for reason, count in sorted(self.dropped.items())]
+        return said + self.notes
+
+
+def loop_episodes(bags: Sequence[str | os.PathLike[str]], temperature: str, coolant: str, *,
+                  input_delay_ns: int = 0) -> tuple[list[Episode], Account]:
+    """
+    Read the episodes of some bags.
+
+    Nothing is resampled: measurements keep their stamps, and the coolant is held from the time
+    on at which it was commanded. A command that answers a measurement carries its stamp; where
+    the stamps are those of the wall clock, it acts later by the time between the two receipts. A
+    command without a stamp acts when it is received.
+    Episodes end at gaps and where time is set back; measurements before the first command are
+    dropped, since nobody knows what acted on them. A bag that was not closed or is damaged is
+    read as far as it goes, and the account says so.
+
+    :param bags: files or folders.
+    :param temperature: topic of the measurements, sensor_msgs/Temperature.
+    :param coolant: topic of the coolant temperature that acts, likewise.
+    :param input_delay_ns: dead time of the actuator, after which a command begins to act.
+    :raises BagReadError: for a bag that cannot be read, lacks a topic, or has another type there.
+    """
+    episodes: list[Episode] = []
+    account = Account()
+    read: set[str] = set()
+    for bag in bags:
+        if (path := os.path.realpath(bag)) in read:
+            account.notes.append(f'{os.fspath(bag)} is named twice: read once')
+            continue
+        read.add(path)
+        for run in _runs(bag, temperature, coolant, account):
+            episodes += _episodes(os.fspath(bag), run, account, input_delay_ns)
+    account.used = sum(len(episode.stamp_ns) for episode in episodes)
+    account.dropped = +account.dropped
+    return episodes, account
+
+
+@dataclass
+class _Run:
+    """Messages between two resets of time: (stamp or 0, time of receipt, value)."""
+
+    measured: list[tuple[int, int, float]] = field(default_factory=list)
+    commanded: list[tuple[int, int, float]] = field(default_factory=list)
+
+
+def _runs(bag: str | os.PathLike[str], temperature: str, coolant: str, account: Account
+          ) -> Iterator[_Run]:
+    """Yield what lies between resets of time."""
+    content = summary(bag)
+    for topic in (temperature, coolant):
+        if topic not in content.types:
+            known = ', '.join(sorted(content.types)) or 'no topic at all'
+            raise BagReadError(f'bag {os.fspath(bag)!r} has no topic {topic!r}, it has {known}: '
+                               'name the right topics, or record them')
+        if content.types[topic] != _TEMPERATURE:
+            raise BagReadError(f'topic {topic!r} of bag {os.fspath(bag)!r} is '
+                               f'{content.types[topic]}, not {_TEMPERATURE}: name another topic')
+    if not content.complete:
+        account.notes.append(f'{os.fspath(bag)} was not closed or is damaged: read up to its last '
+                             'whole record')
+    run = _Run()
+    latest = -1
+    for entry in read_messages(bag, [temperature, coolant], recover=True):
+        stamp = entry.message.header.stamp
+        stamp_ns = stamp.sec * _NS + stamp.nanosec
+        value = float(entry.message.temperature)
+        measured = entry.topic == temperature
+        account.measurements += measured
+        if not (math.isfinite(value) and _COLDEST <= value <= _HOTTEST):
+            account.dropped['not a temperature'] += 1
+            continue
+        if measured and stamp_ns < latest - _SET_BACK_NS:
+            account.notes.append(f'{os.fspath(bag)}: time was set back by '
+                                 f'{(latest - stamp_ns) / _NS:.3f} s, a new episode begins')
+            yield run
+            run, latest = _Run(), -1
+        if measured:
+            latest = max(latest, stamp_ns)
+        (run.measured if measured else run.commanded).append((stamp_ns, entry.log_time_ns, value))
+    yield run
+
+
+def _episodes(bag: str, run: _Run, account: Account, input_delay_ns: int) -> list[Episode]:
+    """Sort one run by time and cut it at its gaps."""
+    measured = _sorted(run.measured, account, 'measurement with a repeated stamp')
+    if len(measured) < _SHORTEST or not run.commanded:
+        account.dropped['too short, or without any coolant'] += len(measured)
+        return []
+    stamps = np.array([entry[0] for entry in measured])
+    period = float(np.median(np.diff(stamps)))
+    input_ns, values = _inputs(run, measured, period)
+    input_ns = input_ns + input_delay_ns
+    known = stamps >= input_ns[0]
+    account.dropped['before the first coolant'] += int(np.sum(~known))
+    ends = np.flatnonzero(np.diff(stamps) > _GAP_PERIODS * period) + 1
+    for end in ends.tolist():
+        account.notes.append(f'{bag}: gap of {(stamps[end] - stamps[end - 1]) / _NS:.3f} s at '
+                             f'{stamps[end - 1] / _NS:.3f} s, a new episode begins')
+    found = []
+    for rows in np.split(np.arange(len(stamps)), ends):
+        rows = rows[known[rows]]
+        if len(rows) < _SHORTEST:
+            account.dropped[f'in a stretch of fewer than {_SHORTEST}'] += len(rows)
+            continue
+        first = np.searchsorted(input_ns, stamps[rows[0]], side='right') - 1
+        last = np.searchsorted(input_ns, stamps[rows[-1]], side='left')
+        keep = slice(first, max(first + 1, last))
+        found.append(Episode(bag, stamps[rows], np.array([measured[i][2] for i in rows]),
+                             input_ns[keep], values[keep]))
+    return found
+
+
+def _sorted(entries: list[tuple[int, int, float]], account: Account, repeated: str
+            ) -> list[tuple[int, int, float]]:
+    """Sort by stamp; of repeated stamps the first one received stays."""
+    kept: list[tuple[int, int, float]] = []
+    for entry in sorted(entries, key=lambda entry: entry[0]):
+        if kept and kept[-1][0] == entry[0]:
+            account.dropped[repeated] += 1
+        else:
+            kept.append(entry)
+    return kept
+
+
+def _inputs(run: _Run, measured: list[tuple[int, int, float]], period: float
+            ) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
+    """Return when which coolant began to act."""
+    received = {stamp: log for stamp, log, _ in measured}
+    wall = float(np.median([abs(log - stamp) for stamp, log, _ in measured])) < _SAME_CLOCK_NS
+    logs = sorted(received.values())
+    times: dict[int, float] = {}
+    for given, log, value in sorted(run.commanded, key=lambda entry: entry[1]):
+        # without a stamp it acts on receipt, which plant time may have to be asked for
+        stamp = given or (log if wall else int(np.interp(log, logs, list(received))))
+        delay = log - received[stamp] if wall and stamp in received else 0
+        # the last word counts
+        times[stamp + (delay if delay > _NO_DELAY * period else 0)] = value
+    order = sorted(times)
+    changes = [t for i, t in enumerate(order) if i == 0 or times[t] != times[order[i - 1]]]
+    return np.array(changes), np.array([times[t] for t in changes])

@@ -1,0 +1,157 @@
+# Copyright 2026 The koopman_ros Authors
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""Bags of all the kinds that are read, and random damage to their bytes."""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+import random
+import struct
+
+from bag_samples import Sample, TOPICS
+from koopman_ros.bags import BagWriter, message_definition
+from mcap.writer import CompressionType, Writer
+import yaml
+import zstandard
+
+# Values that lengths and counts are most likely to trip over.
+_WORDS = [0, 1, 2**31 - 1, 2**32 - 1, 2**40, 2**63 - 1, 2**64 - 1]
+
+
+@dataclass(frozen=True)
+class Specimen:
+    """A whole bag: files by name ('' for a bare file), and whether checksums guard them all."""
+
+    files: dict[str, bytes]
+    guarded: bool
+
+
+def specimens(folder: Path, samples: list[Sample]) -> dict[str, Specimen]:
+    """Return whole bags that hold the same messages."""
+    found = {}
+    for compression in ('none', 'zstd', 'lz4'):
+        path = folder / f'{compression}.mcap'
+        with BagWriter(path, compression=compression, max_chunk_bytes=1500) as writer:
+            fill(writer, samples)
+        found[compression] = Specimen({'': path.read_bytes()}, guarded=True)
+    with BagWriter(folder / 'run', max_file_bytes=6000, max_chunk_bytes=1500) as writer:
+        fill(writer, samples)
+    run = {file.name: file.read_bytes() for file in (folder / 'run').iterdir()}
+    assert len(run) >= 3
+    found['directory'] = Specimen(run, guarded=True)
+    found['files compressed by rosbag2'] = Specimen(compressed_files(run), guarded=True)
+    found['messages compressed by rosbag2'] = Specimen({'': foreign(
+        folder / 'messages.mcap', samples, zstandard.compress)}, guarded=False)
+    found['without checksums'] = Specimen({'': foreign(
+        folder / 'unguarded.mcap', samples, enable_crcs=False)}, guarded=False)
+    found['without chunks'] = Specimen({'': foreign(
+        folder / 'chunkless.mcap', samples, use_chunking=False)}, guarded=False)
+    return found
+
+
+def compressed_files(files: dict[str, bytes]) -> dict[str, bytes]:
+    """Return a bag directory as rosbag2 leaves it with the compression mode 'file'."""
+    text = files['metadata.yaml'].decode()
+    metadata = yaml.safe_load(text)
+    information = metadata['rosbag2_bagfile_information']
+    information |= {'compression_format': 'zstd', 'compression_mode': 'FILE'}
+    names = information['relative_file_paths']
+    information['relative_file_paths'] = [f'{name}.zstd' for name in names]
+    # in a stream, as rosbag2 does it: the frame does not tell its size
+    compressor = zstandard.ZstdCompressor(write_content_size=False)
+    return {'metadata.yaml': yaml.safe_dump(metadata, sort_keys=False).encode(),
+            **{f'{name}.zstd': compressor.compress(files[name]) for name in names}}
+
+
+def foreign(path: Path, samples: list[Sample],
+            compress: Callable[[bytes], bytes] = lambda data: data,
+            **options: bool) -> bytes:
+    """Return an MCAP file of the samples as other programs write them."""
+    with path.open('wb') as stream:
+        writer = Writer(stream, chunk_size=1500, compression=CompressionType.NONE, **options)
+        writer.start('ros2')
+        channels = {}
+        for topic, type_name in TOPICS.items():
+            text = message_definition(type_name).text.encode()
+            schema = writer.register_schema(type_name, 'ros2msg', text)
+            channels[topic] = writer.register_channel(topic, 'cdr', schema)
+        for sample in samples:
+            writer.add_message(channels[sample.topic], sample.log_time_ns, compress(sample.data),
+                               sample.publish_time_ns)
+        writer.finish()
+    return path.read_bytes()
+
+
+def mutate(dice: random.Random, content: bytes) -> bytes:
+    """Return the content with one to three kinds of damage."""
+    for _ in range(dice.choice([1, 1, 1, 2, 3])):
+        content = dice.choice(_DAMAGES)(dice, content)
+    return content
+
+
+def _range(dice: random.Random, content: bytes) -> tuple[int, int]:
+    start = dice.randrange(len(content) + 1)
+    return start, min(len(content), start + int(2 ** dice.uniform(0, 12)))
+
+
+def _flip(dice: random.Random, content: bytes) -> bytes:
+    damaged = bytearray(content or b'\0')
+    for _ in range(dice.choice([1, 1, 8])):
+        damaged[dice.randrange(len(damaged))] ^= 1 << dice.randrange(8)
+    return bytes(damaged)
+
+
+def _cut(dice: random.Random, content: bytes) -> bytes:
+    return content[:dice.randrange(len(content) + 1)]
+
+
+def _delete(dice: random.Random, content: bytes) -> bytes:
+    start, end = _range(dice, content)
+    return content[:start] + content[end:]
+
+
+def _repeat(dice: random.Random, content: bytes) -> bytes:
+    start, end = _range(dice, content)
+    return content[:end] + content[start:end] + content[end:]
+
+
+def _swap(dice: random.Random, content: bytes) -> bytes:
+    start, end = _range(dice, content)
+    later, last = _range(dice, content[end:])
+    later, last = later + end, last + end
+    return (content[:start] + content[later:last] + content[end:later] + content[start:end]
+            + content[last:])
+
+
+def _zero(dice: random.Random, content: bytes) -> bytes:
+    start, end = _range(dice, content)
+    return content[:start] + bytes(end - start) + content[end:]
+
+
+def _overwrite(dice: random.Random, content: bytes) -> bytes:
+    word = struct.pack('<Q', dice.choice(_WORDS))[:dice.choice([2, 4, 8])]
+    start = dice.randrange(len(content) + 1)
+    return content[:start] + word + content[start + len(word):]
+
+
+_DAMAGES = [_flip, _flip, _cut, _delete, _repeat, _swap, _zero, _overwrite, _overwrite]
+
+
+def fill(writer: BagWriter, samples: list[Sample]) -> None:
+    """Write the samples, whose topics become known on the way."""
+    for topic, type_name in TOPICS.items():
+        writer.add_topic(topic, message_definition(type_name))
+    for sample in samples:
+        writer.write(sample.topic, sample.data, sample.log_time_ns, sample.publish_time_ns)

@@ -1,0 +1,319 @@
+# Copyright 2026 The koopman_ros Authors
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+
+"""Recording that goes wrong or goes on for long: kills, split bags, full disks, fast topics."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+import json
+from pathlib import Path
+import re
+import shutil
+import signal
+import subprocess
+import sys
+import time
+
+from diagnostic_msgs.msg import DiagnosticStatus
+from koopman_ros.bags import read_messages, summary
+from koopman_ros.nodes import topics
+from koopman_ros.nodes.recording import free_name
+from koopman_ros.nodes.trainer_parameters import TABLE, TrainerParameters
+from mcap.exceptions import EndOfFile
+from mcap.reader import make_reader, NonSeekingReader
+from mcap_ros2.decoder import DecoderFactory
+import pytest
+from rclpy.duration import Duration
+from rosbags.highlevel import AnyReader
+from sensor_msgs.msg import Temperature
+from std_msgs.msg import String
+from workbench import temperature, TIMEOUT, Workbench
+import yaml
+
+TOPIC = '/temperature'
+PUBLISHER = Path(__file__).parents[2] / 'benchmarks' / 'recording' / 'publisher.py'
+# (output, compression, moments of the kill [s after the first message])
+KILLED = [
+    ('file.mcap', 'none', (1.2, 1.9)),
+    ('squeezed.mcap', 'zstd', (1.3,)),
+    ('split', 'none', (1.4,)),
+    ('squeezed_split', 'zstd', (1.55, 2.1)),
+]
+
+
+def values(bag: Path, *, recover: bool = False) -> list[int]:
+    """Return the numbers in a bag, by our reader."""
+    return [round(m.message.temperature) for m in read_messages(bag, [TOPIC], recover=recover)]
+
+
+def values_by_mcap(bag: Path) -> list[int]:
+    """Return the numbers in a bag by mcap, from files that need not be complete."""
+    found = []
+    for file in sorted(bag.glob('*.mcap')) if bag.is_dir() else [bag]:
+        with file.open('rb') as stream:
+            reader = NonSeekingReader(stream, decoder_factories=[DecoderFactory()])
+            try:
+                for entry in reader.iter_decoded_messages([TOPIC], log_time_order=False):
+                    found.append(round(entry.decoded_message.temperature))
+            except EndOfFile:
+                pass
+    return found
+
+
+# Killed.
+
+
+@dataclass(frozen=True)
+class Killed:
+    """A bag whose trainer was killed, and how many messages were older than a second."""
+
+    bag: Path
+    compression: str
+    old: int
+    sent: int
+
+
+@pytest.fixture(scope='module')
+def killed(shared_ros: Workbench, tmp_path_factory: pytest.TempPathFactory) -> list[Killed]:
+    """Kill trainers at several moments while messages stream."""
+    ros = shared_ros
+    cases = []
+    for output, compression, moments in KILLED:
+        for moment in moments:
+            bag = tmp_path_factory.mktemp('killed') / output
+            name = f'trainer_{len(cases)}'
+            split = {} if bag.suffix else {'max_bag_duration': 0.4}
+            process = ros.start(
+                'trainer', {'output': bag, 'compression': compression, **split},
+                ('-r', f'__node:={name}'))
+            cases.append((moment, bag, compression, name, process))
+    publisher = ros.speak(Temperature, topics.TEMPERATURE, to='trainer_0', subscribers=len(cases))
+    for _, _, _, name, _ in cases:
+        ros.meet(name)
+    sent: list[float] = []
+
+    def tick() -> None:
+        publisher.publish(temperature(float(len(sent))))
+        sent.append(time.monotonic())
+
+    timer = ros.node.create_timer(0.005, tick)
+    found = []
+    for moment, bag, compression, _, process in sorted(cases, key=lambda case: case[0]):
+        ros.wait_until(lambda m=moment: sent and time.monotonic() > sent[0] + m)
+        now = time.monotonic()
+        assert process.stop(signal.SIGKILL) == -signal.SIGKILL
+        ros.processes.remove(process)
+        found.append(Killed(bag, compression, sum(at <= now - 1.0 for at in sent), len(sent)))
+    timer.cancel()
+    return found
+
+
+def test_kill_loses_no_more_than_the_last_second(killed: list[Killed]) -> None:
+    for case in killed:
+        for found in (values(case.bag, recover=True), values_by_mcap(case.bag)):
+            assert found == list(range(len(found)))
+            assert 0 < case.old <= len(found) <= case.sent, case
+        assert not summary(case.bag).complete
+        assert case.bag.suffix or len(list(case.bag.glob('*.mcap'))) >= 3
+
+
+def test_start_after_a_kill_takes_the_next_name(shared_ros: Workbench, killed: list[Killed]
+                                                ) -> None:
+    left = [killed[0], next(case for case in killed if not case.bag.suffix)]
+    for case in left:
+        before = _contents(case.bag)
+        trainer = shared_ros.start('trainer', {'output': case.bag})
+        following = free_name(case.bag)
+        shared_ros.wait_until(following.exists)
+        assert trainer.stop() == 0
+        assert summary(following).complete
+        assert f'recording to {following}, because {case.bag} exists already' in trainer.output()
+        assert _contents(case.bag) == before
+
+
+@pytest.mark.parametrize('name', ['run', 'run.mcap'])
+def test_killed_before_the_first_message(ros: Workbench, tmp_path: Path, name: str) -> None:
+    bag = tmp_path / name
+    first = ros.start('trainer', {'output': bag})
+    ros.wait_until(bag.exists)
+    first.stop(signal.SIGKILL)
+    ros.processes.remove(first)
+    second = ros.start('trainer', {'output': bag})
+    ros.wait_until(free_name(bag).exists)
+    assert second.stop() == 0
+    assert summary(tmp_path / name.replace('run', 'run_2')).complete
+
+
+def _contents(bag: Path) -> dict[Path, bytes]:
+    return {file: file.read_bytes() for file in (bag.iterdir() if bag.is_dir() else [bag])}
+
+
+@pytest.mark.parametrize(('wanted', 'free'), [
+    ('run', 'run_4'), ('run.mcap', 'run_2.mcap'), ('run_1.mcap', 'run_1_2.mcap'), ('new', 'new'),
+    ('v1.0', 'v1.0_2')])
+def test_free_name(tmp_path: Path, wanted: str, free: str) -> None:
+    for name in ('run', 'run_2', 'v1.0'):
+        (tmp_path / name).mkdir()
+    (tmp_path / 'run_3').symlink_to('nowhere')
+    for name in ('run.mcap', 'run_1.mcap'):
+        (tmp_path / name).touch()
+    assert free_name(tmp_path / wanted) == tmp_path / free
+
+
+# Split.
+
+
+@pytest.mark.parametrize('limit', [{'max_bag_duration': 0.3}, {'max_bag_size': 0.01}])
+def test_split_bag_reads_as_one(ros: Workbench, tmp_path: Path, limit: dict[str, float]) -> None:
+    bag = tmp_path / 'run'
+    trainer = ros.start('trainer', {'output': bag, 'topics': [TOPIC], **limit})
+    publisher = ros.speak(Temperature, topics.TEMPERATURE, to='trainer')
+    sent: list[int] = []
+
+    def tick() -> None:
+        publisher.publish(temperature(float(len(sent))))
+        sent.append(len(sent))
+
+    timer = ros.node.create_timer(0.005, tick)
+    ros.wait_until(lambda: len(list(bag.glob('*.mcap'))) >= 3)
+    timer.cancel()
+    assert publisher.wait_for_all_acked(Duration(seconds=TIMEOUT))
+    assert trainer.stop() == 0
+    assert values(bag) == sent
+    assert summary(bag).complete
+    files = sorted(bag.glob('*.mcap'))
+    information = yaml.safe_load((bag / 'metadata.yaml').read_text())[
+        'rosbag2_bagfile_information']
+    assert information['relative_file_paths'] == [file.name for file in files]
+    assert sum(file['message_count'] for file in information['files']) == len(sent)
+    with AnyReader([bag]) as reader:
+        assert [reader.deserialize(data, connection.msgtype).temperature
+                for connection, _, data in reader.messages()] == sent
+    heard = 0
+    for file in files:
+        with file.open('rb') as stream:
+            heard += sum(1 for _ in make_reader(stream, validate_crcs=True).iter_messages())
+    assert heard == len(sent)
+
+
+def test_single_file_is_not_split() -> None:
+    for limit in ({'max_bag_size': 1.0}, {'max_bag_duration': 60.0}):
+        assert TABLE.check(TrainerParameters(output='run.mcap', **limit)) == (
+            "output = 'run.mcap' is one file, which max_bag_size and max_bag_duration cannot "
+            'split: give the name of a folder, without .mcap')
+        assert not TABLE.check(TrainerParameters(output='run', **limit))
+        assert not TABLE.check(TrainerParameters(output='', **limit))
+
+
+# Full disk.
+
+
+def test_does_not_start_on_a_disk_with_too_little_room(ros: Workbench, tmp_path: Path) -> None:
+    bag = tmp_path / 'deep' / 'run'
+    trainer = ros.start('trainer', {'output': bag, 'min_free_disk': 1e9})
+    assert ros.wait_for_end(trainer) == 1
+    (line,) = trainer.output().splitlines()
+    assert re.fullmatch(
+        rf'trainer: cannot start: cannot record: \d+ MB are free on the disk of {tmp_path}, below '
+        r'min_free_disk = 1000000000 MB: free some space, or choose another disk', line)
+    assert not bag.parent.exists()
+
+
+def test_too_little_room_stops_the_recording_but_not_the_node(ros: Workbench, tmp_path: Path
+                                                              ) -> None:
+    bag = tmp_path / 'run'
+    trainer = ros.start('trainer', {'output': bag})
+    publisher = ros.speak(Temperature, topics.TEMPERATURE, to='trainer')
+    for k in range(900):
+        publisher.publish(temperature(float(k)))
+    assert publisher.wait_for_all_acked(Duration(seconds=TIMEOUT))
+    (result,) = ros.set_parameters('trainer', min_free_disk=1e9)
+    assert result.successful
+    status = ros.wait_for_status('trainer: recording', lambda s: s.level == DiagnosticStatus.ERROR)
+    assert status.message.startswith(f'recording to {bag} stopped: ')
+    assert 'below min_free_disk = 1000000000 MB; free some space and call' in status.message
+    assert values(bag) == list(range(900))
+    assert summary(bag).complete
+
+    refused = ros.set_bool('trainer/record', True)
+    assert not refused.success
+    assert 'below min_free_disk = 1000000000 MB: free some space' in refused.message
+    ros.set_parameters('trainer', min_free_disk=0.0)
+    again = ros.set_bool('trainer/record', True)
+    assert again.success
+    assert str(tmp_path / 'run_2') in again.message
+    ros.wait_for_status('trainer: recording', lambda s: s.level == DiagnosticStatus.OK)
+    assert trainer.stop() == 0
+
+
+@pytest.mark.parametrize(('size', 'limit', 'complete'), [(6, 4.0, True), (3, 0.0, False)])
+def test_small_disk_runs_full(ros: Workbench, tmp_path: Path, size: int, limit: float,
+                              complete: bool) -> None:
+    (disk := tmp_path / 'disk').mkdir()
+    private = ('unshare', '--user', '--map-root-user', '--mount', 'sh', '-c',
+               f'mount -t tmpfs -o size={size}m tmpfs {disk} && exec "$@"', 'sh')
+    if subprocess.run([*private, 'true'], capture_output=True, check=False).returncode:
+        pytest.skip('only some machines lend a disk of its own to a process')
+    trainer = ros.start(
+        'trainer', {'output': disk / 'run.mcap', 'topics': ['notes'], 'min_free_disk': limit},
+        command=(*private, sys.executable, '-m', 'koopman_ros.nodes.trainer'))
+    notes = ros.speak(String, 'notes', to='trainer')
+    page = 'x' * 100_000
+
+    ros.node.create_timer(0.02, lambda: notes.publish(String(data=page)))
+    status = ros.wait_for_status('trainer: recording', lambda s: s.level == DiagnosticStatus.ERROR)
+    assert status.message.startswith(f'recording to {disk}/run.mcap stopped: ')
+    # the disk as the trainer sees it
+    bag = Path(f'/proc/{trainer.process.pid}/root') / (disk / 'run.mcap').relative_to('/')
+    found = [m.message.data == page for m in read_messages(bag, recover=True)]
+    assert len(found) > 15
+    assert all(found)
+    assert summary(bag).complete == complete
+    assert summary(bag).message_count == len(found)
+    assert trainer.stop() == 0
+    assert 'Traceback' not in trainer.output()
+
+
+def test_bag_that_vanished_is_no_success(ros: Workbench, tmp_path: Path) -> None:
+    bag = tmp_path / 'run'
+    ros.start('trainer', {'output': bag})
+    ros.wait_until((bag / 'run_0.mcap').exists)
+    shutil.rmtree(bag)
+    response = ros.set_bool('trainer/record', False)
+    assert not response.success
+    assert response.message.startswith(f'{bag} is not complete: ')
+    status = ros.wait_for_status('trainer: recording', lambda s: s.level == DiagnosticStatus.ERROR)
+    assert status.message == response.message
+
+
+# Fast.
+
+
+def test_loses_nothing_at_1_khz(ros: Workbench, tmp_path: Path) -> None:
+    bag = tmp_path / 'run'
+    trainer = ros.start('trainer', {'output': bag, 'max_bag_duration': 1.0})
+    publisher = ros.start('publisher', command=(
+        sys.executable, str(PUBLISHER), '--rate', '1000', '--count', '3000'))
+    assert ros.wait_for_end(publisher) == 0
+    sent = json.loads(publisher.output().splitlines()[-1])
+    assert sent['sent'] == 3000
+    assert trainer.stop() == 0
+    messages = list(read_messages(bag, [TOPIC]))
+    assert [m.message.header.stamp.nanosec for m in messages] == list(range(3000))
+    logged = [m.log_time_ns for m in messages]
+    assert logged == sorted(logged)
+    # the times are those of receipt, not those at which the recorder took a batch
+    assert len({at // 1_000_000 for at in logged}) > 1500
