@@ -16,13 +16,11 @@
 
 from __future__ import annotations
 
-import math
 import sys
 import time
 
 from koopman_ros.control import Controller, Mode, Report, State
-from koopman_ros.lifting import LiftedModel, load, ModelFileError
-from koopman_ros.nodes import topics
+from koopman_ros.nodes import topics, translation
 from koopman_ros.nodes.controller_parameters import ControllerParameters, TABLE
 from koopman_ros.nodes.diagnostics import DiagnosticsPublisher, Level, Status
 from koopman_ros.nodes.messages import (
@@ -32,9 +30,11 @@ from koopman_ros.nodes.messages import (
     to_celsius,
     to_kelvin,
 )
+from koopman_ros.nodes.model_loading import load_suitable, Situation
+from koopman_ros.nodes.model_reload import ModelReload
 from koopman_ros.nodes.process import LoopNode, run
-from koopman_ros.nodes.shipped import model_path
 import numpy as np
+from rclpy.callback_groups import MutuallyExclusiveCallbackGroup
 from rclpy.qos_overriding_options import QoSOverridingOptions
 from sensor_msgs.msg import Temperature
 from std_srvs.srv import SetBool, Trigger
@@ -47,8 +47,9 @@ class ControllerNode(LoopNode):
         super().__init__('controller', automatically_declare_parameters_from_overrides=True)
         parameters = TABLE.declare(self)
         self._settings = parameters
-        self._model_name = parameters.model
-        self._controller = Controller(_load_suitable(parameters.model), parameters.settings())
+        self._models = ModelReload(
+            self, load_suitable(parameters.model), self._situation, self._on_model)
+        self._controller = Controller(self._models.in_force.model, parameters.settings())
         self._state = State()
         self._report = Report(Mode.AUTOMATIC)
         self._refused = ''
@@ -62,7 +63,7 @@ class ControllerNode(LoopNode):
         self._active = self.create_publisher(
             Temperature, topics.ACTIVE_SETPOINT, topics.LATCHED_QOS)
         self._published_setpoint: float | None = None
-        self._diagnostics = DiagnosticsPublisher(self, 'control', parameters.model, self._status)
+        self._diagnostics = DiagnosticsPublisher(self, 'control', 'controller', self._status)
         # volatile, so that `ros2 topic pub` matches
         self.create_subscription(
             Temperature, topics.SETPOINT, self._on_setpoint, topics.LOOP_QOS)
@@ -73,27 +74,21 @@ class ControllerNode(LoopNode):
             Temperature, topics.TEMPERATURE, self._on_temperature, topics.LOOP_QOS,
             qos_overriding_options=QoSOverridingOptions.with_default_policies())
         self.create_service(SetBool, '~/set_automatic', self._on_set_automatic)
-        self.create_service(Trigger, '~/reload_model', self._on_reload_model)
-        TABLE.follow(self, parameters, self._on_parameters)
-        self.get_logger().info(self._about_model())
-
-    def _about_model(self) -> str:
-        states = self._controller.model.states
-        return (f'model {self._model_name}: n_z = {self._controller.model.n_z}, trained for '
-                f'{to_celsius(states.lower[0]):.2f} to {to_celsius(states.upper[0]):.2f} degC')
+        # a group of its own, or measurements would wait until a model is read
+        self.create_service(Trigger, '~/reload_model', self._models.on_reload,
+                            callback_group=MutuallyExclusiveCallbackGroup())
+        TABLE.follow(self, parameters, self._on_parameters, self._models.accept)
+        self.get_logger().info(self._models.in_force.about)
 
     def _on_temperature(self, message: Temperature) -> None:
         self._measurements += 1
         self._temperature = message.temperature
         self._last_heard = time.monotonic()
-        # below absolute zero there is nothing to measure
-        kelvin = to_kelvin(message.temperature)
-        self._state, command, self._report = self._controller.step(
-            self._state, np.array([kelvin if kelvin >= 0.0 else math.nan]),
-            stamp_nanoseconds(message.header.stamp))
+        self._state, command, self._report = translation.answer(
+            self._controller, self._state, message)
         self._late += self._report.late
         self._commands.publish(temperature_message(
-            float(command[0]), message.header.stamp, message.header.frame_id))
+            command, message.header.stamp, message.header.frame_id))
         active = self._report.active_setpoint
         if active is not None and active[0] != self._published_setpoint:
             self._published_setpoint = float(active[0])
@@ -106,8 +101,8 @@ class ControllerNode(LoopNode):
 
     def _on_setpoint(self, message: Temperature) -> None:
         stamp_ns = stamp_nanoseconds(message.header.stamp)
-        self._state, self._refused = self._controller.request_setpoint(
-            self._state, np.array([to_kelvin(message.temperature)]), stamp_ns, _in_celsius)
+        self._state, self._refused = translation.ask_setpoint(
+            self._controller, self._state, message)
         if self._refused:
             self.get_logger().warning(self._refused, throttle_duration_sec=1.0)
         else:
@@ -119,8 +114,8 @@ class ControllerNode(LoopNode):
         self._diagnostics.publish_if_changed()
 
     def _on_manual_coolant_setpoint(self, message: Temperature) -> None:
-        self._state, self._refused = self._controller.request_manual_input(
-            self._state, np.array([to_kelvin(message.temperature)]))
+        self._state, self._refused = translation.ask_manual_coolant(
+            self._controller, self._state, message)
         if self._refused:
             self.get_logger().warning(self._refused, throttle_duration_sec=1.0)
         self._diagnostics.publish_if_changed()
@@ -135,35 +130,18 @@ class ControllerNode(LoopNode):
         self._diagnostics.publish_if_changed()
         return response
 
-    def _on_reload_model(self, _: Trigger.Request, response: Trigger.Response
-                         ) -> Trigger.Response:
-        try:
-            model = _load_suitable(self._model_name)
-            controller = Controller(model, self._controller.settings)
-            self._check_setpoints(controller)
-        except (ModelFileError, FileNotFoundError) as error:
-            response.success, response.message = False, f'the old model is kept: {error}'
-            self.get_logger().error(response.message)
-            return response
-        self._controller = controller
-        response.success, response.message = True, self._about_model()
-        self.get_logger().info(response.message)
-        self._diagnostics.publish_if_changed()
-        return response
-
-    def _check_setpoints(self, controller: Controller) -> None:
-        """Refuse a model that cannot track what the operator asked for."""
-        setpoint = self._state.setpoint
-        asked = [value for _, value in setpoint.scheduled]
-        asked += [value for value in (setpoint.requested, setpoint.active) if value is not None]
-        for value in asked:
-            reason = controller.request_setpoint(self._state, value, 0, _in_celsius)[1]
-            if reason:
-                raise ModelFileError(reason)
+    def _situation(self) -> Situation:
+        return Situation(self._settings.settings(), self._state,
+                         np.array([to_kelvin(self._temperature)]))
 
     def _on_parameters(self, parameters: ControllerParameters) -> None:
         self._settings = parameters
-        self._controller = Controller(self._controller.model, parameters.settings())
+        self._models.take_over()
+        self._on_model()
+
+    def _on_model(self) -> None:
+        self._controller = Controller(self._models.in_force.model, self._settings.settings())
+        self._diagnostics.publish_if_changed()
 
     def _status(self) -> Status:
         report, model = self._report, self._controller.model
@@ -184,6 +162,8 @@ class ControllerNode(LoopNode):
                 'measurements with their time')
         elif self._refused:
             level, message = Level.WARN, f'request refused: {self._refused}'
+        elif self._models.refused:
+            level, message = Level.WARN, self._models.refused
         elif report.outside > 0.0:
             level, message = Level.WARN, (
                 f'temperature is outside the trained range '
@@ -200,7 +180,7 @@ class ControllerNode(LoopNode):
         return Status(level, message, {
             'mode': mode.value,
             'law': 'none' if report.law is None else report.law.value,
-            'model': self._model_name,
+            **self._models.figures(),
             'temperature [degC]': float(self._temperature),
             'set-point [degC]': np.nan if active is None else to_celsius(float(active[0])),
             'coolant [degC]': np.nan if command is None else to_celsius(float(command[0])),
@@ -212,21 +192,6 @@ class ControllerNode(LoopNode):
             'late measurements': self._late,
             'since last measurement [s]': silent,
         })
-
-
-def _in_celsius(kelvin: float, unit: str) -> str:
-    return f'{to_celsius(kelvin):.2f} degC'
-
-
-def _load_suitable(name: str) -> LiftedModel:
-    """Load a model and refuse one that is not for one temperature and one coolant temperature."""
-    path = model_path(name)
-    model = load(path)
-    if (model.states.units, model.inputs.units) != (('K',), ('K',)):
-        raise ModelFileError(
-            f'{path} has states in {model.states.units} and inputs in {model.inputs.units}, the '
-            "controller needs one of each in ('K',): choose a model of the one-state reactor")
-    return model
 
 
 def main(args: list[str] | None = None) -> int:

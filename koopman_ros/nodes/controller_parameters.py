@@ -31,8 +31,7 @@ class ControllerParameters:
     """Snapshot of the controller's parameters, temperatures in degrees Celsius."""
 
     model: str = parameter(
-        'reactor_nz4', 'name of a shipped model, or path of a .safetensors model file',
-        read_only=True)
+        'reactor_nz4', 'name of a shipped model, or path of a .safetensors model file')
     temperature_weight: float = parameter(
         1.0, 'cost of a squared temperature error', unit='1/K^2', minimum=0.0, maximum=1e6,
         open_minimum=True)

@@ -81,7 +81,7 @@ class DiagnosticsPublisher:
         message.status.append(DiagnosticStatus(
             level=status.level.value, name=self._name, message=status.message,
             hardware_id=self._hardware_id,
-            values=[KeyValue(key=key, value=_text(value))
+            values=[KeyValue(key=key, value=as_text(value))
                     for key, value in status.values.items()]))
         self._publisher.publish(message)
 
@@ -92,5 +92,6 @@ class DiagnosticsPublisher:
             self.publish()
 
 
-def _text(value: object) -> str:
+def as_text(value: object) -> str:
+    """Write a figure as it stands in a status."""
     return f'{value:.9g}' if isinstance(value, float) else str(value)

@@ -33,6 +33,11 @@ def to_celsius(kelvin: float) -> float:
     return kelvin - ZERO_CELSIUS
 
 
+def in_celsius(kelvin: float, unit: str = 'K') -> str:
+    """Write a temperature given in K for the operator."""
+    return f'{to_celsius(kelvin):.2f} degC'
+
+
 def stamp_nanoseconds(stamp: Time) -> int:
     """Return a stamp as integer nanoseconds."""
     return int(stamp.sec) * NANOSECONDS + int(stamp.nanosec)

@@ -181,20 +181,24 @@ class ParameterTable(Generic[T]):
             hint = f': did you mean {near[0]}?' if near else ''
             raise ConfigurationError(f'there is no parameter {name!r}{hint}')
 
-    def follow(self, node: Node, snapshot: T, apply: Callable[[T], None]) -> None:
+    def follow(self, node: Node, snapshot: T, apply: Callable[[T], None],
+               accept: Callable[[T, set[str]], str] = lambda *_: '') -> None:
         """
         Keep a snapshot in step with the node's parameters from now on.
 
         :param node: the node, all parameters declared.
         :param snapshot: the present values.
         :param apply: called with each new snapshot, after the change took effect.
+        :param accept: called before with a snapshot that fits and the names of what was set;
+            returns why it cannot be, or an empty string.
         """
         current = snapshot
 
         def validate(changes: list[Parameter]) -> SetParametersResult:
             # rclpy has refused values of another type
             known = [change for change in changes if change.name in self.rows]
-            reason = self.check(self._merged(current, known))
+            merged = self._merged(current, known)
+            reason = self.check(merged) or accept(merged, {change.name for change in known})
             if reason:
                 node.get_logger().warning(f'parameter change refused: {reason}')
             return SetParametersResult(successful=not reason, reason=reason)
@@ -250,5 +254,5 @@ def _as_yaml(value: Any) -> str:
             text = f'{mantissa}e{int(exponent):+03d}'
         return text
     if isinstance(value, tuple):
-        return '[' + ', '.join(value) + ']'
+        return '[' + ', '.join(item or "''" for item in value) + ']'
     return repr(value) if isinstance(value, int) else f"'{value}'"

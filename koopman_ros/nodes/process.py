@@ -38,10 +38,16 @@ _TAKE_DOWN_PATIENCE = 5.0  # s; taking down a participant needs some ten millise
 
 
 class LoopNode(Node):
-    """A node with work of its own to complete before the middleware is taken down."""
+    """
+    A node with work of its own to complete before the middleware is taken down.
+
+    :ivar exit_code: ends the process when a node whose work is done sets it.
+    """
+
+    exit_code: int | None = None
 
     def complete(self) -> None:
-        """Complete that work; by default there is none. Nothing is published any more."""
+        """Complete that work; by default there is none. What is published here goes out last."""
 
 
 def run(name: str, create: Callable[[], LoopNode], args: list[str] | None = None) -> int:
@@ -51,7 +57,7 @@ def run(name: str, create: Callable[[], LoopNode], args: list[str] | None = None
     :param name: word that starts an error line.
     :param create: builds the node.
     :param args: command line, or None for the process's own.
-    :return: exit code, 0 after a signal and 1 when the node could not start.
+    :return: exit code, 0 after a signal, 1 when the node could not start, or the node's own.
     """
     # a list, because a second signal may come while the first is handled, where a lock would hang
     arrived: list[int] = []
@@ -67,7 +73,7 @@ def run(name: str, create: Callable[[], LoopNode], args: list[str] | None = None
             return 1
         executor = SingleThreadedExecutor()
         executor.add_node(node)
-        while not arrived:
+        while not arrived and node.exit_code is None:
             # Python handles a signal when the wait returns, so the wait is bounded
             executor.spin_once(timeout_sec=_LONGEST_WAIT)
     finally:
@@ -76,7 +82,32 @@ def run(name: str, create: Callable[[], LoopNode], args: list[str] | None = None
                 node.complete()
         finally:
             _take_down(name, node)
-    return 0
+    return node.exit_code or 0
+
+
+def run_task(name: str, prepare: Callable[[], Callable[[], int]],
+             args: list[str] | None = None) -> int:
+    """
+    Run what needs ROS for its parameters and names alone; an interrupt ends it.
+
+    :param name: word that starts an error line.
+    :param prepare: reads them with a node of its own, and returns the task, which runs without
+        the middleware and returns the exit code.
+    :param args: command line, or None for the process's own.
+    :return: exit code; 1 when it could not start or complete.
+    """
+    try:
+        try:
+            _init(args)
+            task = prepare()
+        finally:
+            rclpy.try_shutdown()
+        return task()
+    except _START_ERRORS as error:
+        print(f'{name}: {_one_line(error)}', file=sys.stderr)
+        return 1
+    except KeyboardInterrupt:
+        return 128 + signal.SIGINT
 
 
 def _take_down(name: str, node: LoopNode | None) -> None:

@@ -1,0 +1,187 @@
+# Copyright 2026 The koopman_ros Authors
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""Another model in a running controller: read and tried aside, swapped between measurements."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Collection
+import contextlib
+from dataclasses import replace
+import threading
+
+from koopman_ros.lifting import ModelFileError
+from koopman_ros.nodes.controller_parameters import ControllerParameters
+from koopman_ros.nodes.model_loading import (
+    load_suitable,
+    LoadedModel,
+    refuse_setpoints,
+    refuse_without_law,
+    Situation,
+)
+from rclpy.node import Node
+from rclpy.task import Future
+from std_srvs.srv import Trigger
+
+_SHORT_WAIT = 0.2  # s that the loop may stand still for a parameter
+_LONG_WAIT = 10.0  # s that the service waits for a slow disk
+_MAX_READING = 8  # files that a dead disk may keep open at once
+
+
+class _Trial:
+    """
+    A model file on its way, in a thread of its own that does not keep the process.
+
+    :param node: whose executor is woken when the file was read and tried.
+    :param name: of the model.
+    :param situation: that of now.
+    """
+
+    def __init__(self, node: Node, name: str, situation: Situation) -> None:
+        self.outcome = Future()
+        self.thread = threading.Thread(target=self._run, args=(name, situation), daemon=True)
+        self._node = node
+
+    def _run(self, name: str, situation: Situation) -> None:
+        try:
+            loaded = load_suitable(name)
+            refuse_setpoints(loaded.model, situation)
+            refuse_without_law(loaded.model, situation)
+        except (ModelFileError, FileNotFoundError) as error:
+            self.end(str(error))
+        except Exception as error:
+            # whatever a file may hold: the loop goes on with what it has
+            self.end(f'{name} cannot be used ({type(error).__name__}: {error}): train the model '
+                     'again')
+        else:
+            self.end(loaded)
+
+    def end(self, outcome: LoadedModel | str) -> None:
+        """Say what became of it: the model, or why there is none."""
+        self.outcome.set_result(outcome)
+        executor = self._node.executor
+        # in shutdown the middleware may be gone already
+        with contextlib.suppress(RuntimeError):
+            if executor is not None:
+                executor.wake()
+
+
+class ModelReload:
+    """
+    Swap the model of a running controller, or keep the old one and say why.
+
+    Files are read and tried in a thread, so that no measurement waits for a disk. The service
+    answers when that is done, up to ten seconds later. A parameter must be answered at once, for
+    only then `ros2 param set` can say why it was refused: the loop waits for the thread a fifth
+    of a second, where a local file takes milliseconds. Whatever is not read by then is refused,
+    and the service is there for it.
+
+    :param node: the controller; its service calls :meth:`on_reload`.
+    :param in_force: the model it starts with.
+    :param situation: returns the present situation.
+    :param changed: called in the executor, so between two measurements, when another model is in
+        force or one was refused.
+    """
+
+    def __init__(self, node: Node, in_force: LoadedModel, situation: Callable[[], Situation],
+                 changed: Callable[[], None]) -> None:
+        self.in_force = in_force
+        self.reloads = 0
+        self.refused = ''
+        self._node = node
+        self._situation = situation
+        self._changed = changed
+        self._accepted: LoadedModel | None = None
+        self._reading: list[threading.Thread] = []
+
+    async def on_reload(self, _: Trigger.Request, response: Trigger.Response
+                        ) -> Trigger.Response:
+        """Read the file of the model in force again."""
+        name = self.in_force.name
+        trial = self._start(name, self._situation())
+        patience = threading.Timer(_LONG_WAIT, trial.end, [
+            f'{name} was not read within {_LONG_WAIT:g} s: check its disk'])
+        patience.daemon = True
+        patience.start()
+        outcome: LoadedModel | str = await trial.outcome
+        patience.cancel()
+        if name != self.in_force.name:
+            outcome = f'the model was changed to {self.in_force.name} while {name} was read'
+        if isinstance(outcome, LoadedModel):
+            try:
+                # the operator may have asked for another one meanwhile
+                refuse_setpoints(outcome.model, self._situation())
+            except ModelFileError as error:
+                outcome = str(error)
+        if isinstance(outcome, LoadedModel):
+            self._swap(outcome)
+            response.success, response.message = True, outcome.about
+        else:
+            response.success, response.message = False, self._refuse(outcome)
+            self._node.get_logger().error(response.message)
+        return response
+
+    def accept(self, parameters: ControllerParameters, changes: Collection[str]) -> str:
+        """Say why a change of parameters brings no usable model, or keep it for taking over."""
+        self._accepted = None
+        if 'model' not in changes:
+            return ''
+        situation = replace(self._situation(), settings=parameters.settings())
+        trial = self._start(parameters.model, situation)
+        if not trial.outcome.done():
+            trial.thread.join(_SHORT_WAIT)
+        outcome = trial.outcome.result() if trial.outcome.done() else (
+            f'{parameters.model} is still being read after {_SHORT_WAIT:g} s: try again, or copy '
+            'it to a local disk')
+        if isinstance(outcome, LoadedModel):
+            self._accepted = outcome
+            return ''
+        return self._refuse(outcome)
+
+    def take_over(self) -> None:
+        """Put the model that was accepted with the last change of parameters in force."""
+        if self._accepted is not None:
+            self._swap(self._accepted)
+            self._accepted = None
+
+    def figures(self) -> dict[str, object]:
+        """Return what tells an operator which model is in force."""
+        return {
+            'model': self.in_force.name,
+            'model file time': self.in_force.file_time,
+            'model training data': self.in_force.model.provenance.data_digest[:12] or 'none',
+            'model reloads': self.reloads,
+            'model refused': self.refused or 'none',
+        }
+
+    def _start(self, name: str, situation: Situation) -> _Trial:
+        trial = _Trial(self._node, name, situation)
+        self._reading = [thread for thread in self._reading if thread.is_alive()]
+        if len(self._reading) < _MAX_READING:
+            self._reading.append(trial.thread)
+            trial.thread.start()
+        else:
+            trial.end(f'{_MAX_READING} model files are still being read: check their disk')
+        return trial
+
+    def _swap(self, loaded: LoadedModel) -> None:
+        self.in_force, self.refused = loaded, ''
+        self.reloads += 1
+        self._node.get_logger().info(loaded.about)
+        self._changed()
+
+    def _refuse(self, reason: str) -> str:
+        self.refused = f'the old model is kept: {reason}'
+        self._changed()
+        return self.refused

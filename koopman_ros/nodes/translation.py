@@ -1,0 +1,64 @@
+# Copyright 2026 The koopman_ros Authors
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""
+Messages into control steps: the same for the running controller and for a bag that is replayed.
+
+A message is anything with the fields of sensor_msgs/Temperature: ROS's own, or one decoded from a
+bag.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+from koopman_ros.control import Controller, Report, State
+from koopman_ros.nodes.messages import in_celsius, stamp_nanoseconds, to_celsius, to_kelvin
+import numpy as np
+
+
+def answer(controller: Controller, state: State, message: Any) -> tuple[State, float, Report]:
+    """
+    Answer a measurement.
+
+    :param controller: model and settings.
+    :param state: as returned by the step before.
+    :param message: temperature in degrees Celsius with its stamp.
+    :return: the new state, the coolant temperature commanded in K, and the report.
+    """
+    kelvin = to_kelvin(message.temperature)
+    # below absolute zero there is nothing to measure
+    state, command, report = controller.step(
+        state, np.array([kelvin if kelvin >= 0.0 else math.nan]),
+        stamp_nanoseconds(message.header.stamp))
+    return state, float(command[0]), report
+
+
+def ask_setpoint(controller: Controller, state: State, message: Any) -> tuple[State, str]:
+    """Ask for a set-point; return the new state and an empty string, or why it is refused."""
+    return controller.request_setpoint(
+        state, np.array([to_kelvin(message.temperature)]),
+        stamp_nanoseconds(message.header.stamp), in_celsius)
+
+
+def ask_manual_coolant(controller: Controller, state: State, message: Any) -> tuple[State, str]:
+    """Ask for a coolant temperature in manual mode; return as for a set-point."""
+    return controller.request_manual_input(state, np.array([to_kelvin(message.temperature)]))
+
+
+def tracked_celsius(report: Report) -> float:
+    """Return the set-point that was tracked in degrees Celsius; NaN where there was none."""
+    active = report.active_setpoint
+    return math.nan if active is None else to_celsius(float(active[0]))

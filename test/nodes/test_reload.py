@@ -1,0 +1,360 @@
+# Copyright 2026 The koopman_ros Authors
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+
+"""Another model in the running controller: nothing unanswered, no jump, reasons in words."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, field, replace
+import itertools
+import math
+import os
+from pathlib import Path
+import sys
+import time
+
+from diagnostic_msgs.msg import DiagnosticStatus
+from koopman_ros.control import Controller, State
+from koopman_ros.lifting import LiftedModel, load, save
+from koopman_ros.nodes import topics
+from koopman_ros.nodes.controller_parameters import ControllerParameters
+from koopman_ros.nodes.messages import stamp_nanoseconds, to_celsius, to_kelvin
+from koopman_ros.nodes.shipped import model_path
+import numpy as np
+import pytest
+from rcl_interfaces.srv import SetParameters
+from rclpy.client import Client
+from rclpy.parameter import Parameter
+from rclpy.task import Future
+from sensor_msgs.msg import Temperature
+from std_srvs.srv import Trigger
+from workbench import seconds, temperature, value, Workbench
+
+STATUS = 'controller: control'
+STEADY = 51.8  # degC, near the plant's steady state
+NAMES = ('reactor_nz3', 'reactor_nz4', 'reactor_linear')
+PERIOD = 0.1  # s between the stamps of measurements
+SETPOINTS = [(20.0 * k, 45.0 + 6.0 * math.sin(k)) for k in range(1, 150)]
+
+
+def shipped(name: str) -> LiftedModel:
+    return load(model_path(name))
+
+
+def put(content: bytes, path: Path) -> None:
+    """Replace a file at once, as a program that saves a model does."""
+    new = path.with_suffix('.new')
+    new.write_bytes(content)
+    os.replace(new, path)
+
+
+class Operator:
+    """
+    Changes the model of a running controller, time and again.
+
+    :param ros: where the controller runs.
+    """
+
+    def __init__(self, ros: Workbench) -> None:
+        self._ros = ros
+        self._reload = self._client(Trigger, 'controller/reload_model')
+        self._set = self._client(SetParameters, 'controller/set_parameters')
+        ros.meet('controller')
+
+    def _client(self, kind: type, service: str) -> Client:
+        client = self._ros.node.create_client(kind, service)
+        self._ros.wait_until(client.service_is_ready)
+        return client
+
+    def ask_to_reload(self) -> Future:
+        """Ask the controller to read its model again."""
+        return self._reload.call_async(Trigger.Request())
+
+    def reload(self) -> tuple[bool, str]:
+        """Let the controller read its model again; return what it answers."""
+        future = self.ask_to_reload()
+        self._ros.wait_until(future.done)
+        return future.result().success, future.result().message
+
+    def set_model(self, name: str | Path) -> tuple[bool, str]:
+        """Set the parameter; a busy machine may need more than the moment that it is given."""
+        while True:
+            future = self._set.call_async(SetParameters.Request(
+                parameters=[Parameter('model', value=str(name)).to_parameter_msg()]))
+            self._ros.wait_until(future.done)
+            (result,) = future.result().results
+            if 'still being read' not in result.reason:
+                return result.successful, result.reason
+
+
+@dataclass
+class Thermometer:
+    """
+    Measures at a rate, and notes what is answered.
+
+    :param ros: where the controller runs.
+    """
+
+    ros: Workbench
+    sent: list[Temperature] = field(default_factory=list)
+    commands: list[Temperature] = field(default_factory=list)
+    times: dict[int, float] = field(default_factory=dict)
+    latencies: list[float] = field(default_factory=list)
+
+    def __post_init__(self) -> None:
+        self.ros.node.create_subscription(
+            Temperature, topics.COOLANT_SETPOINT, self._on_command, topics.LOOP_QOS)
+        self._publisher = self.ros.speak(Temperature, topics.TEMPERATURE, to='controller')
+
+    def measure_at(self, hertz: float) -> None:
+        """Measure from now on."""
+        self._timer = self.ros.node.create_timer(1.0 / hertz, self.measure)
+
+    def stop(self) -> None:
+        """Measure no more, and wait until all is answered."""
+        self._timer.cancel()
+        self.ros.wait_until(lambda: len(self.commands) >= len(self.sent))
+
+    def measure(self) -> None:
+        """Measure once: a reactor that swings."""
+        k = len(self.sent) + 1
+        message = temperature(46.0 + 5.0 * math.sin(0.13 * k), PERIOD * k)
+        self.sent.append(message)
+        self.times[stamp_nanoseconds(message.header.stamp)] = time.monotonic()
+        self._publisher.publish(message)
+
+    def _on_command(self, message: Temperature) -> None:
+        self.commands.append(message)
+        self.latencies.append(
+            time.monotonic() - self.times[stamp_nanoseconds(message.header.stamp)])
+
+
+def test_a_hundred_reloads_under_load_leave_no_trace(ros: Workbench, tmp_path: Path) -> None:
+    """Each command is the very one that one of the models gives in the state that was left."""
+    file = tmp_path / 'model.safetensors'
+    contents = {name: model_path(name).read_bytes() for name in NAMES}
+    whole = contents['reactor_nz4']
+    bad = itertools.cycle((b'', b'garbage' * 1000, whole[:len(whole) // 2], whole[:-1]))
+    put(contents['reactor_nz4'], file)
+    ros.start('controller', {'model': file})
+    operator, thermometer = Operator(ros), Thermometer(ros)
+    setpoint = ros.speak(Temperature, topics.SETPOINT, to='controller')
+    for at, celsius in SETPOINTS:
+        setpoint.publish(temperature(celsius, at))
+    ros.meet('controller')
+
+    thermometer.measure_at(400.0)
+    for k, name in zip(range(100), itertools.cycle(NAMES)):
+        if k % 10 == 0:
+            put(next(bad), file)
+            for done, reason in (operator.reload(), operator.set_model(file)):
+                assert not done
+                assert reason.startswith(f'the old model is kept: {file}')
+        put(contents[name], file)
+        done, reason = operator.reload() if k % 2 else operator.set_model(file)
+        assert done, reason
+    status = ros.wait_for_status(STATUS, lambda s: value(s, 'model reloads') == '100')
+    thermometer.stop()
+
+    assert [message.header.stamp for message in thermometer.commands] == [
+        message.header.stamp for message in thermometer.sent]
+    replay(thermometer)
+    limit = ControllerParameters().coolant_rate_limit / 60.0 * PERIOD
+    commands = [message.temperature for message in thermometer.commands]
+    jumps = np.abs(np.diff(commands))
+    assert np.max(jumps) <= limit * (1.0 + 1e-9)
+    assert np.max(jumps) > 0.5 * limit
+    assert status.level != DiagnosticStatus.ERROR
+
+
+def replay(thermometer: Thermometer) -> None:
+    """Follow the commands from state to state, whichever model answered."""
+    settings = ControllerParameters().settings()
+    controllers = {name: Controller(shipped(name), settings) for name in NAMES}
+    state, used = State(), set()
+    for at, celsius in SETPOINTS:
+        state, refused = controllers['reactor_nz4'].request_setpoint(
+            state, np.array([to_kelvin(celsius)]), round(at * 1e9))
+        assert not refused
+    for measured, command in zip(thermometer.sent, thermometer.commands, strict=True):
+        answers = {name: controller.step(
+            state, np.array([to_kelvin(measured.temperature)]),
+            stamp_nanoseconds(measured.header.stamp)) for name, controller in controllers.items()}
+        agreeing = [name for name, (_, u, _) in answers.items()
+                    if to_celsius(float(u[0])) == command.temperature]
+        assert agreeing, (seconds(measured), command.temperature)
+        used.update(agreeing if len(agreeing) == 1 else ())
+        state = answers[agreeing[0]][0]
+    assert used == set(controllers)
+
+
+# Models that are refused.
+
+
+def edited(**changes: object) -> LiftedModel:
+    return replace(shipped('reactor_nz4'), **changes)
+
+
+def with_states(**changes: object) -> LiftedModel:
+    return edited(states=replace(shipped('reactor_nz4').states, **changes))
+
+
+BAD_MODELS = {
+    'other unit': (lambda: with_states(units=('degC',)), "has states in ('degC',)"),
+    'nominal point outside its range': (
+        lambda: with_states(center=np.array([400.0])),
+        'trained for a temperature of 305 to 327 K around 400 K, which cannot be'),
+    'below absolute zero': (
+        lambda: with_states(lower=np.array([-5.0])), 'which cannot be: train the model again'),
+    'range without the set-point': (
+        lambda: with_states(upper=np.array([324.8])),
+        f'set-point {STEADY:.2f} degC is outside the trained range 31.85 degC to 51.65 degC'),
+    'input without effect': (
+        lambda: edited(A=-shipped('reactor_nz4').A, B=np.zeros((1, 1))),
+        f'tried at {STEADY:.2f} degC with the set-point {STEADY:.2f} degC the model fails (no '
+        'feedback gain: the Hamiltonian has no stable subspace of full size'),
+    'gain beyond its bound': (
+        lambda: edited(A=1e6 * np.abs(shipped('reactor_nz4').A)), 'the model fails'),
+    'numbers that overflow': (
+        lambda: edited(A=1e300 * shipped('reactor_nz4').A), 'the model fails'),
+}
+
+
+@pytest.fixture(scope='module')
+def running(shared_ros: Workbench) -> tuple[Operator, Callable[[], float]]:
+    """Return a controller at its steady state, and what measures it once."""
+    shared_ros.start('controller')
+    commands = shared_ros.listen(Temperature, topics.COOLANT_SETPOINT)
+    thermometer = shared_ros.speak(Temperature, topics.TEMPERATURE, to='controller')
+
+    def measure() -> float:
+        now = float(len(commands) + 1)
+        thermometer.publish(temperature(STEADY, now))
+        shared_ros.wait_until(lambda: commands and seconds(commands[-1]) == now)
+        return float(commands[-1].temperature)
+
+    measure()
+    return Operator(shared_ros), measure
+
+
+@pytest.mark.parametrize('name', BAD_MODELS)
+def test_unsuitable_model_is_refused_with_the_reason(
+        shared_ros: Workbench, running: tuple[Operator, Callable[[], float]],
+        tmp_path: Path, name: str) -> None:
+    operator, measure = running
+    build, words = BAD_MODELS[name]
+    save(build(), tmp_path / 'bad.safetensors')
+    done, _ = operator.set_model('reactor_nz3')
+    assert done
+    before = measure()
+    done, reason = operator.set_model(tmp_path / 'bad.safetensors')
+    assert not done
+    assert reason.startswith('the old model is kept: ')
+    assert words in reason
+    status = shared_ros.wait_for_status(STATUS, lambda s: s.message == reason)
+    assert status.level == DiagnosticStatus.WARN
+    assert value(status, 'model') == 'reactor_nz3'
+    assert shared_ros.get_parameters('controller', 'model') == ['reactor_nz3']
+    assert measure() == pytest.approx(before, abs=1e-9)
+
+    assert operator.reload() == (
+        True, 'model reactor_nz3: n_z = 3, trained for 31.85 degC to 53.85 degC')
+    status = shared_ros.wait_for_status(STATUS, lambda s: s.level == DiagnosticStatus.OK)
+    assert value(status, 'model refused') == 'none'
+
+
+def test_model_that_is_missing_is_refused(
+        running: tuple[Operator, Callable[[], float]]) -> None:
+    operator, _ = running
+    assert operator.set_model('reactor_nz5')[1].startswith(
+        'the old model is kept: no model file at ')
+
+
+def test_model_changes_with_the_weights_that_it_needs(
+        shared_ros: Workbench, running: tuple[Operator, Callable[[], float]]) -> None:
+    result = shared_ros.set_parameters_atomically(
+        'controller', model='reactor_linear', max_gain=1e-3)
+    assert 'the gain exceeds its bound' in result.reason
+    result = shared_ros.set_parameters_atomically(
+        'controller', model='reactor_linear', max_gain=500.0)
+    assert result.successful, result.reason
+    assert shared_ros.get_parameters('controller', 'model', 'max_gain') == [
+        'reactor_linear', 500.0]
+
+
+# Disks that do not answer: a pipe that nobody writes to reads like a file on one.
+
+
+def test_loop_goes_on_while_a_slow_disk_is_read(ros: Workbench, tmp_path: Path) -> None:
+    file, dead = tmp_path / 'model.safetensors', tmp_path / 'dead.safetensors'
+    put(model_path('reactor_nz4').read_bytes(), file)
+    ros.start('controller', {'model': file})
+    operator, thermometer = Operator(ros), Thermometer(ros)
+    file.unlink()
+    for path in (file, dead):
+        os.mkfifo(path)
+    reloaded = operator.ask_to_reload()
+    (result,) = ros.set_parameters('controller', model=str(dead))
+    assert result.reason.startswith(f'the old model is kept: {dead} is still being read')
+    for _ in range(50):
+        thermometer.measure()
+    ros.wait_until(lambda: len(thermometer.commands) == 50)
+    assert not reloaded.done()
+
+    file.write_bytes(model_path('reactor_nz3').read_bytes())
+    ros.wait_until(reloaded.done)
+    assert reloaded.result().success
+    assert 'n_z = 3' in reloaded.result().message
+    # the other is still being read when the process is told to end
+    assert ros.processes[0].stop() == 0
+    assert 'Traceback' not in ros.printed()
+
+
+def test_model_changed_during_a_slow_reload_stays(ros: Workbench, tmp_path: Path) -> None:
+    file = tmp_path / 'model.safetensors'
+    put(model_path('reactor_nz4').read_bytes(), file)
+    ros.start('controller', {'model': file})
+    operator = Operator(ros)
+    file.unlink()
+    os.mkfifo(file)
+    reloaded = operator.ask_to_reload()
+    assert operator.set_model('reactor_linear')[0]
+    file.write_bytes(model_path('reactor_nz3').read_bytes())
+    ros.wait_until(reloaded.done)
+    assert not reloaded.result().success
+    assert 'the model was changed to reactor_linear' in reloaded.result().message
+    ros.wait_for_status(STATUS, lambda s: value(s, 'model') == 'reactor_linear')
+
+
+def test_dead_disk_does_not_pile_up_readers(ros: Workbench, tmp_path: Path) -> None:
+    file = tmp_path / 'model.safetensors'
+    put(model_path('reactor_nz4').read_bytes(), file)
+    # impatient, or this would last
+    program = ('import sys\n'
+               'from koopman_ros.nodes import controller, model_reload\n'
+               'model_reload._SHORT_WAIT = model_reload._LONG_WAIT = 0.02\n'
+               'sys.exit(controller.main())\n')
+    ros.start('controller', {'model': file}, command=(sys.executable, '-c', program))
+    operator = Operator(ros)
+    file.unlink()
+    os.mkfifo(file)
+    assert operator.reload() == (
+        False, f'the old model is kept: {file} was not read within 0.02 s: check its disk')
+    request = SetParameters.Request(
+        parameters=[Parameter('model', value=str(file)).to_parameter_msg()] * 8)
+    results = ros.call(SetParameters, 'controller/set_parameters', request).results
+    assert ['8 model files are still being read' in result.reason for result in results] == [
+        False] * 7 + [True]
