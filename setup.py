@@ -46,7 +46,9 @@ setup(
     data_files=_data_files(),
     python_requires='>=3.11',
     zip_safe=True,
-    install_requires=['setuptools', 'numpy', 'scipy', 'PyYAML', 'mcap>=1.5', 'mcap-ros2-support'],
+    # mcap brings lz4 and zstandard, too
+    install_requires=['setuptools', 'numpy', 'scipy', 'PyYAML', 'mcap>=1.5', 'mcap-ros2-support',
+                      'lz4', 'zstandard'],
     extras_require={
         # A sourced ROS 2 installation brings these itself; elsewhere PyPI does.
         'ros': [
@@ -75,6 +77,8 @@ setup(
             'plant = koopman_ros.nodes.plant:main',
             'controller = koopman_ros.nodes.controller:main',
             'trainer = koopman_ros.nodes.trainer:main',
+            'player = koopman_ros.nodes.player:main',
+            'replay = koopman_ros.nodes.replay:main',
         ],
     },
 )

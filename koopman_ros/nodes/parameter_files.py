@@ -24,13 +24,21 @@ import argparse
 from pathlib import Path
 import sys
 
-from koopman_ros.nodes import controller_parameters, plant_parameters, trainer_parameters
+from koopman_ros.nodes import (
+    controller_parameters,
+    plant_parameters,
+    player_parameters,
+    replay_parameters,
+    trainer_parameters,
+)
 from koopman_ros.nodes.parameters import ParameterTable
 
 TABLES: dict[str, ParameterTable] = {
     'plant': plant_parameters.TABLE,
     'controller': controller_parameters.TABLE,
     'trainer': trainer_parameters.TABLE,
+    'player': player_parameters.TABLE,
+    'replay': replay_parameters.TABLE,
 }
 
 

@@ -21,11 +21,15 @@ import shutil
 import subprocess
 import sys
 
+from koopman_ros.demo.processes import isolated_domain
 import pytest
 from workbench import Workbench
 
 ROOT = Path(__file__).parents[2]
 NODES = {'plant': 'simulation', 'controller': 'control', 'trainer': 'recording'}
+# what ends by itself, and what it says of a bag that is not there
+TOOLS = {'player': "cannot start: bag 'none' does not exist",
+         'replay': "bag 'none' does not exist"}
 
 
 @pytest.fixture(scope='module')
@@ -49,7 +53,7 @@ def install_tree(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 def test_the_tree_is_what_ros2_run_looks_for(install_tree: Path) -> None:
     prefix = install_tree / 'koopman_ros'
-    for name in NODES:
+    for name in (*NODES, *TOOLS):
         executable = prefix / 'lib' / 'koopman_ros' / name
         assert executable.is_file()
         assert executable.stat().st_mode & 0o111
@@ -83,3 +87,16 @@ def test_an_executable_of_the_tree_starts_and_ends(
     process = ros.start(name, parameters, command=('bash', '-c', program, name))
     ros.wait_for_status(f'{name}: {NODES[name]}', lambda status: True)
     assert process.stop() == 0
+
+
+@pytest.mark.parametrize('name', TOOLS)
+def test_a_tool_of_the_tree_reads_its_parameters(install_tree: Path, name: str) -> None:
+    executable = install_tree / 'koopman_ros' / 'lib' / 'koopman_ros' / name
+    parameter = {'player': 'bag:=none', 'replay': 'bags:=[none]'}[name]
+    with isolated_domain():
+        ended = subprocess.run(
+            ['bash', '-c', f'. {install_tree}/setup.bash && exec {executable} "$@"', name,
+             '--ros-args', '-p', parameter],
+            cwd=install_tree, capture_output=True, text=True, timeout=60, check=False)
+    assert ended.returncode == 1
+    assert ended.stderr.strip() == f'{name}: {TOOLS[name]}: check the path'

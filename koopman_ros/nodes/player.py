@@ -1,0 +1,247 @@
+# Copyright 2026 The koopman_ros Authors
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""The player: the inputs of a controller from a bag, as they were recorded."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+import sys
+import time
+
+from koopman_ros.bags import (
+    BagMessage,
+    BagReadError,
+    BagSummary,
+    in_log_order,
+    QosProfile,
+    read_messages,
+    summary,
+)
+from koopman_ros.nodes import topics
+from koopman_ros.nodes.messages import NANOSECONDS, stamp_message, stamp_nanoseconds
+from koopman_ros.nodes.parameters import ConfigurationError
+from koopman_ros.nodes.player_parameters import TABLE
+from koopman_ros.nodes.process import LoopNode, run
+from rclpy.clock import Clock, ClockType
+from rclpy.duration import Duration
+from rclpy.publisher import Publisher
+from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
+from rosgraph_msgs.msg import Clock as ClockMessage
+from sensor_msgs.msg import Temperature
+
+_POLL_PERIOD_NS = 10_000_000  # for what no message announces
+_PROGRESS_PERIOD = 3.0  # s
+_LAST_PATIENCE = Duration(seconds=5.0)  # for what was sent last to be received
+# Messages without an answer that are sent in one go, before signals are heard again.
+_BURST = 100
+
+
+class PlayerNode(LoopNode):
+    """
+    Publish recorded messages byte for byte, in the order and at the pace of the recording.
+
+    As fast as possible means in lock-step: a measurement is followed by the next message when its
+    command has arrived, and any other message when all subscribers have received it. A controller
+    then meets the inputs in the recorded order whatever the machine does.
+    """
+
+    def __init__(self) -> None:
+        super().__init__('player', automatically_declare_parameters_from_overrides=True)
+        self._settings = settings = TABLE.declare(self)
+        # what stands for a name in the bag
+        names = {_in_bag(name): name for name in settings.topics}
+        content = summary(settings.bag)
+        self._messages = self._from_offset(content, in_log_order(
+            read_messages(settings.bag, names, recover=settings.recover)))
+        played = {topic: name for topic, name in names.items() if content.counts.get(topic)}
+        if not played:
+            known = ', '.join(sorted(t for t, count in content.counts.items() if count))
+            raise ConfigurationError(f'bag {settings.bag!r} has no message on {", ".join(names)}: '
+                                     f'choose topics among {known or "none"}')
+        self._total = sum(content.counts[topic] for topic in played)
+        self._measured = _in_bag(settings.measurement)
+        self._lockstep = settings.rate == 0.0
+
+        # the subscription first: a controller that hears the measurement has then seen it, too
+        self._answers = self.create_subscription(
+            Temperature, settings.answer, self._on_answer, topics.LOOP_QOS
+        ) if self._lockstep and self._measured in played else None
+        self._clock_publisher = self.create_publisher(
+            ClockMessage, topics.CLOCK, topics.CLOCK_QOS) if settings.clock else None
+        self._outlets: dict[str, Publisher] = {
+            topic: self.create_publisher(_message_class(content.types[topic]), name,
+                                         recorded_offer(content.offered_qos.get(topic, ())))
+            for topic, name in played.items()}
+
+        self._next: BagMessage | None = None
+        self._began = False
+        self._open: int | None = None  # stamp of the measurement that has no answer yet
+        self._sent = 0
+        self._due = self._wall_start = self._said = self._asked = time.monotonic()
+        self._timer = self.create_timer(_POLL_PERIOD_NS / NANOSECONDS, self._on_timer,
+                                        clock=Clock(clock_type=ClockType.STEADY_TIME))
+
+    def _from_offset(self, content: BagSummary, messages: Iterator[BagMessage]
+                     ) -> Iterator[BagMessage]:
+        """Leave out what comes before the offset."""
+        begin_ns = (content.start_ns or 0) + round(self._settings.start_offset * NANOSECONDS)
+        return (message for message in messages if message.log_time_ns >= begin_ns)
+
+    def _on_timer(self) -> None:
+        try:
+            if not self._began:
+                self._begin()
+            elif self._open is not None:
+                self._check_patience()
+            elif self._lockstep:
+                self._play_in_lockstep()
+            else:
+                self._play_in_time()
+        except BagReadError as error:
+            self._give_up(str(error))
+
+    def _begin(self) -> None:
+        """Start when everybody who shall hear is there."""
+        wanted = self._settings.wait_for_subscribers
+        missing = [publisher.topic_name for publisher in self._outlets.values()
+                   if publisher.get_subscription_count() < wanted]
+        if self._answers is not None and wanted and not self._answers.get_publisher_count():
+            missing.append(self._answers.topic_name)
+        if not missing:
+            self._began = True
+            self._due = self._wall_start = self._said = time.monotonic()
+            self.get_logger().info(f'playing {self._settings.bag}')
+            self._next = next(self._messages, None)
+        elif time.monotonic() - self._wall_start > self._settings.wait_timeout:
+            self._give_up(
+                f'{", ".join(missing)} found no counterpart within '
+                f'{self._settings.wait_timeout:g} s: start the controller first, or set '
+                'wait_for_subscribers to 0')
+
+    # By the clock.
+
+    def _play_in_time(self) -> None:
+        """Publish what is due, and sleep until the next message is."""
+        while self._next is not None and self._due <= time.monotonic():
+            message = self._next
+            self._publish(message)
+            self._next = next(self._messages, None)
+            if self._next is not None:
+                # where the recorder's clock was set back, the next message follows at once
+                seconds = (self._next.log_time_ns - message.log_time_ns) / NANOSECONDS
+                self._due += max(0.0, seconds) / self._settings.rate
+        if self._next is None:
+            self._finish()
+            return
+        left_ns = round((self._due - time.monotonic()) * NANOSECONDS)
+        self._timer.timer_period_ns = min(max(left_ns, 1), 100 * _POLL_PERIOD_NS)
+        self._timer.reset()
+        self._say_progress()
+
+    # In lock-step.
+
+    def _play_in_lockstep(self) -> None:
+        """Publish up to the next measurement, whose answer continues it."""
+        for _ in range(_BURST):
+            if self._next is None:
+                self._finish()
+                return
+            message, self._next = self._next, next(self._messages, None)
+            self._publish(message)
+            if message.topic == self._measured:
+                self._open = stamp_nanoseconds(message.message.header.stamp)
+                self._asked = time.monotonic()
+                break
+            patience = Duration(seconds=self._settings.answer_timeout)
+            if not self._outlets[message.topic].wait_for_all_acked(patience):
+                self._give_up(f'nobody received a message on {message.topic} within '
+                              f'{self._settings.answer_timeout:g} s: is the controller alive?')
+                return
+        self._say_progress()
+
+    def _on_answer(self, message: Temperature) -> None:
+        if self._open is None or stamp_nanoseconds(message.header.stamp) != self._open:
+            return
+        self._open = None
+        self._on_timer()
+
+    def _check_patience(self) -> None:
+        assert self._open is not None
+        if time.monotonic() - self._asked > self._settings.answer_timeout:
+            self._give_up(
+                f'no command for the measurement at {self._open / NANOSECONDS:.3f} s within '
+                f'{self._settings.answer_timeout:g} s: is the controller alive? A rate above 0 '
+                'plays without waiting for answers')
+
+    # Either way.
+
+    def _publish(self, message: BagMessage) -> None:
+        if self._clock_publisher is not None and message.topic == self._measured:
+            self._clock_publisher.publish(ClockMessage(clock=stamp_message(
+                stamp_nanoseconds(message.message.header.stamp))))
+        self._outlets[message.topic].publish(message.data)
+        self._sent += 1
+
+    def _say_progress(self) -> None:
+        now = time.monotonic()
+        if now - self._said >= _PROGRESS_PERIOD:
+            self._said = now
+            self.get_logger().info(f'{self._sent} of {self._total} messages')
+
+    def _finish(self) -> None:
+        received = all(publisher.wait_for_all_acked(_LAST_PATIENCE)
+                       for publisher in self._outlets.values())
+        seconds = time.monotonic() - self._wall_start
+        self.get_logger().info(f'played {self._sent} messages in {seconds:.3f} s')
+        if not received:
+            self._give_up('not all of the last messages were received: are the subscribers alive?')
+            return
+        self.exit_code = 0
+
+    def _give_up(self, reason: str) -> None:
+        self._timer.cancel()
+        print(f'player: {reason}', file=sys.stderr, flush=True)
+        self.exit_code = 1
+
+
+def _in_bag(name: str) -> str:
+    """Return the topic of the bag that a name stands for."""
+    return '/' + name.lstrip('/')
+
+
+def _message_class(type_name: str) -> type:
+    try:
+        return topics.message_class(type_name)
+    except LookupError as error:
+        raise ConfigurationError(str(error)) from error
+
+
+def recorded_offer(offered: tuple[QosProfile, ...]) -> QoSProfile:
+    """Offer what all publishers of the recording offered."""
+    best_effort = bool(offered) and all(o.reliability == 'best_effort' for o in offered)
+    latched = bool(offered) and all(o.durability == 'transient_local' for o in offered)
+    return QoSProfile(
+        depth=max(1, *(o.depth for o in offered)) if latched else topics.LOOP_QOS.depth,
+        reliability=(ReliabilityPolicy.BEST_EFFORT if best_effort else ReliabilityPolicy.RELIABLE),
+        durability=(DurabilityPolicy.TRANSIENT_LOCAL if latched else DurabilityPolicy.VOLATILE))
+
+
+def main(args: list[str] | None = None) -> int:
+    """Run the player."""
+    return run('player', PlayerNode, args)
+
+
+if __name__ == '__main__':
+    sys.exit(main())

@@ -1,0 +1,121 @@
+# Copyright 2026 The koopman_ros Authors
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""The replay: recorded bags through the control step again, with the old and with a new model."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+import sys
+
+from koopman_ros.control import Controller
+from koopman_ros.nodes import topics
+from koopman_ros.nodes.model_loading import load_suitable
+from koopman_ros.nodes.process import run_task
+from koopman_ros.nodes.replay_parameters import ReplayParameters, TABLE
+from koopman_ros.nodes.replaying.comparison import compare, ReplayedBag
+from koopman_ros.nodes.replaying.record import Names, read_record
+from koopman_ros.nodes.replaying.report import reproduced, verdict, write_report
+from koopman_ros.nodes.replaying.steps import commands_of, replay
+import numpy as np
+from rclpy.node import Node
+
+
+def replay_bags(parameters: ReplayParameters, names: Names) -> bool:
+    """
+    Replay bags and write the report.
+
+    :param parameters: of the replay.
+    :param names: of the controller's topics in the bags.
+    :return: whether the recorded commands are reproduced.
+    :raises BagReadError: for a bag that cannot be replayed.
+    :raises ModelFileError: for a model that cannot be used.
+    """
+    # drawing needs a package that a controller's machine may lack
+    from koopman_ros.nodes.replaying.figure import draw
+
+    bags = [replayed_bag(path, names, parameters) for path in parameters.bags]
+    folder = Path(parameters.output)
+    folder.mkdir(parents=True, exist_ok=True)
+    pictures = ['replay.png'] if len(bags) == 1 else [
+        f'replay_{number}.png' for number in range(1, len(bags) + 1)]
+    for bag, picture in zip(bags, pictures, strict=True):
+        draw(folder / picture, bag, parameters)
+        print(f'{bag.path}: {verdict(bag)}')
+        if bag.new is not None:
+            print(f'{bag.path}: {np.count_nonzero(bag.new.beyond)} commands of '
+                  f'{parameters.new_model} differ by more than {parameters.tolerance:g} K')
+    write_report(folder, bags, pictures, parameters)
+    print(f'see {folder / "report.md"}')
+    return all(reproduced(bag) for bag in bags)
+
+
+def replayed_bag(path: str, names: Names, parameters: ReplayParameters) -> ReplayedBag:
+    """
+    Replay one bag.
+
+    :param path: of the bag.
+    :param names: of the controller's topics in it.
+    :param parameters: of the replay.
+    :raises BagReadError: for a bag that cannot be replayed.
+    :raises ModelFileError: for a model that cannot be used.
+    """
+    settings, tolerance = parameters.settings(), parameters.tolerance
+    old = load_suitable(parameters.model).model
+    new = load_suitable(parameters.new_model).model if parameters.new_model else None
+    record = read_record(path, names, recover=parameters.recover)
+    replayed = replay(record, Controller(old, settings))
+    commands = np.array([sample.replayed for sample in replayed.samples])
+    bag = ReplayedBag(path, record, old.states, replayed, compare(replayed, commands, tolerance))
+    if new is None:
+        return bag
+    commands = commands_of(Controller(new, settings), replayed)
+    return replace(bag, new_commands=commands, new=compare(replayed, commands, tolerance),
+                   new_range=new.states)
+
+
+def _prepare() -> Callable[[], int]:
+    """Read parameters and names, which remaps and the namespace change as for the controller."""
+    node = Node('replay', automatically_declare_parameters_from_overrides=True,
+                start_parameter_services=False, enable_rosout=False)
+    try:
+        parameters = TABLE.declare(node)
+        resolve = node.resolve_topic_name
+        names = Names(
+            temperature=resolve(topics.TEMPERATURE), setpoint=resolve(topics.SETPOINT),
+            manual=resolve(topics.MANUAL_COOLANT_SETPOINT),
+            command=resolve(topics.COOLANT_SETPOINT), active=resolve(topics.ACTIVE_SETPOINT),
+            diagnostics=resolve(topics.DIAGNOSTICS), namespace=node.get_namespace().strip('/'))
+    finally:
+        node.destroy_node()
+    return lambda: _run(parameters, names)
+
+
+def _run(parameters: ReplayParameters, names: Names) -> int:
+    if replay_bags(parameters, names):
+        return 0
+    print(f'replay: not all recorded commands are reproduced within {parameters.tolerance:g} K: '
+          'give the model and the settings of the recording', file=sys.stderr)
+    return 1
+
+
+def main(args: list[str] | None = None) -> int:
+    """Run the replay."""
+    return run_task('replay', _prepare, args)
+
+
+if __name__ == '__main__':
+    sys.exit(main())

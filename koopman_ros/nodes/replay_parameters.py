@@ -1,0 +1,53 @@
+# Copyright 2026 The koopman_ros Authors
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""Parameters of the replay: those of the controller that was recorded, and its own."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from koopman_ros.nodes import controller_parameters
+from koopman_ros.nodes.controller_parameters import ControllerParameters
+from koopman_ros.nodes.parameters import parameter, ParameterTable
+
+
+@dataclass(frozen=True)
+class ReplayParameters(ControllerParameters):
+    """Snapshot of the replay's parameters: the controller's file serves it, too."""
+
+    bags: tuple[str, ...] = parameter(
+        ('run_1',), 'bags to replay, each a run of its own: .mcap files or bag folders')
+    new_model: str = parameter(
+        '', 'model whose commands are compared with the recorded ones, by name or path; empty '
+        'only checks that the recorded commands are reproduced')
+    output: str = parameter(
+        'replay', 'folder for report.md, summary.json and the pictures; older ones in it are '
+        'replaced')
+    tolerance: float = parameter(
+        0.1, 'difference of two commands from which on it is counted and marked', unit='K',
+        minimum=0.0, maximum=100.0)
+    recover: bool = parameter(
+        False, 'read bags that were not closed or are damaged as far as they are whole')
+
+
+def _cross_check(values: ReplayParameters) -> str:
+    if not values.bags or not all(values.bags):
+        return f'bags = {list(values.bags)} must hold at least one path and no empty one'
+    if not values.output:
+        return "output = '' must name a folder, e.g. replay"
+    return controller_parameters.TABLE.cross_check(values)
+
+
+TABLE = ParameterTable(ReplayParameters, _cross_check)

@@ -1,0 +1,244 @@
+# Copyright 2026 The koopman_ros Authors
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""What a bag tells of a controller: its inputs in the order they came, and what it answered."""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+import math
+import os
+from typing import Any
+
+from koopman_ros.bags import BagMessage, BagReadError, in_log_order, read_messages, summary
+from koopman_ros.control import Mode
+from koopman_ros.nodes.messages import NANOSECONDS, stamp_nanoseconds
+from koopman_ros.nodes.replaying.status import (
+    Change,
+    changes_of,
+    lives_of,
+    Status,
+    statuses_in,
+)
+
+TEMPERATURE_TYPE = 'sensor_msgs/msg/Temperature'
+# An answer that is recorded longer than this before or after its measurement belongs to another.
+_NEAR_NS = 10 * NANOSECONDS
+
+
+@dataclass(frozen=True)
+class Names:
+    """
+    The topics of a controller in a bag, as absolute names.
+
+    :param namespace: of the controller, by which its diagnostics are known, e.g. ``unit_1``.
+    """
+
+    temperature: str = '/temperature'
+    setpoint: str = '/setpoint'
+    manual: str = '/manual_coolant_setpoint'
+    command: str = '/coolant_setpoint'
+    active: str = '/active_setpoint'
+    diagnostics: str = '/diagnostics'
+    namespace: str = ''
+
+
+@dataclass(frozen=True)
+class Input:
+    """
+    What came to the controller: a message of one of its topics, a mode, or a new beginning.
+
+    :param topic: absolute name; empty for a change of mode and a start.
+    :param time_ns: when it was recorded.
+    :param message: with the fields of sensor_msgs/Temperature, or the mode, or None when the
+        controller was started again.
+    :param command: for a temperature, what was commanded in degrees Celsius, or None.
+    :param active: for a temperature, the set-point that changed with it in degrees Celsius.
+    """
+
+    topic: str
+    time_ns: int
+    message: Any
+    command: float | None = None
+    active: float | None = None
+
+
+@dataclass(frozen=True)
+class ControlRecord:
+    """
+    A controller's run as recorded.
+
+    :param names: of its topics.
+    :param inputs: in the order in which they came.
+    :param active_before: the set-point that was tracked before the first measurement of the bag,
+        (stamp in ns, degrees Celsius), or None.
+    :param command_before: the same for the command.
+    :param mode: at the beginning.
+    :param began_before: whether the controller had answered measurements before the first.
+    :param tells_active: whether changes of the tracked set-point were recorded.
+    :param models: those in force, in the order of their use.
+    :param unmatched_commands: number of commands that answer no recorded measurement.
+    :param complete: whether the recorder closed the bag.
+    """
+
+    names: Names
+    inputs: tuple[Input, ...]
+    active_before: tuple[int, float] | None
+    command_before: tuple[int, float] | None
+    mode: Mode
+    began_before: bool
+    tells_active: bool
+    models: tuple[str, ...]
+    unmatched_commands: int
+    complete: bool
+
+
+def read_record(path: str | os.PathLike[str], names: Names, *, recover: bool = False
+                ) -> ControlRecord:
+    """
+    Read what a replay needs from a bag.
+
+    :param path: a .mcap file or a bag directory.
+    :param names: of the controller's topics.
+    :param recover: read a bag that was not closed or is damaged as far as it is whole.
+    :raises BagReadError: for a bag that cannot be read, or lacks measurements or commands.
+    """
+    wanted = (names.temperature, names.setpoint, names.manual, names.command, names.active)
+    inputs: list[Input] = []
+    commands, actives = _Answers(), _Answers()
+    statuses: list[Status] = []
+    measured = 0
+    for entry in in_log_order(read_messages(
+            path, (*wanted, names.diagnostics), recover=recover)):
+        if entry.topic == names.diagnostics:
+            statuses += statuses_in(entry, names.namespace, measured)
+            continue
+        _check(path, entry)
+        if entry.topic == names.command:
+            commands.add(entry)
+        elif entry.topic == names.active:
+            actives.add(entry)
+        else:
+            inputs.append(Input(entry.topic, entry.log_time_ns, entry.message))
+            measured += entry.topic == names.temperature
+    content = summary(path)
+    for topic, count in ((names.temperature, measured), (names.command, len(commands.in_order))):
+        if not count:
+            known = ', '.join(name for name, count in sorted(content.counts.items()) if count)
+            raise BagReadError(
+                f'bag {os.fspath(path)!r} has no message on {topic!r}, it has {known or "none"}: '
+                f'name the topic that stands for it, e.g. -r {topic[1:]}:=NAME')
+    return _assembled(names, inputs, commands, actives, statuses, content.complete)
+
+
+class _Answers:
+    """Messages of the controller by the stamp of the measurement that they answer."""
+
+    def __init__(self) -> None:
+        self.in_order: list[tuple[int, int, float]] = []
+        self._by_stamp: dict[int, deque[tuple[int, float]]] = {}
+
+    def add(self, entry: BagMessage) -> None:
+        stamp_ns = stamp_nanoseconds(entry.message.header.stamp)
+        self.in_order.append((stamp_ns, entry.log_time_ns, entry.message.temperature))
+        self._by_stamp.setdefault(stamp_ns, deque()).append(
+            (entry.log_time_ns, entry.message.temperature))
+
+    def take(self, stamp_ns: int, time_ns: int) -> float | None:
+        """Return the next answer to a measurement, each once, or None without one near it."""
+        waiting = self._by_stamp.get(stamp_ns, deque())
+        while waiting and waiting[0][0] < time_ns - _NEAR_NS:
+            waiting.popleft()
+        if waiting and waiting[0][0] <= time_ns + _NEAR_NS:
+            return waiting.popleft()[1]
+        return None
+
+    def before(self, first: Input) -> tuple[int, float] | None:
+        """Return the last of those recorded first that answer no measurement of the bag."""
+        first_ns = stamp_nanoseconds(first.message.header.stamp)
+        found = None
+        for stamp_ns, time_ns, celsius in self.in_order:
+            # stamps go back where time was set back, and a latched one may come late
+            if not (stamp_ns < first_ns or (stamp_ns > first_ns and time_ns < first.time_ns)):
+                break
+            found = stamp_ns, celsius
+        return found
+
+
+def _assembled(names: Names, inputs: list[Input], commands: _Answers, actives: _Answers,
+               statuses: list[Status], complete: bool) -> ControlRecord:
+    first = next(entry for entry in inputs if entry.topic == names.temperature)
+    answered = []
+    for entry in inputs:
+        if entry.topic == names.temperature:
+            stamp_ns = stamp_nanoseconds(entry.message.header.stamp)
+            entry = replace(entry, command=commands.take(stamp_ns, entry.time_ns),
+                            active=actives.take(stamp_ns, entry.time_ns))
+        answered.append(entry)
+    matched = sum(entry.command is not None for entry in answered)
+    pairs = [(entry.message.temperature, math.nan if entry.command is None else entry.command)
+             for entry in answered if entry.topic == names.temperature]
+    lives = list(lives_of(statuses, pairs))
+    active_before, command_before = actives.before(first), commands.before(first)
+    return ControlRecord(
+        names=names,
+        inputs=tuple(_with_changes(names, answered, deque(changes_of(lives)))),
+        active_before=active_before,
+        command_before=command_before,
+        mode=statuses[0].mode if statuses else Mode.AUTOMATIC,
+        began_before=(active_before is not None or command_before is not None
+                      or (bool(lives) and lives[0].earlier > 0)),
+        tells_active=bool(actives.in_order),
+        models=tuple(dict.fromkeys(status.model for status in statuses)),
+        unmatched_commands=len(commands.in_order) - matched,
+        complete=complete,
+    )
+
+
+def _with_changes(names: Names, inputs: list[Input], changes: deque[Change]) -> Iterator[Input]:
+    """Yield the inputs with the changes among them."""
+    count = 0
+    for entry in inputs:
+        measured = entry.topic == names.temperature
+        while changes and _comes_before(changes[0], entry, count, measured):
+            change = changes.popleft()
+            yield Input('', change.time_ns, change.mode)
+        count += measured
+        yield entry
+
+
+def _comes_before(change: Change, entry: Input, count: int, measured: bool) -> bool:
+    """Tell whether a change comes before the input that follows `count` measurements."""
+    if change.place == count:
+        return measured or change.time_ns < entry.time_ns
+    return change.place < count
+
+
+def _check(path: str | os.PathLike[str], entry: BagMessage) -> None:
+    """Refuse another type of message, also one that only bears the name."""
+    message = entry.message
+    try:
+        float(message.temperature)
+        stamp_nanoseconds(message.header.stamp)
+    except (AttributeError, TypeError, ValueError):
+        fits = False
+    else:
+        fits = entry.type_name == TEMPERATURE_TYPE
+    if not fits:
+        raise BagReadError(
+            f'topic {entry.topic!r} of bag {os.fspath(path)!r} is {entry.type_name} and not laid '
+            f'out as {TEMPERATURE_TYPE}: choose another topic by a remap, e.g. '
+            f'-r {entry.topic[1:]}:=NAME')

@@ -1,0 +1,256 @@
+# Copyright 2026 The koopman_ros Authors
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""
+The control step replayed from a record.
+
+The topics of a loop are recorded side by side, so that a request and a measurement of almost the
+same time may have reached the controller in either order. Which one it was shows in the set-point
+that was tracked from then on; nothing is taken from the commands, which are compared.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+import itertools
+import math
+from typing import Any
+
+from koopman_ros.control import Controller, Mode, Report, State
+from koopman_ros.nodes.messages import NANOSECONDS, stamp_nanoseconds, to_celsius, to_kelvin
+from koopman_ros.nodes.replaying.record import ControlRecord, Input
+from koopman_ros.nodes.translation import answer, ask_manual_coolant, ask_setpoint, tracked_celsius
+import numpy as np
+from numpy.typing import NDArray
+
+Array = NDArray[np.float64]
+
+# How far apart a request and a measurement are recorded when their order is not to be trusted.
+_CLOSE_NS = NANOSECONDS // 20
+
+
+@dataclass(frozen=True)
+class Sample:
+    """
+    A measurement with what went before it, resolved for any controller.
+
+    :param message: the measurement.
+    :param operations: changes of mode, manual commands and starts since the last one.
+    :param active: set-point tracked, in K; NaN for none.
+    :param recorded: what was commanded in degrees Celsius; NaN where nothing was recorded.
+    :param replayed: the same by the replay.
+    :param given: whether it comes before, or is, the first command of a run that had begun
+        before the bag: the replay goes on from there.
+    """
+
+    message: Any
+    operations: tuple[Input, ...]
+    active: float
+    recorded: float
+    replayed: float
+    given: bool
+
+    @property
+    def stamp_ns(self) -> int:
+        """Stamp of the measurement."""
+        return stamp_nanoseconds(self.message.header.stamp)
+
+
+@dataclass(frozen=True)
+class Replay:
+    """
+    A recorded run replayed through the control step.
+
+    :param start: state before the first sample.
+    :param samples: one for each measurement, in the order in which they came.
+    :param adopted: set-points taken from the record of what was tracked, because no recorded
+        request explains them.
+    :param refused: requests that the replay refused.
+    """
+
+    start: State
+    samples: tuple[Sample, ...]
+    adopted: int
+    refused: int
+
+
+def replay(record: ControlRecord, controller: Controller) -> Replay:
+    """Replay a record through the control step with the model and the settings of its time."""
+    run = _Run(record, controller)
+    for entry in record.inputs:
+        if entry.topic == record.names.setpoint:
+            run.recorded += 1
+        elif entry.topic == record.names.temperature:
+            run.measure(entry)
+        else:
+            run.operate(entry)
+    return Replay(run.start, tuple(run.samples), run.adopted, run.refused)
+
+
+def commands_of(controller: Controller, replayed: Replay) -> Array:
+    """
+    Return what another controller commands for the same measurements and tracked set-points.
+
+    :param controller: model and settings.
+    :param replayed: the run with the model of its time.
+    :return: (n,) degrees Celsius.
+    """
+    state = replayed.start
+    commands = np.empty(len(replayed.samples))
+    for k, sample in enumerate(replayed.samples):
+        for operation in sample.operations:
+            state = _operated(controller, state, operation)[0]
+        if not math.isnan(sample.active):
+            state = _tracking(state, sample.active)
+        if sample.given:
+            commands[k] = sample.replayed
+            continue
+        state, kelvin, _ = answer(controller, state, sample.message)
+        commands[k] = to_celsius(kelvin)
+    return commands
+
+
+@dataclass(frozen=True)
+class _Attempt:
+    """The answer to a measurement if that many requests were known."""
+
+    known: int
+    refused: int
+    asked: State
+    state: State
+    kelvin: float
+    report: Report
+
+
+class _Run:
+    """A replay on its way."""
+
+    def __init__(self, record: ControlRecord, controller: Controller) -> None:
+        self.start = _start(record)
+        self.samples: list[Sample] = []
+        self.recorded = 0  # requests before the present measurement, by the record
+        self.adopted = self.refused = 0
+        self._known = 0  # requests that the controller knows
+        self._record = record
+        self._controller = controller
+        self._state = self.start
+        self._requests = [entry for entry in record.inputs if entry.topic == record.names.setpoint]
+        self._operations: list[Input] = []
+        # until the first command, when the run began before the bag
+        self._begins_unknown = record.began_before and self.start.command is None
+        # the set-point that was tracked, as far as it is known
+        self._active = math.nan if record.active_before is None else record.active_before[1]
+
+    def operate(self, entry: Input) -> None:
+        """Take over what holds at once."""
+        self._operations.append(entry)
+        self._state, refused = _operated(self._controller, self._state, entry)
+        self.refused += bool(refused)
+        if entry.message is None:
+            self._active = math.nan
+
+    def measure(self, entry: Input) -> None:
+        """Answer a measurement, knowing the requests that were known then."""
+        if entry.active is not None:
+            self._active = entry.active
+        given = self._begins_unknown
+        if given:
+            self._begin_with(entry)
+            active = self._state.setpoint.active
+            replayed = math.nan if entry.command is None else entry.command
+        else:
+            active, replayed = self._answer(entry)
+        self.samples.append(Sample(
+            entry.message, tuple(self._operations),
+            math.nan if active is None else float(active[0]),
+            math.nan if entry.command is None else entry.command, replayed, given))
+        self._operations = []
+
+    def _begin_with(self, entry: Input) -> None:
+        """Take what was commanded as given where it follows from what was not recorded."""
+        self._state = self._attempt(entry, self.recorded).asked
+        self._known = self.recorded
+        if not math.isnan(self._active):
+            self._state = _tracking(self._state, to_kelvin(self._active))
+        if entry.command is not None:
+            self._begins_unknown = False
+            self._state = replace(
+                self._state, command=np.array([to_kelvin(entry.command)]),
+                time_ns=stamp_nanoseconds(entry.message.header.stamp))
+            self.start = replace(self.start, command=self._state.command,
+                                 time_ns=self._state.time_ns)
+
+    def _answer(self, entry: Input) -> tuple[Array | None, float]:
+        counts = self._counts(entry)
+        likely = self._attempt(entry, counts[0])
+        others = (self._attempt(entry, count) for count in counts[1:])
+        found = next((a for a in itertools.chain([likely], others) if self._fits(a.report)), None)
+        if found is None:
+            self.adopted += 1
+            asked = _tracking(likely.asked, to_kelvin(self._active))
+            found = _Attempt(likely.known, likely.refused, asked,
+                             *answer(self._controller, asked, entry.message))
+        self._known = found.known
+        self.refused += found.refused
+        self._state = found.state
+        return found.report.active_setpoint, to_celsius(found.kelvin)
+
+    def _counts(self, entry: Input) -> list[int]:
+        """Return how many requests may have been known at a measurement, the likeliest first."""
+        likely = low = high = max(self._known, self.recorded)
+        if self._record.tells_active:
+            while (low > self._known
+                   and entry.time_ns - self._requests[low - 1].time_ns <= _CLOSE_NS):
+                low -= 1
+            while (high < len(self._requests)
+                   and self._requests[high].time_ns - entry.time_ns <= _CLOSE_NS):
+                high += 1
+        return [likely, *(count for count in range(low, high + 1) if count != likely)]
+
+    def _attempt(self, entry: Input, known: int) -> _Attempt:
+        asked, refused = self._state, 0
+        for request in self._requests[self._known:known]:
+            asked, reason = ask_setpoint(self._controller, asked, request.message)
+            refused += bool(reason)
+        return _Attempt(known, refused, asked, *answer(self._controller, asked, entry.message))
+
+    def _fits(self, report: Report) -> bool:
+        """Tell whether the set-point tracked is the one that was, as far as that is known."""
+        return (not self._record.tells_active or math.isnan(self._active)
+                or tracked_celsius(report) == self._active)
+
+
+def _start(record: ControlRecord) -> State:
+    """Return what is known of the state before the first measurement."""
+    state = State(mode=record.mode)
+    if record.active_before is not None:
+        state = _tracking(state, to_kelvin(record.active_before[1]))
+    if record.command_before is not None:
+        stamp_ns, celsius = record.command_before
+        state = replace(state, command=np.array([to_kelvin(celsius)]), time_ns=stamp_ns)
+    return state
+
+
+def _tracking(state: State, kelvin: float) -> State:
+    """Return the state with a set-point in force, its schedule untouched."""
+    value = np.array([kelvin])
+    return replace(state, setpoint=replace(state.setpoint, requested=value, active=value))
+
+
+def _operated(controller: Controller, state: State, entry: Input) -> tuple[State, str]:
+    if entry.message is None:
+        return State(), ''
+    if isinstance(entry.message, Mode):
+        return controller.set_mode(state, entry.message), ''
+    return ask_manual_coolant(controller, state, entry.message)
