@@ -213,7 +213,7 @@ def compare_closed_loops(model: LiftedModel, linear: LiftedModel, samples: Sampl
     weights = Weights(np.eye(model.n_x), np.eye(model.n_u))
     order = np.argsort(np.linalg.norm(model.states.to_deviation(samples.x), axis=1))
     chosen = samples.x[order[np.linspace(0, len(order) - 1, starts + 1).astype(int)[1:]]]
-    duration = _settling_time(linear, weights)
+    duration = settling_time(linear, weights)
 
     def rate(x: Array, u: Array) -> Array:
         return model.states.scale * (model.drift(model.states.to_deviation(x))
@@ -235,7 +235,7 @@ def compare_closed_loops(model: LiftedModel, linear: LiftedModel, samples: Sampl
     return ClosedLoopComparison(float(ratio), arrived[0], arrived[1], starts)
 
 
-def _settling_time(linear: LiftedModel, weights: Weights) -> float:
+def settling_time(linear: LiftedModel, weights: Weights) -> float:
     """Return six time constants of the slowest mode under the linear law, in time units."""
     # not of the open loop: an integrator never settles by itself
     riccati = solve_riccati(linear.A, linear.B, weights.Q, weights.R)

@@ -73,6 +73,7 @@ def save(model: LiftedModel, path: str | os.PathLike[str]) -> None:
         'provenance': {
             'data_digest': model.provenance.data_digest,
             'metrics': dict(model.provenance.metrics),
+            **({'method': model.provenance.method} if model.provenance.method else {}),
             'package_version': model.provenance.package_version,
             'plant': model.provenance.plant,
             'seed': model.provenance.seed,
@@ -166,7 +167,8 @@ def _build(about: dict[str, Any], tensors: dict[str, np.ndarray]) -> LiftedModel
             plant=str(origin['plant']),
             seed=None if origin['seed'] is None else _integer(origin, 'seed'),
             data_digest=str(origin['data_digest']), metrics=metrics,
-            package_version=str(origin['package_version'])))
+            package_version=str(origin['package_version']),
+            method=str(origin.get('method', ''))))
     for name, actual in (('n_x', model.n_x), ('n_u', model.n_u), ('n_z', model.n_z)):
         if _integer(about, name) != actual:
             raise ValueError(f'{name} is given as {about[name]}, the arrays say {actual}')

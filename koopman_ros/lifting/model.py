@@ -97,8 +97,10 @@ class Provenance:
     :param seed: seed of the training run, or None for a model that was not trained.
     :param data_digest: SHA-256 of the training samples, in hexadecimal.
     :param metrics: held-out figures: ``rw``, ``rx`` and ``cond`` without unit,
-        ``rollout_rmse`` in state units.
+        ``rollout_rmse`` in state units; from measured data also ``noise`` in state units and
+        ``coverage``, the visited share of the training box.
     :param package_version: version of koopman_ros that made it.
+    :param method: how derivatives were found; empty where they were given.
     """
 
     plant: str
@@ -106,6 +108,7 @@ class Provenance:
     data_digest: str = ''
     metrics: Mapping[str, float] = field(default_factory=dict)
     package_version: str = ''
+    method: str = ''
 
 
 @dataclass(frozen=True)

@@ -1,0 +1,215 @@
+# Copyright 2026 The koopman_ros Authors
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+
+"""The identification experiment: random steps of the input on a running plant, with a way back."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from enum import Enum
+from functools import cached_property
+
+from koopman_ros.control.controller import LATE_NANOSECONDS
+from koopman_ros.control.setpoint import in_state_units, NANOSECONDS, Show
+import numpy as np
+from numpy.typing import NDArray
+
+Array = NDArray[np.float64]
+
+_FOLLOWS_WITHIN = 0.01  # K
+_COMES_NEARER = 1e-4  # K, less than any rate limit allows
+
+
+class Phase(Enum):
+    """What an experiment is doing; the value is the word an operator reads."""
+
+    RUNNING = 'running'
+    FINISHED = 'finished'
+    ENDED = 'ended'
+    ABORTED = 'aborted'
+
+
+@dataclass(frozen=True)
+class Experiment:
+    """
+    Steps of random height and length (paper, section on the reactor), and what ends them.
+
+    :param duration: s.
+    :param input_lower: lowest level, in K; levels are uniform between the two.
+    :param input_upper: highest level, in K.
+    :param hold_shortest: shortest time of a level, in s; times are uniform between the two.
+    :param hold_longest: longest time of a level, in s.
+    :param rate: largest change of the input, in K/s.
+    :param state_lower: lowest temperature of the reactor that may be measured, in K.
+    :param state_upper: highest temperature, in K.
+    :param safe_input: input that is safe whatever happened, in K.
+    :param seed: of numpy's default generator; the same seed gives the same steps.
+    :raises ValueError: when the limits contradict each other.
+    """
+
+    duration: float
+    input_lower: float
+    input_upper: float
+    hold_shortest: float
+    hold_longest: float
+    rate: float
+    state_lower: float
+    state_upper: float
+    safe_input: float
+    seed: int
+
+    def __post_init__(self) -> None:
+        for low, high in (('input_lower', 'input_upper'), ('state_lower', 'state_upper')):
+            if not getattr(self, low) < getattr(self, high):
+                raise ValueError(f'{low} = {getattr(self, low)} K must be below {high} = '
+                                 f'{getattr(self, high)} K')
+        if not 0.0 < self.hold_shortest <= self.hold_longest:
+            raise ValueError(f'hold_shortest = {self.hold_shortest} s must be above 0 and not '
+                             f'above hold_longest = {self.hold_longest} s')
+        for name in ('duration', 'rate'):
+            if not 0.0 < getattr(self, name) < np.inf:
+                raise ValueError(f'{name} = {getattr(self, name)} must be finite and above 0')
+
+    @cached_property
+    def steps(self) -> tuple[Array, Array]:
+        """When each step ends (S,), in s after the start, and its level (S,), in K."""
+        rng = np.random.default_rng(self.seed)
+        count = int(self.duration / self.hold_shortest) + 1
+        ends = np.cumsum(rng.uniform(self.hold_shortest, self.hold_longest, count))
+        levels = rng.uniform(self.input_lower, self.input_upper, count)
+        used = int(np.searchsorted(ends, self.duration)) + 1
+        return ends[:used], levels[:used]
+
+    def refusal(self, measured: float, show: Show = in_state_units) -> str:
+        """
+        Say why the experiment must not go on with a measurement, or return an empty string.
+
+        :param measured: temperature of the reactor, in K.
+        :param show: how values are written.
+        """
+        if not np.isfinite(measured):
+            return f'the temperature {show(measured, "K")} is not finite: check the sensor'
+        if not self.state_lower <= measured <= self.state_upper:
+            return (f'the temperature {show(measured, "K")} is outside the bounds of the '
+                    f'experiment, {show(self.state_lower, "K")} to {show(self.state_upper, "K")}')
+        return ''
+
+
+@dataclass(frozen=True)
+class Progress:
+    """
+    How far an experiment is.
+
+    :param start_ns: stamp of the measurement it started with.
+    :param time_ns: stamp of the last measurement.
+    :param command: last input, in K.
+    :param interval: usual seconds between measurements; infinity before the second.
+    :param phase: what it is doing; it goes on commanding the safe input when it is over.
+    :param reason: why it was aborted, in words.
+    """
+
+    start_ns: int
+    time_ns: int
+    command: float
+    interval: float = np.inf
+    phase: Phase = Phase.RUNNING
+    reason: str = ''
+
+    @property
+    def elapsed(self) -> float:
+        """Seconds since the start."""
+        return (self.time_ns - self.start_ns) / NANOSECONDS
+
+
+def begin(experiment: Experiment, time_ns: int) -> Progress:
+    """Start with the safe input, at the stamp of the first measurement."""
+    return Progress(time_ns, time_ns, experiment.safe_input)
+
+
+def end(progress: Progress, phase: Phase, reason: str = '') -> Progress:
+    """End the steps, unless they are over; the input then goes back to the safe one."""
+    if progress.phase is not Phase.RUNNING:
+        return progress
+    return replace(progress, phase=phase, reason=reason)
+
+
+def advance(experiment: Experiment, progress: Progress, measured: float | None, time_ns: int,
+            show: Show = in_state_units) -> Progress:
+    """
+    Answer a measurement, or the passing of time without one.
+
+    As in the control step, a stamp that is not later moves nothing, and the rate limit counts a
+    gap in the measurements as twice the interval before it.
+
+    :param experiment: the plan.
+    :param progress: as returned by the call before.
+    :param measured: temperature of the reactor, in K, or None.
+    :param time_ns: its stamp, or the present time.
+    :param show: how values are written in the reason of an abort.
+    :return: the new progress with the command.
+    """
+    ahead = time_ns - progress.time_ns
+    if measured is not None and (reason := experiment.refusal(measured, show)):
+        progress = end(progress, Phase.ABORTED, reason)
+    if ahead < -LATE_NANOSECONDS:
+        progress = end(progress, Phase.ABORTED, 'the stamps of the measurements went back')
+        return replace(progress, time_ns=time_ns)
+    if ahead <= 0:
+        return progress
+    seconds = min(ahead / NANOSECONDS, 2.0 * progress.interval)
+    usual = 0.0 if np.isinf(progress.interval) else 0.5 * progress.interval
+    progress = replace(progress, time_ns=time_ns, interval=max(seconds, usual))
+    if progress.elapsed >= experiment.duration:
+        progress = end(progress, Phase.FINISHED)
+    reach = experiment.rate * seconds
+    change = level(experiment, progress) - progress.command
+    return replace(progress, command=progress.command + min(max(change, -reach), reach))
+
+
+def level(experiment: Experiment, progress: Progress) -> float:
+    """Return where the input goes now, in K."""
+    if progress.phase is not Phase.RUNNING:
+        return experiment.safe_input
+    ends, levels = experiment.steps
+    return float(levels[np.searchsorted(ends, progress.elapsed, side='right')])
+
+
+@dataclass(frozen=True)
+class Following:
+    """
+    Whether a controller in manual mode passes the input on, within limits of its own.
+
+    :param heard: what it commanded last, in K, or None at first.
+    :param astray: how many times in a row that was not, nor came nearer to, what was asked.
+    :param since: time of the first of these, in s.
+    """
+
+    heard: float | None = None
+    astray: int = 0
+    since: float = 0.0
+
+    def after(self, heard: float, asked: float, now: float) -> Following:
+        """
+        Return the same after another command of the controller.
+
+        :param heard: what it commanded, in K.
+        :param asked: what was asked, in K.
+        :param now: time, in s.
+        """
+        gap = abs(heard - asked)
+        nearer = self.heard is None or gap < abs(self.heard - asked) - _COMES_NEARER
+        if gap <= _FOLLOWS_WITHIN or nearer:
+            return Following(heard, 0, now)
+        return Following(heard, self.astray + 1, self.since if self.astray else now)

@@ -1,0 +1,159 @@
+# Copyright 2026 The koopman_ros Authors
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+
+"""Stretches of records side by side on common steps, so that models roll them out at once."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+import itertools
+import math
+
+from koopman_ros.identification.records import Array, Record
+import numpy as np
+
+# dx/dt (M, n_x) of states (M, n_x) and inputs (M, n_u), all in units
+Rate = Callable[[Array, Array], Array]
+
+# Difference of two starts that tells the slope, in units of the states' scale.
+_STEP = 1e-4
+
+
+@dataclass(frozen=True)
+class Stretches:
+    """
+    M stretches on grids of K steps, between which inputs are constant; short ones are padded.
+
+    :param steps: (K, M) lengths of the steps, 0 in the padding, in time units.
+    :param u: (K, M, n_u) inputs held over them.
+    :param x: (K + 1, M, n_x) measured states, 0 where none was measured.
+    :param measured: (K + 1, M) whether one was.
+    """
+
+    steps: Array
+    u: Array
+    x: Array
+    measured: np.ndarray
+
+    @classmethod
+    def of(cls, records: Sequence[Record], longest_step: float) -> Stretches:
+        """
+        Put records on grids of their own: their samples, their input changes and steps between.
+
+        :param records: what was recorded.
+        :param longest_step: in time units.
+        """
+        grids = [_grid(record, longest_step) for record in records]
+        K, M = max(len(grid) for grid in grids) - 1, len(records)
+        n_x, n_u = records[0].x.shape[1], records[0].u.shape[1]
+        steps, u = np.zeros((K, M)), np.zeros((K, M, n_u))
+        x, measured = np.zeros((K + 1, M, n_x)), np.zeros((K + 1, M), dtype=bool)
+        for j, (record, grid) in enumerate(zip(records, grids, strict=True)):
+            k = len(grid) - 1
+            steps[:k, j] = np.diff(grid)
+            u[:k, j] = record.inputs_at(grid[:-1])
+            u[k:, j] = record.u[-1]
+            rows = np.searchsorted(grid, record.time)
+            x[rows, j], measured[rows, j] = record.x, True
+        return cls(steps, u, x, measured)
+
+    def path(self, rate: Rate, x0: Array) -> Array:
+        """
+        Integrate a model from the starts `x0` (M, n_x) by the classical Runge-Kutta method.
+
+        :return: (K + 1, M, n_x) states, not finite where the model diverges.
+        """
+        path = np.empty(self.x.shape)
+        path[0] = x = x0
+        with np.errstate(all='ignore'):
+            for k, (h, u) in enumerate(zip(self.steps[..., None], self.u, strict=True)):
+                k1 = rate(x, u)
+                k2 = rate(x + 0.5 * h * k1, u)
+                k3 = rate(x + 0.5 * h * k2, u)
+                k4 = rate(x + h * k3, u)
+                path[k + 1] = x = x + h / 6.0 * (k1 + 2.0 * k2 + 2.0 * k3 + k4)
+        return path
+
+    def errors(self, rate: Rate, x0: Array) -> Array:
+        """Return the prediction less the measurement (K + 1, M, n_x), 0 where there is none."""
+        return np.where(self.measured[..., None], self.path(rate, x0) - self.x, 0.0)
+
+
+def longest_step(records: Sequence[Record]) -> float:
+    """Return a step over which a Runge-Kutta method follows motion that the records resolve."""
+    # a motion is resolved where it takes several samples
+    return 2.0 * float(np.median(np.concatenate([np.diff(record.time) for record in records])))
+
+
+def fitted_starts(rate: Rate, stretches: Stretches, scale: Array) -> tuple[Array, Array]:
+    """
+    Predict every stretch by a model, from the start that suits it best, and compare.
+
+    The start is fitted, for a measurement of it would bring its noise into the prediction.
+
+    :param rate: the model.
+    :param stretches: measured stretches.
+    :param scale: (n_x,) size of the states, in which their errors are weighed.
+    :return: the starts (M, n_x), and the mean squared errors from there (M, n_x), in state units
+        squared, infinite on divergence.
+    """
+    x0 = first_measured(stretches)
+    n_x = x0.shape[1]
+    count = np.sum(stretches.measured, axis=0)[:, None]
+    best, least = x0, np.full_like(x0, np.inf)
+    # errors in units of the scale: states of different units weigh alike
+    for last in (False, False, True):
+        errors = stretches.errors(rate, x0) / scale
+        # a model may diverge from any of the starts
+        with np.errstate(all='ignore'):
+            squares = np.sum(errors ** 2, axis=0) / count
+            better = np.sum(squares, axis=1) < np.sum(least, axis=1)
+            best, least = (np.where(better[:, None], x0, best),
+                           np.where(better[:, None], squares, least))
+            if last or not np.all(np.isfinite(errors)):
+                break
+            # (K + 1, M, n_x, n_x): change of every state with each start
+            slopes = np.stack([
+                (stretches.errors(rate, x0 + _STEP * scale * unit) / scale - errors) / _STEP
+                for unit in np.eye(n_x)], axis=-1)
+            normal = np.einsum('kmij,kmil->mjl', slopes, slopes)
+            right = np.einsum('kmij,kmi->mj', slopes, errors)
+            if not (np.all(np.isfinite(normal)) and np.all(np.isfinite(right))):
+                break
+            inverse = np.linalg.pinv(normal, rcond=1e-9, hermitian=True)
+            x0 = x0 - scale * (inverse @ right[..., None])[..., 0]
+    return best, least * scale ** 2
+
+
+def prediction_error(rate: Rate, stretches: Stretches, scale: Array) -> Array:
+    """Return the root mean square error (n_x,) of :func:`fitted_starts`, in state units."""
+    squares = fitted_starts(rate, stretches, scale)[1]
+    weights = np.sum(stretches.measured, axis=0)
+    return np.sqrt(np.average(squares, axis=0, weights=weights))
+
+
+def first_measured(stretches: Stretches) -> Array:
+    """Return the first measurement of each stretch (M, n_x)."""
+    return stretches.x[0].copy()
+
+
+def _grid(record: Record, longest: float) -> Array:
+    inside = (record.input_time > record.time[0]) & (record.input_time < record.time[-1])
+    knots = np.union1d(record.time, record.input_time[inside])
+    pieces = [np.linspace(a, b, math.ceil((b - a) / longest * (1.0 - 1e-9)) + 1)[:-1]
+              if b - a > longest else np.array([a])
+              for a, b in itertools.pairwise(knots)]
+    return np.concatenate([*pieces, knots[-1:]])

@@ -1,0 +1,162 @@
+# Copyright 2026 The koopman_ros Authors
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+
+"""Drift from derivatives by total variation, taken of the motion less what the inputs did."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+from koopman_ros.identification.drift import Box, DriftModel, regress
+from koopman_ros.identification.records import Array, Record
+import numpy as np
+from scipy.linalg import solveh_banded
+
+_SWEEPS = 30
+_BISECTIONS = 14
+# Samples that a record needs.
+_SHORTEST = 8
+
+
+def total_variation(records: Sequence[Record], box: Box, degree: int, B: Array | None,
+                    assumed: Array) -> DriftModel:
+    """
+    Fit the drift to derivatives found by total variation on x - integral(B u).
+
+    That difference has no kink where the input steps; its derivative is f(x) alone.
+    (Rudin, Osher, Fatemi 1992; Chartrand 2011. Here the variation of the second derivative is
+    held down, so that the first one may bend and need not be made of stairs.)
+
+    :param records: what was recorded.
+    :param box: the deviations.
+    :param degree: of the drift.
+    :param B: (n_x, n_u) scaled, or None to learn it.
+    :param assumed: (n_x, n_u) scaled B that is taken off before smoothing; it need not be exact.
+    :raises ValueError: when no record is long enough.
+    """
+    shape = DriftModel(box, degree, np.empty(0), assumed)
+    features, pushes, rates = [], [], []
+    for record in records:
+        if len(record) < _SHORTEST:
+            continue
+        v = box.input_deviation(record.inputs_at(record.time))
+        moved = _moved(record, box, assumed)
+        smooth = smoothed(record.time, box.state_deviation(record.x) - moved)
+        rate = np.gradient(smooth, record.time, axis=0, edge_order=2)
+        # one-sided differences at the ends are poor
+        inner = slice(2, -2)
+        features.append(shape.features((smooth + moved)[inner]))
+        pushes.append(v[inner])
+        rates.append(rate[inner] + v[inner] @ assumed.T)
+    if not features:
+        raise ValueError(f'no record has {_SHORTEST} samples: record longer')
+    return regress(box, degree, np.concatenate(features), np.concatenate(pushes),
+                   np.concatenate(rates), B)
+
+
+def noise_level(records: Sequence[Record], model: DriftModel) -> Array:
+    """
+    Return the standard deviation (n_x,) of the measurement noise, in state units.
+
+    From third differences of x - integral(B u), in which a motion that is well resolved leaves
+    nothing but noise.
+
+    :raises ValueError: when no record is long enough.
+    """
+    found = []
+    for record in records:
+        if len(record) >= _SHORTEST:
+            rest = model.box.state_deviation(record.x) - _moved(record, model.box, model.B)
+            D = _third_differences(record.time)
+            found.append([_noise(D, rest[:, j]) for j in range(rest.shape[1])])
+    if not found:
+        raise ValueError(f'no record has {_SHORTEST} samples: record longer')
+    return model.box.state_scale * np.median(np.array(found), axis=0)
+
+
+def _moved(record: Record, box: Box, B: Array) -> Array:
+    """Return the integral of B times the input's deviation (N, n_x), in deviations."""
+    span = record.time - record.time[0]
+    center = 0.5 * (box.input_lower + box.input_upper)
+    moved: Array = (record.input_integral(record.time) - center * span[:, None]
+                    ) / box.input_scale @ B.T
+    return moved
+
+
+def _noise(D: Array, y: Array) -> float:
+    # the median is not moved by the few places where the motion bends
+    return float(np.median(np.abs(_apply(D, y)) / np.sqrt(np.sum(D ** 2, axis=1))) / 0.6745)
+
+
+def smoothed(time: Array, values: Array) -> Array:
+    """
+    Smooth signals as far as their noise allows, with few bends of the derivative.
+
+    min 0.5 ||g - y||^2 + a ||D^3 g||_1 by iterated weights; `a` is such that what is taken away
+    has the size of the noise, which third differences tell (discrepancy principle).
+
+    :param time: (N,) rising.
+    :param values: (N, n).
+    """
+    return np.column_stack([_smoothed(time, values[:, j]) for j in range(values.shape[1])])
+
+
+def _smoothed(time: Array, y: Array) -> Array:
+    D = _third_differences(time)
+    noise = _noise(D, y)
+    if noise <= 1e-9 * float(np.ptp(y) or 1.0):
+        return y
+    low, high = -6.0, 8.0
+    for _ in range(_BISECTIONS):
+        middle = 0.5 * (low + high)
+        g = _filtered(y, D, noise * 10.0 ** middle)
+        if np.sqrt(np.mean((g - y) ** 2)) < noise:
+            low = middle
+        else:
+            high = middle
+    return _filtered(y, D, noise * 10.0 ** low)
+
+
+def _filtered(y: Array, D: Array, weight: float) -> Array:
+    """Solve one l1 trend filter (Kim, Koh, Boyd, Gorinevsky 2009) by iterated weights."""
+    g = y
+    floor = 1e-6 * float(np.std(_apply(D, y)))
+    for _ in range(_SWEEPS):
+        w = weight / np.maximum(np.abs(_apply(D, g)), floor)
+        bands = np.zeros((4, len(y)))
+        for shift in range(4):
+            for i in range(4 - shift):
+                # (D' W D)[k + i, k + i + shift] gathers D[k, i] D[k, i + shift]
+                start = i + shift
+                bands[3 - shift, start:start + len(D)] += w * D[:, i] * D[:, i + shift]
+        bands[3] += 1.0
+        g = solveh_banded(bands, y, check_finite=False)
+    return g
+
+
+def _third_differences(time: Array) -> Array:
+    """Return the rows (N - 3, 4) of third differences, as on an even grid of the mean period."""
+    period = (time[-1] - time[0]) / (len(time) - 1)
+    t = time / period
+    points = np.column_stack([t[i:len(t) - 3 + i] for i in range(4)])
+    rows = np.empty_like(points)
+    for i in range(4):
+        others = [j for j in range(4) if j != i]
+        rows[:, i] = 6.0 / np.prod(points[:, [i]] - points[:, others], axis=1)
+    return rows
+
+
+def _apply(D: Array, y: Array) -> Array:
+    return np.einsum('ki,ki->k', D, np.lib.stride_tricks.sliding_window_view(y, 4))

@@ -1,0 +1,88 @@
+# Copyright 2026 The koopman_ros Authors
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+
+"""Drift from integrals against test functions: the weak form, which needs no derivative."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+from koopman_ros.identification.drift import Box, DriftModel, regress
+from koopman_ros.identification.records import Array, Record
+import numpy as np
+
+# Exponent of the test functions (1 - s^2)^p.
+_POWER = 3
+# It is zero at the first and at the last sample.
+_SHORTEST = 4
+
+
+def weak_form(records: Sequence[Record], box: Box, degree: int, B: Array | None,
+              window: int) -> DriftModel:
+    """
+    Fit the drift to -integral(phi' x) = integral(phi f(x)) + B integral(phi u).
+
+    phi = (1 - s^2)^3 on windows that overlap by three quarters; x enters as measured. (Weak SINDy:
+    Messenger and Bortz 2021.)
+
+    :param records: what was recorded.
+    :param box: the deviations.
+    :param degree: of the drift.
+    :param B: (n_x, n_u) scaled, or None to learn it.
+    :param window: samples of a window, at least 4.
+    :raises ValueError: when the window or the records are too short.
+    """
+    if window < _SHORTEST:
+        raise ValueError(f'a window of {window} samples is too short, at least {_SHORTEST} are '
+                         'needed')
+    n_x, n_u = records[0].x.shape[1], records[0].u.shape[1]
+    shape = DriftModel(box, degree, np.empty(0), np.empty((n_x, n_u)))
+    features, pushes, rates = [], [], []
+    for record in records:
+        xi = box.state_deviation(record.x)
+        P = shape.features(xi)
+        for start in range(0, len(record) - window + 1, max(1, window // 4)):
+            rows = slice(start, start + window)
+            t = record.time[rows]
+            middle, half = 0.5 * (t[0] + t[-1]), 0.5 * (t[-1] - t[0])
+            s = (t - middle) / half
+            phi = (1.0 - s * s) ** _POWER
+            slope = -2.0 * _POWER * s * (1.0 - s * s) ** (_POWER - 1) / half
+            weights = _trapezoid(t)
+            features.append((weights * phi) @ P[rows])
+            rates.append(-(weights * slope) @ xi[rows])
+            pushes.append(_input_integral(record, box, middle, half))
+    if not features:
+        raise ValueError(f'no record has {window} samples: record longer')
+    return regress(box, degree, np.array(features), np.array(pushes), np.array(rates), B)
+
+
+def _trapezoid(t: Array) -> Array:
+    """Return the weights of the trapezoidal rule."""
+    steps = np.diff(t)
+    return 0.5 * (np.append(steps, 0.0) + np.insert(steps, 0, 0.0))
+
+
+def _input_integral(record: Record, box: Box, middle: float, half: float) -> Array:
+    """Integrate phi times the scaled input exactly: it is constant between its changes."""
+    inside = record.input_time[np.abs(record.input_time - middle) < half]
+    edges = np.concatenate(([middle - half], inside, [middle + half]))
+    held = box.input_deviation(record.inputs_at(edges[:-1]))
+    return half * np.diff(_antiderivative((edges - middle) / half)) @ held
+
+
+def _antiderivative(s: Array) -> Array:
+    """Integrate (1 - s^2)^3 from 0."""
+    return s - s ** 3 + 0.6 * s ** 5 - s ** 7 / 7.0

@@ -1,0 +1,177 @@
+# Copyright 2026 The koopman_ros Authors
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+
+"""A retraining in a process of its own: start, progress, outcome, cancel; without ROS."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+import contextlib
+from dataclasses import dataclass, field
+import json
+import queue
+import signal
+import subprocess
+import sys
+import threading
+from typing import Any
+
+_MODULE = 'koopman_ros.retraining'
+_PATIENCE = 5.0  # s from the request to end until the process is killed
+
+
+@dataclass(frozen=True)
+class JobState:
+    """
+    Where a retraining stands.
+
+    :param share: done, in [0, 1].
+    :param text: what is done now, or how it ended.
+    :param ended: whether it has ended.
+    :param summary: figures of a lift that was judged, or None.
+    """
+
+    share: float = 0.0
+    text: str = 'starting'
+    ended: bool = False
+    summary: Mapping[str, Any] | None = field(default=None)
+
+    @property
+    def accepted(self) -> bool:
+        """Whether there is a new lift that may be used."""
+        return bool(self.summary and self.summary['accepted'])
+
+    @property
+    def refused(self) -> bool:
+        """Whether a lift was learned or tried and does not suffice."""
+        return bool(self.summary and not self.summary['accepted'])
+
+
+class RetrainingJob:
+    """
+    A retraining in a process of its own, which does not outlive this one.
+
+    :param task: fields of :class:`koopman_ros.retraining.Task`.
+    """
+
+    def __init__(self, task: Mapping[str, object]) -> None:
+        self.state = JobState()
+        self._cancelled = False
+        # a session of its own: an interrupt of the terminal is passed on by us
+        self._process = subprocess.Popen(
+            [sys.executable, '-m', _MODULE], stdin=subprocess.PIPE, stdout=subprocess.PIPE,
+            stderr=subprocess.PIPE, encoding='utf-8', errors='replace', start_new_session=True)
+        self._lines: queue.SimpleQueue[str | None] = queue.SimpleQueue()
+        self._complaints: list[str] = []
+        assert self._process.stdin is not None
+        self._process.stdin.write(json.dumps(dict(task)) + '\n')
+        self._process.stdin.flush()
+        self._threads = [threading.Thread(target=read, daemon=True)
+                         for read in (self._read_lines, self._read_complaints)]
+        for thread in self._threads:
+            thread.start()
+
+    def poll(self) -> JobState:
+        """Take note of what the process has said since, and return where it stands."""
+        while not self.state.ended and not self._lines.empty():
+            line = self._lines.get()
+            self.state = self._ended() if line is None else self._told(line)
+        return self.state
+
+    def cancel(self) -> None:
+        """Ask the process to end; nothing is written then."""
+        self._cancelled = True
+        self._close_input()
+
+    def close(self) -> None:
+        """End the process, by force when it does not end in time."""
+        self.cancel()
+        try:
+            self._process.wait(_PATIENCE)
+        except subprocess.TimeoutExpired:
+            self._process.kill()
+            self._process.wait()
+        for thread in self._threads:
+            thread.join()
+        for stream in (self._process.stdout, self._process.stderr):
+            assert stream is not None
+            stream.close()
+
+    def _told(self, line: str) -> JobState:
+        try:
+            said = json.loads(line)
+        except ValueError:
+            # cut off when the process was killed, or printed by a library
+            return self.state
+        if 'progress' in said:
+            return JobState(said['progress'], said['text'])
+        if 'summary' in said:
+            return JobState(1.0, _in_words(said['summary']), True, said['summary'])
+        if 'stopped' in said:
+            return JobState(self.state.share, 'cancelled, nothing was written', True)
+        return JobState(self.state.share, f'training failed: {said["error"]}', True)
+
+    def _ended(self) -> JobState:
+        """Say what is known of a process that ended without a word."""
+        code = self._process.wait()
+        if self._cancelled:
+            return JobState(self.state.share, 'cancelled, nothing was written', True)
+        if code < 0:
+            return JobState(
+                self.state.share, f'the training process was killed by {_signal_name(-code)}: see '
+                'whether the memory suffices, and train again', True)
+        self._threads[1].join()
+        last = self._complaints[-1] if self._complaints else 'it said nothing'
+        return JobState(self.state.share, f'the training process ended with code {code}: {last}',
+                        True)
+
+    def _close_input(self) -> None:
+        assert self._process.stdin is not None
+        # it may have ended
+        with contextlib.suppress(BrokenPipeError):
+            self._process.stdin.close()
+
+    def _read_lines(self) -> None:
+        assert self._process.stdout is not None
+        for line in self._process.stdout:
+            self._lines.put(line)
+        self._lines.put(None)
+
+    def _read_complaints(self) -> None:
+        assert self._process.stderr is not None
+        for line in self._process.stderr:
+            self._complaints = [*self._complaints[-20:], line.strip()]
+
+
+def _signal_name(number: int) -> str:
+    try:
+        return signal.Signals(number).name
+    except ValueError:
+        return f'signal {number}'
+
+
+def _in_words(summary: Mapping[str, Any]) -> str:
+    if not summary['accepted']:
+        reasons = '; '.join(summary['reasons'])
+        kept = f'; it is kept as {summary["model_file"]}' if summary['model_file'] else ''
+        return f'the new lift is refused: {reasons}{kept}'
+    return (f'the new lift is accepted: error on held-out records '
+            f'{summary["heldout_error_kelvin"]:.4g} K, that of the present one '
+            f'{_kelvin(summary["heldout_error_of_present_lift_kelvin"])}; written to '
+            f'{summary["model_file"]}')
+
+
+def _kelvin(error: float | None) -> str:
+    return 'infinite, as it diverges' if error is None else f'{error:.4g} K'

@@ -1,0 +1,91 @@
+# Copyright 2026 The koopman_ros Authors
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+
+"""
+The process that retrains: a task in JSON on the first line of its input, JSON lines on its output.
+
+Each line holds either ``progress`` (share done) with ``text``, or at last ``summary`` and
+``files``, or ``error``, or ``stopped``. It ends early on SIGINT, on SIGTERM, and when its input is
+closed, so that it does not outlive whoever started it.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+import sys
+import threading
+import time
+
+_PERIOD = 0.2  # s between two lines of progress
+
+
+def main() -> int:
+    """Run the task; the exit code is 0 for an accepted lift, 2 for a refused one, 1 otherwise."""
+    stop = threading.Event()
+    for number in (signal.SIGINT, signal.SIGTERM):
+        signal.signal(number, lambda *_: stop.set())
+    # whoever controls the plant meanwhile comes first
+    os.nice(10)
+    line = sys.stdin.readline()
+    threading.Thread(target=_wait_for_end_of_input, args=(stop,), daemon=True).start()
+    try:
+        from koopman_ros.identification import Stopped
+        from koopman_ros.lifting import load
+        from koopman_ros.retraining import retrain, Task, write_report
+    except ImportError as error:
+        _say(error=f'training needs a package that is not installed ({error}): '
+             "pip install 'koopman_ros[train]'")
+        return 1
+    last = -_PERIOD
+
+    def tell(share: float, text: str) -> bool:
+        nonlocal last
+        if time.monotonic() - last >= _PERIOD:
+            last = time.monotonic()
+            _say(progress=round(share, 4), text=text)
+        return stop.is_set()
+
+    try:
+        task = Task.from_json(line)
+        # before the new lift takes its place
+        current = load(task.model)
+        outcome = retrain(task, tell)
+        files = write_report(outcome, current)
+    except BrokenPipeError:
+        # whoever started it is gone
+        return 1
+    except Stopped:
+        _say(stopped=True)
+        return 1
+    except (ValueError, TypeError, KeyError, OSError, MemoryError) as error:
+        _say(error=' '.join(str(error).split()) or type(error).__name__)
+        return 1
+    _say(summary=outcome.summary(), files=[str(path) for path in files])
+    return 0 if outcome.accepted else 2
+
+
+def _wait_for_end_of_input(stop: threading.Event) -> None:
+    sys.stdin.read()
+    stop.set()
+
+
+def _say(**values: object) -> None:
+    print(json.dumps(values), flush=True)
+
+
+if __name__ == '__main__':
+    sys.exit(main())

@@ -1,0 +1,275 @@
+# Copyright 2026 The koopman_ros Authors
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+
+"""Retraining from bags, from the first byte to the model file: one path for all who ask for it."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+import dataclasses
+from dataclasses import dataclass, field, replace
+import hashlib
+import json
+import os
+from pathlib import Path
+import shutil
+
+from koopman_ros.bags import Account, Episode, loop_episodes
+from koopman_ros.identification import Identified, identify, Record, Stopped
+from koopman_ros.learning import NoUsefulLift, Progress, Trained
+from koopman_ros.lifting import LiftedModel, load, save
+from koopman_ros.retraining.coverage import coverage
+from koopman_ros.retraining.gate import judge, Thresholds, Verdict
+from koopman_ros.retraining.lift import learn_lift
+import numpy as np
+
+_ZERO_CELSIUS = 273.15  # K
+_NS = 1_000_000_000
+# Shares of the whole at which estimating, learning and judging begin.
+_STAGES = {'estimate': 0.05, 'learn': 0.35, 'judge': 0.9}
+
+# Called with the share done in [0, 1] and what is done now; True asks for an end.
+Tell = Callable[[float, str], bool]
+
+
+@dataclass(frozen=True)
+class Task:
+    """
+    What to retrain from and with.
+
+    :param bags: files or folders.
+    :param output: model file to write, ending in ``.safetensors``.
+    :param model: file of the present lift.
+    :param temperature_topic: absolute name of the measurements.
+    :param coolant_topic: absolute name of the coolant temperature that acts.
+    :param coordinates: n_z of the new lift.
+    :param seed: of the split and of the training.
+    :param starts: of each round of the training.
+    :param input_gain: B in 1/min where it is known, 0 to learn it.
+    :param input_delay: dead time of the actuator, in s.
+    :param margin: see :class:`Thresholds`.
+    :param condition: likewise.
+    """
+
+    bags: tuple[str, ...]
+    output: str
+    model: str
+    temperature_topic: str = '/temperature'
+    coolant_topic: str = '/coolant_setpoint'
+    coordinates: int = 3
+    seed: int = 0
+    starts: int = 3
+    input_gain: float = 0.0
+    input_delay: float = 0.0
+    margin: float = 0.1
+    condition: float = 1e4
+
+    @classmethod
+    def from_json(cls, text: str) -> Task:
+        """Read a task; unknown or missing fields are a TypeError."""
+        values = json.loads(text)
+        return cls(**{**values, 'bags': tuple(values['bags'])})
+
+    def to_json(self) -> str:
+        """Write the task on one line."""
+        return json.dumps(dataclasses.asdict(self))
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """
+    What came of a task.
+
+    :param task: the task.
+    :param account: what was made of the bags.
+    :param found: the estimated drift.
+    :param trained: the lift, None when there is none worth judging.
+    :param verdict: its figures, None without a lift.
+    :param reasons: why it was refused; empty when it was accepted.
+    :param coverage: share of the cells of the state-input box that the records visit.
+    :param seconds_per_time_unit: of the drift's rates.
+    :param model_file: where the lift was written, or an empty string.
+    """
+
+    task: Task
+    account: Account
+    found: Identified
+    trained: Trained | None
+    verdict: Verdict | None
+    reasons: tuple[str, ...]
+    coverage: float
+    seconds_per_time_unit: float
+    model_file: str = field(default='')
+
+    @property
+    def accepted(self) -> bool:
+        """Whether the lift may be used."""
+        return not self.reasons
+
+    def summary(self) -> dict[str, object]:
+        """Return the figures by name, for a JSON file; None is an error that is infinite."""
+        drift = self.found.drift
+        figures: dict[str, object] = {
+            'accepted': self.accepted,
+            'reasons': list(self.reasons),
+            'warnings': list(self.verdict.warnings) if self.verdict else [],
+            'model_file': self.model_file,
+            'measurements_read': self.account.measurements,
+            'measurements_used': self.account.used,
+            'coverage': self.coverage,
+            'derivative_method': self.found.method,
+            'drift_degree': drift.degree,
+            'input_gain_per_minute': (float(drift.input_matrix[0, 0])
+                                      * 60.0 / self.seconds_per_time_unit),
+            'noise_kelvin': float(self.found.noise[0]),
+        }
+        if self.verdict and self.trained:
+            figures |= {
+                'heldout_error_kelvin': float(self.verdict.rmse[0]),
+                'heldout_error_of_present_lift_kelvin': float(self.verdict.current_rmse[0]),
+                'heldout_error_of_linear_model_kelvin': float(self.verdict.linear_rmse[0]),
+                'heldout_rw': self.trained.report.fit.rw,
+                'heldout_rx': self.trained.report.fit.rx,
+                'condition': self.trained.report.fit.cond,
+                'closed_loops': self.verdict.loops,
+                'closed_loops_arrived': self.verdict.arrived,
+            }
+        return {name: None if isinstance(value, float) and not np.isfinite(value) else value
+                for name, value in figures.items()}
+
+
+def retrain(task: Task, tell: Tell = lambda *_: False) -> Outcome:
+    """
+    Read the bags, estimate the drift, learn a lift of it, judge it, and write it.
+
+    An accepted lift goes to the output file, and what was there before is kept beside it as
+    ``.previous.safetensors``; a refused one goes to ``.refused.safetensors``.
+
+    :param task: what to do.
+    :param tell: hears of the progress and can end it.
+    :raises BagReadError: for bags that cannot be used.
+    :raises ModelFileError: when the present lift cannot be read.
+    :raises ValueError: for records that do not determine a model, or a task that does not fit.
+    :raises Stopped: when `tell` asked for it; nothing is written then.
+    """
+    thresholds = Thresholds(task.margin, task.condition)
+    if Path(task.output).suffix != '.safetensors':
+        raise ValueError(f'output = {task.output!r} must end in .safetensors')
+    current = load(task.model)
+    _check_temperatures(current, task.model)
+    # whoever cannot write there should learn it now
+    Path(task.output).parent.mkdir(parents=True, exist_ok=True)
+    _go_on(tell(0.0, 'reading bags'))
+    episodes, account = loop_episodes(
+        task.bags, task.temperature_topic, task.coolant_topic,
+        input_delay_ns=round(task.input_delay * _NS))
+    if not episodes:
+        raise ValueError('the bags hold no usable stretch of measurements: '
+                         + '; '.join(account.lines()))
+    records = [_record(episode, current.seconds_per_time_unit) for episode in episodes]
+    B = None
+    if task.input_gain:
+        B = np.array([[task.input_gain * current.seconds_per_time_unit / 60.0]])
+    found = identify(records, B=B, seed=task.seed, watch=lambda done, total, text: tell(
+        _at('estimate', done / total), f'estimating: {text}'))
+    covered = coverage(records, found.drift.box)
+    trained: Trained | None = None
+    verdict: Verdict | None = None
+    reasons: tuple[str, ...] = ()
+    try:
+        trained = learn_lift(found, current, task.coordinates, seed=task.seed,
+                             starts=task.starts, watch=lambda now: tell(
+                                 _at('learn', now.finished / now.total), _learning(now)))
+    except NoUsefulLift as error:
+        reasons = (str(error),)
+    # a training that was stopped ends with its best so far
+    _go_on(tell(_at('judge', 0.0), 'judging'))
+    if trained is not None:
+        verdict = judge(found, trained, current, thresholds)
+        reasons = verdict.reasons
+        _go_on(tell(_at('judge', 0.9), 'writing'))
+    outcome = Outcome(task, account, found, trained, verdict, reasons, covered,
+                      current.seconds_per_time_unit)
+    if trained is None or verdict is None:
+        return outcome
+    model = _with_provenance(trained.model, outcome, records)
+    path = _place(Path(task.output), outcome.accepted)
+    save(model, path)
+    return replace(outcome, trained=replace(trained, model=model), model_file=str(path))
+
+
+def _check_temperatures(model: LiftedModel, path: str) -> None:
+    if (model.states.units, model.inputs.units) != (('K',), ('K',)):
+        raise ValueError(
+            f'the present lift {path} has {", ".join(model.states.names)} as states and '
+            f'{", ".join(model.inputs.names)} as inputs, bags of the loop hold one temperature '
+            'and the coolant: name a lift of these')
+
+
+def _at(stage: str, share: float) -> float:
+    begin = _STAGES[stage]
+    end = min((value for value in _STAGES.values() if value > begin), default=1.0)
+    return begin + share * (end - begin)
+
+
+def _go_on(stop: bool) -> None:
+    if stop:
+        raise Stopped
+
+
+def _learning(now: Progress) -> str:
+    rw = '' if np.isnan(now.rw) else f', rw {now.rw:.1e}'
+    return f'learning: n_z {now.n_z}, start {min(now.finished + 1, now.total)} of {now.total}{rw}'
+
+
+def _record(episode: Episode, seconds: float) -> Record:
+    """Convert an episode to kelvin and to time units since its first measurement."""
+    origin = episode.stamp_ns[0]
+    return Record((episode.stamp_ns - origin) / _NS / seconds,
+                  episode.celsius[:, None] + _ZERO_CELSIUS,
+                  (episode.input_ns - origin) / _NS / seconds,
+                  episode.input_celsius[:, None] + _ZERO_CELSIUS)
+
+
+def _with_provenance(model: LiftedModel, outcome: Outcome, records: list[Record]) -> LiftedModel:
+    assert outcome.verdict is not None
+    sha = hashlib.sha256()
+    for record in records:
+        for array in (record.time, record.x, record.input_time, record.u):
+            sha.update(np.ascontiguousarray(array).astype('<f8').tobytes())
+    metrics = {**model.provenance.metrics,
+               'rollout_rmse': float(outcome.verdict.rmse[0]),
+               'noise': float(outcome.verdict.noise[0]), 'coverage': outcome.coverage}
+    # a refused lift may diverge
+    metrics = {name: value for name, value in metrics.items() if np.isfinite(value)}
+    return replace(model, provenance=replace(
+        model.provenance, data_digest=sha.hexdigest(), metrics=metrics,
+        method=f'{outcome.found.method}, drift of degree {outcome.found.drift.degree}'))
+
+
+def _place(output: Path, accepted: bool) -> Path:
+    """Return where a lift is written; an accepted one moves its predecessor aside."""
+    if not accepted:
+        return output.with_suffix('.refused.safetensors')
+    if output.exists():
+        previous = output.with_suffix('.previous.safetensors')
+        previous.unlink(missing_ok=True)
+        # a second name, so that there is a model under the first one at every moment
+        try:
+            os.link(output, previous)
+        except OSError:
+            # not every file system has them
+            shutil.copy2(output, previous)
+    return output

@@ -1,0 +1,327 @@
+# Copyright 2026 The koopman_ros Authors
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+
+"""The identification experiment across processes: steps on a plant, refusals, ways back."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from itertools import pairwise
+import math
+from pathlib import Path
+import signal
+
+from diagnostic_msgs.msg import DiagnosticStatus
+from koopman_ros.bags import read_messages
+from koopman_ros.control.experiment import advance, begin, Phase
+from koopman_ros.nodes import topics
+from koopman_ros.nodes.messages import stamp_nanoseconds, to_celsius, to_kelvin
+from koopman_ros.nodes.trainer_parameters import TrainerParameters
+import pytest
+from rclpy.qos import QoSProfile, ReliabilityPolicy
+from sensor_msgs.msg import Temperature
+from workbench import seconds, temperature, value, Workbench
+
+STATUS = 'trainer: experiment'
+SERVICE = 'trainer/experiment'
+SAFE = TrainerParameters().safe_coolant
+LOCKSTEP = {'lockstep': True, 'speed': 0.0, 'lockstep_subscribers': 2}
+IDLE = {'record_at_start': False}
+LOST = 'the trainer does not command the coolant any more'
+
+
+class Bench:
+    """
+    A trainer with a thermometer and a coolant in the test.
+
+    :param ros: where the trainer runs.
+    :param parameters: of the trainer.
+    :param arguments: further ROS arguments of the trainer.
+    :param prefix: of the trainer's topics.
+    """
+
+    def __init__(self, ros: Workbench, parameters: Mapping[str, object] | None = None,
+                 arguments: tuple[str, ...] = (), prefix: str = '',
+                 coolant: str = topics.COOLANT_SETPOINT,
+                 qos: QoSProfile = topics.LOOP_QOS) -> None:
+        self.ros = ros
+        self.service = f'{prefix}{SERVICE}'
+        self.coolant = f'{prefix}{coolant}'
+        self.commands = ros.listen(Temperature, self.coolant)
+        self.process = ros.start('trainer', {**IDLE, **(parameters or {})}, arguments)
+        self.thermometer = ros.node.create_publisher(
+            Temperature, f'{prefix}{topics.TEMPERATURE}', qos)
+        self._time = 0.0
+        ros.meet(f'{prefix}trainer')
+
+    def start(self, celsius: float = 45.0) -> tuple[bool, str]:
+        """Start an experiment, measuring all the while; return what the service answers."""
+        timer = self.ros.node.create_timer(0.02, lambda: self.measure(celsius))
+        response = self.ros.set_bool(self.service, True)
+        self.ros.node.destroy_timer(timer)
+        return response.success, response.message
+
+    def measure(self, celsius: float = 45.0) -> None:
+        """Measure a second later."""
+        self._time += 1.0
+        self.thermometer.publish(temperature(celsius, self._time))
+
+    def answer(self, celsius: float = 45.0) -> float:
+        """Measure a second later and return the command."""
+        self.measure(celsius)
+        self.ros.wait_until(lambda: self.commands and seconds(self.commands[-1]) == self._time)
+        return float(self.commands[-1].temperature)
+
+    def status(self, words: str) -> DiagnosticStatus:
+        """Wait for a sentence."""
+        return self.ros.wait_for_status(STATUS, lambda s: words in s.message)
+
+
+def start_with_plant(ros: Workbench, trainer: Mapping[str, object],
+                     plant: Mapping[str, object] | None = None) -> list[Temperature]:
+    """Start both, and an experiment that both know of; return the measurements to come."""
+    measured = ros.listen(Temperature, topics.TEMPERATURE)
+    ros.start('trainer', {**IDLE, **trainer})
+    ros.start('plant', {**LOCKSTEP, **(plant or {})})
+    ros.meet('plant')
+    response = ros.set_bool(SERVICE, True)
+    assert response.success, response.message
+    assert response.message == 'running on /coolant_setpoint'
+    return measured
+
+
+# An experiment from its start to its end.
+
+
+def test_steps_drive_the_plant_as_planned(ros: Workbench) -> None:
+    commands = ros.listen(Temperature, topics.COOLANT_SETPOINT)
+    measured = start_with_plant(ros, {'experiment_duration': 10.0, 'experiment_seed': 5})
+    status = ros.wait_for_status(STATUS, lambda s: s.message.startswith('finished'))
+    assert status.level == DiagnosticStatus.OK
+    assert status.message == 'finished; the coolant returns to 18.85 degC and is held there'
+    ros.wait_until(lambda: len(commands) > 650)
+
+    values = TrainerParameters(experiment_duration=10.0, experiment_seed=5)
+    # a measurement may be on its way that has no command yet
+    pairs = list(zip(measured, commands, strict=False))
+    assert all(m.header == c.header for m, c in pairs)
+    levels = [c.temperature for _, c in pairs]
+    assert values.experiment_coolant_min <= min(levels) < 12.0
+    assert 24.0 < max(levels) <= values.experiment_coolant_max
+    assert max(abs(b - a) for a, b in pairwise(levels)) <= 1.0 + 1e-9
+    assert all(values.experiment_temperature_min < m.temperature
+               < values.experiment_temperature_max for m, _ in pairs)
+    assert levels[-1] == pytest.approx(SAFE, abs=1e-12)
+
+    plan = values.experiment()
+    progress = begin(plan, stamp_nanoseconds(measured[0].header.stamp))
+    for message, command in pairs:
+        progress = advance(plan, progress, to_kelvin(message.temperature),
+                           stamp_nanoseconds(message.header.stamp))
+        assert command.temperature == to_celsius(progress.command)
+    assert progress.phase is Phase.FINISHED
+
+
+def test_service_ends_the_steps_and_then_lets_go(ros: Workbench) -> None:
+    bench = Bench(ros)
+    assert ros.set_bool(SERVICE, False).message == 'no experiment is running'
+    assert bench.start() == (True, 'running on /coolant_setpoint')
+    assert not ros.set_bool(SERVICE, True).success
+    for _ in range(20):
+        bench.answer()
+    assert bench.answer() != pytest.approx(SAFE, abs=0.5)
+    assert value(bench.status('running'), 'topic') == '/coolant_setpoint'
+
+    assert 'the coolant returns to 18.85 degC' in ros.set_bool(SERVICE, False).message
+    bench.status('ended; the coolant returns')
+    for _ in range(20):
+        bench.answer()
+    assert bench.answer() == pytest.approx(SAFE)
+    assert ros.set_bool(SERVICE, False).message == LOST
+    ros.wait_until(lambda: ros.node.count_publishers(topics.COOLANT_SETPOINT) == 0)
+    assert bench.status('ended').message == 'ended'
+    # and once more, with the same steps
+    assert bench.start()[0]
+
+
+def test_names_follow_namespace_and_remaps(ros: Workbench) -> None:
+    bench = Bench(ros, arguments=('-r', '__ns:=/unit_1', '-r', 'coolant_setpoint:=jacket'),
+                  prefix='/unit_1/', coolant='jacket',
+                  qos=QoSProfile(depth=10, reliability=ReliabilityPolicy.BEST_EFFORT))
+    assert bench.start() == (True, 'running on /unit_1/jacket')
+    ros.wait_until(lambda: bench.commands)
+
+
+# Refusals.
+
+
+@pytest.fixture(scope='module')
+def shared_bench(shared_ros: Workbench) -> Bench:
+    return Bench(shared_ros, {'experiment_timeout': 0.3})
+
+
+@pytest.mark.parametrize(('celsius', 'words'), [
+    (60.0, 'the temperature 60.00 degC is outside the bounds of the experiment, 31.85 degC to '
+     '53.85 degC'),
+    (20.0, 'the temperature 20.00 degC is outside'),
+    (math.nan, 'is not finite: check the sensor'),
+])
+def test_does_not_start_at_a_bad_temperature(shared_bench: Bench, celsius: float, words: str
+                                             ) -> None:
+    started, said = shared_bench.start(celsius)
+    assert not started
+    assert said.startswith('refused: ')
+    assert words in said
+    assert shared_bench.status(words).level == DiagnosticStatus.WARN
+    assert shared_bench.commands == []
+    shared_bench.ros.wait_until(
+        lambda: shared_bench.ros.node.count_publishers(shared_bench.coolant) == 0)
+
+
+def test_does_not_start_without_measurements(shared_bench: Bench) -> None:
+    response = shared_bench.ros.set_bool(SERVICE, True)
+    assert not response.success
+    assert response.message == (
+        'refused: no newer measurement for more than 0.3 s: check sensor and plant')
+
+
+def test_does_not_start_beside_another_publisher(shared_bench: Bench) -> None:
+    node = shared_bench.ros.node
+    publisher = node.create_publisher(Temperature, shared_bench.coolant, topics.LOOP_QOS)
+    shared_bench.ros.meet('trainer')
+    assert shared_bench.start() == (
+        False, 'refused: /bench publishes on /coolant_setpoint: end it, or choose another '
+        'experiment_topic')
+    node.destroy_publisher(publisher)
+
+
+def test_does_not_start_through_a_controller_that_is_not_there(shared_bench: Bench) -> None:
+    ros = shared_bench.ros
+    ros.set_parameters('trainer', experiment_topic='manual_coolant_setpoint')
+    assert 'start the controller and switch it to manual mode' in shared_bench.start()[1]
+    ros.set_parameters('trainer', experiment_topic='coolant_setpoint')
+
+
+@pytest.mark.parametrize(('name', 'given', 'words'), [
+    ('experiment_coolant_min', 30.0,
+     'experiment_coolant_min = 30.0 degC must be below experiment_coolant_max = 27.5 degC'),
+    ('experiment_temperature_max', 20.0, 'must be below experiment_temperature_max = 20.0 degC'),
+    ('experiment_hold_max', 0.4, 'experiment_hold_min = 0.5 min must be below'),
+    ('experiment_topic', 'setpoint', 'must be one of coolant_setpoint, manual_coolant_setpoint'),
+])
+def test_contradicting_limits_are_refused(shared_bench: Bench, name: str, given: object,
+                                          words: str) -> None:
+    (result,) = shared_bench.ros.set_parameters('trainer', **{name: given})
+    assert not result.successful
+    assert words in result.reason
+
+
+# Aborts.
+
+
+def test_reactor_that_leaves_its_bounds_gets_the_safe_coolant(ros: Workbench) -> None:
+    commands = ros.listen(Temperature, topics.COOLANT_SETPOINT)
+    measured = start_with_plant(ros, {'experiment_duration': 1000.0})
+    ros.wait_until(lambda: len(commands) > 50)
+    (result,) = ros.set_parameters('plant', feed_temperature=-20.0)
+    assert result.successful, result.reason
+    status = ros.wait_for_status(STATUS, lambda s: s.level == DiagnosticStatus.ERROR)
+    assert status.message.startswith('aborted: the temperature ')
+    assert 'is outside the bounds of the experiment, 31.85 degC to 53.85 degC' in status.message
+    assert status.message.endswith('; the coolant returns to 18.85 degC and is held there')
+    # 10 K at 1 K/s, and then for good
+    first = ros.wait_until(lambda: next(
+        (k for k, message in enumerate(measured) if message.temperature < 31.85), None))
+    ros.wait_until(lambda: len(commands) > first + 50)
+    assert max(abs(b.temperature - a.temperature) for a, b in pairwise(commands)) <= 1.0 + 1e-9
+    assert {round(message.temperature, 9) for message in commands[first + 12:]} == {SAFE}
+    assert ros.set_bool(SERVICE, False).message == LOST
+
+
+def test_another_commander_ends_it_at_once(ros: Workbench) -> None:
+    bench = Bench(ros)
+    assert bench.start()[0]
+    bench.answer()
+    ros.start('controller')
+    status = bench.status('aborted')
+    assert status.level == DiagnosticStatus.ERROR
+    # found, perhaps, before its name is
+    assert status.message.removeprefix('aborted: ') in (
+        '/controller publishes on /coolant_setpoint, too',
+        'another node publishes on /coolant_setpoint, too')
+    ros.wait_until(lambda: ros.node.count_publishers(topics.COOLANT_SETPOINT) == 1)
+    assert ros.wait_until(lambda: '/controller publishes' in (answer := bench.start())[1]
+                          and answer) == (
+        False, 'refused: /controller publishes on /coolant_setpoint: end it, or choose another '
+        'experiment_topic')
+
+
+def test_silent_sensor_brings_the_safe_coolant(ros: Workbench) -> None:
+    bench = Bench(ros, {'experiment_timeout': 0.5, 'experiment_rate_limit': 600.0})
+    assert bench.start()[0]
+    for _ in range(5):
+        bench.answer()
+    status = bench.status('no newer measurement for more than 0.5 s')
+    assert status.level == DiagnosticStatus.ERROR
+    ros.wait_until(lambda: bench.commands[-1].temperature == pytest.approx(SAFE, abs=1e-9))
+    heard = len(bench.commands)
+    ros.wait_until(lambda: len(bench.commands) > heard + 2)
+    # a sensor that comes back is answered, with the same
+    assert bench.answer() == pytest.approx(SAFE, abs=1e-9)
+
+
+@pytest.mark.parametrize('number', [signal.SIGINT, signal.SIGTERM])
+def test_trainer_that_is_told_to_end_leaves_the_safe_coolant(
+        ros: Workbench, tmp_path: Path, number: int) -> None:
+    bag = tmp_path / 'run.mcap'
+    commands = ros.listen(Temperature, topics.COOLANT_SETPOINT)
+    start_with_plant(ros, {'record_at_start': True, 'output': bag}, {'lockstep_subscribers': 3})
+    ros.wait_until(lambda: len(commands) > 100)
+    assert ros.processes[0].stop(number) == 0
+    status = ros.wait_for_status(
+        'plant: simulation', lambda s: float(value(s, 'coolant [degC]')) == pytest.approx(SAFE))
+    assert float(value(status, 'time [s]')) > 100.0
+    recorded = list(read_messages(bag, ['/coolant_setpoint']))
+    assert recorded[-1].message.temperature == pytest.approx(SAFE)
+    assert 'Traceback' not in ros.printed()
+
+
+# Through a controller in manual mode.
+
+
+def test_experiment_through_a_controller_in_manual_mode(ros: Workbench) -> None:
+    commands = ros.listen(Temperature, topics.COOLANT_SETPOINT)
+    ros.start('controller')
+    ros.meet('controller')
+    ros.set_bool('controller/set_automatic', False)
+    ros.start('trainer', {**IDLE, 'experiment_topic': topics.MANUAL_COOLANT_SETPOINT,
+                          'experiment_duration': 1000.0})
+    ros.meet('trainer')
+    ros.start('plant', {'lockstep': True, 'speed': 400.0})
+    ros.wait_until(lambda: commands)
+    response = ros.set_bool(SERVICE, True)
+    assert response.message == 'running on /manual_coolant_setpoint'
+    first = len(commands)
+    ros.wait_until(lambda: len(commands) > first + 300)
+    levels = [message.temperature for message in commands[first:]]
+    assert max(levels) - min(levels) > 5.0
+    assert max(abs(b - a) for a, b in pairwise(levels)) <= 1.0 + 1e-9
+    assert ros.wait_for_status(STATUS, lambda s: True).message == 'running'
+
+    ros.set_bool('controller/set_automatic', True)
+    status = ros.wait_for_status(STATUS, lambda s: s.level == DiagnosticStatus.ERROR)
+    assert status.message.startswith('aborted: the controller commands ')
+    assert 'switch it to manual mode' in status.message
+    ros.wait_until(lambda: ros.node.count_publishers(topics.MANUAL_COOLANT_SETPOINT) == 0)
