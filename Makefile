@@ -8,7 +8,7 @@ export ROS_AUTOMATIC_DISCOVERY_RANGE ?= LOCALHOST
 # How many seeds each experiment is run from: make studies SEEDS=5
 SEEDS ?= 20
 
-.PHONY: help demo test lint models studies bench config clean
+.PHONY: help demo demo-retrain test lint models studies studies-sensors bench config clean
 
 help:  ## show this list
 	@grep -E '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed 's/:.*## /\t/'
@@ -32,12 +32,19 @@ $(VENV)/train.stamp: setup.py | $(BIN)/python
 	$(BIN)/python -m pip install --quiet --editable '.[demo,train]'
 	@touch $@
 
+$(VENV)/retrain.stamp: setup.py $(VENV)/run.stamp
+	$(BIN)/python -m pip install --quiet --editable '.[ros,demo,train]'
+	@touch $@
+
 $(VENV)/bench.stamp: setup.py $(VENV)/run.stamp
 	$(BIN)/python -m pip install --quiet --editable '.[ros,demo,train,bench]'
 	@touch $@
 
 demo: $(VENV)/run.stamp  ## closed loop of three processes: live table, bag, picture -> out/demo
 	$(BIN)/python -m koopman_ros.demo
+
+demo-retrain: $(VENV)/retrain.stamp  ## the plant drifts, is recorded, learned and controlled anew -> out/demo-retrain
+	$(BIN)/python -m koopman_ros.demo.retrain
 
 test: lint  ## the whole test suite
 	$(BIN)/python -m pytest
@@ -51,6 +58,9 @@ models: $(VENV)/train.stamp  ## train the shipped lifts again -> config/models
 
 studies: $(VENV)/train.stamp  ## the paper's experiments from SEEDS seeds: figures, report -> out/studies
 	$(BIN)/python -m koopman_ros.studies --seeds $(SEEDS)
+
+studies-sensors: $(VENV)/train.stamp  ## learning from noisy data of a sensor, ten seeds -> out/studies-sensors
+	$(BIN)/python -m koopman_ros.studies --sensors --seeds 10
 
 bench: $(VENV)/bench.stamp  ## speed beside other programs, ten minutes (BENCH=--quick: one) -> out/bench
 	$(BIN)/python -m benchmarks $(BENCH)

@@ -24,7 +24,6 @@ from rich.live import Live
 from rich.markup import escape
 from rich.table import Table
 
-_ROW_PERIOD = 30.0  # s of plant time between rows
 _COLUMNS = ('time [min]', 'temperature [°C]', 'set-point [°C]', 'error [K]', 'coolant [°C]')
 
 
@@ -33,10 +32,12 @@ class LiveTable:
     Show a run as it happens.
 
     :param title: what runs.
+    :param row_period: s of plant time between rows.
     """
 
-    def __init__(self, title: str) -> None:
+    def __init__(self, title: str, row_period: float = 30.0) -> None:
         self._title = title
+        self._row_period = row_period
         self._console = Console()
         self._rows: list[tuple[str, ...]] = []
         self._next = 0.0
@@ -48,13 +49,21 @@ class LiveTable:
         cells = _cells(row)
         due = row.seconds >= self._next
         if due:
-            self._next += _ROW_PERIOD
+            self._next = row.seconds + self._row_period
             self._rows.append(cells)
         if self._live is not None:
             self._live.update(self._table(None if due else cells))
         elif due:
             print('  '.join(f'{name} {cell}' for name, cell in zip(_COLUMNS, cells, strict=True)),
                   flush=True)
+
+    def announce(self, text: str) -> None:
+        """Say what happens now."""
+        if self._live is not None:
+            self._rows.append((text, *[''] * (len(_COLUMNS) - 1)))
+            self._live.update(self._table(None))
+        else:
+            print(text, flush=True)
 
     def _table(self, present: tuple[str, ...] | None) -> Table:
         table = Table(title=self._title, title_justify='left')

@@ -13,7 +13,7 @@
 # limitations under the License.
 
 """
-The paper's experiments: figures, tables and a report.
+The paper's experiments, and those on data from a sensor: figures, tables and a report.
 
 Run it as ``python -m koopman_ros.studies`` (needs the `train` and `demo` requirements).
 """
@@ -37,19 +37,24 @@ def main(args: list[str] | None = None) -> int:
     """Run the experiments and write what they found."""
     parser = argparse.ArgumentParser(
         prog='python -m koopman_ros.studies',
-        description="Reproduce the paper's experiments, each from several seeds.")
+        description="Reproduce the paper's experiments, or learn from sensor data, each from "
+        'several seeds.')
     parser.add_argument('--seeds', type=int, default=20, help='number of seeds, at least 1 '
                         '(default: %(default)s)')
-    parser.add_argument('--output', type=Path, default=Path('out/studies'),
-                        help='folder for figures and report (default: %(default)s)')
+    parser.add_argument('--sensors', action='store_true', help='learn from noisy, sampled data '
+                        "instead of the paper's experiments")
+    parser.add_argument('--output', type=Path, help='folder for figures and report (default: '
+                        'out/studies, or out/studies-sensors)')
     options = parser.parse_args(args)
+    options.output = options.output or Path(
+        'out/studies-sensors' if options.sensors else 'out/studies')
     if options.seeds < 1:
         parser.error(f'--seeds is {options.seeds}, must be at least 1')
     options.output.mkdir(parents=True, exist_ok=True)
     # a request to end is an interrupt: what is done is reported
     signal.signal(signal.SIGTERM, signal.default_int_handler)
     start = time.monotonic()
-    campaign = run_campaign(options.seeds)
+    campaign = run_campaign(options.seeds, of_sensors=options.sensors)
     summary = {
         'package_version': __version__, 'seeds': options.seeds, 'complete': campaign.complete,
         'errors': campaign.errors, 'wall_seconds': round(time.monotonic() - start, 1),

@@ -25,7 +25,7 @@ from typing import Any
 
 import joblib
 from koopman_ros.lifting import LiftedModel
-from koopman_ros.studies import reactor, scalar, two_state
+from koopman_ros.studies import reactor, scalar, sensors, two_state
 from koopman_ros.studies.outcome import Metrics, Models
 from tqdm import tqdm
 
@@ -37,6 +37,13 @@ EXPERIMENTS: dict[str, Callable[[int], tuple[Metrics, Models]]] = {
     'paper_algorithm/reactor': reactor.run_paper,
     'paper_algorithm/two_state': two_state.run_paper,
     'scalar': scalar.run,
+}
+# The same for what the paper leaves open: data from a sensor.
+SENSOR_EXPERIMENTS: dict[str, Callable[[int], tuple[Metrics, Models]]] = {
+    'sensors/drifted': sensors.run_drifted,
+    'sensors/noisy': sensors.run_noisy,
+    'sensors/noise_free': sensors.run_noise_free,
+    'sensors/two_state': sensors.run_two_state,
 }
 
 
@@ -72,19 +79,24 @@ class Campaign:
         return nested
 
 
-def run_campaign(seeds: int) -> Campaign:
+def run_campaign(seeds: int, *, of_sensors: bool = False) -> Campaign:
     """
     Run every experiment for the seeds 0 ... `seeds` - 1; an interrupt keeps what is done.
 
     joblib spreads the runs over the cores; within ``joblib.parallel_config(...)`` they go where
     that says.
+
+    :param seeds: number of seeds.
+    :param of_sensors: whether to run the experiments on data from a sensor instead of the
+        paper's.
     """
+    experiments = SENSOR_EXPERIMENTS if of_sensors else EXPERIMENTS
     campaign = Campaign()
     # seed by seed, so that an interrupted campaign is whole for the first ones
-    runs = [(name, seed) for seed in range(seeds) for name in EXPERIMENTS]
+    runs = [(name, seed) for seed in range(seeds) for name in experiments]
     jobs = joblib.parallel.get_active_backend()[1] or len(os.sched_getaffinity(0))
     finished = joblib.Parallel(n_jobs=jobs, return_as='generator_unordered')(
-        joblib.delayed(_run)(name, seed) for name, seed in runs)
+        joblib.delayed(_run)(name, seed, experiments[name]) for name, seed in runs)
     try:
         for name, seed, outcome in _shown(finished, len(runs)):
             if isinstance(outcome, str):
@@ -101,9 +113,10 @@ def run_campaign(seeds: int) -> Campaign:
     return campaign
 
 
-def _run(name: str, seed: int) -> tuple[str, int, tuple[Metrics, Models] | str]:
+def _run(name: str, seed: int, experiment: Callable[[int], tuple[Metrics, Models]]
+         ) -> tuple[str, int, tuple[Metrics, Models] | str]:
     try:
-        return name, seed, EXPERIMENTS[name](seed)
+        return name, seed, experiment(seed)
     except (ValueError, RuntimeError, ArithmeticError) as error:
         # one run that fails must not take the others with it
         return name, seed, f'{type(error).__name__}: {error}'

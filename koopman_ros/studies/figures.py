@@ -75,7 +75,9 @@ def draw_figures(campaign: Campaign, folder: Path) -> list[Drawn]:
             ('08_narrow_derivatives', ('narrow',), _narrow_derivatives),
             ('09_narrow_control', ('narrow', 'two_state'), _narrow_control),
             ('10_narrow_box', ('narrow',), _narrow_box),
-            ('11_both_boxes', ('narrow', 'two_state'), _both_boxes)):
+            ('11_both_boxes', ('narrow', 'two_state'), _both_boxes),
+            ('12_sensors', ('sensors/noisy', 'sensors/noise_free', 'sensors/drifted',
+                            'sensors/two_state'), _sensors)):
         if all(name in campaign.models for name in experiments):
             caption = draw(campaign, folder / f'{name}.png')
             drawn.append(Drawn(f'{name}.png', caption))
@@ -296,3 +298,39 @@ def _both_boxes(campaign: Campaign, path: Path) -> str:
         ('narrow box', 'grey', two_state.NARROW[FIGURE_NARROW_BOX],
          two_state.close_loop(narrow, 1.0), 'tab:red')])
     return 'Both boxes and paths in one picture: the same start, another training range.'
+
+
+def _sensors(campaign: Campaign, path: Path) -> str:
+    def values(experiment: str, name: str) -> list[float]:
+        found = campaign.metrics[f'sensors/{experiment}']
+        return [float(found[seed][name]) for seed in sorted(found)]  # type: ignore[arg-type]
+
+    with _figure(path, 1, 3, (12.0, 4.2)) as (_, (left, middle, right)):
+        for experiment, label, color in (('noisy', 'noise of 0.1 K', 'tab:blue'),
+                                         ('noise_free', 'no noise', 'tab:green')):
+            left.semilogy(values(experiment, 'rollout_kelvin'), 'o', color=color, label=label)
+        for bound, label in ((0.05, 'held to, noisy'), (0.01, 'held to, no noise')):
+            left.axhline(bound, label=label, **{
+                **LIMIT, 'linestyle': ':' if bound > 0.02 else '--'})
+        left.set(ylabel='roll-out error [K]', title='an hour of data')
+        for name, label, color in (('offset_before_kelvin', 'present lift', 'tab:red'),
+                                   ('offset_after_kelvin', 'new lift', 'tab:green')):
+            middle.semilogy(values('drifted', name), 'o', color=color, label=label)
+        before = np.array(values('drifted', 'offset_before_kelvin'))
+        middle.plot(before / 20.0, '_', color='0.4', markersize=12, label='held to: a 20th')
+        middle.set(ylabel='offset from the set-point [K]', title='cooling jacket fouled')
+        for name, label, color in (('linear_kelvin', 'best linear model', 'tab:red'),
+                                   ('heldout_kelvin', 'lift', 'tab:blue'),
+                                   ('noise_kelvin', 'noise', '0.5')):
+            right.plot(values('two_state', name), 'o', color=color, label=label)
+        right.set(ylabel='error on held-out measurements [K]', ylim=(0.0, None),
+                  title='one temperature of two states')
+        for axes in (left, middle, right):
+            axes.set_xlabel('seed')
+            axes.legend(fontsize=8)
+            axes.grid(alpha=0.3)
+    worst = max(values('noisy', 'rollout_kelvin'))
+    return (f'Lifts learned from a sensor: with noise of 0.1 K the worst of {len(before)} seeds '
+            f'predicts to {worst:.2g} K; after fouling the largest offset left is '
+            f'{max(values("drifted", "offset_after_kelvin")):.2g} K; where a state is not '
+            'measured the error stays above the noise.')
