@@ -21,6 +21,7 @@ from collections.abc import Mapping
 import contextlib
 from dataclasses import dataclass, field
 import json
+import os
 import queue
 import signal
 import subprocess
@@ -28,7 +29,9 @@ import sys
 import threading
 from typing import Any
 
-_MODULE = 'koopman_ros.retraining'
+_COMMAND = ('-m', 'koopman_ros.retraining')
+# The problems are small, and the nodes of the loop need the cores; sums keep their order, too.
+_ONE_THREAD = {'OMP_NUM_THREADS': '1', 'OPENBLAS_NUM_THREADS': '1'}
 _PATIENCE = 5.0  # s from the request to end until the process is killed
 
 
@@ -71,8 +74,9 @@ class RetrainingJob:
         self._cancelled = False
         # a session of its own: an interrupt of the terminal is passed on by us
         self._process = subprocess.Popen(
-            [sys.executable, '-m', _MODULE], stdin=subprocess.PIPE, stdout=subprocess.PIPE,
-            stderr=subprocess.PIPE, encoding='utf-8', errors='replace', start_new_session=True)
+            [sys.executable, *_COMMAND], stdin=subprocess.PIPE, stdout=subprocess.PIPE,
+            stderr=subprocess.PIPE, encoding='utf-8', errors='replace', start_new_session=True,
+            env={**_ONE_THREAD, **os.environ})
         self._lines: queue.SimpleQueue[str | None] = queue.SimpleQueue()
         self._complaints: list[str] = []
         assert self._process.stdin is not None
@@ -134,6 +138,9 @@ class RetrainingJob:
                 'whether the memory suffices, and train again', True)
         self._threads[1].join()
         last = self._complaints[-1] if self._complaints else 'it said nothing'
+        if last.startswith(('ModuleNotFoundError', 'ImportError')):
+            return JobState(self.state.share, 'training needs a package that is not installed '
+                            f"({last}): pip install 'koopman_ros[train]'", True)
         return JobState(self.state.share, f'the training process ended with code {code}: {last}',
                         True)
 

@@ -30,6 +30,10 @@ import sys
 import threading
 import time
 
+from koopman_ros.identification import Stopped
+from koopman_ros.lifting import load
+from koopman_ros.retraining import retrain, Task, write_report
+
 _PERIOD = 0.2  # s between two lines of progress
 
 
@@ -42,14 +46,6 @@ def main() -> int:
     os.nice(10)
     line = sys.stdin.readline()
     threading.Thread(target=_wait_for_end_of_input, args=(stop,), daemon=True).start()
-    try:
-        from koopman_ros.identification import Stopped
-        from koopman_ros.lifting import load
-        from koopman_ros.retraining import retrain, Task, write_report
-    except ImportError as error:
-        _say(error=f'training needs a package that is not installed ({error}): '
-             "pip install 'koopman_ros[train]'")
-        return 1
     last = -_PERIOD
 
     def tell(share: float, text: str) -> bool:

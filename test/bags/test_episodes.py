@@ -158,6 +158,16 @@ def test_commands_between_measurements_keep_their_time(write: Callable[..., Path
     assert seconds(episode.input_ns) == [0.5, 5.25, 5.75]
 
 
+def test_dead_time_of_the_actuator(write: Callable[..., Path]) -> None:
+    (episode,), account = loop_episodes([write(loop(20))], TEMPERATURE, COOLANT,
+                                        input_delay_ns=2 * SECOND + 1)
+    assert episode.input_ns[:3].tolist() == [3 * SECOND + 1, 4 * SECOND + 1, 5 * SECOND + 1]
+    assert episode.input_celsius[:3].tolist() == [101.0, 102.0, 103.0]
+    # nobody knows what acted before
+    assert seconds(episode.stamp_ns)[0] == 4.0
+    assert account.dropped == {'before the first coolant': 3}
+
+
 def test_last_word_for_a_measurement_counts(write: Callable[..., Path]) -> None:
     said = [*loop(12), Said(COOLANT, 5.0, 77.0, 5.2)]
     said.sort(key=lambda s: s.stamp if s.received is None else s.received)

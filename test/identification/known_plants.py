@@ -1,0 +1,96 @@
+# Copyright 2026 The koopman_ros Authors
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""Plants whose drift is a known polynomial, and records of them by an independent integrator."""
+
+from dataclasses import dataclass
+
+from koopman_ros.identification import Box, DriftModel, Record
+import numpy as np
+from scipy.integrate import solve_ivp
+
+
+@dataclass(frozen=True)
+class KnownPlant:
+    """
+    dx/dt = f(x) + B u, f a polynomial.
+
+    :param terms: (m, n_x + 1) exponents of the states in each term, then the row that it is in.
+    :param coefficients: (m,) of the terms.
+    :param B: (n_x, n_u).
+    """
+
+    terms: tuple[tuple[int, ...], ...]
+    coefficients: tuple[float, ...]
+    B: np.ndarray
+
+    def rate(self, x, u):
+        """Evaluate dx/dt: (..., n_x) and (..., n_u) -> (..., n_x)."""
+        dxdt = u @ self.B.T
+        for (*powers, row), c in zip(self.terms, self.coefficients, strict=True):
+            dxdt[..., row] += c * np.prod(x ** np.array(powers), axis=-1)
+        return dxdt
+
+    def states(self, x0, times, input_time, u):
+        """Integrate from hold to hold with DOP853 and return the states at the times."""
+        x, found = np.asarray(x0, dtype=np.float64), np.empty((len(times), len(x0)))
+        edges = np.append(input_time, np.inf)
+        for k, held in enumerate(u):
+            begin, end = max(edges[k], times[0]), min(edges[k + 1], times[-1])
+            if end < begin:
+                continue
+            rows = np.flatnonzero((times >= begin) & (times <= end))
+            stops = np.union1d(times[rows], [begin, end])
+            if len(stops) == 1:
+                found[rows] = x
+                continue
+            path = solve_ivp(lambda _, y, held=held: self.rate(y, held), (begin, end), x,
+                             method='DOP853', rtol=1e-11, atol=1e-13, t_eval=stops).y.T
+            found[rows] = path[np.searchsorted(stops, times[rows])]
+            x = path[-1]
+        return found
+
+    def record(self, times, input_time, u, *, x0=None, noise=0.0, seed=0):
+        """Return a record with white noise of standard deviation `noise` on each state."""
+        start = np.zeros(len(self.B)) if x0 is None else x0
+        x = self.states(start, times, input_time, u)
+        noisy = x + noise * np.random.default_rng(seed).standard_normal(x.shape)
+        return Record(times, noisy, input_time, u)
+
+    def excited(self, count, period, *, noise=0.0, seed=0, level=1.0, hold=20):
+        """Return a record of random steps, each held for about `hold` samples."""
+        rng = np.random.default_rng(seed)
+        steps = np.arange(0, count, hold) + rng.integers(0, hold // 2, -(-count // hold))
+        steps[0] = 0
+        u = rng.uniform(-level, level, (len(steps), self.B.shape[1]))
+        return self.record(period * np.arange(count), period * steps, u, noise=noise,
+                           seed=seed + 1000)
+
+    def misfit(self, model: DriftModel, box: Box | None = None) -> float:
+        """Return the largest error of a model's rates over a box, relative to their size."""
+        box = box or model.box
+        axes = [np.linspace(low, high, 9) for low, high in (
+            *zip(box.state_lower, box.state_upper, strict=True),
+            *zip(box.input_lower, box.input_upper, strict=True))]
+        grid = np.stack([axis.ravel() for axis in np.meshgrid(*axes)], axis=-1)
+        x, u = grid[:, :len(self.B)], grid[:, len(self.B):]
+        true = self.rate(x, u)
+        return float(np.max(np.abs(model.rate(x, u) - true) / np.max(np.abs(true), axis=0)))
+
+
+# dx/dt = 0.5 - x + 0.3 x^2 - 0.2 x^3 + 1.5 u
+CUBIC = KnownPlant(((0, 0), (1, 0), (2, 0), (3, 0)), (0.5, -1.0, 0.3, -0.2), np.array([[1.5]]))
+# dx1/dt = -x1 + 0.5 x2 + u1, dx2/dt = -2 x2 + 0.4 x1^2 + 0.3 u1 + 2 u2
+PAIR = KnownPlant(((1, 0, 0), (0, 1, 0), (0, 1, 1), (2, 0, 1)), (-1.0, 0.5, -2.0, 0.4),
+                  np.array([[1.0, 0.0], [0.3, 2.0]]))

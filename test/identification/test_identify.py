@@ -1,0 +1,234 @@
+# Copyright 2026 The koopman_ros Authors
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""Choice of a drift model on held-out stretches."""
+
+from dataclasses import replace
+import sys
+import tracemalloc
+
+from known_plants import CUBIC, PAIR
+from koopman_ros.identification import (
+    Box,
+    cut,
+    identify,
+    longest_step,
+    Record,
+    Stopped,
+    Stretches,
+    weak_form,
+)
+from koopman_ros.identification.output_error import _Problem
+import numpy as np
+import pytest
+
+NOISE = 0.02
+
+
+@pytest.fixture(scope='module')
+def noisy():
+    return CUBIC.excited(900, 0.1, noise=NOISE)
+
+
+@pytest.fixture(scope='module')
+def found(noisy):
+    return identify([noisy], degrees=(1, 2, 3, 4), windows=(10, 20))
+
+
+def test_takes_output_error_and_the_right_degree(found):
+    assert found.method.startswith('output error from ')
+    assert found.drift.degree == 3
+    assert found.linear.degree == 1
+    # 720 samples with noise of 2 % of the range: see the bound in test_regressed_estimates
+    assert CUBIC.misfit(found.drift) < 5.0 * np.sqrt(5.0) * NOISE / np.sqrt(720.0)
+    assert found.drift.input_matrix == pytest.approx(CUBIC.B, rel=5e-3)
+    assert found.noise == pytest.approx([NOISE], rel=0.1)
+
+
+def test_scores_say_what_was_tried(found):
+    assert [(score.degree, score.method.split(' from')[0]) for score in found.scores] == [
+        (degree, method) for degree in (1, 2, 3, 4) for method in (
+            'weak form, 10 samples', 'weak form, 20 samples', 'total variation', 'output error')]
+    scale = found.drift.box.state_scale
+    for score in found.scores:
+        assert score.cost == pytest.approx(float(np.mean((score.rmse / scale) ** 2)))
+    cubic = [score.rmse[0] for score in found.scores if score.degree == 3]
+    linear = [score.rmse[0] for score in found.scores if score.degree == 1]
+    # the noise is in each, and in the cubic ones nothing else
+    assert max(cubic) < 1.2 * NOISE < 2.0 * NOISE < min(linear)
+
+
+def test_stretches_are_fitted_to_or_held_out(noisy, found):
+    assert len(found.held_out) == 3
+    pieces = sorted([*found.fitted, *found.held_out], key=lambda part: part.time[0])
+    assert [p.time[0] for p in pieces] == [noisy.time[0], *(p.time[-1] for p in pieces[:-1])]
+    assert pieces[-1].time[-1] == noisy.time[-1]
+    # the range is known from what is fitted to
+    assert np.concatenate([p.x for p in found.fitted]).min() == found.drift.box.state_lower
+    assert np.concatenate([p.x for p in found.fitted]).max() == found.drift.box.state_upper
+
+
+def test_split_follows_the_seed(noisy, found):
+    other = identify([noisy], degrees=(1,), windows=(20,), seed=1)
+    assert [p.time[0] for p in other.held_out] != [p.time[0] for p in found.held_out]
+
+
+def test_held_out_stretches_change_nothing(noisy, found):
+    """An estimate that had seen them would move with them."""
+    start, end = found.held_out[0].time[[5, -5]]
+    inside = ((noisy.time > start) & (noisy.time < end))[:, None]
+    centre = noisy.x[inside[:, 0]].mean()
+    spoilt = replace(noisy, x=np.where(inside, centre + 0.1 * (noisy.x - centre), noisy.x))
+    again = identify([spoilt], degrees=(1, 2, 3, 4), windows=(10, 20))
+    assert again.drift.coefficients.tobytes() == found.drift.coefficients.tobytes()
+
+
+def test_known_input_matrix_is_kept(noisy):
+    known = identify([noisy.part(0, 500)], B=CUBIC.B, degrees=(1, 3), windows=(20,))
+    assert known.drift.input_matrix == pytest.approx(CUBIC.B, rel=1e-12)
+    assert known.linear.input_matrix == pytest.approx(CUBIC.B, rel=1e-12)
+
+
+def test_two_states_two_inputs_and_records_of_different_length():
+    records = [PAIR.excited(n, 0.1, noise=0.01, seed=i) for i, n in enumerate((260, 120, 25, 9))]
+    found = identify(records, degrees=(1, 2), windows=(10, 20))
+    assert found.drift.degree == 2
+    assert PAIR.misfit(found.drift) < 0.03
+    assert found.drift.input_matrix == pytest.approx(PAIR.B, abs=0.03)
+    assert found.noise == pytest.approx([0.01, 0.01], rel=0.2)
+    # the shortest one is no stretch to learn from
+    assert min(len(part) for part in (*found.fitted, *found.held_out)) >= 10
+
+
+def test_without_noise_it_is_exact():
+    found = identify([CUBIC.excited(300, 0.1)], degrees=(1, 3), windows=(20,))
+    assert CUBIC.misfit(found.drift) < 3e-5
+
+
+def test_the_same_to_the_bit(noisy):
+    first, second = (identify([noisy.part(0, 400)], degrees=(1, 3), windows=(20,))
+                     for _ in range(2))
+    for a, b in ((first.drift, second.drift), (first.linear, second.linear)):
+        assert a.coefficients.tobytes() == b.coefficients.tobytes()
+        assert a.B.tobytes() == b.B.tobytes()
+    assert [s.cost for s in first.scores] == [s.cost for s in second.scores]
+
+
+def test_output_error_is_taken_although_chance_is_against_it():
+    """On a short record the few stretches to choose by rate luck above skill."""
+    for seed in range(2):
+        record = CUBIC.excited(300, 0.1, noise=0.05, seed=seed)
+        found = identify([record], degrees=(2, 3), windows=(10, 20))
+        assert found.method.startswith('output error')
+
+
+# Watching.
+
+
+def test_progress_and_stop(noisy):
+    seen = []
+
+    def watch(done, total, text):
+        seen.append((done, total, text))
+        return False
+
+    identify([noisy.part(0, 200)], degrees=(1, 3), windows=(10,), watch=watch)
+    assert list(dict.fromkeys(seen)) == [
+        (0, 3, 'drift of degree 1'), (1, 3, 'drift of degree 3'),
+        (2, 3, 'drift of degree 3 on all records')]
+    # a refinement is watched at each of its steps
+    assert all(seen.count(step) > 2 for step in seen)
+
+    # at the beginning of any step, and in the midst of one
+    for stop in (1, 2, len(seen) - 1, len(seen)):
+        calls = 0
+
+        def end(*_, stop=stop):
+            nonlocal calls
+            calls += 1
+            return calls == stop
+
+        with pytest.raises(Stopped):
+            identify([noisy.part(0, 200)], degrees=(1, 3), windows=(10,), watch=end)
+        assert calls == stop
+
+
+# What cannot be learned from.
+
+
+def changed(record, **values):
+    return replace(record, **{
+        name: np.full_like(getattr(record, name), value) for name, value in values.items()})
+
+
+@pytest.mark.parametrize(('records', 'words'), [
+    ([CUBIC.excited(159, 0.1)], '159 samples are too few .* at least 160, better some thousand'),
+    ([CUBIC.excited(9, 0.1, seed=i) for i in range(30)],
+     'the records have 0 uninterrupted stretches of 10 samples, at least 8 are needed'),
+    ([changed(CUBIC.excited(300, 0.1), u=1.0)], 'input 0 never moves from 1: excite the plant'),
+    ([changed(CUBIC.excited(300, 0.1), x=310.0)], 'state 0 never moves from 310: excite'),
+])
+def test_degenerate_records(records, words):
+    with pytest.raises(ValueError, match=words):
+        identify(records)
+
+
+def test_extremes_in_every_stretch():
+    parts = cut([PAIR.excited(160, 0.1)], 20)[:8]
+    for i, part in enumerate(parts):
+        x, u = np.zeros_like(part.x), np.zeros_like(part.u)
+        # eight extremes in eight stretches
+        (x if i < 4 else u)[0, i % 2] = 1.0 if i % 4 < 2 else -1.0
+        parts[i] = replace(part, x=x, u=u)
+    with pytest.raises(ValueError, match=r'all but 0 of 8 stretches hold .* record longer'):
+        identify([*parts, parts[0].part(0, 5)] + [parts[0].part(0, 9)] * 2)
+
+
+def test_state_that_is_noise_alone_is_told_apart_from_nothing():
+    rng = np.random.default_rng(0)
+    record = CUBIC.excited(200, 0.1)
+    noise = Record(record.time, rng.standard_normal((200, 1)), record.input_time, record.u)
+    found = identify([noise], degrees=(1, 3), windows=(10,))
+    # no drift predicts it better than its own mean
+    assert min(score.rmse[0] for score in found.scores) > 0.8
+
+
+def test_linear_model_that_diverges_does_not_stand_in_the_way(noisy, monkeypatch):
+    module = sys.modules[identify.__module__]
+    original = module.prediction_error
+    monkeypatch.setattr(module, 'prediction_error', lambda rate, *others: (
+        np.full(1, np.inf) if rate.__self__.degree == 1 else original(rate, *others)))
+    found = identify([noisy.part(0, 400)], degrees=(1, 3), windows=(20,))
+    assert (found.linear.degree, found.drift.degree) == (1, 3)
+    monkeypatch.setattr(module, 'prediction_error', lambda *_: np.full(1, np.inf))
+    with pytest.raises(ValueError, match='no drift fits the records: record longer'):
+        identify([noisy.part(0, 400)], degrees=(1, 3), windows=(20,))
+
+
+def test_memory_of_a_long_record():
+    # 20000 samples: some five hours and a half at one a second
+    rng = np.random.default_rng(0)
+    times = np.arange(20000.0) / 60.0
+    record = Record(times, np.cumsum(rng.standard_normal((20000, 1)), axis=0), times,
+                    rng.uniform(-1.0, 1.0, (20000, 1)))
+    parts = cut([record], 240)
+    model = weak_form(parts, Box.of(parts), 6, None, 80)
+    tracemalloc.start()
+    stretches = Stretches.of(parts, longest_step(parts))
+    problem = _Problem(model, stretches, True)
+    problem.evaluate(0.0 * problem.start())
+    peak = tracemalloc.get_traced_memory()[1]
+    tracemalloc.stop()
+    # sums over the steps are gathered as they are made; kept apart they would take 30 MB
+    assert peak < 20e6

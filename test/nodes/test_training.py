@@ -1,0 +1,202 @@
+# Copyright 2026 The koopman_ros Authors
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""The trainer trains: as a task of its own, on request beside a running loop, to its end."""
+
+from __future__ import annotations
+
+import json
+import os
+from pathlib import Path
+import re
+import signal
+import sys
+
+from diagnostic_msgs.msg import DiagnosticStatus
+from koopman_ros.bags import summary
+from koopman_ros.demo.processes import NodeProcess
+from koopman_ros.lifting import load
+import pytest
+from recorded_runs import driven, linear_run, reactor, write_bag
+from workbench import value, Workbench
+
+STATUS = 'trainer: training'
+QUICK = {'model_coordinates': 2, 'training_starts': 1}
+
+
+@pytest.fixture(scope='module')
+def bag(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Return six minutes of a reactor whose jacket has fouled."""
+    return write_bag(tmp_path_factory.mktemp('bag') / 'run.mcap', driven(reactor(0.8), 6.0))
+
+
+def offline(bag: Path, output: Path) -> dict[str, object]:
+    """Return the parameters of a training from a bag."""
+    return {**QUICK, 'task': 'train', 'bags': [bag], 'model_output': output}
+
+
+def children(process: NodeProcess) -> list[int]:
+    """Return the processes that a process has started."""
+    found = []
+    for stat in Path('/proc').glob('[0-9]*/stat'):
+        try:
+            _, parent = stat.read_text().rpartition(')')[2].split()[:2]
+        except (FileNotFoundError, ProcessLookupError):
+            continue
+        if int(parent) == process.process.pid:
+            found.append(int(stat.parent.name))
+    return found
+
+
+def gone(pid: int) -> bool:
+    """Tell whether a process has ended, even if nobody has asked for its exit code."""
+    try:
+        return Path(f'/proc/{pid}/stat').read_text().rpartition(')')[2].split()[0] == 'Z'
+    except (FileNotFoundError, ProcessLookupError):
+        return True
+
+
+# A task of its own.
+
+
+def test_trains_from_a_bag_with_a_bar_on_the_terminal(ros: Workbench, bag: Path, tmp_path: Path
+                                                      ) -> None:
+    # a terminal of its own, whose output goes to the log
+    program = ('import pty, os, sys; '
+               'sys.exit(os.waitstatus_to_exitcode(pty.spawn(sys.argv[1:])))')
+    trainer = ros.start('trainer', offline(bag, tmp_path / 'new.safetensors'), command=(
+        sys.executable, '-c', program, sys.executable, '-m', 'koopman_ros.nodes.trainer'))
+    assert ros.wait_for_end(trainer) == 0, trainer.output()
+    printed = trainer.output()
+    shares = [int(share) for share in re.findall(r'\|[#-]{30}\| +(\d+) %', printed)]
+    assert shares == sorted(shares)
+    assert len(shares) > 3
+    assert shares[-1] == 100
+    assert 'estimating: drift of degree' in printed
+    assert re.search(r'the new lift is accepted: error on held-out records 0\.\d+ K, that of the '
+                     rf'present one \d\.\d+ K; written to {tmp_path}/new\.safetensors', printed)
+    assert sorted(path.name for path in tmp_path.glob('new.*')) == [
+        'new.json', 'new.md', 'new.png', 'new.safetensors']
+    assert load(tmp_path / 'new.safetensors').n_z == 2
+    # no bag is recorded meanwhile
+    assert not list(tmp_path.glob('koopman_ros_*'))
+
+
+def test_lift_that_is_refused_has_an_exit_code_of_its_own(ros: Workbench, tmp_path: Path) -> None:
+    bag = write_bag(tmp_path / 'linear.mcap', linear_run(200))
+    trainer = ros.start('trainer', offline(bag, tmp_path / 'new.safetensors'))
+    assert ros.wait_for_end(trainer) == 2
+    assert '[WARN]' in trainer.output()
+    assert 'the new lift is refused: the lift with n_z = 2 does not predict' in trainer.output()
+    assert json.loads((tmp_path / 'new.json').read_text())['accepted'] is False
+    assert not (tmp_path / 'new.safetensors').exists()
+
+
+def test_task_that_cannot_start(ros: Workbench) -> None:
+    trainer = ros.start('trainer', {'task': 'train'})
+    assert ros.wait_for_end(trainer) == 1
+    assert trainer.output() == (
+        'trainer: cannot start: cannot train: there is no bag to train from: record one, or name '
+        'it in bags\n')
+
+
+@pytest.mark.parametrize(('number', 'code'), [(signal.SIGINT, 1), (signal.SIGKILL, -9)])
+def test_no_orphan_and_no_file_when_the_trainer_ends(
+        ros: Workbench, bag: Path, tmp_path: Path, number: int, code: int) -> None:
+    trainer = ros.start('trainer', offline(bag, tmp_path / 'new.safetensors'))
+    # the first words say that the process is there
+    ros.wait_until(lambda: children(trainer))
+    (child,) = children(trainer)
+    assert trainer.stop(number) == code
+    ros.processes.remove(trainer)
+    ros.wait_until(lambda: gone(child))
+    assert not list(tmp_path.glob('new*'))
+    if number == signal.SIGINT:
+        assert 'training: cancelled, nothing was written' in trainer.output()
+        assert 'Traceback' not in trainer.output()
+
+
+# On request.
+
+
+def test_trains_beside_the_running_loop(ros: Workbench, tmp_path: Path) -> None:
+    ros.start('plant', {'lockstep': True, 'speed': 100.0, 'lockstep_subscribers': 2,
+                        'noise': 0.1, 'heat_transfer_coefficient': 4e4})
+    trainer = ros.start('trainer', {
+        **QUICK, 'output': tmp_path / 'run.mcap', 'model_output': tmp_path / 'new.safetensors',
+        'experiment_duration': 10.0, 'experiment_coolant_min': 4.0, 'min_free_disk': 0.0})
+    ros.meet('plant')
+    assert ros.set_bool('trainer/experiment', True).success
+    ros.wait_for_status('trainer: recording', lambda status: len(status.values) > 1 and int(
+        value(status, 'messages on /temperature')) > 250)
+
+    # the bag is still being recorded
+    response = ros.trigger('trainer/train')
+    assert (response.success, response.message) == (True, f'training from {tmp_path}/run.mcap')
+    response = ros.trigger('trainer/train')
+    assert (response.success, response.message) == (False, 'already training')
+    (child,) = children(trainer)
+    response = ros.trigger('trainer/cancel_training')
+    assert (response.success, response.message) == (True, 'the training is being cancelled')
+    status = ros.wait_for_status(STATUS, lambda status: status.level == DiagnosticStatus.ERROR)
+    assert status.message == 'cancelled, nothing was written'
+    assert gone(child)
+    response = ros.trigger('trainer/cancel_training')
+    assert (response.success, response.message) == (False, 'not training')
+    assert not list(tmp_path.glob('new*'))
+
+    assert ros.trigger('trainer/train').success
+    status = ros.wait_for_status(STATUS, lambda status: status.message.startswith('the new lift'))
+    figures = json.loads((tmp_path / 'new.json').read_text())
+    assert value(status, 'done [%]') == '100'
+    assert float(value(status, 'noise_kelvin')) == pytest.approx(figures['noise_kelvin'])
+    assert figures['noise_kelvin'] == pytest.approx(0.1, rel=0.2)
+    assert figures['measurements_used'] > 250
+    assert 'was not closed or is damaged' in (tmp_path / 'new.md').read_text()
+    # the benchmark's 2.092 1/min are of 5e4 J/(min K)
+    assert figures['input_gain_per_minute'] == pytest.approx(0.8 * 2.0921, rel=0.15)
+    assert status.level == (
+        DiagnosticStatus.OK if figures['accepted'] else DiagnosticStatus.WARN), status.message
+
+    assert ros.trigger('trainer/train').success
+    ros.wait_until(lambda: children(trainer))
+    (child,) = children(trainer)
+    before = {path: os.stat(path).st_mtime_ns for path in tmp_path.glob('new*')}
+    # the recording was the task, and it is complete
+    assert trainer.stop(signal.SIGINT) == 0
+    assert gone(child)
+    assert 'Traceback' not in trainer.output()
+    assert {path: os.stat(path).st_mtime_ns for path in tmp_path.glob('new*')} == before
+    bag = summary(tmp_path / 'run.mcap')
+    assert bag.complete
+    assert bag.counts['/temperature'] > figures['measurements_read']
+
+
+def test_bag_that_cannot_be_read(ros: Workbench, tmp_path: Path) -> None:
+    trainer = ros.start('trainer', {
+        **QUICK, 'record_at_start': False, 'bags': [tmp_path / 'none.mcap'],
+        'model_output': tmp_path / 'new.safetensors'})
+    ros.meet('trainer')
+    assert ros.trigger('trainer/train').success
+    status = ros.wait_for_status(STATUS, lambda status: status.level == DiagnosticStatus.ERROR)
+    assert status.message == (
+        f"training failed: bag '{tmp_path}/none.mcap' does not exist: check the path")
+    assert trainer.output().count('none.mcap') == 2
+    # nothing keeps the next one from starting
+    (result,) = ros.set_parameters('trainer', bags=[''])
+    assert result.successful, result.reason
+    response = ros.trigger('trainer/train')
+    assert (response.success, response.message) == (
+        False, 'cannot train: there is no bag to train from: record one, or name it in bags')
+    assert trainer.stop() == 0

@@ -1,0 +1,58 @@
+# Copyright 2026 The koopman_ros Authors
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""The share of the range of states and inputs that records visit."""
+
+from koopman_ros.identification import Box, Record
+from koopman_ros.retraining.coverage import CELLS, coverage, visited_cells
+import numpy as np
+import pytest
+
+BOX = Box(np.array([0.0]), np.array([10.0]), np.array([100.0]), np.array([200.0]))
+
+
+def record(x, u):
+    times = np.arange(float(len(x)))
+    return Record(times, np.array(x)[:, None], times, np.array(u)[:, None])
+
+
+def test_cells_are_counted_once():
+    cells = visited_cells([record([0.0, 0.5, 9.9, 10.0], [100.0, 105.0, 199.0, 200.0]),
+                           record([0.2, 5.0], [101.0, 150.0])], BOX)
+    assert cells.tolist() == [[0, 0], [5, 5], [9, 9]]
+
+
+def test_outside_counts_for_the_border():
+    assert visited_cells([record([-3.0, 40.0], [90.0, 150.0])], BOX).tolist() == [[0, 0], [9, 5]]
+
+
+def test_share_of_all_cells():
+    centres = np.arange(0.5, CELLS)
+    x, u = (a.ravel() for a in np.meshgrid(centres, 100.0 + 10.0 * centres))
+    assert coverage([record(x, u)], BOX) == 1.0
+    assert coverage([record(x[:37], u[:37])], BOX) == pytest.approx(0.37)
+
+
+def test_inputs_are_those_that_held():
+    held = Record(np.arange(3.0), np.full((3, 1), 0.5), np.array([-1.0, 0.5]),
+                  np.array([[105.0], [195.0]]))
+    assert visited_cells([held], BOX).tolist() == [[0, 0], [0, 9]]
+
+
+def test_cells_of_two_states():
+    box = Box(np.zeros(2), np.ones(2), np.zeros(1), np.ones(1))
+    path = Record(np.arange(2.0), np.array([[0.05, 0.95], [0.55, 0.45]]), np.zeros(1),
+                  np.array([[0.35]]))
+    assert visited_cells([path], box).tolist() == [[0, 9, 3], [5, 4, 3]]
+    assert coverage([path], box) == pytest.approx(2e-3)

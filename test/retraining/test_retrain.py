@@ -1,0 +1,271 @@
+# Copyright 2026 The koopman_ros Authors
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""Retraining from bags, end to end within one process."""
+
+from dataclasses import replace
+import json
+from pathlib import Path
+
+from koopman_ros.bags import BagReadError
+from koopman_ros.identification import Stopped
+from koopman_ros.lifting import load, ModelFileError, save
+from koopman_ros.nodes.shipped import model_path
+from koopman_ros.retraining import retrain, Task, write_report
+from koopman_ros.retraining import task as task_module
+import numpy as np
+import pytest
+from random_lifts import random_lift
+from recorded_runs import driven, linear_run, NOISE, reactor, write_bag
+
+SHIPPED = str(model_path('reactor_nz4'))
+
+
+@pytest.fixture(scope='module')
+def bag(tmp_path_factory):
+    return write_bag(tmp_path_factory.mktemp('bag') / 'run.mcap', driven(reactor(0.8), 20.0))
+
+
+@pytest.fixture(scope='module')
+def accepted(bag, tmp_path_factory):
+    """Return the outcome of a training that replaces a model, its progress, and its folder."""
+    folder = tmp_path_factory.mktemp('accepted')
+    (folder / 'new.safetensors').write_bytes(Path(SHIPPED).read_bytes())
+    told = []
+    outcome = retrain(Task((str(bag),), str(folder / 'new.safetensors'), SHIPPED, coordinates=2,
+                           starts=1), lambda share, text: told.append((share, text)) or False)
+    return outcome, told, folder
+
+
+def test_accepted_lift_is_written_and_the_one_before_is_kept(accepted):
+    outcome, _, folder = accepted
+    assert outcome.accepted
+    assert outcome.model_file == str(folder / 'new.safetensors')
+    assert sorted(path.name for path in folder.glob('*.safetensors')) == [
+        'new.previous.safetensors', 'new.safetensors']
+    assert (folder / 'new.previous.safetensors').read_bytes() == Path(SHIPPED).read_bytes()
+    # no temporary file is left
+    assert not list(folder.glob('*.tmp'))
+
+
+def test_file_says_where_it_comes_from(accepted):
+    outcome, _, folder = accepted
+    origin = load(folder / 'new.safetensors').provenance
+    found = outcome.found
+    assert origin.plant == load(SHIPPED).provenance.plant
+    assert len(origin.data_digest) == 64
+    assert origin.method == f'{found.method}, drift of degree {found.drift.degree}'
+    assert origin.metrics['noise'] == float(found.noise[0]) == pytest.approx(NOISE, rel=0.1)
+    assert origin.metrics['rollout_rmse'] == float(outcome.verdict.rmse[0])
+    assert origin.metrics['coverage'] == outcome.coverage
+    assert 0.2 < outcome.coverage < 1.0
+    assert {'rw', 'rx', 'cond'} < set(origin.metrics)
+    assert origin.seed == 0
+
+
+def test_learned_lift_predicts_the_plant(accepted):
+    _, _, folder = accepted
+    model = load(folder / 'new.safetensors')
+    system = reactor(0.8)
+    # over the middle of the box, where twenty minutes tell enough
+    x = np.linspace(310.0, 322.0, 25)[:, None]
+    xi = model.states.to_deviation(x)
+    u = np.full((25, 1), 288.0)
+    rate = model.states.scale * (model.drift(xi) + model.inputs.to_deviation(u) @ model.B.T)
+    true = system.derivative(x, u)
+    # K/min, of rates up to 15
+    assert np.max(np.abs(rate - true)) < 0.6
+
+
+def test_progress_rises_to_the_end(accepted):
+    _, told, _ = accepted
+    shares = [share for share, _ in told]
+    assert shares == sorted(shares)
+    assert (shares[0], shares[-1]) == (0.0, pytest.approx(0.99))
+    words = [text for _, text in told]
+    assert words[0] == 'reading bags'
+    assert 'estimating: drift of degree 3' in words
+    assert 'learning: n_z 2, start 1 of 1' in words
+    assert words[-2:] == ['judging', 'writing']
+
+
+def test_refused_lift_is_kept_aside_and_has_the_same_bits(bag, accepted, tmp_path):
+    _, _, folder = accepted
+    present = folder / 'new.safetensors'
+    output = tmp_path / 'deep' / 'er' / 'new.safetensors'
+    outcome = retrain(Task((str(bag),), str(output), str(present), coordinates=2, starts=1))
+    assert not outcome.accepted
+    assert 'is not 10 % below that of the present lift' in outcome.reasons[0]
+    # nothing replaces the output, and the same data and seed give the same file
+    assert [path.name for path in output.parent.iterdir()] == ['new.refused.safetensors']
+    assert Path(outcome.model_file).read_bytes() == present.read_bytes()
+
+
+def test_report(accepted):
+    outcome, _, _ = accepted
+    files = write_report(outcome, load(SHIPPED))
+    assert [path.name for path in files] == ['new.json', 'new.md', 'new.png']
+    figures = json.loads(files[0].read_text())
+    assert figures == outcome.summary()
+    assert figures['accepted'] is True
+    assert figures['measurements_used'] == figures['measurements_read'] == 1201
+    # UA is 0.8 of 2.092 1/min
+    assert figures['input_gain_per_minute'] == pytest.approx(0.8 * 2.0921, rel=0.02)
+    page = files[1].read_text()
+    assert '**The new lift is accepted.**' in page
+    assert '1201 of 1201 measurements used' in page
+    assert f'| the present lift | {outcome.verdict.current_rmse[0]:.5f} |' in page
+    assert '![Data, drift and prediction](new.png)' in page
+    assert files[2].read_bytes().startswith(b'\x89PNG')
+
+
+def test_figures_that_are_infinite_stay_valid_json(accepted):
+    outcome, _, _ = accepted
+    diverging = replace(outcome, verdict=replace(
+        outcome.verdict, current_rmse=np.array([np.inf])))
+    figures = json.loads(json.dumps(diverging.summary(), allow_nan=False))
+    assert figures['heldout_error_of_present_lift_kelvin'] is None
+
+
+def test_refused_lift_that_diverges_is_kept_all_the_same(tmp_path, monkeypatch):
+    bag = write_bag(tmp_path / 'run.mcap', driven(reactor(0.8), 5.0))
+    original = task_module.judge
+
+    def judge(*arguments):
+        return replace(original(*arguments), rmse=np.array([np.inf]), reasons=('it diverges',))
+
+    monkeypatch.setattr(task_module, 'judge', judge)
+    monkeypatch.setattr(task_module, 'identify', _quick)
+    outcome = retrain(Task((str(bag),), str(tmp_path / 'new.safetensors'), SHIPPED,
+                           coordinates=2, starts=1))
+    metrics = load(outcome.model_file).provenance.metrics
+    assert 'rollout_rmse' not in metrics
+    assert 'noise' in metrics
+
+
+_identify = task_module.identify
+
+
+def _quick(records, **options):
+    """Estimate by a few methods alone."""
+    return _identify(records, degrees=(1, 3), windows=(20,), **options)
+
+
+def test_previous_model_is_copied_where_there_are_no_hard_links(tmp_path, monkeypatch):
+    def refuse(*_):
+        raise PermissionError
+
+    monkeypatch.setattr(task_module.os, 'link', refuse)
+    output = tmp_path / 'a.safetensors'
+    for content in (b'first', b'second'):
+        output.write_bytes(content)
+        assert task_module._place(output, True) == output
+        assert (tmp_path / 'a.previous.safetensors').read_bytes() == content
+        assert output.read_bytes() == content
+
+
+def test_a_linear_plant_needs_no_lift(tmp_path):
+    bag = write_bag(tmp_path / 'linear.mcap', linear_run(200))
+    outcome = retrain(Task((str(bag),), str(tmp_path / 'new.safetensors'), SHIPPED,
+                           coordinates=2, starts=1))
+    (reason,) = outcome.reasons
+    assert 'does not predict the motion better than a linear model' in reason
+    assert (outcome.trained, outcome.verdict, outcome.model_file) == (None, None, '')
+    assert not list(tmp_path.glob('*.safetensors'))
+    assert outcome.found.drift.degree == 1
+    # dT/dt = -(T - 315) / 2 + (Tc - 288)
+    assert outcome.found.drift.input_matrix == pytest.approx(np.array([[1.0]]), rel=0.02)
+    files = write_report(outcome, load(SHIPPED))
+    assert '**The new lift is refused.**' in files[1].read_text()
+    assert json.loads(files[0].read_text())['accepted'] is False
+
+
+def test_known_gain_and_a_model_in_seconds(tmp_path, monkeypatch):
+    """The gain is given in 1/min whatever the time unit of the present lift."""
+    monkeypatch.setattr(task_module, 'identify', _quick)
+    bag = write_bag(tmp_path / 'linear.mcap', linear_run(200))
+    present = load(SHIPPED)
+    save(replace(present, A=present.A / 60.0, B=present.B / 60.0, time_unit='s'),
+         tmp_path / 'seconds.safetensors')
+    outcome = retrain(Task((str(bag),), str(tmp_path / 'new.safetensors'),
+                           str(tmp_path / 'seconds.safetensors'), coordinates=2, starts=1,
+                           input_gain=1.0))
+    assert outcome.found.drift.input_matrix == pytest.approx(np.array([[1.0 / 60.0]]), rel=1e-12)
+    assert outcome.summary()['input_gain_per_minute'] == pytest.approx(1.0, rel=1e-12)
+
+
+@pytest.mark.parametrize('text', ['reading bags', 'estimating: drift of degree 3',
+                                  'learning: n_z 2', 'judging', 'writing'])
+def test_stops_at_any_stage_and_writes_nothing(tmp_path_factory, tmp_path, monkeypatch, text):
+    monkeypatch.setattr(task_module, 'identify', _quick)
+    bag = write_bag(tmp_path_factory.mktemp('short') / 'run.mcap', driven(reactor(0.8), 4.0))
+    task = Task((str(bag),), str(tmp_path / 'new.safetensors'), SHIPPED, coordinates=2, starts=1)
+    stopped = False
+
+    def tell(_, said):
+        nonlocal stopped
+        # whoever asked goes on asking
+        stopped = stopped or said.startswith(text)
+        return stopped
+
+    with pytest.raises(Stopped):
+        retrain(task, tell)
+    assert list(tmp_path.iterdir()) == []
+
+
+# Tasks that do not fit.
+
+
+def test_a_task_survives_json():
+    task = Task(('a', 'b'), 'new.safetensors', 'x.safetensors', seed=3, input_gain=2.1)
+    assert Task.from_json(task.to_json()) == task
+    assert '\n' not in task.to_json()
+    with pytest.raises(TypeError, match='nonsense'):
+        Task.from_json('{"bags": [], "output": "", "model": "", "nonsense": 1}')
+
+
+@pytest.mark.parametrize(('values', 'error', 'words'), [
+    ({'model': '/nowhere/x.safetensors'}, ModelFileError, 'no model file at /nowhere/x.safetens'),
+    ({'output': 'new.bin'}, ValueError, "output = 'new.bin' must end in .safetensors"),
+    ({'bags': ('/nowhere/run.mcap',)}, BagReadError, '/nowhere/run.mcap'),
+    ({'temperature_topic': '/other'}, BagReadError, "has no topic '/other', it has /coolant_se"),
+    ({'margin': 2.0}, ValueError, 'margin = 2.0'),
+])
+def test_what_does_not_fit_is_said_at_once(bag, tmp_path, values, error, words):
+    good = Task((str(bag),), str(tmp_path / 'new.safetensors'), SHIPPED)
+    with pytest.raises(error, match=words):
+        retrain(replace(good, **values))
+
+
+def test_folder_that_cannot_be_made_is_said_at_once(bag, tmp_path):
+    (tmp_path / 'file').touch()
+    task = Task((str(bag),), str(tmp_path / 'file' / 'new.safetensors'), SHIPPED)
+    with pytest.raises(OSError, match='file'):
+        retrain(task)
+
+
+def test_present_lift_of_another_plant(bag, tmp_path):
+    save(random_lift(), tmp_path / 'two.safetensors')
+    task = Task((str(bag),), str(tmp_path / 'new.safetensors'), str(tmp_path / 'two.safetensors'))
+    with pytest.raises(ValueError, match='has x0, x1 as states and u0 as inputs, bags of the loop '
+                                         'hold one temperature and the coolant'):
+        retrain(task)
+
+
+def test_bag_without_a_usable_stretch(tmp_path):
+    bag = write_bag(tmp_path / 'short.mcap', linear_run(9))
+    task = Task((str(bag),), str(tmp_path / 'new.safetensors'), SHIPPED)
+    with pytest.raises(ValueError, match='no usable stretch of measurements: 0 of 9 measurements '
+                                         'used; 9 dropped: too short'):
+        retrain(task)
