@@ -24,6 +24,7 @@ import math
 import os
 
 from koopman_ros.bags.errors import BagReadError
+from koopman_ros.bags.jumps import spikes_and_jumps
 from koopman_ros.bags.reader import read_messages, summary
 import numpy as np
 from numpy.typing import NDArray
@@ -94,9 +95,11 @@ def loop_episodes(bags: Sequence[str | os.PathLike[str]], temperature: str, cool
     on at which it was commanded. A command that answers a measurement carries its stamp; where
     the stamps are those of the wall clock, it acts later by the time between the two receipts. A
     command without a stamp acts when it is received.
-    Episodes end at gaps and where time is set back; measurements before the first command are
-    dropped, since nobody knows what acted on them. A bag that was not closed or is damaged is
-    read as far as it goes, and the account says so.
+
+    Episodes end at gaps, where time is set back, and where the temperature jumps to another level
+    as after a reset. Spikes of a single sample are dropped, and so are measurements before the
+    first command, since nobody knows what acted on them. A bag that was not closed or is damaged
+    is read as far as it goes. The account tells all that.
 
     :param bags: files or folders.
     :param temperature: topic of the measurements, sensor_msgs/Temperature.
@@ -165,21 +168,28 @@ def _runs(bag: str | os.PathLike[str], temperature: str, coolant: str, account: 
 
 
 def _episodes(bag: str, run: _Run, account: Account, input_delay_ns: int) -> list[Episode]:
-    """Sort one run by time and cut it at its gaps."""
+    """Sort one run by time and cut it at its gaps and jumps."""
     measured = _sorted(run.measured, account, 'measurement with a repeated stamp')
     if len(measured) < _SHORTEST or not run.commanded:
         account.dropped['too short, or without any coolant'] += len(measured)
         return []
+    spike, _ = spikes_and_jumps(np.array([entry[2] for entry in measured]))
+    account.dropped['spike of a single sample'] += int(np.sum(spike))
+    measured = [entry for entry, odd in zip(measured, spike, strict=True) if not odd]
+    _, jump = spikes_and_jumps(np.array([entry[2] for entry in measured]))
     stamps = np.array([entry[0] for entry in measured])
     period = float(np.median(np.diff(stamps)))
     input_ns, values = _inputs(run, measured, period)
     input_ns = input_ns + input_delay_ns
     known = stamps >= input_ns[0]
     account.dropped['before the first coolant'] += int(np.sum(~known))
-    ends = np.flatnonzero(np.diff(stamps) > _GAP_PERIODS * period) + 1
+    gap = np.diff(stamps, prepend=stamps[0]) > _GAP_PERIODS * period
+    ends = np.flatnonzero(gap | jump)
     for end in ends.tolist():
-        account.notes.append(f'{bag}: gap of {(stamps[end] - stamps[end - 1]) / _NS:.3f} s at '
-                             f'{stamps[end - 1] / _NS:.3f} s, a new episode begins')
+        what = (f'gap of {(stamps[end] - stamps[end - 1]) / _NS:.3f} s' if gap[end]
+                else f'jump to {measured[end][2]:.2f} degC')
+        account.notes.append(
+            f'{bag}: {what} at {stamps[end - 1] / _NS:.3f} s, a new episode begins')
     found = []
     for rows in np.split(np.arange(len(stamps)), ends):
         rows = rows[known[rows]]

@@ -60,7 +60,6 @@ def main() -> int:
         # before the new lift takes its place
         current = load(task.model)
         outcome = retrain(task, tell)
-        files = write_report(outcome, current)
     except BrokenPipeError:
         # whoever started it is gone
         return 1
@@ -70,7 +69,14 @@ def main() -> int:
     except (ValueError, TypeError, KeyError, OSError, MemoryError) as error:
         _say(error=' '.join(str(error).split()) or type(error).__name__)
         return 1
-    _say(summary=outcome.summary(), files=[str(path) for path in files])
+    summary = outcome.summary()
+    try:
+        files = [str(path) for path in write_report(outcome, current)]
+    except OSError as error:
+        # the lift is written already
+        files = []
+        summary['warnings'] += [f'the report could not be written: {error}']
+    _say(summary=summary, files=files)
     return 0 if outcome.accepted else 2
 
 

@@ -15,7 +15,7 @@
 """What acted on which measurement, as read from bags."""
 
 from collections.abc import Callable, Iterable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 import importlib
 import math
 from pathlib import Path
@@ -208,6 +208,18 @@ def test_a_few_lost_samples_are_no_gap(write: Callable[..., Path]) -> None:
     (episode,), account = read(write(said))
     assert len(episode.stamp_ns) == 18
     assert account.lines() == ['18 of 18 measurements used']
+
+
+def test_spike_is_dropped_and_jump_ends_an_episode(write: Callable[..., Path]) -> None:
+    added = {k: 500.0 if k == 40 else 300.0 * (k > 70) for k in range(1, 121)}
+    said = [replace(one, value=one.value + added[round(one.stamp)])
+            if one.topic == TEMPERATURE else one for one in loop(120)]
+    (first, second), account = read(write(said))
+    assert seconds(first.stamp_ns) == [*range(1, 40), *range(41, 71)]
+    assert seconds(second.stamp_ns) == list(range(71, 121))
+    assert account.dropped == {'spike of a single sample': 1}
+    assert account.notes == [
+        f'{first.bag}: jump to 371.00 degC at 70.000 s, a new episode begins']
 
 
 def test_command_before_a_gap_is_held_over_it(write: Callable[..., Path]) -> None:

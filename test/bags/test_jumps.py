@@ -1,0 +1,70 @@
+# Copyright 2026 The koopman_ros Authors
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+
+"""What counts as a spike or a jump, and what is a plant's own motion."""
+
+from koopman_ros.bags.jumps import spikes_and_jumps
+from koopman_ros.plants import one_state_reactor, random_steps, RandomStepDesign
+import numpy as np
+import pytest
+
+DESIGN = RandomStepDesign(281.33, 300.55, 305.0, 327.0, (0.5, 2.0), 1.0 / 60.0, rtol=1e-9)
+
+
+@pytest.fixture(scope='module')
+def motion() -> np.ndarray:
+    """Return twenty minutes of the reactor under random steps, a sample a second [degC]."""
+    states = random_steps(one_state_reactor(), DESIGN, 20.0, 5).trajectory.states
+    return states[:, 0] - 273.15
+
+
+@pytest.mark.parametrize('noise', [0.0, 0.1, 1.0])
+@pytest.mark.parametrize('stride', [1, 10, 30])
+def test_motion_under_steps_is_neither(motion: np.ndarray, noise: float, stride: int) -> None:
+    values = motion[::stride] + noise * np.random.default_rng(1).standard_normal(
+        len(motion[::stride]))
+    spike, jump = spikes_and_jumps(values)
+    assert not spike.any()
+    assert not jump.any()
+
+
+def test_a_step_from_long_rest_is_neither() -> None:
+    time = np.arange(3000.0)
+    values = 51.0 - 10.0 * (1.0 - np.exp(-np.maximum(time - 2950.0, 0.0) / 25.0))
+    spike, jump = spikes_and_jumps(values)
+    assert not spike.any()
+    assert not jump.any()
+
+
+@pytest.mark.parametrize('noise', [0.0, 0.1])
+def test_spikes_and_jumps_are_found(motion: np.ndarray, noise: float) -> None:
+    values = motion + noise * np.random.default_rng(2).standard_normal(len(motion))
+    values[[100, 700]] += [40.0, -35.0]
+    values[900:] += 30.0
+    spike, jump = spikes_and_jumps(values)
+    assert np.flatnonzero(spike).tolist() == [100, 700]
+    assert np.flatnonzero(jump).tolist() == [900]
+
+
+def test_a_reset_while_all_rests_is_found() -> None:
+    values = np.r_[np.full(200, 40.0), np.full(200, 51.0)]
+    spike, jump = spikes_and_jumps(values)
+    assert not spike.any()
+    assert np.flatnonzero(jump).tolist() == [200]
+
+
+def test_few_samples_tell_nothing() -> None:
+    values = np.r_[np.zeros(20), 100.0, np.zeros(20)]
+    assert not np.any(spikes_and_jumps(values))
