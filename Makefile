@@ -46,8 +46,8 @@ demo: $(VENV)/run.stamp  ## closed loop of three processes: live table, bag, pic
 demo-retrain: $(VENV)/retrain.stamp  ## the plant drifts, is recorded, learned and controlled anew -> out/demo-retrain
 	$(BIN)/python -m koopman_ros.demo.retrain
 
-test: lint  ## the whole test suite
-	$(BIN)/python -m pytest
+test: lint  ## the whole test suite, on all cores
+	$(BIN)/python -m pytest -n auto --dist loadfile
 
 lint: $(VENV)/test.stamp  ## style and type checks
 	$(BIN)/ruff check

@@ -66,6 +66,7 @@ setup(
             'distributed',
             'mypy',
             'pytest',
+            'pytest-xdist',
             'rosbags',
             'ruff',
             'safetensors',

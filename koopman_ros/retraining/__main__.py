@@ -69,14 +69,14 @@ def main() -> int:
     except (ValueError, TypeError, KeyError, OSError, MemoryError) as error:
         _say(error=' '.join(str(error).split()) or type(error).__name__)
         return 1
-    summary = outcome.summary()
+    warnings = list(outcome.verdict.warnings) if outcome.verdict else []
     try:
         files = [str(path) for path in write_report(outcome, current)]
     except OSError as error:
         # the lift is written already
         files = []
-        summary['warnings'] += [f'the report could not be written: {error}']
-    _say(summary=summary, files=files)
+        warnings.append(f'the report could not be written: {error}')
+    _say(summary={**outcome.summary(), 'warnings': warnings}, files=files)
     return 0 if outcome.accepted else 2
 
 
