@@ -101,7 +101,11 @@ def test_converges_at_two_hundred_times_real_time(ros: Workbench) -> None:
 
 def test_every_measurement_has_exactly_one_command(ros: Workbench) -> None:
     loop = Loop(ros)
-    start_loop(ros, {**LOCKSTEP, 'duration': 300.0, 'sample_period': 0.7})
+    ros.start('controller')
+    # or its first commands may go out before it knows that the bench listens
+    ros.meet('controller')
+    ros.start('plant', {**LOCKSTEP, 'lockstep_subscribers': 2, 'duration': 300.0,
+                        'sample_period': 0.7})
     ros.wait_until(lambda: len(loop.commands) >= 429 and len(loop.temperatures) >= 429)
     measured = [message.header.stamp for message in loop.temperatures]
     assert [seconds(message) for message in loop.temperatures] == [
