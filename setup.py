@@ -66,6 +66,7 @@ setup(
             'distributed',
             'mypy',
             'pytest',
+            'pytest-timeout',
             'pytest-xdist',
             'rosbags',
             'ruff',

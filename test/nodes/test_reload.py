@@ -19,12 +19,14 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
+import errno
 import itertools
 import math
 import os
 from pathlib import Path
 import sys
 import time
+from typing import BinaryIO
 
 from diagnostic_msgs.msg import DiagnosticStatus
 from koopman_ros.control import Controller, State
@@ -59,6 +61,21 @@ def put(content: bytes, path: Path) -> None:
     new = path.with_suffix('.new')
     new.write_bytes(content)
     os.replace(new, path)
+
+
+def opened(ros: Workbench, pipe: Path) -> BinaryIO:
+    """Wait until somebody reads from a named pipe, and return the end to write to."""
+    def end() -> BinaryIO | None:
+        try:
+            return os.fdopen(os.open(pipe, os.O_WRONLY | os.O_NONBLOCK), 'wb')
+        except OSError as error:
+            # nobody reads yet
+            assert error.errno == errno.ENXIO
+            return None
+
+    found = ros.wait_until(end)
+    assert found is not None
+    return found
 
 
 class Operator:
@@ -307,6 +324,7 @@ def test_loop_goes_on_while_a_slow_disk_is_read(ros: Workbench, tmp_path: Path) 
     for path in (file, dead):
         os.mkfifo(path)
     reloaded = operator.ask_to_reload()
+    slow = opened(ros, file)
     (result,) = ros.set_parameters('controller', model=str(dead))
     assert result.reason.startswith(f'the old model is kept: {dead} is still being read')
     for _ in range(50):
@@ -314,7 +332,8 @@ def test_loop_goes_on_while_a_slow_disk_is_read(ros: Workbench, tmp_path: Path) 
     ros.wait_until(lambda: len(thermometer.commands) == 50)
     assert not reloaded.done()
 
-    file.write_bytes(model_path('reactor_nz3').read_bytes())
+    slow.write(model_path('reactor_nz3').read_bytes())
+    slow.close()
     ros.wait_until(reloaded.done)
     assert reloaded.result().success
     assert 'n_z = 3' in reloaded.result().message
@@ -331,8 +350,10 @@ def test_model_changed_during_a_slow_reload_stays(ros: Workbench, tmp_path: Path
     file.unlink()
     os.mkfifo(file)
     reloaded = operator.ask_to_reload()
+    slow = opened(ros, file)
     assert operator.set_model('reactor_linear')[0]
-    file.write_bytes(model_path('reactor_nz3').read_bytes())
+    slow.write(model_path('reactor_nz3').read_bytes())
+    slow.close()
     ros.wait_until(reloaded.done)
     assert not reloaded.result().success
     assert 'the model was changed to reactor_linear' in reloaded.result().message
