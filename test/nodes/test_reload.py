@@ -69,8 +69,9 @@ def opened(ros: Workbench, pipe: Path) -> BinaryIO:
         try:
             return os.fdopen(os.open(pipe, os.O_WRONLY | os.O_NONBLOCK), 'wb')
         except OSError as error:
+            if error.errno != errno.ENXIO:
+                raise
             # nobody reads yet
-            assert error.errno == errno.ENXIO
             return None
 
     found = ros.wait_until(end)
