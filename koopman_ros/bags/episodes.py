@@ -147,7 +147,9 @@ def _runs(bag: str | os.PathLike[str], temperature: str, coolant: str, account: 
                              'whole record')
     run = _Run()
     latest = -1
+    left = content.counts[temperature] + content.counts[coolant]
     for entry in read_messages(bag, [temperature, coolant], recover=True):
+        left -= 1
         stamp = entry.message.header.stamp
         stamp_ns = stamp.sec * _NS + stamp.nanosec
         value = float(entry.message.temperature)
@@ -164,6 +166,9 @@ def _runs(bag: str | os.PathLike[str], temperature: str, coolant: str, account: 
         if measured:
             latest = max(latest, stamp_ns)
         (run.measured if measured else run.commanded).append((stamp_ns, entry.log_time_ns, value))
+    if left:
+        account.notes.append(f'{os.fspath(bag)} is damaged: {left} messages that it counts could '
+                             'not be read')
     yield run
 
 

@@ -331,6 +331,17 @@ def test_bag_that_was_not_closed(write: Callable[..., Path], cut: int, left: int
         f'{bag} was not closed or is damaged: read up to its last whole record']
 
 
+def test_damage_in_a_closed_bag_is_told(write: Callable[..., Path]) -> None:
+    bag = write(loop(30))
+    content = bytearray(bag.read_bytes())
+    # within the second of three chunks of ten measurements with their answers
+    content[content.index(np.float64(15.0).tobytes())] ^= 1
+    bag.write_bytes(content)
+    (episode,), account = read(bag)
+    assert len(episode.stamp_ns) == 10
+    assert account.notes == [f'{bag} is damaged: 40 messages that it counts could not be read']
+
+
 def test_missing_topic_is_named_with_those_there_are(write: Callable[..., Path]) -> None:
     bag = write(loop(15))
     with pytest.raises(BagReadError, match=(
