@@ -19,10 +19,11 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 from koopman_ros.identification.drift import DriftModel
 from koopman_ros.identification.records import Array
-from koopman_ros.identification.stretches import first_measured, Stretches
+from koopman_ros.identification.stretches import first_measured, runge_kutta, Stretches
 from koopman_ros.learning.levenberg_marquardt import minimise
 from koopman_ros.learning.residuals import NormalEquations
 import numpy as np
@@ -73,6 +74,14 @@ class _Problem:
                         coefficients=theta[:n].reshape(self.model.coefficients.shape))
         return model, theta[n + n_B:].reshape(-1, len(self.model.B))
 
+    @cached_property
+    def _pushes(self) -> Array:
+        return self.model.box.input_deviation(self.stretches.u)
+
+    @cached_property
+    def _target(self) -> Array:
+        return self.model.box.state_deviation(self.stretches.x)
+
     @property
     def _n_B(self) -> int:
         return self.model.B.size if self.learn_input_matrix else 0
@@ -80,10 +89,8 @@ class _Problem:
     def evaluate(self, theta: Tensor, *, derivatives: bool = True) -> NormalEquations:
         """Return cost, gradient and Gauss-Newton matrix of the scaled prediction errors."""
         model, x = self.split(theta.numpy())
-        box, data = model.box, self.stretches
+        data, target = self.stretches, self._target
         count = int(np.sum(data.measured))
-        pushes = box.input_deviation(data.u)
-        target = box.state_deviation(data.x)
         M, n_x = x.shape
         p = model.coefficients.size + self._n_B
         sums = _Sums(M, n_x, p) if derivatives else None
@@ -99,9 +106,13 @@ class _Problem:
                     return NormalEquations(np.inf)
                 if sums is not None:
                     sums.add(np.where(data.measured[k][:, None, None], S, 0.0), error)
-                if k < len(data.steps):
-                    x, S = _step(model, x, S if derivatives else None, pushes[k],
-                                 data.steps[k][:, None], self.learn_input_matrix)
+                if k == len(data.steps):
+                    break
+                v, h = self._pushes[k], data.steps[k][:, None]
+                if derivatives:
+                    x, S = _step(model, x, S, v, h, self.learn_input_matrix)
+                else:
+                    x = runge_kutta(model.scaled_rate, x, v, h)
         if sums is None:
             return NormalEquations(cost)
         return NormalEquations(cost, *(torch.from_numpy(a / count) for a in sums.result()))
@@ -134,24 +145,18 @@ class _Sums:
         return gradient, matrix
 
 
-def _step(model: DriftModel, x: Array, S: Array | None, v: Array, h: Array, learn: bool
+def _step(model: DriftModel, x: Array, S: Array, v: Array, h: Array, learn: bool
           ) -> tuple[Array, Array]:
-    """Take one Runge-Kutta step of the states (M, n_x) and of their sensitivities."""
+    """Take the Runge-Kutta step of the states (M, n_x) together with their sensitivities."""
     ends, slopes = [], []
     dx: Array | float = 0.0
     dS: Array | float = 0.0
     for fraction in (0.0, 0.5, 0.5, 1.0):
-        x_stage = x + fraction * h * dx
-        if S is None:
-            dx = model.scaled_rate(x_stage, v)
-        else:
-            dx, dS = _rates(model, x_stage, S + fraction * h[..., None] * dS, v, learn)
-            slopes.append(dS)
+        dx, dS = _rates(model, x + fraction * h * dx, S + fraction * h[..., None] * dS, v, learn)
         ends.append(dx)
-    x = x + h / 6.0 * (ends[0] + 2.0 * ends[1] + 2.0 * ends[2] + ends[3])
-    if S is None:
-        return x, np.empty(0)
-    return x, S + h[..., None] / 6.0 * (slopes[0] + 2.0 * slopes[1] + 2.0 * slopes[2] + slopes[3])
+        slopes.append(dS)
+    return (x + h / 6.0 * (ends[0] + 2.0 * ends[1] + 2.0 * ends[2] + ends[3]),
+            S + h[..., None] / 6.0 * (slopes[0] + 2.0 * slopes[1] + 2.0 * slopes[2] + slopes[3]))
 
 
 def _rates(model: DriftModel, x: Array, S: Array, v: Array, learn: bool) -> tuple[Array, Array]:

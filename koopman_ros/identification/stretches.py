@@ -80,16 +80,21 @@ class Stretches:
         path[0] = x = x0
         with np.errstate(all='ignore'):
             for k, (h, u) in enumerate(zip(self.steps[..., None], self.u, strict=True)):
-                k1 = rate(x, u)
-                k2 = rate(x + 0.5 * h * k1, u)
-                k3 = rate(x + 0.5 * h * k2, u)
-                k4 = rate(x + h * k3, u)
-                path[k + 1] = x = x + h / 6.0 * (k1 + 2.0 * k2 + 2.0 * k3 + k4)
+                path[k + 1] = x = runge_kutta(rate, x, u, h)
         return path
 
     def errors(self, rate: Rate, x0: Array) -> Array:
         """Return the prediction less the measurement (K + 1, M, n_x), 0 where there is none."""
         return np.where(self.measured[..., None], self.path(rate, x0) - self.x, 0.0)
+
+
+def runge_kutta(rate: Rate, x: Array, u: Array, h: Array) -> Array:
+    """Take the classical Runge-Kutta step: states (M, n_x), inputs (M, n_u), lengths (M, 1)."""
+    k1 = rate(x, u)
+    k2 = rate(x + 0.5 * h * k1, u)
+    k3 = rate(x + 0.5 * h * k2, u)
+    k4 = rate(x + h * k3, u)
+    return x + h / 6.0 * (k1 + 2.0 * k2 + 2.0 * k3 + k4)
 
 
 def longest_step(records: Sequence[Record]) -> float:
