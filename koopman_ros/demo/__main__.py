@@ -16,7 +16,6 @@
 
 from __future__ import annotations
 
-import argparse
 from dataclasses import replace
 import json
 from pathlib import Path
@@ -24,6 +23,7 @@ import sys
 import time
 
 from koopman_ros.bags import summary
+from koopman_ros.demo.command import print_result, read_options
 from koopman_ros.demo.loop import LoopError, run_loop, Scenario
 from koopman_ros.demo.results import plot, read_run
 from koopman_ros.demo.table import LiveTable
@@ -81,13 +81,7 @@ def run_demo(output: Path, speed: float) -> dict[str, object]:
 
 def main(args: list[str] | None = None) -> int:
     """Run the demo from the command line."""
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument('--output', type=Path, default=Path('out/demo'),
-                        help='folder for the results (default: %(default)s)')
-    parser.add_argument('--speed', type=float, default=60.0,
-                        help='simulated seconds per second, 0 for as fast as the machine can '
-                        '(default: %(default)s)')
-    options = parser.parse_args(args)
+    options = read_options(args, __doc__, 'out/demo', 60.0)
     try:
         result = run_demo(options.output, options.speed)
     except (LoopError, OSError) as error:
@@ -96,8 +90,7 @@ def main(args: list[str] | None = None) -> int:
     except KeyboardInterrupt:
         print('demo: interrupted; what was recorded is kept', file=sys.stderr)
         return 130
-    for key, value in result.items():
-        print(f'{key}: {value:.6g}' if isinstance(value, float) else f'{key}: {value}')
+    print_result(result)
     print(f'wrote {options.output}/closed_loop.png, closed_loop.mcap and summary.json')
     return 0
 

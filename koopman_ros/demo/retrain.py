@@ -21,7 +21,6 @@ Plant, controller and trainer run as three processes in lock-step; none is stopp
 
 from __future__ import annotations
 
-import argparse
 from dataclasses import dataclass, field
 import json
 from pathlib import Path
@@ -30,6 +29,7 @@ import sys
 import time
 
 from diagnostic_msgs.msg import DiagnosticStatus
+from koopman_ros.demo.command import print_result, read_options
 from koopman_ros.demo.loop import Loop, LoopError, running_loop, Scenario
 from koopman_ros.demo.retraining_results import plot, read_history, rollout_rmse
 from koopman_ros.demo.table import LiveTable
@@ -204,13 +204,7 @@ class _Actor:
 
 def main(args: list[str] | None = None) -> int:
     """Run the second act from the command line."""
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument('--output', type=Path, default=Path('out/demo-retrain'),
-                        help='folder for the results (default: %(default)s)')
-    parser.add_argument('--speed', type=float, default=120.0,
-                        help='simulated seconds per second, 0 for as fast as the machine can '
-                        '(default: %(default)s)')
-    options = parser.parse_args(args)
+    options = read_options(args, __doc__, 'out/demo-retrain', 120.0)
     try:
         result = run_retraining(options.output, options.speed)
     except (LoopError, OSError, ValueError) as error:
@@ -219,8 +213,7 @@ def main(args: list[str] | None = None) -> int:
     except KeyboardInterrupt:
         print('demo: interrupted; what was recorded is kept', file=sys.stderr)
         return 130
-    for key, value in result.items():
-        print(f'{key}: {value:.6g}' if isinstance(value, float) else f'{key}: {value}')
+    print_result(result)
     print(f'wrote {options.output}/retraining.png, before.mcap, after.mcap, '
           'retrained.safetensors with its report, and summary.json')
     return 0

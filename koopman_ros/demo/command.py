@@ -1,0 +1,47 @@
+# Copyright 2026 The koopman_ros Authors
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+
+"""What the command lines of both acts have in common."""
+
+from __future__ import annotations
+
+import argparse
+from collections.abc import Mapping
+from pathlib import Path
+
+
+def read_options(args: list[str] | None, description: str | None, output: str, speed: float
+                 ) -> argparse.Namespace:
+    """
+    Read `output` and `speed` from a command line.
+
+    :param args: the arguments, or None for the process's own.
+    :param description: what the command does.
+    :param output: default folder for the results.
+    :param speed: default simulated seconds per second.
+    """
+    parser = argparse.ArgumentParser(description=description)
+    parser.add_argument('--output', type=Path, default=Path(output),
+                        help='folder for the results (default: %(default)s)')
+    parser.add_argument('--speed', type=float, default=speed,
+                        help='simulated seconds per second, 0 for as fast as the machine can '
+                        '(default: %(default)s)')
+    return parser.parse_args(args)
+
+
+def print_result(result: Mapping[str, object]) -> None:
+    """Print the figures of a run, one a line."""
+    for key, value in result.items():
+        print(f'{key}: {value:.6g}' if isinstance(value, float) else f'{key}: {value}')
