@@ -19,11 +19,9 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 from koopman_ros.control import InputLimits, Settings
-from koopman_ros.nodes.messages import to_kelvin
+from koopman_ros.nodes.messages import SECONDS_PER_MINUTE, to_kelvin
 from koopman_ros.nodes.parameters import parameter, ParameterTable
 import numpy as np
-
-SECONDS_PER_MINUTE = 60.0
 
 
 @dataclass(frozen=True)

@@ -20,6 +20,7 @@ from builtin_interfaces.msg import Time
 from sensor_msgs.msg import Temperature
 
 NANOSECONDS = 1_000_000_000
+SECONDS_PER_MINUTE = 60.0
 ZERO_CELSIUS = 273.15  # K
 
 

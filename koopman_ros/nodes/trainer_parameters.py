@@ -20,13 +20,12 @@ from dataclasses import dataclass
 
 from koopman_ros.control.experiment import Experiment
 from koopman_ros.nodes import topics
-from koopman_ros.nodes.messages import to_kelvin
+from koopman_ros.nodes.messages import SECONDS_PER_MINUTE, to_kelvin
 from koopman_ros.nodes.parameters import parameter, ParameterTable
 
 LOOP_TOPICS = (topics.TEMPERATURE, topics.CONCENTRATION, topics.SETPOINT, topics.ACTIVE_SETPOINT,
                topics.COOLANT_SETPOINT, topics.MANUAL_COOLANT_SETPOINT, topics.DIAGNOSTICS)
 EXPERIMENT_TOPICS = (topics.COOLANT_SETPOINT, topics.MANUAL_COOLANT_SETPOINT)
-SECONDS_PER_MINUTE = 60.0
 
 
 @dataclass(frozen=True)

@@ -31,7 +31,6 @@ import threading
 import time
 
 from koopman_ros.identification import Stopped
-from koopman_ros.lifting import load
 from koopman_ros.retraining import retrain, Task, write_report
 
 _PERIOD = 0.2  # s between two lines of progress
@@ -57,8 +56,6 @@ def main() -> int:
 
     try:
         task = Task.from_json(line)
-        # before the new lift takes its place
-        current = load(task.model)
         outcome = retrain(task, tell)
     except BrokenPipeError:
         # whoever started it is gone
@@ -71,7 +68,7 @@ def main() -> int:
         return 1
     warnings = list(outcome.verdict.warnings) if outcome.verdict else []
     try:
-        files = [str(path) for path in write_report(outcome, current)]
+        files = [str(path) for path in write_report(outcome)]
     except OSError as error:
         # the lift is written already
         files = []

@@ -23,21 +23,17 @@ from typing import Any
 
 from koopman_ros.identification import Identified, longest_step, Stretches
 from koopman_ros.identification.stretches import fitted_starts, Rate
-from koopman_ros.lifting import LiftedModel
 from koopman_ros.retraining.coverage import CELLS, visited_cells
 from koopman_ros.retraining.gate import lifted_rate
-from koopman_ros.retraining.task import Outcome
+from koopman_ros.retraining.task import Outcome, ZERO_CELSIUS
 import numpy as np
 
-_ZERO_CELSIUS = 273.15  # K
 
-
-def write_report(outcome: Outcome, current: LiftedModel) -> list[Path]:
+def write_report(outcome: Outcome) -> list[Path]:
     """
     Write ``<output>.json``, ``<output>.md`` and, with matplotlib, ``<output>.png``.
 
     :param outcome: what to report.
-    :param current: the lift that was in use.
     :return: what was written.
     """
     base = Path(outcome.task.output)
@@ -46,7 +42,7 @@ def write_report(outcome: Outcome, current: LiftedModel) -> list[Path]:
     written[0].write_text(
         json.dumps(outcome.summary(), indent=2, allow_nan=False) + '\n', encoding='utf-8')
     picture = base.with_suffix('.png')
-    drawn = _draw(picture, outcome, current)
+    drawn = _draw(picture, outcome)
     written[1].write_text(_page(outcome, picture.name if drawn else ''), encoding='utf-8')
     return [*written, *([picture] if drawn else [])]
 
@@ -93,7 +89,7 @@ def _page(outcome: Outcome, picture: str) -> str:
     return '\n'.join(lines) + '\n'
 
 
-def _draw(path: Path, outcome: Outcome, current: LiftedModel) -> bool:
+def _draw(path: Path, outcome: Outcome) -> bool:
     """Draw where the data lie, what was learned, and how it predicts; False without matplotlib."""
     try:
         import matplotlib
@@ -105,8 +101,8 @@ def _draw(path: Path, outcome: Outcome, current: LiftedModel) -> bool:
     figure, (left, middle, right) = pyplot.subplots(1, 3, figsize=(15.0, 4.6),
                                                     layout='constrained')
     _draw_coverage(left, found)
-    _draw_drift(middle, outcome, current)
-    _draw_prediction(right, outcome, current)
+    _draw_drift(middle, outcome)
+    _draw_prediction(right, outcome)
     word = 'accepted' if outcome.accepted else 'refused'
     figure.suptitle(f'Retraining: the new lift is {word}')
     figure.savefig(path, dpi=120)
@@ -117,7 +113,7 @@ def _draw(path: Path, outcome: Outcome, current: LiftedModel) -> bool:
 def _draw_coverage(axes: Any, found: Identified) -> None:
     box = found.drift.box
     records = [*found.fitted, *found.held_out]
-    low = np.append(box.state_lower, box.input_lower) - _ZERO_CELSIUS
+    low = np.append(box.state_lower, box.input_lower) - ZERO_CELSIUS
     size = 2.0 * np.append(box.state_scale, box.input_scale) / CELLS
     visited = np.full((CELLS, CELLS), np.nan)
     for i, j in visited_cells(records, box):
@@ -125,15 +121,15 @@ def _draw_coverage(axes: Any, found: Identified) -> None:
     edges = [low[k] + size[k] * np.arange(CELLS + 1) for k in (0, 1)]
     axes.pcolormesh(*edges, visited, cmap='Greens', vmin=0.0, vmax=3.0)
     for record in records:
-        axes.plot(record.x[:, 0] - _ZERO_CELSIUS,
-                  record.inputs_at(record.time)[:, 0] - _ZERO_CELSIUS, '.', markersize=1.0,
+        axes.plot(record.x[:, 0] - ZERO_CELSIUS,
+                  record.inputs_at(record.time)[:, 0] - ZERO_CELSIUS, '.', markersize=1.0,
                   color='tab:blue')
     axes.set(xlabel='temperature [°C]', ylabel='coolant [°C]',
              title='where the measurements lie (visited cells in green)')
 
 
-def _draw_drift(axes: Any, outcome: Outcome, current: LiftedModel) -> None:
-    found = outcome.found
+def _draw_drift(axes: Any, outcome: Outcome) -> None:
+    found, current = outcome.found, outcome.present
     box = found.drift.box
     x = np.linspace(box.state_lower, box.state_upper, 200)
     u = np.broadcast_to(0.5 * (box.input_lower + box.input_upper), (len(x), 1))
@@ -145,25 +141,25 @@ def _draw_drift(axes: Any, outcome: Outcome, current: LiftedModel) -> None:
         rates.append(('new lift', lifted_rate(outcome.trained.model, unit), 'tab:green'))
     estimated = found.drift.rate(x, u)[:, 0]
     for name, rate, color in rates:
-        axes.plot(x[:, 0] - _ZERO_CELSIUS, rate(x, u)[:, 0] - estimated,
+        axes.plot(x[:, 0] - ZERO_CELSIUS, rate(x, u)[:, 0] - estimated,
                   color=color, label=name)
     axes.axhline(0.0, color='k', linestyle='--', linewidth=1.0,
                  label='estimated from the data')
     axes.set(xlabel='temperature [°C]',
              ylabel=f'difference of dT/dt [K/{current.time_unit}]',
-             title=f'dT/dt at {u[0, 0] - _ZERO_CELSIUS:.1f} °C of coolant, '
+             title=f'dT/dt at {u[0, 0] - ZERO_CELSIUS:.1f} °C of coolant, '
              'less the estimate')
     axes.legend()
     axes.grid(alpha=0.3)
 
 
-def _draw_prediction(axes: Any, outcome: Outcome, current: LiftedModel) -> None:
-    found = outcome.found
+def _draw_prediction(axes: Any, outcome: Outcome) -> None:
+    found, current = outcome.found, outcome.present
     record = found.held_out[0]
     stretches = Stretches.of([record], longest_step([record]))
     minutes = np.concatenate(([0.0], np.cumsum(stretches.steps[:, 0])))
     measured = stretches.measured[:, 0]
-    axes.plot(minutes[measured], stretches.x[measured, 0, 0] - _ZERO_CELSIUS,
+    axes.plot(minutes[measured], stretches.x[measured, 0, 0] - ZERO_CELSIUS,
               '.', color='0.6', markersize=3.0, label='measured')
     unit = current.seconds_per_time_unit
     models = [('present lift', lifted_rate(current, unit), 'tab:red')]
@@ -172,7 +168,7 @@ def _draw_prediction(axes: Any, outcome: Outcome, current: LiftedModel) -> None:
     for name, rate, color in models:
         x0, _ = fitted_starts(rate, stretches, found.drift.box.state_scale)
         path = stretches.path(rate, x0)[:, 0, 0]
-        axes.plot(minutes, path - _ZERO_CELSIUS, color=color, label=name)
+        axes.plot(minutes, path - ZERO_CELSIUS, color=color, label=name)
     axes.set(xlabel=f'time [{current.time_unit}]', ylabel='temperature [°C]',
              title='prediction of a held-out stretch')
     axes.legend()

@@ -35,7 +35,7 @@ from koopman_ros.retraining.gate import judge, Thresholds, Verdict
 from koopman_ros.retraining.lift import learn_lift
 import numpy as np
 
-_ZERO_CELSIUS = 273.15  # K
+ZERO_CELSIUS = 273.15  # K
 _NS = 1_000_000_000
 # Shares of the whole at which estimating, learning and judging begin.
 _STAGES = {'estimate': 0.05, 'learn': 0.35, 'judge': 0.9}
@@ -99,7 +99,7 @@ class Outcome:
     :param verdict: its figures, None without a lift.
     :param reasons: why it was refused; empty when it was accepted.
     :param coverage: share of the cells of the state-input box that the records visit.
-    :param seconds_per_time_unit: of the drift's rates.
+    :param present: the lift that was in use; its time unit is that of the drift.
     :param model_file: where the lift was written, or an empty string.
     """
 
@@ -110,7 +110,7 @@ class Outcome:
     verdict: Verdict | None
     reasons: tuple[str, ...]
     coverage: float
-    seconds_per_time_unit: float
+    present: LiftedModel
     model_file: str = field(default='')
 
     @property
@@ -132,7 +132,7 @@ class Outcome:
             'derivative_method': self.found.method,
             'drift_degree': drift.degree,
             'input_gain_per_minute': (float(drift.input_matrix[0, 0])
-                                      * 60.0 / self.seconds_per_time_unit),
+                                      * 60.0 / self.present.seconds_per_time_unit),
             'noise_kelvin': float(self.found.noise[0]),
         }
         if self.verdict and self.trained:
@@ -200,8 +200,7 @@ def retrain(task: Task, tell: Tell = lambda *_: False) -> Outcome:
         verdict = judge(found, trained, current, thresholds)
         reasons = verdict.reasons
         _go_on(tell(_at('judge', 0.9), 'writing'))
-    outcome = Outcome(task, account, found, trained, verdict, reasons, covered,
-                      current.seconds_per_time_unit)
+    outcome = Outcome(task, account, found, trained, verdict, reasons, covered, current)
     if trained is None or verdict is None:
         return outcome
     model = _with_provenance(trained.model, outcome, records)
@@ -238,9 +237,9 @@ def _record(episode: Episode, seconds: float) -> Record:
     """Convert an episode to kelvin and to time units since its first measurement."""
     origin = episode.stamp_ns[0]
     return Record((episode.stamp_ns - origin) / _NS / seconds,
-                  episode.celsius[:, None] + _ZERO_CELSIUS,
+                  episode.celsius[:, None] + ZERO_CELSIUS,
                   (episode.input_ns - origin) / _NS / seconds,
-                  episode.input_celsius[:, None] + _ZERO_CELSIUS)
+                  episode.input_celsius[:, None] + ZERO_CELSIUS)
 
 
 def _with_provenance(model: LiftedModel, outcome: Outcome, records: list[Record]) -> LiftedModel:

@@ -114,7 +114,7 @@ def test_refused_lift_is_kept_aside_and_has_the_same_bits(bag, accepted, tmp_pat
 
 def test_report(accepted):
     outcome, _, _ = accepted
-    files = write_report(outcome, load(SHIPPED))
+    files = write_report(outcome)
     assert [path.name for path in files] == ['new.json', 'new.md', 'new.png']
     figures = json.loads(files[0].read_text())
     assert figures == outcome.summary()
@@ -186,7 +186,7 @@ def test_a_linear_plant_needs_no_lift(tmp_path):
     assert outcome.found.drift.degree == 1
     # dT/dt = -(T - 315) / 2 + (Tc - 288)
     assert outcome.found.drift.input_matrix == pytest.approx(np.array([[1.0]]), rel=0.02)
-    files = write_report(outcome, load(SHIPPED))
+    files = write_report(outcome)
     assert '**The new lift is refused.**' in files[1].read_text()
     assert json.loads(files[0].read_text())['accepted'] is False
 
