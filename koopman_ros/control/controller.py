@@ -17,14 +17,19 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
-from enum import Enum
 from functools import cached_property
+import math
 
 from koopman_ros.control import setpoint as setpoints
-from koopman_ros.control.laws import feedback, Law, Weights
-from koopman_ros.control.limits import InputLimits, limit
-from koopman_ros.control.setpoint import NANOSECONDS, Setpoint
-from koopman_ros.control.target import steady_state_target
+from koopman_ros.control.ladder import Need, Rung, Standing
+from koopman_ros.control.laws import Feedback, feedback, Weights
+from koopman_ros.control.limits import limit
+from koopman_ros.control.observer import equivalent_bias, Estimate, Observer
+from koopman_ros.control.sensor import judge, Sensed, Verdict
+from koopman_ros.control.setpoint import NANOSECONDS
+from koopman_ros.control.state import Mode, Report, Settings, State
+from koopman_ros.control.target import balance, Reference, reference, Target
+from koopman_ros.control.transfer import Transfer
 from koopman_ros.lifting import LiftedModel
 import numpy as np
 from numpy.typing import NDArray
@@ -37,98 +42,21 @@ Array = NDArray[np.float64]
 LATE_NANOSECONDS = NANOSECONDS
 
 
-class Mode(Enum):
-    """Who commands the input; the value is the word an operator reads."""
-
-    AUTOMATIC = 'automatic'
-    MANUAL = 'manual'
-
-
 @dataclass(frozen=True)
-class Settings:
+class _Attempt:
     """
-    What an engineer tunes, in physical units.
+    What a law gives, or why it gives nothing.
 
-    :param state_weight: (n_x,) weights of squared state errors, per state unit squared.
-    :param input_weight: (n_u,) weights of squared input deviations, per input unit squared.
-    :param limits: range and rate of the inputs.
-    :param setpoint_ramp: largest change of the set-point per second; infinity for steps.
-    :param max_gain: bound on the norm of the Riccati gain in scaled coordinates.
-    :param max_residual: bound on the relative Riccati residual.
+    :param u: (n_u,) in input units, within the range; None with a problem.
+    :param clipped: whether the range cut it.
     """
 
-    state_weight: Array
-    input_weight: Array
-    limits: InputLimits
-    setpoint_ramp: float = np.inf
-    max_gain: float = 1e3
-    max_residual: float = 1e-8
-
-    def __post_init__(self) -> None:
-        if not (np.all(np.isfinite(self.state_weight)) and np.all(self.state_weight >= 0.0)
-                and np.any(self.state_weight > 0.0)):
-            raise ValueError('state_weight must be finite, at least 0 and not all 0, got '
-                             f'{self.state_weight.tolist()}')
-        if not (np.all(np.isfinite(self.input_weight)) and np.all(self.input_weight > 0.0)):
-            raise ValueError('input_weight must be finite and above 0, got '
-                             f'{self.input_weight.tolist()}')
-        if not self.setpoint_ramp > 0.0:
-            raise ValueError(f'setpoint_ramp must be above 0, got {self.setpoint_ramp}')
-
-
-@dataclass(frozen=True)
-class State:
-    """
-    All that a controller remembers between two measurements.
-
-    :param mode: who commands.
-    :param setpoint: requested, active and scheduled set-points.
-    :param manual_input: (n_u,) what the operator asked for in manual mode, or None.
-    :param time_ns: stamp of the last measurement, or None before the first.
-    :param command: (n_u,) last command, or None before the first.
-    :param interval: usual seconds between measurements; infinity before the second.
-    """
-
-    mode: Mode = Mode.AUTOMATIC
-    setpoint: Setpoint = field(default_factory=Setpoint)
-    manual_input: Array | None = None
-    time_ns: int | None = None
-    command: Array | None = None
-    interval: float = np.inf
-
-
-@dataclass(frozen=True)
-class Report:
-    """
-    What a step did, for diagnostics.
-
-    :param mode: who commanded.
-    :param law: the feedback law in force, or None when none was.
-    :param problem: why the law could not act, in words; empty when it did.
-    :param active_setpoint: (n_x,) what was tracked, or None before the first valid measurement.
-    :param outside: distance of the measurement from the training box, in half widths.
-    :param residual: relative Riccati residual; NaN without a law.
-    :param gain: norm of the Riccati gain; NaN without a law.
-    :param at_range: whether the input's range was active.
-    :param at_rate: whether the input's rate limit was active.
-    :param clock_went_back: whether the stamp was earlier than the one before, by so much that
-        time starts afresh.
-    :param late: whether the measurement was out of order and the last command repeated.
-    :param clock_stood_still: whether the stamp was the same as the one before.
-    """
-
-    mode: Mode
-    law: Law | None = None
+    u: Array | None
+    target: Target
+    found: Feedback | None = None
+    growth: float = np.nan
     problem: str = ''
-    active_setpoint: Array | None = None
-    outside: float = np.nan
-    residual: float = np.nan
-    gain: float = np.nan
-    at_range: bool = False
-    at_rate: bool = False
-    clock_went_back: bool = False
-    late: bool = False
-    clock_stood_still: bool = False
+    clipped: bool = False
 
 
 @dataclass(frozen=True)
@@ -138,10 +66,14 @@ class Controller:
 
     :param model: the lift.
     :param settings: the tuning.
+    :param show: how values of the state are written in reasons.
     """
 
     model: LiftedModel
     settings: Settings
+    show: setpoints.Show = setpoints.in_state_units
+    _references: dict[bool, Reference] = field(
+        default_factory=dict, init=False, compare=False, repr=False)
 
     @cached_property
     def weights(self) -> Weights:
@@ -149,18 +81,34 @@ class Controller:
         return Weights(np.diag(self.settings.state_weight * self.model.states.scale ** 2),
                        np.diag(self.settings.input_weight * self.model.inputs.scale ** 2))
 
-    def request_setpoint(self, state: State, value: Array, effective_ns: int = 0,
-                         show: setpoints.Show = setpoints.in_state_units) -> tuple[State, str]:
+    @cached_property
+    def _observers(self) -> tuple[Observer, Observer]:
+        """The observer with the learned model and with the linear one, which share their units."""
+        bound = self.settings.max_disturbance / float(np.max(self.model.inputs.scale))
+        return (Observer(self.model, self.settings.observer_bandwidth, bound),
+                Observer(self.model.linearised, self.settings.observer_bandwidth, bound))
+
+    @cached_property
+    def safe_input(self) -> Array:
+        """What is commanded when nothing else can be, (n_u,) in input units."""
+        given = self.settings.safe_input
+        limits = self.settings.limits
+        return _kept(np.clip(self.model.inputs.center if given is None else given,
+                             limits.lower, limits.upper))
+
+    # What the operator asks for.
+
+    def request_setpoint(self, state: State, value: Array, effective_ns: int = 0
+                         ) -> tuple[State, str]:
         """
         Ask for a set-point, at once or from a later time on.
 
         :param state: the present state.
         :param value: (n_x,) in state units.
         :param effective_ns: stamp from which it holds; see :func:`setpoint.request`.
-        :param show: how values are written in a reason of refusal.
         :return: the new state with an empty string, or the old one with the reason of refusal.
         """
-        reason = setpoints.refusal(self.model, value, show)
+        reason = setpoints.refusal(self.model, value, self.show)
         if reason:
             return state, reason
         if (len(state.setpoint.scheduled) >= setpoints.MAX_SCHEDULED
@@ -185,8 +133,84 @@ class Controller:
         return replace(state, manual_input=_kept(value)), ''
 
     def set_mode(self, state: State, mode: Mode) -> State:
-        """Hand over between operator and law; manual mode starts from the last command."""
-        return state if mode is state.mode else replace(state, mode=mode, manual_input=None)
+        """
+        Hand over between operator and law, without a bump.
+
+        Manual mode starts from the last command, and so does automatic mode: what its law asks
+        for beside that fades in.
+        """
+        if mode is state.mode:
+            return state
+        return replace(state, mode=mode, manual_input=None, standing=Standing(),
+                       estimate=self._rebased(state.estimate, state.linear, False))
+
+    # What happens to the controller itself.
+
+    def take_over(self, state: State, command: Array) -> State:
+        """
+        Start from the input that is in force already, as after a restart.
+
+        :param state: before its first command; afterwards nothing is changed.
+        :param command: (n_u,) in input units; ignored when not finite.
+        """
+        if state.command is not None or not np.all(np.isfinite(command)):
+            return state
+        limits = self.settings.limits
+        return replace(state, command=_kept(np.clip(command, limits.lower, limits.upper)))
+
+    def succeed(self, predecessor: Controller, state: State) -> State:
+        """
+        Take the place of a controller with other settings or another model, without a bump.
+
+        What the two laws ask for in the present state differs by an offset that fades; what is
+        believed of the plant's rate stays.
+
+        :param predecessor: that has been in force.
+        :param state: the state it left.
+        :return: the state in this controller's units.
+        """
+        estimate = state.estimate
+        old, new = predecessor.model, self.model
+        if estimate is not None and old is not new:
+            basis = old.linearised if state.linear else old
+            x = old.states.to_physical(estimate.x)
+            # rates per second, which all models share
+            factor = (old.states.scale / old.seconds_per_time_unit
+                      / (new.states.scale / new.seconds_per_time_unit))
+            rest = estimate.w + basis.drift(estimate.x) + old.B @ self._old_input(old, state)
+            w = factor * rest - new.B @ self._old_input(new, state)
+            estimate = self._observers[state.linear].rebased(
+                Estimate(new.states.to_deviation(x), w), np.zeros_like(w))
+        if estimate is not None and not self.settings.observer_bandwidth > 0.0:
+            estimate = Estimate(estimate.x, np.zeros_like(estimate.w))
+        # the disturbance that froze with a measurement is in the old units
+        sensed = None if old is not new else state.sensed
+        state = replace(state, estimate=estimate, sensed=sensed)
+        if state.law_in_force is None or state.law_input is None or estimate is None:
+            return state
+        now = self._attempt(state, state.law_in_force, estimate)
+        if now.u is None:
+            return state
+        return replace(state, law_input=now.u, transfer=_shifted(
+            state.transfer, state.law_input - now.u))
+
+    @staticmethod
+    def _old_input(model: LiftedModel, state: State) -> Array:
+        command = model.inputs.center if state.command is None else state.command
+        return model.inputs.to_deviation(command)
+
+    def try_law(self, x: Array, setpoint: Array) -> str:
+        """
+        Say why the learned law cannot act at a state (n_x,) towards a set-point (n_x,).
+
+        :return: an empty string when it can.
+        """
+        state = replace(State(), setpoint=setpoints.Setpoint(setpoint, setpoint))
+        estimate = Estimate(self.model.states.to_deviation(x), np.zeros(self.model.n_x))
+        with np.errstate(all='ignore'):
+            return self._attempt(state, Rung.LEARNED, estimate).problem
+
+    # Steps.
 
     def step(self, state: State, measurement: Array, time_ns: int
              ) -> tuple[State, Array, Report]:
@@ -194,9 +218,8 @@ class Controller:
         Answer one measurement.
 
         A repeated stamp and one out of order, earlier by at most a second, return the last
-        command again, within the limits of now; a still earlier stamp starts time afresh. After
-        a gap in the measurements ramp and rate limit count twice the interval before it, not the
-        gap. When no law can act, the last command is held, or the nominal input before the first.
+        command again; a still earlier stamp starts time afresh. After a gap in the measurements
+        ramp and rate limit count twice the interval before it, not the gap.
 
         :param state: as returned by the step before.
         :param measurement: (n_x,) measured state, in state units.
@@ -206,63 +229,284 @@ class Controller:
         """
         ahead = 1 if state.time_ns is None else time_ns - state.time_ns
         if state.command is not None and -LATE_NANOSECONDS <= ahead <= 0:
-            again = limit(self.settings.limits, state.command, state.command, 0.0)
-            return replace(state, command=again.u), again.u, Report(
-                state.mode, active_setpoint=state.setpoint.active, at_range=again.at_range,
-                outside=self.model.states.violation(measurement), late=ahead < 0,
+            report = self._report(state, state.standing.rung, state.standing.reason)
+            return state, state.command, replace(
+                report, outside=self._outside(measurement), late=ahead < 0,
                 clock_stood_still=ahead == 0)
         back = ahead < 0
         if back:
-            # what was scheduled by the old time has lost its meaning
-            state = replace(state, time_ns=None, setpoint=replace(state.setpoint, scheduled=()))
-        seconds = 0.0 if state.time_ns is None else ahead / NANOSECONDS
-        if seconds > 0.0:
-            # the plant stood under the old command all through a gap
-            seconds = min(seconds, 2.0 * state.interval)
-            # a burst of measurements does not make the next regular one a gap
-            usual = 0.0 if np.isinf(state.interval) else 0.5 * state.interval
-            state = replace(state, interval=max(seconds, usual))
-        state = replace(state, time_ns=time_ns)
-        if np.all(np.isfinite(measurement)):
-            state = replace(state, setpoint=setpoints.advance(
-                state.setpoint, measurement, self.model, self.settings.setpoint_ramp, time_ns,
-                seconds))
-        held = self.model.inputs.center if state.command is None else state.command
+            state = _afresh(state)
+        elapsed = 0.0 if state.commanded_ns is None else max(
+            0.0, (time_ns - state.commanded_ns) / NANOSECONDS)
+        # neither a gap nor a burst is the spacing of the samples, nor the first of them
+        spacing = 0.0 if math.isinf(state.interval) else min(state.interval, elapsed)
+        state, seconds, missed = _passed(state, time_ns, elapsed)
         # a measurement of 1e300 may overflow on its way; the result is checked and limited
         with np.errstate(all='ignore'):
-            wanted, report = self._wanted(state, measurement, held)
+            state, verdict, predicted = self._observed(state, measurement, time_ns, elapsed)
+            if not verdict.fault:
+                state = replace(state, setpoint=setpoints.advance(
+                    state.setpoint, measurement, self.model, self.settings.setpoint_ramp,
+                    time_ns, seconds, self.settings.setpoint_filter))
+            outside = self._outside(measurement)
+            state, wanted, report = self._wanted(
+                state, verdict, outside, time_ns, elapsed, spacing)
         # without elapsed time the rate limit holds the last command
         limited = limit(self.settings.limits, wanted, state.command, seconds)
-        return (replace(state, command=limited.u), limited.u,
-                replace(report, at_range=limited.at_range, at_rate=limited.at_rate,
-                        active_setpoint=state.setpoint.active, clock_went_back=back))
+        state = replace(state, command=limited.u, commanded_ns=time_ns)
+        return state, limited.u, replace(
+            report, outside=outside, at_range=report.at_range or limited.at_range,
+            at_rate=limited.at_rate,
+            input_outside=self.model.inputs.violation(limited.u), missed=missed,
+            predicted=predicted, clock_went_back=back)
 
-    def _wanted(self, state: State, measurement: Array, held: Array) -> tuple[Array, Report]:
+    def watch(self, state: State, time_ns: int) -> tuple[State, Array | None, Report]:
+        """
+        Answer that nothing has been measured: hold the command, later go to the safe input.
+
+        :param state: as returned by the step before.
+        :param time_ns: up to which nothing came, in the time of the measurements' stamps.
+        :return: as :meth:`step`; the command is None before the first.
+        """
+        since_ns = state.commanded_ns
+        if state.command is None or state.time_ns is None or since_ns is None:
+            return state, None, Report(state.mode)
+        elapsed = max(0.0, (time_ns - since_ns) / NANOSECONDS)
+        silent = (time_ns - state.time_ns) / NANOSECONDS
+        with np.errstate(all='ignore'):
+            state = self._coasted(state, elapsed)
+            state, wanted, report = self._wanted(state, Verdict(
+                state.sensed, f'no measurement for {silent:.0f} s: check sensor and plant'),
+                np.nan, time_ns, elapsed)
+        limited = limit(self.settings.limits, wanted, state.command, elapsed)
+        state = replace(state, command=limited.u, commanded_ns=max(time_ns, since_ns))
+        return state, limited.u, replace(report, at_range=limited.at_range,
+                                         at_rate=limited.at_rate)
+
+    def equivalent_bias(self, state: State) -> Array:
+        """
+        Return the error (n_x,) of the sensor that would explain the disturbance, in state units.
+
+        NaN where nothing is known, or no error would.
+        """
+        if state.estimate is None:
+            return np.full(self.model.n_x, np.nan)
+        model = self.model.linearised if state.linear else self.model
+        return equivalent_bias(model, state.estimate) * self.model.states.scale
+
+    # Measurement to estimate.
+
+    def _observed(self, state: State, x: Array, time_ns: int, elapsed: float
+                  ) -> tuple[State, Verdict, Array | None]:
+        """Judge a measurement; return what is believed, and what was expected in state units."""
+        states, before, sensed = self.model.states, state.estimate, state.sensed
+        # a run of measurements not believed leaves little of what was known of the state
+        lost = sensed is not None and sensed.time_ns != state.time_ns and (
+            (time_ns - sensed.time_ns) / NANOSECONDS * self.settings.observer_bandwidth > 2.0)
+        coasted = self._coasted(state, elapsed)
+        predicted = coasted.estimate
+        w = np.zeros(self.model.n_x) if before is None else before.w
+
+        def motion(then: Sensed) -> Array:
+            if before is None or state.command is None:
+                return np.zeros_like(x)
+            u = self.model.inputs.to_deviation(state.command)
+            moved = self._observers[state.linear].predict(Estimate(before.x, then.w), u, elapsed)
+            return np.zeros_like(x) if moved is None else (moved.x - before.x) * states.scale
+
+        verdict = judge(self.settings.sensor, states, sensed, x, time_ns, w, motion, self.show)
+        expected = None if predicted is None else states.to_physical(predicted.x)
+        if verdict.fault:
+            if verdict.frozen and predicted is not None and sensed is not None:
+                # what the observer made of a sensor that does not move is no disturbance
+                predicted = Estimate(predicted.x, sensed.w)
+            return replace(state, sensed=verdict.sensed, time_ns=time_ns,
+                           estimate=predicted), verdict, expected
+        xi = states.to_deviation(x)
+        observer = self._observers[state.linear]
+        if not observer.bandwidth > 0.0:
+            estimate = Estimate(xi, np.zeros_like(xi))
+        elif before is None and state.command is not None:
+            estimate = observer.at_rest(xi, self.model.inputs.to_deviation(state.command))
+        elif predicted is None or before is None or not elapsed > 0.0 or verdict.moved or lost or (
+                states.violation(x) > self.settings.ladder.linear_margin):
+            estimate = Estimate(xi, w)
+        else:
+            estimate = observer.correct(predicted, xi, elapsed)
+        return replace(state, sensed=verdict.sensed, time_ns=time_ns,
+                       estimate=estimate), verdict, expected
+
+    def _coasted(self, state: State, elapsed: float) -> State:
+        """Carry the estimate forward without a measurement; None when it is lost."""
+        if state.estimate is None or state.command is None or not elapsed > 0.0:
+            return state
+        u = self.model.inputs.to_deviation(state.command)
+        predicted = self._observers[state.linear].predict(state.estimate, u, elapsed)
+        if predicted is None or not np.all(np.isfinite(predicted.x)):
+            # of the state nothing is known any more; the disturbance is kept
+            predicted = state.estimate
+        return replace(state, estimate=predicted)
+
+    def _rebased(self, estimate: Estimate | None, was_linear: bool, linear: bool
+                 ) -> Estimate | None:
+        """Carry an estimate over from the learned model to the linear one, or back."""
+        if estimate is None or was_linear == linear or not self.settings.observer_bandwidth > 0.0:
+            return estimate
+        return self._observers[linear].rebased(
+            estimate, self._observers[was_linear].model.drift(estimate.x))
+
+    # Estimate to command.
+
+    def _wanted(self, state: State, verdict: Verdict, outside: float, time_ns: int,
+                elapsed: float, spacing: float = 0.0) -> tuple[State, Array, Report]:
         """Return the command before limits with what is known of it."""
-        # finite, yet beyond what scaled deviations can hold, is no measurement either
-        if not np.all(np.isfinite(self.model.states.to_deviation(measurement))):
-            if state.mode is Mode.MANUAL and state.manual_input is not None:
-                return state.manual_input, Report(state.mode, problem='measurement not finite')
-            return held, Report(state.mode, problem=(
-                f'measurement {measurement.tolist()} is not finite: the last command is held; '
-                'check the sensor'))
-        outside = self.model.states.violation(measurement)
+        held = self.model.inputs.center if state.command is None else state.command
+        transfer = state.transfer and state.transfer.after(elapsed, self.settings.transfer_time)
         if state.mode is Mode.MANUAL:
             wanted = held if state.manual_input is None else state.manual_input
-            return wanted, Report(state.mode, outside=outside)
+            state = replace(state, law_in_force=None, law_input=None, transfer=None)
+            return state, wanted, self._report(state, Rung.LEARNED, verdict.fault)
+        standing, attempt = self._decided(
+            state, verdict, outside, time_ns, spacing)
+        was_linear = state.linear
+        state = replace(state, standing=standing)
+        state = replace(state, estimate=self._rebased(
+            state.estimate, was_linear, state.linear))
+        report = self._report(state, standing.rung, standing.reason)
+        if attempt is not None and attempt.found is not None:
+            riccati = attempt.found.riccati
+            report = replace(report, residual=riccati.residual, gain=riccati.gain,
+                             growth=attempt.growth, mismatch=attempt.target.mismatch)
+        if attempt is None or attempt.u is None or attempt.found is None:
+            if standing.rung is Rung.SAFE:
+                state = replace(state, law_in_force=None, law_input=None, transfer=None)
+                return state, self.safe_input, report
+            passing = standing.resumes is not None
+            return (state if passing else replace(state, law_in_force=None, law_input=None),
+                    held, report)
+        report = replace(report, law=attempt.found.law, at_range=attempt.clipped)
+        if state.law_in_force is not standing.rung and state.command is not None:
+            # somebody else has commanded so far
+            transfer = _shifted(None, held - attempt.u)
+        state = replace(state, law_in_force=standing.rung, law_input=attempt.u,
+                        transfer=transfer)
+        if transfer is None:
+            return state, attempt.u, report
+        return state, attempt.u + transfer.offset, replace(report, transfer=transfer.offset)
+
+    def _decided(self, state: State, verdict: Verdict, outside: float, time_ns: int,
+                 spacing: float) -> tuple[Standing, _Attempt | None]:
+        """Find the rung to stand on, and what its law gives."""
+        settings = self.settings.ladder
+        interval = spacing / self.model.seconds_per_time_unit
+        if verdict.fault:
+            need = Need(Rung.HOLD, verdict.fault, passing=True)
+        else:
+            need = state.standing.allowed(settings, outside, self._where_outside(state))
+        attempt = None
+        while True:
+            standing = state.standing.at(settings, need, time_ns)
+            if standing.rung not in (Rung.LEARNED, Rung.LINEAR) or state.estimate is None:
+                return standing, attempt
+            estimate = self._rebased(
+                state.estimate, state.linear, standing.rung is Rung.LINEAR)
+            assert estimate is not None
+            attempt = self._attempt(state, standing.rung, estimate, interval)
+            if not attempt.problem:
+                return standing, attempt
+            below = Rung.LINEAR if standing.rung is Rung.LEARNED else Rung.HOLD
+            need = Need(below, f'the {standing.rung.value} fails: {attempt.problem}')
+
+    def _outside(self, x: Array) -> float:
+        """Return how far a measurement is outside the training box; NaN when it is none."""
+        return self.model.states.violation(x) if np.all(np.isfinite(x)) else np.nan
+
+    def _where_outside(self, state: State) -> str:
+        """Say in words what lies outside the training box."""
+        states = self.model.states
+        ranges = ', '.join(
+            f'{name} {self.show(lower, unit)} to {self.show(upper, unit)}'
+            for name, unit, lower, upper in zip(states.names, states.units, states.lower,
+                                                states.upper, strict=True))
+        return f'outside the trained range ({ranges})'
+
+    def _attempt(self, state: State, rung: Rung, estimate: Estimate, interval: float = 0.0
+                 ) -> _Attempt:
+        """Evaluate a law at an estimate that is in terms of the law's model."""
+        linear = rung is Rung.LINEAR
+        model = self.model.linearised if linear else self.model
         assert state.setpoint.active is not None
-        target = steady_state_target(
-            self.model, self.model.states.to_deviation(state.setpoint.active))
-        law = feedback(self.model, self.model.states.to_deviation(measurement), target,
-                       self.weights, max_gain=self.settings.max_gain,
-                       max_residual=self.settings.max_residual)
-        report = Report(state.mode, law.law, outside=outside, residual=law.riccati.residual,
-                        gain=law.riccati.gain)
-        wanted = self.model.inputs.to_physical(law.u)
-        if law.solved and np.all(np.isfinite(wanted)):
-            return wanted, report
-        return held, replace(report, law=None, problem=(
-            f'no feedback gain: {law.riccati.status.value}; the last command is held'))
+        x_ref = self.model.states.to_deviation(state.setpoint.active)
+        known = self._references.get(linear)
+        if known is None or not np.array_equal(known.x, x_ref):
+            # a memory of the last set-point only; what comes out does not depend on it
+            known = self._references[linear] = reference(model, x_ref)
+        target = balance(model, known, estimate.w)
+        try:
+            found = feedback(model, estimate.x, target, self.weights,
+                             max_gain=self.settings.max_gain,
+                             max_residual=self.settings.max_residual)
+            growth = found.growth(interval) if found.solved else np.nan
+        except np.linalg.LinAlgError as error:
+            return _Attempt(None, target, problem=f'{error}')
+        if not found.solved:
+            return _Attempt(None, target, found,
+                            problem=f'no feedback gain: {found.riccati.status.value}')
+        if not growth < 1.0:
+            return _Attempt(None, target, found, growth, (
+                f'the closed loop is predicted unstable at a sample every '
+                f'{interval * model.seconds_per_time_unit:.3g} s: '
+                'raise the input weight, or measure more often'))
+        u = self.model.inputs.to_physical(found.u)
+        if not np.all(np.isfinite(u)):
+            return _Attempt(None, target, found, growth, 'its command is not finite')
+        limits = self.settings.limits
+        within = np.clip(u, limits.lower, limits.upper)
+        return _Attempt(within, target, found, growth, clipped=bool(np.any(within != u)))
+
+    def _report(self, state: State, rung: Rung, reason: str) -> Report:
+        """Return what is known without a law."""
+        estimate, active = state.estimate, state.setpoint.active
+        report = Report(
+            state.mode, rung, reason, active_setpoint=active,
+            setpoint_outside=np.nan if active is None else self.model.states.violation(active))
+        if estimate is None:
+            return report
+        observer = self._observers[state.linear]
+        disturbance = observer.as_input(estimate.w)
+        return replace(
+            report, estimate=self.model.states.to_physical(estimate.x),
+            disturbance=disturbance * self.model.inputs.scale,
+            at_bound=float(np.linalg.norm(disturbance)) >= observer.max_disturbance * (1 - 1e-9))
+
+
+def _passed(state: State, time_ns: int, elapsed: float) -> tuple[State, float, int]:
+    """
+    Count the time since the last command.
+
+    :return: the state with its usual interval, the seconds that count for ramp and rate limit,
+        and the measurements missed.
+    """
+    if state.time_ns is None or not elapsed > 0.0:
+        return state, 0.0, 0
+    since = (time_ns - state.time_ns) / NANOSECONDS
+    missed = 0 if math.isinf(state.interval) else max(0, round(since / state.interval) - 1)
+    # the plant stood under the old command all through a gap
+    seconds = min(since, 2.0 * state.interval)
+    # a burst of measurements does not make the next regular one a gap
+    usual = 0.0 if np.isinf(state.interval) else 0.5 * state.interval
+    return (replace(state, interval=max(seconds, usual)), min(seconds, elapsed), missed)
+
+
+def _afresh(state: State) -> State:
+    """Return the state after the clock was set back: what was timed by it has lost its meaning."""
+    standing = replace(state.standing, bad_since_ns=None, better_since_ns=None)
+    return replace(state, time_ns=None, commanded_ns=None, sensed=None, standing=standing,
+                   setpoint=replace(state.setpoint, scheduled=()))
+
+
+def _shifted(transfer: Transfer | None, by: Array) -> Transfer:
+    return Transfer(by, by) if transfer is None else transfer.shifted(by)
 
 
 def _kept(value: Array) -> Array:

@@ -24,6 +24,7 @@ from koopman_ros.control.target import Target
 from koopman_ros.lifting import LiftedModel
 import numpy as np
 from numpy.typing import NDArray
+from scipy.linalg import expm
 
 Array = NDArray[np.float64]
 
@@ -56,16 +57,49 @@ class Feedback:
     :param u: (n_u,) u_ref - K e in scaled deviations; not to be used unless solved.
     :param law: which law produced it.
     :param riccati: the solution with its residual, gain and status.
+    :param drift: (n_x, n_x) A_x of the error e = x - x_ref, e' = A_x e + B v.
+    :param action: (n_x, n_x) -B K in terms of that error, so that e' = (A_x + action) e.
     """
 
     u: Array
     law: Law
     riccati: RiccatiSolution
+    drift: Array
+    action: Array
 
     @property
     def solved(self) -> bool:
         """Whether `u` may be used."""
         return self.riccati.status is RiccatiStatus.SOLVED
+
+    def growth(self, interval: float) -> float:
+        """
+        Predict by which factor the error's largest mode changes from one sample to the next.
+
+        The input is held between samples. Without an interval it is that of the continuous loop
+        over one unit of time.
+
+        :param interval: between samples in the model's time unit; 0 when it is not known.
+        :return: 1 and more, or NaN, when the loop is predicted not to be stable.
+        """
+        if len(self.drift) == 1:
+            a, action = float(self.drift[0, 0]), float(self.action[0, 0])
+            if not interval > 0.0:
+                return float(np.exp(a + action))
+            # expm1(a t) / a is the integral of exp(a s), also for a small a
+            held = interval if a == 0.0 else float(np.expm1(a * interval)) / a
+            return abs(float(np.exp(a * interval)) + held * action)
+        if not (np.all(np.isfinite(self.drift)) and np.all(np.isfinite(self.action))):
+            return np.nan
+        if not interval > 0.0:
+            return float(np.exp(np.max(np.linalg.eigvals(self.drift + self.action).real)))
+        n = len(self.drift)
+        block = np.zeros((2 * n, 2 * n))
+        block[:n, :n], block[:n, n:] = self.drift, self.action
+        # Van Loan, 1978: the exponential of the block matrix holds that of A and its integral
+        exponential = expm(interval * block)
+        return float(np.max(np.abs(np.linalg.eigvals(
+            exponential[:n, :n] + exponential[:n, n:]))))
 
 
 def feedback(model: LiftedModel, x: Array, target: Target, weights: Weights, *,
@@ -98,19 +132,20 @@ def recentred(model: LiftedModel, x: Array, target: Target, weights: Weights, *,
     """
     Solve the Riccati equation of the lifted error e = N(x) - z_ref.
 
-    e' = A e + J(x) B v + (J(x) - J(x_ref)) B u_ref, and the last term is H C e with C e the
-    error of the state, so that A + H C takes the place of A. Only with identity coordinates
+    e' = A e + J(x) B v + (J(x) - J(x_ref)) (B u_ref + w), and the last term is H C e with C e
+    the error of the state, so that A + H C takes the place of A. Only with identity coordinates
     is C e linear in e; a free lift goes by M^+ e, exact on the manifold of the lift.
 
     Arguments and result as in :func:`feedback`; valid where every mode of A decays.
     """
     z, J = model.lift_and_jacobian(x)
-    M, H = model.secants(x, target.x, model.B @ target.u)
+    M, H = model.secants(x, target.x, target.push)
     n_x, n_z = model.n_x, model.n_z
     C = np.eye(n_x, n_z) if model.identity else np.linalg.pinv(M)
     riccati = solve_riccati(model.A + H @ C, J @ model.B, C.T @ weights.Q @ C, weights.R,
                             max_gain=max_gain, max_residual=max_residual)
-    return Feedback(target.u - riccati.K @ (z - target.z), Law.RECENTRED, riccati)
+    return Feedback(target.u - riccati.K @ (z - target.z), Law.RECENTRED, riccati,
+                    np.linalg.pinv(J) @ (model.A @ M + H), -model.B @ (riccati.K @ M))
 
 
 def projected(model: LiftedModel, x: Array, target: Target, weights: Weights, *,
@@ -124,8 +159,9 @@ def projected(model: LiftedModel, x: Array, target: Target, weights: Weights, *,
     Arguments and result as in :func:`feedback`.
     """
     J = model.jacobian(x)
-    M, H = model.secants(x, target.x, model.B @ target.u)
+    M, H = model.secants(x, target.x, target.push)
     A = np.linalg.pinv(J) @ (model.A @ M + H)
     riccati = solve_riccati(A, model.B, weights.Q, weights.R,
                             max_gain=max_gain, max_residual=max_residual)
-    return Feedback(target.u - riccati.K @ (x - target.x), Law.PROJECTED, riccati)
+    return Feedback(target.u - riccati.K @ (x - target.x), Law.PROJECTED, riccati,
+                    A, -model.B @ riccati.K)

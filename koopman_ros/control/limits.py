@@ -66,7 +66,7 @@ def limit(limits: InputLimits, wanted: Array, previous: Array | None, seconds: f
     """
     Bring a command within its range, and within its rate where a previous command is known.
 
-    The range wins over the rate: a previous command from outside the range is left at once.
+    A previous command from outside the range, which was tightened since, is left at the rate.
 
     :param limits: the limits.
     :param wanted: (n_u,) the law's command.
@@ -78,7 +78,6 @@ def limit(limits: InputLimits, wanted: Array, previous: Array | None, seconds: f
         within.setflags(write=False)
         return LimitedInput(within, bool(np.any(within != wanted)), False)
     reach = limits.rate * seconds if seconds > 0.0 else np.zeros_like(limits.rate)
-    reached = np.clip(np.clip(within, previous - reach, previous + reach),
-                      limits.lower, limits.upper)
+    reached = np.clip(within, previous - reach, previous + reach)
     reached.setflags(write=False)
     return LimitedInput(reached, bool(np.any(within != wanted)), bool(np.any(reached != within)))

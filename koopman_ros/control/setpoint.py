@@ -18,6 +18,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+import math
 
 from koopman_ros.lifting import LiftedModel
 import numpy as np
@@ -40,11 +41,13 @@ class Setpoint:
     :param requested: (n_x,) where the operator wants to be, or None before the first request.
     :param active: (n_x,) what is tracked now, on its ramp to the requested value; None at first.
     :param scheduled: (time in ns, value) of requests that take effect later, in time order.
+    :param ramped: (n_x,) where the ramp is, which the filter follows; None for where it is.
     """
 
     requested: Array | None = None
     active: Array | None = None
     scheduled: tuple[tuple[int, Array], ...] = ()
+    ramped: Array | None = None
 
 
 # Words for a state's value in the units of whoever reads them: (value, unit) -> text.
@@ -104,7 +107,7 @@ def lies_ahead(effective_ns: int, now_ns: int | None) -> bool:
 
 
 def advance(setpoint: Setpoint, measured: Array, model: LiftedModel, ramp: float, now_ns: int,
-            seconds: float) -> Setpoint:
+            seconds: float, lag: float = 0.0) -> Setpoint:
     """
     Bring the set-point to the present time.
 
@@ -117,6 +120,7 @@ def advance(setpoint: Setpoint, measured: Array, model: LiftedModel, ramp: float
     :param ramp: largest change per second, in state units; infinity for steps.
     :param now_ns: time of the measurement.
     :param seconds: time since the last measurement; 0 at the first.
+    :param lag: time constant in seconds of the filter behind the ramp; 0 for none.
     """
     due = [entry for entry in setpoint.scheduled if not lies_ahead(entry[0], now_ns)]
     if due:
@@ -125,6 +129,11 @@ def advance(setpoint: Setpoint, measured: Array, model: LiftedModel, ramp: float
     held = np.clip(measured, model.states.lower, model.states.upper)
     active = held if setpoint.active is None else setpoint.active
     requested = active if setpoint.requested is None else setpoint.requested
+    ramped = active if setpoint.ramped is None or lag <= 0.0 else setpoint.ramped
     reach = np.inf if np.isinf(ramp) else ramp * seconds
-    return replace(setpoint, requested=requested,
-                   active=np.clip(requested, active - reach, active + reach))
+    ramped = np.clip(requested, ramped - reach, ramped + reach)
+    if lag <= 0.0:
+        return replace(setpoint, requested=requested, active=ramped, ramped=None)
+    share = -math.expm1(-seconds / lag)
+    return replace(setpoint, requested=requested, ramped=ramped,
+                   active=active + share * (ramped - active))

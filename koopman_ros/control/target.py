@@ -32,26 +32,55 @@ class Target:
 
     :param x: (n_x,) reference state.
     :param z: (n_z,) z_ref = N(x_ref) (paper, section on the optimal control problem).
-    :param u: (n_u,) input that balances the model's drift there.
-    :param mismatch: size of the drift that no input balances; 0 where x is a steady state.
+    :param u: (n_u,) input that balances the model's drift and the disturbance there.
+    :param push: (n_x,) B u_ref + w, what acts on the state beside the drift.
+    :param mismatch: size of the rate that no input balances; 0 where x can be held.
     """
 
     x: Array
     z: Array
     u: Array
+    push: Array
     mismatch: float
 
 
-def steady_state_target(model: LiftedModel, x_ref: Array) -> Target:
+def steady_state_target(model: LiftedModel, x_ref: Array, w: Array | None = None) -> Target:
     """
-    Solve J_N(x_ref)^+ A N(x_ref) + B u_ref = 0 for u_ref by least squares.
+    Solve J_N(x_ref)^+ A N(x_ref) + B u_ref + w = 0 for u_ref by least squares.
 
     The feed-forward comes from the lifted model: the linearisation's would leave an offset of
     kelvins far from the nominal point.
 
     :param model: the lift.
     :param x_ref: (n_x,) scaled deviation.
+    :param w: (n_x,) disturbance of the state's rate, none by default.
     """
-    drift = model.drift(x_ref)
-    u: Array = np.linalg.lstsq(model.B, -drift, rcond=None)[0].astype(np.float64)
-    return Target(x_ref, model.lift(x_ref), u, float(np.linalg.norm(drift + model.B @ u)))
+    return balance(model, reference(model, x_ref), np.zeros(model.n_x) if w is None else w)
+
+
+@dataclass(frozen=True)
+class Reference:
+    """
+    What a target has of its set-point alone, in scaled deviations.
+
+    :param x: (n_x,) reference state.
+    :param z: (n_z,) N(x_ref).
+    :param drift: (n_x,) the model's drift there.
+    """
+
+    x: Array
+    z: Array
+    drift: Array
+
+
+def reference(model: LiftedModel, x_ref: Array) -> Reference:
+    """Evaluate the model at a set-point (n_x,), in scaled deviations."""
+    return Reference(x_ref, model.lift(x_ref), model.drift(x_ref))
+
+
+def balance(model: LiftedModel, at: Reference, w: Array) -> Target:
+    """Complete a reference by the input that balances drift and disturbance w (n_x,)."""
+    load = at.drift + w
+    u = -(model.input_inverse @ load)
+    push = model.B @ u
+    return Target(at.x, at.z, u, push + w, float(np.linalg.norm(load + push)))

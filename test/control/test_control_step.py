@@ -21,7 +21,7 @@ import math
 from typing import Any
 
 from closed_loops import COOLANT, REACTOR, SETPOINT, shipped, START, two_state_model
-from koopman_ros.control import Controller, InputLimits, Law, Mode, Settings, State
+from koopman_ros.control import Controller, InputLimits, Law, Mode, Rung, Settings, State
 from koopman_ros.lifting import Coordinates, LiftedModel, NetworkObservables, Provenance
 from koopman_ros.plants import advance
 import numpy as np
@@ -66,7 +66,7 @@ def test_at_its_setpoint_the_loop_rests():
     np.testing.assert_array_equal(report.active_setpoint, [START])
     assert report.law is Law.RECENTRED
     assert report.mode is Mode.AUTOMATIC
-    assert (report.problem, report.outside) == ('', 0.0)
+    assert (report.reason, report.outside) == ('', 0.0)
     assert 0.0 <= report.residual <= 1e-6
     assert 0.0 < report.gain <= 1e3
     assert (report.at_range, report.at_rate, report.clock_went_back) == (False, False, False)
@@ -88,7 +88,7 @@ def test_a_law_with_unstable_modes_is_reported_as_projected():
     state, refused = loop.request_setpoint(state, np.zeros(2))
     assert refused == ''
     report = loop.step(state, np.array([1.0, 2.0]), NOW + SECOND)[2]
-    assert (report.law, report.problem) == (Law.PROJECTED, '')
+    assert (report.law, report.reason) == (Law.PROJECTED, '')
 
 
 @pytest.mark.parametrize('measurement', [312.0, 327.5, math.nan, 1e300])
@@ -136,7 +136,10 @@ def test_commands_are_finite_and_within_limits_whatever_is_measured(name, mode):
         assert report.late is (last_ns - SECOND <= time_ns < last_ns)
         assert report.clock_stood_still is (time_ns == last_ns)
         repeated = report.late or report.clock_stood_still
-        assert bool(report.problem) is (not math.isfinite(value) and not repeated)
+        if not repeated:
+            believed = math.isfinite(value)
+            assert (report.estimate is not None) or not believed
+            assert bool(report.reason) or believed or mode is Mode.MANUAL
         if repeated:
             np.testing.assert_array_equal(command, previous)
 
@@ -184,20 +187,20 @@ def test_a_failed_sensor_holds_the_last_command():
     state, held, report = loop.step(state, np.array([math.nan]), NOW + 2 * SECOND)
     np.testing.assert_array_equal(held, command)
     assert report.law is None
-    assert report.problem == ('measurement [nan] is not finite: the last command is held; check '
-                              'the sensor')
+    assert report.reason == 'the measured temperature is nan, not finite: check the sensor'
+    assert report.rung is Rung.HOLD
     assert math.isnan(report.outside)
     # the set-point stays, and the loop goes on when the sensor does
     np.testing.assert_array_equal(report.active_setpoint, [316.0])
     report = loop.step(state, np.array([319.0]), NOW + 3 * SECOND)[2]
-    assert (report.law, report.problem) == (Law.RECENTRED, '')
+    assert (report.law, report.reason) == (Law.RECENTRED, '')
 
 
 def test_a_sensor_that_fails_from_the_start_gives_the_nominal_input():
     state, command, report = controller().step(State(), np.array([math.nan]), NOW)
     np.testing.assert_array_equal(command, [300.0])
     assert report.active_setpoint is None
-    assert 'is not finite' in report.problem
+    assert 'not finite' in report.reason
     # the first valid measurement is what is held
     report = controller().step(state, np.array([315.0]), NOW + SECOND)[2]
     np.testing.assert_array_equal(report.active_setpoint, [315.0])
@@ -215,8 +218,9 @@ def test_a_nominal_input_out_of_range_is_limited():
 def test_outside_the_box_the_distance_is_reported():
     model = shipped('reactor_nz4')
     half = 0.5 * (model.states.upper - model.states.lower)
-    report = controller().step(started(), model.states.upper + 0.25 * half, NOW + SECOND)[2]
-    assert report.outside == pytest.approx(0.25, rel=1e-9)
+    report = controller().step(started(), model.states.upper + 0.05 * half, NOW + SECOND)[2]
+    assert report.outside == pytest.approx(0.05, rel=1e-9)
+    assert report.rung is Rung.LEARNED
     assert report.law is Law.RECENTRED
 
 
@@ -227,8 +231,8 @@ def test_without_a_gain_the_last_command_is_held():
     state, held, report = strict.step(state, np.array([315.0]), NOW + 2 * SECOND)
     np.testing.assert_array_equal(held, command)
     assert report.law is None
-    assert report.problem.startswith('no feedback')
-    assert 'the gain exceeds its bound' in report.problem
+    assert report.reason.startswith('the linear law fails: no feedback')
+    assert 'the gain exceeds its bound' in report.reason
     assert report.gain > 1e-6
 
 
@@ -245,12 +249,16 @@ def test_a_repeated_stamp_repeats_the_command():
         assert not report.clock_went_back
 
 
-def test_a_repeated_stamp_is_within_limits_that_have_changed():
+def test_a_range_that_was_tightened_is_reached_at_the_rate():
     loop = controller()
     state = loop.step(started(loop), np.array([START]), NOW + SECOND)[0]
     lower = replace(loop, settings=replace(loop.settings, limits=InputLimits(
         np.array([LOWER]), np.array([290.0]), np.array([RATE]))))
-    assert lower.step(state, np.array([START]), NOW + SECOND)[1] == 290.0
+    for second in range(2, 20):
+        before = state.command[0]
+        state, command, report = lower.step(state, np.array([START]), NOW + second * SECOND)
+        assert command[0] == pytest.approx(max(before - RATE, 290.0), abs=1e-9)
+    assert report.at_range
 
 
 @pytest.mark.parametrize('late', [1, SECOND // 2, SECOND])
@@ -364,7 +372,7 @@ def test_manual_mode_starts_from_the_last_command():
     for second in range(2, 5):
         state, manual, report = loop.step(state, np.array([310.0]), NOW + second * SECOND)
         np.testing.assert_array_equal(manual, command)
-        assert (report.mode, report.law, report.problem) == (Mode.MANUAL, None, '')
+        assert (report.mode, report.law, report.reason) == (Mode.MANUAL, None, '')
         assert report.outside == 0.0
 
 
@@ -395,7 +403,7 @@ def test_manual_commands_outlive_a_failed_sensor():
         loop.set_mode(started(loop), Mode.MANUAL), np.array([299.0]))[0]
     _, command, report = loop.step(state, np.array([math.nan]), NOW + 10 * SECOND)
     np.testing.assert_array_equal(command, [299.0])
-    assert report.problem == 'measurement not finite'
+    assert 'not finite' in report.reason
 
 
 @pytest.mark.parametrize('value', [math.nan, math.inf])
@@ -436,7 +444,7 @@ def drive(loop, seconds, *, plant=REACTOR, kelvin=START, setpoint=SETPOINT):
     temperatures, commands = [], []
     for second in range(1, seconds + 1):
         state, command, report = loop.step(state, temperature, NOW + second * SECOND)
-        assert report.problem == ''
+        assert report.reason == ''
         temperature = advance(plant, temperature, command, 1.0 / 60.0)
         temperatures.append(float(temperature[0]))
         commands.append(float(command[0]))
