@@ -21,38 +21,32 @@ from enum import Enum
 import math
 import sys
 import time
+from typing import Any
 
 from koopman_ros.nodes import topics
 from koopman_ros.nodes.diagnostics import DiagnosticsPublisher, Level, Status
-from koopman_ros.nodes.messages import (
-    NANOSECONDS,
-    stamp_message,
-    stamp_nanoseconds,
-    temperature_message,
-    to_celsius,
-    to_kelvin,
-)
+from koopman_ros.nodes.instruments import Instruments
+from koopman_ros.nodes.messages import NANOSECONDS, stamp_nanoseconds, to_celsius, to_kelvin
 from koopman_ros.nodes.plant_parameters import PlantParameters, TABLE
 from koopman_ros.nodes.process import LoopNode, run
+from koopman_ros.nodes.rivals import Rivals
 from koopman_ros.plants import (
+    ActuatedProcess,
     ControlAffineSystem,
     EquilibriumError,
     IntegrationError,
     one_state_reactor,
     Process,
-    sensor_noise,
     two_state_reactor,
 )
 import numpy as np
 from rclpy.clock import Clock, ClockType
-from rosgraph_msgs.msg import Clock as ClockMessage
-from sensor_msgs.msg import JointState, Temperature
+from sensor_msgs.msg import Temperature
 from std_srvs.srv import Trigger
 
 _REACTORS = {'one_state': one_state_reactor, 'two_state': two_state_reactor}
 _POLL_PERIOD = 0.01  # s; for what no message announces
 _SILENCE = 3.0  # s without a command, and five periods, after which somebody should know
-_CONCENTRATION_NAME = 'reactant_concentration [mol/L]'
 
 
 class Phase(Enum):
@@ -74,7 +68,7 @@ class PlantNode(LoopNode):
         self._real_time = parameters.speed == 1.0 and not parameters.lockstep
         self._period_ns = round(parameters.sample_period * NANOSECONDS)
         self._start_ns = round(parameters.start_time * NANOSECONDS)
-        self._process = self._initial(system, self._start_ns)
+        self._plant = self._initial(system, self._start_ns)
         self._phase = Phase.WAITING if parameters.lockstep else Phase.RUNNING
         self._trip = ''
         self._sample = 0  # number of the next measurement
@@ -88,15 +82,15 @@ class PlantNode(LoopNode):
         # the subscription first: a controller that hears the measurement has then seen it, too
         self._command_subscription = self.create_subscription(
             Temperature, topics.COOLANT_SETPOINT, self._on_command, topics.LOOP_QOS)
-        self._temperature = self.create_publisher(
-            Temperature, topics.TEMPERATURE, topics.LOOP_QOS)
-        self._concentration = self.create_publisher(
-            JointState, topics.CONCENTRATION, topics.LOOP_QOS) if system.n_x == 2 else None
-        self._clock_publisher = self.create_publisher(
-            ClockMessage, topics.CLOCK, topics.CLOCK_QOS) if (
-                parameters.publish_clock and not self._real_time) else None
+        self._instruments = Instruments(
+            self, clock=parameters.publish_clock and not self._real_time,
+            concentration=system.n_x == 2)
         self._diagnostics = DiagnosticsPublisher(
             self, 'simulation', parameters.reactor, self._status)
+        self._rivals = Rivals(
+            self, {topics.COOLANT_SETPOINT: 'command the coolant',
+                   topics.TEMPERATURE: 'publish the temperature'},
+            self._diagnostics.publish_if_changed)
         self.create_service(Trigger, '~/reset', self._on_reset)
         # simulated time comes from here, so nothing in here may wait for it
         wall_clock = Clock(clock_type=ClockType.STEADY_TIME)
@@ -120,10 +114,20 @@ class PlantNode(LoopNode):
                 f'{error}; the plant starts at {to_celsius(float(nominal[-1])):.3f} degC instead')
             return build(parameters.constants(), nominal_state=nominal)
 
-    def _initial(self, system: ControlAffineSystem, time_ns: int) -> Process:
+    def _initial(self, system: ControlAffineSystem, time_ns: int) -> ActuatedProcess:
         x = system.nominal_state.copy()
         x[-1] += self._settings.initial_temperature_offset
-        return Process(system, time_ns, x, system.nominal_input)
+        u = system.nominal_input
+        return ActuatedProcess(Process(system, time_ns, x, u), self._settings.actuator(), u)
+
+    @property
+    def _process(self) -> Process:
+        """The reactor as it stands, with the coolant that is in force."""
+        return self._plant.process
+
+    def _alter(self, **changes: Any) -> None:
+        """Change the reactor, or its time."""
+        self._plant = replace(self._plant, process=replace(self._process, **changes))
 
     # Time: in lock-step by commands, otherwise by the wall clock.
 
@@ -148,13 +152,13 @@ class PlantNode(LoopNode):
         self._wall_start = time.monotonic()
         if self._real_time:
             self._start_ns = time.time_ns()
-            self._process = replace(self._process, time_ns=self._start_ns)
+            self._alter(time_ns=self._start_ns)
 
     def _on_poll(self) -> None:
         """Start lock-step when the loop is complete, and watch for a command that is missing."""
         if self._phase is Phase.WAITING:
             complete = (
-                self._temperature.get_subscription_count() >= self._settings.lockstep_subscribers
+                self._instruments.subscribers >= self._settings.lockstep_subscribers
                 and self._command_subscription.get_publisher_count() > 0)
             if complete:
                 self._phase = Phase.RUNNING
@@ -193,27 +197,17 @@ class PlantNode(LoopNode):
             return
         if not self._advance(instant):
             return
-        stamp = stamp_message(instant)
-        if self._clock_publisher is not None:
-            self._clock_publisher.publish(ClockMessage(clock=stamp))
-        if self._concentration is not None:
-            message = JointState(name=[_CONCENTRATION_NAME], position=[float(self._process.x[0])])
-            message.header.stamp = stamp
-            message.header.frame_id = self._settings.frame_id
-            self._concentration.publish(message)
-        noise = sensor_noise(self._settings.noise, self._settings.seed, self._sample)
+        sample = self._sample
         self._sample += 1
         self._answered = False
         self._wall_published = time.monotonic()
-        self._temperature.publish(temperature_message(
-            float(self._process.x[-1]) + noise, stamp, self._settings.frame_id,
-            self._settings.noise ** 2))
+        self._instruments.publish(self._process, sample, self._settings)
         self._diagnostics.publish_if_changed()
 
     def _advance(self, time_ns: int) -> bool:
         """Bring the process to an instant; a reactor that ran away stops the plant."""
         try:
-            self._process = self._process.until(time_ns)
+            self._plant = self._plant.until(time_ns)
         except IntegrationError as error:
             self._phase, self._trip = Phase.TRIPPED, str(error)
             self.get_logger().error(f'{error}; call ~/reset to start again')
@@ -232,11 +226,10 @@ class PlantNode(LoopNode):
             self._commands += 1
             self._last_command = time.monotonic()
             self._rejection = ''
-            # in lock-step it acts from its measurement on, otherwise from now on
+            # in lock-step it was given at its measurement, otherwise now
             if lockstep or self._advance_to_now():
-                low, high = self._settings.coolant_min, self._settings.coolant_max
-                reached = min(max(message.temperature, low), high)
-                self._process = replace(self._process, u=np.array([to_kelvin(reached)]))
+                command = np.array([to_kelvin(message.temperature)])
+                self._plant = self._plant.commanded(command, self._process.time_ns)
         else:
             self._rejected += 1
             self._rejection = (f'coolant command {message.temperature} degC is not finite and '
@@ -262,9 +255,8 @@ class PlantNode(LoopNode):
         if not response.success:
             response.message = 'the duration is over: start the plant again'
             return response
-        system = self._process.system
-        fresh = self._initial(system, self._process.time_ns)
-        self._process = fresh
+        self._plant = self._initial(self._process.system, self._process.time_ns)
+        fresh = self._process
         if self._phase is Phase.TRIPPED:
             self._phase, self._trip = Phase.RUNNING, ''
             self._resynchronise()
@@ -282,7 +274,7 @@ class PlantNode(LoopNode):
             return
         passed = self._now_ns() if self._settings.speed else self._process.time_ns
         self._sample = max(self._sample, -(-(passed - self._start_ns) // self._period_ns))
-        self._process = replace(self._process, time_ns=max(passed, self._process.time_ns))
+        self._alter(time_ns=max(passed, self._process.time_ns))
 
     def _on_parameters(self, parameters: PlantParameters) -> None:
         if not self._settings.lockstep:
@@ -290,8 +282,9 @@ class PlantNode(LoopNode):
         self._settings = parameters
         build = _REACTORS[parameters.reactor]
         # the changed plant may have no steady state near; the nominal point stays what it was
-        self._process = replace(self._process, system=build(
+        self._alter(system=build(
             parameters.constants(), nominal_state=self._process.system.nominal_state))
+        self._plant = replace(self._plant, actuator=parameters.actuator())
 
     def _status(self) -> Status:
         level, message = Level.OK, self._phase.value
@@ -299,6 +292,8 @@ class PlantNode(LoopNode):
             level, message = Level.ERROR, f'stopped: {self._trip}; call ~/reset'
         elif self._rejection:
             level, message = Level.WARN, self._rejection
+        elif self._rivals.complaint:
+            level, message = Level.WARN, self._rivals.complaint
         elif self._phase is Phase.WAITING:
             level = Level.WARN
         elif self._unanswered():
@@ -308,6 +303,7 @@ class PlantNode(LoopNode):
             'time [s]': self._process.time_ns / NANOSECONDS,
             'temperature [degC]': to_celsius(float(self._process.x[-1])),
             'coolant [degC]': to_celsius(float(self._process.u[0])),
+            'coolant command [degC]': to_celsius(float(self._plant.command[0])),
             'measurements': self._sample,
             'commands': self._commands,
             'rejected commands': self._rejected,

@@ -21,7 +21,7 @@ from typing import Any
 
 from koopman_ros.nodes.messages import to_kelvin
 from koopman_ros.nodes.parameters import parameter, ParameterTable
-from koopman_ros.plants import ReactorParameters
+from koopman_ros.plants import Actuator, ReactorParameters
 
 _CONSTANTS = {item.name: item for item in fields(ReactorParameters)}
 
@@ -44,6 +44,12 @@ class PlantParameters:
         1.0, 'time between measurements', unit='s', minimum=1e-3, maximum=3600.0, read_only=True)
     noise: float = parameter(
         0.0, 'standard deviation of the measured temperature', unit='K', minimum=0.0,
+        maximum=100.0)
+    sensor_bias: float = parameter(
+        0.0, 'by how much the temperature is measured too high', unit='K', minimum=-100.0,
+        maximum=100.0)
+    sensor_resolution: float = parameter(
+        0.0, 'smallest difference that the measurement shows; 0 for all', unit='K', minimum=0.0,
         maximum=100.0)
     seed: int = parameter(
         0, 'seed of the measurement noise', minimum=0, maximum=2 ** 31, read_only=True)
@@ -74,10 +80,16 @@ class PlantParameters:
         'reactor', 'frame_id of the messages', read_only=True)
     coolant_min: float = parameter(
         -20.0, 'lowest coolant temperature that the actuator reaches', unit='degC',
-        minimum=-50.0, maximum=150.0, read_only=True)
+        minimum=-50.0, maximum=150.0)
     coolant_max: float = parameter(
         100.0, 'highest coolant temperature that the actuator reaches', unit='degC',
-        minimum=-50.0, maximum=150.0, read_only=True)
+        minimum=-50.0, maximum=150.0)
+    command_delay: float = parameter(
+        0.0, 'how much later a command takes effect; the sample_period for one sample', unit='s',
+        minimum=0.0, maximum=3600.0)
+    coolant_lag: float = parameter(
+        0.0, 'time constant with which the coolant follows its command; 0 for at once', unit='s',
+        minimum=0.0, maximum=3600.0)
     flow_rate: float = _constant('flow_rate', 'feed and product flow', read_only=True)
     volume: float = _constant('volume', 'volume of the liquid', read_only=True)
     density: float = _constant('density', 'density of the liquid', read_only=True)
@@ -95,9 +107,14 @@ class PlantParameters:
     feed_temperature: float = parameter(
         76.85, 'temperature of the feed', unit='degC', minimum=-20.0, maximum=200.0)
     feed_concentration: float = _constant(
-        'feed_concentration', 'reactant in the feed (two_state)', read_only=True)
+        'feed_concentration', 'reactant in the feed (two_state)')
     concentration: float = _constant(
-        'concentration', 'reactant in the reactor (one_state)', read_only=True)
+        'concentration', 'reactant in the reactor (one_state)')
+
+    def actuator(self) -> Actuator:
+        """Return what stands before the coolant, in the plant's units."""
+        return Actuator(to_kelvin(self.coolant_min), to_kelvin(self.coolant_max),
+                        self.command_delay, self.coolant_lag)
 
     def constants(self) -> ReactorParameters:
         """Return the physical constants in the plant's units."""

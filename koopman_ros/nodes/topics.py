@@ -32,19 +32,26 @@ CONCENTRATION = 'concentration'
 SETPOINT = 'setpoint'
 ACTIVE_SETPOINT = 'active_setpoint'
 COOLANT_SETPOINT = 'coolant_setpoint'
+COOLANT_TEMPERATURE = 'coolant_temperature'
 MANUAL_COOLANT_SETPOINT = 'manual_coolant_setpoint'
+PREDICTED_TEMPERATURE = 'predicted_temperature'
+CONTROLLER_STATE = 'controller_state'
 DIAGNOSTICS = '/diagnostics'
 CLOCK = '/clock'
 
 # JointState is the one stamped type of common_interfaces that carries named float64 values, so
-# that a concentration goes on the wire with its name and unit instead of under a false meaning.
+# that a concentration goes on the wire with its name and unit instead of under a false meaning,
+# and so do the internals of the controller.
 TYPES = {
     TEMPERATURE: Temperature,
     CONCENTRATION: JointState,
     SETPOINT: Temperature,
     ACTIVE_SETPOINT: Temperature,
     COOLANT_SETPOINT: Temperature,
+    COOLANT_TEMPERATURE: Temperature,
     MANUAL_COOLANT_SETPOINT: Temperature,
+    PREDICTED_TEMPERATURE: Temperature,
+    CONTROLLER_STATE: JointState,
     DIAGNOSTICS: DiagnosticArray,
     CLOCK: Clock,
 }
@@ -52,11 +59,12 @@ TYPES = {
 # Every message of the loop counts: reliable, with room for a receiver that falls behind while
 # the plant runs hundreds of times faster than real time, or is not found by all yet.
 LOOP_QOS = QoSProfile(depth=1000)
-# A late joiner learns what is tracked (REP 2003 leaves latching to the publisher).
+# A late joiner learns what is tracked, and which coolant is in force (REP 2003 leaves latching to
+# the publisher).
 LATCHED_QOS = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
 CLOCK_QOS = QoSProfile(depth=1, reliability=ReliabilityPolicy.BEST_EFFORT)
 
-_QOS = {ACTIVE_SETPOINT: LATCHED_QOS, CLOCK: CLOCK_QOS}
+_QOS = {ACTIVE_SETPOINT: LATCHED_QOS, COOLANT_TEMPERATURE: LATCHED_QOS, CLOCK: CLOCK_QOS}
 
 
 def qos(topic: str) -> QoSProfile:

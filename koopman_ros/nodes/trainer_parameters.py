@@ -24,7 +24,9 @@ from koopman_ros.nodes.messages import SECONDS_PER_MINUTE, to_kelvin
 from koopman_ros.nodes.parameters import parameter, ParameterTable
 
 LOOP_TOPICS = (topics.TEMPERATURE, topics.CONCENTRATION, topics.SETPOINT, topics.ACTIVE_SETPOINT,
-               topics.COOLANT_SETPOINT, topics.MANUAL_COOLANT_SETPOINT, topics.DIAGNOSTICS)
+               topics.COOLANT_SETPOINT, topics.COOLANT_TEMPERATURE,
+               topics.MANUAL_COOLANT_SETPOINT, topics.PREDICTED_TEMPERATURE,
+               topics.CONTROLLER_STATE, topics.DIAGNOSTICS)
 EXPERIMENT_TOPICS = (topics.COOLANT_SETPOINT, topics.MANUAL_COOLANT_SETPOINT)
 
 

@@ -14,6 +14,7 @@
 
 """What is controlled: control-affine systems and their simulation; imports nothing of ours."""
 
+from koopman_ros.plants.actuator import ActuatedProcess, Actuator, with_input_lag
 from koopman_ros.plants.equilibria import (
     eigenvalues,
     equilibrium,
@@ -33,7 +34,7 @@ from koopman_ros.plants.integration import (
     IntegrationFailure,
     IntegratorSettings,
 )
-from koopman_ros.plants.process import Process, sensor_noise
+from koopman_ros.plants.process import Process
 from koopman_ros.plants.reactor import (
     NOMINAL_COOLANT_TEMPERATURE,
     one_state_reactor,
@@ -41,6 +42,7 @@ from koopman_ros.plants.reactor import (
     two_state_reactor,
 )
 from koopman_ros.plants.scalar import scalar_exact_lift, scalar_example
+from koopman_ros.plants.sensor import in_steps, sensor_noise
 from koopman_ros.plants.simulation import advance, simulate, simulate_many
 from koopman_ros.plants.system import ControlAffineSystem, FloatArray
 from koopman_ros.plants.trajectory import DerivativeSamples, sample_derivatives, Trajectory
@@ -48,6 +50,8 @@ from koopman_ros.plants.two_state import two_state_exact_lift, two_state_example
 
 __all__ = [
     'NOMINAL_COOLANT_TEMPERATURE',
+    'ActuatedProcess',
+    'Actuator',
     'ControlAffineSystem',
     'DerivativeSamples',
     'EquilibriumError',
@@ -67,6 +71,7 @@ __all__ = [
     'equilibrium',
     'equilibrium_input',
     'fold',
+    'in_steps',
     'one_state_reactor',
     'random_steps',
     'sample_derivatives',
@@ -78,4 +83,5 @@ __all__ = [
     'two_state_exact_lift',
     'two_state_example',
     'two_state_reactor',
+    'with_input_lag',
 ]

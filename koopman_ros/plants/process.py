@@ -20,7 +20,6 @@ from dataclasses import dataclass, replace
 
 from koopman_ros.plants.simulation import advance
 from koopman_ros.plants.system import ControlAffineSystem, FloatArray
-import numpy as np
 
 _NANOSECONDS = 1_000_000_000
 
@@ -53,16 +52,3 @@ class Process:
         seconds = (time_ns - self.time_ns) / _NANOSECONDS
         x = advance(self.system, self.x, self.u, seconds / self.system.seconds_per_time_unit)
         return replace(self, time_ns=time_ns, x=x)
-
-
-def sensor_noise(deviation: float, seed: int, sample: int) -> float:
-    """
-    Return the noise of one sample, the same for the same seed and number.
-
-    :param deviation: standard deviation, in state units.
-    :param seed: seed of the run, not negative.
-    :param sample: number of the sample, not negative.
-    """
-    if deviation == 0.0:
-        return 0.0
-    return deviation * float(np.random.default_rng((seed, sample)).standard_normal())

@@ -26,6 +26,7 @@ from koopman_ros.nodes import topics
 from koopman_ros.nodes.messages import stamp_nanoseconds
 from koopman_ros.nodes.plant_parameters import TABLE
 import pytest
+from rclpy.node import Node
 from sensor_msgs.msg import JointState, Temperature
 from workbench import seconds, temperature, value, Workbench
 
@@ -46,6 +47,7 @@ class Bench:
         self.coolant = NOMINAL_COOLANT
         self.answering = True
         self.measured: list[Temperature] = []
+        self.commanded: dict[float, float] = {}  # by the stamp that is answered
         self._commands = ros.node.create_publisher(
             Temperature, topics.COOLANT_SETPOINT, topics.LOOP_QOS)
         ros.node.create_subscription(
@@ -55,8 +57,14 @@ class Bench:
     def _answer(self, message: Temperature) -> None:
         self.measured.append(message)
         if self.answering:
+            self.commanded[seconds(message)] = self.coolant
             self._commands.publish(
                 Temperature(header=message.header, temperature=self.coolant))
+
+    def resume(self) -> None:
+        """Answer again, beginning with the last measurement."""
+        self.answering = True
+        self._answer(self.measured.pop())
 
     def start_afresh(self) -> None:
         """Bring the plant back to its steady state, and forget the rest."""
@@ -66,6 +74,7 @@ class Bench:
         self.ros.trigger('plant/reset')
         self.wait_for_more(3)
         del self.measured[:], self.ros.statuses[:]
+        self.commanded.clear()
 
     @property
     def celsius(self) -> float:
@@ -123,6 +132,28 @@ def test_variance_is_the_square_of_the_noise_which_changes_while_it_runs(bench: 
     mean = sum(message.temperature for message in measured) / 200
     spread = math.sqrt(sum((message.temperature - mean) ** 2 for message in measured) / 200)
     assert 0.4 < spread < 0.6
+
+
+def test_biased_sensor_leaves_the_truth_to_the_diagnostics(bench: Bench) -> None:
+    steady = bench.wait_for_more(1)[0].temperature
+    (result,) = bench.ros.set_parameters('plant', sensor_bias=2.0)
+    assert result.successful, result.reason
+    bench.wait_for(lambda celsius: celsius > steady + 1.0)
+    assert bench.celsius == pytest.approx(steady + 2.0, abs=1e-6)
+    del bench.ros.statuses[:]
+    status = bench.ros.wait_for_status(STATUS, lambda s: True)
+    assert float(value(status, 'temperature [degC]')) == pytest.approx(steady, abs=1e-6)
+
+
+def test_coarse_sensor_shows_steps_and_says_how_coarse_it_is(bench: Bench) -> None:
+    (result,) = bench.ros.set_parameters('plant', sensor_resolution=0.25)
+    assert result.successful, result.reason
+    bench.coolant = 25.0
+    bench.ros.wait_until(lambda: bench.measured[-1].variance > 0.0)
+    measured = bench.wait_for_more(200)
+    assert {message.temperature % 0.25 for message in measured} == {0.0}
+    assert {message.variance for message in measured} == {0.25 ** 2 / 12.0}
+    assert len({message.temperature for message in measured}) > 3
 
 
 def test_noise_repeats_with_its_seed(ros: Workbench) -> None:
@@ -207,6 +238,75 @@ def test_stands_still_after_its_duration(ros: Workbench) -> None:
     assert [seconds(message) for message in bench.measured] == [1.0 + 2.0 * k for k in range(11)]
 
 
+# The coolant that is in force.
+
+
+def test_coolant_in_force_is_told_before_each_measurement(bench: Bench) -> None:
+    sent: dict[str, list[tuple[float, int, float]]] = {'coolant': [], 'measured': []}
+    for name, topic in (('coolant', topics.COOLANT_TEMPERATURE), ('measured', topics.TEMPERATURE)):
+        bench.ros.node.create_subscription(
+            Temperature, topic, lambda message, info, name=name: sent[name].append(
+                (seconds(message), info['source_timestamp'], message.temperature)),
+            topics.LOOP_QOS)
+    bench.ros.meet('plant')
+    bench.coolant = 25.0
+    bench.wait_for_more(20)
+    coolants = {stamp: (at, celsius) for stamp, at, celsius in sent['coolant']}
+    told = [(stamp, coolants[stamp][0], at) for stamp, at, _ in sent['measured'][:15]]
+    assert all(coolant_at <= measured_at for _, coolant_at, measured_at in told)
+    # what acted until then is the answer to the measurement before
+    for stamp, *_ in told[1:]:
+        assert coolants[stamp][1] == pytest.approx(bench.commanded[stamp - 1.0], abs=1e-9)
+
+
+def test_coolant_in_force_is_latched_for_a_late_joiner(bench: Bench) -> None:
+    bench.coolant = 25.0
+    bench.wait_for_more(3)
+    bench.answering = False
+    bench.ros.meet('plant')
+    late = bench.ros.listen(Temperature, topics.COOLANT_TEMPERATURE, topics.LATCHED_QOS)
+    bench.ros.wait_until(lambda: late and late[-1].header == bench.measured[-1].header)
+    assert late[-1].temperature == pytest.approx(25.0)
+    bench.resume()
+
+
+def coolants(bench: Bench, **parameters: float) -> dict[float, float]:
+    """Set parameters, step the coolant to 20 degC, and return by stamp what was in force."""
+    (*results,) = bench.ros.set_parameters('plant', **parameters)
+    assert all(result.successful for result in results), results
+    heard = bench.ros.listen(Temperature, topics.COOLANT_TEMPERATURE)
+    bench.ros.meet('plant')
+    bench.wait_for_more(3)
+    bench.coolant = 20.0
+    bench.wait_for_more(30)
+    return {seconds(message): message.temperature for message in list(heard)}
+
+
+def step_of(bench: Bench) -> float:
+    """Return the stamp whose answer was the first other command."""
+    return next(stamp for stamp, celsius in bench.commanded.items() if celsius == 20.0)
+
+
+def test_coolant_lags_behind_its_command(bench: Bench) -> None:
+    in_force = coolants(bench, coolant_lag=8.0)
+    step = step_of(bench)
+    for n in range(20):
+        assert in_force[step + n] == pytest.approx(
+            20.0 + (NOMINAL_COOLANT - 20.0) * math.exp(-n / 8.0), abs=1e-6)
+
+
+def test_command_takes_effect_after_the_delay(bench: Bench) -> None:
+    in_force = coolants(bench, command_delay=2.0)
+    step = step_of(bench)
+    # in force for the first time in the hold that ends three samples later
+    assert [round(in_force[step + n], 6) for n in range(5)] == [NOMINAL_COOLANT] * 3 + [20.0] * 2
+
+
+def test_actuator_whose_range_narrows_leaves_its_command(bench: Bench) -> None:
+    in_force = coolants(bench, coolant_min=22.5)
+    assert in_force[max(in_force)] == pytest.approx(22.5)
+
+
 # Commands.
 
 
@@ -287,6 +387,13 @@ def test_heat_transfer_changes_while_it_runs(bench: Bench) -> None:
     bench.wait_for(lambda celsius: celsius > steady + 0.5)
 
 
+def test_concentration_changes_while_it_runs(bench: Bench) -> None:
+    steady = bench.wait_for_more(1)[0].temperature
+    (result,) = bench.ros.set_parameters('plant', concentration=0.85)
+    assert result.successful, result.reason
+    bench.wait_for(lambda celsius: celsius < steady - 0.5)
+
+
 def test_feed_temperature_changes_while_it_runs(bench: Bench) -> None:
     steady = bench.wait_for_more(1)[0].temperature
     (result,) = bench.ros.set_parameters('plant', feed_temperature=75.0)
@@ -307,3 +414,36 @@ def test_start_without_a_steady_state_says_so(ros: Workbench) -> None:
     ros.wait_until(lambda: heard)
     assert heard[0].temperature == pytest.approx(51.7, abs=1.0)
     assert 'the plant starts at' in process.output()
+
+
+# Others where only one may be.
+
+
+def told(status: DiagnosticStatus) -> bool:
+    """Tell whether others are known by their names, which come a moment after their topics."""
+    return 'end all but one' in status.message and 'UNKNOWN' not in status.message
+
+
+def test_second_commander_is_told_by_its_name_while_it_lasts(bench: Bench) -> None:
+    bench.ros.wait_for_status(STATUS, lambda s: s.level == DiagnosticStatus.OK)
+    intruder = Node('intruder', context=bench.ros.node.context, namespace='/elsewhere')
+    intruder.create_publisher(Temperature, f'/{topics.COOLANT_SETPOINT}', topics.LOOP_QOS)
+    status = bench.ros.wait_for_status(STATUS, told)
+    assert status.level == DiagnosticStatus.WARN
+    assert status.message == (
+        '2 nodes command the coolant: /bench, /elsewhere/intruder; end all but one')
+    intruder.destroy_node()
+    status = bench.ros.wait_for_status(STATUS, lambda s: s.level == DiagnosticStatus.OK)
+    assert status.message == 'running'
+
+
+def test_second_plant_is_told_by_both_while_it_lasts(ros: Workbench) -> None:
+    ros.start('plant', {'sample_period': 0.1})
+    second = ros.start('plant', {'sample_period': 0.1}, ('-r', '__node:=plant_2'))
+    for name in ('plant', 'plant_2'):
+        status = ros.wait_for_status(f'{name}: simulation', told)
+        assert status.level == DiagnosticStatus.WARN
+        assert status.message == (
+            '2 nodes publish the temperature: /plant, /plant_2; end all but one')
+    assert second.stop() == 0
+    ros.wait_for_status(STATUS, lambda s: s.level == DiagnosticStatus.OK)

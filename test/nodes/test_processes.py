@@ -47,6 +47,21 @@ def test_signal_ends_a_node_cleanly(ros: Workbench, tmp_path: Path, name: str, n
     assert 'Traceback' not in process.output()
 
 
+def test_interrupt_while_a_program_loads_ends_it_without_a_word(ros: Workbench) -> None:
+    program = (
+        'import os, signal, sys\n'
+        'class Interrupted:\n'
+        '    def find_spec(self, name, path=None, target=None):\n'
+        '        if name == "scipy":\n'
+        '            os.kill(os.getpid(), signal.SIGINT)\n'
+        'sys.meta_path.insert(0, Interrupted())\n'
+        'from koopman_ros.nodes.programs import plant\n'
+        'sys.exit(plant())\n')
+    process = ros.start('plant', command=(sys.executable, '-c', program))
+    assert ros.wait_for_end(process) == -signal.SIGINT
+    assert process.output() == ''
+
+
 @pytest.mark.parametrize('number', [signal.SIGINT, signal.SIGTERM])
 def test_signal_during_the_start_ends_a_node_cleanly(ros: Workbench, number: int) -> None:
     program = (

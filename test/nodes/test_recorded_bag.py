@@ -36,12 +36,15 @@ import yaml
 SAMPLES = 61
 SETPOINT = 315.15  # K
 TOPICS = {'/temperature', '/concentration', '/setpoint', '/active_setpoint', '/coolant_setpoint',
-          '/diagnostics'}
+          '/coolant_temperature', '/predicted_temperature', '/controller_state', '/diagnostics'}
+LATCHED = {'/active_setpoint', '/coolant_temperature'}
 
 
-# A minute of a closed loop on the noisy two-state reactor, with a step at 20 s.
+# A minute of a closed loop on the noisy two-state reactor, with a step at 20 s and a coolant that
+# comes late and slowly.
 SCENARIO = Scenario('reactor_nz4', SETPOINT, step_time=20.0, duration=SAMPLES - 1.0,
-                    plant={'reactor': 'two_state', 'noise': 0.05, 'seed': 3})
+                    plant={'reactor': 'two_state', 'noise': 0.05, 'seed': 3,
+                           'command_delay': 1.0, 'coolant_lag': 2.0})
 
 
 @pytest.fixture(scope='module')
@@ -63,6 +66,7 @@ def test_mcap_finds_every_measurement_and_command(bag: Path) -> None:
             heard[entry.channel.topic].append(entry.decoded_message)
     assert stamps(heard['/temperature']) == list(range(1, SAMPLES + 1))
     assert stamps(heard['/coolant_setpoint']) == list(range(1, SAMPLES + 1))
+    assert stamps(heard['/coolant_temperature']) == list(range(1, SAMPLES + 1))
     assert [m.temperature for m in heard['/setpoint']] == pytest.approx([SETPOINT - 273.15])
     assert heard['/active_setpoint'][-1].temperature == pytest.approx(SETPOINT - 273.15)
     assert stamps(heard['/active_setpoint']) == [1, 21]
@@ -104,14 +108,15 @@ def test_offered_qos_is_kept(bag: Path) -> None:
         offered = {channel.topic: yaml.safe_load(channel.metadata['offered_qos_profiles'])
                    for channel in channels}
     for topic, profiles in offered.items():
-        latched = topic == '/active_setpoint'
+        latched = topic in LATCHED
         assert profiles
         for profile in profiles:
             assert profile['reliability'] == 'reliable'
             assert profile['durability'] == ('transient_local' if latched else 'volatile')
     with Reader(bag) as reader:
         parsed = {c.topic: c.ext.offered_qos_profiles for c in reader.connections}
-    assert {p.durability.name.lower() for p in parsed['/active_setpoint']} == {'transient_local'}
+    for topic in LATCHED:
+        assert {p.durability.name.lower() for p in parsed[topic]} == {'transient_local'}
 
 
 def test_bare_file_describes_itself_as_rosbag2_does(bag: Path) -> None:
@@ -130,7 +135,7 @@ def test_bare_file_describes_itself_as_rosbag2_does(bag: Path) -> None:
 
 def test_second_run_is_the_same_to_the_bit(tmp_path: Path, bag: Path) -> None:
     run_loop(SCENARIO, tmp_path / 'again.mcap', tmp_path)
-    for topic in ('/temperature', '/coolant_setpoint'):
+    for topic in ('/temperature', '/coolant_setpoint', '/coolant_temperature'):
         first = temperature_series(bag, topic)
         again = temperature_series(tmp_path / 'again.mcap', topic)
         np.testing.assert_array_equal(first.stamp_ns, again.stamp_ns)

@@ -22,7 +22,6 @@ from koopman_ros.plants import (
     one_state_reactor,
     Process,
     scalar_example,
-    sensor_noise,
 )
 import numpy as np
 import pytest
@@ -71,16 +70,3 @@ def test_a_runaway_is_an_error() -> None:
     process = Process(system, 0, system.nominal_state, np.array([320.0]))
     with pytest.raises(IntegrationError, match='temperature'):
         process.until(3600 * SECOND)
-
-
-def test_noise_repeats_by_seed_and_sample() -> None:
-    values = [sensor_noise(0.1, 7, n) for n in range(4000)]
-    assert values == [sensor_noise(0.1, 7, n) for n in range(4000)]
-    assert values[:5] != [sensor_noise(0.1, 8, n) for n in range(5)]
-    # 4000 samples determine the standard deviation to about 1.1 % (one sigma)
-    assert math.isclose(np.std(values), 0.1, rel_tol=0.05)
-    assert abs(np.mean(values)) < 5 * 0.1 / math.sqrt(4000)
-
-
-def test_no_deviation_is_no_noise() -> None:
-    assert sensor_noise(0.0, 7, 3) == 0.0

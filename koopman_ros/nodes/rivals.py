@@ -1,0 +1,57 @@
+# Copyright 2026 The koopman_ros Authors
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""Others that publish where only one node may."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+
+from rclpy.clock import Clock, ClockType
+from rclpy.node import Node
+
+_LOOK_PERIOD = 0.5  # s
+
+
+class Rivals:
+    """
+    Watch topics for more than one publisher.
+
+    :param node: that watches.
+    :param what: by topic, what a publisher of it does, e.g. 'command the coolant'.
+    :param on_change: called when there are some, others, or none any more.
+    """
+
+    def __init__(self, node: Node, what: Mapping[str, str], on_change: Callable[[], None]
+                 ) -> None:
+        self._node = node
+        self._what = what
+        self._on_change = on_change
+        self.complaint = ''
+        node.create_timer(_LOOK_PERIOD, self._look, clock=Clock(clock_type=ClockType.STEADY_TIME))
+
+    def _look(self) -> None:
+        complaint = '; '.join(filter(None, map(self._complaint, self._what)))
+        if complaint != self.complaint:
+            self.complaint = complaint
+            self._on_change()
+
+    def _complaint(self, topic: str) -> str:
+        """Return who publishes a topic if there are several, or an empty string."""
+        publishers = self._node.get_publishers_info_by_topic(topic)
+        names = sorted(f'{info.node_namespace.rstrip("/")}/{info.node_name}'
+                       for info in publishers)
+        # publishers, not names: a node may have been started twice under the same
+        return '' if len(names) < 2 else (
+            f'{len(names)} nodes {self._what[topic]}: {", ".join(names)}; end all but one')

@@ -1,0 +1,43 @@
+# Copyright 2026 The koopman_ros Authors
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""What a sensor adds to the truth."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+
+
+def sensor_noise(deviation: float, seed: int, sample: int) -> float:
+    """
+    Return the noise of one sample, the same for the same seed and number.
+
+    :param deviation: standard deviation, in state units.
+    :param seed: seed of the run, not negative.
+    :param sample: number of the sample, not negative.
+    """
+    if deviation == 0.0:
+        return 0.0
+    return deviation * float(np.random.default_rng((seed, sample)).standard_normal())
+
+
+def in_steps(value: float, resolution: float) -> float:
+    """
+    Return the nearest value that a sensor of finite resolution can show.
+
+    :param resolution: distance between two such values, the multiples of it; 0 shows all.
+    """
+    return value if resolution == 0.0 else value - math.remainder(value, resolution)

@@ -1,0 +1,184 @@
+# Copyright 2026 The koopman_ros Authors
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""Tests of what stands between a command and the input of a plant."""
+
+from dataclasses import replace
+
+from koopman_ros.plants import (
+    ActuatedProcess,
+    Actuator,
+    ControlAffineSystem,
+    one_state_reactor,
+    Process,
+    two_state_reactor,
+    with_input_lag,
+)
+from koopman_ros.plants.system import FloatArray
+import numpy as np
+import pytest
+
+SECOND = 1_000_000_000
+SLOPE, GAIN = -0.7, 0.4  # 1/s, of the linear plant
+
+
+def linear() -> ControlAffineSystem:
+    """Return dx/dt = SLOPE x + GAIN u, in seconds."""
+    return ControlAffineSystem(
+        name='linear', state_names=('x',), state_units=('1',), input_names=('u',),
+        input_units=('1',), time_unit='s', drift=lambda x: SLOPE * x,
+        drift_jacobian=lambda x: np.full((*x.shape, 1), SLOPE), B=np.array([[GAIN]]),
+        nominal_state=np.zeros(1), nominal_input=np.zeros(1))
+
+
+def analytic(x: float, v: float, u: float, lag: float, seconds: float) -> tuple[float, float]:
+    """Solve the linear plant whose input v goes to u with a lag."""
+    grown, decayed = np.exp(SLOPE * seconds), np.exp(-seconds / lag)
+    steady = GAIN * u * (grown - 1.0) / SLOPE
+    transient = GAIN * (v - u) * (grown - decayed) / (SLOPE + 1.0 / lag)
+    return x * grown + steady + transient, u + (v - u) * decayed
+
+
+def actuated(actuator: Actuator, system: ControlAffineSystem | None = None) -> ActuatedProcess:
+    system = linear() if system is None else system
+    start = Process(system, 0, system.nominal_state, system.nominal_input)
+    return ActuatedProcess(start, actuator, start.u)
+
+
+def given(plant: ActuatedProcess, value: float) -> ActuatedProcess:
+    """Return a plant with a command given at its present time."""
+    return plant.commanded(np.array([value]), plant.process.time_ns)
+
+
+# The lag.
+
+
+@pytest.mark.parametrize('lag', [0.02, 1.0, 30.0])
+def test_a_lag_is_that_of_the_analytic_solution(lag: float) -> None:
+    plant = given(actuated(Actuator(lag=lag)), 2.0).until(3 * SECOND)
+    expected = analytic(0.0, 0.0, 2.0, lag, 3.0)
+    assert (plant.process.x[0], plant.process.u[0]) == pytest.approx(expected, abs=1e-9)
+    plant = given(plant, -1.0).until(5 * SECOND)
+    expected = analytic(*expected, -1.0, lag, 2.0)
+    assert (plant.process.x[0], plant.process.u[0]) == pytest.approx(expected, abs=1e-9)
+
+
+def test_a_lag_is_in_the_seconds_of_a_plant_in_minutes() -> None:
+    system = one_state_reactor()
+    late, at_once = (given(actuated(Actuator(lag=lag), system), 310.0).until(60 * SECOND).process
+                     for lag in (30.0, 0.0))
+    assert late.u[0] == pytest.approx(310.0 - 10.0 * np.exp(-2.0), abs=1e-7)
+    assert system.nominal_state[0] < late.x[0] < at_once.x[0] - 1.0
+
+
+def test_a_short_lag_in_a_long_hold_settles_to_the_bit() -> None:
+    plant = given(actuated(Actuator(lag=1e-3)), 2.0).until(3600 * SECOND)
+    assert plant.process.u[0] == 2.0
+    assert plant.process.x[0] == pytest.approx(-2.0 * GAIN / SLOPE, rel=1e-9)
+
+
+def test_a_lag_that_is_taken_away_leaves_the_command() -> None:
+    plant = given(actuated(Actuator(lag=10.0)), 2.0).until(1 * SECOND)
+    plant = replace(plant, actuator=Actuator()).until(2 * SECOND)
+    assert plant.process.u[0] == 2.0
+
+
+def test_lagged_system_is_control_affine_with_the_input_as_a_state() -> None:
+    system = two_state_reactor()
+    lagged = with_input_lag(system, 0.25)
+    assert lagged.state_names == ('concentration', 'temperature', 'coolant_temperature')
+    assert lagged.state_units == ('mol/L', 'K', 'K')
+    state, u = np.array([0.9, 320.0, 295.0]), np.array([301.0])
+    np.testing.assert_array_equal(
+        lagged.derivative(state, u), [*system.derivative(state[:2], state[2:]), 24.0])
+    step = 1e-4 * np.array([0.1, 1.0, 1.0])
+    columns: list[FloatArray] = [
+        (lagged.drift(state + shift) - lagged.drift(state - shift)) / (2.0 * size)
+        for size, shift in zip(step, np.diag(step), strict=True)]
+    np.testing.assert_allclose(
+        lagged.drift_jacobian(state), np.stack(columns, axis=-1), rtol=1e-6, atol=1e-7)
+
+
+@pytest.mark.parametrize('time_constant', [0.0, -1.0, np.inf, np.nan])
+def test_a_lagged_system_needs_a_time_constant(time_constant: float) -> None:
+    with pytest.raises(ValueError, match=r'time_constant is .* s, must be finite and above 0'):
+        with_input_lag(linear(), time_constant)
+
+
+# The delay.
+
+
+def test_without_an_actuator_the_plant_is_the_same_to_the_bit() -> None:
+    system = one_state_reactor()
+    plant, alone = actuated(Actuator(), system), actuated(Actuator(), system).process
+    for n in range(1, 20):
+        value = 300.0 + 3.0 * np.sin(n)
+        plant = given(plant, value).until(n * SECOND)
+        alone = replace(alone, u=np.array([value])).until(n * SECOND)
+        assert (plant.process.x[0], plant.process.u[0]) == (alone.x[0], alone.u[0])
+
+
+@pytest.mark.parametrize('samples', [0, 1, 3])
+def test_a_delay_of_samples_shifts_the_commands(samples: int) -> None:
+    values = [float(n * n) for n in range(10)]
+    plant = actuated(Actuator(delay=0.1 * samples))
+    acted = []
+    for n, value in enumerate(values, start=1):
+        # what acts in a hold is known at its end
+        plant = given(plant, value).until(n * SECOND // 10)
+        acted.append(plant.process.u[0])
+    assert acted == [0.0] * samples + values[:len(values) - samples]
+
+
+def test_a_delay_within_a_hold_takes_effect_in_the_middle_of_it() -> None:
+    plant = given(actuated(Actuator(delay=0.4)), 2.0).until(SECOND)
+    assert plant.process.x[0] == pytest.approx(
+        2.0 * GAIN / SLOPE * (np.exp(SLOPE * 0.6) - 1.0), abs=1e-10)
+
+
+def test_a_lag_follows_the_delay() -> None:
+    plant = given(actuated(Actuator(delay=0.5, lag=0.3)), 2.0).until(SECOND)
+    assert (plant.process.x[0], plant.process.u[0]) == pytest.approx(
+        analytic(0.0, 0.0, 2.0, 0.3, 0.5), abs=1e-9)
+
+
+def test_a_command_supersedes_those_that_would_act_later() -> None:
+    plant = given(given(actuated(Actuator(delay=5.0)), 1.0).until(SECOND), 2.0)
+    plant = given(replace(plant, actuator=Actuator(delay=4.5)), 3.0)
+    assert [(time_ns, u[0]) for time_ns, u in plant.pending] == [
+        (5 * SECOND, 1.0), (11 * SECOND // 2, 3.0)]
+    plant = given(replace(plant, actuator=Actuator()), 4.0).until(20 * SECOND)
+    assert plant.process.u[0] == plant.command[0] == 4.0
+
+
+def test_an_earlier_instant_changes_nothing() -> None:
+    plant = given(actuated(Actuator(delay=1.0)), 1.0).until(2 * SECOND)
+    assert plant.until(2 * SECOND) is plant
+    assert plant.until(SECOND) is plant
+
+
+# The range.
+
+
+def test_an_input_reaches_no_further_than_its_range() -> None:
+    plant = given(actuated(Actuator(lower=-1.0, upper=1.5)), 2.0).until(SECOND)
+    assert plant.process.u[0] == 1.5
+    assert given(plant, -2.0).until(2 * SECOND).process.u[0] == -1.0
+
+
+def test_a_range_that_narrows_moves_the_held_input() -> None:
+    plant = given(actuated(Actuator()), 2.0).until(SECOND)
+    plant = replace(plant, actuator=Actuator(upper=1.0)).until(2 * SECOND)
+    assert plant.process.u[0] == 1.0
+    assert replace(plant, actuator=Actuator()).until(3 * SECOND).process.u[0] == 2.0
