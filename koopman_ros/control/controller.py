@@ -16,19 +16,20 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from functools import cached_property
 import math
 
 from koopman_ros.control import setpoint as setpoints
-from koopman_ros.control.ladder import Need, Rung, Standing
-from koopman_ros.control.laws import Feedback, feedback, Weights
+from koopman_ros.control.choice import LawChoice
+from koopman_ros.control.estimation import Estimator
+from koopman_ros.control.ladder import Rung, Standing
+from koopman_ros.control.laws import Weights
 from koopman_ros.control.limits import limit
-from koopman_ros.control.observer import equivalent_bias, Estimate, Observer
-from koopman_ros.control.sensor import judge, Sensed, Verdict
+from koopman_ros.control.observer import equivalent_bias, Estimate
+from koopman_ros.control.sensor import Verdict
 from koopman_ros.control.setpoint import NANOSECONDS
 from koopman_ros.control.state import Mode, Report, Settings, State
-from koopman_ros.control.target import balance, Reference, reference, Target
 from koopman_ros.control.transfer import Transfer
 from koopman_ros.lifting import LiftedModel
 import numpy as np
@@ -40,23 +41,6 @@ Array = NDArray[np.float64]
 # A measurement earlier than the last by no more than this is out of order; one that is earlier
 # still means that time itself was set back.
 LATE_NANOSECONDS = NANOSECONDS
-
-
-@dataclass(frozen=True)
-class _Attempt:
-    """
-    What a law gives, or why it gives nothing.
-
-    :param u: (n_u,) in input units, within the range; None with a problem.
-    :param clipped: whether the range cut it.
-    """
-
-    u: Array | None
-    target: Target
-    found: Feedback | None = None
-    growth: float = np.nan
-    problem: str = ''
-    clipped: bool = False
 
 
 @dataclass(frozen=True)
@@ -72,21 +56,19 @@ class Controller:
     model: LiftedModel
     settings: Settings
     show: setpoints.Show = setpoints.in_state_units
-    _references: dict[bool, Reference] = field(
-        default_factory=dict, init=False, compare=False, repr=False)
 
     @cached_property
+    def _estimator(self) -> Estimator:
+        return Estimator(self.model, self.settings, self.show)
+
+    @cached_property
+    def _laws(self) -> LawChoice:
+        return LawChoice(self._estimator)
+
+    @property
     def weights(self) -> Weights:
         """The cost in the model's scaled deviations."""
-        return Weights(np.diag(self.settings.state_weight * self.model.states.scale ** 2),
-                       np.diag(self.settings.input_weight * self.model.inputs.scale ** 2))
-
-    @cached_property
-    def _observers(self) -> tuple[Observer, Observer]:
-        """The observer with the learned model and with the linear one, which share their units."""
-        bound = self.settings.max_disturbance / float(np.max(self.model.inputs.scale))
-        return (Observer(self.model, self.settings.observer_bandwidth, bound),
-                Observer(self.model.linearised, self.settings.observer_bandwidth, bound))
+        return self._laws.weights
 
     @cached_property
     def safe_input(self) -> Array:
@@ -142,7 +124,7 @@ class Controller:
         if mode is state.mode:
             return state
         return replace(state, mode=mode, manual_input=None, standing=Standing(),
-                       estimate=self._rebased(state.estimate, state.linear, False))
+                       estimate=self._estimator.rebase(state.estimate, state.linear, False))
 
     # What happens to the controller itself.
 
@@ -169,35 +151,14 @@ class Controller:
         :param state: the state it left.
         :return: the state in this controller's units.
         """
-        estimate = state.estimate
-        old, new = predecessor.model, self.model
-        if estimate is not None and old is not new:
-            basis = old.linearised if state.linear else old
-            x = old.states.to_physical(estimate.x)
-            # rates per second, which all models share
-            factor = (old.states.scale / old.seconds_per_time_unit
-                      / (new.states.scale / new.seconds_per_time_unit))
-            rest = estimate.w + basis.drift(estimate.x) + old.B @ self._old_input(old, state)
-            w = factor * rest - new.B @ self._old_input(new, state)
-            estimate = self._observers[state.linear].rebased(
-                Estimate(new.states.to_deviation(x), w), np.zeros_like(w))
-        if estimate is not None and not self.settings.observer_bandwidth > 0.0:
-            estimate = Estimate(estimate.x, np.zeros_like(estimate.w))
-        # the disturbance that froze with a measurement is in the old units
-        sensed = None if old is not new else state.sensed
-        state = replace(state, estimate=estimate, sensed=sensed)
-        if state.law_in_force is None or state.law_input is None or estimate is None:
+        state = self._estimator.inherit(predecessor._estimator, state)
+        if state.law_in_force is None or state.law_input is None or state.estimate is None:
             return state
-        now = self._attempt(state, state.law_in_force, estimate)
+        now = self._laws.attempt(state, state.law_in_force, state.estimate)
         if now.u is None:
             return state
         return replace(state, law_input=now.u, transfer=_shifted(
             state.transfer, state.law_input - now.u))
-
-    @staticmethod
-    def _old_input(model: LiftedModel, state: State) -> Array:
-        command = model.inputs.center if state.command is None else state.command
-        return model.inputs.to_deviation(command)
 
     def try_law(self, x: Array, setpoint: Array) -> str:
         """
@@ -208,7 +169,7 @@ class Controller:
         state = replace(State(), setpoint=setpoints.Setpoint(setpoint, setpoint))
         estimate = Estimate(self.model.states.to_deviation(x), np.zeros(self.model.n_x))
         with np.errstate(all='ignore'):
-            return self._attempt(state, Rung.LEARNED, estimate).problem
+            return self._laws.attempt(state, Rung.LEARNED, estimate).problem
 
     # Steps.
 
@@ -243,7 +204,8 @@ class Controller:
         state, seconds, missed = _passed(state, time_ns, elapsed)
         # a measurement of 1e300 may overflow on its way; the result is checked and limited
         with np.errstate(all='ignore'):
-            state, verdict, predicted = self._observed(state, measurement, time_ns, elapsed)
+            state, verdict, predicted = self._estimator.observe(
+                state, measurement, time_ns, elapsed)
             if not verdict.fault:
                 state = replace(state, setpoint=setpoints.advance(
                     state.setpoint, measurement, self.model, self.settings.setpoint_ramp,
@@ -274,7 +236,7 @@ class Controller:
         elapsed = max(0.0, (time_ns - since_ns) / NANOSECONDS)
         silent = (time_ns - state.time_ns) / NANOSECONDS
         with np.errstate(all='ignore'):
-            state = self._coasted(state, elapsed)
+            state = self._estimator.coast(state, elapsed)
             state, wanted, report = self._wanted(state, Verdict(
                 state.sensed, f'no measurement for {silent:.0f} s: check sensor and plant'),
                 np.nan, time_ns, elapsed)
@@ -291,71 +253,8 @@ class Controller:
         """
         if state.estimate is None:
             return np.full(self.model.n_x, np.nan)
-        model = self.model.linearised if state.linear else self.model
+        model = self._estimator.observer(state.linear).model
         return equivalent_bias(model, state.estimate) * self.model.states.scale
-
-    # Measurement to estimate.
-
-    def _observed(self, state: State, x: Array, time_ns: int, elapsed: float
-                  ) -> tuple[State, Verdict, Array | None]:
-        """Judge a measurement; return what is believed, and what was expected in state units."""
-        states, before, sensed = self.model.states, state.estimate, state.sensed
-        # a run of measurements not believed leaves little of what was known of the state
-        lost = sensed is not None and sensed.time_ns != state.time_ns and (
-            (time_ns - sensed.time_ns) / NANOSECONDS * self.settings.observer_bandwidth > 2.0)
-        coasted = self._coasted(state, elapsed)
-        predicted = coasted.estimate
-        w = np.zeros(self.model.n_x) if before is None else before.w
-
-        def motion(then: Sensed) -> Array:
-            if before is None or state.command is None:
-                return np.zeros_like(x)
-            u = self.model.inputs.to_deviation(state.command)
-            moved = self._observers[state.linear].predict(Estimate(before.x, then.w), u, elapsed)
-            return np.zeros_like(x) if moved is None else (moved.x - before.x) * states.scale
-
-        verdict = judge(self.settings.sensor, states, sensed, x, time_ns, w, motion, self.show)
-        expected = None if predicted is None else states.to_physical(predicted.x)
-        if verdict.fault:
-            if verdict.frozen and predicted is not None and sensed is not None:
-                # what the observer made of a sensor that does not move is no disturbance
-                predicted = Estimate(predicted.x, sensed.w)
-            return replace(state, sensed=verdict.sensed, time_ns=time_ns,
-                           estimate=predicted), verdict, expected
-        xi = states.to_deviation(x)
-        observer = self._observers[state.linear]
-        if not observer.bandwidth > 0.0:
-            estimate = Estimate(xi, np.zeros_like(xi))
-        elif before is None and state.command is not None:
-            estimate = observer.at_rest(xi, self.model.inputs.to_deviation(state.command))
-        elif predicted is None or before is None or not elapsed > 0.0 or verdict.moved or lost or (
-                states.violation(x) > self.settings.ladder.linear_margin):
-            estimate = Estimate(xi, w)
-        else:
-            estimate = observer.correct(predicted, xi, elapsed)
-        return replace(state, sensed=verdict.sensed, time_ns=time_ns,
-                       estimate=estimate), verdict, expected
-
-    def _coasted(self, state: State, elapsed: float) -> State:
-        """Carry the estimate forward without a measurement; None when it is lost."""
-        if state.estimate is None or state.command is None or not elapsed > 0.0:
-            return state
-        u = self.model.inputs.to_deviation(state.command)
-        predicted = self._observers[state.linear].predict(state.estimate, u, elapsed)
-        if predicted is None or not np.all(np.isfinite(predicted.x)):
-            # of the state nothing is known any more; the disturbance is kept
-            predicted = state.estimate
-        return replace(state, estimate=predicted)
-
-    def _rebased(self, estimate: Estimate | None, was_linear: bool, linear: bool
-                 ) -> Estimate | None:
-        """Carry an estimate over from the learned model to the linear one, or back."""
-        if estimate is None or was_linear == linear or not self.settings.observer_bandwidth > 0.0:
-            return estimate
-        return self._observers[linear].rebased(
-            estimate, self._observers[was_linear].model.drift(estimate.x))
-
-    # Estimate to command.
 
     def _wanted(self, state: State, verdict: Verdict, outside: float, time_ns: int,
                 elapsed: float, spacing: float = 0.0) -> tuple[State, Array, Report]:
@@ -366,11 +265,10 @@ class Controller:
             wanted = held if state.manual_input is None else state.manual_input
             state = replace(state, law_in_force=None, law_input=None, transfer=None)
             return state, wanted, self._report(state, Rung.LEARNED, verdict.fault)
-        standing, attempt = self._decided(
-            state, verdict, outside, time_ns, spacing)
+        standing, attempt = self._laws.choose(state, verdict, outside, time_ns, spacing)
         was_linear = state.linear
         state = replace(state, standing=standing)
-        state = replace(state, estimate=self._rebased(
+        state = replace(state, estimate=self._estimator.rebase(
             state.estimate, was_linear, state.linear))
         report = self._report(state, standing.rung, standing.reason)
         if attempt is not None and attempt.found is not None:
@@ -394,75 +292,9 @@ class Controller:
             return state, attempt.u, report
         return state, attempt.u + transfer.offset, replace(report, transfer=transfer.offset)
 
-    def _decided(self, state: State, verdict: Verdict, outside: float, time_ns: int,
-                 spacing: float) -> tuple[Standing, _Attempt | None]:
-        """Find the rung to stand on, and what its law gives."""
-        settings = self.settings.ladder
-        interval = spacing / self.model.seconds_per_time_unit
-        if verdict.fault:
-            need = Need(Rung.HOLD, verdict.fault, passing=True)
-        else:
-            need = state.standing.allowed(settings, outside, self._where_outside(state))
-        attempt = None
-        while True:
-            standing = state.standing.at(settings, need, time_ns)
-            if standing.rung not in (Rung.LEARNED, Rung.LINEAR) or state.estimate is None:
-                return standing, attempt
-            estimate = self._rebased(
-                state.estimate, state.linear, standing.rung is Rung.LINEAR)
-            assert estimate is not None
-            attempt = self._attempt(state, standing.rung, estimate, interval)
-            if not attempt.problem:
-                return standing, attempt
-            below = Rung.LINEAR if standing.rung is Rung.LEARNED else Rung.HOLD
-            need = Need(below, f'the {standing.rung.value} fails: {attempt.problem}')
-
     def _outside(self, x: Array) -> float:
         """Return how far a measurement is outside the training box; NaN when it is none."""
         return self.model.states.violation(x) if np.all(np.isfinite(x)) else np.nan
-
-    def _where_outside(self, state: State) -> str:
-        """Say in words what lies outside the training box."""
-        states = self.model.states
-        ranges = ', '.join(
-            f'{name} {self.show(lower, unit)} to {self.show(upper, unit)}'
-            for name, unit, lower, upper in zip(states.names, states.units, states.lower,
-                                                states.upper, strict=True))
-        return f'outside the trained range ({ranges})'
-
-    def _attempt(self, state: State, rung: Rung, estimate: Estimate, interval: float = 0.0
-                 ) -> _Attempt:
-        """Evaluate a law at an estimate that is in terms of the law's model."""
-        linear = rung is Rung.LINEAR
-        model = self.model.linearised if linear else self.model
-        assert state.setpoint.active is not None
-        x_ref = self.model.states.to_deviation(state.setpoint.active)
-        known = self._references.get(linear)
-        if known is None or not np.array_equal(known.x, x_ref):
-            # a memory of the last set-point only; what comes out does not depend on it
-            known = self._references[linear] = reference(model, x_ref)
-        target = balance(model, known, estimate.w)
-        try:
-            found = feedback(model, estimate.x, target, self.weights,
-                             max_gain=self.settings.max_gain,
-                             max_residual=self.settings.max_residual)
-            growth = found.growth(interval) if found.solved else np.nan
-        except np.linalg.LinAlgError as error:
-            return _Attempt(None, target, problem=f'{error}')
-        if not found.solved:
-            return _Attempt(None, target, found,
-                            problem=f'no feedback gain: {found.riccati.status.value}')
-        if not growth < 1.0:
-            return _Attempt(None, target, found, growth, (
-                f'the closed loop is predicted unstable at a sample every '
-                f'{interval * model.seconds_per_time_unit:.3g} s: '
-                'raise the input weight, or measure more often'))
-        u = self.model.inputs.to_physical(found.u)
-        if not np.all(np.isfinite(u)):
-            return _Attempt(None, target, found, growth, 'its command is not finite')
-        limits = self.settings.limits
-        within = np.clip(u, limits.lower, limits.upper)
-        return _Attempt(within, target, found, growth, clipped=bool(np.any(within != u)))
 
     def _report(self, state: State, rung: Rung, reason: str) -> Report:
         """Return what is known without a law."""
@@ -472,7 +304,7 @@ class Controller:
             setpoint_outside=np.nan if active is None else self.model.states.violation(active))
         if estimate is None:
             return report
-        observer = self._observers[state.linear]
+        observer = self._estimator.observer(state.linear)
         disturbance = observer.as_input(estimate.w)
         return replace(
             report, estimate=self.model.states.to_physical(estimate.x),

@@ -143,7 +143,7 @@ class Standing:
         if (time_ns - since) / NANOSECONDS >= settings.recovery_time:
             return Standing(need.rung, need.reason, None, bad_since)
         reason = self.reason.removesuffix(_RECOVERING) + _RECOVERING
-        return Standing(present, reason, None, bad_since, since)
+        return Standing(present, reason, None, self.bad_since_ns, since)
 
 
 _RECOVERING = ' (over, waiting for it to stay so)'

@@ -247,7 +247,9 @@ def running_loop(scenario: Scenario, logs: Path, trainer: Mapping[str, object],
 def _processes(scenario: Scenario, logs: Path, environment: dict[str, str],
                trainer_parameters: Mapping[str, object], operator: Operator,
                spin: Callable[[], None]) -> Iterator[Loop]:
-    with (NodeProcess('controller', {'model': scenario.model}, logs / 'controller.log',
+    # the observer would make up for what a model does not know, which is what is to be seen here
+    with (NodeProcess('controller', {'model': scenario.model, 'observer_bandwidth': 0.0},
+                      logs / 'controller.log',
                       environment) as controller,
           NodeProcess('trainer', trainer_parameters, logs / 'trainer.log', environment
                       ) as trainer):

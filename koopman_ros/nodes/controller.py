@@ -17,27 +17,36 @@
 from __future__ import annotations
 
 import sys
-import time
 
-from koopman_ros.control import Controller, Mode, Report, State
+from koopman_ros.control import Controller, Mode, Report, Rung, State
 from koopman_ros.nodes import topics, translation
+from koopman_ros.nodes.arrival import Arrival
 from koopman_ros.nodes.controller_parameters import ControllerParameters, TABLE
-from koopman_ros.nodes.diagnostics import DiagnosticsPublisher, Level, Status
+from koopman_ros.nodes.controller_status import Counts, internals, Situation, status
+from koopman_ros.nodes.diagnostics import DiagnosticsPublisher, Status
 from koopman_ros.nodes.messages import (
     NANOSECONDS,
+    stamp_message,
     stamp_nanoseconds,
     temperature_message,
-    to_celsius,
     to_kelvin,
 )
-from koopman_ros.nodes.model_loading import load_suitable, Situation
+from koopman_ros.nodes.model_loading import load_suitable
+from koopman_ros.nodes.model_loading import Situation as ModelSituation
 from koopman_ros.nodes.model_reload import ModelReload
 from koopman_ros.nodes.process import LoopNode, run
+from koopman_ros.nodes.rivals import Rivals
 import numpy as np
 from rclpy.callback_groups import MutuallyExclusiveCallbackGroup
+from rclpy.clock import Clock, ClockType
 from rclpy.qos_overriding_options import QoSOverridingOptions
-from sensor_msgs.msg import Temperature
+from rclpy.timer import Timer
+from sensor_msgs.msg import JointState, Temperature
 from std_srvs.srv import SetBool, Trigger
+
+_WATCH_PERIOD = 0.1  # s by the wall
+_WATCH_STEP = NANOSECONDS // 2  # of plant time between two commands without a measurement
+_COOLANT_PATIENCE = 0.5  # s that the first answer waits for the coolant that is in force
 
 
 class ControllerNode(LoopNode):
@@ -48,20 +57,27 @@ class ControllerNode(LoopNode):
         parameters = TABLE.declare(self)
         self._settings = parameters
         self._models = ModelReload(
-            self, load_suitable(parameters.model), self._situation, self._on_model)
-        self._controller = Controller(self._models.in_force.model, parameters.settings())
+            self, load_suitable(parameters.model), self._model_situation, self._on_model)
+        self._controller = self._built()
         self._state = State()
         self._report = Report(Mode.AUTOMATIC)
         self._refused = ''
-        self._measurements = self._late = 0
+        self._counts = Counts()
         self._temperature = np.nan
-        self._last_heard = time.monotonic()
-        self._setpoint_received = False
+        self._arrival = Arrival(self)
+        self._coolant: Temperature | None = None
+        self._waiting: list[Temperature] = []  # measurements that came before the coolant
+        self._patience: Timer | None = None
+        self._frame_id = ''
 
         self._commands = self.create_publisher(
             Temperature, topics.COOLANT_SETPOINT, topics.LOOP_QOS)
         self._active = self.create_publisher(
             Temperature, topics.ACTIVE_SETPOINT, topics.LATCHED_QOS)
+        self._predicted = self.create_publisher(
+            Temperature, topics.PREDICTED_TEMPERATURE, topics.LOOP_QOS)
+        self._internals = self.create_publisher(
+            JointState, topics.CONTROLLER_STATE, topics.LOOP_QOS)
         self._published_setpoint: float | None = None
         self._diagnostics = DiagnosticsPublisher(self, 'control', 'controller', self._status)
         # volatile, so that `ros2 topic pub` matches
@@ -69,35 +85,116 @@ class ControllerNode(LoopNode):
             Temperature, topics.SETPOINT, self._on_setpoint, topics.LOOP_QOS)
         self.create_subscription(Temperature, topics.MANUAL_COOLANT_SETPOINT,
                                  self._on_manual_coolant_setpoint, topics.LOOP_QOS)
+        self.create_subscription(Temperature, topics.COOLANT_TEMPERATURE, self._on_coolant,
+                                 topics.LATCHED_QOS)
         # a sensor driver that publishes best effort needs this overridden to match
-        self.create_subscription(
+        self._measurements = self.create_subscription(
             Temperature, topics.TEMPERATURE, self._on_temperature, topics.LOOP_QOS,
             qos_overriding_options=QoSOverridingOptions.with_default_policies())
         self.create_service(SetBool, '~/set_automatic', self._on_set_automatic)
         # a group of its own, or measurements would wait until a model is read
         self.create_service(Trigger, '~/reload_model', self._models.on_reload,
                             callback_group=MutuallyExclusiveCallbackGroup())
+        # the plant's time may stand still, and be asked for nevertheless
+        self._steady = Clock(clock_type=ClockType.STEADY_TIME)
+        self.create_timer(_WATCH_PERIOD, self._on_watch, clock=self._steady)
+        self._rivals = Rivals(self, {
+            topics.COOLANT_SETPOINT: 'command the coolant',
+            topics.TEMPERATURE: 'publish the temperature'}, self._on_rivals)
         TABLE.follow(self, parameters, self._on_parameters, self._models.accept)
         self.get_logger().info(self._models.in_force.about)
 
+    # Measurements and their absence.
+
     def _on_temperature(self, message: Temperature) -> None:
-        self._measurements += 1
-        self._temperature = message.temperature
-        self._last_heard = time.monotonic()
-        self._state, command, self._report = translation.answer(
+        if self._waiting or self._lacks_coolant():
+            self._waiting.append(message)
+            if self._patience is None:
+                self._patience = self.create_timer(
+                    _COOLANT_PATIENCE, self._answer_waiting, clock=self._steady)
+            return
+        self._answer(message)
+
+    def _lacks_coolant(self) -> bool:
+        """Tell whether the coolant in force will be known in a moment."""
+        return (self._state.command is None and self._coolant is None
+                and self._patience is None
+                and self.count_publishers(topics.COOLANT_TEMPERATURE) > 0)
+
+    def _on_coolant(self, message: Temperature) -> None:
+        self._coolant = message
+        if self._waiting:
+            self._answer_waiting()
+
+    def _answer_waiting(self) -> None:
+        if self._patience is not None:
+            self._patience.cancel()
+        waiting, self._waiting = self._waiting, []
+        for message in waiting:
+            self._answer(message)
+
+    def _answer(self, message: Temperature) -> None:
+        stamp_ns = stamp_nanoseconds(message.header.stamp)
+        if stamp_ns != self._state.time_ns:
+            self._arrival.note(stamp_ns)
+        if self._state.command is None and self._coolant is not None:
+            self._state = translation.take_over(self._controller, self._state, self._coolant)
+        self._state, command, report = translation.answer(
             self._controller, self._state, message)
-        self._late += self._report.late
         self._commands.publish(temperature_message(
             command, message.header.stamp, message.header.frame_id))
-        active = self._report.active_setpoint
+        self._arrival.answered()
+        self._temperature = message.temperature
+        self._frame_id = message.header.frame_id
+        self._counts.measurements += 1
+        self._counts.late += report.late
+        self._counts.missed += report.missed
+        self._counts.refused += report.rung is Rung.HOLD
+        self._tell(report, message.header.stamp)
+
+    def _on_watch(self) -> None:
+        """Hold the command, and go to the safe coolant, when measurements stay away."""
+        timeout, silence = self._settings.measurement_timeout, self._arrival.silence
+        state = self._state
+        if not timeout or not silence > timeout or state.time_ns is None:
+            return
+        now_ns = state.time_ns + round(silence * NANOSECONDS)
+        if state.commanded_ns is not None and now_ns - state.commanded_ns < _WATCH_STEP:
+            return
+        self._state, command, report = translation.watch(self._controller, state, now_ns)
+        if command is not None:
+            stamp = stamp_message(now_ns)
+            self._commands.publish(temperature_message(command, stamp, self._frame_id))
+            self._tell(report, stamp)
+
+    def _tell(self, report: Report, stamp: object) -> None:
+        """Publish what is known beside the command."""
+        before, self._report = self._report, report
+        active = report.active_setpoint
         if active is not None and active[0] != self._published_setpoint:
             self._published_setpoint = float(active[0])
             self._active.publish(temperature_message(
-                float(active[0]), message.header.stamp, message.header.frame_id))
-        if self._report.clock_went_back:
+                float(active[0]), stamp, self._frame_id))
+        if report.predicted is not None:
+            self._predicted.publish(temperature_message(
+                float(report.predicted[0]), stamp, self._frame_id))
+        self._internals.publish(internals(report, stamp, self._frame_id))
+        if report.rung is not before.rung:
+            self._log_transition(before.rung, report)
+        if report.clock_went_back:
             self.get_logger().warning('the measurement is older than the last one: time starts '
                                       'afresh', throttle_duration_sec=1.0)
         self._diagnostics.publish_if_changed()
+
+    def _log_transition(self, before: Rung, report: Report) -> None:
+        if report.rung.depth > before.depth:
+            self.get_logger().warning(f'{before.value} -> {report.rung.value}: {report.reason}',
+                                      throttle_duration_sec=1.0)
+        else:
+            self.get_logger().info(f'{before.value} -> {report.rung.value}',
+                                   throttle_duration_sec=1.0)
+
+    # The operator.
 
     def _on_setpoint(self, message: Temperature) -> None:
         stamp_ns = stamp_nanoseconds(message.header.stamp)
@@ -106,7 +203,7 @@ class ControllerNode(LoopNode):
         if self._refused:
             self.get_logger().warning(self._refused, throttle_duration_sec=1.0)
         else:
-            self._setpoint_received = True
+            self._counts.setpoint_received = True
             scheduled = any(entry[0] == stamp_ns for entry in self._state.setpoint.scheduled)
             when = f', holds from {stamp_ns / NANOSECONDS:.3f} s on' if scheduled else ''
             self.get_logger().info(f'set-point {message.temperature:.6g} degC accepted{when}',
@@ -130,9 +227,15 @@ class ControllerNode(LoopNode):
         self._diagnostics.publish_if_changed()
         return response
 
-    def _situation(self) -> Situation:
-        return Situation(self._settings.settings(), self._state,
-                         np.array([to_kelvin(self._temperature)]))
+    # Settings and models.
+
+    def _built(self) -> Controller:
+        return translation.controller_of(
+            self._models.in_force.model, self._settings.settings())
+
+    def _model_situation(self) -> ModelSituation:
+        return ModelSituation(self._settings.settings(), self._state,
+                              np.array([to_kelvin(self._temperature)]))
 
     def _on_parameters(self, parameters: ControllerParameters) -> None:
         self._settings = parameters
@@ -140,58 +243,22 @@ class ControllerNode(LoopNode):
         self._on_model()
 
     def _on_model(self) -> None:
-        self._controller = Controller(self._models.in_force.model, self._settings.settings())
+        predecessor, self._controller = self._controller, self._built()
+        self._state = self._controller.succeed(predecessor, self._state)
+        self._diagnostics.publish_if_changed()
+
+    # Diagnostics.
+
+    def _on_rivals(self) -> None:
+        if self._rivals.complaint:
+            self.get_logger().warning(self._rivals.complaint)
         self._diagnostics.publish_if_changed()
 
     def _status(self) -> Status:
-        report, model = self._report, self._controller.model
-        mode = self._state.mode
-        level, message = Level.OK, mode.value
-        silent = time.monotonic() - self._last_heard
-        if not self._measurements:
-            level, message = Level.WARN, 'waiting for the first temperature measurement'
-        elif silent > self._settings.measurement_timeout:
-            level, message = Level.ERROR, (
-                f'no measurement for more than {self._settings.measurement_timeout:g} s: the last '
-                'command stays in force; check sensor and plant')
-        elif report.problem:
-            level, message = Level.ERROR, report.problem
-        elif report.clock_stood_still:
-            level, message = Level.WARN, (
-                'the stamp of the measurement does not advance: the last command is held; stamp '
-                'measurements with their time')
-        elif self._refused:
-            level, message = Level.WARN, f'request refused: {self._refused}'
-        elif self._models.refused:
-            level, message = Level.WARN, self._models.refused
-        elif report.outside > 0.0:
-            level, message = Level.WARN, (
-                f'temperature is outside the trained range '
-                f'[{to_celsius(model.states.lower[0]):.2f}, '
-                f'{to_celsius(model.states.upper[0]):.2f}] degC: the model extrapolates')
-        elif mode is Mode.AUTOMATIC and not self._setpoint_received:
-            message += ', no set-point yet: the temperature first measured is held'
-        elif report.at_range:
-            message += ', coolant at its limit'
-        elif report.at_rate:
-            message += ', coolant at its rate limit'
-        active = report.active_setpoint
-        command = self._state.command
-        return Status(level, message, {
-            'mode': mode.value,
-            'law': 'none' if report.law is None else report.law.value,
-            **self._models.figures(),
-            'temperature [degC]': float(self._temperature),
-            'set-point [degC]': np.nan if active is None else to_celsius(float(active[0])),
-            'coolant [degC]': np.nan if command is None else to_celsius(float(command[0])),
-            'distance outside training box [half widths]': float(report.outside),
-            'Riccati residual': float(report.residual),
-            'gain norm': float(report.gain),
-            'scheduled set-points': len(self._state.setpoint.scheduled),
-            'measurements': self._measurements,
-            'late measurements': self._late,
-            'since last measurement [s]': silent,
-        })
+        return status(Situation(
+            self._controller, self._settings, self._state, self._report, self._counts,
+            self._arrival, self._rivals.complaint, self._refused, self._models.refused,
+            self._models.figures(), self._temperature))
 
 
 def main(args: list[str] | None = None) -> int:

@@ -43,12 +43,14 @@ class Status:
 
     :param level: severity.
     :param message: one sentence an operator reads.
-    :param values: figures with their units in the key, e.g. ``{'temperature [degC]': 51.3}``.
+    :param values: figures with their units in the key, e.g. ``{'temperature [degC]': 51.3}``, or
+        what returns them, to be called only when they are published.
     """
 
     level: Level
     message: str
-    values: Mapping[str, object] = field(default_factory=dict)
+    values: Mapping[str, object] | Callable[[], Mapping[str, object]] = field(
+        default_factory=dict)
 
 
 class DiagnosticsPublisher:
@@ -76,13 +78,14 @@ class DiagnosticsPublisher:
         """Publish the present status."""
         status = self._collect()
         self._last = (status.level, status.message)
+        values = status.values() if callable(status.values) else status.values
         message = DiagnosticArray()
         message.header.stamp = stamp_message(time.time_ns())
         message.status.append(DiagnosticStatus(
             level=status.level.value, name=self._name, message=status.message,
             hardware_id=self._hardware_id,
             values=[KeyValue(key=key, value=as_text(value))
-                    for key, value in status.values.items()]))
+                    for key, value in values.items()]))
         self._publisher.publish(message)
 
     def publish_if_changed(self) -> None:

@@ -18,13 +18,14 @@
 from __future__ import annotations
 
 import contextlib
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from datetime import datetime, UTC
 
-from koopman_ros.control import Controller, Mode, Setpoint, Settings, State
+from koopman_ros.control import Settings, State
 from koopman_ros.lifting import LiftedModel, load, ModelFileError
 from koopman_ros.nodes.messages import in_celsius
 from koopman_ros.nodes.shipped import model_path
+from koopman_ros.nodes.translation import controller_of
 import numpy as np
 from numpy.typing import NDArray
 
@@ -100,12 +101,12 @@ def refuse_setpoints(model: LiftedModel, situation: Situation) -> None:
 
     :raises ModelFileError: naming the set-point and the trained range.
     """
-    controller = Controller(model, situation.settings)
+    controller = controller_of(model, situation.settings)
     setpoint = situation.state.setpoint
     asked = [value for _, value in setpoint.scheduled]
     asked += [value for value in (setpoint.requested, setpoint.active) if value is not None]
     for value in asked:
-        reason = controller.request_setpoint(situation.state, value, 0, in_celsius)[1]
+        reason = controller.request_setpoint(situation.state, value)[1]
         if reason:
             raise ModelFileError(reason)
 
@@ -116,21 +117,14 @@ def refuse_without_law(model: LiftedModel, situation: Situation) -> None:
 
     :raises ModelFileError: naming the temperature and the reason.
     """
-    controller = Controller(model, situation.settings)
+    controller = controller_of(model, situation.settings)
     asked = (situation.state.setpoint.active, situation.state.setpoint.requested)
     for setpoint in [value for value in asked if value is not None] or [model.states.center]:
-        state = replace(situation.state, mode=Mode.AUTOMATIC,
-                        setpoint=Setpoint(requested=setpoint, active=setpoint))
         for place in (setpoint, situation.measured):
-            # neither before the first measurement nor below absolute zero
-            if not 0.0 <= place[0] < np.inf:
+            # neither before the first measurement, nor where the learned law would not act
+            if not model.states.violation(place) <= situation.settings.ladder.validity_margin:
                 continue
-            try:
-                # a nanosecond on: the same stamp again would only repeat the last command
-                problem = controller.step(state, place, (state.time_ns or 0) + 1)[2].problem
-            except np.linalg.LinAlgError as error:
-                problem = str(error)
-            if problem:
+            if problem := controller.try_law(place, setpoint):
                 raise ModelFileError(
                     f'tried at {in_celsius(float(place[0]))} with the set-point '
                     f'{in_celsius(float(setpoint[0]))} the model fails ({problem}): train it '

@@ -21,6 +21,7 @@ from dataclasses import dataclass
 from koopman_ros.nodes.parameters import parameter, ParameterTable
 from koopman_ros.nodes.topics import (
     COOLANT_SETPOINT,
+    COOLANT_TEMPERATURE,
     MANUAL_COOLANT_SETPOINT,
     refusal,
     SETPOINT,
@@ -34,7 +35,7 @@ class PlayerParameters:
 
     bag: str = parameter('run_1', 'bag to play: a .mcap file or a bag folder', read_only=True)
     topics: tuple[str, ...] = parameter(
-        (TEMPERATURE, SETPOINT, MANUAL_COOLANT_SETPOINT),
+        (COOLANT_TEMPERATURE, TEMPERATURE, SETPOINT, MANUAL_COOLANT_SETPOINT),
         'topics to play; a relative name stands for that below / in the bag, and follows '
         'namespaces and remaps when it is published', read_only=True)
     rate: float = parameter(

@@ -21,7 +21,6 @@ from dataclasses import replace
 from pathlib import Path
 import sys
 
-from koopman_ros.control import Controller
 from koopman_ros.nodes import topics
 from koopman_ros.nodes.model_loading import load_suitable
 from koopman_ros.nodes.process import run_task
@@ -30,6 +29,7 @@ from koopman_ros.nodes.replaying.comparison import compare, ReplayedBag
 from koopman_ros.nodes.replaying.record import Names, read_record
 from koopman_ros.nodes.replaying.report import reproduced, verdict, write_report
 from koopman_ros.nodes.replaying.steps import commands_of, replay
+from koopman_ros.nodes.translation import controller_of
 import numpy as np
 from rclpy.node import Node
 
@@ -77,12 +77,12 @@ def replayed_bag(path: str, names: Names, parameters: ReplayParameters) -> Repla
     old = load_suitable(parameters.model).model
     new = load_suitable(parameters.new_model).model if parameters.new_model else None
     record = read_record(path, names, recover=parameters.recover)
-    replayed = replay(record, Controller(old, settings))
+    replayed = replay(record, controller_of(old, settings))
     commands = np.array([sample.replayed for sample in replayed.samples])
     bag = ReplayedBag(path, record, old.states, replayed, compare(replayed, commands, tolerance))
     if new is None:
         return bag
-    commands = commands_of(Controller(new, settings), replayed)
+    commands = commands_of(controller_of(new, settings), replayed)
     return replace(bag, new_commands=commands, new=compare(replayed, commands, tolerance),
                    new_range=new.states)
 

@@ -24,9 +24,15 @@ from __future__ import annotations
 import math
 from typing import Any
 
-from koopman_ros.control import Controller, Report, State
+from koopman_ros.control import Controller, Report, Settings, State
+from koopman_ros.lifting import LiftedModel
 from koopman_ros.nodes.messages import in_celsius, stamp_nanoseconds, to_celsius, to_kelvin
 import numpy as np
+
+
+def controller_of(model: LiftedModel, settings: Settings) -> Controller:
+    """Return the controller that speaks to an operator in degrees Celsius."""
+    return Controller(model, settings, in_celsius)
 
 
 def answer(controller: Controller, state: State, message: Any) -> tuple[State, float, Report]:
@@ -46,11 +52,27 @@ def answer(controller: Controller, state: State, message: Any) -> tuple[State, f
     return state, float(command[0]), report
 
 
+def watch(controller: Controller, state: State, stamp_ns: int
+          ) -> tuple[State, float | None, Report]:
+    """
+    Answer that nothing has been measured up to a time.
+
+    :return: the new state, the coolant temperature commanded in K or None, and the report.
+    """
+    state, command, report = controller.watch(state, stamp_ns)
+    return state, None if command is None else float(command[0]), report
+
+
+def take_over(controller: Controller, state: State, message: Any) -> State:
+    """Start from a coolant temperature that is in force already."""
+    return controller.take_over(state, np.array([to_kelvin(message.temperature)]))
+
+
 def ask_setpoint(controller: Controller, state: State, message: Any) -> tuple[State, str]:
     """Ask for a set-point; return the new state and an empty string, or why it is refused."""
     return controller.request_setpoint(
         state, np.array([to_kelvin(message.temperature)]),
-        stamp_nanoseconds(message.header.stamp), in_celsius)
+        stamp_nanoseconds(message.header.stamp))
 
 
 def ask_manual_coolant(controller: Controller, state: State, message: Any) -> tuple[State, str]:

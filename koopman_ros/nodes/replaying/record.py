@@ -57,14 +57,36 @@ class Names:
 
 
 @dataclass(frozen=True)
+class Silence:
+    """
+    No measurement up to a time, which the controller answered with a command.
+
+    :param stamp_ns: that of the command.
+    """
+
+    stamp_ns: int
+
+
+@dataclass(frozen=True)
+class TakeOver:
+    """
+    A start from the coolant temperature that was in force, in degrees Celsius.
+
+    :param temperature: as in a message.
+    """
+
+    temperature: float
+
+
+@dataclass(frozen=True)
 class Input:
     """
-    What came to the controller: a message of one of its topics, a mode, or a new beginning.
+    What came to the controller: a message of one of its topics, or something else that happened.
 
-    :param topic: absolute name; empty for a change of mode and a start.
+    :param topic: absolute name; empty when it was no message.
     :param time_ns: when it was recorded.
-    :param message: with the fields of sensor_msgs/Temperature, or the mode, or None when the
-        controller was started again.
+    :param message: with the fields of sensor_msgs/Temperature, or a mode, a silence, a take-over,
+        or None when the controller was started again.
     :param command: for a temperature, what was commanded in degrees Celsius, or None.
     :param active: for a temperature, the set-point that changed with it in degrees Celsius.
     """
@@ -149,6 +171,7 @@ class _Answers:
 
     def __init__(self) -> None:
         self.in_order: list[tuple[int, int, float]] = []
+        self.taken: set[tuple[int, int]] = set()
         self._by_stamp: dict[int, deque[tuple[int, float]]] = {}
 
     def add(self, entry: BagMessage) -> None:
@@ -163,8 +186,15 @@ class _Answers:
         while waiting and waiting[0][0] < time_ns - _NEAR_NS:
             waiting.popleft()
         if waiting and waiting[0][0] <= time_ns + _NEAR_NS:
-            return waiting.popleft()[1]
+            found_ns, celsius = waiting.popleft()
+            self.taken.add((stamp_ns, found_ns))
+            return celsius
         return None
+
+    def left(self) -> list[tuple[int, int]]:
+        """Return (stamp, time) of those that answer no measurement, in order."""
+        return [(stamp_ns, time_ns) for stamp_ns, time_ns, _ in self.in_order
+                if (stamp_ns, time_ns) not in self.taken]
 
     def before(self, first: Input) -> tuple[int, float] | None:
         """Return the last of those recorded first that answer no measurement of the bag."""
@@ -189,6 +219,7 @@ def _assembled(names: Names, inputs: list[Input], commands: _Answers, actives: _
                             active=actives.take(stamp_ns, entry.time_ns))
         answered.append(entry)
     matched = sum(entry.command is not None for entry in answered)
+    answered = _with_silences(answered, commands.left(), names)
     pairs = [(entry.message.temperature, math.nan if entry.command is None else entry.command)
              for entry in answered if entry.topic == names.temperature]
     lives = list(lives_of(statuses, pairs))
@@ -206,6 +237,24 @@ def _assembled(names: Names, inputs: list[Input], commands: _Answers, actives: _
         unmatched_commands=len(commands.in_order) - matched,
         complete=complete,
     )
+
+
+def _with_silences(inputs: list[Input], commands: list[tuple[int, int]], names: Names
+                   ) -> list[Input]:
+    """Return the inputs with what the controller commanded by itself among them."""
+    result: list[Input] = []
+    measured_ns: int | None = None
+    waiting = deque(commands)
+    for entry in [*inputs, None]:
+        while waiting and (entry is None or waiting[0][1] < entry.time_ns):
+            stamp_ns, time_ns = waiting.popleft()
+            if measured_ns is not None and stamp_ns > measured_ns:
+                result.append(Input('', time_ns, Silence(stamp_ns)))
+        if entry is not None:
+            result.append(entry)
+            if entry.topic == names.temperature:
+                measured_ns = stamp_nanoseconds(entry.message.header.stamp)
+    return result
 
 
 def _with_changes(names: Names, inputs: list[Input], changes: deque[Change]) -> Iterator[Input]:

@@ -29,8 +29,15 @@ from typing import Any
 
 from koopman_ros.control import Controller, Mode, Report, State
 from koopman_ros.nodes.messages import NANOSECONDS, stamp_nanoseconds, to_celsius, to_kelvin
-from koopman_ros.nodes.replaying.record import ControlRecord, Input
-from koopman_ros.nodes.translation import answer, ask_manual_coolant, ask_setpoint, tracked_celsius
+from koopman_ros.nodes.replaying.record import ControlRecord, Input, Silence, TakeOver
+from koopman_ros.nodes.translation import (
+    answer,
+    ask_manual_coolant,
+    ask_setpoint,
+    take_over,
+    tracked_celsius,
+    watch,
+)
 import numpy as np
 from numpy.typing import NDArray
 
@@ -46,7 +53,7 @@ class Sample:
     A measurement with what went before it, resolved for any controller.
 
     :param message: the measurement.
-    :param operations: changes of mode, manual commands and starts since the last one.
+    :param operations: what else happened since the last one.
     :param active: set-point tracked, in K; NaN for none.
     :param recorded: what was commanded in degrees Celsius; NaN where nothing was recorded.
     :param replayed: the same by the replay.
@@ -65,6 +72,11 @@ class Sample:
     def stamp_ns(self) -> int:
         """Stamp of the measurement."""
         return stamp_nanoseconds(self.message.header.stamp)
+
+    @property
+    def taken_over(self) -> bool:
+        """Whether the controller started from the coolant in force, which it commanded first."""
+        return any(isinstance(entry.message, TakeOver) for entry in self.operations)
 
 
 @dataclass(frozen=True)
@@ -165,6 +177,8 @@ class _Run:
         if entry.active is not None:
             self._active = entry.active
         given = self._begins_unknown
+        if self._state.command is None and entry.command is not None and not given:
+            self._begin_from_coolant(entry, entry.command)
         if given:
             self._begin_with(entry)
             active = self._state.setpoint.active
@@ -176,6 +190,12 @@ class _Run:
             math.nan if active is None else float(active[0]),
             math.nan if entry.command is None else entry.command, replayed, given))
         self._operations = []
+
+    def _begin_from_coolant(self, entry: Input, recorded: float) -> None:
+        """Find out whether a start was one from the coolant in force, which is not recorded."""
+        alone = self._attempt(entry, self.recorded)
+        if to_celsius(alone.kelvin) != recorded:
+            self.operate(Input('', entry.time_ns, TakeOver(recorded)))
 
     def _begin_with(self, entry: Input) -> None:
         """Take what was commanded as given where it follows from what was not recorded."""
@@ -249,8 +269,14 @@ def _tracking(state: State, kelvin: float) -> State:
 
 
 def _operated(controller: Controller, state: State, entry: Input) -> tuple[State, str]:
-    if entry.message is None:
-        return State(), ''
-    if isinstance(entry.message, Mode):
-        return controller.set_mode(state, entry.message), ''
-    return ask_manual_coolant(controller, state, entry.message)
+    match entry.message:
+        case None:
+            return State(), ''
+        case Mode() as mode:
+            return controller.set_mode(state, mode), ''
+        case Silence(stamp_ns):
+            return watch(controller, state, stamp_ns)[0], ''
+        case TakeOver() as coolant:
+            return take_over(controller, state, coolant), ''
+        case message:
+            return ask_manual_coolant(controller, state, message)

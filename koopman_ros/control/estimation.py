@@ -1,0 +1,176 @@
+# Copyright 2026 The koopman_ros Authors
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""From measurements to an estimate: which are believed, and what is known between them."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from functools import cached_property
+
+from koopman_ros.control.observer import Estimate, Observer
+from koopman_ros.control.sensor import judge, Sensed, Verdict
+from koopman_ros.control.setpoint import NANOSECONDS, Show
+from koopman_ros.control.state import Settings, State
+from koopman_ros.lifting import LiftedModel
+import numpy as np
+from numpy.typing import NDArray
+
+Array = NDArray[np.float64]
+
+# After so many time constants without a measurement that is believed the state is not known.
+_LOST = 2.0
+
+
+@dataclass(frozen=True)
+class Estimator:
+    """
+    The disturbance observer behind the measurement watchdog.
+
+    While the linear law is in force its model takes the learned one's place, and the disturbance
+    makes up for the difference, so that the plant's rate stays as believed.
+
+    :param model: the lift.
+    :param settings: the tuning.
+    :param show: how values of the state are written in reasons.
+    """
+
+    model: LiftedModel
+    settings: Settings
+    show: Show
+
+    @cached_property
+    def _observers(self) -> tuple[Observer, Observer]:
+        bound = self.settings.max_disturbance / float(np.max(self.model.inputs.scale))
+        bandwidth = self.settings.observer_bandwidth
+        return (Observer(self.model, bandwidth, bound),
+                Observer(self.model.linearised, bandwidth, bound))
+
+    def observer(self, linear: bool) -> Observer:
+        """Return the observer with the linear model or the learned one; they share their units."""
+        return self._observers[linear]
+
+    def observe(self, state: State, x: Array, time_ns: int, elapsed: float
+                ) -> tuple[State, Verdict, Array | None]:
+        """
+        Judge a measurement and take it into account.
+
+        :param state: before it.
+        :param x: (n_x,) measured, in state units.
+        :param time_ns: its stamp.
+        :param elapsed: seconds since the last command.
+        :return: the state with sensor, time and estimate, what became of the measurement, and
+            what was expected of it in state units, None when nothing was.
+        """
+        before, sensed = state.estimate, state.sensed
+        predicted = self.coast(state, elapsed).estimate
+        w = np.zeros(self.model.n_x) if before is None else before.w
+
+        def motion(then: Sensed) -> Array:
+            frozen = None if before is None else Estimate(before.x, then.w)
+            moved = self.coast(replace(state, estimate=frozen), elapsed).estimate
+            if before is None or moved is None:
+                return np.zeros_like(x)
+            return (moved.x - before.x) * self.model.states.scale
+
+        verdict = judge(self.settings.sensor, self.model.states, sensed, x, time_ns, w, motion,
+                        self.show)
+        expected = None if predicted is None else self.model.states.to_physical(predicted.x)
+        if not verdict.fault:
+            predicted = self._corrected(state, predicted, verdict, x, time_ns, elapsed)
+        elif verdict.frozen and predicted is not None and sensed is not None:
+            # what the observer made of a sensor that does not move is no disturbance
+            predicted = Estimate(predicted.x, sensed.w)
+        return (replace(state, sensed=verdict.sensed, time_ns=time_ns, estimate=predicted),
+                verdict, expected)
+
+    def _corrected(self, state: State, predicted: Estimate | None, verdict: Verdict, x: Array,
+                   time_ns: int, elapsed: float) -> Estimate:
+        """Return the estimate with a measurement that is believed."""
+        xi = self.model.states.to_deviation(x)
+        observer = self.observer(state.linear)
+        if not observer.bandwidth > 0.0:
+            return Estimate(xi, np.zeros_like(xi))
+        if predicted is None:
+            if state.command is None:
+                return Estimate(xi, np.zeros_like(xi))
+            # taken over from somebody who, it is supposed, held the plant where it is
+            return observer.at_rest(xi, self.model.inputs.to_deviation(state.command))
+        afresh = (
+            verdict.moved or not elapsed > 0.0
+            or self._lost(state, time_ns)
+            # out there the model's prediction is worth nothing
+            or self.model.states.violation(x) > self.settings.ladder.linear_margin)
+        return Estimate(xi, predicted.w) if afresh else observer.correct(predicted, xi, elapsed)
+
+    def _lost(self, state: State, time_ns: int) -> bool:
+        """Tell whether measurements were not believed for so long that the state is not known."""
+        if state.sensed is None or state.sensed.time_ns == state.time_ns:
+            return False
+        seconds = (time_ns - state.sensed.time_ns) / NANOSECONDS
+        return seconds * self.settings.observer_bandwidth > _LOST
+
+    def coast(self, state: State, elapsed: float) -> State:
+        """
+        Carry the estimate forward without a measurement.
+
+        :param elapsed: seconds since the last command, which has been in force all the time.
+        """
+        if state.estimate is None or state.command is None or not elapsed > 0.0:
+            return state
+        u = self.model.inputs.to_deviation(state.command)
+        predicted = self.observer(state.linear).predict(state.estimate, u, elapsed)
+        if predicted is None or not np.all(np.isfinite(predicted.x)):
+            # after so long, or from so far out, nothing is known; the disturbance is kept
+            return state
+        return replace(state, estimate=predicted)
+
+    def rebase(self, estimate: Estimate | None, was_linear: bool, linear: bool
+               ) -> Estimate | None:
+        """Carry an estimate over from the learned model to the linear one, or back."""
+        if estimate is None or was_linear == linear or not self.settings.observer_bandwidth > 0.0:
+            return estimate
+        return self.observer(linear).rebased(
+            estimate, self.observer(was_linear).model.drift(estimate.x))
+
+    def inherit(self, predecessor: Estimator, state: State) -> State:
+        """Carry an estimate over from other settings or another model."""
+        estimate, old, new = state.estimate, predecessor.model, self.model
+        if estimate is None:
+            return state
+        if not self.settings.observer_bandwidth > 0.0:
+            estimate = Estimate(estimate.x, np.zeros_like(estimate.w))
+        if old is new:
+            return replace(state, estimate=estimate)
+        x = old.states.to_physical(estimate.x)
+        # the rates that the old model believed, per second, which all models share
+        believed = estimate.w + predecessor.observer(state.linear).model.drift(estimate.x) + (
+            old.B @ _command(old, state))
+        factor = (old.states.scale / old.seconds_per_time_unit
+                  / (new.states.scale / new.seconds_per_time_unit))
+        moved = Estimate(new.states.to_deviation(x),
+                         factor * believed - new.B @ _command(new, state))
+        if self.settings.observer_bandwidth > 0.0:
+            moved = self.observer(state.linear).rebased(moved, np.zeros_like(moved.w))
+        else:
+            moved = Estimate(moved.x, np.zeros_like(moved.w))
+        # what it holds of the disturbance is in the old model's units
+        return replace(state, estimate=moved, sensed=None)
+
+
+def _command(model: LiftedModel, state: State) -> Array:
+    """Return the command in force in a model's scaled deviations; the nominal one at first."""
+    if state.command is None:
+        return np.zeros(model.n_u)
+    return model.inputs.to_deviation(state.command)

@@ -1,0 +1,79 @@
+# Copyright 2026 The koopman_ros Authors
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""When measurements arrive: how long ago, how old, and by which clock."""
+
+from __future__ import annotations
+
+import math
+import time
+
+from koopman_ros.nodes.messages import NANOSECONDS
+from rclpy.node import Node
+
+# Stamps further from the node's clock than this come from another clock.
+_SAME_CLOCK = 3600.0  # s
+
+
+class Arrival:
+    """
+    The time of the last measurement that brought news, by the plant's time where it is known.
+
+    With `use_sim_time` that is the time on /clock, as long as there is one; otherwise the steady
+    clock, which no correction of the system's time upsets.
+
+    :param node: whose clock and parameter `use_sim_time` count.
+    """
+
+    def __init__(self, node: Node) -> None:
+        self._node = node
+        self._simulated = bool(node.get_parameter('use_sim_time').value)
+        self._wall = time.monotonic()
+        self._sim = self._sim_now()
+        self._begun = self._wall
+        self.age = math.nan  # s, of the last measurement at its arrival
+        self.answer_seconds = math.nan  # from its arrival to its command
+
+    def note(self, stamp_ns: int) -> None:
+        """Take down that a measurement with a new stamp has arrived."""
+        self._wall, self._sim = time.monotonic(), self._sim_now()
+        age = (self._node.get_clock().now().nanoseconds - stamp_ns) / NANOSECONDS
+        self.age = age if abs(age) < _SAME_CLOCK else math.nan
+
+    def answered(self) -> None:
+        """Take down that its command is out."""
+        self.answer_seconds = time.monotonic() - self._wall
+
+    @property
+    def without_clock(self) -> bool:
+        """Whether `use_sim_time` is set and nobody publishes the time."""
+        return self._simulated and self._sim_now() == 0 and self.wall_silence > 1.0
+
+    @property
+    def wall_silence(self) -> float:
+        """Seconds since the last measurement by the steady clock."""
+        return time.monotonic() - self._wall
+
+    @property
+    def silence(self) -> float:
+        """Seconds since the last measurement, in the plant's time where it is known."""
+        now = self._sim_now()
+        if now:
+            # a clock that was set back says nothing yet
+            self._sim = min(self._sim or now, now)
+            return (now - self._sim) / NANOSECONDS
+        return self.wall_silence
+
+    def _sim_now(self) -> int:
+        return self._node.get_clock().now().nanoseconds if self._simulated else 0

@@ -1,0 +1,195 @@
+# Copyright 2026 The koopman_ros Authors
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""What the controller says of itself: its status for /diagnostics, and its internals to plot."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+from builtin_interfaces.msg import Time
+from koopman_ros.control import Controller, Mode, Report, Rung, State
+from koopman_ros.nodes.arrival import Arrival
+from koopman_ros.nodes.controller_parameters import ControllerParameters
+from koopman_ros.nodes.diagnostics import Level, Status
+from koopman_ros.nodes.messages import in_celsius, to_celsius
+import numpy as np
+from sensor_msgs.msg import JointState
+
+_LEVELS = {Rung.LEARNED: Level.OK, Rung.LINEAR: Level.WARN, Rung.HOLD: Level.ERROR,
+           Rung.SAFE: Level.ERROR}
+_ACTIONS = {Rung.LEARNED: '', Rung.LINEAR: 'linear law', Rung.HOLD: 'the last command is held',
+            Rung.SAFE: 'the safe coolant temperature is commanded'}
+
+
+@dataclass
+class Counts:
+    """How many measurements came, late or not at all, and whether the operator spoke."""
+
+    measurements: int = 0
+    late: int = 0
+    missed: int = 0
+    refused: int = 0
+    setpoint_received: bool = False
+
+
+@dataclass(frozen=True)
+class Situation:
+    """
+    All that a status tells of.
+
+    :param complaint: what is wrong around the node, e.g. a second controller; or empty.
+    :param request_refused: why the operator's last request was refused, or empty.
+    :param model_refused: why the last model was refused, or empty.
+    :param model: figures of the model in force.
+    :param temperature: last measured, in degrees Celsius.
+    """
+
+    controller: Controller
+    parameters: ControllerParameters
+    state: State
+    report: Report
+    counts: Counts
+    arrival: Arrival
+    complaint: str
+    request_refused: str
+    model_refused: str
+    model: Mapping[str, object]
+    temperature: float
+
+
+def status(now: Situation) -> Status:
+    """Return the status of the control task."""
+    level, message = _verdict(now)
+    return Status(level, message, lambda: _figures(now))
+
+
+def _verdict(now: Situation) -> tuple[Level, str]:
+    report, mode = now.report, now.state.mode
+    timeout = now.parameters.measurement_timeout
+    if not now.counts.measurements:
+        return Level.WARN, 'waiting for the first temperature measurement'
+    if timeout and max(now.arrival.silence, now.arrival.wall_silence) > timeout:
+        command = now.state.command
+        doing = '' if command is None else f', coolant at {in_celsius(float(command[0]))}'
+        action = 'manual mode' if mode is Mode.MANUAL else (
+            _ACTIONS[report.rung] or _ACTIONS[Rung.HOLD])
+        return Level.ERROR, (f'no measurement for more than {timeout:g} s: {action}{doing}; check '
+                             'sensor and plant')
+    if report.reason and mode is Mode.MANUAL:
+        return Level.ERROR, f'{mode.value}: {report.reason}'
+    if report.rung is not Rung.LEARNED:
+        return _LEVELS[report.rung], f'{_ACTIONS[report.rung]}: {report.reason}'
+    warning = _warning(now)
+    if warning:
+        return Level.WARN, warning
+    message = mode.value
+    if mode is Mode.AUTOMATIC and not now.counts.setpoint_received:
+        message += ', no set-point yet: the temperature first measured is held'
+    elif report.at_range:
+        message += ', coolant at its limit'
+    elif report.at_rate:
+        message += ', coolant at its rate limit'
+    return Level.OK, message
+
+
+def _warning(now: Situation) -> str:
+    """Return the first thing that an operator should know of, or an empty string."""
+    report, states = now.report, now.controller.model.states
+    age, oldest = now.arrival.age, now.parameters.max_measurement_age
+    if now.complaint:
+        return now.complaint
+    if report.clock_stood_still:
+        return ('the stamp of the measurement does not advance: the last command is held; stamp '
+                'measurements with their time')
+    if now.arrival.without_clock:
+        return ('use_sim_time is set and nobody publishes /clock: time-outs count by the wall '
+                'clock; set use_sim_time to false, or publish_clock of the plant to true')
+    if now.request_refused:
+        return f'request refused: {now.request_refused}'
+    if now.model_refused:
+        return now.model_refused
+    if report.outside > 0.0:
+        return (f'temperature is outside the trained range '
+                f'[{to_celsius(states.lower[0]):.2f}, {to_celsius(states.upper[0]):.2f}] degC: '
+                'the model extrapolates')
+    if oldest and abs(age) > oldest:
+        return (f'measurements are {age:.1f} s old when they arrive, at most {oldest:g} s are '
+                'expected: check the connection and the clocks')
+    if report.at_bound:
+        return (f'the disturbance estimate is at its bound of {now.parameters.max_disturbance:g} '
+                'K of coolant: the plant is far from its model; retrain')
+    return ''
+
+
+def _figures(now: Situation) -> dict[str, object]:
+    report, state, arrival = now.report, now.state, now.arrival
+    active, command = report.active_setpoint, state.command
+    return {
+        'mode': state.mode.value,
+        'active law': report.rung.value,
+        'law': 'none' if report.law is None else report.law.value,
+        'reason': report.reason or 'none',
+        **now.model,
+        'temperature [degC]': float(now.temperature),
+        'set-point [degC]': np.nan if active is None else to_celsius(float(active[0])),
+        'coolant [degC]': np.nan if command is None else to_celsius(float(command[0])),
+        'disturbance [K of coolant]': _first(report.disturbance),
+        'the same as a sensor bias [K]': _bias(now),
+        'distance outside training box [half widths]': float(report.outside),
+        'set-point outside training box [half widths]': float(report.setpoint_outside),
+        'coolant outside training box [half widths]': float(report.input_outside),
+        'Riccati residual': float(report.residual),
+        'gain norm': float(report.gain),
+        'predicted growth per sample': float(report.growth),
+        'transfer [K]': 0.0 if report.transfer is None else float(report.transfer[0]),
+        'scheduled set-points': len(state.setpoint.scheduled),
+        'measurements': now.counts.measurements,
+        'late measurements': now.counts.late,
+        'missed measurements': now.counts.missed,
+        'measurements not believed': now.counts.refused,
+        'since last measurement [s]': arrival.wall_silence,
+        'age of measurement [s]': arrival.age,
+        'latency from stamp to command [s]': arrival.age + arrival.answer_seconds,
+        'latency from arrival to command [s]': arrival.answer_seconds,
+    }
+
+
+def _bias(now: Situation) -> float:
+    if now.report.disturbance is None:
+        return np.nan
+    return float(now.controller.equivalent_bias(now.state)[0])
+
+
+def _first(values: np.ndarray | None) -> float:
+    return np.nan if values is None else float(values[0])
+
+
+def internals(report: Report, stamp: Time, frame_id: str) -> JointState:
+    """Return what a person would plot beside the temperatures, under names with units."""
+    values = {
+        'disturbance [K]': _first(report.disturbance),
+        'estimated_temperature [K]': _first(report.estimate),
+        'distance_outside [half widths]': float(report.outside),
+        'rung [0 learned, 1 linear, 2 hold, 3 safe]': float(report.rung.depth),
+        'gain': float(report.gain),
+        'riccati_residual': float(report.residual),
+        'growth_per_sample': float(report.growth),
+        'transfer [K]': 0.0 if report.transfer is None else float(report.transfer[0]),
+    }
+    message = JointState(name=list(values), position=list(values.values()))
+    message.header.stamp = stamp
+    message.header.frame_id = frame_id
+    return message
