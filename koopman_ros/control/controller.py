@@ -234,11 +234,10 @@ class Controller:
         if state.command is None or state.time_ns is None or since_ns is None:
             return state, None, Report(state.mode)
         elapsed = max(0.0, (time_ns - since_ns) / NANOSECONDS)
-        silent = (time_ns - state.time_ns) / NANOSECONDS
         with np.errstate(all='ignore'):
             state = self._estimator.coast(state, elapsed)
             state, wanted, report = self._wanted(state, Verdict(
-                state.sensed, f'no measurement for {silent:.0f} s: check sensor and plant'),
+                state.sensed, 'no measurement arrives: check sensor and plant'),
                 np.nan, time_ns, elapsed)
         limited = limit(self.settings.limits, wanted, state.command, elapsed)
         state = replace(state, command=limited.u, commanded_ns=max(time_ns, since_ns))

@@ -31,6 +31,8 @@ Array = NDArray[np.float64]
 
 # After so many time constants without a measurement that is believed the state is not known.
 _LOST = 2.0
+# So many intervals between measurements are a gap.
+_GAP = 1.5
 
 
 @dataclass(frozen=True)
@@ -115,11 +117,13 @@ class Estimator:
         return Estimate(xi, predicted.w) if afresh else observer.correct(predicted, xi, elapsed)
 
     def _lost(self, state: State, time_ns: int) -> bool:
-        """Tell whether measurements were not believed for so long that the state is not known."""
-        if state.sensed is None or state.sensed.time_ns == state.time_ns:
+        """Tell whether no measurement was believed for so long that the state is not known."""
+        if state.sensed is None:
             return False
         seconds = (time_ns - state.sensed.time_ns) / NANOSECONDS
-        return seconds * self.settings.observer_bandwidth > _LOST
+        # where measurements are always that rare, they are all there is
+        return seconds * self.settings.observer_bandwidth > _LOST and (
+            seconds > _GAP * state.interval)
 
     def coast(self, state: State, elapsed: float) -> State:
         """

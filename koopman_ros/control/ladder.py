@@ -115,8 +115,8 @@ class Standing:
                 (Rung.LINEAR, settings.validity_margin, 'the learned law')):
             entered = (self.resumes or self.rung).depth >= rung.depth
             if outside > (_HYSTERESIS * margin if entered else margin):
-                return Need(rung, f'{words} by {outside:.2f} half widths, {margin:g} are allowed '
-                                  f'for {name}')
+                return Need(rung, f'{words} by more than the {margin:g} half widths that {name} '
+                                  'is allowed')
         return Need(Rung.LEARNED)
 
     def at(self, settings: LadderSettings, need: Need, time_ns: int) -> Standing:
@@ -132,8 +132,8 @@ class Standing:
             # the safe input once commanded stays until there is a law again
             if held > settings.hold_timeout or (
                     self.rung is Rung.SAFE and self.bad_since_ns is not None):
-                need = Need(Rung.SAFE, f'{need.reason}; held for {held:.0f} s, '
-                                       f'{settings.hold_timeout:g} s are allowed')
+                need = Need(Rung.SAFE, f'{need.reason}; held for longer than '
+                                       f'{settings.hold_timeout:g} s')
         if need.rung is Rung.HOLD and need.passing:
             return Standing(need.rung, need.reason, self.resumes or self.rung, bad_since)
         present = self.resumes or self.rung

@@ -152,5 +152,6 @@ def equivalent_bias(model: LiftedModel, estimate: Estimate) -> Array:
                 break
             if not np.all(np.abs(bias) < 1e3):
                 break
-        solved = np.allclose(model.drift(estimate.x - bias), wanted, rtol=0.0, atol=1e-6)
+        solved = np.all(np.abs(bias) < 1e3) and np.allclose(
+            model.drift(estimate.x - bias), wanted, rtol=0.0, atol=1e-6)
     return bias if solved else np.full_like(bias, np.nan)

@@ -135,8 +135,9 @@ def judge(limits: SensorLimits, states: Coordinates, sensed: Sensed | None, x: A
         i = int(np.argmax(np.abs(moved)))
         return Verdict(still, (
             f'the measured {states.names[i]} has been {show(x[i], states.units[i])} to the bit '
-            f'for {stood:.0f} s while the model moved by {moved[i]:.2g} {states.units[i]}: the '
-            'sensor is frozen; check it'), frozen=True)
+            f'for longer than {limits.frozen_timeout:g} s while the model moved by more than '
+            f'{0.5 * limits.jump:g} {states.units[i]}: the sensor is frozen; check it'),
+            frozen=True)
     return Verdict(still)
 
 

@@ -1,0 +1,183 @@
+# Copyright 2026 The koopman_ros Authors
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""A sampled closed loop on the true reactor, in which anything may go wrong at any time."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field, replace
+import math
+from typing import Any
+
+from closed_loops import REACTOR, shipped, START
+from koopman_ros.control import (
+    Controller,
+    InputLimits,
+    LadderSettings,
+    Mode,
+    Report,
+    Rung,
+    SensorLimits,
+    Settings,
+    State,
+)
+from koopman_ros.plants import (
+    advance,
+    ControlAffineSystem,
+    equilibrium_input,
+    one_state_reactor,
+    ReactorParameters,
+)
+import numpy as np
+
+SECOND = 1_000_000_000
+EPOCH = 1_785_000_000 * SECOND
+LOWER, UPPER, RATE = 278.15, 305.15, 1.0  # K, K, K/s
+SAFE = LOWER
+
+
+def controller(model: Any = 'reactor_nz4', *, ladder: Mapping[str, float] | None = None,
+               sensor: Mapping[str, float] | None = None, **changes: Any) -> Controller:
+    """Return a controller with the node's default tuning."""
+    settings = Settings(
+        np.ones(1), np.ones(1),
+        InputLimits(np.array([LOWER]), np.array([UPPER]), np.array([RATE])),
+        observer_bandwidth=6.0 / 60.0, max_disturbance=20.0, safe_input=np.array([SAFE]),
+        sensor=SensorLimits(**{'lower': 253.15, 'upper': 423.15, 'rate': 2.0, 'jump': 2.0,
+                               'frozen_timeout': 20.0, **(sensor or {})}),
+        ladder=LadderSettings(**(ladder or {})))
+    return Controller(shipped(model) if isinstance(model, str) else model,
+                      replace(settings, **changes))
+
+
+def changed_reactor(feed_shift: float = 0.0, **factors: float) -> ControlAffineSystem:
+    """Return the reactor with constants multiplied, and the feed's temperature shifted."""
+    before = ReactorParameters()
+    constants = {name: getattr(before, name) * factor for name, factor in factors.items()}
+    constants['feed_temperature'] = before.feed_temperature + feed_shift
+    return one_state_reactor(replace(before, **constants), nominal_state=REACTOR.nominal_state)
+
+
+@dataclass
+class Sample:
+    """What happened at one second."""
+
+    second: int
+    temperature: float
+    command: float
+    report: Report
+
+
+@dataclass
+class Loop:
+    """
+    A controller and a plant, one second a sample.
+
+    :param plant: temperature last in its state.
+    :param bias: error of the sensor in K.
+    :param lag: time constant of the coolant in s.
+    :param delay: samples that a command is late.
+    :param noise: of the sensor in K, from a fixed seed.
+    """
+
+    controller: Controller
+    plant: ControlAffineSystem = REACTOR
+    kelvin: float = START
+    bias: float = 0.0
+    lag: float = 0.0
+    delay: int = 0
+    noise: float = 0.0
+    state: State = field(default_factory=State)
+    samples: list[Sample] = field(default_factory=list)
+
+    def __post_init__(self) -> None:
+        self.x = self.plant.nominal_state.copy()
+        self.x[-1] = self.kelvin
+        self.coolant = float(equilibrium_input(self.plant, self.x)[0])
+        self.state = self.controller.take_over(self.state, np.array([self.coolant]))
+        self._late = [self.coolant] * self.delay
+        self._rng = np.random.default_rng(0)
+
+    @property
+    def second(self) -> int:
+        return len(self.samples)
+
+    def ask(self, kelvin: float) -> None:
+        self.state, refused = self.controller.request_setpoint(self.state, np.array([kelvin]))
+        assert refused == ''
+
+    def set_mode(self, mode: Mode) -> None:
+        self.state = self.controller.set_mode(self.state, mode)
+
+    def replace(self, other: Controller) -> None:
+        self.state = other.succeed(self.controller, self.state)
+        self.controller = other
+
+    def restart(self) -> None:
+        """Kill the controller; the next one finds the coolant in force."""
+        self.state = self.controller.take_over(State(), np.array([self.coolant]))
+
+    def run(self, seconds: int, sensor: Callable[[float], float | None] = lambda kelvin: kelvin
+            ) -> list[Sample]:
+        """
+        Let the loop run.
+
+        :param sensor: what is measured of a temperature; None for nothing.
+        :return: the samples of this run.
+        """
+        first = self.second
+        for _ in range(seconds):
+            measured = sensor(float(self.x[-1]) + self.bias
+                              + self.noise * float(self._rng.standard_normal()))
+            now = EPOCH + self.second * SECOND
+            if measured is None:
+                self.state, command, report = self.controller.watch(self.state, now)
+                assert command is not None
+            else:
+                self.state, command, report = self.controller.step(
+                    self.state, np.array([measured]), now)
+            self.samples.append(Sample(self.second, float(self.x[-1]), float(command[0]), report))
+            self._move(float(command[0]))
+        return self.samples[first:]
+
+    def _move(self, command: float) -> None:
+        self._late.append(command)
+        command = self._late.pop(0)
+        # a lag in steps that are short beside it
+        parts = 5 if self.lag else 1
+        for _ in range(parts):
+            share = -math.expm1(-1.0 / parts / self.lag) if self.lag else 1.0
+            self.coolant += share * (command - self.coolant)
+            self.x = advance(self.plant, self.x, np.array([self.coolant]), 1.0 / 60.0 / parts)
+
+
+def largest_step(samples: list[Sample]) -> float:
+    """Return the largest change of command from one second to the next."""
+    return float(np.max(np.abs(np.diff([sample.command for sample in samples]))))
+
+
+def settled(samples: list[Sample], kelvin: float, tolerance: float) -> int:
+    """Return how many seconds it takes until the temperature stays within a tolerance."""
+    off = [k for k, s in enumerate(samples) if abs(s.temperature - kelvin) > tolerance]
+    return off[-1] + 1 if off else 0
+
+
+def rungs(samples: list[Sample]) -> list[Rung]:
+    """Return the rungs in the order in which they were stood on."""
+    found: list[Rung] = []
+    for sample in samples:
+        if not found or found[-1] is not sample.report.rung:
+            found.append(sample.report.rung)
+    return found

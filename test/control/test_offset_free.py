@@ -1,0 +1,124 @@
+# Copyright 2026 The koopman_ros Authors
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""Zero offset on plants that are not the model, with the node's default tuning."""
+
+from closed_loops import SETPOINT, START
+from koopman_ros.plants import two_state_reactor
+import numpy as np
+import pytest
+from sampled_loops import changed_reactor, controller, Loop, settled, UPPER
+
+# The nominal loop's step response of 10 K takes 192 s to stay within 1e-3 K.
+RESPONSE, MORE = 192, 120  # s
+
+CHANGES = {
+    'UA - 20 %': {'heat_transfer_coefficient': 0.8},
+    'UA + 20 %': {'heat_transfer_coefficient': 1.2},
+    'C_A + 10 %': {'concentration': 1.1},
+    'C_A - 10 %': {'concentration': 0.9},
+    'T_i + 5 K': {'feed_shift': 5.0},
+    'T_i - 5 K': {'feed_shift': -5.0},
+}
+
+
+def test_nominal_step_response():
+    loop = Loop(controller())
+    loop.run(10)
+    loop.ask(SETPOINT)
+    samples = loop.run(RESPONSE + MORE)
+    assert settled(samples, SETPOINT, 1e-3) <= RESPONSE
+    # the model is so good that there is next to nothing to estimate
+    assert max(abs(float(s.report.disturbance[0])) for s in samples) < 0.01
+
+
+@pytest.mark.parametrize('change', CHANGES)
+def test_a_plant_that_is_not_the_model_is_brought_to_its_setpoint(change):
+    loop = Loop(controller(), plant=changed_reactor(**CHANGES[change]))
+    loop.run(10)
+    loop.ask(SETPOINT)
+    samples = loop.run(RESPONSE + MORE)
+    assert settled(samples, SETPOINT, 1e-3) <= RESPONSE + MORE - 10
+    assert abs(float(samples[-1].report.disturbance[0])) > 0.4
+
+
+@pytest.mark.parametrize('change', CHANGES)
+def test_a_plant_that_changes_under_way_is_brought_back(change):
+    loop = Loop(controller())
+    loop.run(10)
+    loop.plant = changed_reactor(**CHANGES[change])
+    samples = loop.run(RESPONSE + MORE)
+    assert settled(samples, START, 1e-3) <= RESPONSE + MORE - 10
+
+
+@pytest.mark.parametrize(('lag', 'delay'), [(5.0, 0), (10.0, 0), (0.0, 1), (10.0, 1)])
+def test_a_slow_actuator(lag, delay):
+    loop = Loop(controller(), lag=lag, delay=delay)
+    loop.run(10)
+    loop.ask(SETPOINT)
+    assert settled(loop.run(RESPONSE + MORE), SETPOINT, 1e-3) <= RESPONSE + MORE - 10
+
+
+@pytest.mark.parametrize('step', [-3.0, 1.5])
+def test_two_state_reactor_under_the_lift_of_the_one_state_one(step):
+    plant = two_state_reactor()
+    loop = Loop(controller(), plant=plant, kelvin=float(plant.nominal_state[1]))
+    loop.run(10)
+    setpoint = float(plant.nominal_state[1]) + step
+    loop.ask(setpoint)
+    # its own slow mode, -1.05/min, takes 224 s to fade to a fiftieth
+    assert settled(loop.run(420), setpoint, 1e-3) <= 224 + 130
+
+
+def test_a_biased_sensor_is_shown_for_what_it_is():
+    loop = Loop(controller(), bias=2.0)
+    loop.run(1)
+    loop.ask(START)
+    last = loop.run(600)[-1]
+    # what is measured has no offset; the reactor has, and nobody in the loop can know
+    assert last.temperature + 2.0 == pytest.approx(START, abs=1e-3)
+    bias = loop.controller.equivalent_bias(loop.state)
+    np.testing.assert_allclose(bias, [2.0], rtol=0, atol=2e-3)
+    assert float(last.report.disturbance[0]) == pytest.approx(1.07, abs=0.02)
+
+
+def test_a_quarter_of_an_hour_at_the_limit_leaves_nothing_behind():
+    loop = Loop(controller())
+    loop.run(10)
+    nominal, loop.plant = loop.plant, changed_reactor(feed_shift=-40.0)
+    saturated = loop.run(900)
+    assert all(s.command == UPPER for s in saturated[-800:])
+    assert START - saturated[-1].temperature > 10.0
+    loop.plant = nominal
+    samples = loop.run(600)
+    assert max(s.temperature for s in samples) - START < 0.5
+    assert settled(samples, START, 1e-3) <= RESPONSE + MORE
+
+
+def test_without_the_observer_the_offset_stays():
+    loop = Loop(controller(observer_bandwidth=0.0), plant=changed_reactor(
+        heat_transfer_coefficient=0.8))
+    loop.run(10)
+    loop.ask(SETPOINT)
+    assert abs(loop.run(600)[-1].temperature - SETPOINT) > 3.0
+
+
+@pytest.mark.parametrize(('bandwidth', 'low', 'high'), [(2.0, 0.0, 0.03), (6.0, 0.04, 0.09),
+                                                       (12.0, 0.09, 0.4)])
+def test_bandwidth_trades_noise_for_speed(bandwidth, low, high):
+    loop = Loop(controller(observer_bandwidth=bandwidth / 60.0), noise=0.1)
+    commands = np.array([s.command for s in loop.run(1800)[300:]])
+    assert low < np.std(commands) < high
+    # the filter adds no offset
+    assert abs(np.mean([s.temperature for s in loop.samples[300:]]) - START) < 0.02

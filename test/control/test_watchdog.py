@@ -1,0 +1,177 @@
+# Copyright 2026 The koopman_ros Authors
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""Which measurements are believed, and what the loop does with the others."""
+
+import math
+
+from closed_loops import SETPOINT, shipped, START
+from koopman_ros.control import Mode, Rung, SensorLimits, State
+import numpy as np
+import pytest
+from sampled_loops import controller, EPOCH, largest_step, Loop, rungs, SAFE, SECOND, settled
+
+NAN = math.nan
+
+
+@pytest.mark.parametrize(('value', 'words'), [
+    (NAN, 'the measured temperature is nan, not finite: check the sensor'),
+    (math.inf, 'is inf, not finite'),
+    (1e300, 'outside the range of the sensor, 253.15 K to 423.15 K: check it'),
+    (-0.0, 'the measured temperature -0 K is outside the range of the sensor'),
+    (START + 30.0, 'to 354.475 K in 1 s, at most 2 K and 2 K/s are possible: check the sensor'),
+])
+def test_one_bad_measurement_holds_the_command(value, words):
+    loop = Loop(controller())
+    loop.run(10)
+    loop.ask(SETPOINT)
+    before = loop.run(20)[-1].command
+    bad = loop.run(1, lambda _: value)[0]
+    assert (bad.command, bad.report.rung) == (before, Rung.HOLD)
+    assert words in bad.report.reason
+    # and the next good one is used
+    after = loop.run(250)
+    assert after[0].report.rung is Rung.LEARNED
+    assert settled(after, SETPOINT, 1e-3) < 200
+
+
+def test_every_other_measurement_is_enough():
+    loop = Loop(controller())
+    loop.run(10)
+    loop.ask(SETPOINT)
+    count = 0
+
+    def flickering(kelvin: float) -> float:
+        nonlocal count
+        count += 1
+        return kelvin if count % 2 else NAN
+
+    samples = loop.run(300, flickering)
+    assert settled(samples, SETPOINT, 1e-3) < 250
+    assert Rung.SAFE not in rungs(samples)
+
+
+@pytest.mark.parametrize('measured', [NAN, None], ids=['not finite', 'missing'])
+def test_a_lost_sensor_leads_to_the_safe_input_and_back(measured):
+    loop = Loop(controller())
+    loop.run(10)
+    held = loop.samples[-1].command
+    lost = loop.run(85, lambda _: measured)
+    assert rungs(lost) == [Rung.HOLD, Rung.SAFE]
+    assert {s.command for s in lost[:61]} == {held}
+    assert lost[-1].command == SAFE
+    assert largest_step(lost) <= 1.0 + 1e-9
+    assert lost[-1].report.reason.endswith('held for longer than 60 s')
+    back = loop.run(460)
+    # a while until the sensor is trusted, then without a bump
+    assert rungs(back)[:2] == [Rung.SAFE, Rung.LEARNED]
+    assert [s.report.rung for s in back].index(Rung.LEARNED) == 10
+    assert abs(back[10].command - back[9].command) < 0.01
+    assert settled(back, START, 0.01) < 440
+
+
+def test_a_jump_that_stays_is_believed():
+    loop = Loop(controller())
+    loop.run(60)
+    loop.x = loop.x - 9.0
+    samples = loop.run(300)
+    assert [s.report.rung for s in samples[:3]] == [Rung.HOLD, Rung.HOLD, Rung.LEARNED]
+    # what it was is no disturbance
+    assert abs(float(samples[3].report.disturbance[0])) < 0.01
+    assert settled(samples, START, 1e-3) < 250
+
+
+def test_a_sensor_that_freezes_under_way_is_found_out():
+    loop = Loop(controller())
+    loop.run(10)
+    loop.ask(SETPOINT)
+    loop.run(10)
+    value = float(loop.x[-1])
+    frozen = loop.run(40, lambda _: value)
+    assert rungs(frozen) == [Rung.LEARNED, Rung.HOLD]
+    first = next(s for s in frozen if s.report.rung is Rung.HOLD)
+    assert first.second - frozen[0].second == 21
+    assert 'to the bit for longer than 20 s while the model moved' in first.report.reason
+    # what the observer made of it is forgotten
+    assert abs(float(first.report.disturbance[0])) < 0.05
+
+
+def test_a_plant_at_rest_is_not_frozen():
+    loop = Loop(controller())
+    samples = loop.run(900, lambda _: START)
+    assert rungs(samples) == [Rung.LEARNED]
+
+
+def test_a_frozen_sensor_is_not_looked_for_when_switched_off():
+    loop = Loop(controller(sensor={'frozen_timeout': math.inf}))
+    loop.run(10)
+    loop.ask(SETPOINT)
+    assert rungs(loop.run(60, lambda _: START)) == [Rung.LEARNED]
+
+
+def test_steps_of_the_sensor_are_no_fault():
+    loop = Loop(controller(), noise=0.02)
+    loop.run(10)
+    loop.ask(SETPOINT)
+    samples = loop.run(400, lambda kelvin: 0.1 * round(kelvin / 0.1))
+    assert rungs(samples) == [Rung.LEARNED]
+    assert max(abs(s.temperature - SETPOINT) for s in samples[-60:]) < 0.1
+
+
+def test_rare_measurements_are_not_taken_for_a_gap():
+    model = shipped('reactor_nz4')
+    loop = controller(model)
+    state = loop.take_over(State(), np.array([300.0]))
+    for k in range(30):
+        state, command, report = loop.step(
+            state, np.array([START + 1e-9 * k]), EPOCH + 60 * k * SECOND)
+        assert report.missed == 0
+        assert report.rung is Rung.LEARNED
+    assert command[0] == pytest.approx(300.0, abs=1e-3)
+
+
+def test_missed_measurements_are_counted():
+    loop = controller()
+    state, missed = State(), []
+    for second in (0, 1, 2, 3, 7, 8):
+        state, _, report = loop.step(state, np.array([START]), EPOCH + second * SECOND)
+        missed.append(report.missed)
+    assert missed == [0, 0, 0, 0, 3, 0]
+
+
+def test_nobody_watches_before_the_first_measurement():
+    loop = controller()
+    state, command, report = loop.watch(State(), EPOCH)
+    assert (state.command, command, report.reason) == (None, None, '')
+
+
+def test_manual_commands_go_on_without_measurements():
+    loop = Loop(controller())
+    loop.run(10)
+    loop.set_mode(Mode.MANUAL)
+    loop.state = loop.controller.request_manual_input(loop.state, np.array([296.0]))[0]
+    samples = loop.run(200, lambda _: None)
+    assert samples[-1].command == 296.0
+    assert 'no measurement' in samples[-1].report.reason
+
+
+@pytest.mark.parametrize(('change', 'message'), [
+    ({'lower': 400.0, 'upper': 300.0}, r'sensor limits must be lower < upper, got 400\.0 and 300'),
+    ({'rate': 0.0}, r'rate must be above 0, got 0\.0'),
+    ({'jump': NAN}, 'jump must be above 0, got nan'),
+    ({'frozen_timeout': -1.0}, r'frozen_timeout must be above 0, got -1\.0'),
+])
+def test_limits_that_make_no_sense_are_refused(change, message):
+    with pytest.raises(ValueError, match=message):
+        SensorLimits(**change)
