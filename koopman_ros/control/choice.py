@@ -117,7 +117,7 @@ class LawChoice:
         assert state.setpoint.active is not None
         x_ref = model.states.to_deviation(state.setpoint.active)
         known = self._references.get(linear)
-        if known is None or not np.array_equal(known.x, x_ref):
+        if known is None or not (known.x == x_ref).all():
             # a memory of the last set-point only; what comes out does not depend on it
             known = self._references[linear] = reference(model, x_ref)
         target = balance(model, known, estimate.w)
@@ -136,10 +136,10 @@ class LawChoice:
                 f'the closed loop is predicted unstable at a sample every {spacing:.3g} s: raise '
                 'the input weight, or measure more often'))
         u = model.inputs.to_physical(found.u)
-        if not np.all(np.isfinite(u)):
+        if not np.isfinite(u).all():
             return Attempt(None, target, found, growth, 'its command is not finite')
-        within = np.clip(u, settings.limits.lower, settings.limits.upper)
-        return Attempt(within, target, found, growth, clipped=bool(np.any(within != u)))
+        within = settings.limits.within(u)
+        return Attempt(within, target, found, growth, clipped=bool((within != u).any()))
 
     @cached_property
     def _where_outside(self) -> str:

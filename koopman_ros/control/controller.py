@@ -16,7 +16,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import cached_property
 import math
 
@@ -29,7 +29,7 @@ from koopman_ros.control.limits import limit
 from koopman_ros.control.observer import equivalent_bias, Estimate
 from koopman_ros.control.sensor import Verdict
 from koopman_ros.control.setpoint import NANOSECONDS
-from koopman_ros.control.state import Mode, Report, Settings, State
+from koopman_ros.control.state import amended, Mode, Report, Settings, State
 from koopman_ros.control.transfer import Transfer
 from koopman_ros.lifting import LiftedModel
 import numpy as np
@@ -74,9 +74,8 @@ class Controller:
     def safe_input(self) -> Array:
         """What is commanded when nothing else can be, (n_u,) in input units."""
         given = self.settings.safe_input
-        limits = self.settings.limits
-        return _kept(np.clip(self.model.inputs.center if given is None else given,
-                             limits.lower, limits.upper))
+        return _kept(self.settings.limits.within(
+            self.model.inputs.center if given is None else given))
 
     # What the operator asks for.
 
@@ -97,7 +96,7 @@ class Controller:
                 and setpoints.lies_ahead(effective_ns, state.time_ns)):
             return state, (f'{setpoints.MAX_SCHEDULED} set-points are scheduled already: wait '
                            'until some have taken effect, or send this one with stamp 0')
-        return replace(state, setpoint=setpoints.request(
+        return amended(state, setpoint=setpoints.request(
             state.setpoint, _kept(value), effective_ns, state.time_ns)), ''
 
     def request_manual_input(self, state: State, value: Array) -> tuple[State, str]:
@@ -112,7 +111,7 @@ class Controller:
             return state, 'manual command refused in automatic mode: switch to manual mode first'
         if not np.all(np.isfinite(value)):
             return state, f'manual command {value.tolist()} is not finite: the old one is kept'
-        return replace(state, manual_input=_kept(value)), ''
+        return amended(state, manual_input=_kept(value)), ''
 
     def set_mode(self, state: State, mode: Mode) -> State:
         """
@@ -123,7 +122,7 @@ class Controller:
         """
         if mode is state.mode:
             return state
-        return replace(state, mode=mode, manual_input=None, standing=Standing(),
+        return amended(state, mode=mode, manual_input=None, standing=Standing(),
                        estimate=self._estimator.rebase(state.estimate, state.linear, False))
 
     # What happens to the controller itself.
@@ -137,8 +136,7 @@ class Controller:
         """
         if state.command is not None or not np.all(np.isfinite(command)):
             return state
-        limits = self.settings.limits
-        return replace(state, command=_kept(np.clip(command, limits.lower, limits.upper)))
+        return amended(state, command=_kept(self.settings.limits.within(command)))
 
     def succeed(self, predecessor: Controller, state: State) -> State:
         """
@@ -157,7 +155,7 @@ class Controller:
         now = self._laws.attempt(state, state.law_in_force, state.estimate)
         if now.u is None:
             return state
-        return replace(state, law_input=now.u, transfer=_shifted(
+        return amended(state, law_input=now.u, transfer=_shifted(
             state.transfer, state.law_input - now.u))
 
     def try_law(self, x: Array, setpoint: Array) -> str:
@@ -166,7 +164,7 @@ class Controller:
 
         :return: an empty string when it can.
         """
-        state = replace(State(), setpoint=setpoints.Setpoint(setpoint, setpoint))
+        state = amended(State(), setpoint=setpoints.Setpoint(setpoint, setpoint))
         estimate = Estimate(self.model.states.to_deviation(x), np.zeros(self.model.n_x))
         with np.errstate(all='ignore'):
             return self._laws.attempt(state, Rung.LEARNED, estimate).problem
@@ -191,7 +189,7 @@ class Controller:
         ahead = 1 if state.time_ns is None else time_ns - state.time_ns
         if state.command is not None and -LATE_NANOSECONDS <= ahead <= 0:
             report = self._report(state, state.standing.rung, state.standing.reason)
-            return state, state.command, replace(
+            return state, state.command, amended(
                 report, outside=self._outside(measurement), late=ahead < 0,
                 clock_stood_still=ahead == 0)
         back = ahead < 0
@@ -207,7 +205,7 @@ class Controller:
             state, verdict, predicted = self._estimator.observe(
                 state, measurement, time_ns, elapsed)
             if not verdict.fault:
-                state = replace(state, setpoint=setpoints.advance(
+                state = amended(state, setpoint=setpoints.advance(
                     state.setpoint, measurement, self.model, self.settings.setpoint_ramp,
                     time_ns, seconds, self.settings.setpoint_filter))
             outside = self._outside(measurement)
@@ -215,8 +213,8 @@ class Controller:
                 state, verdict, outside, time_ns, elapsed, spacing)
         # without elapsed time the rate limit holds the last command
         limited = limit(self.settings.limits, wanted, state.command, seconds)
-        state = replace(state, command=limited.u, commanded_ns=time_ns)
-        return state, limited.u, replace(
+        state = amended(state, command=limited.u, commanded_ns=time_ns)
+        return state, limited.u, amended(
             report, outside=outside, at_range=report.at_range or limited.at_range,
             at_rate=limited.at_rate,
             input_outside=self.model.inputs.violation(limited.u), missed=missed,
@@ -240,8 +238,8 @@ class Controller:
                 state.sensed, 'no measurement arrives: check sensor and plant'),
                 np.nan, time_ns, elapsed)
         limited = limit(self.settings.limits, wanted, state.command, elapsed)
-        state = replace(state, command=limited.u, commanded_ns=max(time_ns, since_ns))
-        return state, limited.u, replace(report, at_range=limited.at_range,
+        state = amended(state, command=limited.u, commanded_ns=max(time_ns, since_ns))
+        return state, limited.u, amended(report, at_range=limited.at_range,
                                          at_rate=limited.at_rate)
 
     def equivalent_bias(self, state: State) -> Array:
@@ -262,34 +260,34 @@ class Controller:
         transfer = state.transfer and state.transfer.after(elapsed, self.settings.transfer_time)
         if state.mode is Mode.MANUAL:
             wanted = held if state.manual_input is None else state.manual_input
-            state = replace(state, law_in_force=None, law_input=None, transfer=None)
+            state = amended(state, law_in_force=None, law_input=None, transfer=None)
             return state, wanted, self._report(state, Rung.LEARNED, verdict.fault)
         standing, attempt = self._laws.choose(state, verdict, outside, time_ns, spacing)
         was_linear = state.linear
-        state = replace(state, standing=standing)
-        state = replace(state, estimate=self._estimator.rebase(
+        state = amended(state, standing=standing)
+        state = amended(state, estimate=self._estimator.rebase(
             state.estimate, was_linear, state.linear))
         report = self._report(state, standing.rung, standing.reason)
         if attempt is not None and attempt.found is not None:
             riccati = attempt.found.riccati
-            report = replace(report, residual=riccati.residual, gain=riccati.gain,
+            report = amended(report, residual=riccati.residual, gain=riccati.gain,
                              growth=attempt.growth, mismatch=attempt.target.mismatch)
         if attempt is None or attempt.u is None or attempt.found is None:
             if standing.rung is Rung.SAFE:
-                state = replace(state, law_in_force=None, law_input=None, transfer=None)
+                state = amended(state, law_in_force=None, law_input=None, transfer=None)
                 return state, self.safe_input, report
             passing = standing.resumes is not None
-            return (state if passing else replace(state, law_in_force=None, law_input=None),
+            return (state if passing else amended(state, law_in_force=None, law_input=None),
                     held, report)
-        report = replace(report, law=attempt.found.law, at_range=attempt.clipped)
+        report = amended(report, law=attempt.found.law, at_range=attempt.clipped)
         if state.law_in_force is not standing.rung and state.command is not None:
             # somebody else has commanded so far
             transfer = _shifted(None, held - attempt.u)
-        state = replace(state, law_in_force=standing.rung, law_input=attempt.u,
+        state = amended(state, law_in_force=standing.rung, law_input=attempt.u,
                         transfer=transfer)
         if transfer is None:
             return state, attempt.u, report
-        return state, attempt.u + transfer.offset, replace(report, transfer=transfer.offset)
+        return state, attempt.u + transfer.offset, amended(report, transfer=transfer.offset)
 
     def _outside(self, x: Array) -> float:
         """Return how far a measurement is outside the training box; NaN when it is none."""
@@ -298,17 +296,18 @@ class Controller:
     def _report(self, state: State, rung: Rung, reason: str) -> Report:
         """Return what is known without a law."""
         estimate, active = state.estimate, state.setpoint.active
-        report = Report(
-            state.mode, rung, reason, active_setpoint=active,
-            setpoint_outside=np.nan if active is None else self.model.states.violation(active))
+        outside = np.nan if active is None else self.model.states.violation(active)
         if estimate is None:
-            return report
+            return Report(state.mode, rung, reason, active_setpoint=active,
+                          setpoint_outside=outside)
         observer = self._estimator.observer(state.linear)
         disturbance = observer.as_input(estimate.w)
-        return replace(
-            report, estimate=self.model.states.to_physical(estimate.x),
+        return Report(
+            state.mode, rung, reason, active_setpoint=active, setpoint_outside=outside,
+            estimate=self.model.states.to_physical(estimate.x),
             disturbance=disturbance * self.model.inputs.scale,
-            at_bound=float(np.linalg.norm(disturbance)) >= observer.max_disturbance * (1 - 1e-9))
+            at_bound=math.sqrt(disturbance.dot(disturbance)) >= (
+                observer.max_disturbance * (1.0 - 1e-9)))
 
 
 def _passed(state: State, time_ns: int, elapsed: float) -> tuple[State, float, int]:
@@ -326,14 +325,14 @@ def _passed(state: State, time_ns: int, elapsed: float) -> tuple[State, float, i
     seconds = min(since, 2.0 * state.interval)
     # a burst of measurements does not make the next regular one a gap
     usual = 0.0 if np.isinf(state.interval) else 0.5 * state.interval
-    return (replace(state, interval=max(seconds, usual)), min(seconds, elapsed), missed)
+    return (amended(state, interval=max(seconds, usual)), min(seconds, elapsed), missed)
 
 
 def _afresh(state: State) -> State:
     """Return the state after the clock was set back: what was timed by it has lost its meaning."""
-    standing = replace(state.standing, bad_since_ns=None, better_since_ns=None)
-    return replace(state, time_ns=None, commanded_ns=None, sensed=None, standing=standing,
-                   setpoint=replace(state.setpoint, scheduled=()))
+    standing = amended(state.standing, bad_since_ns=None, better_since_ns=None)
+    return amended(state, time_ns=None, commanded_ns=None, sensed=None, standing=standing,
+                   setpoint=amended(state.setpoint, scheduled=()))
 
 
 def _shifted(transfer: Transfer | None, by: Array) -> Transfer:

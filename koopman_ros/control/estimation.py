@@ -16,13 +16,13 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import cached_property
 
 from koopman_ros.control.observer import Estimate, Observer
 from koopman_ros.control.sensor import judge, Sensed, Verdict
 from koopman_ros.control.setpoint import NANOSECONDS, Show
-from koopman_ros.control.state import Settings, State
+from koopman_ros.control.state import amended, Settings, State
 from koopman_ros.lifting import LiftedModel
 import numpy as np
 from numpy.typing import NDArray
@@ -81,7 +81,7 @@ class Estimator:
 
         def motion(then: Sensed) -> Array:
             frozen = None if before is None else Estimate(before.x, then.w)
-            moved = self.coast(replace(state, estimate=frozen), elapsed).estimate
+            moved = self.coast(amended(state, estimate=frozen), elapsed).estimate
             if before is None or moved is None:
                 return np.zeros_like(x)
             return (moved.x - before.x) * self.model.states.scale
@@ -94,7 +94,7 @@ class Estimator:
         elif verdict.frozen and predicted is not None and sensed is not None:
             # what the observer made of a sensor that does not move is no disturbance
             predicted = Estimate(predicted.x, sensed.w)
-        return (replace(state, sensed=verdict.sensed, time_ns=time_ns, estimate=predicted),
+        return (amended(state, sensed=verdict.sensed, time_ns=time_ns, estimate=predicted),
                 verdict, expected)
 
     def _corrected(self, state: State, predicted: Estimate | None, verdict: Verdict, x: Array,
@@ -138,7 +138,7 @@ class Estimator:
         if predicted is None or not np.all(np.isfinite(predicted.x)):
             # after so long, or from so far out, nothing is known; the disturbance is kept
             return state
-        return replace(state, estimate=predicted)
+        return amended(state, estimate=predicted)
 
     def rebase(self, estimate: Estimate | None, was_linear: bool, linear: bool
                ) -> Estimate | None:
@@ -156,7 +156,7 @@ class Estimator:
         if not self.settings.observer_bandwidth > 0.0:
             estimate = Estimate(estimate.x, np.zeros_like(estimate.w))
         if old is new:
-            return replace(state, estimate=estimate)
+            return amended(state, estimate=estimate)
         x = old.states.to_physical(estimate.x)
         # the rates that the old model believed, per second, which all models share
         believed = estimate.w + predecessor.observer(state.linear).model.drift(estimate.x) + (
@@ -170,7 +170,7 @@ class Estimator:
         else:
             moved = Estimate(moved.x, np.zeros_like(moved.w))
         # what it holds of the disturbance is in the old model's units
-        return replace(state, estimate=moved, sensed=None)
+        return amended(state, estimate=moved, sensed=None)
 
 
 def _command(model: LiftedModel, state: State) -> Array:

@@ -138,14 +138,20 @@ def recentred(model: LiftedModel, x: Array, target: Target, weights: Weights, *,
 
     Arguments and result as in :func:`feedback`; valid where every mode of A decays.
     """
-    z, J = model.lift_and_jacobian(x)
-    M, H = model.secants(x, target.x, target.push)
+    z, J, M, H = model.lift_and_secants(x, target.x, target.push)
     n_x, n_z = model.n_x, model.n_z
-    C = np.eye(n_x, n_z) if model.identity else np.linalg.pinv(M)
-    riccati = solve_riccati(model.A + H @ C, J @ model.B, C.T @ weights.Q @ C, weights.R,
-                            max_gain=max_gain, max_residual=max_residual)
+    if model.identity:
+        # C picks the first coordinates: the products are written out, which is faster
+        A, Q = model.A.copy(), np.zeros((n_z, n_z))
+        A[:, :n_x] += H
+        Q[:n_x, :n_x] = weights.Q
+    else:
+        C = np.linalg.pinv(M)
+        A, Q = model.A + H @ C, C.T @ weights.Q @ C
+    riccati = solve_riccati(A, J @ model.B, Q, weights.R, max_gain=max_gain,
+                            max_residual=max_residual)
     return Feedback(target.u - riccati.K @ (z - target.z), Law.RECENTRED, riccati,
-                    np.linalg.pinv(J) @ (model.A @ M + H), -model.B @ (riccati.K @ M))
+                    model.onto_states(J, model.A @ M + H), -model.B @ (riccati.K @ M))
 
 
 def projected(model: LiftedModel, x: Array, target: Target, weights: Weights, *,
@@ -158,9 +164,8 @@ def projected(model: LiftedModel, x: Array, target: Target, weights: Weights, *,
 
     Arguments and result as in :func:`feedback`.
     """
-    J = model.jacobian(x)
-    M, H = model.secants(x, target.x, target.push)
-    A = np.linalg.pinv(J) @ (model.A @ M + H)
+    _, J, M, H = model.lift_and_secants(x, target.x, target.push)
+    A = model.onto_states(J, model.A @ M + H)
     riccati = solve_riccati(A, model.B, weights.Q, weights.R,
                             max_gain=max_gain, max_residual=max_residual)
     return Feedback(target.u - riccati.K @ (x - target.x), Law.PROJECTED, riccati,

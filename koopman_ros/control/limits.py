@@ -45,6 +45,11 @@ class InputLimits:
         if not np.all(self.rate > 0.0):
             raise ValueError(f'input rate must be above 0, got {self.rate.tolist()}')
 
+    def within(self, u: Array) -> Array:
+        """Return the input (n_u,) of the range that is nearest."""
+        # several times faster than clip
+        return np.minimum(np.maximum(u, self.lower), self.upper)
+
 
 @dataclass(frozen=True)
 class LimitedInput:
@@ -73,11 +78,11 @@ def limit(limits: InputLimits, wanted: Array, previous: Array | None, seconds: f
     :param previous: (n_u,) command `seconds` ago, or None at the first.
     :param seconds: time since the previous command, not negative.
     """
-    within = np.clip(wanted, limits.lower, limits.upper)
+    within = limits.within(wanted)
     if previous is None:
         within.setflags(write=False)
         return LimitedInput(within, bool(np.any(within != wanted)), False)
     reach = limits.rate * seconds if seconds > 0.0 else np.zeros_like(limits.rate)
-    reached = np.clip(within, previous - reach, previous + reach)
+    reached = np.minimum(np.maximum(within, previous - reach), previous + reach)
     reached.setflags(write=False)
     return LimitedInput(reached, bool(np.any(within != wanted)), bool(np.any(reached != within)))

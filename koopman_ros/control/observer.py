@@ -115,7 +115,8 @@ class Observer:
 
     def bounded(self, w: Array) -> Array:
         """Return a disturbance within its bound; none where it is not finite."""
-        size = float(np.linalg.norm(self.as_input(w)))
+        d = self.as_input(w)
+        size = math.sqrt(d.dot(d))
         if size <= self.max_disturbance:
             return w
         return w * (self.max_disturbance / size) if math.isfinite(size) else np.zeros_like(w)

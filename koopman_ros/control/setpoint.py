@@ -122,6 +122,10 @@ def advance(setpoint: Setpoint, measured: Array, model: LiftedModel, ramp: float
     :param seconds: time since the last measurement; 0 at the first.
     :param lag: time constant in seconds of the filter behind the ramp; 0 for none.
     """
+    if (not setpoint.scheduled and setpoint.active is setpoint.requested is not None
+            and setpoint.ramped is None):
+        # arrived, and nothing ahead
+        return setpoint
     due = [entry for entry in setpoint.scheduled if not lies_ahead(entry[0], now_ns)]
     if due:
         kept = tuple(entry for entry in setpoint.scheduled if lies_ahead(entry[0], now_ns))
@@ -133,7 +137,9 @@ def advance(setpoint: Setpoint, measured: Array, model: LiftedModel, ramp: float
     reach = np.inf if np.isinf(ramp) else ramp * seconds
     ramped = np.clip(requested, ramped - reach, ramped + reach)
     if lag <= 0.0:
-        return replace(setpoint, requested=requested, active=ramped, ramped=None)
+        arrived = bool(np.all(ramped == requested))
+        return replace(setpoint, requested=requested, active=requested if arrived else ramped,
+                       ramped=None)
     share = -math.expm1(-seconds / lag)
     return replace(setpoint, requested=requested, ramped=ramped,
                    active=active + share * (ramped - active))

@@ -17,6 +17,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+import math
 
 from koopman_ros.lifting import LiftedModel
 import numpy as np
@@ -83,4 +84,5 @@ def balance(model: LiftedModel, at: Reference, w: Array) -> Target:
     load = at.drift + w
     u = -(model.input_inverse @ load)
     push = model.B @ u
-    return Target(at.x, at.z, u, push + w, float(np.linalg.norm(load + push)))
+    rest = load + push
+    return Target(at.x, at.z, u, push + w, math.sqrt(rest.dot(rest)))
