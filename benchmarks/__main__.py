@@ -23,6 +23,7 @@ from pathlib import Path
 import sys
 from typing import Any
 
+from benchmarks.loop import part as loop
 from benchmarks.options import Extent, Options
 from benchmarks.recording import part as recording
 from benchmarks.summary import Summary
@@ -30,7 +31,7 @@ from benchmarks.training import part as training
 
 # A part is a module with a function that returns its figures.
 PARTS: dict[str, Callable[[Options], dict[str, Any]]] = {
-    'training': training.run, 'recording': recording.run}
+    'training': training.run, 'recording': recording.run, 'loop': loop.run}
 
 
 def main(args: list[str] | None = None) -> int:

@@ -22,6 +22,7 @@ from functools import cached_property
 from koopman_ros.control.estimation import Estimator
 from koopman_ros.control.ladder import Need, Rung, Standing
 from koopman_ros.control.laws import Feedback, feedback, Weights
+from koopman_ros.control.limits import finite
 from koopman_ros.control.observer import Estimate
 from koopman_ros.control.sensor import Verdict
 from koopman_ros.control.state import State
@@ -136,7 +137,7 @@ class LawChoice:
                 f'the closed loop is predicted unstable at a sample every {spacing:.3g} s: raise '
                 'the input weight, or measure more often'))
         u = model.inputs.to_physical(found.u)
-        if not np.isfinite(u).all():
+        if not finite(u):
             return Attempt(None, target, found, growth, 'its command is not finite')
         within = settings.limits.within(u)
         return Attempt(within, target, found, growth, clipped=bool((within != u).any()))

@@ -25,7 +25,7 @@ from koopman_ros.control.choice import LawChoice
 from koopman_ros.control.estimation import Estimator
 from koopman_ros.control.ladder import Rung, Standing
 from koopman_ros.control.laws import Weights
-from koopman_ros.control.limits import limit
+from koopman_ros.control.limits import finite, limit
 from koopman_ros.control.observer import equivalent_bias, Estimate
 from koopman_ros.control.sensor import Verdict
 from koopman_ros.control.setpoint import NANOSECONDS
@@ -195,8 +195,11 @@ class Controller:
         back = ahead < 0
         if back:
             state = _afresh(state)
-        elapsed = 0.0 if state.commanded_ns is None else max(
-            0.0, (time_ns - state.commanded_ns) / NANOSECONDS)
+        since_ns = state.commanded_ns
+        if since_ns is not None and since_ns > time_ns + LATE_NANOSECONDS:
+            # what was commanded in silence was timed by a clock that these stamps do not follow
+            since_ns = state.time_ns
+        elapsed = 0.0 if since_ns is None else max(0.0, (time_ns - since_ns) / NANOSECONDS)
         # neither a gap nor a burst is the spacing of the samples, nor the first of them
         spacing = 0.0 if math.isinf(state.interval) else min(state.interval, elapsed)
         state, seconds, missed = _passed(state, time_ns, elapsed)
@@ -265,13 +268,16 @@ class Controller:
         standing, attempt = self._laws.choose(state, verdict, outside, time_ns, spacing)
         was_linear = state.linear
         state = amended(state, standing=standing)
-        state = amended(state, estimate=self._estimator.rebase(
-            state.estimate, was_linear, state.linear))
+        if state.linear != was_linear:
+            state = amended(state, estimate=self._estimator.rebase(
+                state.estimate, was_linear, state.linear))
         report = self._report(state, standing.rung, standing.reason)
         if attempt is not None and attempt.found is not None:
             riccati = attempt.found.riccati
             report = amended(report, residual=riccati.residual, gain=riccati.gain,
-                             growth=attempt.growth, mismatch=attempt.target.mismatch)
+                             growth=attempt.growth, mismatch=attempt.target.mismatch,
+                             law=None if attempt.u is None else attempt.found.law,
+                             at_range=attempt.clipped)
         if attempt is None or attempt.u is None or attempt.found is None:
             if standing.rung is Rung.SAFE:
                 state = amended(state, law_in_force=None, law_input=None, transfer=None)
@@ -279,7 +285,6 @@ class Controller:
             passing = standing.resumes is not None
             return (state if passing else amended(state, law_in_force=None, law_input=None),
                     held, report)
-        report = amended(report, law=attempt.found.law, at_range=attempt.clipped)
         if state.law_in_force is not standing.rung and state.command is not None:
             # somebody else has commanded so far
             transfer = _shifted(None, held - attempt.u)
@@ -291,7 +296,7 @@ class Controller:
 
     def _outside(self, x: Array) -> float:
         """Return how far a measurement is outside the training box; NaN when it is none."""
-        return self.model.states.violation(x) if np.all(np.isfinite(x)) else np.nan
+        return self.model.states.violation(x) if finite(x) else np.nan
 
     def _report(self, state: State, rung: Rung, reason: str) -> Report:
         """Return what is known without a law."""
@@ -324,7 +329,7 @@ def _passed(state: State, time_ns: int, elapsed: float) -> tuple[State, float, i
     # the plant stood under the old command all through a gap
     seconds = min(since, 2.0 * state.interval)
     # a burst of measurements does not make the next regular one a gap
-    usual = 0.0 if np.isinf(state.interval) else 0.5 * state.interval
+    usual = 0.0 if math.isinf(state.interval) else 0.5 * state.interval
     return (amended(state, interval=max(seconds, usual)), min(seconds, elapsed), missed)
 
 

@@ -19,6 +19,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from functools import cached_property
 
+from koopman_ros.control.limits import finite
 from koopman_ros.control.observer import Estimate, Observer
 from koopman_ros.control.sensor import judge, Sensed, Verdict
 from koopman_ros.control.setpoint import NANOSECONDS, Show
@@ -135,7 +136,7 @@ class Estimator:
             return state
         u = self.model.inputs.to_deviation(state.command)
         predicted = self.observer(state.linear).predict(state.estimate, u, elapsed)
-        if predicted is None or not np.all(np.isfinite(predicted.x)):
+        if predicted is None or not finite(predicted.x):
             # after so long, or from so far out, nothing is known; the disturbance is kept
             return state
         return amended(state, estimate=predicted)

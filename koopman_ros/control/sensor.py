@@ -18,6 +18,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+import math
 
 from koopman_ros.control.setpoint import in_state_units, NANOSECONDS, Show
 from koopman_ros.lifting import Coordinates
@@ -126,7 +127,7 @@ def judge(limits: SensorLimits, states: Coordinates, sensed: Sensed | None, x: A
     seconds = (time_ns - sensed.time_ns) / NANOSECONDS
     if not _reachable(limits, sensed.value, x, seconds):
         return _jump(limits, states, sensed, changed, show)
-    if not np.array_equal(x, sensed.value):
+    if not (x == sensed.value).all():
         return Verdict(changed)
     moved = sensed.motion + motion(sensed)
     still = replace(sensed, time_ns=time_ns, motion=moved, jumped=None, agreeing=0)
@@ -142,8 +143,8 @@ def judge(limits: SensorLimits, states: Coordinates, sensed: Sensed | None, x: A
 
 
 def _absurd(limits: SensorLimits, states: Coordinates, x: Array, show: Show) -> str:
-    for value, name, unit in zip(x, states.names, states.units, strict=True):
-        if not np.isfinite(value):
+    for value, name, unit in zip(x.tolist(), states.names, states.units, strict=True):
+        if not math.isfinite(value):
             return f'the measured {name} is {value}, not finite: check the sensor'
         if not limits.lower <= value <= limits.upper:
             return (f'the measured {name} {show(value, unit)} is outside the range of the sensor, '
@@ -152,9 +153,8 @@ def _absurd(limits: SensorLimits, states: Coordinates, x: Array, show: Show) -> 
 
 
 def _reachable(limits: SensorLimits, before: Array, x: Array, seconds: float) -> bool:
-    if np.isinf(limits.jump) or np.isinf(limits.rate):
-        return True
-    return float(np.max(np.abs(x - before))) <= limits.jump + limits.rate * seconds
+    farthest = max(abs(a - b) for a, b in zip(x.tolist(), before.tolist(), strict=True))
+    return farthest <= limits.jump + limits.rate * seconds
 
 
 def _jump(limits: SensorLimits, states: Coordinates, sensed: Sensed, changed: Sensed, show: Show

@@ -130,14 +130,15 @@ def advance(setpoint: Setpoint, measured: Array, model: LiftedModel, ramp: float
     if due:
         kept = tuple(entry for entry in setpoint.scheduled if lies_ahead(entry[0], now_ns))
         setpoint = replace(setpoint, requested=due[-1][1], scheduled=kept)
-    held = np.clip(measured, model.states.lower, model.states.upper)
-    active = held if setpoint.active is None else setpoint.active
+    active = setpoint.active
+    if active is None:
+        active = np.clip(measured, model.states.lower, model.states.upper)
     requested = active if setpoint.requested is None else setpoint.requested
     ramped = active if setpoint.ramped is None or lag <= 0.0 else setpoint.ramped
     reach = np.inf if np.isinf(ramp) else ramp * seconds
-    ramped = np.clip(requested, ramped - reach, ramped + reach)
+    ramped = np.minimum(np.maximum(requested, ramped - reach), ramped + reach)
     if lag <= 0.0:
-        arrived = bool(np.all(ramped == requested))
+        arrived = ramped.tolist() == requested.tolist()
         return replace(setpoint, requested=requested, active=requested if arrived else ramped,
                        ramped=None)
     share = -math.expm1(-seconds / lag)

@@ -82,7 +82,7 @@ def reference(model: LiftedModel, x_ref: Array) -> Reference:
 def balance(model: LiftedModel, at: Reference, w: Array) -> Target:
     """Complete a reference by the input that balances drift and disturbance w (n_x,)."""
     load = at.drift + w
-    u = -(model.input_inverse @ load)
-    push = model.B @ u
+    u = -model.input_inverse.dot(load)
+    push = model.B.dot(u)
     rest = load + push
     return Target(at.x, at.z, u, push + w, math.sqrt(rest.dot(rest)))

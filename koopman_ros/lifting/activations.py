@@ -59,10 +59,10 @@ def activation_named(name: str) -> Activation:
 
 
 def _per_delta(function: Callable[[Array], Array], delta: Array) -> Array:
-    """Return function(delta) / delta of tanh or sin, which is 1 to rounding below 1e-8."""
-    small = np.abs(delta) < 1e-8
-    safe = np.where(small, 1.0, delta)
-    return np.where(small, 1.0, function(safe) / safe)
+    """Return function(delta) / delta of tanh or sin, which is 1 at 0."""
+    # only differences for which the ratio is 1 to rounding change by this
+    apart = delta + np.copysign(1e-300, delta)
+    return function(apart) / apart
 
 
 def _tanh_slope(a: Array, t: Array) -> Array:

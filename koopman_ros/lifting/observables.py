@@ -57,6 +57,11 @@ class Observables(ABC):
         """Evaluate N(x) and J_N(x) = dN/dx: (..., n_x) -> (..., n_z), (..., n_z, n_x)."""
 
     @abstractmethod
+    def lift_and_secants(self, x: Array, x_ref: Array, w: Array
+                         ) -> tuple[Array, Array, Array, Array]:
+        """Evaluate N(x) and J_N(x), which a feedback law needs, too, before the secants."""
+
+    @final
     def secants(self, x: Array, x_ref: Array, w: Array) -> tuple[Array, Array]:
         """
         Evaluate the secants of N and of J_N w between two states, exactly.
@@ -69,6 +74,7 @@ class Observables(ABC):
         :param w: (n_x,) constant direction, e.g. B u_ref.
         :return: M (n_z, n_x) and H (n_z, n_x).
         """
+        return self.lift_and_secants(x, x_ref, w)[2:]
 
 
 @final
@@ -130,6 +136,12 @@ class NetworkObservables(Observables):
         return h
 
     @cached_property
+    def _rows(self) -> Array:
+        """The output (n_z, h) with rows of zeros where the state goes."""
+        states = self.n_z - self.output.shape[0]
+        return np.concatenate((np.zeros((states, self.output.shape[1])), self.output))
+
+    @cached_property
     def _identity_rows(self) -> Array:
         return frozen(np.eye(self.n_x), 'identity', (self.n_x, self.n_x))
 
@@ -143,50 +155,59 @@ class NetworkObservables(Observables):
             return np.array(x)
         h, value = x, self._activation.value
         for weight, bias in self.hidden:
-            h = value(h @ weight.T + bias)
-        free: Array = (h - self._value_at_zero) @ self.output.T
-        return np.concatenate((x, free), axis=-1) if self.identity else free
+            h = value(_product(h, weight.T) + bias)
+        return self._with_states(x, _product(h - self._value_at_zero, self._rows.T))
 
     def lift_and_jacobian(self, x: Array) -> tuple[Array, Array]:
         """Evaluate N(x) and J_N(x) in one forward pass; shapes as in the interface."""
-        eye = np.broadcast_to(self._identity_rows, (*x.shape, x.shape[-1]))
+        eye = self._identity_rows
+        if x.ndim > 1:
+            eye = np.broadcast_to(eye, (*x.shape, self.n_x))
         if not self.hidden:
             return x, eye
+        # T is the transpose of dh/dx
         h, T, f = x, eye, self._activation
         for weight, bias in self.hidden:
-            a = h @ weight.T + bias
+            a = _product(h, weight.T) + bias
             h = f.value(a)
-            T = f.slope(a, h)[..., None] * (weight @ T)
-        free = (h - self._value_at_zero) @ self.output.T
-        J = self.output @ T
-        if self.identity:
-            return np.concatenate((x, free), axis=-1), np.concatenate((eye, J), axis=-2)
-        return free, J
+            T = f.slope(a, h)[..., None, :] * _product(T, weight.T)
+        z = _product(h - self._value_at_zero, self._rows.T)
+        J = _product(T, self._rows.T)
+        return self._with_states(x, z), self._with_states(eye, J).swapaxes(-1, -2)
 
-    def secants(self, x: Array, x_ref: Array, w: Array) -> tuple[Array, Array]:
+    def lift_and_secants(self, x: Array, x_ref: Array, w: Array
+                         ) -> tuple[Array, Array, Array, Array]:
         """
-        Evaluate the secants of the interface by the chain rule of divided differences.
+        Evaluate the lift and, by the chain rule of divided differences, the secants.
 
         With one hidden layer M is the mean of J_N along the segment.
         """
-        h, h_ref, p = x, x_ref, w
-        T, G, f = self._identity_rows, self._zero_rows, self._activation
-        for weight, bias in self.hidden:
-            a, a_ref = weight @ h + bias, weight @ h_ref + bias
-            h, h_ref = f.value(a), f.value(a_ref)
-            slope, slope_of_slope = f.divided_differences(a, a_ref, h, h_ref)
-            q = weight @ p
-            T = weight @ T
-            G = (slope_of_slope * q)[:, None] * T + f.slope(a_ref, h_ref)[:, None] * (weight @ G)
-            T = slope[:, None] * T
-            p = f.slope(a, h) * q
+        eye, zero, f = self._identity_rows, self._zero_rows, self._activation
         if not self.hidden:
-            return T, G
-        M, H = self.output @ T, self.output @ G
+            return x, eye, eye, zero
+        # both states pass the layers at once; T, S and G are transposes of what is wanted
+        h, p, T, S, G = np.array((x, x_ref)), w, eye, eye, zero
+        for weight, bias in self.hidden:
+            W = weight.T
+            a = h.dot(W) + bias
+            h = f.value(a)
+            at_x, at_ref = f.slope(a, h)
+            slope, slope_of_slope = f.divided_differences(a[0], a[1], h[0], h[1])
+            q, S = p.dot(W), S.dot(W)
+            G = slope_of_slope * q * S + at_ref * G.dot(W)
+            S = slope * S
+            T = at_x * T.dot(W)
+            p = at_x * q
+        rows = self._rows.T
+        return (self._with_states(x, (h[0] - self._value_at_zero).dot(rows)),
+                self._with_states(eye, T.dot(rows)).T, self._with_states(eye, S.dot(rows)).T,
+                G.dot(rows).T)
+
+    def _with_states(self, states: Array, rows: Array) -> Array:
+        """Fill in what the coordinates (..., n_z) of `rows` begin with where z does."""
         if self.identity:
-            M = np.concatenate((self._identity_rows, M))
-            H = np.concatenate((self._zero_rows, H))
-        return M, H
+            rows[..., :states.shape[-1]] = states
+        return rows
 
 
 @final
@@ -273,9 +294,10 @@ class PolynomialObservables(Observables):
         factors, exponents = self._first
         return self.lift(x), factors * _monomials(x, exponents)
 
-    def secants(self, x: Array, x_ref: Array, w: Array) -> tuple[Array, Array]:
+    def lift_and_secants(self, x: Array, x_ref: Array, w: Array
+                         ) -> tuple[Array, Array, Array, Array]:
         """
-        Evaluate the secants of the interface as means along the segment.
+        Evaluate the lift, and the secants as means along the segment.
 
         M is the mean of J_N and H that of d(J_N w)/dx, by Gauss-Legendre quadrature, which is
         exact for polynomials.
@@ -288,7 +310,13 @@ class PolynomialObservables(Observables):
         M[:self.n_x] = np.eye(self.n_x)
         second, exponents = self._second
         H: Array = np.tensordot(weights, second * _monomials(points, exponents) @ w, 1)
-        return M, H
+        return *self.lift_and_jacobian(x), M, H
+
+
+def _product(rows: Array, matrix: Array) -> Array:
+    """Multiply (..., n) by (n, m); one state's few numbers take `dot` a third of the time of @."""
+    product: Array = rows.dot(matrix) if rows.ndim <= 2 else rows @ matrix
+    return product
 
 
 def _columns(array: Array) -> int:

@@ -51,6 +51,7 @@ def test_a_model_lifts_as_its_observables_do(model):
     np.testing.assert_array_equal(model.jacobian(x), observables.lift_and_jacobian(x)[1])
     for ours, theirs in (
             (model.lift_and_jacobian(x), observables.lift_and_jacobian(x)),
+            (model.lift_and_secants(*x[:3]), observables.lift_and_secants(*x[:3])),
             (model.secants(*x[:3]), observables.secants(*x[:3]))):
         for a, b in zip(ours, theirs, strict=True):
             np.testing.assert_array_equal(a, b)
@@ -63,6 +64,25 @@ def test_drift_is_the_least_squares_projection(n_x, widths, identity):
         z, J = model.lift_and_jacobian(x)
         expected = np.linalg.lstsq(J, model.A @ z, rcond=None)[0]
         np.testing.assert_allclose(model.drift(x), expected, rtol=1e-10, atol=1e-13)
+
+
+@every_shape
+@pytest.mark.parametrize('columns', [(), (1,), (3,)])
+def test_rates_of_z_are_brought_to_the_nearest_rate_of_the_state(n_x, widths, identity, columns):
+    model = random_lift(n_x, widths, identity=identity)
+    rate = np.random.default_rng(3).normal(size=(model.n_z, *columns))
+    for x in states(n_x):
+        J = model.jacobian(x)
+        found = model.onto_states(J, rate)
+        assert found.shape == (n_x, *columns)
+        expected = np.linalg.lstsq(J, rate, rcond=None)[0]
+        np.testing.assert_allclose(found, expected, rtol=1e-10, atol=1e-13)
+
+
+def test_a_lift_that_stands_still_moves_no_state():
+    model = random_lift(1, identity=False)
+    flat = np.zeros((model.n_z, 1))
+    np.testing.assert_array_equal(model.onto_states(flat, np.ones(model.n_z)), [0.0])
 
 
 @every_shape
@@ -214,6 +234,12 @@ def test_coordinates_scale_both_ways():
 ])
 def test_violation_counts_half_widths(value, violation):
     assert coordinates('x', 2).violation(np.array(value)) == pytest.approx(violation, rel=1e-15)
+
+
+@pytest.mark.parametrize('value', [
+    [np.nan, 0.0], [3.0, np.nan], [np.inf, 0.0], [5.0, -np.inf], [np.nan, 70.0]])
+def test_what_is_not_finite_is_infinitely_far_outside(value):
+    assert coordinates('x', 2).violation(np.array(value)) == np.inf
 
 
 def test_model_without_inputs():

@@ -144,6 +144,28 @@ def test_secants_at_zero_separation_are_derivatives(lift):
 
 
 @every_lift
+def test_lift_and_secants_lift_as_the_single_methods(lift):
+    x, x_ref, w = states(lift.n_x, 3, seed=5)
+    z, J, M, H = lift.lift_and_secants(x, x_ref, w)
+    for found, expected in zip((z, J), lift.lift_and_jacobian(x), strict=True):
+        # matrix and vector products may round differently
+        np.testing.assert_allclose(found, expected, rtol=1e-14, atol=1e-14)
+    for found, expected in zip((M, H), lift.secants(x, x_ref, w), strict=True):
+        np.testing.assert_array_equal(found, expected)
+
+
+@every_lift
+def test_what_is_returned_is_not_the_lift_s_own(lift):
+    """Whoever changes a result in place must not change the next one."""
+    x, x_ref, w = states(lift.n_x, 3, seed=5)
+    before = lift.lift_and_secants(x.copy(), x_ref, w)
+    for array in (*lift.lift_and_jacobian(x.copy()), *lift.lift_and_secants(x.copy(), x_ref, w)):
+        array[...] = 7.0
+    for a, b in zip(before, lift.lift_and_secants(x, x_ref, w), strict=True):
+        np.testing.assert_array_equal(a, b)
+
+
+@every_lift
 def test_a_lift_cannot_be_changed(lift):
     with pytest.raises(FrozenInstanceError):
         lift.identity = not lift.identity

@@ -156,6 +156,22 @@ def test_nobody_watches_before_the_first_measurement():
     assert (state.command, command, report.reason) == (None, None, '')
 
 
+@pytest.mark.parametrize('ahead', [15, 3600])
+def test_stamps_that_stood_still_while_it_was_watched_do_not_stop_the_law(ahead):
+    """The plant was halted, or its clock was an hour ahead for a moment."""
+    loop = Loop(controller())
+    loop.run(10)
+    loop.ask(START - 2.0)
+    loop.state, _, report = loop.controller.watch(
+        loop.state, loop.state.time_ns + ahead * SECOND)
+    assert report.rung is Rung.HOLD
+    samples = loop.run(300)
+    assert rungs(samples) == [Rung.LEARNED]
+    assert abs(samples[9].command - samples[0].command) > 0.5
+    assert largest_step(samples) <= 1.0 + 1e-9
+    assert abs(samples[-1].temperature - (START - 2.0)) < 0.01
+
+
 def test_manual_commands_go_on_without_measurements():
     loop = Loop(controller())
     loop.run(10)

@@ -1,0 +1,133 @@
+# Copyright 2026 The koopman_ros Authors
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+
+"""A sensor and an actuator in one: publishes measurements, and notes when their commands come."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+import time
+from types import TracebackType
+
+from koopman_ros.nodes import topics
+from koopman_ros.nodes.messages import NANOSECONDS, stamp_message, stamp_nanoseconds
+import numpy as np
+import rclpy
+from rclpy.context import Context
+from rclpy.executors import SingleThreadedExecutor
+from rclpy.node import Node
+from sensor_msgs.msg import Temperature
+
+TIMEOUT = 30.0  # s, until somebody answers
+_CELSIUS = 51.0  # about the nominal point of the shipped lifts
+_NOISE = 0.01  # K, standard deviation
+_RETRY = 0.01  # s between measurements that nobody may hear yet
+
+
+class Probe:
+    """
+    The measuring end of a loop; leaving the context takes the node down.
+
+    :param domain: ROS domain.
+    """
+
+    def __init__(self, domain: int) -> None:
+        self._context = Context()
+        rclpy.init(context=self._context, domain_id=domain)
+        self.node = Node('probe', context=self._context)
+        self._executor = SingleThreadedExecutor(context=self._context)
+        self._executor.add_node(self.node)
+
+    def __enter__(self) -> Probe:
+        return self
+
+    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None,
+                 trace: TracebackType | None) -> None:
+        self._executor.shutdown()
+        self.node.destroy_node()
+        rclpy.shutdown(context=self._context)
+
+    def spin_once(self, seconds: float) -> None:
+        """Handle one message, or wait for so long."""
+        self._executor.spin_once(timeout_sec=max(seconds, 0.0))
+
+    def wait_until(self, condition: Callable[[], bool], what: str) -> None:
+        """
+        Handle messages until a condition holds.
+
+        :raises TimeoutError: saying what was waited for.
+        """
+        deadline = time.monotonic() + TIMEOUT
+        while not condition():
+            if time.monotonic() > deadline:
+                raise TimeoutError(f'not within {TIMEOUT:g} s: {what}')
+            self.spin_once(0.05)
+
+
+class Loop:
+    """
+    The two topics of one controller, under a namespace.
+
+    :param probe: the node that measures.
+    :param namespace: of whoever answers, e.g. ``/ours``.
+    """
+
+    def __init__(self, probe: Probe, namespace: str) -> None:
+        self._probe = probe
+        self._rng = np.random.default_rng(0)
+        self._answers: dict[int, int] = {}  # stamp -> arrival
+        self._measurements = probe.node.create_publisher(
+            Temperature, f'{namespace}/{topics.TEMPERATURE}', topics.LOOP_QOS)
+        probe.node.create_subscription(
+            Temperature, f'{namespace}/{topics.COOLANT_SETPOINT}', self._on_command,
+            topics.LOOP_QOS)
+
+    def wait_for_first_answer(self) -> int:
+        """Publish until somebody answers; return when the answer came [ns of time.time_ns]."""
+        self._answers.clear()
+        deadline = time.monotonic() + TIMEOUT
+        while not self._answers:
+            if time.monotonic() > deadline:
+                raise TimeoutError(f'nobody answers within {TIMEOUT:g} s')
+            self.publish()
+            self._probe.spin_once(_RETRY)
+        return next(iter(self._answers.values()))
+
+    def settle(self) -> None:
+        """Handle all answers that are still on their way."""
+        last = self.publish()
+        self._probe.wait_until(lambda: last in self._answers, 'the answer to a measurement')
+
+    def ask(self) -> float:
+        """Publish a measurement and wait for its command; return the seconds between."""
+        stamp = self.publish()
+        self._probe.wait_until(lambda: stamp in self._answers, 'the answer to a measurement')
+        return self.seconds(stamp)
+
+    def publish(self) -> int:
+        """Publish a measurement of now; return its stamp."""
+        message = Temperature(temperature=_CELSIUS + _NOISE * self._rng.normal())
+        stamp = time.time_ns()
+        message.header.stamp = stamp_message(stamp)
+        self._measurements.publish(message)
+        return stamp
+
+    def seconds(self, stamp: int) -> float:
+        """Return the time from a measurement to its command; infinity where none came."""
+        arrival = self._answers.get(stamp)
+        return np.inf if arrival is None else (arrival - stamp) / NANOSECONDS
+
+    def _on_command(self, message: Temperature) -> None:
+        self._answers[stamp_nanoseconds(message.header.stamp)] = time.time_ns()
