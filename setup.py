@@ -29,7 +29,8 @@ def _data_files() -> list[tuple[str, list[str]]]:
         (os.path.join('share', 'ament_index', 'resource_index', 'packages'),
          [os.path.join('resource', PACKAGE)]),
         (share, ['package.xml']),
-        (os.path.join(share, 'config'), sorted(glob('config/*.yaml') + glob('config/*.xml'))),
+        (os.path.join(share, 'config'),
+         sorted(glob('config/*.yaml') + glob('config/*.xml') + glob('config/*.json'))),
         (os.path.join(share, 'config', 'models'), sorted(glob('config/models/*'))),
     ]
 
@@ -59,11 +60,12 @@ setup(
         'demo': ['matplotlib', 'rich'],
         'train': ['torch==2.13.0', 'joblib', 'tqdm'],
         # what the benchmark compares with, no part of the package
-        'bench': ['casadi==3.8.2'],
+        'bench': ['casadi==3.8.2', 'control', 'psutil'],
         'test': [
             'colcon-common-extensions',
             'control',
             'distributed',
+            'hypothesis',
             'mypy',
             'pytest',
             'pytest-timeout',
@@ -76,11 +78,11 @@ setup(
     },
     entry_points={
         'console_scripts': [
-            'plant = koopman_ros.nodes.plant:main',
-            'controller = koopman_ros.nodes.controller:main',
-            'trainer = koopman_ros.nodes.trainer:main',
-            'player = koopman_ros.nodes.player:main',
-            'replay = koopman_ros.nodes.replay:main',
+            'plant = koopman_ros.nodes.programs:plant',
+            'controller = koopman_ros.nodes.programs:controller',
+            'trainer = koopman_ros.nodes.programs:trainer',
+            'player = koopman_ros.nodes.programs:player',
+            'replay = koopman_ros.nodes.programs:replay',
         ],
     },
 )

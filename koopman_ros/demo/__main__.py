@@ -12,7 +12,11 @@
 # See the License for the specific language governing permissions and
 # limitations under the License.
 
-"""The demo: bring the reactor 10 K down with the learned lift, and with the linearisation."""
+"""
+The demo: bring the reactor 10 K down with the learned lift, and with the linearisation.
+
+The disturbance observer is off, so that what is seen is what each model knows.
+"""
 
 from __future__ import annotations
 
@@ -54,8 +58,8 @@ def run_demo(output: Path, speed: float) -> dict[str, object]:
     for old in (*bags, output / 'closed_loop.png', output / 'summary.json'):
         old.unlink(missing_ok=True)
 
-    with LiveTable(f'learned controller ({parameters.model}), set-point {STEP:+.0f} K '
-                   f'after {scenario.step_time:.0f} s') as table:
+    with LiveTable(f'learned controller ({parameters.model}) without observer, set-point '
+                   f'{STEP:+.0f} K after {scenario.step_time:.0f} s') as table:
         run_loop(scenario, bags[0], logs, table.show)
     print('the same with the linearised controller ...', flush=True)
     linear_scenario = replace(scenario, model=LINEAR_MODEL, speed=0.0)

@@ -104,8 +104,8 @@ def plot(path: Path, learned: Run, linear: Run, setpoint: float, step_time: floa
                label=f'learned controller (ends {learned.final_error(setpoint):+.0e} K off)')
     upper.set_ylabel('reactor temperature [°C]')
     upper.set_ylim(low - 1.0, high + 1.0)
-    upper.set_title(f'Set-point step of {setpoint - start:+.0f} K at '
-                    f'{step_time / 60.0:.0f} min: the reactor under closed loop')
+    upper.set_title(f'Set-point step of {setpoint - start:+.0f} K at {step_time / 60.0:.0f} min, '
+                    'disturbance observer off: what each model knows')
     upper.legend(loc='upper right')
     lower.axhline(limits.coolant_max, color='0.4', linestyle=':', label='coolant limits')
     lower.axhline(limits.coolant_min, color='0.4', linestyle=':')

@@ -151,7 +151,8 @@ def plot(path: Path, history: History, phases: Sequence[tuple[str, float]], setp
         upper.text(0.5 * (left + right), high + 0.16 * (high - low), name.replace(' ', '\n'),
                    ha='center', va='top', fontsize=9)
     upper.legend(loc='lower right', ncols=2, fontsize=8)
-    upper.set_title('The plant drifts, is recorded, and its controller learns it anew')
+    upper.set_title('The plant drifts, is recorded, and its controller learns it anew '
+                    '(disturbance observer off)')
     middle.axhline(limits.coolant_max, color='0.4', linestyle=':', label='coolant limits')
     middle.axhline(limits.coolant_min, color='0.4', linestyle=':')
     middle.step(history.command_seconds / 60.0, history.coolant - ZERO_CELSIUS, where='post',

@@ -1,0 +1,120 @@
+# Copyright 2026 The koopman_ros Authors
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""The shipped plot layouts name what the nodes publish."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+import json
+import re
+from typing import Any
+import xml.etree.ElementTree as ElementTree
+
+from builtin_interfaces.msg import Time
+from koopman_ros.control import Mode, Report
+from koopman_ros.nodes import topics
+from koopman_ros.nodes.controller_status import internals
+from koopman_ros.nodes.shipped import config_directory
+import pytest
+from sensor_msgs.msg import JointState
+
+# What a layout shows: topics with one value by themselves, and internals by their names.
+TEMPERATURES = {topics.TEMPERATURE, topics.ACTIVE_SETPOINT, topics.PREDICTED_TEMPERATURE,
+                topics.COOLANT_SETPOINT, topics.COOLANT_TEMPERATURE}
+INTERNALS = {'disturbance', 'transfer', 'gain', 'growth_per_sample', 'rung', 'distance_outside'}
+NAMES = list(internals(Report(Mode.AUTOMATIC), Time(), '').name)
+
+
+def published(topic: str, field: str, name: str = '') -> str:
+    """Return what a curve shows, after a look at the message that it is taken from."""
+    kind = topics.TYPES[topic]
+    assert kind.get_fields_and_field_types()[field] in ('double', 'sequence<double>')
+    assert (kind is JointState) == bool(name)
+    return name.split(' [')[0] or topic
+
+
+@pytest.fixture(scope='module')
+def plotjuggler() -> ElementTree.Element:
+    return ElementTree.parse(config_directory() / 'plotjuggler.xml').getroot()
+
+
+@pytest.fixture(scope='module')
+def foxglove() -> dict[str, Any]:
+    layout: dict[str, Any] = json.loads(
+        (config_directory() / 'foxglove_layout.json').read_text())
+    return layout
+
+
+def test_every_curve_of_plotjuggler_is_published(plotjuggler: ElementTree.Element) -> None:
+    shown = []
+    for curve in plotjuggler.iter('curve'):
+        # PlotJuggler unrolls a JointState as /topic/name/position
+        _, topic, *name, field = curve.attrib['name'].split('/')
+        assert all(part in NAMES for part in name)
+        shown.append(published(topic, field, *name))
+    assert len(shown) == len(set(shown))
+    assert set(shown) == TEMPERATURES | INTERNALS
+
+
+def test_plotjuggler_subscribes_to_what_it_shows(plotjuggler: ElementTree.Element) -> None:
+    streamer = plotjuggler.find('previouslyLoaded_Streamer')
+    plugin = plotjuggler.find('Plugins/plugin')
+    assert streamer is not None
+    assert plugin is not None
+    assert streamer.attrib['name'] == plugin.attrib['ID'] == 'ROS2 Topic Subscriber'
+    selected = plugin.find('selected_topics')
+    assert selected is not None
+    assert sorted(selected.attrib['value'].split(';')) == sorted(
+        {'/' + curve.attrib['name'].split('/')[1] for curve in plotjuggler.iter('curve')})
+
+
+def test_splitters_of_plotjuggler_count_their_children(plotjuggler: ElementTree.Element) -> None:
+    splitters = list(plotjuggler.iter('DockSplitter'))
+    assert splitters
+    for splitter in splitters:
+        sizes = [float(size) for size in splitter.attrib['sizes'].split(';')]
+        assert len(splitter) == len(sizes) == int(splitter.attrib['count'])
+        assert sum(sizes) == pytest.approx(1.0)
+        assert splitter.attrib['orientation'] in '|-'
+
+
+def test_every_series_of_foxglove_is_published(foxglove: dict[str, Any]) -> None:
+    shown = []
+    for panel in foxglove['configById'].values():
+        for series in panel.get('paths', ()):
+            parts = re.fullmatch(r'/(\w+)\.(\w+)(?:\[(\d+)\])?', series['value'])
+            assert parts is not None
+            topic, field, place = parts.groups()
+            name = [] if place is None else [NAMES[int(place)]]
+            # nothing but its label says what the number in brackets stands for
+            assert name in ([], [series['label']])
+            shown.append(published(topic, field, *name))
+    assert len(shown) == len(set(shown))
+    assert set(shown) == TEMPERATURES | INTERNALS
+
+
+def test_panels_of_foxglove_have_their_places(foxglove: dict[str, Any]) -> None:
+    assert sorted(_panels(foxglove['layout'])) == sorted(foxglove['configById'])
+    assert foxglove['configById']['DiagnosticSummary!all']['topicToRender'] == topics.DIAGNOSTICS
+
+
+def _panels(node: str | dict[str, Any]) -> Iterator[str]:
+    """Yield the panels of a layout, which is a tree of splits."""
+    if isinstance(node, str):
+        yield node
+    else:
+        assert node['direction'] in ('row', 'column')
+        yield from _panels(node['first'])
+        yield from _panels(node['second'])
