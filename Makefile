@@ -8,7 +8,7 @@ export ROS_AUTOMATIC_DISCOVERY_RANGE ?= LOCALHOST
 # How many seeds each experiment is run from: make studies SEEDS=5
 SEEDS ?= 20
 
-.PHONY: help demo demo-retrain test lint models studies studies-sensors bench config clean
+.PHONY: help demo demo-retrain test lint models studies studies-sensors studies-robustness bench faults config clean
 
 help:  ## show this list
 	@grep -E '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed 's/:.*## /\t/'
@@ -62,8 +62,14 @@ studies: $(VENV)/train.stamp  ## the paper's experiments from SEEDS seeds: figur
 studies-sensors: $(VENV)/train.stamp  ## learning from noisy data of a sensor, ten seeds -> out/studies-sensors
 	$(BIN)/python -m koopman_ros.studies --sensors --seeds 10
 
+studies-robustness: $(VENV)/bench.stamp  ## margins, attraction, disturbances, noise, narrow data, five minutes -> out/studies-robustness
+	$(BIN)/python -m koopman_ros.studies.robustness
+
 bench: $(VENV)/bench.stamp  ## speed beside other programs, ten minutes (BENCH=--quick: one) -> out/bench
 	$(BIN)/python -m benchmarks $(BENCH)
+
+faults: $(VENV)/run.stamp  ## put faults into the loop, and soak it for a day, ten minutes (FAULTS=--quick: half a one) -> out/faults
+	$(BIN)/python -m faults $(FAULTS)
 
 config: $(VENV)/run.stamp  ## write config/*.yaml from the parameter tables
 	$(BIN)/python -m koopman_ros.nodes.parameter_files

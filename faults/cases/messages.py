@@ -1,0 +1,66 @@
+# Copyright 2026 The koopman_ros Authors
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""Faults of the line: messages lost, doubled, overtaken and late."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+from faults.alterations import Alteration, delayed, lost, swapped, twice, unchanged
+from faults.case import Case
+from faults.cases.sensor import altered
+from faults.rig import Rig
+
+GROUP = 'messages'
+SECONDS = 120.0
+
+
+def _commands(make: Callable[[], Alteration]) -> Callable[[Rig], None]:
+    def play(rig: Rig) -> None:
+        rig.begin()
+        rig.line.commands = make()
+        rig.operator.ask(44.0)
+        rig.run_for(SECONDS)
+        rig.line.commands = unchanged
+        rig.end()
+
+    return play
+
+
+def altered_in_a_step(make: Callable[[], Alteration], seconds: float) -> Callable[[Rig], None]:
+    """Return the play that alters measurements while there is something to control."""
+    def play(rig: Rig) -> None:
+        rig.operator.ask(44.0)
+        altered(make, seconds)(rig)
+
+    return play
+
+
+_ALTERATIONS: dict[str, tuple[str, Callable[[], Alteration]]] = {
+    'lost': ('30 % lost', lambda: lost(0.3)),
+    'mostly-lost': ('80 % lost', lambda: lost(0.8)),
+    'doubled': ('each comes twice', lambda: twice),
+    'swapped': ('each two in the wrong order', swapped),
+    'late': ('each 3 s late', lambda: delayed(3)),
+}
+
+CASES = (
+    *(Case(f'measurements-{name}', GROUP, f'measurements: {does}, while the set-point steps, '
+           f'{SECONDS:g} s', altered_in_a_step(make, SECONDS), between=True, largest_step=2.0)
+      for name, (does, make) in _ALTERATIONS.items()),
+    *(Case(f'commands-{name}', GROUP, f'commands: {does}, while the set-point steps, '
+           f'{SECONDS:g} s', _commands(make), between=True)
+      for name, (does, make) in _ALTERATIONS.items()),
+)

@@ -1,0 +1,104 @@
+# Copyright 2026 The koopman_ros Authors
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""What happened in a case: plain figures, gathered while it ran and judged afterwards."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+import itertools
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+Array = NDArray[np.float64]
+
+
+class Sample(NamedTuple):
+    """A true temperature of the reactor, in degrees Celsius, at a plant time in seconds."""
+
+    seconds: float
+    celsius: float
+
+
+class Command(NamedTuple):
+    """A coolant command in degrees Celsius, with the stamp that it carries."""
+
+    seconds: float
+    celsius: float
+    stamp_ns: int
+
+
+class Said(NamedTuple):
+    """A status of diagnostics: whose, how bad (0 is OK, 1 WARN, 2 ERROR), and the sentence."""
+
+    seconds: float
+    name: str
+    level: int
+    message: str
+    values: dict[str, str]
+
+
+@dataclass
+class Course:
+    """
+    All that the rig saw of a case; times are plant time in seconds since the first measurement.
+
+    :ivar samples: true temperatures, before any fault of the sensor.
+    :ivar setpoints: what the operator wanted: (from when on, degrees Celsius).
+    :ivar commands: as the controller published them.
+    :ivar coolants: the coolant that was in force at a measurement, degC by the plant's stamp.
+    :ivar delivered: stamps of the measurements that reached the controller.
+    :ivar said: statuses of all nodes.
+    :ivar begin: when the fault began.
+    :ivar end: when the fault was over, or had been put in where it stays.
+    :ivar complaints: what the case itself, or the rig, found wrong, in sentences.
+    :ivar notes: figures worth a line in the report.
+    """
+
+    samples: list[Sample] = field(default_factory=list)
+    setpoints: list[tuple[float, float]] = field(default_factory=list)
+    commands: list[Command] = field(default_factory=list)
+    coolants: dict[int, float] = field(default_factory=dict)
+    delivered: list[int] = field(default_factory=list)
+    said: list[Said] = field(default_factory=list)
+    begin: float = np.inf
+    end: float = np.inf
+    complaints: list[str] = field(default_factory=list)
+    notes: list[str] = field(default_factory=list)
+
+    def steps(self) -> tuple[Array, Array]:
+        """
+        Return the times (N - 1,) of the commands after the first and their steps in K.
+
+        A step is that from the command before, or from the coolant that is in force, whichever
+        is less: when messages are lost it is not the one, and when the controller is a new one
+        it need not be the other.
+        """
+        times = np.array([command.seconds for command in self.commands[1:]])
+        steps = [min(abs(after.celsius - before.celsius),
+                     abs(after.celsius - self.coolants.get(after.stamp_ns, np.inf)))
+                 for before, after in itertools.pairwise(self.commands)]
+        return times, np.array(steps, dtype=np.float64)
+
+    def errors(self) -> tuple[Array, Array]:
+        """Return the times (N,) of the samples and |T - set-point| (N,) in K."""
+        samples = np.array(self.samples, dtype=np.float64).reshape(-1, 2)
+        since = np.array([seconds for seconds, _ in self.setpoints])
+        wanted = np.array([celsius for _, celsius in self.setpoints])
+        latest = np.searchsorted(since, samples[:, 0], side='right') - 1
+        asked = latest >= 0
+        times, temperatures = samples[asked].T
+        return times, np.abs(temperatures - wanted[latest[asked]])
