@@ -39,7 +39,7 @@ from koopman_ros.learning.validation import (
     judge,
     Report,
 )
-from koopman_ros.lifting import LiftedModel, NetworkObservables, Provenance
+from koopman_ros.lifting import LiftedModel, NetworkObservables, Provenance, TrainingStates
 import numpy as np
 import torch
 
@@ -145,7 +145,9 @@ def train(plant: Plant, samples: Samples, recipe: Recipe, *, seed: int = 0, star
         raise ValueError(f'starts must be at least 1, got {starts}')
     rounds = recipe.rounds(samples.x.shape[1])
     parts = split_by_episode(samples, split_seed)
-    assembly = _Assembly(plant, Scaling.of(plant, samples), parts[0], samples.digest(), seed)
+    scaling = Scaling.of(plant, samples)
+    assembly = _Assembly(plant, scaling, parts[0], samples.digest(), seed,
+                         _training_states(scaling, samples))
     data = assembly.data(device)
     tracker = _Tracker(watch, starts * len(rounds))
     path: list[_Candidate] = []
@@ -217,6 +219,15 @@ def _conclude(plant: Plant, parts: tuple[Samples, Samples, Samples], path: list[
                    tuple(models), finished)
 
 
+def _training_states(scaling: Scaling, samples: Samples) -> TrainingStates | None:
+    """Return where the data are, held-out ones included; None for one state: its box says it."""
+    states = scaling.states
+    if len(states) == 1:
+        return None
+    return TrainingStates.of(states.to_deviation(samples.x),
+                             0.5 * (states.upper - states.lower) / states.scale)
+
+
 def _judged(assembly: _Assembly, grown: Grown | str, validation: Samples
             ) -> _Candidate | str:
     """Return what a start has found, or why it is of no use."""
@@ -271,6 +282,7 @@ class _Assembly:
     samples: Samples
     digest: str
     seed: int
+    training_states: TrainingStates | None
 
     @cached_property
     def pace(self) -> float:
@@ -299,7 +311,8 @@ class _Assembly:
         return LiftedModel(
             observables, self.pace * parts.A.numpy(), B, self.scaling.states,
             self.scaling.inputs, self.scaling.time_unit,
-            Provenance(self.plant.name, self.seed, self.digest, {}, __version__))
+            Provenance(self.plant.name, self.seed, self.digest, {}, __version__),
+            self.training_states)
 
 
 def _run_starts(recipe: Recipe, data: Data, n_z: int, parent: Grown | None, seed: int,

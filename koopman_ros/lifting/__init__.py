@@ -22,6 +22,7 @@ from koopman_ros.lifting.observables import (
     Observables,
     PolynomialObservables,
 )
+from koopman_ros.lifting.training_states import TrainingStates
 
 __all__ = [
     'Coordinates',
@@ -31,6 +32,7 @@ __all__ = [
     'Observables',
     'PolynomialObservables',
     'Provenance',
+    'TrainingStates',
     'linearised_model',
     'load',
     'save',

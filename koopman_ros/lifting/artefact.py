@@ -29,6 +29,7 @@ from typing import Any, NoReturn
 from koopman_ros.lifting.activations import activation_named
 from koopman_ros.lifting.model import Coordinates, LiftedModel, Provenance
 from koopman_ros.lifting.observables import NetworkObservables
+from koopman_ros.lifting.training_states import TrainingStates
 import numpy as np
 
 FORMAT = 'koopman_ros.lift'
@@ -62,8 +63,12 @@ def save(model: LiftedModel, path: str | os.PathLike[str]) -> None:
     for i, (weight, bias) in enumerate(network.hidden):
         tensors[f'hidden.{i}.weight'] = weight
         tensors[f'hidden.{i}.bias'] = bias
+    known = model.training_states
+    if known is not None:
+        tensors['training_states'] = known.states
     description = json.dumps({
         'activation': network.activation,
+        **({'fill_distance': known.fill_distance} if known is not None else {}),
         'hidden_layers': len(network.hidden),
         'identity': network.identity,
         'inputs': _describe(model.inputs),
@@ -146,6 +151,8 @@ def _build(about: dict[str, Any], tensors: dict[str, np.ndarray]) -> LiftedModel
         raise ValueError(f'{len(tensors)} arrays cannot make up {layers} hidden layers')
     expected = {'A', 'B', 'output'} | {
         f'hidden.{i}.{part}' for i in range(layers) for part in ('weight', 'bias')}
+    if 'fill_distance' in about:
+        expected.add('training_states')
     if set(tensors) != expected:
         raise ValueError(f'expected the arrays {sorted(expected)}, got {sorted(tensors)}')
     if not isinstance(about['identity'], bool):
@@ -168,7 +175,9 @@ def _build(about: dict[str, Any], tensors: dict[str, np.ndarray]) -> LiftedModel
             seed=None if origin['seed'] is None else _integer(origin, 'seed'),
             data_digest=str(origin['data_digest']), metrics=metrics,
             package_version=str(origin['package_version']),
-            method=str(origin.get('method', ''))))
+            method=str(origin.get('method', ''))),
+        training_states=None if 'fill_distance' not in about else TrainingStates(
+            tensors['training_states'], _number(about, 'fill_distance')))
     for name, actual in (('n_x', model.n_x), ('n_u', model.n_u), ('n_z', model.n_z)):
         if _integer(about, name) != actual:
             raise ValueError(f'{name} is given as {about[name]}, the arrays say {actual}')
@@ -186,6 +195,13 @@ def _integer(about: dict[str, Any], name: str) -> int:
     if not isinstance(value, int) or isinstance(value, bool) or value < 0:
         raise TypeError(f'{name} must be an integer of at least 0, got {value!r}')
     return value
+
+
+def _number(about: dict[str, Any], name: str) -> float:
+    value = about[name]
+    if not isinstance(value, int | float) or isinstance(value, bool):
+        raise TypeError(f'{name} must be a number, got {value!r}')
+    return float(value)
 
 
 def _describe(coordinates: Coordinates) -> dict[str, Any]:

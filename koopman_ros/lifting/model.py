@@ -23,6 +23,7 @@ import math
 
 from koopman_ros.lifting.arrays import Array, frozen
 from koopman_ros.lifting.observables import NetworkObservables, Observables
+from koopman_ros.lifting.training_states import TrainingStates
 import numpy as np
 from numpy.typing import NDArray
 
@@ -135,6 +136,7 @@ class LiftedModel:
     :param inputs: the inputs' names, units, scaling and training box.
     :param time_unit: ``'s'`` or ``'min'``.
     :param provenance: origin and held-out figures.
+    :param training_states: where the data were, within their box; None when that is not known.
     :raises ValueError: naming the array that does not fit and both shapes.
     """
 
@@ -145,6 +147,7 @@ class LiftedModel:
     inputs: Coordinates
     time_unit: str
     provenance: Provenance
+    training_states: TrainingStates | None = None
 
     def __post_init__(self) -> None:
         n_x, n_z = self.observables.n_x, self.observables.n_z
@@ -154,6 +157,9 @@ class LiftedModel:
             raise ValueError(f'incompatible observables: expected {self.n_x} states, got {n_x}')
         object.__setattr__(self, 'A', frozen(self.A, 'A', (n_z, n_z)))
         object.__setattr__(self, 'B', frozen(self.B, 'B', (n_x, self.n_u)))
+        if self.training_states is not None and self.training_states.states.shape[1] != n_x:
+            raise ValueError(f'incompatible training_states: expected {n_x} states, got '
+                             f'{self.training_states.states.shape[1]}')
 
     @property
     def n_x(self) -> int:
@@ -202,6 +208,20 @@ class LiftedModel:
         J = self.jacobian(np.zeros(self.n_x))
         observables = NetworkObservables((), np.zeros((0, self.n_x)), identity=True)
         return replace(self, observables=observables, A=np.linalg.pinv(J) @ self.A @ J)
+
+    def distance(self, x: Array) -> float:
+        """
+        Measure how far a state (n_x,), in state units, is from the training data.
+
+        :return: in half widths of the training box: the larger of the distance from the box and,
+            where it is known, that from the data in it; infinity for what is not finite.
+        """
+        outside = self.states.violation(x)
+        if self.training_states is None:
+            return outside
+        states = self.states
+        return max(outside, self.training_states.distance(
+            states.to_deviation(x), 0.5 * (states.upper - states.lower) / states.scale))
 
     def lift(self, x: Array) -> Array:
         """Evaluate z = N(x): (..., n_x) -> (..., n_z)."""
