@@ -171,7 +171,7 @@ class Controller:
 
     # Steps.
 
-    def step(self, state: State, measurement: Array, time_ns: int
+    def step(self, state: State, measurement: Array, time_ns: int, acting: Array | None = None
              ) -> tuple[State, Array, Report]:
         """
         Answer one measurement.
@@ -183,6 +183,8 @@ class Controller:
         :param state: as returned by the step before.
         :param measurement: (n_x,) measured state, in state units.
         :param time_ns: its stamp.
+        :param acting: (n_u,) the input that was found in force then, where it is measured; see
+            :meth:`Estimator.in_force`.
         :return: the new state, the command (n_u,) in input units, always finite and within the
             limits, and the report.
         """
@@ -205,8 +207,9 @@ class Controller:
         state, seconds, missed = _passed(state, time_ns, elapsed)
         # a measurement of 1e300 may overflow on its way; the result is checked and limited
         with np.errstate(all='ignore'):
+            u, follows = self._estimator.in_force(state, acting)
             state, verdict, predicted = self._estimator.observe(
-                state, measurement, time_ns, elapsed)
+                state, measurement, time_ns, elapsed, u)
             if not verdict.fault:
                 state = amended(state, setpoint=setpoints.advance(
                     state.setpoint, measurement, self.model, self.settings.setpoint_ramp,
@@ -221,7 +224,7 @@ class Controller:
             report, outside=outside, at_range=report.at_range or limited.at_range,
             at_rate=limited.at_rate,
             input_outside=self.model.inputs.violation(limited.u), missed=missed,
-            predicted=predicted, clock_went_back=back)
+            predicted=predicted, clock_went_back=back, follows=follows)
 
     def watch(self, state: State, time_ns: int) -> tuple[State, Array | None, Report]:
         """
@@ -236,7 +239,7 @@ class Controller:
             return state, None, Report(state.mode)
         elapsed = max(0.0, (time_ns - since_ns) / NANOSECONDS)
         with np.errstate(all='ignore'):
-            state = self._estimator.coast(state, elapsed)
+            state = self._estimator.coast(state, elapsed, self._estimator.in_force(state)[0])
             state, wanted, report = self._wanted(state, Verdict(
                 state.sensed, 'no measurement arrives: check sensor and plant'),
                 np.nan, time_ns, elapsed)
@@ -295,8 +298,8 @@ class Controller:
         return state, attempt.u + transfer.offset, amended(report, transfer=transfer.offset)
 
     def _outside(self, x: Array) -> float:
-        """Return how far a measurement is outside the training box; NaN when it is none."""
-        return self.model.states.violation(x) if finite(x) else np.nan
+        """Return how far a measurement is from the training data; NaN when it is none."""
+        return self.model.distance(x) if finite(x) else np.nan
 
     def _report(self, state: State, rung: Rung, reason: str) -> Report:
         """Return what is known without a law."""

@@ -64,7 +64,26 @@ class Estimator:
         """Return the observer with the linear model or the learned one; they share their units."""
         return self._observers[linear]
 
-    def observe(self, state: State, x: Array, time_ns: int, elapsed: float
+    def in_force(self, state: State, acting: Array | None = None) -> tuple[Array, bool]:
+        """
+        Return the input that has acted since the last command, as far as it is known.
+
+        That is the command, unless a measurement of the input says that it was not reached: at
+        a limit of the actuator, or behind its lag, nothing may wind up. Differences below
+        `input_tolerance` count for nothing, since a biased measurement of the input would bring
+        its bias into the loop.
+
+        :param acting: (n_u,) measured, in input units, or None.
+        :return: (n_u,) in scaled deviations, and whether it follows the command.
+        """
+        if state.command is None:
+            return np.zeros(self.model.n_u), True
+        u, tolerance = state.command, self.settings.input_tolerance
+        if acting is not None and finite(acting):
+            u = np.minimum(np.maximum(u, acting - tolerance), acting + tolerance)
+        return self.model.inputs.to_deviation(u), bool((u == state.command).all())
+
+    def observe(self, state: State, x: Array, time_ns: int, elapsed: float, u: Array
                 ) -> tuple[State, Verdict, Array | None]:
         """
         Judge a measurement and take it into account.
@@ -73,16 +92,20 @@ class Estimator:
         :param x: (n_x,) measured, in state units.
         :param time_ns: its stamp.
         :param elapsed: seconds since the last command.
+        :param u: (n_u,) what has acted since then, in scaled deviations.
         :return: the state with sensor, time and estimate, what became of the measurement, and
             what was expected of it in state units, None when nothing was.
         """
         before, sensed = state.estimate, state.sensed
-        predicted = self.coast(state, elapsed).estimate
+        predicted = self.coast(state, elapsed, u).estimate
         w = np.zeros(self.model.n_x) if before is None else before.w
 
         def motion(then: Sensed) -> Array:
+            if self._far_out(x):
+                # what the model says of its motion is worth nothing
+                return np.zeros_like(x)
             frozen = None if before is None else Estimate(before.x, then.w)
-            moved = self.coast(amended(state, estimate=frozen), elapsed).estimate
+            moved = self.coast(amended(state, estimate=frozen), elapsed, u).estimate
             if before is None or moved is None:
                 return np.zeros_like(x)
             return (moved.x - before.x) * self.model.states.scale
@@ -114,8 +137,12 @@ class Estimator:
             verdict.moved or not elapsed > 0.0
             or self._lost(state, time_ns)
             # out there the model's prediction is worth nothing
-            or self.model.states.violation(x) > self.settings.ladder.linear_margin)
+            or self._far_out(x))
         return Estimate(xi, predicted.w) if afresh else observer.correct(predicted, xi, elapsed)
+
+    def _far_out(self, x: Array) -> bool:
+        """Tell whether not even the linear law is to act at a state (n_x,) in state units."""
+        return self.model.distance(x) > self.settings.ladder.linear_margin
 
     def _lost(self, state: State, time_ns: int) -> bool:
         """Tell whether no measurement was believed for so long that the state is not known."""
@@ -126,15 +153,15 @@ class Estimator:
         return seconds * self.settings.observer_bandwidth > _LOST and (
             seconds > _GAP * state.interval)
 
-    def coast(self, state: State, elapsed: float) -> State:
+    def coast(self, state: State, elapsed: float, u: Array) -> State:
         """
         Carry the estimate forward without a measurement.
 
-        :param elapsed: seconds since the last command, which has been in force all the time.
+        :param elapsed: seconds since the last command.
+        :param u: (n_u,) what has acted since then, in scaled deviations.
         """
         if state.estimate is None or state.command is None or not elapsed > 0.0:
             return state
-        u = self.model.inputs.to_deviation(state.command)
         predicted = self.observer(state.linear).predict(state.estimate, u, elapsed)
         if predicted is None or not finite(predicted.x):
             # after so long, or from so far out, nothing is known; the disturbance is kept

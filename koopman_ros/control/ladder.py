@@ -56,7 +56,7 @@ class LadderSettings:
     """
 
     validity_margin: float = 0.1
-    linear_margin: float = 1.0
+    linear_margin: float = 0.5
     hold_timeout: float = 60.0
     recovery_time: float = 10.0
 
@@ -134,9 +134,12 @@ class Standing:
                     self.rung is Rung.SAFE and self.bad_since_ns is not None):
                 need = Need(Rung.SAFE, f'{need.reason}; held for longer than '
                                        f'{settings.hold_timeout:g} s')
-        if need.rung is Rung.HOLD and need.passing:
-            return Standing(need.rung, need.reason, self.resumes or self.rung, bad_since)
         present = self.resumes or self.rung
+        if need.passing and present.depth < need.rung.depth:
+            return Standing(need.rung, need.reason, present, bad_since)
+        if need.passing and present.depth > need.rung.depth:
+            # on its way to the safe input, nothing is gained by a hold
+            return Standing(present, need.reason, None, bad_since)
         if need.rung.depth >= present.depth:
             return Standing(need.rung, need.reason, None, bad_since)
         since = time_ns if self.better_since_ns is None else self.better_since_ns

@@ -27,9 +27,6 @@ from numpy.typing import NDArray
 
 Array = NDArray[np.float64]
 
-# A jump that so many measurements in a row agree on has happened.
-_AGREEING = 3
-
 
 @dataclass(frozen=True)
 class SensorLimits:
@@ -38,7 +35,8 @@ class SensorLimits:
 
     :param lower: smallest measurement believed, in state units.
     :param upper: largest measurement believed.
-    :param rate: fastest change of the plant per second.
+    :param rate: fastest change of the plant per second; a jump that stays is believed when the
+        plant could have got there by then.
     :param jump: change that noise alone may bring between two measurements.
     :param frozen_timeout: seconds that a measurement may stay the same to the bit while the
         model moves by more than `jump` or half of it; infinity for ever.
@@ -70,9 +68,7 @@ class Sensed:
         observer gives it.
     :param since_ns: stamp of the first of those that are the same to the bit.
     :param motion: (n_x,) how far the model says that the state has moved since then.
-    :param jumped: (n_x,) the last one that was taken for a jump, or None.
-    :param jumped_ns: its stamp.
-    :param agreeing: how many in a row agree on that jump.
+    :param jumped: whether a later one was taken for a jump.
     """
 
     value: Array
@@ -80,9 +76,7 @@ class Sensed:
     w: Array
     since_ns: int
     motion: Array
-    jumped: Array | None = None
-    jumped_ns: int = 0
-    agreeing: int = 0
+    jumped: bool = False
 
 
 @dataclass(frozen=True)
@@ -126,11 +120,13 @@ def judge(limits: SensorLimits, states: Coordinates, sensed: Sensed | None, x: A
         return Verdict(changed)
     seconds = (time_ns - sensed.time_ns) / NANOSECONDS
     if not _reachable(limits, sensed.value, x, seconds):
-        return _jump(limits, states, sensed, changed, show)
+        return Verdict(replace(sensed, jumped=True),
+                       _jump(limits, states, sensed, x, seconds, show))
     if not (x == sensed.value).all():
-        return Verdict(changed)
+        return Verdict(changed, moved=sensed.jumped and not _reachable(
+            limits, sensed.value, x, 0.0))
     moved = sensed.motion + motion(sensed)
-    still = replace(sensed, time_ns=time_ns, motion=moved, jumped=None, agreeing=0)
+    still = replace(sensed, time_ns=time_ns, motion=moved, jumped=False)
     stood = (time_ns - sensed.since_ns) / NANOSECONDS
     if stood > limits.frozen_timeout and np.max(np.abs(moved)) > 0.5 * limits.jump:
         i = int(np.argmax(np.abs(moved)))
@@ -154,23 +150,14 @@ def _absurd(limits: SensorLimits, states: Coordinates, x: Array, show: Show) -> 
 
 def _reachable(limits: SensorLimits, before: Array, x: Array, seconds: float) -> bool:
     farthest = max(abs(a - b) for a, b in zip(x.tolist(), before.tolist(), strict=True))
-    return farthest <= limits.jump + limits.rate * seconds
+    possible = limits.rate * seconds if seconds > 0.0 else 0.0
+    return farthest <= limits.jump + possible
 
 
-def _jump(limits: SensorLimits, states: Coordinates, sensed: Sensed, changed: Sensed, show: Show
-          ) -> Verdict:
-    """Refuse a jump until enough measurements agree on it."""
-    x, time_ns, agreeing = changed.value, changed.time_ns, 1
-    if sensed.jumped is not None:
-        since = (time_ns - sensed.jumped_ns) / NANOSECONDS
-        agreeing += sensed.agreeing if _reachable(limits, sensed.jumped, x, since) else 0
-    if agreeing >= _AGREEING:
-        return Verdict(changed, moved=True)
+def _jump(limits: SensorLimits, states: Coordinates, sensed: Sensed, x: Array, seconds: float,
+          show: Show) -> str:
     i = int(np.argmax(np.abs(x - sensed.value)))
-    seconds = (time_ns - sensed.time_ns) / NANOSECONDS
     unit = states.units[i]
-    return Verdict(
-        replace(sensed, jumped=x, jumped_ns=time_ns, agreeing=agreeing),
-        f'the measured {states.names[i]} jumped from {show(sensed.value[i], unit)} to '
-        f'{show(x[i], unit)} in {seconds:.3g} s, at most {limits.jump:g} {unit} and '
-        f'{limits.rate:.3g} {unit}/s are possible: check the sensor')
+    return (f'the measured {states.names[i]} jumped from {show(sensed.value[i], unit)} to '
+            f'{show(x[i], unit)} in {seconds:.3g} s, at most {limits.jump:g} {unit} and '
+            f'{limits.rate:.3g} {unit}/s are possible: check the sensor')

@@ -68,6 +68,8 @@ class Settings:
     :param setpoint_filter: time constant in s with which the set-point follows its ramp.
     :param observer_bandwidth: of the disturbance observer in 1/s; 0 for none, as in the paper.
     :param max_disturbance: largest disturbance that is believed, in input units.
+    :param input_tolerance: how far, in input units, a measured input may be from its command
+        before it is believed that the command was not reached.
     :param transfer_time: time constant in s in which the difference between two laws or models,
         or from manual mode, fades.
     :param safe_input: (n_u,) commanded when nothing else can be; by default the nominal input.
@@ -84,6 +86,7 @@ class Settings:
     setpoint_filter: float = 0.0
     observer_bandwidth: float = 0.0
     max_disturbance: float = np.inf
+    input_tolerance: float = 2.0
     transfer_time: float = 30.0
     safe_input: Array | None = None
     max_gain: float = 1e3
@@ -104,7 +107,8 @@ class Settings:
         for name in ('setpoint_ramp', 'max_disturbance'):
             if not getattr(self, name) > 0.0:
                 raise ValueError(f'{name} must be above 0, got {getattr(self, name)}')
-        for name in ('setpoint_filter', 'observer_bandwidth', 'transfer_time'):
+        for name in ('setpoint_filter', 'observer_bandwidth', 'input_tolerance',
+                     'transfer_time'):
             if not 0.0 <= getattr(self, name) < np.inf:
                 raise ValueError(f'{name} must be finite and at least 0, got '
                                  f'{getattr(self, name)}')
@@ -175,6 +179,7 @@ class Report:
     :param transfer: (n_u,) what a change of law or mode still adds to the command.
     :param at_range: whether the input's range was active.
     :param at_rate: whether the input's rate limit was active.
+    :param follows: whether the input in force, where it is measured, is what was commanded.
     :param missed: measurements that should have come since the last one.
     :param clock_went_back: whether the stamp was earlier than the one before, by so much that
         time starts afresh.
@@ -201,6 +206,7 @@ class Report:
     transfer: Array | None = None
     at_range: bool = False
     at_rate: bool = False
+    follows: bool = True
     missed: int = 0
     clock_went_back: bool = False
     late: bool = False

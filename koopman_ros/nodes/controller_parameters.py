@@ -57,6 +57,10 @@ class ControllerParameters:
     max_disturbance: float = parameter(
         20.0, 'largest disturbance that is believed, as a change of the coolant', unit='K',
         minimum=0.0, maximum=1000.0, open_minimum=True)
+    coolant_tolerance: float = parameter(
+        2.0, 'how far the coolant temperature in force may be from its command before the '
+        'observer goes by it, as at a limit of the actuator', unit='K', minimum=0.0,
+        maximum=1000.0)
     transfer_time: float = parameter(
         30.0, 'time constant in which the coolant moves to what another law, model, tuning or '
         'mode asks for', unit='s', minimum=0.0, maximum=86400.0)
@@ -68,7 +72,7 @@ class ControllerParameters:
         0.1, 'how far outside the trained range the learned law acts, in halves of its width; '
         'beyond, the linear law does', minimum=0.0, maximum=100.0)
     linear_margin: float = parameter(
-        1.0, 'how far outside the trained range the linear law acts, in halves of its width; '
+        0.5, 'how far outside the trained range the linear law acts, in halves of its width; '
         'beyond, the safe coolant is commanded', minimum=0.0, maximum=100.0)
     hold_timeout: float = parameter(
         60.0, 'how long the coolant is held without a usable measurement or law before it goes to '
@@ -117,6 +121,7 @@ class ControllerParameters:
             setpoint_filter=self.setpoint_filter,
             observer_bandwidth=self.observer_bandwidth / SECONDS_PER_MINUTE,
             max_disturbance=self.max_disturbance,
+            input_tolerance=self.coolant_tolerance,
             transfer_time=self.transfer_time,
             safe_input=np.array([to_kelvin(self.safe_coolant)]),
             max_gain=self.max_gain, max_residual=self.max_riccati_residual,

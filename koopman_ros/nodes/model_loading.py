@@ -122,7 +122,7 @@ def refuse_without_law(model: LiftedModel, situation: Situation) -> None:
     for setpoint in [value for value in asked if value is not None] or [model.states.center]:
         for place in (setpoint, situation.measured):
             # neither before the first measurement, nor where the learned law would not act
-            if not model.states.violation(place) <= situation.settings.ladder.validity_margin:
+            if not model.distance(place) <= situation.settings.ladder.validity_margin:
                 continue
             if problem := controller.try_law(place, setpoint):
                 raise ModelFileError(

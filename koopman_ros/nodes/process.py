@@ -17,6 +17,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+import faulthandler
 import os
 import signal
 import sys
@@ -35,6 +36,7 @@ _START_ERRORS = (OSError, ParameterException, RuntimeError, ValueError)
 
 _LONGEST_WAIT = 0.1  # s from a signal to the end
 _TAKE_DOWN_PATIENCE = 5.0  # s; taking down a participant needs some ten milliseconds
+_LAST_RESORT = 8.0  # s from the beginning of the end to that by force
 
 
 class LoopNode(Node):
@@ -121,6 +123,9 @@ def _take_down(name: str, node: LoopNode | None) -> None:
     patience = threading.Timer(_TAKE_DOWN_PATIENCE, give_up)
     patience.daemon = True
     patience.start()
+    # for a hang in which no other Python runs, and for one at the interpreter's own end; it stays
+    # armed, and says where it hung
+    faulthandler.dump_traceback_later(_LAST_RESORT, exit=True)
     if node is not None:
         node.destroy_node()
     rclpy.try_shutdown()

@@ -90,6 +90,9 @@ class Loop:
     :param lag: time constant of the coolant in s.
     :param delay: samples that a command is late.
     :param noise: of the sensor in K, from a fixed seed.
+    :param reached: range of the coolant that the actuator reaches.
+    :param tells: whether the coolant in force is measured.
+    :param coolant_error: of that measurement in K.
     """
 
     controller: Controller
@@ -99,6 +102,9 @@ class Loop:
     lag: float = 0.0
     delay: int = 0
     noise: float = 0.0
+    reached: tuple[float, float] = (0.0, 1000.0)
+    tells: bool = False
+    coolant_error: float = 0.0
     state: State = field(default_factory=State)
     samples: list[Sample] = field(default_factory=list)
 
@@ -147,14 +153,15 @@ class Loop:
                 assert command is not None
             else:
                 self.state, command, report = self.controller.step(
-                    self.state, np.array([measured]), now)
+                    self.state, np.array([measured]), now,
+                    np.array([self.coolant + self.coolant_error]) if self.tells else None)
             self.samples.append(Sample(self.second, float(self.x[-1]), float(command[0]), report))
             self._move(float(command[0]))
         return self.samples[first:]
 
     def _move(self, command: float) -> None:
         self._late.append(command)
-        command = self._late.pop(0)
+        command = min(max(self._late.pop(0), self.reached[0]), self.reached[1])
         # a lag in steps that are short beside it
         parts = 5 if self.lag else 1
         for _ in range(parts):

@@ -106,6 +106,32 @@ def test_a_quarter_of_an_hour_at_the_limit_leaves_nothing_behind():
     assert settled(samples, START, 1e-3) <= RESPONSE + MORE
 
 
+@pytest.mark.parametrize(('tells', 'winds_up'), [(True, False), (False, True)])
+def test_an_actuator_that_reaches_less_than_is_commanded(tells, winds_up):
+    loop = Loop(controller(), tells=tells)
+    loop.run(10)
+    loop.ask(SETPOINT)
+    # 292.29 K would be needed
+    loop.reached = (298.15, 1000.0)
+    stuck = loop.run(900)
+    assert all(s.report.follows for s in stuck[20:]) is not tells
+    loop.reached = (0.0, 1000.0)
+    samples = loop.run(420)
+    below = SETPOINT - min(s.temperature for s in samples)
+    assert below > 1.0 if winds_up else below < 0.5
+    assert settled(samples, SETPOINT, 1e-3) <= RESPONSE + MORE or winds_up
+
+
+@pytest.mark.parametrize('error', [-1.5, 1.5])
+def test_a_biased_measurement_of_the_coolant_brings_no_offset(error):
+    loop = Loop(controller(), plant=changed_reactor(heat_transfer_coefficient=0.8), tells=True,
+                coolant_error=error)
+    loop.run(10)
+    loop.ask(SETPOINT)
+    samples = loop.run(RESPONSE + MORE)
+    assert settled(samples, SETPOINT, 1e-3) <= RESPONSE + MORE - 10
+
+
 def test_without_the_observer_the_offset_stays():
     loop = Loop(controller(observer_bandwidth=0.0), plant=changed_reactor(
         heat_transfer_coefficient=0.8))
