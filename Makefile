@@ -65,7 +65,7 @@ studies-sensors: $(VENV)/train.stamp  ## learning from noisy data of a sensor, t
 studies-robustness: $(VENV)/bench.stamp  ## margins, attraction, disturbances, noise, narrow data, five minutes -> out/studies-robustness
 	$(BIN)/python -m koopman_ros.studies.robustness
 
-bench: $(VENV)/bench.stamp  ## speed beside other programs, ten minutes (BENCH=--quick: one) -> out/bench
+bench: $(VENV)/bench.stamp  ## speed beside other programs, thirteen minutes (BENCH=--quick: two) -> out/bench
 	$(BIN)/python -m benchmarks $(BENCH)
 
 faults: $(VENV)/run.stamp  ## put faults into the loop, and soak it for a day, ten minutes (FAULTS=--quick: half a one) -> out/faults

@@ -21,7 +21,7 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 import sys
 
-from koopman_ros.demo.loop import _deferred_interrupt as deferred_interrupt
+from koopman_ros.demo.loop import deferred_interrupt
 
 from faults import report
 from faults.case import Case, Outcome, run

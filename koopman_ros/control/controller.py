@@ -224,7 +224,8 @@ class Controller:
             report, outside=outside, at_range=report.at_range or limited.at_range,
             at_rate=limited.at_rate,
             input_outside=self.model.inputs.violation(limited.u), missed=missed,
-            predicted=predicted, clock_went_back=back, follows=follows)
+            predicted=predicted, clock_went_back=back, follows=follows,
+            believed=not verdict.fault)
 
     def watch(self, state: State, time_ns: int) -> tuple[State, Array | None, Report]:
         """

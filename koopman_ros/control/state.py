@@ -179,6 +179,7 @@ class Report:
     :param transfer: (n_u,) what a change of law or mode still adds to the command.
     :param at_range: whether the input's range was active.
     :param at_rate: whether the input's rate limit was active.
+    :param believed: whether the measurement was.
     :param follows: whether the input in force, where it is measured, is what was commanded.
     :param missed: measurements that should have come since the last one.
     :param clock_went_back: whether the stamp was earlier than the one before, by so much that
@@ -206,6 +207,7 @@ class Report:
     transfer: Array | None = None
     at_range: bool = False
     at_rate: bool = False
+    believed: bool = True
     follows: bool = True
     missed: int = 0
     clock_went_back: bool = False

@@ -223,7 +223,7 @@ def running_loop(scenario: Scenario, logs: Path, trainer: Mapping[str, object],
     :param on_row: called with every answered measurement.
     :raises LoopError: when a process ends early or the loop stands still.
     """
-    with _deferred_interrupt() as check_interrupt, isolated_domain() as environment:
+    with deferred_interrupt() as check_interrupt, isolated_domain() as environment:
         context = Context()
         rclpy.init(context=context, domain_id=int(environment['ROS_DOMAIN_ID']))
         operator = Operator(scenario, context, on_row)
@@ -287,7 +287,7 @@ def run_loop(scenario: Scenario, bag: Path, logs: Path,
 
 
 @contextlib.contextmanager
-def _deferred_interrupt() -> Iterator[Callable[[], None]]:
+def deferred_interrupt() -> Iterator[Callable[[], None]]:
     """
     Let a signal raise KeyboardInterrupt where the yielded function is called, and at the end.
 

@@ -24,6 +24,7 @@ from rclpy.node import Node
 
 # Stamps further from the node's clock than this come from another clock.
 _SAME_CLOCK = 3600.0  # s
+_CLOCK_PATIENCE = 1.0  # s from the start until somebody should publish the time
 
 
 class Arrival:
@@ -48,8 +49,10 @@ class Arrival:
     def note(self, stamp_ns: int) -> None:
         """Take down that a measurement with a new stamp has arrived."""
         self._wall, self._sim = time.monotonic(), self._sim_now()
-        age = (self._node.get_clock().now().nanoseconds - stamp_ns) / NANOSECONDS
-        self.age = age if abs(age) < _SAME_CLOCK else math.nan
+        now = self._node.get_clock().now().nanoseconds
+        age = (now - stamp_ns) / NANOSECONDS
+        # at time zero the clock has not begun
+        self.age = age if now and abs(age) < _SAME_CLOCK else math.nan
 
     def answered(self) -> None:
         """Take down that its command is out."""
@@ -58,7 +61,8 @@ class Arrival:
     @property
     def without_clock(self) -> bool:
         """Whether `use_sim_time` is set and nobody publishes the time."""
-        return self._simulated and self._sim_now() == 0 and self.wall_silence > 1.0
+        waited = time.monotonic() - self._begun
+        return self._simulated and self._sim_now() == 0 and waited > _CLOCK_PATIENCE
 
     @property
     def wall_silence(self) -> float:

@@ -85,8 +85,8 @@ class ControllerNode(LoopNode):
             Temperature, topics.SETPOINT, self._on_setpoint, topics.LOOP_QOS)
         self.create_subscription(Temperature, topics.MANUAL_COOLANT_SETPOINT,
                                  self._on_manual_coolant_setpoint, topics.LOOP_QOS)
-        self.create_subscription(Temperature, topics.COOLANT_TEMPERATURE, self._on_coolant,
-                                 topics.LATCHED_QOS)
+        self._coolants = self.create_subscription(
+            Temperature, topics.COOLANT_TEMPERATURE, self._on_coolant, topics.LATCHED_QOS)
         # a sensor driver that publishes best effort needs this overridden to match
         self._measurements = self.create_subscription(
             Temperature, topics.TEMPERATURE, self._on_temperature, topics.LOOP_QOS,
@@ -119,7 +119,7 @@ class ControllerNode(LoopNode):
         """Tell whether the coolant in force will be known in a moment."""
         return (self._state.command is None and self._coolant is None
                 and self._patience is None
-                and self.count_publishers(topics.COOLANT_TEMPERATURE) > 0)
+                and self.count_publishers(self._coolants.topic_name) > 0)
 
     def _on_coolant(self, message: Temperature) -> None:
         self._coolant = message
@@ -140,7 +140,7 @@ class ControllerNode(LoopNode):
         if self._state.command is None and self._coolant is not None:
             self._state = translation.take_over(self._controller, self._state, self._coolant)
         self._state, command, report = translation.answer(
-            self._controller, self._state, message)
+            self._controller, self._state, message, self._coolant_at(stamp_ns))
         self._commands.publish(temperature_message(
             command, message.header.stamp, message.header.frame_id))
         self._arrival.answered()
@@ -149,8 +149,16 @@ class ControllerNode(LoopNode):
         self._counts.measurements += 1
         self._counts.late += report.late
         self._counts.missed += report.missed
-        self._counts.refused += report.rung is Rung.HOLD
+        self._counts.refused += not report.believed
         self._tell(report, message.header.stamp)
+
+    def _coolant_at(self, stamp_ns: int) -> float | None:
+        """Return the coolant temperature in force at a time, if it is known."""
+        heard = self._coolant
+        if heard is None or (abs(stamp_nanoseconds(heard.header.stamp) - stamp_ns)
+                             > translation.SAME_TIME_NS):
+            return None
+        return float(heard.temperature)
 
     def _on_watch(self) -> None:
         """Hold the command, and go to the safe coolant, when measurements stay away."""

@@ -80,7 +80,7 @@ def _verdict(now: Situation) -> tuple[Level, str]:
     report, mode = now.report, now.state.mode
     timeout = now.parameters.measurement_timeout
     if not now.counts.measurements:
-        return Level.WARN, 'waiting for the first temperature measurement'
+        return Level.WARN, now.complaint or 'waiting for the first temperature measurement'
     if timeout and max(now.arrival.silence, now.arrival.wall_silence) > timeout:
         command = now.state.command
         doing = '' if command is None else f', coolant at {in_celsius(float(command[0]))}'
@@ -128,6 +128,10 @@ def _warning(now: Situation) -> str:
     if oldest and abs(age) > oldest:
         return (f'measurements are {age:.1f} s old when they arrive, at most {oldest:g} s are '
                 'expected: check the connection and the clocks')
+    if not report.follows:
+        return (f'the coolant does not follow its set-point within '
+                f'{now.parameters.coolant_tolerance:g} K: the observer goes by the coolant '
+                'temperature; check the actuator and its limits')
     if report.at_bound:
         return (f'the disturbance estimate is at its bound of {now.parameters.max_disturbance:g} '
                 'K of coolant: the plant is far from its model; retrain')
@@ -181,13 +185,14 @@ def internals(report: Report, stamp: Time, frame_id: str) -> JointState:
     """Return what a person would plot beside the temperatures, under names with units."""
     values = {
         'disturbance [K]': _first(report.disturbance),
-        'estimated_temperature [K]': _first(report.estimate),
+        'estimated_temperature [degC]': to_celsius(_first(report.estimate)),
         'distance_outside [half widths]': float(report.outside),
         'rung [0 learned, 1 linear, 2 hold, 3 safe]': float(report.rung.depth),
         'gain': float(report.gain),
         'riccati_residual': float(report.residual),
         'growth_per_sample': float(report.growth),
         'transfer [K]': 0.0 if report.transfer is None else float(report.transfer[0]),
+        'setpoint [degC]': to_celsius(_first(report.active_setpoint)),
     }
     message = JointState(name=list(values), position=list(values.values()))
     message.header.stamp = stamp

@@ -98,6 +98,8 @@ def _prepare() -> Callable[[], int]:
             temperature=resolve(topics.TEMPERATURE), setpoint=resolve(topics.SETPOINT),
             manual=resolve(topics.MANUAL_COOLANT_SETPOINT),
             command=resolve(topics.COOLANT_SETPOINT), active=resolve(topics.ACTIVE_SETPOINT),
+            coolant=resolve(topics.COOLANT_TEMPERATURE),
+            internals=resolve(topics.CONTROLLER_STATE),
             diagnostics=resolve(topics.DIAGNOSTICS), namespace=node.get_namespace().strip('/'))
     finally:
         node.destroy_node()

@@ -26,8 +26,17 @@ from typing import Any
 
 from koopman_ros.control import Controller, Report, Settings, State
 from koopman_ros.lifting import LiftedModel
-from koopman_ros.nodes.messages import in_celsius, stamp_nanoseconds, to_celsius, to_kelvin
+from koopman_ros.nodes.messages import (
+    in_celsius,
+    NANOSECONDS,
+    stamp_nanoseconds,
+    to_celsius,
+    to_kelvin,
+)
 import numpy as np
+
+# The temperatures of reactor and coolant at an instant are stamped no further apart.
+SAME_TIME_NS = 2 * NANOSECONDS
 
 
 def controller_of(model: LiftedModel, settings: Settings) -> Controller:
@@ -35,20 +44,23 @@ def controller_of(model: LiftedModel, settings: Settings) -> Controller:
     return Controller(model, settings, in_celsius)
 
 
-def answer(controller: Controller, state: State, message: Any) -> tuple[State, float, Report]:
+def answer(controller: Controller, state: State, message: Any, coolant: float | None = None
+           ) -> tuple[State, float, Report]:
     """
     Answer a measurement.
 
     :param controller: model and settings.
     :param state: as returned by the step before.
     :param message: temperature in degrees Celsius with its stamp.
+    :param coolant: its temperature in force then, in degrees Celsius, where it is known.
     :return: the new state, the coolant temperature commanded in K, and the report.
     """
     kelvin = to_kelvin(message.temperature)
     # below absolute zero there is nothing to measure
     state, command, report = controller.step(
         state, np.array([kelvin if kelvin >= 0.0 else math.nan]),
-        stamp_nanoseconds(message.header.stamp))
+        stamp_nanoseconds(message.header.stamp),
+        None if coolant is None else np.array([to_kelvin(coolant)]))
     return state, float(command[0]), report
 
 

@@ -16,101 +16,19 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+import itertools
 import math
 from pathlib import Path
 import shutil
-import time as clock
 
+from controller_bench import Bench, STATUS, STEADY
 from diagnostic_msgs.msg import DiagnosticStatus
 from koopman_ros.nodes import topics
-from koopman_ros.nodes.controller_parameters import TABLE
 from koopman_ros.nodes.shipped import model_path
 import pytest
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 from sensor_msgs.msg import Temperature
-from workbench import seconds, temperature, TIMEOUT, value, Workbench
-
-STATUS = 'controller: control'
-STEADY = 51.8  # degC, near the plant's steady state
-
-
-class Bench:
-    """
-    A controller with a thermometer and an operator in the test.
-
-    :param ros: where the controller runs.
-    :param parameters: of the controller.
-    :param arguments: further ROS arguments of the controller.
-    :param qos: what the thermometer offers.
-    """
-
-    def __init__(self, ros: Workbench, parameters: Mapping[str, object] | None = None,
-                 arguments: tuple[str, ...] = (), qos: QoSProfile = topics.LOOP_QOS) -> None:
-        self.ros = ros
-        self.process = ros.start('controller', parameters, arguments)
-        self.commands = ros.listen(Temperature, topics.COOLANT_SETPOINT)
-        self.tracked = ros.listen(Temperature, topics.ACTIVE_SETPOINT, topics.LATCHED_QOS)
-        self.thermometer = ros.speak(Temperature, topics.TEMPERATURE, qos, to='controller')
-        self._setpoint = ros.speak(Temperature, topics.SETPOINT, to='controller')
-        self.measure(STEADY, 1.0)
-        self.active_since(STEADY)
-
-    def start_afresh(self) -> None:
-        """Bring the controller back to its steady state at the time 1 s, and forget the rest."""
-        self.ros.set_parameters('controller', **{
-            name: row.default for name, row in TABLE.rows.items() if not row.read_only})
-        self.ros.set_bool('controller/set_automatic', True)
-        self.ask(STEADY)
-        self.settle(STEADY, self.measure_until_active(STEADY, 1e6))
-        del self.commands[:], self.tracked[:-1], self.ros.statuses[:]
-        # the clock goes back
-        self.measure(STEADY, 1.0)
-
-    def measure(self, celsius: float, time: float) -> Temperature:
-        """Send a measurement and return its command."""
-        self.thermometer.publish(temperature(celsius, time))
-        return self.ros.wait_until(
-            lambda: next((m for m in self.commands if seconds(m) == time), None))
-
-    def ask(self, celsius: float, time: float = 0.0) -> None:
-        """Turn the set-point, in force from a time, and wait until the controller knows it."""
-        self._setpoint.publish(temperature(celsius, time))
-        self.ros.meet('controller')
-
-    def refusal(self) -> DiagnosticStatus:
-        """Wait until a set-point was refused."""
-        return self.ros.wait_for_status(STATUS, lambda s: 'set-point' in s.message)
-
-    def active_since(self, celsius: float) -> float:
-        """Wait until a set-point is tracked; return since when."""
-        return seconds(self.ros.wait_until(lambda: next(
-            (m for m in self.tracked if m.temperature == pytest.approx(celsius)), None)))
-
-    @property
-    def active(self) -> float:
-        """The set-point that is tracked."""
-        return float(self.tracked[-1].temperature)
-
-    def measure_until(self, condition: Callable[[Temperature], bool], time: float) -> float:
-        """Measure once a second from a time on until a command meets a condition; say when."""
-        deadline = clock.monotonic() + TIMEOUT
-        while not condition(self.measure(STEADY, time)):
-            assert clock.monotonic() < deadline
-            time += 1.0
-        return time
-
-    def settle(self, celsius: float, time: float) -> tuple[float, float]:
-        """Measure the same until the command stays the same; return the time and the command."""
-        before, command = math.nan, self.measure(celsius, time).temperature
-        while abs(command - before) > 1e-9 or math.isnan(before):
-            time += 1.0
-            before, command = command, self.measure(celsius, time).temperature
-        return time, command
-
-    def measure_until_active(self, celsius: float, time: float) -> float:
-        """Measure once a second from a time on until a set-point is tracked; say when."""
-        return self.measure_until(lambda _: self.active == pytest.approx(celsius), time)
+from workbench import seconds, temperature, value, Workbench
 
 
 @pytest.fixture(scope='module')
@@ -120,7 +38,7 @@ def shared_bench(shared_ros: Workbench) -> Bench:
 
 @pytest.fixture
 def bench(shared_bench: Bench) -> Bench:
-    """Return a controller at its steady state."""
+    """Return a controller at its steady state, which acts by its law alone."""
     shared_bench.start_afresh()
     return shared_bench
 
@@ -235,9 +153,10 @@ def test_sensor_that_falls_silent_is_reported(ros: Workbench) -> None:
 
 
 def test_temperature_outside_the_trained_range_is_reported(bench: Bench) -> None:
-    assert math.isfinite(bench.measure(60.0, 2.0).temperature)
+    assert math.isfinite(bench.measure(54.5, 2.0).temperature)
     status = bench.ros.wait_for_status(STATUS, lambda s: s.level == DiagnosticStatus.WARN)
     assert 'outside the trained range' in status.message
+    assert value(status, 'active law') == 'learned law'
 
 
 def test_clock_that_goes_back_starts_time_afresh(ros: Workbench) -> None:
@@ -318,13 +237,16 @@ def test_coolant_limit_changes_while_the_loop_runs(bench: Bench) -> None:
     assert bench.measure(STEADY, 2.0).temperature > 25.0
     (result,) = bench.ros.set_parameters('controller', coolant_max=24.0)
     assert result.successful, result.reason
-    assert bench.measure(STEADY, 3.0).temperature == pytest.approx(24.0)
+    commands = [bench.measure(STEADY, float(time)).temperature for time in range(2, 8)]
+    # at the rate limit of 1 K/s
+    assert max(before - now for before, now in itertools.pairwise(commands)) == pytest.approx(1.0)
+    assert commands[-1] == pytest.approx(24.0)
 
 
 def test_rate_limit_changes_while_the_loop_runs(bench: Bench) -> None:
     held = bench.measure(STEADY, 2.0).temperature
     bench.ros.set_parameters('controller', coolant_rate_limit=6.0)
-    command = bench.measure(STEADY + 5.0, 3.0).temperature
+    command = bench.measure(STEADY + 3.0, 3.0).temperature
     assert command == pytest.approx(held - 0.1)
 
 

@@ -87,14 +87,15 @@ def stamps(messages: Sequence[Any]) -> list[int]:
 def test_lockstep_gives_the_recorded_commands_to_the_bit(ros: Workbench, bag: Path) -> None:
     recorded = temperature_series(bag, '/coolant_setpoint')
     commands = ros.listen(Temperature, topics.COOLANT_SETPOINT)
-    ros.start('controller')
+    ros.start('controller', {'observer_bandwidth': 0.0})
     ros.meet('controller')
     process = play(ros, bag, rate=0.0)
     assert ros.wait_for_end(process) == 0
     ros.wait_until(lambda: len(commands) >= SAMPLES)
     assert stamps(commands) == recorded.stamp_ns.tolist()
     assert [command.temperature for command in commands] == recorded.celsius.tolist()
-    assert f'played {SAMPLES + 1} messages' in process.output()
+    # the coolant in force with each measurement, and one set-point
+    assert f'played {2 * SAMPLES + 1} messages' in process.output()
 
 
 def test_messages_are_played_byte_for_byte(ros: Workbench, bag: Path) -> None:

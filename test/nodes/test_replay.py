@@ -17,6 +17,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator
+from dataclasses import replace
 import itertools
 import json
 import math
@@ -37,7 +38,9 @@ from koopman_ros.nodes.messages import NANOSECONDS
 from koopman_ros.nodes.replay_parameters import ReplayParameters
 from koopman_ros.nodes.replaying.comparison import ReplayedBag
 from koopman_ros.nodes.replaying.record import Names
+from koopman_ros.nodes.replaying.report import about_beginning, reproduced, verdict
 from koopman_ros.nodes.shipped import config_directory
+import numpy as np
 import pytest
 from sensor_msgs.msg import Temperature
 from workbench import seconds, temperature, value, Workbench
@@ -45,6 +48,8 @@ from workbench import seconds, temperature, value, Workbench
 STEADY = 51.8  # degC
 # The rate limit is active through every step of the set-point, and the ramp takes some samples.
 SETTINGS = {'coolant_rate_limit': 30.0, 'setpoint_ramp': 60.0}
+# The law alone, which follows from a measurement and what is recorded of the rest.
+PURE = {'observer_bandwidth': 0.0, 'transfer_time': 0.0}
 
 
 class Operator:
@@ -53,13 +58,14 @@ class Operator:
 
     :param ros: where both run.
     :param bag: where the trainer records.
+    :param settings: of the controller.
     """
 
-    def __init__(self, ros: Workbench, bag: Path) -> None:
+    def __init__(self, ros: Workbench, bag: Path, settings: dict[str, float]) -> None:
         self.ros = ros
         self.time = 0.0
         ros.start('trainer', {'output': bag})
-        ros.start('controller', SETTINGS)
+        ros.start('controller', settings)
         self.commands = ros.listen(Temperature, topics.COOLANT_SETPOINT)
         self.thermometer = ros.speak(
             Temperature, topics.TEMPERATURE, to='controller', subscribers=2)
@@ -109,25 +115,37 @@ def run_a_day(operator: Operator) -> None:
     for mode, celsius in ((False, 26.0), (True, 15.0), (False, 24.0)):
         operator.ros.set_bool('controller/set_automatic', mode)
         operator.manual.publish(temperature(celsius))
-        for k in range(10):
-            operator.measure(46.0 + 0.1 * k)
+        for k in range(25):
+            operator.measure(46.0 + 0.04 * k)
     operator.ros.set_bool('controller/set_automatic', True)
     # requests and measurements side by side, whose order only the controller knows
     for k in range(30):
         operator.setpoint.publish(temperature(44.0 + (k % 5)))
         operator.measure(46.0 - 0.03 * k)
+    for k in range(240):
+        if k in (30, 200):
+            operator.setpoint.publish(temperature(46.0 + 0.01 * k))
+        operator.measure(45.1 + math.sin(0.1 * k))
 
 
-@pytest.fixture(scope='module')
-def day(tmp_path_factory: pytest.TempPathFactory) -> Iterator[tuple[Path, int]]:
+def record_a_day(folder: Path, settings: dict[str, float]) -> tuple[Path, int]:
     """Record it; return the bag and how many measurements there were."""
-    folder = tmp_path_factory.mktemp('day')
     with isolated_domain() as environment, Workbench(environment, folder) as ros:
-        operator = Operator(ros, folder / 'day')
+        operator = Operator(ros, folder / 'day', settings)
         run_a_day(operator)
         count = len(operator.commands)
         assert ros.set_bool('trainer/record', False).success
     return folder / 'day', count
+
+
+@pytest.fixture(scope='module')
+def day(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, int]:
+    return record_a_day(tmp_path_factory.mktemp('day'), SETTINGS)
+
+
+@pytest.fixture(scope='module')
+def pure_day(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, int]:
+    return record_a_day(tmp_path_factory.mktemp('pure_day'), SETTINGS | PURE)
 
 
 def replayed(bag: Path, model: str = 'reactor_nz4', new_model: str = 'reactor_nz3',
@@ -182,9 +200,10 @@ def test_new_model_is_compared_where_it_would_have_acted_otherwise(day: tuple[Pa
     found = replayed(day[0], new_model='reactor_linear')
     assert found.new is not None
     assert 10 < sum(found.new.beyond) < found.new.compared
-    # in manual mode no model acts
+    # in manual mode no model acts, once the coolant has arrived
     manual = abs(found.recorded - 26.0) < 1e-9
-    assert not any(found.new.beyond[manual])
+    assert sum(manual) > 10
+    assert not any(found.new.beyond[manual][8:])
 
 
 def rewrite(path: Path, *parts: Iterable[BagMessage]) -> Path:
@@ -207,16 +226,40 @@ def from_measurement(bag: Path, number: int) -> Iterator[BagMessage]:
     yield from entries[place:]
 
 
-# the one before the last comes after the clock was set back
-@pytest.mark.parametrize('number', [10, 30, 58, 95])
-def test_bag_that_begins_in_the_middle_of_a_run(
-        day: tuple[Path, int], tmp_path: Path, number: int) -> None:
-    bag, count = day
-    found = replayed(rewrite(tmp_path / 'late.mcap', from_measurement(bag, number)))
+# the one before the last comes after the clock was set back, the last in automatic mode again
+@pytest.mark.parametrize('number', [10, 30, 58, 145])
+def test_bag_that_begins_in_the_middle_of_a_run_of_the_law_alone(
+        pure_day: tuple[Path, int], tmp_path: Path, number: int) -> None:
+    bag, count = pure_day
+    found = replayed(rewrite(tmp_path / 'late.mcap', from_measurement(bag, number)), **PURE)
     assert found.record.began_before
     assert len(found.recorded) == count - number
     # the first command, or the second if that one was missed, follows from what is not recorded
     assert found.check.identical == found.check.compared >= count - number - 3
+
+
+@pytest.mark.parametrize('number', [10, 30, 58, 145])
+def test_bag_that_begins_in_the_middle_of_a_run_agrees_after_three_minutes(
+        day: tuple[Path, int], tmp_path: Path, number: int) -> None:
+    """What the controller remembered of the disturbance then is not in the bag."""
+    bag, count = day
+    found = replayed(rewrite(tmp_path / 'late.mcap', from_measurement(bag, number)))
+    assert found.record.began_before
+    assert found.replayed.given_seconds == 180.0
+    assert found.check.compared >= count - number - 185
+    difference = np.abs(found.check.difference)
+    assert np.nanmax(difference) < 0.05
+    assert np.nanmax(difference[-20:]) < 0.005
+    assert 'the commands of the first 180 s are taken over' in about_beginning(found)
+
+
+def test_bag_of_the_middle_that_is_too_short_to_be_compared_says_so(
+        day: tuple[Path, int], tmp_path: Path) -> None:
+    bag, count = day
+    found = replayed(rewrite(tmp_path / 'late.mcap', from_measurement(bag, count - 50)))
+    assert found.check.compared == 0
+    assert 'after the first 180 s, which are not compared because' in verdict(found)
+    assert not reproduced(found)
 
 
 def test_setpoints_that_were_not_recorded_follow_from_what_was_tracked(
@@ -243,6 +286,30 @@ def test_missing_diagnostics_are_told_by_commands_that_differ(
     found = replayed(rewrite(tmp_path / 'part.mcap', entries))
     assert found.check.identical < found.check.compared
     assert not found.record.models
+
+
+def test_word_of_a_mode_that_comes_after_the_request_it_allows(
+        day: tuple[Path, int], tmp_path: Path) -> None:
+    """The recorder hears of the mode from one node, and of the request from another."""
+    bag, _ = day
+    late = (replace(entry, log_time_ns=entry.log_time_ns + NANOSECONDS // 20)
+            if entry.topic == '/diagnostics' else entry for entry in read_messages(bag))
+    found = replayed(rewrite(tmp_path / 'late.mcap', late))
+    assert found.check.identical == found.check.compared
+    assert found.replayed.refused == 2
+
+
+def test_changes_of_the_setpoint_that_a_busy_recorder_missed_do_no_harm(
+        day: tuple[Path, int], tmp_path: Path) -> None:
+    """Their topic keeps the last one alone; requests are recorded late, too."""
+    bag, _ = day
+    changes = itertools.count()
+    kept = (replace(entry, log_time_ns=entry.log_time_ns + (
+                NANOSECONDS // 50 if entry.topic == '/setpoint' else 0))
+            for entry in read_messages(bag)
+            if entry.topic != '/active_setpoint' or next(changes) % 3)
+    found = replayed(rewrite(tmp_path / 'part.mcap', kept))
+    assert found.check.identical == found.check.compared
 
 
 def test_lost_messages_leave_the_rest_comparable(day: tuple[Path, int], tmp_path: Path) -> None:

@@ -141,8 +141,7 @@ def compare(replayed: Replay, commands: Array, tolerance: float) -> Comparison:
     :param tolerance: in K.
     """
     recorded = np.array([sample.recorded for sample in replayed.samples], dtype=np.float64)
-    compared = np.isfinite(recorded) & np.array(
-        [not (s.given or s.taken_over) for s in replayed.samples])
+    compared = np.isfinite(recorded) & np.array([not s.given for s in replayed.samples])
     same = commands.view(np.uint64) == recorded.view(np.uint64)
     return Comparison(np.where(compared, commands - recorded, np.nan),
                       int(np.count_nonzero(same & compared)), tolerance)

@@ -16,6 +16,7 @@
 
 from __future__ import annotations
 
+from bisect import bisect_right
 from collections import deque
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
@@ -33,10 +34,16 @@ from koopman_ros.nodes.replaying.status import (
     Status,
     statuses_in,
 )
+from koopman_ros.nodes.translation import SAME_TIME_NS
 
+# The set-point tracked among the controller's internals; changes alone are on a topic that keeps
+# the last one, so that a busy recorder misses some.
+TRACKED = 'setpoint [degC]'
 TEMPERATURE_TYPE = 'sensor_msgs/msg/Temperature'
 # An answer that is recorded longer than this before or after its measurement belongs to another.
 _NEAR_NS = 10 * NANOSECONDS
+# By so much a message may be recorded too early beside one of another topic.
+_OVERTAKING_NS = NANOSECONDS // 5
 
 
 @dataclass(frozen=True)
@@ -52,6 +59,8 @@ class Names:
     manual: str = '/manual_coolant_setpoint'
     command: str = '/coolant_setpoint'
     active: str = '/active_setpoint'
+    coolant: str = '/coolant_temperature'
+    internals: str = '/controller_state'
     diagnostics: str = '/diagnostics'
     namespace: str = ''
 
@@ -89,6 +98,7 @@ class Input:
         or None when the controller was started again.
     :param command: for a temperature, what was commanded in degrees Celsius, or None.
     :param active: for a temperature, the set-point that changed with it in degrees Celsius.
+    :param coolant: for a temperature, what was in force then in degrees Celsius, or None.
     """
 
     topic: str
@@ -96,6 +106,7 @@ class Input:
     message: Any
     command: float | None = None
     active: float | None = None
+    coolant: float | None = None
 
 
 @dataclass(frozen=True)
@@ -107,23 +118,23 @@ class ControlRecord:
     :param inputs: in the order in which they came.
     :param active_before: the set-point that was tracked before the first measurement of the bag,
         (stamp in ns, degrees Celsius), or None.
-    :param command_before: the same for the command.
     :param mode: at the beginning.
     :param began_before: whether the controller had answered measurements before the first.
     :param tells_active: whether changes of the tracked set-point were recorded.
     :param models: those in force, in the order of their use.
-    :param unmatched_commands: number of commands that answer no recorded measurement.
+    :param silences: number of commands that the controller gave because no measurement came.
+    :param unmatched_commands: number of others that answer no recorded measurement.
     :param complete: whether the recorder closed the bag.
     """
 
     names: Names
     inputs: tuple[Input, ...]
     active_before: tuple[int, float] | None
-    command_before: tuple[int, float] | None
     mode: Mode
     began_before: bool
     tells_active: bool
     models: tuple[str, ...]
+    silences: int
     unmatched_commands: int
     complete: bool
 
@@ -138,21 +149,27 @@ def read_record(path: str | os.PathLike[str], names: Names, *, recover: bool = F
     :param recover: read a bag that was not closed or is damaged as far as it is whole.
     :raises BagReadError: for a bag that cannot be read, or lacks measurements or commands.
     """
-    wanted = (names.temperature, names.setpoint, names.manual, names.command, names.active)
+    wanted = (names.temperature, names.setpoint, names.manual, names.command, names.active,
+              names.coolant)
     inputs: list[Input] = []
-    commands, actives = _Answers(), _Answers()
+    commands, actives, coolants, tracked = _Answers(), _Answers(), _Answers(), _Answers()
     statuses: list[Status] = []
     measured = 0
     for entry in in_log_order(read_messages(
-            path, (*wanted, names.diagnostics), recover=recover)):
+            path, (*wanted, names.internals, names.diagnostics), recover=recover)):
         if entry.topic == names.diagnostics:
             statuses += statuses_in(entry, names.namespace, measured)
+            continue
+        if entry.topic == names.internals:
+            tracked.add_tracked(entry)
             continue
         _check(path, entry)
         if entry.topic == names.command:
             commands.add(entry)
         elif entry.topic == names.active:
             actives.add(entry)
+        elif entry.topic == names.coolant:
+            coolants.add(entry)
         else:
             inputs.append(Input(entry.topic, entry.log_time_ns, entry.message))
             measured += entry.topic == names.temperature
@@ -163,38 +180,61 @@ def read_record(path: str | os.PathLike[str], names: Names, *, recover: bool = F
             raise BagReadError(
                 f'bag {os.fspath(path)!r} has no message on {topic!r}, it has {known or "none"}: '
                 f'name the topic that stands for it, e.g. -r {topic[1:]}:=NAME')
-    return _assembled(names, inputs, commands, actives, statuses, content.complete)
+    return _assembled(names, inputs, commands, actives, coolants, tracked, statuses,
+                      content.complete)
 
 
 class _Answers:
-    """Messages of the controller by the stamp of the measurement that they answer."""
+    """Messages that go with a measurement, by the stamp of that measurement."""
 
     def __init__(self) -> None:
         self.in_order: list[tuple[int, int, float]] = []
-        self.taken: set[tuple[int, int]] = set()
-        self._by_stamp: dict[int, deque[tuple[int, float]]] = {}
+        self._by_stamp: dict[int, deque[int]] = {}
+        self._heard = 0
 
     def add(self, entry: BagMessage) -> None:
-        stamp_ns = stamp_nanoseconds(entry.message.header.stamp)
-        self.in_order.append((stamp_ns, entry.log_time_ns, entry.message.temperature))
-        self._by_stamp.setdefault(stamp_ns, deque()).append(
-            (entry.log_time_ns, entry.message.temperature))
+        self._add(entry, entry.message.temperature)
 
-    def take(self, stamp_ns: int, time_ns: int) -> float | None:
-        """Return the next answer to a measurement, each once, or None without one near it."""
-        waiting = self._by_stamp.get(stamp_ns, deque())
-        while waiting and waiting[0][0] < time_ns - _NEAR_NS:
+    def add_tracked(self, entry: BagMessage) -> None:
+        """Add the set-point among the internals, which tell it with every measurement."""
+        try:
+            found = dict(zip(entry.message.name, entry.message.position, strict=True))
+            celsius = float(found[TRACKED])
+        except (AttributeError, KeyError, TypeError, ValueError):
+            # of another program, or another version of ours
+            return
+        if math.isfinite(celsius):
+            self._add(entry, celsius)
+
+    def _add(self, entry: BagMessage, celsius: float) -> None:
+        stamp_ns = stamp_nanoseconds(entry.message.header.stamp)
+        self._by_stamp.setdefault(stamp_ns, deque()).append(len(self.in_order))
+        self.in_order.append((stamp_ns, entry.log_time_ns, celsius))
+
+    def take(self, entry: Input) -> int | None:
+        """Return the place of the next answer to a measurement, each once, or None."""
+        waiting = self._by_stamp.get(stamp_nanoseconds(entry.message.header.stamp), deque())
+        while waiting and self.in_order[waiting[0]][1] < entry.time_ns - _NEAR_NS:
             waiting.popleft()
-        if waiting and waiting[0][0] <= time_ns + _NEAR_NS:
-            found_ns, celsius = waiting.popleft()
-            self.taken.add((stamp_ns, found_ns))
-            return celsius
+        if waiting and self.in_order[waiting[0]][1] <= entry.time_ns + _NEAR_NS:
+            return waiting.popleft()
         return None
 
-    def left(self) -> list[tuple[int, int]]:
-        """Return (stamp, time) of those that answer no measurement, in order."""
-        return [(stamp_ns, time_ns) for stamp_ns, time_ns, _ in self.in_order
-                if (stamp_ns, time_ns) not in self.taken]
+    def taken(self, entry: Input) -> float | None:
+        """Return the next answer to a measurement in degrees Celsius, each once, or None."""
+        place = self.take(entry)
+        return None if place is None else self.in_order[place][2]
+
+    def last(self, entry: Input) -> float | None:
+        """Return what a measurement's own stamp tells, or else the last news, if it is timely."""
+        own = self.taken(entry)
+        self._heard = bisect_right(
+            self.in_order, entry.time_ns, self._heard, key=lambda message: message[1])
+        if own is not None or not self._heard:
+            return own
+        stamp_ns, _, celsius = self.in_order[self._heard - 1]
+        away = abs(stamp_nanoseconds(entry.message.header.stamp) - stamp_ns)
+        return celsius if away <= SAME_TIME_NS else None
 
     def before(self, first: Input) -> tuple[int, float] | None:
         """Return the last of those recorded first that answer no measurement of the bag."""
@@ -209,52 +249,60 @@ class _Answers:
 
 
 def _assembled(names: Names, inputs: list[Input], commands: _Answers, actives: _Answers,
-               statuses: list[Status], complete: bool) -> ControlRecord:
+               coolants: _Answers, tracked: _Answers, statuses: list[Status], complete: bool
+               ) -> ControlRecord:
     first = next(entry for entry in inputs if entry.topic == names.temperature)
-    answered = []
-    for entry in inputs:
+    answers: dict[int, int] = {}  # place of the command by that of the measurement
+    for k, entry in enumerate(inputs):
         if entry.topic == names.temperature:
-            stamp_ns = stamp_nanoseconds(entry.message.header.stamp)
-            entry = replace(entry, command=commands.take(stamp_ns, entry.time_ns),
-                            active=actives.take(stamp_ns, entry.time_ns))
-        answered.append(entry)
-    matched = sum(entry.command is not None for entry in answered)
-    answered = _with_silences(answered, commands.left(), names)
+            place = commands.take(entry)
+            if place is not None:
+                answers[k] = place
+            changed, every = actives.taken(entry), tracked.taken(entry)
+            inputs[k] = replace(
+                entry, command=None if place is None else commands.in_order[place][2],
+                active=changed if every is None else every, coolant=coolants.last(entry))
+    answered = list(_with_silences(inputs, answers, commands, names))
+    silences = len(answered) - len(inputs)
     pairs = [(entry.message.temperature, math.nan if entry.command is None else entry.command)
              for entry in answered if entry.topic == names.temperature]
     lives = list(lives_of(statuses, pairs))
-    active_before, command_before = actives.before(first), commands.before(first)
+    active_before = actives.before(first)
     return ControlRecord(
         names=names,
         inputs=tuple(_with_changes(names, answered, deque(changes_of(lives)))),
         active_before=active_before,
-        command_before=command_before,
         mode=statuses[0].mode if statuses else Mode.AUTOMATIC,
-        began_before=(active_before is not None or command_before is not None
+        began_before=(active_before is not None or commands.before(first) is not None
                       or (bool(lives) and lives[0].earlier > 0)),
         tells_active=bool(actives.in_order),
         models=tuple(dict.fromkeys(status.model for status in statuses)),
-        unmatched_commands=len(commands.in_order) - matched,
+        silences=silences,
+        unmatched_commands=len(commands.in_order) - len(answers) - silences,
         complete=complete,
     )
 
 
-def _with_silences(inputs: list[Input], commands: list[tuple[int, int]], names: Names
-                   ) -> list[Input]:
-    """Return the inputs with what the controller commanded by itself among them."""
-    result: list[Input] = []
+def _with_silences(inputs: list[Input], answers: dict[int, int], commands: _Answers, names: Names
+                   ) -> Iterator[Input]:
+    """
+    Yield the inputs with what the controller commanded by itself among them.
+
+    Its commands went out in the order of what they answer, whenever that was recorded.
+    """
+    taken = set(answers.values())
+    waiting = deque(place for place in range(len(commands.in_order)) if place not in taken)
     measured_ns: int | None = None
-    waiting = deque(commands)
-    for entry in [*inputs, None]:
-        while waiting and (entry is None or waiting[0][1] < entry.time_ns):
-            stamp_ns, time_ns = waiting.popleft()
+    for k, entry in enumerate([*inputs, None]):
+        while waiting and (waiting[0] < answers[k] if k in answers else
+                           entry is None or commands.in_order[waiting[0]][1] < entry.time_ns):
+            stamp_ns, time_ns, _ = commands.in_order[waiting.popleft()]
             if measured_ns is not None and stamp_ns > measured_ns:
-                result.append(Input('', time_ns, Silence(stamp_ns)))
+                yield Input('', time_ns, Silence(stamp_ns))
         if entry is not None:
-            result.append(entry)
+            yield entry
             if entry.topic == names.temperature:
                 measured_ns = stamp_nanoseconds(entry.message.header.stamp)
-    return result
 
 
 def _with_changes(names: Names, inputs: list[Input], changes: deque[Change]) -> Iterator[Input]:
@@ -272,7 +320,8 @@ def _with_changes(names: Names, inputs: list[Input], changes: deque[Change]) -> 
 def _comes_before(change: Change, entry: Input, count: int, measured: bool) -> bool:
     """Tell whether a change comes before the input that follows `count` measurements."""
     if change.place == count:
-        return measured or change.time_ns < entry.time_ns
+        # a request follows the change that it needs, also when it overtook word of it
+        return measured or change.time_ns < entry.time_ns + _OVERTAKING_NS
     return change.place < count
 
 

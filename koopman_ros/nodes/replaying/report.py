@@ -59,7 +59,9 @@ def verdict(bag: ReplayedBag) -> str:
     """Say in one sentence how the replay of the recorded model did."""
     check = bag.check
     if not check.compared:
-        return 'no measurement has a recorded command'
+        return 'no measurement has a recorded command' + (
+            f' after the first {bag.replayed.given_seconds:g} s, which are not compared because '
+            'the run had begun before the bag' if bag.replayed.given_seconds else '')
     if check.identical == check.compared:
         return f'all {check.compared} recorded commands are reproduced to the bit'
     beyond = int(np.count_nonzero(check.beyond))
@@ -104,13 +106,13 @@ def _section(bag: ReplayedBag, parameters: ReplayParameters) -> list[str]:
         lines.append(f'- At {bag.outside} measurements the tracked set-point is outside the range '
                      'that the new model was trained for, which would have refused it.')
     if record.began_before:
-        lines.append('- The run had begun before the bag: the replay starts from the set-point '
-                     'and the command recorded first.')
+        lines.append(about_beginning(bag))
     for count, words in (
             (bag.replayed.adopted, 'set-points are taken from what was tracked, because no '
                                    'recorded request explains them'),
             (bag.replayed.refused, 'requests are refused'),
             (bag.unanswered, 'measurements have no recorded command'),
+            (record.silences, 'commands were given because no measurement came'),
             (record.unmatched_commands, 'recorded commands answer no recorded measurement')):
         if count:
             lines.append(f'- {count} {words}.')
@@ -122,6 +124,19 @@ def _section(bag: ReplayedBag, parameters: ReplayParameters) -> list[str]:
     return lines
 
 
+def about_beginning(bag: ReplayedBag) -> str:
+    """Say what follows from a bag that begins in the middle of a run."""
+    words = ('- The run had begun before the bag: the replay starts from the set-point and the '
+             'command recorded first.')
+    seconds = bag.replayed.given_seconds
+    if seconds:
+        words += (f' What the controller remembered then is not in the bag, above all its '
+                  f'estimate of the disturbance, so that the commands of the first {seconds:g} s '
+                  'are taken over and not compared; later ones can differ by what is left of '
+                  'that memory.')
+    return words
+
+
 def _figures(bag: ReplayedBag) -> dict[str, Any]:
     figures: dict[str, Any] = {
         'bag': bag.path,
@@ -130,9 +145,11 @@ def _figures(bag: ReplayedBag) -> dict[str, Any]:
         'recorded_model': _comparison(bag, bag.check),
         'measurements_without_command': bag.unanswered,
         'commands_without_measurement': bag.record.unmatched_commands,
+        'commands_in_silence': bag.record.silences,
         'adopted_setpoints': bag.replayed.adopted,
         'refused_requests': bag.replayed.refused,
         'began_before_bag': bag.record.began_before,
+        'taken_over_s': bag.replayed.given_seconds,
         'models_in_diagnostics': list(bag.record.models),
         'complete': bag.record.complete,
     }

@@ -27,7 +27,7 @@ import itertools
 import math
 from typing import Any
 
-from koopman_ros.control import Controller, Mode, Report, State
+from koopman_ros.control import Controller, Mode, Report, Settings, State
 from koopman_ros.nodes.messages import NANOSECONDS, stamp_nanoseconds, to_celsius, to_kelvin
 from koopman_ros.nodes.replaying.record import ControlRecord, Input, Silence, TakeOver
 from koopman_ros.nodes.translation import (
@@ -45,6 +45,9 @@ Array = NDArray[np.float64]
 
 # How far apart a request and a measurement are recorded when their order is not to be trusted.
 _CLOSE_NS = NANOSECONDS // 20
+# In time constants, which leave less than a thousandth, and 2 % of a change of law or mode.
+_MEMORY_OF_OBSERVER = 10.0
+_MEMORY_OF_TRANSFER = 6.0
 
 
 @dataclass(frozen=True)
@@ -53,15 +56,17 @@ class Sample:
     A measurement with what went before it, resolved for any controller.
 
     :param message: the measurement.
+    :param coolant: that was in force then, in degrees Celsius, or None.
     :param operations: what else happened since the last one.
     :param active: set-point tracked, in K; NaN for none.
     :param recorded: what was commanded in degrees Celsius; NaN where nothing was recorded.
     :param replayed: the same by the replay.
-    :param given: whether it comes before, or is, the first command of a run that had begun
-        before the bag: the replay goes on from there.
+    :param given: whether the replay takes the recorded command over here, because what it
+        follows from is not in the bag: the run had begun before.
     """
 
     message: Any
+    coolant: float | None
     operations: tuple[Input, ...]
     active: float
     recorded: float
@@ -73,11 +78,6 @@ class Sample:
         """Stamp of the measurement."""
         return stamp_nanoseconds(self.message.header.stamp)
 
-    @property
-    def taken_over(self) -> bool:
-        """Whether the controller started from the coolant in force, which it commanded first."""
-        return any(isinstance(entry.message, TakeOver) for entry in self.operations)
-
 
 @dataclass(frozen=True)
 class Replay:
@@ -85,6 +85,7 @@ class Replay:
     A recorded run replayed through the control step.
 
     :param start: state before the first sample.
+    :param given_seconds: for so long the recorded commands were taken over.
     :param samples: one for each measurement, in the order in which they came.
     :param adopted: set-points taken from the record of what was tracked, because no recorded
         request explains them.
@@ -92,6 +93,7 @@ class Replay:
     """
 
     start: State
+    given_seconds: float
     samples: tuple[Sample, ...]
     adopted: int
     refused: int
@@ -107,7 +109,7 @@ def replay(record: ControlRecord, controller: Controller) -> Replay:
             run.measure(entry)
         else:
             run.operate(entry)
-    return Replay(run.start, tuple(run.samples), run.adopted, run.refused)
+    return Replay(run.start, run.given_seconds, tuple(run.samples), run.adopted, run.refused)
 
 
 def commands_of(controller: Controller, replayed: Replay) -> Array:
@@ -125,11 +127,10 @@ def commands_of(controller: Controller, replayed: Replay) -> Array:
             state = _operated(controller, state, operation)[0]
         if not math.isnan(sample.active):
             state = _tracking(state, sample.active)
-        if sample.given:
-            commands[k] = sample.replayed
-            continue
-        state, kelvin, _ = answer(controller, state, sample.message)
+        state, kelvin, _ = answer(controller, state, sample.message, sample.coolant)
         commands[k] = to_celsius(kelvin)
+        if sample.given and not math.isnan(sample.recorded):
+            state, commands[k] = _commanding(state, sample.recorded), sample.recorded
     return commands
 
 
@@ -160,7 +161,11 @@ class _Run:
         self._requests = [entry for entry in record.inputs if entry.topic == record.names.setpoint]
         self._operations: list[Input] = []
         # until the first command, when the run began before the bag
-        self._begins_unknown = record.began_before and self.start.command is None
+        self._begins_unknown = record.began_before
+        # for so long, what is not in the bag is not yet forgotten
+        self.given_seconds = _memory(controller.settings) if record.began_before else 0.0
+        self._given_left = self.given_seconds
+        self._last_ns: int | None = None
         # the set-point that was tracked, as far as it is known
         self._active = math.nan if record.active_before is None else record.active_before[1]
 
@@ -170,46 +175,55 @@ class _Run:
         self._state, refused = _operated(self._controller, self._state, entry)
         self.refused += bool(refused)
         if entry.message is None:
-            self._active = math.nan
+            self._active, self._begins_unknown, self._given_left = math.nan, False, 0.0
 
     def measure(self, entry: Input) -> None:
         """Answer a measurement, knowing the requests that were known then."""
         if entry.active is not None:
             self._active = entry.active
-        given = self._begins_unknown
-        if self._state.command is None and entry.command is not None and not given:
-            self._begin_from_coolant(entry, entry.command)
-        if given:
-            self._begin_with(entry)
-            active = self._state.setpoint.active
-            replayed = math.nan if entry.command is None else entry.command
-        else:
-            active, replayed = self._answer(entry)
+        if self._begins_unknown and not math.isnan(self._active):
+            self._state = _tracking(self._state, to_kelvin(self._active))
+        given = self._is_given(entry)
+        if self._state.command is None and not given:
+            given = self._begin_from_coolant(entry)
+        active, replayed = self._answer(entry)
+        recorded = math.nan if entry.command is None else entry.command
+        if given and entry.command is not None:
+            self._state, replayed = _commanding(self._state, recorded), recorded
         self.samples.append(Sample(
-            entry.message, tuple(self._operations),
-            math.nan if active is None else float(active[0]),
-            math.nan if entry.command is None else entry.command, replayed, given))
+            entry.message, entry.coolant, tuple(self._operations),
+            math.nan if active is None else float(active[0]), recorded, replayed, given))
         self._operations = []
 
-    def _begin_from_coolant(self, entry: Input, recorded: float) -> None:
-        """Find out whether a start was one from the coolant in force, which is not recorded."""
-        alone = self._attempt(entry, self.recorded)
-        if to_celsius(alone.kelvin) != recorded:
-            self.operate(Input('', entry.time_ns, TakeOver(recorded)))
+    def _is_given(self, entry: Input) -> bool:
+        """Tell whether a command follows from what is not in the bag: the first one, and more."""
+        stamp_ns, first = stamp_nanoseconds(entry.message.header.stamp), self._begins_unknown
+        if self._last_ns is not None:
+            self._given_left -= max(0, stamp_ns - self._last_ns) / NANOSECONDS
+        self._last_ns = stamp_ns
+        self._begins_unknown &= entry.command is None
+        return first or self._given_left > 0.0
 
-    def _begin_with(self, entry: Input) -> None:
-        """Take what was commanded as given where it follows from what was not recorded."""
-        self._state = self._attempt(entry, self.recorded).asked
-        self._known = self.recorded
-        if not math.isnan(self._active):
-            self._state = _tracking(self._state, to_kelvin(self._active))
-        if entry.command is not None:
-            self._begins_unknown = False
-            self._state = replace(
-                self._state, command=np.array([to_kelvin(entry.command)]),
-                time_ns=stamp_nanoseconds(entry.message.header.stamp))
-            self.start = replace(self.start, command=self._state.command,
-                                 time_ns=self._state.time_ns)
+    def _begin_from_coolant(self, entry: Input) -> bool:
+        """
+        Find out whether a start was one from the coolant that was in force.
+
+        :return: whether that follows from the first command alone, as the coolant itself was not
+            recorded.
+        """
+        told, coolant = entry.coolant is not None, entry.coolant
+        coolant = coolant if told else entry.command
+        if coolant is None:
+            return False
+        start = Input('', entry.time_ns, TakeOver(coolant))
+        state = _operated(self._controller, self._state, start)[0]
+        from_coolant = to_celsius(answer(
+            self._controller, state, entry.message, entry.coolant)[1])
+        alone = to_celsius(self._attempt(entry, self.recorded).kelvin)
+        took_over = entry.command in (None, from_coolant) and (told or alone != from_coolant)
+        if took_over:
+            self.operate(start)
+        return took_over and not told
 
     def _answer(self, entry: Input) -> tuple[Array | None, float]:
         counts = self._counts(entry)
@@ -220,7 +234,7 @@ class _Run:
             self.adopted += 1
             asked = _tracking(likely.asked, to_kelvin(self._active))
             found = _Attempt(likely.known, likely.refused, asked,
-                             *answer(self._controller, asked, entry.message))
+                             *answer(self._controller, asked, entry.message, entry.coolant))
         self._known = found.known
         self.refused += found.refused
         self._state = found.state
@@ -243,7 +257,8 @@ class _Run:
         for request in self._requests[self._known:known]:
             asked, reason = ask_setpoint(self._controller, asked, request.message)
             refused += bool(reason)
-        return _Attempt(known, refused, asked, *answer(self._controller, asked, entry.message))
+        return _Attempt(known, refused, asked, *answer(
+            self._controller, asked, entry.message, entry.coolant))
 
     def _fits(self, report: Report) -> bool:
         """Tell whether the set-point tracked is the one that was, as far as that is known."""
@@ -256,16 +271,26 @@ def _start(record: ControlRecord) -> State:
     state = State(mode=record.mode)
     if record.active_before is not None:
         state = _tracking(state, to_kelvin(record.active_before[1]))
-    if record.command_before is not None:
-        stamp_ns, celsius = record.command_before
-        state = replace(state, command=np.array([to_kelvin(celsius)]), time_ns=stamp_ns)
     return state
+
+
+def _memory(settings: Settings) -> float:
+    """Return the seconds after which a controller has forgotten what it did not measure."""
+    bandwidth = settings.observer_bandwidth
+    observer = _MEMORY_OF_OBSERVER / bandwidth if bandwidth > 0.0 else 0.0
+    return max(observer, _MEMORY_OF_TRANSFER * settings.transfer_time)
+
+
+def _commanding(state: State, celsius: float) -> State:
+    """Return the state with another command in force."""
+    return replace(state, command=np.array([to_kelvin(celsius)]))
 
 
 def _tracking(state: State, kelvin: float) -> State:
     """Return the state with a set-point in force, its schedule untouched."""
     value = np.array([kelvin])
-    return replace(state, setpoint=replace(state.setpoint, requested=value, active=value))
+    return replace(state, setpoint=replace(
+        state.setpoint, requested=value, active=value, ramped=None))
 
 
 def _operated(controller: Controller, state: State, entry: Input) -> tuple[State, str]:

@@ -1,0 +1,117 @@
+# Copyright 2026 The koopman_ros Authors
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""A controller as a process, with a thermometer and an operator in the test."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+import math
+import time as clock
+
+from diagnostic_msgs.msg import DiagnosticStatus
+from koopman_ros.nodes import topics
+from koopman_ros.nodes.controller_parameters import TABLE
+import pytest
+from rclpy.qos import QoSProfile
+from sensor_msgs.msg import Temperature
+from workbench import seconds, temperature, TIMEOUT, Workbench
+
+STATUS = 'controller: control'
+STEADY = 51.8  # degC, near the plant's steady state
+# The law alone, which the temperature of a moment determines.
+PURE = {'observer_bandwidth': 0.0, 'transfer_time': 0.0, 'frozen_timeout': 0.0}
+
+
+class Bench:
+    """
+    A controller with a thermometer and an operator in the test.
+
+    :param ros: where the controller runs.
+    :param parameters: of the controller.
+    :param arguments: further ROS arguments of the controller.
+    :param qos: what the thermometer offers.
+    :param first: stamp of the first measurement in s.
+    """
+
+    def __init__(self, ros: Workbench, parameters: Mapping[str, object] | None = None,
+                 arguments: tuple[str, ...] = (), qos: QoSProfile = topics.LOOP_QOS,
+                 first: float = 1.0) -> None:
+        self.ros = ros
+        self.process = ros.start('controller', parameters, arguments)
+        self.commands = ros.listen(Temperature, topics.COOLANT_SETPOINT)
+        self.tracked = ros.listen(Temperature, topics.ACTIVE_SETPOINT, topics.LATCHED_QOS)
+        self.thermometer = ros.speak(Temperature, topics.TEMPERATURE, qos, to='controller')
+        self._setpoint = ros.speak(Temperature, topics.SETPOINT, to='controller')
+        self.measure(STEADY, first)
+        self.active_since(STEADY)
+
+    def start_afresh(self) -> None:
+        """Bring the controller back to its steady state at the time 1 s, and forget the rest."""
+        self.ros.set_parameters('controller', **{
+            name: PURE.get(name, row.default)
+            for name, row in TABLE.rows.items() if not row.read_only})
+        self.ros.set_bool('controller/set_automatic', True)
+        self.ask(STEADY)
+        # no gap, which would be the interval of the samples
+        now = seconds(self.commands[-1]) + 1.0
+        self.settle(STEADY, self.measure_until_active(STEADY, now))
+        del self.commands[:], self.tracked[:-1], self.ros.statuses[:]
+        # the clock goes back
+        self.measure(STEADY, 1.0)
+
+    def measure(self, celsius: float, time: float) -> Temperature:
+        """Send a measurement and return its command."""
+        self.thermometer.publish(temperature(celsius, time))
+        return self.ros.wait_until(
+            lambda: next((m for m in self.commands if seconds(m) == time), None))
+
+    def ask(self, celsius: float, time: float = 0.0) -> None:
+        """Turn the set-point, in force from a time, and wait until the controller knows it."""
+        self._setpoint.publish(temperature(celsius, time))
+        self.ros.meet('controller')
+
+    def refusal(self) -> DiagnosticStatus:
+        """Wait until a set-point was refused."""
+        return self.ros.wait_for_status(STATUS, lambda s: 'set-point' in s.message)
+
+    def active_since(self, celsius: float) -> float:
+        """Wait until a set-point is tracked; return since when."""
+        return seconds(self.ros.wait_until(lambda: next(
+            (m for m in self.tracked if m.temperature == pytest.approx(celsius)), None)))
+
+    @property
+    def active(self) -> float:
+        """The set-point that is tracked."""
+        return float(self.tracked[-1].temperature)
+
+    def measure_until(self, condition: Callable[[Temperature], bool], time: float) -> float:
+        """Measure once a second from a time on until a command meets a condition; say when."""
+        deadline = clock.monotonic() + TIMEOUT
+        while not condition(self.measure(STEADY, time)):
+            assert clock.monotonic() < deadline
+            time += 1.0
+        return time
+
+    def settle(self, celsius: float, time: float) -> tuple[float, float]:
+        """Measure the same until the command stays the same; return the time and the command."""
+        before, command = math.nan, self.measure(celsius, time).temperature
+        while abs(command - before) > 1e-9 or math.isnan(before):
+            time += 1.0
+            before, command = command, self.measure(celsius, time).temperature
+        return time, command
+
+    def measure_until_active(self, celsius: float, time: float) -> float:
+        """Measure once a second from a time on until a set-point is tracked; say when."""
+        return self.measure_until(lambda _: self.active == pytest.approx(celsius), time)

@@ -1,0 +1,195 @@
+# Copyright 2026 The koopman_ros Authors
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""Plant and controller in a loop: no offset, and no bump whatever happens to the controller."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+
+from diagnostic_msgs.msg import DiagnosticStatus
+from koopman_ros.nodes import topics
+from koopman_ros.nodes.plant_parameters import PlantParameters
+import numpy as np
+import pytest
+from rosgraph_msgs.msg import Clock
+from sensor_msgs.msg import Temperature
+from workbench import seconds, temperature, value, Workbench
+
+FOULED = 0.8 * PlantParameters().heat_transfer_coefficient
+SETPOINT = 45.0  # degC
+
+
+class Loop:
+    """
+    A controller and a plant without noise in lock-step, as fast as they can.
+
+    :param ros: where both run.
+    :param plant: parameters of the plant.
+    """
+
+    def __init__(self, ros: Workbench, plant: Mapping[str, object]) -> None:
+        self.ros = ros
+        self.measured = ros.listen(Temperature, topics.TEMPERATURE)
+        self.commands = ros.listen(Temperature, topics.COOLANT_SETPOINT)
+        self._clock = ros.listen(Clock, topics.CLOCK, topics.CLOCK_QOS)
+        self.controller = ros.start('controller')
+        self._setpoint = ros.speak(Temperature, topics.SETPOINT, to='controller')
+        self._manual = ros.speak(Temperature, topics.MANUAL_COOLANT_SETPOINT, to='controller')
+        ros.start('plant', {**plant, 'lockstep': True, 'speed': 0.0, 'lockstep_subscribers': 2})
+
+    def ask(self, celsius: float) -> None:
+        """Turn the set-point."""
+        self._setpoint.publish(temperature(celsius))
+
+    def ask_manually(self, celsius: float) -> None:
+        """Turn the coolant by hand."""
+        self._manual.publish(temperature(celsius))
+
+    def wait_for(self, duration: int) -> None:
+        """Wait until the bench has heard what happens in so many seconds of the plant."""
+        # the bench may be some hundred commands behind, but not of the clock
+        ticks = len(self._clock) + 2
+        self.ros.wait_until(lambda: len(self._clock) >= ticks)
+        last = self._clock[-1].clock.sec + duration
+        self.ros.wait_until(lambda: self.commands and seconds(self.commands[-1]) >= last)
+
+    def rest(self) -> None:
+        """Wait until the plant has come to rest at the set-point."""
+        self.wait_for(60)
+        seen = 0
+
+        def rests() -> bool:
+            nonlocal seen
+            if len(self.commands) < seen + 30:
+                return False
+            seen = len(self.commands)
+            measured, commands = (
+                np.array([message.temperature for message in messages[-30:]])
+                for messages in (self.measured, self.commands))
+            return bool(np.all(np.abs(measured - SETPOINT) <= 1e-3)
+                        and np.ptp(commands) <= 1e-3)
+
+        self.ros.wait_until(rests)
+
+    def steps(self, change: Callable[[], object], count: int) -> np.ndarray:
+        """Return the steps of the coolant during a change and some seconds of the plant after."""
+        first = len(self.commands) - 1
+        change()
+        self.wait_for(count)
+        commands = self.commands[first:]
+        assert np.all(np.diff([seconds(message) for message in commands]) == 1.0)
+        return np.abs(np.diff([message.temperature for message in commands]))
+
+
+@pytest.fixture(scope='module')
+def shared_loop(shared_ros: Workbench) -> Loop:
+    return Loop(shared_ros, {})
+
+
+@pytest.fixture
+def loop(shared_loop: Loop) -> Loop:
+    """Return a loop at rest, of a plant that is not as its model has it."""
+    ros = shared_loop.ros
+    ros.set_parameters('plant', heat_transfer_coefficient=FOULED)
+    ros.set_parameters('controller', temperature_weight=1.0, coolant_weight=1.0,
+                       setpoint_ramp=1000.0)
+    ros.set_bool('controller/set_automatic', True)
+    shared_loop.ask(SETPOINT)
+    shared_loop.rest()
+    return shared_loop
+
+
+def test_no_offset_is_left_when_the_heat_transfer_changes(loop: Loop) -> None:
+    loop.ros.set_parameters(
+        'plant', heat_transfer_coefficient=PlantParameters().heat_transfer_coefficient)
+    loop.rest()
+    count = len(loop.measured)
+    loop.steps(lambda: loop.ros.set_parameters(
+        'plant', heat_transfer_coefficient=FOULED), 30)
+    loop.rest()
+    off = [seconds(message) for message in loop.measured[count:]
+           if abs(message.temperature - SETPOINT) > 1e-3]
+    assert off[-1] - off[0] < 600.0
+    del loop.ros.statuses[:]
+    truth = loop.ros.wait_for_status('plant: simulation', lambda s: True)
+    assert abs(float(value(truth, 'temperature [degC]')) - SETPOINT) <= 1e-3
+    # it is no small thing that it makes up for
+    status = loop.ros.wait_for_status('controller: control', lambda s: True)
+    assert status.level == DiagnosticStatus.OK
+    assert abs(float(value(status, 'disturbance [K of coolant]'))) > 1.0
+
+
+def test_manual_mode_and_back_without_a_bump(loop: Loop) -> None:
+    steps = loop.steps(lambda: loop.ros.set_bool('controller/set_automatic', False), 30)
+    assert np.max(steps) < 0.01
+    steps = loop.steps(lambda: loop.ros.set_bool('controller/set_automatic', True), 100)
+    assert np.max(steps) < 0.01
+    loop.rest()
+
+
+def test_manual_coolant_is_left_without_a_bump(loop: Loop) -> None:
+    """The law would command another one."""
+    law = loop.commands[-1].temperature
+    loop.ros.set_bool('controller/set_automatic', False)
+    loop.ask_manually(law - 0.3)
+    loop.ros.wait_until(lambda: loop.commands[-1].temperature == pytest.approx(law - 0.3))
+    count = len(loop.commands) + 20
+    loop.ros.wait_until(lambda: len(loop.commands) > count)
+    steps = loop.steps(lambda: loop.ros.set_bool('controller/set_automatic', True), 200)
+    # in manual mode nothing moves, so that the first steps are those of the switch
+    assert np.max(steps[np.flatnonzero(steps)][:5]) < 0.01
+    loop.rest()
+    assert loop.commands[-1].temperature == pytest.approx(law, abs=0.01)
+    steps = loop.steps(lambda: loop.ros.set_bool('controller/set_automatic', False), 30)
+    assert np.max(steps) < 0.01
+
+
+def test_weights_change_without_a_bump(loop: Loop) -> None:
+    """At rest, and on the way to another set-point."""
+    def retune() -> None:
+        for weight in (0.01, 10.0, 0.3):
+            (result,) = loop.ros.set_parameters('controller', coolant_weight=weight)
+            assert result.successful, result.reason
+
+    assert np.max(loop.steps(retune, 100)) < 0.01
+    loop.ros.set_parameters('controller', setpoint_ramp=0.2)
+    loop.ask(SETPOINT + 4.0)
+    loop.ros.wait_until(lambda: loop.measured[-1].temperature > SETPOINT + 0.2)
+    steps = loop.steps(retune, 30)
+    assert loop.measured[-1].temperature < SETPOINT + 3.9
+    assert np.max(steps) < 0.05
+
+
+def test_controller_that_was_killed_takes_over_the_coolant_in_force(ros: Workbench) -> None:
+    loop = Loop(ros, {'heat_transfer_coefficient': FOULED, 'lockstep_timeout': 0.3})
+    loop.ask(SETPOINT)
+    loop.rest()
+    ros.processes.remove(loop.controller)
+    loop.controller.process.kill()
+    loop.controller.process.wait()
+    ros.wait_for_status('plant: simulation', lambda s: 'no command arrives' in s.message)
+    coolants = ros.listen(Temperature, topics.COOLANT_TEMPERATURE)
+    # what the old one said is still on its way to the other subscription
+    commands = ros.listen(Temperature, topics.COOLANT_SETPOINT)
+
+    ros.start('controller')
+    ros.wait_until(lambda: len(commands) > 200)
+    in_force = {seconds(message): message.temperature for message in coolants}
+    # the very first may be given before the bench is known
+    assert commands[0].temperature == pytest.approx(in_force[seconds(commands[0])], abs=1e-3)
+    assert commands[0].temperature == pytest.approx(min(in_force.values()), abs=1e-3)
+    assert np.max(np.abs(np.diff([message.temperature for message in commands]))) < 0.05
+    # of the set-point it knows nothing: it holds what it finds
+    loop.rest()
