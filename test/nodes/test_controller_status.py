@@ -23,7 +23,7 @@ import time
 from controller_bench import Bench, STATUS, STEADY
 from diagnostic_msgs.msg import DiagnosticStatus
 from koopman_ros.nodes import topics
-from koopman_ros.nodes.replaying.record import TRACKED
+from koopman_ros.nodes.replaying.answers import TRACKED
 import pytest
 from rclpy.node import Node
 from sensor_msgs.msg import JointState, Temperature

@@ -27,7 +27,8 @@ from koopman_ros.nodes import replay, topics, translation
 from koopman_ros.nodes.messages import NANOSECONDS, to_celsius
 from koopman_ros.nodes.replay_parameters import ReplayParameters
 from koopman_ros.nodes.replaying.comparison import ReplayedBag
-from koopman_ros.nodes.replaying.record import Names, Silence, TakeOver
+from koopman_ros.nodes.replaying.inputs import Silence, TakeOver
+from koopman_ros.nodes.replaying.record import Names
 from koopman_ros.nodes.shipped import model_path
 import pytest
 from rclpy.serialization import serialize_message

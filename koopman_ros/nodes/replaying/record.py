@@ -16,17 +16,17 @@
 
 from __future__ import annotations
 
-from bisect import bisect_right
 from collections import deque
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
 import math
 import os
-from typing import Any
 
 from koopman_ros.bags import BagMessage, BagReadError, in_log_order, read_messages, summary
 from koopman_ros.control import Mode
 from koopman_ros.nodes.messages import NANOSECONDS, stamp_nanoseconds
+from koopman_ros.nodes.replaying.answers import Answers
+from koopman_ros.nodes.replaying.inputs import Input, Silence
 from koopman_ros.nodes.replaying.status import (
     Change,
     changes_of,
@@ -34,14 +34,8 @@ from koopman_ros.nodes.replaying.status import (
     Status,
     statuses_in,
 )
-from koopman_ros.nodes.translation import SAME_TIME_NS
 
-# The set-point tracked among the controller's internals; changes alone are on a topic that keeps
-# the last one, so that a busy recorder misses some.
-TRACKED = 'setpoint [degC]'
 TEMPERATURE_TYPE = 'sensor_msgs/msg/Temperature'
-# An answer that is recorded longer than this before or after its measurement belongs to another.
-_NEAR_NS = 10 * NANOSECONDS
 # By so much a message may be recorded too early beside one of another topic.
 _OVERTAKING_NS = NANOSECONDS // 5
 
@@ -63,50 +57,6 @@ class Names:
     internals: str = '/controller_state'
     diagnostics: str = '/diagnostics'
     namespace: str = ''
-
-
-@dataclass(frozen=True)
-class Silence:
-    """
-    No measurement up to a time, which the controller answered with a command.
-
-    :param stamp_ns: that of the command.
-    """
-
-    stamp_ns: int
-
-
-@dataclass(frozen=True)
-class TakeOver:
-    """
-    A start from the coolant temperature that was in force, in degrees Celsius.
-
-    :param temperature: as in a message.
-    """
-
-    temperature: float
-
-
-@dataclass(frozen=True)
-class Input:
-    """
-    What came to the controller: a message of one of its topics, or something else that happened.
-
-    :param topic: absolute name; empty when it was no message.
-    :param time_ns: when it was recorded.
-    :param message: with the fields of sensor_msgs/Temperature, or a mode, a silence, a take-over,
-        or None when the controller was started again.
-    :param command: for a temperature, what was commanded in degrees Celsius, or None.
-    :param active: for a temperature, the set-point that changed with it in degrees Celsius.
-    :param coolant: for a temperature, what was in force then in degrees Celsius, or None.
-    """
-
-    topic: str
-    time_ns: int
-    message: Any
-    command: float | None = None
-    active: float | None = None
-    coolant: float | None = None
 
 
 @dataclass(frozen=True)
@@ -152,7 +102,7 @@ def read_record(path: str | os.PathLike[str], names: Names, *, recover: bool = F
     wanted = (names.temperature, names.setpoint, names.manual, names.command, names.active,
               names.coolant)
     inputs: list[Input] = []
-    commands, actives, coolants, tracked = _Answers(), _Answers(), _Answers(), _Answers()
+    commands, actives, coolants, tracked = Answers(), Answers(), Answers(), Answers()
     statuses: list[Status] = []
     measured = 0
     for entry in in_log_order(read_messages(
@@ -184,72 +134,8 @@ def read_record(path: str | os.PathLike[str], names: Names, *, recover: bool = F
                       content.complete)
 
 
-class _Answers:
-    """Messages that go with a measurement, by the stamp of that measurement."""
-
-    def __init__(self) -> None:
-        self.in_order: list[tuple[int, int, float]] = []
-        self._by_stamp: dict[int, deque[int]] = {}
-        self._heard = 0
-
-    def add(self, entry: BagMessage) -> None:
-        self._add(entry, entry.message.temperature)
-
-    def add_tracked(self, entry: BagMessage) -> None:
-        """Add the set-point among the internals, which tell it with every measurement."""
-        try:
-            found = dict(zip(entry.message.name, entry.message.position, strict=True))
-            celsius = float(found[TRACKED])
-        except (AttributeError, KeyError, TypeError, ValueError):
-            # of another program, or another version of ours
-            return
-        if math.isfinite(celsius):
-            self._add(entry, celsius)
-
-    def _add(self, entry: BagMessage, celsius: float) -> None:
-        stamp_ns = stamp_nanoseconds(entry.message.header.stamp)
-        self._by_stamp.setdefault(stamp_ns, deque()).append(len(self.in_order))
-        self.in_order.append((stamp_ns, entry.log_time_ns, celsius))
-
-    def take(self, entry: Input) -> int | None:
-        """Return the place of the next answer to a measurement, each once, or None."""
-        waiting = self._by_stamp.get(stamp_nanoseconds(entry.message.header.stamp), deque())
-        while waiting and self.in_order[waiting[0]][1] < entry.time_ns - _NEAR_NS:
-            waiting.popleft()
-        if waiting and self.in_order[waiting[0]][1] <= entry.time_ns + _NEAR_NS:
-            return waiting.popleft()
-        return None
-
-    def taken(self, entry: Input) -> float | None:
-        """Return the next answer to a measurement in degrees Celsius, each once, or None."""
-        place = self.take(entry)
-        return None if place is None else self.in_order[place][2]
-
-    def last(self, entry: Input) -> float | None:
-        """Return what a measurement's own stamp tells, or else the last news, if it is timely."""
-        own = self.taken(entry)
-        self._heard = bisect_right(
-            self.in_order, entry.time_ns, self._heard, key=lambda message: message[1])
-        if own is not None or not self._heard:
-            return own
-        stamp_ns, _, celsius = self.in_order[self._heard - 1]
-        away = abs(stamp_nanoseconds(entry.message.header.stamp) - stamp_ns)
-        return celsius if away <= SAME_TIME_NS else None
-
-    def before(self, first: Input) -> tuple[int, float] | None:
-        """Return the last of those recorded first that answer no measurement of the bag."""
-        first_ns = stamp_nanoseconds(first.message.header.stamp)
-        found = None
-        for stamp_ns, time_ns, celsius in self.in_order:
-            # stamps go back where time was set back, and a latched one may come late
-            if not (stamp_ns < first_ns or (stamp_ns > first_ns and time_ns < first.time_ns)):
-                break
-            found = stamp_ns, celsius
-        return found
-
-
-def _assembled(names: Names, inputs: list[Input], commands: _Answers, actives: _Answers,
-               coolants: _Answers, tracked: _Answers, statuses: list[Status], complete: bool
+def _assembled(names: Names, inputs: list[Input], commands: Answers, actives: Answers,
+               coolants: Answers, tracked: Answers, statuses: list[Status], complete: bool
                ) -> ControlRecord:
     first = next(entry for entry in inputs if entry.topic == names.temperature)
     answers: dict[int, int] = {}  # place of the command by that of the measurement
@@ -283,7 +169,7 @@ def _assembled(names: Names, inputs: list[Input], commands: _Answers, actives: _
     )
 
 
-def _with_silences(inputs: list[Input], answers: dict[int, int], commands: _Answers, names: Names
+def _with_silences(inputs: list[Input], answers: dict[int, int], commands: Answers, names: Names
                    ) -> Iterator[Input]:
     """
     Yield the inputs with what the controller commanded by itself among them.

@@ -29,7 +29,8 @@ from typing import Any
 
 from koopman_ros.control import Controller, Mode, Report, Settings, State
 from koopman_ros.nodes.messages import NANOSECONDS, stamp_nanoseconds, to_celsius, to_kelvin
-from koopman_ros.nodes.replaying.record import ControlRecord, Input, Silence, TakeOver
+from koopman_ros.nodes.replaying.inputs import Input, Silence, TakeOver
+from koopman_ros.nodes.replaying.record import ControlRecord
 from koopman_ros.nodes.translation import (
     answer,
     ask_manual_coolant,

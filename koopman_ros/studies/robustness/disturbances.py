@@ -27,6 +27,7 @@ from koopman_ros.studies.outcome import Metrics
 from koopman_ros.studies.robustness.loop import (
     at_setpoint,
     BANDWIDTH,
+    behind,
     Change,
     changed_reactor,
     COOLANT,
@@ -52,7 +53,9 @@ CHANGED = {
     'C_A +10 %': changed_reactor(concentration=1.1),
     'T_i −5 K': changed_reactor(feed=-5.0), 'T_i +5 K': changed_reactor(feed=5.0)}
 # The coolant cannot hold this set-point while the feed is so much warmer.
-SATURATED_SETPOINT, WARM_FEED, WARM_SECONDS = 308.0, 20.0, 900.0
+SATURATED_SETPOINT, WARM_FEED, SATURATED_SECONDS = 308.0, 20.0, 900.0
+REACHED = 298.15  # K, the coldest coolant of an actuator that is stuck
+_MEASURED = {False: '', True: ', measured'}
 
 
 @dataclass(frozen=True)
@@ -68,6 +71,7 @@ class Case:
     :param since: when the time to get there starts, in s.
     :param overshoot: whether its deviation counts from the first time that it gets there.
     :param actuator: between command and plant; perfect when None.
+    :param tells: whether the coolant in force is measured.
     :param seconds: how long.
     """
 
@@ -79,13 +83,15 @@ class Case:
     since: float = LEAD
     overshoot: bool = False
     actuator: Actuator | None = None
+    tells: bool = False
     seconds: float = SECONDS
 
     def run(self, bandwidth: float = BANDWIDTH) -> Course:
         """Simulate it with the default controller, from rest."""
         coolant = float(equilibrium_input(self.system, self.x0)[0])
         return run_loop(reactor_controller(bandwidth=bandwidth), self.system, np.array(self.x0),
-                        coolant, self.seconds, self.changes, actuator=self.actuator)
+                        coolant, self.seconds, self.changes, actuator=self.actuator,
+                        tells=self.tells)
 
 
 def cases() -> Iterator[Case]:
@@ -97,13 +103,12 @@ def cases() -> Iterator[Case]:
     for name, system in CHANGED.items():
         yield Case(f'set-point −10 K, {name} all along', system, [START], step, SETPOINT,
                    overshoot=True)
-    for lag in (5.0, 10.0, 20.0):
-        yield Case(f'set-point −10 K, coolant lags by {lag:g} s', REACTOR, [START], step, SETPOINT,
-                   overshoot=True, actuator=Actuator(lag=lag))
-    yield Case('set-point −10 K, coolant one sample late', REACTOR, [START], step, SETPOINT,
-               overshoot=True, actuator=Actuator(delay=1.0))
-    yield Case('set-point −10 K, coolant 10 s late', REACTOR, [START], step, SETPOINT,
-               overshoot=True, actuator=Actuator(delay=10.0))
+    for words, actuator in (
+            *((f'lags by {lag:g} s', Actuator(lag=lag)) for lag in (5.0, 10.0, 20.0)),
+            ('one sample late', Actuator(delay=1.0)), ('10 s late', Actuator(delay=10.0))):
+        for tells in (False, True):
+            yield Case(f'set-point −10 K, coolant {words}{_MEASURED[tells]}', REACTOR, [START],
+                       step, SETPOINT, overshoot=True, actuator=actuator, tells=tells)
     two = two_state_reactor()
     warm = float(two.nominal_state[1])
     for change in (-3.0, 1.5):
@@ -113,7 +118,7 @@ def cases() -> Iterator[Case]:
                    warm + change, overshoot=True)
     yield Case('sensor bias +2 K', REACTOR, [START - 5.0], [
         (0.0, at_setpoint(START - 5.0)), (LEAD, with_bias(BIAS))], START - 5.0)
-    end = LEAD + WARM_SECONDS
+    end = LEAD + SATURATED_SECONDS
     for setpoint, words in ((SATURATED_SETPOINT, 'coolant saturated'),
                             (START, 'coolant in its range')):
         yield Case(f'T_i +{WARM_FEED:g} K for 15 min, {words}, after its end', REACTOR, [setpoint],
@@ -121,6 +126,11 @@ def cases() -> Iterator[Case]:
                     (LEAD, on_plant(changed_reactor(feed=WARM_FEED))), (end, on_plant(REACTOR))],
                    setpoint, since=end, overshoot=setpoint == SATURATED_SETPOINT,
                    seconds=end + SECONDS)
+    for tells in (False, True):
+        yield Case(f'set-point −10 K, coolant stuck at {REACHED:g} K for 15 min, after its end'
+                   f'{_MEASURED[tells]}', REACTOR, [START],
+                   [*step, (end, behind(Actuator()))], SETPOINT, since=end, overshoot=True,
+                   actuator=Actuator(lower=REACHED), tells=tells, seconds=end + SECONDS)
 
 
 def judge(case: Case) -> Metrics:

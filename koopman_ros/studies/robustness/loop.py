@@ -140,6 +140,11 @@ def on_plant(system: ControlAffineSystem) -> Change:
     return change
 
 
+def behind(actuator: Actuator) -> Change:
+    """Put another actuator before the plant."""
+    return lambda loop: replace(loop, plant=replace(loop.plant, actuator=actuator))
+
+
 def with_bias(bias: float) -> Change:
     """Let the sensor err by so much, in state units."""
     return lambda loop: replace(loop, bias=bias)
@@ -190,9 +195,9 @@ class Course:
 
 def run_loop(controller: Controller, system: ControlAffineSystem, x0: Array, coolant: float,
              seconds: float, changes: Sequence[tuple[float, Change]] = (), *,
-             actuator: Actuator | None = None, noise: float = 0.0, seed: int = 0,
-             period: float = PERIOD, stop: Callable[[Array, Array, Rung], bool] | None = None
-             ) -> Course:
+             actuator: Actuator | None = None, tells: bool = False, noise: float = 0.0,
+             seed: int = 0, period: float = PERIOD,
+             stop: Callable[[Array, Array, Rung], bool] | None = None) -> Course:
     """
     Run a loop whose controller takes over from an input in force.
 
@@ -203,6 +208,7 @@ def run_loop(controller: Controller, system: ControlAffineSystem, x0: Array, coo
     :param seconds: how long.
     :param changes: what happens when, in s.
     :param actuator: between command and plant; perfect by default.
+    :param tells: whether the input in force is measured.
     :param noise: standard deviation of the measurement, in state units.
     :param seed: of the noise.
     :param period: between samples, in s.
@@ -228,7 +234,8 @@ def run_loop(controller: Controller, system: ControlAffineSystem, x0: Array, coo
             loop = waiting.pop(0)[1](loop)
         x = plant.process.x
         measured = x[-n_x:] + loop.bias + sensor_noise(noise, seed, number)
-        state, u, report = loop.controller.step(loop.state, measured, time_ns + _NS)
+        state, u, report = loop.controller.step(
+            loop.state, measured, time_ns + _NS, plant.process.u if tells else None)
         loop = replace(loop, state=state, plant=loop.plant.commanded(u, time_ns))
         disturbance = np.nan if report.disturbance is None else float(report.disturbance[0])
         rows.append((number * period, x, float(u[0]), disturbance))
