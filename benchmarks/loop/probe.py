@@ -97,13 +97,14 @@ class Loop:
     def wait_for_first_answer(self) -> int:
         """Publish until somebody answers; return when the answer came [ns of time.time_ns]."""
         self._answers.clear()
-        deadline = time.monotonic() + TIMEOUT
-        while not self._answers:
+        begun, deadline = time.time_ns(), time.monotonic() + TIMEOUT
+        # answers of somebody who has ended meanwhile may still come in
+        while not (news := [came for stamp, came in self._answers.items() if stamp >= begun]):
             if time.monotonic() > deadline:
                 raise TimeoutError(f'nobody answers within {TIMEOUT:g} s')
             self.publish()
             self._probe.spin_once(_RETRY)
-        return next(iter(self._answers.values()))
+        return news[0]
 
     def settle(self) -> None:
         """Handle all answers that are still on their way."""
