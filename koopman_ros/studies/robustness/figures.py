@@ -17,7 +17,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -38,6 +38,7 @@ import matplotlib
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 import numpy as np
+from numpy.typing import NDArray
 
 matplotlib.use('Agg')
 from matplotlib import pyplot
@@ -102,21 +103,27 @@ def _margins(found: Found, path: Path) -> Drawn:
         f'{min(m.delay for m in usual):.0f} s of dead time may be added, anywhere in the range.'))
 
 
+def _column(rows: Mapping[float, Mapping[str, Any]], keys: Iterable[float], name: str
+            ) -> NDArray[np.float64]:
+    """Return a figure of each row; NaN where there is none."""
+    return np.array([rows[key][name] for key in keys], dtype=np.float64)
+
+
 def _noise(found: Found, path: Path) -> Drawn:
     figure, (left, right) = _axes(2, 3.8)
     bandwidths = list(found.noise)
     for name, label in (('coolant_kelvin', 'coolant'),
                         ('coolant_change_kelvin', 'coolant, change in a second'),
                         ('temperature_kelvin', 'true temperature')):
-        left.plot(bandwidths, [found.noise[b][name] for b in bandwidths], 'o-', label=label)
+        left.plot(bandwidths, _column(found.noise, bandwidths, name), 'o-', label=label)
     left.axhline(disturbances.NOISE, color='0.5', linestyle=':', label='measurement')
     left.set(xlabel='observer_bandwidth [1/min]', ylabel='standard deviation [K]', yscale='log')
     left.legend(fontsize=8)
     speeds = [b for b in bandwidths if found.noise[b]['fouled_to_0.2_kelvin'] is not None]
     for name, label in (('fouled_to_0.2_kelvin', 'to 0.2 K'), ('fouled_to_0.001_kelvin',
                                                                'to 0.001 K')):
-        right.plot([found.noise[b]['coolant_kelvin'] for b in speeds],
-                   [found.noise[b][name] for b in speeds], 'o-', label=label)
+        right.plot(_column(found.noise, speeds, 'coolant_kelvin'),
+                   _column(found.noise, speeds, name), 'o-', label=label)
     for b in speeds:
         right.annotate(f'{b:g}', (found.noise[b]['coolant_kelvin'],
                                   found.noise[b]['fouled_to_0.2_kelvin']),
@@ -156,7 +163,7 @@ def _attraction(found: Found, path: Path) -> Drawn:
             ('physics_kelvin', 'no coolant saves it above', 'k-'),
             ('ladder_kelvin', 'the loop with the ladder', 'o--'),
             ('no_ladder_kelvin', 'the learned law alone', 'x:')):
-        axes[2].plot(coolants, [found.boundaries[u][name] for u in coolants], style, label=label)
+        axes[2].plot(coolants, _column(found.boundaries, coolants, name), style, label=label)
     axes[2].set(title='hottest start that comes back', xlabel='coolant at the start [K]',
                 ylabel='[K]')
     axes[2].legend(fontsize=7)
