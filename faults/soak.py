@@ -64,8 +64,10 @@ class Memory:
         warm = self.seconds >= _WARM * self.seconds[-1]
         if np.count_nonzero(warm) < 3:
             return 0.0
-        slope = np.polyfit(self.seconds[warm], self.megabytes[warm], 1)[0]
-        return float(slope * np.ptp(self.seconds[warm]))
+        # from the first on, so that what does not grow is exactly 0
+        since = self.megabytes[warm] - self.megabytes[warm][0]
+        slope = np.polyfit(self.seconds[warm], since, 1)[0]
+        return float(slope * np.ptp(self.seconds[warm])) + 0.0
 
 
 @dataclass(frozen=True)
