@@ -43,7 +43,7 @@ events = st.one_of(
     st.tuples(st.just('restart'), values, st.just(0)))
 
 
-@settings(max_examples=120, deadline=None, derandomize=True)
+@settings(max_examples=80, deadline=None, derandomize=True)
 @given(st.lists(events, min_size=1, max_size=40))
 def test_no_sequence_of_events_brings_out_a_wild_command(sequence):
     loop, state, now = TUNINGS[0], State(), EPOCH

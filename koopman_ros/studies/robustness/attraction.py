@@ -17,12 +17,13 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from enum import Enum
 
 from koopman_ros.control import Rung
 from koopman_ros.plants import ControlAffineSystem, fold, two_state_reactor
 from koopman_ros.studies.outcome import Metrics
+from koopman_ros.studies.robustness.disturbances import finite
 from koopman_ros.studies.robustness.loop import (
     at_setpoint,
     COOLANT,
@@ -30,6 +31,7 @@ from koopman_ros.studies.robustness.loop import (
     REACTOR,
     reactor_controller,
     run_loop,
+    shipped_model,
 )
 import numpy as np
 from numpy.typing import NDArray
@@ -48,6 +50,7 @@ SETPOINTS = (306.0, 310.0, 314.475, 319.0, 324.475, 326.5)  # K
 COOLANTS = (278.15, 285.0, 290.0, 295.0, 300.0, 305.15)  # K
 SETPOINT = 314.475  # K, for the coolant in force at the start
 _SHORT_STEP = 0.25  # s
+_RETURN = 600.0  # s
 
 
 class End(Enum):
@@ -181,3 +184,24 @@ def two_state_grid() -> dict[tuple[float, float], End]:
         concentration=concentration)
         for T in (300.0, 310.0, 320.0, 330.0, 340.0, 350.0, 360.0, 380.0, 400.0)
         for concentration in (0.6, 0.75, float(system.nominal_state[0]), 0.95)}
+
+
+def back_from_safe(system: ControlAffineSystem, linear_margin: float) -> Metrics:
+    """
+    Let the loop start where the reactor rests under the safe coolant, as after a dead sensor.
+
+    :param system: the reactor, changed or not.
+    :param linear_margin: of the ladder, in half widths.
+    :return: `rest_kelvin`, `outside` the trained range in half widths, `seconds_to_0.2_kelvin`
+        from there (None for never).
+    """
+    coldest = COOLANT_RANGE[0]
+    rest = np.array([brentq(lambda T: system.derivative(np.array([T]), np.array([coldest]))[0],
+                            coldest, 320.0)])
+    usual = reactor_controller()
+    ladder = replace(usual.settings.ladder, linear_margin=linear_margin)
+    controller = replace(usual, settings=replace(usual.settings, ladder=ladder))
+    course = run_loop(controller, system, rest, coldest, _RETURN,
+                      [(0.0, at_setpoint(SETPOINT))])
+    return {'rest_kelvin': float(rest[0]), 'outside': shipped_model().states.violation(rest),
+            'seconds_to_0.2_kelvin': finite(course.settling(SETPOINT, TOLERANCE))}

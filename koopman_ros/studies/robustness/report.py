@@ -94,12 +94,17 @@ def attraction_table(found: Found) -> str:
         for u, m in found.boundaries.items()]
     counts = [(end.value, *(str(sum(one is end for one in grid.values())) for grid in (
         found.grids[True], found.grids[False], found.two_state_grid))) for end in attraction.End]
+    returns = [(name, f'{margin:g}', f'{m["rest_kelvin"]:.2f}', f'{m["outside"]:.2f}',
+                _seconds(m['seconds_to_0.2_kelvin']))
+               for (name, margin), m in found.returns.items()]
     return (f'## Region of attraction\n\nUnder the coldest coolant the reactor heats up by itself '
             f'above {attraction.hottest_cooled():.2f} K.\n\n' + _table(
                 ('coolant at the start [K]', 'hottest start that any coolant saves [K]',
                  'that the loop brings back [K]', 'without the ladder [K]'), rows)
             + '\n\n' + _table(('of all starts', 'with the ladder', 'without',
-                               'two-state reactor'), counts))
+                               'two-state reactor'), counts)
+            + '\n\n' + _table(('back from the safe coolant', 'linear_margin', 'it rests at [K]',
+                               'outside [half widths]', 'to 0.2 K [s]'), returns))
 
 
 def narrow_tables(found: Found) -> str:

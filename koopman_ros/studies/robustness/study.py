@@ -25,7 +25,13 @@ from typing import Any
 from koopman_ros.studies.outcome import Metrics
 from koopman_ros.studies.robustness import attraction, disturbances, narrow
 from koopman_ros.studies.robustness.attraction import End
-from koopman_ros.studies.robustness.loop import Course, reactor_controller, shipped_model, START
+from koopman_ros.studies.robustness.loop import (
+    Course,
+    REACTOR,
+    reactor_controller,
+    shipped_model,
+    START,
+)
 from koopman_ros.studies.robustness.margins import grows, Margins, margins_at
 import numpy as np
 
@@ -48,6 +54,7 @@ class Found:
     :param grids: ends by start and set-point in K, with and without the ladder.
     :param two_state_grid: ends by temperature in K and concentration in mol/L.
     :param boundaries: hottest starts by the coolant in force at the start, in K.
+    :param returns: figures of the way back from the safe coolant, by plant and `linear_margin`.
     :param reactor: courses of the lift of narrow data.
     :param far: figures after UA -40 % by `linear_margin` and bandwidth in 1/min.
     :param two_state: those of the two-state example.
@@ -61,6 +68,7 @@ class Found:
     grids: dict[bool, dict[tuple[float, float], End]] = field(default_factory=dict)
     two_state_grid: dict[tuple[float, float], End] = field(default_factory=dict)
     boundaries: dict[float, Metrics] = field(default_factory=dict)
+    returns: dict[tuple[str, float], Metrics] = field(default_factory=dict)
     reactor: dict[tuple[str, str], Course] = field(default_factory=dict)
     far: dict[tuple[float, float], Metrics] = field(default_factory=dict)
     two_state: dict[tuple[str, str], Course] = field(default_factory=dict)
@@ -83,6 +91,8 @@ class Found:
                 **{f'ladder={ladder}': {f'{start:g}K to {end:g}K': found.value
                                         for (start, end), found in grid.items()}
                    for ladder, grid in self.grids.items()},
+                'from_the_safe_coolant': {f'{name}/linear_margin={margin:g}': m
+                                          for (name, margin), m in self.returns.items()},
                 'two_state': {f'{kelvin:g}K, {c:.3g}mol/L': found.value
                               for (kelvin, c), found in self.two_state_grid.items()}},
             'narrow': {
@@ -134,6 +144,10 @@ def study(tell: Callable[[str], None]) -> Found:
         found.boundaries[coolant] = attraction.boundary(coolant)
     tell('region of attraction, two-state reactor')
     found.two_state_grid = attraction.two_state_grid()
+    tell('back from the safe coolant')
+    for (name, system), margin in product(
+            {'unchanged': REACTOR, **disturbances.CHANGED}.items(), narrow.LINEAR_MARGINS):
+        found.returns[name, margin] = attraction.back_from_safe(system, margin)
     tell('lifts of narrow data')
     found.reactor = narrow.reactor_courses(narrow.narrow_lift())
     for margin, bandwidth in product(narrow.LINEAR_MARGINS, narrow.MARGIN_BANDWIDTHS):
