@@ -19,6 +19,7 @@ from dataclasses import astuple, replace
 import math
 
 from koopman_ros.nodes.controller_parameters import ControllerParameters
+from koopman_ros.plants import Actuator
 from koopman_ros.studies.robustness import attraction, disturbances
 from koopman_ros.studies.robustness.attraction import End, Start
 from koopman_ros.studies.robustness.disturbances import Case
@@ -66,7 +67,7 @@ def test_settings_are_the_defaults_of_the_node():
     assert theirs.ladder == ours.ladder
     np.testing.assert_allclose(astuple(theirs.sensor), astuple(ours.sensor), rtol=1e-12)
     for name in ('setpoint_ramp', 'setpoint_filter', 'observer_bandwidth', 'max_disturbance',
-                 'transfer_time', 'max_gain', 'max_residual'):
+                 'input_tolerance', 'transfer_time', 'max_gain', 'max_residual'):
         assert getattr(theirs, name) == pytest.approx(getattr(ours, name)), name
 
 
@@ -172,3 +173,24 @@ def test_settling_counts_from_the_change():
     errors = course.x[:, 0] - (START - 1.0)
     first = course.seconds[np.flatnonzero(np.abs(errors) > 0.9)[-1] + 1]
     assert course.settling(START - 1.0, 0.9, 20.0) == first - 20.0
+
+
+def test_what_rests_too_far_outside_the_data_does_not_leave_the_safe_coolant():
+    usual = attraction.back_from_safe(REACTOR, 0.5)
+    # by the heat balance; the trained range starts at 305 K, half its width is 11
+    assert usual['rest_kelvin'] == pytest.approx(302.565, abs=1e-2)
+    assert usual['outside'] == pytest.approx((305.0 - usual['rest_kelvin']) / 11.0, abs=1e-6)
+    assert usual['seconds_to_0.2_kelvin'] < 300.0
+    better_cooled = attraction.back_from_safe(disturbances.CHANGED['UA +20 %'], 0.5)
+    assert better_cooled['outside'] > 0.25
+    assert better_cooled['seconds_to_0.2_kelvin'] is None
+
+
+def test_only_a_measured_coolant_tells_that_the_actuator_is_stuck():
+    estimates = [run_loop(
+        reactor_controller(), REACTOR, np.array([START]), 300.0, 300.0,
+        [(0.0, at_setpoint(disturbances.SETPOINT))],
+        actuator=Actuator(lower=disturbances.REACHED), tells=tells).disturbance[-1]
+        for tells in (False, True)]
+    # the bound, and the tolerance
+    np.testing.assert_allclose(estimates, [20.0, 2.0], rtol=0, atol=0.1)

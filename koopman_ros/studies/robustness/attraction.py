@@ -21,6 +21,7 @@ from dataclasses import dataclass, replace
 from enum import Enum
 
 from koopman_ros.control import Rung
+from koopman_ros.control.ladder import Standing
 from koopman_ros.plants import ControlAffineSystem, fold, two_state_reactor
 from koopman_ros.studies.outcome import Metrics
 from koopman_ros.studies.robustness.disturbances import finite
@@ -28,6 +29,7 @@ from koopman_ros.studies.robustness.loop import (
     at_setpoint,
     COOLANT,
     COOLANT_RANGE,
+    Loop,
     REACTOR,
     reactor_controller,
     run_loop,
@@ -188,7 +190,7 @@ def two_state_grid() -> dict[tuple[float, float], End]:
 
 def back_from_safe(system: ControlAffineSystem, linear_margin: float) -> Metrics:
     """
-    Let the loop start where the reactor rests under the safe coolant, as after a dead sensor.
+    Let the loop start at rest under the safe coolant, where a dead sensor leads it.
 
     :param system: the reactor, changed or not.
     :param linear_margin: of the ladder, in half widths.
@@ -201,7 +203,11 @@ def back_from_safe(system: ControlAffineSystem, linear_margin: float) -> Metrics
     usual = reactor_controller()
     ladder = replace(usual.settings.ladder, linear_margin=linear_margin)
     controller = replace(usual, settings=replace(usual.settings, ladder=ladder))
+
+    def safe(loop: Loop) -> Loop:
+        return replace(loop, state=replace(loop.state, standing=Standing(Rung.SAFE)))
+
     course = run_loop(controller, system, rest, coldest, _RETURN,
-                      [(0.0, at_setpoint(SETPOINT))])
+                      [(0.0, safe), (0.0, at_setpoint(SETPOINT))])
     return {'rest_kelvin': float(rest[0]), 'outside': shipped_model().states.violation(rest),
             'seconds_to_0.2_kelvin': finite(course.settling(SETPOINT, TOLERANCE))}
