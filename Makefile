@@ -62,7 +62,7 @@ studies: $(VENV)/train.stamp  ## the paper's experiments from SEEDS seeds: figur
 studies-sensors: $(VENV)/train.stamp  ## learning from noisy data of a sensor, ten seeds -> out/studies-sensors
 	$(BIN)/python -m koopman_ros.studies --sensors --seeds 10
 
-studies-robustness: $(VENV)/bench.stamp  ## margins, attraction, disturbances, noise, narrow data, five minutes -> out/studies-robustness
+studies-robustness: $(VENV)/bench.stamp  ## margins, attraction, disturbances, noise, narrow data, three minutes -> out/studies-robustness
 	$(BIN)/python -m koopman_ros.studies.robustness
 
 bench: $(VENV)/bench.stamp  ## speed beside other programs, thirteen minutes (BENCH=--quick: two) -> out/bench
