@@ -2,13 +2,17 @@
 PYTHON ?= python3
 VENV := .venv
 BIN := $(VENV)/bin
+# All versions are locked, those of the tools that build the package, too (two names, because pip
+# changed its mind about which of them governs that).
+LOCK := requirements.lock
+INSTALL := PIP_CONSTRAINT=$(LOCK) PIP_BUILD_CONSTRAINT=$(LOCK) $(BIN)/python -m pip install --quiet
 # The loop stays on this machine.
 export ROS_AUTOMATIC_DISCOVERY_RANGE ?= LOCALHOST
 
 # How many seeds each experiment is run from: make studies SEEDS=5
 SEEDS ?= 20
 
-.PHONY: help demo demo-retrain test lint models studies studies-sensors studies-robustness bench faults config clean
+.PHONY: help demo demo-retrain test lint models studies studies-sensors studies-robustness bench faults config lock clean
 
 help:  ## show this list
 	@grep -E '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed 's/:.*## /\t/'
@@ -20,24 +24,24 @@ $(BIN)/python:
 	  { echo 'Python venv is missing: sudo apt-get install python3-venv'; exit 1; }
 	$(PYTHON) -m venv $(VENV)
 
-$(VENV)/run.stamp: setup.py | $(BIN)/python
-	$(BIN)/python -m pip install --quiet --editable '.[ros,demo]'
+$(VENV)/run.stamp: setup.py $(LOCK) | $(BIN)/python
+	$(INSTALL) --editable '.[ros,demo]'
 	@touch $@
 
-$(VENV)/test.stamp: setup.py $(VENV)/run.stamp
-	$(BIN)/python -m pip install --quiet --editable '.[ros,demo,train,test,bench]'
+$(VENV)/test.stamp: setup.py $(LOCK) $(VENV)/run.stamp
+	$(INSTALL) --editable '.[ros,demo,train,test,bench]'
 	@touch $@
 
-$(VENV)/train.stamp: setup.py | $(BIN)/python
-	$(BIN)/python -m pip install --quiet --editable '.[demo,train]'
+$(VENV)/train.stamp: setup.py $(LOCK) | $(BIN)/python
+	$(INSTALL) --editable '.[demo,train]'
 	@touch $@
 
-$(VENV)/retrain.stamp: setup.py $(VENV)/run.stamp
-	$(BIN)/python -m pip install --quiet --editable '.[ros,demo,train]'
+$(VENV)/retrain.stamp: setup.py $(LOCK) $(VENV)/run.stamp
+	$(INSTALL) --editable '.[ros,demo,train]'
 	@touch $@
 
-$(VENV)/bench.stamp: setup.py $(VENV)/run.stamp
-	$(BIN)/python -m pip install --quiet --editable '.[ros,demo,train,bench]'
+$(VENV)/bench.stamp: setup.py $(LOCK) $(VENV)/run.stamp
+	$(INSTALL) --editable '.[ros,demo,train,bench]'
 	@touch $@
 
 demo: $(VENV)/run.stamp  ## closed loop of three processes: live table, bag, picture -> out/demo
@@ -73,6 +77,11 @@ faults: $(VENV)/run.stamp  ## put faults into the loop, and soak it for a day, t
 
 config: $(VENV)/run.stamp  ## write config/*.yaml from the parameter tables
 	$(BIN)/python -m koopman_ros.nodes.parameter_files
+
+lock: | $(BIN)/python  ## take the newest versions within the ranges of setup.py -> requirements.lock
+	$(BIN)/python -m pip install --quiet uv
+	UV_CUSTOM_COMPILE_COMMAND='make lock' $(BIN)/python -m uv pip compile --quiet --universal --upgrade \
+	  --python-version 3.11 --all-extras --no-annotate setup.py --output-file $(LOCK)
 
 clean:  ## remove the environment and the results
 	rm -rf $(VENV) out build install log

@@ -39,15 +39,14 @@ setup(
     name=PACKAGE,
     version='0.1.0',
     description='Learned linear representations (Koopman lifts) in control of a reactor, on ROS 2',
-    maintainer='koopman_ros maintainers',
-    maintainer_email='koopman-ros@users.noreply.example.org',
+    maintainer='The koopman_ros developers',
+    maintainer_email='no-mailbox@koopman-ros.invalid',
     license='Apache-2.0',
     packages=find_packages(include=[PACKAGE, PACKAGE + '.*']),
     package_data={PACKAGE: ['py.typed']},
     data_files=_data_files(),
     python_requires='>=3.11',
     zip_safe=True,
-    # mcap brings lz4 and zstandard, too
     install_requires=['setuptools', 'numpy', 'scipy', 'PyYAML', 'mcap>=1.5', 'mcap-ros2-support',
                       'lz4', 'zstandard'],
     extras_require={
@@ -59,7 +58,7 @@ setup(
         ],
         'demo': ['matplotlib', 'rich'],
         'train': ['torch==2.13.0', 'joblib', 'tqdm'],
-        # what the benchmark compares with, no part of the package
+        # what validation and benchmarks compare with
         'bench': ['casadi==3.8.2', 'control', 'psutil'],
         'test': [
             'colcon-common-extensions',
@@ -67,6 +66,7 @@ setup(
             'distributed',
             'hypothesis',
             'mypy',
+            'packaging',
             'pytest',
             'pytest-timeout',
             'pytest-xdist',

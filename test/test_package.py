@@ -15,11 +15,15 @@
 """Tests of the package as a whole: manifest, versions, licence headers, import directions."""
 
 import ast
+import importlib.metadata
 from pathlib import Path
 import re
 import xml.etree.ElementTree as ElementTree
 
+from catkin_pkg.package import parse_package
 import koopman_ros
+from packaging.requirements import Requirement
+from packaging.utils import canonicalize_name
 import pytest
 
 ROOT = Path(__file__).parent.parent
@@ -67,6 +71,56 @@ def test_manifest_is_of_format_3_and_ament_python() -> None:
     assert manifest.findtext('name') == 'koopman_ros'
     assert manifest.findtext('export/build_type') == 'ament_python'
     assert (ROOT / 'resource' / 'koopman_ros').is_file()
+
+
+def test_manifest_names_people_and_a_place_that_are_no_placeholders() -> None:
+    manifest = ElementTree.parse(ROOT / 'package.xml').getroot()
+    people = [*manifest.findall('maintainer'), *manifest.findall('author')]
+    assert people
+    for person in people:
+        assert 'example' not in (person.get('email') or '')
+        assert 'koopman_ros' in (person.text or '')
+    assert manifest.findtext('url', '').startswith('https://')
+
+
+# catkin_pkg's own
+@pytest.mark.filterwarnings('ignore::DeprecationWarning')
+@pytest.mark.parametrize('control_only', [False, True])
+def test_manifest_declares_what_is_imported(control_only: bool) -> None:
+    keys = {'torch': 'python3-torch', 'joblib': 'python3-joblib', 'tqdm': 'python3-tqdm',
+            'numpy': 'python3-numpy', 'scipy': 'python3-scipy', 'yaml': 'python3-yaml',
+            'matplotlib': 'python3-matplotlib', 'rich': 'python3-rich',
+            # rosdep has no key for mcap, lz4 and zstandard: they come with this one
+            'mcap_ros2': 'mcap-ros2-support', 'mcap': 'mcap-ros2-support',
+            'lz4': 'mcap-ros2-support', 'zstandard': 'mcap-ros2-support',
+            'control': 'python-control-pip', 'casadi': 'casadi-pip', 'psutil': 'python3-psutil',
+            'hypothesis': 'python3-hypothesis', 'rosbags': 'python3-rosbags-pip'}
+    learning = {'torch', 'joblib', 'tqdm'}
+    manifest = parse_package(ROOT / 'package.xml')
+    manifest.evaluate_conditions({'KOOPMAN_ROS_CONTROL_ONLY': '1'} if control_only else {})
+    declared = {depend.name for depend in (*manifest.exec_depends, *manifest.test_depends)
+                if depend.evaluated_condition}
+    used = {name.split('.')[0] for folder in ('koopman_ros', 'benchmarks', 'faults', 'test')
+            for path in ROOT.glob(f'{folder}/**/*.py') for name in _imports(path)}
+    assert {keys[name] for name in used & set(keys) - (learning if control_only else set())
+            } <= declared
+    assert not control_only or not {keys[name] for name in learning} & declared
+
+
+def test_lock_holds_each_requirement_within_its_range() -> None:
+    locked: dict[str, list[Requirement]] = {}
+    for line in (ROOT / 'requirements.lock').read_text().splitlines():
+        if not line.startswith('#'):
+            pin = Requirement(line)
+            locked.setdefault(canonicalize_name(pin.name), []).append(pin)
+    wanted = [Requirement(text) for text in importlib.metadata.requires('koopman_ros') or ()]
+    assert len(wanted) > 20
+    for requirement in wanted:
+        pins = locked[canonicalize_name(requirement.name)]
+        for pin in pins:
+            (specifier,) = pin.specifier
+            assert specifier.operator == '=='
+            assert requirement.specifier.contains(specifier.version), (requirement, pin)
 
 
 @pytest.mark.parametrize('path', SOURCES, ids=lambda path: str(path.relative_to(ROOT)))
