@@ -27,6 +27,8 @@ import tempfile
 from typing import Any, NoReturn
 
 from koopman_ros.lifting.activations import activation_named
+from koopman_ros.lifting.bounds import check_sizes, check_texts, MAX_LAYERS
+from koopman_ros.lifting.files import NotRegularError, read_regular
 from koopman_ros.lifting.model import Coordinates, LiftedModel, Provenance
 from koopman_ros.lifting.observables import NetworkObservables
 from koopman_ros.lifting.training_states import TrainingStates
@@ -35,9 +37,10 @@ import numpy as np
 FORMAT = 'koopman_ros.lift'
 FORMAT_VERSION = 1
 
-# A lift is small; a header or file beyond these sizes is not one.
+# A lift is small, see the bounds; a header or file beyond these sizes is not one.
 _MAX_HEADER_BYTES = 1 << 20
-_MAX_FILE_BYTES = 1 << 28
+_MAX_FILE_BYTES = 1 << 22
+_MAX_REASON = 300  # characters of what is wrong with a file, which may quote it
 _COORDINATE_ARRAYS = ('center', 'scale', 'lower', 'upper')
 
 
@@ -53,12 +56,14 @@ def save(model: LiftedModel, path: str | os.PathLike[str]) -> None:
     :param path: a file name ending in ``.safetensors``.
     :raises OSError: when the folder cannot be written.
     :raises TypeError: when the lift is not a network's.
-    :raises ValueError: when a metric is not finite.
+    :raises ValueError: when :func:`load` would refuse it, e.g. for a metric that is not finite.
     """
     network = model.observables
     if not isinstance(network, NetworkObservables):
         raise TypeError(f'only network lifts can be saved, got {type(network).__name__}: keep the '
                         'program that makes the model instead')
+    check_sizes(model)
+    check_texts(model)
     tensors = {'A': model.A, 'B': model.B, 'output': network.output}
     for i, (weight, bias) in enumerate(network.hidden):
         tensors[f'hidden.{i}.weight'] = weight
@@ -106,20 +111,21 @@ def load(path: str | os.PathLike[str]) -> LiftedModel:
     """
     Read a model and check every field of it.
 
-    :param path: the file.
+    :param path: a regular file, or a link to one.
     :raises ModelFileError: naming the file, what is wrong and what to do.
     """
     path = Path(path)
     try:
-        size = path.stat().st_size
-        if size > _MAX_FILE_BYTES:
-            _refuse(path, f'it is {size} bytes long, far more than any lift')
-        content = path.read_bytes()
+        content = read_regular(path, _MAX_FILE_BYTES)
     except FileNotFoundError:
         raise ModelFileError(
             f'no model file at {path}: check the path, or train a model') from None
+    except NotRegularError as error:
+        raise ModelFileError(f'cannot read the model file {path}: {error}') from None
     except OSError as error:
         raise ModelFileError(f'cannot read the model file {path}: {error.strerror}') from error
+    if len(content) > _MAX_FILE_BYTES:
+        _refuse(path, f'it is more than {_MAX_FILE_BYTES} bytes long, far more than any lift')
     header, data = _split_file(path, content)
     metadata = header.pop('__metadata__', None)
     if not isinstance(metadata, dict) or metadata.get('format') != FORMAT:
@@ -129,10 +135,14 @@ def load(path: str | os.PathLike[str]) -> LiftedModel:
         raise ModelFileError(
             f'the model file {path} has format version {version!r}, this package reads '
             f'{FORMAT_VERSION}: retrain the model, or install the matching package')
+    if len(header) > 2 * MAX_LAYERS + 4:
+        _refuse(path, f'it holds {len(header)} arrays, more than any lift')
     tensors = {name: _tensor(path, name, entry, data) for name, entry in header.items()}
     try:
-        about = json.loads(metadata['description'])
+        about = _parsed(metadata['description'])
         model = _build(about, tensors)
+        check_sizes(model)
+        check_texts(model)
         # last, so that whatever has a reason of its own is refused with that reason
         if metadata['sha256'] != _checksum(metadata['description'], header, data):
             raise ValueError('its checksum is wrong, so it was damaged or edited')
@@ -158,9 +168,7 @@ def _build(about: dict[str, Any], tensors: dict[str, np.ndarray]) -> LiftedModel
     if not isinstance(about['identity'], bool):
         raise TypeError('identity must be true or false')
     origin = about['provenance']
-    metrics = {str(name): float(value) for name, value in origin['metrics'].items()}
-    if not all(math.isfinite(value) for value in metrics.values()):
-        raise ValueError('a metric is not finite')
+    metrics = {name: float(value) for name, value in origin['metrics'].items()}
     model = LiftedModel(
         observables=NetworkObservables(
             hidden=tuple((tensors[f'hidden.{i}.weight'], tensors[f'hidden.{i}.bias'])
@@ -169,13 +177,13 @@ def _build(about: dict[str, Any], tensors: dict[str, np.ndarray]) -> LiftedModel
             activation=about['activation']),
         A=tensors['A'], B=tensors['B'],
         states=_coordinates(about['states']), inputs=_coordinates(about['inputs']),
-        time_unit=str(about['time_unit']),
+        time_unit=about['time_unit'],
         provenance=Provenance(
-            plant=str(origin['plant']),
+            plant=origin['plant'],
             seed=None if origin['seed'] is None else _integer(origin, 'seed'),
-            data_digest=str(origin['data_digest']), metrics=metrics,
-            package_version=str(origin['package_version']),
-            method=str(origin.get('method', ''))),
+            data_digest=origin['data_digest'], metrics=metrics,
+            package_version=origin['package_version'],
+            method=origin.get('method', '')),
         training_states=None if 'fill_distance' not in about else TrainingStates(
             tensors['training_states'], _number(about, 'fill_distance')))
     for name, actual in (('n_x', model.n_x), ('n_u', model.n_u), ('n_z', model.n_z)):
@@ -210,8 +218,7 @@ def _describe(coordinates: Coordinates) -> dict[str, Any]:
 
 
 def _coordinates(about: dict[str, Any]) -> Coordinates:
-    return Coordinates(names=tuple(str(name) for name in about['names']),
-                       units=tuple(str(unit) for unit in about['units']),
+    return Coordinates(names=tuple(about['names']), units=tuple(about['units']),
                        **{name: np.array(about[name], dtype=np.float64)
                           for name in _COORDINATE_ARRAYS})
 
@@ -226,7 +233,7 @@ def _split_file(path: Path, content: bytes) -> tuple[dict[str, Any], bytes]:
     if len(content) < 8 + length:
         _refuse(path, 'it ends within its header, so it was cut off')
     try:
-        header = json.loads(content[8:8 + length])
+        header = _parsed(content[8:8 + length])
     except (ValueError, RecursionError):
         _refuse(path, 'it is not a safetensors file')
     if not isinstance(header, dict):
@@ -271,7 +278,20 @@ def _size(value: Any) -> int:
     return value
 
 
+def _parsed(text: str | bytes) -> Any:
+    """Read JSON in which no name comes twice, as readers differ in which of the two counts."""
+    def once(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
+        found = dict(pairs)
+        if len(found) < len(pairs):
+            raise ValueError('a name comes twice')
+        return found
+
+    return json.loads(text, object_pairs_hook=once)
+
+
 def _refuse(path: Path, reason: str) -> NoReturn:
+    if len(reason) > _MAX_REASON:
+        reason = reason[:_MAX_REASON] + '...'
     raise ModelFileError(f'{path} is not a usable model file: {reason}; '
                          'restore it from a backup, or train the model again')
 

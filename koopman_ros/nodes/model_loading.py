@@ -20,16 +20,27 @@ from __future__ import annotations
 import contextlib
 from dataclasses import dataclass
 from datetime import datetime, UTC
+from pathlib import Path
+import time
 
 from koopman_ros.control import Settings, State
 from koopman_ros.lifting import LiftedModel, load, ModelFileError
-from koopman_ros.nodes.messages import in_celsius
+from koopman_ros.nodes.controller_parameters import ControllerParameters
+from koopman_ros.nodes.messages import in_celsius, NANOSECONDS
 from koopman_ros.nodes.shipped import model_path
 from koopman_ros.nodes.translation import controller_of
 import numpy as np
 from numpy.typing import NDArray
 
 Array = NDArray[np.float64]
+
+# Names of the other one: with these a model takes the coolant for what is controlled.
+_MISPLACED = ('coolant_temperature', 'temperature')
+_LONGEST_PATH = 4096  # bytes, as Linux has it
+# What a control step may take of a processor, in s: the largest model that is read takes some
+# milliseconds, and measurements come once a second.
+_LONGEST_STEP = 0.1
+_TRIALS = 3
 
 
 @dataclass(frozen=True)
@@ -74,25 +85,58 @@ def load_suitable(name: str) -> LoadedModel:
     Load a model and refuse one that is not for one temperature and one coolant temperature.
 
     :param name: of a shipped model, or the path of a file.
-    :raises ModelFileError: naming the file, what is wrong and what to do.
+    :raises ModelFileError: naming the file, what is wrong and what to do; also for a model that
+        a control step fails with, or takes too long for.
     """
+    if len(name.encode()) > _LONGEST_PATH or '\0' in name:
+        raise ModelFileError(f'model = {name[:50]!r}... is no path of a file, which has at most '
+                             f'{_LONGEST_PATH} bytes: check it')
     path = model_path(name)
     model = load(path)
     if (model.states.units, model.inputs.units) != (('K',), ('K',)):
         raise ModelFileError(
             f'{path} has states in {model.states.units} and inputs in {model.inputs.units}, the '
             "controller needs one of each in ('K',): choose a model of the one-state reactor")
+    names = (model.states.names[0], model.inputs.names[0])
+    if names[0] == names[1] or any(map(str.__eq__, names, _MISPLACED)):
+        raise ModelFileError(
+            f'{path} has {names[0]!r} as state and {names[1]!r} as input, the controller needs '
+            'the temperature as state and that of the coolant as input: choose a model of the '
+            'one-state reactor')
     for box in (model.states, model.inputs):
         if not 0.0 < box.lower[0] <= box.center[0] <= box.upper[0]:
             raise ModelFileError(
                 f'{path} was trained for a {box.names[0]} of {box.lower[0]:.6g} to '
                 f'{box.upper[0]:.6g} K around {box.center[0]:.6g} K, which cannot be: train the '
                 'model again')
+    _refuse_slow(path, model)
     with contextlib.suppress(OSError):
         written = datetime.fromtimestamp(path.stat().st_mtime, UTC)
         return LoadedModel(name, model, written.isoformat(timespec='milliseconds'))
     # gone since it was read
     return LoadedModel(name, model, 'unknown')
+
+
+def _refuse_slow(path: Path, model: LiftedModel) -> None:
+    """Refuse a model with which a control step raises an error or takes too long."""
+    controller, state = controller_of(model, ControllerParameters().settings()), State()
+    needed = []
+    for k in range(1, _TRIALS + 1):
+        # of this thread alone, for a busy machine says nothing of a model
+        begun = time.thread_time()
+        try:
+            state = controller.step(state, model.states.center, k * NANOSECONDS)[0]
+            # which diagnostics tell
+            controller.equivalent_bias(state)
+        except (ArithmeticError, ValueError) as error:
+            raise ModelFileError(f'{path}: a control step with the model fails ({error}): train '
+                                 'it again') from error
+        needed.append(time.thread_time() - begun)
+    if min(needed) > _LONGEST_STEP:
+        raise ModelFileError(
+            f'{path}: a control step with the model takes {min(needed):.3g} s of a processor, at '
+            f'most {_LONGEST_STEP:g} s are allowed: train one with fewer coordinates (n_z = '
+            f'{model.n_z})')
 
 
 def refuse_setpoints(model: LiftedModel, situation: Situation) -> None:

@@ -1,0 +1,54 @@
+# Copyright 2026 The koopman_ros Authors
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""Reading a file that may be anything: neither without end nor for ever."""
+
+from __future__ import annotations
+
+import os
+import stat
+
+_KINDS = ((stat.S_ISDIR, 'a folder'), (stat.S_ISFIFO, 'a named pipe'), (stat.S_ISSOCK, 'a socket'),
+          (stat.S_ISCHR, 'a device'), (stat.S_ISBLK, 'a device'))
+
+
+class NotRegularError(OSError):
+    """What is to be read is no regular file; its text says what it is."""
+
+
+def read_regular(path: str | os.PathLike[str], limit: int) -> bytes:
+    """
+    Return what a regular file holds, or its first `limit` + 1 bytes.
+
+    :param path: the file, or a link to it.
+    :param limit: how many bytes are wanted at most.
+    :raises NotRegularError: for a device, a pipe, a socket or a folder.
+    :raises OSError: when it cannot be opened or read.
+    """
+    # looked at before it is opened, for opening is an order to some devices
+    _refuse_special(os.stat(path))
+    # a pipe that took its place would keep the opener waiting, and a terminal take it over
+    descriptor = os.open(path, os.O_RDONLY | os.O_NONBLOCK | os.O_CLOEXEC | os.O_NOCTTY)
+    with open(descriptor, 'rb', buffering=0) as file:
+        _refuse_special(os.fstat(descriptor))
+        content = bytearray()
+        while len(content) <= limit and (part := file.read(limit + 1 - len(content))):
+            content += part
+    return bytes(content)
+
+
+def _refuse_special(found: os.stat_result) -> None:
+    if not stat.S_ISREG(found.st_mode):
+        kind = next((word for test, word in _KINDS if test(found.st_mode)), 'something else')
+        raise NotRegularError(f'it is {kind}, not a regular file')
