@@ -16,6 +16,7 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 import math
 import time
 
@@ -25,6 +26,21 @@ from rclpy.node import Node
 # Stamps further from the node's clock than this come from another clock.
 _SAME_CLOCK = 3600.0  # s
 _CLOCK_PATIENCE = 1.0  # s from the start until somebody should publish the time
+
+
+@dataclass(frozen=True)
+class Moment:
+    """
+    A time by all clocks.
+
+    :param wall: of the steady clock, in s.
+    :param sim: on /clock, in ns; 0 where it does not count.
+    :param node_ns: of the node's clock.
+    """
+
+    wall: float
+    sim: int
+    node_ns: int
 
 
 class Arrival:
@@ -45,14 +61,19 @@ class Arrival:
         self._begun = self._wall
         self.age = math.nan  # s, of the last measurement at its arrival
         self.answer_seconds = math.nan  # from its arrival to its command
+        self.busy = False  # whether what has arrived since then waits for the node itself
 
-    def note(self, stamp_ns: int) -> None:
-        """Take down that a measurement with a new stamp has arrived."""
-        self._wall, self._sim = time.monotonic(), self._sim_now()
-        now = self._node.get_clock().now().nanoseconds
-        age = (now - stamp_ns) / NANOSECONDS
+    def now(self) -> Moment:
+        """Return the present time."""
+        return Moment(time.monotonic(), self._sim_now(),
+                      self._node.get_clock().now().nanoseconds)
+
+    def note(self, stamp_ns: int, at: Moment) -> None:
+        """Take down that a measurement with a new stamp has arrived at a time."""
+        self._wall, self._sim = at.wall, at.sim
+        age = (at.node_ns - stamp_ns) / NANOSECONDS
         # at time zero the clock has not begun
-        self.age = age if now and abs(age) < _SAME_CLOCK else math.nan
+        self.age = age if at.node_ns and abs(age) < _SAME_CLOCK else math.nan
 
     def answered(self) -> None:
         """Take down that its command is out."""
@@ -63,6 +84,14 @@ class Arrival:
         """Whether `use_sim_time` is set and nobody publishes the time."""
         waited = time.monotonic() - self._begun
         return self._simulated and self._sim_now() == 0 and waited > _CLOCK_PATIENCE
+
+    def busy_silence(self, seconds: float) -> float:
+        """
+        Return the silence while the node has been busy for so many seconds.
+
+        Nobody takes the time from /clock then, and the steady clock stands in for it.
+        """
+        return max(self.silence, seconds if self._simulated else 0.0)
 
     @property
     def wall_silence(self) -> float:

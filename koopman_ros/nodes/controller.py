@@ -17,7 +17,9 @@
 from __future__ import annotations
 
 import sys
+import threading
 
+from builtin_interfaces.msg import Time
 from koopman_ros.control import Controller, Mode, Report, Rung, State
 from koopman_ros.nodes import topics, translation
 from koopman_ros.nodes.arrival import Arrival
@@ -36,6 +38,7 @@ from koopman_ros.nodes.model_loading import Situation as ModelSituation
 from koopman_ros.nodes.model_reload import ModelReload
 from koopman_ros.nodes.process import LoopNode, run
 from koopman_ros.nodes.rivals import Rivals
+from koopman_ros.nodes.watchdog import PERIOD, Watchdog
 import numpy as np
 from rclpy.callback_groups import MutuallyExclusiveCallbackGroup
 from rclpy.clock import Clock, ClockType
@@ -44,13 +47,20 @@ from rclpy.timer import Timer
 from sensor_msgs.msg import JointState, Temperature
 from std_srvs.srv import SetBool, Trigger
 
-_WATCH_PERIOD = 0.1  # s by the wall
 _WATCH_STEP = NANOSECONDS // 2  # of plant time between two commands without a measurement
 _COOLANT_PATIENCE = 0.5  # s that the first answer waits for the coolant that is in force
+# A step that the watchdog has overtaken so often is given up, and its measurement with it.
+_ATTEMPTS = 2
 
 
 class ControllerNode(LoopNode):
-    """Carry messages to and from the control step; see the README for topics and services."""
+    """
+    Carry messages to and from the control step; see the README for topics and services.
+
+    All runs in the executor's thread, but for the watch over silence: while that thread is busy,
+    the watchdog's does it. The lock is held where the state changes and its command goes out, not
+    while a measurement is answered, so that the watchdog goes by the last state that commanded.
+    """
 
     def __init__(self) -> None:
         super().__init__('controller', automatically_declare_parameters_from_overrides=True)
@@ -60,7 +70,10 @@ class ControllerNode(LoopNode):
             self, load_suitable(parameters.model), self._model_situation, self._on_model)
         self._controller = self._built()
         self._state = State()
+        self._lock = threading.Lock()
+        self._telling = threading.Lock()
         self._report = Report(Mode.AUTOMATIC)
+        self._logged = self._report.rung
         self._refused = ''
         self._counts = Counts()
         self._temperature = np.nan
@@ -97,12 +110,18 @@ class ControllerNode(LoopNode):
                             callback_group=MutuallyExclusiveCallbackGroup())
         # the plant's time may stand still, and be asked for nevertheless
         self._steady = Clock(clock_type=ClockType.STEADY_TIME)
-        self.create_timer(_WATCH_PERIOD, self._on_watch, clock=self._steady)
+        self.create_timer(PERIOD, self._on_watch, clock=self._steady)
         self._rivals = Rivals(self, {
             topics.COOLANT_SETPOINT: 'command the coolant',
             topics.TEMPERATURE: 'publish the temperature'}, self._on_rivals)
         TABLE.follow(self, parameters, self._on_parameters, self._models.accept)
         self.get_logger().info(self._models.in_force.about)
+        self._watchdog = Watchdog(self._on_busy)
+        self._watchdog.start()
+
+    def complete(self) -> None:
+        """Let nobody command while the middleware is taken down."""
+        self._watchdog.end()
 
     # Measurements and their absence.
 
@@ -134,16 +153,29 @@ class ControllerNode(LoopNode):
             self._answer(message)
 
     def _answer(self, message: Temperature) -> None:
-        stamp_ns = stamp_nanoseconds(message.header.stamp)
-        if stamp_ns != self._state.time_ns:
-            self._arrival.note(stamp_ns)
-        if self._state.command is None and self._coolant is not None:
-            self._state = translation.take_over(self._controller, self._state, self._coolant)
-        self._state, command, report = translation.answer(
-            self._controller, self._state, message, self._coolant_at(stamp_ns))
-        self._commands.publish(temperature_message(
-            command, message.header.stamp, message.header.frame_id))
-        self._arrival.answered()
+        stamp_ns, arrived = stamp_nanoseconds(message.header.stamp), self._arrival.now()
+        for _ in range(_ATTEMPTS):
+            before = state = self._state
+            if state.command is None and self._coolant is not None:
+                state = translation.take_over(self._controller, state, self._coolant)
+            state, command, report = translation.answer(
+                self._controller, state, message, self._coolant_at(stamp_ns))
+            with self._lock:
+                if self._state is not before:
+                    # the watchdog has commanded meanwhile: the answer must go on from there
+                    continue
+                self._state = state
+                self._commands.publish(temperature_message(
+                    command, message.header.stamp, message.header.frame_id))
+                if stamp_ns != before.time_ns:
+                    self._arrival.note(stamp_ns, arrived)
+                self._arrival.answered()
+            break
+        else:
+            self.get_logger().error(
+                'a measurement is not answered, as a control step takes longer than the watchdog '
+                'waits: choose a smaller model', throttle_duration_sec=1.0)
+            return
         self._temperature = message.temperature
         self._frame_id = message.header.frame_id
         self._counts.measurements += 1
@@ -161,23 +193,60 @@ class ControllerNode(LoopNode):
         return float(heard.temperature)
 
     def _on_watch(self) -> None:
-        """Hold the command, and go to the safe coolant, when measurements stay away."""
-        timeout, silence = self._settings.measurement_timeout, self._arrival.silence
-        state = self._state
-        if not timeout or not silence > timeout or state.time_ns is None:
+        self._arrival.busy = False
+        self._watchdog.beat()
+        watched = self._watch(self._arrival.silence)
+        if watched is not None:
+            self._tell(*watched)
+
+    def _on_busy(self, seconds: float) -> None:
+        """Stand in for the executor; called in the watchdog's thread."""
+        watched = self._watch(self._arrival.busy_silence(seconds))
+        if watched is None:
             return
-        now_ns = state.time_ns + round(silence * NANOSECONDS)
-        if state.commanded_ns is not None and now_ns - state.commanded_ns < _WATCH_STEP:
-            return
-        self._state, command, report = translation.watch(self._controller, state, now_ns)
-        if command is not None:
+        self._arrival.busy = True
+        # the executor may be stuck in there
+        if self._telling.acquire(blocking=False):
+            try:
+                self._publish_beside(*watched)
+                self._diagnostics.publish_if_changed()
+            finally:
+                self._telling.release()
+
+    def _watch(self, silence: float) -> tuple[Report, Time] | None:
+        """
+        Hold the command, and go to the safe coolant, when measurements stay away.
+
+        :return: report and stamp of what was commanded, or None.
+        """
+        with self._lock:
+            timeout, state = self._settings.measurement_timeout, self._state
+            if not timeout or not silence > timeout or state.time_ns is None:
+                return None
+            now_ns = state.time_ns + round(silence * NANOSECONDS)
+            if state.commanded_ns is not None and now_ns - state.commanded_ns < _WATCH_STEP:
+                return None
+            self._state, command, report = translation.watch(self._controller, state, now_ns)
+            if command is None:
+                return None
             stamp = stamp_message(now_ns)
             self._commands.publish(temperature_message(command, stamp, self._frame_id))
-            self._tell(report, stamp)
+            return report, stamp
 
-    def _tell(self, report: Report, stamp: object) -> None:
-        """Publish what is known beside the command."""
-        before, self._report = self._report, report
+    def _tell(self, report: Report, stamp: Time) -> None:
+        """Publish and log what is known beside the command."""
+        with self._telling:
+            self._publish_beside(report, stamp)
+        if report.rung is not self._logged:
+            self._log_transition(self._logged, report)
+            self._logged = report.rung
+        if report.clock_went_back:
+            self.get_logger().warning('the measurement is older than the last one: time starts '
+                                      'afresh', throttle_duration_sec=1.0)
+        self._diagnostics.publish_if_changed()
+
+    def _publish_beside(self, report: Report, stamp: Time) -> None:
+        self._report = report
         active = report.active_setpoint
         if active is not None and active[0] != self._published_setpoint:
             self._published_setpoint = float(active[0])
@@ -187,12 +256,6 @@ class ControllerNode(LoopNode):
             self._predicted.publish(temperature_message(
                 float(report.predicted[0]), stamp, self._frame_id))
         self._internals.publish(internals(report, stamp, self._frame_id))
-        if report.rung is not before.rung:
-            self._log_transition(before.rung, report)
-        if report.clock_went_back:
-            self.get_logger().warning('the measurement is older than the last one: time starts '
-                                      'afresh', throttle_duration_sec=1.0)
-        self._diagnostics.publish_if_changed()
 
     def _log_transition(self, before: Rung, report: Report) -> None:
         if report.rung.depth > before.depth:
@@ -206,8 +269,9 @@ class ControllerNode(LoopNode):
 
     def _on_setpoint(self, message: Temperature) -> None:
         stamp_ns = stamp_nanoseconds(message.header.stamp)
-        self._state, self._refused = translation.ask_setpoint(
-            self._controller, self._state, message)
+        with self._lock:
+            self._state, self._refused = translation.ask_setpoint(
+                self._controller, self._state, message)
         if self._refused:
             self.get_logger().warning(self._refused, throttle_duration_sec=1.0)
         else:
@@ -219,8 +283,9 @@ class ControllerNode(LoopNode):
         self._diagnostics.publish_if_changed()
 
     def _on_manual_coolant_setpoint(self, message: Temperature) -> None:
-        self._state, self._refused = translation.ask_manual_coolant(
-            self._controller, self._state, message)
+        with self._lock:
+            self._state, self._refused = translation.ask_manual_coolant(
+                self._controller, self._state, message)
         if self._refused:
             self.get_logger().warning(self._refused, throttle_duration_sec=1.0)
         self._diagnostics.publish_if_changed()
@@ -228,7 +293,8 @@ class ControllerNode(LoopNode):
     def _on_set_automatic(self, request: SetBool.Request, response: SetBool.Response
                           ) -> SetBool.Response:
         mode = Mode.AUTOMATIC if request.data else Mode.MANUAL
-        self._state = self._controller.set_mode(self._state, mode)
+        with self._lock:
+            self._state = self._controller.set_mode(self._state, mode)
         self._refused = ''
         response.success, response.message = True, f'{mode.value} mode'
         self.get_logger().info(response.message)
@@ -251,8 +317,9 @@ class ControllerNode(LoopNode):
         self._on_model()
 
     def _on_model(self) -> None:
-        predecessor, self._controller = self._controller, self._built()
-        self._state = self._controller.succeed(predecessor, self._state)
+        with self._lock:
+            predecessor, self._controller = self._controller, self._built()
+            self._state = self._controller.succeed(predecessor, self._state)
         self._diagnostics.publish_if_changed()
 
     # Diagnostics.

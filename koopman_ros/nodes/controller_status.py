@@ -86,6 +86,9 @@ def _verdict(now: Situation) -> tuple[Level, str]:
         doing = '' if command is None else f', coolant at {in_celsius(float(command[0]))}'
         action = 'manual mode' if mode is Mode.MANUAL else (
             _ACTIONS[report.rung] or _ACTIONS[Rung.HOLD])
+        if now.arrival.busy:
+            return Level.ERROR, (f'no measurement answered for more than {timeout:g} s, as the '
+                                 f'node is busy: {action}{doing}; ask for less at once')
         return Level.ERROR, (f'no measurement for more than {timeout:g} s: {action}{doing}; check '
                              'sensor and plant')
     if report.reason and mode is Mode.MANUAL:

@@ -19,6 +19,9 @@ from __future__ import annotations
 from collections.abc import Callable, Collection
 import contextlib
 from dataclasses import replace
+import os
+from pathlib import Path
+import re
 import threading
 
 from koopman_ros.lifting import ModelFileError
@@ -37,6 +40,7 @@ from std_srvs.srv import Trigger
 _SHORT_WAIT = 0.2  # s that the loop may stand still for a parameter
 _LONG_WAIT = 10.0  # s that the service waits for a slow disk
 _MAX_READING = 8  # files that a dead disk may keep open at once
+_MOUNTS = Path('/proc/self/mountinfo')
 
 
 class _Trial:
@@ -50,6 +54,8 @@ class _Trial:
 
     def __init__(self, node: Node, name: str, situation: Situation) -> None:
         self.outcome = Future()
+        self.path = _absolute(name)
+        self.mount = _mount_of(self.path)
         self.thread = threading.Thread(target=self._run, args=(name, situation), daemon=True)
         self._node = node
 
@@ -87,6 +93,9 @@ class ModelReload:
     of a second, where a local file takes milliseconds. Whatever is not read by then is refused,
     and the service is there for it.
 
+    A read from a disk that does not answer cannot be ended. No file is read twice at once, and no
+    more than eight from one file system, so that little piles up and a model elsewhere is read.
+
     :param node: the controller; its service calls :meth:`on_reload`.
     :param in_force: the model it starts with.
     :param situation: returns the present situation.
@@ -103,7 +112,7 @@ class ModelReload:
         self._situation = situation
         self._changed = changed
         self._accepted: LoadedModel | None = None
-        self._reading: list[threading.Thread] = []
+        self._reading: list[_Trial] = []
 
     async def on_reload(self, _: Trigger.Request, response: Trigger.Response
                         ) -> Trigger.Response:
@@ -167,12 +176,16 @@ class ModelReload:
 
     def _start(self, name: str, situation: Situation) -> _Trial:
         trial = _Trial(self._node, name, situation)
-        self._reading = [thread for thread in self._reading if thread.is_alive()]
-        if len(self._reading) < _MAX_READING:
-            self._reading.append(trial.thread)
-            trial.thread.start()
+        self._reading = [other for other in self._reading if other.thread.is_alive()]
+        beside = [other.path for other in self._reading if other.mount == trial.mount]
+        if trial.path in beside:
+            trial.end(f'{name} is still being read: check its disk, or try again')
+        elif len(beside) >= _MAX_READING:
+            trial.end(f'{len(beside)} model files of the file system {trial.mount} are still '
+                      'being read: check its disk, or copy the model to another')
         else:
-            trial.end(f'{_MAX_READING} model files are still being read: check their disk')
+            self._reading.append(trial)
+            trial.thread.start()
         return trial
 
     def _swap(self, loaded: LoadedModel) -> None:
@@ -185,3 +198,23 @@ class ModelReload:
         self.refused = f'the old model is kept: {reason}'
         self._changed()
         return self.refused
+
+
+def _absolute(name: str) -> str:
+    """Return what tells one file from another, also where there is none."""
+    with contextlib.suppress(OSError):
+        return os.path.abspath(os.path.expanduser(name))
+    # the folder in which the process was started is gone
+    return name
+
+
+def _mount_of(path: str) -> str:
+    """Return where the file system of an absolute path is mounted; no disk is asked for that."""
+    try:
+        # the mount point is the fifth field, with white space and backslashes in octal
+        mounts = [re.sub(r'\\([0-7]{3})', lambda code: chr(int(code[1], 8)), line.split()[4])
+                  for line in _MOUNTS.read_text().splitlines()]
+    except OSError:
+        return '/'
+    holding = [mount for mount in mounts if f'{path}/'.startswith(f'{mount.rstrip("/")}/')]
+    return max(holding, key=len, default='/')

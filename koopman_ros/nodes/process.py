@@ -23,6 +23,7 @@ import signal
 import sys
 import threading
 
+from koopman_ros.nodes.watchdog import end_in_time
 import rclpy
 from rclpy.exceptions import ParameterException
 from rclpy.executors import SingleThreadedExecutor
@@ -56,6 +57,8 @@ def run(name: str, create: Callable[[], LoopNode], args: list[str] | None = None
     """
     Run a node until SIGINT, SIGTERM or SIGHUP, which end it between two callbacks.
 
+    One that is still in a callback after five seconds is ended by force.
+
     :param name: word that starts an error line.
     :param create: builds the node.
     :param args: command line, or None for the process's own.
@@ -65,6 +68,7 @@ def run(name: str, create: Callable[[], LoopNode], args: list[str] | None = None
     arrived: list[int] = []
     for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
         signal.signal(number, lambda number, _: arrived.append(number))
+    leave = end_in_time(name)
     node = None
     try:
         try:
@@ -79,6 +83,7 @@ def run(name: str, create: Callable[[], LoopNode], args: list[str] | None = None
             # Python handles a signal when the wait returns, so the wait is bounded
             executor.spin_once(timeout_sec=_LONGEST_WAIT)
     finally:
+        leave()
         try:
             if node is not None:
                 node.complete()

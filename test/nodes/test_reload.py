@@ -31,7 +31,7 @@ from typing import BinaryIO
 from diagnostic_msgs.msg import DiagnosticStatus
 from koopman_ros.control import Controller, State
 from koopman_ros.lifting import LiftedModel, load, save
-from koopman_ros.nodes import topics
+from koopman_ros.nodes import model_reload, topics
 from koopman_ros.nodes.controller_parameters import ControllerParameters
 from koopman_ros.nodes.messages import stamp_nanoseconds, to_celsius, to_kelvin
 from koopman_ros.nodes.shipped import model_path
@@ -258,6 +258,9 @@ BAD_MODELS = {
         lambda: edited(A=-shipped('reactor_nz4').A, B=np.zeros((1, 1))),
         f'tried at {STEADY:.2f} degC with the set-point {STEADY:.2f} degC the model fails (no '
         'feedback gain: the Hamiltonian has no stable subspace of full size'),
+    'coolant in place of the temperature': (
+        lambda: with_states(names=('coolant_temperature',)),
+        "has 'coolant_temperature' as state and 'coolant_temperature' as input"),
     'gain beyond its bound': (
         lambda: edited(A=1e6 * np.abs(shipped('reactor_nz4').A)), 'the model fails'),
     'numbers that overflow': (
@@ -327,19 +330,86 @@ def test_model_changes_with_the_weights_that_it_needs(
         'reactor_linear', 500.0]
 
 
-# Disks that do not answer: a pipe that nobody writes to reads like a file on one.
+# What is no regular file.
 
 
-def test_loop_goes_on_while_a_slow_disk_is_read(ros: Workbench, tmp_path: Path) -> None:
-    file, dead = tmp_path / 'model.safetensors', tmp_path / 'dead.safetensors'
-    put(model_path('reactor_nz4').read_bytes(), file)
-    ros.start('controller', {'model': file})
+def test_pipes_and_devices_are_refused_at_once_and_a_good_model_is_taken_after_them(
+        running: tuple[Operator, Callable[[], float]], tmp_path: Path) -> None:
+    """Eight pipes that nobody writes to once kept all readers busy for ever."""
+    operator, _ = running
+    pipes = [tmp_path / f'{k}.safetensors' for k in range(9)]
+    for pipe in pipes:
+        os.mkfifo(pipe)
+    endless = tmp_path / 'endless.safetensors'
+    endless.symlink_to('/dev/zero')
+    for path, kind in ((endless, 'a device'), (Path('/dev/random'), 'a device'),
+                       (tmp_path, 'a folder'), *((pipe, 'a named pipe') for pipe in pipes)):
+        done, reason = operator.set_model(path)
+        assert not done
+        assert reason == (f'the old model is kept: cannot read the model file {path}: it is '
+                          f'{kind}, not a regular file')
+    done, reason = operator.set_model('reactor_nz4')
+    assert done, reason
+
+
+# Disks that do not answer. A file with a pipe beside it is read when somebody has written to that:
+# a system call that waits in a thread, as one on such a disk does.
+
+SLOW_DISK = """
+import os, sys
+from koopman_ros.nodes import controller, model_reload
+read = model_reload.load_suitable
+def slowly(name):
+    if os.path.exists(name + '.disk'):
+        open(name + '.disk', 'rb').read()
+    return read(name)
+model_reload.load_suitable = slowly
+"""
+
+
+@dataclass
+class SlowDisk:
+    """
+    Model files that are on a disk which does not answer until it is told to.
+
+    :param ros: where the controller runs.
+    :param folder: for the files.
+    """
+
+    ros: Workbench
+    folder: Path
+
+    def start_controller(self, changes: str = '') -> Path:
+        """Start a controller whose model, not slow yet, is returned."""
+        file = self.folder / 'model.safetensors'
+        put(model_path('reactor_nz4').read_bytes(), file)
+        self.ros.start('controller', {'model': file}, command=(
+            sys.executable, '-c', f'{SLOW_DISK}{changes}\nsys.exit(controller.main())'))
+        return file
+
+    def hang(self, file: Path) -> None:
+        """Let a file wait from now on."""
+        os.mkfifo(f'{file}.disk')
+
+    def wait_for_reader(self, file: Path) -> BinaryIO:
+        """Wait until a file is read; closing what is returned lets the reader go on."""
+        return opened(self.ros, Path(f'{file}.disk'))
+
+
+@pytest.fixture
+def disk(ros: Workbench, tmp_path: Path) -> SlowDisk:
+    return SlowDisk(ros, tmp_path)
+
+
+def test_loop_goes_on_while_a_slow_disk_is_read(ros: Workbench, disk: SlowDisk) -> None:
+    file = disk.start_controller()
+    dead = file.with_name('dead.safetensors')
     operator, thermometer = Operator(ros), Thermometer(ros)
-    file.unlink()
     for path in (file, dead):
-        os.mkfifo(path)
+        disk.hang(path)
+    put(model_path('reactor_nz3').read_bytes(), file)
     reloaded = operator.ask_to_reload()
-    slow = opened(ros, file)
+    slow = disk.wait_for_reader(file)
     (result,) = ros.set_parameters('controller', model=str(dead))
     assert result.reason.startswith(f'the old model is kept: {dead} is still being read')
     for _ in range(50):
@@ -347,7 +417,6 @@ def test_loop_goes_on_while_a_slow_disk_is_read(ros: Workbench, tmp_path: Path) 
     ros.wait_until(lambda: len(thermometer.commands) == 50)
     assert not reloaded.done()
 
-    slow.write(model_path('reactor_nz3').read_bytes())
     slow.close()
     ros.wait_until(reloaded.done)
     assert reloaded.result().success
@@ -357,17 +426,13 @@ def test_loop_goes_on_while_a_slow_disk_is_read(ros: Workbench, tmp_path: Path) 
     assert 'Traceback' not in ros.printed()
 
 
-def test_model_changed_during_a_slow_reload_stays(ros: Workbench, tmp_path: Path) -> None:
-    file = tmp_path / 'model.safetensors'
-    put(model_path('reactor_nz4').read_bytes(), file)
-    ros.start('controller', {'model': file})
+def test_model_changed_during_a_slow_reload_stays(ros: Workbench, disk: SlowDisk) -> None:
+    file = disk.start_controller()
     operator = Operator(ros)
-    file.unlink()
-    os.mkfifo(file)
+    disk.hang(file)
     reloaded = operator.ask_to_reload()
-    slow = opened(ros, file)
+    slow = disk.wait_for_reader(file)
     assert operator.set_model('reactor_linear')[0]
-    slow.write(model_path('reactor_nz3').read_bytes())
     slow.close()
     ros.wait_until(reloaded.done)
     assert not reloaded.result().success
@@ -375,22 +440,40 @@ def test_model_changed_during_a_slow_reload_stays(ros: Workbench, tmp_path: Path
     ros.wait_for_status(STATUS, lambda s: value(s, 'model') == 'reactor_linear')
 
 
-def test_dead_disk_does_not_pile_up_readers(ros: Workbench, tmp_path: Path) -> None:
-    file = tmp_path / 'model.safetensors'
-    put(model_path('reactor_nz4').read_bytes(), file)
-    # impatient, or this would last
-    program = ('import sys\n'
-               'from koopman_ros.nodes import controller, model_reload\n'
-               'model_reload._SHORT_WAIT = model_reload._LONG_WAIT = 0.02\n'
-               'sys.exit(controller.main())\n')
-    ros.start('controller', {'model': file}, command=(sys.executable, '-c', program))
+def test_dead_disk_does_not_pile_up_readers_and_a_healthy_one_is_read(
+        ros: Workbench, disk: SlowDisk) -> None:
+    # impatient, or this would last; the folder stands for a disk
+    file = disk.start_controller(f"""
+model_reload._LONG_WAIT = 0.02
+model_reload._mount_of = lambda path: '/dead' if path.startswith('{disk.folder}/') else '/'
+""")
     operator = Operator(ros)
-    file.unlink()
-    os.mkfifo(file)
+    others = [file.with_name(f'{k}.safetensors') for k in range(8)]
+    for path in (file, *others):
+        disk.hang(path)
     assert operator.reload() == (
         False, f'the old model is kept: {file} was not read within 0.02 s: check its disk')
-    request = SetParameters.Request(
-        parameters=[Parameter('model', value=str(file)).to_parameter_msg()] * 8)
+    assert operator.reload() == (
+        False, f'the old model is kept: {file} is still being read: check its disk, or try again')
+    request = SetParameters.Request(parameters=[
+        Parameter('model', value=str(path)).to_parameter_msg() for path in others])
     results = ros.call(SetParameters, 'controller/set_parameters', request).results
-    assert ['8 model files are still being read' in result.reason for result in results] == [
+    assert ['8 model files of the file system /dead' in result.reason for result in results] == [
         False] * 7 + [True]
+    done, reason = operator.set_model('reactor_nz3')
+    assert done, reason
+
+
+@pytest.mark.parametrize(('path', 'mount'), [
+    ('/mnt/a b/model', '/mnt/a b'), ('/mnt/a', '/mnt'), ('/mnt', '/mnt'), ('/mntx/a', '/'),
+    ('/proc/1/x', '/proc')])
+def test_file_system_of_a_path_is_found_without_asking_it(
+        tmp_path: Path, monkeypatch: pytest.MonkeyPatch, path: str, mount: str) -> None:
+    mounts = tmp_path / 'mountinfo'
+    mounts.write_text(''.join(
+        f'{k} 1 0:{k} / {name} rw - ext4 none rw\n'
+        for k, name in enumerate(('/', '/proc', '/mnt', '/mnt/a\\040b'))))
+    monkeypatch.setattr(model_reload, '_MOUNTS', mounts)
+    assert model_reload._mount_of(path) == mount
+    mounts.unlink()
+    assert model_reload._mount_of(path) == '/'

@@ -1,0 +1,203 @@
+# Copyright 2026 The koopman_ros Authors
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""The controller whose executor does not come to its timers: who commands, and who ends it."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+import os
+from pathlib import Path
+import signal
+import sys
+import threading
+from typing import BinaryIO
+
+from controller_bench import STATUS, STEADY
+from diagnostic_msgs.msg import DiagnosticStatus
+from koopman_ros.control import State
+from koopman_ros.lifting import load
+from koopman_ros.nodes import topics, translation
+from koopman_ros.nodes.controller_parameters import ControllerParameters
+from koopman_ros.nodes.messages import stamp_nanoseconds, to_celsius
+from koopman_ros.nodes.shipped import model_path
+from koopman_ros.nodes.watchdog import PERIOD, Watchdog
+import numpy as np
+import pytest
+from rosgraph_msgs.msg import Clock
+from sensor_msgs.msg import Temperature
+from test_reload import opened
+from workbench import seconds, temperature, TIMEOUT, Workbench
+
+SAFE = 10.0  # degC
+SETTINGS = {'measurement_timeout': 0.3, 'hold_timeout': 0.5, 'coolant_rate_limit': 1200.0,
+            'safe_coolant': SAFE}
+
+# A control step that takes as long as somebody keeps the pipe of the second argument open.
+BUSY = """
+import os, sys
+from koopman_ros.nodes import controller, translation, watchdog
+watchdog._PATIENCE = 0.2
+pipe, answer = sys.argv.pop(1), translation.answer
+def slowly(*args):
+    result = answer(*args)
+    if os.path.exists(pipe):
+        open(pipe, 'rb').read()
+    return result
+translation.answer = slowly
+sys.exit(controller.main())
+"""
+
+
+class BusyBench:
+    """
+    A controller whose control step can be kept from ending, with a thermometer.
+
+    :param ros: where it runs.
+    :param pipe: that keeps it.
+    :param simulated: whether time comes from /clock, where it stands still.
+    """
+
+    def __init__(self, ros: Workbench, pipe: Path, simulated: bool = False) -> None:
+        self.ros, self.pipe = ros, pipe
+        clock = ros.node.create_publisher(Clock, topics.CLOCK, topics.CLOCK_QOS)
+        self.process = ros.start(
+            'controller', SETTINGS, ('-p', f'use_sim_time:={simulated}'.lower()),
+            (sys.executable, '-c', BUSY, str(pipe)))
+        self.commands = ros.listen(Temperature, topics.COOLANT_SETPOINT)
+        self.thermometer = ros.speak(Temperature, topics.TEMPERATURE, to='controller')
+        if simulated:
+            ros.wait_until(lambda: clock.get_subscription_count() > 0)
+            clock.publish(Clock(clock=temperature(0.0, 100.0).header.stamp))
+        self.thermometer.publish(temperature(STEADY, 1.0))
+        ros.wait_until(lambda: self.commands)
+
+    def get_busy(self, time: float) -> BinaryIO:
+        """Measure at a time; return what keeps the step from ending while it is open."""
+        os.mkfifo(self.pipe)
+        self.thermometer.publish(temperature(STEADY, time))
+        return opened(self.ros, self.pipe)
+
+    def answered(self, time: float) -> bool:
+        """Tell whether a measurement was answered."""
+        return any(seconds(message) == time for message in self.commands)
+
+
+def replayed(commands: list[Temperature], measured: dict[float, float]) -> list[float]:
+    """Return what the control step makes of measurements, and of silence at all other stamps."""
+    controller = translation.controller_of(
+        load(model_path('reactor_nz4')), ControllerParameters(**SETTINGS).settings())
+    state, found = State(), []
+    for message in commands:
+        if (time := seconds(message)) in measured:
+            state, kelvin, _ = translation.answer(
+                controller, state, temperature(measured[time], time))
+        else:
+            state, held, _ = translation.watch(
+                controller, state, stamp_nanoseconds(message.header.stamp))
+            assert held is not None
+            kelvin = held
+        found.append(to_celsius(kelvin))
+    return found
+
+
+@pytest.mark.parametrize('simulated', [False, True], ids=['real time', 'simulated time'])
+def test_watchdog_commands_while_the_control_step_is_busy(
+        ros: Workbench, tmp_path: Path, simulated: bool) -> None:
+    bench = BusyBench(ros, tmp_path / 'pipe', simulated)
+    held = bench.commands[0].temperature
+    busy = bench.get_busy(2.03)
+    ros.wait_until(lambda: bench.commands[-1].temperature == SAFE)
+    ros.wait_for_status(STATUS, lambda s: s.level == DiagnosticStatus.ERROR and s.message == (
+        'no measurement answered for more than 0.3 s, as the node is busy: the safe coolant '
+        'temperature is commanded, coolant at 10.00 degC; ask for less at once'))
+    assert not bench.answered(2.03)
+    own = bench.commands[1:]
+    stamps = np.array([seconds(message) for message in bench.commands[:-1]])
+    assert own[0].temperature == held
+    assert np.all(np.diff(stamps) >= 0.3)
+    steps = np.diff([message.temperature for message in bench.commands[:-1]])
+    assert np.all(np.abs(steps) <= 20.0 * np.diff(stamps) * (1.0 + 1e-6))
+
+    bench.pipe.unlink()
+    busy.close()
+    ros.wait_until(lambda: bench.answered(2.03))
+    bench.thermometer.publish(temperature(STEADY, 3.03))
+    ros.wait_until(lambda: bench.answered(3.03))
+    # what the step had found was thrown away, and found again from what was commanded meanwhile
+    assert [message.temperature for message in bench.commands] == replayed(
+        bench.commands, dict.fromkeys((1.0, 2.03, 3.03), STEADY))
+    assert 'learned law -> ' in bench.process.output()
+
+
+def test_step_that_is_always_too_slow_is_given_up_and_the_process_ends_in_it(
+        ros: Workbench, tmp_path: Path) -> None:
+    bench = BusyBench(ros, tmp_path / 'pipe')
+    busy = bench.get_busy(2.03)
+    ros.wait_until(lambda: len(bench.commands) > 1)
+    again = tmp_path / 'again'
+    os.mkfifo(again)
+    # the second attempt finds another pipe
+    os.replace(again, bench.pipe)
+    busy.close()
+    busy, count = opened(ros, bench.pipe), len(bench.commands)
+    ros.wait_until(lambda: len(bench.commands) > count)
+    bench.pipe.unlink()
+    busy.close()
+    ros.wait_until(lambda: 'a measurement is not answered' in bench.process.output())
+    assert not bench.answered(2.03)
+    bench.thermometer.publish(temperature(STEADY, 3.03))
+    ros.wait_until(lambda: bench.answered(3.03))
+    assert [message.temperature for message in bench.commands] == replayed(
+        bench.commands, {1.0: STEADY, 3.03: STEADY})
+
+    busy = bench.get_busy(4.0)
+    bench.process.process.send_signal(signal.SIGINT)
+    code = ros.wait_for_end(bench.process)
+    busy.close()
+    assert code == 1
+    assert 'controller: busy for 0.2 s after a signal: ended by force' in bench.process.output()
+
+
+@pytest.fixture
+def watched() -> Iterator[tuple[Watchdog, list[float], threading.Event]]:
+    """Yield a watchdog with what it did, and an event at each time."""
+    acted: list[float] = []
+    event = threading.Event()
+
+    def act(busy: float) -> None:
+        acted.append(busy)
+        event.set()
+        if len(acted) == 2:
+            raise RuntimeError('the second time')
+
+    watchdog = Watchdog(act)
+    yield watchdog, acted, event
+    watchdog.end()
+
+
+def test_watchdog_acts_only_without_a_beat_and_tells_its_errors(
+        watched: tuple[Watchdog, list[float], threading.Event]) -> None:
+    watchdog, acted, event = watched
+    watchdog.start()
+    # beats more often than it looks
+    for _ in range(30):
+        watchdog.beat()
+        assert not event.wait(PERIOD / 2)
+    while len(acted) < 3:
+        assert event.wait(TIMEOUT)
+        event.clear()
+    assert acted[:3] == pytest.approx([1.0, 1.1, 1.2])
+    with pytest.raises(RuntimeError, match='the second time'):
+        watchdog.beat()
