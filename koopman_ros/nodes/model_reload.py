@@ -56,22 +56,29 @@ class _Trial:
         self.outcome = Future()
         self.path = _absolute(name)
         self.mount = _mount_of(self.path)
+        self.reading = True
         self.thread = threading.Thread(target=self._run, args=(name, situation), daemon=True)
         self._node = node
 
     def _run(self, name: str, situation: Situation) -> None:
+        outcome = self._tried(name, situation)
+        # before whoever waits for it can ask for the same file again
+        self.reading = False
+        self.end(outcome)
+
+    @staticmethod
+    def _tried(name: str, situation: Situation) -> LoadedModel | str:
         try:
             loaded = load_suitable(name)
             refuse_setpoints(loaded.model, situation)
             refuse_without_law(loaded.model, situation)
         except (ModelFileError, FileNotFoundError) as error:
-            self.end(str(error))
+            return str(error)
         except Exception as error:
             # whatever a file may hold: the loop goes on with what it has
-            self.end(f'{name} cannot be used ({type(error).__name__}: {error}): train the model '
-                     'again')
-        else:
-            self.end(loaded)
+            return (f'{name} cannot be used ({type(error).__name__}: {error}): train the model '
+                    'again')
+        return loaded
 
     def end(self, outcome: LoadedModel | str) -> None:
         """Say what became of it: the model, or why there is none."""
@@ -176,7 +183,7 @@ class ModelReload:
 
     def _start(self, name: str, situation: Situation) -> _Trial:
         trial = _Trial(self._node, name, situation)
-        self._reading = [other for other in self._reading if other.thread.is_alive()]
+        self._reading = [other for other in self._reading if other.reading]
         beside = [other.path for other in self._reading if other.mount == trial.mount]
         if trial.path in beside:
             trial.end(f'{name} is still being read: check its disk, or try again')

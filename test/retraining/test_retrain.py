@@ -237,6 +237,7 @@ def test_a_task_survives_json():
 
 @pytest.mark.parametrize(('values', 'error', 'words'), [
     ({'model': '/nowhere/x.safetensors'}, ModelFileError, 'no model file at /nowhere/x.safetens'),
+    ({'model': '/dev/zero'}, ModelFileError, '/dev/zero: it is a device, not a regular file'),
     ({'output': 'new.bin'}, ValueError, "output = 'new.bin' must end in .safetensors"),
     ({'bags': ('/nowhere/run.mcap',)}, BagReadError, '/nowhere/run.mcap'),
     ({'temperature_topic': '/other'}, BagReadError, "has no topic '/other', it has /coolant_se"),
