@@ -18,8 +18,11 @@
 from __future__ import annotations
 
 import argparse
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
+import contextlib
 from pathlib import Path
+
+from koopman_ros.demo.processes import reserved_output
 
 
 def read_options(args: list[str] | None, description: str | None, output: str, speed: float
@@ -39,6 +42,15 @@ def read_options(args: list[str] | None, description: str | None, output: str, s
                         help='simulated seconds per second, 0 for as fast as the machine can '
                         '(default: %(default)s)')
     return parser.parse_args(args)
+
+
+@contextlib.contextmanager
+def chosen_output(wanted: Path) -> Iterator[Path]:
+    """Reserve the folder for the results, and say when it is another one."""
+    with reserved_output(wanted) as folder:
+        if folder != wanted:
+            print(f'another run writes to {wanted}: this one writes to {folder}', flush=True)
+        yield folder
 
 
 def print_result(result: Mapping[str, object]) -> None:

@@ -18,18 +18,20 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
 import contextlib
+import hashlib
 import os
 from pathlib import Path
 import signal
 import socket
 import subprocess
-import sys
 from types import TracebackType
 
+from koopman_ros.nodes.exposure import LOOPBACK_PROFILE
 from koopman_ros.nodes.shipped import config_directory
+from koopman_ros.startup import blocked_signals
+from koopman_ros.startup import command as child_command
 
 _DOMAINS = range(1, 102)
-_DISCOVERY_PROFILE = 'loopback_discovery.xml'
 STOP_TIMEOUT = 10.0  # s from a signal to the end of a process
 
 
@@ -49,7 +51,7 @@ def isolated_domain() -> Iterator[dict[str, str]]:
             'RMW_IMPLEMENTATION': 'rmw_fastrtps_cpp',
             # the profile alone says where to look
             'ROS_AUTOMATIC_DISCOVERY_RANGE': 'SYSTEM_DEFAULT',
-            'FASTRTPS_DEFAULT_PROFILES_FILE': str(config_directory() / _DISCOVERY_PROFILE),
+            'FASTRTPS_DEFAULT_PROFILES_FILE': str(config_directory() / LOOPBACK_PROFILE),
         }
         before = {name: os.environ.get(name) for name in environment}
         os.environ.update(environment)
@@ -67,20 +69,51 @@ def _reserved_domain() -> Iterator[int]:
     # runs side by side start looking at different places
     offset = os.getpid() % len(_DOMAINS)
     for domain in (*_DOMAINS[offset:], *_DOMAINS[:offset]):
-        with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as reservation:
-            try:
-                # an abstract name: whoever's process holds it, it goes when the process ends
-                reservation.bind(f'\0koopman_ros_domain_{domain}')
-            except OSError:
-                continue
-            yield domain
-            return
+        with _reservation(f'domain_{domain}') as mine:
+            if mine:
+                yield domain
+                return
     raise RuntimeError('all ROS domains are taken by other runs: wait until one ends')
+
+
+@contextlib.contextmanager
+def reserved_output(wanted: Path) -> Iterator[Path]:
+    """
+    Reserve a folder for the results of a run.
+
+    It is the one wanted or, while another run on this machine writes there, the first of demo-2,
+    demo-3, ... that is free.
+
+    :param wanted: the folder, which need not exist.
+    """
+    folder, number = wanted, 1
+    while True:
+        # a name of a socket has little room
+        digest = hashlib.sha256(os.fsencode(folder.resolve())).hexdigest()[:32]
+        with _reservation(f'output_{digest}') as mine:
+            if mine:
+                yield folder
+                return
+        number += 1
+        folder = wanted.with_name(f'{wanted.name}-{number}')
+
+
+@contextlib.contextmanager
+def _reservation(name: str) -> Iterator[bool]:
+    """Hold a name on this machine; yields whether nobody else holds it."""
+    with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as held:
+        mine = True
+        try:
+            # an abstract name: whoever's process holds it, it goes when the process ends
+            held.bind(f'\0koopman_ros_{name}')
+        except OSError:
+            mine = False
+        yield mine
 
 
 class NodeProcess:
     """
-    One node running as a process; leaving the context ends it.
+    One node running as a process; leaving the context ends it, as does the end of this process.
 
     :param name: ``plant``, ``controller`` or ``trainer``.
     :param parameters: values other than the node's defaults.
@@ -97,9 +130,11 @@ class NodeProcess:
         self.log = log
         given = [part for key, value in parameters.items()
                  for part in ('-p', f'{key}:={_as_argument(value)}')]
-        program = command or (sys.executable, '-m', f'koopman_ros.nodes.{name}')
+        program = command or child_command(
+            f'koopman_ros.nodes.{name}', signal.SIGINT, interrupted=0)
+        waiting = contextlib.nullcontext() if command else blocked_signals()
         ros_arguments = ['--ros-args', *given, *arguments] if given or arguments else []
-        with open(log, 'wb') as output:
+        with open(log, 'wb') as output, waiting:
             # a session of its own: an interrupt of the terminal is passed on by us, in order
             self.process = subprocess.Popen(
                 [*program, *ros_arguments], stdout=output, stderr=subprocess.STDOUT,

@@ -17,19 +17,28 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+import contextlib
 import faulthandler
 import os
 import signal
 import sys
 import threading
+from typing import Any
 
+from koopman_ros.nodes import command_line
+from koopman_ros.nodes.exposure import open_to_the_network
+from koopman_ros.nodes.last_resort import exit_later
+from koopman_ros.nodes.messages import NANOSECONDS
 from koopman_ros.nodes.watchdog import end_in_time
+from koopman_ros.startup import ignore_signals, SIGNALS
 import rclpy
 from rclpy.exceptions import ParameterException
 from rclpy.executors import SingleThreadedExecutor
 from rclpy.logging import LoggingSeverity, set_logger_level
 from rclpy.node import Node
 from rclpy.signals import SignalHandlerOptions
+from rclpy.subscription import Subscription
+from rosgraph_msgs.msg import Clock
 
 # A parameter or a model that does not fit is a ValueError; rclpy raises RCLError for an unreadable
 # parameter file, a RuntimeError whose class is private to the extension.
@@ -48,6 +57,28 @@ class LoopNode(Node):
     """
 
     exit_code: int | None = None
+    _clocks_refused = 0
+
+    def create_subscription(self, msg_type: Any, topic: str, callback: Callable[[Any], None],
+                            *args: Any, **options: Any) -> Subscription:
+        """Subscribe as any node does; a time that cannot be does not reach its clock."""
+        # rclpy subscribes through here for `use_sim_time`, and a negative time ends it in spin
+        heard = self._possible(callback) if msg_type is Clock else callback
+        return super().create_subscription(msg_type, topic, heard, *args, **options)
+
+    def _possible(self, callback: Callable[[Clock], None]) -> Callable[[Clock], None]:
+        def hear(message: Clock) -> None:
+            time = message.clock
+            if time.sec >= 0 and time.nanosec < NANOSECONDS:
+                callback(message)
+                return
+            self._clocks_refused += 1
+            self.get_logger().warning(
+                f'/clock told sec {time.sec}, nanosec {time.nanosec}, which is no time: ignored '
+                f'({self._clocks_refused} so far); check who publishes /clock',
+                throttle_duration_sec=10.0)
+
+        return hear
 
     def complete(self) -> None:
         """Complete that work; by default there is none. What is published here goes out last."""
@@ -62,12 +93,15 @@ def run(name: str, create: Callable[[], LoopNode], args: list[str] | None = None
     :param name: word that starts an error line.
     :param create: builds the node.
     :param args: command line, or None for the process's own.
-    :return: exit code, 0 after a signal, 1 when the node could not start, or the node's own.
+    :return: exit code, 0 after a signal and for `--help`, 1 when the node could not start, 2 for
+        an unknown argument, or the node's own.
     """
     # a list, because a second signal may come while the first is handled, where a lock would hang
     arrived: list[int] = []
-    for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
+    for number in SIGNALS:
         signal.signal(number, lambda number, _: arrived.append(number))
+    if (said := command_line.answer(name, args)) is not None:
+        return said
     leave = end_in_time(name)
     node = None
     try:
@@ -77,6 +111,8 @@ def run(name: str, create: Callable[[], LoopNode], args: list[str] | None = None
         except _START_ERRORS as error:
             print(f'{name}: cannot start: {_one_line(error)}', file=sys.stderr)
             return 1
+        if note := open_to_the_network(os.environ):
+            node.get_logger().warning(note)
         executor = SingleThreadedExecutor()
         executor.add_node(node)
         while not arrived and node.exit_code is None:
@@ -89,6 +125,7 @@ def run(name: str, create: Callable[[], LoopNode], args: list[str] | None = None
                 node.complete()
         finally:
             _take_down(name, node)
+            ignore_signals()
     return node.exit_code or 0
 
 
@@ -101,8 +138,10 @@ def run_task(name: str, prepare: Callable[[], Callable[[], int]],
     :param prepare: reads them with a node of its own, and returns the task, which runs without
         the middleware and returns the exit code.
     :param args: command line, or None for the process's own.
-    :return: exit code; 1 when it could not start or complete.
+    :return: exit code; 1 when it could not start or complete, 2 for an unknown argument.
     """
+    if (said := command_line.answer(name, args)) is not None:
+        return said
     try:
         try:
             _init(args)
@@ -118,7 +157,12 @@ def run_task(name: str, prepare: Callable[[], Callable[[], int]],
 
 
 def _take_down(name: str, node: LoopNode | None) -> None:
-    """Take the middleware down, or leave it to the operating system when it hangs in that."""
+    """
+    Take the middleware down, or leave it to the operating system when it hangs in that.
+
+    Fast DDS can: two of its threads wait for each other, and whoever takes an entity down waits
+    for them, in rclpy with the interpreter's lock held. See docs/middleware.md.
+    """
 
     def give_up() -> None:
         print(f'{name}: the middleware does not shut down: left to the operating system',
@@ -128,9 +172,10 @@ def _take_down(name: str, node: LoopNode | None) -> None:
     patience = threading.Timer(_TAKE_DOWN_PATIENCE, give_up)
     patience.daemon = True
     patience.start()
-    # for a hang in which no other Python runs, and for one at the interpreter's own end; it stays
-    # armed, and says where it hung
-    faulthandler.dump_traceback_later(_LAST_RESORT, exit=True)
+    # for a hang in which no other Python runs, and for one at the interpreter's own end; both stay
+    # armed: the first says where it hung, the second ends it
+    with contextlib.suppress(OSError, ValueError, RuntimeError):
+        faulthandler.dump_traceback_later(_LAST_RESORT, exit=not exit_later(_LAST_RESORT + 0.5))
     if node is not None:
         node.destroy_node()
     rclpy.try_shutdown()

@@ -25,11 +25,12 @@ import os
 import queue
 import signal
 import subprocess
-import sys
 import threading
 from typing import Any
 
-_COMMAND = ('-m', 'koopman_ros.retraining')
+from koopman_ros.startup import command
+
+_MODULE = 'koopman_ros.retraining.__main__'
 # The problems are small, and the nodes of the loop need the cores; sums keep their order, too.
 _ONE_THREAD = {'OMP_NUM_THREADS': '1', 'OPENBLAS_NUM_THREADS': '1'}
 _PATIENCE = 5.0  # s from the request to end until the process is killed
@@ -74,7 +75,7 @@ class RetrainingJob:
         self._cancelled = False
         # a session of its own: an interrupt of the terminal is passed on by us
         self._process = subprocess.Popen(
-            [sys.executable, *_COMMAND], stdin=subprocess.PIPE, stdout=subprocess.PIPE,
+            _command(), stdin=subprocess.PIPE, stdout=subprocess.PIPE,
             stderr=subprocess.PIPE, encoding='utf-8', errors='replace', start_new_session=True,
             env={**_ONE_THREAD, **os.environ})
         self._lines: queue.SimpleQueue[str | None] = queue.SimpleQueue()
@@ -160,6 +161,11 @@ class RetrainingJob:
         assert self._process.stderr is not None
         for line in self._process.stderr:
             self._complaints = [*self._complaints[-20:], line.strip()]
+
+
+def _command() -> tuple[str, ...]:
+    # killed with us: nobody would hear what it says
+    return command(_MODULE, signal.SIGKILL, interrupted=1)
 
 
 def _signal_name(number: int) -> str:

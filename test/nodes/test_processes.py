@@ -23,13 +23,20 @@ import os
 from pathlib import Path
 import signal
 import sys
+import time
 
+from koopman_ros.bags import summary
 from koopman_ros.demo import processes
 from koopman_ros.demo.processes import isolated_domain, NodeProcess
+from koopman_ros.nodes import command_line, topics
+from koopman_ros.nodes.exposure import open_to_the_network
+from koopman_ros.nodes.messages import NANOSECONDS, stamp_message
+from koopman_ros.nodes.parameter_files import TABLES
 from koopman_ros.nodes.shipped import model_path
 import pytest
+from rosgraph_msgs.msg import Clock
 from sensor_msgs.msg import Temperature
-from workbench import temperature, Workbench
+from workbench import temperature, TIMEOUT, Workbench
 
 # Ends.
 
@@ -47,18 +54,27 @@ def test_signal_ends_a_node_cleanly(ros: Workbench, tmp_path: Path, name: str, n
     assert 'Traceback' not in process.output()
 
 
-def test_interrupt_while_a_program_loads_ends_it_without_a_word(ros: Workbench) -> None:
+@pytest.mark.parametrize(('name', 'number', 'code'), [
+    ('plant', signal.SIGINT, 0), ('plant', signal.SIGTERM, 0), ('replay', signal.SIGINT, 130)])
+def test_signal_while_a_program_loads_ends_it_without_a_word(
+        ros: Workbench, name: str, number: int, code: int) -> None:
     program = (
         'import os, signal, sys\n'
         'class Interrupted:\n'
         '    def find_spec(self, name, path=None, target=None):\n'
         '        if name == "scipy":\n'
-        '            os.kill(os.getpid(), signal.SIGINT)\n'
+        f'            os.kill(os.getpid(), {int(number)})\n'
         'sys.meta_path.insert(0, Interrupted())\n'
-        'from koopman_ros.nodes.programs import plant\n'
-        'sys.exit(plant())\n')
-    process = ros.start('plant', command=(sys.executable, '-c', program))
-    assert ros.wait_for_end(process) == -signal.SIGINT
+        f'from koopman_ros.nodes.programs import {name} as program\n'
+        'sys.exit(program())\n')
+    process = ros.start(name, command=(sys.executable, '-c', program))
+    assert ros.wait_for_end(process) == code
+    assert process.output() == ''
+
+
+def test_signal_before_the_interpreter_is_up_ends_a_node_cleanly(ros: Workbench) -> None:
+    process = ros.start('plant')
+    assert process.stop(signal.SIGTERM) == 0
     assert process.output() == ''
 
 
@@ -74,7 +90,85 @@ def test_signal_during_the_start_ends_a_node_cleanly(ros: Workbench, number: int
         'sys.exit(run("plant", create))\n')
     process = ros.start('plant', command=(sys.executable, '-c', program))
     assert ros.wait_for_end(process) == 0
-    assert process.output() == ''
+    assert 'Traceback' not in process.output()
+
+
+@pytest.mark.parametrize('number', [signal.SIGINT, signal.SIGTERM])
+def test_signal_at_the_end_of_the_interpreter_changes_nothing(ros: Workbench, number: int
+                                                              ) -> None:
+    # what a module holds goes when the interpreter has given up its handlers
+    program = (
+        'import os, sys\n'
+        'from koopman_ros.nodes.plant import PlantNode\n'
+        'from koopman_ros.nodes.process import run\n'
+        'class Late:\n'
+        f'    def __del__(self, kill=os.kill, own=(os.getpid(), {int(number)})):\n'
+        '        kill(*own)\n'
+        'late = Late()\n'
+        'def create():\n'
+        f'    os.kill(os.getpid(), {int(number)})\n'
+        '    return PlantNode()\n'
+        'sys.exit(run("plant", create))\n')
+    process = ros.start('plant', command=(sys.executable, '-c', program))
+    assert ros.wait_for_end(process) == 0
+    assert 'Traceback' not in process.output()
+
+
+def test_node_without_standard_streams_ends_cleanly(ros: Workbench, tmp_path: Path) -> None:
+    program = 'import sys; from koopman_ros.nodes.programs import trainer; sys.exit(trainer())'
+    process = ros.start('trainer', {'output': tmp_path / 'bag.mcap'}, command=(
+        'sh', '-c', 'exec "$@" <&- >&- 2>&-', 'sh', sys.executable, '-c', program))
+    ros.meet('trainer')
+    assert process.stop() == 0
+    assert summary(tmp_path / 'bag.mcap').complete
+
+
+def test_node_ends_with_its_parent_that_is_killed(ros: Workbench, tmp_path: Path) -> None:
+    program = (
+        'import time\n'
+        'from pathlib import Path\n'
+        'from koopman_ros.demo.processes import NodeProcess\n'
+        f'folder = Path({str(tmp_path)!r})\n'
+        'node = NodeProcess(\n'
+        '    "trainer", {"output": folder / "bag.mcap"}, folder / "child.log", {})\n'
+        'print(node.process.pid, flush=True)\n'
+        'time.sleep(60)\n')
+    parent = ros.start('parent', command=(sys.executable, '-c', program))
+    ros.meet('trainer')
+    child = int(parent.output())
+    assert parent.stop(signal.SIGKILL) == -signal.SIGKILL
+    deadline = time.monotonic() + TIMEOUT
+    while not _has_ended(child):
+        assert time.monotonic() < deadline
+        time.sleep(0.01)
+    assert summary(tmp_path / 'bag.mcap').complete
+
+
+def _has_ended(pid: int) -> bool:
+    try:
+        stat = Path(f'/proc/{pid}/stat').read_text()
+    except OSError:
+        return True
+    # nobody may be there who waits for it
+    return stat.rpartition(') ')[2][0] == 'Z'
+
+
+def test_middleware_that_hangs_with_the_lock_held_does_not_keep_a_process(ros: Workbench) -> None:
+    program = (
+        'import ctypes, os, signal, sys\n'
+        'from koopman_ros.nodes import process\n'
+        'from koopman_ros.nodes.plant import PlantNode\n'
+        'process._LAST_RESORT = 0.2\n'
+        'class Hanging(PlantNode):\n'
+        '    def destroy_node(self):\n'
+        '        ctypes.PyDLL(None).sleep(3600)\n'
+        'def create():\n'
+        '    os.kill(os.getpid(), signal.SIGTERM)\n'
+        '    return Hanging()\n'
+        'sys.exit(process.run("plant", create))\n')
+    process = ros.start('plant', command=(sys.executable, '-c', program))
+    assert ros.wait_for_end(process) == 0
+    assert 'in destroy_node' in process.output()
 
 
 def test_middleware_that_hangs_does_not_keep_a_process(ros: Workbench) -> None:
@@ -92,8 +186,104 @@ def test_middleware_that_hangs_does_not_keep_a_process(ros: Workbench) -> None:
         'sys.exit(run("plant", create))\n')
     process = ros.start('plant', command=(sys.executable, '-c', program))
     assert ros.wait_for_end(process) == 0
-    assert process.output() == (
-        'plant: the middleware does not shut down: left to the operating system\n')
+    assert process.output().splitlines()[-1] == (
+        'plant: the middleware does not shut down: left to the operating system')
+
+
+# The time that they are told.
+
+
+@pytest.mark.parametrize(('sec', 'nanosec'), [(-5, 0), (7, 4_000_000_000)])
+def test_impossible_time_does_not_end_a_node(ros: Workbench, sec: int, nanosec: int) -> None:
+    process = ros.start('controller', {'use_sim_time': True})
+    clock = ros.speak(Clock, '/clock', topics.CLOCK_QOS, to='controller')
+    message = Clock()
+    message.clock.sec, message.clock.nanosec = sec, nanosec
+
+    def told() -> bool:
+        clock.publish(message)
+        return 'which is no time: ignored' in process.output()
+
+    ros.wait_until(told)
+    ros.meet('controller')
+    # the true time is taken still
+    clock.publish(Clock(clock=stamp_message(3 * NANOSECONDS)))
+    ros.meet('controller')
+    assert process.output().count('is no time') == 1
+
+
+# Arguments.
+
+
+@pytest.mark.parametrize('name', ['plant', 'controller', 'trainer', 'player', 'replay'])
+def test_help_and_unknown_arguments(
+        name: str, capsys: pytest.CaptureFixture[str]) -> None:
+    assert command_line.answer(name, [name, '--ros-args', '-p', 'a:=1.0']) is None
+    assert command_line.answer(name, [name, '--help']) == 0
+    said = capsys.readouterr().out
+    assert said.startswith(f'usage: ros2 run koopman_ros {name} ')
+    assert 'exit codes: 0 ' in said
+    assert f'config/{name}.yaml' in said
+    assert all(f'\n  {row} ' in said for row in TABLES[name].rows)
+    # rules as in ROS 1, which rcl still takes
+    assert command_line.answer(name, [name, '__ns:=/unit']) is None
+    assert command_line.answer(name, [name, 'speed:=2.0', 'more']) == 2
+    assert capsys.readouterr().err == (
+        f"{name}: unknown argument 'speed:=2.0': parameters are given as --ros-args -p "
+        'name:=value; --help says more\n')
+
+
+def test_help_names_topics_of_the_loop() -> None:
+    for program in command_line.PROGRAMS.values():
+        for name in (*program.hears, *program.says):
+            assert name in topics.TYPES or 'parameter' in name
+
+
+@pytest.mark.parametrize(('argument', 'code'), [('--help', 0), ('--speed=2.0', 2)])
+def test_program_answers_arguments_before_it_starts(
+        ros: Workbench, argument: str, code: int) -> None:
+    program = 'import sys; from koopman_ros.nodes.programs import plant; sys.exit(plant())'
+    process = ros.start('plant', command=(sys.executable, '-c', program, argument))
+    assert ros.wait_for_end(process) == code
+    assert 'started' not in process.output()
+
+
+# Who can reach them.
+
+
+@pytest.mark.parametrize(('environment', 'is_open'), [
+    ({}, True),
+    ({'ROS_AUTOMATIC_DISCOVERY_RANGE': 'SUBNET'}, True),
+    ({'ROS_AUTOMATIC_DISCOVERY_RANGE': 'localhost'}, False),
+    ({'ROS_AUTOMATIC_DISCOVERY_RANGE': 'OFF'}, False),
+    ({'ROS_LOCALHOST_ONLY': '1'}, False),
+    ({'FASTRTPS_DEFAULT_PROFILES_FILE': '/somewhere/loopback_discovery.xml'}, False),
+    ({'FASTRTPS_DEFAULT_PROFILES_FILE': '/somewhere/other.xml'}, True),
+    ({'ROS_SECURITY_ENABLE': 'true', 'ROS_SECURITY_STRATEGY': 'Enforce'}, False),
+    ({'ROS_SECURITY_ENABLE': 'true', 'ROS_SECURITY_STRATEGY': 'Permissive'}, True),
+])
+def test_who_can_reach_a_node(environment: dict[str, str], is_open: bool) -> None:
+    note = open_to_the_network({**environment, 'ROS_DOMAIN_ID': '7'})
+    assert bool(note) == is_open
+    if is_open:
+        assert 'in ROS domain 7' in note
+        assert 'ROS_AUTOMATIC_DISCOVERY_RANGE=LOCALHOST' in note
+
+
+def test_node_that_is_open_to_the_network_says_so_once(
+        ros: Workbench) -> None:
+    # a node that believes itself open, on loopback
+    program = (
+        'import os, sys\n'
+        'from koopman_ros.nodes import process\n'
+        'from koopman_ros.nodes.plant import PlantNode\n'
+        'said = process.open_to_the_network\n'
+        'process.open_to_the_network = lambda _: said({})\n'
+        'sys.exit(process.run("plant", PlantNode))\n')
+    process = ros.start('plant', command=(sys.executable, '-c', program))
+    ros.meet('plant')
+    assert process.stop() == 0
+    assert process.output().count('can command this node') == 1
 
 
 # Bad starts.

@@ -20,6 +20,8 @@ from collections.abc import Iterator
 import os
 from pathlib import Path
 import signal
+import subprocess
+import sys
 import time
 
 from koopman_ros.nodes import training_job
@@ -95,7 +97,7 @@ def test_process_that_breaks_down(monkeypatch: pytest.MonkeyPatch) -> None:
     program = ('import sys; sys.stdin.readline(); print("hello"); print(\'{"progress": 0.5, \'); '
                'print(\'{"progress": 0.25, "text": "learning"}\', flush=True); '
                'raise RuntimeError("the core melts")')
-    monkeypatch.setattr(training_job, '_COMMAND', ('-c', program))
+    monkeypatch.setattr(training_job, '_command', lambda: (sys.executable, '-c', program))
     job = RetrainingJob({})
     *_, state = follow(job)
     assert state == JobState(
@@ -104,7 +106,8 @@ def test_process_that_breaks_down(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 def test_package_that_is_missing(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(training_job, '_COMMAND', ('-c', 'import no_such_torch'))
+    program = 'import no_such_torch'
+    monkeypatch.setattr(training_job, '_command', lambda: (sys.executable, '-c', program))
     job = RetrainingJob({})
     *_, state = follow(job)
     assert state.text == (
@@ -113,10 +116,42 @@ def test_package_that_is_missing(monkeypatch: pytest.MonkeyPatch) -> None:
     job.close()
 
 
+@pytest.mark.parametrize('word', ['starting', 'estimating'])
+def test_process_ends_with_its_parent_that_is_killed(
+        task: dict[str, object], tmp_path: Path, word: str) -> None:
+    program = (
+        'import sys, time\n'
+        'from koopman_ros.nodes.training_job import RetrainingJob\n'
+        f'job = RetrainingJob({task!r})\n'
+        f'while not job.poll().text.startswith({word!r}):\n'
+        '    time.sleep(0.01)\n'
+        'print(job._process.pid, flush=True)\n'
+        'time.sleep(60)\n')
+    with subprocess.Popen(
+            [sys.executable, '-c', program], stdout=subprocess.PIPE, text=True) as parent:
+        assert parent.stdout is not None
+        child = int(parent.stdout.readline())
+        parent.kill()
+    deadline = time.monotonic() + 1.0
+    while _running(child):
+        assert time.monotonic() < deadline
+        time.sleep(0.01)
+    assert list(tmp_path.iterdir()) == []
+
+
+def _running(pid: int) -> bool:
+    try:
+        state = Path(f'/proc/{pid}/stat').read_text().rpartition(')')[2].split()[0]
+    except FileNotFoundError:
+        return False
+    # one that nobody waits for stays as a zombie where the first process of a container sleeps
+    return state != 'Z'
+
+
 def test_process_that_does_not_end_is_killed(monkeypatch: pytest.MonkeyPatch) -> None:
     program = 'import signal, time; print(\'{"progress": 0.5, "text": "x"}\', flush=True); ' \
         'time.sleep(3600)'
-    monkeypatch.setattr(training_job, '_COMMAND', ('-c', program))
+    monkeypatch.setattr(training_job, '_command', lambda: (sys.executable, '-c', program))
     monkeypatch.setattr(training_job, '_PATIENCE', 0.2)
     job = RetrainingJob({})
     next(follow(job))

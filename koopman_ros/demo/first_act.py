@@ -1,0 +1,100 @@
+# Copyright 2026 The koopman_ros Authors
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""
+The demo: bring the reactor 10 K down with the learned lift, and with the linearisation.
+
+The disturbance observer is off, so that what is seen is what each model knows.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+import json
+from pathlib import Path
+import sys
+import time
+
+from koopman_ros.bags import summary
+from koopman_ros.demo.command import chosen_output, print_result, read_options
+from koopman_ros.demo.loop import LoopError, run_loop, Scenario
+from koopman_ros.demo.results import plot, read_run
+from koopman_ros.demo.table import LiveTable
+from koopman_ros.lifting import load
+from koopman_ros.nodes import topics
+from koopman_ros.nodes.controller_parameters import ControllerParameters
+from koopman_ros.nodes.shipped import model_path
+
+STEP = -10.0  # K
+LINEAR_MODEL = 'reactor_linear'
+
+
+def run_demo(output: Path, speed: float) -> dict[str, object]:
+    """
+    Run both loops and write bags, picture and summary.
+
+    :param output: folder for the results; what an earlier demo left there is replaced.
+    :param speed: simulated seconds per second of the learned loop, 0 for as fast as it can.
+    :return: the summary.
+    """
+    begin = time.monotonic()
+    parameters = ControllerParameters()
+    model = load(model_path(parameters.model))
+    scenario = Scenario(parameters.model, float(model.states.center[0]) + STEP, speed=speed)
+    logs = output / 'logs'
+    logs.mkdir(parents=True, exist_ok=True)
+    bags = [output / 'closed_loop.mcap', output / 'linearised.mcap']
+    for old in (*bags, output / 'closed_loop.png', output / 'summary.json'):
+        old.unlink(missing_ok=True)
+
+    with LiveTable(f'learned controller ({parameters.model}) without observer, set-point '
+                   f'{STEP:+.0f} K after {scenario.step_time:.0f} s') as table:
+        run_loop(scenario, bags[0], logs, table.show)
+    print('the same with the linearised controller ...', flush=True)
+    linear_scenario = replace(scenario, model=LINEAR_MODEL, speed=0.0)
+    run_loop(linear_scenario, bags[1], logs)
+
+    learned, linear = read_run(bags[0]), read_run(bags[1])
+    plot(output / 'closed_loop.png', learned, linear, scenario.setpoint, scenario.step_time,
+         model, parameters)
+    counts = summary(bags[0]).counts
+    result: dict[str, object] = {
+        'setpoint_kelvin': scenario.setpoint,
+        'final_error_kelvin': abs(learned.final_error(scenario.setpoint)),
+        'linear_final_error_kelvin': abs(linear.final_error(scenario.setpoint)),
+        'settling_time_seconds': learned.settling_time(scenario.setpoint, scenario.step_time),
+        'measurements': counts['/' + topics.TEMPERATURE],
+        'commands': counts['/' + topics.COOLANT_SETPOINT],
+        'bag_messages': sum(counts.values()),
+        'wall_seconds': round(time.monotonic() - begin, 3),
+    }
+    (output / 'summary.json').write_text(json.dumps(result, indent=2) + '\n')
+    return result
+
+
+def main(args: list[str] | None = None) -> int:
+    """Run the demo from the command line."""
+    options = read_options(args, __doc__, 'out/demo', 60.0)
+    try:
+        with chosen_output(options.output) as output:
+            result = run_demo(output, options.speed)
+    except (LoopError, OSError) as error:
+        print(f'demo: {error}', file=sys.stderr)
+        return 1
+    except KeyboardInterrupt:
+        print('demo: interrupted; what was recorded is kept', file=sys.stderr)
+        return 130
+    print_result(result)
+    print(f'wrote {output}/closed_loop.png, closed_loop.mcap and summary.json')
+    return 0

@@ -1,0 +1,222 @@
+# Copyright 2026 The koopman_ros Authors
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+
+"""
+The demo's second act: the plant drifts, and its controller learns it anew from its record.
+
+Plant, controller and trainer run as three processes in lock-step; none is stopped or restarted.
+The disturbance observer is off: it would make up for the drift, and for what a lift lacks.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+import json
+from pathlib import Path
+import shutil
+import sys
+import time
+
+from diagnostic_msgs.msg import DiagnosticStatus
+from koopman_ros.demo.command import chosen_output, print_result, read_options
+from koopman_ros.demo.loop import Loop, LoopError, running_loop, Scenario
+from koopman_ros.demo.retraining_results import plot, read_history, rollout_rmse
+from koopman_ros.demo.table import LiveTable
+from koopman_ros.lifting import load
+from koopman_ros.nodes import topics
+from koopman_ros.nodes.controller_parameters import ControllerParameters
+from koopman_ros.nodes.messages import NANOSECONDS
+from koopman_ros.nodes.plant_parameters import PlantParameters
+from koopman_ros.nodes.shipped import model_path
+from rcl_interfaces.srv import SetParameters
+from rclpy.parameter import Parameter
+from std_srvs.srv import SetBool, Trigger
+
+STEP = -10.0  # K
+FOULING = 0.8  # share of the heat transfer that is left
+NOISE = 0.1  # K
+_STEP_TIME = 60.0  # s of plant time
+_DRIFT_TIME = 360.0
+_EXPERIMENT_TIME = 960.0
+_EXPERIMENT_MINUTES = 45.0
+_AFTER = 960.0  # s of plant time from the reload to the end
+_TRAINING_TIMEOUT = 300.0  # s
+_EXPERIMENT_TIMEOUT = 600.0  # s
+_TASKS = {task: f'trainer: {task}' for task in ('experiment', 'training')}
+# What the fouled reactor bears; see the bounds of the experiment.
+_EXPERIMENT = {
+    'experiment_topic': topics.MANUAL_COOLANT_SETPOINT,
+    'experiment_duration': _EXPERIMENT_MINUTES, 'experiment_coolant_min': 5.5,
+    'experiment_coolant_max': 20.5, 'experiment_hold_max': 3.0, 'safe_coolant': 13.0,
+    'experiment_seed': 1,
+}
+
+
+@dataclass
+class Story:
+    """
+    What happens when, in seconds of plant time since the first measurement.
+
+    :param phases: name and start of each phase.
+    """
+
+    phases: list[tuple[str, float]] = field(default_factory=list)
+
+    def start_of(self, name: str) -> float:
+        """Return when a phase began."""
+        return dict(self.phases)[name]
+
+
+def run_retraining(output: Path, speed: float) -> dict[str, object]:
+    """
+    Run the loop through drift, experiment, training and reload; write picture and summary.
+
+    :param output: folder for the results; what an earlier run left there is replaced.
+    :param speed: simulated seconds per second.
+    :return: the summary.
+    """
+    begin = time.monotonic()
+    if output.exists():
+        shutil.rmtree(output)
+    logs = output / 'logs'
+    logs.mkdir(parents=True)
+    parameters = ControllerParameters()
+    present = load(model_path(parameters.model))
+    setpoint = float(present.states.center[0]) + STEP
+    scenario = Scenario(parameters.model, setpoint, step_time=_STEP_TIME, duration=0.0,
+                        speed=speed, plant={'noise': NOISE})
+    bags = [output / 'before.mcap', output / 'after.mcap']
+    new_model = output / 'retrained.safetensors'
+    story = Story()
+    table = LiveTable('a controller without observer learns its plant anew', row_period=300.0)
+    trainer = {'output': bags[0], 'model_output': new_model, **_EXPERIMENT}
+    with table, running_loop(scenario, logs, trainer, table.show) as loop:
+        _Actor(loop, table, story).act(bags[1], new_model)
+    drifted = PlantParameters(heat_transfer_coefficient=FOULING * PlantParameters(
+        ).heat_transfer_coefficient)
+    history = read_history(bags)
+    learned = load(new_model)
+    trained = json.loads(new_model.with_suffix('.json').read_text())
+    plot(output / 'retraining.png', history, story.phases, setpoint, present, learned, parameters)
+    reload = story.start_of('new lift')
+    result: dict[str, object] = {
+        'setpoint_kelvin': setpoint,
+        'heat_transfer_left': FOULING,
+        'noise_kelvin': NOISE,
+        'offset_before_kelvin': history.offset(setpoint, _EXPERIMENT_TIME),
+        'offset_after_kelvin': history.offset(setpoint, reload + _AFTER),
+        'heldout_rw': trained['heldout_rw'],
+        'heldout_error_kelvin': trained['heldout_error_kelvin'],
+        'rollout_rmse_kelvin': rollout_rmse(learned, drifted),
+        'max_coolant_step_before_kelvin': history.largest_step(reload - 120.0, reload - 30.0),
+        'max_coolant_step_at_reload_kelvin': history.largest_step(reload - 30.0, reload + 60.0),
+        'derivative_method': trained['derivative_method'],
+        'wall_seconds': round(time.monotonic() - begin, 3),
+    }
+    (output / 'summary.json').write_text(json.dumps(result, indent=2) + '\n')
+    return result
+
+
+@dataclass
+class _Actor:
+    """The operator's hands."""
+
+    loop: Loop
+    table: LiveTable
+    story: Story
+
+    def act(self, second_bag: Path, new_model: Path) -> None:
+        loop = self.loop
+        for node in ('plant', 'controller', 'trainer'):
+            loop.meet(SetParameters, f'{node}/set_parameters')
+        for service in ('controller/set_automatic', 'trainer/record', 'trainer/experiment'):
+            loop.meet(SetBool, service)
+        loop.meet(Trigger, 'trainer/train')
+        self._begin('shipped lift', 'set-point step of -10 K with the shipped lift')
+        loop.run_until(_DRIFT_TIME)
+        heat_transfer = FOULING * PlantParameters().heat_transfer_coefficient
+        self._set('plant', heat_transfer_coefficient=heat_transfer)
+        self._begin('fouling', 'the cooling jacket fouls: a fifth of its heat transfer is lost')
+        # a new bag, so that the plant as it was is not among the data
+        self._switch('trainer/record', False)
+        self._set('trainer', output=str(second_bag))
+        self._switch('trainer/record', True)
+        loop.run_until(_EXPERIMENT_TIME)
+        self._switch('controller/set_automatic', False)
+        self._switch('trainer/experiment', True)
+        self._begin('experiment', f'manual mode: random steps for {_EXPERIMENT_MINUTES:.0f} min')
+        self._wait_for('experiment', 'finished', _EXPERIMENT_TIMEOUT)
+        self._switch('trainer/experiment', False)
+        self._switch('controller/set_automatic', True)
+        self._begin('training', 'automatic mode again; a lift is learned from the recording')
+        self._checked('trainer/train', Trigger.Request())
+        status = self._wait_for('training', 'the new lift is', _TRAINING_TIMEOUT)
+        self.table.announce(status.message)
+        if not new_model.exists():
+            raise LoopError(status.message)
+        self._set('controller', model=str(new_model.resolve()))
+        self._begin('new lift', 'the controller has taken the new lift over')
+        loop.run_until(self.story.start_of('new lift') + _AFTER)
+
+    def _begin(self, name: str, text: str) -> None:
+        operator = self.loop.operator
+        now = (operator.last_stamp_ns - operator.scenario.first_stamp_ns) / NANOSECONDS
+        self.story.phases.append((name, max(0.0, now)))
+        self.table.announce(text)
+
+    def _wait_for(self, task: str, words: str, timeout: float) -> DiagnosticStatus:
+        """Wait until a task of the trainer says so."""
+        def said() -> DiagnosticStatus | None:
+            status = self.loop.operator.statuses.get(_TASKS[task])
+            if status is not None and status.level == DiagnosticStatus.ERROR:
+                raise LoopError(f'{task}: {status.message}')
+            return status if status is not None and status.message.startswith(words) else None
+
+        status = self.loop.wait(said, timeout, f'the {task} did not end')
+        assert status is not None
+        return status
+
+    def _switch(self, service: str, on: bool) -> None:
+        self._checked(service, SetBool.Request(data=on))
+
+    def _checked(self, service: str, request: object) -> None:
+        response = self.loop.call(service, request)
+        if not response.success:
+            raise LoopError(f'{service}: {response.message}')
+
+    def _set(self, node: str, **values: object) -> None:
+        request = SetParameters.Request(parameters=[
+            Parameter(name, value=value).to_parameter_msg() for name, value in values.items()])
+        for result in self.loop.call(f'{node}/set_parameters', request).results:
+            if not result.successful:
+                raise LoopError(f'{node}: {result.reason}')
+
+
+def main(args: list[str] | None = None) -> int:
+    """Run the second act from the command line."""
+    options = read_options(args, __doc__, 'out/demo-retrain', 120.0)
+    try:
+        with chosen_output(options.output) as output:
+            result = run_retraining(output, options.speed)
+    except (LoopError, OSError, ValueError) as error:
+        print(f'demo: {error}', file=sys.stderr)
+        return 1
+    except KeyboardInterrupt:
+        print('demo: interrupted; what was recorded is kept', file=sys.stderr)
+        return 130
+    print_result(result)
+    print(f'wrote {output}/retraining.png, before.mcap, after.mcap, '
+          'retrained.safetensors with its report, and summary.json')
+    return 0

@@ -1,0 +1,121 @@
+# Copyright 2026 The koopman_ros Authors
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""What a program of the package says to arguments that are not ROS's."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+import sys
+
+from koopman_ros.nodes import topics
+from rclpy.utilities import remove_ros_args
+
+_UNKNOWN = 2  # exit code, that of argparse
+
+
+@dataclass(frozen=True)
+class _Program:
+    """
+    What the help says of a program.
+
+    :param does: a sentence.
+    :param hears: topics it subscribes to.
+    :param says: topics it publishes.
+    :param codes: meaning of its exit codes.
+    """
+
+    does: str
+    hears: tuple[str, ...]
+    says: tuple[str, ...]
+    codes: str
+
+
+_NODE_CODES = '0 after a signal, 1 when it cannot start, 2 for an unknown argument'
+_LOOP = (topics.TEMPERATURE, topics.SETPOINT)
+PROGRAMS = {
+    'plant': _Program(
+        'Simulates the reactor: publishes its temperature and takes a coolant temperature.',
+        (topics.COOLANT_SETPOINT,),
+        (topics.TEMPERATURE, topics.COOLANT_TEMPERATURE, topics.CONCENTRATION, topics.CLOCK,
+         topics.DIAGNOSTICS), _NODE_CODES),
+    'controller': _Program(
+        'Answers each measured temperature with a coolant set-point, by a learned model.',
+        (*_LOOP, topics.COOLANT_TEMPERATURE, topics.MANUAL_COOLANT_SETPOINT),
+        (topics.COOLANT_SETPOINT, topics.ACTIVE_SETPOINT, topics.PREDICTED_TEMPERATURE,
+         topics.CONTROLLER_STATE, topics.DIAGNOSTICS), _NODE_CODES),
+    'trainer': _Program(
+        'Records the loop to MCAP bags, excites the plant, and learns models from bags.',
+        ('those of the parameter topics',),
+        ('that of the parameter experiment_topic', topics.DIAGNOSTICS),
+        f'{_NODE_CODES}; with task:=train 0 for an accepted model, 2 for a refused one, 1 for a '
+        'failure'),
+    'player': _Program(
+        'Publishes the measurements and set-points of a bag again, by the clock or in lock-step.',
+        (topics.COOLANT_SETPOINT,), ('those of the parameter topics',),
+        '0 when all was played or after a signal, 1 when it cannot start or go on, 2 for an '
+        'unknown argument'),
+    'replay': _Program(
+        'Runs bags through the control step, offline, with the old model and a new one.',
+        (), (), '0 when the recorded commands are reproduced, 1 when not or when it cannot run, 2 '
+        'for an unknown argument, 130 when interrupted'),
+}
+
+
+def answer(name: str, args: list[str] | None) -> int | None:
+    """
+    Print the help that is asked for, or refuse what is not ROS's.
+
+    :param name: of the program.
+    :param args: command line, or None for the process's own.
+    :return: exit code, or None for a program that is to run.
+    """
+    try:
+        rest = remove_ros_args(args)[1:]
+    except RuntimeError:
+        # the start says what is wrong with them
+        return None
+    if not rest:
+        return None
+    if '--help' in rest or '-h' in rest:
+        print(help_text(name))
+        return 0
+    print(f'{name}: unknown argument {rest[0][:100]!r}: parameters are given as --ros-args -p '
+          'name:=value; --help says more', file=sys.stderr)
+    return _UNKNOWN
+
+
+def help_text(name: str) -> str:
+    """Return what `--help` prints."""
+    # it imports the tables of all nodes
+    from koopman_ros.nodes.parameter_files import TABLES
+    from koopman_ros.nodes.shipped import config_directory
+
+    program = PROGRAMS[name]
+    rows = TABLES[name].rows.values()
+    width = max(len(row.name) for row in rows)
+    parameters = '\n'.join(
+        f'  {row.name:{width}}  {row.description}' + (f' [{row.unit}]' if row.unit else '')
+        for row in rows)
+    lists = ''.join(f'{title}: {", ".join(names)}\n' for title, names in (
+        ('subscribes to', program.hears), ('publishes', program.says)) if names)
+    return f"""\
+usage: ros2 run koopman_ros {name} [--ros-args [-p name:=value ...] [--params-file file] ...]
+
+{program.does}
+
+{lists}exit codes: {program.codes}
+
+Parameters, whose defaults and ranges are in {config_directory() / f'{name}.yaml'}:
+{parameters}"""

@@ -1,0 +1,149 @@
+# Copyright 2026 The koopman_ros Authors
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""
+First steps of a program, before anything large is loaded: signals, standard streams, parent.
+
+Until a program runs this, a signal does what Python does with it: in the interpreter's own first
+tens of milliseconds an interrupt ends it with SIGINT or a traceback. A child that is started by
+:func:`command` and :func:`blocked_signals` has no such time.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+import contextlib
+import ctypes
+import importlib
+import os
+import signal
+import sys
+import threading
+import time
+from types import FrameType
+
+SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
+
+_PR_SET_PDEATHSIG = 1  # of prctl(2)
+_QUIET = 1.0  # s after an interrupt in which another one is the same
+
+
+def run_program(module: str, interrupted: int) -> int:
+    """
+    Load a module and run its `main`, whatever signals come meanwhile.
+
+    :param module: name of the module, whose `main` takes no argument and returns the exit code.
+    :param interrupted: exit code when a signal ends it that `main` does not handle itself.
+    :return: the exit code.
+    """
+    open_standard_streams()
+    # numpy, scipy and rclpy take half a second, in which there is nothing to complete
+    for number in SIGNALS:
+        signal.signal(number, lambda *_: os._exit(interrupted))
+    main = importlib.import_module(module).main
+    _raise_interrupts()
+    try:
+        code: int = main()
+        return code
+    except KeyboardInterrupt:
+        return interrupted
+    finally:
+        ignore_signals()
+
+
+def open_standard_streams() -> None:
+    """
+    Open what is closed of the three standard streams, to nowhere.
+
+    The next file or socket would take its number, and what a library prints would go there.
+    """
+    for number, name in enumerate(('stdin', 'stdout', 'stderr')):
+        try:
+            os.fstat(number)
+        except OSError:
+            # takes the lowest free number, which is this one
+            os.open(os.devnull, os.O_RDWR)
+        if getattr(sys, name) is None:
+            stream = os.fdopen(number, 'r' if number == 0 else 'w', closefd=False)
+            setattr(sys, name, stream)
+            setattr(sys, f'__{name}__', stream)
+
+
+def ignore_signals() -> None:
+    """Ignore further signals: the interpreter gives up its handlers before it has ended."""
+    for number in SIGNALS:
+        signal.signal(number, signal.SIG_IGN)
+
+
+def _raise_interrupts() -> None:
+    last = -_QUIET
+
+    def interrupt(_: int, __: FrameType | None) -> None:
+        nonlocal last
+        # a second one would end in the middle what the first has made to end
+        if time.monotonic() - last >= _QUIET:
+            last = time.monotonic()
+            raise KeyboardInterrupt
+
+    for number in SIGNALS:
+        signal.signal(number, interrupt)
+
+
+def command(module: str, number: int, interrupted: int) -> tuple[str, ...]:
+    """
+    Return the command line of a child that does not outlive this process.
+
+    :param module: as for :func:`run_program`; its arguments follow.
+    :param number: signal that the child gets when this process ends, however it ends.
+    :param interrupted: as for :func:`run_program`.
+    """
+    # the signal comes when the thread ends that started the child
+    parent = os.getpid() if threading.current_thread() is threading.main_thread() else 0
+    return (sys.executable, '-m', 'koopman_ros.startup', str(parent), str(int(number)),
+            str(interrupted), module)
+
+
+@contextlib.contextmanager
+def blocked_signals() -> Iterator[None]:
+    """Block signals in a child started meanwhile, until it handles them."""
+    before = signal.pthread_sigmask(signal.SIG_BLOCK, SIGNALS)
+    try:
+        yield
+    finally:
+        signal.pthread_sigmask(signal.SIG_SETMASK, before)
+
+
+def _end_with_parent(parent: int, number: int) -> None:
+    libc = ctypes.CDLL(None)
+    if not parent or not hasattr(libc, 'prctl'):
+        return
+    libc.prctl(_PR_SET_PDEATHSIG, number, 0, 0, 0)
+    if os.getppid() != parent:
+        # it has ended before
+        os._exit(0)
+
+
+def main() -> int:
+    """Run a child; see :func:`command`."""
+    parent, number, interrupted, module, *arguments = sys.argv[1:]
+    _end_with_parent(int(parent), int(number))
+    sys.argv = [module, *arguments]
+    for blocked in SIGNALS:
+        signal.signal(blocked, lambda *_: os._exit(int(interrupted)))
+    signal.pthread_sigmask(signal.SIG_UNBLOCK, SIGNALS)
+    return run_program(module, int(interrupted))
+
+
+if __name__ == '__main__':
+    sys.exit(main())
