@@ -26,7 +26,9 @@ from koopman_ros.nodes.arrival import Arrival
 from koopman_ros.nodes.controller_parameters import ControllerParameters, TABLE
 from koopman_ros.nodes.controller_status import Counts, internals, Situation, status
 from koopman_ros.nodes.diagnostics import DiagnosticsPublisher, Status
+from koopman_ros.nodes.matching import Matching
 from koopman_ros.nodes.messages import (
+    LONGEST_FRAME_ID,
     NANOSECONDS,
     stamp_message,
     stamp_nanoseconds,
@@ -82,8 +84,10 @@ class ControllerNode(LoopNode):
         self._waiting: list[Temperature] = []  # measurements that came before the coolant
         self._patience: Timer | None = None
         self._frame_id = ''
+        self._frame_length = 0  # of the last measurement's, where it is too long
 
-        self._commands = self.create_publisher(
+        self._matching = Matching(self, self._on_neighbours)
+        self._commands = self._matching.publish(
             Temperature, topics.COOLANT_SETPOINT, topics.LOOP_QOS)
         self._active = self.create_publisher(
             Temperature, topics.ACTIVE_SETPOINT, topics.LATCHED_QOS)
@@ -94,14 +98,14 @@ class ControllerNode(LoopNode):
         self._published_setpoint: float | None = None
         self._diagnostics = DiagnosticsPublisher(self, 'control', 'controller', self._status)
         # volatile, so that `ros2 topic pub` matches
-        self.create_subscription(
+        self._matching.subscribe(
             Temperature, topics.SETPOINT, self._on_setpoint, topics.LOOP_QOS)
-        self.create_subscription(Temperature, topics.MANUAL_COOLANT_SETPOINT,
+        self._matching.subscribe(Temperature, topics.MANUAL_COOLANT_SETPOINT,
                                  self._on_manual_coolant_setpoint, topics.LOOP_QOS)
-        self._coolants = self.create_subscription(
+        self._coolants = self._matching.subscribe(
             Temperature, topics.COOLANT_TEMPERATURE, self._on_coolant, topics.LATCHED_QOS)
         # a sensor driver that publishes best effort needs this overridden to match
-        self._measurements = self.create_subscription(
+        self._measurements = self._matching.subscribe(
             Temperature, topics.TEMPERATURE, self._on_temperature, topics.LOOP_QOS,
             qos_overriding_options=QoSOverridingOptions.with_default_policies())
         self.create_service(SetBool, '~/set_automatic', self._on_set_automatic)
@@ -141,6 +145,8 @@ class ControllerNode(LoopNode):
                 and self.count_publishers(self._coolants.topic_name) > 0)
 
     def _on_coolant(self, message: Temperature) -> None:
+        # only value and stamp are kept
+        message.header.frame_id = ''
         self._coolant = message
         if self._waiting:
             self._answer_waiting()
@@ -154,6 +160,9 @@ class ControllerNode(LoopNode):
 
     def _answer(self, message: Temperature) -> None:
         stamp_ns, arrived = stamp_nanoseconds(message.header.stamp), self._arrival.now()
+        frame_id = message.header.frame_id
+        self._frame_id = frame_id[:LONGEST_FRAME_ID]
+        self._frame_length = len(frame_id) if len(frame_id) > LONGEST_FRAME_ID else 0
         for _ in range(_ATTEMPTS):
             before = state = self._state
             if state.command is None and self._coolant is not None:
@@ -166,7 +175,7 @@ class ControllerNode(LoopNode):
                     continue
                 self._state = state
                 self._commands.publish(temperature_message(
-                    command, message.header.stamp, message.header.frame_id))
+                    command, message.header.stamp, self._frame_id))
                 if stamp_ns != before.time_ns:
                     self._arrival.note(stamp_ns, arrived)
                 self._arrival.answered()
@@ -177,7 +186,6 @@ class ControllerNode(LoopNode):
                 'waits: choose a smaller model', throttle_duration_sec=1.0)
             return
         self._temperature = message.temperature
-        self._frame_id = message.header.frame_id
         self._counts.measurements += 1
         self._counts.late += report.late
         self._counts.missed += report.missed
@@ -329,10 +337,20 @@ class ControllerNode(LoopNode):
             self.get_logger().warning(self._rivals.complaint)
         self._diagnostics.publish_if_changed()
 
+    def _on_neighbours(self) -> None:
+        self._diagnostics.publish_if_changed()
+
+    def _complaint(self) -> str:
+        """Return what is wrong around the node, or an empty string."""
+        frame = (f'the frame_id of the measurement has {self._frame_length} characters, of which '
+                 f'{LONGEST_FRAME_ID} are passed on: shorten it at the sensor'
+                 ) if self._frame_length else ''
+        return self._rivals.complaint or self._matching.complaint or frame
+
     def _status(self) -> Status:
         return status(Situation(
             self._controller, self._settings, self._state, self._report, self._counts,
-            self._arrival, self._rivals.complaint, self._refused, self._models.refused,
+            self._arrival, self._complaint(), self._refused, self._models.refused,
             self._models.figures(), self._temperature))
 
 

@@ -17,6 +17,7 @@
 from __future__ import annotations
 
 from koopman_ros.nodes import topics
+from koopman_ros.nodes.matching import Matching
 from koopman_ros.nodes.messages import stamp_message, temperature_message
 from koopman_ros.nodes.plant_parameters import PlantParameters
 from koopman_ros.plants import in_steps, Process, sensor_noise
@@ -32,19 +33,20 @@ class Instruments:
     Publish the measurements of a plant.
 
     :param node: the plant.
+    :param matching: makes the publishers that the loop hears.
     :param clock: whether to publish the time, too.
     :param concentration: whether the plant has a concentration, as its first state.
     """
 
-    def __init__(self, node: Node, clock: bool, concentration: bool) -> None:
+    def __init__(self, node: Node, matching: Matching, clock: bool, concentration: bool) -> None:
         self._clock = node.create_publisher(
             Clock, topics.CLOCK, topics.CLOCK_QOS) if clock else None
         self._concentration = node.create_publisher(
             JointState, topics.CONCENTRATION, topics.LOOP_QOS) if concentration else None
         # the temperature last: who has found it has found the coolant, too
-        self._coolant = node.create_publisher(
+        self._coolant = matching.publish(
             Temperature, topics.COOLANT_TEMPERATURE, topics.LATCHED_QOS)
-        self._temperature = node.create_publisher(
+        self._temperature = matching.publish(
             Temperature, topics.TEMPERATURE, topics.LOOP_QOS)
 
     @property

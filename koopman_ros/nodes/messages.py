@@ -22,6 +22,8 @@ from sensor_msgs.msg import Temperature
 NANOSECONDS = 1_000_000_000
 SECONDS_PER_MINUTE = 60.0
 ZERO_CELSIUS = 273.15  # K
+LAST_STAMP_SECONDS = 2 ** 31 - 1  # of a stamp, whose seconds are an int32
+LONGEST_FRAME_ID = 256  # characters that are passed on
 
 
 def to_kelvin(celsius: float) -> float:
@@ -45,9 +47,20 @@ def stamp_nanoseconds(stamp: Time) -> int:
 
 
 def stamp_message(nanoseconds: int) -> Time:
-    """Return integer nanoseconds as a stamp."""
+    """Return integer nanoseconds as a stamp, the nearest one when none holds them."""
     seconds, rest = divmod(nanoseconds, NANOSECONDS)
+    if seconds > LAST_STAMP_SECONDS:
+        return Time(sec=LAST_STAMP_SECONDS, nanosec=NANOSECONDS - 1)
+    if seconds < -LAST_STAMP_SECONDS - 1:
+        return Time(sec=-LAST_STAMP_SECONDS - 1, nanosec=0)
     return Time(sec=seconds, nanosec=rest)
+
+
+def seconds_text(nanoseconds: int) -> str:
+    """Write integer nanoseconds in seconds, with all digits, e.g. '1700000000.25'."""
+    seconds, rest = divmod(abs(nanoseconds), NANOSECONDS)
+    sign = '-' if nanoseconds < 0 else ''
+    return f'{sign}{seconds}.{rest:09d}'.rstrip('0').rstrip('.')
 
 
 def temperature_message(kelvin: float, stamp: Time, frame_id: str, variance: float = 0.0

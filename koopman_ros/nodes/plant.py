@@ -26,7 +26,15 @@ from typing import Any
 from koopman_ros.nodes import topics
 from koopman_ros.nodes.diagnostics import DiagnosticsPublisher, Level, Status
 from koopman_ros.nodes.instruments import Instruments
-from koopman_ros.nodes.messages import NANOSECONDS, stamp_nanoseconds, to_celsius, to_kelvin
+from koopman_ros.nodes.matching import Matching
+from koopman_ros.nodes.messages import (
+    LAST_STAMP_SECONDS,
+    NANOSECONDS,
+    seconds_text,
+    stamp_nanoseconds,
+    to_celsius,
+    to_kelvin,
+)
 from koopman_ros.nodes.plant_parameters import PlantParameters, TABLE
 from koopman_ros.nodes.process import LoopNode, run
 from koopman_ros.nodes.rivals import Rivals
@@ -46,6 +54,7 @@ from std_srvs.srv import Trigger
 
 _REACTORS = {'one_state': one_state_reactor, 'two_state': two_state_reactor}
 _POLL_PERIOD = 0.01  # s; for what no message announces
+_LAST_STAMP_NS = (LAST_STAMP_SECONDS + 1) * NANOSECONDS - 1
 _SILENCE = 3.0  # s without a command, and five periods, after which somebody should know
 
 
@@ -55,7 +64,14 @@ class Phase(Enum):
     WAITING = 'waiting for the loop: no controller yet'
     RUNNING = 'running'
     FINISHED = 'finished: the duration is over'
+    OUT_OF_STAMPS = (f'finished: the stamps of messages end at {LAST_STAMP_SECONDS} s; start the '
+                     'plant again with a smaller start_time')
     TRIPPED = 'stopped'
+
+    @property
+    def is_over(self) -> bool:
+        """Whether the plant stands still for good."""
+        return self in (Phase.FINISHED, Phase.OUT_OF_STAMPS)
 
 
 class PlantNode(LoopNode):
@@ -80,17 +96,17 @@ class PlantNode(LoopNode):
         self._wall_start = self._wall_published = time.monotonic()
 
         # the subscription first: a controller that hears the measurement has then seen it, too
-        self._command_subscription = self.create_subscription(
+        self._matching = Matching(self, self._on_neighbours)
+        self._command_subscription = self._matching.subscribe(
             Temperature, topics.COOLANT_SETPOINT, self._on_command, topics.LOOP_QOS)
         self._instruments = Instruments(
-            self, clock=parameters.publish_clock and not self._real_time,
+            self, self._matching, clock=parameters.publish_clock and not self._real_time,
             concentration=system.n_x == 2)
         self._diagnostics = DiagnosticsPublisher(
             self, 'simulation', parameters.reactor, self._status)
         self._rivals = Rivals(
             self, {topics.COOLANT_SETPOINT: 'command the coolant',
-                   topics.TEMPERATURE: 'publish the temperature'},
-            self._diagnostics.publish_if_changed)
+                   topics.TEMPERATURE: 'publish the temperature'}, self._on_neighbours)
         self.create_service(Trigger, '~/reset', self._on_reset)
         # simulated time comes from here, so nothing in here may wait for it
         wall_clock = Clock(clock_type=ClockType.STEADY_TIME)
@@ -102,6 +118,18 @@ class PlantNode(LoopNode):
         else:
             self.create_timer(wall_period, self._step_in_time, clock=wall_clock)
         TABLE.follow(self, parameters, self._on_parameters)
+        self.get_logger().info(self._started())
+
+    def _started(self) -> str:
+        """Say what starts, for the log."""
+        settings = self._settings
+        pace = ('as fast as it can' if not settings.speed else 'in real time' if self._real_time
+                else f'{settings.speed:g} times as fast as the clock')
+        start = '' if self._real_time else f' from {seconds_text(self._start_ns)} s on'
+        lockstep = (f', in lock-step: it begins with {settings.lockstep_subscribers} subscribers '
+                    'and a controller') if settings.lockstep else ''
+        return (f'{settings.reactor} reactor started: a measurement every '
+                f'{settings.sample_period:g} s{start}, {pace}{lockstep}')
 
     def _build(self, parameters: PlantParameters) -> ControlAffineSystem:
         """Build the reactor, which starts from its steady state if it has one."""
@@ -170,7 +198,7 @@ class PlantNode(LoopNode):
             self._missed += 1
             self._waiting_in_vain = True
             self.get_logger().warning(
-                f'no command for the measurement at {self._process.time_ns / NANOSECONDS:.3f} s '
+                f'no command for the measurement at {seconds_text(self._process.time_ns)} s '
                 f'within {self._settings.lockstep_timeout} s: the last one is held',
                 throttle_duration_sec=10.0)
             self._answered = True
@@ -193,6 +221,11 @@ class PlantNode(LoopNode):
         duration_ns = round(self._settings.duration * NANOSECONDS)
         if duration_ns and instant > self._start_ns + duration_ns:
             self._phase = Phase.FINISHED
+            self._diagnostics.publish_if_changed()
+            return
+        if instant > _LAST_STAMP_NS:
+            self._phase = Phase.OUT_OF_STAMPS
+            self.get_logger().error(self._phase.value)
             self._diagnostics.publish_if_changed()
             return
         if not self._advance(instant):
@@ -251,9 +284,10 @@ class PlantNode(LoopNode):
 
     def _on_reset(self, _: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
         """Put the reactor back to its initial state; time goes on."""
-        response.success = self._phase is not Phase.FINISHED
+        response.success = not self._phase.is_over
         if not response.success:
-            response.message = 'the duration is over: start the plant again'
+            response.message = ('the duration is over: start the plant again'
+                                if self._phase is Phase.FINISHED else self._phase.value)
             return response
         self._plant = self._initial(self._process.system, self._process.time_ns)
         fresh = self._process
@@ -286,21 +320,26 @@ class PlantNode(LoopNode):
             parameters.constants(), nominal_state=self._process.system.nominal_state))
         self._plant = replace(self._plant, actuator=parameters.actuator())
 
+    def _on_neighbours(self) -> None:
+        self._diagnostics.publish_if_changed()
+
     def _status(self) -> Status:
         level, message = Level.OK, self._phase.value
         if self._phase is Phase.TRIPPED:
             level, message = Level.ERROR, f'stopped: {self._trip}; call ~/reset'
+        elif self._phase is Phase.OUT_OF_STAMPS:
+            level = Level.ERROR
         elif self._rejection:
             level, message = Level.WARN, self._rejection
-        elif self._rivals.complaint:
-            level, message = Level.WARN, self._rivals.complaint
+        elif complaint := self._rivals.complaint or self._matching.complaint:
+            level, message = Level.WARN, complaint
         elif self._phase is Phase.WAITING:
             level = Level.WARN
         elif self._unanswered():
             level, message = Level.WARN, (
                 'running, but no command arrives: the last one is held; is the controller alive?')
         return Status(level, message, {
-            'time [s]': self._process.time_ns / NANOSECONDS,
+            'time [s]': seconds_text(self._process.time_ns),
             'temperature [degC]': to_celsius(float(self._process.x[-1])),
             'coolant [degC]': to_celsius(float(self._process.u[0])),
             'coolant command [degC]': to_celsius(float(self._plant.command[0])),

@@ -19,7 +19,7 @@ from __future__ import annotations
 from dataclasses import dataclass, fields
 from typing import Any
 
-from koopman_ros.nodes.messages import to_kelvin
+from koopman_ros.nodes.messages import LAST_STAMP_SECONDS, LONGEST_FRAME_ID, to_kelvin
 from koopman_ros.nodes.parameters import parameter, ParameterTable
 from koopman_ros.plants import Actuator, ReactorParameters
 
@@ -73,7 +73,7 @@ class PlantParameters:
         minimum=0.0, maximum=1e9, read_only=True)
     start_time: float = parameter(
         1.0, 'time of the first measurement when not in real time', unit='s', minimum=1e-3,
-        maximum=4e9, read_only=True)
+        maximum=LAST_STAMP_SECONDS, read_only=True)
     publish_clock: bool = parameter(
         True, 'publish /clock when not in real time', read_only=True)
     frame_id: str = parameter(
@@ -127,6 +127,13 @@ def _cross_check(values: PlantParameters) -> str:
     if not values.coolant_min < values.coolant_max:
         return (f'coolant_min = {values.coolant_min} degC must be below coolant_max = '
                 f'{values.coolant_max} degC')
+    if values.start_time + values.duration > LAST_STAMP_SECONDS:
+        return (f'start_time + duration = {values.start_time + values.duration:.10g} s must be at '
+                f'most {LAST_STAMP_SECONDS} s, where the stamps of messages end: choose a smaller '
+                'start_time')
+    if len(values.frame_id) > LONGEST_FRAME_ID:
+        return (f'frame_id has {len(values.frame_id)} characters, must have at most '
+                f'{LONGEST_FRAME_ID}: shorten it')
     return ''
 
 

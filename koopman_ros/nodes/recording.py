@@ -99,9 +99,7 @@ class Recording:
         recorder = self._end()
         if self._problem:
             raise OSError(self._problem)
-        said = f'recorded {sum(recorder.counts.values())} messages to {recorder.path}'
-        self._node.get_logger().info(said)
-        return said
+        return self._counted(recorder)
 
     def flushed(self) -> str:
         """Return the path of the present or the last bag with all of it on disk, or ''."""
@@ -110,9 +108,16 @@ class Recording:
         return self._path
 
     def complete(self) -> None:
-        """Complete the bag, if there is one, with all that has arrived; publishes nothing."""
+        """Complete the bag, if there is one, with all that has arrived, and say what it holds."""
         if self._recorder is not None:
-            self._end()
+            recorder = self._end()
+            if not self._problem:
+                self._counted(recorder)
+
+    def _counted(self, recorder: Recorder) -> str:
+        said = f'recorded {sum(recorder.counts.values())} messages to {recorder.path}'
+        self._node.get_logger().info(said)
+        return said
 
     def _end(self) -> Recorder:
         assert self._recorder is not None

@@ -18,6 +18,8 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 
+from koopman_ros.nodes import topics
+from koopman_ros.nodes.matching import node_name, type_name
 from rclpy.clock import Clock, ClockType
 from rclpy.node import Node
 
@@ -29,7 +31,7 @@ class Rivals:
     Watch topics for more than one publisher.
 
     :param node: that watches.
-    :param what: by topic, what a publisher of it does, e.g. 'command the coolant'.
+    :param what: by topic of the loop, what a publisher of it does, e.g. 'command the coolant'.
     :param on_change: called when there are some, others, or none any more.
     """
 
@@ -49,9 +51,10 @@ class Rivals:
 
     def _complaint(self, topic: str) -> str:
         """Return who publishes a topic if there are several, or an empty string."""
-        publishers = self._node.get_publishers_info_by_topic(topic)
-        names = sorted(f'{info.node_namespace.rstrip("/")}/{info.node_name}'
-                       for info in publishers)
+        # who publishes something else there is no rival
+        publishers = [info for info in self._node.get_publishers_info_by_topic(topic)
+                      if info.topic_type == type_name(topics.TYPES[topic])]
+        names = sorted(map(node_name, publishers))
         # publishers, not names: a node may have been started twice under the same
         return '' if len(names) < 2 else (
             f'{len(names)} nodes {self._what[topic]}: {", ".join(names)}; end all but one')

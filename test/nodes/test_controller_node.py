@@ -26,8 +26,11 @@ from diagnostic_msgs.msg import DiagnosticStatus
 from koopman_ros.nodes import topics
 from koopman_ros.nodes.shipped import model_path
 import pytest
+import rclpy
+from rclpy.context import Context
+from rclpy.node import Node
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
-from sensor_msgs.msg import Temperature
+from sensor_msgs.msg import JointState, Temperature
 from workbench import seconds, temperature, value, Workbench
 
 
@@ -171,6 +174,61 @@ def test_best_effort_thermometer_is_heard_by_override(ros: Workbench) -> None:
     override = 'qos_overrides./temperature.subscription.reliability:=best_effort'
     bench = Bench(ros, arguments=('-p', override), qos=best_effort)
     assert math.isfinite(bench.measure(STEADY, 2.0).temperature)
+
+
+def test_publishers_that_cannot_be_heard_are_named_with_the_remedy(ros: Workbench) -> None:
+    process = ros.start('controller')
+
+    def said(words: str) -> str:
+        return ros.wait_for_status(
+            STATUS, lambda s: words in s.message and 'UNKNOWN' not in s.message).message
+
+    best_effort = QoSProfile(depth=10, reliability=ReliabilityPolicy.BEST_EFFORT)
+    sensor = ros.node.create_publisher(Temperature, topics.TEMPERATURE, best_effort)
+    assert said('incompatible') == (
+        '/temperature: /bench publishes with best_effort, which is incompatible in reliability, '
+        'so that no message passes: use reliable there, or start this node with -p '
+        'qos_overrides./temperature.subscription.reliability:=best_effort')
+    assert '/temperature: /bench publishes with best_effort' in process.output()
+    ros.node.destroy_publisher(sensor)
+    said('waiting for the first temperature measurement')
+    # not a second plant; no participant may use a topic for two types
+    ros.node.create_publisher(Temperature, topics.TEMPERATURE, topics.LOOP_QOS)
+    context = Context()
+    rclpy.init(context=context, domain_id=int(ros.environment['ROS_DOMAIN_ID']))
+    stranger = Node('stranger', context=context)
+    stranger.create_publisher(JointState, topics.TEMPERATURE, topics.LOOP_QOS)
+    message = said('uses it for')
+    stranger.destroy_node()
+    rclpy.shutdown(context=context)
+    assert message == (
+        '/temperature: /stranger uses it for sensor_msgs/msg/JointState, here it is '
+        'sensor_msgs/msg/Temperature: end that node, or remap its topic')
+
+
+def test_long_frame_id_is_cut_and_reported(bench: Bench) -> None:
+    message = temperature(STEADY, 2.0)
+    message.header.frame_id = 'x' * 100_000
+    bench.thermometer.publish(message)
+    command = bench.ros.wait_until(
+        lambda: next((m for m in bench.commands if seconds(m) == 2.0), None))
+    assert command.header.frame_id == 'x' * 256
+    status = bench.ros.wait_for_status(STATUS, lambda s: 'frame_id' in s.message)
+    assert status.level == DiagnosticStatus.WARN
+    assert 'has 100000 characters, of which 256 are passed on' in status.message
+    assert bench.measure(STEADY, 3.0).header.frame_id == ''
+    bench.ros.wait_for_status(STATUS, lambda s: s.level == DiagnosticStatus.OK)
+
+
+def test_odd_stamps_are_answered_with_themselves(bench: Bench) -> None:
+    message = temperature(STEADY)
+    message.header.stamp.sec, message.header.stamp.nanosec = 2, 1_500_000_000
+    bench.thermometer.publish(message)
+    command = bench.ros.wait_until(
+        lambda: next((m for m in bench.commands if seconds(m) == 3.5), None))
+    assert command.header.stamp == message.header.stamp
+    for time in (-2.0 ** 31, -5.25, -4.25):
+        assert math.isfinite(bench.measure(STEADY, time).temperature)
 
 
 def test_manual_mode_commands_what_the_operator_asks(bench: Bench) -> None:

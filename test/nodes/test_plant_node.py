@@ -23,8 +23,8 @@ import time
 
 from diagnostic_msgs.msg import DiagnosticStatus
 from koopman_ros.nodes import topics
-from koopman_ros.nodes.messages import stamp_nanoseconds
-from koopman_ros.nodes.plant_parameters import TABLE
+from koopman_ros.nodes.messages import LAST_STAMP_SECONDS, seconds_text, stamp_nanoseconds
+from koopman_ros.nodes.plant_parameters import PlantParameters, TABLE
 import pytest
 from rclpy.node import Node
 from sensor_msgs.msg import JointState, Temperature
@@ -236,6 +236,48 @@ def test_stands_still_after_its_duration(ros: Workbench) -> None:
     ros.wait_for_status(STATUS, lambda s: s.message == 'finished: the duration is over')
     ros.wait_until(lambda: len(bench.measured) >= 11)
     assert [seconds(message) for message in bench.measured] == [1.0 + 2.0 * k for k in range(11)]
+
+
+def test_stands_still_where_the_stamps_end(ros: Workbench) -> None:
+    bench = Bench(ros, start_time=LAST_STAMP_SECONDS - 7.0)
+    status = ros.wait_for_status(STATUS, lambda s: s.level == DiagnosticStatus.ERROR)
+    assert status.message == (
+        'finished: the stamps of messages end at 2147483647 s; start the plant again with a '
+        'smaller start_time')
+    # all digits
+    assert value(status, 'time [s]') == '2147483647'
+    ros.wait_until(lambda: len(bench.measured) >= 8)
+    assert [message.header.stamp.sec for message in bench.measured] == [
+        LAST_STAMP_SECONDS - 7 + k for k in range(8)]
+    response = ros.trigger('plant/reset')
+    assert (response.success, response.message) == (False, status.message)
+    assert (
+        'one_state reactor started: a measurement every 1 s from 2147483640 s on, as fast as it '
+        'can, in lock-step: it begins with 1 subscribers and a controller'
+    ) in bench.process.output()
+
+
+@pytest.mark.parametrize(('parameters', 'words'), [
+    ({'start_time': 2147483647.0}, ''),
+    ({'start_time': 2147483648.0}, 'must be in [0.001, 2147483647] s'),
+    ({'start_time': 2e9, 'duration': 1e9}, 'start_time + duration = 3000000000 s must be at most'),
+    ({'frame_id': 'x' * 256}, ''),
+    ({'frame_id': 'x' * 50_000}, 'frame_id has 50000 characters, must have at most 256'),
+])
+def test_stamps_and_frames_that_a_message_can_hold(
+        parameters: dict[str, object], words: str) -> None:
+    reason = TABLE.check(PlantParameters(**parameters))
+    assert words in reason
+    assert bool(words) == bool(reason)
+    assert len(reason) < 200
+
+
+@pytest.mark.parametrize(('nanoseconds', 'text'), [
+    (0, '0'), (1_000_000_000, '1'), (1_700_000_000_250_000_001, '1700000000.250000001'),
+    (-500_000_000, '-0.5'), (600_000_000_000, '600'),
+])
+def test_time_is_written_with_all_digits(nanoseconds: int, text: str) -> None:
+    assert seconds_text(nanoseconds) == text
 
 
 # The coolant that is in force.

@@ -21,6 +21,7 @@ from dataclasses import dataclass
 import ipaddress
 import os
 from pathlib import Path
+import re
 import signal
 import sys
 import time
@@ -52,6 +53,9 @@ def test_signal_ends_a_node_cleanly(ros: Workbench, tmp_path: Path, name: str, n
     ros.meet(name)
     assert process.stop(number) == 0
     assert 'Traceback' not in process.output()
+    said = {'plant': r'one_state reactor started: ', 'controller': 'reactor_nz4',
+            'trainer': rf'recorded \d+ messages to {re.escape(str(tmp_path))}/bag\n'}[name]
+    assert re.search(said, process.output())
 
 
 @pytest.mark.parametrize(('name', 'number', 'code'), [

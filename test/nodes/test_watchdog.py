@@ -22,6 +22,7 @@ import math
 from controller_bench import Bench, STATUS, STEADY
 from diagnostic_msgs.msg import DiagnosticStatus
 from koopman_ros.nodes import topics
+from koopman_ros.nodes.messages import LAST_STAMP_SECONDS
 import numpy as np
 import pytest
 from rosgraph_msgs.msg import Clock
@@ -218,3 +219,11 @@ def test_measurements_may_stay_away_where_the_timeout_is_off(ros: Workbench) -> 
         STATUS, lambda s: float(value(s, 'since last measurement [s]')) > 1.5)
     assert status.level == DiagnosticStatus.OK
     assert len(bench.commands) == 1
+
+
+def test_silence_at_the_end_of_the_stamps_is_answered(ros: Workbench) -> None:
+    last = float(LAST_STAMP_SECONDS)
+    bench = Bench(ros, {'measurement_timeout': 0.1}, first=last)
+    ros.wait_until(lambda: len(own_commands(bench, last)) >= 2)
+    assert {message.header.stamp.sec for message in bench.commands} == {LAST_STAMP_SECONDS}
+    assert all(math.isfinite(message.temperature) for message in bench.commands)
