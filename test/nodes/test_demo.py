@@ -27,6 +27,7 @@ import time
 
 from koopman_ros.bags import summary
 from koopman_ros.demo.loop import LoopError, run_loop, Scenario
+from koopman_ros.demo.processes import reserved_output
 import pytest
 
 
@@ -57,12 +58,29 @@ def test_demo_says_in_one_line_why_it_cannot_run(tmp_path: Path) -> None:
     assert str(tmp_path / 'taken') in line
 
 
+@pytest.mark.parametrize('module', ['koopman_ros.demo', 'koopman_ros.demo.retrain'])
+def test_demo_interrupted_while_it_loads_ends_without_a_word(tmp_path: Path, module: str) -> None:
+    program = (
+        'import os, runpy, signal, sys\n'
+        'class Interrupted:\n'
+        '    def find_spec(self, name, path=None, target=None):\n'
+        '        if name == "matplotlib":\n'
+        '            os.kill(os.getpid(), signal.SIGINT)\n'
+        'sys.meta_path.insert(0, Interrupted())\n'
+        f'runpy.run_module({module!r}, run_name="__main__", alter_sys=True)\n')
+    done = subprocess.run([sys.executable, '-c', program, '--output', tmp_path],
+                          capture_output=True, text=True, timeout=120, check=False)
+    assert (done.returncode, done.stdout, done.stderr) == (130, '', '')
+
+
 @pytest.fixture
 def demo(tmp_path: Path) -> Iterator[subprocess.Popen[str]]:
-    """Start the demo as fast as it can go."""
-    with subprocess.Popen(
-            [sys.executable, '-u', '-m', 'koopman_ros.demo', '--speed', '0', '--output', tmp_path],
+    """Start the demo as fast as it can go, beside another run, so that it writes to demo-2."""
+    wanted = tmp_path / 'demo'
+    with reserved_output(wanted) as taken, subprocess.Popen(
+            [sys.executable, '-u', '-m', 'koopman_ros.demo', '--speed', '0', '--output', wanted],
             stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) as process:
+        assert taken == wanted
         yield process
         process.kill()
 
@@ -70,26 +88,46 @@ def demo(tmp_path: Path) -> Iterator[subprocess.Popen[str]]:
 def test_demo_interrupted_in_its_loop_keeps_what_it_recorded(
         demo: subprocess.Popen[str], tmp_path: Path) -> None:
     assert demo.stdout is not None
+    assert demo.stdout.readline() == (
+        f'another run writes to {tmp_path}/demo: this one writes to {tmp_path}/demo-2\n')
     assert any('time [min] 1.0' in said for said in demo.stdout)
     demo.send_signal(signal.SIGINT)
+    # a second one while the first is handled
+    demo.send_signal(signal.SIGTERM)
     assert demo.communicate()[1] == 'demo: interrupted; what was recorded is kept\n'
     assert demo.returncode == 130
-    recorded = summary(tmp_path / 'closed_loop.mcap')
+    recorded = summary(tmp_path / 'demo-2' / 'closed_loop.mcap')
     assert recorded.complete
     assert recorded.counts['/temperature'] > 0
     assert not _processes(tmp_path)
+    assert not (tmp_path / 'demo').exists()
 
 
-def test_demo_terminated_at_its_start_ends_its_processes(
-        demo: subprocess.Popen[str], tmp_path: Path) -> None:
+@pytest.mark.parametrize(('number', 'code'), [(signal.SIGTERM, 130), (signal.SIGKILL, -9)])
+def test_demo_ended_at_its_start_ends_its_processes(
+        demo: subprocess.Popen[str], tmp_path: Path, number: int, code: int) -> None:
     deadline = time.monotonic() + 30.0
     while not _processes(tmp_path):
         assert time.monotonic() < deadline
         time.sleep(0.01)
-    demo.send_signal(signal.SIGTERM)
-    demo.communicate()
-    assert demo.returncode == 130
+    demo.send_signal(number)
+    demo.wait()
+    assert demo.returncode == code
+    while number == signal.SIGKILL and _processes(tmp_path):
+        # they hear of it, and end by themselves
+        assert time.monotonic() < deadline
+        time.sleep(0.01)
     assert not _processes(tmp_path)
+
+
+def test_two_runs_write_to_two_folders(tmp_path: Path) -> None:
+    (tmp_path / 'link').symlink_to(tmp_path)
+    with (reserved_output(tmp_path / 'demo') as first,
+          reserved_output(tmp_path / 'link' / 'demo') as second):
+        assert first == tmp_path / 'demo'
+        assert second == tmp_path / 'link' / 'demo-2'
+    with reserved_output(tmp_path / 'demo') as again:
+        assert again == first
 
 
 def _processes(output: Path) -> list[str]:
