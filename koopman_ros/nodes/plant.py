@@ -116,7 +116,7 @@ class PlantNode(LoopNode):
             if parameters.speed:
                 self.create_timer(wall_period, self._step_in_lockstep, clock=wall_clock)
         else:
-            self.create_timer(wall_period, self._step_in_time, clock=wall_clock)
+            self._tick = self.create_timer(wall_period, self._step_in_time, clock=wall_clock)
         TABLE.follow(self, parameters, self._on_parameters)
         self.get_logger().info(self._started())
 
@@ -177,6 +177,9 @@ class PlantNode(LoopNode):
 
     def _start_clock(self) -> None:
         """Let time begin now, with the first measurement."""
+        # the next tick in a period from now: after a first one that was late, all stamps would be
+        # ahead of the clock
+        self._tick.reset()
         self._wall_start = time.monotonic()
         if self._real_time:
             self._start_ns = time.time_ns()
