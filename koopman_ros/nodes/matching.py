@@ -22,11 +22,13 @@ from dataclasses import dataclass
 from typing import Any
 
 from rclpy.clock import Clock, ClockType
+from rclpy.duration import Infinite
 from rclpy.event_handler import PublisherEventCallbacks, SubscriptionEventCallbacks
 from rclpy.node import Node
 from rclpy.publisher import Publisher
 from rclpy.qos import (
     DurabilityPolicy,
+    LivelinessPolicy,
     qos_check_compatible,
     qos_policy_name_from_kind,
     QoSCompatibility,
@@ -132,7 +134,7 @@ class Matching:
 
     def _qos_complaint(self, own: _Endpoint, other: TopicEndpointInfo) -> str:
         offered, asked = _in_order(own, other)
-        policy, wanted = self._policies.get(own.topic, 'quality of service'), 'what matches'
+        policy, wanted = self._policies.get(own.topic, 'quality of service'), 'the default'
         does = 'publishes' if own.subscribes else 'subscribes'
         for name, too_little, too_much in _CONFLICTS:
             if (getattr(offered, name), getattr(asked, name)) == (too_little, too_much):
@@ -154,7 +156,19 @@ def _passes(own: _Endpoint, other: TopicEndpointInfo) -> bool:
 
 def _in_order(own: _Endpoint, other: TopicEndpointInfo) -> tuple[QoSProfile, QoSProfile]:
     """Return what is offered and what is asked for."""
-    return (other.qos_profile, own.qos) if own.subscribes else (own.qos, other.qos_profile)
+    ours, theirs = _explicit(own.qos), _explicit(other.qos_profile)
+    return (theirs, ours) if own.subscribes else (ours, theirs)
+
+
+def _explicit(profile: QoSProfile) -> QoSProfile:
+    """Write out what a profile leaves to the default, which else passes for a difference."""
+    filled = copy.copy(profile)
+    for name in ('deadline', 'liveliness_lease_duration'):
+        if not getattr(filled, name).nanoseconds:
+            setattr(filled, name, Infinite)
+    if filled.liveliness == LivelinessPolicy.SYSTEM_DEFAULT:
+        filled.liveliness = LivelinessPolicy.AUTOMATIC
+    return filled
 
 
 def node_name(info: TopicEndpointInfo) -> str:
