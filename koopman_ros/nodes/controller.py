@@ -65,7 +65,7 @@ class ControllerNode(LoopNode):
     """
 
     def __init__(self) -> None:
-        super().__init__('controller', automatically_declare_parameters_from_overrides=True)
+        super().__init__('controller')
         parameters = TABLE.declare(self)
         self._settings = parameters
         self._models = ModelReload(

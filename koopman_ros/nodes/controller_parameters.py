@@ -105,9 +105,12 @@ class ControllerParameters:
         1000.0, 'largest Riccati gain, in scaled coordinates, that is acted on; small weights '
         'need a large one', minimum=0.0,
         maximum=1e9, open_minimum=True)
+    min_riccati_digits: float = parameter(
+        8.0, 'decimal digits to which a solution must fulfil its Riccati equation to be acted on',
+        minimum=0.0, maximum=15.0)
     max_riccati_residual: float = parameter(
-        1e-8, 'largest relative Riccati residual that is acted on', minimum=0.0, maximum=1.0,
-        open_minimum=True)
+        0.0, 'the same as a relative residual, as in former files: 1.0e-08 for 8 digits; 0 leaves '
+        'it to min_riccati_digits', minimum=0.0, maximum=1.0)
 
     def settings(self) -> Settings:
         """Return the tuning of the control step in SI units."""
@@ -124,7 +127,8 @@ class ControllerParameters:
             input_tolerance=self.coolant_tolerance,
             transfer_time=self.transfer_time,
             safe_input=np.array([to_kelvin(self.safe_coolant)]),
-            max_gain=self.max_gain, max_residual=self.max_riccati_residual,
+            max_gain=self.max_gain,
+            max_residual=self.max_riccati_residual or 10.0 ** -self.min_riccati_digits,
             sensor=SensorLimits(
                 lower=to_kelvin(self.sensor_min), upper=to_kelvin(self.sensor_max),
                 rate=self.max_temperature_rate / SECONDS_PER_MINUTE,
@@ -145,4 +149,4 @@ def _cross_check(values: ControllerParameters) -> str:
     return ''
 
 
-TABLE = ParameterTable(ControllerParameters, _cross_check)
+TABLE = ParameterTable(ControllerParameters, _cross_check, ControllerParameters.settings)

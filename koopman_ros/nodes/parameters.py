@@ -17,12 +17,18 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping
-from dataclasses import dataclass, field, fields, MISSING
+from dataclasses import dataclass, field, fields, MISSING, replace
 import difflib
 import math
 from typing import Any, Generic, TypeVar
 
-from rcl_interfaces.msg import ParameterDescriptor, SetParametersResult
+from koopman_ros.nodes.parameter_node import ParameterNode
+from rcl_interfaces.msg import (
+    FloatingPointRange,
+    IntegerRange,
+    ParameterDescriptor,
+    SetParametersResult,
+)
 from rclpy.exceptions import InvalidParameterTypeException
 from rclpy.node import Node
 from rclpy.parameter import Parameter
@@ -56,6 +62,7 @@ class Specification:
     :param minimum: smallest value.
     :param maximum: largest value.
     :param open_minimum: whether the minimum itself is excluded.
+    :param smallest: smallest value above a minimum of 0 that stands for something of its own.
     :param choices: allowed strings, empty for any.
     :param read_only: whether it can be changed while the node runs.
     """
@@ -67,6 +74,7 @@ class Specification:
     minimum: float = -math.inf
     maximum: float = math.inf
     open_minimum: bool = False
+    smallest: float = 0.0
     choices: tuple[str, ...] = ()
     read_only: bool = False
 
@@ -80,6 +88,8 @@ class Specification:
         unit = f' {self.unit}' if self.unit else ''
         if math.isinf(self.maximum):
             return f'{"above" if self.open_minimum else "at least"} {self.minimum:.10g}{unit}'
+        if self.smallest:
+            return f'{self.minimum:.10g}, or in [{self.smallest:.10g}, {self.maximum:.10g}]{unit}'
         bracket = '(' if self.open_minimum else '['
         return f'{bracket}{self.minimum:.10g}, {self.maximum:.10g}]{unit}'
 
@@ -89,7 +99,9 @@ class Specification:
         if self.choices and value not in self.choices:
             return f'{self.name} = {value!r} must be {self.range_text}'
         if isinstance(value, (int, float)) and not isinstance(value, bool):
-            above = value > self.minimum if self.open_minimum else value >= self.minimum
+            above = value > self.minimum if self.open_minimum else (
+                value >= self.smallest or value == self.minimum if self.smallest
+                else value >= self.minimum)
             # written so that NaN, which compares false with everything, is refused, too
             if not (above and value <= self.maximum and math.isfinite(value)):
                 return f'{self.name} = {value}{unit} must be {self._in_range_words()}'
@@ -102,7 +114,18 @@ class Specification:
     def type_error(self, value: Any) -> str:
         """Return the sentence for a value of another type."""
         word, example = _TYPE_WORDS[type(self.default)]
+        if value == [] and isinstance(self.default, tuple):
+            word = 'a list of at least one string'
         return f'{self.name} = {value!r} must be {word}, e.g. {example}'
+
+    @property
+    def limits(self) -> FloatingPointRange | IntegerRange | None:
+        """The range for a slider, which holds an open minimum, too; None where it has no end."""
+        if math.isinf(self.minimum) or math.isinf(self.maximum):
+            return None
+        if isinstance(self.default, int):
+            return IntegerRange(from_value=int(self.minimum), to_value=int(self.maximum))
+        return FloatingPointRange(from_value=float(self.minimum), to_value=float(self.maximum))
 
 
 def parameter(default: Any, description: str, **details: Any) -> Any:
@@ -121,35 +144,67 @@ class ParameterTable(Generic[T]):
 
     :param kind: a frozen dataclass whose fields come from :func:`parameter`.
     :param cross_check: returns what is wrong with a whole snapshot, or an empty string.
+    :param build: builds from a snapshot what the node will use, of which a ValueError or an
+        ArithmeticError is the reason to refuse the snapshot.
     """
 
-    def __init__(self, kind: type[T], cross_check: Callable[[T], str] = lambda _: '') -> None:
+    def __init__(self, kind: type[T], cross_check: Callable[[T], str] = lambda _: '',
+                 build: Callable[[T], object] = lambda _: None) -> None:
         self.kind = kind
         self.cross_check = cross_check
+        self.build = build
         self.rows: dict[str, Specification] = {}
         for item in fields(kind):  # type: ignore[arg-type]
             assert item.default is not MISSING
             details = {'unit': '', **item.metadata}
             self.rows[item.name] = Specification(item.name, item.default, **details)
 
-    def check(self, snapshot: T) -> str:
-        """Return the first thing wrong with a snapshot, or an empty string."""
+    def check(self, snapshot: T, before: T | None = None) -> str:
+        """
+        Return the first thing wrong with a snapshot, or an empty string.
+
+        :param snapshot: the values.
+        :param before: those in force, which are known to be right; None for the defaults.
+        """
         for name, row in self.rows.items():
             reason = row.check(getattr(snapshot, name))
             if reason:
                 return reason
-        return self.cross_check(snapshot)
+        return self.cross_check(snapshot) or self._unusable(
+            snapshot, self.kind() if before is None else before)
 
-    def declare(self, node: Node) -> T:
+    def _unusable(self, snapshot: T, before: T) -> str:
+        """Return why nothing can be built from values that fit each for itself, or ''."""
+        error = self._build_error(snapshot)
+        if not error:
+            return ''
+        changed = [row for name, row in self.rows.items()
+                   if getattr(snapshot, name) != getattr(before, name)]
+        guilty = [row for row in changed if not self._build_error(replace(
+            snapshot, **{row.name: getattr(before, row.name)}))] or changed  # type: ignore
+        given = ' and '.join(f'{row.name} = {getattr(snapshot, row.name)} {row.unit}'.rstrip()
+                             for row in guilty)
+        ranges = dict.fromkeys(f' in {row.range_text}' for row in guilty if row.range_text)
+        return f'{given} cannot be used: {error}; choose another value{" or".join(ranges)}'
+
+    def _build_error(self, snapshot: T) -> str:
+        try:
+            self.build(snapshot)
+        except (ValueError, ArithmeticError) as error:
+            return ' '.join(str(error).split()) or type(error).__name__
+        return ''
+
+    def declare(self, node: ParameterNode) -> T:
         """
-        Declare every parameter on a node that declared its overrides, and validate the whole.
+        Declare every parameter on a node, and validate the whole.
 
-        :param node: created with ``automatically_declare_parameters_from_overrides``, which is
-            how names that no table knows come to light.
+        Names that no table knows are ignored with a warning: a parameter file may serve several
+        nodes.
+
         :raises ConfigurationError: naming the parameter, its value and the allowed range.
         """
         given: dict[str, Any] = dict(node.get_parameters_by_prefix(''))
-        self._refuse_unknown(given)
+        self._ignore_unknown(node, given)
         values = {}
         for name, row in self.rows.items():
             if name in given:
@@ -162,7 +217,7 @@ class ParameterTable(Generic[T]):
             raise ConfigurationError(reason)
         return snapshot
 
-    def _declare_one(self, node: Node, row: Specification, given: Any) -> Any:
+    def _declare_one(self, node: ParameterNode, row: Specification, given: Any) -> Any:
         unit = f' [{row.unit}]' if row.unit else ''
         default = list(row.default) if isinstance(row.default, tuple) else row.default
         try:
@@ -171,15 +226,26 @@ class ParameterTable(Generic[T]):
                 read_only=row.read_only))
         except InvalidParameterTypeException:
             raise ConfigurationError(row.type_error(given)) from None
+        if declared.value is None:
+            # a list without an element has no type
+            raise ConfigurationError(row.type_error([]))
+        if row.limits is not None:
+            node.set_range(row.name, row.limits)
         return _as_python(declared.value)
 
-    def _refuse_unknown(self, given: Iterable[str]) -> None:
-        for name in given:
-            if name in self.rows or name in _RCLPY_PARAMETERS or name.startswith('qos_overrides'):
-                continue
-            near = difflib.get_close_matches(name, self.rows, n=1)
-            hint = f': did you mean {near[0]}?' if near else ''
-            raise ConfigurationError(f'there is no parameter {name!r}{hint}')
+    def _ignore_unknown(self, node: ParameterNode, given: Iterable[str]) -> None:
+        unknown = [name for name in given if name not in self.rows
+                   and name not in _RCLPY_PARAMETERS and not name.startswith('qos_overrides')]
+        for name in unknown:
+            # as if it had not been given, like in any node
+            node.undeclare_parameter(name)
+        if unknown:
+            node.get_logger().warning('parameters that this node does not have are ignored: '
+                                      + ', '.join(map(self._with_hint, unknown)))
+
+    def _with_hint(self, name: str) -> str:
+        near = difflib.get_close_matches(name, self.rows, n=1)
+        return f'{name!r}' + (f' (did you mean {near[0]}?)' if near else '')
 
     def follow(self, node: Node, snapshot: T, apply: Callable[[T], None],
                accept: Callable[[T, set[str]], str] = lambda *_: '') -> None:
@@ -198,7 +264,8 @@ class ParameterTable(Generic[T]):
             # rclpy has refused values of another type
             known = [change for change in changes if change.name in self.rows]
             merged = self._merged(current, known)
-            reason = self.check(merged) or accept(merged, {change.name for change in known})
+            reason = self.check(merged, current) or accept(
+                merged, {change.name for change in known})
             if reason:
                 node.get_logger().warning(f'parameter change refused: {reason}')
             return SetParametersResult(successful=not reason, reason=reason)

@@ -78,7 +78,7 @@ class PlantNode(LoopNode):
     """Run a reactor in time; see the README for topics and services."""
 
     def __init__(self) -> None:
-        super().__init__('plant', automatically_declare_parameters_from_overrides=True)
+        super().__init__('plant')
         self._settings = parameters = TABLE.declare(self)
         system = self._build(parameters)
         self._real_time = parameters.speed == 1.0 and not parameters.lockstep

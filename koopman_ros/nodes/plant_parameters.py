@@ -57,8 +57,8 @@ class PlantParameters:
         0.0, 'start this far from the steady state', unit='K', minimum=-100.0, maximum=100.0,
         read_only=True)
     speed: float = parameter(
-        1.0, 'simulated seconds per second; 0 for as fast as it can', minimum=0.0, maximum=1e6,
-        read_only=True)
+        1.0, 'simulated seconds per second; 0 for as fast as it can', minimum=0.0, smallest=1e-6,
+        maximum=1e6, read_only=True)
     lockstep: bool = parameter(
         False, 'advance only when the command for the last measurement has arrived',
         read_only=True)
@@ -137,4 +137,5 @@ def _cross_check(values: PlantParameters) -> str:
     return ''
 
 
-TABLE = ParameterTable(PlantParameters, _cross_check)
+TABLE = ParameterTable(PlantParameters, _cross_check,
+                       lambda values: (values.actuator(), values.constants()))

@@ -58,7 +58,7 @@ class PlayerNode(LoopNode):
     """
 
     def __init__(self) -> None:
-        super().__init__('player', automatically_declare_parameters_from_overrides=True)
+        super().__init__('player')
         self._settings = settings = TABLE.declare(self)
         # what stands for a name in the bag
         names = {_in_bag(name): name for name in settings.topics}

@@ -40,7 +40,8 @@ class PlayerParameters:
         'namespaces and remaps when it is published', read_only=True)
     rate: float = parameter(
         1.0, 'seconds of the recording, by the time of receipt, per second; 0 plays as fast as '
-        'the controller answers, in lock-step', minimum=0.0, maximum=10000.0, read_only=True)
+        'the controller answers, in lock-step', minimum=0.0, smallest=1e-6,
+        maximum=10000.0, read_only=True)
     measurement: str = parameter(
         TEMPERATURE, 'the topic among them whose messages are answered', read_only=True)
     answer: str = parameter(

@@ -29,13 +29,13 @@ from koopman_ros.nodes import command_line
 from koopman_ros.nodes.exposure import open_to_the_network
 from koopman_ros.nodes.last_resort import exit_later
 from koopman_ros.nodes.messages import NANOSECONDS
+from koopman_ros.nodes.parameter_node import ParameterNode
 from koopman_ros.nodes.watchdog import end_in_time
 from koopman_ros.startup import ignore_signals, SIGNALS
 import rclpy
 from rclpy.exceptions import ParameterException
 from rclpy.executors import SingleThreadedExecutor
 from rclpy.logging import LoggingSeverity, set_logger_level
-from rclpy.node import Node
 from rclpy.signals import SignalHandlerOptions
 from rclpy.subscription import Subscription
 from rosgraph_msgs.msg import Clock
@@ -49,7 +49,7 @@ _TAKE_DOWN_PATIENCE = 5.0  # s; taking down a participant needs some ten millise
 _LAST_RESORT = 8.0  # s from the beginning of the end to that by force
 
 
-class LoopNode(Node):
+class LoopNode(ParameterNode):
     """
     A node with work of its own to complete before the middleware is taken down.
 

@@ -23,6 +23,7 @@ import sys
 
 from koopman_ros.nodes import topics
 from koopman_ros.nodes.model_loading import load_suitable
+from koopman_ros.nodes.parameter_node import ParameterNode
 from koopman_ros.nodes.process import run_task
 from koopman_ros.nodes.replay_parameters import ReplayParameters, TABLE
 from koopman_ros.nodes.replaying.comparison import compare, ReplayedBag
@@ -31,7 +32,6 @@ from koopman_ros.nodes.replaying.report import reproduced, verdict, write_report
 from koopman_ros.nodes.replaying.steps import commands_of, replay
 from koopman_ros.nodes.translation import controller_of
 import numpy as np
-from rclpy.node import Node
 
 
 def replay_bags(parameters: ReplayParameters, names: Names) -> bool:
@@ -89,8 +89,7 @@ def replayed_bag(path: str, names: Names, parameters: ReplayParameters) -> Repla
 
 def _prepare() -> Callable[[], int]:
     """Read parameters and names, which remaps and the namespace change as for the controller."""
-    node = Node('replay', automatically_declare_parameters_from_overrides=True,
-                start_parameter_services=False, enable_rosout=False)
+    node = ParameterNode('replay', start_parameter_services=False, enable_rosout=False)
     try:
         parameters = TABLE.declare(node)
         resolve = node.resolve_topic_name

@@ -50,4 +50,4 @@ def _cross_check(values: ReplayParameters) -> str:
     return controller_parameters.TABLE.cross_check(values)
 
 
-TABLE = ParameterTable(ReplayParameters, _cross_check)
+TABLE = ParameterTable(ReplayParameters, _cross_check, ReplayParameters.settings)

@@ -31,7 +31,7 @@ class TrainerNode(LoopNode):
     """Compose what the trainer does; see the README for topics and services."""
 
     def __init__(self) -> None:
-        super().__init__('trainer', automatically_declare_parameters_from_overrides=True)
+        super().__init__('trainer')
         settings = TABLE.declare(self)
         self._recording = Recording(self, settings)
         self._experiment = CoolantExperiment(self, settings)

@@ -17,6 +17,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 from koopman_ros.control.experiment import Experiment
 from koopman_ros.nodes import topics
@@ -51,13 +52,13 @@ class TrainerParameters:
         choices=('none', 'zstd', 'lz4'))
     max_bag_size: float = parameter(
         0.0, 'size from which the recording goes on in the next file of the folder; 0 for never',
-        unit='MB', minimum=0.0)
+        unit='MB', minimum=0.0, smallest=1e-6, maximum=1e9)
     max_bag_duration: float = parameter(
         0.0, 'time after which the recording goes on in the next file of the folder; 0 for never',
-        unit='s', minimum=0.0)
+        unit='s', minimum=0.0, smallest=1e-6, maximum=1e9)
     min_free_disk: float = parameter(
         100.0, 'room that the disk must have; with less, recording does not start, or stops',
-        unit='MB', minimum=0.0)
+        unit='MB', minimum=0.0, maximum=1e12)
     experiment_topic: str = parameter(
         EXPERIMENT_TOPICS[0], 'where the experiment commands the coolant: the plant, or a '
         'controller in manual mode', choices=EXPERIMENT_TOPICS)
@@ -131,6 +132,13 @@ class TrainerParameters:
             state_upper=to_kelvin(self.experiment_temperature_max),
             safe_input=to_kelvin(self.safe_coolant), seed=self.experiment_seed)
 
+    def training(self) -> dict[str, Any]:
+        """Return the fields of a :class:`koopman_ros.retraining.Task` that are settings."""
+        return {'coordinates': self.model_coordinates, 'seed': self.training_seed,
+                'starts': self.training_starts, 'input_gain': self.input_gain,
+                'input_delay': self.input_delay, 'margin': self.gate_margin,
+                'condition': self.gate_condition}
+
 
 def _cross_check(values: TrainerParameters) -> str:
     if reason := topics.refusal(values.topics):
@@ -152,4 +160,4 @@ def _check_experiment(values: TrainerParameters) -> str:
     return ''
 
 
-TABLE = ParameterTable(TrainerParameters, _cross_check)
+TABLE = ParameterTable(TrainerParameters, _cross_check, TrainerParameters.experiment)

@@ -79,11 +79,7 @@ class Training:
             'output': os.path.abspath(settings.model_output),
             'model': os.path.abspath(model_path(settings.model)),
             'temperature_topic': name(topics.TEMPERATURE),
-            'coolant_topic': name(topics.COOLANT_SETPOINT),
-            'coordinates': settings.model_coordinates, 'seed': settings.training_seed,
-            'starts': settings.training_starts, 'input_gain': settings.input_gain,
-            'input_delay': settings.input_delay,
-            'margin': settings.gate_margin, 'condition': settings.gate_condition})
+            'coolant_topic': name(topics.COOLANT_SETPOINT), **settings.training()})
         self._state = self._job.state
         self._last_line = time.monotonic()
         self._timer.reset()

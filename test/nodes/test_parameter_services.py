@@ -81,6 +81,15 @@ def test_change_that_does_not_fit_is_refused_with_the_reason(
      'max_temperature_rate = 0.0 K/min must be in (0, 1000000] K/min'),
     ('max_temperature_jump', -2.0, 'max_temperature_jump = -2.0 K must be in (0, 1000000] K'),
     ('frozen_timeout', -1.0, 'frozen_timeout = -1.0 s must be in [0, 86400] s'),
+    ('min_riccati_digits', 16.0, 'min_riccati_digits = 16.0 must be in [0, 15]'),
+    ('max_riccati_residual', 2.0, 'max_riccati_residual = 2.0 must be in [0, 1]'),
+    # what fits, and cannot be used: 0 per second
+    ('coolant_rate_limit', 5e-324, 'coolant_rate_limit = 5e-324 K/min cannot be used: input rate '
+     'must be above 0, got [0.0]; choose another value in (0, 1000000] K/min'),
+    ('setpoint_ramp', 5e-324, 'setpoint_ramp = 5e-324 K/min cannot be used: setpoint_ramp must be '
+     'above 0, got 0.0; choose another value in (0, 1000000] K/min'),
+    ('max_temperature_rate', 5e-324, 'max_temperature_rate = 5e-324 K/min cannot be used: rate '
+     'must be above 0, got 0.0; choose another value in (0, 1000000] K/min'),
 ])
 def test_new_value_out_of_range_is_refused_with_value_range_and_unit(
         running: Workbench, name: str, bad: float, words: str) -> None:
@@ -103,6 +112,18 @@ def test_two_limits_that_cross_on_the_way_change_together(running: Workbench) ->
         assert running.get_parameters(CONTROLLER, *limits) == list(limits.values())
 
 
+@pytest.mark.parametrize(('low', 'high', 'kind'), [
+    ('coolant_min', 'coolant_max', 'input'), ('sensor_min', 'sensor_max', 'sensor')])
+def test_limits_that_are_equal_in_kelvin_are_refused(
+        running: Workbench, low: str, high: str, kind: str) -> None:
+    above = 20.00000000000001
+    result = running.set_parameters_atomically(CONTROLLER, **{low: 20.0, high: above})
+    assert not result.successful
+    assert result.reason.startswith(f'{low} = 20.0 degC and {high} = {above} degC cannot be used: '
+                                    f'{kind} limits must be lower < upper, got ')
+    assert running.get_parameters(CONTROLLER, low) == [TABLE.rows[low].default]
+
+
 def test_atomic_change_is_refused_as_a_whole(running: Workbench) -> None:
     result = running.set_parameters_atomically(CONTROLLER, max_gain=7.0, coolant_max=500.0)
     assert not result.successful
@@ -121,6 +142,8 @@ def test_every_parameter_is_described_with_unit_and_range(running: Workbench) ->
         assert described[name].description.endswith(f'[{row.unit}]' if row.unit else '')
         assert described[name].additional_constraints == row.range_text
         assert described[name].read_only == row.read_only
+        found = [*described[name].floating_point_range, *described[name].integer_range]
+        assert found == ([] if row.limits is None else [row.limits])
     assert described['coolant_min'].description == 'lowest coolant temperature commanded [degC]'
     assert described['coolant_min'].additional_constraints == '[-50, 150] degC'
 

@@ -21,12 +21,22 @@ import math
 from pathlib import Path
 from typing import Any
 
+from koopman_ros.nodes.controller_parameters import ControllerParameters
 from koopman_ros.nodes.parameter_files import main, parameter_file, TABLES
-from koopman_ros.nodes.parameters import parameter, ParameterTable, Specification
+from koopman_ros.nodes.parameter_node import ParameterNode
+from koopman_ros.nodes.parameters import (
+    ConfigurationError,
+    parameter,
+    ParameterTable,
+    Specification,
+)
+from koopman_ros.nodes.replay_parameters import ReplayParameters
 from koopman_ros.nodes.shipped import config_directory
 import pytest
 from rclpy.node import Node
+from rclpy.parameter import parameter_dict_from_yaml_file, parameter_value_to_python
 from workbench import Workbench
+import yaml
 
 
 def row(default: Any, **details: Any) -> Specification:
@@ -43,6 +53,7 @@ def row(default: Any, **details: Any) -> Specification:
     (row(1.0, minimum=0.0, maximum=5.0), '[0, 5] m'),
     (row(1.0, minimum=0.0, maximum=5.0, open_minimum=True), '(0, 5] m'),
     (row(1, minimum=1, maximum=1000, unit=''), '[1, 1000]'),
+    (row(1.0, minimum=0.0, smallest=0.01, maximum=5.0), '0, or in [0.01, 5] m'),
     (row('low', choices=('low', 'high'), unit=''), 'one of low, high'),
 ])
 def test_range_in_words(specification: Specification, words: str) -> None:
@@ -58,6 +69,10 @@ def test_range_in_words(specification: Specification, words: str) -> None:
     (row(1.0), math.nan, 'level = nan m must be finite'),
     (row(1.0), -math.inf, 'level = -inf m must be finite'),
     (row(1, minimum=1, unit=''), 0, 'level = 0 must be at least 1'),
+    (row(1.0, minimum=0.0, smallest=0.01, maximum=5.0), 0.001,
+     'level = 0.001 m must be 0, or in [0.01, 5] m'),
+    (row(1.0, minimum=0.0, smallest=0.01, maximum=5.0), math.nan,
+     'level = nan m must be 0, or in [0.01, 5] m'),
     (row('low', choices=('low', 'high'), unit=''), 'up', "level = 'up' must be one of low, high"),
 ])
 def test_refusal_names_value_and_range_with_unit(
@@ -71,6 +86,8 @@ def test_refusal_names_value_and_range_with_unit(
     (row(1.0, minimum=0.0, maximum=5.0), 5.0),
     (row(1.0, minimum=0.0, open_minimum=True), 1e-300),
     (row(1, minimum=0), 0),
+    (row(1.0, minimum=0.0, smallest=0.01, maximum=5.0), 0.0),
+    (row(1.0, minimum=0.0, smallest=0.01, maximum=5.0), 0.01),
     (row(True), False),
     (row('low', choices=('low', 'high')), 'high'),
     (row('anything'), ''),
@@ -85,6 +102,7 @@ def test_value_that_fits_has_no_refusal(specification: Specification, given: Any
     (True, 'yes', "level = 'yes' must be a boolean, e.g. true"),
     ('low', 3, 'level = 3 must be a string, e.g. text'),
     (('a',), 'a', "level = 'a' must be a list of strings, e.g. [a, b]"),
+    (('a',), [], 'level = [] must be a list of at least one string, e.g. [a, b]'),
 ])
 def test_other_type_is_named_with_an_example(default: Any, given: Any, words: str) -> None:
     assert row(default).type_error(given) == words
@@ -112,6 +130,107 @@ def test_cross_check_comes_after_the_ranges() -> None:
     assert ODD.check(Odd()) == ''
     assert ODD.check(Odd(count=2)) == 'count must be odd'
     assert ODD.check(Odd(count=2, tiny=2.0)) == 'tiny = 2.0 m must be in [0, 1] m'
+
+
+def _reciprocal(odd: Odd) -> float:
+    if odd.whole == -1.0:
+        raise ValueError('whole and count\nare no pair')
+    return 1.0 / (odd.whole + odd.count)
+
+
+BUILT = ParameterTable(Odd, build=_reciprocal)
+
+
+@pytest.mark.parametrize(('before', 'now', 'reason'), [
+    (Odd(), Odd(), ''),
+    (Odd(), Odd(count=3), 'count = 3 cannot be used: float division by zero'),
+    (Odd(), Odd(count=4, whole=-4.0, tiny=0.5),
+     'whole = -4.0 and count = 4 cannot be used: float division by zero'),
+    (Odd(count=4), Odd(count=4, whole=-4.0),
+     'whole = -4.0 cannot be used: float division by zero'),
+    (Odd(), Odd(whole=-1.0), 'whole = -1.0 cannot be used: whole and count are no pair'),
+])
+def test_what_cannot_be_built_is_refused_with_the_error_and_what_was_changed(
+        before: Odd, now: Odd, reason: str) -> None:
+    assert BUILT.check(now, before) == (reason and f'{reason}; choose another value')
+
+
+@pytest.mark.parametrize('node', TABLES)
+def test_every_number_has_a_range_that_a_slider_can_show(node: str) -> None:
+    for item in TABLES[node].rows.values():
+        if isinstance(item.default, bool) or not isinstance(item.default, (int, float)):
+            assert item.limits is None
+            continue
+        assert item.limits is not None
+        assert (item.limits.from_value, item.limits.to_value) == (item.minimum, item.maximum)
+        assert item.limits.step == 0
+
+
+@pytest.mark.parametrize('node', TABLES)
+def test_what_is_dumped_can_be_loaded_again(ros: Workbench, tmp_path: Path, node: str) -> None:
+    """As `ros2 param dump` writes it, and as `ros2 param load` and a node at its start read."""
+    defaults = {name: list(item.default) if isinstance(item.default, tuple) else item.default
+                for name, item in TABLES[node].rows.items()}
+    file = tmp_path / 'dumped.yaml'
+    file.write_text(yaml.dump({f'/{node}': {'ros__parameters': defaults}},
+                              default_flow_style=False))
+    loaded = {name: parameter_value_to_python(message.value)
+              for name, message in parameter_dict_from_yaml_file(str(file)).items()}
+    reader = ParameterNode(node, context=ros.node.context,
+                           cli_args=['--ros-args', '--params-file', str(file)])
+    started = {name: reader.get_parameter(name).value for name in defaults}
+    reader.destroy_node()
+    for read in (loaded, started):
+        assert read == defaults
+        assert {name: type(value) for name, value in read.items()} == {
+            name: type(value) for name, value in defaults.items()}
+
+
+def declared(ros: Workbench, *arguments: str, table: ParameterTable[Any] = ODD) -> Any:
+    """Return the snapshot of a node started with arguments, and if it has what is not its own."""
+    node = ParameterNode('odd', context=ros.node.context, cli_args=['--ros-args', *arguments])
+    try:
+        return table.declare(node), node.has_parameter('foreign')
+    finally:
+        node.destroy_node()
+
+
+def test_names_of_other_nodes_are_ignored_with_one_warning(
+        ros: Workbench, tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:
+    file = tmp_path / 'shared.yaml'
+    file.write_text('/**:\n  ros__parameters:\n    count: 5\n    foreign: 1.0\n    cuont: 7\n'
+                    '    nothing: []\n    more:\n      than: one\n')
+    assert declared(ros, '--params-file', str(file)) == (Odd(count=5), False)
+    (line,) = capfd.readouterr().err.splitlines()
+    assert '[WARN]' in line
+    assert line.endswith("[odd]: parameters that this node does not have are ignored: 'foreign', "
+                         "'cuont' (did you mean count?), 'more.than'")
+
+
+@pytest.mark.parametrize(('node', 'name', 'words'), [
+    ('trainer', 'topics', 'a list of at least one string, e.g. [a, b]'),
+    ('trainer', 'bags', 'a list of at least one string, e.g. [a, b]'),
+    ('player', 'topics', 'a list of at least one string, e.g. [a, b]'),
+    ('replay', 'bags', 'a list of at least one string, e.g. [a, b]'),
+    ('plant', 'speed', 'a double, e.g. 1.0'),
+])
+def test_empty_list_is_refused_with_its_name(
+        ros: Workbench, node: str, name: str, words: str) -> None:
+    with pytest.raises(ConfigurationError) as refusal:
+        declared(ros, '-p', f'{name}:=[]', table=TABLES[node])
+    assert str(refusal.value) == f'{name} = [] must be {words}'
+
+
+@pytest.mark.parametrize(('given', 'residual'), [
+    ({}, 1e-8),
+    ({'min_riccati_digits': 6.0}, 1e-6),
+    ({'max_riccati_residual': 1e-5}, 1e-5),
+    ({'max_riccati_residual': 1e-9, 'min_riccati_digits': 3.0}, 1e-9),
+])
+def test_former_form_of_the_riccati_bound_still_counts(
+        given: dict[str, float], residual: float) -> None:
+    for kind in (ControllerParameters, ReplayParameters):
+        assert kind(**given).settings().max_residual == pytest.approx(residual, rel=1e-15)
 
 
 def test_rcl_reads_back_what_the_table_writes(ros: Workbench, tmp_path: Path) -> None:

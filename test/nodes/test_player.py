@@ -216,7 +216,7 @@ def test_bag_in_a_namespace_is_played_into_another_controller(
     ({'bag': 'none.mcap'}, "cannot start: bag 'none.mcap' does not exist"),
     ({'topics': ['pressure']}, 'no message on /pressure: choose topics among /temperature'),
     ({'topics': ['a b']}, 'cannot start: topics: Invalid topic name'),
-    ({'rate': -1.0}, 'rate = -1.0 must be in [0, 10000]'),
+    ({'rate': -1.0}, 'rate = -1.0 must be 0, or in [1e-06, 10000]'),
     ({'wait_timeout': 0.1}, '/temperature found no counterpart within 0.1 s: start the'),
     ({'wait_for_subscribers': 0, 'rate': 0.0, 'answer_timeout': 0.1},
      'no command for the measurement at 1.000 s within 0.1 s: is the controller alive?'),

@@ -311,9 +311,9 @@ BAD_STARTS = {
     'not YAML': BadStart('plant', 'plant: [1, 2\n foo: : bar\n', "Couldn't parse params file"),
     'no parameters in it': BadStart(
         'trainer', '/**:\n  speed: 1.0\n', 'Cannot have a value before ros__parameters'),
-    'unknown name': BadStart(
-        'plant', _parameters('plant', 'sped: 1.0'),
-        "there is no parameter 'sped': did you mean speed?"),
+    'empty list': BadStart(
+        'player', _parameters('player', 'topics: []'),
+        'topics = [] must be a list of at least one string, e.g. [a, b]'),
     'another type': BadStart(
         'plant', _parameters('plant', 'speed: 1'), 'speed = 1 must be a double, e.g. 1.0'),
     'out of range': BadStart(

@@ -369,7 +369,6 @@ def test_several_bags_and_the_shipped_parameter_file(
     (('-r', 'setpoint:=diagnostics', '-r', '/diagnostics:=none'), 'not laid out as sensor_msgs'),
     (('-p', 'coolant_min:=40.0'), 'coolant_min = 40.0 degC must be below'),
     (('-p', 'tolerance:=-1.0'), 'tolerance = -1.0 K must be in [0, 100] K'),
-    (('-p', 'weight:=1.0'), "there is no parameter 'weight'"),
     (('-p', 'output:=/dev/null/out'), 'Not a directory'),
     (('-p', 'coolant_weight:=2.0'), 'not all recorded commands are reproduced within 0.1 K'),
 ])

@@ -1,0 +1,325 @@
+# Copyright 2026 The koopman_ros Authors
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""Every parameter of every table at both ends of its range: what is accepted can be used."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Mapping
+import contextlib
+from dataclasses import replace
+import json
+import math
+from pathlib import Path
+import time
+from typing import Any
+
+from diagnostic_msgs.msg import DiagnosticArray
+from koopman_ros.bags import BagReadError, BagWriter, message_definition
+from koopman_ros.demo.processes import isolated_domain
+from koopman_ros.nodes import topics
+from koopman_ros.nodes.controller import ControllerNode
+from koopman_ros.nodes.messages import NANOSECONDS
+from koopman_ros.nodes.parameter_files import TABLES
+from koopman_ros.nodes.parameters import Specification
+from koopman_ros.nodes.plant import PlantNode
+from koopman_ros.nodes.player import PlayerNode
+from koopman_ros.nodes.process import LoopNode
+from koopman_ros.nodes.replay import replayed_bag
+from koopman_ros.nodes.replay_parameters import ReplayParameters
+from koopman_ros.nodes.replaying.record import Names
+from koopman_ros.nodes.shipped import model_path
+from koopman_ros.nodes.trainer import TrainerNode
+from koopman_ros.nodes.trainer_parameters import TrainerParameters
+from koopman_ros.retraining import retrain, Task
+import pytest
+import rclpy
+from rclpy.executors import SingleThreadedExecutor
+from rclpy.node import Node
+from rclpy.parameter import Parameter
+from rclpy.serialization import serialize_message
+from rclpy.task import Future
+from sensor_msgs.msg import Temperature
+from std_srvs.srv import SetBool, Trigger
+from workbench import seconds, temperature, TIMEOUT
+
+STEADY = 51.8  # degC, near the plant's steady state
+DENORMAL = 5e-324
+TINY = 1e-300
+# Why a plant may not measure: no controller, past its duration, or its reactor ran away.
+STANDSTILL = ('waiting for the loop', 'finished', 'stopped: ')
+# A lower limit and its upper one, which must change together to reach the ends.
+PAIRS = (('coolant_min', 'coolant_max'), ('sensor_min', 'sensor_max'),
+         ('validity_margin', 'linear_margin'),
+         ('experiment_coolant_min', 'experiment_coolant_max'),
+         ('experiment_temperature_min', 'experiment_temperature_max'),
+         ('experiment_hold_min', 'experiment_hold_max'))
+
+
+def ends(row: Specification) -> list[Any]:
+    """Return the values at the ends of a range, and what lies nearest to an end at 0."""
+    if row.choices or isinstance(row.default, bool):
+        return list(row.choices) or [False, True]
+    if not isinstance(row.default, (int, float)):
+        return []
+    assert math.isfinite(row.minimum)
+    assert math.isfinite(row.maximum)
+    kind = type(row.default)
+    low = [] if row.open_minimum else [kind(row.minimum)]
+    if kind is float and row.minimum == 0.0:
+        # a file cannot hold a denormal number
+        low.append(row.smallest or (TINY if row.read_only else DENORMAL))
+    return [*low, kind(row.maximum)]
+
+
+def with_partner(rows: Mapping[str, Specification], name: str, value: Any) -> dict[str, Any]:
+    """Return the change with the other limit of the pair, where that has to give way."""
+    for low, high in PAIRS:
+        if low not in rows:
+            continue
+        if name == low and value == rows[low].maximum:
+            # just below the top, which the other one has
+            return {low: value - 1.0, high: rows[high].maximum}
+        if name == high and value == rows[high].minimum:
+            return {low: rows[low].minimum, high: value + 1.0}
+        if name == high:
+            return {low: min(rows[low].default, value), high: value}
+    return {name: value}
+
+
+def cases(table: str, *, read_only: bool) -> list[dict[str, Any]]:
+    """Return the changes that bring each parameter of a table to its ends."""
+    rows = TABLES[table].rows
+    return [with_partner(rows, name, value) for name, row in rows.items()
+            if row.read_only is read_only for value in ends(row)]
+
+
+class Site:
+    """A node with somebody who talks to it, all in this thread: what the node raises is raised."""
+
+    def __init__(self, node: LoopNode) -> None:
+        self.node = node
+        self.bench = Node('bench', start_parameter_services=False, enable_rosout=False)
+        self.executor = SingleThreadedExecutor()
+        self.executor.add_node(node)
+        self.executor.add_node(self.bench)
+        self.sent = 0
+        self.statuses: list[str] = []
+        self.bench.create_subscription(
+            DiagnosticArray, topics.DIAGNOSTICS, lambda message: self.statuses.extend(
+                status.message for status in message.status), 100)
+
+    def listen(self, topic: str) -> list[Temperature]:
+        heard: list[Temperature] = []
+        self.bench.create_subscription(Temperature, topic, heard.append, topics.LOOP_QOS)
+        return heard
+
+    def spin_until(self, condition: Callable[[], object]) -> None:
+        deadline = time.monotonic() + TIMEOUT
+        while not condition():
+            assert time.monotonic() < deadline
+            self.executor.spin_once(timeout_sec=0.05)
+
+    def ask(self, kind: Any, service: str, **request: Any) -> Future:
+        client = self.bench.create_client(kind, f'{self.node.get_name()}/{service}')
+        self.spin_until(client.service_is_ready)
+        return client.call_async(kind.Request(**request))
+
+    def call(self, kind: Any, service: str, **request: Any) -> Any:
+        future = self.ask(kind, service, **request)
+        self.spin_until(future.done)
+        return future.result()
+
+    def fire_timers(self) -> None:
+        """Do the work of every timer now, whatever its period."""
+        for timer in list(self.node.timers):
+            timer.callback()
+
+    def change(self, **values: Any) -> bool:
+        """Change parameters as the services do; what is refused says which, and why."""
+        result = self.node.set_parameters_atomically(
+            [Parameter(name, value=value) for name, value in values.items()])
+        assert result.successful or DENORMAL in values.values(), result.reason
+        assert result.successful or ' = 5e-324' in result.reason
+        return result.successful
+
+    def close(self) -> None:
+        self.executor.shutdown()
+        self.bench.destroy_node()
+        self.node.destroy_node()
+
+
+@contextlib.contextmanager
+def site(create: Callable[[], LoopNode], **parameters: Any) -> Iterator[Site]:
+    """Run a node with parameters given at its start."""
+    given = [part for name, value in parameters.items() for part in (
+        '-p', f'{name}:={str(value).lower() if isinstance(value, bool) else value}')]
+    rclpy.init(args=['--ros-args', *given] if given else [])
+    try:
+        place = Site(create())
+        try:
+            yield place
+        finally:
+            place.close()
+    finally:
+        rclpy.shutdown()
+
+
+@pytest.fixture(autouse=True)
+def own_domain() -> Iterator[None]:
+    """Keep the nodes of a test to themselves."""
+    with isolated_domain():
+        yield
+
+
+@pytest.fixture(scope='module')
+def bag(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Write a bag of three measurements with their commands."""
+    path = tmp_path_factory.mktemp('bag') / 'short.mcap'
+    with BagWriter(path) as writer:
+        for topic in ('/temperature', '/coolant_setpoint'):
+            writer.add_topic(topic, message_definition('sensor_msgs/msg/Temperature'))
+        for second in (1, 2, 3):
+            for k, (topic, celsius) in enumerate((('/temperature', STEADY),
+                                                  ('/coolant_setpoint', 20.0))):
+                writer.write(topic, serialize_message(temperature(celsius, float(second))),
+                             second * NANOSECONDS + k)
+    return path
+
+
+def defaults(table: str, names: Mapping[str, Any]) -> dict[str, Any]:
+    return {name: TABLES[table].rows[name].default for name in names}
+
+
+def test_controller_answers_with_every_parameter_at_its_ends() -> None:
+    with site(ControllerNode) as place:
+        commands = place.listen(topics.COOLANT_SETPOINT)
+        sensor = place.bench.create_publisher(Temperature, topics.TEMPERATURE, topics.LOOP_QOS)
+        place.spin_until(lambda: sensor.get_subscription_count() and place.node.count_subscribers(
+            topics.COOLANT_SETPOINT))
+
+        def answer() -> None:
+            place.sent += 1
+            sensor.publish(temperature(STEADY + 0.01 * (place.sent % 3), float(place.sent)))
+            place.spin_until(lambda: commands and seconds(commands[-1]) == place.sent)
+            assert math.isfinite(commands[-1].temperature)
+
+        answer()
+        for change in cases('controller', read_only=False):
+            if place.change(**change):
+                answer()
+                place.fire_timers()
+                answer()
+            assert place.change(**defaults('controller', change))
+
+
+@pytest.mark.parametrize('reactor', TABLES['plant'].rows['reactor'].choices)
+def test_plant_runs_with_every_changeable_parameter_at_its_ends(reactor: str) -> None:
+    with site(PlantNode, reactor=reactor, speed=0.0, sample_period=0.1) as place:
+        heard = place.listen(topics.TEMPERATURE)
+        coolant = place.bench.create_publisher(
+            Temperature, topics.COOLANT_SETPOINT, topics.LOOP_QOS)
+        place.spin_until(lambda: heard and coolant.get_subscription_count())
+        for change in cases('plant', read_only=False):
+            if place.change(**change):
+                del heard[:], place.statuses[:]
+                coolant.publish(temperature(20.0))
+                place.fire_timers()
+                place.spin_until(lambda: len(heard) > 2 or any(
+                    'stopped: ' in text for text in place.statuses))
+                assert all(math.isfinite(message.temperature) for message in heard)
+            assert place.change(**defaults('plant', change))
+            assert place.call(Trigger, 'reset').success
+
+
+@pytest.mark.parametrize('change', cases('plant', read_only=True), ids=str)
+def test_plant_starts_with_every_fixed_parameter_at_its_ends(change: dict[str, Any]) -> None:
+    lockstep = {'lockstep': True} if 'lockstep' in next(iter(change)) else {}
+    with site(PlantNode, **{**lockstep, **change}) as place:
+        heard = place.listen(topics.TEMPERATURE)
+
+        def ran() -> bool:
+            place.fire_timers()
+            return bool(heard) or any(text.startswith(STANDSTILL) for text in place.statuses)
+
+        place.spin_until(ran)
+        assert all(math.isfinite(message.temperature) for message in heard)
+
+
+@pytest.mark.parametrize('change', cases('player', read_only=True), ids=str)
+def test_player_plays_with_every_parameter_at_its_ends(bag: Path, change: dict[str, Any]) -> None:
+    alone = {} if 'wait_for_subscribers' in change else {'wait_for_subscribers': 0}
+    with site(PlayerNode, bag=bag, **{**alone, **change}) as place:
+        for _ in range(5):
+            place.fire_timers()
+            place.executor.spin_once(timeout_sec=0.0)
+
+
+def test_trainer_records_with_every_parameter_at_its_ends(tmp_path: Path) -> None:
+    with site(TrainerNode, record_at_start=False, output=tmp_path / 'bag') as place:
+        for change in cases('trainer', read_only=False):
+            if not next(iter(change)).startswith(('max_bag', 'min_free', 'compression')):
+                continue
+            if place.change(**change):
+                begun = place.call(SetBool, 'record', data=True)
+                place.fire_timers()
+                ended = place.call(SetBool, 'record', data=False)
+                assert begun.success is ended.success
+                assert begun.success or 'below min_free_disk = 1e+12 MB' in begun.message
+            assert place.change(**defaults('trainer', change))
+
+
+def test_trainer_steps_with_every_parameter_of_the_experiment_at_its_ends() -> None:
+    with site(TrainerNode, record_at_start=False) as place:
+        sensor = place.bench.create_publisher(Temperature, topics.TEMPERATURE, topics.LOOP_QOS)
+        commands = place.listen(topics.COOLANT_SETPOINT)
+        for change in cases('trainer', read_only=False):
+            name = next(iter(change))
+            if not name.startswith(('experiment', 'safe_coolant')):
+                continue
+            if place.change(**change):
+                begun = place.ask(SetBool, 'experiment', data=True)
+                while not begun.done():
+                    place.sent += 1
+                    sensor.publish(temperature(40.0, float(place.sent)))
+                    place.executor.spin_once(timeout_sec=0.01)
+                    place.fire_timers()
+                assert begun.result().success or begun.result().message.startswith('refused: ')
+                place.call(SetBool, 'experiment', data=False)
+                place.call(SetBool, 'experiment', data=False)
+                assert all(math.isfinite(message.temperature) for message in commands)
+            assert place.change(**defaults('trainer', change))
+
+
+def test_training_is_told_every_parameter_at_its_ends(tmp_path: Path) -> None:
+    for change in cases('trainer', read_only=False):
+        if next(iter(change)).startswith(('model_coordinates', 'training', 'input', 'gate')):
+            parameters = replace(TrainerParameters(), **change)
+            assert TABLES['trainer'].check(parameters) == ''
+            task = Task.from_json(json.dumps({
+                'bags': ['/nowhere/run.mcap'], 'output': str(tmp_path / 'new.safetensors'),
+                'model': str(model_path(parameters.model)), **parameters.training()}))
+            # all else was looked at before
+            with pytest.raises(BagReadError, match='does not exist'):
+                retrain(task)
+
+
+def test_replay_runs_with_every_parameter_at_its_ends(bag: Path) -> None:
+    for change in cases('replay', read_only=False):
+        parameters = replace(ReplayParameters(), **change)
+        reason = TABLES['replay'].check(parameters)
+        assert not reason or (DENORMAL in change.values() and ' = 5e-324' in reason)
+        if not reason:
+            found = replayed_bag(str(bag), Names(), parameters)
+            assert all(math.isfinite(sample.replayed) for sample in found.replayed.samples)
