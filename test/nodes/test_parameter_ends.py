@@ -22,8 +22,9 @@ from dataclasses import replace
 import json
 import math
 from pathlib import Path
+import random
 import time
-from typing import Any
+from typing import Any, TypeVar
 
 from diagnostic_msgs.msg import DiagnosticArray
 from koopman_ros.bags import BagReadError, BagWriter, message_definition
@@ -155,23 +156,28 @@ class Site:
         return result.successful
 
     def close(self) -> None:
+        self.node.complete()
         self.executor.shutdown()
         self.bench.destroy_node()
         self.node.destroy_node()
 
 
+S = TypeVar('S', bound=Site)
+
+
 @contextlib.contextmanager
-def site(create: Callable[[], LoopNode], **parameters: Any) -> Iterator[Site]:
+def site(create: Callable[[], LoopNode], *, place: type[S] = Site, **parameters: Any
+         ) -> Iterator[S]:
     """Run a node with parameters given at its start."""
     given = [part for name, value in parameters.items() for part in (
         '-p', f'{name}:={str(value).lower() if isinstance(value, bool) else value}')]
     rclpy.init(args=['--ros-args', *given] if given else [])
     try:
-        place = Site(create())
+        found = place(create())
         try:
-            yield place
+            yield found
         finally:
-            place.close()
+            found.close()
     finally:
         rclpy.shutdown()
 
@@ -202,26 +208,55 @@ def defaults(table: str, names: Mapping[str, Any]) -> dict[str, Any]:
     return {name: TABLES[table].rows[name].default for name in names}
 
 
+class Loop(Site):
+    """A controller with a sensor."""
+
+    def __init__(self, node: LoopNode) -> None:
+        super().__init__(node)
+        self.commands = self.listen(topics.COOLANT_SETPOINT)
+        self.sensor = self.bench.create_publisher(
+            Temperature, topics.TEMPERATURE, topics.LOOP_QOS)
+        self.spin_until(lambda: self.sensor.get_subscription_count()
+                        and self.node.count_subscribers(topics.COOLANT_SETPOINT))
+
+    def answer(self) -> None:
+        """Wait for the answer to another measurement."""
+        self.sent += 1
+        self.sensor.publish(temperature(STEADY + 0.01 * (self.sent % 3), float(self.sent)))
+        self.spin_until(lambda: self.commands and seconds(self.commands[-1]) == self.sent)
+        assert math.isfinite(self.commands[-1].temperature)
+
+    def work(self) -> None:
+        """Answer measurements, watch and tell."""
+        self.answer()
+        self.fire_timers()
+        self.answer()
+
+
 def test_controller_answers_with_every_parameter_at_its_ends() -> None:
-    with site(ControllerNode) as place:
-        commands = place.listen(topics.COOLANT_SETPOINT)
-        sensor = place.bench.create_publisher(Temperature, topics.TEMPERATURE, topics.LOOP_QOS)
-        place.spin_until(lambda: sensor.get_subscription_count() and place.node.count_subscribers(
-            topics.COOLANT_SETPOINT))
-
-        def answer() -> None:
-            place.sent += 1
-            sensor.publish(temperature(STEADY + 0.01 * (place.sent % 3), float(place.sent)))
-            place.spin_until(lambda: commands and seconds(commands[-1]) == place.sent)
-            assert math.isfinite(commands[-1].temperature)
-
-        answer()
+    with site(ControllerNode, place=Loop) as loop:
         for change in cases('controller', read_only=False):
-            if place.change(**change):
-                answer()
-                place.fire_timers()
-                answer()
-            assert place.change(**defaults('controller', change))
+            if loop.change(**change):
+                loop.work()
+            assert loop.change(**defaults('controller', change))
+
+
+def test_controller_answers_with_all_parameters_at_ends_at_once() -> None:
+    rows = TABLES['controller'].rows
+    draw = random.Random(1)
+    accepted = 0
+    with site(ControllerNode, place=Loop) as loop:
+        for _ in range(40):
+            change = {name: draw.choice([*ends(row), row.default])
+                      for name, row in rows.items() if ends(row)}
+            for low, high in PAIRS:
+                # one pair in four would be drawn in order
+                if low in rows and not change[low] < change[high]:
+                    change[low], change[high] = rows[low].minimum, rows[high].maximum
+            if loop.change(**change):
+                accepted += 1
+                loop.work()
+    assert accepted >= 5
 
 
 @pytest.mark.parametrize('reactor', TABLES['plant'].rows['reactor'].choices)
@@ -245,8 +280,11 @@ def test_plant_runs_with_every_changeable_parameter_at_its_ends(reactor: str) ->
 
 @pytest.mark.parametrize('change', cases('plant', read_only=True), ids=str)
 def test_plant_starts_with_every_fixed_parameter_at_its_ends(change: dict[str, Any]) -> None:
-    lockstep = {'lockstep': True} if 'lockstep' in next(iter(change)) else {}
-    with site(PlantNode, **{**lockstep, **change}) as place:
+    (name,) = change
+    # in real time there is neither a start_time nor a clock
+    beside: dict[str, Any] = {'lockstep': True} if name.startswith('lockstep') else {
+        'speed': 2.0} if name in ('start_time', 'publish_clock') else {}
+    with site(PlantNode, **{**beside, **change}) as place:
         heard = place.listen(topics.TEMPERATURE)
 
         def ran() -> bool:
@@ -254,7 +292,8 @@ def test_plant_starts_with_every_fixed_parameter_at_its_ends(change: dict[str, A
             return bool(heard) or any(text.startswith(STANDSTILL) for text in place.statuses)
 
         place.spin_until(ran)
-        assert all(math.isfinite(message.temperature) for message in heard)
+        assert all(math.isfinite(message.temperature) and seconds(message) > 0.0
+                   for message in heard)
 
 
 @pytest.mark.parametrize('change', cases('player', read_only=True), ids=str)

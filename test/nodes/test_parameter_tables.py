@@ -221,6 +221,25 @@ def test_empty_list_is_refused_with_its_name(
     assert str(refusal.value) == f'{name} = [] must be {words}'
 
 
+@pytest.mark.parametrize(('node', 'given', 'words'), [
+    ('controller', ('coolant_min:=20.0', 'coolant_max:=20.00000000000001'),
+     'coolant_min = 20.0 degC and coolant_max = 20.00000000000001 degC cannot be used: '),
+    ('replay', ('sensor_min:=20.0', 'sensor_max:=20.00000000000001'),
+     'sensor_min = 20.0 degC and sensor_max = 20.00000000000001 degC cannot be used: '),
+    ('trainer', ('experiment_coolant_max:=8.500000000000002',),
+     'experiment_coolant_max = 8.500000000000002 degC cannot be used: '),
+    ('trainer', ('max_bag_size:=1.0e+308',),
+     'max_bag_size = 1e+308 MB must be 0, or in [1e-06, 1000000000] MB'),
+])
+def test_start_with_what_cannot_be_used_is_refused(
+        ros: Workbench, node: str, given: tuple[str, ...], words: str) -> None:
+    arguments = [part for argument in given for part in ('-p', argument)]
+    with pytest.raises(ConfigurationError) as refusal:
+        declared(ros, *arguments, table=TABLES[node])
+    assert str(refusal.value).startswith(words)
+    assert '\n' not in str(refusal.value)
+
+
 @pytest.mark.parametrize(('given', 'residual'), [
     ({}, 1e-8),
     ({'min_riccati_digits': 6.0}, 1e-6),
@@ -298,7 +317,7 @@ def test_node_runs_with_its_shipped_file(ros: Workbench, tmp_path: Path, node: s
     file = config_directory() / f'{node}.yaml'
     # the trainer would otherwise name its bag after the date, in the present folder
     arguments = ('-p', f'output:={tmp_path / "bag"}') if node == 'trainer' else ()
-    ros.start(node, arguments=('--params-file', str(file), *arguments))
+    ros.start(node, arguments=('--params-file', str(file), '-p', 'foreign:=1.0', *arguments))
     rows = dict(TABLES[node].rows)
     rows.pop('output', None)
     read = ros.get_parameters(node, *rows)
@@ -307,3 +326,4 @@ def test_node_runs_with_its_shipped_file(ros: Workbench, tmp_path: Path, node: s
     assert [type(found) for found in read] == [
         list if isinstance(item.default, tuple) else type(item.default)
         for item in rows.values()]
+    assert "parameters that this node does not have are ignored: 'foreign'" in ros.printed()
