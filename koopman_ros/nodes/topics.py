@@ -18,10 +18,12 @@ from __future__ import annotations
 
 from collections.abc import Collection
 import importlib
+import reprlib
 from typing import Any
 
 from diagnostic_msgs.msg import DiagnosticArray
 from rclpy.exceptions import InvalidTopicNameException
+from rclpy.node import Node
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 from rclpy.validate_topic_name import validate_topic_name
 from rosgraph_msgs.msg import Clock
@@ -81,6 +83,17 @@ def refusal(names: Collection[str]) -> str:
             validate_topic_name(name)
         except InvalidTopicNameException as error:
             return f'topics: {" ".join(str(error).split())}'
+    return ''
+
+
+def unresolvable(node: Node, names: Collection[str]) -> str:
+    """Say which name a node cannot make a topic of, as with a substitution; '' for none."""
+    for name in names:
+        try:
+            node.resolve_topic_name(name)
+        except (RuntimeError, ValueError) as error:
+            reason = ' '.join(str(error).split(', at /')[0].split())
+            return f'topics: {reprlib.repr(name)} cannot be used ({reason}): choose another name'
     return ''
 
 

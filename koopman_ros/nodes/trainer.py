@@ -18,6 +18,7 @@ from __future__ import annotations
 
 import sys
 
+from koopman_ros.nodes import topics
 from koopman_ros.nodes.experiment import CoolantExperiment
 from koopman_ros.nodes.parameters import ConfigurationError
 from koopman_ros.nodes.process import LoopNode, run
@@ -33,10 +34,13 @@ class TrainerNode(LoopNode):
     def __init__(self) -> None:
         super().__init__('trainer')
         settings = TABLE.declare(self)
+        if reason := topics.unresolvable(self, settings.topics):
+            raise ConfigurationError(reason)
         self._recording = Recording(self, settings)
         self._experiment = CoolantExperiment(self, settings)
         self._training = Training(self, settings, self._recording.flushed, self._on_trained)
-        TABLE.follow(self, settings, self._on_parameters)
+        TABLE.follow(self, settings, self._on_parameters, lambda changed, _: topics.unresolvable(
+            self, changed.topics))
         try:
             if settings.task == 'train':
                 self._training.start()

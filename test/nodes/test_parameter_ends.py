@@ -33,7 +33,7 @@ from koopman_ros.nodes import topics
 from koopman_ros.nodes.controller import ControllerNode
 from koopman_ros.nodes.messages import NANOSECONDS
 from koopman_ros.nodes.parameter_files import TABLES
-from koopman_ros.nodes.parameters import Specification
+from koopman_ros.nodes.parameters import ConfigurationError, Specification
 from koopman_ros.nodes.plant import PlantNode
 from koopman_ros.nodes.player import PlayerNode
 from koopman_ros.nodes.process import LoopNode
@@ -317,6 +317,26 @@ def test_trainer_records_with_every_parameter_at_its_ends(tmp_path: Path) -> Non
                 assert begun.success is ended.success
                 assert begun.success or 'below min_free_disk = 1e+12 MB' in begun.message
             assert place.change(**defaults('trainer', change))
+
+
+UNRESOLVABLE = {
+    '{nobody}': "topics: '{nobody}' cannot be used (failed to resolve name: unknown substitution",
+    'a//b': "topics: 'a//b' cannot be used (failed to resolve name: topic name must not contain",
+    'x' * 5000: "topics: 'xxxxxxxxxxxx...xxxxxxxxxxxxx' cannot be used (failed to resolve name: "
+                'topic length should not exceed',
+}
+
+
+def test_trainer_refuses_names_that_cannot_be_topics() -> None:
+    with site(TrainerNode, record_at_start=False) as place:
+        for name, words in UNRESOLVABLE.items():
+            result = place.node.set_parameters_atomically([Parameter('topics', value=[name])])
+            assert not result.successful
+            assert result.reason.startswith(words)
+            assert '\n' not in result.reason
+    with (pytest.raises(ConfigurationError, match='unknown substitution'),
+          site(TrainerNode, record_at_start=False, topics="['{nobody}']")):
+        pass
 
 
 def test_trainer_steps_with_every_parameter_of_the_experiment_at_its_ends() -> None:
