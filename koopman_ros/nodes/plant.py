@@ -35,7 +35,7 @@ from koopman_ros.nodes.messages import (
     to_celsius,
     to_kelvin,
 )
-from koopman_ros.nodes.plant_parameters import PlantParameters, TABLE
+from koopman_ros.nodes.plant_parameters import PlantParameters, REACTORS, TABLE
 from koopman_ros.nodes.process import LoopNode, run
 from koopman_ros.nodes.rivals import Rivals
 from koopman_ros.plants import (
@@ -43,16 +43,13 @@ from koopman_ros.plants import (
     ControlAffineSystem,
     EquilibriumError,
     IntegrationError,
-    one_state_reactor,
     Process,
-    two_state_reactor,
 )
 import numpy as np
 from rclpy.clock import Clock, ClockType
 from sensor_msgs.msg import Temperature
 from std_srvs.srv import Trigger
 
-_REACTORS = {'one_state': one_state_reactor, 'two_state': two_state_reactor}
 _POLL_PERIOD = 0.01  # s; for what no message announces
 _LAST_STAMP_NS = (LAST_STAMP_SECONDS + 1) * NANOSECONDS - 1
 _SILENCE = 3.0  # s without a command, and five periods, after which somebody should know
@@ -133,7 +130,7 @@ class PlantNode(LoopNode):
 
     def _build(self, parameters: PlantParameters) -> ControlAffineSystem:
         """Build the reactor, which starts from its steady state if it has one."""
-        build = _REACTORS[parameters.reactor]
+        build = REACTORS[parameters.reactor]
         try:
             return build(parameters.constants())
         except EquilibriumError as error:
@@ -317,7 +314,7 @@ class PlantNode(LoopNode):
         if not self._settings.lockstep:
             self._advance_to_now()
         self._settings = parameters
-        build = _REACTORS[parameters.reactor]
+        build = REACTORS[parameters.reactor]
         # the changed plant may have no steady state near; the nominal point stays what it was
         self._alter(system=build(
             parameters.constants(), nominal_state=self._process.system.nominal_state))

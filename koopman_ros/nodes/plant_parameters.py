@@ -21,8 +21,17 @@ from typing import Any
 
 from koopman_ros.nodes.messages import LAST_STAMP_SECONDS, LONGEST_FRAME_ID, to_kelvin
 from koopman_ros.nodes.parameters import parameter, ParameterTable
-from koopman_ros.plants import Actuator, ReactorParameters
+from koopman_ros.plants import (
+    Actuator,
+    EquilibriumError,
+    IntegratorSettings,
+    one_state_reactor,
+    ReactorParameters,
+    two_state_reactor,
+)
+from koopman_ros.plants.integration import resolved_limits
 
+REACTORS = {'one_state': one_state_reactor, 'two_state': two_state_reactor}
 _CONSTANTS = {item.name: item for item in fields(ReactorParameters)}
 
 
@@ -39,7 +48,7 @@ class PlantParameters:
 
     reactor: str = parameter(
         'one_state', 'one_state holds the concentration fixed, two_state lets it move',
-        choices=('one_state', 'two_state'), read_only=True)
+        choices=tuple(REACTORS), read_only=True)
     sample_period: float = parameter(
         1.0, 'time between measurements', unit='s', minimum=1e-3, maximum=3600.0, read_only=True)
     noise: float = parameter(
@@ -137,5 +146,16 @@ def _cross_check(values: PlantParameters) -> str:
     return ''
 
 
-TABLE = ParameterTable(PlantParameters, _cross_check,
-                       lambda values: (values.actuator(), values.constants()))
+def _build(values: PlantParameters) -> None:
+    """Build what a plant starts with, down to the tolerances of its integration."""
+    values.actuator()
+    build, constants = REACTORS[values.reactor], values.constants()
+    try:
+        system = build(constants)
+    except EquilibriumError:
+        # it then starts from the nominal state
+        system = build(constants, nominal_state=build().nominal_state)
+    resolved_limits(system, IntegratorSettings())
+
+
+TABLE = ParameterTable(PlantParameters, _cross_check, _build)

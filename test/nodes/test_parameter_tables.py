@@ -30,6 +30,7 @@ from koopman_ros.nodes.parameters import (
     ParameterTable,
     Specification,
 )
+from koopman_ros.nodes.plant_parameters import PlantParameters
 from koopman_ros.nodes.replay_parameters import ReplayParameters
 from koopman_ros.nodes.shipped import config_directory
 import pytest
@@ -238,6 +239,16 @@ def test_start_with_what_cannot_be_used_is_refused(
         declared(ros, *arguments, table=TABLES[node])
     assert str(refusal.value).startswith(words)
     assert '\n' not in str(refusal.value)
+
+
+def test_concentration_too_small_to_integrate_is_refused() -> None:
+    table = TABLES['plant']
+    assert table.check(PlantParameters(feed_concentration=1e-315)) == ''
+    assert table.check(PlantParameters(reactor='two_state', feed_concentration=1e-315)).startswith(
+        'reactor = two_state and feed_concentration = 1e-315 mol/L cannot be used: atol is ')
+    for harmless in (0.0, 1e-100):
+        assert table.check(PlantParameters(
+            reactor='two_state', feed_concentration=harmless)) == ''
 
 
 @pytest.mark.parametrize(('given', 'residual'), [
