@@ -28,6 +28,7 @@ from typing import BinaryIO
 import zlib
 
 from koopman_ros.bags.errors import BagReadError, DamageError
+from koopman_ros.bags.limits import block_limit, Budget, check_block, file_limit
 import lz4.frame
 from mcap.records import Chunk
 import zstandard
@@ -35,10 +36,6 @@ import zstandard
 # What each zstd frame begins with; no CDR message does, its first byte is 0.
 ZSTD_MAGIC = b'\x28\xb5\x2f\xfd'
 
-# A chunk is written when it exceeds some megabytes, with the message that makes it exceed them.
-_MAX_BLOCK_BYTES = 2**28
-# A bag of nothing but repeated messages shrinks a hundredfold.
-_MAX_FILE_RATIO = 1000
 _PIECE_BYTES = 2**20
 
 
@@ -62,11 +59,11 @@ def opened(file: Path) -> Iterator[BinaryIO]:
             yield plain
 
 
-def chunk_content(chunk: Chunk) -> bytes:
+def chunk_content(chunk: Chunk, budget: Budget) -> bytes:
     """Return the records of a chunk, of the declared length and with the declared checksum."""
     size = chunk.uncompressed_size
-    if size > _MAX_BLOCK_BYTES:
-        raise DamageError(f'a chunk that declares {size} bytes')
+    check_block('a chunk', size, len(chunk.data))
+    budget.take_chunk(size)
     if chunk.compression == '':
         content = chunk.data
     elif chunk.compression == 'zstd':
@@ -82,7 +79,14 @@ def chunk_content(chunk: Chunk) -> bytes:
     return content
 
 
-def zstd_content(data: bytes, limit: int = _MAX_BLOCK_BYTES) -> bytes:
+def message_content(data: bytes) -> bytes:
+    """Return a message that rosbag2 compressed by itself as it was sent, any other as it is."""
+    if not data.startswith(ZSTD_MAGIC):
+        return data
+    return zstd_content(data, block_limit(len(data)))
+
+
+def zstd_content(data: bytes, limit: int) -> bytes:
     """Return the content of a zstd frame of at most `limit` bytes."""
     declared = zstandard.frame_content_size(data)
     if declared > limit:
@@ -91,7 +95,8 @@ def zstd_content(data: bytes, limit: int = _MAX_BLOCK_BYTES) -> bytes:
 
 
 def _expand(stream: BinaryIO, plain: BinaryIO, file: Path) -> None:
-    limit = _MAX_FILE_RATIO * os.fstat(stream.fileno()).st_size
+    size = os.fstat(stream.fileno()).st_size
+    limit = file_limit(size)
     # a damaged frame ends the file early, which its reader notices
     with contextlib.suppress(zstandard.ZstdError):
         reader = zstandard.ZstdDecompressor().stream_reader(stream)
@@ -99,5 +104,5 @@ def _expand(stream: BinaryIO, plain: BinaryIO, file: Path) -> None:
             plain.write(piece)
             if plain.tell() > limit:
                 raise BagReadError(
-                    f'{str(file)!r} grows to more than {_MAX_FILE_RATIO} times its size, which '
+                    f'{str(file)!r} grows to more than {limit // size} times its size, which '
                     'no bag does: fetch it again')

@@ -23,6 +23,10 @@ class BagReadError(ValueError):
         super().__init__(' '.join(sentence.split()))
 
 
+class BagTooLargeError(BagReadError):
+    """A bag that would take more memory or time than its size warrants, or than there is."""
+
+
 class DamageError(Exception):
     """Bytes that do not parse as what they should be."""
 

@@ -18,6 +18,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
+from koopman_ros.bags.plain_yaml import load_plain
 import yaml
 
 # An unlimited duration [ns]: RMW_DURATION_INFINITE, 9223372036 s and 854775807 ns.
@@ -107,7 +108,7 @@ def parse_offered_qos(text: str) -> tuple[QosProfile, ...]:
     What cannot be read gives no profile: a bag is of use without.
     """
     try:
-        return tuple(_profile(mapping) for mapping in yaml.safe_load(text) or ())
+        return tuple(_profile(mapping) for mapping in load_plain(text) or ())
     except (yaml.YAMLError, ValueError, KeyError, TypeError, IndexError, AttributeError,
             RecursionError):
         return ()

@@ -17,20 +17,26 @@
 from collections import Counter
 from collections.abc import Callable, Collection, Iterable, Iterator
 import contextlib
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 import io
 import os
 from pathlib import Path
 from typing import Any
 
 from koopman_ros.bags.compression import opened
-from koopman_ros.bags.errors import BagReadError, reason
+from koopman_ros.bags.errors import BagReadError, BagTooLargeError, reason
+from koopman_ros.bags.fields import fields_only
+from koopman_ros.bags.limits import Budget, enough_memory
 from koopman_ros.bags.qos import parse_offered_qos, QosProfile
 from koopman_ros.bags.records import stored_messages, StoredMessage, summary_section
 from koopman_ros.bags.storage import locate
 from mcap.exceptions import EndOfFile
 from mcap.records import Channel
+from mcap.well_known import SchemaEncoding
 from mcap_ros2.decoder import DecoderFactory
+
+# Of the different offers in a file, which take seconds to read; seven hundred publishers' worth.
+_MAX_OFFERS_BYTES = 2**18
 
 
 @dataclass(frozen=True, slots=True)
@@ -128,18 +134,21 @@ def _decoded(
     files: tuple[Path, ...], topics: frozenset[str] | None, recover: bool
 ) -> Iterator[BagMessage]:
     for file in files:
-        # One factory for each file: it keeps decoders by schema id, and ids are a file's own.
-        factory = DecoderFactory()
-        for stored in stored_messages(file, recover=recover):
-            if topics is None or stored.channel.topic in topics:
-                yield _decode(stored, factory, file)
+        # One set of decoders for each file: they are kept by schema id, and ids are a file's own.
+        decoders = _Decoders(file)
+        for stored in stored_messages(file, recover=recover, topics=topics):
+            with enough_memory(file):
+                message = _decode(stored, decoders, file)
+            yield message
 
 
-def _decode(stored: StoredMessage, factory: DecoderFactory, file: Path) -> BagMessage:
+def _decode(stored: StoredMessage, decoders: '_Decoders', file: Path) -> BagMessage:
     topic = stored.channel.topic
-    decoder = _decoder(stored, factory, file)
+    decoder = decoders.find(stored)
     try:
         message = decoder(_WholeSlices(stored.message.data))
+    except MemoryError:
+        raise
     except Exception as error:
         # The decoder walks over foreign bytes and fails in as many ways as they can be wrong.
         raise BagReadError(
@@ -169,26 +178,43 @@ class _WholeSlices(bytes):
         return super().__getitem__(key)
 
 
-def _decoder(
-    stored: StoredMessage, factory: DecoderFactory, file: Path
-) -> Callable[[bytes], Any]:
-    encoding = stored.channel.message_encoding
-    schema_encoding = stored.schema.encoding if stored.schema else 'no schema'
-    try:
-        # the definition parser prints what it also raises
-        with contextlib.redirect_stderr(io.StringIO()):
-            decoder = factory.decoder_for(encoding, stored.schema)
-    except Exception as error:
-        # Another recorder's schema text meets the definition parser here.
-        raise BagReadError(
-            f'{str(file)!r}: the definition stored for {stored.channel.topic!r} does not parse '
-            f'({reason(error)}): read the other topics by name') from error
-    if decoder is None:
-        raise BagReadError(
-            f'{str(file)!r}: topic {stored.channel.topic!r} is encoded as {encoding!r} with '
-            f'{schema_encoding!r}, only cdr with ros2msg is decoded here: read the other topics '
-            'by name')
-    return decoder
+class _Decoders:
+    """The decoders of one file's message types."""
+
+    def __init__(self, file: Path) -> None:
+        self._file = file
+        self._factory = DecoderFactory()
+        self._known: dict[tuple[str, int], Callable[[bytes], Any]] = {}
+
+    def find(self, stored: StoredMessage) -> Callable[[bytes], Any]:
+        """Return the decoder of a message; raise BagReadError where there can be none."""
+        key = stored.channel.message_encoding, stored.channel.schema_id
+        if key not in self._known:
+            self._known[key] = self._decoder(stored)
+        return self._known[key]
+
+    def _decoder(self, stored: StoredMessage) -> Callable[[bytes], Any]:
+        schema, encoding = stored.schema, stored.channel.message_encoding
+        try:
+            if schema is not None and schema.encoding == SchemaEncoding.ROS2:
+                schema = replace(schema, data=fields_only(schema.data))
+            # the definition parser prints what it also raises
+            with contextlib.redirect_stderr(io.StringIO()):
+                decoder = self._factory.decoder_for(encoding, schema)
+        except MemoryError:
+            raise
+        except Exception as error:
+            # Another recorder's schema text meets the definition parser here.
+            raise BagReadError(
+                f'{str(self._file)!r}: the definition stored for {stored.channel.topic!r} does '
+                f'not parse ({reason(error)}): read the other topics by name') from error
+        if decoder is None:
+            schema_encoding = schema.encoding if schema else 'no schema'
+            raise BagReadError(
+                f'{str(self._file)!r}: topic {stored.channel.topic!r} is encoded as {encoding!r} '
+                f'with {schema_encoding!r}, only cdr with ros2msg is decoded here: read the other '
+                'topics by name')
+        return decoder
 
 
 def _file_summary(file: Path) -> BagSummary:
@@ -198,8 +224,8 @@ def _file_summary(file: Path) -> BagSummary:
 
 def _indexed_summary(file: Path) -> BagSummary | None:
     """Return the summary from the statistics at the end of a closed file, None without them."""
-    with opened(file) as stream:
-        content = summary_section(stream)
+    with enough_memory(file), opened(file) as stream:
+        content = summary_section(stream, Budget(file))
     if content is None or content.statistics is None:
         return None
     statistics = content.statistics
@@ -228,13 +254,15 @@ def _scanned_summary(file: Path) -> BagSummary:
     start_ns = end_ns = None
     complete = True
     try:
-        for stored in stored_messages(file, recover=False):
+        for stored in stored_messages(file, recover=False, with_data=False):
             topic, time_ns = stored.channel.topic, stored.message.log_time
             counts[topic] += 1
             types[topic] = stored.schema.name if stored.schema else ''
             channels[topic] = stored.channel
             start_ns = time_ns if start_ns is None else min(start_ns, time_ns)
             end_ns = time_ns if end_ns is None else max(end_ns, time_ns)
+    except BagTooLargeError:
+        raise
     except BagReadError:
         complete = False
     return BagSummary(
@@ -243,6 +271,14 @@ def _scanned_summary(file: Path) -> BagSummary:
 
 def _offered_qos(channels: Iterable[Channel]) -> dict[str, tuple[QosProfile, ...]]:
     """Return what was offered on each topic, as far as it was kept and can be read."""
-    offers = {channel.topic: parse_offered_qos(channel.metadata.get('offered_qos_profiles', ''))
-              for channel in channels}
+    offers: dict[str, tuple[QosProfile, ...]] = {}
+    # the same text is on many topics
+    known: dict[str, tuple[QosProfile, ...]] = {'': ()}
+    left = _MAX_OFFERS_BYTES
+    for channel in channels:
+        text = channel.metadata.get('offered_qos_profiles', '')
+        if text not in known:
+            left -= len(text)
+            known[text] = parse_offered_qos(text) if left >= 0 else ()
+        offers[channel.topic] = known[text]
     return {topic: offered for topic, offered in offers.items() if offered}

@@ -18,7 +18,7 @@ The records of one MCAP file, whole or left behind by a recorder that was killed
 Records are read in file order, which is the order in which the recorder received them.
 """
 
-from collections.abc import Iterator
+from collections.abc import Callable, Collection, Iterator
 from dataclasses import dataclass, replace
 import io
 import os
@@ -27,15 +27,15 @@ import struct
 from typing import BinaryIO, cast
 import zlib
 
-from koopman_ros.bags.compression import chunk_content, opened, zstd_content, ZSTD_MAGIC
-from koopman_ros.bags.errors import BagReadError, DamageError, reason
+from koopman_ros.bags.compression import chunk_content, message_content, opened
+from koopman_ros.bags.errors import BagReadError, BagTooLargeError, DamageError, reason
+from koopman_ros.bags.limits import Budget, enough_memory
 from mcap.data_stream import ReadDataStream
 from mcap.exceptions import EndOfFile
 from mcap.opcode import Opcode
-from mcap.reader import SeekingReader
-from mcap.records import Channel, Chunk, DataEnd, McapRecord, Message, Schema
-from mcap.stream_reader import StreamReader
+from mcap.records import Channel, Chunk, DataEnd, McapRecord, Message, Schema, Statistics
 from mcap.summary import Summary
+import zstandard
 
 # The MCAP specification's magic, and the opcode and length that begin every record.
 MAGIC = b'\x89MCAP0\r\n'
@@ -44,6 +44,14 @@ _FOOTER_HEAD = _HEAD.pack(Opcode.FOOTER, 20)
 # Footer: start of the summary, start of its offsets, checksum from the start up to here.
 _FOOTER = struct.Struct('<QQI')
 _TAIL_SIZE = len(_FOOTER_HEAD) + _FOOTER.size + len(MAGIC)
+# Message: channel, sequence, log time, publish time; its data is the rest of the record.
+_MESSAGE_HEAD = struct.Struct('<HIQQ')
+_READ_BY: dict[int, Callable[[ReadDataStream], McapRecord]] = {
+    Opcode.SCHEMA: Schema.read, Opcode.CHANNEL: Channel.read, Opcode.CHUNK: Chunk.read,
+    Opcode.STATISTICS: Statistics.read}
+# What the data section and its chunks are read for.
+_READ = (Opcode.MESSAGE, Opcode.SCHEMA, Opcode.CHANNEL)
+_PIECE_BYTES = 2**20
 
 RECOVER = 'pass recover=True to read what is whole'
 
@@ -57,34 +65,39 @@ class StoredMessage:
     message: Message
 
 
-def stored_messages(file: Path, *, recover: bool) -> Iterator[StoredMessage]:
+def stored_messages(file: Path, *, recover: bool, topics: Collection[str] | None = None,
+                    with_data: bool = True) -> Iterator[StoredMessage]:
     """
     Yield the messages of one MCAP file in file order, with checksums verified.
 
-    With `recover`, the messages end at the first record that is damaged or cut short; without,
-    that raises BagReadError, and so do fewer or more messages than the file says it holds.
+    `topics` limits them to these names. Those that rosbag2 compressed by themselves come as they
+    were sent, unless it is without data. With `recover`, the messages end at the first record
+    that is damaged or cut short; without, that raises BagReadError, and so do fewer or more
+    messages than the file says it holds. Raises BagTooLargeError for what grows beyond reason.
     """
     count = 0
-    with opened(file) as stream:
+    budget = Budget(file)
+    with enough_memory(file), opened(file) as stream:
         try:
-            for message in _messages(stream):
+            for stored in _messages(stream, budget):
                 count += 1
-                yield message
+                if topics is not None and stored.channel.topic not in topics:
+                    continue
+                yield _as_sent(stored, budget) if with_data else stored
             if not recover:
-                _check_count(count, summary_section(stream))
+                _check_count(count, summary_section(stream, budget))
         except DamageError as damage:
             if not recover:
                 raise BagReadError(f'{str(file)!r} is damaged ({damage}): {RECOVER}') from damage
 
 
-def summary_section(stream: BinaryIO) -> Summary | None:
+def summary_section(stream: BinaryIO, budget: Budget) -> Summary | None:
     """Return the index at the end of a file, None where it is missing or damaged."""
     try:
-        if not _summary_is_sound(stream):
-            return None
-        whole = _WholeReads(stream)
-        stream.seek(0)
-        return SeekingReader(cast('BinaryIO', whole), record_size_limit=whole.size).get_summary()
+        start = _start_of_summary(stream)
+        return None if start is None else _summary(stream, start, budget)
+    except (MemoryError, BagTooLargeError):
+        raise
     except Exception:
         # A cut or damaged end fails in any way, a seek out of range among them.
         return None
@@ -125,14 +138,19 @@ class _WholeReads:
             raise EndOfFile
         return self._stream.read(length)
 
-    def seek(self, offset: int, origin: int = os.SEEK_SET) -> int:
-        return self._stream.seek(offset, origin)
+    def skip(self, length: int) -> None:
+        if not 0 <= length <= self.size - self._stream.tell():
+            raise EndOfFile
+        self._stream.seek(length, os.SEEK_CUR)
+
+    def seek(self, offset: int) -> int:
+        return self._stream.seek(offset)
 
 
-def _messages(stream: BinaryIO) -> Iterator[StoredMessage]:
+def _messages(stream: BinaryIO, budget: Budget) -> Iterator[StoredMessage]:
     schemas: dict[int, Schema] = {}
     channels: dict[int, Channel] = {}
-    for record in _records(stream):
+    for record in _records(stream, budget):
         if isinstance(record, Schema):
             schemas[record.id] = record
         elif isinstance(record, Channel):
@@ -144,51 +162,92 @@ def _messages(stream: BinaryIO) -> Iterator[StoredMessage]:
             yield StoredMessage(schemas.get(channel.schema_id), channel, record)
 
 
-def _records(stream: BinaryIO) -> Iterator[McapRecord]:
+def _records(stream: BinaryIO, budget: Budget) -> Iterator[McapRecord]:
     """Yield the records of the data section; raise DamageError where they stop making sense."""
-    whole = _WholeReads(stream)
-    records = iter(StreamReader(cast('BinaryIO', whole), emit_chunks=True, validate_crcs=True,
-                                record_size_limit=whole.size).records)
+    try:
+        for record in _data_section(stream, budget):
+            if isinstance(record, Chunk):
+                yield from _chunk_records(record, budget)
+            else:
+                yield record
+    except (OSError, MemoryError, DamageError, BagTooLargeError):
+        raise
+    except Exception as error:
+        # Arbitrary bytes meet the parser here, and the decompressor behind it: the kinds of
+        # exception are theirs, the meaning is the same.
+        raise DamageError(reason(error)) from error
+
+
+def _data_section(stream: BinaryIO, budget: Budget) -> Iterator[McapRecord]:
+    """Yield the records between the two ends of a file, chunks whole."""
+    data = ReadDataStream(cast('BinaryIO', _WholeReads(stream)), calculate_crc=True)
+    if data.read(len(MAGIC)) != MAGIC:
+        raise DamageError('no MCAP file')
     while True:
-        try:
-            record = next(records)
-            found = _chunk_records(record) if isinstance(record, Chunk) else [_plain(record)]
-        except (OSError, DamageError):
-            raise
-        except Exception as error:
-            # Arbitrary bytes meet the parser here, and the decompressor behind it: the kinds of
-            # exception are theirs, the meaning is the same.
-            raise DamageError(reason(error)) from error
-        if isinstance(record, DataEnd):
+        checksum = data.checksum()
+        opcode, length = _HEAD.unpack(data.read(_HEAD.size))
+        if opcode == Opcode.FOOTER:
+            raise DamageError('the end of the data is missing')
+        if opcode == Opcode.DATA_END:
+            expected = DataEnd.read(data).data_section_crc
+            if expected and expected != checksum:
+                raise DamageError('wrong checksum of the data')
             return
-        yield from found
+        _count(opcode, length, budget)
+        if opcode in _READ or opcode == Opcode.CHUNK:
+            yield _parsed(opcode, data.read(length))
+        else:
+            while length:
+                length -= len(data.read(min(length, _PIECE_BYTES)))
 
 
-def _chunk_records(chunk: Chunk) -> list[McapRecord]:
-    """Return the schemas, channels and messages of a chunk, each within its own length."""
-    content = chunk_content(chunk)
-    found: list[McapRecord] = []
+def _chunk_records(chunk: Chunk, budget: Budget) -> Iterator[McapRecord]:
+    """Yield the schemas, channels and messages of a chunk, once it is whole."""
+    content = chunk_content(chunk, budget)
+    for opcode, start, end in _spans(content):
+        _count(opcode, end - start, budget)
+    for opcode, start, end in _spans(content):
+        if opcode in _READ:
+            yield _parsed(opcode, content[start:end])
+
+
+def _spans(content: bytes) -> Iterator[tuple[int, int, int]]:
+    """Yield the opcode of each record of a chunk with its begin and end, within the chunk."""
     end = 0
     while end < len(content):
         opcode, length = _HEAD.unpack_from(content, end)
         start, end = end + _HEAD.size, end + _HEAD.size + length
         if end > len(content):
             raise EndOfFile
-        body = ReadDataStream(cast('BinaryIO', _WholeReads(io.BytesIO(content[start:end]))))
-        if opcode == Opcode.MESSAGE:
-            found.append(_plain(Message.read(body, length)))
-        elif opcode == Opcode.CHANNEL:
-            found.append(Channel.read(body))
-        elif opcode == Opcode.SCHEMA:
-            found.append(Schema.read(body))
-    return found
+        yield opcode, start, end
 
 
-def _plain(record: McapRecord) -> McapRecord:
-    """Return a message that rosbag2 compressed by itself as it was sent."""
-    if isinstance(record, Message) and record.data.startswith(ZSTD_MAGIC):
-        return replace(record, data=zstd_content(record.data))
-    return record
+def _count(opcode: int, length: int, budget: Budget) -> None:
+    if opcode == 0:
+        # what a disk that was full leaves, and reserved for nothing
+        raise DamageError('zeros in place of a record')
+    budget.take_record(length if opcode in (Opcode.SCHEMA, Opcode.CHANNEL) else 0)
+
+
+def _parsed(opcode: int, body: bytes) -> McapRecord:
+    """Return a record from its own bytes."""
+    if opcode == Opcode.MESSAGE:
+        channel, sequence, log_time, publish_time = _MESSAGE_HEAD.unpack_from(body)
+        return Message(channel_id=channel, sequence=sequence, log_time=log_time,
+                       publish_time=publish_time, data=body[_MESSAGE_HEAD.size:])
+    return _READ_BY[opcode](ReadDataStream(cast('BinaryIO', _WholeReads(io.BytesIO(body)))))
+
+
+def _as_sent(stored: StoredMessage, budget: Budget) -> StoredMessage:
+    """Return a message as it was sent, also where rosbag2 compressed it by itself."""
+    try:
+        data = message_content(stored.message.data)
+    except zstandard.ZstdError as error:
+        raise DamageError(reason(error)) from error
+    budget.take_message(len(data))
+    if data is stored.message.data:
+        return stored
+    return replace(stored, message=replace(stored.message, data=data))
 
 
 def _check_count(count: int, summary: Summary | None) -> None:
@@ -197,11 +256,35 @@ def _check_count(count: int, summary: Summary | None) -> None:
         raise DamageError(f'{count} of the {statistics.message_count} messages it should hold')
 
 
-def _summary_is_sound(stream: BinaryIO) -> bool:
-    """Verify the checksum of the summary where there is one."""
+def _start_of_summary(stream: BinaryIO) -> int | None:
+    """Return where the summary starts, None where there is none or its checksum is wrong."""
     size = stream.seek(0, os.SEEK_END)
     footer = size - len(MAGIC) - _FOOTER.size
     stream.seek(footer)
     start, _, expected = _FOOTER.unpack(stream.read(_FOOTER.size))
     stream.seek(start)
-    return not expected or zlib.crc32(stream.read(max(0, footer + 16 - start))) == expected
+    if expected and zlib.crc32(stream.read(max(0, footer + 16 - start))) != expected:
+        return None
+    return start or None
+
+
+def _summary(stream: BinaryIO, start: int, budget: Budget) -> Summary | None:
+    """Return the schemas, channels and statistics between a place and the footer."""
+    found = Summary()
+    whole = _WholeReads(stream)
+    whole.seek(start)
+    while True:
+        opcode, length = _HEAD.unpack(whole.read(_HEAD.size))
+        if opcode == Opcode.FOOTER:
+            return found
+        _count(opcode, length, budget)
+        if opcode not in (Opcode.SCHEMA, Opcode.CHANNEL, Opcode.STATISTICS):
+            whole.skip(length)
+            continue
+        record = _parsed(opcode, whole.read(length))
+        if isinstance(record, Schema):
+            found.schemas[record.id] = record
+        elif isinstance(record, Channel):
+            found.channels[record.id] = record
+        elif isinstance(record, Statistics):
+            found.statistics = record

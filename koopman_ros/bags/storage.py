@@ -24,14 +24,18 @@ from pathlib import Path
 import re
 from typing import Any
 
-from koopman_ros.bags.errors import BagReadError
+from koopman_ros.bags.errors import BagReadError, reason
+from koopman_ros.bags.limits import enough_memory
 from koopman_ros.bags.metadata import METADATA_FILE, METADATA_KEY
+from koopman_ros.bags.plain_yaml import load_plain
 from koopman_ros.bags.records import is_closed, RECOVER
 import yaml
 
 # The files of a bag directory: run_0.mcap, run_1.mcap, ..., or the same compressed by rosbag2.
 _COMPRESSED = '.zstd'
 _NUMBERED = re.compile(r'(.*)_\d+\.mcap(?:\.zstd)?')
+# Of metadata.yaml; one that lists ten thousand files has a fifth of it.
+_MAX_METADATA_BYTES = 2**24
 
 
 @dataclass(frozen=True)
@@ -78,7 +82,8 @@ def _listed_files(folder: Path) -> tuple[Path, ...]:
     """Return the files that metadata.yaml lists, in its order."""
     source = folder / METADATA_FILE
     try:
-        information: dict[str, Any] = yaml.safe_load(source.read_text('utf-8'))[METADATA_KEY]
+        with enough_memory(source):
+            information: dict[str, Any] = load_plain(_metadata_text(source))[METADATA_KEY]
         storage = str(information['storage_identifier'])
         compression = str(information.get('compression_format') or '')
         names = _file_names(information['relative_file_paths'])
@@ -86,8 +91,8 @@ def _listed_files(folder: Path) -> tuple[Path, ...]:
     except (yaml.YAMLError, ValueError, KeyError, TypeError, AttributeError, RecursionError
             ) as error:
         raise BagReadError(
-            f'{str(source)!r} is not the metadata of a bag: delete it and pass recover=True '
-            'to read the files beside it') from error
+            f'{str(source)!r} is not the metadata of a bag ({reason(error)}): delete it and pass '
+            'recover=True to read the files beside it') from error
     if storage != 'mcap' or compression not in ('', 'zstd'):
         kind = f'{storage} files' + (f' compressed with {compression}' if compression else '')
         raise BagReadError(
@@ -98,7 +103,17 @@ def _listed_files(folder: Path) -> tuple[Path, ...]:
         if not file.is_file():
             raise BagReadError(
                 f'{str(source)!r} lists {file.name!r}, which is not there: put it back')
+    if len({os.path.realpath(file) for file in files}) < len(files):
+        raise BagReadError(f'{str(source)!r} lists one file under two names: correct it')
     return files
+
+
+def _metadata_text(source: Path) -> str:
+    with source.open('rb') as stream:
+        text = stream.read(_MAX_METADATA_BYTES + 1)
+    if len(text) > _MAX_METADATA_BYTES:
+        raise ValueError(f'more than {_MAX_METADATA_BYTES} bytes')
+    return text.decode('utf-8')
 
 
 def _file_names(listed: Any) -> list[str]:
