@@ -115,8 +115,10 @@ def loop_episodes(bags: Sequence[str | os.PathLike[str]], temperature: str, cool
             account.notes.append(f'{os.fspath(bag)} is named twice: read once')
             continue
         read.add(path)
-        for run in _runs(bag, temperature, coolant, account):
-            episodes += _episodes(os.fspath(bag), run, account, input_delay_ns)
+        cuts = _Cuts()
+        for run in _runs(bag, temperature, coolant, account, cuts):
+            episodes += _episodes(os.fspath(bag), run, account, cuts, input_delay_ns)
+        account.notes += cuts.notes(os.fspath(bag))
     account.used = sum(len(episode.stamp_ns) for episode in episodes)
     account.dropped = +account.dropped
     return episodes, account
@@ -130,8 +132,32 @@ class _Run:
     commanded: list[tuple[int, int, float]] = field(default_factory=list)
 
 
-def _runs(bag: str | os.PathLike[str], temperature: str, coolant: str, account: Account
-          ) -> Iterator[_Run]:
+@dataclass
+class _Cuts:
+    """Where episodes of a bag end: (what happened, by how much in words, how much), by kind."""
+
+    set_back: list[tuple[str, float]] = field(default_factory=list)
+    gaps: list[tuple[str, float]] = field(default_factory=list)
+    jumps: list[tuple[str, float]] = field(default_factory=list)
+
+    def notes(self, bag: str) -> Iterator[str]:
+        """Yield one sentence for each kind, however often it happened."""
+        for cuts, first, most in (
+                (self.set_back, 'time was set back by {}', 'at most by {}'),
+                (self.gaps, 'gap of {}', 'the longest of {}'),
+                (self.jumps, 'jump to {}', 'the highest to {}')):
+            if cuts:
+                said = first.format(cuts[0][0])
+                if len(cuts) == 1:
+                    yield f'{bag}: {said}, a new episode begins'
+                else:
+                    largest = max(cuts, key=lambda cut: cut[1])[0]
+                    yield (f'{bag}: {said}, the first of {len(cuts)}, {most.format(largest)}; '
+                           'a new episode begins at each')
+
+
+def _runs(bag: str | os.PathLike[str], temperature: str, coolant: str, account: Account,
+          cuts: _Cuts) -> Iterator[_Run]:
     """Yield what lies between resets of time."""
     content = summary(bag)
     for topic in (temperature, coolant):
@@ -159,8 +185,8 @@ def _runs(bag: str | os.PathLike[str], temperature: str, coolant: str, account: 
             account.dropped['not a temperature'] += 1
             continue
         if measured and stamp_ns < latest - _SET_BACK_NS:
-            account.notes.append(f'{os.fspath(bag)}: time was set back by '
-                                 f'{(latest - stamp_ns) / _NS:.3f} s, a new episode begins')
+            back = (latest - stamp_ns) / _NS
+            cuts.set_back.append((f'{back:.3f} s', back))
             yield run
             run, latest = _Run(), -1
         if measured:
@@ -172,7 +198,8 @@ def _runs(bag: str | os.PathLike[str], temperature: str, coolant: str, account: 
     yield run
 
 
-def _episodes(bag: str, run: _Run, account: Account, input_delay_ns: int) -> list[Episode]:
+def _episodes(bag: str, run: _Run, account: Account, cuts: _Cuts, input_delay_ns: int
+              ) -> list[Episode]:
     """Sort one run by time and cut it at its gaps and jumps."""
     measured = _sorted(run.measured, account, 'measurement with a repeated stamp')
     if len(measured) < _SHORTEST or not run.commanded:
@@ -191,10 +218,10 @@ def _episodes(bag: str, run: _Run, account: Account, input_delay_ns: int) -> lis
     gap = np.diff(stamps, prepend=stamps[0]) > _GAP_PERIODS * period
     ends = np.flatnonzero(gap | jump)
     for end in ends.tolist():
-        what = (f'gap of {(stamps[end] - stamps[end - 1]) / _NS:.3f} s' if gap[end]
-                else f'jump to {measured[end][2]:.2f} degC')
-        account.notes.append(
-            f'{bag}: {what} at {stamps[end - 1] / _NS:.3f} s, a new episode begins')
+        amount = (stamps[end] - stamps[end - 1]) / _NS if gap[end] else measured[end][2]
+        unit = 's' if gap[end] else 'degC'
+        (cuts.gaps if gap[end] else cuts.jumps).append((
+            f'{amount:.{3 if gap[end] else 2}f} {unit} at {stamps[end - 1] / _NS:.3f} s', amount))
     found = []
     for rows in np.split(np.arange(len(stamps)), ends):
         rows = rows[known[rows]]
@@ -226,11 +253,11 @@ def _inputs(run: _Run, measured: list[tuple[int, int, float]], period: float
     """Return when which coolant began to act."""
     received = {stamp: log for stamp, log, _ in measured}
     wall = float(np.median([abs(log - stamp) for stamp, log, _ in measured])) < _SAME_CLOCK_NS
-    logs = sorted(received.values())
+    logs, stamps = np.array(sorted(received.values())), np.array(list(received))
     times: dict[int, float] = {}
     for given, log, value in sorted(run.commanded, key=lambda entry: entry[1]):
         # without a stamp it acts on receipt, which plant time may have to be asked for
-        stamp = given or (log if wall else int(np.interp(log, logs, list(received))))
+        stamp = given or (log if wall else int(np.interp(log, logs, stamps)))
         delay = log - received[stamp] if wall and stamp in received else 0
         # the last word counts
         times[stamp + (delay if delay > _NO_DELAY * period else 0)] = value

@@ -75,7 +75,7 @@ def write(samples: Any, tmp_path: Path) -> Callable[..., Path]:
         writer.add_topic(COOLANT, definition)
         for number, one in enumerate(said):
             stamp_ns = round(one.stamp * SECOND) + (WALL if wall and one.stamp else 0)
-            written = message(temperature=one.value)
+            written = message(temperature=float(one.value))
             written.header.stamp = time(sec=stamp_ns // SECOND, nanosec=stamp_ns % SECOND)
             received = one.stamp if one.received is None else one.received
             writer.write(one.topic, serialize(written), WALL + round(received * SECOND))
@@ -238,6 +238,22 @@ def test_time_set_back_begins_anew(write: Callable[..., Path]) -> None:
     assert second.input_celsius[0] == 601.0
     assert account.notes == [
         f'{first.bag}: time was set back by 29.000 s, a new episode begins']
+
+
+def test_what_happens_often_is_told_once(write: Callable[..., Path]) -> None:
+    set_back = [part for k in range(500) for part in (
+        Said(TEMPERATURE, 10.0 + 0.01 * k, 50.0, float(k)), Said(COOLANT, 5.0, 20.0, float(k)),
+        Said(TEMPERATURE, 5.0, 50.0, k + 0.5))]
+    gaps = [Said(topic, 100.0 + 40.0 * k + (k > 6) + t, 20.0, 5000.0 + 40.0 * k + t)
+            for k in range(9) for t in range(12) for topic in (COOLANT, TEMPERATURE)]
+    bag = write([*set_back, *gaps])
+    episodes, account = read(bag)
+    assert len(episodes) == 9
+    assert account.notes == [
+        f'{bag}: time was set back by 5.000 s, the first of 500, at most by 9.990 s; a new '
+        'episode begins at each',
+        f'{bag}: gap of 95.000 s at 5.000 s, the first of 9, the longest of 95.000 s at 5.000 s; '
+        'a new episode begins at each']
 
 
 def test_late_and_repeated_stamps_are_put_in_order(write: Callable[..., Path]) -> None:
