@@ -113,7 +113,7 @@ def test_compressed_messages_that_grow(
 
 @pytest.mark.parametrize(('count', 'words'), [
     # 31 bytes each
-    (8_700_000, 'is damaged .a chunk that declares 269700000 bytes'),
+    (8_600_000, 'is damaged .a chunk that declares 266600000 bytes'),
     (2_000_000, 'grows to more records than bytes, which no recording does'),
 ])
 def test_millions_of_empty_messages(tmp_path: Path, count: int, words: str) -> None:
@@ -134,16 +134,10 @@ def test_millions_of_empty_messages(tmp_path: Path, count: int, words: str) -> N
         summary(path)
 
 
-@pytest.mark.parametrize('compressed', [True, False])
-def test_zeros_in_place_of_records(tmp_path: Path, compressed: bool) -> None:
-    path = bag(tmp_path / 'run.mcap', chunk(bytes(60 * MIB)) if compressed else bytes(MIB))
-    if not compressed:
-        with path.open('r+b') as stream:
-            # without a place on the disk
-            stream.truncate(256 * MIB)
-    else:
-        with pytest.raises(BagReadError, match='is damaged .zeros in place of a record'):
-            list(read_messages(path))
+def test_zeros_in_place_of_records(tmp_path: Path) -> None:
+    path = bag(tmp_path / 'run.mcap', chunk(bytes(60 * MIB)))
+    with pytest.raises(BagReadError, match='is damaged .zeros in place of a record'):
+        list(read_messages(path))
     assert list(read_messages(path, recover=True)) == []
     assert not summary(path).complete
 
