@@ -17,9 +17,10 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
+from dataclasses import dataclass
 import heapq
-import itertools
 import time
+from typing import Any
 
 from koopman_ros.bags import BagWriter, INFINITE_NS, message_definition, QosProfile
 from koopman_ros.nodes import topics
@@ -34,7 +35,15 @@ _QUEUE_DEPTH = 5000
 
 _LINGER = 0.1  # s
 
-_Taken = tuple[str, bytes, Mapping[str, int]]  # topic, message, times
+
+@dataclass(frozen=True)
+class _Taken:
+    """A message with when it was received and sent, in ns."""
+
+    topic: str
+    data: bytes
+    received_ns: int
+    sent_ns: int
 
 
 class _OutsideTheExecutor(CallbackGroup):
@@ -77,6 +86,7 @@ class Recorder:
         self._types = {topic: topics.TYPES.get(name) for topic, name in self._names.items()}
         self._group = _OutsideTheExecutor()
         self._subscriptions: dict[str, Subscription] = {}
+        self._empty_ns: dict[str, int] = {}  # when nothing waited in each
         self.counts: dict[str, int] = dict.fromkeys(self._types, 0)
         self.look_for_publishers()
 
@@ -108,6 +118,7 @@ class Recorder:
                         wanted.reliability, wanted.durability):
                     continue
                 self._end([topic])
+            self._empty_ns[topic] = time.time_ns()
             self._subscriptions[topic] = self._node.create_subscription(
                 message_type, topic, lambda _: None, wanted, callback_group=self._group,
                 raw=True)
@@ -142,23 +153,29 @@ class Recorder:
 
     def _waiting(self, topic: str, subscription: Subscription) -> list[_Taken]:
         """Take what waits in the middleware."""
+        waiting: list[_Taken] = []
         with (handle := subscription.handle):
-            taken = iter(lambda: handle.take_message(subscription.msg_type, True), None)
             # no more than can wait, lest a fast publisher keeps us here
-            return [(topic, *entry) for entry in itertools.islice(taken, _QUEUE_DEPTH)]
+            while len(waiting) < _QUEUE_DEPTH:
+                now_ns = time.time_ns()
+                taken = take_raw(handle, subscription.msg_type)
+                if taken is None:
+                    self._empty_ns[topic] = now_ns
+                    break
+                data, info = taken
+                received_ns = receipt_ns(info, now_ns, self._empty_ns[topic])
+                waiting.append(_Taken(
+                    topic, data, received_ns, info['source_timestamp'] or received_ns))
+        return waiting
 
     def _record_in_order(self, waiting: Iterable[list[_Taken]]) -> None:
         """Record in the order of receipt; the order within a topic stays whatever the clock."""
-        for topic, data, info in heapq.merge(*waiting, key=_received):
-            self._record(topic, data, info)
-
-    def _record(self, topic: str, data: bytes, info: Mapping[str, int]) -> None:
-        if not self.counts[topic]:
-            self._announce(topic)
-        # the middleware stamps both ends; rosbag2 logs the time of receipt
-        received = info['received_timestamp'] or time.time_ns()
-        self._writer.write(topic, data, received, info['source_timestamp'] or received)
-        self.counts[topic] += 1
+        for taken in heapq.merge(*waiting, key=lambda taken: taken.received_ns):
+            if not self.counts[taken.topic]:
+                self._announce(taken.topic)
+            # rosbag2, too, logs the time of receipt
+            self._writer.write(taken.topic, taken.data, taken.received_ns, taken.sent_ns)
+            self.counts[taken.topic] += 1
 
     def _announce(self, topic: str) -> None:
         """Add a topic to the bag with what its publishers offer now."""
@@ -170,8 +187,28 @@ class Recorder:
                                [_offered(info.qos_profile) for info in publishers])
 
 
-def _received(taken: _Taken) -> int:
-    return taken[2]['received_timestamp']
+def take_raw(handle: Any, message_type: type) -> tuple[bytes, Mapping[str, int]] | None:
+    """Take one serialized message with its times from the middleware, None when none waits."""
+    return handle.take_message(message_type, True)
+
+
+def receipt_ns(info: Mapping[str, int], take_ns: int, empty_ns: int) -> int:
+    """
+    Return when a message was received, for its place in the recording.
+
+    rmw_fastrtps tells when it arrived; rmw_cyclonedds when it was taken, which puts all that
+    waited on one topic before all that waited on the next. The sender's time is what is left
+    then, within the time in which the message must have arrived, as far as clocks differ.
+
+    :param info: received and source timestamp in ns, 0 where unknown.
+    :param take_ns: a time just before it was taken.
+    :param empty_ns: when nothing waited on its topic for the last time.
+    """
+    received_ns, source_ns = info['received_timestamp'], info['source_timestamp']
+    if 0 < received_ns < take_ns:
+        return received_ns
+    latest_ns = received_ns or take_ns
+    return min(max(source_ns, empty_ns), latest_ns) if source_ns else latest_ns
 
 
 def _matching_qos(topic: str, publishers: list[TopicEndpointInfo]) -> QoSProfile:
