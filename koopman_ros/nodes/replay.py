@@ -12,12 +12,18 @@
 # See the License for the specific language governing permissions and
 # limitations under the License.
 
-"""The replay: recorded bags through the control step again, with the old and with a new model."""
+"""
+The replay: recorded bags through the control step again, with the old and with a new model.
+
+Its exit code is 0 when the recorded commands are reproduced, 1 when some are not and for every
+error, and 3 when there was nothing to compare, as in a short bag from the middle of a run.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import replace
+import enum
 from pathlib import Path
 import sys
 
@@ -34,13 +40,22 @@ from koopman_ros.nodes.translation import controller_of
 import numpy as np
 
 
-def replay_bags(parameters: ReplayParameters, names: Names) -> bool:
+class Result(enum.IntEnum):
+    """What a replay found, as exit code."""
+
+    REPRODUCED = 0
+    DIFFERENT = 1
+    NOTHING_COMPARED = 3
+
+
+def replay_bags(parameters: ReplayParameters, names: Names) -> Result:
     """
     Replay bags and write the report.
 
     :param parameters: of the replay.
     :param names: of the controller's topics in the bags.
-    :return: whether the recorded commands are reproduced.
+    :return: whether the recorded commands are reproduced; when none differs, yet a bag has
+        nothing to compare, that.
     :raises BagReadError: for a bag that cannot be replayed.
     :raises ModelFileError: for a model that cannot be used.
     """
@@ -60,7 +75,9 @@ def replay_bags(parameters: ReplayParameters, names: Names) -> bool:
                   f'{parameters.new_model} differ by more than {parameters.tolerance:g} K')
     write_report(folder, bags, pictures, parameters)
     print(f'see {folder / "report.md"}')
-    return all(reproduced(bag) for bag in bags)
+    if any(np.any(bag.check.beyond) for bag in bags):
+        return Result.DIFFERENT
+    return Result.REPRODUCED if all(map(reproduced, bags)) else Result.NOTHING_COMPARED
 
 
 def replayed_bag(path: str, names: Names, parameters: ReplayParameters) -> ReplayedBag:
@@ -106,11 +123,20 @@ def _prepare() -> Callable[[], int]:
 
 
 def _run(parameters: ReplayParameters, names: Names) -> int:
-    if replay_bags(parameters, names):
-        return 0
-    print(f'replay: not all recorded commands are reproduced within {parameters.tolerance:g} K: '
-          'give the model and the settings of the recording', file=sys.stderr)
-    return 1
+    try:
+        result = replay_bags(parameters, names)
+    except MemoryError:
+        print('replay: memory does not suffice for these bags: replay them one by one, or shorter '
+              'ones', file=sys.stderr)
+        return 1
+    if result is Result.DIFFERENT:
+        print('replay: not all recorded commands are reproduced within '
+              f'{parameters.tolerance:g} K: give the model and the settings of the recording',
+              file=sys.stderr)
+    elif result is Result.NOTHING_COMPARED:
+        print('replay: too short, or without commands: not every bag has commands to compare; '
+              'give bags that begin with the run, or go on for longer', file=sys.stderr)
+    return result
 
 
 def main(args: list[str] | None = None) -> int:

@@ -136,7 +136,7 @@ def test_millions_of_empty_messages(tmp_path: Path, count: int, words: str) -> N
 
 def test_zeros_in_place_of_records(tmp_path: Path) -> None:
     path = bag(tmp_path / 'run.mcap', chunk(bytes(60 * MIB)))
-    with pytest.raises(BagReadError, match='is damaged .zeros in place of a record'):
+    with pytest.raises(BagReadError, match=r'is damaged .zeros in place of a record'):
         list(read_messages(path))
     assert list(read_messages(path, recover=True)) == []
     assert not summary(path).complete

@@ -36,12 +36,14 @@ from koopman_ros.demo.processes import isolated_domain
 from koopman_ros.nodes import replay, topics
 from koopman_ros.nodes.messages import NANOSECONDS
 from koopman_ros.nodes.replay_parameters import ReplayParameters
+from koopman_ros.nodes.replaying import steps
 from koopman_ros.nodes.replaying.comparison import ReplayedBag
 from koopman_ros.nodes.replaying.record import Names
 from koopman_ros.nodes.replaying.report import about_beginning, reproduced, verdict
 from koopman_ros.nodes.shipped import config_directory
 import numpy as np
 import pytest
+from rclpy.serialization import serialize_message
 from sensor_msgs.msg import Temperature
 from workbench import seconds, temperature, value, Workbench
 
@@ -261,8 +263,48 @@ def test_bag_of_the_middle_that_is_too_short_to_be_compared_says_so(
     bag, count = day
     found = replayed(rewrite(tmp_path / 'late.mcap', from_measurement(bag, count - 50)))
     assert found.check.compared == 0
-    assert 'after the first 180 s, which are not compared because' in verdict(found)
+    assert verdict(found) == (
+        'nothing is compared: the bag is too short, the commands of the first 180 s are not '
+        'compared because the run had begun before it')
     assert not reproduced(found)
+
+
+@pytest.mark.parametrize(('number', 'settings', 'code', 'words'), [
+    (50, [], 3, 'replay: too short, or without commands: not every bag has commands to compare'),
+    (0, ['-p', 'coolant_weight:=2.0'], 1, 'replay: not all recorded commands are reproduced'),
+])
+def test_too_short_has_an_exit_code_of_its_own(
+        day: tuple[Path, int], tmp_path: Path, capfd: pytest.CaptureFixture[str], number: int,
+        settings: list[str], code: int, words: str) -> None:
+    bag, count = day
+    short = rewrite(tmp_path / 'late.mcap', from_measurement(bag, count - 50))
+    bags = f'[{short}]' if number else f'[{bag}, {short}]'
+    given = [part for name, value in SETTINGS.items() for part in ('-p', f'{name}:={value}')]
+    with isolated_domain():
+        assert replay.main(['replay', '--ros-args', *given, *settings, '-p', f'bags:={bags}',
+                            '-p', f'output:={tmp_path}']) == code
+    (line,) = capfd.readouterr().err.splitlines()
+    assert line.startswith(words)
+    assert ('not those of the recording' in (tmp_path / 'report.md').read_text()) == (code == 1)
+
+
+def test_requests_and_measurements_of_one_time(day: tuple[Path, int], tmp_path: Path) -> None:
+    """A thousand requests that explain nothing are not tried out for each measurement."""
+    names = Names()
+    asked = [replace(entry, log_time_ns=NANOSECONDS, message=None, data=serialize_message(
+        temperature(44.0 + 0.001 * k))) for k, entry in enumerate(itertools.islice(
+            itertools.cycle(read_messages(day[0], [names.setpoint])), 400))]
+    told = [replace(entry, log_time_ns=NANOSECONDS + k // 400)
+            for topic in (names.temperature, names.command, names.active)
+            for k, entry in enumerate(read_messages(day[0], [topic]))]
+    attempts: list[int] = []
+    with pytest.MonkeyPatch.context() as patch:
+        ask = steps.ask_setpoint
+        patch.setattr(steps, 'ask_setpoint',
+                      lambda *values: attempts.append(1) or ask(*values))
+        replayed(rewrite(tmp_path / 'one.mcap', [*asked, *told]))
+    inputs = len(asked) + len(told)
+    assert len(attempts) < steps._TRIALS + (steps._TRIALS_EACH + 2) * inputs
 
 
 def test_setpoints_that_were_not_recorded_follow_from_what_was_tracked(

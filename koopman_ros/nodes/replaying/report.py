@@ -59,15 +59,22 @@ def verdict(bag: ReplayedBag) -> str:
     """Say in one sentence how the replay of the recorded model did."""
     check = bag.check
     if not check.compared:
-        return 'no measurement has a recorded command' + (
-            f' after the first {bag.replayed.given_seconds:g} s, which are not compared because '
-            'the run had begun before the bag' if bag.replayed.given_seconds else '')
+        return f'nothing is compared: {_why_nothing(bag)}'
     if check.identical == check.compared:
         return f'all {check.compared} recorded commands are reproduced to the bit'
     beyond = int(np.count_nonzero(check.beyond))
     said = (f'{check.identical} of {check.compared} recorded commands are reproduced to the bit, '
             f'{beyond} differ by more than {check.tolerance:g} K')
     return f'{said}; {_worst(bag, check)}'
+
+
+def _why_nothing(bag: ReplayedBag) -> str:
+    if bag.unanswered == len(bag.recorded):
+        return 'no measurement has a recorded command'
+    seconds = bag.replayed.given_seconds
+    uncompared = f'commands of the first {seconds:g} s are' if seconds else 'first command is'
+    return (f'the bag is too short, the {uncompared} not compared because the run had begun '
+            'before it')
 
 
 def _worst(bag: ReplayedBag, comparison: Comparison) -> str:
@@ -118,7 +125,7 @@ def _section(bag: ReplayedBag, parameters: ReplayParameters) -> list[str]:
             lines.append(f'- {count} {words}.')
     if not record.complete:
         lines.append('- The bag was not closed or is damaged: this is the part that is whole.')
-    if not reproduced(bag):
+    if bag.check.compared and not reproduced(bag):
         lines.append('- The model or the settings given are not those of the recording, or they '
                      'were changed during it.')
     return lines

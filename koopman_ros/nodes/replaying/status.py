@@ -29,6 +29,9 @@ from koopman_ros.bags import BagMessage
 from koopman_ros.control import Mode
 from koopman_ros.nodes.diagnostics import as_text
 
+# Of one controller there are a few; each is compared with every status.
+_MOST_OFFSETS = 200
+
 
 @dataclass(frozen=True)
 class Status:
@@ -109,7 +112,7 @@ def _earlier(life: list[Status], written: list[tuple[str, str]]) -> int:
         return sum(0 <= place < len(written) and written[place] == status.last
                    for place, status in places), offsets[offset]
 
-    return max(offsets, key=confirmed)
+    return max((offset for offset, _ in offsets.most_common(_MOST_OFFSETS)), key=confirmed)
 
 
 @dataclass(frozen=True)
