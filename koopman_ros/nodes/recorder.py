@@ -187,7 +187,7 @@ class Recorder:
                                [_offered(info.qos_profile) for info in publishers])
 
 
-def take_raw(handle: Any, message_type: type) -> tuple[bytes, Mapping[str, int]] | None:
+def take_raw(handle: Any, message_type: Any) -> tuple[bytes, Mapping[str, int]] | None:
     """Take one serialized message with its times from the middleware, None when none waits."""
     return handle.take_message(message_type, True)
 

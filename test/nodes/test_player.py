@@ -30,11 +30,13 @@ from koopman_ros.bags import (
     temperature_series,
 )
 from koopman_ros.demo.loop import run_loop, Scenario
-from koopman_ros.demo.processes import NodeProcess
+from koopman_ros.demo.processes import isolated_domain, NodeProcess
 from koopman_ros.nodes import player, topics
 from koopman_ros.nodes.messages import NANOSECONDS, stamp_nanoseconds
 from koopman_ros.nodes.shipped import config_directory
 import pytest
+from rclpy.duration import Duration
+from rclpy.publisher import Publisher
 from rclpy.qos import DurabilityPolicy, ReliabilityPolicy
 from rclpy.serialization import serialize_message
 from rosgraph_msgs.msg import Clock
@@ -96,6 +98,31 @@ def test_lockstep_gives_the_recorded_commands_to_the_bit(ros: Workbench, bag: Pa
     assert [command.temperature for command in commands] == recorded.celsius.tolist()
     # the coolant in force with each measurement, and one set-point
     assert f'played {2 * SAMPLES + 1} messages' in process.output()
+
+
+def test_lockstep_waits_for_requests_alone(tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+                                           ) -> None:
+    """To wait until a message is received takes 0.1 s with some middlewares."""
+    bag = write_bag(tmp_path / 'bag.mcap', [
+        (topic, temperature(celsius, stamp), float(k)) for k in range(1, 21)
+        for topic, celsius, stamp in [
+            ('/coolant_temperature', 22.0, float(k)), ('/temperature', 50.0 + 0.1 * k, float(k)),
+            *([('/setpoint', 49.0, 0.0)] if k in (5, 6) else [])]],
+        [QosProfile(durability='transient_local', depth=1)])
+    waits: list[str] = []
+    wait = Publisher.wait_for_all_acked
+
+    def counted(publisher: Publisher, timeout: Duration) -> bool:
+        waits.append(publisher.topic_name)
+        return wait(publisher, timeout)
+
+    monkeypatch.setattr(Publisher, 'wait_for_all_acked', counted)
+    with isolated_domain() as environment, NodeProcess(
+            'controller', {}, tmp_path / 'controller.log', environment):
+        assert player.main(['player', '--ros-args', '-p', f'bag:={bag}', '-p', 'rate:=0.0']) == 0
+    # and once for each topic at the end
+    assert waits[:-3] == ['/setpoint'] * 2
+    assert sorted(waits[-3:]) == ['/coolant_temperature', '/setpoint', '/temperature']
 
 
 def test_messages_are_played_byte_for_byte(ros: Workbench, bag: Path) -> None:
