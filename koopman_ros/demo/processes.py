@@ -41,16 +41,19 @@ def isolated_domain() -> Iterator[dict[str, str]]:
     Reserve a ROS domain on loopback that no other run on this machine uses.
 
     Yields the environment variables of the run, which hold for this process, too, until the end.
-    The Fast DDS profile they name keeps everything on 127.0.0.1 and says what else it is for.
+    A middleware that RMW_IMPLEMENTATION names stays, else it is Fast DDS, whose profile keeps
+    everything on 127.0.0.1 and says what else it is for.
 
     :raises RuntimeError: when all domains are taken.
     """
+    middleware = os.environ.get('RMW_IMPLEMENTATION') or 'rmw_fastrtps_cpp'
     with _reserved_domain() as domain:
         environment = {
             'ROS_DOMAIN_ID': str(domain),
-            'RMW_IMPLEMENTATION': 'rmw_fastrtps_cpp',
-            # the profile alone says where to look
-            'ROS_AUTOMATIC_DISCOVERY_RANGE': 'SYSTEM_DEFAULT',
+            'RMW_IMPLEMENTATION': middleware,
+            # the profile alone says where to look; others do not read it
+            'ROS_AUTOMATIC_DISCOVERY_RANGE': (
+                'SYSTEM_DEFAULT' if 'fastrtps' in middleware else 'LOCALHOST'),
             'FASTRTPS_DEFAULT_PROFILES_FILE': str(config_directory() / LOOPBACK_PROFILE),
         }
         before = {name: os.environ.get(name) for name in environment}

@@ -35,6 +35,7 @@ from koopman_ros.nodes.messages import NANOSECONDS, stamp_message
 from koopman_ros.nodes.parameter_files import TABLES
 from koopman_ros.nodes.shipped import model_path
 import pytest
+from rclpy.utilities import get_rmw_implementation_identifier
 from rosgraph_msgs.msg import Clock
 from sensor_msgs.msg import Temperature
 from workbench import temperature, TIMEOUT, Workbench
@@ -408,6 +409,8 @@ def test_reservation_ends_with_its_context() -> None:
         assert again['ROS_DOMAIN_ID'] == first['ROS_DOMAIN_ID']
 
 
+@pytest.mark.skipif('fastrtps' not in get_rmw_implementation_identifier(),
+                    reason='the profile is one for Fast DDS')
 def test_everything_stays_on_loopback_without_shared_memory(ros: Workbench) -> None:
     process = ros.start('trainer', {'record_at_start': False})
     ros.meet('trainer')
@@ -435,6 +438,21 @@ def test_environment_of_the_reservation_holds_here_too(monkeypatch: pytest.Monke
         assert environment.items() <= os.environ.items()
     assert os.environ['ROS_DOMAIN_ID'] == '7'
     assert 'RMW_IMPLEMENTATION' not in os.environ
+
+
+@pytest.mark.parametrize(('given', 'found', 'reach'), [
+    ('', 'rmw_fastrtps_cpp', 'SYSTEM_DEFAULT'),
+    ('rmw_fastrtps_dynamic_cpp', 'rmw_fastrtps_dynamic_cpp', 'SYSTEM_DEFAULT'),
+    # whose default is the whole network, as it knows nothing of the profile
+    ('rmw_cyclonedds_cpp', 'rmw_cyclonedds_cpp', 'LOCALHOST'),
+])
+def test_middleware_that_is_named_stays(
+        monkeypatch: pytest.MonkeyPatch, given: str, found: str, reach: str) -> None:
+    monkeypatch.setenv('RMW_IMPLEMENTATION', given)
+    with isolated_domain() as environment:
+        assert environment['RMW_IMPLEMENTATION'] == os.environ['RMW_IMPLEMENTATION'] == found
+        assert environment['ROS_AUTOMATIC_DISCOVERY_RANGE'] == reach
+    assert os.environ['RMW_IMPLEMENTATION'] == given
 
 
 def test_process_that_ignores_signals_is_killed(
