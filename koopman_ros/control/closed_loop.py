@@ -24,7 +24,6 @@ from koopman_ros.control.target import steady_state_target, Target
 from koopman_ros.lifting import LiftedModel
 import numpy as np
 from numpy.typing import NDArray
-from scipy.integrate import DOP853
 
 Array = NDArray[np.float64]
 Law = Callable[..., Feedback]
@@ -81,6 +80,9 @@ def run_closed_loop(model: LiftedModel, rate: Rate, x0: Array, x_ref: Array, wei
         in units of its scale.
     :param max_evaluations: of the law, after which the loop has failed: it chatters or is stiff.
     """
+    # in here: no node needs it, and it would make a fourth of their start
+    from scipy.integrate import DOP853
+
     target = steady_state_target(model, model.states.to_deviation(np.asarray(x_ref)))
     v_ref = target.u if u_ref is None else model.inputs.to_deviation(np.asarray(u_ref))
 

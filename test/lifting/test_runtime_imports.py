@@ -38,7 +38,7 @@ def run(statements):
     program = PROGRAM.format(foreign=FOREIGN, statements=statements)
     return subprocess.run(
         [sys.executable, '-W', 'error', '-c', program], capture_output=True, text=True,
-        timeout=60, check=False, cwd=Path(koopman_ros.__file__).parents[1])
+        timeout=240, check=False, cwd=Path(koopman_ros.__file__).parents[1])
 
 
 @pytest.mark.parametrize('packages', [*((name,) for name in RUNTIME), RUNTIME], ids=str)

@@ -122,11 +122,13 @@ def test_no_offset_is_left_when_the_heat_transfer_changes(loop: Loop) -> None:
     off = [seconds(message) for message in loop.measured[count:]
            if abs(message.temperature - SETPOINT) > 1e-3]
     assert off[-1] - off[0] < 600.0
-    del loop.ros.statuses[:]
-    truth = loop.ros.wait_for_status('plant: simulation', lambda s: True)
+    rested = seconds(loop.commands[-1])
+    truth = loop.ros.wait_for_status(
+        'plant: simulation', lambda s: float(value(s, 'time [s]')) >= rested)
     assert abs(float(value(truth, 'temperature [degC]')) - SETPOINT) <= 1e-3
     # it is no small thing that it makes up for
-    status = loop.ros.wait_for_status('controller: control', lambda s: True)
+    status = loop.ros.wait_for_status(
+        'controller: control', lambda s: int(value(s, 'measurements')) >= rested)
     assert status.level == DiagnosticStatus.OK
     assert abs(float(value(status, 'disturbance [K of coolant]'))) > 1.0
 
@@ -164,7 +166,8 @@ def test_weights_change_without_a_bump(loop: Loop) -> None:
             assert result.successful, result.reason
 
     assert np.max(loop.steps(retune, 100)) < 0.01
-    loop.ros.set_parameters('controller', setpoint_ramp=0.2)
+    # slow, so that a busy machine comes in time, too
+    loop.ros.set_parameters('controller', setpoint_ramp=0.05)
     loop.ask(SETPOINT + 4.0)
     loop.ros.wait_until(lambda: loop.measured[-1].temperature > SETPOINT + 0.2)
     steps = loop.steps(retune, 30)

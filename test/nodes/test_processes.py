@@ -362,7 +362,7 @@ def bad_starts(tmp_path_factory: pytest.TempPathFactory) -> Iterator[dict[str, N
 @pytest.mark.parametrize('name', BAD_STARTS)
 def test_bad_start_says_why_in_one_line(bad_starts: dict[str, NodeProcess], name: str) -> None:
     process, case = bad_starts[name], BAD_STARTS[name]
-    assert process.process.wait(30.0) == 1
+    assert process.process.wait(TIMEOUT) == 1
     (line,) = process.output().splitlines()
     assert line.startswith(f'{case.node}: cannot start: ')
     assert case.words in line
@@ -402,11 +402,14 @@ def test_two_reservations_are_two_domains() -> None:
         assert first['ROS_DOMAIN_ID'] != second['ROS_DOMAIN_ID']
 
 
-def test_reservation_ends_with_its_context() -> None:
-    with isolated_domain() as first:
-        pass
-    with isolated_domain() as again:
-        assert again['ROS_DOMAIN_ID'] == first['ROS_DOMAIN_ID']
+def test_reservation_ends_with_its_context(monkeypatch: pytest.MonkeyPatch) -> None:
+    # one that no other test reserves meanwhile
+    monkeypatch.setattr(processes, '_DOMAINS', [1000 + os.getpid()])
+    for _ in range(2):
+        with isolated_domain() as environment:
+            assert environment['ROS_DOMAIN_ID'] == str(1000 + os.getpid())
+            with pytest.raises(RuntimeError, match='taken'), isolated_domain():
+                pass
 
 
 @pytest.mark.skipif('fastrtps' not in get_rmw_implementation_identifier(),

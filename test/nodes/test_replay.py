@@ -375,7 +375,7 @@ def test_report_tells_where_the_new_model_differs(day: tuple[Path, int], tmp_pat
             [sys.executable, '-m', 'koopman_ros.nodes.replay', '--ros-args', '--params-file',
              str(config_directory() / 'controller.yaml'), *settings, '-p', f'bags:=[{day[0]}]',
              '-p', 'new_model:=reactor_linear', '-p', 'output:=out'],
-            cwd=tmp_path, capture_output=True, text=True, timeout=60, check=False)
+            cwd=tmp_path, capture_output=True, text=True, timeout=240, check=False)
     assert (ended.returncode, ended.stderr) == (0, '')
     assert 'reproduced to the bit' in ended.stdout
     summary = json.loads((tmp_path / 'out' / 'summary.json').read_text())

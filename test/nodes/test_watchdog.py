@@ -19,7 +19,7 @@ from __future__ import annotations
 import itertools
 import math
 
-from controller_bench import Bench, STATUS, STEADY
+from controller_bench import Bench, STEADY
 from diagnostic_msgs.msg import DiagnosticStatus
 from koopman_ros.nodes import topics
 from koopman_ros.nodes.messages import LAST_STAMP_SECONDS
@@ -60,7 +60,8 @@ def bench(shared_bench: Bench) -> Bench:
     """Return a controller with its shipped settings that has measured for 20 s, up to 20 s."""
     del shared_bench.commands[:], shared_bench.ros.statuses[:]
     measured(shared_bench, 1, 20)
-    shared_bench.ros.wait_for_status(STATUS, lambda s: s.level == DiagnosticStatus.OK)
+    shared_bench.status(lambda s: s.level == DiagnosticStatus.OK)
+    del shared_bench.ros.statuses[:-1]
     return shared_bench
 
 
@@ -68,7 +69,7 @@ def bench(shared_bench: Bench) -> Bench:
     (math.nan, 'the measured temperature is nan, not finite: check the sensor'),
     (400.0, 'the measured temperature 400.00 degC is outside the range of the sensor, -20.00 degC '
             'to 150.00 degC: check it'),
-    (30.0, 'to 30.00 degC in 1 s, at most 2 K and 2 K/s are possible: check the sensor'),
+    (30.0, 'to 30.00 degC in 2 s, at most 2 K and 2 K/s are possible: check the sensor'),
 ])
 def test_burst_of_nonsense_holds_the_coolant_which_goes_on_smoothly(
         bench: Bench, celsius: float, words: str) -> None:
@@ -76,13 +77,15 @@ def test_burst_of_nonsense_holds_the_coolant_which_goes_on_smoothly(
     count = 2 if celsius == 30.0 else 5
     for k in range(21, 21 + count):
         assert bench.measure(celsius, float(k)).temperature == held
-    status = bench.ros.wait_for_status(STATUS, lambda s: s.level == DiagnosticStatus.ERROR)
+    status = bench.status()
+    assert status.level == DiagnosticStatus.ERROR
     assert status.message.startswith('the last command is held: ')
     assert words in status.message
     assert value(status, 'active law') == 'hold'
     after = measured(bench, 21 + count, 10)
     assert np.max(np.abs(np.diff([held, *after]))) < 0.2
-    status = bench.ros.wait_for_status(STATUS, lambda s: s.level == DiagnosticStatus.OK)
+    status = bench.status()
+    assert status.level == DiagnosticStatus.OK
     assert value(status, 'active law') == 'learned law'
 
 
@@ -100,7 +103,7 @@ def test_frozen_sensor_is_found_out_by_what_the_model_says(bench: Bench) -> None
     assert k > 40
     bench.ask(STEADY)
     measured(bench, k, 30)
-    bench.ros.wait_for_status(STATUS, lambda s: s.level == DiagnosticStatus.OK)
+    bench.status(lambda s: s.level == DiagnosticStatus.OK)
 
 
 def test_runaway_beyond_the_trained_range_goes_down_the_ladder_and_up_again(bench: Bench
@@ -112,6 +115,7 @@ def test_runaway_beyond_the_trained_range_goes_down_the_ladder_and_up_again(benc
         # 60 K/min
         assert abs(command - before) <= 1.0 + 1e-9
         before = command
+    bench.status()
     statuses = [(value(s, 'active law'), s.level) for s in bench.ros.statuses]
     laws = [law for law, _ in itertools.groupby(law for law, _ in statuses)]
     assert laws == ['learned law', 'linear law', 'safe input', 'linear law', 'learned law']
@@ -131,7 +135,8 @@ def test_time_may_begin_at_zero_and_jump_by_an_hour_and_back(ros: Workbench) -> 
     assert np.max(np.abs(np.diff(commands))) < 0.05
     assert np.ptp(commands) > 0.0
     ros.wait_until(lambda: 'time starts afresh' in bench.process.output())
-    status = ros.wait_for_status(STATUS, lambda s: value(s, 'measurements') == '16')
+    status = bench.status()
+    assert value(status, 'measurements') == '16'
     assert status.level == DiagnosticStatus.OK
 
 
@@ -162,15 +167,19 @@ def test_silence_in_simulated_time_ends_at_the_safe_coolant(ros: Workbench) -> N
                  for part in ('-r', f'{name}:=elsewhere/{name}')]
     clock = ros.listen(Clock, topics.CLOCK, topics.CLOCK_QOS)
     ros.start('plant', {'speed': 50.0}, tuple(elsewhere))
-    bench = Bench(ros, {'hold_timeout': 20.0}, ('-p', 'use_sim_time:=true'))
+    bench = Bench(ros, {'measurement_timeout': 10.0, 'hold_timeout': 20.0},
+                  ('-p', 'use_sim_time:=true'))
     ros.wait_until(lambda: clock)
     held = bench.measure(STEADY, 2.0).temperature
     begun = clock[-1].clock.sec
-    status = ros.wait_for_status(STATUS, lambda s: s.level == DiagnosticStatus.ERROR)
+    status = bench.status(lambda s: s.level == DiagnosticStatus.ERROR)
     assert status.message.startswith(
         f'no measurement for more than 10 s: the last command is held, coolant at {held:.2f} degC')
     ros.wait_until(lambda: bench.commands[-1].temperature == SAFE)
-    status = ros.wait_for_status(STATUS, lambda s: 'safe coolant temperature' in s.message)
+    # what the bench has heard of the clock may be older
+    ticks = len(clock)
+    ros.wait_until(lambda: len(clock) > ticks + 1)
+    status = bench.status(lambda s: 'safe coolant temperature' in s.message)
     assert status.level == DiagnosticStatus.ERROR
     assert value(status, 'active law') == 'safe input'
     # 10 s until it holds and 20 s until it gives up, then at 60 K/min
@@ -185,18 +194,19 @@ def test_silence_in_simulated_time_ends_at_the_safe_coolant(ros: Workbench) -> N
     # the plant was not forgotten: the law takes over from there
     command = bench.measure(STEADY - 0.5, stamps[-1] + 5.0).temperature
     assert command == pytest.approx(SAFE, abs=5.0)
-    ros.wait_until(lambda: 'the measured' not in ros.statuses[-1].message)
+    bench.status(lambda s: 'the measured' not in s.message)
 
 
 def test_silence_by_the_wall_clock_ends_at_the_safe_coolant(ros: Workbench) -> None:
-    bench = Bench(ros, {'measurement_timeout': 0.3, 'hold_timeout': 0.5,
+    bench = Bench(ros, {'measurement_timeout': 0.3, 'hold_timeout': 1.5,
                         'coolant_rate_limit': 6000.0, 'safe_coolant': 10.0})
     held = bench.commands[0].temperature
     ros.wait_until(lambda: bench.commands[-1].temperature == 10.0)
     own = own_commands(bench, 1.0)
     assert own[0].temperature == held
-    assert seconds(own[0]) == pytest.approx(1.3, abs=0.3)
-    ros.wait_for_status(STATUS, lambda s: s.level == DiagnosticStatus.ERROR and (
+    # it is held for 1.5 s, within which a busy machine looks for it
+    assert 1.3 < seconds(own[0]) < 2.8
+    bench.status(lambda s: s.level == DiagnosticStatus.ERROR and (
         'the safe coolant temperature is commanded, coolant at 10.00 degC' in s.message))
     assert 'learned law -> hold' in bench.process.output()
 
@@ -209,14 +219,13 @@ def test_silence_in_manual_mode_leaves_the_coolant_to_the_operator(ros: Workbenc
     manual.publish(temperature(held - 0.5))
     ros.wait_until(lambda: bench.commands[-1].temperature == pytest.approx(held - 0.5))
     assert own_commands(bench, 2.0)
-    status = ros.wait_for_status(STATUS, lambda s: s.level == DiagnosticStatus.ERROR)
-    assert 'no measurement for more than 0.3 s: manual mode' in status.message
+    bench.status(lambda s: s.level == DiagnosticStatus.ERROR and (
+        'no measurement for more than 0.3 s: manual mode' in s.message))
 
 
 def test_measurements_may_stay_away_where_the_timeout_is_off(ros: Workbench) -> None:
     bench = Bench(ros, {'measurement_timeout': 0.0, 'hold_timeout': 0.0})
-    status = ros.wait_for_status(
-        STATUS, lambda s: float(value(s, 'since last measurement [s]')) > 1.5)
+    status = bench.status(lambda s: float(value(s, 'since last measurement [s]')) > 1.5)
     assert status.level == DiagnosticStatus.OK
     assert len(bench.commands) == 1
 

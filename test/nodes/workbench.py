@@ -41,7 +41,7 @@ from rclpy.task import Future
 from sensor_msgs.msg import Temperature
 from std_srvs.srv import SetBool, Trigger
 
-TIMEOUT = 30.0  # s; a test that waits this long has failed
+TIMEOUT = 60.0  # s; a test that waits this long has failed, on a busy machine, too
 T = TypeVar('T')
 
 
@@ -99,11 +99,16 @@ class Workbench:
 
     # Waiting.
 
-    def wait_until(self, condition: Callable[[], T]) -> T:
-        """Spin until a condition holds, and return what it returned."""
+    def wait_until(self, condition: Callable[[], T], about: Callable[[], str] = str) -> T:
+        """
+        Spin until a condition holds, and return what it returned.
+
+        :param about: says what there was instead.
+        """
         deadline = time.monotonic() + TIMEOUT
         while not (found := condition()):
-            assert time.monotonic() < deadline, f'not within {TIMEOUT} s\n{self.printed()}'
+            assert time.monotonic() < deadline, (
+                f'not within {TIMEOUT} s\n{about()}\n{self.printed()}')
             assert not any(p.process.poll() for p in self.processes), self.printed()
             self._executor.spin_once(timeout_sec=0.05)
         return found
@@ -114,14 +119,24 @@ class Workbench:
 
     def wait_for_status(self, name: str, condition: Callable[[DiagnosticStatus], bool]
                         ) -> DiagnosticStatus:
-        """Wait until the last status of a task meets a condition."""
-        def found() -> DiagnosticStatus | None:
-            last = next((s for s in reversed(self.statuses) if s.name == name), None)
-            return last if last is not None and condition(last) else None
+        """
+        Wait until the last status of a task meets a condition.
 
-        status = self.wait_until(found)
-        assert status is not None
-        return status
+        It may have been collected before the event that it is to show: a status comes on a topic
+        of its own, later or sooner than what else a node answers with, and again each second.
+        The condition has to hold for no status from before, e.g. by a count that it carries; what
+        a test asserts of one status belongs into one condition.
+        """
+        last: DiagnosticStatus | None = None
+
+        def met() -> bool:
+            nonlocal last
+            last = next((s for s in reversed(self.statuses) if s.name == name), None)
+            return last is not None and condition(last)
+
+        self.wait_until(met, lambda: f'last status: {last}')
+        assert last is not None
+        return last
 
     # Topics.
 

@@ -165,10 +165,10 @@ def test_runaway_ends_in_an_error_that_names_state_and_time():
     system = one_state_reactor()
     message = (r'one-state reactor: temperature = \d+\.\d+ K at 1\.\d+ min, '
                r'temperature outside \[200, 1000\] K: it left its bounds; choose an input')
-    begin = time.monotonic()
+    begin = time.process_time()
     with pytest.raises(IntegrationError, match=message) as caught:
         advance(system, system.nominal_state, [310.0], 100.0)
-    assert time.monotonic() - begin < 2.0
+    assert time.process_time() - begin < 2.0
     assert caught.value.failure is IntegrationFailure.OUT_OF_BOUNDS
     assert 1.0 < caught.value.time < 2.0
     assert caught.value.state.item() > 1000.0
@@ -207,10 +207,10 @@ def test_failure_of_one_of_many_says_which():
 
 
 def test_escape_to_infinity_without_bounds():
-    begin = time.monotonic()
+    begin = time.process_time()
     with pytest.raises(IntegrationError, match=r'at 1 s: it changes too fast') as caught:
         advance(scalar_example(), [1.0], [], 2.0)
-    assert time.monotonic() - begin < 2.0
+    assert time.process_time() - begin < 2.0
     assert caught.value.failure is IntegrationFailure.STEP_TOO_SMALL
     assert caught.value.time == pytest.approx(1.0)
 
