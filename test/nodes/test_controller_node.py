@@ -21,7 +21,7 @@ import math
 from pathlib import Path
 import shutil
 
-from controller_bench import Bench, STEADY
+from controller_bench import Bench, STATUS, STEADY
 from diagnostic_msgs.msg import DiagnosticStatus
 from koopman_ros.nodes import topics
 from koopman_ros.nodes.shipped import model_path
