@@ -50,8 +50,13 @@ demo: $(VENV)/run.stamp  ## closed loop of three processes: live table, bag, pic
 demo-retrain: $(VENV)/retrain.stamp  ## the plant drifts, is recorded, learned and controlled anew -> out/demo-retrain
 	$(BIN)/python -m koopman_ros.demo.retrain
 
-test: lint  ## the whole test suite, on all cores
-	$(BIN)/python -m pytest -n auto --dist loadfile
+# Types are checked beside the tests. Tests across processes wait most of their time, so that there
+# is one worker more than cores; the longest files come first (test/conftest.py).
+test: $(VENV)/test.stamp  ## style and type checks and the whole test suite, on all cores
+	$(BIN)/ruff check
+	@$(BIN)/mypy > $(VENV)/mypy.log & types=$$!; \
+	  $(BIN)/python -m pytest -n $$(($$(nproc) + 1)) --dist loadfile --no-loadscope-reorder; \
+	  tests=$$?; wait $$types || tests=1; cat $(VENV)/mypy.log; exit $$tests
 
 lint: $(VENV)/test.stamp  ## style and type checks
 	$(BIN)/ruff check

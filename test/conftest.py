@@ -12,10 +12,23 @@
 # See the License for the specific language governing permissions and
 # limitations under the License.
 
-"""Every message that a test or a node under test makes is checked, field by field."""
+"""What holds for all tests: their order, and messages that are checked field by field."""
 
 import os
+
+import pytest
 
 # An int in a float64 field, say, passes unnoticed here, and aborts the process where the message
 # packages are built with asserts. The packages read this when they are imported.
 os.environ['ROS_PYTHON_CHECK_FIELDS'] = '1'
+
+# What takes longest, first: where each core takes the next file, none is then idle at the end.
+LONGEST = ('test_replay', 'test_campaign', 'test_experiments', 'test_retrain',
+           'test_training_benchmark', 'test_examples', 'test_training_node', 'test_processes',
+           'test_bumpless_loop', 'test_experiment_node', 'test_plant_node', 'test_recording')
+
+
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    """Put the longest files first, the others in their order."""
+    order = {name: place for place, name in enumerate(LONGEST)}
+    items.sort(key=lambda item: order.get(item.path.stem, len(order)))
