@@ -112,6 +112,30 @@ def campaign():
     return found
 
 
+def reactor_figures(campaign, name):
+    """Return what the campaign says of a shipped model."""
+    return {key.removeprefix(f'{name}/'): value
+            for key, value in campaign.metrics['reactor'][0].items() if key.startswith(name)}
+
+
+def test_the_linear_model_of_the_reactor_is_as_far_off_as_it_is(campaign):
+    found = reactor_figures(campaign, 'linear')
+    assert found['feed_forward_offset_kelvin'] == pytest.approx(3.3009, abs=1e-4)
+    assert found['tracking_offset_kelvin'] == pytest.approx(1.9334, abs=1e-4)
+    assert found['rollout_rmse_in_kelvin'] > 8.0
+    assert found['cost_ratio_to_optimum'] > 5.0
+
+
+@pytest.mark.parametrize('n_z', [3, 4])
+def test_the_shipped_lifts_track(campaign, n_z):
+    found = reactor_figures(campaign, f'nz={n_z}')
+    assert found['tracking_offset_kelvin'] < 1e-3
+    assert found['feed_forward_offset_kelvin'] < 1e-3
+    assert found['rollout_rmse_in_kelvin'] < 0.005
+    assert 1.0 - 1e-7 < found['cost_ratio_to_optimum'] < 1.0 + 1e-5
+    assert found['rollout_rmse_out_kelvin'] > found['rollout_rmse_in_kelvin']
+
+
 @pytest.fixture(scope='module')
 def drawn(campaign, tmp_path_factory):
     folder = tmp_path_factory.mktemp('studies')
