@@ -122,6 +122,8 @@ def soak(folder: Path, check: Callable[[], None], hours: float = HOURS,
                 _let_happen(rig, 3600.0 * hours, random, happened, looks, on_progress)
                 # what is on its way arrives, so that the counts can agree
                 rig.kill('plant', signal.SIGINT)
+                rig.wait(lambda: len(rig.course.commands) >= len(rig.course.delivered),
+                         'measurements are left without an answer')
                 rig.linger(0.5)
             except StalledError as error:
                 rig.course.complaints.append(str(error))

@@ -35,7 +35,8 @@ pytestmark = pytest.mark.filterwarnings('ignore::DeprecationWarning')
 
 
 def quick(case, **changes):
-    return replace(case, **{'settle': 120.0, 'afterwards': 120.0, **changes})
+    # in the wall time of a busy machine
+    return replace(case, **{'settle': 120.0, 'afterwards': 120.0, 'limit': 200.0, **changes})
 
 
 @pytest.mark.parametrize('name', ['nan-short', 'model-garbage'])
@@ -61,7 +62,7 @@ def test_what_goes_wrong_is_held_against_the_case(tmp_path):
         rig.processes['controller'].process.kill()
 
     outcome = run(Case('doomed', 'test', '', play, settle=20.0, afterwards=60.0,
-                       says=('nobody says this',)), tmp_path)
+                       says=('nobody says this',), limit=200.0), tmp_path)
     assert not outcome.survived
     reasons = '; '.join(outcome.verdict.reasons)
     assert 'controller ended by itself' in reasons
