@@ -41,7 +41,7 @@ from rclpy.task import Future
 from sensor_msgs.msg import Temperature
 from std_srvs.srv import SetBool, Trigger
 
-TIMEOUT = 60.0  # s; a test that waits this long has failed, on a busy machine, too
+TIMEOUT = 120.0  # s; a test that waits this long has failed, on a busy machine, too
 T = TypeVar('T')
 
 
