@@ -35,7 +35,7 @@ def run(tmp_path_factory: pytest.TempPathFactory) -> tuple[str, Path]:
     """Run the example as a user does; return what it prints and the file it leaves."""
     folder = tmp_path_factory.mktemp('example')
     done = subprocess.run([sys.executable, EXAMPLE], cwd=folder, capture_output=True, text=True,
-                          timeout=300, check=False)
+                          timeout=500, check=False)
     assert done.returncode == 0, done.stderr
     return done.stdout, folder / 'two_tanks.safetensors'
 

@@ -40,7 +40,7 @@ def summary(tmp_path_factory):
     (folder / 'summary.json').write_text('{"loop": {"kept": true}}')
     subprocess.run(
         [sys.executable, '-m', 'benchmarks', 'training', '--quick', '--limit', '0.5',
-         '--output', str(folder)], cwd=ROOT, check=True, timeout=240)
+         '--output', str(folder)], cwd=ROOT, check=True, timeout=500)
     assert (folder / 'training.png').stat().st_size > 10_000
     return json.loads((folder / 'summary.json').read_text())
 
