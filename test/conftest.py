@@ -23,9 +23,11 @@ import pytest
 os.environ['ROS_PYTHON_CHECK_FIELDS'] = '1'
 
 # What takes longest, first: where each core takes the next file, none is then idle at the end.
-LONGEST = ('test_replay', 'test_campaign', 'test_experiments', 'test_retrain',
-           'test_training_benchmark', 'test_examples', 'test_training_node', 'test_processes',
-           'test_bumpless_loop', 'test_experiment_node', 'test_plant_node', 'test_recording')
+LONGEST = ('test_training_node', 'test_training_benchmark', 'test_examples', 'test_plant_node',
+           'test_experiment_node', 'test_demo', 'test_retrain', 'test_replay', 'test_recording',
+           'test_processes', 'test_identify', 'test_experiments', 'test_campaign', 'test_gate',
+           'test_bumpless_loop', 'test_closed_loop', 'test_fault_campaign', 'test_player',
+           'test_install_tree', 'test_trainer_node')
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
