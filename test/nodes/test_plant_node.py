@@ -236,8 +236,8 @@ def test_lockstep_can_be_paced(ros: Workbench) -> None:
         lambda _, info: sent.append(info['source_timestamp']), topics.LOOP_QOS)
     Bench(ros, speed=20.0, sample_period=0.5, lockstep_subscribers=2)
     ros.wait_until(lambda: len(sent) > 20)
-    # 10 s of plant time at twenty times real time, the first tick maybe at once
-    assert sent[20] - sent[0] >= 0.47e9
+    # 10 s of plant time at twenty times real time, the first tick maybe at once, or late by one
+    assert sent[20] - sent[0] >= 0.449e9
 
 
 def test_stands_still_after_its_duration(ros: Workbench) -> None:
