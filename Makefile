@@ -12,7 +12,7 @@ export ROS_AUTOMATIC_DISCOVERY_RANGE ?= LOCALHOST
 # How many seeds each experiment is run from: make studies SEEDS=5
 SEEDS ?= 20
 
-.PHONY: help demo demo-retrain test lint models studies studies-sensors studies-robustness bench faults config lock clean
+.PHONY: help demo demo-retrain test test-machines lint models studies studies-sensors studies-robustness bench faults config lock clean
 
 help:  ## show this list
 	@grep -E '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed 's/:.*## /\t/'
@@ -57,6 +57,9 @@ test: $(VENV)/test.stamp  ## style and type checks and the whole test suite, on 
 	@$(BIN)/mypy > $(VENV)/mypy.log & types=$$!; \
 	  $(BIN)/python -m pytest -n $$(($$(nproc) + 1)) --dist loadfile --no-loadscope-reorder; \
 	  tests=$$?; wait $$types || tests=1; cat $(VENV)/mypy.log; exit $$tests
+
+test-machines: $(VENV)/test.stamp  ## the numerical tests under imitated processors, a quarter of an hour (MACHINES=--quick: two minutes)
+	$(BIN)/python test/machines.py $(MACHINES)
 
 lint: $(VENV)/test.stamp  ## style and type checks
 	$(BIN)/ruff check

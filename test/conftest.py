@@ -16,6 +16,7 @@
 
 import os
 
+from disturbance import disturb_training
 import pytest
 
 # An int in a float64 field, say, passes unnoticed here, and aborts the process where the message
@@ -34,3 +35,8 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     """Put the longest files first, the others in their order."""
     order = {name: place for place, name in enumerate(LONGEST)}
     items.sort(key=lambda item: order.get(item.path.stem, len(order)))
+
+
+def pytest_configure() -> None:
+    """Disturb the data of all trainings where the environment asks for it."""
+    disturb_training()

@@ -19,6 +19,7 @@ import importlib
 from pathlib import Path
 import warnings
 
+from disturbance import disturbed
 from koopman_ros.bags import BagWriter, message_definition
 from koopman_ros.identification import Record
 from koopman_ros.plants import (
@@ -65,7 +66,7 @@ def driven(system: ControlAffineSystem, minutes: float, *, seed: int = 0, noise:
     path = random_steps(system, design, minutes, seed).trajectory
     true = path.states[:, -1]
     noisy = true + noise * np.random.default_rng(seed).standard_normal(len(true))
-    return Run(noisy, np.append(path.inputs[:, 0], path.inputs[-1, 0]))
+    return Run(disturbed(noisy), np.append(path.inputs[:, 0], path.inputs[-1, 0]))
 
 
 def linear_run(count: int) -> Run:

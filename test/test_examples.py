@@ -17,8 +17,8 @@
 from pathlib import Path
 import re
 import subprocess
-import sys
 
+from disturbance import script
 from koopman_ros.lifting import load
 import numpy as np
 import pytest
@@ -26,6 +26,8 @@ import pytest
 ROOT = Path(__file__).parent.parent
 EXAMPLE = ROOT / 'examples' / 'own_plant.py'
 PAGES = [ROOT / 'README.md', ROOT / 'CONTRIBUTING.md', *sorted(ROOT.glob('docs/*.md'))]
+# half a minute of computing, several of them beside other programs
+pytestmark = pytest.mark.timeout(320)
 # Columns of the table that the example prints.
 ROLL_OUT, COST, OFFSET = 3, 4, 5
 
@@ -34,7 +36,7 @@ ROLL_OUT, COST, OFFSET = 3, 4, 5
 def run(tmp_path_factory: pytest.TempPathFactory) -> tuple[str, Path]:
     """Run the example as a user does; return what it prints and the file it leaves."""
     folder = tmp_path_factory.mktemp('example')
-    done = subprocess.run([sys.executable, EXAMPLE], cwd=folder, capture_output=True, text=True,
+    done = subprocess.run(script(EXAMPLE), cwd=folder, capture_output=True, text=True,
                           timeout=500, check=False)
     assert done.returncode == 0, done.stderr
     return done.stdout, folder / 'two_tanks.safetensors'

@@ -113,19 +113,19 @@ def nearly_uncontrollable(reach):
 
 @pytest.mark.parametrize('reach', [1e-2, 1e-3, 1e-4])
 def test_the_residual_reported_is_that_of_the_solution(reach):
-    # here it is large enough for its own rounding errors not to matter
     problem = nearly_uncontrollable(reach)
     solution = solve_riccati(*problem)
-    assert solution.residual > 1e-12
-    assert solution.residual == pytest.approx(residual(solution.P, *problem), rel=1e-2)
+    # how large it is depends on how the processor rounds; its own rounding errors are of 1e-16
+    assert solution.residual == pytest.approx(residual(solution.P, *problem), rel=1e-2, abs=1e-14)
 
 
 def test_a_bound_on_the_residual():
     problem = nearly_uncontrollable(1e-2)
-    assert solve_riccati(*problem).status is RiccatiStatus.SOLVED
-    strict = solve_riccati(*problem, max_residual=1e-12)
+    solution = solve_riccati(*problem)
+    assert solution.status is RiccatiStatus.SOLVED
+    strict = solve_riccati(*problem, max_residual=0.5 * solution.residual)
     assert strict.status is RiccatiStatus.INACCURATE
-    assert strict.residual > 1e-12
+    assert strict.residual == solution.residual > 0.0
 
 
 @pytest.mark.parametrize('reach', [0.1, 0.03, 0.01])

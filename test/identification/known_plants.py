@@ -16,6 +16,7 @@
 
 from dataclasses import dataclass
 
+from disturbance import disturbed
 from koopman_ros.identification import Box, DriftModel, Record
 import numpy as np
 from scipy.integrate import solve_ivp
@@ -66,7 +67,7 @@ class KnownPlant:
         start = np.zeros(len(self.B)) if x0 is None else x0
         x = self.states(start, times, input_time, u)
         noisy = x + noise * np.random.default_rng(seed).standard_normal(x.shape)
-        return Record(times, noisy, input_time, u)
+        return Record(times, disturbed(noisy), input_time, u)
 
     def excited(self, count, period, *, noise=0.0, seed=0, level=1.0, hold=20):
         """Return a record of random steps, each held for about `hold` samples."""

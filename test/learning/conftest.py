@@ -14,6 +14,8 @@
 
 """What holds for all tests of learning."""
 
+import os
+
 import pytest
 import torch
 
@@ -21,4 +23,5 @@ import torch
 @pytest.fixture(autouse=True, scope='session')
 def _one_thread():
     """Small problems are slower on several threads, and far slower where others use the cores."""
-    torch.set_num_threads(1)
+    if 'OMP_NUM_THREADS' not in os.environ:
+        torch.set_num_threads(1)

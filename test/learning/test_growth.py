@@ -16,6 +16,7 @@
 
 from dataclasses import replace
 
+from disturbance import disturbed_data
 from koopman_ros.learning import Growth
 from koopman_ros.learning.growth import least_squares
 from koopman_ros.learning.levenberg_marquardt import Status
@@ -53,7 +54,7 @@ def grow(recipe, data, seed=0, monitor=None):
     """Run one start a round."""
     grown = None
     for n_z in recipe.rounds(data.x.shape[1]):
-        grown = recipe.start(data, n_z, grown, seed, monitor)
+        grown = recipe.start(disturbed_data(data), n_z, grown, seed, monitor)
     return grown
 
 

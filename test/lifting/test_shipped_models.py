@@ -23,7 +23,12 @@ from koopman_ros.plants import (
     random_steps,
     RandomStepDesign,
 )
-from koopman_ros.studies.reactor import training_samples
+from koopman_ros.studies.reactor import (
+    close_loop,
+    feed_forward_offset,
+    SETPOINT,
+    training_samples,
+)
 from koopman_ros.studies.shipped_models import SEED, train_lifts
 import numpy as np
 import pytest
@@ -86,23 +91,53 @@ def test_the_box_covers_the_range_of_operation(name):
     assert model.inputs.upper[0] > 300.5
 
 
-# What is known to be reachable on this plant, 1e-6 and 1e-7 for rw.
-@pytest.mark.parametrize(('n_z', 'rw'), [(3, 1e-6), (4, 1e-7)])
-def test_fit_on_fresh_data(n_z, rw):
-    model = shipped(f'reactor_nz{n_z}')
-    fresh = training_samples(7001)
+# What is known to be reachable on this plant, by n_z: of rw, and of the error of a prediction in
+# K, be it over an episode or at rest, where a wrong feed-forward leaves an offset.
+PROMISED_FIT = {3: 1e-6, 4: 1e-7}
+PROMISED_KELVIN = {3: 0.005, 4: 0.002}
+
+
+def assert_fit(model):
+    """Hold a lift to the promise on fresh samples."""
+    promised, fresh = PROMISED_FIT[model.n_z], training_samples(7001)
     figures = fit(model, fresh.x, fresh.dxdt, fresh.u)
-    assert figures.rw <= rw
-    assert figures.rx <= rw
+    assert figures.rw <= promised
+    assert figures.rx <= promised
     assert figures.cond < 10.0
     # the file promises what fresh data confirm
-    assert model.provenance.metrics['rw'] <= rw
+    assert model.provenance.metrics['rw'] <= promised
     assert figures.rw < 10.0 * model.provenance.metrics['rw']
 
 
-@pytest.mark.parametrize(('n_z', 'kelvin'), [(3, 0.005), (4, 0.002)])
-def test_roll_out_on_fresh_data(n_z, kelvin, episodes):
-    assert roll_out_error(shipped(f'reactor_nz{n_z}'), episodes) <= kelvin
+def assert_drift(model):
+    """
+    Hold a lift to the drift of the true plant, at every temperature of its range.
+
+    rw and rx are squares of errors relative to the motion: what is promised of them on average
+    lets the drift err by their root times the largest rate.
+    """
+    system = one_state_reactor()
+    x = np.linspace(model.states.lower, model.states.upper, 400)
+    # a lift's drift is what the plant does under the input that its deviations are counted from
+    true = system.derivative(x, np.broadcast_to(model.inputs.center, x.shape))
+    learned = model.drift(model.states.to_deviation(x)) * model.states.scale
+    assert np.max(np.abs(learned - true)) <= (
+        np.sqrt(PROMISED_FIT[model.n_z]) * np.max(np.abs(true)))
+
+
+@pytest.mark.parametrize('n_z', [3, 4])
+def test_fit_on_fresh_data(n_z):
+    assert_fit(shipped(f'reactor_nz{n_z}'))
+
+
+@pytest.mark.parametrize('n_z', [3, 4])
+def test_drift_is_that_of_the_plant(n_z):
+    assert_drift(shipped(f'reactor_nz{n_z}'))
+
+
+@pytest.mark.parametrize('n_z', [3, 4])
+def test_roll_out_on_fresh_data(n_z, episodes):
+    assert roll_out_error(shipped(f'reactor_nz{n_z}'), episodes) <= PROMISED_KELVIN[n_z]
 
 
 def test_the_linear_model_predicts_far_worse(episodes):
@@ -121,22 +156,32 @@ def retrained():
     return train_lifts()
 
 
+# half a minute of computing, several of them beside other programs
+@pytest.mark.timeout(400)
 @pytest.mark.parametrize('n_z', [3, 4])
-def test_retraining_gives_the_shipped_model_back(n_z, retrained):
-    model, again = shipped(f'reactor_nz{n_z}'), retrained[n_z]
-    # The same machine gives the same bits. Another processor rounds differently, in the simulated
-    # data already, and a thousand steps of the minimisation move the parameters along directions
-    # that hardly change the model: under other instruction sets entries of A came out up to 0.06
-    # off, yet the drift, of up to 40 K/min, no more than 2e-5 K/min and rw no more than 2 %.
-    x = np.linspace(model.states.lower, model.states.upper, 400)
-    difference = (again.drift(again.states.to_deviation(x)) * again.states.scale
-                  - model.drift(model.states.to_deviation(x)) * model.states.scale)
-    assert np.max(np.abs(difference)) < 1e-4
+def test_a_retrained_lift_keeps_what_the_shipped_one_promises(n_z, retrained, episodes):
+    """
+    Judge by the true plant alone: the bits of a training are those of its processor.
+
+    Another one rounds differently, in the simulated data already, and a thousand steps of the
+    minimisation carry that along directions that hardly change the model: with data that differ
+    by 1e-13 rw comes out several times as large or as small.
+    """
+    model, shipped_one = retrained[n_z], shipped(f'reactor_nz{n_z}')
+    assert model.is_hurwitz
+    assert_fit(model)
+    assert_drift(model)
+    assert roll_out_error(model, episodes) <= PROMISED_KELVIN[n_z]
+    assert model.provenance.metrics['rollout_rmse'] <= PROMISED_KELVIN[n_z]
+    # of a step of 10 K, without an observer
+    assert feed_forward_offset(model) <= PROMISED_KELVIN[n_z]
+    loop = close_loop(model)
+    assert loop.failure == ''
+    assert abs(float(loop.states[-1, 0]) - SETPOINT) <= PROMISED_KELVIN[n_z]
+    # it is learned from what the shipped one was learned from
     for name in ('center', 'scale', 'lower', 'upper'):
         np.testing.assert_allclose(
-            getattr(again.states, name), getattr(model.states, name), rtol=1e-9)
+            getattr(model.states, name), getattr(shipped_one.states, name), rtol=1e-9)
         np.testing.assert_allclose(
-            getattr(again.inputs, name), getattr(model.inputs, name), rtol=1e-9)
-    assert again.provenance.data_digest == training_samples(SEED).digest()
-    assert again.provenance.metrics['rw'] == pytest.approx(
-        model.provenance.metrics['rw'], rel=0.1)
+            getattr(model.inputs, name), getattr(shipped_one.inputs, name), rtol=1e-9)
+    assert model.provenance.data_digest == training_samples(SEED).digest()

@@ -12,6 +12,7 @@
 # See the License for the specific language governing permissions and
 # limitations under the License.
 
+import os
 
 import pytest
 import torch
@@ -20,4 +21,5 @@ import torch
 @pytest.fixture(autouse=True, scope='session')
 def _one_thread():
     """Small problems are slower on several threads, and far slower where others use the cores."""
-    torch.set_num_threads(1)
+    if 'OMP_NUM_THREADS' not in os.environ:
+        torch.set_num_threads(1)

@@ -1,0 +1,67 @@
+# Copyright 2026 The koopman_ros Authors
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""
+A disturbance of the data that trainings see, in place of a processor that rounds differently.
+
+``DISTURB_TRAINING=1e-13`` in the environment switches it on, for pytest through test/conftest.py
+and for a script as ``python test/disturbance.py SCRIPT ARGUMENTS``. Rounding of one part in 2^53
+is carried that far by the simulations from which samples come; what a test asks of a training has
+to hold with it.
+"""
+
+import os
+from pathlib import Path
+import runpy
+import sys
+
+import numpy as np
+
+# relative, 0 for none
+SIZE = float(os.environ.get('DISTURB_TRAINING') or 0.0)
+
+
+def disturbed(values: np.ndarray) -> np.ndarray:
+    """Return values with relative white noise, the same for the same shape; as they are for 0."""
+    if not SIZE:
+        return values
+    return values * (1.0 + SIZE * np.random.default_rng(2026).standard_normal(values.shape))
+
+
+def disturbed_data(data):
+    """Return samples as a minimisation sees them, disturbed likewise."""
+    import torch
+    arrays = (data.x, data.f, data.u)
+    return type(data)(*(None if array is None else torch.from_numpy(disturbed(array.numpy()))
+                        for array in arrays))
+
+
+def disturb_training() -> None:
+    """Disturb what `train` hands to its starts; figures and digests are of the data as given."""
+    if not SIZE:
+        return
+    from koopman_ros.learning import training
+    original = training.Data
+    training.Data = lambda *arrays: disturbed_data(original(*arrays))
+
+
+def script(path: Path) -> list[str]:
+    """Return the command that runs a script, disturbed where these tests are."""
+    return [sys.executable, *([__file__] if SIZE else []), str(path)]
+
+
+if __name__ == '__main__':
+    disturb_training()
+    sys.argv = sys.argv[1:]
+    runpy.run_path(sys.argv[0], run_name='__main__')

@@ -1,0 +1,107 @@
+# Copyright 2026 The koopman_ros Authors
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""
+The numerical tests under imitated machines: ``python test/machines.py [--quick] [NAME ...]``.
+
+Other processors are imitated by taking instruction sets away from torch and numpy, other rounding
+than either has by disturbing the data of all trainings. OpenBLAS chooses its own kernels as ever:
+there are processors that need its variables set. ``--quick`` runs two imitations on the tests
+that train; NAMEs choose among them. Exit status 1 when a test failed.
+"""
+
+import argparse
+import os
+from pathlib import Path
+import subprocess
+import sys
+import time
+
+import numpy as np
+import torch
+
+ROOT = Path(__file__).parent.parent
+# What holds on every machine or not: the numerics, and what is made of them.
+NUMERICAL = ('test/plants', 'test/lifting', 'test/control', 'test/learning',
+             'test/identification', 'test/retraining', 'test/studies', 'test/test_examples.py')
+# The trainings, of which each amplifies rounding.
+TRAINING = ('test/lifting/test_shipped_models.py', 'test/learning/test_growth.py',
+            'test/learning/test_training.py', 'test/retraining/test_gate.py',
+            'test/studies/test_experiments.py')
+QUICK = ('oldest', 'disturbed')
+
+
+def found_by_numpy(*parts: str) -> list[str]:
+    """Return the features that numpy finds and can do without, all or by parts of their names."""
+    found = np.show_config(mode='dicts')['SIMD Extensions'].get('found', [])
+    return [name for name in found if not parts or any(part in name for part in parts)]
+
+
+def threads(count: int) -> dict[str, str]:
+    """Return what sets the threads of torch, MKL and OpenBLAS."""
+    return {f'{library}_NUM_THREADS': str(count) for library in ('OMP', 'MKL', 'OPENBLAS')}
+
+
+def imitations() -> dict[str, dict[str, str]]:
+    """Return what the environment of each imitated machine says besides."""
+    machines = {'oldest': {'ATEN_CPU_CAPABILITY': 'default', **without(found_by_numpy()),
+                           **threads(1)}}
+    if torch.backends.cpu.get_cpu_capability() in ('AVX2', 'AVX512'):
+        # X86_V4 is what numpy calls AVX-512 since its release 2.4
+        machines['avx2'] = {'ATEN_CPU_CAPABILITY': 'avx2',
+                            **without(found_by_numpy('AVX512', 'X86_V4')), **threads(1)}
+    machines['two-threads'] = threads(2)
+    machines['disturbed'] = {'DISTURB_TRAINING': '1e-13', **threads(1)}
+    return machines
+
+
+def without(features: list[str]) -> dict[str, str]:
+    """Return what takes features away from numpy; nothing where there is none to take."""
+    return {'NPY_DISABLE_CPU_FEATURES': ' '.join(features)} if features else {}
+
+
+def run(name: str, setting: dict[str, str], tests: tuple[str, ...]) -> bool:
+    """Run tests on an imitated machine and tell whether they passed."""
+    print(f'== {name}: ' + ', '.join(f'{key}={value}' for key, value in setting.items()),
+          flush=True)
+    workers = max(1, (os.cpu_count() or 1) // int(setting['OMP_NUM_THREADS']))
+    return subprocess.run(
+        [sys.executable, '-m', 'pytest', '-q', '-n', str(workers), '--dist', 'loadfile', *tests],
+        cwd=ROOT, env={**os.environ, **setting}, check=False).returncode == 0
+
+
+def main(arguments: list[str] | None = None) -> int:
+    """Run what is asked for, and say what passed."""
+    machines = imitations()
+    parser = argparse.ArgumentParser(description='The numerical tests under imitated machines.')
+    parser.add_argument('names', nargs='*', metavar='NAME',
+                        help=f'imitations to run, of {", ".join(machines)} (default: all)')
+    parser.add_argument('--quick', action='store_true',
+                        help=f'the tests that train alone, on {" and ".join(QUICK)}')
+    asked = parser.parse_args(arguments)
+    if unknown := [name for name in asked.names if name not in machines]:
+        parser.error(f'this processor has no imitation {unknown[0]}, choose from '
+                     f'{", ".join(machines)}')
+    results = {}
+    for name in asked.names or (QUICK if asked.quick else machines):
+        begin = time.monotonic()
+        passed = run(name, machines[name], TRAINING if asked.quick else NUMERICAL)
+        results[name] = f'{"passed" if passed else "FAILED"} in {time.monotonic() - begin:.0f} s'
+    for name, result in results.items():
+        print(f'{name}: {result}')
+    return int(any(result.startswith('FAILED') for result in results.values()))
+
+
+if __name__ == '__main__':
+    sys.exit(main())
