@@ -58,7 +58,7 @@ test: $(VENV)/test.stamp  ## style and type checks and the whole test suite, on 
 	  $(BIN)/python -m pytest -n $$(($$(nproc) + 1)) --dist loadfile --no-loadscope-reorder; \
 	  tests=$$?; wait $$types || tests=1; cat $(VENV)/mypy.log; exit $$tests
 
-test-machines: $(VENV)/test.stamp  ## the numerical tests under imitated processors, a quarter of an hour (MACHINES=--quick: two minutes)
+test-machines: $(VENV)/test.stamp  ## the numerical tests under imitated processors, a quarter of an hour (MACHINES=--quick: a minute and a half)
 	$(BIN)/python test/machines.py $(MACHINES)
 
 lint: $(VENV)/test.stamp  ## style and type checks
