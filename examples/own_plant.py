@@ -80,18 +80,19 @@ def main(file):
     known, _, test = split_by_episode(samples, seed=0)
     scaling = Scaling.of(PLANT, samples)
     slope = np.array([[-0.1, 0.0], [10.0 / 140.0, -10.0 / 140.0]])  # of the rates, at 1 m
-    models = {'linearised': Linearisation(slope).learn(PLANT, samples, scaling),
-              'EDMD, degree 3': Edmd(degree=3).learn(PLANT, known, scaling)}
+    models = {'linearised': Linearisation(slope).learn(PLANT, samples, scaling)}
+    models |= {f'EDMD, degree {degree}': Edmd(degree).learn(PLANT, known, scaling)
+               for degree in (3, 5)}
     models |= {f'lift, n_z = {model.n_z}': model for model in trained.path}
     models['free, n_z = 2'] = load(file)
     goal, inflow = np.array([0.3, 0.3]), 20.0 * np.sqrt([0.3])
     weights = Weights(Q=np.eye(2), R=np.eye(1))
-    print('                      rw       rx   cond  roll-out, mm   cost  offset, mm')
+    print('                      rw       rx     cond  roll-out, mm   cost  offset, mm')
     for name, model in models.items():
         report = judge(model, test)
         loop = run_closed_loop(model, rate, PLANT.nominal_state, goal, weights, duration=120.0,
                                u_ref=inflow)
-        print(f'{name:15} {report.fit.rw:8.1e} {report.fit.rx:8.1e} {report.fit.cond:6.1f}'
+        print(f'{name:15} {report.fit.rw:8.1e} {report.fit.rx:8.1e} {report.fit.cond:8.3g}'
               f' {1e3 * report.rollout_rmse[1]:13.3f} {loop.cost:6.2f}'
               f' {1e3 * abs(loop.states[-1, 1] - goal[1]):11.3f}')
 

@@ -160,8 +160,9 @@ def projected(model: LiftedModel, x: Array, target: Target, weights: Weights, *,
     """
     Solve the Riccati equation of the state's error e = x - x_ref under the projected dynamics.
 
-    e' = J^+ (A M + H) e + B v, with N(x) - N(x_ref) = M e. It needs no more than that (df/dx, B)
-    be stabilisable, so unstable modes of A and their products do no harm.
+    e' = J^+ (A M + H) e + B v, with N(x) - N(x_ref) = M e; for monomials the rows of the states
+    take the place of J^+. It needs no more than that (df/dx, B) be stabilisable, so unstable
+    modes of A and their products do no harm.
 
     Arguments and result as in :func:`feedback`.
     """

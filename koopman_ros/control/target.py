@@ -47,7 +47,7 @@ class Target:
 
 def steady_state_target(model: LiftedModel, x_ref: Array, w: Array | None = None) -> Target:
     """
-    Solve J_N(x_ref)^+ A N(x_ref) + B u_ref + w = 0 for u_ref by least squares.
+    Solve f(x_ref) + B u_ref + w = 0 for u_ref by least squares, f the model's drift.
 
     The feed-forward comes from the lifted model: the linearisation's would leave an offset of
     kelvins far from the nominal point.

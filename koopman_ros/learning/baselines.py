@@ -55,8 +55,9 @@ class Edmd:
     Extended dynamic mode decomposition of the generator, with inputs, on monomials.
 
     dz/dt = A z + J(x) B u by linear least squares on J (dx/dt - B u), z all monomials of the
-    scaled states up to a degree; degree 1 is the linear model that fits the samples best. Where
-    B is not known it comes from the rows of the states alone. (Williams, Kevrekidis, Rowley 2015;
+    scaled states up to a degree; degree 1 is the linear model that fits the samples best. The
+    drift is read off the rows of the states, which are a fit to dx/dt by itself. Where B is not
+    known it comes from them, too. (Williams, Kevrekidis, Rowley 2015;
     generator with control-affine inputs: Peitz, Otto, Rowley 2020.)
 
     :param degree: highest total degree of the monomials.

@@ -136,7 +136,7 @@ def fit(model: LiftedModel, x: Array, dxdt: Array, u: Array) -> Fit:
 def roll_out(model: LiftedModel, x0: Array, inputs: Array, sample_period: float | Array,
              ) -> Array:
     """
-    Predict the states under inputs that are held, from the projected drift J^+ A N(x) + B u.
+    Predict the states under inputs that are held, from the model's drift: dx/dt = f(x) + B u.
 
     :param model: the lift.
     :param x0: (..., n_x) start, in state units; leading dimensions are predicted side by side.

@@ -204,10 +204,12 @@ class LiftedModel:
 
     @cached_property
     def linearised(self) -> LiftedModel:
-        """The model linearised at its nominal point: dx/dt = J_N(0)^+ A J_N(0) x + B u."""
+        """The model linearised at its nominal point: dx/dt = (df/dx)(0) x + B u, f its drift."""
         J = self.jacobian(np.zeros(self.n_x))
         observables = NetworkObservables((), np.zeros((0, self.n_x)), identity=True)
-        return replace(self, observables=observables, A=np.linalg.pinv(J) @ self.A @ J)
+        # an axis more, because the shortcut for one state rounds otherwise
+        onto = self.onto_states(J[None], self.A[None])[0]
+        return replace(self, observables=observables, A=onto @ J)
 
     def distance(self, x: Array) -> float:
         """
@@ -256,21 +258,18 @@ class LiftedModel:
 
     def onto_states(self, J: Array, rate: Array) -> Array:
         """
-        Evaluate J_N(x)^+ times a rate of z: (n_z,) -> (n_x,), or (n_z, k) -> (n_x, k).
+        Read the rate of the state off a rate of z: (..., n_z, k) -> (..., n_x, k).
 
-        :param J: (n_z, n_x) from the state x in question.
-        :param rate: what the nearest rate of the state is wanted of.
+        A network's lift is read by J_N(x)^+, monomials by the rows of the states.
+
+        :param J: (..., n_z, n_x) from the state x in question.
+        :param rate: what the rate of the state is wanted of; (n_z,) gives (n_x,).
         """
-        if self.n_x == 1 and self.identity:
-            # the same without a singular value decomposition; J holds a 1
-            column = J[:, 0]
-            found: Array = J.T.dot(rate) / column.dot(column)
-            return found
-        return np.linalg.pinv(J) @ rate
+        return self.observables.onto_states(J, rate)
 
     def drift(self, x: Array) -> Array:
-        """Evaluate the projected drift J_N(x)^+ A N(x), the model's f: (..., n_x) -> same."""
+        """Evaluate f, the rate of the state that A N(x) implies: (..., n_x) -> same."""
         z, J = self.lift_and_jacobian(x)
         if x.ndim == 1:
             return self.onto_states(J, self.A.dot(z))
-        return (np.linalg.pinv(J) @ (z @ self.A.T)[..., None])[..., 0]
+        return self.onto_states(J, (z @ self.A.T)[..., None])[..., 0]

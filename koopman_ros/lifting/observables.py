@@ -61,6 +61,15 @@ class Observables(ABC):
                          ) -> tuple[Array, Array, Array, Array]:
         """Evaluate N(x) and J_N(x), which a feedback law needs, too, before the secants."""
 
+    @abstractmethod
+    def onto_states(self, J: Array, rate: Array) -> Array:
+        """
+        Read the rate of the state off a rate of z: (..., n_z, k) -> (..., n_x, k).
+
+        :param J: (..., n_z, n_x) from the state x in question.
+        :param rate: what the rate of the state is wanted of; (n_z,) gives (n_x,).
+        """
+
     @final
     def secants(self, x: Array, x_ref: Array, w: Array) -> tuple[Array, Array]:
         """
@@ -203,6 +212,19 @@ class NetworkObservables(Observables):
                 self._with_states(eye, T.dot(rows)).T, self._with_states(eye, S.dot(rows)).T,
                 G.dot(rows).T)
 
+    def onto_states(self, J: Array, rate: Array) -> Array:
+        """
+        Evaluate J_N(x)^+ times a rate of z; shapes as in the interface.
+
+        All coordinates share in what training left over, so that all of them are asked.
+        """
+        if self.identity and J.shape[1:] == (1,):
+            # one state: the same without a singular value decomposition; J holds a 1
+            column = J[:, 0]
+            found: Array = J.T.dot(rate) / column.dot(column)
+            return found
+        return np.linalg.pinv(J) @ rate
+
     def _with_states(self, states: Array, rows: Array) -> Array:
         """Fill in what the coordinates (..., n_z) of `rows` begin with where z does."""
         if self.identity:
@@ -311,6 +333,16 @@ class PolynomialObservables(Observables):
         second, exponents = self._second
         H: Array = np.tensordot(weights, second * _monomials(points, exponents) @ w, 1)
         return *self.lift_and_jacobian(x), M, H
+
+    def onto_states(self, J: Array, rate: Array) -> Array:
+        """
+        Take the rows of the states; shapes as in the interface.
+
+        Least squares fit each row of A by itself, those of the states to dx/dt. The other
+        monomials' rates are mostly not in the span of the dictionary: J_N(x)^+ would bring in
+        what they lack.
+        """
+        return rate[:self.n_x] if rate.ndim == 1 else rate[..., :self.n_x, :]
 
 
 def _product(rows: Array, matrix: Array) -> Array:

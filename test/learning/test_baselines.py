@@ -16,8 +16,8 @@
 
 from dataclasses import replace
 
-from koopman_ros.control import run_closed_loop, Weights
-from koopman_ros.learning import Edmd, fit, judge, Linearisation, Scaling
+from koopman_ros.control import projected, run_closed_loop, steady_state_target, Weights
+from koopman_ros.learning import Edmd, fit, judge, Linearisation, Plant, Samples, Scaling
 from koopman_ros.lifting import linearised_model
 import numpy as np
 import pytest
@@ -41,6 +41,51 @@ def test_monomials_hold_the_exact_lift_of_the_two_state_example(degree, B):
         assert np.min(np.abs(model.eigenvalues - value)) < 1e-9
     units = model.B * model.states.scale[:, None] / model.inputs.scale
     np.testing.assert_allclose(units, TWO_STATE.B, rtol=0, atol=1e-12)
+
+
+def van_der_pol(x, u):
+    """Return the rates (..., 2) of dx1/dt = x2, dx2/dt = (1 - x1^2) x2 - x1 + u."""
+    return np.stack([x[..., 1], (1.0 - x[..., 0] ** 2) * x[..., 1] - x[..., 0] + u[..., 0]], -1)
+
+
+VAN_DER_POL = Plant('Van der Pol', ('x1', 'x2'), ('1', '1'), ('u',), ('1',), 's', np.zeros(2),
+                    np.zeros(1), np.array([[0.0], [1.0]]))
+
+
+def van_der_pol_samples(count=400, seed=0):
+    rng = np.random.default_rng(seed)
+    x, u = rng.uniform(-2.0, 2.0, (count, 2)), rng.uniform(-1.0, 1.0, (count, 1))
+    return Samples(x, van_der_pol(x, u), u, np.arange(count) // 40)
+
+
+@pytest.mark.parametrize('degree', [3, 5])
+@pytest.mark.parametrize('B', [VAN_DER_POL.B, None], ids=['known B', 'learned B'])
+def test_a_drift_of_monomials_is_found_exactly(degree, B):
+    """
+    Van der Pol's drift is of degree 3; the rates of its other monomials are of degree 5.
+
+    So no A fits those, and what they lack must not come into the rate of the state.
+    """
+    model = Edmd(degree).learn(replace(VAN_DER_POL, B=B), van_der_pol_samples())
+    fresh = van_der_pol_samples(seed=1)
+    found = fit(model, fresh.x, fresh.dxdt, fresh.u)
+    assert found.rw > 1e-3
+    assert found.rx < 1e-20
+    xi = model.states.to_deviation(fresh.x)
+    f = van_der_pol(fresh.x, np.zeros((400, 1)))
+    np.testing.assert_allclose(model.drift(xi) * model.states.scale, f, rtol=0, atol=1e-10)
+    # each alone as all at once, and the law's error dynamics are those of the same drift
+    target = steady_state_target(model, xi[0])
+    for x in xi[1:30]:
+        np.testing.assert_allclose(
+            model.drift(x) * model.states.scale,
+            van_der_pol(model.states.to_physical(x), np.zeros(1)), rtol=0, atol=1e-10)
+        law = projected(model, x, target, Weights(np.eye(2), np.eye(1)))
+        np.testing.assert_allclose(law.drift @ (x - xi[0]), model.drift(x) - model.drift(xi[0]),
+                                   rtol=0, atol=1e-10)
+    np.testing.assert_allclose(model.linearised.A * model.states.scale[:, None]
+                               / model.states.scale, [[0.0, 1.0], [-1.0, 1.0]],
+                               rtol=0, atol=1e-10)
 
 
 def test_a_linear_plant_is_fitted_exactly():

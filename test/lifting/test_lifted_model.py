@@ -96,12 +96,26 @@ def test_drift_of_a_batch_is_that_of_its_members(n_x, widths, identity):
 
 
 def test_drift_of_a_dictionary_by_hand():
-    """With z = (x, x^2), dz/dt = (a z_1, b z_2), J = (1, 2 x): f = (a x + 2 b x^3)/(1 + 4 x^2)."""
+    """With z = (x, x^2) the first row of A z is the rate of x, whatever the second one says."""
     model = replace(random_lift(1), observables=PolynomialObservables.total_degree(1, 2),
-                    A=np.diag([-1.0, -3.0]))
+                    A=np.array([[-1.0, 0.25], [0.5, -3.0]]))
     x = np.linspace(-2.0, 2.0, 9)[:, None]
-    expected = (-x - 6.0 * x ** 3) / (1.0 + 4.0 * x ** 2)
+    expected = -x + 0.25 * x ** 2
     np.testing.assert_allclose(model.drift(x), expected, rtol=1e-13)
+    np.testing.assert_allclose([model.drift(v) for v in x], expected, rtol=1e-13)
+    np.testing.assert_array_equal(model.linearised.A, [[-1.0]])
+
+
+@pytest.mark.parametrize('columns', [(), (1,), (3,)])
+def test_rates_of_monomials_are_read_by_the_rows_of_the_states(columns):
+    model = dictionary_model()
+    rate = np.random.default_rng(3).normal(size=(model.n_z, *columns))
+    for J in (model.jacobian(x) for x in states(2)):
+        np.testing.assert_array_equal(model.onto_states(J, rate), rate[:2])
+    if columns:
+        both = np.stack([rate, -rate])
+        np.testing.assert_array_equal(
+            model.onto_states(model.jacobian(states(2, 2)), both), both[:, :2])
 
 
 def linear_reactor():

@@ -14,12 +14,15 @@
 
 """The experiments: their data, what they measure, and their known answers."""
 
-from koopman_ros.learning import fit, Growth, Linearisation, train
+
+from koopman_ros.control import projected, steady_state_target, Weights
+from koopman_ros.learning import Edmd, fit, Growth, Linearisation, train
 from koopman_ros.plants import scalar_example
 from koopman_ros.studies import reactor, scalar, two_state
 from koopman_ros.studies.datasets import describe
 import numpy as np
 import pytest
+from scipy.linalg import solve_continuous_are
 
 BOXES = [two_state.WIDE, *two_state.NARROW.values()]
 
@@ -70,6 +73,22 @@ def test_linearised_control_of_the_two_state_example():
         loop = two_state.close_loop(linear, R)
         assert loop.cost / two_state.exact_two_state_cost(two_state.START, R) == pytest.approx(
             ratio, abs=1e-3)
+
+
+def test_monomials_control_the_two_state_example_by_its_exact_drift():
+    """The drift is of degree 2, and f(x) = (the mean of df/dx from 0 to x) x by hand."""
+    samples = two_state.samples(two_state.WIDE, 0, episodes=5)
+    model = Edmd(2).learn(describe(two_state.SYSTEM), samples)
+    assert fit(model, samples.x, samples.dxdt, samples.u).rx < 1e-20
+    scale = model.states.scale
+    weights = Weights(np.diag(scale ** 2), np.diag(model.inputs.scale ** 2))
+    origin = steady_state_target(model, model.states.to_deviation(np.zeros(2)))
+    for x in samples.x[::8]:
+        found = projected(model, model.states.to_deviation(x), origin, weights)
+        A = np.array([[-0.1, 0.0], [-x[0], 1.0]])
+        P = solve_continuous_are(A, two_state.SYSTEM.B, np.eye(2), np.eye(1))
+        expected = -two_state.SYSTEM.B.T @ P @ x
+        np.testing.assert_allclose(model.inputs.to_physical(found.u), expected, rtol=0, atol=1e-8)
 
 
 def test_learned_control_of_the_two_state_example():
