@@ -83,7 +83,7 @@ bench: $(VENV)/bench.stamp  ## speed beside other programs, thirteen minutes (BE
 faults: $(VENV)/run.stamp  ## put faults into the loop, and soak it for a day, ten minutes (FAULTS=--quick: half a one) -> out/faults
 	$(BIN)/python -m faults $(FAULTS)
 
-config: $(VENV)/run.stamp  ## write config/*.yaml from the parameter tables
+config: $(VENV)/run.stamp  ## write config/*.yaml and the SROS2 policy from their tables
 	$(BIN)/python -m koopman_ros.nodes.parameter_files
 
 lock: | $(BIN)/python  ## take the newest versions within the ranges of setup.py -> requirements.lock

@@ -13,7 +13,7 @@
 # limitations under the License.
 
 """
-The shipped parameter files, written from the parameter tables.
+The shipped parameter files, written from the parameter tables, and the SROS2 policy.
 
 Run it as ``python -m koopman_ros.nodes.parameter_files`` after a change to a table.
 """
@@ -25,6 +25,7 @@ from pathlib import Path
 import sys
 
 from koopman_ros.nodes import (
+    access,
     controller_parameters,
     plant_parameters,
     player_parameters,
@@ -50,12 +51,14 @@ def parameter_file(node: str) -> str:
 
 
 def main(args: list[str] | None = None) -> int:
-    """Write all parameter files."""
-    parser = argparse.ArgumentParser(description='Write the shipped parameter files.')
+    """Write all parameter files and the policy."""
+    parser = argparse.ArgumentParser(
+        description='Write the shipped parameter files and the SROS2 policy.')
     parser.add_argument('--output', type=Path, default=Path('config'))
     output = parser.parse_args(args).output
     for node in TABLES:
         (output / f'{node}.yaml').write_text(parameter_file(node))
+    (output / access.POLICY_FILE).write_text(access.policy())
     return 0
 
 

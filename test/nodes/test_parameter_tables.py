@@ -21,6 +21,7 @@ import math
 from pathlib import Path
 from typing import Any
 
+from koopman_ros.nodes.access import policy, POLICY_FILE
 from koopman_ros.nodes.controller_parameters import ControllerParameters
 from koopman_ros.nodes.parameter_files import main, parameter_file, TABLES
 from koopman_ros.nodes.parameter_node import ParameterNode
@@ -311,7 +312,7 @@ def test_shipped_file_is_what_the_table_writes(node: str) -> None:
 def test_shipped_files_are_written_by_one_command(tmp_path: Path) -> None:
     assert main(['--output', str(tmp_path)]) == 0
     assert {path.name: path.read_text() for path in tmp_path.iterdir()} == {
-        f'{node}.yaml': parameter_file(node) for node in TABLES}
+        **{f'{node}.yaml': parameter_file(node) for node in TABLES}, POLICY_FILE: policy()}
 
 
 @pytest.mark.parametrize('node', TABLES)

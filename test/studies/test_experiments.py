@@ -14,7 +14,6 @@
 
 """The experiments: their data, what they measure, and their known answers."""
 
-
 from koopman_ros.control import projected, steady_state_target, Weights
 from koopman_ros.learning import Edmd, fit, Growth, Linearisation, train
 from koopman_ros.plants import scalar_example

@@ -1,0 +1,113 @@
+# Copyright 2026 The koopman_ros Authors
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""Who publishes, subscribes and serves what, and the SROS2 policy that grants no more."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from xml.etree import ElementTree
+
+from koopman_ros.nodes import player_parameters, topics, trainer_parameters
+
+POLICY_FILE = 'sros2_policy.xml'
+
+# what rclpy gives every node
+_ROSOUT, _PARAMETER_EVENTS = '/rosout', '/parameter_events'
+_PARAMETER_SERVICES = (
+    '~/describe_parameters', '~/get_parameter_types', '~/get_parameters', '~/list_parameters',
+    '~/set_parameters', '~/set_parameters_atomically')
+_TYPE_SERVICE = '~/get_type_description'
+_STANDARD_TOPICS = (_ROSOUT, _PARAMETER_EVENTS)
+_STANDARD_SERVICES = (*_PARAMETER_SERVICES, _TYPE_SERVICE)
+# `ros2 topic pub` and its like start a node with this service, named after their process
+_COMMAND_LINE_SERVICE = '/_ros2cli_*/get_type_description'
+
+_LOOP = tuple(name for name in topics.TYPES if name != topics.CLOCK)
+
+
+@dataclass(frozen=True)
+class Access:
+    """
+    What a node does on the network, by names as in the node; all tuples of names.
+
+    :param publishes: topics.
+    :param subscribes: topics; /clock where it follows simulated time (`use_sim_time`).
+    :param serves: services.
+    :param calls: services of others.
+    """
+
+    publishes: tuple[str, ...] = ()
+    subscribes: tuple[str, ...] = ()
+    serves: tuple[str, ...] = ()
+    calls: tuple[str, ...] = ()
+
+
+NODES = {
+    'plant': Access(
+        publishes=(topics.TEMPERATURE, topics.CONCENTRATION, topics.COOLANT_TEMPERATURE,
+                   topics.CLOCK, topics.DIAGNOSTICS, *_STANDARD_TOPICS),
+        subscribes=(topics.COOLANT_SETPOINT,),
+        serves=('~/reset', *_STANDARD_SERVICES)),
+    'controller': Access(
+        publishes=(topics.COOLANT_SETPOINT, topics.ACTIVE_SETPOINT,
+                   topics.PREDICTED_TEMPERATURE, topics.CONTROLLER_STATE, topics.DIAGNOSTICS,
+                   *_STANDARD_TOPICS),
+        subscribes=(topics.TEMPERATURE, topics.COOLANT_TEMPERATURE, topics.SETPOINT,
+                    topics.MANUAL_COOLANT_SETPOINT, topics.CLOCK),
+        serves=('~/set_automatic', '~/reload_model', *_STANDARD_SERVICES)),
+    'trainer': Access(
+        publishes=(*trainer_parameters.EXPERIMENT_TOPICS, topics.DIAGNOSTICS,
+                   *_STANDARD_TOPICS),
+        subscribes=(*trainer_parameters.LOOP_TOPICS, topics.CLOCK),
+        serves=('~/record', '~/experiment', '~/train', '~/cancel_training',
+                *_STANDARD_SERVICES)),
+    'player': Access(
+        publishes=(*player_parameters.PlayerParameters().topics, topics.CLOCK,
+                   *_STANDARD_TOPICS),
+        subscribes=(topics.COOLANT_SETPOINT,),
+        serves=_STANDARD_SERVICES),
+    'replay': Access(publishes=(_PARAMETER_EVENTS,), serves=(_TYPE_SERVICE,)),
+}
+
+# whoever moves the set-point, calls the services, tunes and watches: a person or a panel
+OPERATOR = Access(
+    publishes=(topics.SETPOINT, topics.MANUAL_COOLANT_SETPOINT, *_STANDARD_TOPICS),
+    subscribes=(*_LOOP, topics.CLOCK, *_STANDARD_TOPICS),
+    serves=(*_STANDARD_SERVICES, _COMMAND_LINE_SERVICE),
+    calls=tuple(f'{node}/{service.removeprefix("~/")}' for node, access in NODES.items()
+                if node != 'replay' for service in access.serves))
+
+
+def policy() -> str:
+    """Return the text of the SROS2 policy: one enclave for each node, and one for operators."""
+    root = ElementTree.Element('policy', version='0.2.0')
+    root.append(ElementTree.Comment(
+        ' Least privilege for each node, written by `make config`: see docs/security.md. For '
+        'nodes in\n       a namespace replace every ns="/" by it. '))
+    enclaves = ElementTree.SubElement(root, 'enclaves')
+    for name, access in {**NODES, 'operator': OPERATOR}.items():
+        enclave = ElementTree.SubElement(enclaves, 'enclave', path=f'/koopman_ros/{name}')
+        profiles = ElementTree.SubElement(enclave, 'profiles')
+        profile = ElementTree.SubElement(profiles, 'profile', ns='/', node=name)
+        for kind, verb, names in (
+                ('topic', 'publish', access.publishes), ('topic', 'subscribe', access.subscribes),
+                ('service', 'reply', access.serves), ('service', 'request', access.calls)):
+            if names:
+                rules = ElementTree.SubElement(profile, f'{kind}s', {verb: 'ALLOW'})
+                for granted in sorted(set(names)):
+                    ElementTree.SubElement(rules, kind).text = granted
+    ElementTree.indent(root)
+    return ('<?xml version="1.0" encoding="UTF-8"?>\n'
+            + ElementTree.tostring(root, encoding='unicode') + '\n')
