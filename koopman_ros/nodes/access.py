@@ -29,8 +29,8 @@ _PARAMETER_SERVICES = (
     '~/describe_parameters', '~/get_parameter_types', '~/get_parameters', '~/list_parameters',
     '~/set_parameters', '~/set_parameters_atomically')
 _TYPE_SERVICE = '~/get_type_description'
-_STANDARD_TOPICS = (_ROSOUT, _PARAMETER_EVENTS)
-_STANDARD_SERVICES = (*_PARAMETER_SERVICES, _TYPE_SERVICE)
+STANDARD_TOPICS = (_ROSOUT, _PARAMETER_EVENTS)
+STANDARD_SERVICES = (*_PARAMETER_SERVICES, _TYPE_SERVICE)
 # `ros2 topic pub` and its like start a node with this service, named after their process
 _COMMAND_LINE_SERVICE = '/_ros2cli_*/get_type_description'
 
@@ -57,35 +57,35 @@ class Access:
 NODES = {
     'plant': Access(
         publishes=(topics.TEMPERATURE, topics.CONCENTRATION, topics.COOLANT_TEMPERATURE,
-                   topics.CLOCK, topics.DIAGNOSTICS, *_STANDARD_TOPICS),
+                   topics.CLOCK, topics.DIAGNOSTICS, *STANDARD_TOPICS),
         subscribes=(topics.COOLANT_SETPOINT,),
-        serves=('~/reset', *_STANDARD_SERVICES)),
+        serves=('~/reset', *STANDARD_SERVICES)),
     'controller': Access(
         publishes=(topics.COOLANT_SETPOINT, topics.ACTIVE_SETPOINT,
                    topics.PREDICTED_TEMPERATURE, topics.CONTROLLER_STATE, topics.DIAGNOSTICS,
-                   *_STANDARD_TOPICS),
+                   *STANDARD_TOPICS),
         subscribes=(topics.TEMPERATURE, topics.COOLANT_TEMPERATURE, topics.SETPOINT,
                     topics.MANUAL_COOLANT_SETPOINT, topics.CLOCK),
-        serves=('~/set_automatic', '~/reload_model', *_STANDARD_SERVICES)),
+        serves=('~/set_automatic', '~/reload_model', *STANDARD_SERVICES)),
     'trainer': Access(
         publishes=(*trainer_parameters.EXPERIMENT_TOPICS, topics.DIAGNOSTICS,
-                   *_STANDARD_TOPICS),
+                   *STANDARD_TOPICS),
         subscribes=(*trainer_parameters.LOOP_TOPICS, topics.CLOCK),
         serves=('~/record', '~/experiment', '~/train', '~/cancel_training',
-                *_STANDARD_SERVICES)),
+                *STANDARD_SERVICES)),
     'player': Access(
         publishes=(*player_parameters.PlayerParameters().topics, topics.CLOCK,
-                   *_STANDARD_TOPICS),
+                   *STANDARD_TOPICS),
         subscribes=(topics.COOLANT_SETPOINT,),
-        serves=_STANDARD_SERVICES),
+        serves=STANDARD_SERVICES),
     'replay': Access(publishes=(_PARAMETER_EVENTS,), serves=(_TYPE_SERVICE,)),
 }
 
 # whoever moves the set-point, calls the services, tunes and watches: a person or a panel
 OPERATOR = Access(
-    publishes=(topics.SETPOINT, topics.MANUAL_COOLANT_SETPOINT, *_STANDARD_TOPICS),
-    subscribes=(*_LOOP, topics.CLOCK, *_STANDARD_TOPICS),
-    serves=(*_STANDARD_SERVICES, _COMMAND_LINE_SERVICE),
+    publishes=(topics.SETPOINT, topics.MANUAL_COOLANT_SETPOINT, *STANDARD_TOPICS),
+    subscribes=(*_LOOP, topics.CLOCK, *STANDARD_TOPICS),
+    serves=(*STANDARD_SERVICES, _COMMAND_LINE_SERVICE),
     calls=tuple(f'{node}/{service.removeprefix("~/")}' for node, access in NODES.items()
                 if node != 'replay' for service in access.serves))
 

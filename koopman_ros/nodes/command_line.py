@@ -17,9 +17,9 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+import os
 import sys
 
-from koopman_ros.nodes import topics
 from rclpy.utilities import remove_ros_args
 
 _UNKNOWN = 2  # exit code, that of argparse
@@ -28,48 +28,36 @@ _UNKNOWN = 2  # exit code, that of argparse
 @dataclass(frozen=True)
 class _Program:
     """
-    What the help says of a program.
+    What the help says of a program beside its topics and parameters.
 
     :param does: a sentence.
-    :param hears: topics it subscribes to.
-    :param says: topics it publishes.
     :param codes: meaning of its exit codes.
     """
 
     does: str
-    hears: tuple[str, ...]
-    says: tuple[str, ...]
     codes: str
 
 
 _NODE_CODES = '0 after a signal, 1 when it cannot start, 2 for an unknown argument'
-_LOOP = (topics.TEMPERATURE, topics.SETPOINT)
 PROGRAMS = {
     'plant': _Program(
         'Simulates the reactor: publishes its temperature and takes a coolant temperature.',
-        (topics.COOLANT_SETPOINT,),
-        (topics.TEMPERATURE, topics.COOLANT_TEMPERATURE, topics.CONCENTRATION, topics.CLOCK,
-         topics.DIAGNOSTICS), _NODE_CODES),
+        _NODE_CODES),
     'controller': _Program(
         'Answers each measured temperature with a coolant set-point, by a learned model.',
-        (*_LOOP, topics.COOLANT_TEMPERATURE, topics.MANUAL_COOLANT_SETPOINT),
-        (topics.COOLANT_SETPOINT, topics.ACTIVE_SETPOINT, topics.PREDICTED_TEMPERATURE,
-         topics.CONTROLLER_STATE, topics.DIAGNOSTICS), _NODE_CODES),
+        _NODE_CODES),
     'trainer': _Program(
         'Records the loop to MCAP bags, excites the plant, and learns models from bags.',
-        ('those of the parameter topics',),
-        ('that of the parameter experiment_topic', topics.DIAGNOSTICS),
         f'{_NODE_CODES}; with task:=train 0 for an accepted model, 2 for a refused one, 1 for a '
         'failure'),
     'player': _Program(
         'Publishes the measurements and set-points of a bag again, by the clock or in lock-step.',
-        (topics.COOLANT_SETPOINT,), ('those of the parameter topics',),
         '0 when all was played or after a signal, 1 when it cannot start or go on, 2 for an '
         'unknown argument'),
     'replay': _Program(
         'Runs bags through the control step, offline, with the old model and a new one.',
-        (), (), '0 when the recorded commands are reproduced, 1 when not or when it cannot run, 2 '
-        'for an unknown argument, 130 when interrupted'),
+        '0 when the recorded commands are reproduced, 1 when not or when it cannot run, 2 for an '
+        'unknown argument, 3 when a bag is too short to compare anything, 130 when interrupted'),
 }
 
 
@@ -89,16 +77,26 @@ def answer(name: str, args: list[str] | None) -> int | None:
     if not rest:
         return None
     if '--help' in rest or '-h' in rest:
-        print(help_text(name))
+        _show(help_text(name))
         return 0
     print(f'{name}: unknown argument {rest[0][:100]!r}: parameters are given as --ros-args -p '
           'name:=value; --help says more', file=sys.stderr)
     return _UNKNOWN
 
 
+def _show(text: str) -> None:
+    """Print a text to whoever reads it; `--help | head` stops half-way."""
+    try:
+        print(text, flush=True)
+    except BrokenPipeError:
+        # the interpreter flushes once more when it ends
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+
+
 def help_text(name: str) -> str:
     """Return what `--help` prints."""
-    # it imports the tables of all nodes
+    # they import the tables of all nodes
+    from koopman_ros.nodes.access import NODES, STANDARD_SERVICES, STANDARD_TOPICS
     from koopman_ros.nodes.parameter_files import TABLES
     from koopman_ros.nodes.shipped import config_directory
 
@@ -108,8 +106,11 @@ def help_text(name: str) -> str:
     parameters = '\n'.join(
         f'  {row.name:{width}}  {row.description}' + (f' [{row.unit}]' if row.unit else '')
         for row in rows)
-    lists = ''.join(f'{title}: {", ".join(names)}\n' for title, names in (
-        ('subscribes to', program.hears), ('publishes', program.says)) if names)
+    lists = ''.join(
+        f'{title}: {", ".join(own)}\n' for title, names in (
+            ('subscribes to', NODES[name].subscribes), ('publishes', NODES[name].publishes),
+            ('serves', NODES[name].serves))
+        if (own := [item for item in names if item not in STANDARD_TOPICS + STANDARD_SERVICES]))
     return f"""\
 usage: ros2 run koopman_ros {name} [--ros-args [-p name:=value ...] [--params-file file] ...]
 

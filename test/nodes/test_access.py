@@ -22,6 +22,7 @@ from xml.etree import ElementTree
 from koopman_ros.bags import BagWriter, message_definition
 from koopman_ros.nodes import replay, topics
 from koopman_ros.nodes.access import Access, NODES, OPERATOR, policy, POLICY_FILE
+from koopman_ros.nodes.parameter_node import ParameterNode
 from koopman_ros.nodes.player_parameters import PlayerParameters
 from koopman_ros.nodes.shipped import config_directory
 import pytest
@@ -139,12 +140,12 @@ def test_the_replay_does_what_it_is_granted(context: None, monkeypatch: pytest.M
     """It is gone before others have found it, so that it is asked itself, at its end."""
     seen: list[dict[str, set[str]]] = []
 
-    class Asked(Node):
+    class Asked(ParameterNode):
         def destroy_node(self) -> None:
             seen.append(done(self, 'replay'))
             super().destroy_node()
 
-    monkeypatch.setattr(replay, 'Node', Asked)
+    monkeypatch.setattr(replay, 'ParameterNode', Asked)
     replay._prepare()
     assert seen == [resolved(NODES['replay'], 'replay')]
 
