@@ -27,7 +27,7 @@ ROOT = Path(__file__).parent.parent
 EXAMPLE = ROOT / 'examples' / 'own_plant.py'
 PAGES = [ROOT / 'README.md', ROOT / 'CONTRIBUTING.md', *sorted(ROOT.glob('docs/*.md'))]
 # half a minute of computing, several of them beside other programs
-pytestmark = pytest.mark.timeout(320)
+pytestmark = pytest.mark.timeout(600)
 # Columns of the table that the example prints.
 ROLL_OUT, COST, OFFSET = 3, 4, 5
 

@@ -157,7 +157,7 @@ def retrained():
 
 
 # half a minute of computing, several of them beside other programs
-@pytest.mark.timeout(400)
+@pytest.mark.timeout(900)
 @pytest.mark.parametrize('n_z', [3, 4])
 def test_a_retrained_lift_keeps_what_the_shipped_one_promises(n_z, retrained, episodes):
     """
