@@ -91,6 +91,7 @@ class PlayerNode(LoopNode):
         self._began = False
         self._open: int | None = None  # stamp of the measurement that has no answer yet
         self._sent = 0
+        self._received: set[str] = set()  # topics of which subscribers have received a message
         self._due = self._wall_start = self._said = self._asked = time.monotonic()
         self._timer = self.create_timer(_POLL_PERIOD_NS / NANOSECONDS, self._on_timer,
                                         clock=Clock(clock_type=ClockType.STEADY_TIME))
@@ -169,13 +170,15 @@ class PlayerNode(LoopNode):
                 self._open = stamp_nanoseconds(message.message.header.stamp)
                 self._asked = time.monotonic()
                 break
-            if self._goes_with_next(message):
+            # the first one of a topic tells that the subscribers have found it
+            if message.topic in self._received and self._goes_with_next(message):
                 continue
             patience = Duration(seconds=self._settings.answer_timeout)
             if not self._outlets[message.topic].wait_for_all_acked(patience):
                 self._give_up(f'nobody received a message on {message.topic} within '
                               f'{self._settings.answer_timeout:g} s: is the controller alive?')
                 return
+            self._received.add(message.topic)
         self._say_progress()
 
     def _goes_with_next(self, message: BagMessage) -> bool:
