@@ -22,8 +22,10 @@ import time
 from typing import Any
 
 from koopman_ros.bags import (
+    BagReadError,
     BagWriter,
     INFINITE_NS,
+    loop_episodes,
     message_definition,
     QosProfile,
     read_messages,
@@ -31,9 +33,10 @@ from koopman_ros.bags import (
 )
 from koopman_ros.demo.loop import run_loop, Scenario
 from koopman_ros.demo.processes import isolated_domain, NodeProcess
-from koopman_ros.nodes import player, topics
+from koopman_ros.nodes import player, replay, topics
 from koopman_ros.nodes.messages import NANOSECONDS, stamp_nanoseconds
 from koopman_ros.nodes.shipped import config_directory
+from mcap.writer import CompressionType, IndexType, Writer
 import pytest
 from rclpy.duration import Duration
 from rclpy.publisher import Publisher
@@ -255,6 +258,47 @@ def test_what_cannot_be_played_is_refused_in_one_line(
     bag = write_bag(tmp_path / 'bag.mcap', [('/temperature', temperature(50.0, 1.0), 1.0)])
     process = ros.start('player', {'bag': bag, **parameters})
     assert words in refusal(ros, process)
+
+
+@pytest.fixture(scope='module')
+def hostile(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
+    """Return bags of some kilobytes that would take minutes, or all the memory there is."""
+    folder = tmp_path_factory.mktemp('hostile')
+    with (folder / 'records.mcap').open('wb') as stream:
+        writer = Writer(stream, chunk_size=2**26, compression=CompressionType.ZSTD,
+                        index_types=IndexType.NONE)
+        writer.start('ros2')
+        schema = writer.register_schema(
+            TEMPERATURE, 'ros2msg', message_definition(TEMPERATURE).text.encode())
+        channels = [writer.register_channel(topic, 'cdr', schema)
+                    for topic in ('/temperature', '/coolant_setpoint')]
+        for k in range(120_000):
+            writer.add_message(channels[k % 2], 1, b'', 1)
+        writer.finish()
+    (laughs := folder / 'laughs').mkdir()
+    (laughs / 'metadata.yaml').write_text('\n'.join(['a0: &a0 [ha]', *(
+        f'a{k}: &a{k} [{", ".join([f"*a{k - 1}"] * 10)}]' for k in range(1, 30))]))
+    return {'records': folder / 'records.mcap', 'laughs': laughs}
+
+
+@pytest.mark.parametrize(('name', 'words'), [
+    ('records', 'grows to more records than bytes, which no recording does: fetch it again'),
+    ('laughs', 'aliases are not read in the metadata of a bag'),
+])
+def test_bags_beyond_reason_are_refused_by_all_who_read_bags(
+        hostile: dict[str, Path], tmp_path: Path, capfd: pytest.CaptureFixture[str], name: str,
+        words: str) -> None:
+    with pytest.raises(BagReadError, match=words):
+        loop_episodes([hostile[name]], '/temperature', '/coolant_setpoint')
+    with isolated_domain():
+        for program, arguments in (
+                (player, [f'bag:={hostile[name]}', 'wait_for_subscribers:=0', 'rate:=10000.0']),
+                (replay, [f'bags:=[{hostile[name]}]', f'output:={tmp_path}'])):
+            given = [part for argument in arguments for part in ('-p', argument)]
+            assert program.main(['program', '--ros-args', *given]) == 1
+            (line,) = [line for line in capfd.readouterr().err.splitlines()
+                       if line.startswith(('player: ', 'replay: '))]
+            assert words in line
 
 
 def test_damage_on_the_way_is_told_in_one_line(ros: Workbench, tmp_path: Path) -> None:
