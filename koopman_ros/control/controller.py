@@ -31,6 +31,7 @@ from koopman_ros.control.sensor import Verdict
 from koopman_ros.control.setpoint import NANOSECONDS
 from koopman_ros.control.state import amended, Mode, Report, Settings, State
 from koopman_ros.control.transfer import Transfer
+from koopman_ros.control.way_back import leads_home, WayBack
 from koopman_ros.lifting import LiftedModel
 import numpy as np
 from numpy.typing import NDArray
@@ -77,6 +78,10 @@ class Controller:
         return _kept(self.settings.limits.within(
             self.model.inputs.center if given is None else given))
 
+    @cached_property
+    def _nominal_input(self) -> Array:
+        return _kept(self.settings.limits.within(self.model.inputs.center))
+
     # What the operator asks for.
 
     def request_setpoint(self, state: State, value: Array, effective_ns: int = 0
@@ -122,7 +127,7 @@ class Controller:
         """
         if mode is state.mode:
             return state
-        return amended(state, mode=mode, manual_input=None, standing=Standing(),
+        return amended(state, mode=mode, manual_input=None, standing=Standing(), way_back=None,
                        estimate=self._estimator.rebase(state.estimate, state.linear, False))
 
     # What happens to the controller itself.
@@ -271,7 +276,8 @@ class Controller:
             return state, wanted, self._report(state, Rung.LEARNED, verdict.fault)
         standing, attempt = self._laws.choose(state, verdict, outside, time_ns, spacing)
         was_linear = state.linear
-        state = amended(state, standing=standing)
+        state = amended(state, standing=standing, way_back=self._way_back(
+            state, standing, verdict, outside, time_ns))
         if state.linear != was_linear:
             state = amended(state, estimate=self._estimator.rebase(
                 state.estimate, was_linear, state.linear))
@@ -285,7 +291,11 @@ class Controller:
         if attempt is None or attempt.u is None or attempt.found is None:
             if standing.rung is Rung.SAFE:
                 state = amended(state, law_in_force=None, law_input=None, transfer=None)
-                return state, self.safe_input, report
+                share = 0.0 if state.way_back is None else state.way_back.share
+                if not share:
+                    return state, self.safe_input, report
+                wanted = self.safe_input + share * (self._nominal_input - self.safe_input)
+                return state, wanted, amended(report, way_back=share)
             passing = standing.resumes is not None
             return (state if passing else amended(state, law_in_force=None, law_input=None),
                     held, report)
@@ -297,6 +307,20 @@ class Controller:
         if transfer is None:
             return state, attempt.u, report
         return state, attempt.u + transfer.offset, amended(report, transfer=transfer.offset)
+
+    def _way_back(self, state: State, standing: Standing, verdict: Verdict, outside: float,
+                  time_ns: int) -> WayBack | None:
+        """Return how far the plant has come back where the safe input keeps it outside."""
+        if (standing.rung is not Rung.SAFE or verdict.fault or verdict.sensed is None
+                or not leads_home(self.model, verdict.sensed.value, self.safe_input,
+                                  self._nominal_input)):
+            return None
+        if state.way_back is not None:
+            return state.way_back.moved(
+                outside, time_ns, self.settings.ladder.recovery_time)
+        # where laws failed, or one may act soon, it is not the distance that keeps them off
+        kept_out = standing.bad_since_ns is None and standing.better_since_ns is None
+        return WayBack(outside, outside, time_ns) if kept_out and outside > 0.0 else None
 
     def _outside(self, x: Array) -> float:
         """Return how far a measurement is from the training data; NaN when it is none."""
@@ -341,7 +365,7 @@ def _afresh(state: State) -> State:
     """Return the state after the clock was set back: what was timed by it has lost its meaning."""
     standing = amended(state.standing, bad_since_ns=None, better_since_ns=None)
     return amended(state, time_ns=None, commanded_ns=None, sensed=None, standing=standing,
-                   setpoint=amended(state.setpoint, scheduled=()))
+                   way_back=None, setpoint=amended(state.setpoint, scheduled=()))
 
 
 def _shifted(transfer: Transfer | None, by: Array) -> Transfer:

@@ -101,8 +101,9 @@ class Estimator:
         w = np.zeros(self.model.n_x) if before is None else before.w
 
         def motion(then: Sensed) -> Array:
-            if self._far_out(x):
-                # what the model says of its motion is worth nothing
+            if self._far_out(x) or state.way_back is not None:
+                # what the model says of its motion is worth nothing; under the safe input even a
+                # plant that it does not expect to may rest there
                 return np.zeros_like(x)
             frozen = None if before is None else Estimate(before.x, then.w)
             moved = self.coast(amended(state, estimate=frozen), elapsed, u).estimate
@@ -197,8 +198,8 @@ class Estimator:
             moved = self.observer(state.linear).rebased(moved, np.zeros_like(moved.w))
         else:
             moved = Estimate(moved.x, np.zeros_like(moved.w))
-        # what it holds of the disturbance is in the old model's units
-        return amended(state, estimate=moved, sensed=None)
+        # what it holds of the disturbance is in the old model's units, and distances from its data
+        return amended(state, estimate=moved, sensed=None, way_back=None)
 
 
 def _command(model: LiftedModel, state: State) -> Array:

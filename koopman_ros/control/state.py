@@ -27,6 +27,7 @@ from koopman_ros.control.observer import Estimate
 from koopman_ros.control.sensor import Sensed, SensorLimits
 from koopman_ros.control.setpoint import Setpoint
 from koopman_ros.control.transfer import Transfer
+from koopman_ros.control.way_back import WayBack
 import numpy as np
 from numpy.typing import NDArray
 
@@ -129,6 +130,7 @@ class State:
     :param sensed: what is remembered of the measurements.
     :param estimate: state and disturbance, in the deviations of the model in force.
     :param standing: on the ladder.
+    :param way_back: from the safe input, while it is in force where no law may act, or None.
     :param law_in_force: the law that gave the last command; None when none did.
     :param law_input: (n_u,) what that law asked for, within the range.
     :param transfer: what is added to it for a while, or None.
@@ -144,6 +146,7 @@ class State:
     sensed: Sensed | None = None
     estimate: Estimate | None = None
     standing: Standing = field(default_factory=Standing)
+    way_back: WayBack | None = None
     law_in_force: Rung | None = None
     law_input: Array | None = None
     transfer: Transfer | None = None
@@ -177,6 +180,7 @@ class Report:
     :param disturbance: (n_u,) estimated, as an input that would have the same effect, or None.
     :param at_bound: whether that is as large as is believed.
     :param transfer: (n_u,) what a change of law or mode still adds to the command.
+    :param way_back: share of the nominal input in the command on the way back from the safe one.
     :param at_range: whether the input's range was active.
     :param at_rate: whether the input's rate limit was active.
     :param believed: whether the measurement was.
@@ -205,6 +209,7 @@ class Report:
     disturbance: Array | None = None
     at_bound: bool = False
     transfer: Array | None = None
+    way_back: float = 0.0
     at_range: bool = False
     at_rate: bool = False
     believed: bool = True

@@ -1,0 +1,92 @@
+# Copyright 2026 The koopman_ros Authors
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""The way back from the safe input to where a law may act, led by the plant itself."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from koopman_ros.control.setpoint import NANOSECONDS
+from koopman_ros.lifting import LiftedModel
+import numpy as np
+from numpy.typing import NDArray
+
+Array = NDArray[np.float64]
+
+# The input is ahead of the plant by this share of the way from the safe input to the nominal
+# one; a sensor that stands still out there brings it no further.
+_LEAD = 0.25
+# Moved is what changes its distance from the middle of the training box by this share of it.
+_MOVED = 0.03
+# At rest is what has not moved for so many times as a better rung is waited for.
+_REST = 3.0
+
+
+@dataclass(frozen=True)
+class WayBack:
+    """
+    How far a plant under the safe input has come back, by its distance from the training data.
+
+    Where the safe input itself keeps the plant outside, no law may act, and waiting does not
+    help. The input then moves towards the nominal one: by :data:`_LEAD`, and by the share of the
+    distance that the plant has left behind already. No model is asked how the plant moves out
+    there. One that does not follow, or a sensor that does not, stops the input where it is.
+
+    :param farthest: where it rested under the safe input, in half widths of the training box.
+    :param nearest: smallest distance since then.
+    :param since_ns: from when it has rested.
+    :param led: whether the input has begun to move.
+    """
+
+    farthest: float
+    nearest: float
+    since_ns: int
+    led: bool = False
+
+    def moved(self, outside: float, time_ns: int, recovery_time: float) -> WayBack:
+        """
+        Take a distance into account.
+
+        What still moves under the safe input is waited for, and what goes away from where the
+        way began starts it anew.
+
+        :param outside: in half widths.
+        :param time_ns: now.
+        :param recovery_time: of the ladder, in s.
+        """
+        change, still = outside - self.farthest, _MOVED * (1.0 + self.farthest)
+        if change > still or (change < -still and not self.led):
+            return WayBack(outside, outside, time_ns)
+        led = self.led or (time_ns - self.since_ns) / NANOSECONDS >= _REST * recovery_time
+        return WayBack(self.farthest, min(self.nearest, outside), self.since_ns, led)
+
+    @property
+    def share(self) -> float:
+        """The share of the nominal input in the command, from 0 to 1."""
+        return min(1.0, _LEAD + 1.0 - self.nearest / self.farthest) if self.led else 0.0
+
+
+def leads_home(model: LiftedModel, x: Array, safe: Array, nominal: Array) -> bool:
+    """
+    Tell whether the nominal input pushes a state towards the nominal one, beside the safe input.
+
+    On the other side, as that of a runaway, it is the safe input that does.
+
+    :param x: (n_x,) in state units.
+    :param safe: (n_u,) in input units.
+    :param nominal: (n_u,) likewise.
+    """
+    push = model.B @ (model.inputs.to_deviation(nominal) - model.inputs.to_deviation(safe))
+    return bool(model.states.to_deviation(x) @ push < 0.0)
