@@ -31,7 +31,7 @@ from koopman_ros.control.sensor import Verdict
 from koopman_ros.control.setpoint import NANOSECONDS
 from koopman_ros.control.state import amended, Mode, Report, Settings, State
 from koopman_ros.control.transfer import Transfer
-from koopman_ros.control.way_back import leads_home, WayBack
+from koopman_ros.control.way_back import leads_home, Rest, rest_under, WayBack
 from koopman_ros.lifting import LiftedModel
 import numpy as np
 from numpy.typing import NDArray
@@ -81,6 +81,11 @@ class Controller:
     @cached_property
     def _nominal_input(self) -> Array:
         return _kept(self.settings.limits.within(self.model.inputs.center))
+
+    @cached_property
+    def rest(self) -> Rest:
+        """Where the safe input leads the plant, as far as the model tells."""
+        return rest_under(self.model, self.safe_input, self.settings.ladder.return_margin)
 
     # What the operator asks for.
 
@@ -311,13 +316,13 @@ class Controller:
     def _way_back(self, state: State, standing: Standing, verdict: Verdict, outside: float,
                   time_ns: int) -> WayBack | None:
         """Return how far the plant has come back where the safe input keeps it outside."""
-        if (standing.rung is not Rung.SAFE or verdict.fault or verdict.sensed is None
-                or not leads_home(self.model, verdict.sensed.value, self.safe_input,
-                                  self._nominal_input)):
+        if standing.rung is not Rung.SAFE or verdict.fault or verdict.sensed is None:
+            return None
+        if outside > 0.0 and not leads_home(self.model, verdict.sensed.value, self.safe_input,
+                                            self._nominal_input):
             return None
         if state.way_back is not None:
-            return state.way_back.moved(
-                outside, time_ns, self.settings.ladder.recovery_time)
+            return state.way_back.moved(outside, time_ns, self.settings.ladder.recovery_time)
         # where laws failed, or one may act soon, it is not the distance that keeps them off
         kept_out = standing.bad_since_ns is None and standing.better_since_ns is None
         return WayBack(outside, outside, time_ns) if kept_out and outside > 0.0 else None

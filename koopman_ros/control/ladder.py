@@ -68,6 +68,11 @@ class LadderSettings:
             if not getattr(self, name) >= 0.0:
                 raise ValueError(f'{name} must be at least 0, got {getattr(self, name)}')
 
+    @property
+    def return_margin(self) -> float:
+        """Distance up to which a law takes over from the safe input."""
+        return _HYSTERESIS * self.linear_margin
+
 
 @dataclass(frozen=True)
 class Need:

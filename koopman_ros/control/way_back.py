@@ -32,6 +32,10 @@ _LEAD = 0.25
 _MOVED = 0.03
 # At rest is what has not moved for so many times as a better rung is waited for.
 _REST = 3.0
+# A model is followed in steps of this share of its box and of the time in which its rate changes,
+# until less than a share of the box is left of its way.
+_STEP, _STEP_SHARE, _AT_REST = 0.02, 0.2, 1e-5
+_MAX_STEPS = 500
 
 
 @dataclass(frozen=True)
@@ -90,3 +94,70 @@ def leads_home(model: LiftedModel, x: Array, safe: Array, nominal: Array) -> boo
     """
     push = model.B @ (model.inputs.to_deviation(nominal) - model.inputs.to_deviation(safe))
     return bool(model.states.to_deviation(x) @ push < 0.0)
+
+
+@dataclass(frozen=True)
+class Rest:
+    """
+    Where the safe input leads the plant, according to its model.
+
+    :param x: (n_x,) in state units; where it leaves what the model knows, a linear extrapolation
+        from there, and NaN where that does not come to rest.
+    :param outside: its distance from the training data in half widths, NaN likewise.
+    :param holding: (n_u,) input that would keep the plant where it leaves what the model knows,
+        in input units; None where it comes to rest before.
+    """
+
+    x: Array
+    outside: float
+    holding: Array | None = None
+
+
+def rest_under(model: LiftedModel, u: Array, known: float) -> Rest:
+    """
+    Follow the model from its nominal state under an input until it rests, or is too far out.
+
+    :param model: the lift.
+    :param u: (n_u,) in input units.
+    :param known: distance outside the training data, in half widths, up to which it is followed.
+    """
+    try:
+        with np.errstate(all='ignore'):
+            return _followed(model, u, known)
+    except np.linalg.LinAlgError:
+        # a model that gives no numbers: what it is to do in the loop fails likewise
+        return Rest(np.full(model.n_x, np.nan), np.nan)
+
+
+def _followed(model: LiftedModel, u: Array, known: float) -> Rest:
+    push = model.B @ model.inputs.to_deviation(u)
+    x = np.zeros(model.n_x)
+    rate = model.drift(x) + push
+    # of the deviations: steps of a fraction of the box, and of the time in which the rate changes
+    width = float(np.min((model.states.upper - model.states.lower) / model.states.scale))
+    time = np.inf
+    for _ in range(_MAX_STEPS):
+        speed = float(np.linalg.norm(rate))
+        if speed == 0.0 or speed * time < _AT_REST * width:
+            break
+        before, rate_before = x, rate
+        x = x + min(_STEP * width / speed, _STEP_SHARE * time) * rate
+        rate = model.drift(x) + push
+        if not model.distance(model.states.to_physical(x)) <= known:
+            return _beyond(model, x, rate)
+        change = float(np.linalg.norm(rate - rate_before))
+        time = float(np.linalg.norm(x - before)) / change if change > 0.0 else np.inf
+    place = model.states.to_physical(x)
+    return Rest(place, model.distance(place))
+
+
+def _beyond(model: LiftedModel, x: Array, rate: Array) -> Rest:
+    """Extrapolate from a state (n_x,) that moves at a rate (n_x,), in scaled deviations."""
+    half = 1e-4 * np.eye(model.n_x)
+    slope = np.stack([(model.drift(x + d) - model.drift(x - d)) / 2e-4 for d in half], axis=-1)
+    place, outside = np.full(model.n_x, np.nan), np.nan
+    if np.all(np.isfinite(slope)) and np.all(np.linalg.eigvals(slope).real < 0.0):
+        place = model.states.to_physical(x - np.linalg.solve(slope, rate))
+        outside = model.distance(place)
+    return Rest(place, outside, model.inputs.to_physical(
+        -model.input_inverse @ model.drift(x)))

@@ -35,7 +35,7 @@ from koopman_ros.nodes.messages import (
     temperature_message,
     to_kelvin,
 )
-from koopman_ros.nodes.model_loading import load_suitable
+from koopman_ros.nodes.model_loading import load_suitable, rests_outside
 from koopman_ros.nodes.model_loading import Situation as ModelSituation
 from koopman_ros.nodes.model_reload import ModelReload
 from koopman_ros.nodes.process import LoopNode, run
@@ -77,6 +77,7 @@ class ControllerNode(LoopNode):
         self._report = Report(Mode.AUTOMATIC)
         self._logged = self._report.rung
         self._refused = ''
+        self._rests_outside = ''
         self._counts = Counts()
         self._temperature = np.nan
         self._arrival = Arrival(self)
@@ -120,6 +121,7 @@ class ControllerNode(LoopNode):
             topics.TEMPERATURE: 'publish the temperature'}, self._on_rivals)
         TABLE.follow(self, parameters, self._on_parameters, self._models.accept)
         self.get_logger().info(self._models.in_force.about)
+        self._warn_of_rest()
         self._watchdog = Watchdog(self._on_busy)
         self._watchdog.start()
 
@@ -328,7 +330,14 @@ class ControllerNode(LoopNode):
         with self._lock:
             predecessor, self._controller = self._controller, self._built()
             self._state = self._controller.succeed(predecessor, self._state)
+        self._warn_of_rest()
         self._diagnostics.publish_if_changed()
+
+    def _warn_of_rest(self) -> None:
+        """Say that the safe coolant leads out of the model's range, once for each reason."""
+        before, self._rests_outside = self._rests_outside, rests_outside(self._controller)
+        if self._rests_outside not in ('', before):
+            self.get_logger().warning(self._rests_outside)
 
     # Diagnostics.
 
@@ -351,7 +360,8 @@ class ControllerNode(LoopNode):
         return status(Situation(
             self._controller, self._settings, self._state, self._report, self._counts,
             self._arrival, self._complaint(), self._refused, self._models.refused,
-            self._models.figures(), self._temperature))
+            {**self._models.figures(), 'safe coolant': self._rests_outside or 'within reach'},
+            self._temperature))
 
 
 def main(args: list[str] | None = None) -> int:

@@ -32,6 +32,7 @@ _LEVELS = {Rung.LEARNED: Level.OK, Rung.LINEAR: Level.WARN, Rung.HOLD: Level.ERR
            Rung.SAFE: Level.ERROR}
 _ACTIONS = {Rung.LEARNED: '', Rung.LINEAR: 'linear law', Rung.HOLD: 'the last command is held',
             Rung.SAFE: 'the safe coolant temperature is commanded'}
+_WAY_BACK = 'the coolant leads the reactor back from where the safe coolant keeps it'
 
 
 @dataclass
@@ -94,7 +95,8 @@ def _verdict(now: Situation) -> tuple[Level, str]:
     if report.reason and mode is Mode.MANUAL:
         return Level.ERROR, f'{mode.value}: {report.reason}'
     if report.rung is not Rung.LEARNED:
-        return _LEVELS[report.rung], f'{_ACTIONS[report.rung]}: {report.reason}'
+        action = _WAY_BACK if report.way_back else _ACTIONS[report.rung]
+        return _LEVELS[report.rung], f'{action}: {report.reason}'
     warning = _warning(now)
     if warning:
         return Level.WARN, warning

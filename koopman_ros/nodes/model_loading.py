@@ -23,7 +23,7 @@ from datetime import datetime, UTC
 from pathlib import Path
 import time
 
-from koopman_ros.control import Settings, State
+from koopman_ros.control import Controller, Settings, State
 from koopman_ros.lifting import LiftedModel, load, ModelFileError
 from koopman_ros.nodes.controller_parameters import ControllerParameters
 from koopman_ros.nodes.messages import in_celsius, NANOSECONDS
@@ -173,3 +173,23 @@ def refuse_without_law(model: LiftedModel, situation: Situation) -> None:
                     f'tried at {in_celsius(float(place[0]))} with the set-point '
                     f'{in_celsius(float(setpoint[0]))} the model fails ({problem}): train it '
                     'again, or change the weights')
+
+
+def rests_outside(controller: Controller) -> str:
+    """
+    Say that the safe coolant keeps the reactor where no law may act, or return an empty string.
+
+    A model without training data is a linearisation, which does not know where that is.
+    """
+    model, rest = controller.model, controller.rest
+    if rest.holding is None or not model.provenance.data_digest:
+        return ''
+    safe, holding = float(controller.safe_input[0]), float(rest.holding[0])
+    states, place = model.states, float(rest.x[0])
+    where = 'does not come to rest' if np.isnan(place) else (
+        f'rests at about {in_celsius(place)} if one extrapolates')
+    return (f'under safe_coolant = {in_celsius(safe)} the reactor leaves the trained range, '
+            f'{in_celsius(states.lower[0])} to {in_celsius(states.upper[0])}, and {where}: no law '
+            'can act there, and the way back is slow; record data from there and train again, or '
+            f'set safe_coolant to {in_celsius(holding)} or {"more" if holding > safe else "less"} '
+            'if that is still safe')
