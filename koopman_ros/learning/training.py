@@ -21,6 +21,8 @@ from contextlib import closing
 from dataclasses import dataclass, replace
 from functools import cached_property
 import math
+import multiprocessing
+import signal
 import warnings
 
 import joblib
@@ -344,6 +346,10 @@ def _runs_here() -> bool:
 
 def _start(recipe: Recipe, data: Data, n_z: int, parent: Grown | None, seed: int, threads: int,
            monitor: Monitor | None) -> Grown | str:
+    if multiprocessing.current_process().name.startswith('LokyProcess'):
+        # an interrupt of the terminal reaches the whole group: the process that waits answers it
+        # and ends its workers, which between two starts would only print where they were
+        signal.signal(signal.SIGINT, signal.SIG_IGN)
     before = torch.get_num_threads()
     torch.set_num_threads(threads)
     try:

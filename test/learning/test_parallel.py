@@ -26,7 +26,7 @@ import warnings
 
 import joblib
 import koopman_ros
-from koopman_ros.learning import train
+from koopman_ros.learning import train, training
 import numpy as np
 import pytest
 from small_plants import BENT, bent_samples, bits, SMALL
@@ -132,6 +132,22 @@ def test_an_interrupt_from_the_keyboard(backend):
     last = output.splitlines()[-1]
     assert last.startswith('model ')
     assert last.endswith('interrupted: the best parameters so far are kept')
+
+
+class Probe:
+    """A recipe whose start says how its process answers an interrupt."""
+
+    def start(self, *_):
+        return signal.getsignal(signal.SIGINT) is signal.SIG_IGN
+
+
+@pytest.mark.parametrize(('backend', 'leaves'), [('loky', True), ('threading', False)])
+def test_workers_leave_an_interrupt_to_the_process_that_waits(backend, leaves):
+    """Between two starts they would print where they were."""
+    with joblib.parallel_config(backend, n_jobs=2):
+        answers = joblib.Parallel()(joblib.delayed(training._start)(
+            Probe(), None, 2, None, 0, 1, None) for _ in range(2))
+    assert answers == [leaves, leaves]
 
 
 def test_many_samples_go_to_processes():

@@ -93,6 +93,30 @@ class Loop:
         return np.abs(np.diff([message.temperature for message in commands]))
 
 
+# first, for a shared loop beside it would take what the machine has
+def test_controller_that_was_killed_takes_over_the_coolant_in_force(ros: Workbench) -> None:
+    loop = Loop(ros, {'heat_transfer_coefficient': FOULED, 'lockstep_timeout': 0.3})
+    loop.ask(SETPOINT)
+    loop.rest()
+    ros.processes.remove(loop.controller)
+    loop.controller.process.kill()
+    loop.controller.process.wait()
+    ros.wait_for_status('plant: simulation', lambda s: 'no command arrives' in s.message)
+    coolants = ros.listen(Temperature, topics.COOLANT_TEMPERATURE)
+    # what the old one said is still on its way to the other subscription
+    commands = ros.listen(Temperature, topics.COOLANT_SETPOINT)
+
+    ros.start('controller')
+    ros.wait_until(lambda: len(commands) > 200)
+    in_force = {seconds(message): message.temperature for message in coolants}
+    # the very first may be given before the bench is known
+    assert commands[0].temperature == pytest.approx(in_force[seconds(commands[0])], abs=1e-3)
+    assert commands[0].temperature == pytest.approx(min(in_force.values()), abs=1e-3)
+    assert np.max(np.abs(np.diff([message.temperature for message in commands]))) < 0.05
+    # of the set-point it knows nothing: it holds what it finds
+    loop.rest()
+
+
 @pytest.fixture(scope='module')
 def shared_loop(shared_ros: Workbench) -> Loop:
     return Loop(shared_ros, {})
@@ -173,26 +197,3 @@ def test_weights_change_without_a_bump(loop: Loop) -> None:
     steps = loop.steps(retune, 30)
     assert loop.measured[-1].temperature < SETPOINT + 3.9
     assert np.max(steps) < 0.05
-
-
-def test_controller_that_was_killed_takes_over_the_coolant_in_force(ros: Workbench) -> None:
-    loop = Loop(ros, {'heat_transfer_coefficient': FOULED, 'lockstep_timeout': 0.3})
-    loop.ask(SETPOINT)
-    loop.rest()
-    ros.processes.remove(loop.controller)
-    loop.controller.process.kill()
-    loop.controller.process.wait()
-    ros.wait_for_status('plant: simulation', lambda s: 'no command arrives' in s.message)
-    coolants = ros.listen(Temperature, topics.COOLANT_TEMPERATURE)
-    # what the old one said is still on its way to the other subscription
-    commands = ros.listen(Temperature, topics.COOLANT_SETPOINT)
-
-    ros.start('controller')
-    ros.wait_until(lambda: len(commands) > 200)
-    in_force = {seconds(message): message.temperature for message in coolants}
-    # the very first may be given before the bench is known
-    assert commands[0].temperature == pytest.approx(in_force[seconds(commands[0])], abs=1e-3)
-    assert commands[0].temperature == pytest.approx(min(in_force.values()), abs=1e-3)
-    assert np.max(np.abs(np.diff([message.temperature for message in commands]))) < 0.05
-    # of the set-point it knows nothing: it holds what it finds
-    loop.rest()
