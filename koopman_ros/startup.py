@@ -15,6 +15,8 @@
 """
 First steps of a program, before anything large is loaded: signals, standard streams, parent.
 
+What is imported here is imported before signals are handled, so it is little.
+
 Until a program runs this, a signal does what Python does with it: in the interpreter's own first
 tens of milliseconds an interrupt ends it with SIGINT or a traceback. A child that is started by
 :func:`command` and :func:`blocked_signals` has no such time.
@@ -24,12 +26,10 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 import contextlib
-import ctypes
 import importlib
 import os
 import signal
 import sys
-import threading
 import time
 from types import FrameType
 
@@ -108,6 +108,8 @@ def command(module: str, number: int, interrupted: int) -> tuple[str, ...]:
     :param number: signal that the child gets when this process ends, however it ends.
     :param interrupted: as for :func:`run_program`.
     """
+    import threading
+
     # the signal comes when the thread ends that started the child
     parent = os.getpid() if threading.current_thread() is threading.main_thread() else 0
     return (sys.executable, '-m', 'koopman_ros.startup', str(parent), str(int(number)),
@@ -125,6 +127,8 @@ def blocked_signals() -> Iterator[None]:
 
 
 def _end_with_parent(parent: int, number: int) -> None:
+    import ctypes
+
     libc = ctypes.CDLL(None)
     if not parent or not hasattr(libc, 'prctl'):
         return
