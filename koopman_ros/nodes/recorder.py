@@ -34,6 +34,8 @@ from rclpy.topic_endpoint_info import TopicEndpointInfo
 _QUEUE_DEPTH = 5000
 
 _LINGER = 0.1  # s
+# From sending to receipt, on a machine that is busy.
+_LONGEST_WAY_NS = 1_000_000_000
 
 
 @dataclass(frozen=True)
@@ -198,7 +200,7 @@ def receipt_ns(info: Mapping[str, int], take_ns: int, empty_ns: int) -> int:
 
     rmw_fastrtps tells when it arrived; rmw_cyclonedds when it was taken, which puts all that
     waited on one topic before all that waited on the next. The sender's time is what is left
-    then, within the time in which the message must have arrived, as far as clocks differ.
+    then. Where its clock is another, the nearest time at which the message can have arrived is.
 
     :param info: received and source timestamp in ns, 0 where unknown.
     :param take_ns: a time just before it was taken.
@@ -208,7 +210,10 @@ def receipt_ns(info: Mapping[str, int], take_ns: int, empty_ns: int) -> int:
     if 0 < received_ns < take_ns:
         return received_ns
     latest_ns = received_ns or take_ns
-    return min(max(source_ns, empty_ns), latest_ns) if source_ns else latest_ns
+    if not source_ns:
+        return latest_ns
+    return source_ns if empty_ns - _LONGEST_WAY_NS <= source_ns <= latest_ns else min(
+        max(source_ns, empty_ns), latest_ns)
 
 
 def _matching_qos(topic: str, publishers: list[TopicEndpointInfo]) -> QoSProfile:

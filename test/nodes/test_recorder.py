@@ -22,6 +22,7 @@ from typing import Any
 
 from koopman_ros.bags import BagWriter, read_messages
 from koopman_ros.nodes import recorder, topics
+from koopman_ros.nodes.messages import NANOSECONDS
 from koopman_ros.nodes.recorder import receipt_ns, Recorder
 import pytest
 from rclpy.duration import Duration
@@ -73,10 +74,13 @@ def test_batch_is_recorded_in_the_order_of_sending(
     (0, 60, 60),  # not at all
     (101, 0, 101),
     (0, 0, 100),
-    (101, 20, 50),  # by a sender whose clock is late, or on its way for long
+    (101, 49.5, 49.5),  # on its way when nothing had come yet
+    (101, 20, 50),  # by a sender whose clock is late
     (101, 900, 101),  # or early
     (40, 30, 40),
 ])
-def test_time_of_receipt(received: int, source: int, found: int) -> None:
-    info = {'received_timestamp': received, 'source_timestamp': source}
-    assert receipt_ns(info, take_ns=100, empty_ns=50) == found
+def test_time_of_receipt(received: float, source: float, found: float) -> None:
+    info = {'received_timestamp': round(received * NANOSECONDS),
+            'source_timestamp': round(source * NANOSECONDS)}
+    assert receipt_ns(info, take_ns=100 * NANOSECONDS, empty_ns=50 * NANOSECONDS) == round(
+        found * NANOSECONDS)
