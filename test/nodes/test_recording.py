@@ -315,6 +315,8 @@ def test_loses_nothing_at_1_khz(ros: Workbench, tmp_path: Path) -> None:
     assert [m.message.header.stamp.nanosec for m in messages] == list(range(3000))
     logged = [m.log_time_ns for m in messages]
     assert logged == sorted(logged)
-    # the times are those of receipt, not those at which the recorder took one of its 60 batches;
-    # on a busy machine some messages are sent, and received, together
-    assert len({at // 1_000_000 for at in logged}) > 300
+    # the times are those of receipt, not those at which the recorder took a batch: they differ as
+    # often as those of sending do, whatever else the machine does
+    sent_at = {m.publish_time_ns // 1_000_000 for m in messages}
+    assert len({at // 1_000_000 for at in logged}) > len(sent_at) / 2
+    assert len(sent_at) > 300
