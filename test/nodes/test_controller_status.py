@@ -16,14 +16,18 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 import math
+from pathlib import Path
 import sys
 import time
 
 from controller_bench import Bench, STATUS, STEADY
 from diagnostic_msgs.msg import DiagnosticStatus
+from koopman_ros.lifting import load, save
 from koopman_ros.nodes import topics
 from koopman_ros.nodes.replaying.answers import TRACKED
+from koopman_ros.nodes.shipped import model_path
 import pytest
 from rclpy.node import Node
 from sensor_msgs.msg import JointState, Temperature
@@ -192,3 +196,23 @@ def test_coolant_that_is_promised_and_never_told_delays_the_first_command_only(r
         waited.append(time.monotonic() - before)
     # on a busy machine some may be slow, but if they waited for the coolant all would be
     assert min(waited) < 0.4
+
+
+def test_a_model_that_does_not_reach_to_the_safe_coolant_says_so(
+        shared_bench: Bench, tmp_path: Path) -> None:
+    bench = shared_bench
+    bench.ros.wait_for_status(STATUS, lambda s: value(s, 'safe coolant') == 'within reach')
+    model = load(model_path('reactor_nz4'))
+    lower, upper = model.states.center - 1.5, model.states.center + 1.5
+    narrow = tmp_path / 'narrow.safetensors'
+    save(replace(model, states=replace(model.states, lower=lower, upper=upper)), narrow)
+    # accepted nevertheless
+    (result,) = bench.ros.set_parameters('controller', model=str(narrow))
+    assert result.successful, result.reason
+    words = 'under safe_coolant = 5'
+    status = bench.ros.wait_for_status(STATUS, lambda s: words in value(s, 'safe coolant'))
+    assert 'leaves the trained range' in value(status, 'safe coolant')
+    bench.ros.wait_until(lambda: words in bench.process.output())
+    bench.ros.set_parameters('controller', safe_coolant=27.0)
+    bench.ros.wait_for_status(STATUS, lambda s: value(s, 'safe coolant') == 'within reach')
+    bench.ros.set_parameters('controller', model='reactor_nz4', safe_coolant=5.0)
