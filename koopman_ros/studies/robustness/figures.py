@@ -226,5 +226,5 @@ def _narrow(found: Found, path: Path) -> Drawn:
     _save(figure, path)
     return Drawn(path.name, (
         'Lifts of narrow data (grey: the data) asked for more than they know. On the reactor the '
-        'ladder keeps the loop from running away, but does not always bring it back; the '
+        'ladder keeps the loop from running away, and leads it back from the cold; the '
         'two-state example is unstable by itself and no constant input saves it.'))
