@@ -19,7 +19,7 @@ from pathlib import Path
 import re
 
 import joblib
-from koopman_ros.learning import Growth, Linearisation, train
+from koopman_ros.learning import Edmd, Growth, Linearisation, train
 from koopman_ros.lifting import load
 from koopman_ros.studies import campaign as campaigns
 from koopman_ros.studies import figures, reactor, report, scalar, two_state
@@ -106,6 +106,8 @@ def campaign():
         ('final_distance', None))}, lifts))
     models = {f'nz={n}': load(MODELS / f'reactor_nz{n}.safetensors') for n in (3, 4)}
     models['linear'] = load(MODELS / 'reactor_linear.safetensors')
+    models['edmd'] = Edmd(reactor.EDMD_DEGREE).learn(
+        describe(reactor.SYSTEM), reactor.training_samples(0))
     judge = reactor.Judge.of(0)
     add('reactor', ({f'{name}/{figure}': value for name, model in models.items()
                      for figure, value in judge.figures(model).items()}, models))
