@@ -33,9 +33,12 @@ import sys
 import time
 from types import FrameType
 
+from koopman_ros.last_resort import end_by_force
+
 SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
 
 _PR_SET_PDEATHSIG = 1  # of prctl(2)
+_END = 8.0  # s from the end of a program to that by force
 _QUIET = 1.0  # s after an interrupt in which another one is the same
 
 
@@ -53,13 +56,16 @@ def run_program(module: str, interrupted: int) -> int:
         signal.signal(number, lambda *_: os._exit(interrupted))
     main = importlib.import_module(module).main
     _raise_interrupts()
+    code = 1
     try:
-        code: int = main()
-        return code
+        code = main()
     except KeyboardInterrupt:
-        return interrupted
+        code = interrupted
     finally:
         ignore_signals()
+        # what libraries do at the interpreter's own end may hang, too
+        end_by_force(_END, code)
+    return code
 
 
 def open_standard_streams() -> None:

@@ -17,17 +17,15 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-import contextlib
-import faulthandler
 import os
 import signal
 import sys
 import threading
 from typing import Any
 
+from koopman_ros.last_resort import end_by_force
 from koopman_ros.nodes import command_line
 from koopman_ros.nodes.exposure import open_to_the_network
-from koopman_ros.nodes.last_resort import exit_later
 from koopman_ros.nodes.messages import NANOSECONDS
 from koopman_ros.nodes.parameter_node import ParameterNode
 from koopman_ros.nodes.watchdog import end_in_time
@@ -172,14 +170,14 @@ def _take_down(name: str, node: LoopNode | None) -> None:
     patience = threading.Timer(_TAKE_DOWN_PATIENCE, give_up)
     patience.daemon = True
     patience.start()
-    # for a hang in which no other Python runs, and for one at the interpreter's own end; both stay
-    # armed: the first says where it hung, the second ends it
-    with contextlib.suppress(OSError, ValueError, RuntimeError):
-        faulthandler.dump_traceback_later(_LAST_RESORT, exit=not exit_later(_LAST_RESORT + 0.5))
+    # for a hang in which no other Python runs
+    disarm = end_by_force(_LAST_RESORT)
     if node is not None:
         node.destroy_node()
     rclpy.try_shutdown()
     patience.cancel()
+    # whoever called may go on
+    disarm()
 
 
 def _init(args: list[str] | None) -> None:

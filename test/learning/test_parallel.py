@@ -89,7 +89,7 @@ def test_the_watch_can_end_starts_in_processes():
 
 
 PROGRAM = """
-import contextlib, dataclasses, sys
+import contextlib, dataclasses, signal, sys
 import joblib
 from koopman_ros.learning import Growth, train
 from small_plants import BENT, bent_samples
@@ -98,6 +98,8 @@ def watch(now):
     print(now.n_z, now.finished, now.iteration, flush=True)
     return False
 
+# started in the background of a shell, it would ignore it
+signal.signal(signal.SIGINT, signal.default_int_handler)
 parallel = {'loky': lambda: joblib.parallel_config('loky', n_jobs=2),
             'sequential': contextlib.nullcontext}[sys.argv[1]]
 if __name__ == '__main__':

@@ -177,6 +177,20 @@ def test_middleware_that_hangs_with_the_lock_held_does_not_keep_a_process(ros: W
     assert 'in destroy_node' in process.output()
 
 
+def test_a_process_that_runs_a_node_among_other_things_is_not_ended_by_force() -> None:
+    program = (
+        'import sys, time\n'
+        'from koopman_ros.nodes import process\n'
+        'process._LAST_RESORT = 0.01\n'
+        'process._take_down("plant", None)\n'
+        '# longer than it takes until a process is ended by force\n'
+        'time.sleep(0.7)\n'
+        'sys.exit(7)\n')
+    done = subprocess.run([sys.executable, '-c', program], capture_output=True, check=False,
+                          timeout=TIMEOUT)
+    assert (done.returncode, done.stderr) == (7, b'')
+
+
 def test_middleware_that_hangs_does_not_keep_a_process(ros: Workbench) -> None:
     program = (
         'import os, signal, sys, time\n'

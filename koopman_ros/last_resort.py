@@ -16,10 +16,14 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+import contextlib
 import ctypes
+import faulthandler
 import time
 
 _SIGEV_THREAD = 2  # of sigevent(3type): the function is called in a thread of its own
+_AFTER = 0.5  # s from the stack that is printed to the end
 
 
 class _Event(ctypes.Structure):
@@ -29,20 +33,41 @@ class _Event(ctypes.Structure):
                 ('function', ctypes.c_void_p), ('rest', ctypes.c_char * 64))
 
 
-def exit_later(seconds: float) -> bool:
+def end_by_force(seconds: float, code: int = 0) -> Callable[[], None]:
     """
-    Let the C library end the process with code 0 then, which takes no lock of the interpreter's.
+    Print then where the process hangs, and end it.
 
-    :return: whether it will.
+    Neither takes a lock of the interpreter's: Python prints from a thread of its own, and the C
+    library ends the process.
+
+    :param code: its exit code.
+    :return: takes that back.
     """
+    cancel = _exit_later(seconds + _AFTER, code)
+    # where standard error is no file it says nothing
+    with contextlib.suppress(OSError, ValueError, RuntimeError):
+        faulthandler.dump_traceback_later(seconds, exit=cancel is None)
+
+    def disarm() -> None:
+        faulthandler.cancel_dump_traceback_later()
+        if cancel is not None:
+            cancel()
+
+    return disarm
+
+
+def _exit_later(seconds: float, code: int) -> Callable[[], object] | None:
+    """Let the C library end the process then; return what takes it back, None where it cannot."""
     libc = ctypes.CDLL(None)
     if not hasattr(libc, 'timer_create'):
-        return False
+        return None
     # _exit(value)
-    event = _Event(None, 0, _SIGEV_THREAD, ctypes.cast(libc._exit, ctypes.c_void_p))
+    event = _Event(code, 0, _SIGEV_THREAD, ctypes.cast(libc._exit, ctypes.c_void_p))
     timer = ctypes.c_void_p()
     if libc.timer_create(time.CLOCK_MONOTONIC, ctypes.byref(event), ctypes.byref(timer)):
-        return False
+        return None
     # the interval, and the time until the first; each in seconds and nanoseconds
     due = (ctypes.c_long * 4)(0, 0, int(seconds), int(seconds % 1.0 * 1e9))
-    return not libc.timer_settime(timer, 0, ctypes.byref(due), None)
+    if libc.timer_settime(timer, 0, ctypes.byref(due), None):
+        return None
+    return lambda: libc.timer_delete(timer)
