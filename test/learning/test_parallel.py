@@ -146,9 +146,14 @@ class Probe:
 @pytest.mark.parametrize(('backend', 'leaves'), [('loky', True), ('threading', False)])
 def test_workers_leave_an_interrupt_to_the_process_that_waits(backend, leaves):
     """Between two starts they would print where they were."""
-    with joblib.parallel_config(backend, n_jobs=2):
-        answers = joblib.Parallel()(joblib.delayed(training._start)(
-            Probe(), None, 2, None, 0, 1, None) for _ in range(2))
+    # in the background of a shell all of them would ignore it
+    before = signal.signal(signal.SIGINT, signal.default_int_handler)
+    try:
+        with joblib.parallel_config(backend, n_jobs=2):
+            answers = joblib.Parallel()(joblib.delayed(training._start)(
+                Probe(), None, 2, None, 0, 1, None) for _ in range(2))
+    finally:
+        signal.signal(signal.SIGINT, before)
     assert answers == [leaves, leaves]
 
 
