@@ -18,9 +18,10 @@
 from __future__ import annotations
 
 import argparse
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 import contextlib
 from pathlib import Path
+import sys
 
 from koopman_ros.demo.processes import reserved_output
 
@@ -44,16 +45,36 @@ def read_options(args: list[str] | None, description: str | None, output: str, s
     return parser.parse_args(args)
 
 
+def run_act(act: Callable[[Path, float], Mapping[str, object]], options: argparse.Namespace,
+            errors: tuple[type[Exception], ...], files: str) -> int:
+    """
+    Run a demo, and say what came of it.
+
+    :param act: takes the folder for the results and the speed, and returns the summary.
+    :param options: as :func:`read_options` returns them.
+    :param errors: what is told in one line.
+    :param files: in words, what it leaves in the folder.
+    :return: the exit code.
+    """
+    try:
+        with _chosen_output(options.output) as output:
+            result = act(output, options.speed)
+    except errors as error:
+        print(f'demo: {error}', file=sys.stderr)
+        return 1
+    except KeyboardInterrupt:
+        print('demo: interrupted; what was recorded is kept', file=sys.stderr)
+        return 130
+    for key, value in result.items():
+        print(f'{key}: {value:.6g}' if isinstance(value, float) else f'{key}: {value}')
+    print(f'wrote {output}/{files}')
+    return 0
+
+
 @contextlib.contextmanager
-def chosen_output(wanted: Path) -> Iterator[Path]:
+def _chosen_output(wanted: Path) -> Iterator[Path]:
     """Reserve the folder for the results, and say when it is another one."""
     with reserved_output(wanted) as folder:
         if folder != wanted:
             print(f'another run writes to {wanted}: this one writes to {folder}', flush=True)
         yield folder
-
-
-def print_result(result: Mapping[str, object]) -> None:
-    """Print the figures of a run, one a line."""
-    for key, value in result.items():
-        print(f'{key}: {value:.6g}' if isinstance(value, float) else f'{key}: {value}')

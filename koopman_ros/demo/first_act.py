@@ -23,11 +23,10 @@ from __future__ import annotations
 from dataclasses import replace
 import json
 from pathlib import Path
-import sys
 import time
 
 from koopman_ros.bags import summary
-from koopman_ros.demo.command import chosen_output, print_result, read_options
+from koopman_ros.demo.command import read_options, run_act
 from koopman_ros.demo.loop import LoopError, run_loop, Scenario
 from koopman_ros.demo.results import plot, read_run
 from koopman_ros.demo.table import LiveTable
@@ -86,15 +85,5 @@ def run_demo(output: Path, speed: float) -> dict[str, object]:
 def main(args: list[str] | None = None) -> int:
     """Run the demo from the command line."""
     options = read_options(args, __doc__, 'out/demo', 60.0)
-    try:
-        with chosen_output(options.output) as output:
-            result = run_demo(output, options.speed)
-    except (LoopError, OSError) as error:
-        print(f'demo: {error}', file=sys.stderr)
-        return 1
-    except KeyboardInterrupt:
-        print('demo: interrupted; what was recorded is kept', file=sys.stderr)
-        return 130
-    print_result(result)
-    print(f'wrote {output}/closed_loop.png, closed_loop.mcap and summary.json')
-    return 0
+    return run_act(run_demo, options, (LoopError, OSError),
+                   'closed_loop.png, closed_loop.mcap and summary.json')

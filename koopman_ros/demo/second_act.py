@@ -26,11 +26,10 @@ from dataclasses import dataclass, field
 import json
 from pathlib import Path
 import shutil
-import sys
 import time
 
 from diagnostic_msgs.msg import DiagnosticStatus
-from koopman_ros.demo.command import chosen_output, print_result, read_options
+from koopman_ros.demo.command import read_options, run_act
 from koopman_ros.demo.loop import Loop, LoopError, running_loop, Scenario
 from koopman_ros.demo.retraining_results import plot, read_history, rollout_rmse
 from koopman_ros.demo.table import LiveTable
@@ -207,16 +206,6 @@ class _Actor:
 def main(args: list[str] | None = None) -> int:
     """Run the second act from the command line."""
     options = read_options(args, __doc__, 'out/demo-retrain', 120.0)
-    try:
-        with chosen_output(options.output) as output:
-            result = run_retraining(output, options.speed)
-    except (LoopError, OSError, ValueError) as error:
-        print(f'demo: {error}', file=sys.stderr)
-        return 1
-    except KeyboardInterrupt:
-        print('demo: interrupted; what was recorded is kept', file=sys.stderr)
-        return 130
-    print_result(result)
-    print(f'wrote {output}/retraining.png, before.mcap, after.mcap, '
-          'retrained.safetensors with its report, and summary.json')
-    return 0
+    return run_act(run_retraining, options, (LoopError, OSError, ValueError),
+                   'retraining.png, before.mcap, after.mcap, '
+                   'retrained.safetensors with its report, and summary.json')
