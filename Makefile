@@ -51,11 +51,13 @@ demo-retrain: $(VENV)/retrain.stamp  ## the plant drifts, is recorded, learned a
 	$(BIN)/python -m koopman_ros.demo.retrain
 
 # Types are checked beside the tests. Tests across processes wait most of their time, so that there
-# is one worker more than cores; the longest files come first (test/conftest.py).
+# is one worker more than cores; the longest files come first (test/conftest.py). A worker that was
+# ended is not replaced: its successor would be given the same test again, without end.
 test: $(VENV)/test.stamp  ## style and type checks and the whole test suite, on all cores
 	$(BIN)/ruff check
 	@$(BIN)/mypy > $(VENV)/mypy.log & types=$$!; \
-	  $(BIN)/python -m pytest -n $$(($$(nproc) + 1)) --dist loadfile --no-loadscope-reorder; \
+	  $(BIN)/python -m pytest -n $$(($$(nproc) + 1)) --dist loadfile --no-loadscope-reorder \
+	    --max-worker-restart 0; \
 	  tests=$$?; wait $$types || tests=1; cat $(VENV)/mypy.log; exit $$tests
 
 test-machines: $(VENV)/test.stamp  ## the numerical tests under imitated processors, a quarter of an hour (MACHINES=--quick: a minute and a half)

@@ -67,7 +67,7 @@ setup(
             'hypothesis',
             'mypy',
             'packaging',
-            'pytest',
+            'pytest>=9',
             'pytest-timeout',
             'pytest-xdist',
             'rosbags',
