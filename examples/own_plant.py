@@ -1,16 +1,5 @@
-# Copyright 2026 The koopman_ros Authors
-#
-# Licensed under the Apache License, Version 2.0 (the "License");
-# you may not use this file except in compliance with the License.
-# You may obtain a copy of the License at
-#
-#     http://www.apache.org/licenses/LICENSE-2.0
-#
-# Unless required by applicable law or agreed to in writing, software
-# distributed under the License is distributed on an "AS IS" BASIS,
-# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
-# See the License for the specific language governing permissions and
-# limitations under the License.
+# SPDX-FileCopyrightText: 2026 The koopman_ros Authors
+# SPDX-License-Identifier: Apache-2.0
 
 """
 Two tanks in series, a plant that is not part of the package: learned, saved and controlled.
@@ -20,6 +9,8 @@ Run it as ``python examples/own_plant.py [model file]``; docs/own_plant.md walks
 
 from dataclasses import replace
 import sys
+
+import numpy as np
 
 from koopman_ros.control import run_closed_loop, Weights
 from koopman_ros.learning import (
@@ -34,7 +25,6 @@ from koopman_ros.learning import (
     train,
 )
 from koopman_ros.lifting import load, save
-import numpy as np
 
 PLANT = Plant(
     name='two tanks', state_names=('upper', 'lower'), state_units=('m', 'm'),

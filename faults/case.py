@@ -1,16 +1,5 @@
-# Copyright 2026 The koopman_ros Authors
-#
-# Licensed under the Apache License, Version 2.0 (the "License");
-# you may not use this file except in compliance with the License.
-# You may obtain a copy of the License at
-#
-#     http://www.apache.org/licenses/LICENSE-2.0
-#
-# Unless required by applicable law or agreed to in writing, software
-# distributed under the License is distributed on an "AS IS" BASIS,
-# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
-# See the License for the specific language governing permissions and
-# limitations under the License.
+# SPDX-FileCopyrightText: 2026 The koopman_ros Authors
+# SPDX-License-Identifier: Apache-2.0
 
 """A case of the campaign: what is done to a running loop, and what is expected of it."""
 
@@ -22,12 +11,11 @@ import math
 from pathlib import Path
 import time
 
-from koopman_ros.demo.processes import isolated_domain
-from koopman_ros.nodes.controller_parameters import ControllerParameters
-
 from faults.course import Course
 from faults.judge import BAND, Bounds, judge, Verdict
 from faults.rig import LOCKSTEP, Rig, StalledError
+from koopman_ros.demo.processes import isolated_domain
+from koopman_ros.nodes.controller_parameters import ControllerParameters
 
 SETPOINT = 46.0  # degC; 5 K below the steady state that the reactor starts from
 SETTLED = 240.0  # s of plant time from the start until the reactor stays there

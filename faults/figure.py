@@ -1,16 +1,5 @@
-# Copyright 2026 The koopman_ros Authors
-#
-# Licensed under the Apache License, Version 2.0 (the "License");
-# you may not use this file except in compliance with the License.
-# You may obtain a copy of the License at
-#
-#     http://www.apache.org/licenses/LICENSE-2.0
-#
-# Unless required by applicable law or agreed to in writing, software
-# distributed under the License is distributed on an "AS IS" BASIS,
-# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
-# See the License for the specific language governing permissions and
-# limitations under the License.
+# SPDX-FileCopyrightText: 2026 The koopman_ros Authors
+# SPDX-License-Identifier: Apache-2.0
 
 """A picture of cases side by side: temperature and coolant around the fault."""
 
@@ -20,9 +9,8 @@ from collections.abc import Sequence
 import math
 from pathlib import Path
 
-from koopman_ros.nodes.controller_parameters import ControllerParameters
-
 from faults.case import Outcome
+from koopman_ros.nodes.controller_parameters import ControllerParameters
 
 # Those that tell most; others are drawn only where none of these was run.
 TELLING = ('nan-long', 'bias', 'feed-warm', 'controller-killed-in-a-step', 'plant-reset',

@@ -1,29 +1,18 @@
-# Copyright 2026 The koopman_ros Authors
-#
-# Licensed under the Apache License, Version 2.0 (the "License");
-# you may not use this file except in compliance with the License.
-# You may obtain a copy of the License at
-#
-#     http://www.apache.org/licenses/LICENSE-2.0
-#
-# Unless required by applicable law or agreed to in writing, software
-# distributed under the License is distributed on an "AS IS" BASIS,
-# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
-# See the License for the specific language governing permissions and
-# limitations under the License.
+# SPDX-FileCopyrightText: 2026 The koopman_ros Authors
+# SPDX-License-Identifier: Apache-2.0
 
 """The line between plant and controller: heard, timed, and altered where a case wants that."""
 
 from __future__ import annotations
 
 from diagnostic_msgs.msg import DiagnosticArray
-from koopman_ros.nodes import topics
-from koopman_ros.nodes.messages import NANOSECONDS, stamp_message, stamp_nanoseconds
 from rclpy.node import Node
 from sensor_msgs.msg import Temperature
 
 from faults.alterations import Alteration, Packet, unchanged
 from faults.course import Command, Course, Said, Sample
+from koopman_ros.nodes import topics
+from koopman_ros.nodes.messages import NANOSECONDS, stamp_message, stamp_nanoseconds
 
 PLANT_TEMPERATURE = 'plant/temperature'
 PLANT_COOLANT = 'plant/coolant_setpoint'

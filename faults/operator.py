@@ -1,16 +1,5 @@
-# Copyright 2026 The koopman_ros Authors
-#
-# Licensed under the Apache License, Version 2.0 (the "License");
-# you may not use this file except in compliance with the License.
-# You may obtain a copy of the License at
-#
-#     http://www.apache.org/licenses/LICENSE-2.0
-#
-# Unless required by applicable law or agreed to in writing, software
-# distributed under the License is distributed on an "AS IS" BASIS,
-# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
-# See the License for the specific language governing permissions and
-# limitations under the License.
+# SPDX-FileCopyrightText: 2026 The koopman_ros Authors
+# SPDX-License-Identifier: Apache-2.0
 
 """The operator beside a loop: set-points, parameters and services."""
 
@@ -20,7 +9,6 @@ from collections.abc import Callable
 import time
 from typing import Any
 
-from koopman_ros.nodes import topics
 from rcl_interfaces.srv import GetParameters, SetParameters
 from rclpy.client import Client
 from rclpy.node import Node
@@ -31,6 +19,7 @@ from sensor_msgs.msg import Temperature
 from std_srvs.srv import SetBool, Trigger
 
 from faults.line import Line
+from koopman_ros.nodes import topics
 
 _STEADY = 0.3  # s of wall time that a set-point must stay the one tracked
 _START_TIMEOUT = 30.0  # s for the processes to find each other

@@ -1,16 +1,5 @@
-# Copyright 2026 The koopman_ros Authors
-#
-# Licensed under the Apache License, Version 2.0 (the "License");
-# you may not use this file except in compliance with the License.
-# You may obtain a copy of the License at
-#
-#     http://www.apache.org/licenses/LICENSE-2.0
-#
-# Unless required by applicable law or agreed to in writing, software
-# distributed under the License is distributed on an "AS IS" BASIS,
-# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
-# See the License for the specific language governing permissions and
-# limitations under the License.
+# SPDX-FileCopyrightText: 2026 The koopman_ros Authors
+# SPDX-License-Identifier: Apache-2.0
 
 """Plant and controller as real processes, to put faults into, with an operator beside them."""
 
@@ -24,7 +13,6 @@ import time
 from types import TracebackType
 from typing import TypeVar
 
-from koopman_ros.demo.processes import NodeProcess, STOP_TIMEOUT
 import rclpy
 from rclpy.context import Context
 from rclpy.executors import SingleThreadedExecutor
@@ -32,6 +20,7 @@ from rclpy.node import Node
 
 from faults.line import Line, REMAPPED
 from faults.operator import Operator
+from koopman_ros.demo.processes import NodeProcess, STOP_TIMEOUT
 
 T = TypeVar('T')
 LOCKSTEP = {'lockstep': True, 'speed': 0.0, 'lockstep_timeout': 0.5}

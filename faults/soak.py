@@ -1,16 +1,5 @@
-# Copyright 2026 The koopman_ros Authors
-#
-# Licensed under the Apache License, Version 2.0 (the "License");
-# you may not use this file except in compliance with the License.
-# You may obtain a copy of the License at
-#
-#     http://www.apache.org/licenses/LICENSE-2.0
-#
-# Unless required by applicable law or agreed to in writing, software
-# distributed under the License is distributed on an "AS IS" BASIS,
-# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
-# See the License for the specific language governing permissions and
-# limitations under the License.
+# SPDX-FileCopyrightText: 2026 The koopman_ros Authors
+# SPDX-License-Identifier: Apache-2.0
 
 """A day of plant time with whatever may happen in one: nothing is lost, and nothing grows."""
 
@@ -25,15 +14,15 @@ import shutil
 import signal
 import time
 
-from koopman_ros.bags import summary
-from koopman_ros.demo.processes import isolated_domain
-from koopman_ros.nodes.controller_parameters import ControllerParameters
 import numpy as np
 
 from faults.course import Array, Course
 from faults.events import EVENTS
 from faults.judge import Account, account, RUNAWAY
 from faults.rig import LOCKSTEP, Rig, StalledError
+from koopman_ros.bags import summary
+from koopman_ros.demo.processes import isolated_domain
+from koopman_ros.nodes.controller_parameters import ControllerParameters
 
 HOURS = 24.0
 SEED = 0

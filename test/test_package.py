@@ -1,16 +1,5 @@
-# Copyright 2026 The koopman_ros Authors
-#
-# Licensed under the Apache License, Version 2.0 (the "License");
-# you may not use this file except in compliance with the License.
-# You may obtain a copy of the License at
-#
-#     http://www.apache.org/licenses/LICENSE-2.0
-#
-# Unless required by applicable law or agreed to in writing, software
-# distributed under the License is distributed on an "AS IS" BASIS,
-# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
-# See the License for the specific language governing permissions and
-# limitations under the License.
+# SPDX-FileCopyrightText: 2026 The koopman_ros Authors
+# SPDX-License-Identifier: Apache-2.0
 
 """Tests of the package as a whole: manifest, versions, licence headers, import directions."""
 
@@ -21,14 +10,16 @@ import re
 import xml.etree.ElementTree as ElementTree
 
 from catkin_pkg.package import parse_package
-import koopman_ros
 from packaging.requirements import Requirement
 from packaging.utils import canonicalize_name
 import pytest
 
+import koopman_ros
+
 ROOT = Path(__file__).parent.parent
-SOURCES = sorted([ROOT / 'setup.py', *ROOT.glob('koopman_ros/**/*.py'),
-                  *ROOT.glob('test/**/*.py')])
+SOURCES = sorted([ROOT / 'setup.py', *(
+    path for folder in ('koopman_ros', 'benchmarks', 'examples', 'faults', 'test')
+    for path in ROOT.glob(f'{folder}/**/*.py'))])
 # What each sub-package may import of the others.
 ALLOWED = {
     'plants': set(),
@@ -126,8 +117,8 @@ def test_lock_holds_each_requirement_within_its_range() -> None:
 @pytest.mark.parametrize('path', SOURCES, ids=lambda path: str(path.relative_to(ROOT)))
 def test_licence_header(path: Path) -> None:
     lines = path.read_text().splitlines()
-    assert lines[0] == '# Copyright 2026 The koopman_ros Authors'
-    assert lines[2].startswith('# Licensed under the Apache License, Version 2.0')
+    assert lines[:2] == ['# SPDX-FileCopyrightText: 2026 The koopman_ros Authors',
+                         '# SPDX-License-Identifier: Apache-2.0']
 
 
 @pytest.mark.parametrize('package', sorted(ALLOWED))

@@ -1,16 +1,5 @@
-# Copyright 2026 The koopman_ros Authors
-#
-# Licensed under the Apache License, Version 2.0 (the "License");
-# you may not use this file except in compliance with the License.
-# You may obtain a copy of the License at
-#
-#     http://www.apache.org/licenses/LICENSE-2.0
-#
-# Unless required by applicable law or agreed to in writing, software
-# distributed under the License is distributed on an "AS IS" BASIS,
-# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
-# See the License for the specific language governing permissions and
-# limitations under the License.
+# SPDX-FileCopyrightText: 2026 The koopman_ros Authors
+# SPDX-License-Identifier: Apache-2.0
 
 
 """The loop across processes: its latency and rate, the nodes' start and memory, lock-step."""
@@ -23,15 +12,15 @@ import sys
 import time
 from typing import Any
 
-from koopman_ros.demo.processes import NodeProcess
-from koopman_ros.nodes import topics
-from koopman_ros.nodes.messages import NANOSECONDS
 import numpy as np
 import psutil
 from sensor_msgs.msg import Temperature
 from std_srvs.srv import Trigger
 
 from benchmarks.loop.probe import Loop, Probe
+from koopman_ros.demo.processes import NodeProcess
+from koopman_ros.nodes import topics
+from koopman_ros.nodes.messages import NANOSECONDS
 
 _ROUND = 50  # measurements of one side, then of the other
 _PACE = 0.005  # s between measurements whose latency is taken

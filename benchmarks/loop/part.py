@@ -1,16 +1,5 @@
-# Copyright 2026 The koopman_ros Authors
-#
-# Licensed under the Apache License, Version 2.0 (the "License");
-# you may not use this file except in compliance with the License.
-# You may obtain a copy of the License at
-#
-#     http://www.apache.org/licenses/LICENSE-2.0
-#
-# Unless required by applicable law or agreed to in writing, software
-# distributed under the License is distributed on an "AS IS" BASIS,
-# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
-# See the License for the specific language governing permissions and
-# limitations under the License.
+# SPDX-FileCopyrightText: 2026 The koopman_ros Authors
+# SPDX-License-Identifier: Apache-2.0
 
 
 """The part *loop* of the benchmark: the control step, and the loop across processes."""
@@ -25,12 +14,11 @@ import sys
 import tempfile
 from typing import Any
 
-from koopman_ros.demo.processes import isolated_domain
-
 from benchmarks.loop import across, step, table
 from benchmarks.loop.probe import Probe
 from benchmarks.machine import machine
 from benchmarks.options import Extent, Options
+from koopman_ros.demo.processes import isolated_domain
 
 MEANING = {
     'step_us': 'median time of a control step, by n_z; step has the 99th percentiles, too',

@@ -1,16 +1,5 @@
-# Copyright 2026 The koopman_ros Authors
-#
-# Licensed under the Apache License, Version 2.0 (the "License");
-# you may not use this file except in compliance with the License.
-# You may obtain a copy of the License at
-#
-#     http://www.apache.org/licenses/LICENSE-2.0
-#
-# Unless required by applicable law or agreed to in writing, software
-# distributed under the License is distributed on an "AS IS" BASIS,
-# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
-# See the License for the specific language governing permissions and
-# limitations under the License.
+# SPDX-FileCopyrightText: 2026 The koopman_ros Authors
+# SPDX-License-Identifier: Apache-2.0
 
 
 """
@@ -29,13 +18,13 @@ import sys
 from time import perf_counter_ns, thread_time_ns
 from typing import Any
 
-from koopman_ros.control import Controller, Law, State
-from koopman_ros.nodes.messages import NANOSECONDS
 import numpy as np
 from numpy.typing import NDArray
 
 from benchmarks.loop import lifts
 from benchmarks.loop.naive import NaiveLaw
+from koopman_ros.control import Controller, Law, State
+from koopman_ros.nodes.messages import NANOSECONDS
 
 Array = NDArray[np.float64]
 

@@ -1,16 +1,5 @@
-# Copyright 2026 The koopman_ros Authors
-#
-# Licensed under the Apache License, Version 2.0 (the "License");
-# you may not use this file except in compliance with the License.
-# You may obtain a copy of the License at
-#
-#     http://www.apache.org/licenses/LICENSE-2.0
-#
-# Unless required by applicable law or agreed to in writing, software
-# distributed under the License is distributed on an "AS IS" BASIS,
-# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
-# See the License for the specific language governing permissions and
-# limitations under the License.
+# SPDX-FileCopyrightText: 2026 The koopman_ros Authors
+# SPDX-License-Identifier: Apache-2.0
 
 
 """The part *recording* of the benchmark: a minute at 1 kHz, a ladder of rates, and from memory."""
@@ -25,12 +14,11 @@ import sys
 import tempfile
 from typing import Any
 
-from koopman_ros.bags import read_messages
-from koopman_ros.demo.processes import isolated_domain
-
 from benchmarks.machine import machine
 from benchmarks.options import Extent, Options
 from benchmarks.recording import memory, stream, table
+from koopman_ros.bags import read_messages
+from koopman_ros.demo.processes import isolated_domain
 
 _STEADY_RATE = 1000.0  # Hz
 

@@ -1,16 +1,5 @@
-# Copyright 2026 The koopman_ros Authors
-#
-# Licensed under the Apache License, Version 2.0 (the "License");
-# you may not use this file except in compliance with the License.
-# You may obtain a copy of the License at
-#
-#     http://www.apache.org/licenses/LICENSE-2.0
-#
-# Unless required by applicable law or agreed to in writing, software
-# distributed under the License is distributed on an "AS IS" BASIS,
-# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
-# See the License for the specific language governing permissions and
-# limitations under the License.
+# SPDX-FileCopyrightText: 2026 The koopman_ros Authors
+# SPDX-License-Identifier: Apache-2.0
 
 """The least-squares problems that all solvers are given, from the same data and start."""
 
@@ -19,13 +8,14 @@ from __future__ import annotations
 from dataclasses import dataclass
 from pathlib import Path
 
+import numpy as np
+import torch
+from torch import Tensor
+
 from koopman_ros.learning.growth import Growth
 from koopman_ros.learning.network import Layout, Pass
 from koopman_ros.learning.residuals import Data, Problem, ResidualWeights
 from koopman_ros.plants import ControlAffineSystem, one_state_reactor, two_state_example
-import numpy as np
-import torch
-from torch import Tensor
 
 WHITENING = 1.0
 N_Z = 3

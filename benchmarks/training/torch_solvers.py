@@ -1,16 +1,5 @@
-# Copyright 2026 The koopman_ros Authors
-#
-# Licensed under the Apache License, Version 2.0 (the "License");
-# you may not use this file except in compliance with the License.
-# You may obtain a copy of the License at
-#
-#     http://www.apache.org/licenses/LICENSE-2.0
-#
-# Unless required by applicable law or agreed to in writing, software
-# distributed under the License is distributed on an "AS IS" BASIS,
-# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
-# See the License for the specific language governing permissions and
-# limitations under the License.
+# SPDX-FileCopyrightText: 2026 The koopman_ros Authors
+# SPDX-License-Identifier: Apache-2.0
 
 """The solvers in torch: our learner, L-BFGS and Adam."""
 
@@ -19,13 +8,13 @@ from __future__ import annotations
 from collections.abc import Callable
 import math
 
-from koopman_ros.learning.levenberg_marquardt import minimise
-from koopman_ros.learning.residuals import NormalEquations
 import torch
 from torch import Tensor
 
 from benchmarks.training.problems import Case, WHITENING
 from benchmarks.training.trace import Finished, Trace
+from koopman_ros.learning.levenberg_marquardt import minimise
+from koopman_ros.learning.residuals import NormalEquations
 
 # Of constant and falling rates from 0.003 to 0.03 this was the best over both systems.
 _ADAM_RATE = 1e-2

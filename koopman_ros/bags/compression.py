@@ -1,16 +1,5 @@
-# Copyright 2026 The koopman_ros Authors
-#
-# Licensed under the Apache License, Version 2.0 (the "License");
-# you may not use this file except in compliance with the License.
-# You may obtain a copy of the License at
-#
-#     http://www.apache.org/licenses/LICENSE-2.0
-#
-# Unless required by applicable law or agreed to in writing, software
-# distributed under the License is distributed on an "AS IS" BASIS,
-# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
-# See the License for the specific language governing permissions and
-# limitations under the License.
+# SPDX-FileCopyrightText: 2026 The koopman_ros Authors
+# SPDX-License-Identifier: Apache-2.0
 
 """
 Decompression with bounds: of chunks, and of rosbag2's compressed files and messages.
@@ -27,11 +16,12 @@ import tempfile
 from typing import BinaryIO
 import zlib
 
-from koopman_ros.bags.errors import BagReadError, DamageError
-from koopman_ros.bags.limits import block_limit, Budget, check_block, file_limit
 import lz4.frame
 from mcap.records import Chunk
 import zstandard
+
+from koopman_ros.bags.errors import BagReadError, DamageError
+from koopman_ros.bags.limits import block_limit, Budget, check_block, file_limit
 
 # What each zstd frame begins with; no CDR message does, its first byte is 0.
 ZSTD_MAGIC = b'\x28\xb5\x2f\xfd'

@@ -1,16 +1,5 @@
-# Copyright 2026 The koopman_ros Authors
-#
-# Licensed under the Apache License, Version 2.0 (the "License");
-# you may not use this file except in compliance with the License.
-# You may obtain a copy of the License at
-#
-#     http://www.apache.org/licenses/LICENSE-2.0
-#
-# Unless required by applicable law or agreed to in writing, software
-# distributed under the License is distributed on an "AS IS" BASIS,
-# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
-# See the License for the specific language governing permissions and
-# limitations under the License.
+# SPDX-FileCopyrightText: 2026 The koopman_ros Authors
+# SPDX-License-Identifier: Apache-2.0
 
 
 """A loop's measurements with the coolant that acted on them, cut from bags into episodes."""
@@ -23,11 +12,12 @@ from dataclasses import dataclass, field
 import math
 import os
 
+import numpy as np
+from numpy.typing import NDArray
+
 from koopman_ros.bags.errors import BagReadError
 from koopman_ros.bags.jumps import spikes_and_jumps
 from koopman_ros.bags.reader import read_messages, summary
-import numpy as np
-from numpy.typing import NDArray
 
 _TEMPERATURE = 'sensor_msgs/msg/Temperature'
 _NS = 1_000_000_000

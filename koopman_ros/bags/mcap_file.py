@@ -1,16 +1,5 @@
-# Copyright 2026 The koopman_ros Authors
-#
-# Licensed under the Apache License, Version 2.0 (the "License");
-# you may not use this file except in compliance with the License.
-# You may obtain a copy of the License at
-#
-#     http://www.apache.org/licenses/LICENSE-2.0
-#
-# Unless required by applicable law or agreed to in writing, software
-# distributed under the License is distributed on an "AS IS" BASIS,
-# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
-# See the License for the specific language governing permissions and
-# limitations under the License.
+# SPDX-FileCopyrightText: 2026 The koopman_ros Authors
+# SPDX-License-Identifier: Apache-2.0
 
 
 """One MCAP file of a bag being written: complete in itself, with schemas, topics and metadata."""
@@ -22,12 +11,13 @@ import contextlib
 import os
 from pathlib import Path
 
+from mcap.well_known import MessageEncoding, Profile, SchemaEncoding
+from mcap.writer import CompressionType, Writer
+
 from koopman_ros import __version__
 from koopman_ros.bags.metadata import bag_metadata, dump_metadata, RecordedFile, RecordedTopic
 from koopman_ros.bags.qos import dump_offered_qos
 from koopman_ros.bags.schemas import MessageDefinition
-from mcap.well_known import MessageEncoding, Profile, SchemaEncoding
-from mcap.writer import CompressionType, Writer
 
 COMPRESSIONS = {
     'none': CompressionType.NONE,

@@ -1,16 +1,5 @@
-# Copyright 2026 The koopman_ros Authors
-#
-# Licensed under the Apache License, Version 2.0 (the "License");
-# you may not use this file except in compliance with the License.
-# You may obtain a copy of the License at
-#
-#     http://www.apache.org/licenses/LICENSE-2.0
-#
-# Unless required by applicable law or agreed to in writing, software
-# distributed under the License is distributed on an "AS IS" BASIS,
-# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
-# See the License for the specific language governing permissions and
-# limitations under the License.
+# SPDX-FileCopyrightText: 2026 The koopman_ros Authors
+# SPDX-License-Identifier: Apache-2.0
 
 """Offered quality of service, in the words that rosbag2 stores with a topic (Jazzy and later)."""
 
@@ -18,8 +7,9 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
-from koopman_ros.bags.plain_yaml import load_plain
 import yaml
+
+from koopman_ros.bags.plain_yaml import load_plain
 
 # An unlimited duration [ns]: RMW_DURATION_INFINITE, 9223372036 s and 854775807 ns.
 INFINITE_NS = 2**63 - 1

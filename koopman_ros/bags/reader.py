@@ -1,16 +1,5 @@
-# Copyright 2026 The koopman_ros Authors
-#
-# Licensed under the Apache License, Version 2.0 (the "License");
-# you may not use this file except in compliance with the License.
-# You may obtain a copy of the License at
-#
-#     http://www.apache.org/licenses/LICENSE-2.0
-#
-# Unless required by applicable law or agreed to in writing, software
-# distributed under the License is distributed on an "AS IS" BASIS,
-# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
-# See the License for the specific language governing permissions and
-# limitations under the License.
+# SPDX-FileCopyrightText: 2026 The koopman_ros Authors
+# SPDX-License-Identifier: Apache-2.0
 
 """Reading bags back: decoded messages and a summary, from rosbag2's bags as from our own."""
 
@@ -23,6 +12,11 @@ import os
 from pathlib import Path
 from typing import Any
 
+from mcap.exceptions import EndOfFile
+from mcap.records import Channel
+from mcap.well_known import SchemaEncoding
+from mcap_ros2.decoder import DecoderFactory
+
 from koopman_ros.bags.compression import opened
 from koopman_ros.bags.errors import BagReadError, BagTooLargeError, reason
 from koopman_ros.bags.fields import fields_only
@@ -30,10 +24,6 @@ from koopman_ros.bags.limits import Budget, enough_memory
 from koopman_ros.bags.qos import parse_offered_qos, QosProfile
 from koopman_ros.bags.records import stored_messages, StoredMessage, summary_section
 from koopman_ros.bags.storage import locate
-from mcap.exceptions import EndOfFile
-from mcap.records import Channel
-from mcap.well_known import SchemaEncoding
-from mcap_ros2.decoder import DecoderFactory
 
 # Of the different offers in a file, which take seconds to read; seven hundred publishers' worth.
 _MAX_OFFERS_BYTES = 2**18

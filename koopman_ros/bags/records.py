@@ -1,16 +1,5 @@
-# Copyright 2026 The koopman_ros Authors
-#
-# Licensed under the Apache License, Version 2.0 (the "License");
-# you may not use this file except in compliance with the License.
-# You may obtain a copy of the License at
-#
-#     http://www.apache.org/licenses/LICENSE-2.0
-#
-# Unless required by applicable law or agreed to in writing, software
-# distributed under the License is distributed on an "AS IS" BASIS,
-# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
-# See the License for the specific language governing permissions and
-# limitations under the License.
+# SPDX-FileCopyrightText: 2026 The koopman_ros Authors
+# SPDX-License-Identifier: Apache-2.0
 
 """
 The records of one MCAP file, whole or left behind by a recorder that was killed.
@@ -27,15 +16,16 @@ import struct
 from typing import BinaryIO, cast
 import zlib
 
-from koopman_ros.bags.compression import chunk_content, message_content, opened
-from koopman_ros.bags.errors import BagReadError, BagTooLargeError, DamageError, reason
-from koopman_ros.bags.limits import Budget, enough_memory
 from mcap.data_stream import ReadDataStream
 from mcap.exceptions import EndOfFile
 from mcap.opcode import Opcode
 from mcap.records import Channel, Chunk, DataEnd, McapRecord, Message, Schema, Statistics
 from mcap.summary import Summary
 import zstandard
+
+from koopman_ros.bags.compression import chunk_content, message_content, opened
+from koopman_ros.bags.errors import BagReadError, BagTooLargeError, DamageError, reason
+from koopman_ros.bags.limits import Budget, enough_memory
 
 # The MCAP specification's magic, and the opcode and length that begin every record.
 MAGIC = b'\x89MCAP0\r\n'

@@ -1,26 +1,16 @@
-# Copyright 2026 The koopman_ros Authors
-#
-# Licensed under the Apache License, Version 2.0 (the "License");
-# you may not use this file except in compliance with the License.
-# You may obtain a copy of the License at
-#
-#     http://www.apache.org/licenses/LICENSE-2.0
-#
-# Unless required by applicable law or agreed to in writing, software
-# distributed under the License is distributed on an "AS IS" BASIS,
-# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
-# See the License for the specific language governing permissions and
-# limitations under the License.
+# SPDX-FileCopyrightText: 2026 The koopman_ros Authors
+# SPDX-License-Identifier: Apache-2.0
 
 """Recorded signals as arrays, for plots and studies."""
 
 from dataclasses import dataclass
 import os
 
-from koopman_ros.bags.errors import BagReadError, reason
-from koopman_ros.bags.reader import read_messages, summary
 import numpy as np
 from numpy.typing import NDArray
+
+from koopman_ros.bags.errors import BagReadError, reason
+from koopman_ros.bags.reader import read_messages, summary
 
 _TEMPERATURE = 'sensor_msgs/msg/Temperature'
 _NS_PER_S = 1_000_000_000

@@ -1,16 +1,5 @@
-# Copyright 2026 The koopman_ros Authors
-#
-# Licensed under the Apache License, Version 2.0 (the "License");
-# you may not use this file except in compliance with the License.
-# You may obtain a copy of the License at
-#
-#     http://www.apache.org/licenses/LICENSE-2.0
-#
-# Unless required by applicable law or agreed to in writing, software
-# distributed under the License is distributed on an "AS IS" BASIS,
-# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
-# See the License for the specific language governing permissions and
-# limitations under the License.
+# SPDX-FileCopyrightText: 2026 The koopman_ros Authors
+# SPDX-License-Identifier: Apache-2.0
 
 """
 The files of a bag, in reading order, of a recorder that ended well or was killed.
@@ -24,12 +13,13 @@ from pathlib import Path
 import re
 from typing import Any
 
+import yaml
+
 from koopman_ros.bags.errors import BagReadError, reason
 from koopman_ros.bags.limits import enough_memory
 from koopman_ros.bags.metadata import METADATA_FILE, METADATA_KEY
 from koopman_ros.bags.plain_yaml import load_plain
 from koopman_ros.bags.records import is_closed, RECOVER
-import yaml
 
 # The files of a bag directory: run_0.mcap, run_1.mcap, ..., or the same compressed by rosbag2.
 _COMPRESSED = '.zstd'

@@ -1,16 +1,5 @@
-# Copyright 2026 The koopman_ros Authors
-#
-# Licensed under the Apache License, Version 2.0 (the "License");
-# you may not use this file except in compliance with the License.
-# You may obtain a copy of the License at
-#
-#     http://www.apache.org/licenses/LICENSE-2.0
-#
-# Unless required by applicable law or agreed to in writing, software
-# distributed under the License is distributed on an "AS IS" BASIS,
-# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
-# See the License for the specific language governing permissions and
-# limitations under the License.
+# SPDX-FileCopyrightText: 2026 The koopman_ros Authors
+# SPDX-License-Identifier: Apache-2.0
 
 """From an estimate to a law: what each gives, and which one may act."""
 
@@ -18,6 +7,9 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 from functools import cached_property
+
+import numpy as np
+from numpy.typing import NDArray
 
 from koopman_ros.control.estimation import Estimator
 from koopman_ros.control.ladder import Need, Rung, Standing
@@ -27,8 +19,6 @@ from koopman_ros.control.observer import Estimate
 from koopman_ros.control.sensor import Verdict
 from koopman_ros.control.state import State
 from koopman_ros.control.target import balance, Reference, reference, Target
-import numpy as np
-from numpy.typing import NDArray
 
 Array = NDArray[np.float64]
 

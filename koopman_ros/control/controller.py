@@ -1,16 +1,5 @@
-# Copyright 2026 The koopman_ros Authors
-#
-# Licensed under the Apache License, Version 2.0 (the "License");
-# you may not use this file except in compliance with the License.
-# You may obtain a copy of the License at
-#
-#     http://www.apache.org/licenses/LICENSE-2.0
-#
-# Unless required by applicable law or agreed to in writing, software
-# distributed under the License is distributed on an "AS IS" BASIS,
-# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
-# See the License for the specific language governing permissions and
-# limitations under the License.
+# SPDX-FileCopyrightText: 2026 The koopman_ros Authors
+# SPDX-License-Identifier: Apache-2.0
 
 """The control step: one pure function of state, measurement and time, replayable bit for bit."""
 
@@ -19,6 +8,9 @@ from __future__ import annotations
 from dataclasses import dataclass
 from functools import cached_property
 import math
+
+import numpy as np
+from numpy.typing import NDArray
 
 from koopman_ros.control import setpoint as setpoints
 from koopman_ros.control.choice import LawChoice
@@ -33,8 +25,6 @@ from koopman_ros.control.state import amended, Mode, Report, Settings, State
 from koopman_ros.control.transfer import Transfer
 from koopman_ros.control.way_back import leads_home, Rest, rest_under, WayBack
 from koopman_ros.lifting import LiftedModel
-import numpy as np
-from numpy.typing import NDArray
 
 Array = NDArray[np.float64]
 

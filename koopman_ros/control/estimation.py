@@ -1,16 +1,5 @@
-# Copyright 2026 The koopman_ros Authors
-#
-# Licensed under the Apache License, Version 2.0 (the "License");
-# you may not use this file except in compliance with the License.
-# You may obtain a copy of the License at
-#
-#     http://www.apache.org/licenses/LICENSE-2.0
-#
-# Unless required by applicable law or agreed to in writing, software
-# distributed under the License is distributed on an "AS IS" BASIS,
-# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
-# See the License for the specific language governing permissions and
-# limitations under the License.
+# SPDX-FileCopyrightText: 2026 The koopman_ros Authors
+# SPDX-License-Identifier: Apache-2.0
 
 """From measurements to an estimate: which are believed, and what is known between them."""
 
@@ -19,14 +8,15 @@ from __future__ import annotations
 from dataclasses import dataclass
 from functools import cached_property
 
+import numpy as np
+from numpy.typing import NDArray
+
 from koopman_ros.control.limits import finite
 from koopman_ros.control.observer import Estimate, Observer
 from koopman_ros.control.sensor import judge, Sensed, Verdict
 from koopman_ros.control.setpoint import NANOSECONDS, Show
 from koopman_ros.control.state import amended, Settings, State
 from koopman_ros.lifting import LiftedModel
-import numpy as np
-from numpy.typing import NDArray
 
 Array = NDArray[np.float64]
 

@@ -1,16 +1,5 @@
-# Copyright 2026 The koopman_ros Authors
-#
-# Licensed under the Apache License, Version 2.0 (the "License");
-# you may not use this file except in compliance with the License.
-# You may obtain a copy of the License at
-#
-#     http://www.apache.org/licenses/LICENSE-2.0
-#
-# Unless required by applicable law or agreed to in writing, software
-# distributed under the License is distributed on an "AS IS" BASIS,
-# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
-# See the License for the specific language governing permissions and
-# limitations under the License.
+# SPDX-FileCopyrightText: 2026 The koopman_ros Authors
+# SPDX-License-Identifier: Apache-2.0
 
 
 """The identification experiment: random steps of the input on a running plant, with a way back."""
@@ -21,10 +10,11 @@ from dataclasses import dataclass, replace
 from enum import Enum
 from functools import cached_property
 
-from koopman_ros.control.controller import LATE_NANOSECONDS
-from koopman_ros.control.setpoint import in_state_units, NANOSECONDS, Show
 import numpy as np
 from numpy.typing import NDArray
+
+from koopman_ros.control.controller import LATE_NANOSECONDS
+from koopman_ros.control.setpoint import in_state_units, NANOSECONDS, Show
 
 Array = NDArray[np.float64]
 

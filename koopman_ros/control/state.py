@@ -1,16 +1,5 @@
-# Copyright 2026 The koopman_ros Authors
-#
-# Licensed under the Apache License, Version 2.0 (the "License");
-# you may not use this file except in compliance with the License.
-# You may obtain a copy of the License at
-#
-#     http://www.apache.org/licenses/LICENSE-2.0
-#
-# Unless required by applicable law or agreed to in writing, software
-# distributed under the License is distributed on an "AS IS" BASIS,
-# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
-# See the License for the specific language governing permissions and
-# limitations under the License.
+# SPDX-FileCopyrightText: 2026 The koopman_ros Authors
+# SPDX-License-Identifier: Apache-2.0
 
 """What a controller is tuned by, what it remembers, and what it tells of a step."""
 
@@ -20,6 +9,9 @@ from dataclasses import dataclass, field
 from enum import Enum
 from typing import TypeVar
 
+import numpy as np
+from numpy.typing import NDArray
+
 from koopman_ros.control.ladder import LadderSettings, Rung, Standing
 from koopman_ros.control.laws import Law
 from koopman_ros.control.limits import InputLimits
@@ -28,8 +20,6 @@ from koopman_ros.control.sensor import Sensed, SensorLimits
 from koopman_ros.control.setpoint import Setpoint
 from koopman_ros.control.transfer import Transfer
 from koopman_ros.control.way_back import WayBack
-import numpy as np
-from numpy.typing import NDArray
 
 Array = NDArray[np.float64]
 

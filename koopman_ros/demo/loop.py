@@ -1,16 +1,5 @@
-# Copyright 2026 The koopman_ros Authors
-#
-# Licensed under the Apache License, Version 2.0 (the "License");
-# you may not use this file except in compliance with the License.
-# You may obtain a copy of the License at
-#
-#     http://www.apache.org/licenses/LICENSE-2.0
-#
-# Unless required by applicable law or agreed to in writing, software
-# distributed under the License is distributed on an "AS IS" BASIS,
-# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
-# See the License for the specific language governing permissions and
-# limitations under the License.
+# SPDX-FileCopyrightText: 2026 The koopman_ros Authors
+# SPDX-License-Identifier: Apache-2.0
 
 """One closed loop of plant, controller and trainer in lock-step, with an operator beside it."""
 
@@ -25,15 +14,16 @@ import time
 from typing import Any, TypeVar
 
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
-from koopman_ros.demo.processes import isolated_domain, NodeProcess
-from koopman_ros.nodes import topics
-from koopman_ros.nodes.messages import NANOSECONDS, stamp_nanoseconds, temperature_message
 import rclpy
 from rclpy.client import Client
 from rclpy.context import Context
 from rclpy.executors import SingleThreadedExecutor
 from rclpy.node import Node
 from sensor_msgs.msg import Temperature
+
+from koopman_ros.demo.processes import isolated_domain, NodeProcess
+from koopman_ros.nodes import topics
+from koopman_ros.nodes.messages import NANOSECONDS, stamp_nanoseconds, temperature_message
 
 T = TypeVar('T')
 

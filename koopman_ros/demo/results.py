@@ -1,16 +1,5 @@
-# Copyright 2026 The koopman_ros Authors
-#
-# Licensed under the Apache License, Version 2.0 (the "License");
-# you may not use this file except in compliance with the License.
-# You may obtain a copy of the License at
-#
-#     http://www.apache.org/licenses/LICENSE-2.0
-#
-# Unless required by applicable law or agreed to in writing, software
-# distributed under the License is distributed on an "AS IS" BASIS,
-# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
-# See the License for the specific language governing permissions and
-# limitations under the License.
+# SPDX-FileCopyrightText: 2026 The koopman_ros Authors
+# SPDX-License-Identifier: Apache-2.0
 
 """Results of a demo run, from its bag: series, figures and the picture."""
 
@@ -19,14 +8,15 @@ from __future__ import annotations
 from dataclasses import dataclass
 from pathlib import Path
 
+import matplotlib
+import numpy as np
+from numpy.typing import NDArray
+
 from koopman_ros.bags import temperature_series
 from koopman_ros.lifting import LiftedModel
 from koopman_ros.nodes import topics
 from koopman_ros.nodes.controller_parameters import ControllerParameters
 from koopman_ros.nodes.messages import to_celsius, ZERO_CELSIUS
-import matplotlib
-import numpy as np
-from numpy.typing import NDArray
 
 matplotlib.use('Agg')
 from matplotlib import pyplot

@@ -1,16 +1,5 @@
-# Copyright 2026 The koopman_ros Authors
-#
-# Licensed under the Apache License, Version 2.0 (the "License");
-# you may not use this file except in compliance with the License.
-# You may obtain a copy of the License at
-#
-#     http://www.apache.org/licenses/LICENSE-2.0
-#
-# Unless required by applicable law or agreed to in writing, software
-# distributed under the License is distributed on an "AS IS" BASIS,
-# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
-# See the License for the specific language governing permissions and
-# limitations under the License.
+# SPDX-FileCopyrightText: 2026 The koopman_ros Authors
+# SPDX-License-Identifier: Apache-2.0
 
 
 """
@@ -29,6 +18,10 @@ import shutil
 import time
 
 from diagnostic_msgs.msg import DiagnosticStatus
+from rcl_interfaces.srv import SetParameters
+from rclpy.parameter import Parameter
+from std_srvs.srv import SetBool, Trigger
+
 from koopman_ros.demo.command import read_options, run_act
 from koopman_ros.demo.loop import Loop, LoopError, running_loop, Scenario
 from koopman_ros.demo.retraining_results import plot, read_history, rollout_rmse
@@ -39,9 +32,6 @@ from koopman_ros.nodes.controller_parameters import ControllerParameters
 from koopman_ros.nodes.messages import NANOSECONDS
 from koopman_ros.nodes.plant_parameters import PlantParameters
 from koopman_ros.nodes.shipped import model_path
-from rcl_interfaces.srv import SetParameters
-from rclpy.parameter import Parameter
-from std_srvs.srv import SetBool, Trigger
 
 STEP = -10.0  # K
 FOULING = 0.8  # share of the heat transfer that is left

@@ -1,16 +1,5 @@
-# Copyright 2026 The koopman_ros Authors
-#
-# Licensed under the Apache License, Version 2.0 (the "License");
-# you may not use this file except in compliance with the License.
-# You may obtain a copy of the License at
-#
-#     http://www.apache.org/licenses/LICENSE-2.0
-#
-# Unless required by applicable law or agreed to in writing, software
-# distributed under the License is distributed on an "AS IS" BASIS,
-# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
-# See the License for the specific language governing permissions and
-# limitations under the License.
+# SPDX-FileCopyrightText: 2026 The koopman_ros Authors
+# SPDX-License-Identifier: Apache-2.0
 
 
 """Choice of a drift model: by every method and degree, judged on stretches that were held out."""
@@ -22,13 +11,14 @@ import contextlib
 from dataclasses import dataclass
 import math
 
+import numpy as np
+
 from koopman_ros.identification.drift import Box, DriftModel, scaled_input_matrix
 from koopman_ros.identification.output_error import output_error
 from koopman_ros.identification.records import Array, cut, Record
 from koopman_ros.identification.stretches import longest_step, prediction_error, Stretches
 from koopman_ros.identification.total_variation import noise_level, total_variation
 from koopman_ros.identification.weak_form import weak_form
-import numpy as np
 
 WINDOWS = (10, 20, 40, 80)
 DEGREES = (1, 2, 3, 4, 5, 6)

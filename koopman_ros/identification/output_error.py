@@ -1,16 +1,5 @@
-# Copyright 2026 The koopman_ros Authors
-#
-# Licensed under the Apache License, Version 2.0 (the "License");
-# you may not use this file except in compliance with the License.
-# You may obtain a copy of the License at
-#
-#     http://www.apache.org/licenses/LICENSE-2.0
-#
-# Unless required by applicable law or agreed to in writing, software
-# distributed under the License is distributed on an "AS IS" BASIS,
-# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
-# See the License for the specific language governing permissions and
-# limitations under the License.
+# SPDX-FileCopyrightText: 2026 The koopman_ros Authors
+# SPDX-License-Identifier: Apache-2.0
 
 
 """Output error: the drift whose predictions, not whose derivatives, fit what was measured."""
@@ -21,14 +10,15 @@ from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import cached_property
 
+import numpy as np
+import torch
+from torch import Tensor
+
 from koopman_ros.identification.drift import DriftModel
 from koopman_ros.identification.records import Array
 from koopman_ros.identification.stretches import first_measured, runge_kutta, Stretches
 from koopman_ros.learning.levenberg_marquardt import minimise
 from koopman_ros.learning.residuals import NormalEquations
-import numpy as np
-import torch
-from torch import Tensor
 
 _MAX_ITERATIONS = 40
 

@@ -1,16 +1,5 @@
-# Copyright 2026 The koopman_ros Authors
-#
-# Licensed under the Apache License, Version 2.0 (the "License");
-# you may not use this file except in compliance with the License.
-# You may obtain a copy of the License at
-#
-#     http://www.apache.org/licenses/LICENSE-2.0
-#
-# Unless required by applicable law or agreed to in writing, software
-# distributed under the License is distributed on an "AS IS" BASIS,
-# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
-# See the License for the specific language governing permissions and
-# limitations under the License.
+# SPDX-FileCopyrightText: 2026 The koopman_ros Authors
+# SPDX-License-Identifier: Apache-2.0
 
 """Algorithm 1 of the paper, as printed: random start, decoder term, decreasing lambda."""
 
@@ -18,11 +7,12 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+import torch
+
 from koopman_ros.learning.growth import Grown, Monitor
 from koopman_ros.learning.levenberg_marquardt import minimise, Status
 from koopman_ros.learning.network import check_activation, Layout
 from koopman_ros.learning.residuals import Data, Problem, ResidualWeights
-import torch
 
 
 @dataclass(frozen=True)

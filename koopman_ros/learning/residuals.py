@@ -1,16 +1,5 @@
-# Copyright 2026 The koopman_ros Authors
-#
-# Licensed under the Apache License, Version 2.0 (the "License");
-# you may not use this file except in compliance with the License.
-# You may obtain a copy of the License at
-#
-#     http://www.apache.org/licenses/LICENSE-2.0
-#
-# Unless required by applicable law or agreed to in writing, software
-# distributed under the License is distributed on an "AS IS" BASIS,
-# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
-# See the License for the specific language governing permissions and
-# limitations under the License.
+# SPDX-FileCopyrightText: 2026 The koopman_ros Authors
+# SPDX-License-Identifier: Apache-2.0
 
 """The stacked residuals by which a lift is learned, with their hand-derived Jacobian, in torch."""
 
@@ -18,11 +7,12 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 
+import torch
+from torch import Tensor
+
 from koopman_ros.learning.deep import ProductSums
 from koopman_ros.learning.network import Layout, Parameters, Pass
 from koopman_ros.learning.shallow import FeatureMap, MomentSums
-import torch
-from torch import Tensor
 
 
 @dataclass(frozen=True)

@@ -1,16 +1,5 @@
-# Copyright 2026 The koopman_ros Authors
-#
-# Licensed under the Apache License, Version 2.0 (the "License");
-# you may not use this file except in compliance with the License.
-# You may obtain a copy of the License at
-#
-#     http://www.apache.org/licenses/LICENSE-2.0
-#
-# Unless required by applicable law or agreed to in writing, software
-# distributed under the License is distributed on an "AS IS" BASIS,
-# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
-# See the License for the specific language governing permissions and
-# limitations under the License.
+# SPDX-FileCopyrightText: 2026 The koopman_ros Authors
+# SPDX-License-Identifier: Apache-2.0
 
 """Training of a lifted model from samples: split, scaling, rounds of starts, held-out report."""
 
@@ -26,6 +15,9 @@ import signal
 import warnings
 
 import joblib
+import numpy as np
+import torch
+
 from koopman_ros import __version__
 from koopman_ros.learning.algorithm1 import Algorithm1
 from koopman_ros.learning.baselines import Edmd
@@ -42,8 +34,6 @@ from koopman_ros.learning.validation import (
     Report,
 )
 from koopman_ros.lifting import LiftedModel, NetworkObservables, Provenance, TrainingStates
-import numpy as np
-import torch
 
 Recipe = Growth | Algorithm1
 RECIPES: dict[str, type[Growth] | type[Algorithm1]] = {'growth': Growth, 'paper': Algorithm1}

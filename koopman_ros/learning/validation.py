@@ -1,16 +1,5 @@
-# Copyright 2026 The koopman_ros Authors
-#
-# Licensed under the Apache License, Version 2.0 (the "License");
-# you may not use this file except in compliance with the License.
-# You may obtain a copy of the License at
-#
-#     http://www.apache.org/licenses/LICENSE-2.0
-#
-# Unless required by applicable law or agreed to in writing, software
-# distributed under the License is distributed on an "AS IS" BASIS,
-# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
-# See the License for the specific language governing permissions and
-# limitations under the License.
+# SPDX-FileCopyrightText: 2026 The koopman_ros Authors
+# SPDX-License-Identifier: Apache-2.0
 
 """Held-out figures of a lifted model, invariant where the lift's own objective is not."""
 
@@ -18,12 +7,13 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 
-from koopman_ros.control import run_closed_loop, solve_riccati, Weights
-from koopman_ros.learning.samples import Array, Samples
-from koopman_ros.lifting import LiftedModel
 import numpy as np
 from numpy.typing import NDArray
 from scipy.integrate import solve_ivp
+
+from koopman_ros.control import run_closed_loop, solve_riccati, Weights
+from koopman_ros.learning.samples import Array, Samples
+from koopman_ros.lifting import LiftedModel
 
 # Beyond it S is singular to working precision, and rw is noise.
 _MAX_COND = 1e13

@@ -1,16 +1,5 @@
-# Copyright 2026 The koopman_ros Authors
-#
-# Licensed under the Apache License, Version 2.0 (the "License");
-# you may not use this file except in compliance with the License.
-# You may obtain a copy of the License at
-#
-#     http://www.apache.org/licenses/LICENSE-2.0
-#
-# Unless required by applicable law or agreed to in writing, software
-# distributed under the License is distributed on an "AS IS" BASIS,
-# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
-# See the License for the specific language governing permissions and
-# limitations under the License.
+# SPDX-FileCopyrightText: 2026 The koopman_ros Authors
+# SPDX-License-Identifier: Apache-2.0
 
 """The model file: one .safetensors file, written atomically and read with numpy alone."""
 
@@ -26,13 +15,14 @@ from pathlib import Path
 import tempfile
 from typing import Any, NoReturn
 
+import numpy as np
+
 from koopman_ros.lifting.activations import activation_named
 from koopman_ros.lifting.bounds import check_sizes, check_texts, MAX_LAYERS
 from koopman_ros.lifting.files import NotRegularError, read_regular
 from koopman_ros.lifting.model import Coordinates, LiftedModel, Provenance
 from koopman_ros.lifting.observables import NetworkObservables
 from koopman_ros.lifting.training_states import TrainingStates
-import numpy as np
 
 FORMAT = 'koopman_ros.lift'
 FORMAT_VERSION = 1

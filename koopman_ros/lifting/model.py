@@ -1,16 +1,5 @@
-# Copyright 2026 The koopman_ros Authors
-#
-# Licensed under the Apache License, Version 2.0 (the "License");
-# you may not use this file except in compliance with the License.
-# You may obtain a copy of the License at
-#
-#     http://www.apache.org/licenses/LICENSE-2.0
-#
-# Unless required by applicable law or agreed to in writing, software
-# distributed under the License is distributed on an "AS IS" BASIS,
-# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
-# See the License for the specific language governing permissions and
-# limitations under the License.
+# SPDX-FileCopyrightText: 2026 The koopman_ros Authors
+# SPDX-License-Identifier: Apache-2.0
 
 """The run-time lifted model: lift, Jacobian, secants and projected drift, in numpy alone."""
 
@@ -21,11 +10,12 @@ from dataclasses import dataclass, field, replace
 from functools import cached_property
 import math
 
+import numpy as np
+from numpy.typing import NDArray
+
 from koopman_ros.lifting.arrays import Array, frozen
 from koopman_ros.lifting.observables import NetworkObservables, Observables
 from koopman_ros.lifting.training_states import TrainingStates
-import numpy as np
-from numpy.typing import NDArray
 
 SECONDS_PER_TIME_UNIT = {'s': 1.0, 'min': 60.0}
 

@@ -1,16 +1,5 @@
-# Copyright 2026 The koopman_ros Authors
-#
-# Licensed under the Apache License, Version 2.0 (the "License");
-# you may not use this file except in compliance with the License.
-# You may obtain a copy of the License at
-#
-#     http://www.apache.org/licenses/LICENSE-2.0
-#
-# Unless required by applicable law or agreed to in writing, software
-# distributed under the License is distributed on an "AS IS" BASIS,
-# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
-# See the License for the specific language governing permissions and
-# limitations under the License.
+# SPDX-FileCopyrightText: 2026 The koopman_ros Authors
+# SPDX-License-Identifier: Apache-2.0
 
 """The controller node: answers each temperature measurement with a coolant set-point."""
 
@@ -20,6 +9,14 @@ import sys
 import threading
 
 from builtin_interfaces.msg import Time
+import numpy as np
+from rclpy.callback_groups import MutuallyExclusiveCallbackGroup
+from rclpy.clock import Clock, ClockType
+from rclpy.qos_overriding_options import QoSOverridingOptions
+from rclpy.timer import Timer
+from sensor_msgs.msg import JointState, Temperature
+from std_srvs.srv import SetBool, Trigger
+
 from koopman_ros.control import Controller, Mode, Report, Rung, State
 from koopman_ros.nodes import topics, translation
 from koopman_ros.nodes.arrival import Arrival
@@ -41,13 +38,6 @@ from koopman_ros.nodes.model_reload import ModelReload
 from koopman_ros.nodes.process import LoopNode, run
 from koopman_ros.nodes.rivals import Rivals
 from koopman_ros.nodes.watchdog import PERIOD, Watchdog
-import numpy as np
-from rclpy.callback_groups import MutuallyExclusiveCallbackGroup
-from rclpy.clock import Clock, ClockType
-from rclpy.qos_overriding_options import QoSOverridingOptions
-from rclpy.timer import Timer
-from sensor_msgs.msg import JointState, Temperature
-from std_srvs.srv import SetBool, Trigger
 
 _WATCH_STEP = NANOSECONDS // 2  # of plant time between two commands without a measurement
 _COOLANT_PATIENCE = 0.5  # s that the first answer waits for the coolant that is in force

@@ -1,16 +1,5 @@
-# Copyright 2026 The koopman_ros Authors
-#
-# Licensed under the Apache License, Version 2.0 (the "License");
-# you may not use this file except in compliance with the License.
-# You may obtain a copy of the License at
-#
-#     http://www.apache.org/licenses/LICENSE-2.0
-#
-# Unless required by applicable law or agreed to in writing, software
-# distributed under the License is distributed on an "AS IS" BASIS,
-# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
-# See the License for the specific language governing permissions and
-# limitations under the License.
+# SPDX-FileCopyrightText: 2026 The koopman_ros Authors
+# SPDX-License-Identifier: Apache-2.0
 
 """What the controller says of itself: its status for /diagnostics, and its internals to plot."""
 
@@ -20,13 +9,14 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 
 from builtin_interfaces.msg import Time
+import numpy as np
+from sensor_msgs.msg import JointState
+
 from koopman_ros.control import Controller, Mode, Report, Rung, State
 from koopman_ros.nodes.arrival import Arrival
 from koopman_ros.nodes.controller_parameters import ControllerParameters
 from koopman_ros.nodes.diagnostics import Level, Status
 from koopman_ros.nodes.messages import in_celsius, to_celsius
-import numpy as np
-from sensor_msgs.msg import JointState
 
 _LEVELS = {Rung.LEARNED: Level.OK, Rung.LINEAR: Level.WARN, Rung.HOLD: Level.ERROR,
            Rung.SAFE: Level.ERROR}

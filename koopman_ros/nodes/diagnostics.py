@@ -1,16 +1,5 @@
-# Copyright 2026 The koopman_ros Authors
-#
-# Licensed under the Apache License, Version 2.0 (the "License");
-# you may not use this file except in compliance with the License.
-# You may obtain a copy of the License at
-#
-#     http://www.apache.org/licenses/LICENSE-2.0
-#
-# Unless required by applicable law or agreed to in writing, software
-# distributed under the License is distributed on an "AS IS" BASIS,
-# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
-# See the License for the specific language governing permissions and
-# limitations under the License.
+# SPDX-FileCopyrightText: 2026 The koopman_ros Authors
+# SPDX-License-Identifier: Apache-2.0
 
 """Diagnostics of a node: once a second by the wall clock, and at once when the state changes."""
 
@@ -22,10 +11,11 @@ from enum import Enum
 import time
 
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
-from koopman_ros.nodes.messages import stamp_message
-from koopman_ros.nodes.topics import DIAGNOSTICS
 from rclpy.clock import Clock, ClockType
 from rclpy.node import Node
+
+from koopman_ros.nodes.messages import stamp_message
+from koopman_ros.nodes.topics import DIAGNOSTICS
 
 
 class Level(Enum):

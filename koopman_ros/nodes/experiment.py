@@ -1,20 +1,13 @@
-# Copyright 2026 The koopman_ros Authors
-#
-# Licensed under the Apache License, Version 2.0 (the "License");
-# you may not use this file except in compliance with the License.
-# You may obtain a copy of the License at
-#
-#     http://www.apache.org/licenses/LICENSE-2.0
-#
-# Unless required by applicable law or agreed to in writing, software
-# distributed under the License is distributed on an "AS IS" BASIS,
-# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
-# See the License for the specific language governing permissions and
-# limitations under the License.
+# SPDX-FileCopyrightText: 2026 The koopman_ros Authors
+# SPDX-License-Identifier: Apache-2.0
 
 """Identification experiments as the trainer does them: on its service, with words for each end."""
 
 from __future__ import annotations
+
+from rclpy.callback_groups import MutuallyExclusiveCallbackGroup
+from rclpy.node import Node
+from std_srvs.srv import SetBool
 
 from koopman_ros.control.experiment import level, Phase
 from koopman_ros.nodes import topics
@@ -22,9 +15,6 @@ from koopman_ros.nodes.diagnostics import DiagnosticsPublisher, Level, Status
 from koopman_ros.nodes.experiment_run import ExperimentRun, other_publishers
 from koopman_ros.nodes.messages import in_celsius, to_celsius
 from koopman_ros.nodes.trainer_parameters import TrainerParameters
-from rclpy.callback_groups import MutuallyExclusiveCallbackGroup
-from rclpy.node import Node
-from std_srvs.srv import SetBool
 
 
 class CoolantExperiment:

@@ -1,16 +1,5 @@
-# Copyright 2026 The koopman_ros Authors
-#
-# Licensed under the Apache License, Version 2.0 (the "License");
-# you may not use this file except in compliance with the License.
-# You may obtain a copy of the License at
-#
-#     http://www.apache.org/licenses/LICENSE-2.0
-#
-# Unless required by applicable law or agreed to in writing, software
-# distributed under the License is distributed on an "AS IS" BASIS,
-# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
-# See the License for the specific language governing permissions and
-# limitations under the License.
+# SPDX-FileCopyrightText: 2026 The koopman_ros Authors
+# SPDX-License-Identifier: Apache-2.0
 
 """One identification experiment: answers each temperature with a coolant, while it commands."""
 
@@ -18,6 +7,13 @@ from __future__ import annotations
 
 from collections.abc import Callable
 import time
+
+from rclpy.clock import Clock, ClockType
+from rclpy.duration import Duration
+from rclpy.node import Node
+from rclpy.qos import QoSProfile, ReliabilityPolicy
+from rclpy.task import Future
+from sensor_msgs.msg import Temperature
 
 from koopman_ros.control.experiment import advance, begin, end, Following, Phase, Progress
 from koopman_ros.nodes import topics
@@ -30,12 +26,6 @@ from koopman_ros.nodes.messages import (
     to_kelvin,
 )
 from koopman_ros.nodes.trainer_parameters import TrainerParameters
-from rclpy.clock import Clock, ClockType
-from rclpy.duration import Duration
-from rclpy.node import Node
-from rclpy.qos import QoSProfile, ReliabilityPolicy
-from rclpy.task import Future
-from sensor_msgs.msg import Temperature
 
 _TICK = 0.1  # s
 _ASTRAY = 10  # commands of a controller, and

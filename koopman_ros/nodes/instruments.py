@@ -1,29 +1,19 @@
-# Copyright 2026 The koopman_ros Authors
-#
-# Licensed under the Apache License, Version 2.0 (the "License");
-# you may not use this file except in compliance with the License.
-# You may obtain a copy of the License at
-#
-#     http://www.apache.org/licenses/LICENSE-2.0
-#
-# Unless required by applicable law or agreed to in writing, software
-# distributed under the License is distributed on an "AS IS" BASIS,
-# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
-# See the License for the specific language governing permissions and
-# limitations under the License.
+# SPDX-FileCopyrightText: 2026 The koopman_ros Authors
+# SPDX-License-Identifier: Apache-2.0
 
 """What the plant publishes at an instant: the time, and what its instruments show."""
 
 from __future__ import annotations
+
+from rclpy.node import Node
+from rosgraph_msgs.msg import Clock
+from sensor_msgs.msg import JointState, Temperature
 
 from koopman_ros.nodes import topics
 from koopman_ros.nodes.matching import Matching
 from koopman_ros.nodes.messages import stamp_message, temperature_message
 from koopman_ros.nodes.plant_parameters import PlantParameters
 from koopman_ros.plants import in_steps, Process, sensor_noise
-from rclpy.node import Node
-from rosgraph_msgs.msg import Clock
-from sensor_msgs.msg import JointState, Temperature
 
 _CONCENTRATION_NAME = 'reactant_concentration [mol/L]'
 

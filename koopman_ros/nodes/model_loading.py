@@ -1,16 +1,5 @@
-# Copyright 2026 The koopman_ros Authors
-#
-# Licensed under the Apache License, Version 2.0 (the "License");
-# you may not use this file except in compliance with the License.
-# You may obtain a copy of the License at
-#
-#     http://www.apache.org/licenses/LICENSE-2.0
-#
-# Unless required by applicable law or agreed to in writing, software
-# distributed under the License is distributed on an "AS IS" BASIS,
-# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
-# See the License for the specific language governing permissions and
-# limitations under the License.
+# SPDX-FileCopyrightText: 2026 The koopman_ros Authors
+# SPDX-License-Identifier: Apache-2.0
 
 
 """Models for the controller: read, and tried in the situation that they shall take over."""
@@ -23,14 +12,15 @@ from datetime import datetime, UTC
 from pathlib import Path
 import time
 
+import numpy as np
+from numpy.typing import NDArray
+
 from koopman_ros.control import Controller, Settings, State
 from koopman_ros.lifting import LiftedModel, load, ModelFileError
 from koopman_ros.nodes.controller_parameters import ControllerParameters
 from koopman_ros.nodes.messages import in_celsius, NANOSECONDS
 from koopman_ros.nodes.shipped import model_path
 from koopman_ros.nodes.translation import controller_of
-import numpy as np
-from numpy.typing import NDArray
 
 Array = NDArray[np.float64]
 

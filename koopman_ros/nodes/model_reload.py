@@ -1,16 +1,5 @@
-# Copyright 2026 The koopman_ros Authors
-#
-# Licensed under the Apache License, Version 2.0 (the "License");
-# you may not use this file except in compliance with the License.
-# You may obtain a copy of the License at
-#
-#     http://www.apache.org/licenses/LICENSE-2.0
-#
-# Unless required by applicable law or agreed to in writing, software
-# distributed under the License is distributed on an "AS IS" BASIS,
-# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
-# See the License for the specific language governing permissions and
-# limitations under the License.
+# SPDX-FileCopyrightText: 2026 The koopman_ros Authors
+# SPDX-License-Identifier: Apache-2.0
 
 """Another model in a running controller: read and tried aside, swapped between measurements."""
 
@@ -24,6 +13,10 @@ from pathlib import Path
 import re
 import threading
 
+from rclpy.node import Node
+from rclpy.task import Future
+from std_srvs.srv import Trigger
+
 from koopman_ros.lifting import ModelFileError
 from koopman_ros.nodes.controller_parameters import ControllerParameters
 from koopman_ros.nodes.model_loading import (
@@ -33,9 +26,6 @@ from koopman_ros.nodes.model_loading import (
     refuse_without_law,
     Situation,
 )
-from rclpy.node import Node
-from rclpy.task import Future
-from std_srvs.srv import Trigger
 
 _SHORT_WAIT = 0.2  # s that the loop may stand still for a parameter
 _LONG_WAIT = 10.0  # s that the service waits for a slow disk

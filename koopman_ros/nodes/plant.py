@@ -1,16 +1,5 @@
-# Copyright 2026 The koopman_ros Authors
-#
-# Licensed under the Apache License, Version 2.0 (the "License");
-# you may not use this file except in compliance with the License.
-# You may obtain a copy of the License at
-#
-#     http://www.apache.org/licenses/LICENSE-2.0
-#
-# Unless required by applicable law or agreed to in writing, software
-# distributed under the License is distributed on an "AS IS" BASIS,
-# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
-# See the License for the specific language governing permissions and
-# limitations under the License.
+# SPDX-FileCopyrightText: 2026 The koopman_ros Authors
+# SPDX-License-Identifier: Apache-2.0
 
 """The plant node: a simulated reactor that publishes its temperature and takes a coolant."""
 
@@ -22,6 +11,11 @@ import math
 import sys
 import time
 from typing import Any
+
+import numpy as np
+from rclpy.clock import Clock, ClockType
+from sensor_msgs.msg import Temperature
+from std_srvs.srv import Trigger
 
 from koopman_ros.nodes import topics
 from koopman_ros.nodes.diagnostics import DiagnosticsPublisher, Level, Status
@@ -45,10 +39,6 @@ from koopman_ros.plants import (
     IntegrationError,
     Process,
 )
-import numpy as np
-from rclpy.clock import Clock, ClockType
-from sensor_msgs.msg import Temperature
-from std_srvs.srv import Trigger
 
 _POLL_PERIOD = 0.01  # s; for what no message announces
 _LAST_STAMP_NS = (LAST_STAMP_SECONDS + 1) * NANOSECONDS - 1

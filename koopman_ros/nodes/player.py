@@ -1,16 +1,5 @@
-# Copyright 2026 The koopman_ros Authors
-#
-# Licensed under the Apache License, Version 2.0 (the "License");
-# you may not use this file except in compliance with the License.
-# You may obtain a copy of the License at
-#
-#     http://www.apache.org/licenses/LICENSE-2.0
-#
-# Unless required by applicable law or agreed to in writing, software
-# distributed under the License is distributed on an "AS IS" BASIS,
-# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
-# See the License for the specific language governing permissions and
-# limitations under the License.
+# SPDX-FileCopyrightText: 2026 The koopman_ros Authors
+# SPDX-License-Identifier: Apache-2.0
 
 """The player: the inputs of a controller from a bag, as they were recorded."""
 
@@ -19,6 +8,13 @@ from __future__ import annotations
 from collections.abc import Iterator
 import sys
 import time
+
+from rclpy.clock import Clock, ClockType
+from rclpy.duration import Duration
+from rclpy.publisher import Publisher
+from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
+from rosgraph_msgs.msg import Clock as ClockMessage
+from sensor_msgs.msg import Temperature
 
 from koopman_ros.bags import (
     BagMessage,
@@ -34,12 +30,6 @@ from koopman_ros.nodes.messages import NANOSECONDS, stamp_message, stamp_nanosec
 from koopman_ros.nodes.parameters import ConfigurationError
 from koopman_ros.nodes.player_parameters import TABLE
 from koopman_ros.nodes.process import LoopNode, run
-from rclpy.clock import Clock, ClockType
-from rclpy.duration import Duration
-from rclpy.publisher import Publisher
-from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
-from rosgraph_msgs.msg import Clock as ClockMessage
-from sensor_msgs.msg import Temperature
 
 _POLL_PERIOD_NS = 10_000_000  # for what no message announces
 _PROGRESS_PERIOD = 3.0  # s

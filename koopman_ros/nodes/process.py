@@ -1,16 +1,5 @@
-# Copyright 2026 The koopman_ros Authors
-#
-# Licensed under the Apache License, Version 2.0 (the "License");
-# you may not use this file except in compliance with the License.
-# You may obtain a copy of the License at
-#
-#     http://www.apache.org/licenses/LICENSE-2.0
-#
-# Unless required by applicable law or agreed to in writing, software
-# distributed under the License is distributed on an "AS IS" BASIS,
-# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
-# See the License for the specific language governing permissions and
-# limitations under the License.
+# SPDX-FileCopyrightText: 2026 The koopman_ros Authors
+# SPDX-License-Identifier: Apache-2.0
 
 """Life of a node's process: start, one-line reason on a bad start, clean end on a signal."""
 
@@ -23,13 +12,6 @@ import sys
 import threading
 from typing import Any
 
-from koopman_ros.last_resort import end_by_force
-from koopman_ros.nodes import command_line
-from koopman_ros.nodes.exposure import open_to_the_network
-from koopman_ros.nodes.messages import NANOSECONDS
-from koopman_ros.nodes.parameter_node import ParameterNode
-from koopman_ros.nodes.watchdog import end_in_time
-from koopman_ros.startup import ignore_signals, SIGNALS
 import rclpy
 from rclpy.exceptions import ParameterException
 from rclpy.executors import SingleThreadedExecutor
@@ -37,6 +19,14 @@ from rclpy.logging import LoggingSeverity, set_logger_level
 from rclpy.signals import SignalHandlerOptions
 from rclpy.subscription import Subscription
 from rosgraph_msgs.msg import Clock
+
+from koopman_ros.last_resort import end_by_force
+from koopman_ros.nodes import command_line
+from koopman_ros.nodes.exposure import open_to_the_network
+from koopman_ros.nodes.messages import NANOSECONDS
+from koopman_ros.nodes.parameter_node import ParameterNode
+from koopman_ros.nodes.watchdog import end_in_time
+from koopman_ros.startup import ignore_signals, SIGNALS
 
 # A parameter or a model that does not fit is a ValueError; rclpy raises RCLError for an unreadable
 # parameter file, a RuntimeError whose class is private to the extension.

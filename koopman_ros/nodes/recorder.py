@@ -1,16 +1,5 @@
-# Copyright 2026 The koopman_ros Authors
-#
-# Licensed under the Apache License, Version 2.0 (the "License");
-# you may not use this file except in compliance with the License.
-# You may obtain a copy of the License at
-#
-#     http://www.apache.org/licenses/LICENSE-2.0
-#
-# Unless required by applicable law or agreed to in writing, software
-# distributed under the License is distributed on an "AS IS" BASIS,
-# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
-# See the License for the specific language governing permissions and
-# limitations under the License.
+# SPDX-FileCopyrightText: 2026 The koopman_ros Authors
+# SPDX-License-Identifier: Apache-2.0
 
 """Recording of topics as they come: raw subscriptions into a bag."""
 
@@ -22,13 +11,14 @@ import heapq
 import time
 from typing import Any
 
-from koopman_ros.bags import BagWriter, INFINITE_NS, message_definition, QosProfile
-from koopman_ros.nodes import topics
 from rclpy.callback_groups import CallbackGroup
 from rclpy.node import Node
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 from rclpy.subscription import Subscription
 from rclpy.topic_endpoint_info import TopicEndpointInfo
+
+from koopman_ros.bags import BagWriter, INFINITE_NS, message_definition, QosProfile
+from koopman_ros.nodes import topics
 
 # Five seconds at 1 kHz wait here while the disk is slow; Fast DDS keeps no more than this.
 _QUEUE_DEPTH = 5000

@@ -1,16 +1,5 @@
-# Copyright 2026 The koopman_ros Authors
-#
-# Licensed under the Apache License, Version 2.0 (the "License");
-# you may not use this file except in compliance with the License.
-# You may obtain a copy of the License at
-#
-#     http://www.apache.org/licenses/LICENSE-2.0
-#
-# Unless required by applicable law or agreed to in writing, software
-# distributed under the License is distributed on an "AS IS" BASIS,
-# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
-# See the License for the specific language governing permissions and
-# limitations under the License.
+# SPDX-FileCopyrightText: 2026 The koopman_ros Authors
+# SPDX-License-Identifier: Apache-2.0
 
 
 """Recording as the trainer does it: starts and stops, names, room on the disk, what went wrong."""
@@ -24,13 +13,14 @@ import os
 from pathlib import Path
 import shutil
 
+from rclpy.clock import Clock, ClockType
+from rclpy.node import Node
+from std_srvs.srv import SetBool
+
 from koopman_ros.bags import BagWriter
 from koopman_ros.nodes.diagnostics import DiagnosticsPublisher, Level, Status
 from koopman_ros.nodes.recorder import Recorder
 from koopman_ros.nodes.trainer_parameters import TrainerParameters
-from rclpy.clock import Clock, ClockType
-from rclpy.node import Node
-from std_srvs.srv import SetBool
 
 _TAKE_PERIOD = 0.05  # s, for new messages
 _LOOK_PERIOD = 0.2  # s, for new publishers

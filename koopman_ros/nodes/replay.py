@@ -1,16 +1,5 @@
-# Copyright 2026 The koopman_ros Authors
-#
-# Licensed under the Apache License, Version 2.0 (the "License");
-# you may not use this file except in compliance with the License.
-# You may obtain a copy of the License at
-#
-#     http://www.apache.org/licenses/LICENSE-2.0
-#
-# Unless required by applicable law or agreed to in writing, software
-# distributed under the License is distributed on an "AS IS" BASIS,
-# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
-# See the License for the specific language governing permissions and
-# limitations under the License.
+# SPDX-FileCopyrightText: 2026 The koopman_ros Authors
+# SPDX-License-Identifier: Apache-2.0
 
 """
 The replay: recorded bags through the control step again, with the old and with a new model.
@@ -27,6 +16,8 @@ import enum
 from pathlib import Path
 import sys
 
+import numpy as np
+
 from koopman_ros.nodes import topics
 from koopman_ros.nodes.model_loading import load_suitable
 from koopman_ros.nodes.parameter_node import ParameterNode
@@ -37,7 +28,6 @@ from koopman_ros.nodes.replaying.record import Names, read_record
 from koopman_ros.nodes.replaying.report import reproduced, verdict, write_report
 from koopman_ros.nodes.replaying.steps import commands_of, replay
 from koopman_ros.nodes.translation import controller_of
-import numpy as np
 
 
 class Result(enum.IntEnum):

@@ -1,16 +1,5 @@
-# Copyright 2026 The koopman_ros Authors
-#
-# Licensed under the Apache License, Version 2.0 (the "License");
-# you may not use this file except in compliance with the License.
-# You may obtain a copy of the License at
-#
-#     http://www.apache.org/licenses/LICENSE-2.0
-#
-# Unless required by applicable law or agreed to in writing, software
-# distributed under the License is distributed on an "AS IS" BASIS,
-# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
-# See the License for the specific language governing permissions and
-# limitations under the License.
+# SPDX-FileCopyrightText: 2026 The koopman_ros Authors
+# SPDX-License-Identifier: Apache-2.0
 
 """
 Messages into control steps: the same for the running controller and for a bag that is replayed.
@@ -24,6 +13,8 @@ from __future__ import annotations
 import math
 from typing import Any
 
+import numpy as np
+
 from koopman_ros.control import Controller, Report, Settings, State
 from koopman_ros.lifting import LiftedModel
 from koopman_ros.nodes.messages import (
@@ -33,7 +24,6 @@ from koopman_ros.nodes.messages import (
     to_celsius,
     to_kelvin,
 )
-import numpy as np
 
 # The temperatures of reactor and coolant at an instant are stamped no further apart.
 SAME_TIME_NS = 2 * NANOSECONDS

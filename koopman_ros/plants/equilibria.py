@@ -1,25 +1,15 @@
-# Copyright 2026 The koopman_ros Authors
-#
-# Licensed under the Apache License, Version 2.0 (the "License");
-# you may not use this file except in compliance with the License.
-# You may obtain a copy of the License at
-#
-#     http://www.apache.org/licenses/LICENSE-2.0
-#
-# Unless required by applicable law or agreed to in writing, software
-# distributed under the License is distributed on an "AS IS" BASIS,
-# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
-# See the License for the specific language governing permissions and
-# limitations under the License.
+# SPDX-FileCopyrightText: 2026 The koopman_ros Authors
+# SPDX-License-Identifier: Apache-2.0
 
 """Steady states of a plant, the inputs that hold them, their eigenvalues and their folds."""
 
 from __future__ import annotations
 
-from koopman_ros.plants.system import ControlAffineSystem, FloatArray
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.optimize import brentq, root
+
+from koopman_ros.plants.system import ControlAffineSystem, FloatArray
 
 # The last Newton correction of a steady state, as a fraction of each state or of its nominal
 # magnitude, whichever is larger.

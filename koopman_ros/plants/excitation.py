@@ -1,16 +1,5 @@
-# Copyright 2026 The koopman_ros Authors
-#
-# Licensed under the Apache License, Version 2.0 (the "License");
-# you may not use this file except in compliance with the License.
-# You may obtain a copy of the License at
-#
-#     http://www.apache.org/licenses/LICENSE-2.0
-#
-# Unless required by applicable law or agreed to in writing, software
-# distributed under the License is distributed on an "AS IS" BASIS,
-# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
-# See the License for the specific language governing permissions and
-# limitations under the License.
+# SPDX-FileCopyrightText: 2026 The koopman_ros Authors
+# SPDX-License-Identifier: Apache-2.0
 
 """Random step inputs that excite a plant without driving it out of a box of states."""
 
@@ -18,6 +7,9 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 import math
+
+import numpy as np
+from numpy.typing import ArrayLike
 
 from koopman_ros.plants.integration import (
     IntegrationError,
@@ -27,8 +19,6 @@ from koopman_ros.plants.integration import (
 from koopman_ros.plants.simulation import simulate
 from koopman_ros.plants.system import checked_vector, ControlAffineSystem, FloatArray
 from koopman_ros.plants.trajectory import sample_times, Trajectory
-import numpy as np
-from numpy.typing import ArrayLike
 
 
 class ExcitationError(ValueError):

@@ -1,16 +1,5 @@
-# Copyright 2026 The koopman_ros Authors
-#
-# Licensed under the Apache License, Version 2.0 (the "License");
-# you may not use this file except in compliance with the License.
-# You may obtain a copy of the License at
-#
-#     http://www.apache.org/licenses/LICENSE-2.0
-#
-# Unless required by applicable law or agreed to in writing, software
-# distributed under the License is distributed on an "AS IS" BASIS,
-# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
-# See the License for the specific language governing permissions and
-# limitations under the License.
+# SPDX-FileCopyrightText: 2026 The koopman_ros Authors
+# SPDX-License-Identifier: Apache-2.0
 
 """Integration of a plant over one hold of its input, with its precision, bounds and failures."""
 
@@ -20,10 +9,11 @@ from dataclasses import dataclass
 from enum import Enum
 import math
 
-from koopman_ros.plants.system import ControlAffineSystem, FloatArray
 import numpy as np
 from numpy.typing import ArrayLike
 from scipy.integrate import DOP853
+
+from koopman_ros.plants.system import ControlAffineSystem, FloatArray
 
 LOOSEST_RTOL = 1e-9
 # What scipy still keeps; it takes tighter tolerances for this one, with a warning.

@@ -1,16 +1,5 @@
-# Copyright 2026 The koopman_ros Authors
-#
-# Licensed under the Apache License, Version 2.0 (the "License");
-# you may not use this file except in compliance with the License.
-# You may obtain a copy of the License at
-#
-#     http://www.apache.org/licenses/LICENSE-2.0
-#
-# Unless required by applicable law or agreed to in writing, software
-# distributed under the License is distributed on an "AS IS" BASIS,
-# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
-# See the License for the specific language governing permissions and
-# limitations under the License.
+# SPDX-FileCopyrightText: 2026 The koopman_ros Authors
+# SPDX-License-Identifier: Apache-2.0
 
 
 """Whether a new lift may replace the present one: judged on what no part of it has seen."""
@@ -19,6 +8,9 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 import itertools
+
+import numpy as np
+from numpy.typing import NDArray
 
 from koopman_ros.control import run_closed_loop, Weights
 from koopman_ros.identification import (
@@ -32,8 +24,6 @@ from koopman_ros.identification.stretches import Rate
 from koopman_ros.learning import Trained
 from koopman_ros.learning.validation import settling_time
 from koopman_ros.lifting import LiftedModel, linearised_model, Provenance
-import numpy as np
-from numpy.typing import NDArray
 
 Array = NDArray[np.float64]
 

@@ -1,21 +1,13 @@
-# Copyright 2026 The koopman_ros Authors
-#
-# Licensed under the Apache License, Version 2.0 (the "License");
-# you may not use this file except in compliance with the License.
-# You may obtain a copy of the License at
-#
-#     http://www.apache.org/licenses/LICENSE-2.0
-#
-# Unless required by applicable law or agreed to in writing, software
-# distributed under the License is distributed on an "AS IS" BASIS,
-# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
-# See the License for the specific language governing permissions and
-# limitations under the License.
+# SPDX-FileCopyrightText: 2026 The koopman_ros Authors
+# SPDX-License-Identifier: Apache-2.0
 
 
 """From an estimated drift to a lift: samples, nominal point, training."""
 
 from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
 
 from koopman_ros.identification import (
     DriftModel,
@@ -28,8 +20,6 @@ from koopman_ros.identification import (
 from koopman_ros.learning import Growth, Plant, Samples, train, Trained
 from koopman_ros.learning.training import Watch
 from koopman_ros.lifting import LiftedModel
-import numpy as np
-from numpy.typing import NDArray
 
 Array = NDArray[np.float64]
 

@@ -1,16 +1,5 @@
-# Copyright 2026 The koopman_ros Authors
-#
-# Licensed under the Apache License, Version 2.0 (the "License");
-# you may not use this file except in compliance with the License.
-# You may obtain a copy of the License at
-#
-#     http://www.apache.org/licenses/LICENSE-2.0
-#
-# Unless required by applicable law or agreed to in writing, software
-# distributed under the License is distributed on an "AS IS" BASIS,
-# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
-# See the License for the specific language governing permissions and
-# limitations under the License.
+# SPDX-FileCopyrightText: 2026 The koopman_ros Authors
+# SPDX-License-Identifier: Apache-2.0
 
 
 """Retraining from bags, from the first byte to the model file: one path for all who ask for it."""
@@ -26,6 +15,8 @@ import os
 from pathlib import Path
 import shutil
 
+import numpy as np
+
 from koopman_ros.bags import Account, Episode, loop_episodes
 from koopman_ros.identification import Identified, identify, Record, Stopped
 from koopman_ros.learning import NoUsefulLift, Progress, Trained
@@ -33,7 +24,6 @@ from koopman_ros.lifting import LiftedModel, load, save
 from koopman_ros.retraining.coverage import coverage
 from koopman_ros.retraining.gate import judge, Thresholds, Verdict
 from koopman_ros.retraining.lift import learn_lift
-import numpy as np
 
 ZERO_CELSIUS = 273.15  # K
 _NS = 1_000_000_000

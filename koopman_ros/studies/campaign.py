@@ -1,16 +1,5 @@
-# Copyright 2026 The koopman_ros Authors
-#
-# Licensed under the Apache License, Version 2.0 (the "License");
-# you may not use this file except in compliance with the License.
-# You may obtain a copy of the License at
-#
-#     http://www.apache.org/licenses/LICENSE-2.0
-#
-# Unless required by applicable law or agreed to in writing, software
-# distributed under the License is distributed on an "AS IS" BASIS,
-# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
-# See the License for the specific language governing permissions and
-# limitations under the License.
+# SPDX-FileCopyrightText: 2026 The koopman_ros Authors
+# SPDX-License-Identifier: Apache-2.0
 
 """All experiments over a number of seeds, side by side on the cores of the machine."""
 
@@ -24,10 +13,11 @@ import sys
 from typing import Any
 
 import joblib
+from tqdm import tqdm
+
 from koopman_ros.lifting import LiftedModel
 from koopman_ros.studies import reactor, scalar, sensors, two_state
 from koopman_ros.studies.outcome import Metrics, Models
-from tqdm import tqdm
 
 # Each experiment with the place of its figures in the summary; the slow ones first.
 EXPERIMENTS: dict[str, Callable[[int], tuple[Metrics, Models]]] = {

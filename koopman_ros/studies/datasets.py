@@ -1,22 +1,13 @@
-# Copyright 2026 The koopman_ros Authors
-#
-# Licensed under the Apache License, Version 2.0 (the "License");
-# you may not use this file except in compliance with the License.
-# You may obtain a copy of the License at
-#
-#     http://www.apache.org/licenses/LICENSE-2.0
-#
-# Unless required by applicable law or agreed to in writing, software
-# distributed under the License is distributed on an "AS IS" BASIS,
-# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
-# See the License for the specific language governing permissions and
-# limitations under the License.
+# SPDX-FileCopyrightText: 2026 The koopman_ros Authors
+# SPDX-License-Identifier: Apache-2.0
 
 """Samples of the simulated plants, in the form that training takes."""
 
 from __future__ import annotations
 
 import contextlib
+
+import numpy as np
 
 from koopman_ros.learning import Plant, Samples
 from koopman_ros.plants import (
@@ -27,7 +18,6 @@ from koopman_ros.plants import (
     sample_derivatives,
     Trajectory,
 )
-import numpy as np
 
 # Share of the episodes that start in a corner of their box.
 _AT_CORNERS = 0.2

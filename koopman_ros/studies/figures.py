@@ -1,16 +1,5 @@
-# Copyright 2026 The koopman_ros Authors
-#
-# Licensed under the Apache License, Version 2.0 (the "License");
-# you may not use this file except in compliance with the License.
-# You may obtain a copy of the License at
-#
-#     http://www.apache.org/licenses/LICENSE-2.0
-#
-# Unless required by applicable law or agreed to in writing, software
-# distributed under the License is distributed on an "AS IS" BASIS,
-# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
-# See the License for the specific language governing permissions and
-# limitations under the License.
+# SPDX-FileCopyrightText: 2026 The koopman_ros Authors
+# SPDX-License-Identifier: Apache-2.0
 
 """The figures of the paper's results, one file each."""
 
@@ -22,6 +11,11 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+import matplotlib
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+import numpy as np
+
 from koopman_ros.control import ClosedLoop
 from koopman_ros.learning import roll_out, Samples
 from koopman_ros.lifting import LiftedModel
@@ -30,10 +24,6 @@ from koopman_ros.studies import reactor, scalar, two_state
 from koopman_ros.studies.boxes import draw_box
 from koopman_ros.studies.campaign import Campaign
 from koopman_ros.studies.datasets import random_step_episodes
-import matplotlib
-from matplotlib.axes import Axes
-from matplotlib.figure import Figure
-import numpy as np
 
 matplotlib.use('Agg')
 from matplotlib import pyplot

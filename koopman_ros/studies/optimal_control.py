@@ -1,27 +1,17 @@
-# Copyright 2026 The koopman_ros Authors
-#
-# Licensed under the Apache License, Version 2.0 (the "License");
-# you may not use this file except in compliance with the License.
-# You may obtain a copy of the License at
-#
-#     http://www.apache.org/licenses/LICENSE-2.0
-#
-# Unless required by applicable law or agreed to in writing, software
-# distributed under the License is distributed on an "AS IS" BASIS,
-# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
-# See the License for the specific language governing permissions and
-# limitations under the License.
+# SPDX-FileCopyrightText: 2026 The koopman_ros Authors
+# SPDX-License-Identifier: Apache-2.0
 
 """What is known exactly of the plants under control, to measure learned controllers by."""
 
 from __future__ import annotations
 
-from koopman_ros.control import solve_riccati
-from koopman_ros.plants import ControlAffineSystem, equilibrium_input, two_state_exact_lift
 import numpy as np
 from numpy.typing import NDArray
 from scipy.integrate import quad
 from scipy.linalg import solve_continuous_lyapunov
+
+from koopman_ros.control import solve_riccati
+from koopman_ros.plants import ControlAffineSystem, equilibrium_input, two_state_exact_lift
 
 Array = NDArray[np.float64]
 

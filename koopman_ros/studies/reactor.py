@@ -1,22 +1,14 @@
-# Copyright 2026 The koopman_ros Authors
-#
-# Licensed under the Apache License, Version 2.0 (the "License");
-# you may not use this file except in compliance with the License.
-# You may obtain a copy of the License at
-#
-#     http://www.apache.org/licenses/LICENSE-2.0
-#
-# Unless required by applicable law or agreed to in writing, software
-# distributed under the License is distributed on an "AS IS" BASIS,
-# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
-# See the License for the specific language governing permissions and
-# limitations under the License.
+# SPDX-FileCopyrightText: 2026 The koopman_ros Authors
+# SPDX-License-Identifier: Apache-2.0
 
 """The one-state reactor: lifts of 2 to 5 coordinates, baselines, and Algorithm 1."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
+
+import numpy as np
+from scipy.integrate import solve_ivp
 
 from koopman_ros.control import ClosedLoop, run_closed_loop, steady_state_target, Weights
 from koopman_ros.learning import (
@@ -35,8 +27,6 @@ from koopman_ros.plants import equilibrium_input, one_state_reactor, RandomStepD
 from koopman_ros.studies.datasets import box_episodes, describe, random_step_episodes
 from koopman_ros.studies.optimal_control import scalar_optimal_cost
 from koopman_ros.studies.outcome import Metrics, Models
-import numpy as np
-from scipy.integrate import solve_ivp
 
 SYSTEM = one_state_reactor()
 START = float(SYSTEM.nominal_state[0])

@@ -1,27 +1,17 @@
-# Copyright 2026 The koopman_ros Authors
-#
-# Licensed under the Apache License, Version 2.0 (the "License");
-# you may not use this file except in compliance with the License.
-# You may obtain a copy of the License at
-#
-#     http://www.apache.org/licenses/LICENSE-2.0
-#
-# Unless required by applicable law or agreed to in writing, software
-# distributed under the License is distributed on an "AS IS" BASIS,
-# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
-# See the License for the specific language governing permissions and
-# limitations under the License.
+# SPDX-FileCopyrightText: 2026 The koopman_ros Authors
+# SPDX-License-Identifier: Apache-2.0
 
 """The paper's motivating example dx/dt = x^2, learned on [0, 5] and judged inside and beyond."""
 
 from __future__ import annotations
+
+import numpy as np
 
 from koopman_ros.learning import fit, Growth, Samples, train
 from koopman_ros.lifting import LiftedModel
 from koopman_ros.plants import scalar_example
 from koopman_ros.studies.datasets import describe
 from koopman_ros.studies.outcome import Metrics, Models
-import numpy as np
 
 RANGE = (0.0, 5.0)
 BEYOND = {'rw_5_6': (5.0, 6.0), 'rw_6_8': (6.0, 8.0)}

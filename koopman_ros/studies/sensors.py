@@ -1,16 +1,5 @@
-# Copyright 2026 The koopman_ros Authors
-#
-# Licensed under the Apache License, Version 2.0 (the "License");
-# you may not use this file except in compliance with the License.
-# You may obtain a copy of the License at
-#
-#     http://www.apache.org/licenses/LICENSE-2.0
-#
-# Unless required by applicable law or agreed to in writing, software
-# distributed under the License is distributed on an "AS IS" BASIS,
-# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
-# See the License for the specific language governing permissions and
-# limitations under the License.
+# SPDX-FileCopyrightText: 2026 The koopman_ros Authors
+# SPDX-License-Identifier: Apache-2.0
 
 
 """Lifts from what a sensor sees: sampled, noisy, of a plant that drifted, of half the state."""
@@ -19,6 +8,9 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
 
 from koopman_ros.control import Controller, InputLimits, Settings, State
 from koopman_ros.control import experiment as experiments
@@ -37,8 +29,6 @@ from koopman_ros.plants import (
 from koopman_ros.retraining import judge, learn_lift, Thresholds, Verdict
 from koopman_ros.studies.outcome import Metrics, Models
 from koopman_ros.studies.reactor import SETPOINT, SYSTEM
-import numpy as np
-from numpy.typing import NDArray
 
 Array = NDArray[np.float64]
 

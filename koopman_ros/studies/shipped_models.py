@@ -1,16 +1,5 @@
-# Copyright 2026 The koopman_ros Authors
-#
-# Licensed under the Apache License, Version 2.0 (the "License");
-# you may not use this file except in compliance with the License.
-# You may obtain a copy of the License at
-#
-#     http://www.apache.org/licenses/LICENSE-2.0
-#
-# Unless required by applicable law or agreed to in writing, software
-# distributed under the License is distributed on an "AS IS" BASIS,
-# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
-# See the License for the specific language governing permissions and
-# limitations under the License.
+# SPDX-FileCopyrightText: 2026 The koopman_ros Authors
+# SPDX-License-Identifier: Apache-2.0
 
 """
 Training of the models that the package ships: lifts of the one-state reactor and its linear model.
@@ -26,13 +15,14 @@ from dataclasses import replace
 from pathlib import Path
 import sys
 
+import numpy as np
+
 from koopman_ros.learning import Growth, roll_out, train
 from koopman_ros.lifting import LiftedModel, linearised_model, Provenance, save
 from koopman_ros.plants import ControlAffineSystem, one_state_reactor, random_steps
 from koopman_ros.studies.datasets import describe
 from koopman_ros.studies.progress import TrainingProgress
 from koopman_ros.studies.reactor import TRAINING, training_samples
-import numpy as np
 
 SEED = 2026
 STARTS = 3

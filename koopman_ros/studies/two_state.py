@@ -1,16 +1,5 @@
-# Copyright 2026 The koopman_ros Authors
-#
-# Licensed under the Apache License, Version 2.0 (the "License");
-# you may not use this file except in compliance with the License.
-# You may obtain a copy of the License at
-#
-#     http://www.apache.org/licenses/LICENSE-2.0
-#
-# Unless required by applicable law or agreed to in writing, software
-# distributed under the License is distributed on an "AS IS" BASIS,
-# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
-# See the License for the specific language governing permissions and
-# limitations under the License.
+# SPDX-FileCopyrightText: 2026 The koopman_ros Authors
+# SPDX-License-Identifier: Apache-2.0
 
 """The paper's two-state example: learned on a wide box, on narrow boxes, and by Algorithm 1."""
 
@@ -18,6 +7,10 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.integrate import solve_ivp
 
 from koopman_ros.control import (
     ClosedLoop,
@@ -43,9 +36,6 @@ from koopman_ros.plants import RandomStepDesign, two_state_exact_lift, two_state
 from koopman_ros.studies.datasets import box_episodes, describe
 from koopman_ros.studies.optimal_control import exact_two_state_cost, exact_two_state_gain
 from koopman_ros.studies.outcome import Metrics, Models
-import numpy as np
-from numpy.typing import NDArray
-from scipy.integrate import solve_ivp
 
 Array = NDArray[np.float64]
 

@@ -1,16 +1,5 @@
-# Copyright 2026 The koopman_ros Authors
-#
-# Licensed under the Apache License, Version 2.0 (the "License");
-# you may not use this file except in compliance with the License.
-# You may obtain a copy of the License at
-#
-#     http://www.apache.org/licenses/LICENSE-2.0
-#
-# Unless required by applicable law or agreed to in writing, software
-# distributed under the License is distributed on an "AS IS" BASIS,
-# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
-# See the License for the specific language governing permissions and
-# limitations under the License.
+# SPDX-FileCopyrightText: 2026 The koopman_ros Authors
+# SPDX-License-Identifier: Apache-2.0
 
 """Bags of all the kinds that are read, and random damage to their bytes."""
 
@@ -21,10 +10,11 @@ import random
 import struct
 
 from bag_samples import Sample, TOPICS
-from koopman_ros.bags import BagWriter, message_definition
 from mcap.writer import CompressionType, Writer
 import yaml
 import zstandard
+
+from koopman_ros.bags import BagWriter, message_definition
 
 # Values that lengths and counts are most likely to trip over.
 _WORDS = [0, 1, 2**31 - 1, 2**32 - 1, 2**40, 2**63 - 1, 2**64 - 1]

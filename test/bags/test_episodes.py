@@ -1,16 +1,5 @@
-# Copyright 2026 The koopman_ros Authors
-#
-# Licensed under the Apache License, Version 2.0 (the "License");
-# you may not use this file except in compliance with the License.
-# You may obtain a copy of the License at
-#
-#     http://www.apache.org/licenses/LICENSE-2.0
-#
-# Unless required by applicable law or agreed to in writing, software
-# distributed under the License is distributed on an "AS IS" BASIS,
-# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
-# See the License for the specific language governing permissions and
-# limitations under the License.
+# SPDX-FileCopyrightText: 2026 The koopman_ros Authors
+# SPDX-License-Identifier: Apache-2.0
 
 """What acted on which measurement, as read from bags."""
 
@@ -21,6 +10,9 @@ import math
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+import pytest
+
 from koopman_ros.bags import (
     Account,
     BagReadError,
@@ -29,8 +21,6 @@ from koopman_ros.bags import (
     loop_episodes,
     message_definition,
 )
-import numpy as np
-import pytest
 
 TEMPERATURE, COOLANT = '/temperature', '/coolant_setpoint'
 TYPE = 'sensor_msgs/msg/Temperature'

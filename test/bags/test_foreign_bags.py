@@ -1,16 +1,5 @@
-# Copyright 2026 The koopman_ros Authors
-#
-# Licensed under the Apache License, Version 2.0 (the "License");
-# you may not use this file except in compliance with the License.
-# You may obtain a copy of the License at
-#
-#     http://www.apache.org/licenses/LICENSE-2.0
-#
-# Unless required by applicable law or agreed to in writing, software
-# distributed under the License is distributed on an "AS IS" BASIS,
-# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
-# See the License for the specific language governing permissions and
-# limitations under the License.
+# SPDX-FileCopyrightText: 2026 The koopman_ros Authors
+# SPDX-License-Identifier: Apache-2.0
 
 """Bags as rosbag2 itself has written them through the years, and of types that only look right."""
 
@@ -20,6 +9,9 @@ from typing import Any
 
 from bag_mutants import compressed_files
 from bag_samples import OFFERED_QOS, Sample
+import pytest
+import yaml
+
 from koopman_ros.bags import (
     BagReadError,
     BagWriter,
@@ -31,8 +23,6 @@ from koopman_ros.bags import (
     temperature_series,
 )
 from koopman_ros.bags.qos import dump_offered_qos, parse_offered_qos
-import pytest
-import yaml
 
 WriteBag = Callable[..., Path]
 

@@ -1,16 +1,5 @@
-# Copyright 2026 The koopman_ros Authors
-#
-# Licensed under the Apache License, Version 2.0 (the "License");
-# you may not use this file except in compliance with the License.
-# You may obtain a copy of the License at
-#
-#     http://www.apache.org/licenses/LICENSE-2.0
-#
-# Unless required by applicable law or agreed to in writing, software
-# distributed under the License is distributed on an "AS IS" BASIS,
-# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
-# See the License for the specific language governing permissions and
-# limitations under the License.
+# SPDX-FileCopyrightText: 2026 The koopman_ros Authors
+# SPDX-License-Identifier: Apache-2.0
 
 """
 Bags with random damage: they give a result or one clear sentence, and never what was not recorded.
@@ -27,6 +16,8 @@ import shutil
 
 from bag_mutants import mutate, Specimen, specimens
 from bag_samples import Sample, TOPICS
+import pytest
+
 from koopman_ros.bags import (
     BagMessage,
     BagReadError,
@@ -35,7 +26,6 @@ from koopman_ros.bags import (
     summary,
     temperature_series,
 )
-import pytest
 
 MUTANTS = int(os.environ.get('BAG_MUTANTS', '40'))
 ROUNDS = 8

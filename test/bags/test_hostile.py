@@ -1,16 +1,5 @@
-# Copyright 2026 The koopman_ros Authors
-#
-# Licensed under the Apache License, Version 2.0 (the "License");
-# you may not use this file except in compliance with the License.
-# You may obtain a copy of the License at
-#
-#     http://www.apache.org/licenses/LICENSE-2.0
-#
-# Unless required by applicable law or agreed to in writing, software
-# distributed under the License is distributed on an "AS IS" BASIS,
-# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
-# See the License for the specific language governing permissions and
-# limitations under the License.
+# SPDX-FileCopyrightText: 2026 The koopman_ros Authors
+# SPDX-License-Identifier: Apache-2.0
 
 """Bags of some kilobytes that ask for gigabytes or minutes, and large ones that do not."""
 
@@ -22,14 +11,15 @@ import subprocess
 import sys
 import tracemalloc
 
-from koopman_ros.bags import BagReadError, BagWriter, MessageDefinition, read_messages, summary
-from koopman_ros.bags.fields import fields_only
-from koopman_ros.bags.qos import parse_offered_qos
 from mcap.data_stream import RecordBuilder
 from mcap.records import Channel, Chunk, DataEnd, Footer, Header, McapRecord, Message, Schema
 import pytest
 import yaml
 import zstandard
+
+from koopman_ros.bags import BagReadError, BagWriter, MessageDefinition, read_messages, summary
+from koopman_ros.bags.fields import fields_only
+from koopman_ros.bags.qos import parse_offered_qos
 
 MIB = 2**20
 MAGIC = b'\x89MCAP0\r\n'

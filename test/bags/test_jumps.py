@@ -1,24 +1,14 @@
-# Copyright 2026 The koopman_ros Authors
-#
-# Licensed under the Apache License, Version 2.0 (the "License");
-# you may not use this file except in compliance with the License.
-# You may obtain a copy of the License at
-#
-#     http://www.apache.org/licenses/LICENSE-2.0
-#
-# Unless required by applicable law or agreed to in writing, software
-# distributed under the License is distributed on an "AS IS" BASIS,
-# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
-# See the License for the specific language governing permissions and
-# limitations under the License.
+# SPDX-FileCopyrightText: 2026 The koopman_ros Authors
+# SPDX-License-Identifier: Apache-2.0
 
 
 """What counts as a spike or a jump, and what is a plant's own motion."""
 
-from koopman_ros.bags.jumps import spikes_and_jumps
-from koopman_ros.plants import one_state_reactor, random_steps, RandomStepDesign
 import numpy as np
 import pytest
+
+from koopman_ros.bags.jumps import spikes_and_jumps
+from koopman_ros.plants import one_state_reactor, random_steps, RandomStepDesign
 
 DESIGN = RandomStepDesign(281.33, 300.55, 305.0, 327.0, (0.5, 2.0), 1.0 / 60.0, rtol=1e-9)
 

@@ -1,16 +1,5 @@
-# Copyright 2026 The koopman_ros Authors
-#
-# Licensed under the Apache License, Version 2.0 (the "License");
-# you may not use this file except in compliance with the License.
-# You may obtain a copy of the License at
-#
-#     http://www.apache.org/licenses/LICENSE-2.0
-#
-# Unless required by applicable law or agreed to in writing, software
-# distributed under the License is distributed on an "AS IS" BASIS,
-# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
-# See the License for the specific language governing permissions and
-# limitations under the License.
+# SPDX-FileCopyrightText: 2026 The koopman_ros Authors
+# SPDX-License-Identifier: Apache-2.0
 
 
 """Bags of several files: where they are split, what is written where, and what a kill leaves."""
@@ -21,6 +10,13 @@ from pathlib import Path
 import shutil
 from typing import Any
 
+from mcap.reader import make_reader
+import numpy as np
+import pytest
+from rosbags.highlevel import AnyReader
+from rosbags.rosbag2 import Reader
+import yaml
+
 from koopman_ros.bags import (
     BagReadError,
     BagWriter,
@@ -29,12 +25,6 @@ from koopman_ros.bags import (
     read_messages,
     summary,
 )
-from mcap.reader import make_reader
-import numpy as np
-import pytest
-from rosbags.highlevel import AnyReader
-from rosbags.rosbag2 import Reader
-import yaml
 
 HASH = 'RIHS01_705ba9c3d1a09df43737eb67095534de36fd426c0587779bda2bc51fe790182a'
 NUMBER = MessageDefinition('std_msgs/msg/Float64', 'float64 data\n', HASH)

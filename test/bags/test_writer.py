@@ -1,16 +1,5 @@
-# Copyright 2026 The koopman_ros Authors
-#
-# Licensed under the Apache License, Version 2.0 (the "License");
-# you may not use this file except in compliance with the License.
-# You may obtain a copy of the License at
-#
-#     http://www.apache.org/licenses/LICENSE-2.0
-#
-# Unless required by applicable law or agreed to in writing, software
-# distributed under the License is distributed on an "AS IS" BASIS,
-# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
-# See the License for the specific language governing permissions and
-# limitations under the License.
+# SPDX-FileCopyrightText: 2026 The koopman_ros Authors
+# SPDX-License-Identifier: Apache-2.0
 
 from collections import Counter
 from collections.abc import Callable
@@ -20,14 +9,15 @@ import subprocess
 import sys
 from typing import Any
 
-from koopman_ros import __version__
-from koopman_ros.bags import BagWriter, MessageDefinition, QosProfile, read_messages
 from mcap.reader import make_reader
 from mcap.records import Chunk
 from mcap.stream_reader import StreamReader
 import numpy as np
 import pytest
 import yaml
+
+from koopman_ros import __version__
+from koopman_ros.bags import BagWriter, MessageDefinition, QosProfile, read_messages
 
 HASH = 'RIHS01_' + 'a' * 64
 NUMBER = MessageDefinition('std_msgs/msg/Float64', 'float64 data\n', HASH)

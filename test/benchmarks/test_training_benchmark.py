@@ -1,16 +1,5 @@
-# Copyright 2026 The koopman_ros Authors
-#
-# Licensed under the Apache License, Version 2.0 (the "License");
-# you may not use this file except in compliance with the License.
-# You may obtain a copy of the License at
-#
-#     http://www.apache.org/licenses/LICENSE-2.0
-#
-# Unless required by applicable law or agreed to in writing, software
-# distributed under the License is distributed on an "AS IS" BASIS,
-# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
-# See the License for the specific language governing permissions and
-# limitations under the License.
+# SPDX-FileCopyrightText: 2026 The koopman_ros Authors
+# SPDX-License-Identifier: Apache-2.0
 
 """The benchmark of training: its command, the figures it leaves, and solvers on one objective."""
 
@@ -19,8 +8,6 @@ from pathlib import Path
 import subprocess
 import sys
 
-from koopman_ros.learning import fit
-from koopman_ros.lifting import Coordinates, LiftedModel, NetworkObservables, Provenance
 import numpy as np
 import pytest
 import torch
@@ -29,6 +16,8 @@ from benchmarks.training import process
 from benchmarks.training.plan import SOLVERS
 from benchmarks.training.problems import artificial, invariant_residual, two_state
 from benchmarks.training.torch_solvers import differentiable
+from koopman_ros.learning import fit
+from koopman_ros.lifting import Coordinates, LiftedModel, NetworkObservables, Provenance
 
 ROOT = Path(__file__).parents[2]
 

@@ -1,21 +1,14 @@
-# Copyright 2026 The koopman_ros Authors
-#
-# Licensed under the Apache License, Version 2.0 (the "License");
-# you may not use this file except in compliance with the License.
-# You may obtain a copy of the License at
-#
-#     http://www.apache.org/licenses/LICENSE-2.0
-#
-# Unless required by applicable law or agreed to in writing, software
-# distributed under the License is distributed on an "AS IS" BASIS,
-# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
-# See the License for the specific language governing permissions and
-# limitations under the License.
+# SPDX-FileCopyrightText: 2026 The koopman_ros Authors
+# SPDX-License-Identifier: Apache-2.0
 
 """Models, closed loops and exact solutions that the tests of the control laws share."""
 
 from collections.abc import Callable
 from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.integrate import quad, solve_ivp
 
 from koopman_ros.control import Feedback, steady_state_target, Weights
 from koopman_ros.lifting import Coordinates, LiftedModel, load, NetworkObservables, Provenance
@@ -26,9 +19,6 @@ from koopman_ros.plants import (
     two_state_exact_lift,
     two_state_example,
 )
-import numpy as np
-from numpy.typing import NDArray
-from scipy.integrate import quad, solve_ivp
 
 Array = NDArray[np.float64]
 Law = Callable[..., Feedback]

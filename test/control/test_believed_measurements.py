@@ -1,26 +1,16 @@
-# Copyright 2026 The koopman_ros Authors
-#
-# Licensed under the Apache License, Version 2.0 (the "License");
-# you may not use this file except in compliance with the License.
-# You may obtain a copy of the License at
-#
-#     http://www.apache.org/licenses/LICENSE-2.0
-#
-# Unless required by applicable law or agreed to in writing, software
-# distributed under the License is distributed on an "AS IS" BASIS,
-# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
-# See the License for the specific language governing permissions and
-# limitations under the License.
+# SPDX-FileCopyrightText: 2026 The koopman_ros Authors
+# SPDX-License-Identifier: Apache-2.0
 
 """Which measurements are believed, and what the loop does with the others."""
 
 import math
 
 from closed_loops import SETPOINT, shipped, START
-from koopman_ros.control import Mode, Rung, SensorLimits, State
 import numpy as np
 import pytest
 from sampled_loops import controller, EPOCH, largest_step, Loop, rungs, SAFE, SECOND, settled
+
+from koopman_ros.control import Mode, Rung, SensorLimits, State
 
 NAN = math.nan
 

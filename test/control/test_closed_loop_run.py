@@ -1,26 +1,16 @@
-# Copyright 2026 The koopman_ros Authors
-#
-# Licensed under the Apache License, Version 2.0 (the "License");
-# you may not use this file except in compliance with the License.
-# You may obtain a copy of the License at
-#
-#     http://www.apache.org/licenses/LICENSE-2.0
-#
-# Unless required by applicable law or agreed to in writing, software
-# distributed under the License is distributed on an "AS IS" BASIS,
-# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
-# See the License for the specific language governing permissions and
-# limitations under the License.
+# SPDX-FileCopyrightText: 2026 The koopman_ros Authors
+# SPDX-License-Identifier: Apache-2.0
 
 """A law in continuous time against the analytic cost of the linear regulator, and its failures."""
+
+import numpy as np
+import pytest
+from scipy.linalg import solve_continuous_are
 
 from koopman_ros.control import feedback, RiccatiStatus, run_closed_loop, solve_riccati, Weights
 from koopman_ros.control.laws import Feedback, Law
 from koopman_ros.lifting import linearised_model, Provenance
-import numpy as np
-import pytest
 from random_lifts import coordinates
-from scipy.linalg import solve_continuous_are
 
 JACOBIAN = np.array([[0.4, 1.0], [-0.3, -0.5]])
 B = np.array([[0.2], [1.5]])

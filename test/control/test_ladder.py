@@ -1,25 +1,15 @@
-# Copyright 2026 The koopman_ros Authors
-#
-# Licensed under the Apache License, Version 2.0 (the "License");
-# you may not use this file except in compliance with the License.
-# You may obtain a copy of the License at
-#
-#     http://www.apache.org/licenses/LICENSE-2.0
-#
-# Unless required by applicable law or agreed to in writing, software
-# distributed under the License is distributed on an "AS IS" BASIS,
-# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
-# See the License for the specific language governing permissions and
-# limitations under the License.
+# SPDX-FileCopyrightText: 2026 The koopman_ros Authors
+# SPDX-License-Identifier: Apache-2.0
 
 """The ladder: learned law, linear law, hold, safe input, and back with hysteresis."""
 
 from closed_loops import SETPOINT, START
-from koopman_ros.control import LadderSettings, Rung, State
-from koopman_ros.control.ladder import Need, Standing
 import numpy as np
 import pytest
 from sampled_loops import changed_reactor, controller, largest_step, Loop, rungs, SAFE, settled
+
+from koopman_ros.control import LadderSettings, Rung, State
+from koopman_ros.control.ladder import Need, Standing
 
 SECOND = 1_000_000_000
 SETTINGS = LadderSettings(validity_margin=0.2, linear_margin=1.0, hold_timeout=60.0,

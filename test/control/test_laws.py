@@ -1,16 +1,5 @@
-# Copyright 2026 The koopman_ros Authors
-#
-# Licensed under the Apache License, Version 2.0 (the "License");
-# you may not use this file except in compliance with the License.
-# You may obtain a copy of the License at
-#
-#     http://www.apache.org/licenses/LICENSE-2.0
-#
-# Unless required by applicable law or agreed to in writing, software
-# distributed under the License is distributed on an "AS IS" BASIS,
-# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
-# See the License for the specific language governing permissions and
-# limitations under the License.
+# SPDX-FileCopyrightText: 2026 The koopman_ros Authors
+# SPDX-License-Identifier: Apache-2.0
 
 """The laws against exact optima: the reactor's Hamilton-Jacobi solution, an exact lift, LQR."""
 
@@ -30,6 +19,12 @@ from closed_loops import (
     two_state_model,
     UNIT,
 )
+import numpy as np
+import pytest
+from scipy.integrate import solve_ivp
+from scipy.linalg import solve_continuous_are
+from scipy.optimize import brentq
+
 from koopman_ros.control import (
     feedback,
     Law,
@@ -48,12 +43,7 @@ from koopman_ros.lifting import (
     Provenance,
 )
 from koopman_ros.plants import equilibrium, two_state_example, two_state_reactor
-import numpy as np
-import pytest
 from random_lifts import random_lift
-from scipy.integrate import solve_ivp
-from scipy.linalg import solve_continuous_are
-from scipy.optimize import brentq
 
 BOUNDS = {'max_gain': 1e3, 'max_residual': 1e-6}
 

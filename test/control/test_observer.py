@@ -1,25 +1,15 @@
-# Copyright 2026 The koopman_ros Authors
-#
-# Licensed under the Apache License, Version 2.0 (the "License");
-# you may not use this file except in compliance with the License.
-# You may obtain a copy of the License at
-#
-#     http://www.apache.org/licenses/LICENSE-2.0
-#
-# Unless required by applicable law or agreed to in writing, software
-# distributed under the License is distributed on an "AS IS" BASIS,
-# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
-# See the License for the specific language governing permissions and
-# limitations under the License.
+# SPDX-FileCopyrightText: 2026 The koopman_ros Authors
+# SPDX-License-Identifier: Apache-2.0
 
 """The disturbance observer against its own design, and against exact disturbances."""
 
 from closed_loops import shipped, START, two_state_model
-from koopman_ros.control import Controller, InputLimits, Settings, State
-from koopman_ros.control.observer import equivalent_bias, Estimate, Observer
 import numpy as np
 import pytest
 from scipy.integrate import solve_ivp
+
+from koopman_ros.control import Controller, InputLimits, Settings, State
+from koopman_ros.control.observer import equivalent_bias, Estimate, Observer
 
 MODEL = shipped('reactor_nz4')
 

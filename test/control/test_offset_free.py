@@ -1,24 +1,14 @@
-# Copyright 2026 The koopman_ros Authors
-#
-# Licensed under the Apache License, Version 2.0 (the "License");
-# you may not use this file except in compliance with the License.
-# You may obtain a copy of the License at
-#
-#     http://www.apache.org/licenses/LICENSE-2.0
-#
-# Unless required by applicable law or agreed to in writing, software
-# distributed under the License is distributed on an "AS IS" BASIS,
-# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
-# See the License for the specific language governing permissions and
-# limitations under the License.
+# SPDX-FileCopyrightText: 2026 The koopman_ros Authors
+# SPDX-License-Identifier: Apache-2.0
 
 """Zero offset on plants that are not the model, with the node's default tuning."""
 
 from closed_loops import SETPOINT, START
-from koopman_ros.plants import two_state_reactor
 import numpy as np
 import pytest
 from sampled_loops import changed_reactor, controller, Loop, settled, UPPER
+
+from koopman_ros.plants import two_state_reactor
 
 # The nominal loop's step response of 10 K takes 192 s to stay within 1e-3 K.
 RESPONSE, MORE = 192, 120  # s

@@ -1,24 +1,14 @@
-# Copyright 2026 The koopman_ros Authors
-#
-# Licensed under the Apache License, Version 2.0 (the "License");
-# you may not use this file except in compliance with the License.
-# You may obtain a copy of the License at
-#
-#     http://www.apache.org/licenses/LICENSE-2.0
-#
-# Unless required by applicable law or agreed to in writing, software
-# distributed under the License is distributed on an "AS IS" BASIS,
-# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
-# See the License for the specific language governing permissions and
-# limitations under the License.
+# SPDX-FileCopyrightText: 2026 The koopman_ros Authors
+# SPDX-License-Identifier: Apache-2.0
 
 """The Riccati solver against independent solvers, and at the border of what can be solved."""
 
-import control
-from koopman_ros.control import RiccatiStatus, solve_riccati
 import numpy as np
 import pytest
 from scipy.linalg import block_diag, solve_continuous_are
+
+import control
+from koopman_ros.control import RiccatiStatus, solve_riccati
 
 SIZES = [(n, m) for n in range(1, 9) for m in range(1, 4)]
 every_size = pytest.mark.parametrize(('n', 'm'), SIZES)

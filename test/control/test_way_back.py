@@ -1,31 +1,21 @@
-# Copyright 2026 The koopman_ros Authors
-#
-# Licensed under the Apache License, Version 2.0 (the "License");
-# you may not use this file except in compliance with the License.
-# You may obtain a copy of the License at
-#
-#     http://www.apache.org/licenses/LICENSE-2.0
-#
-# Unless required by applicable law or agreed to in writing, software
-# distributed under the License is distributed on an "AS IS" BASIS,
-# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
-# See the License for the specific language governing permissions and
-# limitations under the License.
+# SPDX-FileCopyrightText: 2026 The koopman_ros Authors
+# SPDX-License-Identifier: Apache-2.0
 
 """The way back from the safe input, and where that leads."""
 
 from dataclasses import replace
 
 from closed_loops import REACTOR, shipped, START
+import numpy as np
+import pytest
+from sampled_loops import changed_reactor, controller, largest_step, Loop, rungs, SAFE, settled
+from scipy.optimize import brentq
+
 from koopman_ros.control import Controller, InputLimits, Rung, Settings, State
 from koopman_ros.control.way_back import leads_home, rest_under, WayBack
 from koopman_ros.lifting import Coordinates, linearised_model, Provenance
 from koopman_ros.nodes.model_loading import rests_outside
 from koopman_ros.nodes.translation import controller_of
-import numpy as np
-import pytest
-from sampled_loops import changed_reactor, controller, largest_step, Loop, rungs, SAFE, settled
-from scipy.optimize import brentq
 
 SECOND = 1_000_000_000
 NOMINAL = 300.0  # K, of the coolant

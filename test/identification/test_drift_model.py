@@ -1,23 +1,13 @@
-# Copyright 2026 The koopman_ros Authors
-#
-# Licensed under the Apache License, Version 2.0 (the "License");
-# you may not use this file except in compliance with the License.
-# You may obtain a copy of the License at
-#
-#     http://www.apache.org/licenses/LICENSE-2.0
-#
-# Unless required by applicable law or agreed to in writing, software
-# distributed under the License is distributed on an "AS IS" BASIS,
-# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
-# See the License for the specific language governing permissions and
-# limitations under the License.
+# SPDX-FileCopyrightText: 2026 The koopman_ros Authors
+# SPDX-License-Identifier: Apache-2.0
 
 """Box and polynomial drift: scaling, slope, and the regression that finds it."""
 
-from koopman_ros.identification import Box, DriftModel, Record
-from koopman_ros.identification.drift import regress, scaled_input_matrix
 import numpy as np
 import pytest
+
+from koopman_ros.identification import Box, DriftModel, Record
+from koopman_ros.identification.drift import regress, scaled_input_matrix
 
 BOX = Box(np.array([300.0, 0.2]), np.array([330.0, 0.9]), np.array([280.0]), np.array([305.0]))
 

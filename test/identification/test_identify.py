@@ -1,16 +1,5 @@
-# Copyright 2026 The koopman_ros Authors
-#
-# Licensed under the Apache License, Version 2.0 (the "License");
-# you may not use this file except in compliance with the License.
-# You may obtain a copy of the License at
-#
-#     http://www.apache.org/licenses/LICENSE-2.0
-#
-# Unless required by applicable law or agreed to in writing, software
-# distributed under the License is distributed on an "AS IS" BASIS,
-# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
-# See the License for the specific language governing permissions and
-# limitations under the License.
+# SPDX-FileCopyrightText: 2026 The koopman_ros Authors
+# SPDX-License-Identifier: Apache-2.0
 
 """Choice of a drift model on held-out stretches."""
 
@@ -19,6 +8,9 @@ import sys
 import tracemalloc
 
 from known_plants import CUBIC, PAIR
+import numpy as np
+import pytest
+
 from koopman_ros.identification import (
     Box,
     cut,
@@ -30,8 +22,6 @@ from koopman_ros.identification import (
     weak_form,
 )
 from koopman_ros.identification.output_error import _Problem
-import numpy as np
-import pytest
 
 NOISE = 0.02
 

@@ -1,20 +1,14 @@
-# Copyright 2026 The koopman_ros Authors
-#
-# Licensed under the Apache License, Version 2.0 (the "License");
-# you may not use this file except in compliance with the License.
-# You may obtain a copy of the License at
-#
-#     http://www.apache.org/licenses/LICENSE-2.0
-#
-# Unless required by applicable law or agreed to in writing, software
-# distributed under the License is distributed on an "AS IS" BASIS,
-# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
-# See the License for the specific language governing permissions and
-# limitations under the License.
+# SPDX-FileCopyrightText: 2026 The koopman_ros Authors
+# SPDX-License-Identifier: Apache-2.0
 
 """Output error: exact derivatives, exact recovery, and the statistics of maximum likelihood."""
 
 from known_plants import CUBIC, PAIR
+import numpy as np
+import pytest
+from scipy.stats import chi2
+import torch
+
 from koopman_ros.identification import (
     Box,
     cut,
@@ -26,10 +20,6 @@ from koopman_ros.identification import (
 )
 from koopman_ros.identification.drift import scaled_input_matrix
 from koopman_ros.identification.output_error import _Problem
-import numpy as np
-import pytest
-from scipy.stats import chi2
-import torch
 
 NOISE = 0.02
 

@@ -1,20 +1,12 @@
-# Copyright 2026 The koopman_ros Authors
-#
-# Licensed under the Apache License, Version 2.0 (the "License");
-# you may not use this file except in compliance with the License.
-# You may obtain a copy of the License at
-#
-#     http://www.apache.org/licenses/LICENSE-2.0
-#
-# Unless required by applicable law or agreed to in writing, software
-# distributed under the License is distributed on an "AS IS" BASIS,
-# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
-# See the License for the specific language governing permissions and
-# limitations under the License.
+# SPDX-FileCopyrightText: 2026 The koopman_ros Authors
+# SPDX-License-Identifier: Apache-2.0
 
 """Stretches: grids, the Runge-Kutta path against the plants' integrator, and fitted starts."""
 
 from known_plants import CUBIC, PAIR
+import numpy as np
+import pytest
+
 from koopman_ros.identification import (
     cut,
     fitted_starts,
@@ -24,8 +16,6 @@ from koopman_ros.identification import (
     Stretches,
 )
 from koopman_ros.plants import one_state_reactor, simulate, two_state_example
-import numpy as np
-import pytest
 
 
 def test_grid_has_samples_changes_and_steps_between():

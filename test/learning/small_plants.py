@@ -1,24 +1,14 @@
-# Copyright 2026 The koopman_ros Authors
-#
-# Licensed under the Apache License, Version 2.0 (the "License");
-# you may not use this file except in compliance with the License.
-# You may obtain a copy of the License at
-#
-#     http://www.apache.org/licenses/LICENSE-2.0
-#
-# Unless required by applicable law or agreed to in writing, software
-# distributed under the License is distributed on an "AS IS" BASIS,
-# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
-# See the License for the specific language governing permissions and
-# limitations under the License.
+# SPDX-FileCopyrightText: 2026 The koopman_ros Authors
+# SPDX-License-Identifier: Apache-2.0
 
 """Plants of one and two states with samples of them, small enough to learn in a second."""
 
 from dataclasses import replace
 
+import numpy as np
+
 from koopman_ros.learning import Growth, Plant, Samples
 from koopman_ros.plants import two_state_example
-import numpy as np
 
 # dx/dt = -x - 0.3 x^2 + 2 u, in deviations from 3 m and 0.5 m/s
 BENT = Plant('bent', ('level',), ('m',), ('flow',), ('m/s',), 's', np.array([3.0]),

@@ -1,28 +1,18 @@
-# Copyright 2026 The koopman_ros Authors
-#
-# Licensed under the Apache License, Version 2.0 (the "License");
-# you may not use this file except in compliance with the License.
-# You may obtain a copy of the License at
-#
-#     http://www.apache.org/licenses/LICENSE-2.0
-#
-# Unless required by applicable law or agreed to in writing, software
-# distributed under the License is distributed on an "AS IS" BASIS,
-# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
-# See the License for the specific language governing permissions and
-# limitations under the License.
+# SPDX-FileCopyrightText: 2026 The koopman_ros Authors
+# SPDX-License-Identifier: Apache-2.0
 
 """Algorithm 1: its start, its schedule of lambda and its two criteria of termination."""
 
-from koopman_ros.learning import Algorithm1
-from koopman_ros.learning.levenberg_marquardt import Status
-from koopman_ros.learning.network import Layout
-from koopman_ros.learning.residuals import Data, Problem, ResidualWeights
 import numpy as np
 import pytest
 from scipy.stats import kstest
 from small_plants import bent_samples
 import torch
+
+from koopman_ros.learning import Algorithm1
+from koopman_ros.learning.levenberg_marquardt import Status
+from koopman_ros.learning.network import Layout
+from koopman_ros.learning.residuals import Data, Problem, ResidualWeights
 
 SMALL = {'n_z': 2, 'hidden': (3,), 'decoder': 3, 'max_iterations': 5}
 

@@ -1,27 +1,17 @@
-# Copyright 2026 The koopman_ros Authors
-#
-# Licensed under the Apache License, Version 2.0 (the "License");
-# you may not use this file except in compliance with the License.
-# You may obtain a copy of the License at
-#
-#     http://www.apache.org/licenses/LICENSE-2.0
-#
-# Unless required by applicable law or agreed to in writing, software
-# distributed under the License is distributed on an "AS IS" BASIS,
-# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
-# See the License for the specific language governing permissions and
-# limitations under the License.
+# SPDX-FileCopyrightText: 2026 The koopman_ros Authors
+# SPDX-License-Identifier: Apache-2.0
 
 """The baselines against exact models, numpy's least squares and the linearisation."""
 
 from dataclasses import replace
 
-from koopman_ros.control import projected, run_closed_loop, steady_state_target, Weights
-from koopman_ros.learning import Edmd, fit, judge, Linearisation, Plant, Samples, Scaling
-from koopman_ros.lifting import linearised_model
 import numpy as np
 import pytest
 from small_plants import BENT, bent_samples, TWO_STATE, two_state_samples
+
+from koopman_ros.control import projected, run_closed_loop, steady_state_target, Weights
+from koopman_ros.learning import Edmd, fit, judge, Linearisation, Plant, Samples, Scaling
+from koopman_ros.lifting import linearised_model
 
 
 @pytest.mark.parametrize('degree', [2, 3])

@@ -1,23 +1,10 @@
-# Copyright 2026 The koopman_ros Authors
-#
-# Licensed under the Apache License, Version 2.0 (the "License");
-# you may not use this file except in compliance with the License.
-# You may obtain a copy of the License at
-#
-#     http://www.apache.org/licenses/LICENSE-2.0
-#
-# Unless required by applicable law or agreed to in writing, software
-# distributed under the License is distributed on an "AS IS" BASIS,
-# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
-# See the License for the specific language governing permissions and
-# limitations under the License.
+# SPDX-FileCopyrightText: 2026 The koopman_ros Authors
+# SPDX-License-Identifier: Apache-2.0
 
 """Which start and which lift a training takes, and what it refuses."""
 
 from dataclasses import replace
 
-from koopman_ros.learning import fit, Growth, NoUsefulLift, split_by_episode, train
-from koopman_ros.learning.levenberg_marquardt import Status
 import numpy as np
 import pytest
 from small_plants import (
@@ -30,6 +17,9 @@ from small_plants import (
     unforced_samples,
 )
 import torch
+
+from koopman_ros.learning import fit, Growth, NoUsefulLift, split_by_episode, train
+from koopman_ros.learning.levenberg_marquardt import Status
 
 
 class Recorded:

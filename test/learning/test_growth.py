@@ -1,20 +1,14 @@
-# Copyright 2026 The koopman_ros Authors
-#
-# Licensed under the Apache License, Version 2.0 (the "License");
-# you may not use this file except in compliance with the License.
-# You may obtain a copy of the License at
-#
-#     http://www.apache.org/licenses/LICENSE-2.0
-#
-# Unless required by applicable law or agreed to in writing, software
-# distributed under the License is distributed on an "AS IS" BASIS,
-# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
-# See the License for the specific language governing permissions and
-# limitations under the License.
+# SPDX-FileCopyrightText: 2026 The koopman_ros Authors
+# SPDX-License-Identifier: Apache-2.0
 
 """Growth of a lift: what a new coordinate starts from, and known eigenfunctions that it finds."""
 
 from dataclasses import replace
+
+import numpy as np
+import pytest
+from small_plants import bent_samples, two_state_samples
+import torch
 
 from disturbance import disturbed_data
 from koopman_ros.learning import Growth
@@ -22,10 +16,6 @@ from koopman_ros.learning.growth import least_squares
 from koopman_ros.learning.levenberg_marquardt import Status
 from koopman_ros.learning.network import Pass
 from koopman_ros.learning.residuals import Data
-import numpy as np
-import pytest
-from small_plants import bent_samples, two_state_samples
-import torch
 
 
 def tensors(*arrays):

@@ -1,27 +1,17 @@
-# Copyright 2026 The koopman_ros Authors
-#
-# Licensed under the Apache License, Version 2.0 (the "License");
-# you may not use this file except in compliance with the License.
-# You may obtain a copy of the License at
-#
-#     http://www.apache.org/licenses/LICENSE-2.0
-#
-# Unless required by applicable law or agreed to in writing, software
-# distributed under the License is distributed on an "AS IS" BASIS,
-# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
-# See the License for the specific language governing permissions and
-# limitations under the License.
+# SPDX-FileCopyrightText: 2026 The koopman_ros Authors
+# SPDX-License-Identifier: Apache-2.0
 
 """Levenberg-Marquardt on problems with known minima, and every way in which it ends."""
 
 from itertools import pairwise
 import math
 
-from koopman_ros.learning.levenberg_marquardt import minimise, Status
-from koopman_ros.learning.residuals import NormalEquations
 import numpy as np
 import pytest
 import torch
+
+from koopman_ros.learning.levenberg_marquardt import minimise, Status
+from koopman_ros.learning.residuals import NormalEquations
 
 
 def least_squares(residual):

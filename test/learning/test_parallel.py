@@ -1,16 +1,5 @@
-# Copyright 2026 The koopman_ros Authors
-#
-# Licensed under the Apache License, Version 2.0 (the "License");
-# you may not use this file except in compliance with the License.
-# You may obtain a copy of the License at
-#
-#     http://www.apache.org/licenses/LICENSE-2.0
-#
-# Unless required by applicable law or agreed to in writing, software
-# distributed under the License is distributed on an "AS IS" BASIS,
-# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
-# See the License for the specific language governing permissions and
-# limitations under the License.
+# SPDX-FileCopyrightText: 2026 The koopman_ros Authors
+# SPDX-License-Identifier: Apache-2.0
 
 """The same bits whether starts run one after the other, in processes, threads or on Dask."""
 
@@ -25,12 +14,13 @@ import sys
 import warnings
 
 import joblib
-import koopman_ros
-from koopman_ros.learning import train, training
 import numpy as np
 import pytest
 from small_plants import BENT, bent_samples, bits, SMALL
 import torch
+
+import koopman_ros
+from koopman_ros.learning import train, training
 
 RECIPE = replace(SMALL, n_z=3)
 

@@ -1,16 +1,5 @@
-# Copyright 2026 The koopman_ros Authors
-#
-# Licensed under the Apache License, Version 2.0 (the "License");
-# you may not use this file except in compliance with the License.
-# You may obtain a copy of the License at
-#
-#     http://www.apache.org/licenses/LICENSE-2.0
-#
-# Unless required by applicable law or agreed to in writing, software
-# distributed under the License is distributed on an "AS IS" BASIS,
-# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
-# See the License for the specific language governing permissions and
-# limitations under the License.
+# SPDX-FileCopyrightText: 2026 The koopman_ros Authors
+# SPDX-License-Identifier: Apache-2.0
 
 """The hand-derived normal equations against automatic differentiation of the plain residuals."""
 
@@ -19,11 +8,12 @@ from pathlib import Path
 import subprocess
 import sys
 
+import pytest
+import torch
+
 import koopman_ros
 from koopman_ros.learning.network import Layout
 from koopman_ros.learning.residuals import Data, Problem, ResidualWeights
-import pytest
-import torch
 
 FUNCTIONS = {'tanh': torch.tanh, 'sigmoid': torch.sigmoid, 'sine': torch.sin,
              'softplus': torch.nn.functional.softplus}

@@ -1,21 +1,24 @@
-# Copyright 2026 The koopman_ros Authors
-#
-# Licensed under the Apache License, Version 2.0 (the "License");
-# you may not use this file except in compliance with the License.
-# You may obtain a copy of the License at
-#
-#     http://www.apache.org/licenses/LICENSE-2.0
-#
-# Unless required by applicable law or agreed to in writing, software
-# distributed under the License is distributed on an "AS IS" BASIS,
-# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
-# See the License for the specific language governing permissions and
-# limitations under the License.
+# SPDX-FileCopyrightText: 2026 The koopman_ros Authors
+# SPDX-License-Identifier: Apache-2.0
 
 """Training: what is reported, what the recipe and the plant change, invariance, same bits."""
 
 from dataclasses import replace
 import math
+
+import numpy as np
+import pytest
+from small_plants import (
+    BENT,
+    bent_samples,
+    bits,
+    SMALL,
+    TWO_STATE,
+    two_state_samples,
+    UNFORCED,
+    unforced_samples,
+)
+import torch
 
 from koopman_ros.learning import (
     Edmd,
@@ -31,19 +34,6 @@ from koopman_ros.learning import (
 )
 from koopman_ros.learning.levenberg_marquardt import Status
 from koopman_ros.plants import scalar_example
-import numpy as np
-import pytest
-from small_plants import (
-    BENT,
-    bent_samples,
-    bits,
-    SMALL,
-    TWO_STATE,
-    two_state_samples,
-    UNFORCED,
-    unforced_samples,
-)
-import torch
 
 
 @pytest.fixture(scope='module')

@@ -1,20 +1,13 @@
-# Copyright 2026 The koopman_ros Authors
-#
-# Licensed under the Apache License, Version 2.0 (the "License");
-# you may not use this file except in compliance with the License.
-# You may obtain a copy of the License at
-#
-#     http://www.apache.org/licenses/LICENSE-2.0
-#
-# Unless required by applicable law or agreed to in writing, software
-# distributed under the License is distributed on an "AS IS" BASIS,
-# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
-# See the License for the specific language governing permissions and
-# limitations under the License.
+# SPDX-FileCopyrightText: 2026 The koopman_ros Authors
+# SPDX-License-Identifier: Apache-2.0
 
 """Held-out figures and roll-outs against systems whose answers are known."""
 
 from dataclasses import replace
+
+import numpy as np
+import pytest
+from scipy.linalg import block_diag, expm
 
 from koopman_ros.learning import (
     compare_closed_loops,
@@ -33,10 +26,7 @@ from koopman_ros.lifting import (
     NetworkObservables,
     Provenance,
 )
-import numpy as np
-import pytest
 from random_lifts import coordinates, random_lift
-from scipy.linalg import block_diag, expm
 
 JACOBIAN = np.array([[-1.0, 4.0], [-2.0, -0.5]])
 B = np.array([[0.3], [2.0]])

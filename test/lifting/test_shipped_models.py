@@ -1,20 +1,12 @@
-# Copyright 2026 The koopman_ros Authors
-#
-# Licensed under the Apache License, Version 2.0 (the "License");
-# you may not use this file except in compliance with the License.
-# You may obtain a copy of the License at
-#
-#     http://www.apache.org/licenses/LICENSE-2.0
-#
-# Unless required by applicable law or agreed to in writing, software
-# distributed under the License is distributed on an "AS IS" BASIS,
-# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
-# See the License for the specific language governing permissions and
-# limitations under the License.
+# SPDX-FileCopyrightText: 2026 The koopman_ros Authors
+# SPDX-License-Identifier: Apache-2.0
 
 """The shipped models: what they promise, recomputed on data that no training has seen."""
 
 from pathlib import Path
+
+import numpy as np
+import pytest
 
 from koopman_ros.learning import fit, roll_out
 from koopman_ros.lifting import load
@@ -30,8 +22,6 @@ from koopman_ros.studies.reactor import (
     training_samples,
 )
 from koopman_ros.studies.shipped_models import SEED, train_lifts
-import numpy as np
-import pytest
 
 MODELS = Path(__file__).parents[2] / 'config' / 'models'
 SAMPLE_PERIOD = 0.25

@@ -1,16 +1,5 @@
-# Copyright 2026 The koopman_ros Authors
-#
-# Licensed under the Apache License, Version 2.0 (the "License");
-# you may not use this file except in compliance with the License.
-# You may obtain a copy of the License at
-#
-#     http://www.apache.org/licenses/LICENSE-2.0
-#
-# Unless required by applicable law or agreed to in writing, software
-# distributed under the License is distributed on an "AS IS" BASIS,
-# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
-# See the License for the specific language governing permissions and
-# limitations under the License.
+# SPDX-FileCopyrightText: 2026 The koopman_ros Authors
+# SPDX-License-Identifier: Apache-2.0
 
 """The SROS2 policy grants each node what the real node does on the network, and no more."""
 
@@ -19,12 +8,6 @@ from pathlib import Path
 from typing import Any
 from xml.etree import ElementTree
 
-from koopman_ros.bags import BagWriter, message_definition
-from koopman_ros.nodes import replay, topics
-from koopman_ros.nodes.access import Access, NODES, OPERATOR, policy, POLICY_FILE
-from koopman_ros.nodes.parameter_node import ParameterNode
-from koopman_ros.nodes.player_parameters import PlayerParameters
-from koopman_ros.nodes.shipped import config_directory
 import pytest
 import rclpy
 from rclpy.node import Node, NodeNameNonExistentError
@@ -32,6 +15,13 @@ from rclpy.serialization import serialize_message
 from sensor_msgs.msg import Temperature
 from std_srvs.srv import SetBool
 from workbench import temperature, Workbench
+
+from koopman_ros.bags import BagWriter, message_definition
+from koopman_ros.nodes import replay, topics
+from koopman_ros.nodes.access import Access, NODES, OPERATOR, policy, POLICY_FILE
+from koopman_ros.nodes.parameter_node import ParameterNode
+from koopman_ros.nodes.player_parameters import PlayerParameters
+from koopman_ros.nodes.shipped import config_directory
 
 
 def resolved(access: Access, node: str) -> dict[str, set[str]]:

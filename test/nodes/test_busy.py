@@ -1,16 +1,5 @@
-# Copyright 2026 The koopman_ros Authors
-#
-# Licensed under the Apache License, Version 2.0 (the "License");
-# you may not use this file except in compliance with the License.
-# You may obtain a copy of the License at
-#
-#     http://www.apache.org/licenses/LICENSE-2.0
-#
-# Unless required by applicable law or agreed to in writing, software
-# distributed under the License is distributed on an "AS IS" BASIS,
-# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
-# See the License for the specific language governing permissions and
-# limitations under the License.
+# SPDX-FileCopyrightText: 2026 The koopman_ros Authors
+# SPDX-License-Identifier: Apache-2.0
 
 """The controller whose executor does not come to its timers: who commands, and who ends it."""
 
@@ -26,6 +15,13 @@ from typing import BinaryIO
 
 from controller_bench import STATUS, STEADY
 from diagnostic_msgs.msg import DiagnosticStatus
+import numpy as np
+import pytest
+from rosgraph_msgs.msg import Clock
+from sensor_msgs.msg import Temperature
+from test_reload import opened
+from workbench import seconds, temperature, Workbench
+
 from koopman_ros.control import State
 from koopman_ros.lifting import load
 from koopman_ros.nodes import topics, translation
@@ -33,12 +29,6 @@ from koopman_ros.nodes.controller_parameters import ControllerParameters
 from koopman_ros.nodes.messages import stamp_nanoseconds, to_celsius
 from koopman_ros.nodes.shipped import model_path
 from koopman_ros.nodes.watchdog import Watchdog
-import numpy as np
-import pytest
-from rosgraph_msgs.msg import Clock
-from sensor_msgs.msg import Temperature
-from test_reload import opened
-from workbench import seconds, temperature, Workbench
 
 SAFE = 10.0  # degC
 SETTINGS = {'measurement_timeout': 0.3, 'hold_timeout': 0.2, 'coolant_rate_limit': 1200.0,

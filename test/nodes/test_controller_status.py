@@ -1,16 +1,5 @@
-# Copyright 2026 The koopman_ros Authors
-#
-# Licensed under the Apache License, Version 2.0 (the "License");
-# you may not use this file except in compliance with the License.
-# You may obtain a copy of the License at
-#
-#     http://www.apache.org/licenses/LICENSE-2.0
-#
-# Unless required by applicable law or agreed to in writing, software
-# distributed under the License is distributed on an "AS IS" BASIS,
-# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
-# See the License for the specific language governing permissions and
-# limitations under the License.
+# SPDX-FileCopyrightText: 2026 The koopman_ros Authors
+# SPDX-License-Identifier: Apache-2.0
 
 """What the controller tells of itself: figures for an operator, internals to plot, rivals."""
 
@@ -24,14 +13,15 @@ import time
 
 from controller_bench import Bench, STATUS, STEADY
 from diagnostic_msgs.msg import DiagnosticStatus
-from koopman_ros.lifting import load, save
-from koopman_ros.nodes import topics
-from koopman_ros.nodes.replaying.answers import TRACKED
-from koopman_ros.nodes.shipped import model_path
 import pytest
 from rclpy.node import Node
 from sensor_msgs.msg import JointState, Temperature
 from workbench import seconds, temperature, value, Workbench
+
+from koopman_ros.lifting import load, save
+from koopman_ros.nodes import topics
+from koopman_ros.nodes.replaying.answers import TRACKED
+from koopman_ros.nodes.shipped import model_path
 
 
 @pytest.fixture(scope='module')

@@ -1,16 +1,5 @@
-# Copyright 2026 The koopman_ros Authors
-#
-# Licensed under the Apache License, Version 2.0 (the "License");
-# you may not use this file except in compliance with the License.
-# You may obtain a copy of the License at
-#
-#     http://www.apache.org/licenses/LICENSE-2.0
-#
-# Unless required by applicable law or agreed to in writing, software
-# distributed under the License is distributed on an "AS IS" BASIS,
-# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
-# See the License for the specific language governing permissions and
-# limitations under the License.
+# SPDX-FileCopyrightText: 2026 The koopman_ros Authors
+# SPDX-License-Identifier: Apache-2.0
 
 
 """The identification experiment across processes: steps on a plant, refusals, ways back."""
@@ -24,15 +13,16 @@ from pathlib import Path
 import signal
 
 from diagnostic_msgs.msg import DiagnosticStatus
+import pytest
+from rclpy.qos import QoSProfile, ReliabilityPolicy
+from sensor_msgs.msg import Temperature
+from workbench import seconds, temperature, value, Workbench
+
 from koopman_ros.bags import read_messages
 from koopman_ros.control.experiment import advance, begin, Phase
 from koopman_ros.nodes import topics
 from koopman_ros.nodes.messages import stamp_nanoseconds, to_celsius, to_kelvin
 from koopman_ros.nodes.trainer_parameters import TrainerParameters
-import pytest
-from rclpy.qos import QoSProfile, ReliabilityPolicy
-from sensor_msgs.msg import Temperature
-from workbench import seconds, temperature, value, Workbench
 
 STATUS = 'trainer: experiment'
 SERVICE = 'trainer/experiment'

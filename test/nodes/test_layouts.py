@@ -1,16 +1,5 @@
-# Copyright 2026 The koopman_ros Authors
-#
-# Licensed under the Apache License, Version 2.0 (the "License");
-# you may not use this file except in compliance with the License.
-# You may obtain a copy of the License at
-#
-#     http://www.apache.org/licenses/LICENSE-2.0
-#
-# Unless required by applicable law or agreed to in writing, software
-# distributed under the License is distributed on an "AS IS" BASIS,
-# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
-# See the License for the specific language governing permissions and
-# limitations under the License.
+# SPDX-FileCopyrightText: 2026 The koopman_ros Authors
+# SPDX-License-Identifier: Apache-2.0
 
 """The shipped plot layouts name what the nodes publish."""
 
@@ -23,12 +12,13 @@ from typing import Any
 import xml.etree.ElementTree as ElementTree
 
 from builtin_interfaces.msg import Time
+import pytest
+from sensor_msgs.msg import JointState
+
 from koopman_ros.control import Mode, Report
 from koopman_ros.nodes import topics
 from koopman_ros.nodes.controller_status import internals
 from koopman_ros.nodes.shipped import config_directory
-import pytest
-from sensor_msgs.msg import JointState
 
 # What a layout shows: topics with one value by themselves, and internals by their names.
 TEMPERATURES = {topics.TEMPERATURE, topics.ACTIVE_SETPOINT, topics.PREDICTED_TEMPERATURE,

@@ -1,16 +1,5 @@
-# Copyright 2026 The koopman_ros Authors
-#
-# Licensed under the Apache License, Version 2.0 (the "License");
-# you may not use this file except in compliance with the License.
-# You may obtain a copy of the License at
-#
-#     http://www.apache.org/licenses/LICENSE-2.0
-#
-# Unless required by applicable law or agreed to in writing, software
-# distributed under the License is distributed on an "AS IS" BASIS,
-# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
-# See the License for the specific language governing permissions and
-# limitations under the License.
+# SPDX-FileCopyrightText: 2026 The koopman_ros Authors
+# SPDX-License-Identifier: Apache-2.0
 
 """Complaints about others whose messages cannot pass, between two nodes of one process."""
 
@@ -19,9 +8,6 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator
 import time
 
-from koopman_ros.demo.processes import isolated_domain
-from koopman_ros.nodes import topics
-from koopman_ros.nodes.matching import Matching
 import pytest
 import rclpy
 from rclpy.context import Context
@@ -30,6 +16,10 @@ from rclpy.executors import SingleThreadedExecutor
 from rclpy.node import Node
 from rclpy.qos import DurabilityPolicy, LivelinessPolicy, QoSProfile, ReliabilityPolicy
 from sensor_msgs.msg import Temperature
+
+from koopman_ros.demo.processes import isolated_domain
+from koopman_ros.nodes import topics
+from koopman_ros.nodes.matching import Matching
 
 TIMEOUT = 20.0  # s
 

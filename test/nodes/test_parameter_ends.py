@@ -1,16 +1,5 @@
-# Copyright 2026 The koopman_ros Authors
-#
-# Licensed under the Apache License, Version 2.0 (the "License");
-# you may not use this file except in compliance with the License.
-# You may obtain a copy of the License at
-#
-#     http://www.apache.org/licenses/LICENSE-2.0
-#
-# Unless required by applicable law or agreed to in writing, software
-# distributed under the License is distributed on an "AS IS" BASIS,
-# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
-# See the License for the specific language governing permissions and
-# limitations under the License.
+# SPDX-FileCopyrightText: 2026 The koopman_ros Authors
+# SPDX-License-Identifier: Apache-2.0
 
 """Every parameter of every table at both ends of its range: what is accepted can be used."""
 
@@ -27,6 +16,17 @@ import time
 from typing import Any, TypeVar
 
 from diagnostic_msgs.msg import DiagnosticArray
+import pytest
+import rclpy
+from rclpy.executors import SingleThreadedExecutor
+from rclpy.node import Node
+from rclpy.parameter import Parameter
+from rclpy.serialization import serialize_message
+from rclpy.task import Future
+from sensor_msgs.msg import Temperature
+from std_srvs.srv import SetBool, Trigger
+from workbench import seconds, temperature, TIMEOUT
+
 from koopman_ros.bags import BagReadError, BagWriter, message_definition
 from koopman_ros.demo.processes import isolated_domain
 from koopman_ros.nodes import topics
@@ -44,16 +44,6 @@ from koopman_ros.nodes.shipped import model_path
 from koopman_ros.nodes.trainer import TrainerNode
 from koopman_ros.nodes.trainer_parameters import TrainerParameters
 from koopman_ros.retraining import retrain, Task
-import pytest
-import rclpy
-from rclpy.executors import SingleThreadedExecutor
-from rclpy.node import Node
-from rclpy.parameter import Parameter
-from rclpy.serialization import serialize_message
-from rclpy.task import Future
-from sensor_msgs.msg import Temperature
-from std_srvs.srv import SetBool, Trigger
-from workbench import seconds, temperature, TIMEOUT
 
 STEADY = 51.8  # degC, near the plant's steady state
 DENORMAL = 5e-324

@@ -1,16 +1,5 @@
-# Copyright 2026 The koopman_ros Authors
-#
-# Licensed under the Apache License, Version 2.0 (the "License");
-# you may not use this file except in compliance with the License.
-# You may obtain a copy of the License at
-#
-#     http://www.apache.org/licenses/LICENSE-2.0
-#
-# Unless required by applicable law or agreed to in writing, software
-# distributed under the License is distributed on an "AS IS" BASIS,
-# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
-# See the License for the specific language governing permissions and
-# limitations under the License.
+# SPDX-FileCopyrightText: 2026 The koopman_ros Authors
+# SPDX-License-Identifier: Apache-2.0
 
 """Parameter tables: words for ranges and refusals, and the shipped files that they write."""
 
@@ -20,6 +9,12 @@ from dataclasses import dataclass, fields
 import math
 from pathlib import Path
 from typing import Any
+
+import pytest
+from rclpy.node import Node
+from rclpy.parameter import parameter_dict_from_yaml_file, parameter_value_to_python
+from workbench import Workbench
+import yaml
 
 from koopman_ros.nodes.access import policy, POLICY_FILE
 from koopman_ros.nodes.controller_parameters import ControllerParameters
@@ -34,11 +29,6 @@ from koopman_ros.nodes.parameters import (
 from koopman_ros.nodes.plant_parameters import PlantParameters
 from koopman_ros.nodes.replay_parameters import ReplayParameters
 from koopman_ros.nodes.shipped import config_directory
-import pytest
-from rclpy.node import Node
-from rclpy.parameter import parameter_dict_from_yaml_file, parameter_value_to_python
-from workbench import Workbench
-import yaml
 
 
 def row(default: Any, **details: Any) -> Specification:

@@ -1,16 +1,5 @@
-# Copyright 2026 The koopman_ros Authors
-#
-# Licensed under the Apache License, Version 2.0 (the "License");
-# you may not use this file except in compliance with the License.
-# You may obtain a copy of the License at
-#
-#     http://www.apache.org/licenses/LICENSE-2.0
-#
-# Unless required by applicable law or agreed to in writing, software
-# distributed under the License is distributed on an "AS IS" BASIS,
-# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
-# See the License for the specific language governing permissions and
-# limitations under the License.
+# SPDX-FileCopyrightText: 2026 The koopman_ros Authors
+# SPDX-License-Identifier: Apache-2.0
 
 """The plant as a process: its measurements, its time, and what it does with commands."""
 
@@ -22,13 +11,14 @@ import math
 import time
 
 from diagnostic_msgs.msg import DiagnosticStatus
-from koopman_ros.nodes import topics
-from koopman_ros.nodes.messages import LAST_STAMP_SECONDS, seconds_text, stamp_nanoseconds
-from koopman_ros.nodes.plant_parameters import PlantParameters, TABLE
 import pytest
 from rclpy.node import Node
 from sensor_msgs.msg import JointState, Temperature
 from workbench import seconds, temperature, value, Workbench
+
+from koopman_ros.nodes import topics
+from koopman_ros.nodes.messages import LAST_STAMP_SECONDS, seconds_text, stamp_nanoseconds
+from koopman_ros.nodes.plant_parameters import PlantParameters, TABLE
 
 STATUS = 'plant: simulation'
 NOMINAL_COOLANT = 26.85  # degC

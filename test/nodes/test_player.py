@@ -1,16 +1,5 @@
-# Copyright 2026 The koopman_ros Authors
-#
-# Licensed under the Apache License, Version 2.0 (the "License");
-# you may not use this file except in compliance with the License.
-# You may obtain a copy of the License at
-#
-#     http://www.apache.org/licenses/LICENSE-2.0
-#
-# Unless required by applicable law or agreed to in writing, software
-# distributed under the License is distributed on an "AS IS" BASIS,
-# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
-# See the License for the specific language governing permissions and
-# limitations under the License.
+# SPDX-FileCopyrightText: 2026 The koopman_ros Authors
+# SPDX-License-Identifier: Apache-2.0
 
 """The player as a process: recorded inputs into a fresh controller, which answers as before."""
 
@@ -20,6 +9,16 @@ from collections.abc import Sequence
 from pathlib import Path
 import time
 from typing import Any
+
+from mcap.writer import CompressionType, IndexType, Writer
+import pytest
+from rclpy.duration import Duration
+from rclpy.publisher import Publisher
+from rclpy.qos import DurabilityPolicy, ReliabilityPolicy
+from rclpy.serialization import serialize_message
+from rosgraph_msgs.msg import Clock
+from sensor_msgs.msg import Temperature
+from workbench import temperature, TIMEOUT, Workbench
 
 from koopman_ros.bags import (
     BagReadError,
@@ -36,15 +35,6 @@ from koopman_ros.demo.processes import isolated_domain, NodeProcess
 from koopman_ros.nodes import player, replay, topics
 from koopman_ros.nodes.messages import NANOSECONDS, stamp_nanoseconds
 from koopman_ros.nodes.shipped import config_directory
-from mcap.writer import CompressionType, IndexType, Writer
-import pytest
-from rclpy.duration import Duration
-from rclpy.publisher import Publisher
-from rclpy.qos import DurabilityPolicy, ReliabilityPolicy
-from rclpy.serialization import serialize_message
-from rosgraph_msgs.msg import Clock
-from sensor_msgs.msg import Temperature
-from workbench import temperature, TIMEOUT, Workbench
 
 SAMPLES = 61
 SCENARIO = Scenario('reactor_nz4', 315.15, step_time=20.0, duration=SAMPLES - 1.0,

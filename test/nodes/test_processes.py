@@ -1,16 +1,5 @@
-# Copyright 2026 The koopman_ros Authors
-#
-# Licensed under the Apache License, Version 2.0 (the "License");
-# you may not use this file except in compliance with the License.
-# You may obtain a copy of the License at
-#
-#     http://www.apache.org/licenses/LICENSE-2.0
-#
-# Unless required by applicable law or agreed to in writing, software
-# distributed under the License is distributed on an "AS IS" BASIS,
-# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
-# See the License for the specific language governing permissions and
-# limitations under the License.
+# SPDX-FileCopyrightText: 2026 The koopman_ros Authors
+# SPDX-License-Identifier: Apache-2.0
 
 """Life of the processes: clean ends, bad starts in one line, imports, and how they are kept."""
 
@@ -27,6 +16,12 @@ import subprocess
 import sys
 import time
 
+import pytest
+from rclpy.utilities import get_rmw_implementation_identifier
+from rosgraph_msgs.msg import Clock
+from sensor_msgs.msg import Temperature
+from workbench import temperature, TIMEOUT, Workbench
+
 from koopman_ros.bags import summary
 from koopman_ros.demo import processes
 from koopman_ros.demo.processes import isolated_domain, NodeProcess
@@ -35,11 +30,6 @@ from koopman_ros.nodes.exposure import open_to_the_network
 from koopman_ros.nodes.messages import NANOSECONDS, stamp_message
 from koopman_ros.nodes.parameter_files import TABLES
 from koopman_ros.nodes.shipped import model_path
-import pytest
-from rclpy.utilities import get_rmw_implementation_identifier
-from rosgraph_msgs.msg import Clock
-from sensor_msgs.msg import Temperature
-from workbench import temperature, TIMEOUT, Workbench
 
 # Ends.
 

@@ -1,16 +1,5 @@
-# Copyright 2026 The koopman_ros Authors
-#
-# Licensed under the Apache License, Version 2.0 (the "License");
-# you may not use this file except in compliance with the License.
-# You may obtain a copy of the License at
-#
-#     http://www.apache.org/licenses/LICENSE-2.0
-#
-# Unless required by applicable law or agreed to in writing, software
-# distributed under the License is distributed on an "AS IS" BASIS,
-# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
-# See the License for the specific language governing permissions and
-# limitations under the License.
+# SPDX-FileCopyrightText: 2026 The koopman_ros Authors
+# SPDX-License-Identifier: Apache-2.0
 
 """The bag of a closed loop: opened with readers that are not ours, and recorded twice."""
 
@@ -21,9 +10,6 @@ from pathlib import Path
 import re
 from typing import Any
 
-from koopman_ros.bags import temperature_series
-from koopman_ros.demo.loop import run_loop, Scenario
-from koopman_ros.nodes import topics
 from mcap.reader import make_reader
 from mcap_ros2.decoder import DecoderFactory
 import numpy as np
@@ -32,6 +18,10 @@ from rosbags.highlevel import AnyReader
 from rosbags.rosbag2 import Reader
 from workbench import Workbench
 import yaml
+
+from koopman_ros.bags import temperature_series
+from koopman_ros.demo.loop import run_loop, Scenario
+from koopman_ros.nodes import topics
 
 SAMPLES = 61
 SETPOINT = 315.15  # K

@@ -1,16 +1,5 @@
-# Copyright 2026 The koopman_ros Authors
-#
-# Licensed under the Apache License, Version 2.0 (the "License");
-# you may not use this file except in compliance with the License.
-# You may obtain a copy of the License at
-#
-#     http://www.apache.org/licenses/LICENSE-2.0
-#
-# Unless required by applicable law or agreed to in writing, software
-# distributed under the License is distributed on an "AS IS" BASIS,
-# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
-# See the License for the specific language governing permissions and
-# limitations under the License.
+# SPDX-FileCopyrightText: 2026 The koopman_ros Authors
+# SPDX-License-Identifier: Apache-2.0
 
 
 """Recording that goes wrong or goes on for long: kills, split bags, full disks, fast topics."""
@@ -28,10 +17,6 @@ import sys
 import time
 
 from diagnostic_msgs.msg import DiagnosticStatus
-from koopman_ros.bags import read_messages, summary
-from koopman_ros.nodes import topics
-from koopman_ros.nodes.recording import free_name
-from koopman_ros.nodes.trainer_parameters import TABLE, TrainerParameters
 from mcap.exceptions import EndOfFile
 from mcap.reader import make_reader, NonSeekingReader
 from mcap_ros2.decoder import DecoderFactory
@@ -42,6 +27,11 @@ from sensor_msgs.msg import Temperature
 from std_msgs.msg import String
 from workbench import temperature, TIMEOUT, Workbench
 import yaml
+
+from koopman_ros.bags import read_messages, summary
+from koopman_ros.nodes import topics
+from koopman_ros.nodes.recording import free_name
+from koopman_ros.nodes.trainer_parameters import TABLE, TrainerParameters
 
 TOPIC = '/temperature'
 PUBLISHER = Path(__file__).parents[2] / 'benchmarks' / 'recording' / 'publisher.py'

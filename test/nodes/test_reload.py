@@ -1,16 +1,5 @@
-# Copyright 2026 The koopman_ros Authors
-#
-# Licensed under the Apache License, Version 2.0 (the "License");
-# you may not use this file except in compliance with the License.
-# You may obtain a copy of the License at
-#
-#     http://www.apache.org/licenses/LICENSE-2.0
-#
-# Unless required by applicable law or agreed to in writing, software
-# distributed under the License is distributed on an "AS IS" BASIS,
-# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
-# See the License for the specific language governing permissions and
-# limitations under the License.
+# SPDX-FileCopyrightText: 2026 The koopman_ros Authors
+# SPDX-License-Identifier: Apache-2.0
 
 
 """Another model in the running controller: nothing unanswered, no jump, reasons in words."""
@@ -28,12 +17,6 @@ import sys
 from typing import BinaryIO
 
 from diagnostic_msgs.msg import DiagnosticStatus
-from koopman_ros.control import Controller, State
-from koopman_ros.lifting import LiftedModel, load, save
-from koopman_ros.nodes import model_reload, topics
-from koopman_ros.nodes.controller_parameters import ControllerParameters
-from koopman_ros.nodes.messages import stamp_nanoseconds, to_celsius, to_kelvin
-from koopman_ros.nodes.shipped import model_path
 import numpy as np
 import pytest
 from rcl_interfaces.msg import SetParametersResult
@@ -44,6 +27,13 @@ from rclpy.task import Future
 from sensor_msgs.msg import Temperature
 from std_srvs.srv import Trigger
 from workbench import seconds, temperature, value, Workbench
+
+from koopman_ros.control import Controller, State
+from koopman_ros.lifting import LiftedModel, load, save
+from koopman_ros.nodes import model_reload, topics
+from koopman_ros.nodes.controller_parameters import ControllerParameters
+from koopman_ros.nodes.messages import stamp_nanoseconds, to_celsius, to_kelvin
+from koopman_ros.nodes.shipped import model_path
 
 STATUS = 'controller: control'
 STEADY = 51.8  # degC, near the plant's steady state

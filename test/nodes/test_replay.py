@@ -1,16 +1,5 @@
-# Copyright 2026 The koopman_ros Authors
-#
-# Licensed under the Apache License, Version 2.0 (the "License");
-# you may not use this file except in compliance with the License.
-# You may obtain a copy of the License at
-#
-#     http://www.apache.org/licenses/LICENSE-2.0
-#
-# Unless required by applicable law or agreed to in writing, software
-# distributed under the License is distributed on an "AS IS" BASIS,
-# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
-# See the License for the specific language governing permissions and
-# limitations under the License.
+# SPDX-FileCopyrightText: 2026 The koopman_ros Authors
+# SPDX-License-Identifier: Apache-2.0
 
 """A controller recorded by a trainer, and replayed: offline to the bit, and with another model."""
 
@@ -24,6 +13,12 @@ import math
 from pathlib import Path
 import subprocess
 import sys
+
+import numpy as np
+import pytest
+from rclpy.serialization import serialize_message
+from sensor_msgs.msg import Temperature
+from workbench import seconds, temperature, value, Workbench
 
 from koopman_ros.bags import (
     BagMessage,
@@ -41,11 +36,6 @@ from koopman_ros.nodes.replaying.comparison import ReplayedBag
 from koopman_ros.nodes.replaying.record import Names
 from koopman_ros.nodes.replaying.report import about_beginning, reproduced, verdict
 from koopman_ros.nodes.shipped import config_directory
-import numpy as np
-import pytest
-from rclpy.serialization import serialize_message
-from sensor_msgs.msg import Temperature
-from workbench import seconds, temperature, value, Workbench
 
 STEADY = 51.8  # degC
 # The rate limit is active through every step of the set-point, and the ramp takes some samples.

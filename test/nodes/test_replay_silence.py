@@ -1,16 +1,5 @@
-# Copyright 2026 The koopman_ros Authors
-#
-# Licensed under the Apache License, Version 2.0 (the "License");
-# you may not use this file except in compliance with the License.
-# You may obtain a copy of the License at
-#
-#     http://www.apache.org/licenses/LICENSE-2.0
-#
-# Unless required by applicable law or agreed to in writing, software
-# distributed under the License is distributed on an "AS IS" BASIS,
-# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
-# See the License for the specific language governing permissions and
-# limitations under the License.
+# SPDX-FileCopyrightText: 2026 The koopman_ros Authors
+# SPDX-License-Identifier: Apache-2.0
 
 """Replays of a controller that commanded by itself, or began from the coolant in force."""
 
@@ -18,6 +7,11 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 from pathlib import Path
+
+import pytest
+from rclpy.serialization import serialize_message
+from sensor_msgs.msg import Temperature
+from workbench import seconds, temperature, Workbench
 
 from koopman_ros.bags import BagWriter, message_definition
 from koopman_ros.control import Rung, State
@@ -30,10 +24,6 @@ from koopman_ros.nodes.replaying.comparison import ReplayedBag
 from koopman_ros.nodes.replaying.inputs import Silence, TakeOver
 from koopman_ros.nodes.replaying.record import Names
 from koopman_ros.nodes.shipped import model_path
-import pytest
-from rclpy.serialization import serialize_message
-from sensor_msgs.msg import Temperature
-from workbench import seconds, temperature, Workbench
 
 STEADY = 51.8  # degC
 COOLANT = 24.5  # degC, not what the law would command

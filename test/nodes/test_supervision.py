@@ -1,16 +1,5 @@
-# Copyright 2026 The koopman_ros Authors
-#
-# Licensed under the Apache License, Version 2.0 (the "License");
-# you may not use this file except in compliance with the License.
-# You may obtain a copy of the License at
-#
-#     http://www.apache.org/licenses/LICENSE-2.0
-#
-# Unless required by applicable law or agreed to in writing, software
-# distributed under the License is distributed on an "AS IS" BASIS,
-# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
-# See the License for the specific language governing permissions and
-# limitations under the License.
+# SPDX-FileCopyrightText: 2026 The koopman_ros Authors
+# SPDX-License-Identifier: Apache-2.0
 
 """What is said when a partner falls silent or asks for what cannot be."""
 
@@ -22,13 +11,14 @@ import shutil
 import signal
 
 from diagnostic_msgs.msg import DiagnosticStatus
+import numpy as np
+from sensor_msgs.msg import Temperature
+from workbench import temperature, Workbench
+
 from koopman_ros.bags import summary
 from koopman_ros.lifting import load, save
 from koopman_ros.nodes import topics
 from koopman_ros.nodes.shipped import model_path
-import numpy as np
-from sensor_msgs.msg import Temperature
-from workbench import temperature, Workbench
 
 
 def test_controller_that_falls_silent_is_reported_by_the_plant(ros: Workbench) -> None:

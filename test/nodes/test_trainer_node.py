@@ -1,16 +1,5 @@
-# Copyright 2026 The koopman_ros Authors
-#
-# Licensed under the Apache License, Version 2.0 (the "License");
-# you may not use this file except in compliance with the License.
-# You may obtain a copy of the License at
-#
-#     http://www.apache.org/licenses/LICENSE-2.0
-#
-# Unless required by applicable law or agreed to in writing, software
-# distributed under the License is distributed on an "AS IS" BASIS,
-# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
-# See the License for the specific language governing permissions and
-# limitations under the License.
+# SPDX-FileCopyrightText: 2026 The koopman_ros Authors
+# SPDX-License-Identifier: Apache-2.0
 
 """The trainer as a process: what it records, how it starts and stops, and how the bag ends."""
 
@@ -22,9 +11,6 @@ import sys
 from typing import Any
 
 from diagnostic_msgs.msg import DiagnosticStatus
-from koopman_ros.bags import BagMessage, read_messages, summary
-from koopman_ros.demo.processes import NodeProcess
-from koopman_ros.nodes import topics
 import pytest
 from rclpy.duration import Duration
 from rclpy.publisher import Publisher
@@ -32,6 +18,10 @@ from rclpy.qos import QoSProfile, ReliabilityPolicy
 from sensor_msgs.msg import Temperature
 from std_msgs.msg import String
 from workbench import seconds, temperature, TIMEOUT, Workbench
+
+from koopman_ros.bags import BagMessage, read_messages, summary
+from koopman_ros.demo.processes import NodeProcess
+from koopman_ros.nodes import topics
 
 BEST_EFFORT = QoSProfile(depth=1000, reliability=ReliabilityPolicy.BEST_EFFORT)
 

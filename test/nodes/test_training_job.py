@@ -1,16 +1,5 @@
-# Copyright 2026 The koopman_ros Authors
-#
-# Licensed under the Apache License, Version 2.0 (the "License");
-# you may not use this file except in compliance with the License.
-# You may obtain a copy of the License at
-#
-#     http://www.apache.org/licenses/LICENSE-2.0
-#
-# Unless required by applicable law or agreed to in writing, software
-# distributed under the License is distributed on an "AS IS" BASIS,
-# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
-# See the License for the specific language governing permissions and
-# limitations under the License.
+# SPDX-FileCopyrightText: 2026 The koopman_ros Authors
+# SPDX-License-Identifier: Apache-2.0
 
 """The process that retrains, as its parent sees it."""
 
@@ -24,12 +13,13 @@ import subprocess
 import sys
 import time
 
+import pytest
+from workbench import TIMEOUT
+
 from koopman_ros.nodes import training_job
 from koopman_ros.nodes.shipped import model_path
 from koopman_ros.nodes.training_job import JobState, RetrainingJob
-import pytest
 from recorded_runs import driven, reactor, write_bag
-from workbench import TIMEOUT
 
 
 @pytest.fixture(scope='module')

@@ -1,16 +1,5 @@
-# Copyright 2026 The koopman_ros Authors
-#
-# Licensed under the Apache License, Version 2.0 (the "License");
-# you may not use this file except in compliance with the License.
-# You may obtain a copy of the License at
-#
-#     http://www.apache.org/licenses/LICENSE-2.0
-#
-# Unless required by applicable law or agreed to in writing, software
-# distributed under the License is distributed on an "AS IS" BASIS,
-# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
-# See the License for the specific language governing permissions and
-# limitations under the License.
+# SPDX-FileCopyrightText: 2026 The koopman_ros Authors
+# SPDX-License-Identifier: Apache-2.0
 
 """The controller when measurements are nonsense, stay away, or come with stamps that jump."""
 
@@ -21,13 +10,14 @@ import math
 
 from controller_bench import Bench, STEADY
 from diagnostic_msgs.msg import DiagnosticStatus
-from koopman_ros.nodes import topics
-from koopman_ros.nodes.messages import LAST_STAMP_SECONDS
 import numpy as np
 import pytest
 from rosgraph_msgs.msg import Clock
 from sensor_msgs.msg import Temperature
 from workbench import seconds, temperature, value, Workbench
+
+from koopman_ros.nodes import topics
+from koopman_ros.nodes.messages import LAST_STAMP_SECONDS
 
 SAFE = 5.0  # degC
 

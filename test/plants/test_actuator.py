@@ -1,20 +1,12 @@
-# Copyright 2026 The koopman_ros Authors
-#
-# Licensed under the Apache License, Version 2.0 (the "License");
-# you may not use this file except in compliance with the License.
-# You may obtain a copy of the License at
-#
-#     http://www.apache.org/licenses/LICENSE-2.0
-#
-# Unless required by applicable law or agreed to in writing, software
-# distributed under the License is distributed on an "AS IS" BASIS,
-# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
-# See the License for the specific language governing permissions and
-# limitations under the License.
+# SPDX-FileCopyrightText: 2026 The koopman_ros Authors
+# SPDX-License-Identifier: Apache-2.0
 
 """Tests of what stands between a command and the input of a plant."""
 
 from dataclasses import replace
+
+import numpy as np
+import pytest
 
 from koopman_ros.plants import (
     ActuatedProcess,
@@ -26,8 +18,6 @@ from koopman_ros.plants import (
     with_input_lag,
 )
 from koopman_ros.plants.system import FloatArray
-import numpy as np
-import pytest
 
 SECOND = 1_000_000_000
 SLOPE, GAIN = -0.7, 0.4  # 1/s, of the linear plant

@@ -1,18 +1,11 @@
-# Copyright 2026 The koopman_ros Authors
-#
-# Licensed under the Apache License, Version 2.0 (the "License");
-# you may not use this file except in compliance with the License.
-# You may obtain a copy of the License at
-#
-#     http://www.apache.org/licenses/LICENSE-2.0
-#
-# Unless required by applicable law or agreed to in writing, software
-# distributed under the License is distributed on an "AS IS" BASIS,
-# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
-# See the License for the specific language governing permissions and
-# limitations under the License.
+# SPDX-FileCopyrightText: 2026 The koopman_ros Authors
+# SPDX-License-Identifier: Apache-2.0
 
 """The lifts known in closed form, and the optimal control that follows from them."""
+
+import numpy as np
+import pytest
+from scipy.linalg import solve_continuous_are
 
 from koopman_ros.plants import (
     ControlAffineSystem,
@@ -23,9 +16,6 @@ from koopman_ros.plants import (
     two_state_exact_lift,
     two_state_example,
 )
-import numpy as np
-import pytest
-from scipy.linalg import solve_continuous_are
 
 START = np.array([5.0, 5.0])
 STATE_WEIGHT = np.diag([1.0, 1.0])

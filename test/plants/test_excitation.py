@@ -1,20 +1,12 @@
-# Copyright 2026 The koopman_ros Authors
-#
-# Licensed under the Apache License, Version 2.0 (the "License");
-# you may not use this file except in compliance with the License.
-# You may obtain a copy of the License at
-#
-#     http://www.apache.org/licenses/LICENSE-2.0
-#
-# Unless required by applicable law or agreed to in writing, software
-# distributed under the License is distributed on an "AS IS" BASIS,
-# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
-# See the License for the specific language governing permissions and
-# limitations under the License.
+# SPDX-FileCopyrightText: 2026 The koopman_ros Authors
+# SPDX-License-Identifier: Apache-2.0
 
 """Random step inputs: inside the box, repeatable, and refused where nothing fits."""
 
 from dataclasses import replace
+
+import numpy as np
+import pytest
 
 from koopman_ros.plants import (
     ExcitationError,
@@ -27,8 +19,6 @@ from koopman_ros.plants import (
     two_state_example,
     two_state_reactor,
 )
-import numpy as np
-import pytest
 
 DESIGN = RandomStepDesign(
     input_lower=281.3, input_upper=300.9, state_lower=305.0, state_upper=330.0,

@@ -1,23 +1,13 @@
-# Copyright 2026 The koopman_ros Authors
-#
-# Licensed under the Apache License, Version 2.0 (the "License");
-# you may not use this file except in compliance with the License.
-# You may obtain a copy of the License at
-#
-#     http://www.apache.org/licenses/LICENSE-2.0
-#
-# Unless required by applicable law or agreed to in writing, software
-# distributed under the License is distributed on an "AS IS" BASIS,
-# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
-# See the License for the specific language governing permissions and
-# limitations under the License.
+# SPDX-FileCopyrightText: 2026 The koopman_ros Authors
+# SPDX-License-Identifier: Apache-2.0
 
 """The share of the range of states and inputs that records visit."""
 
-from koopman_ros.identification import Box, Record
-from koopman_ros.retraining.coverage import CELLS, coverage, visited_cells
 import numpy as np
 import pytest
+
+from koopman_ros.identification import Box, Record
+from koopman_ros.retraining.coverage import CELLS, coverage, visited_cells
 
 BOX = Box(np.array([0.0]), np.array([10.0]), np.array([100.0]), np.array([200.0]))
 

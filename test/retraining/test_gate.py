@@ -1,21 +1,13 @@
-# Copyright 2026 The koopman_ros Authors
-#
-# Licensed under the Apache License, Version 2.0 (the "License");
-# you may not use this file except in compliance with the License.
-# You may obtain a copy of the License at
-#
-#     http://www.apache.org/licenses/LICENSE-2.0
-#
-# Unless required by applicable law or agreed to in writing, software
-# distributed under the License is distributed on an "AS IS" BASIS,
-# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
-# See the License for the specific language governing permissions and
-# limitations under the License.
+# SPDX-FileCopyrightText: 2026 The koopman_ros Authors
+# SPDX-License-Identifier: Apache-2.0
 
 """The gate: what is let through, what is refused, and why."""
 
 from dataclasses import replace
 import sys
+
+import numpy as np
+import pytest
 
 from koopman_ros.identification import identify
 from koopman_ros.lifting import linearised_model, load, Provenance
@@ -23,8 +15,6 @@ from koopman_ros.nodes.shipped import model_path
 from koopman_ros.plants import two_state_reactor
 from koopman_ros.retraining import judge, learn_lift, Thresholds
 from koopman_ros.retraining.gate import lifted_rate
-import numpy as np
-import pytest
 from random_lifts import random_lift
 from recorded_runs import driven, linear_run, NOISE, reactor
 

@@ -1,26 +1,16 @@
-# Copyright 2026 The koopman_ros Authors
-#
-# Licensed under the Apache License, Version 2.0 (the "License");
-# you may not use this file except in compliance with the License.
-# You may obtain a copy of the License at
-#
-#     http://www.apache.org/licenses/LICENSE-2.0
-#
-# Unless required by applicable law or agreed to in writing, software
-# distributed under the License is distributed on an "AS IS" BASIS,
-# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
-# See the License for the specific language governing permissions and
-# limitations under the License.
+# SPDX-FileCopyrightText: 2026 The koopman_ros Authors
+# SPDX-License-Identifier: Apache-2.0
 
 """From a drift to a lift: steady point, samples, training."""
 
-from koopman_ros.identification import Box, cut, DriftModel, Record
-from koopman_ros.identification.drift import scaled_input_matrix
-from koopman_ros.retraining.lift import _spread, drift_samples, steady_point
 import numpy as np
 import pytest
 from scipy.integrate import solve_ivp
 from scipy.optimize import brentq
+
+from koopman_ros.identification import Box, cut, DriftModel, Record
+from koopman_ros.identification.drift import scaled_input_matrix
+from koopman_ros.retraining.lift import _spread, drift_samples, steady_point
 
 BOX = Box(np.array([-1.0]), np.array([3.0]), np.array([-2.0]), np.array([2.0]))
 

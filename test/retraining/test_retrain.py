@@ -1,16 +1,5 @@
-# Copyright 2026 The koopman_ros Authors
-#
-# Licensed under the Apache License, Version 2.0 (the "License");
-# you may not use this file except in compliance with the License.
-# You may obtain a copy of the License at
-#
-#     http://www.apache.org/licenses/LICENSE-2.0
-#
-# Unless required by applicable law or agreed to in writing, software
-# distributed under the License is distributed on an "AS IS" BASIS,
-# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
-# See the License for the specific language governing permissions and
-# limitations under the License.
+# SPDX-FileCopyrightText: 2026 The koopman_ros Authors
+# SPDX-License-Identifier: Apache-2.0
 
 """Retraining from bags, end to end within one process."""
 
@@ -18,14 +7,15 @@ from dataclasses import replace
 import json
 from pathlib import Path
 
+import numpy as np
+import pytest
+
 from koopman_ros.bags import BagReadError
 from koopman_ros.identification import Stopped
 from koopman_ros.lifting import load, ModelFileError, save
 from koopman_ros.nodes.shipped import model_path
 from koopman_ros.retraining import retrain, Task, write_report
 from koopman_ros.retraining import task as task_module
-import numpy as np
-import pytest
 from random_lifts import random_lift
 from recorded_runs import driven, linear_run, NOISE, reactor, write_bag
 

@@ -1,16 +1,5 @@
-# Copyright 2026 The koopman_ros Authors
-#
-# Licensed under the Apache License, Version 2.0 (the "License");
-# you may not use this file except in compliance with the License.
-# You may obtain a copy of the License at
-#
-#     http://www.apache.org/licenses/LICENSE-2.0
-#
-# Unless required by applicable law or agreed to in writing, software
-# distributed under the License is distributed on an "AS IS" BASIS,
-# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
-# See the License for the specific language governing permissions and
-# limitations under the License.
+# SPDX-FileCopyrightText: 2026 The koopman_ros Authors
+# SPDX-License-Identifier: Apache-2.0
 
 """The campaign over seeds, its summary, figures and report."""
 
@@ -19,15 +8,16 @@ from pathlib import Path
 import re
 
 import joblib
+import matplotlib.image
+import numpy as np
+import pytest
+
 from koopman_ros.learning import Edmd, Growth, Linearisation, train
 from koopman_ros.lifting import load
 from koopman_ros.studies import campaign as campaigns
 from koopman_ros.studies import figures, reactor, report, scalar, two_state
 from koopman_ros.studies.campaign import Campaign, run_campaign
 from koopman_ros.studies.datasets import describe
-import matplotlib.image
-import numpy as np
-import pytest
 
 MODELS = Path(__file__).parents[2] / 'config' / 'models'
 

@@ -1,27 +1,17 @@
-# Copyright 2026 The koopman_ros Authors
-#
-# Licensed under the Apache License, Version 2.0 (the "License");
-# you may not use this file except in compliance with the License.
-# You may obtain a copy of the License at
-#
-#     http://www.apache.org/licenses/LICENSE-2.0
-#
-# Unless required by applicable law or agreed to in writing, software
-# distributed under the License is distributed on an "AS IS" BASIS,
-# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
-# See the License for the specific language governing permissions and
-# limitations under the License.
+# SPDX-FileCopyrightText: 2026 The koopman_ros Authors
+# SPDX-License-Identifier: Apache-2.0
 
 """The experiments: their data, what they measure, and their known answers."""
+
+import numpy as np
+import pytest
+from scipy.linalg import solve_continuous_are
 
 from koopman_ros.control import projected, steady_state_target, Weights
 from koopman_ros.learning import Edmd, fit, Growth, Linearisation, train
 from koopman_ros.plants import scalar_example
 from koopman_ros.studies import reactor, scalar, two_state
 from koopman_ros.studies.datasets import describe
-import numpy as np
-import pytest
-from scipy.linalg import solve_continuous_are
 
 BOXES = [two_state.WIDE, *two_state.NARROW.values()]
 

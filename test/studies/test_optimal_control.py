@@ -1,18 +1,10 @@
-# Copyright 2026 The koopman_ros Authors
-#
-# Licensed under the Apache License, Version 2.0 (the "License");
-# you may not use this file except in compliance with the License.
-# You may obtain a copy of the License at
-#
-#     http://www.apache.org/licenses/LICENSE-2.0
-#
-# Unless required by applicable law or agreed to in writing, software
-# distributed under the License is distributed on an "AS IS" BASIS,
-# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
-# See the License for the specific language governing permissions and
-# limitations under the License.
+# SPDX-FileCopyrightText: 2026 The koopman_ros Authors
+# SPDX-License-Identifier: Apache-2.0
 
 """Optima that learned controllers are measured by, against closed forms and simulation."""
+
+import numpy as np
+import pytest
 
 from koopman_ros.plants import ControlAffineSystem, one_state_reactor
 from koopman_ros.studies import reactor, two_state
@@ -21,8 +13,6 @@ from koopman_ros.studies.optimal_control import (
     exact_two_state_gain,
     scalar_optimal_cost,
 )
-import numpy as np
-import pytest
 
 
 # K on (x1, x2, x1^2) and cost from (5, 5), from an independent Riccati solver

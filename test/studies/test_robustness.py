@@ -1,22 +1,15 @@
-# Copyright 2026 The koopman_ros Authors
-#
-# Licensed under the Apache License, Version 2.0 (the "License");
-# you may not use this file except in compliance with the License.
-# You may obtain a copy of the License at
-#
-#     http://www.apache.org/licenses/LICENSE-2.0
-#
-# Unless required by applicable law or agreed to in writing, software
-# distributed under the License is distributed on an "AS IS" BASIS,
-# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
-# See the License for the specific language governing permissions and
-# limitations under the License.
+# SPDX-FileCopyrightText: 2026 The koopman_ros Authors
+# SPDX-License-Identifier: Apache-2.0
 
 
 """Figures of the robustness study against references that do not use its code."""
 
 from dataclasses import astuple, replace
 import math
+
+import numpy as np
+import pytest
+from scipy.integrate import solve_ivp
 
 from koopman_ros.nodes.controller_parameters import ControllerParameters
 from koopman_ros.plants import Actuator
@@ -38,9 +31,6 @@ from koopman_ros.studies.robustness.margins import (
     linearised_reactor,
     margins_at,
 )
-import numpy as np
-import pytest
-from scipy.integrate import solve_ivp
 
 PERIOD = 1.0 / 60.0  # min
 

@@ -1,16 +1,5 @@
-# Copyright 2026 The koopman_ros Authors
-#
-# Licensed under the Apache License, Version 2.0 (the "License");
-# you may not use this file except in compliance with the License.
-# You may obtain a copy of the License at
-#
-#     http://www.apache.org/licenses/LICENSE-2.0
-#
-# Unless required by applicable law or agreed to in writing, software
-# distributed under the License is distributed on an "AS IS" BASIS,
-# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
-# See the License for the specific language governing permissions and
-# limitations under the License.
+# SPDX-FileCopyrightText: 2026 The koopman_ros Authors
+# SPDX-License-Identifier: Apache-2.0
 
 """
 The control step replayed from a record.
@@ -28,6 +17,9 @@ import itertools
 import math
 from typing import Any
 
+import numpy as np
+from numpy.typing import NDArray
+
 from koopman_ros.control import Controller, Mode, Report, Settings, State
 from koopman_ros.nodes.messages import NANOSECONDS, stamp_nanoseconds, to_celsius, to_kelvin
 from koopman_ros.nodes.replaying.inputs import Input, Silence, TakeOver
@@ -40,8 +32,6 @@ from koopman_ros.nodes.translation import (
     tracked_celsius,
     watch,
 )
-import numpy as np
-from numpy.typing import NDArray
 
 Array = NDArray[np.float64]
 

@@ -1,16 +1,5 @@
-# Copyright 2026 The koopman_ros Authors
-#
-# Licensed under the Apache License, Version 2.0 (the "License");
-# you may not use this file except in compliance with the License.
-# You may obtain a copy of the License at
-#
-#     http://www.apache.org/licenses/LICENSE-2.0
-#
-# Unless required by applicable law or agreed to in writing, software
-# distributed under the License is distributed on an "AS IS" BASIS,
-# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
-# See the License for the specific language governing permissions and
-# limitations under the License.
+# SPDX-FileCopyrightText: 2026 The koopman_ros Authors
+# SPDX-License-Identifier: Apache-2.0
 
 
 """What changed plants, lags, biases, saturation and noise do to the loop."""
@@ -20,6 +9,8 @@ from __future__ import annotations
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 import math
+
+import numpy as np
 
 from koopman_ros.control import Rung
 from koopman_ros.plants import Actuator, ControlAffineSystem, equilibrium_input, two_state_reactor
@@ -39,7 +30,6 @@ from koopman_ros.studies.robustness.loop import (
     START,
     with_bias,
 )
-import numpy as np
 
 SETPOINT = START - 10.0
 LEAD = 10.0  # s of rest before a change

@@ -1,16 +1,5 @@
-# Copyright 2026 The koopman_ros Authors
-#
-# Licensed under the Apache License, Version 2.0 (the "License");
-# you may not use this file except in compliance with the License.
-# You may obtain a copy of the License at
-#
-#     http://www.apache.org/licenses/LICENSE-2.0
-#
-# Unless required by applicable law or agreed to in writing, software
-# distributed under the License is distributed on an "AS IS" BASIS,
-# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
-# See the License for the specific language governing permissions and
-# limitations under the License.
+# SPDX-FileCopyrightText: 2026 The koopman_ros Authors
+# SPDX-License-Identifier: Apache-2.0
 
 
 """Gain, phase and delay margins of the loop, linearised at a set-point and opened at the plant."""
@@ -20,15 +9,16 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 import math
 
+import numpy as np
+from numpy.typing import NDArray
+from scipy.signal import cont2discrete
+
 import control
 from koopman_ros.control import Controller, State
 from koopman_ros.control.observer import Estimate
 from koopman_ros.lifting import LiftedModel
 from koopman_ros.plants import Actuator, ControlAffineSystem, equilibrium_input
 from koopman_ros.studies.robustness.loop import at_setpoint, PERIOD, REACTOR, run_loop
-import numpy as np
-from numpy.typing import NDArray
-from scipy.signal import cont2discrete
 
 Array = NDArray[np.float64]
 

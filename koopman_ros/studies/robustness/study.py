@@ -1,16 +1,5 @@
-# Copyright 2026 The koopman_ros Authors
-#
-# Licensed under the Apache License, Version 2.0 (the "License");
-# you may not use this file except in compliance with the License.
-# You may obtain a copy of the License at
-#
-#     http://www.apache.org/licenses/LICENSE-2.0
-#
-# Unless required by applicable law or agreed to in writing, software
-# distributed under the License is distributed on an "AS IS" BASIS,
-# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
-# See the License for the specific language governing permissions and
-# limitations under the License.
+# SPDX-FileCopyrightText: 2026 The koopman_ros Authors
+# SPDX-License-Identifier: Apache-2.0
 
 
 """The study of robustness: everything that is computed for it, by name."""
@@ -21,6 +10,8 @@ from collections.abc import Callable
 from dataclasses import dataclass, field
 from itertools import product
 from typing import Any
+
+import numpy as np
 
 from koopman_ros.studies.outcome import Metrics
 from koopman_ros.studies.robustness import attraction, disturbances, narrow
@@ -33,7 +24,6 @@ from koopman_ros.studies.robustness.loop import (
     START,
 )
 from koopman_ros.studies.robustness.margins import grows, Margins, margins_at
-import numpy as np
 
 BANDWIDTHS = (0.0, 2.0, 4.0, 6.0, 10.0)  # 1/min
 COOLANT_WEIGHTS = (1.0, 0.1)  # 1/K^2
