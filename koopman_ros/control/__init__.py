@@ -8,7 +8,6 @@ from koopman_ros.control.controller import Controller
 from koopman_ros.control.ladder import LadderSettings, Rung
 from koopman_ros.control.laws import Feedback, feedback, Law, projected, recentred, Weights
 from koopman_ros.control.limits import InputLimits, limit, LimitedInput
-from koopman_ros.control.riccati import RiccatiSolution, RiccatiStatus, solve_riccati
 from koopman_ros.control.sensor import SensorLimits
 from koopman_ros.control.setpoint import Setpoint
 from koopman_ros.control.state import Mode, Report, Settings, State
@@ -24,8 +23,6 @@ __all__ = [
     'LimitedInput',
     'Mode',
     'Report',
-    'RiccatiSolution',
-    'RiccatiStatus',
     'Rung',
     'SensorLimits',
     'Setpoint',
@@ -38,6 +35,5 @@ __all__ = [
     'projected',
     'recentred',
     'run_closed_loop',
-    'solve_riccati',
     'steady_state_target',
 ]

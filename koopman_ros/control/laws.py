@@ -12,9 +12,9 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.linalg import expm
 
-from koopman_ros.control.riccati import RiccatiSolution, RiccatiStatus, solve_riccati
 from koopman_ros.control.target import Target
 from koopman_ros.lifting import LiftedModel
+from koopman_ros.solvers import RiccatiSolution, RiccatiStatus, solve_riccati
 
 Array = NDArray[np.float64]
 

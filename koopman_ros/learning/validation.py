@@ -11,9 +11,10 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.integrate import solve_ivp
 
-from koopman_ros.control import run_closed_loop, solve_riccati, Weights
+from koopman_ros.control import run_closed_loop, Weights
 from koopman_ros.learning.samples import Array, Samples
 from koopman_ros.lifting import LiftedModel
+from koopman_ros.solvers import solve_riccati
 
 # Beyond it S is singular to working precision, and rw is noise.
 _MAX_COND = 1e13

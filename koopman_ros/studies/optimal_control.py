@@ -10,8 +10,8 @@ from numpy.typing import NDArray
 from scipy.integrate import quad
 from scipy.linalg import solve_continuous_lyapunov
 
-from koopman_ros.control import solve_riccati
 from koopman_ros.plants import ControlAffineSystem, equilibrium_input, two_state_exact_lift
+from koopman_ros.solvers import solve_riccati
 
 Array = NDArray[np.float64]
 

@@ -7,9 +7,10 @@ import numpy as np
 import pytest
 from scipy.linalg import solve_continuous_are
 
-from koopman_ros.control import feedback, RiccatiStatus, run_closed_loop, solve_riccati, Weights
+from koopman_ros.control import feedback, run_closed_loop, Weights
 from koopman_ros.control.laws import Feedback, Law
 from koopman_ros.lifting import linearised_model, Provenance
+from koopman_ros.solvers import RiccatiStatus, solve_riccati
 from random_lifts import coordinates
 
 JACOBIAN = np.array([[0.4, 1.0], [-0.3, -0.5]])

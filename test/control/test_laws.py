@@ -30,7 +30,6 @@ from koopman_ros.control import (
     Law,
     projected,
     recentred,
-    RiccatiStatus,
     steady_state_target,
     Weights,
 )
@@ -43,6 +42,7 @@ from koopman_ros.lifting import (
     Provenance,
 )
 from koopman_ros.plants import equilibrium, two_state_example, two_state_reactor
+from koopman_ros.solvers import RiccatiStatus
 from random_lifts import random_lift
 
 BOUNDS = {'max_gain': 1e3, 'max_residual': 1e-6}

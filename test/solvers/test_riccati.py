@@ -8,7 +8,7 @@ import pytest
 from scipy.linalg import block_diag, solve_continuous_are
 
 import control
-from koopman_ros.control import RiccatiStatus, solve_riccati
+from koopman_ros.solvers import RiccatiStatus, solve_riccati
 
 SIZES = [(n, m) for n in range(1, 9) for m in range(1, 4)]
 every_size = pytest.mark.parametrize(('n', 'm'), SIZES)
