@@ -68,22 +68,22 @@ lint: $(VENV)/test.stamp  ## style and type checks
 	$(BIN)/mypy
 
 models: $(VENV)/train.stamp  ## train the shipped lifts again -> config/models
-	$(BIN)/python -m koopman_ros.studies.shipped_models
+	$(BIN)/python -m validation.paper.shipped_models
 
 studies: $(VENV)/train.stamp  ## the paper's experiments from SEEDS seeds: figures, report -> out/studies
-	$(BIN)/python -m koopman_ros.studies --seeds $(SEEDS)
+	$(BIN)/python -m validation.paper --seeds $(SEEDS)
 
 studies-sensors: $(VENV)/train.stamp  ## learning from noisy data of a sensor, ten seeds -> out/studies-sensors
-	$(BIN)/python -m koopman_ros.studies --sensors --seeds 10
+	$(BIN)/python -m validation.paper --sensors --seeds 10
 
 studies-robustness: $(VENV)/bench.stamp  ## margins, attraction, disturbances, noise, narrow data, three minutes -> out/studies-robustness
-	$(BIN)/python -m koopman_ros.studies.robustness
+	$(BIN)/python -m validation.robustness
 
 bench: $(VENV)/bench.stamp  ## speed beside other programs, thirteen minutes (BENCH=--quick: two) -> out/bench
-	$(BIN)/python -m benchmarks $(BENCH)
+	$(BIN)/python -m validation.benchmarks $(BENCH)
 
 faults: $(VENV)/run.stamp  ## put faults into the loop, and soak it for a day, ten minutes (FAULTS=--quick: half a one) -> out/faults
-	$(BIN)/python -m faults $(FAULTS)
+	$(BIN)/python -m validation.faults $(FAULTS)
 
 config: $(VENV)/run.stamp  ## write config/*.yaml and the SROS2 policy from their tables
 	$(BIN)/python -m koopman_ros.nodes.parameter_files

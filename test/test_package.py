@@ -18,7 +18,7 @@ import koopman_ros
 
 ROOT = Path(__file__).parent.parent
 SOURCES = sorted([ROOT / 'setup.py', *(
-    path for folder in ('koopman_ros', 'benchmarks', 'examples', 'faults', 'test')
+    path for folder in ('koopman_ros', 'examples', 'test', 'validation')
     for path in ROOT.glob(f'{folder}/**/*.py'))])
 # What each sub-package may import of the others.
 ALLOWED = {
@@ -30,8 +30,6 @@ ALLOWED = {
     'learning': {'control', 'lifting', 'solvers'},
     'identification': {'learning', 'lifting'},
     'retraining': {'bags', 'control', 'identification', 'learning', 'lifting'},
-    'studies': {'bags', 'control', 'identification', 'learning', 'lifting', 'plants',
-                'retraining', 'solvers'},
     'nodes': {'control', 'lifting', 'plants', 'bags'},
     'demo': {'control', 'lifting', 'plants', 'bags', 'nodes'},
 }
@@ -92,7 +90,7 @@ def test_manifest_declares_what_is_imported(control_only: bool) -> None:
     manifest.evaluate_conditions({'KOOPMAN_ROS_CONTROL_ONLY': '1'} if control_only else {})
     declared = {depend.name for depend in (*manifest.exec_depends, *manifest.test_depends)
                 if depend.evaluated_condition}
-    used = {name.split('.')[0] for folder in ('koopman_ros', 'benchmarks', 'faults', 'test')
+    used = {name.split('.')[0] for folder in ('koopman_ros', 'test', 'validation')
             for path in ROOT.glob(f'{folder}/**/*.py') for name in _imports(path)}
     assert {keys[name] for name in used & set(keys) - (learning if control_only else set())
             } <= declared

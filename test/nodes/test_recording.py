@@ -34,7 +34,8 @@ from koopman_ros.nodes.recording import free_name
 from koopman_ros.nodes.trainer_parameters import TABLE, TrainerParameters
 
 TOPIC = '/temperature'
-PUBLISHER = Path(__file__).parents[2] / 'benchmarks' / 'recording' / 'publisher.py'
+PUBLISHER = (Path(__file__).parents[2]
+             / 'validation' / 'benchmarks' / 'recording' / 'publisher.py')
 # (output, compression, moments of the kill [s after the first message])
 KILLED = [
     ('file.mcap', 'none', (1.2, 1.9)),

@@ -1,0 +1,128 @@
+# SPDX-FileCopyrightText: 2026 The koopman_ros Authors
+# SPDX-License-Identifier: Apache-2.0
+
+"""Cases of the campaign across real processes, and what the campaign leaves behind."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+import json
+
+import numpy as np
+import pytest
+
+from validation.faults.__main__ import main
+from validation.faults.case import Case, Outcome, run
+from validation.faults.cases import CASES
+from validation.faults.course import Course
+from validation.faults.judge import Account, Verdict
+from validation.faults.report import survived, write
+from validation.faults.soak import Memory, Soak, soak
+
+# the type support's parser imports a module that Python deprecated
+pytestmark = pytest.mark.filterwarnings('ignore::DeprecationWarning')
+
+
+def quick(case, **changes):
+    # in the wall time of a busy machine
+    return replace(case, **{'settle': 120.0, 'afterwards': 120.0, 'limit': 200.0, **changes})
+
+
+@pytest.mark.parametrize('name', ['nan-short', 'model-garbage'])
+def test_quick_case_is_survived(name, tmp_path):
+    outcome = run(quick(CASES[name]), tmp_path)
+    assert outcome.verdict is not None
+    assert outcome.verdict.reasons == ()
+    assert len(outcome.course.samples) > 240
+
+
+def test_controller_is_killed_and_comes_back(tmp_path):
+    outcome = run(quick(CASES['controller-killed'], settle=240.0, recovery=100.0), tmp_path)
+    assert outcome.survived, outcome.verdict
+    assert (tmp_path / 'controller_2.log').exists()
+
+
+def test_what_goes_wrong_is_held_against_the_case(tmp_path):
+    """A process that dies, words that nobody says, and a reactor that stays away."""
+    def play(rig):
+        rig.begin()
+        rig.end()
+        # where it does not come by on its way from 51.8 to 46 degC, however far it has come
+        rig.operator.ask(53.0)
+        rig.processes['controller'].process.kill()
+
+    outcome = run(Case('doomed', 'test', '', play, settle=20.0, afterwards=60.0,
+                       says=('nobody says this',), limit=200.0), tmp_path)
+    assert not outcome.survived
+    reasons = '; '.join(outcome.verdict.reasons)
+    assert 'controller ended by itself' in reasons
+    assert 'controller ended with code -9' in reasons
+    assert 'not back within 0.3 K' in reasons
+    assert 'diagnostics never said "nobody says this"' in reasons
+
+
+def test_short_soak_accounts_for_everything(tmp_path):
+    shares = []
+    found = soak(tmp_path / 'soak', lambda: None, hours=0.05, on_progress=shares.append)
+    assert found.reasons == ()
+    assert found.answers.complete
+    assert found.answers.measurements > 170
+    assert found.recorded['/coolant_setpoint'] == found.recorded['/temperature'] == (
+        found.answers.measurements)
+    assert {'plant', 'controller', 'trainer'} >= set(found.memory)
+    assert all(seen.megabytes[-1] > 20.0 for seen in found.memory.values())
+    assert shares[-1] == 1.0
+
+
+def test_growth_is_that_of_a_warm_process():
+    seconds = np.arange(0.0, 101.0)
+    warming = Memory(seconds, np.where(seconds < 20.0, 50.0 + seconds, 70.0))
+    assert warming.growth == pytest.approx(0.0, abs=1e-9)
+    leaking = Memory(seconds, 50.0 + 0.1 * seconds)
+    assert leaking.growth == pytest.approx(7.5)
+
+
+GOOD = Outcome(CASES['nan-short'], Course(notes=['a note']), Verdict((), 1.0, 0.5, 20.0, 0.0), '',
+               2.0)
+BAD = Outcome(CASES['bias'], Course(), Verdict(('not back',), 9.0, 0.5, np.inf, 3.0), '', 2.0)
+SKIPPED = Outcome(CASES['disk-full'], Course(), None, 'no disk', 0.5)
+SOAK = Soak((), 1.0, 9.0, Account(3, 3, 0, 0, 0, 0), {'weights': 2},
+            {'plant': Memory(np.arange(9.0), np.full(9, 80.0))}, {'/temperature': 3}, 52.0, 0.5)
+
+
+def test_report_says_what_failed_and_why(tmp_path):
+    write(tmp_path, [GOOD, BAD, SKIPPED], SOAK)
+    text = (tmp_path / 'report.md').read_text()
+    assert '1 of 3 cases survived, 1 skipped' in text
+    assert '- **bias**: not back' in text
+    assert '| 9.00 | 0.50 | never | 3.000 | **failed** |' in text
+    assert 'skipped: no disk' in text
+    assert 'a note' in text
+    assert '| plant | 80.0 | 80.0 | 0.00 |' in text
+    summary = json.loads((tmp_path / 'summary.json').read_text())
+    assert (summary['cases'], summary['survived'], summary['skipped']) == (3, 1, 1)
+    assert summary['results']['bias']['time_to_recover_s'] is None
+    assert summary['results']['nan-short']['worst_temperature_error_K'] == 1.0
+    assert summary['soak']['survived']
+
+
+def test_campaign_is_survived_when_nothing_failed():
+    assert survived([GOOD, SKIPPED], SOAK)
+    assert not survived([GOOD, BAD], SOAK)
+    assert not survived([GOOD], replace(SOAK, reasons=('it grew',)))
+
+
+def test_cases_are_many_and_each_says_what_it_does():
+    assert len(CASES) >= 40
+    assert all(case.does and case.group for case in CASES.values())
+
+
+def test_command_line(capsys):
+    assert main(['sensor', 'feed-warm', '--list']) == 0
+    listed = capsys.readouterr().out
+    assert 'nan-short' in listed
+    assert 'feed-warm' in listed
+    assert 'clock-back' not in listed
+    with pytest.raises(SystemExit):
+        main(['no-such-case'])
+    assert 'there is no case no-such-case: --list shows them' in capsys.readouterr().err

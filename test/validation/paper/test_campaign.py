@@ -1,0 +1,179 @@
+# SPDX-FileCopyrightText: 2026 The koopman_ros Authors
+# SPDX-License-Identifier: Apache-2.0
+
+"""The campaign over seeds, its summary, figures and report."""
+
+import json
+from pathlib import Path
+import re
+
+import joblib
+import matplotlib.image
+import numpy as np
+import pytest
+
+from koopman_ros.learning import Edmd, Growth, Linearisation, train
+from koopman_ros.lifting import load
+from validation.paper import campaign as campaigns
+from validation.paper import figures, reactor, report, scalar, two_state
+from validation.paper.campaign import Campaign, run_campaign
+from validation.paper.datasets import describe
+
+MODELS = Path(__file__).parents[3] / 'config' / 'models'
+
+
+@pytest.fixture
+def one_process():
+    with joblib.parallel_config('threading', n_jobs=1):
+        yield
+
+
+def quick(seed):
+    return {'rw': 0.5 ** seed, 'part/cond': None if seed == 1 else 2.0,
+            'ratio': {'R=1': np.inf}}, {}
+
+
+def failing(seed):
+    if seed == 1:
+        raise ValueError('no such lift')
+    return {'rw': 1.0}, {}
+
+
+@pytest.mark.usefixtures('one_process')
+def test_summary_has_one_entry_for_each_seed(monkeypatch, capsys):
+    monkeypatch.setattr(campaigns, 'EXPERIMENTS', {'a': quick, 'b/c': failing})
+    campaign = run_campaign(3)
+    assert campaign.complete
+    assert campaign.errors == ['b/c, seed 1: ValueError: no such lift']
+    assert campaign.summary() == {
+        'a': {'rw': [1.0, 0.5, 0.25], 'part': {'cond': [2.0, None, 2.0]},
+              'ratio': {'R=1': [None, None, None]}},
+        'b': {'c': {'rw': [1.0, 1.0]}}}
+    lines = capsys.readouterr().err.splitlines()
+    assert lines[0] == '1/6: a, seed 0, rw 1.0e+00'
+    assert '4/6: b/c, seed 1 failed' in lines
+
+
+@pytest.mark.usefixtures('one_process')
+def test_an_interrupt_keeps_what_is_done(monkeypatch):
+    def interrupted(seed):
+        if seed == 2:
+            raise KeyboardInterrupt
+        return {'rw': 1.0}, {}
+
+    monkeypatch.setattr(campaigns, 'EXPERIMENTS', {'a': interrupted})
+    campaign = run_campaign(4)
+    assert not campaign.complete
+    assert campaign.summary() == {'a': {'rw': [1.0, 1.0]}}
+
+
+@pytest.fixture(scope='module')
+def campaign():
+    """Return a campaign of one seed with quickly trained models and its real figures."""
+    found = Campaign(complete=True)
+
+    def add(name, outcome):
+        found.metrics[name], found.models[name] = {0: outcome[0]}, {0: outcome[1]}
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(scalar, 'STARTS', 1)
+        add('scalar', scalar.run(0))
+    plant = describe(two_state.SYSTEM)
+    recipe = Growth(3, max_iterations=60)
+    lifts = {name: train(plant, two_state.samples(box, 0, episodes=20), recipe, starts=1,
+                         refuse=False).model
+             for name, box in (('wide', two_state.WIDE),
+                               (figures.FIGURE_NARROW_BOX,
+                                two_state.NARROW[figures.FIGURE_NARROW_BOX]))}
+    lifts['linear'] = Linearisation(two_state.SYSTEM.drift_jacobian(np.zeros(2))).learn(
+        plant, two_state.samples(two_state.WIDE, 0, episodes=20))
+    metrics = two_state._judged(lifts['wide'], two_state.samples(two_state.WIDE, 1, episodes=20))
+    metrics['linear_cost_ratio'] = {'R=1': 4.5, 'R=0.1': 1.9, 'R=0.001': 1.0}
+    metrics['edmd_cost_ratio'] = {'R=1': None}
+    add('two_state', (metrics, lifts))
+    add('narrow', ({f'{figures.FIGURE_NARROW_BOX}/{name}': value for name, value in (
+        ('rw_in', 1e-7), ('cost_ratio_to_exact', None), ('left_box', True),
+        ('final_distance', None))}, lifts))
+    models = {f'nz={n}': load(MODELS / f'reactor_nz{n}.safetensors') for n in (3, 4)}
+    models['linear'] = load(MODELS / 'reactor_linear.safetensors')
+    models['edmd'] = Edmd(reactor.EDMD_DEGREE).learn(
+        describe(reactor.SYSTEM), reactor.training_samples(0))
+    judge = reactor.Judge.of(0)
+    add('reactor', ({f'{name}/{figure}': value for name, model in models.items()
+                     for figure, value in judge.figures(model).items()}, models))
+    return found
+
+
+def reactor_figures(campaign, name):
+    """Return what the campaign says of a shipped model."""
+    return {key.removeprefix(f'{name}/'): value
+            for key, value in campaign.metrics['reactor'][0].items() if key.startswith(name)}
+
+
+def test_the_linear_model_of_the_reactor_is_as_far_off_as_it_is(campaign):
+    found = reactor_figures(campaign, 'linear')
+    assert found['feed_forward_offset_kelvin'] == pytest.approx(3.3009, abs=1e-4)
+    assert found['tracking_offset_kelvin'] == pytest.approx(1.9334, abs=1e-4)
+    assert found['rollout_rmse_in_kelvin'] > 8.0
+    assert found['cost_ratio_to_optimum'] > 5.0
+
+
+@pytest.mark.parametrize('n_z', [3, 4])
+def test_the_shipped_lifts_track(campaign, n_z):
+    found = reactor_figures(campaign, f'nz={n_z}')
+    assert found['tracking_offset_kelvin'] < 1e-3
+    assert found['feed_forward_offset_kelvin'] < 1e-3
+    assert found['rollout_rmse_in_kelvin'] < 0.005
+    assert 1.0 - 1e-7 < found['cost_ratio_to_optimum'] < 1.0 + 1e-5
+    assert found['rollout_rmse_out_kelvin'] > found['rollout_rmse_in_kelvin']
+
+
+@pytest.fixture(scope='module')
+def drawn(campaign, tmp_path_factory):
+    folder = tmp_path_factory.mktemp('studies')
+    return folder, figures.draw_figures(campaign, folder)
+
+
+def test_eleven_figures(drawn):
+    folder, figures_drawn = drawn
+    assert [figure.file[:2] for figure in figures_drawn] == [
+        f'{number:02d}' for number in range(1, 12)]
+    for figure in figures_drawn:
+        image = matplotlib.image.imread(folder / figure.file)
+        assert min(image.shape[:2]) > 500
+        # neither blank nor one colour
+        assert np.std(image[..., :3]) > 0.02
+        assert figure.caption.endswith('.')
+
+
+def test_report_names_every_experiment_and_figure(campaign, drawn):
+    folder, figures_drawn = drawn
+    summary = {'package_version': '1', 'seeds': 1, 'complete': True, 'errors': [],
+               'wall_seconds': 1.0, **campaign.summary()}
+    json.dumps(summary, allow_nan=False)
+    # the quick campaign has no lifts of 2 and 5 coordinates
+    targets = tuple(target for target in report.TARGETS
+                    if 'nz=2' not in target.path and 'nz=5' not in target.path)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(report, 'TARGETS', targets)
+        report.write_report(summary, figures_drawn, folder / 'report.md')
+    text = (folder / 'report.md').read_text()
+    for heading in ('Motivating example', 'Two-state example', 'One-state reactor',
+                    'Narrow data', 'Figures'):
+        assert f'\n## {heading}' in text
+    assert len(re.findall(r'^!\[.*\]\((.*)\)$', text, re.MULTILINE)) == 11
+    assert '| `reactor/nz=3/tracking_offset_kelvin` | 0.001 |' in text
+    assert 'failed in all 1' in text
+    assert 'nan' not in text
+
+
+def test_a_missed_target_is_counted():
+    target = report.Target('a/b', 1e-6, 1.0)
+    assert target.met({'a': {'b': [1.0, 1.0 + 2e-6, None, 0.99]}}) == (2, 4)
+
+
+def test_seeds_below_one_are_refused(capsys):
+    from validation.paper.__main__ import main
+    with pytest.raises(SystemExit):
+        main(['--seeds', '0'])
+    assert '--seeds is 0, must be at least 1' in capsys.readouterr().err

@@ -1,0 +1,186 @@
+# SPDX-FileCopyrightText: 2026 The koopman_ros Authors
+# SPDX-License-Identifier: Apache-2.0
+
+
+"""Figures of the robustness study against references that do not use its code."""
+
+from dataclasses import astuple, replace
+import math
+
+import numpy as np
+import pytest
+from scipy.integrate import solve_ivp
+
+from koopman_ros.nodes.controller_parameters import ControllerParameters
+from koopman_ros.plants import Actuator
+from validation.robustness import attraction, disturbances
+from validation.robustness.attraction import End, Start
+from validation.robustness.disturbances import Case
+from validation.robustness.loop import (
+    at_setpoint,
+    REACTOR,
+    reactor_controller,
+    run_loop,
+    shipped_model,
+    START,
+    with_bias,
+)
+from validation.robustness.margins import (
+    grows,
+    linearised_controller,
+    linearised_reactor,
+    margins_at,
+)
+
+PERIOD = 1.0 / 60.0  # min
+
+
+def _first_order(temperature, coolant_weight=1.0):
+    """Return slope a, gain b (1/min) and the scalar regulator's K by hand."""
+    a = REACTOR.drift_jacobian(np.array([temperature]))[0, 0]
+    b = REACTOR.B[0, 0]
+    K = (a + math.sqrt(a * a + b * b / coolant_weight)) / b
+    return a, b, K
+
+
+def _pole(a, b):
+    """Return pole and gain of the plant between samples."""
+    pole = math.exp(a * PERIOD)
+    return pole, b * (pole - 1.0) / a
+
+
+def test_settings_are_the_defaults_of_the_node():
+    theirs, ours = ControllerParameters().settings(), reactor_controller().settings
+    arrays = [[s.state_weight, s.input_weight, s.limits.lower, s.limits.upper, s.limits.rate,
+               s.safe_input] for s in (theirs, ours)]
+    np.testing.assert_allclose(*arrays, rtol=1e-12)
+    assert theirs.ladder == ours.ladder
+    np.testing.assert_allclose(astuple(theirs.sensor), astuple(ours.sensor), rtol=1e-12)
+    for name in ('setpoint_ramp', 'setpoint_filter', 'observer_bandwidth', 'max_disturbance',
+                 'input_tolerance', 'transfer_time', 'max_gain', 'max_residual'):
+        assert getattr(theirs, name) == pytest.approx(getattr(ours, name)), name
+
+
+@pytest.mark.parametrize(('temperature', 'weight'), [(310.0, 1.0), (START, 0.1)])
+def test_margins_without_observer_are_those_of_a_first_order_loop(temperature, weight):
+    a, b, K = _first_order(temperature, weight)
+    pole, gain = _pole(a, b)
+    controller = reactor_controller(bandwidth=0.0, coolant_weight=weight)
+    found = margins_at(controller, temperature)
+    learned = -linearised_controller(controller, temperature).D[0, 0]
+    # as far as the lift's slope is that of the reactor
+    assert learned == pytest.approx(K, rel=2e-3)
+    K = learned
+    # the pole of the closed loop leaves the unit circle at -1
+    assert found.gain == pytest.approx((1.0 + pole) / (K * gain), rel=1e-6)
+    # |K gain| = |exp(jw) - pole|; the rest of half a turn is the phase margin
+    cosine = (1.0 + pole ** 2 - (K * gain) ** 2) / (2.0 * pole)
+    if abs(cosine) > 1.0 or K * gain < 1.0 - pole:
+        assert found.delay == math.inf
+        return
+    w = math.acos(cosine)
+    phase = math.pi - np.angle(np.exp(1j * w) - pole)
+    assert found.phase == pytest.approx(math.degrees(phase), rel=1e-4)
+    assert found.delay == pytest.approx(phase / w, rel=1e-4)
+
+
+def test_differences_of_the_step_agree_with_the_observer_by_hand():
+    temperature, bandwidth = 316.0, 6.0
+    found = linearised_controller(reactor_controller(bandwidth=bandwidth), temperature)
+    a, b, K = _first_order(temperature)
+    p = math.exp(-bandwidth * PERIOD)
+    # the observer predicts by Heun's method; disturbance in K/min, measured in K
+    h = PERIOD
+    drift, push = 1.0 + a * h + 0.5 * (a * h) ** 2, h * (1.0 + 0.5 * a * h)
+    take, learn = 1.0 - p * p, (1.0 - p) ** 2 / h
+    F = np.array([[(1.0 - take) * drift, (1.0 - take) * push, (1.0 - take) * b * push],
+                  [-learn * drift, 1.0 - learn * push, -learn * b * push]])
+    G = np.array([[take], [learn]])
+    law = np.array([[-K, -1.0 / b]])
+    scale = np.diag([1.0 / shipped_model().states.scale[0]] * 2 + [1.0])
+    A = np.vstack([F, law @ F])
+    B = np.vstack([G, law @ G])
+    # in the lift's scaled deviations; the lift is not the reactor to the last digit
+    np.testing.assert_allclose(found.A, scale @ A @ np.linalg.inv(scale), atol=2e-3)
+    np.testing.assert_allclose(found.B, scale @ B, atol=2e-3)
+    np.testing.assert_allclose(found.D, law @ G, atol=2e-3)
+
+
+def test_the_delay_margin_is_where_the_simulated_loop_begins_to_oscillate():
+    controller = reactor_controller(bandwidth=10.0, coolant_weight=0.1)
+    at = margins_at(controller, 316.0)
+    assert at.delay == pytest.approx(8.73, abs=0.05)
+    assert not grows(controller, 316.0, delay=0.95 * at.delay, seconds=450.0)
+    assert grows(controller, 316.0, delay=1.05 * at.delay, seconds=450.0)
+    assert linearised_reactor(316.0).A[0, 0] == pytest.approx(
+        math.exp(REACTOR.drift_jacobian(np.array([316.0]))[0, 0] * PERIOD), rel=1e-12)
+
+
+def test_no_coolant_saves_what_is_hotter_than_the_boundary():
+    """With the coolant on its way to the coldest as fast as it may, from scipy's integration."""
+    boundary = attraction.hottest_saved(300.0)
+
+    def rate(t, x):
+        return REACTOR.derivative(x, np.array([max(278.15, 300.0 - 60.0 * t)]))
+
+    ends = [solve_ivp(rate, (0.0, 5.0), [boundary + d], rtol=1e-9, max_step=0.05,
+                      events=_runaway).y[0, -1] for d in (-0.01, 0.01)]
+    assert ends[0] < 330.0
+    assert ends[1] > 399.0
+
+
+def _runaway(t, x):
+    return x[0] - 400.0
+
+
+_runaway.terminal = True
+
+
+@pytest.mark.parametrize(('temperature', 'ladder', 'end'), [
+    (340.0, True, End.SAFE), (340.0, False, End.RAN_AWAY), (343.0, True, End.RAN_AWAY)])
+def test_the_ladder_widens_the_region_of_attraction(temperature, ladder, end):
+    assert attraction.end_of(Start(temperature, 300.0, 316.0), ladder=ladder) is end
+
+
+def test_a_disturbance_leaves_no_offset_and_a_biased_sensor_its_bias():
+    cases = {case.name: case for case in disturbances.cases()}
+    found = disturbances.judge(replace(cases['UA −20 %, in the loop'], seconds=600.0))
+    assert found['final_kelvin'] == pytest.approx(0.0, abs=1e-3)
+    assert found['seconds_to_0.2_kelvin'] < 180.0
+    # the coolant that makes up for it: UA (T_c - T) as before, from the heat balance
+    assert found['disturbance_kelvin'] == pytest.approx(0.25 * (START - 300.0), abs=0.01)
+    biased = disturbances.judge(Case('', REACTOR, [START - 5.0], [
+        (0.0, at_setpoint(START - 5.0)), (10.0, with_bias(1.0))], START - 5.0, seconds=600.0))
+    assert biased['final_kelvin'] == pytest.approx(-1.0, abs=1e-3)
+    assert biased['equivalent_bias_kelvin'] == pytest.approx(1.0, abs=1e-2)
+
+
+def test_settling_counts_from_the_change():
+    course = run_loop(reactor_controller(), REACTOR, np.array([START]), 300.0, 60.0,
+                      [(20.0, at_setpoint(START - 1.0))])
+    assert course.settling(START, 0.01, 0.0) == math.inf
+    assert course.settling(START - 1.0, 2.0, 20.0) == 0.0
+    errors = course.x[:, 0] - (START - 1.0)
+    first = course.seconds[np.flatnonzero(np.abs(errors) > 0.9)[-1] + 1]
+    assert course.settling(START - 1.0, 0.9, 20.0) == first - 20.0
+
+
+def test_what_rests_outside_the_data_comes_back_from_the_safe_coolant():
+    usual = attraction.back_from_safe(REACTOR, 0.5)
+    # by the heat balance; the trained range starts at 305 K, half its width is 11
+    assert usual['rest_kelvin'] == pytest.approx(302.565, abs=1e-2)
+    assert usual['outside'] == pytest.approx((305.0 - usual['rest_kelvin']) / 11.0, abs=1e-6)
+    assert usual['seconds_to_0.2_kelvin'] < 300.0
+    better_cooled = attraction.back_from_safe(disturbances.CHANGED['UA +20 %'], 0.5)
+    assert better_cooled['outside'] > 0.5
+    assert better_cooled['seconds_to_0.2_kelvin'] < 300.0
+
+
+def test_only_a_measured_coolant_tells_that_the_actuator_is_stuck():
+    estimates = [run_loop(
+        reactor_controller(), REACTOR, np.array([START]), 300.0, 300.0,
+        [(0.0, at_setpoint(disturbances.SETPOINT))],
+        actuator=Actuator(lower=disturbances.REACHED), tells=tells).disturbance[-1]
+        for tells in (False, True)]
+    # the bound, and the tolerance
+    np.testing.assert_allclose(estimates, [20.0, 2.0], rtol=0, atol=0.1)

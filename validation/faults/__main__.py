@@ -1,0 +1,84 @@
+# SPDX-FileCopyrightText: 2026 The koopman_ros Authors
+# SPDX-License-Identifier: Apache-2.0
+
+"""Run the campaign: ``python -m validation.faults [case | group | soak ...] [--quick]``."""
+
+from __future__ import annotations
+
+import argparse
+from collections.abc import Callable, Sequence
+from pathlib import Path
+import sys
+
+from koopman_ros.demo.loop import deferred_interrupt
+from validation.faults import report
+from validation.faults.case import Case, Outcome, run
+from validation.faults.cases import CASES
+from validation.faults.figure import draw
+from validation.faults.soak import HOURS, Soak, soak
+
+SOAK = 'soak'
+# One of each group, quick ones that say much.
+QUICK = ('nan-short', 'measurements-lost', 'clock-zero', 'controller-killed', 'bad-values-storm',
+         'feed-warm')
+
+
+def main(args: list[str] | None = None) -> int:
+    """Run the cases asked for and the soak; return 1 where one was not survived."""
+    groups = dict.fromkeys(case.group for case in CASES.values())
+    parser = argparse.ArgumentParser(
+        prog='python -m validation.faults',
+        description='Put faults into the loop and judge what it does.')
+    parser.add_argument('names', nargs='*', metavar='name',
+                        help=f'a case, a group ({", ".join(groups)}), or {SOAK} (default: all)')
+    parser.add_argument('--quick', action='store_true', help='six cases, no soak: half a minute')
+    parser.add_argument('--list', action='store_true', help='show the cases, and run none')
+    parser.add_argument('--hours', type=float, default=HOURS,
+                        help='plant time of the soak (default: %(default)g)')
+    parser.add_argument('--output', type=Path, default=Path('out/faults'),
+                        help='folder for the report (default: %(default)s)')
+    given = parser.parse_args(args)
+    if unknown := [name for name in given.names if name not in {*CASES, *groups, SOAK}]:
+        parser.error(f'there is no case {", ".join(unknown)}: --list shows them')
+    if not given.hours > 0.0:
+        parser.error(f'--hours is {given.hours} h, must be above 0 h')
+    names = given.names or (QUICK if given.quick else [*CASES, SOAK])
+    cases = [case for case in CASES.values() if case.name in names or case.group in names]
+    if given.list:
+        for case in cases:
+            print(f'{case.name:34s}{case.group:14s}{case.does}')
+        return 0
+    return _run(cases, given.hours if SOAK in names else 0.0, given.output)
+
+
+def _run(cases: Sequence[Case], hours: float, folder: Path) -> int:
+    outcomes: list[Outcome] = []
+    soaked: Soak | None = None
+    try:
+        with deferred_interrupt() as check:
+            for number, case in enumerate(cases, 1):
+                print(f'[{number:2d}/{len(cases)}] {case.name:34s}', end='', flush=True)
+                outcomes.append(run(case, folder / 'logs' / case.name, check))
+                print(report.line(outcomes[-1]), flush=True)
+                report.write(folder, outcomes, None)
+            if hours:
+                soaked = soak(folder / 'logs' / SOAK, check, hours, _progress(hours))
+                print('\n'.join(soaked.reasons) or 'survived')
+    except KeyboardInterrupt:
+        print(f'\ninterrupted; what was finished is in {folder}', file=sys.stderr)
+        return 130
+    report.write(folder, outcomes, soaked, draw(outcomes, folder / report.FIGURE))
+    print(f'\n{sum(outcome.survived for outcome in outcomes)} of {len(outcomes)} cases survived; '
+          f'see {folder / "report.md"}')
+    return 0 if report.survived(outcomes, soaked) else 1
+
+
+def _progress(hours: float) -> Callable[[float], None]:
+    def show(share: float) -> None:
+        print(f'\r{SOAK}: {share * hours:5.1f} of {hours:g} h ', end='', flush=True)
+
+    return show
+
+
+if __name__ == '__main__':
+    sys.exit(main())

@@ -1,0 +1,187 @@
+# SPDX-FileCopyrightText: 2026 The koopman_ros Authors
+# SPDX-License-Identifier: Apache-2.0
+
+"""Storms of requests: parameters, set-points and modes, good and bad, as fast as they go."""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Callable, Iterator, Mapping
+import itertools
+import math
+import time
+from typing import Any
+
+import numpy as np
+from rcl_interfaces.srv import SetParameters
+from rclpy.parameter import Parameter
+from rclpy.task import Future
+from sensor_msgs.msg import Temperature
+from std_srvs.srv import SetBool
+
+from validation.faults.case import Case, SETPOINT
+from validation.faults.rig import Rig
+
+GROUP = 'operators'
+_AT_ONCE = 10  # requests on their way
+_REQUESTS = 400
+_STORM = 2.0  # s of wall time
+_WORKED_OFF = 5.0  # s of wall time, within which a storm is worked off
+
+
+def _send(rig: Rig, kind: Any, service: str, requests: Iterator[Any]) -> list[Any]:
+    """Send requests as fast as they are answered, and return the answers."""
+    client = rig.operator.client(kind, service)
+    rig.wait(client.service_is_ready, f'there is no service {service}')
+    waiting: deque[Future] = deque()
+    answers = []
+    for request in requests:
+        waiting.append(client.call_async(request))
+        while len(waiting) >= _AT_ONCE:
+            rig.wait(waiting[0].done, f'{service} does not answer')
+            answers.append(waiting.popleft().result())
+    for future in waiting:
+        rig.wait(future.done, f'{service} does not answer')
+        answers.append(future.result())
+    return answers
+
+
+def _changes(values: Iterator[Mapping[str, Any]]) -> Iterator[SetParameters.Request]:
+    for change in values:
+        yield SetParameters.Request(parameters=[
+            Parameter(name, value=value).to_parameter_msg() for name, value in change.items()])
+
+
+def _weights() -> Iterator[dict[str, Any]]:
+    random = np.random.default_rng(0)
+    for _ in range(_REQUESTS):
+        yield {'temperature_weight': float(10.0 ** random.uniform(-2.0, 2.0)),
+               'coolant_weight': float(10.0 ** random.uniform(-2.0, 2.0))}
+
+
+def _limits() -> Iterator[dict[str, Any]]:
+    random = np.random.default_rng(1)
+    for _ in range(_REQUESTS):
+        yield {'coolant_min': float(random.uniform(5.0, 22.0)),
+               'coolant_max': float(random.uniform(24.0, 32.0)),
+               'coolant_rate_limit': float(random.uniform(1.0, 60.0))}
+
+
+def _ramps() -> Iterator[dict[str, Any]]:
+    random = np.random.default_rng(2)
+    for _ in range(_REQUESTS):
+        yield {'setpoint_ramp': float(10.0 ** random.uniform(-3.0, 3.0))}
+
+
+_BAD: tuple[tuple[str, Any], ...] = (
+    ('temperature_weight', math.nan), ('temperature_weight', -1.0), ('temperature_weight', 1),
+    ('coolant_weight', 0.0), ('coolant_weight', math.inf), ('coolant_weight', 'much'),
+    ('coolant_min', 60.0), ('coolant_max', -10.0), ('coolant_max', math.nan),
+    ('coolant_rate_limit', 0.0), ('setpoint_ramp', -math.inf), ('max_gain', 0.0),
+    ('max_riccati_residual', 2.0), ('measurement_timeout', math.nan),
+    ('model', ''), ('model', '/nowhere/lift.safetensors'), ('model', 3.0))
+
+
+def _bad() -> Iterator[dict[str, Any]]:
+    for name, value in itertools.islice(itertools.cycle(_BAD), _REQUESTS):
+        yield {name: value}
+
+
+def _storm_of_parameters(values: Callable[[], Iterator[Mapping[str, Any]]], refused: bool = False
+                         ) -> Callable[[Rig], None]:
+    def play(rig: Rig) -> None:
+        rig.begin()
+        rig.operator.ask(44.0)
+        started = time.monotonic()
+        answers = _send(rig, SetParameters, 'controller/set_parameters', _changes(values()))
+        seconds = time.monotonic() - started
+        rig.course.notes.append(f'{len(answers)} changes at {len(answers) / seconds:.0f} 1/s')
+        results = [result for answer in answers for result in answer.results]
+        if refused:
+            taken = sum(result.successful for result in results)
+            rig.expect(taken == 0, f'{taken} bad values were taken')
+            rig.expect(all(result.reason for result in results), 'refused without a reason')
+        else:
+            reasons = {result.reason for result in results if not result.successful}
+            rig.expect(not reasons, f'good values were refused: {sorted(reasons)[:2]}')
+            last = rig.operator.set_parameters(
+                'controller', temperature_weight=1.0, coolant_weight=1.0, coolant_min=5.0,
+                coolant_max=32.0, coolant_rate_limit=60.0, setpoint_ramp=1000.0)
+            rig.expect(not any(last), f'the defaults were refused: {last}')
+        rig.end()
+
+    return play
+
+
+def _storm_of_setpoints(values: Callable[[int], float]) -> Callable[[Rig], None]:
+    """Return the play that asks for a set-point a thousand times a second."""
+    def play(rig: Rig) -> None:
+        rig.begin()
+        started = time.monotonic()
+        sent = 0
+        while (passed := time.monotonic() - started) < _STORM:
+            while sent < 1000.0 * passed:
+                rig.operator.setpoint.publish(Temperature(temperature=values(sent)))
+                sent += 1
+            rig.spin()
+        rig.course.notes.append(f'{sent} set-points at {sent / passed:.0f} 1/s')
+        over = time.monotonic()
+        rig.operator.insist(SETPOINT)
+        waited = time.monotonic() - over
+        rig.course.notes.append(f'the next one was tracked {waited:.1f} s of wall time later')
+        rig.expect(waited < _WORKED_OFF, f'the next one was tracked {waited:.1f} s later only')
+        rig.end()
+
+    return play
+
+
+def _storm_of_modes(rig: Rig) -> None:
+    """Between operator and law, while a manual command is always on its way."""
+    manual = rig.operator.speak('manual_coolant_setpoint')
+    rig.begin()
+
+    def requests() -> Iterator[SetBool.Request]:
+        for number in range(_REQUESTS):
+            manual.publish(Temperature(temperature=20.0 + number % 7))
+            yield SetBool.Request(data=bool(number % 2))
+
+    _send(rig, SetBool, 'controller/set_automatic', requests())
+    rig.operator.set_bool('controller/set_automatic', True)
+    rig.end()
+
+
+def _mode_once(rig: Rig) -> None:
+    rig.begin()
+    rig.operator.set_bool('controller/set_automatic', False)
+    rig.run_for(60.0)
+    rig.operator.set_bool('controller/set_automatic', True)
+    rig.end()
+
+
+def _case(name: str, does: str, play: Callable[[Rig], None], **details: Any) -> Case:
+    return Case(name, GROUP, does, play, **details)
+
+
+CASES = (
+    _case('weights-storm', f'{_REQUESTS} changes of both weights by factors of up to 10,000',
+          _storm_of_parameters(_weights)),
+    _case('limits-storm', f'{_REQUESTS} changes of range and rate of the coolant',
+          _storm_of_parameters(_limits)),
+    _case('ramps-storm', f'{_REQUESTS} changes of the ramp of the set-point',
+          _storm_of_parameters(_ramps)),
+    _case('bad-values-storm', f'{_REQUESTS} parameters that cannot be', _storm_of_parameters(
+        _bad, refused=True)),
+    _case('setpoint-storm', 'set-points at 1 kHz, all the same',
+          _storm_of_setpoints(lambda _: SETPOINT)),
+    _case('setpoint-storm-nan', 'set-points at 1 kHz: NaN',
+          _storm_of_setpoints(lambda _: math.nan), says=('^controller: control: .*not finite',)),
+    _case('setpoint-storm-outside', 'set-points at 1 kHz: 500 and -1e308 degC',
+          _storm_of_setpoints(lambda number: (500.0, -1e308)[number % 2]),
+          says=('^controller: control: .*outside the trained range',)),
+    _case('setpoint-storm-alternating', 'set-points at 1 kHz: 41 and 51 degC in turn',
+          _storm_of_setpoints(lambda number: (41.0, 51.0)[number % 2])),
+    _case('mode-once', 'manual mode for a minute, and back, without a bump', _mode_once,
+          bump=0.01),
+    _case('mode-storm', f'{_REQUESTS} changes between automatic and manual mode',
+          _storm_of_modes),
+)

@@ -1,0 +1,201 @@
+# SPDX-FileCopyrightText: 2026 The koopman_ros Authors
+# SPDX-License-Identifier: Apache-2.0
+
+"""Whether a case was survived, and by how much: from the course alone, without ROS."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Sequence
+from dataclasses import dataclass
+import itertools
+import math
+import re
+
+import numpy as np
+
+from validation.faults.course import Course
+
+RUNAWAY = 60.0  # degC; the reactor's operating points end below 54 degC
+_LAST = 30.0  # s at the end of a course, in which an offset is looked for
+BAND = 0.3  # K around the set-point that counts as back
+
+
+@dataclass(frozen=True)
+class Bounds:
+    """
+    What a case must keep to.
+
+    :param coolant_min: lowest command, degC.
+    :param coolant_max: highest command, degC.
+    :param largest_step: between two commands, K.
+    :param recovery: plant time from the end of the fault within which the reactor must be back, s.
+    :param bump: largest step from the fault on, K, where nothing calls for any.
+    :param band: distance from the set-point that counts as back, K; infinity where none is asked.
+    :param offset: largest distance from the set-point in the last seconds, K.
+    :param worst: largest distance from the set-point from the fault on, K.
+    :param says: regular expressions that diagnostics (``<node>: <task>: <sentence>``) must have
+        matched from the beginning of the fault on.
+    :param excused: statuses (``<node>: <task>``) that may end in ERROR.
+    """
+
+    coolant_min: float
+    coolant_max: float
+    largest_step: float
+    recovery: float
+    bump: float = math.inf
+    band: float = BAND
+    offset: float = math.inf
+    worst: float = math.inf
+    says: tuple[str, ...] = ()
+    excused: tuple[str, ...] = ()
+
+
+@dataclass(frozen=True)
+class Verdict:
+    """
+    What became of a case.
+
+    :param reasons: why it was not survived, in sentences; empty when it was.
+    :param worst_error: largest |T - set-point| from the fault on, K; NaN when nothing was seen.
+    :param worst_step: largest step between two commands from the fault on, K.
+    :param recovery: plant time from the end of the fault until the temperature stays within the
+        band, s; infinity when it never does.
+    :param offset: largest |T - set-point| in the last seconds, K.
+    """
+
+    reasons: tuple[str, ...]
+    worst_error: float
+    worst_step: float
+    recovery: float
+    offset: float
+
+    @property
+    def survived(self) -> bool:
+        """Whether nothing is held against it."""
+        return not self.reasons
+
+
+def judge(course: Course, bounds: Bounds) -> Verdict:
+    """Judge the course of a case."""
+    reasons = [*course.complaints]
+    times, errors = course.errors()
+    since = times >= course.begin
+    worst = float(np.max(errors[since])) if np.any(since) else math.nan
+    recovery = _recovery(course, bounds.band)
+    if math.isnan(worst):
+        reasons.append('no temperature was measured after the fault began')
+    elif not recovery <= bounds.recovery:
+        taken = 'not back' if math.isinf(recovery) else f'back only after {recovery:.0f} s'
+        reasons.append(f'{taken} within {bounds.band:g} K of the set-point; {bounds.recovery:g} s '
+                       f'are allowed, and {errors[-1]:.2f} K are left')
+    offset = float(np.max(errors[times >= times[-1] - _LAST])) if len(times) else math.nan
+    if not offset <= bounds.offset:
+        reasons.append(f'an offset of {offset:.3f} K is left, {bounds.offset:g} K are allowed')
+    if worst > bounds.worst:
+        reasons.append(f'the temperature was {worst:.2f} K from the set-point, {bounds.worst:g} K '
+                       'are allowed')
+    hottest = max((sample.celsius for sample in course.samples), default=-math.inf)
+    if not hottest < RUNAWAY:
+        reasons.append(f'the reactor reached {hottest:.1f} degC, {RUNAWAY:g} degC is a runaway')
+    reasons += _commands(course, bounds)
+    step = _worst_step(course)
+    if step > bounds.bump:
+        reasons.append(f'the coolant command stepped by {step:.3f} K after the fault, '
+                       f'{bounds.bump:g} K are allowed')
+    reasons += _words(course, bounds.says, bounds.excused)
+    return Verdict(tuple(reasons), worst, step, recovery, offset)
+
+
+def _recovery(course: Course, band: float) -> float:
+    times, errors = course.errors()
+    after = times >= course.end
+    times, out = times[after], errors[after] > band
+    if not len(times) or out[-1]:
+        return math.inf
+    # back with the first sample after the last one that was outside
+    return float(times[np.flatnonzero(out)[-1] + 1] - course.end) if np.any(out) else 0.0
+
+
+def _commands(course: Course, bounds: Bounds) -> list[str]:
+    if not course.commands:
+        return ['the controller never commanded']
+    reasons = []
+    for command in course.commands:
+        if not bounds.coolant_min <= command.celsius <= bounds.coolant_max:
+            reasons.append(
+                f'the command {command.celsius:g} degC at {command.seconds:.0f} s is not within '
+                f'{bounds.coolant_min:g} to {bounds.coolant_max:g} degC')
+            break
+    times, steps = course.steps()
+    # written so that NaN counts
+    large = np.flatnonzero(~(steps <= bounds.largest_step + 1e-6))
+    if len(large):
+        reasons.append(f'the coolant command stepped by {steps[large[0]]:.2f} K at '
+                       f'{times[large[0]]:.0f} s, {bounds.largest_step:g} K are allowed')
+    return reasons
+
+
+def _worst_step(course: Course) -> float:
+    times, steps = course.steps()
+    return float(np.max(steps[times >= course.begin], initial=0.0))
+
+
+def _words(course: Course, says: Sequence[str], excused: Sequence[str]) -> list[str]:
+    lasted = [f'{said.name}: {said.message}' for said in course.said
+              if said.seconds >= course.begin]
+    reasons = [f'diagnostics never said "{words}"' for words in says
+               if not any(re.search(words, said) for said in lasted)]
+    last = {said.name: said for said in course.said}
+    reasons += [f'at the end diagnostics still say ERROR: {name}: {said.message}'
+                for name, said in sorted(last.items()) if said.level >= 2 and name not in excused]
+    return reasons
+
+
+@dataclass(frozen=True)
+class Account:
+    """
+    How the commands answer the measurements that reached the controller, by their stamps.
+
+    :param measurements: that reached it.
+    :param answered: of these, exactly once.
+    :param unanswered: of these, not at all.
+    :param repeated: answers beyond the first.
+    :param unasked: commands with a stamp that no measurement had.
+    :param out_of_order: answers that came before the answer to an earlier measurement.
+    """
+
+    measurements: int
+    answered: int
+    unanswered: int
+    repeated: int
+    unasked: int
+    out_of_order: int
+
+    @property
+    def complete(self) -> bool:
+        """Whether each measurement was answered once, in order."""
+        return self.answered == self.measurements and not (
+            self.repeated or self.unasked or self.out_of_order)
+
+
+def account(delivered: Sequence[int], answers: Sequence[int]) -> Account:
+    """
+    Count answers by their stamps.
+
+    :param delivered: stamps of the measurements as they reached the controller; one that came
+        twice is to be answered twice.
+    :param answers: stamps of the commands as they were published.
+    """
+    asked, given = Counter(delivered), Counter(answers)
+    place: dict[int, int] = {}
+    for number, stamp in enumerate(delivered):
+        place.setdefault(stamp, number)
+    order = [place[stamp] for stamp in answers if stamp in place]
+    return Account(
+        measurements=len(delivered),
+        answered=sum(count for stamp, count in asked.items() if given[stamp] == count),
+        unanswered=sum(max(count - given[stamp], 0) for stamp, count in asked.items()),
+        repeated=sum(max(given[stamp] - count, 0) for stamp, count in asked.items()),
+        unasked=sum(count for stamp, count in given.items() if stamp not in asked),
+        out_of_order=sum(after < before for before, after in itertools.pairwise(order)))

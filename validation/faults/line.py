@@ -1,0 +1,121 @@
+# SPDX-FileCopyrightText: 2026 The koopman_ros Authors
+# SPDX-License-Identifier: Apache-2.0
+
+"""The line between plant and controller: heard, timed, and altered where a case wants that."""
+
+from __future__ import annotations
+
+from diagnostic_msgs.msg import DiagnosticArray
+from rclpy.node import Node
+from sensor_msgs.msg import Temperature
+
+from koopman_ros.nodes import topics
+from koopman_ros.nodes.messages import NANOSECONDS, stamp_message, stamp_nanoseconds
+from validation.faults.alterations import Alteration, Packet, unchanged
+from validation.faults.course import Command, Course, Said, Sample
+
+PLANT_TEMPERATURE = 'plant/temperature'
+PLANT_COOLANT = 'plant/coolant_setpoint'
+# What a plant is started with when the line alters messages.
+REMAPPED = ('-r', f'{topics.TEMPERATURE}:={PLANT_TEMPERATURE}',
+            '-r', f'{topics.COOLANT_SETPOINT}:={PLANT_COOLANT}')
+
+
+class Line:
+    """
+    What is said between plant and controller, kept as a course.
+
+    Where it stands between them it plays the actuator, too, which holds its last command when
+    none arrives: so lock-step goes on whatever is lost.
+
+    :param node: whose executor does the work.
+    :param between: whether plant and controller hear each other through it alone.
+
+    :ivar measurements: what is done to measurements on their way to the controller.
+    :ivar commands: what is done to commands on their way to the plant.
+    :ivar now: plant time in s since the first measurement.
+    """
+
+    def __init__(self, node: Node, between: bool) -> None:
+        self.course = Course()
+        self.measurements: Alteration = unchanged
+        self.commands: Alteration = unchanged
+        self.now = 0.0
+        self._node = node
+        self._between = between
+        self._stamp_ns: int | None = None  # of the last true temperature
+        self._origin_ns = 0
+        self._awaited = 0  # answers to what was delivered
+        self._held: float | None = None  # the command that the actuator stands at
+        if between:
+            self._to_controller = node.create_publisher(
+                Temperature, topics.TEMPERATURE, topics.LOOP_QOS)
+            self._to_plant = node.create_publisher(Temperature, PLANT_COOLANT, topics.LOOP_QOS)
+        node.create_subscription(
+            DiagnosticArray, topics.DIAGNOSTICS, self._on_diagnostics, topics.LOOP_QOS)
+        node.create_subscription(
+            Temperature, topics.COOLANT_TEMPERATURE, self._on_coolant, topics.LATCHED_QOS)
+        node.create_subscription(
+            Temperature, topics.COOLANT_SETPOINT, self._on_command, topics.LOOP_QOS)
+
+    def open(self) -> None:
+        """Hear the plant from now on."""
+        self._node.create_subscription(
+            Temperature, PLANT_TEMPERATURE if self._between else topics.TEMPERATURE,
+            self._on_temperature, topics.LOOP_QOS)
+
+    def _on_temperature(self, message: Temperature) -> None:
+        stamp_ns = stamp_nanoseconds(message.header.stamp)
+        if self._stamp_ns is None:
+            self._origin_ns = stamp_ns
+        elif stamp_ns <= self._stamp_ns:
+            # another plant: its time goes on from here
+            self._origin_ns += stamp_ns - self._stamp_ns - NANOSECONDS
+        self._stamp_ns = stamp_ns
+        self.now = (stamp_ns - self._origin_ns) / NANOSECONDS
+        self.course.samples.append(Sample(self.now, message.temperature))
+        if not self._between:
+            self.course.delivered.append(stamp_ns)
+            return
+        arriving = self.measurements(Packet(stamp_ns, message.temperature))
+        self._awaited = len(arriving)
+        for packet in arriving:
+            self.course.delivered.append(packet.stamp_ns)
+            self._to_controller.publish(_message(packet))
+        if not arriving:
+            self._actuate([])
+
+    def _on_coolant(self, message: Temperature) -> None:
+        self.course.coolants[stamp_nanoseconds(message.header.stamp)] = message.temperature
+
+    def _on_command(self, message: Temperature) -> None:
+        packet = Packet(stamp_nanoseconds(message.header.stamp), message.temperature)
+        self.course.commands.append(Command(self.now, packet.celsius, packet.stamp_ns))
+        if not self._between:
+            return
+        self._awaited -= 1
+        arriving = self.commands(packet)
+        if arriving:
+            self._held = arriving[-1].celsius
+        if self._awaited <= 0:
+            self._actuate(arriving)
+
+    def _actuate(self, arriving: list[Packet]) -> None:
+        """Give the plant the last command that arrived, under the open stamp."""
+        if self._held is None or self._stamp_ns is None:
+            return
+        self._to_plant.publish(_message(Packet(self._stamp_ns, self._held)))
+        for packet in arriving[:-1]:
+            self._to_plant.publish(_message(packet))
+
+    def _on_diagnostics(self, message: DiagnosticArray) -> None:
+        self.course.said += [
+            Said(self.now, status.name, status.level[0], status.message,
+                 {item.key: item.value for item in status.values}) for status in message.status]
+
+
+def _message(packet: Packet) -> Temperature:
+    message = Temperature(temperature=packet.celsius)
+    # a stamp cannot show a time before zero
+    message.header.stamp = stamp_message(max(packet.stamp_ns, 0))
+    return message

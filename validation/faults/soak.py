@@ -1,0 +1,180 @@
+# SPDX-FileCopyrightText: 2026 The koopman_ros Authors
+# SPDX-License-Identifier: Apache-2.0
+
+"""A day of plant time with whatever may happen in one: nothing is lost, and nothing grows."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+import math
+from pathlib import Path
+import shutil
+import signal
+import time
+
+import numpy as np
+
+from koopman_ros.bags import summary
+from koopman_ros.demo.processes import isolated_domain
+from koopman_ros.nodes.controller_parameters import ControllerParameters
+from validation.faults.course import Array, Course
+from validation.faults.events import EVENTS
+from validation.faults.judge import Account, account, RUNAWAY
+from validation.faults.rig import LOCKSTEP, Rig, StalledError
+
+HOURS = 24.0
+SEED = 0
+_EVENT_PERIOD = 300.0  # s, mean time between two events
+_WALL_PER_HOUR = 60.0  # s, at most
+_LOOKS = 200  # at the memory
+_WARM = 0.25  # share of the run after which memory is to be flat
+_GROWTH = 4.0  # MB that a process may grow from then on
+_RECORDED = ('temperature', 'coolant_setpoint')
+_MEGABYTE = 1e6
+
+
+@dataclass(frozen=True)
+class Memory:
+    """
+    The resident memory of a process over the run.
+
+    :param seconds: (N,) plant time.
+    :param megabytes: (N,) resident.
+    """
+
+    seconds: Array
+    megabytes: Array
+
+    @property
+    def growth(self) -> float:
+        """By how much it grows by a straight line from when the process is warm, MB."""
+        warm = self.seconds >= _WARM * self.seconds[-1]
+        if np.count_nonzero(warm) < 3:
+            return 0.0
+        # from the first on, so that what does not grow is exactly 0
+        since = self.megabytes[warm] - self.megabytes[warm][0]
+        slope = np.polyfit(self.seconds[warm], since, 1)[0]
+        return float(slope * np.ptp(self.seconds[warm])) + 0.0
+
+
+@dataclass(frozen=True)
+class Soak:
+    """
+    What a soak found.
+
+    :param reasons: what is held against it, in sentences.
+    :param hours: of plant time.
+    :param wall: what it took, s.
+    :param answers: how measurements were answered.
+    :param events: how often each happened.
+    :param memory: by process.
+    :param recorded: messages in the bag by topic.
+    :param hottest: the highest true temperature, degC.
+    :param mean_error: mean |T - set-point| in K.
+    """
+
+    reasons: tuple[str, ...]
+    hours: float
+    wall: float
+    answers: Account
+    events: dict[str, int]
+    memory: dict[str, Memory]
+    recorded: dict[str, int]
+    hottest: float
+    mean_error: float
+
+
+def soak(folder: Path, check: Callable[[], None], hours: float = HOURS,
+         on_progress: Callable[[float], None] = lambda _: None) -> Soak:
+    """
+    Run plant, controller and trainer for some hours of plant time, and account for everything.
+
+    :param folder: for the bag, which is deleted afterwards, and for what the processes print.
+    :param check: called all the time; may raise to end it.
+    :param on_progress: called with the share that is done.
+    """
+    started = time.monotonic()
+    shutil.rmtree(folder, ignore_errors=True)
+    folder.mkdir(parents=True)
+    random = np.random.default_rng(SEED)
+    happened: Counter[str] = Counter()
+    looks: dict[str, list[tuple[float, float]]] = {}
+    with isolated_domain() as environment:
+        rig = Rig(environment, folder, 60.0 + _WALL_PER_HOUR * hours, check, between=True)
+        with rig:
+            try:
+                rig.start('trainer', {'output': folder / 'bag', 'min_free_disk': 0.0,
+                                      'topics': _RECORDED})
+                rig.start_loop(46.0, LOCKSTEP, {})
+                _let_happen(rig, 3600.0 * hours, random, happened, looks, on_progress)
+                # what is on its way arrives, so that the counts can agree
+                rig.kill('plant', signal.SIGINT)
+                rig.wait(lambda: len(rig.course.commands) >= len(rig.course.delivered),
+                         'measurements are left without an answer')
+                rig.linger(0.5)
+            except StalledError as error:
+                rig.course.complaints.append(str(error))
+    bag, recorded = folder / 'bag', {}
+    if bag.exists():
+        recorded = dict(summary(bag).counts)
+        shutil.rmtree(bag)
+    memory = {name: Memory(*np.array(seen).T) for name, seen in looks.items()}
+    course = rig.course
+    answers = account(course.delivered, [command.stamp_ns for command in course.commands])
+    hottest = max((sample.celsius for sample in course.samples), default=math.nan)
+    return Soak(tuple(_held_against(course, answers, memory, recorded, hottest)), hours,
+                time.monotonic() - started, answers, dict(happened), memory, recorded, hottest,
+                float(np.mean(course.errors()[1])) if course.samples else math.nan)
+
+
+def _let_happen(rig: Rig, until: float, random: np.random.Generator, happened: Counter[str],
+                looks: dict[str, list[tuple[float, float]]],
+                on_progress: Callable[[float], None]) -> None:
+    look = until / _LOOKS
+    due = rig.now + random.exponential(_EVENT_PERIOD)
+    for number in range(1, _LOOKS + 1):
+        while due < number * look:
+            rig.run_until(due)
+            name, play = EVENTS[random.integers(len(EVENTS))]
+            happened[name] += 1
+            play(rig, random)
+            due = rig.now + random.exponential(_EVENT_PERIOD)
+        rig.run_until(number * look)
+        for name, process in rig.processes.items():
+            looks.setdefault(name, []).append((rig.now, _resident(process.process.pid)))
+        on_progress(number / _LOOKS)
+
+
+def _resident(pid: int) -> float:
+    """Return the resident memory of a process in MB."""
+    lines = Path(f'/proc/{pid}/status').read_text().splitlines()
+    kilobytes = next(line.split()[1] for line in lines if line.startswith('VmRSS'))
+    return int(kilobytes) * 1024 / _MEGABYTE
+
+
+def _held_against(course: Course, answers: Account, memory: dict[str, Memory],
+                  recorded: dict[str, int], hottest: float) -> Iterator[str]:
+    yield from course.complaints
+    if not answers.complete:
+        yield (f'of {answers.measurements} measurements {answers.unanswered} were not answered; '
+               f'{answers.repeated} answers were repeated, {answers.unasked} unasked, '
+               f'{answers.out_of_order} out of order')
+    usual = ControllerParameters()
+    wild = [command for command in course.commands
+            if not usual.coolant_min <= command.celsius <= usual.coolant_max]
+    if wild:
+        yield (f'{len(wild)} commands are not within {usual.coolant_min:g} to '
+               f'{usual.coolant_max:g} degC, the first {wild[0].celsius:g} degC at '
+               f'{wild[0].seconds:.0f} s')
+    if not hottest < RUNAWAY:
+        yield f'the reactor reached {hottest:.1f} degC'
+    for name, seen in memory.items():
+        if not seen.growth <= _GROWTH:
+            yield (f'{name} grew by {seen.growth:.1f} MB after it was warm, {_GROWTH:g} MB are '
+                   'allowed')
+    for topic, heard in (('/temperature', len(course.delivered)),
+                         ('/coolant_setpoint', len(course.commands))):
+        if recorded.get(topic) != heard:
+            yield f'the bag holds {recorded.get(topic, 0)} of {heard} messages on {topic}'

@@ -1,0 +1,63 @@
+# SPDX-FileCopyrightText: 2026 The koopman_ros Authors
+# SPDX-License-Identifier: Apache-2.0
+
+"""
+The paper's experiments, and those on data from a sensor: figures, tables and a report.
+
+Run it as ``python -m validation.paper`` (needs the `train` and `demo` requirements).
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+from pathlib import Path
+import signal
+import sys
+import time
+
+from koopman_ros import __version__
+from validation.paper.campaign import run_campaign
+from validation.paper.figures import draw_figures
+from validation.paper.report import write_report
+
+
+def main(args: list[str] | None = None) -> int:
+    """Run the experiments and write what they found."""
+    parser = argparse.ArgumentParser(
+        prog='python -m validation.paper',
+        description="Reproduce the paper's experiments, or learn from sensor data, each from "
+        'several seeds.')
+    parser.add_argument('--seeds', type=int, default=20, help='number of seeds, at least 1 '
+                        '(default: %(default)s)')
+    parser.add_argument('--sensors', action='store_true', help='learn from noisy, sampled data '
+                        "instead of the paper's experiments")
+    parser.add_argument('--output', type=Path, help='folder for figures and report (default: '
+                        'out/studies, or out/studies-sensors)')
+    options = parser.parse_args(args)
+    options.output = options.output or Path(
+        'out/studies-sensors' if options.sensors else 'out/studies')
+    if options.seeds < 1:
+        parser.error(f'--seeds is {options.seeds}, must be at least 1')
+    options.output.mkdir(parents=True, exist_ok=True)
+    # a request to end is an interrupt: what is done is reported
+    signal.signal(signal.SIGTERM, signal.default_int_handler)
+    start = time.monotonic()
+    campaign = run_campaign(options.seeds, of_sensors=options.sensors)
+    summary = {
+        'package_version': __version__, 'seeds': options.seeds, 'complete': campaign.complete,
+        'errors': campaign.errors, 'wall_seconds': round(time.monotonic() - start, 1),
+        **campaign.summary()}
+    (options.output / 'summary.json').write_text(
+        json.dumps(summary, indent=2, allow_nan=False) + '\n')
+    figures = draw_figures(campaign, options.output)
+    write_report(summary, figures, options.output / 'report.md')
+    for line in campaign.errors:
+        print(f'failed: {line}', file=sys.stderr)
+    print(f'wrote {options.output}/report.md, summary.json and {len(figures)} figures in '
+          f'{time.monotonic() - start:.0f} s')
+    return 0 if campaign.complete and not campaign.errors else 1
+
+
+if __name__ == '__main__':
+    sys.exit(main())

@@ -1,0 +1,148 @@
+# SPDX-FileCopyrightText: 2026 The koopman_ros Authors
+# SPDX-License-Identifier: Apache-2.0
+
+"""All experiments over a number of seeds, side by side on the cores of the machine."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import dataclass, field
+import math
+import os
+import sys
+from typing import Any
+
+import joblib
+from tqdm import tqdm
+
+from koopman_ros.lifting import LiftedModel
+from validation.paper import reactor, scalar, sensors, two_state
+from validation.paper.outcome import Metrics, Models
+
+# Each experiment with the place of its figures in the summary; the slow ones first.
+EXPERIMENTS: dict[str, Callable[[int], tuple[Metrics, Models]]] = {
+    'reactor': reactor.run,
+    'two_state': two_state.run,
+    'narrow': two_state.run_narrow,
+    'paper_algorithm/reactor': reactor.run_paper,
+    'paper_algorithm/two_state': two_state.run_paper,
+    'scalar': scalar.run,
+}
+# The same for what the paper leaves open: data from a sensor.
+SENSOR_EXPERIMENTS: dict[str, Callable[[int], tuple[Metrics, Models]]] = {
+    'sensors/drifted': sensors.run_drifted,
+    'sensors/noisy': sensors.run_noisy,
+    'sensors/noise_free': sensors.run_noise_free,
+    'sensors/two_state': sensors.run_two_state,
+}
+
+
+@dataclass
+class Campaign:
+    """
+    What has been computed so far.
+
+    :param metrics: figures by experiment and seed.
+    :param models: learned models by experiment and seed, for the figures.
+    :param errors: one line for each run that failed.
+    :param complete: whether every run was made.
+    """
+
+    metrics: dict[str, dict[int, Metrics]] = field(default_factory=dict)
+    models: dict[str, dict[int, Mapping[str, LiftedModel]]] = field(default_factory=dict)
+    errors: list[str] = field(default_factory=list)
+    complete: bool = False
+
+    def summary(self) -> dict[str, Any]:
+        """Nest the figures: experiment, its parts, then one list over the seeds."""
+        nested: dict[str, Any] = {}
+        for experiment, by_seed in self.metrics.items():
+            seeds = sorted(by_seed)
+            flat = {seed: dict(_flattened(by_seed[seed])) for seed in seeds}
+            names = dict.fromkeys(name for seed in seeds for name in flat[seed])
+            for name in names:
+                *path, last = f'{experiment}/{name}'.split('/')
+                place = nested
+                for part in path:
+                    place = place.setdefault(part, {})
+                place[last] = [flat[seed].get(name) for seed in seeds]
+        return nested
+
+
+def run_campaign(seeds: int, *, of_sensors: bool = False) -> Campaign:
+    """
+    Run every experiment for the seeds 0 ... `seeds` - 1; an interrupt keeps what is done.
+
+    joblib spreads the runs over the cores; within ``joblib.parallel_config(...)`` they go where
+    that says.
+
+    :param seeds: number of seeds.
+    :param of_sensors: whether to run the experiments on data from a sensor instead of the
+        paper's.
+    """
+    experiments = SENSOR_EXPERIMENTS if of_sensors else EXPERIMENTS
+    campaign = Campaign()
+    # seed by seed, so that an interrupted campaign is whole for the first ones
+    runs = [(name, seed) for seed in range(seeds) for name in experiments]
+    jobs = joblib.parallel.get_active_backend()[1] or len(os.sched_getaffinity(0))
+    finished = joblib.Parallel(n_jobs=jobs, return_as='generator_unordered')(
+        joblib.delayed(_run)(name, seed, experiments[name]) for name, seed in runs)
+    try:
+        for name, seed, outcome in _shown(finished, len(runs)):
+            if isinstance(outcome, str):
+                campaign.errors.append(f'{name}, seed {seed}: {outcome}')
+                continue
+            campaign.metrics.setdefault(name, {})[seed] = outcome[0]
+            campaign.models.setdefault(name, {})[seed] = outcome[1]
+        campaign.complete = True
+    except KeyboardInterrupt:
+        print('interrupted: reporting on what is done', file=sys.stderr)
+    finally:
+        finished.close()
+    campaign.errors.sort()
+    return campaign
+
+
+def _run(name: str, seed: int, experiment: Callable[[int], tuple[Metrics, Models]]
+         ) -> tuple[str, int, tuple[Metrics, Models] | str]:
+    try:
+        return name, seed, experiment(seed)
+    except (ValueError, RuntimeError, ArithmeticError) as error:
+        # one run that fails must not take the others with it
+        return name, seed, f'{type(error).__name__}: {error}'
+
+
+def _shown(results: Iterator[Any], total: int) -> Iterator[Any]:
+    """Pass results on and show how many there are."""
+    terminal = sys.stderr.isatty()
+    with tqdm(total=total, unit='run', disable=not terminal) as bar:
+        for number, (name, seed, outcome) in enumerate(results, 1):
+            text = f'{name}, seed {seed}{_best_rw(outcome)}'
+            if terminal:
+                bar.set_postfix_str(text, refresh=False)
+                bar.update()
+            else:
+                print(f'{number}/{total}: {text}', file=sys.stderr, flush=True)
+            yield name, seed, outcome
+
+
+def _best_rw(outcome: tuple[Metrics, Models] | str) -> str:
+    if isinstance(outcome, str):
+        return ' failed'
+    found = [value for name, value in outcome[0].items()
+             if name.split('/')[-1] in ('rw', 'rw_in') and isinstance(value, float)]
+    return f', rw {min(found):.1e}' if found else ''
+
+
+def _flattened(metrics: Metrics) -> Iterator[tuple[str, float | bool | None]]:
+    for name, value in metrics.items():
+        if isinstance(value, dict):
+            for key, entry in value.items():
+                yield f'{name}/{key}', _finite(entry)
+        else:
+            yield name, _finite(value)
+
+
+def _finite(value: float | bool | None) -> float | bool | None:
+    """Return None for what JSON cannot hold."""
+    return value if value is None or math.isfinite(value) else None

@@ -1,0 +1,326 @@
+# SPDX-FileCopyrightText: 2026 The koopman_ros Authors
+# SPDX-License-Identifier: Apache-2.0
+
+"""The figures of the paper's results, one file each."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import matplotlib
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+import numpy as np
+
+from koopman_ros.control import ClosedLoop
+from koopman_ros.learning import roll_out, Samples
+from koopman_ros.lifting import LiftedModel
+from koopman_ros.plants import RandomStepDesign
+from validation.paper import reactor, scalar, two_state
+from validation.paper.boxes import draw_box
+from validation.paper.campaign import Campaign
+from validation.paper.datasets import random_step_episodes
+
+matplotlib.use('Agg')
+from matplotlib import pyplot
+
+# The paper's colours.
+EXACT: dict[str, Any] = {'color': 'black', 'linewidth': 1.8}
+LEARNED: dict[str, Any] = {'color': 'tab:green', 'linestyle': '--', 'linewidth': 1.8}
+LINEAR: dict[str, Any] = {'color': 'tab:red', 'linewidth': 1.2}
+RANGE: dict[str, Any] = {'color': '0.9', 'zorder': 0}
+LIMIT: dict[str, Any] = {'color': '0.5', 'linestyle': ':', 'linewidth': 1.0}
+FIGURE_SEED = 0
+FIGURE_NARROW_BOX = '[4,5.5]x[4,5.5]'
+
+
+@dataclass(frozen=True)
+class Drawn:
+    """
+    A figure that was drawn.
+
+    :param file: name of the file.
+    :param caption: what it shows, with its numbers.
+    """
+
+    file: str
+    caption: str
+
+
+def draw_figures(campaign: Campaign, folder: Path) -> list[Drawn]:
+    """Draw every figure whose experiment has been run; return them in the paper's order."""
+    drawn = []
+    for name, experiments, draw in (
+            ('01_scalar_example', ('scalar',), _scalar),
+            ('02_two_state_derivatives', ('two_state',), _wide_derivatives),
+            ('03_two_state_control', ('two_state',), _wide_control),
+            ('04_reactor_in_range', ('reactor',), _in_range),
+            ('05_reactor_out_of_range', ('reactor',), _out_of_range),
+            ('06_reactor_set_point', ('reactor',), _set_point),
+            ('07_wide_box', ('two_state',), _wide_box),
+            ('08_narrow_derivatives', ('narrow',), _narrow_derivatives),
+            ('09_narrow_control', ('narrow', 'two_state'), _narrow_control),
+            ('10_narrow_box', ('narrow',), _narrow_box),
+            ('11_both_boxes', ('narrow', 'two_state'), _both_boxes),
+            ('12_sensors', ('sensors/noisy', 'sensors/noise_free', 'sensors/drifted',
+                            'sensors/two_state'), _sensors)):
+        if all(name in campaign.models for name in experiments):
+            caption = draw(campaign, folder / f'{name}.png')
+            drawn.append(Drawn(f'{name}.png', caption))
+    return drawn
+
+
+@contextmanager
+def _figure(path: Path, rows: int = 1, columns: int = 1, size: tuple[float, float] = (7.0, 4.5),
+            **options: Any) -> Iterator[tuple[Figure, list[Axes]]]:
+    figure, axes = pyplot.subplots(rows, columns, figsize=size, squeeze=False,
+                                   layout='constrained', **options)
+    try:
+        yield figure, list(axes.ravel())
+        figure.savefig(path, dpi=150)
+    finally:
+        pyplot.close(figure)
+
+
+def _models(campaign: Campaign, experiment: str) -> dict[str, LiftedModel]:
+    """Return the models of the first seed that was finished."""
+    by_seed = campaign.models[experiment]
+    return dict(by_seed[min(by_seed)])
+
+
+def _scalar(campaign: Campaign, path: Path) -> str:
+    model = _models(campaign, 'scalar')['scalar']
+    x = np.linspace(0.0, 8.0, 801)
+    at = 2.5
+    # within these bounds the tangent is within 10 % of x^2
+    reach = np.array([1.0 / (1.0 + np.sqrt(0.1)), 1.0 / (1.0 - np.sqrt(0.1))]) * at
+    xi = model.states.to_deviation(x[:, None])
+    z, J = model.lift_and_jacobian(xi)
+    exact = (J[:, :, 0] * (x * x)[:, None] / model.states.scale)[:, 0]
+    linear = (z @ model.A.T)[:, 0]
+    scale = 1.0 / np.max(np.abs(exact[x <= 5.0]))
+    with _figure(path, 1, 2, (10.0, 4.3)) as (_, (left, right)):
+        left.axvspan(*scalar.RANGE, label='training range', **RANGE)
+        left.plot(x, x * x, color='tab:blue', label='$\\dot x = x^2$')
+        left.plot(x, at * at + 2.0 * at * (x - at), label='linearisation', **LINEAR)
+        left.plot([at], [at * at], 'o', color='tab:red', label='operating point')
+        for bound in reach:
+            left.axvline(bound, color='tab:red', linestyle='--', linewidth=1.0)
+        left.plot([], [], color='tab:red', linestyle='--', label='linearisation within 10 %')
+        left.set(xlabel='x', ylabel='dx/dt  [1/s]', ylim=(-6.0, 66.0), xlim=(0.0, 8.0))
+        left.legend(loc='upper left')
+        right.axvspan(*scalar.RANGE, label='training range', **RANGE)
+        right.plot(x, scale * exact, label='chain rule  $J_N(x)\\,\\dot x$', **EXACT)
+        right.plot(x, scale * linear, color='tab:red', linestyle='--', linewidth=1.8,
+                   label='learned  $A\\,N(x)$')
+        right.set(xlabel='x', ylabel='dz/dt  (largest in range = 1)', xlim=(0.0, 8.0))
+        right.legend(loc='lower right')
+    off = abs(exact[-1] - linear[-1]) / abs(exact[-1])
+    return ('The motivating example. The learned lift holds on the whole training range, the '
+            f'linearisation from x = {reach[0]:.2g} to {reach[1]:.2g}. At x = 8, outside the '
+            f'range, A z is {100 * off:.2g} % off.')
+
+
+def _episode(box: two_state.Box) -> Samples:
+    """Simulate one training trajectory that is long enough to look at."""
+    return two_state.samples(box, FIGURE_SEED, episodes=1, duration=3.0)
+
+
+def _derivatives(model: LiftedModel, box: two_state.Box, path: Path) -> float:
+    """Draw both sides of the lifted dynamics; return the largest relative difference."""
+    episode = _episode(box)
+    assert episode.time is not None
+    xi = model.states.to_deviation(episode.x)
+    push = model.inputs.to_deviation(episode.u) @ model.B.T
+    z, J = model.lift_and_jacobian(xi)
+    exact = (J @ (episode.dxdt / model.states.scale)[..., None])[..., 0]
+    linear = z @ model.A.T + (J @ push[..., None])[..., 0]
+    with _figure(path, 3, 1, (7.0, 6.5), sharex=True) as (_, axes):
+        for i, axis in enumerate(axes):
+            axis.step(episode.time, exact[:, i], where='post',
+                      label='chain rule  $J_N(x)\\,\\dot x$', **EXACT)
+            axis.step(episode.time, linear[:, i], where='post', color='tab:red',
+                      linestyle='--', linewidth=1.8, label='learned  $A z + J_N(x) B u$')
+            axis.set(ylabel=f'dz$_{i + 1}$/dt  [1/s]')
+        axes[0].legend(loc='best')
+        axes[-1].set(xlabel='time  [s]')
+    return float(np.max(np.abs(exact - linear)) / np.max(np.abs(exact)))
+
+
+def _wide_derivatives(campaign: Campaign, path: Path) -> str:
+    off = _derivatives(_models(campaign, 'two_state')['wide'], two_state.WIDE, path)
+    return ('Time derivatives of the lifted coordinates (scaled) along a training trajectory; '
+            f'the two sides differ by at most {off:.1e} of the largest.')
+
+
+def _control(path: Path, loops: list[tuple[str, dict[str, Any], ClosedLoop]], until: float
+             ) -> None:
+    with _figure(path, 1, 2, (10.0, 4.0)) as (_, (state, action)):
+        for label, style, loop in loops:
+            state.plot(loop.times, loop.states[:, 1], label=label, **style)
+            action.plot(loop.times, loop.inputs[:, 0], label=label, **style)
+        state.axhline(0.0, label='reference', **LIMIT)
+        state.set(xlabel='time  [s]', ylabel='unstable state x$_2$', xlim=(-0.02 * until, until))
+        action.set(xlabel='time  [s]', ylabel='control action u  [1/s]',
+                   xlim=(-0.02 * until, until))
+        state.legend()
+
+
+def _wide_control(campaign: Campaign, path: Path) -> str:
+    models = _models(campaign, 'two_state')
+    exact = two_state.exact_loop(1.0)
+    loops = {name: two_state.close_loop(models[name], 1.0) for name in ('linear', 'wide')}
+    _control(path, [('linearisation', LINEAR, loops['linear']), ('exact lift', EXACT, exact),
+                    ('learned lift', LEARNED, loops['wide'])], 30.0)
+    return ('Control of the two-state example from (5, 5), R = 1. Costs: exact '
+            f'{exact.cost:.2f}, learned {loops["wide"].cost:.2f}, linearised '
+            f'{loops["linear"].cost:.2f}.')
+
+
+def _narrow_control(campaign: Campaign, path: Path) -> str:
+    seed, model = worst_narrow(campaign)
+    linear = _models(campaign, 'two_state')['linear']
+    loop = two_state.close_loop(model, 1.0)
+    _control(path, [('linearisation', LINEAR, two_state.close_loop(linear, 1.0)),
+                    ('exact lift', EXACT, two_state.exact_loop(1.0)),
+                    (f'learned on {FIGURE_NARROW_BOX}', LEARNED, loop)], 30.0)
+    end = loop.failure or f'x2 ends at {loop.states[-1, 1]:.3g}'
+    return (f'The same control with a lift learned on the narrow box, seed {seed}: {end}.')
+
+
+def _narrow_derivatives(campaign: Campaign, path: Path) -> str:
+    seed, model = worst_narrow(campaign)
+    off = _derivatives(model, two_state.NARROW[FIGURE_NARROW_BOX], path)
+    return (f'As figure 2, for the narrow box, seed {seed}: within the box the two sides differ '
+            f'by at most {off:.1e} of the largest, and nothing warns.')
+
+
+def worst_narrow(campaign: Campaign) -> tuple[int, LiftedModel]:
+    """Return the seed whose narrow lift controls worst among those that go on to the end."""
+    def badness(seed: int) -> float:
+        end = campaign.metrics['narrow'][seed][f'{FIGURE_NARROW_BOX}/final_distance']
+        return -1.0 if end is None else float(end)  # type: ignore[arg-type]
+
+    seed = max(sorted(campaign.models['narrow']), key=badness)
+    return seed, campaign.models['narrow'][seed][FIGURE_NARROW_BOX]
+
+
+def _reactor_roll_out(campaign: Campaign, path: Path, design: RandomStepDesign) -> str:
+    models = _models(campaign, 'reactor')
+    truth = random_step_episodes(reactor.SYSTEM, design, 1, 60.0, 77)
+    assert truth.time is not None
+    errors = {}
+    with _figure(path, 2, 1, (8.0, 5.5), sharex=True, height_ratios=(3, 1)) as (_, (top, low)):
+        box = models['nz=3'].states
+        top.axhspan(box.lower[0], box.upper[0], label='training range', **RANGE)
+        top.plot(truth.time, truth.x[:, 0], label='reactor', **EXACT)
+        for name, label, style in (('nz=3', 'learned lift, n$_z$ = 3', LEARNED),
+                                   ('linear', 'linearisation', LINEAR)):
+            predicted = roll_out(models[name], truth.x[0], truth.u[:-1], np.diff(truth.time))
+            errors[name] = float(np.sqrt(np.mean((predicted - truth.x) ** 2)))
+            top.plot(truth.time, predicted[:, 0], label=label, **style)
+        top.set(ylabel='temperature  [K]')
+        top.legend(loc='best', ncols=2)
+        inputs = models['nz=3'].inputs
+        low.axhspan(inputs.lower[0], inputs.upper[0], **RANGE)
+        low.step(truth.time, truth.u[:, 0], where='post', color='tab:blue')
+        low.set(ylabel='coolant  [K]', xlabel='time  [min]')
+    return (f'root mean square error: learned {errors["nz=3"]:.2g} K, linearised '
+            f'{errors["linear"]:.2g} K.')
+
+
+def _in_range(campaign: Campaign, path: Path) -> str:
+    return 'Fresh random coolant steps within the training range; ' + _reactor_roll_out(
+        campaign, path, reactor.IN_RANGE)
+
+
+def _out_of_range(campaign: Campaign, path: Path) -> str:
+    return 'Fresh random coolant steps that leave the training range; ' + _reactor_roll_out(
+        campaign, path, reactor.OUT_OF_RANGE)
+
+
+def _set_point(campaign: Campaign, path: Path) -> str:
+    models = _models(campaign, 'reactor')
+    offsets = {}
+    with _figure(path, 2, 1, (7.0, 5.5), sharex=True) as (_, (top, low)):
+        top.axhline(reactor.SETPOINT, label='set-point T$_{ss}$ − 10 K', **LIMIT)
+        for name, label, style in (
+                ('linear', 'linearisation', LINEAR),
+                ('nz=3', 'learned lift, n$_z$ = 3', {**LEARNED, 'linestyle': '-'})):
+            loop = reactor.close_loop(models[name])
+            offsets[name] = abs(loop.states[-1, 0] - reactor.SETPOINT)
+            top.plot(loop.times, loop.states[:, 0], label=label, **style)
+            low.plot(loop.times, loop.inputs[:, 0], label=label, **style)
+        top.set(ylabel='temperature  [K]')
+        low.set(ylabel='coolant  [K]', xlabel='time  [min]', xlim=(0.0, 10.0))
+        top.legend()
+    return ('Set-point tracking to T_ss - 10 K, R = 1: the learned lift ends '
+            f'{offsets["nz=3"]:.1e} K off, the linearised controller {offsets["linear"]:.3f} K.')
+
+
+Draw3D = Callable[..., None]
+
+
+def _wide_box(campaign: Campaign, path: Path) -> str:
+    loop = two_state.close_loop(_models(campaign, 'two_state')['wide'], 1.0)
+    draw_box(path, [('wide box', 'gold', two_state.WIDE, loop, 'tab:red')])
+    return 'The wide training box holds the whole path of the controlled system.'
+
+
+def _narrow_box(campaign: Campaign, path: Path) -> str:
+    seed, model = worst_narrow(campaign)
+    box = two_state.NARROW[FIGURE_NARROW_BOX]
+    loop = two_state.close_loop(model, 1.0)
+    draw_box(path, [('narrow box', 'gold', box, loop, 'tab:red')])
+    return (f'The narrow training box, seed {seed}: the path starts in it and leaves it, by up '
+            f'to {loop.distance(model):.2g} times half its width.')
+
+
+def _both_boxes(campaign: Campaign, path: Path) -> str:
+    _, narrow = worst_narrow(campaign)
+    wide = _models(campaign, 'two_state')['wide']
+    draw_box(path, [
+        ('wide box', 'none', two_state.WIDE, two_state.close_loop(wide, 1.0), 'tab:green'),
+        ('narrow box', 'grey', two_state.NARROW[FIGURE_NARROW_BOX],
+         two_state.close_loop(narrow, 1.0), 'tab:red')])
+    return 'Both boxes and paths in one picture: the same start, another training range.'
+
+
+def _sensors(campaign: Campaign, path: Path) -> str:
+    def values(experiment: str, name: str) -> list[float]:
+        found = campaign.metrics[f'sensors/{experiment}']
+        return [float(found[seed][name]) for seed in sorted(found)]  # type: ignore[arg-type]
+
+    with _figure(path, 1, 3, (12.0, 4.2)) as (_, (left, middle, right)):
+        for experiment, label, color in (('noisy', 'noise of 0.1 K', 'tab:blue'),
+                                         ('noise_free', 'no noise', 'tab:green')):
+            left.semilogy(values(experiment, 'rollout_kelvin'), 'o', color=color, label=label)
+        for bound, label in ((0.05, 'held to, noisy'), (0.01, 'held to, no noise')):
+            left.axhline(bound, label=label, **{
+                **LIMIT, 'linestyle': ':' if bound > 0.02 else '--'})
+        left.set(ylabel='roll-out error [K]', title='an hour of data')
+        for name, label, color in (('offset_before_kelvin', 'present lift', 'tab:red'),
+                                   ('offset_after_kelvin', 'new lift', 'tab:green')):
+            middle.semilogy(values('drifted', name), 'o', color=color, label=label)
+        before = np.array(values('drifted', 'offset_before_kelvin'))
+        middle.plot(before / 20.0, '_', color='0.4', markersize=12, label='held to: a 20th')
+        middle.set(ylabel='offset from the set-point [K]', title='cooling jacket fouled')
+        for name, label, color in (('linear_kelvin', 'best linear model', 'tab:red'),
+                                   ('heldout_kelvin', 'lift', 'tab:blue'),
+                                   ('noise_kelvin', 'noise', '0.5')):
+            right.plot(values('two_state', name), 'o', color=color, label=label)
+        right.set(ylabel='error on held-out measurements [K]', ylim=(0.0, None),
+                  title='one temperature of two states')
+        for axes in (left, middle, right):
+            axes.set_xlabel('seed')
+            axes.legend(fontsize=8)
+            axes.grid(alpha=0.3)
+    worst = max(values('noisy', 'rollout_kelvin'))
+    return (f'Lifts learned from a sensor: with noise of 0.1 K the worst of {len(before)} seeds '
+            f'predicts to {worst:.2g} K; after fouling the largest offset left is '
+            f'{max(values("drifted", "offset_after_kelvin")):.2g} K; where a state is not '
+            'measured the error stays above the noise.')

@@ -1,0 +1,170 @@
+# SPDX-FileCopyrightText: 2026 The koopman_ros Authors
+# SPDX-License-Identifier: Apache-2.0
+
+"""The one-state reactor: lifts of 2 to 5 coordinates, baselines, and Algorithm 1."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.integrate import solve_ivp
+
+from koopman_ros.control import ClosedLoop, run_closed_loop, steady_state_target, Weights
+from koopman_ros.learning import (
+    Algorithm1,
+    Edmd,
+    fit,
+    Growth,
+    Linearisation,
+    NoUsefulLift,
+    rollout_rmse,
+    Samples,
+    train,
+)
+from koopman_ros.lifting import LiftedModel
+from koopman_ros.plants import equilibrium_input, one_state_reactor, RandomStepDesign
+from validation.paper.datasets import box_episodes, describe, random_step_episodes
+from validation.paper.optimal_control import scalar_optimal_cost
+from validation.paper.outcome import Metrics, Models
+
+SYSTEM = one_state_reactor()
+START = float(SYSTEM.nominal_state[0])
+SETPOINT = START - 10.0
+UNIT = 10.0  # K, in which deviations of temperature and coolant are weighed
+INPUT_WEIGHT = 1.0
+HORIZON = 30.0  # min
+LIFTED_SIZES = (2, 3, 4, 5)
+STARTS = 4
+# Coolant and reactor in K, times in min. The coolant moves the reactor through the box from end
+# to end, short of the fold at 329.37 K beyond which a coolant held warmer lets it run away.
+TRAINING = RandomStepDesign(
+    input_lower=281.3, input_upper=301.1, state_lower=305.0, state_upper=327.0,
+    hold_time=(0.5, 1.0), sample_period=0.25)
+IN_RANGE = RandomStepDesign(
+    input_lower=281.3, input_upper=300.9, state_lower=305.0, state_upper=327.0,
+    hold_time=(2.0, 10.0), sample_period=0.25)
+OUT_OF_RANGE = RandomStepDesign(
+    input_lower=270.0, input_upper=301.1, state_lower=293.0, state_upper=329.3,
+    hold_time=(2.0, 10.0), sample_period=0.25)
+RECIPE = Growth(max(LIFTED_SIZES), max_iterations=600)
+EDMD_DEGREE = 5
+
+
+def training_samples(seed: int) -> Samples:
+    """Simulate 240 episodes of 1 min under random coolant steps from anywhere in the box."""
+    return box_episodes(SYSTEM, TRAINING, 240, 1.0, seed)
+
+
+def test_samples(design: RandomStepDesign, seed: int) -> Samples:
+    """Simulate 10 fresh episodes of 30 min."""
+    return random_step_episodes(SYSTEM, design, 10, 30.0, 10_000 * seed + 5_000)
+
+
+def close_loop(model: LiftedModel) -> ClosedLoop:
+    """
+    Move the true reactor from T_ss to T_ss - 10 K with the model's controller.
+
+    The cost is the integral of e^2 + v^2, e and v the deviations from the set-point and from
+    the coolant that really holds it, in units of 10 K.
+    """
+    weights = Weights(np.diag((model.states.scale / UNIT) ** 2),
+                      INPUT_WEIGHT * np.diag((model.inputs.scale / UNIT) ** 2))
+    return run_closed_loop(
+        model, SYSTEM.derivative, np.array([START]), np.array([SETPOINT]), weights, HORIZON,
+        u_ref=equilibrium_input(SYSTEM, [SETPOINT]))
+
+
+def feed_forward_offset(model: LiftedModel) -> float:
+    """Return where the reactor settles under the model's steady-state coolant alone, in K."""
+    target = steady_state_target(model, model.states.to_deviation(np.array([SETPOINT])))
+    coolant = model.inputs.to_physical(target.u)
+    end = solve_ivp(lambda _, x: SYSTEM.derivative(x, coolant), (0.0, 60.0), [START],
+                    method='DOP853', rtol=1e-10, atol=1e-10).y[0, -1]
+    return abs(float(end) - SETPOINT)
+
+
+@dataclass(frozen=True)
+class Judge:
+    """
+    Fresh episodes to judge models on.
+
+    :param held_out: made like the training episodes.
+    :param inside: longer ones within the range.
+    :param outside: longer ones that leave it.
+    """
+
+    held_out: Samples
+    inside: Samples
+    outside: Samples
+
+    @staticmethod
+    def of(seed: int) -> Judge:
+        """Simulate the episodes of a seed."""
+        return Judge(training_samples(1000 + seed), test_samples(IN_RANGE, seed),
+                     test_samples(OUT_OF_RANGE, seed))
+
+    def figures(self, model: LiftedModel) -> Metrics:
+        """
+        Judge a model on the episodes and on the task of the paper.
+
+        :return: `rw`, `cond`; `rollout_rmse_in_kelvin` and `rollout_rmse_out_kelvin` (None when
+            it diverges); `tracking_offset_kelvin`, `cost_ratio_to_optimum` (over 30 min, R = 1)
+            and `feed_forward_offset_kelvin`.
+        """
+        found = fit(model, self.held_out.x, self.held_out.dxdt, self.held_out.u)
+        loop = close_loop(model)
+        failed = bool(loop.failure)
+        optimum = scalar_optimal_cost(SYSTEM, START, SETPOINT, INPUT_WEIGHT, UNIT)
+        return {
+            'rw': found.rw, 'cond': found.cond,
+            'rollout_rmse_in_kelvin': _kelvin(model, self.inside),
+            'rollout_rmse_out_kelvin': _kelvin(model, self.outside),
+            'tracking_offset_kelvin': (
+                None if failed else abs(float(loop.states[-1, 0]) - SETPOINT)),
+            'cost_ratio_to_optimum': None if failed else loop.cost / optimum,
+            'feed_forward_offset_kelvin': feed_forward_offset(model)}
+
+
+def _kelvin(model: LiftedModel, samples: Samples) -> float | None:
+    error = rollout_rmse(model, samples)
+    assert error is not None
+    return float(error[0]) if np.isfinite(error[0]) else None
+
+
+def run(seed: int) -> tuple[Metrics, Models]:
+    """
+    Grow lifts of 2 to 5 coordinates and set them beside the baselines.
+
+    :return: figures named ``nz=<n>/<figure>``, ``linear/<figure>`` and ``edmd/<figure>``.
+    """
+    samples, plant = training_samples(seed), describe(SYSTEM)
+    models = {f'nz={model.n_z}': model for model in train(
+        plant, samples, RECIPE, seed=seed, starts=STARTS, refuse=False).path}
+    models['linear'] = Linearisation(SYSTEM.drift_jacobian(SYSTEM.nominal_state)).learn(
+        plant, samples)
+    models['edmd'] = Edmd(EDMD_DEGREE).learn(plant, samples)
+    return _named(models, seed), models
+
+
+def run_paper(seed: int) -> tuple[Metrics, Models]:
+    """
+    Run Algorithm 1 once for each size, with a free lift and its decoder.
+
+    :return: as :func:`run`; the figures of a degenerate lift are missing.
+    """
+    samples, models = training_samples(seed), {}
+    for n_z in LIFTED_SIZES:
+        try:
+            recipe = Algorithm1(n_z, max_iterations=100)
+            models[f'nz={n_z}'] = train(describe(SYSTEM), samples, recipe, seed=seed, starts=1,
+                                        refuse=False).model
+        except NoUsefulLift:
+            continue
+    return _named(models, seed), {f'paper_{name}': model for name, model in models.items()}
+
+
+def _named(models: dict[str, LiftedModel], seed: int) -> Metrics:
+    judge = Judge.of(seed)
+    return {f'{name}/{figure}': value for name, model in models.items()
+            for figure, value in judge.figures(model).items()}

@@ -1,0 +1,265 @@
+# SPDX-FileCopyrightText: 2026 The koopman_ros Authors
+# SPDX-License-Identifier: Apache-2.0
+
+
+"""Lifts from what a sensor sees: sampled, noisy, of a plant that drifted, of half the state."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from koopman_ros.control import Controller, InputLimits, Settings, State
+from koopman_ros.control import experiment as experiments
+from koopman_ros.identification import Identified, identify, Record
+from koopman_ros.learning import NoUsefulLift, roll_out, Trained
+from koopman_ros.lifting import Coordinates, LiftedModel, linearised_model, Provenance
+from koopman_ros.plants import (
+    ControlAffineSystem,
+    one_state_reactor,
+    Process,
+    random_steps,
+    RandomStepDesign,
+    ReactorParameters,
+    two_state_reactor,
+)
+from koopman_ros.retraining import judge, learn_lift, Thresholds, Verdict
+from validation.paper.outcome import Metrics, Models
+from validation.paper.reactor import SETPOINT, SYSTEM
+
+Array = NDArray[np.float64]
+
+NOISE = 0.1  # K
+MINUTES = 60.0
+PERIOD = 1.0 / 60.0  # min
+HEAT_TRANSFER_LEFT = 0.8
+N_Z = 3
+STARTS = 3
+# Coolant and reactor in K, times in min.
+DESIGN = RandomStepDesign(
+    input_lower=281.33, input_upper=300.55, state_lower=305.0, state_upper=327.0,
+    hold_time=(0.5, 2.0), sample_period=PERIOD, rtol=1e-9)
+FOULED_DESIGN = replace(DESIGN, input_lower=275.4, input_upper=293.9)
+# Around the stable point of the reactor whose concentration moves.
+TWO_STATE_DESIGN = replace(DESIGN, input_lower=294.0, input_upper=302.0, state_lower=[0.0, 305.0],
+                           state_upper=[1.0, 340.0])
+_TESTS = 4
+_TEST_MINUTES = 15.0
+_NS = 1_000_000_000
+
+
+@dataclass(frozen=True)
+class _Learned:
+    found: Identified
+    trained: Trained
+
+
+def run_noisy(seed: int) -> tuple[Metrics, Models]:
+    """
+    Learn from an hour of a noisy sensor, B unknown.
+
+    :return: `rollout_kelvin` (root mean square over an hour of fresh random steps without
+        noise), `input_gain_error` (relative), `rw`, `cond`, `degree`,
+        `noise_kelvin` as estimated.
+    """
+    return _judged_on_truth(seed, NOISE)
+
+
+def run_noise_free(seed: int) -> tuple[Metrics, Models]:
+    """Learn from the same hour without noise; figures as in :func:`run_noisy`."""
+    return _judged_on_truth(seed, 0.0)
+
+
+def run_drifted(seed: int) -> tuple[Metrics, Models]:
+    """
+    Retrain on a reactor whose cooling jacket has fouled, from its own loop and an experiment.
+
+    The present lift comes from an hour of noisy data of the clean reactor. The record is ten
+    minutes of the loop under that lift and fifty of an experiment.
+
+    :return: `offset_before_kelvin`, `offset_after_kelvin` (of the true temperature from the
+        set-point, mean over the last five minutes), `offset_ratio`, `accepted`,
+        `rollout_kelvin`, `input_gain_error`.
+    """
+    present = _learn(_measured(_drive(SYSTEM, DESIGN, seed), NOISE, seed), _like(), seed).trained
+    fouled = _fouled()
+    before = _controlled(fouled, present.model, SYSTEM.nominal_state, 15.0, seed)
+    loop = _controlled(fouled, present.model, SYSTEM.nominal_state, 10.0, seed + 1)
+    plan = experiments.Experiment(
+        duration=3000.0, input_lower=276.0, input_upper=293.6, hold_shortest=30.0,
+        hold_longest=150.0, rate=1.0, state_lower=300.0, state_upper=328.0, safe_input=286.0,
+        seed=seed)
+    driven = _experiment(fouled, plan, loop.x[-1], seed + 2)
+    learned = _learn([loop.record, driven.record], present.model, seed)
+    verdict = judge(learned.found, learned.trained, present.model, Thresholds())
+    after = _controlled(fouled, learned.trained.model, before.x[-1], 15.0, seed)
+    offsets = [abs(float(np.mean(run.x[-300:, 0])) - SETPOINT) for run in (before, after)]
+    return {
+        'offset_before_kelvin': offsets[0], 'offset_after_kelvin': offsets[1],
+        'offset_ratio': offsets[1] / offsets[0], 'accepted': verdict.accepted,
+        'rollout_kelvin': _roll_out_error(learned.trained.model, fouled, FOULED_DESIGN, seed),
+        'input_gain_error': _gain_error(learned.found, fouled),
+    }, {'present': present.model, 'new': learned.trained.model}
+
+
+def run_two_state(seed: int) -> tuple[Metrics, Models]:
+    """
+    Learn a lift of the temperature alone of a reactor whose concentration moves, too.
+
+    :return: `heldout_kelvin` (of the measurements, noise included), `noise_kelvin` as estimated,
+        `linear_kelvin` (of the best linear model), `rollout_kelvin`, `warned` (whether the report
+        says that something is not measured), `accepted`.
+    """
+    system = two_state_reactor()
+    path = _drive(system, TWO_STATE_DESIGN, seed)
+    record = _measured(path, NOISE, seed, state=1)
+    found = identify(record, seed=seed)
+    like = _like()
+    try:
+        trained = learn_lift(found, like, N_Z, seed=seed, starts=STARTS)
+    except NoUsefulLift:
+        return {'accepted': False, 'noise_kelvin': float(found.noise[0])}, {}
+    verdict: Verdict = judge(found, trained, like, Thresholds())
+    errors = []
+    for number in range(_TESTS):
+        truth = _drive(system, TWO_STATE_DESIGN, 10_000 * (seed + 1) + number, _TEST_MINUTES)
+        predicted = roll_out(trained.model, truth.x[0, 1:], truth.u[:-1], PERIOD)
+        errors.append(predicted[:, 0] - truth.x[:, 1])
+    return {
+        'heldout_kelvin': float(verdict.rmse[0]), 'noise_kelvin': float(verdict.noise[0]),
+        'linear_kelvin': float(verdict.linear_rmse[0]),
+        'rollout_kelvin': float(np.sqrt(np.mean(np.square(errors)))),
+        'warned': bool(verdict.warnings), 'accepted': verdict.accepted,
+    }, {'new': trained.model}
+
+
+@dataclass(frozen=True)
+class _Path:
+    """True states (N, n_x) and inputs (N, n_u) held from each sample on, one a second."""
+
+    x: Array
+    u: Array
+
+    @property
+    def time(self) -> Array:
+        """Times of the samples (N,), in min."""
+        return PERIOD * np.arange(len(self.x), dtype=np.float64)
+
+
+@dataclass(frozen=True)
+class _Run:
+    """A true path (N, n_x) and the record of its noisy measurements."""
+
+    x: Array
+    record: Record
+
+
+def _judged_on_truth(seed: int, noise: float) -> tuple[Metrics, Models]:
+    learned = _learn(_measured(_drive(SYSTEM, DESIGN, seed), noise, seed), _like(), seed)
+    model, fitted = learned.trained.model, learned.trained.report.fit
+    return {
+        'rollout_kelvin': _roll_out_error(model, SYSTEM, DESIGN, seed),
+        'input_gain_error': _gain_error(learned.found, SYSTEM),
+        'rw': fitted.rw, 'cond': fitted.cond, 'degree': float(learned.found.drift.degree),
+        'noise_kelvin': float(learned.found.noise[0]),
+    }, {'new': model}
+
+
+def _like() -> LiftedModel:
+    """Return a model with the names, units and nominal point of the reactor."""
+    lower, upper = np.array([305.0]), np.array([327.0])
+    states = Coordinates(SYSTEM.state_names, SYSTEM.state_units, SYSTEM.nominal_state,
+                         0.5 * (upper - lower), lower, upper)
+    lower, upper = np.array([281.3]), np.array([301.1])
+    inputs = Coordinates(SYSTEM.input_names, SYSTEM.input_units, SYSTEM.nominal_input,
+                         0.5 * (upper - lower), lower, upper)
+    return linearised_model(SYSTEM.drift_jacobian(SYSTEM.nominal_state), SYSTEM.B, states, inputs,
+                            SYSTEM.time_unit, Provenance(SYSTEM.name))
+
+
+def _fouled() -> ControlAffineSystem:
+    clean = ReactorParameters()
+    return one_state_reactor(replace(
+        clean, heat_transfer_coefficient=HEAT_TRANSFER_LEFT * clean.heat_transfer_coefficient),
+        nominal_state=[314.0])
+
+
+def _drive(system: ControlAffineSystem, design: RandomStepDesign, seed: int,
+           minutes: float = MINUTES) -> _Path:
+    trajectory = random_steps(system, design, minutes, seed).trajectory
+    return _Path(trajectory.states, np.vstack([trajectory.inputs, trajectory.inputs[-1:]]))
+
+
+def _measured(path: _Path, noise: float, seed: int, state: int = 0) -> list[Record]:
+    rng = np.random.default_rng([seed, 1])
+    x = path.x[:, [state]] + noise * rng.standard_normal((len(path.x), 1))
+    return [Record(path.time, x, path.time, path.u)]
+
+
+def _learn(records: list[Record], like: LiftedModel, seed: int) -> _Learned:
+    found = identify(records, seed=seed)
+    return _Learned(found, learn_lift(found, like, N_Z, seed=seed, starts=STARTS))
+
+
+def _gain_error(found: Identified, system: ControlAffineSystem) -> float:
+    return abs(float(found.drift.input_matrix[0, 0] / system.B[0, 0]) - 1.0)
+
+
+def _roll_out_error(model: LiftedModel, system: ControlAffineSystem, design: RandomStepDesign,
+                    seed: int) -> float:
+    """Return the root mean square error, in K, over an hour of fresh steps without noise."""
+    errors = []
+    for number in range(_TESTS):
+        truth = _drive(system, design, 10_000 * (seed + 1) + number, _TEST_MINUTES)
+        predicted = roll_out(model, truth.x[0], truth.u[:-1], PERIOD)
+        errors.append(predicted - truth.x)
+    return float(np.sqrt(np.mean(np.square(errors))))
+
+
+def _controlled(system: ControlAffineSystem, model: LiftedModel, x0: Array, minutes: float,
+                seed: int) -> _Run:
+    """Run the control step once a second on a noisy measurement."""
+    controller = Controller(model, Settings(np.ones(1), np.ones(1), InputLimits(
+        np.array([278.15]), np.array([305.15]), np.ones(1))))
+    state, reason = controller.request_setpoint(State(), np.array([SETPOINT]))
+    if reason:
+        raise ValueError(reason)
+
+    def answer(measured: float, time_ns: int) -> float:
+        nonlocal state
+        state, command, _ = controller.step(state, np.array([measured]), time_ns)
+        return float(command[0])
+
+    return _run(system, x0, minutes, seed, answer)
+
+
+def _experiment(system: ControlAffineSystem, plan: experiments.Experiment, x0: Array, seed: int
+                ) -> _Run:
+    """Run an experiment as the trainer does."""
+    progress = experiments.begin(plan, _NS)
+
+    def answer(measured: float, time_ns: int) -> float:
+        nonlocal progress
+        progress = experiments.advance(plan, progress, measured, time_ns)
+        return progress.command
+
+    return _run(system, x0, plan.duration / 60.0, seed, answer)
+
+
+def _run(system: ControlAffineSystem, x0: Array, minutes: float, seed: int,
+         answer: Callable[[float, int], float]) -> _Run:
+    rng = np.random.default_rng([seed, 2])
+    process = Process(system, _NS, np.asarray(x0), system.nominal_input)
+    states, measured, inputs = [], [], []
+    for number in range(round(60.0 * minutes)):
+        time_ns = (number + 1) * _NS
+        process = process.until(time_ns)
+        states.append(process.x)
+        measured.append(process.x + NOISE * rng.standard_normal(system.n_x))
+        inputs.append(np.array([answer(float(measured[-1][0]), time_ns)]))
+        process = replace(process, u=inputs[-1])
+    path = _Path(np.array(states), np.array(inputs))
+    return _Run(path.x, Record(path.time, np.array(measured), path.time, path.u))

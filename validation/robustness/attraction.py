@@ -1,0 +1,203 @@
+# SPDX-FileCopyrightText: 2026 The koopman_ros Authors
+# SPDX-License-Identifier: Apache-2.0
+
+
+"""From where the loop gets back to its set-point, and from where no coolant could bring it."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from enum import Enum
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.optimize import brentq
+
+from koopman_ros.control import Rung
+from koopman_ros.control.ladder import Standing
+from koopman_ros.plants import ControlAffineSystem, fold, two_state_reactor
+from validation.paper.outcome import Metrics
+from validation.robustness.disturbances import finite
+from validation.robustness.loop import (
+    at_setpoint,
+    COOLANT,
+    COOLANT_RANGE,
+    Loop,
+    REACTOR,
+    reactor_controller,
+    run_loop,
+    shipped_model,
+)
+
+Array = NDArray[np.float64]
+
+HORIZON = 2400.0  # s
+TOLERANCE = 0.2  # K
+# Temperatures from which the one-state reactor is hotter than any coolant can hold.
+GONE = 420.0  # K
+_SETTLED = 60  # samples within the tolerance that count as arrived
+_BOUNDARY = 0.02  # K
+STARTS = np.concatenate([np.arange(260.0, 325.0, 10.0), np.arange(325.0, 346.0, 2.5), [355.0]])
+SETPOINTS = (306.0, 310.0, 314.475, 319.0, 324.475, 326.5)  # K
+COOLANTS = (278.15, 285.0, 290.0, 295.0, 300.0, 305.15)  # K
+SETPOINT = 314.475  # K, for the coolant in force at the start
+_SHORT_STEP = 0.25  # s
+_RETURN = 600.0  # s
+
+
+class End(Enum):
+    """How a loop ends."""
+
+    LEARNED = 'back by the learned law alone'
+    LINEAR = 'back, on the way the linear law'
+    SAFE = 'back, on the way the safe coolant'
+    ELSEWHERE = 'rests elsewhere'
+    RAN_AWAY = 'runs away'
+
+
+@dataclass(frozen=True)
+class Start:
+    """
+    Where a loop starts and where it is to go.
+
+    :param temperature: of the reactor, in K.
+    :param coolant: in force, in K.
+    :param setpoint: in K.
+    """
+
+    temperature: float
+    coolant: float
+    setpoint: float
+
+
+def end_of(start: Start, *, ladder: bool, system: ControlAffineSystem = REACTOR,
+           concentration: float | None = None) -> End:
+    """
+    Simulate the default loop from a start until it has arrived, ran away or two thirds of an hour.
+
+    :param ladder: whether the controller has one.
+    :param concentration: in mol/L, at the start; for the two-state reactor.
+    """
+    near = 0
+
+    def arrived(x: Array, _: Array, rung: Rung) -> bool:
+        nonlocal near
+        near = near + 1 if abs(x[-1] - start.setpoint) <= TOLERANCE else 0
+        # it could still fall from the rungs of recovery
+        gone = x[-1] > GONE and system is REACTOR
+        return bool(gone or (near >= _SETTLED and rung is Rung.LEARNED))
+
+    x0 = [start.temperature] if concentration is None else [concentration, start.temperature]
+    course = run_loop(reactor_controller(ladder=ladder), system, np.array(x0), start.coolant,
+                      HORIZON, [(0.0, at_setpoint(start.setpoint))], stop=arrived)
+    if course.ran_away or course.x[-1, -1] > GONE:
+        return End.RAN_AWAY
+    if near < _SETTLED:
+        return End.ELSEWHERE
+    worst = course.worst()
+    return {Rung.LEARNED: End.LEARNED, Rung.LINEAR: End.LINEAR}.get(worst, End.SAFE)
+
+
+def hottest_start(coolant: float, setpoint: float, *, ladder: bool, lowest: float = 326.0,
+                  highest: float = 350.0) -> float:
+    """
+    Find by bisection the hottest start from which the default loop gets back, in K.
+
+    :param coolant: in force at the start, in K.
+    :param lowest: a start that gets back.
+    :param highest: one that does not.
+    """
+    while highest - lowest > _BOUNDARY:
+        middle = 0.5 * (lowest + highest)
+        back = end_of(Start(middle, coolant, setpoint), ladder=ladder)
+        lowest, highest = ((lowest, middle) if back in (End.RAN_AWAY, End.ELSEWHERE)
+                           else (middle, highest))
+    return lowest
+
+
+def hottest_cooled() -> float:
+    """Return the temperature above which the reactor heats up under the coldest coolant, in K."""
+    coldest = np.array(COOLANT_RANGE[:1])
+    knee = float(fold(REACTOR, 320.0, 335.0)[0][0])
+    return float(brentq(lambda T: REACTOR.derivative(np.array([T]), coldest)[0], knee, 400.0))
+
+
+def hottest_saved(coolant: float) -> float:
+    """
+    Return the hottest start from which the coolant, moved as fast as it may, saves the reactor.
+
+    Backwards in time from the unstable state under the coldest coolant, while the coolant rises
+    by 1 K a second to what is in force at the start; by Runge and Kutta's method.
+
+    :param coolant: at the start, in K.
+    """
+    coldest = COOLANT_RANGE[0]
+    temperature, seconds = hottest_cooled(), coolant - coldest
+    steps = max(1, round(seconds / _SHORT_STEP))
+    h = -seconds / steps / 60.0
+
+    def rate(T: float, u: float) -> float:
+        return float(REACTOR.derivative(np.array([T]), np.array([u]))[0])
+
+    for number in range(steps):
+        u, v = (coldest + (number + part) * seconds / steps for part in (0.0, 1.0))
+        middle = 0.5 * (u + v)
+        k1 = rate(temperature, u)
+        k2 = rate(temperature + 0.5 * h * k1, middle)
+        k3 = rate(temperature + 0.5 * h * k2, middle)
+        k4 = rate(temperature + h * k3, v)
+        temperature += h / 6.0 * (k1 + 2.0 * k2 + 2.0 * k3 + k4)
+    return temperature
+
+
+def grid(*, ladder: bool) -> dict[tuple[float, float], End]:
+    """Return the ends by start and set-point, both in K, with a coolant of 300 K at the start."""
+    return {(float(start), setpoint): end_of(Start(float(start), COOLANT, setpoint), ladder=ladder)
+            for setpoint in SETPOINTS for start in STARTS}
+
+
+def boundary(coolant: float) -> Metrics:
+    """
+    Compare the hottest starts that are brought back, in K, for a coolant at the start.
+
+    :return: `physics_kelvin`, `ladder_kelvin`, `no_ladder_kelvin`.
+    """
+    return {'physics_kelvin': hottest_saved(coolant),
+            'ladder_kelvin': hottest_start(coolant, SETPOINT, ladder=True),
+            'no_ladder_kelvin': hottest_start(coolant, SETPOINT, ladder=False)}
+
+
+def two_state_grid() -> dict[tuple[float, float], End]:
+    """Return the ends on the two-state reactor, by starting temperature and concentration."""
+    system = two_state_reactor()
+    rest = float(system.nominal_state[1])
+    return {(T, concentration): end_of(
+        Start(T, COOLANT, round(rest, 3)), ladder=True, system=system,
+        concentration=concentration)
+        for T in (300.0, 310.0, 320.0, 330.0, 340.0, 350.0, 360.0, 380.0, 400.0)
+        for concentration in (0.6, 0.75, float(system.nominal_state[0]), 0.95)}
+
+
+def back_from_safe(system: ControlAffineSystem, linear_margin: float) -> Metrics:
+    """
+    Let the loop start at rest under the safe coolant, where a dead sensor leads it.
+
+    :param system: the reactor, changed or not.
+    :param linear_margin: of the ladder, in half widths.
+    :return: `rest_kelvin`, `outside` the trained range in half widths, `seconds_to_0.2_kelvin`
+        from there (None for never).
+    """
+    coldest = COOLANT_RANGE[0]
+    rest = np.array([brentq(lambda T: system.derivative(np.array([T]), np.array([coldest]))[0],
+                            coldest, 320.0)])
+    usual = reactor_controller()
+    ladder = replace(usual.settings.ladder, linear_margin=linear_margin)
+    controller = replace(usual, settings=replace(usual.settings, ladder=ladder))
+
+    def safe(loop: Loop) -> Loop:
+        return replace(loop, state=replace(loop.state, standing=Standing(Rung.SAFE)))
+
+    course = run_loop(controller, system, rest, coldest, _RETURN,
+                      [(0.0, safe), (0.0, at_setpoint(SETPOINT))])
+    return {'rest_kelvin': float(rest[0]), 'outside': shipped_model().states.violation(rest),
+            'seconds_to_0.2_kelvin': finite(course.settling(SETPOINT, TOLERANCE))}

@@ -1,0 +1,188 @@
+# SPDX-FileCopyrightText: 2026 The koopman_ros Authors
+# SPDX-License-Identifier: Apache-2.0
+
+
+"""Lifts of too narrow data, asked for more than they know, without the ladder and with it."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from koopman_ros.control import Controller, InputLimits, LadderSettings, Rung, Setpoint, Settings
+from koopman_ros.learning import Growth, Linearisation, train
+from koopman_ros.lifting import LiftedModel
+from koopman_ros.plants import RandomStepDesign
+from validation.paper import two_state
+from validation.paper.datasets import box_episodes, describe
+from validation.paper.outcome import Metrics
+from validation.robustness.disturbances import finite
+from validation.robustness.loop import (
+    at_setpoint,
+    BANDWIDTH,
+    Change,
+    changed_reactor,
+    COOLANT,
+    Course,
+    Loop,
+    on_plant,
+    REACTOR,
+    reactor_controller,
+    run_loop,
+    START,
+)
+
+Array = NDArray[np.float64]
+
+HALF_WIDTH = 1.5  # K
+# Coolant and reactor in K, times in min.
+DESIGN = RandomStepDesign(
+    input_lower=295.0, input_upper=305.0, state_lower=START - HALF_WIDTH,
+    state_upper=START + HALF_WIDTH, hold_time=(0.1, 0.25), sample_period=0.05, max_redraws=20)
+SECONDS = 1200.0
+LINEAR_MARGINS, MARGIN_BANDWIDTHS = (0.2, 0.5, 1.0), (0.0, 2.0, 6.0)
+_DISTURBED = 60.0  # s
+_ESCAPED = 100.0  # in either state of the two-state example
+_BOUND = 200.0  # of its input, in 1/s
+_SAMPLE = 0.05  # s
+_HORIZON = 60.0  # s
+_HOLDING = float(two_state.START[0] ** 2 - two_state.START[1])  # holds x2 where it starts
+NARROWEST = '[3,6]x[3,8]'
+
+
+@dataclass(frozen=True)
+class Trial:
+    """
+    What a lift of narrow data is asked for.
+
+    :param name: for the tables.
+    :param temperature: of the reactor at the start, in K.
+    :param bandwidth: of the observer, in 1/min.
+    :param changes: what happens when, in s.
+    """
+
+    name: str
+    temperature: float
+    bandwidth: float = BANDWIDTH
+    changes: Sequence[tuple[float, Change]] = ()
+
+
+TRIALS = (
+    Trial('start at 338 K', 338.0),
+    Trial('UA −40 % after 1 min, no observer', START, 0.0,
+          ((_DISTURBED, on_plant(changed_reactor(heat_transfer=0.6))),)),
+    Trial('start at 300 K', 300.0))
+
+
+def narrow_lift() -> LiftedModel:
+    """Learn a lift of the reactor from an hour of steps within 1.5 K of its steady state."""
+    samples = box_episodes(REACTOR, DESIGN, 60, 1.0, 0)
+    return train(describe(REACTOR), samples, Growth(3), seed=0, starts=1, refuse=False).model
+
+
+def run_trial(trial: Trial, model: LiftedModel | None, *, ladder: bool) -> Course:
+    """
+    Drive the true reactor to its steady state.
+
+    :param model: the lift; the shipped one when None.
+    """
+    controller = reactor_controller(bandwidth=trial.bandwidth, ladder=ladder, model=model)
+    return run_loop(controller, REACTOR, np.array([trial.temperature]), COOLANT, SECONDS,
+                    [(0.0, at_setpoint(START)), *trial.changes],
+                    stop=lambda x, _, rung: bool(x[0] > 420.0))
+
+
+def reactor_courses(narrow: LiftedModel) -> dict[tuple[str, str], Course]:
+    """Run all trials: by their name and ``narrow``, ``guarded`` (with the ladder) or ``wide``."""
+    return {(trial.name, kind): run_trial(trial, model, ladder=ladder) for trial in TRIALS
+            for kind, model, ladder in (('narrow', narrow, False), ('guarded', narrow, True),
+                                        ('wide', None, True))}
+
+
+def judge_reactor(course: Course, since: float = 0.0) -> Metrics:
+    """
+    Say what became of a trial.
+
+    :param since: from when the time counts, in s.
+    :return: `hottest_kelvin`, `final_kelvin`, `seconds_to_0.2_kelvin` (None for never),
+        `ran_away` (above 350 K), `safe_share` of the time.
+    """
+    hottest = float(np.max(course.x))
+    return {'hottest_kelvin': hottest, 'final_kelvin': float(course.x[-1, 0]),
+            'seconds_to_0.2_kelvin': finite(course.settling(START, 0.2, since)),
+            'ran_away': course.ran_away or hottest > 350.0,
+            'safe_share': float(np.mean([rung is Rung.SAFE for rung in course.rungs]))}
+
+
+def far_from_the_model(linear_margin: float, bandwidth: float) -> Metrics:
+    """
+    Take away 40 % of UA from the loop with the shipped lift.
+
+    :param linear_margin: of the ladder, in half widths.
+    :param bandwidth: of the observer, in 1/min.
+    :return: as :func:`judge_reactor`, the time counting from the change.
+    """
+    usual = reactor_controller(bandwidth=bandwidth)
+    ladder = LadderSettings(linear_margin=linear_margin)
+    controller = replace(usual, settings=replace(usual.settings, ladder=ladder))
+    course = run_loop(controller, REACTOR, np.array([START]), COOLANT, SECONDS,
+                      [(0.0, at_setpoint(START)), *TRIALS[1].changes],
+                      stop=lambda x, _, rung: bool(x[0] > 420.0))
+    return judge_reactor(course, _DISTURBED)
+
+
+def two_state_models() -> dict[str, LiftedModel]:
+    """Learn the two-state example on each narrow box and on the wide one; linearise it, too."""
+    boxes = {**two_state.NARROW, 'wide': two_state.WIDE}
+    plant, system = describe(two_state.SYSTEM), two_state.SYSTEM
+    linear = Linearisation(system.drift_jacobian(np.zeros(2))).learn(
+        plant, two_state.samples(two_state.WIDE, 0, episodes=5))
+    learned = {name: train(
+        plant, two_state.samples(box, 0),
+        two_state.WIDE_RECIPE if name == 'wide' else two_state.NARROW_RECIPE, seed=0, starts=1,
+        refuse=False).model for name, box in boxes.items()}
+    return {**learned, 'true linearisation': linear}
+
+
+def two_state_course(model: LiftedModel, *, ladder: bool) -> Course:
+    """
+    Regulate the two-state example from (5, 5) to the origin, sampled 20 times a second.
+
+    The origin is put into the controller's state, since it refuses set-points outside its data.
+    """
+    controller = Controller(model, Settings(
+        np.ones(2), np.ones(1),
+        InputLimits(np.array([-_BOUND]), np.array([_BOUND]), np.array([np.inf])),
+        safe_input=np.zeros(1), transfer_time=1.0,
+        ladder=LadderSettings(recovery_time=1.0) if ladder else LadderSettings(1e9, 1e9)))
+
+    def to_origin(loop: Loop) -> Loop:
+        origin = Setpoint(np.zeros(2), np.zeros(2))
+        return replace(loop, state=replace(loop.state, setpoint=origin))
+
+    return run_loop(controller, two_state.SYSTEM, two_state.START, _HOLDING, _HORIZON,
+                    [(0.0, to_origin)], period=_SAMPLE,
+                    stop=lambda x, _, rung: bool(np.max(np.abs(x)) > _ESCAPED))
+
+
+def two_state_courses(models: Mapping[str, LiftedModel]) -> dict[tuple[str, str], Course]:
+    """Run the example with each lift: by box and ``narrow`` or ``guarded`` (with the ladder)."""
+    return {(name, kind): two_state_course(model, ladder=kind == 'guarded')
+            for name, model in models.items() for kind in ('narrow', 'guarded')}
+
+
+def judge_two_state(course: Course) -> Metrics:
+    """
+    Say what became of the example.
+
+    :return: `largest_x2`, `final_distance` from the origin, `escaped`, `left_after` (seconds
+        until it stood below the learned law; None for never).
+    """
+    below = [rung is not Rung.LEARNED for rung in course.rungs]
+    return {'largest_x2': float(np.max(np.abs(course.x[:, 1]))),
+            'final_distance': float(np.linalg.norm(course.x[-1])),
+            'escaped': bool(np.max(np.abs(course.x)) > _ESCAPED),
+            'left_after': float(course.seconds[below.index(True)]) if any(below) else None}
