@@ -12,7 +12,7 @@ import contextlib
 from pathlib import Path
 import sys
 
-from koopman_ros.demo.processes import reserved_output
+from koopman_ros.testing import reserved_output
 
 
 def read_options(args: list[str] | None, description: str | None, output: str, speed: float

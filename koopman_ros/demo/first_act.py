@@ -16,13 +16,14 @@ import time
 
 from koopman_ros.bags import summary
 from koopman_ros.demo.command import read_options, run_act
-from koopman_ros.demo.loop import LoopError, run_loop, Scenario
+from koopman_ros.demo.loop import run_loop, Scenario
 from koopman_ros.demo.results import plot, read_run
 from koopman_ros.demo.table import LiveTable
 from koopman_ros.lifting import load
 from koopman_ros.nodes import topics
 from koopman_ros.nodes.controller_parameters import ControllerParameters
 from koopman_ros.nodes.shipped import model_path
+from koopman_ros.testing import HarnessError
 
 STEP = -10.0  # K
 LINEAR_MODEL = 'reactor_linear'
@@ -74,5 +75,5 @@ def run_demo(output: Path, speed: float) -> dict[str, object]:
 def main(args: list[str] | None = None) -> int:
     """Run the demo from the command line."""
     options = read_options(args, __doc__, 'out/demo', 60.0)
-    return run_act(run_demo, options, (LoopError, OSError),
+    return run_act(run_demo, options, (HarnessError, OSError),
                    'closed_loop.png, closed_loop.mcap and summary.json')

@@ -9,31 +9,17 @@ from collections.abc import Callable, Iterator, Mapping
 import contextlib
 from dataclasses import dataclass, field
 from pathlib import Path
-import signal
-import time
-from typing import Any, TypeVar
 
-from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
 import rclpy
-from rclpy.client import Client
-from rclpy.context import Context
-from rclpy.executors import SingleThreadedExecutor
 from rclpy.node import Node
 from sensor_msgs.msg import Temperature
 
-from koopman_ros.demo.processes import isolated_domain, NodeProcess
 from koopman_ros.nodes import topics
 from koopman_ros.nodes.messages import NANOSECONDS, stamp_nanoseconds, temperature_message
-
-T = TypeVar('T')
+from koopman_ros.testing import deferred_interrupt, Harness, HarnessError
 
 _START_TIME = 1.0  # s of plant time at the first measurement
-_START_TIMEOUT = 30.0  # s for the processes to find each other
-_STALL_TIMEOUT = 30.0  # s without a command before the run is given up
-
-
-class LoopError(RuntimeError):
-    """A closed loop did not run to its end; the message says which process failed and how."""
+_TIMEOUT = 30.0  # s for the processes to find each other, and from one command to the next
 
 
 @dataclass(frozen=True)
@@ -81,28 +67,23 @@ class Row:
     coolant: float
 
 
-class Operator(Node):
-    """Set the set-point through its topic and watch the loop and the status of each task."""
+class Operator:
+    """Set the set-point through its topic and watch the loop."""
 
-    def __init__(self, scenario: Scenario, context: Context,
-                 on_row: Callable[[Row], None]) -> None:
-        super().__init__('operator', context=context)
+    def __init__(self, scenario: Scenario, node: Node, on_row: Callable[[Row], None]) -> None:
         self.scenario = scenario
         self._on_row = on_row
-        self.statuses: dict[str, DiagnosticStatus] = {}
         # two topics: either message of a pair may come first
         self._measured: dict[int, float] = {}
         self._commanded: dict[int, float] = {}
         self._active: float | None = None
         self.last_stamp_ns = 0
-        self.setpoint = self.create_publisher(Temperature, topics.SETPOINT, topics.LOOP_QOS)
-        self.create_subscription(
+        self.setpoint = node.create_publisher(Temperature, topics.SETPOINT, topics.LOOP_QOS)
+        node.create_subscription(
             Temperature, topics.TEMPERATURE, self._on_temperature, topics.LOOP_QOS)
-        self.create_subscription(
+        node.create_subscription(
             Temperature, topics.ACTIVE_SETPOINT, self._on_active, topics.LATCHED_QOS)
-        self.create_subscription(
-            DiagnosticArray, topics.DIAGNOSTICS, self._on_diagnostics, topics.LOOP_QOS)
-        self._commands = self.create_subscription(
+        self._commands = node.create_subscription(
             Temperature, topics.COOLANT_SETPOINT, self._on_command, topics.LOOP_QOS)
 
     @property
@@ -127,9 +108,6 @@ class Operator(Node):
         self._measured[stamp] = message.temperature
         self._show_pair(stamp)
 
-    def _on_diagnostics(self, message: DiagnosticArray) -> None:
-        self.statuses.update({status.name: status for status in message.status})
-
     def _on_active(self, message: Temperature) -> None:
         self._active = message.temperature
 
@@ -146,57 +124,24 @@ class Operator(Node):
                              self._commanded.pop(stamp)))
 
 
+@dataclass(frozen=True)
 class Loop:
     """
     Plant, controller and trainer as three processes, with an operator beside them.
 
+    :param harness: which runs them.
     :param operator: sets the set-point and watches.
-    :param spin: lets the operator hear for a moment.
-    :param processes: those that must not end before the loop does.
     """
 
-    def __init__(self, operator: Operator, spin: Callable[[], None],
-                 processes: list[NodeProcess]) -> None:
-        self.operator = operator
-        self._spin = spin
-        self._processes = processes
-        self._clients: dict[str, Client] = {}
-
-    def wait(self, done: Callable[[], T], timeout: float, complaint: str) -> T:
-        """
-        Spin until a condition holds, and return what it returned.
-
-        :raises LoopError: after `timeout` seconds, or when a process ends.
-        """
-        deadline = time.monotonic() + timeout
-        while not (found := done()):
-            self._spin()
-            for process in self._processes:
-                if not process.running:
-                    raise LoopError(f'{process.name} ended early: {process.output()[-1000:]}')
-            if time.monotonic() > deadline:
-                raise LoopError(f'{complaint} within {timeout:.0f} s; '
-                                f'see {self._processes[0].log.parent}')
-        return found
+    harness: Harness
+    operator: Operator
 
     def run_until(self, seconds: float) -> None:
         """Let the loop go on until so many seconds of plant time after its first measurement."""
         end = self.operator.scenario.first_stamp_ns + round(seconds * NANOSECONDS)
         while self.operator.last_stamp_ns < end:
-            self.wait(self.operator.hears_more_than(self.operator.last_stamp_ns), _STALL_TIMEOUT,
-                      'the loop stands still: no command')
-
-    def meet(self, kind: Any, service: str) -> None:
-        """Get to know a service long before it is called: an answer may be lost otherwise."""
-        self._clients[service] = self.operator.create_client(kind, service)
-        self.wait(self._clients[service].service_is_ready, _START_TIMEOUT,
-                  f'the service {service} is missing')
-
-    def call(self, service: str, request: Any) -> Any:
-        """Call a service that was met before, and return its response."""
-        future = self._clients[service].call_async(request)
-        self.wait(future.done, _STALL_TIMEOUT, f'the service {service} does not answer')
-        return future.result()
+            self.harness.wait_until(self.operator.hears_more_than(self.operator.last_stamp_ns),
+                                    'the loop stands still: no command')
 
 
 @contextlib.contextmanager
@@ -209,60 +154,32 @@ def running_loop(scenario: Scenario, logs: Path, trainer: Mapping[str, object],
 
     :param scenario: what to do.
     :param logs: folder for what the processes print.
-    :param trainer: parameters of the trainer.
-    :param on_row: called with every answered measurement.
-    :raises LoopError: when a process ends early or the loop stands still.
+    :param trainer: parameters of the trainer, which records from its start.
+    :param on_row: called with what the operator sees, at every command.
+    :raises HarnessError: when a process ends early or the loop stands still.
     """
-    with deferred_interrupt() as check_interrupt, isolated_domain() as environment:
-        context = Context()
-        rclpy.init(context=context, domain_id=int(environment['ROS_DOMAIN_ID']))
-        operator = Operator(scenario, context, on_row)
-        executor = SingleThreadedExecutor(context=context)
-        executor.add_node(operator)
-
-        def spin() -> None:
-            executor.spin_once(timeout_sec=0.1)
-            check_interrupt()
-
-        try:
-            with _processes(scenario, logs, environment, trainer, operator, spin) as loop:
-                yield loop
-        finally:
-            executor.shutdown()
-            operator.destroy_node()
-            rclpy.shutdown(context=context)
-
-
-@contextlib.contextmanager
-def _processes(scenario: Scenario, logs: Path, environment: dict[str, str],
-               trainer_parameters: Mapping[str, object], operator: Operator,
-               spin: Callable[[], None]) -> Iterator[Loop]:
-    # the observer would make up for what a model does not know, which is what is to be seen here
-    with (NodeProcess('controller', {'model': scenario.model, 'observer_bandwidth': 0.0},
-                      logs / 'controller.log',
-                      environment) as controller,
-          NodeProcess('trainer', trainer_parameters, logs / 'trainer.log', environment
-                      ) as trainer):
-        processes = [controller, trainer]
-        loop = Loop(operator, spin, processes)
-        loop.wait(lambda: operator.found_loop, _START_TIMEOUT,
-                  'controller and trainer did not find each other')
+    with (deferred_interrupt() as check_interrupt,
+          Harness(logs, name='operator', timeout=_TIMEOUT, lasting=True,
+                  each_turn=check_interrupt) as harness):
+        operator = Operator(scenario, harness.node, on_row)
+        # the observer would make up for what a model does not know, which is what is to be seen
+        harness.start('controller', {'model': scenario.model, 'observer_bandwidth': 0.0})
+        harness.start('trainer', trainer)
+        harness.wait_until(lambda: operator.found_loop,
+                           'controller and trainer did not find each other')
         operator.request_setpoint()
-        plant = NodeProcess('plant', {
+        plant = harness.start('plant', {
             **scenario.plant,
             'lockstep': True, 'speed': scenario.speed, 'duration': scenario.duration,
             'sample_period': scenario.sample_period, 'start_time': _START_TIME,
             # controller, trainer and operator: nobody misses the first measurement
             'lockstep_subscribers': 3,
-        }, logs / 'plant.log', environment)
+        })
+        # the others hear its last measurement
         with plant:
-            processes.append(plant)
-            yield loop
-        codes = {process.name: process.stop() for process in processes}
-    for process in processes:
-        if codes[process.name] != 0:
-            raise LoopError(f'{process.name} ended with code {codes[process.name]}: '
-                            f'{process.output()[-1000:]}')
+            yield Loop(harness, operator)
+        if (code := plant.stop()) != 0:
+            raise HarnessError(f'plant ended with code {code}: {plant.output()[-1000:]}')
 
 
 def run_loop(scenario: Scenario, bag: Path, logs: Path,
@@ -274,28 +191,3 @@ def run_loop(scenario: Scenario, bag: Path, logs: Path,
     """
     with running_loop(scenario, logs, {'output': bag}, on_row) as loop:
         loop.run_until(scenario.duration)
-
-
-@contextlib.contextmanager
-def deferred_interrupt() -> Iterator[Callable[[], None]]:
-    """
-    Let a signal raise KeyboardInterrupt where the yielded function is called, and at the end.
-
-    One that comes while Python looks after a child leaves the child's lock taken for ever, and
-    one inside the middleware's extension comes out as another error. The processes live in
-    sessions of their own: without us nobody would end them.
-    """
-    pending: list[bool] = []
-
-    def check() -> None:
-        if pending:
-            raise KeyboardInterrupt
-
-    before = {number: signal.signal(number, lambda *_: pending.append(True))
-              for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)}
-    try:
-        yield check
-    finally:
-        for number, handler in before.items():
-            signal.signal(number, handler)
-    check()

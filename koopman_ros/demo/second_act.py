@@ -18,12 +18,10 @@ import shutil
 import time
 
 from diagnostic_msgs.msg import DiagnosticStatus
-from rcl_interfaces.srv import SetParameters
-from rclpy.parameter import Parameter
 from std_srvs.srv import SetBool, Trigger
 
 from koopman_ros.demo.command import read_options, run_act
-from koopman_ros.demo.loop import Loop, LoopError, running_loop, Scenario
+from koopman_ros.demo.loop import Loop, running_loop, Scenario
 from koopman_ros.demo.retraining_results import plot, read_history, rollout_rmse
 from koopman_ros.demo.table import LiveTable
 from koopman_ros.lifting import load
@@ -32,6 +30,7 @@ from koopman_ros.nodes.controller_parameters import ControllerParameters
 from koopman_ros.nodes.messages import NANOSECONDS
 from koopman_ros.nodes.plant_parameters import PlantParameters
 from koopman_ros.nodes.shipped import model_path
+from koopman_ros.testing import HarnessError
 
 STEP = -10.0  # K
 FOULING = 0.8  # share of the heat transfer that is left
@@ -118,6 +117,10 @@ def run_retraining(output: Path, speed: float) -> dict[str, object]:
     return result
 
 
+class ActError(RuntimeError):
+    """A step of the act was refused, or failed."""
+
+
 @dataclass
 class _Actor:
     """The operator's hands."""
@@ -128,11 +131,6 @@ class _Actor:
 
     def act(self, second_bag: Path, new_model: Path) -> None:
         loop = self.loop
-        for node in ('plant', 'controller', 'trainer'):
-            loop.meet(SetParameters, f'{node}/set_parameters')
-        for service in ('controller/set_automatic', 'trainer/record', 'trainer/experiment'):
-            loop.meet(SetBool, service)
-        loop.meet(Trigger, 'trainer/train')
         self._begin('shipped lift', 'set-point step of -10 K with the shipped lift')
         loop.run_until(_DRIFT_TIME)
         heat_transfer = FOULING * PlantParameters().heat_transfer_coefficient
@@ -150,11 +148,11 @@ class _Actor:
         self._switch('trainer/experiment', False)
         self._switch('controller/set_automatic', True)
         self._begin('training', 'automatic mode again; a lift is learned from the recording')
-        self._checked('trainer/train', Trigger.Request())
+        _checked('trainer/train', loop.harness.trigger('trainer/train'))
         status = self._wait_for('training', 'the new lift is', _TRAINING_TIMEOUT)
         self.table.announce(status.message)
         if not new_model.exists():
-            raise LoopError(status.message)
+            raise ActError(status.message)
         self._set('controller', model=str(new_model.resolve()))
         self._begin('new lift', 'the controller has taken the new lift over')
         loop.run_until(self.story.start_of('new lift') + _AFTER)
@@ -168,34 +166,32 @@ class _Actor:
     def _wait_for(self, task: str, words: str, timeout: float) -> DiagnosticStatus:
         """Wait until a task of the trainer says so."""
         def said() -> DiagnosticStatus | None:
-            status = self.loop.operator.statuses.get(_TASKS[task])
+            status = self.loop.harness.last_status(_TASKS[task])
             if status is not None and status.level == DiagnosticStatus.ERROR:
-                raise LoopError(f'{task}: {status.message}')
+                raise ActError(f'{task}: {status.message}')
             return status if status is not None and status.message.startswith(words) else None
 
-        status = self.loop.wait(said, timeout, f'the {task} did not end')
+        status = self.loop.harness.wait_until(said, f'the {task} did not end', timeout)
         assert status is not None
         return status
 
     def _switch(self, service: str, on: bool) -> None:
-        self._checked(service, SetBool.Request(data=on))
-
-    def _checked(self, service: str, request: object) -> None:
-        response = self.loop.call(service, request)
-        if not response.success:
-            raise LoopError(f'{service}: {response.message}')
+        _checked(service, self.loop.harness.set_bool(service, on))
 
     def _set(self, node: str, **values: object) -> None:
-        request = SetParameters.Request(parameters=[
-            Parameter(name, value=value).to_parameter_msg() for name, value in values.items()])
-        for result in self.loop.call(f'{node}/set_parameters', request).results:
+        for result in self.loop.harness.set_parameters(node, **values):
             if not result.successful:
-                raise LoopError(f'{node}: {result.reason}')
+                raise ActError(f'{node}: {result.reason}')
+
+
+def _checked(service: str, response: SetBool.Response | Trigger.Response) -> None:
+    if not response.success:
+        raise ActError(f'{service}: {response.message}')
 
 
 def main(args: list[str] | None = None) -> int:
     """Run the second act from the command line."""
     options = read_options(args, __doc__, 'out/demo-retrain', 120.0)
-    return run_act(run_retraining, options, (LoopError, OSError, ValueError),
+    return run_act(run_retraining, options, (ActError, HarnessError, OSError, ValueError),
                    'retraining.png, before.mcap, after.mcap, '
                    'retrained.safetensors with its report, and summary.json')

@@ -10,9 +10,8 @@ import warnings
 import pytest
 from rclpy.serialization import serialize_message
 from sensor_msgs.msg import Temperature
-from workbench import Workbench
 
-from koopman_ros.demo.processes import isolated_domain
+from koopman_ros.testing import Harness
 
 
 @pytest.fixture(scope='session', autouse=True)
@@ -24,15 +23,15 @@ def type_support() -> None:
 
 
 @pytest.fixture
-def ros(tmp_path: Path) -> Iterator[Workbench]:
+def ros(tmp_path: Path) -> Iterator[Harness]:
     """Yield a node in a domain of its own, which starts processes and talks to them."""
-    with isolated_domain() as environment, Workbench(environment, tmp_path) as bench:
+    with Harness(tmp_path) as bench:
         yield bench
 
 
 @pytest.fixture(scope='module')
-def shared_ros(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Workbench]:
+def shared_ros(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Harness]:
     """Yield the same for tests that use one process after each other."""
     folder = tmp_path_factory.mktemp('shared')
-    with isolated_domain() as environment, Workbench(environment, folder) as bench:
+    with Harness(folder) as bench:
         yield bench

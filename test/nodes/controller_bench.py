@@ -13,10 +13,11 @@ from diagnostic_msgs.msg import DiagnosticStatus
 import pytest
 from rclpy.qos import QoSProfile
 from sensor_msgs.msg import Temperature
-from workbench import seconds, temperature, TIMEOUT, value, Workbench
+from workbench import seconds, temperature, TIMEOUT, value
 
 from koopman_ros.nodes import topics
 from koopman_ros.nodes.controller_parameters import TABLE
+from koopman_ros.testing import Harness
 
 STATUS = 'controller: control'
 STEADY = 51.8  # degC, near the plant's steady state
@@ -41,7 +42,7 @@ class Bench:
     :param first: stamp of the first measurement in s.
     """
 
-    def __init__(self, ros: Workbench, parameters: Mapping[str, object] | None = None,
+    def __init__(self, ros: Harness, parameters: Mapping[str, object] | None = None,
                  arguments: tuple[str, ...] = (), qos: QoSProfile = topics.LOOP_QOS,
                  first: float = 1.0) -> None:
         self.ros = ros

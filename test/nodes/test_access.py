@@ -14,7 +14,7 @@ from rclpy.node import Node, NodeNameNonExistentError
 from rclpy.serialization import serialize_message
 from sensor_msgs.msg import Temperature
 from std_srvs.srv import SetBool
-from workbench import temperature, Workbench
+from workbench import temperature
 
 from koopman_ros.bags import BagWriter, message_definition
 from koopman_ros.nodes import replay, topics
@@ -22,6 +22,7 @@ from koopman_ros.nodes.access import Access, NODES, OPERATOR, policy, POLICY_FIL
 from koopman_ros.nodes.parameter_node import ParameterNode
 from koopman_ros.nodes.player_parameters import PlayerParameters
 from koopman_ros.nodes.shipped import config_directory
+from koopman_ros.testing import Harness
 
 
 def resolved(access: Access, node: str) -> dict[str, set[str]]:
@@ -55,7 +56,7 @@ class Watch:
     :param node: its name.
     """
 
-    def __init__(self, ros: Workbench, node: str) -> None:
+    def __init__(self, ros: Harness, node: str) -> None:
         self._ros, self._node = ros, node
         self.seen: dict[str, set[str]] = {
             verb: set() for verb in ('publishes', 'subscribes', 'serves', 'calls')}
@@ -80,13 +81,13 @@ class Watch:
     ('plant', {'reactor': 'two_state', 'speed': 2.0}),
     ('controller', {'use_sim_time': True}),
 ])
-def test_a_node_does_what_it_is_granted(shared_ros: Workbench, node: str,
+def test_a_node_does_what_it_is_granted(shared_ros: Harness, node: str,
                                         parameters: dict[str, Any]) -> None:
     shared_ros.start(node, parameters)
     Watch(shared_ros, node).check()
 
 
-def test_the_trainer_does_what_it_is_granted(ros: Workbench, tmp_path: Path) -> None:
+def test_the_trainer_does_what_it_is_granted(ros: Harness, tmp_path: Path) -> None:
     watch = Watch(ros, 'trainer')
     ros.start('trainer', {'use_sim_time': True, 'output': tmp_path / 'run.mcap',
                           'experiment_timeout': 0.5})
@@ -113,13 +114,13 @@ def bag(tmp_path: Path) -> Path:
     return path
 
 
-def test_the_player_does_what_it_is_granted(ros: Workbench, bag: Path) -> None:
+def test_the_player_does_what_it_is_granted(ros: Harness, bag: Path) -> None:
     ros.start('player', {'bag': bag, 'rate': 0.0, 'clock': True})
     Watch(ros, 'player').check()
 
 
 @pytest.fixture
-def context(ros: Workbench) -> Iterator[None]:
+def context(ros: Harness) -> Iterator[None]:
     rclpy.init(args=['--ros-args', '-p', 'bags:=[run_1]'])
     yield
     rclpy.try_shutdown()

@@ -6,16 +6,18 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
+import signal
 
 from diagnostic_msgs.msg import DiagnosticStatus
 import numpy as np
 import pytest
 from rosgraph_msgs.msg import Clock
 from sensor_msgs.msg import Temperature
-from workbench import seconds, temperature, value, Workbench
+from workbench import seconds, temperature, value
 
 from koopman_ros.nodes import topics
 from koopman_ros.nodes.plant_parameters import PlantParameters
+from koopman_ros.testing import Harness
 
 FOULED = 0.8 * PlantParameters().heat_transfer_coefficient
 SETPOINT = 45.0  # degC
@@ -29,7 +31,7 @@ class Loop:
     :param plant: parameters of the plant.
     """
 
-    def __init__(self, ros: Workbench, plant: Mapping[str, object]) -> None:
+    def __init__(self, ros: Harness, plant: Mapping[str, object]) -> None:
         self.ros = ros
         self.measured = ros.listen(Temperature, topics.TEMPERATURE)
         self.commands = ros.listen(Temperature, topics.COOLANT_SETPOINT)
@@ -84,13 +86,11 @@ class Loop:
 
 
 # first, for a shared loop beside it would take what the machine has
-def test_controller_that_was_killed_takes_over_the_coolant_in_force(ros: Workbench) -> None:
+def test_controller_that_was_killed_takes_over_the_coolant_in_force(ros: Harness) -> None:
     loop = Loop(ros, {'heat_transfer_coefficient': FOULED, 'lockstep_timeout': 0.3})
     loop.ask(SETPOINT)
     loop.rest()
-    ros.processes.remove(loop.controller)
-    loop.controller.process.kill()
-    loop.controller.process.wait()
+    loop.controller.stop(signal.SIGKILL)
     ros.wait_for_status('plant: simulation', lambda s: 'no command arrives' in s.message)
     coolants = ros.listen(Temperature, topics.COOLANT_TEMPERATURE)
     # what the old one said is still on its way to the other subscription
@@ -108,7 +108,7 @@ def test_controller_that_was_killed_takes_over_the_coolant_in_force(ros: Workben
 
 
 @pytest.fixture(scope='module')
-def shared_loop(shared_ros: Workbench) -> Loop:
+def shared_loop(shared_ros: Harness) -> Loop:
     return Loop(shared_ros, {})
 
 

@@ -8,7 +8,6 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable
 import os
 from pathlib import Path
-import signal
 import sys
 import time as clock
 from typing import BinaryIO
@@ -20,7 +19,7 @@ import pytest
 from rosgraph_msgs.msg import Clock
 from sensor_msgs.msg import Temperature
 from test_reload import opened
-from workbench import seconds, temperature, Workbench
+from workbench import seconds, temperature
 
 from koopman_ros.control import State
 from koopman_ros.lifting import load
@@ -29,6 +28,7 @@ from koopman_ros.nodes.controller_parameters import ControllerParameters
 from koopman_ros.nodes.messages import stamp_nanoseconds, to_celsius
 from koopman_ros.nodes.shipped import model_path
 from koopman_ros.nodes.watchdog import Watchdog
+from koopman_ros.testing import Harness
 
 SAFE = 10.0  # degC
 SETTINGS = {'measurement_timeout': 0.3, 'hold_timeout': 0.2, 'coolant_rate_limit': 1200.0,
@@ -62,7 +62,7 @@ class BusyBench:
     :param simulated: whether time comes from /clock, where it stands still.
     """
 
-    def __init__(self, ros: Workbench, pipe: Path, simulated: bool = False) -> None:
+    def __init__(self, ros: Harness, pipe: Path, simulated: bool = False) -> None:
         self.ros, self.pipe = ros, pipe
         time = ros.node.create_publisher(Clock, topics.CLOCK, topics.CLOCK_QOS)
         self.process = ros.start(
@@ -113,7 +113,7 @@ def replayed(commands: list[Temperature], measured: dict[float, float]) -> list[
 
 @pytest.mark.parametrize('simulated', [False, True], ids=['real time', 'simulated time'])
 def test_watchdog_commands_while_the_control_step_is_busy(
-        ros: Workbench, tmp_path: Path, simulated: bool) -> None:
+        ros: Harness, tmp_path: Path, simulated: bool) -> None:
     bench = BusyBench(ros, tmp_path / 'pipe', simulated)
     held = bench.commands[0].temperature
     busy = bench.get_busy(2.03)
@@ -141,7 +141,7 @@ def test_watchdog_commands_while_the_control_step_is_busy(
 
 
 def test_step_that_is_always_too_slow_is_given_up_and_the_process_ends_in_it(
-        ros: Workbench, tmp_path: Path) -> None:
+        ros: Harness, tmp_path: Path) -> None:
     bench = BusyBench(ros, tmp_path / 'pipe')
     busy = bench.get_busy(2.03)
     bench.wait_for_watchdog()
@@ -162,8 +162,7 @@ def test_step_that_is_always_too_slow_is_given_up_and_the_process_ends_in_it(
         bench.commands, {1.0: STEADY, 3.03: STEADY})
 
     busy = bench.get_busy(4.0)
-    bench.process.process.send_signal(signal.SIGINT)
-    code = ros.wait_for_end(bench.process)
+    code = bench.process.stop()
     busy.close()
     assert code == 1
     assert 'controller: busy for 0.2 s after a signal: ended by force' in bench.process.output()

@@ -10,9 +10,10 @@ from collections.abc import Mapping
 import pytest
 from rosgraph_msgs.msg import Clock
 from sensor_msgs.msg import Temperature
-from workbench import seconds, temperature, Workbench
+from workbench import seconds, temperature
 
 from koopman_ros.nodes import topics
+from koopman_ros.testing import Harness
 
 LOCKSTEP = {'lockstep': True, 'speed': 0.0}
 
@@ -26,7 +27,7 @@ class Loop:
     :param measured: topic of the temperature.
     """
 
-    def __init__(self, ros: Workbench, prefix: str = '', measured: str = 'temperature') -> None:
+    def __init__(self, ros: Harness, prefix: str = '', measured: str = 'temperature') -> None:
         self._ros = ros
         self.temperatures = ros.listen(Temperature, f'{prefix}{measured}')
         self.commands = ros.listen(Temperature, f'{prefix}{topics.COOLANT_SETPOINT}')
@@ -50,7 +51,7 @@ class Loop:
         self._ros.wait_until(lambda: self.settled(celsius, within))
 
 
-def start_loop(ros: Workbench, plant: Mapping[str, object], arguments: tuple[str, ...] = ()
+def start_loop(ros: Harness, plant: Mapping[str, object], arguments: tuple[str, ...] = ()
                ) -> None:
     ros.start('controller', arguments=arguments)
     # the bench listens, too: nobody misses the first measurement
@@ -58,7 +59,7 @@ def start_loop(ros: Workbench, plant: Mapping[str, object], arguments: tuple[str
 
 
 @pytest.mark.parametrize('first', ['controller', 'plant'])
-def test_reaches_the_setpoint_whoever_starts_first(ros: Workbench, first: str) -> None:
+def test_reaches_the_setpoint_whoever_starts_first(ros: Harness, first: str) -> None:
     loop = Loop(ros)
     names = ['controller', 'plant'] if first == 'controller' else ['plant', 'controller']
     for name in names:
@@ -67,7 +68,7 @@ def test_reaches_the_setpoint_whoever_starts_first(ros: Workbench, first: str) -
     loop.reach(42.0, within=0.01)
 
 
-def test_follows_the_setpoint_when_it_changes_on_the_way(ros: Workbench) -> None:
+def test_follows_the_setpoint_when_it_changes_on_the_way(ros: Harness) -> None:
     loop = Loop(ros)
     start_loop(ros, LOCKSTEP)
     loop.ask(47.0)
@@ -77,7 +78,7 @@ def test_follows_the_setpoint_when_it_changes_on_the_way(ros: Workbench) -> None
     loop.reach(50.0, within=0.01)
 
 
-def test_converges_at_two_hundred_times_real_time(ros: Workbench) -> None:
+def test_converges_at_two_hundred_times_real_time(ros: Harness) -> None:
     """Without lock-step commands come late by whatever the machine takes, and /clock ticks."""
     loop = Loop(ros)
     clock = ros.listen(Clock, topics.CLOCK, topics.CLOCK_QOS)
@@ -90,7 +91,7 @@ def test_converges_at_two_hundred_times_real_time(ros: Workbench) -> None:
     assert ticks == sorted(ticks)
 
 
-def test_every_measurement_has_exactly_one_command(ros: Workbench) -> None:
+def test_every_measurement_has_exactly_one_command(ros: Harness) -> None:
     loop = Loop(ros)
     ros.start('controller')
     # or its first commands may go out before it knows that the bench listens
@@ -104,7 +105,7 @@ def test_every_measurement_has_exactly_one_command(ros: Workbench) -> None:
     assert [message.header.stamp for message in loop.commands] == measured
 
 
-def test_two_loops_side_by_side_in_their_namespaces(ros: Workbench) -> None:
+def test_two_loops_side_by_side_in_their_namespaces(ros: Harness) -> None:
     loops = {unit: Loop(ros, f'/{unit}/') for unit in ('unit_1', 'unit_2')}
     for unit in loops:
         start_loop(ros, LOCKSTEP, ('-r', f'__ns:=/{unit}'))
@@ -116,7 +117,7 @@ def test_two_loops_side_by_side_in_their_namespaces(ros: Workbench) -> None:
         'unit_1/plant: simulation', 'unit_2/controller: control'}
 
 
-def test_topics_can_be_remapped(ros: Workbench) -> None:
+def test_topics_can_be_remapped(ros: Harness) -> None:
     loop = Loop(ros, measured='reactor_temperature')
     start_loop(ros, LOCKSTEP, ('-r', 'temperature:=reactor_temperature'))
     loop.reach(45.0, within=0.01)

@@ -18,14 +18,15 @@ from rclpy.context import Context
 from rclpy.node import Node
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 from sensor_msgs.msg import JointState, Temperature
-from workbench import seconds, temperature, value, Workbench
+from workbench import seconds, temperature, value
 
 from koopman_ros.nodes import topics
 from koopman_ros.nodes.shipped import model_path
+from koopman_ros.testing import Harness
 
 
 @pytest.fixture(scope='module')
-def shared_bench(shared_ros: Workbench) -> Bench:
+def shared_bench(shared_ros: Harness) -> Bench:
     return Bench(shared_ros)
 
 
@@ -45,7 +46,7 @@ def test_each_command_carries_the_stamp_of_its_measurement(bench: Bench) -> None
     assert [seconds(message) for message in bench.commands] == [1.0, *times, 60.0]
 
 
-def test_before_the_first_setpoint_the_temperature_is_held(ros: Workbench) -> None:
+def test_before_the_first_setpoint_the_temperature_is_held(ros: Harness) -> None:
     bench = Bench(ros)
     assert bench.active == pytest.approx(STEADY)
     bench.measure(STEADY - 1.0, 2.0)
@@ -137,7 +138,7 @@ def test_stamp_that_does_not_advance_is_reported(bench: Bench) -> None:
     bench.status(lambda s: s.level == DiagnosticStatus.OK)
 
 
-def test_sensor_that_falls_silent_is_reported(ros: Workbench) -> None:
+def test_sensor_that_falls_silent_is_reported(ros: Harness) -> None:
     bench = Bench(ros, {'measurement_timeout': 0.1})
     status = bench.status(lambda s: s.level == DiagnosticStatus.ERROR)
     assert status.message.startswith('no measurement for more than 0.1 s')
@@ -151,21 +152,21 @@ def test_temperature_outside_the_trained_range_is_reported(bench: Bench) -> None
     assert value(status, 'active law') == 'learned law'
 
 
-def test_clock_that_goes_back_starts_time_afresh(ros: Workbench) -> None:
+def test_clock_that_goes_back_starts_time_afresh(ros: Harness) -> None:
     bench = Bench(ros)
     bench.measure(STEADY, 100.0)
     assert math.isfinite(bench.measure(STEADY, 10.0).temperature)
     bench.ros.wait_until(lambda: 'time starts afresh' in bench.process.output())
 
 
-def test_best_effort_thermometer_is_heard_by_override(ros: Workbench) -> None:
+def test_best_effort_thermometer_is_heard_by_override(ros: Harness) -> None:
     best_effort = QoSProfile(depth=10, reliability=ReliabilityPolicy.BEST_EFFORT)
     override = 'qos_overrides./temperature.subscription.reliability:=best_effort'
     bench = Bench(ros, arguments=('-p', override), qos=best_effort)
     assert math.isfinite(bench.measure(STEADY, 2.0).temperature)
 
 
-def test_publishers_that_cannot_be_heard_are_named_with_the_remedy(ros: Workbench) -> None:
+def test_publishers_that_cannot_be_heard_are_named_with_the_remedy(ros: Harness) -> None:
     process = ros.start('controller')
 
     def said(words: str) -> str:
@@ -263,7 +264,7 @@ def test_model_is_reloaded_while_the_loop_runs(bench: Bench) -> None:
     assert 'reactor_nz4: n_z = 4' in response.message
 
 
-def test_damaged_model_is_refused_and_the_old_one_kept(ros: Workbench, tmp_path: Path) -> None:
+def test_damaged_model_is_refused_and_the_old_one_kept(ros: Harness, tmp_path: Path) -> None:
     model = tmp_path / 'model.safetensors'
     shutil.copy(model_path('reactor_nz3'), model)
     bench = Bench(ros, {'model': model})

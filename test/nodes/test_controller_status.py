@@ -16,16 +16,17 @@ from diagnostic_msgs.msg import DiagnosticStatus
 import pytest
 from rclpy.node import Node
 from sensor_msgs.msg import JointState, Temperature
-from workbench import seconds, temperature, value, Workbench
+from workbench import seconds, temperature, value
 
 from koopman_ros.lifting import load, save
 from koopman_ros.nodes import topics
 from koopman_ros.nodes.replaying.answers import TRACKED
 from koopman_ros.nodes.shipped import model_path
+from koopman_ros.testing import Harness
 
 
 @pytest.fixture(scope='module')
-def shared_bench(shared_ros: Workbench) -> Bench:
+def shared_bench(shared_ros: Harness) -> Bench:
     # whole seconds of the clock of the node, so that ages are known
     return Bench(shared_ros, {'observer_bandwidth': 6.0}, first=float(int(time.time()) - 40))
 
@@ -120,7 +121,7 @@ def known(status: DiagnosticStatus) -> bool:
     return 'end all but one' in status.message and 'UNKNOWN' not in status.message
 
 
-def test_second_controller_is_told_by_both_while_it_lasts(ros: Workbench) -> None:
+def test_second_controller_is_told_by_both_while_it_lasts(ros: Harness) -> None:
     bench = Bench(ros)
     second = ros.start('controller', arguments=('-r', '__node:=controller_2'))
     ros.meet('controller_2')
@@ -153,7 +154,7 @@ def test_second_thermometer_is_told_by_its_name(shared_bench: Bench) -> None:
 
 
 @pytest.mark.parametrize('topic', [topics.COOLANT_TEMPERATURE, 'jacket'])
-def test_first_command_waits_for_the_coolant_in_force(ros: Workbench, topic: str) -> None:
+def test_first_command_waits_for_the_coolant_in_force(ros: Harness, topic: str) -> None:
     commands = ros.listen(Temperature, topics.COOLANT_SETPOINT)
     # patient, or a busy machine could be too slow for it
     program = ('import sys\n'
@@ -173,7 +174,7 @@ def test_first_command_waits_for_the_coolant_in_force(ros: Workbench, topic: str
     assert seconds(commands[0]) == 1.0
 
 
-def test_coolant_that_is_promised_and_never_told_delays_the_first_command_only(ros: Workbench
+def test_coolant_that_is_promised_and_never_told_delays_the_first_command_only(ros: Harness
                                                                               ) -> None:
     ros.node.create_publisher(Temperature, topics.COOLANT_TEMPERATURE, topics.LATCHED_QOS)
     bench = Bench(ros)

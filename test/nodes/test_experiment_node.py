@@ -16,13 +16,14 @@ from diagnostic_msgs.msg import DiagnosticStatus
 import pytest
 from rclpy.qos import QoSProfile, ReliabilityPolicy
 from sensor_msgs.msg import Temperature
-from workbench import seconds, temperature, value, Workbench
+from workbench import seconds, temperature, value
 
 from koopman_ros.bags import read_messages
 from koopman_ros.control.experiment import advance, begin, Phase
 from koopman_ros.nodes import topics
 from koopman_ros.nodes.messages import stamp_nanoseconds, to_celsius, to_kelvin
 from koopman_ros.nodes.trainer_parameters import TrainerParameters
+from koopman_ros.testing import Harness
 
 STATUS = 'trainer: experiment'
 SERVICE = 'trainer/experiment'
@@ -42,7 +43,7 @@ class Bench:
     :param prefix: of the trainer's topics.
     """
 
-    def __init__(self, ros: Workbench, parameters: Mapping[str, object] | None = None,
+    def __init__(self, ros: Harness, parameters: Mapping[str, object] | None = None,
                  arguments: tuple[str, ...] = (), prefix: str = '',
                  coolant: str = topics.COOLANT_SETPOINT,
                  qos: QoSProfile = topics.LOOP_QOS) -> None:
@@ -79,7 +80,7 @@ class Bench:
         return self.ros.wait_for_status(STATUS, lambda s: words in s.message)
 
 
-def start_with_plant(ros: Workbench, trainer: Mapping[str, object],
+def start_with_plant(ros: Harness, trainer: Mapping[str, object],
                      plant: Mapping[str, object] | None = None) -> list[Temperature]:
     """Start both, and an experiment that both know of; return the measurements to come."""
     measured = ros.listen(Temperature, topics.TEMPERATURE)
@@ -95,7 +96,7 @@ def start_with_plant(ros: Workbench, trainer: Mapping[str, object],
 # An experiment from its start to its end.
 
 
-def test_steps_drive_the_plant_as_planned(ros: Workbench) -> None:
+def test_steps_drive_the_plant_as_planned(ros: Harness) -> None:
     commands = ros.listen(Temperature, topics.COOLANT_SETPOINT)
     measured = start_with_plant(ros, {'experiment_duration': 10.0, 'experiment_seed': 5})
     status = ros.wait_for_status(STATUS, lambda s: s.message.startswith('finished'))
@@ -128,7 +129,7 @@ def test_steps_drive_the_plant_as_planned(ros: Workbench) -> None:
     assert progress.phase is Phase.FINISHED
 
 
-def test_service_ends_the_steps_and_then_lets_go(ros: Workbench) -> None:
+def test_service_ends_the_steps_and_then_lets_go(ros: Harness) -> None:
     bench = Bench(ros)
     assert ros.set_bool(SERVICE, False).message == 'no experiment is running'
     assert bench.start() == (True, 'running on /coolant_setpoint')
@@ -150,7 +151,7 @@ def test_service_ends_the_steps_and_then_lets_go(ros: Workbench) -> None:
     assert bench.start()[0]
 
 
-def test_names_follow_namespace_and_remaps(ros: Workbench) -> None:
+def test_names_follow_namespace_and_remaps(ros: Harness) -> None:
     bench = Bench(ros, arguments=('-r', '__ns:=/unit_1', '-r', 'coolant_setpoint:=jacket'),
                   prefix='/unit_1/', coolant='jacket',
                   qos=QoSProfile(depth=10, reliability=ReliabilityPolicy.BEST_EFFORT))
@@ -162,7 +163,7 @@ def test_names_follow_namespace_and_remaps(ros: Workbench) -> None:
 
 
 @pytest.fixture(scope='module')
-def shared_bench(shared_ros: Workbench) -> Bench:
+def shared_bench(shared_ros: Harness) -> Bench:
     return Bench(shared_ros)
 
 
@@ -228,7 +229,7 @@ def test_contradicting_limits_are_refused(shared_bench: Bench, name: str, given:
 # Aborts.
 
 
-def test_reactor_that_leaves_its_bounds_gets_the_safe_coolant(ros: Workbench) -> None:
+def test_reactor_that_leaves_its_bounds_gets_the_safe_coolant(ros: Harness) -> None:
     commands = ros.listen(Temperature, topics.COOLANT_SETPOINT)
     measured = start_with_plant(ros, {'experiment_duration': 1000.0})
     ros.wait_until(lambda: len(commands) > 50)
@@ -247,7 +248,7 @@ def test_reactor_that_leaves_its_bounds_gets_the_safe_coolant(ros: Workbench) ->
     assert ros.set_bool(SERVICE, False).message == LOST
 
 
-def test_another_commander_ends_it_at_once(ros: Workbench) -> None:
+def test_another_commander_ends_it_at_once(ros: Harness) -> None:
     bench = Bench(ros)
     assert bench.start()[0]
     bench.answer()
@@ -265,7 +266,7 @@ def test_another_commander_ends_it_at_once(ros: Workbench) -> None:
         'experiment_topic')
 
 
-def test_silent_sensor_brings_the_safe_coolant(ros: Workbench) -> None:
+def test_silent_sensor_brings_the_safe_coolant(ros: Harness) -> None:
     bench = Bench(ros, {'experiment_timeout': 0.5, 'experiment_rate_limit': 600.0})
     # which a busy machine may miss
     ros.wait_until(lambda: bench.start()[0])
@@ -282,7 +283,7 @@ def test_silent_sensor_brings_the_safe_coolant(ros: Workbench) -> None:
 
 @pytest.mark.parametrize('number', [signal.SIGINT, signal.SIGTERM])
 def test_trainer_that_is_told_to_end_leaves_the_safe_coolant(
-        ros: Workbench, tmp_path: Path, number: int) -> None:
+        ros: Harness, tmp_path: Path, number: int) -> None:
     bag = tmp_path / 'run.mcap'
     commands = ros.listen(Temperature, topics.COOLANT_SETPOINT)
     start_with_plant(ros, {'record_at_start': True, 'output': bag}, {'lockstep_subscribers': 3})
@@ -299,7 +300,7 @@ def test_trainer_that_is_told_to_end_leaves_the_safe_coolant(
 # Through a controller in manual mode.
 
 
-def test_experiment_through_a_controller_in_manual_mode(ros: Workbench) -> None:
+def test_experiment_through_a_controller_in_manual_mode(ros: Harness) -> None:
     commands = ros.listen(Temperature, topics.COOLANT_SETPOINT)
     ros.start('controller')
     ros.meet('controller')

@@ -11,9 +11,8 @@ import subprocess
 import sys
 
 import pytest
-from workbench import Workbench
 
-from koopman_ros.demo.processes import isolated_domain
+from koopman_ros.testing import Harness, isolated_domain
 
 ROOT = Path(__file__).parents[2]
 NODES = {'plant': 'simulation', 'controller': 'control', 'trainer': 'recording'}
@@ -70,7 +69,7 @@ def test_the_sourced_tree_is_what_python_imports(install_tree: Path) -> None:
 
 @pytest.mark.parametrize('name', NODES)
 def test_an_executable_of_the_tree_starts_and_ends(
-        ros: Workbench, install_tree: Path, tmp_path: Path, name: str) -> None:
+        ros: Harness, install_tree: Path, tmp_path: Path, name: str) -> None:
     executable = install_tree / 'koopman_ros' / 'lib' / 'koopman_ros' / name
     program = f'. {install_tree}/setup.bash && exec {executable} "$@"'
     parameters = {'output': tmp_path / 'bag'} if name == 'trainer' else {}

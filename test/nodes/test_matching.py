@@ -17,9 +17,9 @@ from rclpy.node import Node
 from rclpy.qos import DurabilityPolicy, LivelinessPolicy, QoSProfile, ReliabilityPolicy
 from sensor_msgs.msg import Temperature
 
-from koopman_ros.demo.processes import isolated_domain
 from koopman_ros.nodes import topics
 from koopman_ros.nodes.matching import Matching
+from koopman_ros.testing import isolated_domain
 
 TIMEOUT = 20.0  # s
 

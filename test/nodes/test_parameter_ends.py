@@ -28,7 +28,6 @@ from std_srvs.srv import SetBool, Trigger
 from workbench import seconds, temperature, TIMEOUT
 
 from koopman_ros.bags import BagReadError, BagWriter, message_definition
-from koopman_ros.demo.processes import isolated_domain
 from koopman_ros.nodes import topics
 from koopman_ros.nodes.controller import ControllerNode
 from koopman_ros.nodes.messages import NANOSECONDS
@@ -44,6 +43,7 @@ from koopman_ros.nodes.shipped import model_path
 from koopman_ros.nodes.trainer import TrainerNode
 from koopman_ros.nodes.trainer_parameters import TrainerParameters
 from koopman_ros.retraining import retrain, Task
+from koopman_ros.testing import isolated_domain
 
 STEADY = 51.8  # degC, near the plant's steady state
 DENORMAL = 5e-324

@@ -10,15 +10,15 @@ from typing import Any
 
 import pytest
 from rcl_interfaces.srv import DescribeParameters
-from workbench import Workbench
 
 from koopman_ros.nodes.controller_parameters import TABLE
+from koopman_ros.testing import Harness
 
 CONTROLLER = '/controller'
 
 
 @pytest.fixture(scope='module')
-def running(shared_ros: Workbench) -> Workbench:
+def running(shared_ros: Harness) -> Harness:
     """Start one controller, whose parameters every test leaves as they were."""
     shared_ros.start('controller')
     return shared_ros
@@ -39,7 +39,7 @@ def running(shared_ros: Workbench) -> Workbench:
     ({'no_such_thing': 1.0}, 'undeclared parameter'),
 ])
 def test_change_that_does_not_fit_is_refused_with_the_reason(
-        running: Workbench, change: dict[str, Any], words: str) -> None:
+        running: Harness, change: dict[str, Any], words: str) -> None:
     (result,) = running.set_parameters(CONTROLLER, **change)
     assert not result.successful
     assert words in result.reason
@@ -82,19 +82,19 @@ def test_change_that_does_not_fit_is_refused_with_the_reason(
      'must be above 0, got 0.0; choose another value in (0, 1000000] K/min'),
 ])
 def test_new_value_out_of_range_is_refused_with_value_range_and_unit(
-        running: Workbench, name: str, bad: float, words: str) -> None:
+        running: Harness, name: str, bad: float, words: str) -> None:
     (result,) = running.set_parameters(CONTROLLER, **{name: bad})
     assert (result.successful, result.reason) == (False, words)
 
 
-def test_change_is_read_back(running: Workbench) -> None:
+def test_change_is_read_back(running: Harness) -> None:
     for gain in (500.0, TABLE.rows['max_gain'].default):
         (result,) = running.set_parameters(CONTROLLER, max_gain=gain)
         assert result.successful, result.reason
         assert running.get_parameters(CONTROLLER, 'max_gain') == [gain]
 
 
-def test_two_limits_that_cross_on_the_way_change_together(running: Workbench) -> None:
+def test_two_limits_that_cross_on_the_way_change_together(running: Harness) -> None:
     default = {name: TABLE.rows[name].default for name in ('coolant_min', 'coolant_max')}
     for limits in ({'coolant_min': 40.0, 'coolant_max': 60.0}, default):
         result = running.set_parameters_atomically(CONTROLLER, **limits)
@@ -105,7 +105,7 @@ def test_two_limits_that_cross_on_the_way_change_together(running: Workbench) ->
 @pytest.mark.parametrize(('low', 'high', 'kind'), [
     ('coolant_min', 'coolant_max', 'input'), ('sensor_min', 'sensor_max', 'sensor')])
 def test_limits_that_are_equal_in_kelvin_are_refused(
-        running: Workbench, low: str, high: str, kind: str) -> None:
+        running: Harness, low: str, high: str, kind: str) -> None:
     above = 20.00000000000001
     result = running.set_parameters_atomically(CONTROLLER, **{low: 20.0, high: above})
     assert not result.successful
@@ -114,14 +114,14 @@ def test_limits_that_are_equal_in_kelvin_are_refused(
     assert running.get_parameters(CONTROLLER, low) == [TABLE.rows[low].default]
 
 
-def test_atomic_change_is_refused_as_a_whole(running: Workbench) -> None:
+def test_atomic_change_is_refused_as_a_whole(running: Harness) -> None:
     result = running.set_parameters_atomically(CONTROLLER, max_gain=7.0, coolant_max=500.0)
     assert not result.successful
     assert 'coolant_max = 500.0 degC' in result.reason
     assert running.get_parameters(CONTROLLER, 'max_gain') == [TABLE.rows['max_gain'].default]
 
 
-def test_every_parameter_is_described_with_unit_and_range(running: Workbench) -> None:
+def test_every_parameter_is_described_with_unit_and_range(running: Harness) -> None:
     names = list(TABLE.rows)
     response = running.call(DescribeParameters, f'{CONTROLLER}/describe_parameters',
                             DescribeParameters.Request(names=names))
@@ -138,6 +138,6 @@ def test_every_parameter_is_described_with_unit_and_range(running: Workbench) ->
     assert described['coolant_min'].additional_constraints == '[-50, 150] degC'
 
 
-def test_refused_change_is_logged(running: Workbench) -> None:
+def test_refused_change_is_logged(running: Harness) -> None:
     running.set_parameters(CONTROLLER, max_gain=-3.0)
     running.wait_until(lambda: 'parameter change refused: max_gain = -3.0' in running.printed())

@@ -13,7 +13,6 @@ from typing import Any
 import pytest
 from rclpy.node import Node
 from rclpy.parameter import parameter_dict_from_yaml_file, parameter_value_to_python
-from workbench import Workbench
 import yaml
 
 from koopman_ros.nodes.access import policy, POLICY_FILE
@@ -29,6 +28,7 @@ from koopman_ros.nodes.parameters import (
 from koopman_ros.nodes.plant_parameters import PlantParameters
 from koopman_ros.nodes.replay_parameters import ReplayParameters
 from koopman_ros.nodes.shipped import config_directory
+from koopman_ros.testing import Harness
 
 
 def row(default: Any, **details: Any) -> Specification:
@@ -159,7 +159,7 @@ def test_every_number_has_a_range_that_a_slider_can_show(node: str) -> None:
 
 
 @pytest.mark.parametrize('node', TABLES)
-def test_what_is_dumped_can_be_loaded_again(ros: Workbench, tmp_path: Path, node: str) -> None:
+def test_what_is_dumped_can_be_loaded_again(ros: Harness, tmp_path: Path, node: str) -> None:
     """As `ros2 param dump` writes it, and as `ros2 param load` and a node at its start read."""
     defaults = {name: list(item.default) if isinstance(item.default, tuple) else item.default
                 for name, item in TABLES[node].rows.items()}
@@ -178,7 +178,7 @@ def test_what_is_dumped_can_be_loaded_again(ros: Workbench, tmp_path: Path, node
             name: type(value) for name, value in defaults.items()}
 
 
-def declared(ros: Workbench, *arguments: str, table: ParameterTable[Any] = ODD) -> Any:
+def declared(ros: Harness, *arguments: str, table: ParameterTable[Any] = ODD) -> Any:
     """Return the snapshot of a node started with arguments, and if it has what is not its own."""
     node = ParameterNode('odd', context=ros.node.context, cli_args=['--ros-args', *arguments])
     try:
@@ -188,7 +188,7 @@ def declared(ros: Workbench, *arguments: str, table: ParameterTable[Any] = ODD) 
 
 
 def test_names_of_other_nodes_are_ignored_with_one_warning(
-        ros: Workbench, tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:
+        ros: Harness, tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:
     file = tmp_path / 'shared.yaml'
     file.write_text('/**:\n  ros__parameters:\n    count: 5\n    foreign: 1.0\n    cuont: 7\n'
                     '    nothing: []\n    more:\n      than: one\n')
@@ -207,7 +207,7 @@ def test_names_of_other_nodes_are_ignored_with_one_warning(
     ('plant', 'speed', 'a double, e.g. 1.0'),
 ])
 def test_empty_list_is_refused_with_its_name(
-        ros: Workbench, node: str, name: str, words: str) -> None:
+        ros: Harness, node: str, name: str, words: str) -> None:
     with pytest.raises(ConfigurationError) as refusal:
         declared(ros, '-p', f'{name}:=[]', table=TABLES[node])
     assert str(refusal.value) == f'{name} = [] must be {words}'
@@ -224,7 +224,7 @@ def test_empty_list_is_refused_with_its_name(
      'max_bag_size = 1e+308 MB must be 0, or in [1e-06, 1000000000] MB'),
 ])
 def test_start_with_what_cannot_be_used_is_refused(
-        ros: Workbench, node: str, given: tuple[str, ...], words: str) -> None:
+        ros: Harness, node: str, given: tuple[str, ...], words: str) -> None:
     arguments = [part for argument in given for part in ('-p', argument)]
     with pytest.raises(ConfigurationError) as refusal:
         declared(ros, *arguments, table=TABLES[node])
@@ -254,7 +254,7 @@ def test_former_form_of_the_riccati_bound_still_counts(
         assert kind(**given).settings().max_residual == pytest.approx(residual, rel=1e-15)
 
 
-def test_rcl_reads_back_what_the_table_writes(ros: Workbench, tmp_path: Path) -> None:
+def test_rcl_reads_back_what_the_table_writes(ros: Harness, tmp_path: Path) -> None:
     file = tmp_path / 'odd.yaml'
     file.write_text(ODD.yaml())
     node = Node('odd', context=ros.node.context,
@@ -315,7 +315,7 @@ def test_every_parameter_has_a_comment(node: str) -> None:
 
 # those that go on by themselves; player and replay have tests of their own
 @pytest.mark.parametrize('node', ['plant', 'controller', 'trainer'])
-def test_node_runs_with_its_shipped_file(ros: Workbench, tmp_path: Path, node: str) -> None:
+def test_node_runs_with_its_shipped_file(ros: Harness, tmp_path: Path, node: str) -> None:
     file = config_directory() / f'{node}.yaml'
     # the trainer would otherwise name its bag after the date, in the present folder
     arguments = ('-p', f'output:={tmp_path / "bag"}') if node == 'trainer' else ()

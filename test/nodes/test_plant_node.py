@@ -14,11 +14,12 @@ from diagnostic_msgs.msg import DiagnosticStatus
 import pytest
 from rclpy.node import Node
 from sensor_msgs.msg import JointState, Temperature
-from workbench import seconds, temperature, value, Workbench
+from workbench import seconds, temperature, value
 
 from koopman_ros.nodes import topics
 from koopman_ros.nodes.messages import LAST_STAMP_SECONDS, seconds_text, stamp_nanoseconds
 from koopman_ros.nodes.plant_parameters import PlantParameters, TABLE
+from koopman_ros.testing import Harness
 
 STATUS = 'plant: simulation'
 NOMINAL_COOLANT = 26.85  # degC
@@ -32,7 +33,7 @@ class Bench:
     :param parameters: of the plant.
     """
 
-    def __init__(self, ros: Workbench, **parameters: object) -> None:
+    def __init__(self, ros: Harness, **parameters: object) -> None:
         self.ros = ros
         self.coolant = NOMINAL_COOLANT
         self.answering = True
@@ -89,7 +90,7 @@ class Bench:
 
 
 @pytest.fixture(scope='module')
-def shared_bench(shared_ros: Workbench) -> Bench:
+def shared_bench(shared_ros: Harness) -> Bench:
     return Bench(shared_ros, lockstep_timeout=3600.0)
 
 
@@ -103,7 +104,7 @@ def bench(shared_bench: Bench) -> Bench:
 # Measurements.
 
 
-def test_two_state_reactor_stays_at_its_steady_state(ros: Workbench) -> None:
+def test_two_state_reactor_stays_at_its_steady_state(ros: Harness) -> None:
     concentrations = ros.listen(JointState, topics.CONCENTRATION)
     bench = Bench(ros, reactor='two_state')
     bench.wait_for_more(100)
@@ -154,7 +155,7 @@ def test_coarse_sensor_shows_steps_and_says_how_coarse_it_is(bench: Bench) -> No
     assert len({message.temperature for message in measured}) > 3
 
 
-def test_noise_repeats_with_its_seed(ros: Workbench) -> None:
+def test_noise_repeats_with_its_seed(ros: Harness) -> None:
     heard = {}
     for name, seed in (('a', 1), ('b', 1), ('c', 2)):
         heard[name] = ros.listen(Temperature, f'/{name}/temperature')
@@ -170,7 +171,7 @@ def test_noise_repeats_with_its_seed(ros: Workbench) -> None:
     assert not set(values['a']) & set(values['c'])
 
 
-def test_starts_away_from_the_steady_state(ros: Workbench) -> None:
+def test_starts_away_from_the_steady_state(ros: Harness) -> None:
     bench = Bench(ros, initial_temperature_offset=-5.0, start_time=10.0)
     bench.wait_for_more(1)
     assert seconds(bench.measured[0]) == 10.0
@@ -180,7 +181,7 @@ def test_starts_away_from_the_steady_state(ros: Workbench) -> None:
 # Time.
 
 
-def test_real_time_stamps_are_the_wall_clock(ros: Workbench) -> None:
+def test_real_time_stamps_are_the_wall_clock(ros: Harness) -> None:
     heard = ros.listen(Temperature, topics.TEMPERATURE)
     ros.start('plant', {'sample_period': 0.1})
     ros.wait_until(lambda: len(heard) >= 5)
@@ -192,7 +193,7 @@ def test_real_time_stamps_are_the_wall_clock(ros: Workbench) -> None:
     assert ros.node.count_publishers(topics.CLOCK) == 0
 
 
-def test_lockstep_waits_for_a_controller(ros: Workbench) -> None:
+def test_lockstep_waits_for_a_controller(ros: Harness) -> None:
     heard = ros.listen(Temperature, topics.TEMPERATURE)
     ros.start('plant', {'lockstep': True, 'speed': 0.0, 'start_time': 7.0})
     status = ros.wait_for_status(STATUS, lambda s: s.level == DiagnosticStatus.WARN)
@@ -203,7 +204,7 @@ def test_lockstep_waits_for_a_controller(ros: Workbench) -> None:
     assert seconds(heard[0]) == 7.0
 
 
-def test_lockstep_goes_on_without_an_answer_after_its_timeout(ros: Workbench) -> None:
+def test_lockstep_goes_on_without_an_answer_after_its_timeout(ros: Harness) -> None:
     bench = Bench(ros, lockstep_timeout=0.05)
     bench.coolant = 25.0
     bench.wait_for_more(5)
@@ -219,7 +220,7 @@ def test_lockstep_goes_on_without_an_answer_after_its_timeout(ros: Workbench) ->
     bench.wait_for_more(100)
 
 
-def test_lockstep_can_be_paced(ros: Workbench) -> None:
+def test_lockstep_can_be_paced(ros: Harness) -> None:
     sent: list[int] = []
     ros.node.create_subscription(
         Temperature, topics.TEMPERATURE,
@@ -230,14 +231,14 @@ def test_lockstep_can_be_paced(ros: Workbench) -> None:
     assert sent[20] - sent[0] >= 0.449e9
 
 
-def test_stands_still_after_its_duration(ros: Workbench) -> None:
+def test_stands_still_after_its_duration(ros: Harness) -> None:
     bench = Bench(ros, duration=20.0, sample_period=2.0)
     ros.wait_for_status(STATUS, lambda s: s.message == 'finished: the duration is over')
     ros.wait_until(lambda: len(bench.measured) >= 11)
     assert [seconds(message) for message in bench.measured] == [1.0 + 2.0 * k for k in range(11)]
 
 
-def test_stands_still_where_the_stamps_end(ros: Workbench) -> None:
+def test_stands_still_where_the_stamps_end(ros: Harness) -> None:
     bench = Bench(ros, start_time=LAST_STAMP_SECONDS - 7.0)
     status = ros.wait_for_status(STATUS, lambda s: s.level == DiagnosticStatus.ERROR)
     assert status.message == (
@@ -365,7 +366,7 @@ def test_command_that_is_not_a_number_is_rejected_and_the_last_one_held(bench: B
     bench.ros.wait_for_status(STATUS, lambda s: s.level == DiagnosticStatus.OK)
 
 
-def test_command_that_answers_no_open_measurement_is_not_taken(ros: Workbench) -> None:
+def test_command_that_answers_no_open_measurement_is_not_taken(ros: Harness) -> None:
     bench = Bench(ros, lockstep_timeout=3600.0)
     bench.wait_for_more(5)
     stamp = bench.pause()
@@ -385,7 +386,7 @@ def test_actuator_reaches_no_further_than_its_range(bench: Bench) -> None:
     assert float(value(status, 'coolant [degC]')) == pytest.approx(-20.0)
 
 
-def test_reset_returns_to_the_initial_temperature(ros: Workbench) -> None:
+def test_reset_returns_to_the_initial_temperature(ros: Harness) -> None:
     bench = Bench(ros, initial_temperature_offset=2.0, sample_period=0.1)
     bench.coolant = 10.0
     bench.wait_for(lambda celsius: celsius < 45.0)
@@ -447,7 +448,7 @@ def test_what_is_fixed_at_start_is_refused(bench: Bench) -> None:
     assert 'read-only parameter: speed' in result.reason
 
 
-def test_start_without_a_steady_state_says_so(ros: Workbench) -> None:
+def test_start_without_a_steady_state_says_so(ros: Harness) -> None:
     heard = ros.listen(Temperature, topics.TEMPERATURE)
     process = ros.start('plant', {'heat_transfer_coefficient': 0.0, 'sample_period': 0.05})
     ros.wait_until(lambda: heard)
@@ -476,7 +477,7 @@ def test_second_commander_is_told_by_its_name_while_it_lasts(bench: Bench) -> No
     assert status.message == 'running'
 
 
-def test_second_plant_is_told_by_both_while_it_lasts(ros: Workbench) -> None:
+def test_second_plant_is_told_by_both_while_it_lasts(ros: Harness) -> None:
     ros.start('plant', {'sample_period': 0.1})
     second = ros.start('plant', {'sample_period': 0.1}, ('-r', '__node:=plant_2'))
     for name in ('plant', 'plant_2'):

@@ -18,7 +18,7 @@ from rclpy.qos import DurabilityPolicy, ReliabilityPolicy
 from rclpy.serialization import serialize_message
 from rosgraph_msgs.msg import Clock
 from sensor_msgs.msg import Temperature
-from workbench import temperature, TIMEOUT, Workbench
+from workbench import temperature, TIMEOUT
 
 from koopman_ros.bags import (
     BagReadError,
@@ -31,10 +31,10 @@ from koopman_ros.bags import (
     temperature_series,
 )
 from koopman_ros.demo.loop import run_loop, Scenario
-from koopman_ros.demo.processes import isolated_domain, NodeProcess
 from koopman_ros.nodes import player, replay, topics
 from koopman_ros.nodes.messages import NANOSECONDS, stamp_nanoseconds
 from koopman_ros.nodes.shipped import config_directory
+from koopman_ros.testing import Harness, isolated_domain, NodeProcess
 
 SAMPLES = 61
 SCENARIO = Scenario('reactor_nz4', 315.15, step_time=20.0, duration=SAMPLES - 1.0,
@@ -60,15 +60,14 @@ def write_bag(path: Path, entries: Sequence[tuple[str, Temperature, float]],
     return path
 
 
-def play(ros: Workbench, bag: Path, *, arguments: tuple[str, ...] = (), **parameters: Any
+def play(ros: Harness, bag: Path, *, arguments: tuple[str, ...] = (), **parameters: Any
          ) -> NodeProcess:
     return ros.start('player', {'bag': bag, **parameters}, arguments)
 
 
-def refusal(ros: Workbench, process: NodeProcess) -> str:
+def refusal(ros: Harness, process: NodeProcess) -> str:
     """Wait until the player gives up; return the one line that it says."""
     assert ros.wait_for_end(process) == 1
-    ros.processes.remove(process)
     lines = [line for line in process.output().splitlines() if line.startswith('player: ')]
     assert len(lines) == 1
     assert 'Traceback' not in process.output()
@@ -79,7 +78,7 @@ def stamps(messages: Sequence[Any]) -> list[int]:
     return [stamp_nanoseconds(message.header.stamp) for message in messages]
 
 
-def test_lockstep_gives_the_recorded_commands_to_the_bit(ros: Workbench, bag: Path) -> None:
+def test_lockstep_gives_the_recorded_commands_to_the_bit(ros: Harness, bag: Path) -> None:
     recorded = temperature_series(bag, '/coolant_setpoint')
     commands = ros.listen(Temperature, topics.COOLANT_SETPOINT)
     ros.start('controller', {'observer_bandwidth': 0.0})
@@ -118,7 +117,7 @@ def test_lockstep_waits_for_requests_alone(tmp_path: Path, monkeypatch: pytest.M
     assert sorted(waits[-3:]) == ['/coolant_temperature', '/setpoint', '/temperature']
 
 
-def test_messages_are_played_byte_for_byte(ros: Workbench, bag: Path) -> None:
+def test_messages_are_played_byte_for_byte(ros: Harness, bag: Path) -> None:
     heard = ros.listen(Temperature, 'played/temperature', raw=True)
     process = play(ros, bag, rate=10000.0, topics=['temperature'],
                    arguments=('-r', '__ns:=/played'))
@@ -127,7 +126,7 @@ def test_messages_are_played_byte_for_byte(ros: Workbench, bag: Path) -> None:
     assert heard == [entry.data for entry in read_messages(bag, ['/temperature'])]
 
 
-def test_live_answers_come_within_a_sample(ros: Workbench, bag: Path, tmp_path: Path) -> None:
+def test_live_answers_come_within_a_sample(ros: Harness, bag: Path, tmp_path: Path) -> None:
     """A minute of one sample a second in four."""
     rate = 15.0
     slow = write_bag(tmp_path / 'slow.mcap', [
@@ -157,7 +156,7 @@ def test_live_answers_come_within_a_sample(ros: Workbench, bag: Path, tmp_path: 
     assert stamps(commands) == list(arrived['measured'])
 
 
-def test_shipped_parameter_file_fits(ros: Workbench, bag: Path) -> None:
+def test_shipped_parameter_file_fits(ros: Harness, bag: Path) -> None:
     heard = ros.listen(Temperature, topics.SETPOINT)
     file = config_directory() / 'player.yaml'
     process = ros.start('player', arguments=(
@@ -166,7 +165,7 @@ def test_shipped_parameter_file_fits(ros: Workbench, bag: Path) -> None:
     ros.wait_until(lambda: heard)
 
 
-def test_clock_shows_the_stamp_of_each_measurement_before_it(ros: Workbench, tmp_path: Path
+def test_clock_shows_the_stamp_of_each_measurement_before_it(ros: Harness, tmp_path: Path
                                                              ) -> None:
     bag = write_bag(tmp_path / 'bag.mcap', [
         ('/temperature', temperature(50.0, 100.0), 1.0),
@@ -186,7 +185,7 @@ def test_clock_shows_the_stamp_of_each_measurement_before_it(ros: Workbench, tmp
 
 
 def test_order_is_that_of_receipt_and_the_offset_leaves_out_the_beginning(
-        ros: Workbench, tmp_path: Path) -> None:
+        ros: Harness, tmp_path: Path) -> None:
     bag = write_bag(tmp_path / 'bag.mcap', [
         ('/temperature', temperature(float(k), float(k)), received)
         for k, received in [(0, 10.0), (3, 10.8), (1, 10.4), (2, 10.6), (4, 1.0)]])
@@ -220,7 +219,7 @@ def test_offer_is_that_of_the_recorded_publishers(
 
 
 def test_bag_in_a_namespace_is_played_into_another_controller(
-        ros: Workbench, tmp_path: Path) -> None:
+        ros: Harness, tmp_path: Path) -> None:
     bag = write_bag(tmp_path / 'bag.mcap', [
         ('/unit_1/temperature', temperature(51.0 - k, 1.0 + k), float(k)) for k in range(5)])
     commands = ros.listen(Temperature, '/unit_2/coolant_setpoint')
@@ -244,7 +243,7 @@ def test_bag_in_a_namespace_is_played_into_another_controller(
      'no command for the measurement at 1.000 s within 0.1 s: is the controller alive?'),
 ])
 def test_what_cannot_be_played_is_refused_in_one_line(
-        ros: Workbench, tmp_path: Path, parameters: dict[str, Any], words: str) -> None:
+        ros: Harness, tmp_path: Path, parameters: dict[str, Any], words: str) -> None:
     bag = write_bag(tmp_path / 'bag.mcap', [('/temperature', temperature(50.0, 1.0), 1.0)])
     process = ros.start('player', {'bag': bag, **parameters})
     assert words in refusal(ros, process)
@@ -291,7 +290,7 @@ def test_bags_beyond_reason_are_refused_by_all_who_read_bags(
             assert words in line
 
 
-def test_damage_on_the_way_is_told_in_one_line(ros: Workbench, tmp_path: Path) -> None:
+def test_damage_on_the_way_is_told_in_one_line(ros: Harness, tmp_path: Path) -> None:
     bag = write_bag(tmp_path / 'bag.mcap', [
         ('/temperature', temperature(50.0, float(k)), float(k)) for k in range(100)])
     content = bytearray(bag.read_bytes())
@@ -301,7 +300,7 @@ def test_damage_on_the_way_is_told_in_one_line(ros: Workbench, tmp_path: Path) -
     assert 'is damaged' in refusal(ros, process)
 
 
-def test_signal_ends_it(ros: Workbench, tmp_path: Path) -> None:
+def test_signal_ends_it(ros: Harness, tmp_path: Path) -> None:
     bag = write_bag(tmp_path / 'bag.mcap', [
         ('/temperature', temperature(50.0, float(k)), 3600.0 * k) for k in range(2)])
     heard = ros.listen(Temperature, topics.TEMPERATURE)

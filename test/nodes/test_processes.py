@@ -14,29 +14,27 @@ import re
 import signal
 import subprocess
 import sys
-import time
 
 import pytest
 from rclpy.utilities import get_rmw_implementation_identifier
 from rosgraph_msgs.msg import Clock
 from sensor_msgs.msg import Temperature
-from workbench import temperature, TIMEOUT, Workbench
+from workbench import temperature, TIMEOUT
 
 from koopman_ros.bags import summary
-from koopman_ros.demo import processes
-from koopman_ros.demo.processes import isolated_domain, NodeProcess
 from koopman_ros.nodes import command_line, topics
 from koopman_ros.nodes.exposure import open_to_the_network
 from koopman_ros.nodes.messages import NANOSECONDS, stamp_message
 from koopman_ros.nodes.parameter_files import TABLES
 from koopman_ros.nodes.shipped import model_path
+from koopman_ros.testing import Harness, isolated_domain, NodeProcess
 
 # Ends.
 
 
 @pytest.mark.parametrize('number', [signal.SIGINT, signal.SIGTERM])
 @pytest.mark.parametrize('name', ['plant', 'controller', 'trainer'])
-def test_signal_ends_a_node_cleanly(ros: Workbench, tmp_path: Path, name: str, number: int
+def test_signal_ends_a_node_cleanly(ros: Harness, tmp_path: Path, name: str, number: int
                                     ) -> None:
     # the plant is in the middle of a callback whenever the signal comes
     parameters = {'plant': {'speed': 0.0}, 'controller': {},
@@ -53,7 +51,7 @@ def test_signal_ends_a_node_cleanly(ros: Workbench, tmp_path: Path, name: str, n
 @pytest.mark.parametrize(('name', 'number', 'code'), [
     ('plant', signal.SIGINT, 0), ('plant', signal.SIGTERM, 0), ('replay', signal.SIGINT, 130)])
 def test_signal_while_a_program_loads_ends_it_without_a_word(
-        ros: Workbench, name: str, number: int, code: int) -> None:
+        ros: Harness, name: str, number: int, code: int) -> None:
     program = (
         'import os, signal, sys\n'
         'class Interrupted:\n'
@@ -68,14 +66,14 @@ def test_signal_while_a_program_loads_ends_it_without_a_word(
     assert process.output() == ''
 
 
-def test_signal_before_the_interpreter_is_up_ends_a_node_cleanly(ros: Workbench) -> None:
+def test_signal_before_the_interpreter_is_up_ends_a_node_cleanly(ros: Harness) -> None:
     process = ros.start('plant')
     assert process.stop(signal.SIGTERM) == 0
     assert process.output() == ''
 
 
 @pytest.mark.parametrize('number', [signal.SIGINT, signal.SIGTERM])
-def test_signal_during_the_start_ends_a_node_cleanly(ros: Workbench, number: int) -> None:
+def test_signal_during_the_start_ends_a_node_cleanly(ros: Harness, number: int) -> None:
     program = (
         'import os, sys\n'
         'from koopman_ros.nodes.plant import PlantNode\n'
@@ -90,7 +88,7 @@ def test_signal_during_the_start_ends_a_node_cleanly(ros: Workbench, number: int
 
 
 @pytest.mark.parametrize('number', [signal.SIGINT, signal.SIGTERM])
-def test_signal_at_the_end_of_the_interpreter_changes_nothing(ros: Workbench, number: int
+def test_signal_at_the_end_of_the_interpreter_changes_nothing(ros: Harness, number: int
                                                               ) -> None:
     # what a module holds goes when the interpreter has given up its handlers
     program = (
@@ -110,7 +108,7 @@ def test_signal_at_the_end_of_the_interpreter_changes_nothing(ros: Workbench, nu
     assert 'Traceback' not in process.output()
 
 
-def test_node_without_standard_streams_ends_cleanly(ros: Workbench, tmp_path: Path) -> None:
+def test_node_without_standard_streams_ends_cleanly(ros: Harness, tmp_path: Path) -> None:
     program = 'import sys; from koopman_ros.nodes.programs import trainer; sys.exit(trainer())'
     process = ros.start('trainer', {'output': tmp_path / 'bag.mcap'}, command=(
         'sh', '-c', 'exec "$@" <&- >&- 2>&-', 'sh', sys.executable, '-c', program))
@@ -119,37 +117,7 @@ def test_node_without_standard_streams_ends_cleanly(ros: Workbench, tmp_path: Pa
     assert summary(tmp_path / 'bag.mcap').complete
 
 
-def test_node_ends_with_its_parent_that_is_killed(ros: Workbench, tmp_path: Path) -> None:
-    program = (
-        'import time\n'
-        'from pathlib import Path\n'
-        'from koopman_ros.demo.processes import NodeProcess\n'
-        f'folder = Path({str(tmp_path)!r})\n'
-        'node = NodeProcess(\n'
-        '    "trainer", {"output": folder / "bag.mcap"}, folder / "child.log", {})\n'
-        'print(node.process.pid, flush=True)\n'
-        'time.sleep(60)\n')
-    parent = ros.start('parent', command=(sys.executable, '-c', program))
-    ros.meet('trainer')
-    child = int(parent.output())
-    assert parent.stop(signal.SIGKILL) == -signal.SIGKILL
-    deadline = time.monotonic() + TIMEOUT
-    while not _has_ended(child):
-        assert time.monotonic() < deadline
-        time.sleep(0.01)
-    assert summary(tmp_path / 'bag.mcap').complete
-
-
-def _has_ended(pid: int) -> bool:
-    try:
-        stat = Path(f'/proc/{pid}/stat').read_text()
-    except OSError:
-        return True
-    # nobody may be there who waits for it
-    return stat.rpartition(') ')[2][0] == 'Z'
-
-
-def test_middleware_that_hangs_with_the_lock_held_does_not_keep_a_process(ros: Workbench) -> None:
+def test_middleware_that_hangs_with_the_lock_held_does_not_keep_a_process(ros: Harness) -> None:
     program = (
         'import ctypes, os, signal, sys\n'
         'from koopman_ros.nodes import process\n'
@@ -181,7 +149,7 @@ def test_a_process_that_runs_a_node_among_other_things_is_not_ended_by_force() -
     assert (done.returncode, done.stderr) == (7, b'')
 
 
-def test_middleware_that_hangs_does_not_keep_a_process(ros: Workbench) -> None:
+def test_middleware_that_hangs_does_not_keep_a_process(ros: Harness) -> None:
     program = (
         'import os, signal, sys, time\n'
         'from koopman_ros.nodes.plant import PlantNode\n'
@@ -204,7 +172,7 @@ def test_middleware_that_hangs_does_not_keep_a_process(ros: Workbench) -> None:
 
 
 @pytest.mark.parametrize(('sec', 'nanosec'), [(-5, 0), (7, 4_000_000_000)])
-def test_impossible_time_does_not_end_a_node(ros: Workbench, sec: int, nanosec: int) -> None:
+def test_impossible_time_does_not_end_a_node(ros: Harness, sec: int, nanosec: int) -> None:
     process = ros.start('controller', {'use_sim_time': True})
     clock = ros.speak(Clock, '/clock', topics.CLOCK_QOS, to='controller')
     message = Clock()
@@ -254,7 +222,7 @@ def test_help_is_read_as_far_as_somebody_wants_to() -> None:
 
 @pytest.mark.parametrize(('argument', 'code'), [('--help', 0), ('--speed=2.0', 2)])
 def test_program_answers_arguments_before_it_starts(
-        ros: Workbench, argument: str, code: int) -> None:
+        ros: Harness, argument: str, code: int) -> None:
     program = 'import sys; from koopman_ros.nodes.programs import plant; sys.exit(plant())'
     process = ros.start('plant', command=(sys.executable, '-c', program, argument))
     assert ros.wait_for_end(process) == code
@@ -284,7 +252,7 @@ def test_who_can_reach_a_node(environment: dict[str, str], is_open: bool) -> Non
 
 
 def test_node_that_is_open_to_the_network_says_so_once(
-        ros: Workbench) -> None:
+        ros: Harness) -> None:
     # a node that believes itself open, on loopback
     program = (
         'import os, sys\n'
@@ -380,7 +348,7 @@ def test_bad_start_says_why_in_one_line(bad_starts: dict[str, NodeProcess], name
 
 
 @pytest.mark.parametrize('name', ['plant', 'controller'])
-def test_runs_where_torch_cannot_be_imported(ros: Workbench, name: str) -> None:
+def test_runs_where_torch_cannot_be_imported(ros: Harness, name: str) -> None:
     program = (
         'import sys\n'
         'class NoTorch:\n'
@@ -402,27 +370,12 @@ def test_runs_where_torch_cannot_be_imported(ros: Workbench, name: str) -> None:
     assert process.stop() == 0
 
 
-# How they are kept.
-
-
-def test_two_reservations_are_two_domains() -> None:
-    with isolated_domain() as first, isolated_domain() as second:
-        assert first['ROS_DOMAIN_ID'] != second['ROS_DOMAIN_ID']
-
-
-def test_reservation_ends_with_its_context(monkeypatch: pytest.MonkeyPatch) -> None:
-    # one that no other test reserves meanwhile
-    monkeypatch.setattr(processes, '_DOMAINS', [1000 + os.getpid()])
-    for _ in range(2):
-        with isolated_domain() as environment:
-            assert environment['ROS_DOMAIN_ID'] == str(1000 + os.getpid())
-            with pytest.raises(RuntimeError, match='taken'), isolated_domain():
-                pass
+# Where they are heard.
 
 
 @pytest.mark.skipif('fastrtps' not in get_rmw_implementation_identifier(),
                     reason='the profile is one for Fast DDS')
-def test_everything_stays_on_loopback_without_shared_memory(ros: Workbench) -> None:
+def test_everything_stays_on_loopback_without_shared_memory(ros: Harness) -> None:
     process = ros.start('trainer', {'record_at_start': False})
     ros.meet('trainer')
     sockets = _udp_sockets(process.process.pid)
@@ -440,51 +393,3 @@ def _udp_sockets(pid: int) -> list[str]:
     # the address is written as hexadecimal in the order of the machine
     return [str(ipaddress.ip_address(bytes.fromhex(row[1].split(':')[0])[::-1]))
             for row in rows if row[9] in own]
-
-
-def test_environment_of_the_reservation_holds_here_too(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setenv('ROS_DOMAIN_ID', '7')
-    monkeypatch.delenv('RMW_IMPLEMENTATION', raising=False)
-    with isolated_domain() as environment:
-        assert environment.items() <= os.environ.items()
-    assert os.environ['ROS_DOMAIN_ID'] == '7'
-    assert 'RMW_IMPLEMENTATION' not in os.environ
-
-
-@pytest.mark.parametrize(('given', 'found', 'reach'), [
-    ('', 'rmw_fastrtps_cpp', 'SYSTEM_DEFAULT'),
-    ('rmw_fastrtps_dynamic_cpp', 'rmw_fastrtps_dynamic_cpp', 'SYSTEM_DEFAULT'),
-    # whose default is the whole network, as it knows nothing of the profile
-    ('rmw_cyclonedds_cpp', 'rmw_cyclonedds_cpp', 'LOCALHOST'),
-])
-def test_middleware_that_is_named_stays(
-        monkeypatch: pytest.MonkeyPatch, given: str, found: str, reach: str) -> None:
-    monkeypatch.setenv('RMW_IMPLEMENTATION', given)
-    with isolated_domain() as environment:
-        assert environment['RMW_IMPLEMENTATION'] == os.environ['RMW_IMPLEMENTATION'] == found
-        assert environment['ROS_AUTOMATIC_DISCOVERY_RANGE'] == reach
-    assert os.environ['RMW_IMPLEMENTATION'] == given
-
-
-def test_process_that_ignores_signals_is_killed(
-        tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(processes, 'STOP_TIMEOUT', 0.2)
-    program = ('import signal, time\n'
-               'for number in (signal.SIGINT, signal.SIGTERM):\n'
-               '    signal.signal(number, signal.SIG_IGN)\n'
-               'print("ignoring", flush=True)\n'
-               'time.sleep(60)\n')
-    process = NodeProcess('stubborn', {}, tmp_path / 'log', {},
-                          command=(sys.executable, '-c', program))
-    while 'ignoring' not in process.output():
-        assert process.running
-    assert process.stop() == -signal.SIGKILL
-    assert not process.running
-
-
-def test_process_ends_with_its_context_when_a_test_fails(tmp_path: Path) -> None:
-    with (pytest.raises(ZeroDivisionError),
-          NodeProcess('sleeper', {}, tmp_path / 'log', {},
-                      command=(sys.executable, '-c', 'import time; time.sleep(60)')) as process):
-        raise ZeroDivisionError
-    assert not process.running

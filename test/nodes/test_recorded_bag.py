@@ -16,12 +16,12 @@ import numpy as np
 import pytest
 from rosbags.highlevel import AnyReader
 from rosbags.rosbag2 import Reader
-from workbench import Workbench
 import yaml
 
 from koopman_ros.bags import temperature_series
 from koopman_ros.demo.loop import run_loop, Scenario
 from koopman_ros.nodes import topics
+from koopman_ros.testing import Harness
 
 SAMPLES = 61
 SETPOINT = 315.15  # K
@@ -80,7 +80,7 @@ def test_rosbags_finds_and_decodes_the_same(bag: Path) -> None:
     assert all(0.5 < m.position[0] < 1.0 for m in concentrations)
 
 
-def test_type_hashes_are_those_of_ros(ros: Workbench, bag: Path) -> None:
+def test_type_hashes_are_those_of_ros(ros: Harness, bag: Path) -> None:
     with bag.open('rb') as stream:
         channels = make_reader(stream).get_summary().channels.values()
         stored = {channel.topic: channel.metadata['topic_type_hash'] for channel in channels}

@@ -12,12 +12,13 @@ from typing import Any
 import pytest
 from rclpy.duration import Duration
 from sensor_msgs.msg import Temperature
-from workbench import temperature, TIMEOUT, Workbench
+from workbench import temperature, TIMEOUT
 
 from koopman_ros.bags import BagWriter, read_messages
 from koopman_ros.nodes import recorder, topics
 from koopman_ros.nodes.messages import NANOSECONDS
 from koopman_ros.nodes.recorder import receipt_ns, Recorder
+from koopman_ros.testing import Harness
 
 NAMES = (topics.TEMPERATURE, topics.SETPOINT, topics.COOLANT_SETPOINT)
 
@@ -30,7 +31,7 @@ def stamped_at_the_take(handle: Any, message_type: type) -> Any:
 
 @pytest.mark.parametrize('at_the_take', [False, True])
 def test_batch_is_recorded_in_the_order_of_sending(
-        ros: Workbench, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, at_the_take: bool
+        ros: Harness, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, at_the_take: bool
         ) -> None:
     if at_the_take:
         monkeypatch.setattr(recorder, 'take_raw', stamped_at_the_take)

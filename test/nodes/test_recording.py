@@ -25,13 +25,14 @@ from rclpy.duration import Duration
 from rosbags.highlevel import AnyReader
 from sensor_msgs.msg import Temperature
 from std_msgs.msg import String
-from workbench import temperature, TIMEOUT, Workbench
+from workbench import temperature, TIMEOUT
 import yaml
 
 from koopman_ros.bags import read_messages, summary
 from koopman_ros.nodes import topics
 from koopman_ros.nodes.recording import free_name
 from koopman_ros.nodes.trainer_parameters import TABLE, TrainerParameters
+from koopman_ros.testing import Harness
 
 TOPIC = '/temperature'
 PUBLISHER = (Path(__file__).parents[2]
@@ -78,7 +79,7 @@ class Killed:
 
 
 @pytest.fixture(scope='module')
-def killed(shared_ros: Workbench, tmp_path_factory: pytest.TempPathFactory) -> list[Killed]:
+def killed(shared_ros: Harness, tmp_path_factory: pytest.TempPathFactory) -> list[Killed]:
     """Kill trainers at several moments while messages stream."""
     ros = shared_ros
     cases = []
@@ -106,7 +107,6 @@ def killed(shared_ros: Workbench, tmp_path_factory: pytest.TempPathFactory) -> l
         ros.wait_until(lambda m=moment: sent and time.monotonic() > sent[0] + m)
         now = time.monotonic()
         assert process.stop(signal.SIGKILL) == -signal.SIGKILL
-        ros.processes.remove(process)
         found.append(Killed(bag, compression, sum(at <= now - 1.0 for at in sent), len(sent)))
     timer.cancel()
     return found
@@ -121,7 +121,7 @@ def test_kill_loses_no_more_than_the_last_second(killed: list[Killed]) -> None:
         assert case.bag.suffix or len(list(case.bag.glob('*.mcap'))) >= 3
 
 
-def test_start_after_a_kill_takes_the_next_name(shared_ros: Workbench, killed: list[Killed]
+def test_start_after_a_kill_takes_the_next_name(shared_ros: Harness, killed: list[Killed]
                                                 ) -> None:
     left = [killed[0], next(case for case in killed if not case.bag.suffix)]
     for case in left:
@@ -136,12 +136,11 @@ def test_start_after_a_kill_takes_the_next_name(shared_ros: Workbench, killed: l
 
 
 @pytest.mark.parametrize('name', ['run', 'run.mcap'])
-def test_killed_before_the_first_message(ros: Workbench, tmp_path: Path, name: str) -> None:
+def test_killed_before_the_first_message(ros: Harness, tmp_path: Path, name: str) -> None:
     bag = tmp_path / name
     first = ros.start('trainer', {'output': bag})
     ros.wait_until(bag.exists)
     first.stop(signal.SIGKILL)
-    ros.processes.remove(first)
     second = ros.start('trainer', {'output': bag})
     ros.wait_until(free_name(bag).exists)
     assert second.stop() == 0
@@ -168,7 +167,7 @@ def test_free_name(tmp_path: Path, wanted: str, free: str) -> None:
 
 
 @pytest.mark.parametrize('limit', [{'max_bag_duration': 0.3}, {'max_bag_size': 0.01}])
-def test_split_bag_reads_as_one(ros: Workbench, tmp_path: Path, limit: dict[str, float]) -> None:
+def test_split_bag_reads_as_one(ros: Harness, tmp_path: Path, limit: dict[str, float]) -> None:
     bag = tmp_path / 'run'
     trainer = ros.start('trainer', {'output': bag, 'topics': [TOPIC], **limit})
     publisher = ros.speak(Temperature, topics.TEMPERATURE, to='trainer')
@@ -212,7 +211,7 @@ def test_single_file_is_not_split() -> None:
 # Full disk.
 
 
-def test_does_not_start_on_a_disk_with_too_little_room(ros: Workbench, tmp_path: Path) -> None:
+def test_does_not_start_on_a_disk_with_too_little_room(ros: Harness, tmp_path: Path) -> None:
     bag = tmp_path / 'deep' / 'run'
     trainer = ros.start('trainer', {'output': bag, 'min_free_disk': 1e9})
     assert ros.wait_for_end(trainer) == 1
@@ -223,7 +222,7 @@ def test_does_not_start_on_a_disk_with_too_little_room(ros: Workbench, tmp_path:
     assert not bag.parent.exists()
 
 
-def test_too_little_room_stops_the_recording_but_not_the_node(ros: Workbench, tmp_path: Path
+def test_too_little_room_stops_the_recording_but_not_the_node(ros: Harness, tmp_path: Path
                                                               ) -> None:
     bag = tmp_path / 'run'
     trainer = ros.start('trainer', {'output': bag})
@@ -251,7 +250,7 @@ def test_too_little_room_stops_the_recording_but_not_the_node(ros: Workbench, tm
 
 
 @pytest.mark.parametrize(('size', 'limit', 'complete'), [(6, 4.0, True), (3, 0.0, False)])
-def test_small_disk_runs_full(ros: Workbench, tmp_path: Path, size: int, limit: float,
+def test_small_disk_runs_full(ros: Harness, tmp_path: Path, size: int, limit: float,
                               complete: bool) -> None:
     (disk := tmp_path / 'disk').mkdir()
     private = ('unshare', '--user', '--map-root-user', '--mount', 'sh', '-c',
@@ -278,7 +277,7 @@ def test_small_disk_runs_full(ros: Workbench, tmp_path: Path, size: int, limit: 
     assert 'Traceback' not in trainer.output()
 
 
-def test_bag_that_vanished_is_no_success(ros: Workbench, tmp_path: Path) -> None:
+def test_bag_that_vanished_is_no_success(ros: Harness, tmp_path: Path) -> None:
     bag = tmp_path / 'run'
     ros.start('trainer', {'output': bag})
     ros.wait_until((bag / 'run_0.mcap').exists)
@@ -293,7 +292,7 @@ def test_bag_that_vanished_is_no_success(ros: Workbench, tmp_path: Path) -> None
 # Fast.
 
 
-def test_loses_nothing_at_1_khz(ros: Workbench, tmp_path: Path) -> None:
+def test_loses_nothing_at_1_khz(ros: Harness, tmp_path: Path) -> None:
     bag = tmp_path / 'run'
     trainer = ros.start('trainer', {'output': bag, 'max_bag_duration': 1.0})
     publisher = ros.start('publisher', command=(

@@ -26,7 +26,7 @@ from rclpy.parameter import Parameter
 from rclpy.task import Future
 from sensor_msgs.msg import Temperature
 from std_srvs.srv import Trigger
-from workbench import seconds, temperature, value, Workbench
+from workbench import seconds, temperature, value
 
 from koopman_ros.control import Controller, State
 from koopman_ros.lifting import LiftedModel, load, save
@@ -34,6 +34,7 @@ from koopman_ros.nodes import model_reload, topics
 from koopman_ros.nodes.controller_parameters import ControllerParameters
 from koopman_ros.nodes.messages import stamp_nanoseconds, to_celsius, to_kelvin
 from koopman_ros.nodes.shipped import model_path
+from koopman_ros.testing import Harness
 
 STATUS = 'controller: control'
 STEADY = 51.8  # degC, near the plant's steady state
@@ -58,7 +59,7 @@ def put(content: bytes, path: Path) -> None:
     os.replace(new, path)
 
 
-def opened(ros: Workbench, pipe: Path) -> BinaryIO:
+def opened(ros: Harness, pipe: Path) -> BinaryIO:
     """Wait until somebody reads from a named pipe, and return the end to write to."""
     def end() -> BinaryIO | None:
         try:
@@ -89,7 +90,7 @@ class Operator:
     :param ros: where the controller runs.
     """
 
-    def __init__(self, ros: Workbench) -> None:
+    def __init__(self, ros: Harness) -> None:
         self._ros = ros
         self._reload = self._client(Trigger, 'controller/reload_model')
         self._set = self._client(SetParameters, 'controller/set_parameters')
@@ -131,7 +132,7 @@ class Thermometer:
     :param ros: where the controller runs.
     """
 
-    ros: Workbench
+    ros: Harness
     sent: list[Temperature] = field(default_factory=list)
     commands: list[Temperature] = field(default_factory=list)
 
@@ -161,7 +162,7 @@ class Thermometer:
         self._publisher.publish(message)
 
 
-def test_a_hundred_reloads_under_load_leave_no_trace(ros: Workbench, tmp_path: Path) -> None:
+def test_a_hundred_reloads_under_load_leave_no_trace(ros: Harness, tmp_path: Path) -> None:
     """Each command is the very one that the models give in turn, and none of them jumps."""
     file = tmp_path / 'model.safetensors'
     contents = {name: model_path(name).read_bytes() for name in NAMES}
@@ -268,7 +269,7 @@ BAD_MODELS = {
 
 
 @pytest.fixture(scope='module')
-def running(shared_ros: Workbench) -> tuple[Operator, Callable[[], float]]:
+def running(shared_ros: Harness) -> tuple[Operator, Callable[[], float]]:
     """Return a controller at its steady state, and what measures it once."""
     shared_ros.start('controller', PATIENT)
     commands = shared_ros.listen(Temperature, topics.COOLANT_SETPOINT)
@@ -286,7 +287,7 @@ def running(shared_ros: Workbench) -> tuple[Operator, Callable[[], float]]:
 
 @pytest.mark.parametrize('name', BAD_MODELS)
 def test_unsuitable_model_is_refused_with_the_reason(
-        shared_ros: Workbench, running: tuple[Operator, Callable[[], float]],
+        shared_ros: Harness, running: tuple[Operator, Callable[[], float]],
         tmp_path: Path, name: str) -> None:
     operator, measure = running
     build, words = BAD_MODELS[name]
@@ -318,7 +319,7 @@ def test_model_that_is_missing_is_refused(
 
 
 def test_model_changes_with_the_weights_that_it_needs(
-        shared_ros: Workbench, running: tuple[Operator, Callable[[], float]]) -> None:
+        shared_ros: Harness, running: tuple[Operator, Callable[[], float]]) -> None:
     result = until_read(lambda: shared_ros.set_parameters_atomically(
         'controller', model='reactor_linear', max_gain=1e-3))
     assert 'the gain exceeds its bound' in result.reason
@@ -375,7 +376,7 @@ class SlowDisk:
     :param folder: for the files.
     """
 
-    ros: Workbench
+    ros: Harness
     folder: Path
 
     def start_controller(self, changes: str = '') -> Path:
@@ -396,11 +397,11 @@ class SlowDisk:
 
 
 @pytest.fixture
-def disk(ros: Workbench, tmp_path: Path) -> SlowDisk:
+def disk(ros: Harness, tmp_path: Path) -> SlowDisk:
     return SlowDisk(ros, tmp_path)
 
 
-def test_loop_goes_on_while_a_slow_disk_is_read(ros: Workbench, disk: SlowDisk) -> None:
+def test_loop_goes_on_while_a_slow_disk_is_read(ros: Harness, disk: SlowDisk) -> None:
     file = disk.start_controller()
     dead = file.with_name('dead.safetensors')
     operator, thermometer = Operator(ros), Thermometer(ros)
@@ -425,7 +426,7 @@ def test_loop_goes_on_while_a_slow_disk_is_read(ros: Workbench, disk: SlowDisk) 
     assert 'Traceback' not in ros.printed()
 
 
-def test_model_changed_during_a_slow_reload_stays(ros: Workbench, disk: SlowDisk) -> None:
+def test_model_changed_during_a_slow_reload_stays(ros: Harness, disk: SlowDisk) -> None:
     file = disk.start_controller()
     operator = Operator(ros)
     disk.hang(file)
@@ -440,7 +441,7 @@ def test_model_changed_during_a_slow_reload_stays(ros: Workbench, disk: SlowDisk
 
 
 def test_dead_disk_does_not_pile_up_readers_and_a_healthy_one_is_read(
-        ros: Workbench, disk: SlowDisk) -> None:
+        ros: Harness, disk: SlowDisk) -> None:
     # impatient, or this would last; the folder stands for a disk
     file = disk.start_controller(f"""
 model_reload._LONG_WAIT = 0.02

@@ -18,7 +18,7 @@ import numpy as np
 import pytest
 from rclpy.serialization import serialize_message
 from sensor_msgs.msg import Temperature
-from workbench import seconds, temperature, value, Workbench
+from workbench import seconds, temperature, value
 
 from koopman_ros.bags import (
     BagMessage,
@@ -27,7 +27,6 @@ from koopman_ros.bags import (
     message_definition,
     read_messages,
 )
-from koopman_ros.demo.processes import isolated_domain
 from koopman_ros.nodes import replay, topics
 from koopman_ros.nodes.messages import NANOSECONDS
 from koopman_ros.nodes.replay_parameters import ReplayParameters
@@ -36,6 +35,7 @@ from koopman_ros.nodes.replaying.comparison import ReplayedBag
 from koopman_ros.nodes.replaying.record import Names
 from koopman_ros.nodes.replaying.report import about_beginning, reproduced, verdict
 from koopman_ros.nodes.shipped import config_directory
+from koopman_ros.testing import Harness, isolated_domain
 
 STEADY = 51.8  # degC
 # The rate limit is active through every step of the set-point, and the ramp takes some samples.
@@ -53,7 +53,7 @@ class Operator:
     :param settings: of the controller.
     """
 
-    def __init__(self, ros: Workbench, bag: Path, settings: dict[str, float]) -> None:
+    def __init__(self, ros: Harness, bag: Path, settings: dict[str, float]) -> None:
         self.ros = ros
         self.time = 0.0
         ros.start('trainer', {'output': bag})
@@ -122,7 +122,7 @@ def run_a_day(operator: Operator) -> None:
 
 def record_a_day(folder: Path, settings: dict[str, float]) -> tuple[Path, int]:
     """Record it; return the bag and how many measurements there were."""
-    with isolated_domain() as environment, Workbench(environment, folder) as ros:
+    with Harness(folder) as ros:
         operator = Operator(ros, folder / 'day', settings)
         run_a_day(operator)
         count = len(operator.commands)

@@ -11,11 +11,10 @@ from pathlib import Path
 import pytest
 from rclpy.serialization import serialize_message
 from sensor_msgs.msg import Temperature
-from workbench import seconds, temperature, Workbench
+from workbench import seconds, temperature
 
 from koopman_ros.bags import BagWriter, message_definition
 from koopman_ros.control import Rung, State
-from koopman_ros.demo.processes import isolated_domain
 from koopman_ros.lifting import load
 from koopman_ros.nodes import replay, topics, translation
 from koopman_ros.nodes.messages import NANOSECONDS, to_celsius
@@ -24,6 +23,7 @@ from koopman_ros.nodes.replaying.comparison import ReplayedBag
 from koopman_ros.nodes.replaying.inputs import Silence, TakeOver
 from koopman_ros.nodes.replaying.record import Names
 from koopman_ros.nodes.shipped import model_path
+from koopman_ros.testing import Harness
 
 STEADY = 51.8  # degC
 COOLANT = 24.5  # degC, not what the law would command
@@ -45,7 +45,7 @@ def operations(found: ReplayedBag, kind: type) -> list[int]:
 def bag(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Record a controller that starts from a coolant, and twice hears nothing for a while."""
     folder = tmp_path_factory.mktemp('silent')
-    with isolated_domain() as environment, Workbench(environment, folder) as ros:
+    with Harness(folder) as ros:
         ros.start('trainer', {'output': folder / 'bag'})
         commands = ros.listen(Temperature, topics.COOLANT_SETPOINT)
         coolant = ros.node.create_publisher(

@@ -13,15 +13,16 @@ import signal
 from diagnostic_msgs.msg import DiagnosticStatus
 import numpy as np
 from sensor_msgs.msg import Temperature
-from workbench import temperature, Workbench
+from workbench import temperature
 
 from koopman_ros.bags import summary
 from koopman_ros.lifting import load, save
 from koopman_ros.nodes import topics
 from koopman_ros.nodes.shipped import model_path
+from koopman_ros.testing import Harness
 
 
-def test_controller_that_falls_silent_is_reported_by_the_plant(ros: Workbench) -> None:
+def test_controller_that_falls_silent_is_reported_by_the_plant(ros: Harness) -> None:
     ros.start('plant', {'speed': 20.0})
     command = ros.speak(Temperature, topics.COOLANT_SETPOINT, to='plant')
     command.publish(temperature(26.0))
@@ -33,7 +34,7 @@ def test_controller_that_falls_silent_is_reported_by_the_plant(ros: Workbench) -
     ros.wait_for_status('plant: simulation', lambda s: s.message == 'running')
 
 
-def test_reset_of_a_finished_plant_is_refused(ros: Workbench) -> None:
+def test_reset_of_a_finished_plant_is_refused(ros: Harness) -> None:
     ros.start('plant', {'speed': 0.0, 'duration': 5.0})
     ros.wait_for_status('plant: simulation', lambda s: s.message.startswith('finished'))
     response = ros.trigger('plant/reset')
@@ -41,7 +42,7 @@ def test_reset_of_a_finished_plant_is_refused(ros: Workbench) -> None:
     assert response.message == 'the duration is over: start the plant again'
 
 
-def test_closed_terminal_completes_the_bag(ros: Workbench, tmp_path: Path) -> None:
+def test_closed_terminal_completes_the_bag(ros: Harness, tmp_path: Path) -> None:
     trainer = ros.start('trainer', {'output': tmp_path / 'bag'})
     sender = ros.speak(Temperature, topics.TEMPERATURE, to='trainer')
     sender.publish(temperature(50.0))
@@ -53,14 +54,14 @@ def test_closed_terminal_completes_the_bag(ros: Workbench, tmp_path: Path) -> No
     assert content.counts['/temperature'] == 1
 
 
-def test_impossible_topic_name_is_refused(ros: Workbench, tmp_path: Path) -> None:
+def test_impossible_topic_name_is_refused(ros: Harness, tmp_path: Path) -> None:
     ros.start('trainer', {'output': tmp_path / 'bag'})
     (result,) = ros.set_parameters('trainer', topics=['temperature', 'bad topic!'])
     assert not result.successful
     assert 'bad topic!' in result.reason
 
 
-def test_model_that_cannot_track_the_setpoint_is_refused(ros: Workbench, tmp_path: Path) -> None:
+def test_model_that_cannot_track_the_setpoint_is_refused(ros: Harness, tmp_path: Path) -> None:
     path = tmp_path / 'model.safetensors'
     shutil.copy(model_path('reactor_nz3'), path)
     ros.start('controller', {'model': path})

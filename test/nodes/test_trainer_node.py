@@ -17,11 +17,11 @@ from rclpy.publisher import Publisher
 from rclpy.qos import QoSProfile, ReliabilityPolicy
 from sensor_msgs.msg import Temperature
 from std_msgs.msg import String
-from workbench import seconds, temperature, TIMEOUT, Workbench
+from workbench import seconds, temperature, TIMEOUT
 
 from koopman_ros.bags import BagMessage, read_messages, summary
-from koopman_ros.demo.processes import NodeProcess
 from koopman_ros.nodes import topics
+from koopman_ros.testing import Harness, NodeProcess
 
 BEST_EFFORT = QoSProfile(depth=1000, reliability=ReliabilityPolicy.BEST_EFFORT)
 
@@ -43,7 +43,7 @@ def values(messages: list[Any]) -> list[float]:
     return [entry.message.temperature for entry in messages]
 
 
-def test_loses_nothing_at_100_hz(ros: Workbench, tmp_path: Path) -> None:
+def test_loses_nothing_at_100_hz(ros: Harness, tmp_path: Path) -> None:
     bag = tmp_path / 'run.mcap'
     trainer = ros.start('trainer', {'output': bag})
     received = ros.listen(Temperature, topics.TEMPERATURE, raw=True)
@@ -71,7 +71,7 @@ def test_loses_nothing_at_100_hz(ros: Workbench, tmp_path: Path) -> None:
 @pytest.mark.parametrize(('number', 'name'), [
     (signal.SIGINT, 'run'), (signal.SIGTERM, 'run.mcap')])
 def test_signal_completes_the_bag_with_all_that_arrived(
-        ros: Workbench, tmp_path: Path, number: int, name: str) -> None:
+        ros: Harness, tmp_path: Path, number: int, name: str) -> None:
     trainer = ros.start('trainer', {'output': tmp_path / name})
     publisher = ros.speak(Temperature, topics.TEMPERATURE, to='trainer')
     say(publisher, 900)
@@ -80,7 +80,7 @@ def test_signal_completes_the_bag_with_all_that_arrived(
     assert (tmp_path / 'run' / 'metadata.yaml').exists() == (name == 'run')
 
 
-def test_recording_stops_and_starts_by_service(ros: Workbench, tmp_path: Path) -> None:
+def test_recording_stops_and_starts_by_service(ros: Harness, tmp_path: Path) -> None:
     trainer = ros.start('trainer', {'output': tmp_path / 'first.mcap'})
     publisher = ros.speak(Temperature, topics.TEMPERATURE, to='trainer')
     say(publisher, 900)
@@ -101,7 +101,7 @@ def test_recording_stops_and_starts_by_service(ros: Workbench, tmp_path: Path) -
     assert values(recorded(tmp_path / 'second')) == list(range(1000, 1010))
 
 
-def test_starts_without_recording_on_request(ros: Workbench, tmp_path: Path) -> None:
+def test_starts_without_recording_on_request(ros: Harness, tmp_path: Path) -> None:
     ros.start('trainer', {'output': tmp_path / 'run.mcap', 'record_at_start': False})
     status = ros.wait_for_status('trainer: recording', lambda _: True)
     assert status.message == 'not recording'
@@ -114,7 +114,7 @@ def test_starts_without_recording_on_request(ros: Workbench, tmp_path: Path) -> 
 
 
 @pytest.mark.parametrize('name', ['run', 'run.mcap'])
-def test_takes_the_next_name_beside_an_existing_recording(ros: Workbench, tmp_path: Path, name: str
+def test_takes_the_next_name_beside_an_existing_recording(ros: Harness, tmp_path: Path, name: str
                                                           ) -> None:
     bag = tmp_path / name
     precious = bag / 'note' if name == 'run' else bag
@@ -137,7 +137,7 @@ def test_takes_the_next_name_beside_an_existing_recording(ros: Workbench, tmp_pa
         f'recording to {path}, because {bag} exists already' for path in (second, third)]
 
 
-def test_topic_outside_the_loop_is_recorded_by_name(ros: Workbench, tmp_path: Path) -> None:
+def test_topic_outside_the_loop_is_recorded_by_name(ros: Harness, tmp_path: Path) -> None:
     bag = tmp_path / 'run.mcap'
     trainer = ros.start('trainer', {'output': bag, 'topics': ['temperature', 'notes']})
     notes = ros.speak(String, 'notes', to='trainer')
@@ -151,7 +151,7 @@ def test_topic_outside_the_loop_is_recorded_by_name(ros: Workbench, tmp_path: Pa
     assert {entry.type_name for entry in messages} == {'std_msgs/msg/String'}
 
 
-def test_best_effort_publisher_is_recorded(ros: Workbench, tmp_path: Path) -> None:
+def test_best_effort_publisher_is_recorded(ros: Harness, tmp_path: Path) -> None:
     bag = tmp_path / 'run.mcap'
     trainer = ros.start('trainer', {'output': bag})
     received = ros.listen(Temperature, topics.TEMPERATURE, BEST_EFFORT)
@@ -164,13 +164,13 @@ def test_best_effort_publisher_is_recorded(ros: Workbench, tmp_path: Path) -> No
     assert values(recorded(bag)) == list(range(20))
 
 
-def _stop_after(ros: Workbench, trainer: NodeProcess, bag: Path, count: int) -> int:
+def _stop_after(ros: Harness, trainer: NodeProcess, bag: Path, count: int) -> int:
     """Stop once so many messages are in the bag, which is flushed twice a second."""
     ros.wait_until(lambda: summary(bag).message_count >= count)
     return trainer.stop()
 
 
-def test_records_in_its_namespace(ros: Workbench, tmp_path: Path) -> None:
+def test_records_in_its_namespace(ros: Harness, tmp_path: Path) -> None:
     bag = tmp_path / 'run.mcap'
     trainer = ros.start('trainer', {'output': bag}, ('-r', '__ns:=/unit_1'))
     publisher = ros.speak(Temperature, '/unit_1/temperature', to='/unit_1/trainer')
@@ -179,7 +179,7 @@ def test_records_in_its_namespace(ros: Workbench, tmp_path: Path) -> None:
     assert values(recorded(bag, '/unit_1/temperature')) == list(range(5))
 
 
-def test_killed_trainer_leaves_what_it_flushed(ros: Workbench, tmp_path: Path) -> None:
+def test_killed_trainer_leaves_what_it_flushed(ros: Harness, tmp_path: Path) -> None:
     bag = tmp_path / 'run.mcap'
     trainer = ros.start('trainer', {'output': bag})
     publisher = ros.speak(Temperature, topics.TEMPERATURE, to='trainer')
@@ -191,7 +191,7 @@ def test_killed_trainer_leaves_what_it_flushed(ros: Workbench, tmp_path: Path) -
     assert values(messages) == list(range(100))
 
 
-def test_full_disk_stops_the_recording_but_not_the_node(ros: Workbench, tmp_path: Path) -> None:
+def test_full_disk_stops_the_recording_but_not_the_node(ros: Harness, tmp_path: Path) -> None:
     bag = tmp_path / 'run.mcap'
     # no file of this process may grow beyond 60 kB
     program = ('import resource, sys\n'

@@ -14,11 +14,11 @@ import sys
 
 from diagnostic_msgs.msg import DiagnosticStatus
 import pytest
-from workbench import value, Workbench
+from workbench import value
 
 from koopman_ros.bags import summary
-from koopman_ros.demo.processes import NodeProcess
 from koopman_ros.lifting import load
+from koopman_ros.testing import Harness, NodeProcess
 from recorded_runs import driven, linear_run, reactor, write_bag
 
 STATUS = 'trainer: training'
@@ -60,7 +60,7 @@ def gone(pid: int) -> bool:
 # A task of its own.
 
 
-def test_trains_from_a_bag_with_a_bar_on_the_terminal(ros: Workbench, bag: Path, tmp_path: Path
+def test_trains_from_a_bag_with_a_bar_on_the_terminal(ros: Harness, bag: Path, tmp_path: Path
                                                       ) -> None:
     # a terminal of its own, whose output goes to the log
     program = ('import pty, os, sys; '
@@ -83,7 +83,7 @@ def test_trains_from_a_bag_with_a_bar_on_the_terminal(ros: Workbench, bag: Path,
     assert not list(tmp_path.glob('koopman_ros_*'))
 
 
-def test_lift_that_is_refused_has_an_exit_code_of_its_own(ros: Workbench, tmp_path: Path) -> None:
+def test_lift_that_is_refused_has_an_exit_code_of_its_own(ros: Harness, tmp_path: Path) -> None:
     bag = write_bag(tmp_path / 'linear.mcap', linear_run(200))
     trainer = ros.start('trainer', offline(bag, tmp_path / 'new.safetensors'))
     assert ros.wait_for_end(trainer) == 2
@@ -93,7 +93,7 @@ def test_lift_that_is_refused_has_an_exit_code_of_its_own(ros: Workbench, tmp_pa
     assert not (tmp_path / 'new.safetensors').exists()
 
 
-def test_task_that_cannot_start(ros: Workbench) -> None:
+def test_task_that_cannot_start(ros: Harness) -> None:
     trainer = ros.start('trainer', {'task': 'train'})
     assert ros.wait_for_end(trainer) == 1
     assert trainer.output() == (
@@ -103,13 +103,12 @@ def test_task_that_cannot_start(ros: Workbench) -> None:
 
 @pytest.mark.parametrize(('number', 'code'), [(signal.SIGINT, 1), (signal.SIGKILL, -9)])
 def test_no_orphan_and_no_file_when_the_trainer_ends(
-        ros: Workbench, bag: Path, tmp_path: Path, number: int, code: int) -> None:
+        ros: Harness, bag: Path, tmp_path: Path, number: int, code: int) -> None:
     trainer = ros.start('trainer', offline(bag, tmp_path / 'new.safetensors'))
     # the first words say that the process is there
     ros.wait_until(lambda: children(trainer))
     (child,) = children(trainer)
     assert trainer.stop(number) == code
-    ros.processes.remove(trainer)
     ros.wait_until(lambda: gone(child))
     assert not list(tmp_path.glob('new*'))
     if number == signal.SIGINT:
@@ -120,7 +119,7 @@ def test_no_orphan_and_no_file_when_the_trainer_ends(
 # On request.
 
 
-def test_trains_beside_the_running_loop(ros: Workbench, tmp_path: Path) -> None:
+def test_trains_beside_the_running_loop(ros: Harness, tmp_path: Path) -> None:
     # no quicker: what is recorded while the machine is busy is what there is to train from
     ros.start('plant', {'lockstep': True, 'speed': 50.0, 'lockstep_subscribers': 2,
                         'noise': 0.1, 'heat_transfer_coefficient': 4e4})
@@ -174,7 +173,7 @@ def test_trains_beside_the_running_loop(ros: Workbench, tmp_path: Path) -> None:
     assert bag.counts['/temperature'] > figures['measurements_read']
 
 
-def test_bag_that_cannot_be_read(ros: Workbench, tmp_path: Path) -> None:
+def test_bag_that_cannot_be_read(ros: Harness, tmp_path: Path) -> None:
     trainer = ros.start('trainer', {
         **QUICK, 'record_at_start': False, 'bags': [tmp_path / 'none.mcap'],
         'model_output': tmp_path / 'new.safetensors'})

@@ -14,10 +14,11 @@ import numpy as np
 import pytest
 from rosgraph_msgs.msg import Clock
 from sensor_msgs.msg import Temperature
-from workbench import seconds, temperature, value, Workbench
+from workbench import seconds, temperature, value
 
 from koopman_ros.nodes import topics
 from koopman_ros.nodes.messages import LAST_STAMP_SECONDS
+from koopman_ros.testing import Harness
 
 SAFE = 5.0  # degC
 
@@ -41,7 +42,7 @@ def own_commands(bench: Bench, after: float) -> list[Temperature]:
 
 
 @pytest.fixture(scope='module')
-def shared_bench(shared_ros: Workbench) -> Bench:
+def shared_bench(shared_ros: Harness) -> Bench:
     return Bench(shared_ros)
 
 
@@ -116,7 +117,7 @@ def test_runaway_beyond_the_trained_range_goes_down_the_ladder_and_up_again(benc
 # Clocks.
 
 
-def test_time_may_begin_at_zero_and_jump_by_an_hour_and_back(ros: Workbench) -> None:
+def test_time_may_begin_at_zero_and_jump_by_an_hour_and_back(ros: Harness) -> None:
     bench = Bench(ros, first=0.0)
     assert seconds(bench.commands[0]) == 0.0
     commands = [bench.commands[0].temperature]
@@ -130,7 +131,7 @@ def test_time_may_begin_at_zero_and_jump_by_an_hour_and_back(ros: Workbench) -> 
     assert status.level == DiagnosticStatus.OK
 
 
-def test_simulated_time_that_nobody_publishes_is_told(ros: Workbench) -> None:
+def test_simulated_time_that_nobody_publishes_is_told(ros: Harness) -> None:
     bench = Bench(ros, arguments=('-p', 'use_sim_time:=true'))
     times = iter(range(2, 10000))
 
@@ -149,7 +150,7 @@ def test_simulated_time_that_nobody_publishes_is_told(ros: Workbench) -> None:
 # Measurements that stay away.
 
 
-def test_silence_in_simulated_time_ends_at_the_safe_coolant(ros: Workbench) -> None:
+def test_silence_in_simulated_time_ends_at_the_safe_coolant(ros: Harness) -> None:
     """The clock goes fifty times faster than the wall's."""
     # a plant of which the controller hears the time alone
     elsewhere = [part for name in (topics.TEMPERATURE, topics.COOLANT_SETPOINT,
@@ -187,7 +188,7 @@ def test_silence_in_simulated_time_ends_at_the_safe_coolant(ros: Workbench) -> N
     bench.status(lambda s: 'the measured' not in s.message)
 
 
-def test_silence_by_the_wall_clock_ends_at_the_safe_coolant(ros: Workbench) -> None:
+def test_silence_by_the_wall_clock_ends_at_the_safe_coolant(ros: Harness) -> None:
     bench = Bench(ros, {'measurement_timeout': 0.3, 'hold_timeout': 1.5,
                         'coolant_rate_limit': 6000.0, 'safe_coolant': 10.0})
     held = bench.commands[0].temperature
@@ -201,7 +202,7 @@ def test_silence_by_the_wall_clock_ends_at_the_safe_coolant(ros: Workbench) -> N
     assert 'learned law -> hold' in bench.process.output()
 
 
-def test_silence_in_manual_mode_leaves_the_coolant_to_the_operator(ros: Workbench) -> None:
+def test_silence_in_manual_mode_leaves_the_coolant_to_the_operator(ros: Harness) -> None:
     bench = Bench(ros, {'measurement_timeout': 0.3, 'hold_timeout': 0.0})
     ros.set_bool('controller/set_automatic', False)
     held = bench.measure(STEADY, 2.0).temperature
@@ -213,14 +214,14 @@ def test_silence_in_manual_mode_leaves_the_coolant_to_the_operator(ros: Workbenc
         'no measurement for more than 0.3 s: manual mode' in s.message))
 
 
-def test_measurements_may_stay_away_where_the_timeout_is_off(ros: Workbench) -> None:
+def test_measurements_may_stay_away_where_the_timeout_is_off(ros: Harness) -> None:
     bench = Bench(ros, {'measurement_timeout': 0.0, 'hold_timeout': 0.0})
     status = bench.status(lambda s: float(value(s, 'since last measurement [s]')) > 1.5)
     assert status.level == DiagnosticStatus.OK
     assert len(bench.commands) == 1
 
 
-def test_silence_at_the_end_of_the_stamps_is_answered(ros: Workbench) -> None:
+def test_silence_at_the_end_of_the_stamps_is_answered(ros: Harness) -> None:
     last = float(LAST_STAMP_SECONDS)
     bench = Bench(ros, {'measurement_timeout': 0.1}, first=last)
     ros.wait_until(lambda: len(own_commands(bench, last)) >= 2)

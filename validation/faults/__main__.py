@@ -10,7 +10,7 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 import sys
 
-from koopman_ros.demo.loop import deferred_interrupt
+from koopman_ros.testing import deferred_interrupt
 from validation.faults import report
 from validation.faults.case import Case, Outcome, run
 from validation.faults.cases import CASES

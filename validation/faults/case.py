@@ -11,8 +11,8 @@ import math
 from pathlib import Path
 import time
 
-from koopman_ros.demo.processes import isolated_domain
 from koopman_ros.nodes.controller_parameters import ControllerParameters
+from koopman_ros.testing import isolated_domain
 from validation.faults.course import Course
 from validation.faults.judge import BAND, Bounds, judge, Verdict
 from validation.faults.rig import LOCKSTEP, Rig, StalledError

@@ -18,7 +18,8 @@ from rclpy.context import Context
 from rclpy.executors import SingleThreadedExecutor
 from rclpy.node import Node
 
-from koopman_ros.demo.processes import NodeProcess, STOP_TIMEOUT
+from koopman_ros.testing import NodeProcess
+from koopman_ros.testing.process import STOP_TIMEOUT
 from validation.faults.line import Line, REMAPPED
 from validation.faults.operator import Operator
 

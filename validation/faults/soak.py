@@ -17,8 +17,8 @@ import time
 import numpy as np
 
 from koopman_ros.bags import summary
-from koopman_ros.demo.processes import isolated_domain
 from koopman_ros.nodes.controller_parameters import ControllerParameters
+from koopman_ros.testing import isolated_domain
 from validation.faults.course import Array, Course
 from validation.faults.events import EVENTS
 from validation.faults.judge import Account, account, RUNAWAY

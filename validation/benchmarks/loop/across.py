@@ -17,9 +17,9 @@ import psutil
 from sensor_msgs.msg import Temperature
 from std_srvs.srv import Trigger
 
-from koopman_ros.demo.processes import NodeProcess
 from koopman_ros.nodes import topics
 from koopman_ros.nodes.messages import NANOSECONDS
+from koopman_ros.testing import NodeProcess
 from validation.benchmarks.loop.probe import Loop, Probe
 
 _ROUND = 50  # measurements of one side, then of the other

@@ -14,7 +14,7 @@ import sys
 import tempfile
 from typing import Any
 
-from koopman_ros.demo.processes import isolated_domain
+from koopman_ros.testing import isolated_domain
 from validation.benchmarks.loop import across, step, table
 from validation.benchmarks.loop.probe import Probe
 from validation.benchmarks.machine import machine

@@ -16,7 +16,7 @@ import sys
 from typing import Any
 
 from koopman_ros.bags import read_messages
-from koopman_ros.demo.processes import NodeProcess
+from koopman_ros.testing import NodeProcess
 
 TOPIC = '/temperature'
 # A publisher that needs this much longer than it should does not keep up.

@@ -1,27 +1,21 @@
 # SPDX-FileCopyrightText: 2026 The koopman_ros Authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""Nodes as processes of their own, in a ROS domain of their own, ended whatever happens."""
+"""Names that one run on this machine reserves: its ROS domain, its folder for results."""
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator
 import contextlib
 import hashlib
 import os
 from pathlib import Path
-import signal
 import socket
-import subprocess
-from types import TracebackType
 
 from koopman_ros.nodes.exposure import LOOPBACK_PROFILE
 from koopman_ros.nodes.shipped import config_directory
-from koopman_ros.startup import blocked_signals
-from koopman_ros.startup import command as child_command
 
 _DOMAINS = range(1, 102)
-STOP_TIMEOUT = 10.0  # s from a signal to the end of a process
 
 
 @contextlib.contextmanager
@@ -101,73 +95,3 @@ def _reservation(name: str) -> Iterator[bool]:
         except OSError:
             mine = False
         yield mine
-
-
-class NodeProcess:
-    """
-    One node running as a process; leaving the context ends it, as does the end of this process.
-
-    :param name: ``plant``, ``controller`` or ``trainer``.
-    :param parameters: values other than the node's defaults.
-    :param log: file for everything the process prints.
-    :param environment: variables on top of the present ones.
-    :param arguments: further ROS arguments, e.g. ``('-r', '__ns:=/unit_1')``.
-    :param command: what to run instead of the module of this package.
-    """
-
-    def __init__(self, name: str, parameters: Mapping[str, object], log: Path,
-                 environment: Mapping[str, str], arguments: tuple[str, ...] = (),
-                 command: tuple[str, ...] | None = None) -> None:
-        self.name = name
-        self.log = log
-        given = [part for key, value in parameters.items()
-                 for part in ('-p', f'{key}:={_as_argument(value)}')]
-        program = command or child_command(
-            f'koopman_ros.nodes.{name}', signal.SIGINT, interrupted=0)
-        waiting = contextlib.nullcontext() if command else blocked_signals()
-        ros_arguments = ['--ros-args', *given, *arguments] if given or arguments else []
-        with open(log, 'wb') as output, waiting:
-            # a session of its own: an interrupt of the terminal is passed on by us, in order
-            self.process = subprocess.Popen(
-                [*program, *ros_arguments], stdout=output, stderr=subprocess.STDOUT,
-                stdin=subprocess.DEVNULL, env={**os.environ, **environment},
-                start_new_session=True)
-
-    @property
-    def running(self) -> bool:
-        """Whether the process has not ended."""
-        return self.process.poll() is None
-
-    def output(self) -> str:
-        """Return what the process has printed so far."""
-        return self.log.read_text(errors='replace')
-
-    def stop(self, number: int = signal.SIGINT) -> int:
-        """
-        End the process by a signal, and by SIGKILL if it does not end in time.
-
-        :return: its exit code; negative after a signal that it did not handle.
-        """
-        if self.running:
-            self.process.send_signal(number)
-        try:
-            return self.process.wait(STOP_TIMEOUT)
-        except subprocess.TimeoutExpired:
-            self.process.kill()
-            return self.process.wait()
-
-    def __enter__(self) -> NodeProcess:
-        return self
-
-    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None,
-                 trace: TracebackType | None) -> None:
-        self.stop()
-
-
-def _as_argument(value: object) -> str:
-    """Write a parameter value for the command line, keeping its type."""
-    if isinstance(value, bool):
-        return 'true' if value else 'false'
-    if isinstance(value, (tuple, list)):
-        return '[' + ','.join(str(item) for item in value) + ']'
-    return str(value)

@@ -1,0 +1,202 @@
+# SPDX-FileCopyrightText: 2026 The koopman_ros Authors
+# SPDX-License-Identifier: Apache-2.0
+
+"""The harness: its processes end whatever happens, and it says what went wrong."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+import signal
+import sys
+import time
+
+import pytest
+from workbench import TIMEOUT
+
+from koopman_ros.bags import summary
+from koopman_ros.testing import (
+    Harness,
+    HarnessError,
+    isolated_domain,
+    NodeProcess,
+    process,
+    reservations,
+)
+
+SLEEPER = (sys.executable, '-c', 'import time; time.sleep(600)')
+
+
+def test_end_that_nobody_asked_for_is_told(tmp_path: Path) -> None:
+    with Harness(tmp_path) as ros:
+        ros.start('failing', command=('sh', '-c', 'echo a reason; exit 3'))
+        with pytest.raises(HarnessError, match='failing ended early, with code 3: a reason'):
+            ros.wait_until(bool)
+
+
+@pytest.mark.parametrize('lasting', [False, True])
+def test_end_without_an_error_counts_where_processes_are_to_last(
+        tmp_path: Path, lasting: bool) -> None:
+    with Harness(tmp_path, lasting=lasting, timeout=1.0) as ros:
+        ended = ros.start('brief', command=(sys.executable, '-c', ''))
+        ended.process.wait()
+        with pytest.raises(HarnessError, match=(
+                'brief ended early' if lasting else 'not within 1 s: the impossible; see ')):
+            ros.wait_until(bool, 'the impossible')
+
+
+def test_code_at_the_end_counts_unless_the_process_was_stopped_before(tmp_path: Path) -> None:
+    ros = Harness(tmp_path)
+    ros.start('stopped', command=SLEEPER).stop(signal.SIGKILL)
+    ros.start('left', command=('sleep', '600'))
+    with pytest.raises(HarnessError, match=r'^left_1 ended with code -2; see ') as raised:
+        ros.__exit__(None, None, None)
+    assert raised.value.__notes__ == ['stopped_0.log: \nleft_1.log: ']
+
+
+def test_error_of_the_test_is_raised_and_its_processes_end(tmp_path: Path) -> None:
+    ros = Harness(tmp_path)
+    sleeper = ros.start('sleeper', command=SLEEPER)
+    with pytest.raises(ZeroDivisionError), ros:
+        raise ZeroDivisionError
+    assert not sleeper.running
+
+
+@pytest.mark.parametrize(('ignored', 'code', 'words'), [
+    ('{2}', -signal.SIGABRT, 'in <module>'), ('{2, 6}', -signal.SIGKILL, '')])
+def test_process_that_ignores_signals_is_aborted_and_says_where_it_is(
+        tmp_path: Path, monkeypatch: pytest.MonkeyPatch, ignored: str, code: int, words: str
+        ) -> None:
+    monkeypatch.setattr(process, 'STOP_TIMEOUT', 0.2)
+    monkeypatch.setattr(process, '_ABORT_TIMEOUT', 0.2 if code == -signal.SIGKILL else TIMEOUT)
+    program = ('import signal, time\n'
+               f'signal.pthread_sigmask(signal.SIG_BLOCK, {ignored})\n'
+               'print("ignoring", flush=True)\n'
+               'time.sleep(600)\n')
+    stubborn = NodeProcess('stubborn', {}, tmp_path / 'log', {},
+                           command=(sys.executable, '-c', program))
+    while 'ignoring' not in stubborn.output():
+        assert stubborn.running
+    assert stubborn.stop() == code
+    assert words in stubborn.output()
+
+
+def test_process_that_was_stopped_ends_in_order(tmp_path: Path) -> None:
+    program = ('import signal, sys, time\n'
+               'signal.signal(signal.SIGINT, lambda *_: sys.exit(7))\n'
+               'signal.raise_signal(signal.SIGSTOP)\n'
+               'time.sleep(600)\n')
+    halted = NodeProcess('halted', {}, tmp_path / 'log', {},
+                         command=(sys.executable, '-c', program))
+    os.waitid(os.P_PID, halted.process.pid, os.WSTOPPED)
+    assert halted.stop() == 7
+
+
+# What is left when this process is killed.
+
+
+PARENT = """
+import signal, threading, time
+from pathlib import Path
+from koopman_ros.testing import guard, NodeProcess
+guard.PATIENCE = {patience}
+def start():
+    child = NodeProcess({name!r}, {parameters!r}, Path({log!r}), {{}}, command={command!r})
+    print(child.process.pid, flush=True)
+# a signal at the death of the parent would come with the end of this thread
+thread = threading.Thread(target=start)
+thread.start()
+thread.join()
+time.sleep(600)
+"""
+IGNORING = ('import signal, time\n'
+            'signal.signal(signal.SIGINT, signal.SIG_IGN)\n'
+            'print("ready", flush=True)\n'
+            'time.sleep(600)\n')
+HALTED = 'import signal\nprint("ready", flush=True)\nsignal.raise_signal(signal.SIGSTOP)\n'
+
+
+def orphan(ros: Harness, log: Path, patience: float = TIMEOUT, **child: object) -> int:
+    """Start a process that starts another one; return the number of that one."""
+    parent = ros.start('parent', command=(sys.executable, '-c', PARENT.format(
+        log=str(log), patience=patience, **{'parameters': {}, 'command': None, **child})))
+    ros.wait_until(lambda: parent.output().endswith('\n'))
+    return int(parent.output())
+
+
+def wait_until_gone(pid: int) -> None:
+    deadline = time.monotonic() + TIMEOUT
+    while not _has_ended(pid):
+        assert time.monotonic() < deadline
+        time.sleep(0.01)
+
+
+def _has_ended(pid: int) -> bool:
+    try:
+        stat = Path(f'/proc/{pid}/stat').read_text()
+    except OSError:
+        return True
+    # nobody may be there who waits for it
+    return stat.rpartition(') ')[2][0] == 'Z'
+
+
+def test_node_of_a_process_that_is_killed_completes_its_work(ros: Harness, tmp_path: Path) -> None:
+    bag = tmp_path / 'bag.mcap'
+    child = orphan(ros, tmp_path / 'child.log', name='trainer', parameters={'output': str(bag)})
+    ros.meet('trainer')
+    ros.processes[0].stop(signal.SIGKILL)
+    wait_until_gone(child)
+    assert summary(bag).complete
+
+
+@pytest.mark.parametrize(('program', 'patience'), [(IGNORING, 0.1), (HALTED, TIMEOUT)],
+                         ids=['ignores the interrupt', 'is halted'])
+def test_no_process_outlives_one_that_is_killed(
+        ros: Harness, tmp_path: Path, program: str, patience: float) -> None:
+    log = tmp_path / 'child.log'
+    child = orphan(ros, log, patience, name='child', command=(sys.executable, '-c', program))
+    ros.wait_until(lambda: 'ready' in log.read_text())
+    ros.processes[0].stop(signal.SIGKILL)
+    wait_until_gone(child)
+
+
+# Reservations.
+
+
+def test_two_reservations_are_two_domains() -> None:
+    with isolated_domain() as first, isolated_domain() as second:
+        assert first['ROS_DOMAIN_ID'] != second['ROS_DOMAIN_ID']
+
+
+def test_reservation_ends_with_its_context(monkeypatch: pytest.MonkeyPatch) -> None:
+    # one that no other test reserves meanwhile
+    monkeypatch.setattr(reservations, '_DOMAINS', [1000 + os.getpid()])
+    for _ in range(2):
+        with isolated_domain() as environment:
+            assert environment['ROS_DOMAIN_ID'] == str(1000 + os.getpid())
+            with pytest.raises(RuntimeError, match='taken'), isolated_domain():
+                pass
+
+
+def test_environment_of_the_reservation_holds_here_too(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv('ROS_DOMAIN_ID', '7')
+    monkeypatch.delenv('RMW_IMPLEMENTATION', raising=False)
+    with isolated_domain() as environment:
+        assert environment.items() <= os.environ.items()
+    assert os.environ['ROS_DOMAIN_ID'] == '7'
+    assert 'RMW_IMPLEMENTATION' not in os.environ
+
+
+@pytest.mark.parametrize(('given', 'found', 'reach'), [
+    ('', 'rmw_fastrtps_cpp', 'SYSTEM_DEFAULT'),
+    ('rmw_fastrtps_dynamic_cpp', 'rmw_fastrtps_dynamic_cpp', 'SYSTEM_DEFAULT'),
+    # whose default is the whole network, as it knows nothing of the profile
+    ('rmw_cyclonedds_cpp', 'rmw_cyclonedds_cpp', 'LOCALHOST'),
+])
+def test_middleware_that_is_named_stays(
+        monkeypatch: pytest.MonkeyPatch, given: str, found: str, reach: str) -> None:
+    monkeypatch.setenv('RMW_IMPLEMENTATION', given)
+    with isolated_domain() as environment:
+        assert environment['RMW_IMPLEMENTATION'] == os.environ['RMW_IMPLEMENTATION'] == found
+        assert environment['ROS_AUTOMATIC_DISCOVERY_RANGE'] == reach
+    assert os.environ['RMW_IMPLEMENTATION'] == given
