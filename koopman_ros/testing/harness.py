@@ -101,10 +101,14 @@ class Harness:
                                         for name, code in ended.items() if code))
 
     def close(self) -> dict[str, int]:
-        """End what still runs, then the node; return the exit codes by name of the log."""
+        """
+        End all processes, then the node.
+
+        :return: exit codes by name of the log, of those that were not told to end before.
+        """
         try:
             # all at once, as some take their time
-            left = [process for process in self.processes if process.running]
+            left = [process for process in self.processes if not process.told_to_end]
             for process in left:
                 process.send(signal.SIGINT)
             return {process.log.stem: process.wait() for process in left}
@@ -117,10 +121,14 @@ class Harness:
     # Processes.
 
     def start(self, name: str, parameters: Mapping[str, object] | None = None,
-              arguments: tuple[str, ...] = (), command: tuple[str, ...] | None = None
-              ) -> NodeProcess:
-        """Start a process; the arguments are those of :class:`NodeProcess`."""
-        log = self.folder / f'{name}_{len(self.processes)}.log'
+              arguments: tuple[str, ...] = (), command: tuple[str, ...] | None = None,
+              called: str = '') -> NodeProcess:
+        """
+        Start a process; the arguments are those of :class:`NodeProcess`.
+
+        :param called: starts the name of its log, which is that of the node by default.
+        """
+        log = self.folder / f'{called or name}_{len(self.processes)}.log'
         process = NodeProcess(name, parameters or {}, log, self.environment, arguments, command)
         self.processes.append(process)
         return process

@@ -28,10 +28,10 @@ SLEEPER = (sys.executable, '-c', 'import time; time.sleep(600)')
 
 
 def test_end_that_nobody_asked_for_is_told(tmp_path: Path) -> None:
-    with Harness(tmp_path) as ros:
-        ros.start('failing', command=('sh', '-c', 'echo a reason; exit 3'))
-        with pytest.raises(HarnessError, match='failing ended early, with code 3: a reason'):
-            ros.wait_until(bool)
+    ros = Harness(tmp_path)
+    ros.start('failing', command=('sh', '-c', 'echo a reason; exit 3'))
+    with pytest.raises(HarnessError, match='failing ended early, with code 3: a reason'), ros:
+        ros.wait_until(bool)
 
 
 @pytest.mark.parametrize('lasting', [False, True])

@@ -12,10 +12,10 @@ from pathlib import Path
 import time
 
 from koopman_ros.nodes.controller_parameters import ControllerParameters
-from koopman_ros.testing import isolated_domain
+from koopman_ros.testing import HarnessError
 from validation.faults.course import Course
 from validation.faults.judge import BAND, Bounds, judge, Verdict
-from validation.faults.rig import LOCKSTEP, Rig, StalledError
+from validation.faults.rig import LOCKSTEP, Rig
 
 SETPOINT = 46.0  # degC; 5 K below the steady state that the reactor starts from
 SETTLED = 240.0  # s of plant time from the start until the reactor stays there
@@ -117,17 +117,16 @@ def run(case: Case, folder: Path, check: Callable[[], None] = lambda: None) -> O
     started = time.monotonic()
     folder.mkdir(parents=True, exist_ok=True)
     skipped = ''
-    with isolated_domain() as environment:
-        rig = Rig(environment, folder, case.limit, check, case.between)
-        with rig:
-            try:
-                rig.start_loop(case.setpoint, case.plant, case.controller)
-                rig.run_until(case.settle)
-                case.play(rig)
-                rig.run_for(case.afterwards)
-            except StalledError as error:
-                rig.course.complaints.append(str(error))
-            except SkipError as reason:
-                skipped = str(reason)
+    rig = Rig(folder, case.limit, check, case.between)
+    with rig:
+        try:
+            rig.start_loop(case.setpoint, case.plant, case.controller)
+            rig.run_until(case.settle)
+            case.play(rig)
+            rig.run_for(case.afterwards)
+        except HarnessError as error:
+            rig.course.complaints.append(str(error))
+        except SkipError as reason:
+            skipped = str(reason)
     verdict = None if skipped else judge(rig.course, case.bounds())
     return Outcome(case, rig.course, verdict, skipped, time.monotonic() - started)

@@ -9,9 +9,8 @@ from collections.abc import Callable
 import time
 from typing import Any
 
-from rcl_interfaces.srv import GetParameters, SetParameters
+from rcl_interfaces.srv import SetParameters
 from rclpy.client import Client
-from rclpy.node import Node
 from rclpy.parameter import Parameter
 from rclpy.publisher import Publisher
 from rclpy.task import Future
@@ -19,6 +18,7 @@ from sensor_msgs.msg import Temperature
 from std_srvs.srv import SetBool, Trigger
 
 from koopman_ros.nodes import topics
+from koopman_ros.testing import Harness
 from validation.faults.line import Line
 
 _STEADY = 0.3  # s of wall time that a set-point must stay the one tracked
@@ -29,15 +29,16 @@ class Operator:
     """
     Turn set-points, change parameters and call services of the loop's nodes.
 
-    :param node: who speaks.
+    :param harness: whose node speaks.
     :param line: whose course takes down what was asked for, and when.
     :param wait: waits until a condition holds and returns what it returned, or complains.
 
     :ivar setpoint: the publisher of set-points, for what is not to be taken down.
     """
 
-    def __init__(self, node: Node, line: Line, wait: Callable[..., Any]) -> None:
-        self._node = node
+    def __init__(self, harness: Harness, line: Line, wait: Callable[..., Any]) -> None:
+        self._harness = harness
+        self._node = harness.node
         self._line = line
         self._wait = wait
         self._clients: dict[str, Client] = {}
@@ -49,20 +50,7 @@ class Operator:
 
     def meet_controller(self) -> None:
         """Wait until the controller is there and knows the rig."""
-        client = self.client(GetParameters, 'controller/get_parameters')
-        request = GetParameters.Request(names=['use_sim_time'])
-        asked: list[Future] = []
-        due = 0.0
-
-        def answered() -> bool:
-            nonlocal due
-            # an answer is lost where the rig is not known yet
-            if client.service_is_ready() and (now := time.monotonic()) >= due:
-                asked.append(client.call_async(request))
-                due = now + 0.2
-            return any(future.done() for future in asked)
-
-        self._wait(answered, 'the controller does not answer', _START_TIMEOUT)
+        self._harness.meet('controller')
         self._wait(self.setpoint.get_subscription_count, 'nobody hears the set-point',
                   _START_TIMEOUT)
 

@@ -8,18 +8,11 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping
 from pathlib import Path
 import signal
-import subprocess
 import time
 from types import TracebackType
 from typing import TypeVar
 
-import rclpy
-from rclpy.context import Context
-from rclpy.executors import SingleThreadedExecutor
-from rclpy.node import Node
-
-from koopman_ros.testing import NodeProcess
-from koopman_ros.testing.process import STOP_TIMEOUT
+from koopman_ros.testing import Harness, NodeProcess
 from validation.faults.line import Line, REMAPPED
 from validation.faults.operator import Operator
 
@@ -28,15 +21,10 @@ LOCKSTEP = {'lockstep': True, 'speed': 0.0, 'lockstep_timeout': 0.5}
 _START_TIMEOUT = 30.0  # s for the processes to find each other
 
 
-class StalledError(RuntimeError):
-    """A case did not go on; the message says what was waited for."""
-
-
 class Rig:
     """
     A loop to put faults into; leaving the context ends its processes.
 
-    :param environment: variables of the reserved domain.
     :param folder: for what the processes print.
     :param limit: wall time of the case, s.
     :param check: called at every turn; may raise to end the case.
@@ -47,44 +35,28 @@ class Rig:
     :ivar processes: by name; those that are missed when they end.
     """
 
-    def __init__(self, environment: Mapping[str, str], folder: Path, limit: float,
-                 check: Callable[[], None], between: bool = False) -> None:
+    def __init__(self, folder: Path, limit: float, check: Callable[[], None],
+                 between: bool = False) -> None:
         self.folder = folder
         self.processes: dict[str, NodeProcess] = {}
-        # a process that is aborted prints where it was
-        self._environment = {**environment, 'PYTHONFAULTHANDLER': '1'}
         self._deadline = time.monotonic() + limit
-        self._check = check
         self._between = between
-        self._numbers: dict[str, int] = {}
-        self._started: list[NodeProcess] = []
-
-        self._context = Context()
-        rclpy.init(context=self._context, domain_id=int(environment['ROS_DOMAIN_ID']))
-        self.node = Node('rig', context=self._context)
-        self._executor = SingleThreadedExecutor(context=self._context)
-        self._executor.add_node(self.node)
+        self._harness = Harness(folder, name='rig', lasting=True, each_turn=check)
+        self.node = self._harness.node
         self.line = Line(self.node, between)
         self.course = self.line.course
-        self.operator = Operator(self.node, self.line, self.wait)
+        self.operator = Operator(self._harness, self.line, self.wait)
 
     def __enter__(self) -> Rig:
         return self
 
     def __exit__(self, kind: type[BaseException] | None, error: BaseException | None,
                  trace: TracebackType | None) -> None:
-        for process in self.processes.values():
-            if process.running:
-                # one that was stopped would not hear the interrupt
-                process.process.send_signal(signal.SIGCONT)
-                process.process.send_signal(signal.SIGINT)
-        self._executor.shutdown()
-        self.node.destroy_node()
-        rclpy.shutdown(context=self._context)
-        for name, process in self.processes.items():
-            if (code := _code(process)) != 0:
-                self.course.complaints.append(f'{name} ended with code {code}, see {process.log}')
-        for process in self._started:
+        for name, code in self._harness.close().items():
+            if code:
+                self.course.complaints.append(
+                    f'{name} ended with code {code}, see {self.folder / name}.log')
+        for process in self._harness.processes:
             if 'Traceback' in process.output():
                 self.course.complaints.append(f'{process.log} holds a traceback')
 
@@ -103,13 +75,10 @@ class Rig:
         :param called: name of the process here, its node's name by default.
         """
         called = called or name
-        self._numbers[called] = number = self._numbers.get(called, 0) + 1
         if self._between and called == 'plant':
             arguments += REMAPPED
-        process = NodeProcess(name, parameters or {}, self.folder / f'{called}_{number}.log',
-                              self._environment, arguments, command)
+        process = self._harness.start(name, parameters, arguments, command, called)
         self.processes[called] = process
-        self._started.append(process)
         return process
 
     def start_loop(self, celsius: float, plant: Mapping[str, object],
@@ -135,8 +104,7 @@ class Rig:
 
     def kill(self, called: str, number: int = signal.SIGKILL) -> None:
         """End a process the hard way; it is not missed."""
-        process = self.processes.pop(called)
-        process.stop(number)
+        self.processes.pop(called).stop(number)
 
     # Time.
 
@@ -145,26 +113,16 @@ class Rig:
         """Plant time in s since the first measurement."""
         return self.line.now
 
-    def spin(self) -> None:
-        """Let the rig hear for a moment."""
-        self._executor.spin_once(timeout_sec=0.05)
-        self._check()
-
     def wait(self, done: Callable[[], T], complaint: str, timeout: float = 10.0) -> T:
         """
-        Spin until a condition holds and return what it returned.
+        Wait until a condition holds and return what it returned.
 
-        :raises StalledError: after `timeout` seconds of wall time, or at the end of the case's.
+        :raises HarnessError: after `timeout` seconds of wall time, or at the end of the case's,
+            or when a process ends by itself.
         """
-        end = min(time.monotonic() + timeout, self._deadline)
-        while not (found := done()):
-            if time.monotonic() > end:
-                raise StalledError(f'{complaint}; plant time is {self.now:.0f} s')
-            for called, process in self.processes.items():
-                if not process.running:
-                    raise StalledError(f'{called} ended by itself: {process.output()[-300:]}')
-            self.spin()
-        return found
+        left = min(timeout, self._deadline - time.monotonic())
+        return self._harness.wait_until(
+            done, lambda: f'{complaint}; plant time is {self.now:.0f} s', left)
 
     def run_until(self, seconds: float) -> None:
         """Let the loop run until a plant time."""
@@ -201,11 +159,3 @@ class Rig:
         """Tell whether diagnostics have said some words since the fault began."""
         return any(words in f'{said.name}: {said.message}' for said in self.course.said
                    if said.seconds >= self.course.begin)
-
-
-def _code(process: NodeProcess) -> int:
-    """Return the exit code of a process that was told to end; one that hangs says where."""
-    try:
-        return process.process.wait(STOP_TIMEOUT)
-    except subprocess.TimeoutExpired:
-        return process.stop(signal.SIGABRT)

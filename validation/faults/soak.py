@@ -18,11 +18,11 @@ import numpy as np
 
 from koopman_ros.bags import summary
 from koopman_ros.nodes.controller_parameters import ControllerParameters
-from koopman_ros.testing import isolated_domain
+from koopman_ros.testing import HarnessError
 from validation.faults.course import Array, Course
 from validation.faults.events import EVENTS
 from validation.faults.judge import Account, account, RUNAWAY
-from validation.faults.rig import LOCKSTEP, Rig, StalledError
+from validation.faults.rig import LOCKSTEP, Rig
 
 HOURS = 24.0
 SEED = 0
@@ -101,21 +101,20 @@ def soak(folder: Path, check: Callable[[], None], hours: float = HOURS,
     random = np.random.default_rng(SEED)
     happened: Counter[str] = Counter()
     looks: dict[str, list[tuple[float, float]]] = {}
-    with isolated_domain() as environment:
-        rig = Rig(environment, folder, 60.0 + _WALL_PER_HOUR * hours, check, between=True)
-        with rig:
-            try:
-                rig.start('trainer', {'output': folder / 'bag', 'min_free_disk': 0.0,
-                                      'topics': _RECORDED})
-                rig.start_loop(46.0, LOCKSTEP, {})
-                _let_happen(rig, 3600.0 * hours, random, happened, looks, on_progress)
-                # what is on its way arrives, so that the counts can agree
-                rig.kill('plant', signal.SIGINT)
-                rig.wait(lambda: len(rig.course.commands) >= len(rig.course.delivered),
-                         'measurements are left without an answer')
-                rig.linger(0.5)
-            except StalledError as error:
-                rig.course.complaints.append(str(error))
+    rig = Rig(folder, 60.0 + _WALL_PER_HOUR * hours, check, between=True)
+    with rig:
+        try:
+            rig.start('trainer', {'output': folder / 'bag', 'min_free_disk': 0.0,
+                                  'topics': _RECORDED})
+            rig.start_loop(46.0, LOCKSTEP, {})
+            _let_happen(rig, 3600.0 * hours, random, happened, looks, on_progress)
+            # what is on its way arrives, so that the counts can agree
+            rig.kill('plant', signal.SIGINT)
+            rig.wait(lambda: len(rig.course.commands) >= len(rig.course.delivered),
+                     'measurements are left without an answer')
+            rig.linger(0.5)
+        except HarnessError as error:
+            rig.course.complaints.append(str(error))
     bag, recorded = folder / 'bag', {}
     if bag.exists():
         recorded = dict(summary(bag).counts)

@@ -6,8 +6,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from pathlib import Path
 import sys
 import time
 from typing import Any
@@ -19,8 +17,8 @@ from std_srvs.srv import Trigger
 
 from koopman_ros.nodes import topics
 from koopman_ros.nodes.messages import NANOSECONDS
-from koopman_ros.testing import NodeProcess
-from validation.benchmarks.loop.probe import Loop, Probe
+from koopman_ros.testing import Harness, NodeProcess
+from validation.benchmarks.loop.probe import Loop
 
 _ROUND = 50  # measurements of one side, then of the other
 _PACE = 0.005  # s between measurements whose latency is taken
@@ -31,34 +29,19 @@ _GROWTH, _TRIES = 1.2, 2
 _ON_SCHEDULE = 0.98
 
 
-class Launcher:
-    """
-    Starts the nodes of the benchmark.
-
-    :param environment: variables of the ROS domain.
-    :param folder: for what the processes print.
-    """
-
-    def __init__(self, environment: Mapping[str, str], folder: Path) -> None:
-        self.environment = environment
-        self._folder = folder
-        self._started = 0
-
-    def start(self, name: str, namespace: str, command: tuple[str, ...] | None = None,
-              **parameters: object) -> NodeProcess:
-        """Start a node under a namespace."""
-        self._started += 1
-        return NodeProcess(name, parameters, self._folder / f'{name}_{self._started}.log',
-                           self.environment, ('-r', f'__ns:={namespace}'), command)
+def _start(harness: Harness, name: str, namespace: str, command: tuple[str, ...] | None = None,
+           **parameters: object) -> NodeProcess:
+    """Start a node under a namespace."""
+    return harness.start(name, parameters, ('-r', f'__ns:={namespace}'), command)
 
 
-def latency(launcher: Launcher, probe: Probe, rounds: int) -> dict[str, Any]:
+def latency(harness: Harness, rounds: int) -> dict[str, Any]:
     """Time measurement to command of the controller and of the echo, round by round in turns."""
     echo = (sys.executable, '-m', 'validation.benchmarks.loop.echo')
     taken: dict[str, list[float]] = {'controller': [], 'echo': []}
-    with launcher.start('controller', '/latency/controller'), \
-            launcher.start('echo', '/latency/echo', echo) as echoing:
-        loops = {name: Loop(probe, f'/latency/{name}') for name in taken}
+    with _start(harness, 'controller', '/latency/controller'), \
+            _start(harness, 'echo', '/latency/echo', echo) as echoing:
+        loops = {name: Loop(harness, f'/latency/{name}') for name in taken}
         for loop in loops.values():
             loop.wait_for_first_answer()
             loop.settle()
@@ -84,7 +67,7 @@ def _paced(loop: Loop, count: int) -> list[float]:
     return taken
 
 
-def highest_rate(launcher: Launcher, probe: Probe, seconds: float, lowest: float
+def highest_rate(harness: Harness, seconds: float, lowest: float
                  ) -> dict[str, Any]:
     """
     Raise the rate of measurements until the controller does not keep up.
@@ -97,14 +80,14 @@ def highest_rate(launcher: Launcher, probe: Probe, seconds: float, lowest: float
     """
     steps: list[dict[str, Any]] = []
     highest, ended = None, ''
-    with launcher.start('controller', '/rate'):
-        loop = Loop(probe, '/rate')
+    with _start(harness, 'controller', '/rate'):
+        loop = Loop(harness, '/rate')
         loop.wait_for_first_answer()
         loop.settle()
         while not ended:
             rate = lowest * _GROWTH ** sum(step['kept_up'] for step in steps)
             for _ in range(_TRIES):
-                steps.append(step := _run(loop, probe, rate, seconds))
+                steps.append(step := _run(loop, harness, rate, seconds))
                 if step['kept_up']:
                     highest = step['sent_hz']
                     break
@@ -116,7 +99,7 @@ def highest_rate(launcher: Launcher, probe: Probe, seconds: float, lowest: float
     return {'max_rate_hz': highest, 'ended_by': ended, 'steps': steps}
 
 
-def _run(loop: Loop, probe: Probe, rate: float, seconds: float) -> dict[str, Any]:
+def _run(loop: Loop, harness: Harness, rate: float, seconds: float) -> dict[str, Any]:
     """Publish on schedule while the answers come in."""
     stamps: list[int] = []
     count = round(rate * seconds)
@@ -124,13 +107,13 @@ def _run(loop: Loop, probe: Probe, rate: float, seconds: float) -> dict[str, Any
     for k in range(count):
         due = begun + k / rate
         while (left := due - time.monotonic()) > 0.0:
-            probe.spin_once(left)
+            harness.spin_once(left)
         stamps.append(loop.publish())
-        probe.spin_once(0.0)
+        harness.spin_once(0.0)
     took = time.monotonic() - begun
     end = time.monotonic() + _PATIENCE
     while np.isinf(loop.seconds(stamps[-1])) and time.monotonic() < end:
-        probe.spin_once(0.05)
+        harness.spin_once(0.05)
     delays = np.array([loop.seconds(stamp) for stamp in stamps])
     at_end = float(np.median(delays[-max(1, count // 10):]))
     unanswered = int(np.sum(np.isinf(delays)))
@@ -140,36 +123,36 @@ def _run(loop: Loop, probe: Probe, rate: float, seconds: float) -> dict[str, Any
             'kept_up': not unanswered and at_end < _BEHIND}
 
 
-def start_up(launcher: Launcher, probe: Probe, runs: int) -> dict[str, Any]:
+def start_up(harness: Harness, runs: int) -> dict[str, Any]:
     """Time the controller from the start of its process to its first command."""
-    loop = Loop(probe, '/start')
+    loop = Loop(harness, '/start')
     taken = []
     for _ in range(runs):
         begun = time.time_ns()
-        with launcher.start('controller', '/start'):
+        with _start(harness, 'controller', '/start'):
             taken.append((loop.wait_for_first_answer() - begun) / NANOSECONDS)
     return {'seconds': float(np.median(taken)), 'runs': taken}
 
 
-def lockstep(launcher: Launcher, probe: Probe, seconds: float) -> dict[str, Any]:
+def lockstep(harness: Harness, seconds: float) -> dict[str, Any]:
     """
     Let plant and controller run in lock-step as fast as they can, and weigh all nodes.
 
     :param seconds: of the plant.
     """
     arrivals: list[float] = []
-    probe.node.create_subscription(
+    harness.node.create_subscription(
         Temperature, f'/lockstep/{topics.TEMPERATURE}',
         lambda _: arrivals.append(time.monotonic()), topics.LOOP_QOS, raw=True)
     count = round(seconds) + 1
-    with launcher.start('trainer', '/idle', record_at_start=False) as trainer, \
-            launcher.start('plant', '/lockstep', speed=0.0, lockstep=True, duration=seconds,
+    with _start(harness, 'trainer', '/idle', record_at_start=False) as trainer, \
+            _start(harness, 'plant', '/lockstep', speed=0.0, lockstep=True, duration=seconds,
                        sample_period=1.0, lockstep_subscribers=2) as plant, \
-            launcher.start('controller', '/lockstep') as controller:
-        probe.wait_until(lambda: len(arrivals) >= count,
+            _start(harness, 'controller', '/lockstep') as controller:
+        harness.wait_until(lambda: len(arrivals) >= count,
                          f'the lock-step loop of {seconds:g} s of the plant')
-        ready = probe.node.create_client(Trigger, '/idle/trainer/train').service_is_ready
-        probe.wait_until(ready, 'the trainer')
+        ready = harness.node.create_client(Trigger, '/idle/trainer/train').service_is_ready
+        harness.wait_until(ready, 'the trainer')
         memory = {'plant': megabytes(plant), 'controller': megabytes(controller),
                   'trainer': megabytes(trainer)}
     return {'plant_seconds': seconds, 'seconds': arrivals[-1] - arrivals[0],

@@ -14,9 +14,8 @@ import sys
 import tempfile
 from typing import Any
 
-from koopman_ros.testing import isolated_domain
+from koopman_ros.testing import Harness
 from validation.benchmarks.loop import across, step, table
-from validation.benchmarks.loop.probe import Probe
 from validation.benchmarks.machine import machine
 from validation.benchmarks.options import Extent, Options
 
@@ -75,11 +74,9 @@ def run(options: Options) -> dict[str, Any]:
     _add_steps(figures, plan)
     options.save(figures)
     _say(table.of_step(figures))
-    with (tempfile.TemporaryDirectory() as name, isolated_domain() as environment,
-          Probe(int(environment['ROS_DOMAIN_ID'])) as probe):
-        launcher = across.Launcher(environment, Path(name))
+    with tempfile.TemporaryDirectory() as name, Harness(Path(name), name='probe') as harness:
         _tell('latency beside an echo')
-        latency = figures['latency'] = across.latency(launcher, probe, plan.rounds)
+        latency = figures['latency'] = across.latency(harness, plan.rounds)
         for quantile in ('median', 'p99'):
             ours, echo = (latency[side][f'{quantile}_us'] for side in ('controller', 'echo'))
             figures[f'latency_ratio_{quantile}'] = ours / echo
@@ -87,14 +84,14 @@ def run(options: Options) -> dict[str, Any]:
         _say(table.of_latency(figures))
         _tell('highest rate')
         figures['rate'] = across.highest_rate(
-            launcher, probe, plan.rate_seconds, plan.lowest_rate)
+            harness, plan.rate_seconds, plan.lowest_rate)
         figures['max_rate_hz'] = figures['rate']['max_rate_hz']
         options.save(figures)
         _say(table.of_rate(figures))
         _tell('start-up, memory and lock-step')
-        figures['startup'] = across.start_up(launcher, probe, plan.starts)
+        figures['startup'] = across.start_up(harness, plan.starts)
         figures['startup_seconds'] = figures['startup']['seconds']
-        figures['lockstep'] = across.lockstep(launcher, probe, plan.plant_seconds)
+        figures['lockstep'] = across.lockstep(harness, plan.plant_seconds)
         figures['speedup_over_real_time'] = figures['lockstep']['speed_over_real_time']
         figures['rss_megabytes'] = {**figures['lockstep'].pop('rss_megabytes'),
                                     'echo': latency['echo_rss_megabytes']}

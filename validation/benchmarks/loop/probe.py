@@ -6,19 +6,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 import time
-from types import TracebackType
 
 import numpy as np
-import rclpy
-from rclpy.context import Context
-from rclpy.executors import SingleThreadedExecutor
-from rclpy.node import Node
 from sensor_msgs.msg import Temperature
 
 from koopman_ros.nodes import topics
 from koopman_ros.nodes.messages import NANOSECONDS, stamp_message, stamp_nanoseconds
+from koopman_ros.testing import Harness, HarnessError
 
 TIMEOUT = 30.0  # s, until somebody answers
 _CELSIUS = 51.0  # about the nominal point of the shipped lifts
@@ -26,61 +21,21 @@ _NOISE = 0.01  # K, standard deviation
 _RETRY = 0.01  # s between measurements that nobody may hear yet
 
 
-class Probe:
-    """
-    The measuring end of a loop; leaving the context takes the node down.
-
-    :param domain: ROS domain.
-    """
-
-    def __init__(self, domain: int) -> None:
-        self._context = Context()
-        rclpy.init(context=self._context, domain_id=domain)
-        self.node = Node('probe', context=self._context)
-        self._executor = SingleThreadedExecutor(context=self._context)
-        self._executor.add_node(self.node)
-
-    def __enter__(self) -> Probe:
-        return self
-
-    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None,
-                 trace: TracebackType | None) -> None:
-        self._executor.shutdown()
-        self.node.destroy_node()
-        rclpy.shutdown(context=self._context)
-
-    def spin_once(self, seconds: float) -> None:
-        """Handle one message, or wait for so long."""
-        self._executor.spin_once(timeout_sec=max(seconds, 0.0))
-
-    def wait_until(self, condition: Callable[[], bool], what: str) -> None:
-        """
-        Handle messages until a condition holds.
-
-        :raises TimeoutError: saying what was waited for.
-        """
-        deadline = time.monotonic() + TIMEOUT
-        while not condition():
-            if time.monotonic() > deadline:
-                raise TimeoutError(f'not within {TIMEOUT:g} s: {what}')
-            self.spin_once(0.05)
-
-
 class Loop:
     """
     The two topics of one controller, under a namespace.
 
-    :param probe: the node that measures.
+    :param harness: whose node measures.
     :param namespace: of whoever answers, e.g. ``/ours``.
     """
 
-    def __init__(self, probe: Probe, namespace: str) -> None:
-        self._probe = probe
+    def __init__(self, harness: Harness, namespace: str) -> None:
+        self._harness = harness
         self._rng = np.random.default_rng(0)
         self._answers: dict[int, int] = {}  # stamp -> arrival
-        self._measurements = probe.node.create_publisher(
+        self._measurements = harness.node.create_publisher(
             Temperature, f'{namespace}/{topics.TEMPERATURE}', topics.LOOP_QOS)
-        probe.node.create_subscription(
+        harness.node.create_subscription(
             Temperature, f'{namespace}/{topics.COOLANT_SETPOINT}', self._on_command,
             topics.LOOP_QOS)
 
@@ -91,20 +46,20 @@ class Loop:
         # answers of somebody who has ended meanwhile may still come in
         while not (news := [came for stamp, came in self._answers.items() if stamp >= begun]):
             if time.monotonic() > deadline:
-                raise TimeoutError(f'nobody answers within {TIMEOUT:g} s')
+                raise HarnessError(f'nobody answers within {TIMEOUT:g} s')
             self.publish()
-            self._probe.spin_once(_RETRY)
+            self._harness.spin_once(_RETRY)
         return news[0]
 
     def settle(self) -> None:
         """Handle all answers that are still on their way."""
         last = self.publish()
-        self._probe.wait_until(lambda: last in self._answers, 'the answer to a measurement')
+        self._harness.wait_until(lambda: last in self._answers, 'the answer to a measurement')
 
     def ask(self) -> float:
         """Publish a measurement and wait for its command; return the seconds between."""
         stamp = self.publish()
-        self._probe.wait_until(lambda: stamp in self._answers, 'the answer to a measurement')
+        self._harness.wait_until(lambda: stamp in self._answers, 'the answer to a measurement')
         return self.seconds(stamp)
 
     def publish(self) -> int:
