@@ -1,13 +1,14 @@
 # SPDX-FileCopyrightText: 2026 The koopman_ros Authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""What holds for all tests: their order, and messages that are checked field by field."""
+"""What holds for all tests: their order, checked messages, threads, disturbed trainings."""
 
 import os
+import sys
 
 import pytest
 
-from disturbance import disturb_training
+from support.disturbance import disturb_training
 
 # An int in a float64 field, say, passes unnoticed here, and aborts the process where the message
 # packages are built with asserts. The packages read this when they are imported.
@@ -25,6 +26,13 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     """Put the longest files first, the others in their order."""
     order = {name: place for place, name in enumerate(LONGEST)}
     items.sort(key=lambda item: order.get(item.path.stem, len(order)))
+
+
+@pytest.fixture(autouse=True, scope='session')
+def one_thread() -> None:
+    """Small problems are slower on several threads, and far slower where others use the cores."""
+    if 'OMP_NUM_THREADS' not in os.environ and (torch := sys.modules.get('torch')):
+        torch.set_num_threads(1)
 
 
 def pytest_configure() -> None:

@@ -10,8 +10,8 @@ import subprocess
 import numpy as np
 import pytest
 
-from disturbance import script
 from koopman_ros.lifting import load
+from support.disturbance import script
 
 ROOT = Path(__file__).parent.parent
 EXAMPLE = ROOT / 'examples' / 'own_plant.py'

@@ -10,10 +10,10 @@ import sys
 import numpy as np
 import pytest
 
-import disturbance
 from koopman_ros.learning import train, training
-from learning.small_plants import BENT, bent_samples, bits, SMALL
 import machines
+from support import disturbance
+from support.small_plants import BENT, bent_samples, bits, SMALL
 
 SEEN = """
 import warnings

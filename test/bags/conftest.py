@@ -9,10 +9,10 @@ from pathlib import Path
 from typing import Any
 import warnings
 
-from bag_samples import messages, OFFERED_QOS, PERIOD_NS, ROUNDS, Sample, START_NS, TOPICS
 import pytest
 
 from koopman_ros.bags import BagWriter, message_definition
+from support.bag_samples import messages, OFFERED_QOS, PERIOD_NS, ROUNDS, Sample, START_NS, TOPICS
 
 
 @pytest.fixture(scope='session')

@@ -8,7 +8,6 @@ from pathlib import Path
 import struct
 import tracemalloc
 
-from bag_samples import Sample
 import lz4.frame
 from mcap.data_stream import RecordBuilder
 from mcap.records import Chunk
@@ -16,6 +15,7 @@ import pytest
 import zstandard
 
 from koopman_ros.bags import BagReadError, BagWriter, MessageDefinition, read_messages, summary
+from support.bag_samples import Sample
 
 WriteBag = Callable[..., Path]
 

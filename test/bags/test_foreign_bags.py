@@ -7,8 +7,6 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-from bag_mutants import compressed_files
-from bag_samples import OFFERED_QOS, Sample
 import pytest
 import yaml
 
@@ -23,6 +21,8 @@ from koopman_ros.bags import (
     temperature_series,
 )
 from koopman_ros.bags.qos import dump_offered_qos, parse_offered_qos
+from support.bag_mutants import compressed_files
+from support.bag_samples import OFFERED_QOS, Sample
 
 WriteBag = Callable[..., Path]
 

@@ -14,8 +14,6 @@ import random
 import resource
 import shutil
 
-from bag_mutants import mutate, Specimen, specimens
-from bag_samples import Sample, TOPICS
 import pytest
 
 from koopman_ros.bags import (
@@ -26,6 +24,8 @@ from koopman_ros.bags import (
     summary,
     temperature_series,
 )
+from support.bag_mutants import mutate, Specimen, specimens
+from support.bag_samples import Sample, TOPICS
 
 MUTANTS = int(os.environ.get('BAG_MUTANTS', '40'))
 ROUNDS = 8

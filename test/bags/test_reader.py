@@ -5,7 +5,6 @@ from collections.abc import Callable
 from pathlib import Path
 import shutil
 
-from bag_samples import PERIOD_NS, ROUNDS, Sample, START_NS, TOPICS
 from mcap.writer import Writer
 import pytest
 import yaml
@@ -17,6 +16,7 @@ from koopman_ros.bags import (
     read_messages,
     summary,
 )
+from support.bag_samples import PERIOD_NS, ROUNDS, Sample, START_NS, TOPICS
 
 WriteBag = Callable[..., Path]
 

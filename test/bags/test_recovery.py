@@ -8,12 +8,12 @@ from pathlib import Path
 import shutil
 import struct
 
-from bag_samples import Sample
 from mcap.records import Chunk, Message
 from mcap.stream_reader import breakup_chunk, StreamReader
 import pytest
 
 from koopman_ros.bags import BagReadError, read_messages, summary
+from support.bag_samples import Sample
 
 WriteBag = Callable[..., Path]
 

@@ -7,12 +7,12 @@ from collections.abc import Callable
 import importlib
 from pathlib import Path
 
-from bag_samples import OFFERED_QOS, ROUNDS, Sample, TOPICS
 from mcap.reader import make_reader
 from mcap_ros2.decoder import DecoderFactory
 import pytest
 
 from koopman_ros.bags import BagWriter, message_definition
+from support.bag_samples import OFFERED_QOS, ROUNDS, Sample, TOPICS
 
 highlevel = importlib.import_module('rosbags.highlevel')
 rosbag2 = importlib.import_module('rosbags.rosbag2')

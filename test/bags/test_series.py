@@ -4,11 +4,11 @@
 from collections.abc import Callable
 from pathlib import Path
 
-from bag_samples import PERIOD_NS, ROUNDS, START_NS
 import numpy as np
 import pytest
 
 from koopman_ros.bags import BagReadError, BagWriter, message_definition, temperature_series
+from support.bag_samples import PERIOD_NS, ROUNDS, START_NS
 
 WriteBag = Callable[..., Path]
 

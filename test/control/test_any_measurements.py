@@ -8,9 +8,9 @@ import math
 from hypothesis import given, settings
 from hypothesis import strategies as st
 import numpy as np
-from sampled_loops import controller, EPOCH, LOWER, RATE, SECOND, UPPER
 
 from koopman_ros.control import Mode, Rung, State
+from support.sampled_loops import controller, EPOCH, LOWER, RATE, SECOND, UPPER
 
 TUNINGS = [controller(), controller(observer_bandwidth=0.0, transfer_time=0.0),
            controller('reactor_linear'), controller('reactor_nz3', input_weight=np.array([1e-4])),

@@ -5,12 +5,21 @@
 
 import math
 
-from closed_loops import SETPOINT, shipped, START
 import numpy as np
 import pytest
-from sampled_loops import controller, EPOCH, largest_step, Loop, rungs, SAFE, SECOND, settled
 
 from koopman_ros.control import Mode, Rung, SensorLimits, State
+from support.closed_loops import SETPOINT, shipped, START
+from support.sampled_loops import (
+    controller,
+    EPOCH,
+    largest_step,
+    Loop,
+    rungs,
+    SAFE,
+    SECOND,
+    settled,
+)
 
 NAN = math.nan
 

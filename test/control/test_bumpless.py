@@ -5,12 +5,12 @@
 
 from dataclasses import replace
 
-from closed_loops import SETPOINT, shipped, START
 import numpy as np
 import pytest
-from sampled_loops import changed_reactor, controller, largest_step, Loop, settled
 
 from koopman_ros.control import Controller, InputLimits, Mode, State
+from support.closed_loops import SETPOINT, shipped, START
+from support.sampled_loops import changed_reactor, controller, largest_step, Loop, settled
 
 DRIFTED = {'heat_transfer_coefficient': 0.8}
 

@@ -11,7 +11,7 @@ from koopman_ros.control import feedback, run_closed_loop, Weights
 from koopman_ros.control.laws import Feedback, Law
 from koopman_ros.lifting import linearised_model, Provenance
 from koopman_ros.solvers import RiccatiStatus, solve_riccati
-from random_lifts import coordinates
+from support.random_lifts import coordinates
 
 JACOBIAN = np.array([[0.4, 1.0], [-0.3, -0.5]])
 B = np.array([[0.2], [1.5]])

@@ -9,13 +9,13 @@ from enum import Enum
 import math
 from typing import Any
 
-from closed_loops import COOLANT, REACTOR, SETPOINT, shipped, START, two_state_model
 import numpy as np
 import pytest
 
 from koopman_ros.control import Controller, InputLimits, Law, Mode, Rung, Settings, State
 from koopman_ros.lifting import Coordinates, LiftedModel, NetworkObservables, Provenance
 from koopman_ros.plants import advance
+from support.closed_loops import COOLANT, REACTOR, SETPOINT, shipped, START, two_state_model
 
 SECOND = 1_000_000_000
 NOW = 1_785_000_000 * SECOND

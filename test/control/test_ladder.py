@@ -3,13 +3,21 @@
 
 """The ladder: learned law, linear law, hold, safe input, and back with hysteresis."""
 
-from closed_loops import SETPOINT, START
 import numpy as np
 import pytest
-from sampled_loops import changed_reactor, controller, largest_step, Loop, rungs, SAFE, settled
 
 from koopman_ros.control import LadderSettings, Rung, State
 from koopman_ros.control.ladder import Need, Standing
+from support.closed_loops import SETPOINT, START
+from support.sampled_loops import (
+    changed_reactor,
+    controller,
+    largest_step,
+    Loop,
+    rungs,
+    SAFE,
+    settled,
+)
 
 SECOND = 1_000_000_000
 SETTINGS = LadderSettings(validity_margin=0.2, linear_margin=1.0, hold_timeout=60.0,

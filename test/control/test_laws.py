@@ -5,20 +5,6 @@
 
 from dataclasses import replace
 
-from closed_loops import (
-    COOLANT,
-    optimal_cost,
-    optimal_slope,
-    REACTOR,
-    reactor_weights,
-    run_reactor,
-    run_two_state,
-    SETPOINT,
-    shipped,
-    START,
-    two_state_model,
-    UNIT,
-)
 import numpy as np
 import pytest
 from scipy.integrate import solve_ivp
@@ -43,7 +29,21 @@ from koopman_ros.lifting import (
 )
 from koopman_ros.plants import equilibrium, two_state_example, two_state_reactor
 from koopman_ros.solvers import RiccatiStatus
-from random_lifts import random_lift
+from support.closed_loops import (
+    COOLANT,
+    optimal_cost,
+    optimal_slope,
+    REACTOR,
+    reactor_weights,
+    run_reactor,
+    run_two_state,
+    SETPOINT,
+    shipped,
+    START,
+    two_state_model,
+    UNIT,
+)
+from support.random_lifts import random_lift
 
 BOUNDS = {'max_gain': 1e3, 'max_residual': 1e-6}
 

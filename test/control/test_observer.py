@@ -3,13 +3,13 @@
 
 """The disturbance observer against its own design, and against exact disturbances."""
 
-from closed_loops import shipped, START, two_state_model
 import numpy as np
 import pytest
 from scipy.integrate import solve_ivp
 
 from koopman_ros.control import Controller, InputLimits, Settings, State
 from koopman_ros.control.observer import equivalent_bias, Estimate, Observer
+from support.closed_loops import shipped, START, two_state_model
 
 MODEL = shipped('reactor_nz4')
 

@@ -3,12 +3,12 @@
 
 """Zero offset on plants that are not the model, with the node's default tuning."""
 
-from closed_loops import SETPOINT, START
 import numpy as np
 import pytest
-from sampled_loops import changed_reactor, controller, Loop, settled, UPPER
 
 from koopman_ros.plants import two_state_reactor
+from support.closed_loops import SETPOINT, START
+from support.sampled_loops import changed_reactor, controller, Loop, settled, UPPER
 
 # The nominal loop's step response of 10 K takes 192 s to stay within 1e-3 K.
 RESPONSE, MORE = 192, 120  # s

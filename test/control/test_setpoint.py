@@ -3,12 +3,12 @@
 
 """The set-point: what is refused, when a request takes effect, and its ramp."""
 
-from closed_loops import shipped
 import numpy as np
 import pytest
 
 from koopman_ros.control import Setpoint
 from koopman_ros.control.setpoint import advance, HORIZON_NANOSECONDS, refusal, request
+from support.closed_loops import shipped
 
 MODEL = shipped('reactor_nz4')
 SECOND = 1_000_000_000

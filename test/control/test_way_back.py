@@ -5,10 +5,8 @@
 
 from dataclasses import replace
 
-from closed_loops import REACTOR, shipped, START
 import numpy as np
 import pytest
-from sampled_loops import changed_reactor, controller, largest_step, Loop, rungs, SAFE, settled
 from scipy.optimize import brentq
 
 from koopman_ros.control import Controller, InputLimits, Rung, Settings, State
@@ -16,6 +14,16 @@ from koopman_ros.control.way_back import leads_home, rest_under, WayBack
 from koopman_ros.lifting import Coordinates, linearised_model, Provenance
 from koopman_ros.nodes.model_loading import rests_outside
 from koopman_ros.nodes.translation import controller_of
+from support.closed_loops import REACTOR, shipped, START
+from support.sampled_loops import (
+    changed_reactor,
+    controller,
+    largest_step,
+    Loop,
+    rungs,
+    SAFE,
+    settled,
+)
 
 SECOND = 1_000_000_000
 NOMINAL = 300.0  # K, of the coolant

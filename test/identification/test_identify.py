@@ -7,7 +7,6 @@ from dataclasses import replace
 import sys
 import tracemalloc
 
-from known_plants import CUBIC, PAIR
 import numpy as np
 import pytest
 
@@ -22,6 +21,7 @@ from koopman_ros.identification import (
     weak_form,
 )
 from koopman_ros.identification.output_error import _Problem
+from support.known_plants import CUBIC, PAIR
 
 NOISE = 0.02
 

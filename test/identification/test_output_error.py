@@ -3,7 +3,6 @@
 
 """Output error: exact derivatives, exact recovery, and the statistics of maximum likelihood."""
 
-from known_plants import CUBIC, PAIR
 import numpy as np
 import pytest
 from scipy.stats import chi2
@@ -20,6 +19,7 @@ from koopman_ros.identification import (
 )
 from koopman_ros.identification.drift import scaled_input_matrix
 from koopman_ros.identification.output_error import _Problem
+from support.known_plants import CUBIC, PAIR
 
 NOISE = 0.02
 

@@ -3,7 +3,6 @@
 
 """Total variation and the weak form: recovery, order of the quadrature, noise, and what fails."""
 
-from known_plants import CUBIC, PAIR
 import numpy as np
 import pytest
 
@@ -17,6 +16,7 @@ from koopman_ros.identification import (
 )
 from koopman_ros.identification.drift import scaled_input_matrix
 from koopman_ros.identification.total_variation import smoothed
+from support.known_plants import CUBIC, PAIR
 
 
 def estimate(method, plant, records, degree, B=None, window=20):

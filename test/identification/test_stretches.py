@@ -3,7 +3,6 @@
 
 """Stretches: grids, the Runge-Kutta path against the plants' integrator, and fitted starts."""
 
-from known_plants import CUBIC, PAIR
 import numpy as np
 import pytest
 
@@ -16,6 +15,7 @@ from koopman_ros.identification import (
     Stretches,
 )
 from koopman_ros.plants import one_state_reactor, simulate, two_state_example
+from support.known_plants import CUBIC, PAIR
 
 
 def test_grid_has_samples_changes_and_steps_between():

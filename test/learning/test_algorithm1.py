@@ -6,13 +6,13 @@
 import numpy as np
 import pytest
 from scipy.stats import kstest
-from small_plants import bent_samples
 import torch
 
 from koopman_ros.learning import Algorithm1
 from koopman_ros.learning.levenberg_marquardt import Status
 from koopman_ros.learning.network import Layout
 from koopman_ros.learning.residuals import Data, Problem, ResidualWeights
+from support.small_plants import bent_samples
 
 SMALL = {'n_z': 2, 'hidden': (3,), 'decoder': 3, 'max_iterations': 5}
 

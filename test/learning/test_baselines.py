@@ -7,11 +7,11 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from small_plants import BENT, bent_samples, TWO_STATE, two_state_samples
 
 from koopman_ros.control import projected, run_closed_loop, steady_state_target, Weights
 from koopman_ros.learning import Edmd, fit, judge, Linearisation, Plant, Samples, Scaling
 from koopman_ros.lifting import linearised_model
+from support.small_plants import BENT, bent_samples, TWO_STATE, two_state_samples
 
 
 @pytest.mark.parametrize('degree', [2, 3])

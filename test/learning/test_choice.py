@@ -7,7 +7,11 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from small_plants import (
+import torch
+
+from koopman_ros.learning import fit, Growth, NoUsefulLift, split_by_episode, train
+from koopman_ros.learning.levenberg_marquardt import Status
+from support.small_plants import (
     BENT,
     bent_samples,
     SMALL,
@@ -16,10 +20,6 @@ from small_plants import (
     UNFORCED,
     unforced_samples,
 )
-import torch
-
-from koopman_ros.learning import fit, Growth, NoUsefulLift, split_by_episode, train
-from koopman_ros.learning.levenberg_marquardt import Status
 
 
 class Recorded:

@@ -7,15 +7,15 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from small_plants import bent_samples, two_state_samples
 import torch
 
-from disturbance import disturbed_data
 from koopman_ros.learning import Growth
 from koopman_ros.learning.growth import least_squares
 from koopman_ros.learning.levenberg_marquardt import Status
 from koopman_ros.learning.network import Pass
 from koopman_ros.learning.residuals import Data
+from support.disturbance import disturbed_data
+from support.small_plants import bent_samples, two_state_samples
 
 
 def tensors(*arrays):

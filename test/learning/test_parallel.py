@@ -16,11 +16,11 @@ import warnings
 import joblib
 import numpy as np
 import pytest
-from small_plants import BENT, bent_samples, bits, SMALL
 import torch
 
 import koopman_ros
 from koopman_ros.learning import train, training
+from support.small_plants import BENT, bent_samples, bits, SMALL
 
 RECIPE = replace(SMALL, n_z=3)
 
@@ -82,7 +82,7 @@ PROGRAM = """
 import contextlib, dataclasses, signal, sys
 import joblib
 from koopman_ros.learning import Growth, train
-from small_plants import BENT, bent_samples
+from support.small_plants import BENT, bent_samples
 
 def watch(now):
     print(now.n_z, now.finished, now.iteration, flush=True)
@@ -104,7 +104,7 @@ if __name__ == '__main__':
 @pytest.mark.parametrize('backend', ['sequential', 'loky'])
 def test_an_interrupt_from_the_keyboard(backend):
     """Interrupt the whole process group, as a terminal does, once the first round is over."""
-    here = Path(__file__).parent
+    here = Path(__file__).parents[1]
     path = os.pathsep.join([str(here), str(Path(koopman_ros.__file__).parents[1])])
     with subprocess.Popen(
             [sys.executable, '-c', PROGRAM, backend], stdout=subprocess.PIPE,
@@ -126,16 +126,15 @@ def test_an_interrupt_from_the_keyboard(backend):
     assert last.endswith('interrupted: the best parameters so far are kept')
 
 
-class Probe:
-    """A recipe whose start says how its process answers an interrupt."""
-
-    def start(self, *_):
-        return signal.getsignal(signal.SIGINT) is signal.SIG_IGN
-
-
 @pytest.mark.parametrize(('backend', 'leaves'), [('loky', True), ('threading', False)])
 def test_workers_leave_an_interrupt_to_the_process_that_waits(backend, leaves):
     """Between two starts they would print where they were."""
+    class Probe:
+        """A recipe whose start says how its process answers an interrupt."""
+
+        def start(self, *_):
+            return signal.getsignal(signal.SIGINT) is signal.SIG_IGN
+
     # in the background of a shell all of them would ignore it
     before = signal.signal(signal.SIGINT, signal.default_int_handler)
     try:

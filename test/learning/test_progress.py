@@ -8,11 +8,11 @@ import itertools
 import math
 
 import pytest
-from small_plants import bits, SMALL, UNFORCED, unforced_samples
 import torch
 
 from koopman_ros.learning import NoUsefulLift, train
 from koopman_ros.learning.levenberg_marquardt import Status
+from support.small_plants import bits, SMALL, UNFORCED, unforced_samples
 
 RECIPE = replace(SMALL, n_z=3)
 

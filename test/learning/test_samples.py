@@ -8,9 +8,9 @@ import math
 
 import numpy as np
 import pytest
-from small_plants import BENT, bent_samples
 
 from koopman_ros.learning import Plant, Scaling, split_by_episode
+from support.small_plants import BENT, bent_samples
 
 
 def timed(episodes=4, length=5):

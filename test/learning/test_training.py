@@ -8,16 +8,6 @@ import math
 
 import numpy as np
 import pytest
-from small_plants import (
-    BENT,
-    bent_samples,
-    bits,
-    SMALL,
-    TWO_STATE,
-    two_state_samples,
-    UNFORCED,
-    unforced_samples,
-)
 import torch
 
 from koopman_ros.learning import (
@@ -34,6 +24,16 @@ from koopman_ros.learning import (
 )
 from koopman_ros.learning.levenberg_marquardt import Status
 from koopman_ros.plants import scalar_example
+from support.small_plants import (
+    BENT,
+    bent_samples,
+    bits,
+    SMALL,
+    TWO_STATE,
+    two_state_samples,
+    UNFORCED,
+    unforced_samples,
+)
 
 
 @pytest.fixture(scope='module')

@@ -26,7 +26,7 @@ from koopman_ros.lifting import (
     NetworkObservables,
     Provenance,
 )
-from random_lifts import coordinates, random_lift
+from support.random_lifts import coordinates, random_lift
 
 JACOBIAN = np.array([[-1.0, 4.0], [-2.0, -0.5]])
 B = np.array([[0.3], [2.0]])

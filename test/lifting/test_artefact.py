@@ -30,7 +30,7 @@ from koopman_ros.lifting import (
     save,
 )
 from koopman_ros.lifting.files import read_regular
-from random_lifts import random_lift
+from support.random_lifts import random_lift
 
 SHIPPED = Path(__file__).parents[2] / 'config' / 'models'
 

@@ -15,7 +15,7 @@ from koopman_ros.lifting import (
     Provenance,
 )
 from koopman_ros.plants import eigenvalues, two_state_reactor
-from random_lifts import coordinates, random_lift, random_network
+from support.random_lifts import coordinates, random_lift, random_network
 
 SHAPES = [(n_x, widths, identity)
           for n_x in (1, 2, 3) for widths in ((6,), (5, 4)) for identity in (True, False)]

@@ -13,7 +13,7 @@ import pytest
 
 from koopman_ros.lifting import NetworkObservables, Observables, PolynomialObservables
 from koopman_ros.lifting.activations import ACTIVATIONS
-from random_lifts import random_network
+from support.random_lifts import random_network
 
 NETWORKS = {
     f'{activation} {n_x} {widths} {identity}':

@@ -11,8 +11,8 @@ import pytest
 
 from koopman_ros.learning import Growth, train
 from koopman_ros.lifting import load, ModelFileError, save, TrainingStates
-from learning.small_plants import BENT, bent_samples, TWO_STATE, two_state_samples
-from random_lifts import random_lift
+from support.random_lifts import random_lift
+from support.small_plants import BENT, bent_samples, TWO_STATE, two_state_samples
 
 # an L along two sides of the box [-1, 1] x [-1, 1]
 L_SHAPE = np.array([[-1.0, y] for y in np.linspace(-1.0, 1.0, 21)]

@@ -14,7 +14,6 @@ from rclpy.node import Node, NodeNameNonExistentError
 from rclpy.serialization import serialize_message
 from sensor_msgs.msg import Temperature
 from std_srvs.srv import SetBool
-from workbench import temperature
 
 from koopman_ros.bags import BagWriter, message_definition
 from koopman_ros.nodes import replay, topics
@@ -23,6 +22,7 @@ from koopman_ros.nodes.parameter_node import ParameterNode
 from koopman_ros.nodes.player_parameters import PlayerParameters
 from koopman_ros.nodes.shipped import config_directory
 from koopman_ros.testing import Harness
+from support.messages import temperature
 
 
 def resolved(access: Access, node: str) -> dict[str, set[str]]:

@@ -13,11 +13,11 @@ import numpy as np
 import pytest
 from rosgraph_msgs.msg import Clock
 from sensor_msgs.msg import Temperature
-from workbench import seconds, temperature, value
 
 from koopman_ros.nodes import topics
 from koopman_ros.nodes.plant_parameters import PlantParameters
 from koopman_ros.testing import Harness
+from support.messages import seconds, temperature, value
 
 FOULED = 0.8 * PlantParameters().heat_transfer_coefficient
 SETPOINT = 45.0  # degC

@@ -12,14 +12,11 @@ import sys
 import time as clock
 from typing import BinaryIO
 
-from controller_bench import STATUS, STEADY
 from diagnostic_msgs.msg import DiagnosticStatus
 import numpy as np
 import pytest
 from rosgraph_msgs.msg import Clock
 from sensor_msgs.msg import Temperature
-from test_reload import opened
-from workbench import seconds, temperature
 
 from koopman_ros.control import State
 from koopman_ros.lifting import load
@@ -29,6 +26,9 @@ from koopman_ros.nodes.messages import stamp_nanoseconds, to_celsius
 from koopman_ros.nodes.shipped import model_path
 from koopman_ros.nodes.watchdog import Watchdog
 from koopman_ros.testing import Harness
+from support.controller_bench import STATUS, STEADY
+from support.messages import seconds, temperature
+from support.pipes import opened
 
 SAFE = 10.0  # degC
 SETTINGS = {'measurement_timeout': 0.3, 'hold_timeout': 0.2, 'coolant_rate_limit': 1200.0,

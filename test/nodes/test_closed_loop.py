@@ -10,10 +10,10 @@ from collections.abc import Mapping
 import pytest
 from rosgraph_msgs.msg import Clock
 from sensor_msgs.msg import Temperature
-from workbench import seconds, temperature
 
 from koopman_ros.nodes import topics
 from koopman_ros.testing import Harness
+from support.messages import seconds, temperature
 
 LOCKSTEP = {'lockstep': True, 'speed': 0.0}
 

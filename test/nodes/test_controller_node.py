@@ -10,7 +10,6 @@ import math
 from pathlib import Path
 import shutil
 
-from controller_bench import Bench, STATUS, STEADY
 from diagnostic_msgs.msg import DiagnosticStatus
 import pytest
 import rclpy
@@ -18,11 +17,12 @@ from rclpy.context import Context
 from rclpy.node import Node
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 from sensor_msgs.msg import JointState, Temperature
-from workbench import seconds, temperature, value
 
 from koopman_ros.nodes import topics
 from koopman_ros.nodes.shipped import model_path
 from koopman_ros.testing import Harness
+from support.controller_bench import Bench, STATUS, STEADY
+from support.messages import seconds, temperature, value
 
 
 @pytest.fixture(scope='module')

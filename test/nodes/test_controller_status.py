@@ -11,18 +11,18 @@ from pathlib import Path
 import sys
 import time
 
-from controller_bench import Bench, STATUS, STEADY
 from diagnostic_msgs.msg import DiagnosticStatus
 import pytest
 from rclpy.node import Node
 from sensor_msgs.msg import JointState, Temperature
-from workbench import seconds, temperature, value
 
 from koopman_ros.lifting import load, save
 from koopman_ros.nodes import topics
 from koopman_ros.nodes.replaying.answers import TRACKED
 from koopman_ros.nodes.shipped import model_path
 from koopman_ros.testing import Harness
+from support.controller_bench import Bench, STATUS, STEADY
+from support.messages import seconds, temperature, value
 
 
 @pytest.fixture(scope='module')

@@ -16,7 +16,6 @@ from diagnostic_msgs.msg import DiagnosticStatus
 import pytest
 from rclpy.qos import QoSProfile, ReliabilityPolicy
 from sensor_msgs.msg import Temperature
-from workbench import seconds, temperature, value
 
 from koopman_ros.bags import read_messages
 from koopman_ros.control.experiment import advance, begin, Phase
@@ -24,6 +23,7 @@ from koopman_ros.nodes import topics
 from koopman_ros.nodes.messages import stamp_nanoseconds, to_celsius, to_kelvin
 from koopman_ros.nodes.trainer_parameters import TrainerParameters
 from koopman_ros.testing import Harness
+from support.messages import seconds, temperature, value
 
 STATUS = 'trainer: experiment'
 SERVICE = 'trainer/experiment'

@@ -12,7 +12,6 @@ import sys
 import time
 
 import pytest
-from workbench import TIMEOUT
 
 from koopman_ros.bags import summary
 from koopman_ros.testing import (
@@ -23,6 +22,7 @@ from koopman_ros.testing import (
     process,
     reservations,
 )
+from support.messages import TIMEOUT
 
 SLEEPER = (sys.executable, '-c', 'import time; time.sleep(600)')
 

@@ -25,7 +25,6 @@ from rclpy.serialization import serialize_message
 from rclpy.task import Future
 from sensor_msgs.msg import Temperature
 from std_srvs.srv import SetBool, Trigger
-from workbench import seconds, temperature, TIMEOUT
 
 from koopman_ros.bags import BagReadError, BagWriter, message_definition
 from koopman_ros.nodes import topics
@@ -44,6 +43,7 @@ from koopman_ros.nodes.trainer import TrainerNode
 from koopman_ros.nodes.trainer_parameters import TrainerParameters
 from koopman_ros.retraining import retrain, Task
 from koopman_ros.testing import isolated_domain
+from support.messages import seconds, temperature, TIMEOUT
 
 STEADY = 51.8  # degC, near the plant's steady state
 DENORMAL = 5e-324

@@ -14,12 +14,12 @@ from diagnostic_msgs.msg import DiagnosticStatus
 import pytest
 from rclpy.node import Node
 from sensor_msgs.msg import JointState, Temperature
-from workbench import seconds, temperature, value
 
 from koopman_ros.nodes import topics
 from koopman_ros.nodes.messages import LAST_STAMP_SECONDS, seconds_text, stamp_nanoseconds
 from koopman_ros.nodes.plant_parameters import PlantParameters, TABLE
 from koopman_ros.testing import Harness
+from support.messages import seconds, temperature, value
 
 STATUS = 'plant: simulation'
 NOMINAL_COOLANT = 26.85  # degC

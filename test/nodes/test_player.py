@@ -18,7 +18,6 @@ from rclpy.qos import DurabilityPolicy, ReliabilityPolicy
 from rclpy.serialization import serialize_message
 from rosgraph_msgs.msg import Clock
 from sensor_msgs.msg import Temperature
-from workbench import temperature, TIMEOUT
 
 from koopman_ros.bags import (
     BagReadError,
@@ -35,6 +34,7 @@ from koopman_ros.nodes import player, replay, topics
 from koopman_ros.nodes.messages import NANOSECONDS, stamp_nanoseconds
 from koopman_ros.nodes.shipped import config_directory
 from koopman_ros.testing import Harness, isolated_domain, NodeProcess
+from support.messages import temperature, TIMEOUT
 
 SAMPLES = 61
 SCENARIO = Scenario('reactor_nz4', 315.15, step_time=20.0, duration=SAMPLES - 1.0,

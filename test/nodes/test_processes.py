@@ -19,7 +19,6 @@ import pytest
 from rclpy.utilities import get_rmw_implementation_identifier
 from rosgraph_msgs.msg import Clock
 from sensor_msgs.msg import Temperature
-from workbench import temperature, TIMEOUT
 
 from koopman_ros.bags import summary
 from koopman_ros.nodes import command_line, topics
@@ -28,6 +27,7 @@ from koopman_ros.nodes.messages import NANOSECONDS, stamp_message
 from koopman_ros.nodes.parameter_files import TABLES
 from koopman_ros.nodes.shipped import model_path
 from koopman_ros.testing import Harness, isolated_domain, NodeProcess
+from support.messages import temperature, TIMEOUT
 
 # Ends.
 

@@ -12,13 +12,13 @@ from typing import Any
 import pytest
 from rclpy.duration import Duration
 from sensor_msgs.msg import Temperature
-from workbench import temperature, TIMEOUT
 
 from koopman_ros.bags import BagWriter, read_messages
 from koopman_ros.nodes import recorder, topics
 from koopman_ros.nodes.messages import NANOSECONDS
 from koopman_ros.nodes.recorder import receipt_ns, Recorder
 from koopman_ros.testing import Harness
+from support.messages import temperature, TIMEOUT
 
 NAMES = (topics.TEMPERATURE, topics.SETPOINT, topics.COOLANT_SETPOINT)
 

@@ -25,7 +25,6 @@ from rclpy.duration import Duration
 from rosbags.highlevel import AnyReader
 from sensor_msgs.msg import Temperature
 from std_msgs.msg import String
-from workbench import temperature, TIMEOUT
 import yaml
 
 from koopman_ros.bags import read_messages, summary
@@ -33,6 +32,7 @@ from koopman_ros.nodes import topics
 from koopman_ros.nodes.recording import free_name
 from koopman_ros.nodes.trainer_parameters import TABLE, TrainerParameters
 from koopman_ros.testing import Harness
+from support.messages import temperature, TIMEOUT
 
 TOPIC = '/temperature'
 PUBLISHER = (Path(__file__).parents[2]

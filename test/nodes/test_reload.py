@@ -8,7 +8,6 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
-import errno
 import itertools
 import math
 import os
@@ -26,7 +25,6 @@ from rclpy.parameter import Parameter
 from rclpy.task import Future
 from sensor_msgs.msg import Temperature
 from std_srvs.srv import Trigger
-from workbench import seconds, temperature, value
 
 from koopman_ros.control import Controller, State
 from koopman_ros.lifting import LiftedModel, load, save
@@ -35,6 +33,8 @@ from koopman_ros.nodes.controller_parameters import ControllerParameters
 from koopman_ros.nodes.messages import stamp_nanoseconds, to_celsius, to_kelvin
 from koopman_ros.nodes.shipped import model_path
 from koopman_ros.testing import Harness
+from support.messages import seconds, temperature, value
+from support.pipes import opened
 
 STATUS = 'controller: control'
 STEADY = 51.8  # degC, near the plant's steady state
@@ -57,22 +57,6 @@ def put(content: bytes, path: Path) -> None:
     new = path.with_suffix('.new')
     new.write_bytes(content)
     os.replace(new, path)
-
-
-def opened(ros: Harness, pipe: Path) -> BinaryIO:
-    """Wait until somebody reads from a named pipe, and return the end to write to."""
-    def end() -> BinaryIO | None:
-        try:
-            return os.fdopen(os.open(pipe, os.O_WRONLY | os.O_NONBLOCK), 'wb')
-        except OSError as error:
-            if error.errno != errno.ENXIO:
-                raise
-            # nobody reads yet
-            return None
-
-    found = ros.wait_until(end)
-    assert found is not None
-    return found
 
 
 def until_read(change: Callable[[], SetParametersResult]) -> SetParametersResult:

@@ -18,7 +18,6 @@ import numpy as np
 import pytest
 from rclpy.serialization import serialize_message
 from sensor_msgs.msg import Temperature
-from workbench import seconds, temperature, value
 
 from koopman_ros.bags import (
     BagMessage,
@@ -36,6 +35,7 @@ from koopman_ros.nodes.replaying.record import Names
 from koopman_ros.nodes.replaying.report import about_beginning, reproduced, verdict
 from koopman_ros.nodes.shipped import config_directory
 from koopman_ros.testing import Harness, isolated_domain
+from support.messages import seconds, temperature, value
 
 STEADY = 51.8  # degC
 # The rate limit is active through every step of the set-point, and the ramp takes some samples.

@@ -11,7 +11,6 @@ from pathlib import Path
 import pytest
 from rclpy.serialization import serialize_message
 from sensor_msgs.msg import Temperature
-from workbench import seconds, temperature
 
 from koopman_ros.bags import BagWriter, message_definition
 from koopman_ros.control import Rung, State
@@ -24,6 +23,7 @@ from koopman_ros.nodes.replaying.inputs import Silence, TakeOver
 from koopman_ros.nodes.replaying.record import Names
 from koopman_ros.nodes.shipped import model_path
 from koopman_ros.testing import Harness
+from support.messages import seconds, temperature
 
 STEADY = 51.8  # degC
 COOLANT = 24.5  # degC, not what the law would command

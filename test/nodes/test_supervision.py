@@ -13,13 +13,13 @@ import signal
 from diagnostic_msgs.msg import DiagnosticStatus
 import numpy as np
 from sensor_msgs.msg import Temperature
-from workbench import temperature
 
 from koopman_ros.bags import summary
 from koopman_ros.lifting import load, save
 from koopman_ros.nodes import topics
 from koopman_ros.nodes.shipped import model_path
 from koopman_ros.testing import Harness
+from support.messages import temperature
 
 
 def test_controller_that_falls_silent_is_reported_by_the_plant(ros: Harness) -> None:

@@ -17,11 +17,11 @@ from rclpy.publisher import Publisher
 from rclpy.qos import QoSProfile, ReliabilityPolicy
 from sensor_msgs.msg import Temperature
 from std_msgs.msg import String
-from workbench import seconds, temperature, TIMEOUT
 
 from koopman_ros.bags import BagMessage, read_messages, summary
 from koopman_ros.nodes import topics
 from koopman_ros.testing import Harness, NodeProcess
+from support.messages import seconds, temperature, TIMEOUT
 
 BEST_EFFORT = QoSProfile(depth=1000, reliability=ReliabilityPolicy.BEST_EFFORT)
 

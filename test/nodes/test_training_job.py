@@ -14,12 +14,12 @@ import sys
 import time
 
 import pytest
-from workbench import TIMEOUT
 
 from koopman_ros.nodes import training_job
 from koopman_ros.nodes.shipped import model_path
 from koopman_ros.nodes.training_job import JobState, RetrainingJob
-from recorded_runs import driven, reactor, write_bag
+from support.messages import TIMEOUT
+from support.recorded_runs import driven, reactor, write_bag
 
 
 @pytest.fixture(scope='module')

@@ -14,12 +14,12 @@ import sys
 
 from diagnostic_msgs.msg import DiagnosticStatus
 import pytest
-from workbench import value
 
 from koopman_ros.bags import summary
 from koopman_ros.lifting import load
 from koopman_ros.testing import Harness, NodeProcess
-from recorded_runs import driven, linear_run, reactor, write_bag
+from support.messages import value
+from support.recorded_runs import driven, linear_run, reactor, write_bag
 
 STATUS = 'trainer: training'
 QUICK = {'model_coordinates': 2, 'training_starts': 1}

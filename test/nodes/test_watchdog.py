@@ -8,17 +8,17 @@ from __future__ import annotations
 import itertools
 import math
 
-from controller_bench import Bench, STEADY
 from diagnostic_msgs.msg import DiagnosticStatus
 import numpy as np
 import pytest
 from rosgraph_msgs.msg import Clock
 from sensor_msgs.msg import Temperature
-from workbench import seconds, temperature, value
 
 from koopman_ros.nodes import topics
 from koopman_ros.nodes.messages import LAST_STAMP_SECONDS
 from koopman_ros.testing import Harness
+from support.controller_bench import Bench, STEADY
+from support.messages import seconds, temperature, value
 
 SAFE = 5.0  # degC
 

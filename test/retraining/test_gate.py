@@ -15,8 +15,8 @@ from koopman_ros.nodes.shipped import model_path
 from koopman_ros.plants import two_state_reactor
 from koopman_ros.retraining import judge, learn_lift, Thresholds
 from koopman_ros.retraining.gate import lifted_rate
-from random_lifts import random_lift
-from recorded_runs import driven, linear_run, NOISE, reactor
+from support.random_lifts import random_lift
+from support.recorded_runs import driven, linear_run, NOISE, reactor
 
 
 @pytest.fixture(scope='module')

@@ -16,8 +16,8 @@ from koopman_ros.lifting import load, ModelFileError, save
 from koopman_ros.nodes.shipped import model_path
 from koopman_ros.retraining import retrain, Task, write_report
 from koopman_ros.retraining import task as task_module
-from random_lifts import random_lift
-from recorded_runs import driven, linear_run, NOISE, reactor, write_bag
+from support.random_lifts import random_lift
+from support.recorded_runs import driven, linear_run, NOISE, reactor, write_bag
 
 SHIPPED = str(model_path('reactor_nz4'))
 

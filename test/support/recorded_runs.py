@@ -10,7 +10,6 @@ import warnings
 
 import numpy as np
 
-from disturbance import disturbed
 from koopman_ros.bags import BagWriter, message_definition
 from koopman_ros.identification import Record
 from koopman_ros.plants import (
@@ -20,6 +19,7 @@ from koopman_ros.plants import (
     RandomStepDesign,
     ReactorParameters,
 )
+from support.disturbance import disturbed
 
 NOISE = 0.1  # K
 SECOND = 1_000_000_000

@@ -8,8 +8,8 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.integrate import solve_ivp
 
-from disturbance import disturbed
 from koopman_ros.identification import Box, DriftModel, Record
+from support.disturbance import disturbed
 
 
 @dataclass(frozen=True)

@@ -13,11 +13,11 @@ from diagnostic_msgs.msg import DiagnosticStatus
 import pytest
 from rclpy.qos import QoSProfile
 from sensor_msgs.msg import Temperature
-from workbench import seconds, temperature, TIMEOUT, value
 
 from koopman_ros.nodes import topics
 from koopman_ros.nodes.controller_parameters import TABLE
 from koopman_ros.testing import Harness
+from support.messages import seconds, temperature, TIMEOUT, value
 
 STATUS = 'controller: control'
 STEADY = 51.8  # degC, near the plant's steady state

@@ -10,7 +10,6 @@ from dataclasses import dataclass, field, replace
 import math
 from typing import Any
 
-from closed_loops import REACTOR, shipped, START
 import numpy as np
 
 from koopman_ros.control import (
@@ -31,6 +30,7 @@ from koopman_ros.plants import (
     one_state_reactor,
     ReactorParameters,
 )
+from support.closed_loops import REACTOR, shipped, START
 
 SECOND = 1_000_000_000
 EPOCH = 1_785_000_000 * SECOND

@@ -9,12 +9,12 @@ from pathlib import Path
 import random
 import struct
 
-from bag_samples import Sample, TOPICS
 from mcap.writer import CompressionType, Writer
 import yaml
 import zstandard
 
 from koopman_ros.bags import BagWriter, message_definition
+from support.bag_samples import Sample, TOPICS
 
 # Values that lengths and counts are most likely to trip over.
 _WORDS = [0, 1, 2**31 - 1, 2**32 - 1, 2**40, 2**63 - 1, 2**64 - 1]
