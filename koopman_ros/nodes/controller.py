@@ -36,7 +36,6 @@ from koopman_ros.nodes.model_loading import load_suitable, rests_outside
 from koopman_ros.nodes.model_loading import Situation as ModelSituation
 from koopman_ros.nodes.model_reload import ModelReload
 from koopman_ros.nodes.process import LoopNode, run
-from koopman_ros.nodes.rivals import Rivals
 from koopman_ros.nodes.watchdog import PERIOD, Watchdog
 
 _WATCH_STEP = NANOSECONDS // 2  # of plant time between two commands without a measurement
@@ -77,7 +76,9 @@ class ControllerNode(LoopNode):
         self._frame_id = ''
         self._frame_length = 0  # of the last measurement's, where it is too long
 
-        self._matching = Matching(self, self._on_neighbours)
+        self._matching = Matching(self, self._on_neighbours, {
+            topics.COOLANT_SETPOINT: 'command the coolant',
+            topics.TEMPERATURE: 'publish the temperature'})
         self._commands = self._matching.publish(
             Temperature, topics.COOLANT_SETPOINT, topics.LOOP_QOS)
         self._active = self.create_publisher(
@@ -106,9 +107,6 @@ class ControllerNode(LoopNode):
         # the plant's time may stand still, and be asked for nevertheless
         self._steady = Clock(clock_type=ClockType.STEADY_TIME)
         self.create_timer(PERIOD, self._on_watch, clock=self._steady)
-        self._rivals = Rivals(self, {
-            topics.COOLANT_SETPOINT: 'command the coolant',
-            topics.TEMPERATURE: 'publish the temperature'}, self._on_rivals)
         TABLE.follow(self, parameters, self._on_parameters, self._models.accept)
         self.get_logger().info(self._models.in_force.about)
         self._warn_of_rest()
@@ -331,11 +329,6 @@ class ControllerNode(LoopNode):
 
     # Diagnostics.
 
-    def _on_rivals(self) -> None:
-        if self._rivals.complaint:
-            self.get_logger().warning(self._rivals.complaint)
-        self._diagnostics.publish_if_changed()
-
     def _on_neighbours(self) -> None:
         self._diagnostics.publish_if_changed()
 
@@ -344,7 +337,7 @@ class ControllerNode(LoopNode):
         frame = (f'the frame_id of the measurement has {self._frame_length} characters, of which '
                  f'{LONGEST_FRAME_ID} are passed on: shorten it at the sensor'
                  ) if self._frame_length else ''
-        return self._rivals.complaint or self._matching.complaint or frame
+        return self._matching.complaint or frame
 
     def _status(self) -> Status:
         return status(Situation(

@@ -15,6 +15,7 @@ from rclpy.clock import Clock, ClockType
 from rclpy.node import Node
 
 from koopman_ros.nodes.messages import stamp_message
+from koopman_ros.nodes.owned import Owned
 from koopman_ros.nodes.topics import DIAGNOSTICS
 
 
@@ -59,10 +60,16 @@ class DiagnosticsPublisher:
         self._hardware_id = hardware_id
         self._collect = collect
         self._last: tuple[Level, str] | None = None
-        self._publisher = node.create_publisher(DiagnosticArray, DIAGNOSTICS, 10)
+        self._owned = Owned(node)
+        self._publisher = self._owned.keep(
+            node.create_publisher(DiagnosticArray, DIAGNOSTICS, 10))
         # the wall clock: diagnostics go on while simulated time stands still
-        self._clock = Clock(clock_type=ClockType.STEADY_TIME)
-        self._timer = node.create_timer(1.0, self.publish, clock=self._clock)
+        self._owned.keep(node.create_timer(
+            1.0, self.publish, clock=Clock(clock_type=ClockType.STEADY_TIME)))
+
+    def destroy(self) -> None:
+        """Report no more."""
+        self._owned.destroy()
 
     def publish(self) -> None:
         """Publish the present status."""

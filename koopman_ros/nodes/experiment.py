@@ -14,6 +14,7 @@ from koopman_ros.nodes import topics
 from koopman_ros.nodes.diagnostics import DiagnosticsPublisher, Level, Status
 from koopman_ros.nodes.experiment_run import ExperimentRun, other_publishers
 from koopman_ros.nodes.messages import in_celsius, to_celsius
+from koopman_ros.nodes.owned import Owned
 from koopman_ros.nodes.trainer_parameters import TrainerParameters
 
 
@@ -38,13 +39,21 @@ class CoolantExperiment:
         self._outcome = Status(Level.OK, 'no experiment')
         self._diagnostics = DiagnosticsPublisher(node, 'experiment', 'trainer', self._status)
         # a group of its own: the service waits for the first measurement
-        node.create_service(SetBool, '~/experiment', self._on_service,
-                            callback_group=MutuallyExclusiveCallbackGroup())
+        self._owned = Owned(node)
+        self._owned.keep(node.create_service(
+            SetBool, '~/experiment', self._on_service,
+            callback_group=MutuallyExclusiveCallbackGroup()))
 
     def complete(self) -> None:
         """Leave the coolant at the safe temperature; publishes the last command."""
         if self._run is not None:
             self._run.farewell()
+
+    def destroy(self) -> None:
+        """Take the service down, and a run with it: the coolant is left where it is."""
+        self._let_go(self._outcome)
+        self._owned.destroy()
+        self._diagnostics.destroy()
 
     async def _on_service(self, request: SetBool.Request, response: SetBool.Response
                           ) -> SetBool.Response:

@@ -25,6 +25,7 @@ from koopman_ros.nodes.messages import (
     temperature_message,
     to_kelvin,
 )
+from koopman_ros.nodes.owned import Owned
 from koopman_ros.nodes.trainer_parameters import TrainerParameters
 
 _TICK = 0.1  # s
@@ -61,15 +62,17 @@ class ExperimentRun:
         self._stamp_ns = 0
         self._heard_at = time.monotonic()
         self._following = Following()
-        self._temperatures = node.create_subscription(
-            Temperature, topics.TEMPERATURE, self._on_temperature, _sensor_qos(node))
-        self._coolants = node.create_subscription(
-            Temperature, topics.COOLANT_SETPOINT, self._on_coolant, topics.LOOP_QOS) if (
+        self._owned = owned = Owned(node)
+        self._temperatures = owned.keep(node.create_subscription(
+            Temperature, topics.TEMPERATURE, self._on_temperature, _sensor_qos(node)))
+        self._coolants = owned.keep(node.create_subscription(
+            Temperature, topics.COOLANT_SETPOINT, self._on_coolant, topics.LOOP_QOS)) if (
                 settings.experiment_topic == topics.MANUAL_COOLANT_SETPOINT) else None
-        self._publisher = node.create_publisher(Temperature, self.topic, topics.LOOP_QOS)
+        self._publisher = owned.keep(
+            node.create_publisher(Temperature, self.topic, topics.LOOP_QOS))
         # measurements that stay away come with no message, and the time of the plant stands still
-        self._timer = node.create_timer(
-            _TICK, self._on_tick, clock=Clock(clock_type=ClockType.STEADY_TIME))
+        owned.keep(node.create_timer(
+            _TICK, self._on_tick, clock=Clock(clock_type=ClockType.STEADY_TIME)))
 
     @property
     def running(self) -> bool:
@@ -98,11 +101,7 @@ class ExperimentRun:
 
     def destroy(self) -> None:
         """Command no more."""
-        self._node.destroy_timer(self._timer)
-        self._node.destroy_subscription(self._temperatures)
-        if self._coolants is not None:
-            self._node.destroy_subscription(self._coolants)
-        self._node.destroy_publisher(self._publisher)
+        self._owned.destroy()
 
     def _on_temperature(self, message: Temperature) -> None:
         measured = to_kelvin(message.temperature)

@@ -12,6 +12,7 @@ from sensor_msgs.msg import JointState, Temperature
 from koopman_ros.nodes import topics
 from koopman_ros.nodes.matching import Matching
 from koopman_ros.nodes.messages import stamp_message, temperature_message
+from koopman_ros.nodes.owned import Owned
 from koopman_ros.nodes.plant_parameters import PlantParameters
 from koopman_ros.plants import in_steps, Process, sensor_noise
 
@@ -29,15 +30,20 @@ class Instruments:
     """
 
     def __init__(self, node: Node, matching: Matching, clock: bool, concentration: bool) -> None:
-        self._clock = node.create_publisher(
-            Clock, topics.CLOCK, topics.CLOCK_QOS) if clock else None
-        self._concentration = node.create_publisher(
-            JointState, topics.CONCENTRATION, topics.LOOP_QOS) if concentration else None
+        self._owned = owned = Owned(node)
+        self._clock = owned.keep(node.create_publisher(
+            Clock, topics.CLOCK, topics.CLOCK_QOS)) if clock else None
+        self._concentration = owned.keep(node.create_publisher(
+            JointState, topics.CONCENTRATION, topics.LOOP_QOS)) if concentration else None
         # the temperature last: who has found it has found the coolant, too
         self._coolant = matching.publish(
             Temperature, topics.COOLANT_TEMPERATURE, topics.LATCHED_QOS)
         self._temperature = matching.publish(
             Temperature, topics.TEMPERATURE, topics.LOOP_QOS)
+
+    def destroy(self) -> None:
+        """Take down what `matching` has not made."""
+        self._owned.destroy()
 
     @property
     def subscribers(self) -> int:

@@ -1,11 +1,11 @@
 # SPDX-FileCopyrightText: 2026 The koopman_ros Authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""Others on a node's topics whose messages cannot pass: another type, or another quality."""
+"""Others on a node's topics that should not be: whose messages cannot pass, or who conflict."""
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 import copy
 from dataclasses import dataclass
 from typing import Any
@@ -26,6 +26,9 @@ from rclpy.qos import (
 )
 from rclpy.subscription import Subscription
 from rclpy.topic_endpoint_info import TopicEndpointInfo
+
+from koopman_ros.nodes import topics
+from koopman_ros.nodes.owned import Owned
 
 _LOOK_PERIOD = 0.5  # s
 # What does not pass: policy, offered, asked for.
@@ -54,41 +57,54 @@ class _Endpoint:
 
 class Matching:
     """
-    Make a node's publishers and subscriptions, and say which others do not match them.
+    Make a node's publishers and subscriptions, and say which others conflict or do not match.
 
     The middleware tells when one is found; whether it is still there is looked up.
 
     :param node: whose endpoints they are.
     :param on_change: called when the complaint is another.
-
-    :ivar complaint: names topic, node, what does not match and what to do; or is empty.
+    :param single: what a publisher does, e.g. 'command the coolant', by topic of the loop on
+        which only one node may publish.
     """
 
-    def __init__(self, node: Node, on_change: Callable[[], None]) -> None:
+    def __init__(self, node: Node, on_change: Callable[[], None],
+                 single: Mapping[str, str] | None = None) -> None:
         self._node = node
         self._on_change = on_change
+        self._single = single or {}
+        self._owned = Owned(node)
         self._own: list[_Endpoint] = []
         self._policies: dict[str, str] = {}  # last reported by the middleware, by topic
-        self.complaint = ''
-        node.create_timer(_LOOK_PERIOD, self._look, clock=Clock(clock_type=ClockType.STEADY_TIME))
+        self._said: tuple[str, ...] = ('', '')
+        self._owned.keep(node.create_timer(
+            _LOOK_PERIOD, self._look, clock=Clock(clock_type=ClockType.STEADY_TIME)))
+
+    @property
+    def complaint(self) -> str:
+        """Names topic, nodes, what is wrong and what to do; conflicts first; or is empty."""
+        return next(filter(None, self._said), '')
+
+    def destroy(self) -> None:
+        """Take down the publishers and subscriptions that were made here, and look no more."""
+        self._owned.destroy()
 
     def subscribe(self, kind: Any, topic: str, callback: Callable[[Any], None], qos: QoSProfile,
                   **options: Any) -> Subscription:
         """Create a subscription; the arguments are those of rclpy."""
         # overriding parameters change the profile itself
-        made = self._node.create_subscription(
+        made = self._owned.keep(self._node.create_subscription(
             kind, topic, callback, copy.copy(qos), event_callbacks=SubscriptionEventCallbacks(
                 incompatible_qos=self._found(topic), incompatible_type=lambda _: self._look()),
-            **options)
+            **options))
         self._own.append(_Endpoint(made.topic_name, type_name(kind), made.qos_profile, True,
                                    'qos_overriding_options' in options))
         return made
 
     def publish(self, kind: Any, topic: str, qos: QoSProfile) -> Publisher:
         """Create a publisher; the arguments are those of rclpy."""
-        made = self._node.create_publisher(
+        made = self._owned.keep(self._node.create_publisher(
             kind, topic, copy.copy(qos), event_callbacks=PublisherEventCallbacks(
-                incompatible_qos=self._found(topic), incompatible_type=lambda _: self._look()))
+                incompatible_qos=self._found(topic), incompatible_type=lambda _: self._look())))
         self._own.append(_Endpoint(
             made.topic_name, type_name(kind), made.qos_profile, False, False))
         return made
@@ -103,13 +119,25 @@ class Matching:
         return note
 
     def _look(self) -> None:
-        complaint = '; '.join(dict.fromkeys(
-            said for own in self._own for said in self._complaints(own)))
-        if complaint != self.complaint:
-            self.complaint = complaint
-            if complaint:
+        said = ('; '.join(filter(None, map(self._conflict, self._single))),
+                '; '.join(dict.fromkeys(
+                    complaint for own in self._own for complaint in self._complaints(own))))
+        before, self._said = self._said, said
+        for complaint in said:
+            if complaint and complaint not in before:
                 self._node.get_logger().warning(complaint)
+        if said != before:
             self._on_change()
+
+    def _conflict(self, topic: str) -> str:
+        """Return who publishes a topic if there are several, or an empty string."""
+        # who publishes something else there is not in conflict
+        publishers = [info for info in self._node.get_publishers_info_by_topic(topic)
+                      if info.topic_type == type_name(topics.TYPES[topic])]
+        names = sorted(map(node_name, publishers))
+        # publishers, not names: a node may have been started twice under the same
+        return '' if len(names) < 2 else (
+            f'{len(names)} nodes {self._single[topic]}: {", ".join(names)}; end all but one')
 
     def _complaints(self, own: _Endpoint) -> list[str]:
         publishers = self._node.get_publishers_info_by_topic(own.topic)

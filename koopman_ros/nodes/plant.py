@@ -31,7 +31,6 @@ from koopman_ros.nodes.messages import (
 )
 from koopman_ros.nodes.plant_parameters import PlantParameters, REACTORS, TABLE
 from koopman_ros.nodes.process import LoopNode, run
-from koopman_ros.nodes.rivals import Rivals
 from koopman_ros.plants import (
     ActuatedProcess,
     ControlAffineSystem,
@@ -83,7 +82,9 @@ class PlantNode(LoopNode):
         self._wall_start = self._wall_published = time.monotonic()
 
         # the subscription first: a controller that hears the measurement has then seen it, too
-        self._matching = Matching(self, self._on_neighbours)
+        self._matching = Matching(self, self._on_neighbours, {
+            topics.COOLANT_SETPOINT: 'command the coolant',
+            topics.TEMPERATURE: 'publish the temperature'})
         self._command_subscription = self._matching.subscribe(
             Temperature, topics.COOLANT_SETPOINT, self._on_command, topics.LOOP_QOS)
         self._instruments = Instruments(
@@ -91,9 +92,6 @@ class PlantNode(LoopNode):
             concentration=system.n_x == 2)
         self._diagnostics = DiagnosticsPublisher(
             self, 'simulation', parameters.reactor, self._status)
-        self._rivals = Rivals(
-            self, {topics.COOLANT_SETPOINT: 'command the coolant',
-                   topics.TEMPERATURE: 'publish the temperature'}, self._on_neighbours)
         self.create_service(Trigger, '~/reset', self._on_reset)
         # simulated time comes from here, so nothing in here may wait for it
         wall_clock = Clock(clock_type=ClockType.STEADY_TIME)
@@ -321,7 +319,7 @@ class PlantNode(LoopNode):
             level = Level.ERROR
         elif self._rejection:
             level, message = Level.WARN, self._rejection
-        elif complaint := self._rivals.complaint or self._matching.complaint:
+        elif complaint := self._matching.complaint:
             level, message = Level.WARN, complaint
         elif self._phase is Phase.WAITING:
             level = Level.WARN

@@ -9,7 +9,6 @@ from collections.abc import Callable
 import os
 import signal
 import sys
-import threading
 from typing import Any
 
 import rclpy
@@ -34,7 +33,6 @@ _START_ERRORS = (OSError, ParameterException, RuntimeError, ValueError)
 
 _LONGEST_WAIT = 0.1  # s from a signal to the end
 _TAKE_DOWN_PATIENCE = 5.0  # s; taking down a participant needs some ten milliseconds
-_LAST_RESORT = 8.0  # s from the beginning of the end to that by force
 
 
 class LoopNode(ParameterNode):
@@ -151,21 +149,11 @@ def _take_down(name: str, node: LoopNode | None) -> None:
     Fast DDS can: two of its threads wait for each other, and whoever takes an entity down waits
     for them, in rclpy with the interpreter's lock held. See docs/middleware.md.
     """
-
-    def give_up() -> None:
-        print(f'{name}: the middleware does not shut down: left to the operating system',
-              file=sys.stderr, flush=True)
-        os._exit(0)
-
-    patience = threading.Timer(_TAKE_DOWN_PATIENCE, give_up)
-    patience.daemon = True
-    patience.start()
-    # for a hang in which no other Python runs
-    disarm = end_by_force(_LAST_RESORT)
+    disarm = end_by_force(_TAKE_DOWN_PATIENCE, 0, (
+        f'{name}: the middleware does not shut down: left to the operating system'))
     if node is not None:
         node.destroy_node()
     rclpy.try_shutdown()
-    patience.cancel()
     # whoever called may go on
     disarm()
 

@@ -19,6 +19,7 @@ from std_srvs.srv import SetBool
 
 from koopman_ros.bags import BagWriter
 from koopman_ros.nodes.diagnostics import DiagnosticsPublisher, Level, Status
+from koopman_ros.nodes.owned import Owned
 from koopman_ros.nodes.recorder import Recorder
 from koopman_ros.nodes.trainer_parameters import TrainerParameters
 
@@ -43,11 +44,12 @@ class Recording:
         self._problem = ''
         self._path = ''
         self._diagnostics = DiagnosticsPublisher(node, 'recording', 'trainer', self._status)
-        node.create_service(SetBool, '~/record', self._on_record)
+        self._owned = Owned(node)
+        self._owned.keep(node.create_service(SetBool, '~/record', self._on_record))
         wall_clock = Clock(clock_type=ClockType.STEADY_TIME)
         self._timers = [
-            node.create_timer(period, partial(self._attempt, work), clock=wall_clock,
-                              autostart=False)
+            self._owned.keep(node.create_timer(
+                period, partial(self._attempt, work), clock=wall_clock, autostart=False))
             for period, work in ((_TAKE_PERIOD, Recorder.take), (_FLUSH_PERIOD, self._flush),
                                  (_LOOK_PERIOD, Recorder.look_for_publishers))]
 
@@ -103,6 +105,12 @@ class Recording:
             recorder = self._end()
             if not self._problem:
                 self._counted(recorder)
+
+    def destroy(self) -> None:
+        """Complete the bag, if there is one, and take the service down."""
+        self.complete()
+        self._owned.destroy()
+        self._diagnostics.destroy()
 
     def _counted(self, recorder: Recorder) -> str:
         said = f'recorded {sum(recorder.counts.values())} messages to {recorder.path}'

@@ -17,6 +17,7 @@ from std_srvs.srv import Trigger
 
 from koopman_ros.nodes import topics
 from koopman_ros.nodes.diagnostics import DiagnosticsPublisher, Level, Status
+from koopman_ros.nodes.owned import Owned
 from koopman_ros.nodes.shipped import model_path
 from koopman_ros.nodes.trainer_parameters import TrainerParameters
 from koopman_ros.nodes.training_job import JobState, RetrainingJob
@@ -46,10 +47,12 @@ class Training:
         self._state: JobState | None = None
         self._last_line = 0.0
         self._diagnostics = DiagnosticsPublisher(node, 'training', 'trainer', self._status)
-        node.create_service(Trigger, '~/train', self._on_train)
-        node.create_service(Trigger, '~/cancel_training', self._on_cancel)
-        self._timer = node.create_timer(_POLL_PERIOD, self._on_poll, autostart=False,
-                                        clock=Clock(clock_type=ClockType.STEADY_TIME))
+        self._owned = owned = Owned(node)
+        owned.keep(node.create_service(Trigger, '~/train', self._on_train))
+        owned.keep(node.create_service(Trigger, '~/cancel_training', self._on_cancel))
+        self._timer = owned.keep(node.create_timer(
+            _POLL_PERIOD, self._on_poll, autostart=False,
+            clock=Clock(clock_type=ClockType.STEADY_TIME)))
 
     def start(self) -> str:
         """
@@ -86,6 +89,12 @@ class Training:
             self._job = None
             print(f'training: {state.text}', file=sys.stderr, flush=True)
             self._on_end(state)
+
+    def destroy(self) -> None:
+        """End a training that is under way, and take the services down."""
+        self.complete()
+        self._owned.destroy()
+        self._diagnostics.destroy()
 
     def _on_train(self, _: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
         if self._job is not None:

@@ -8,8 +8,9 @@ from __future__ import annotations
 from collections.abc import Callable
 import os
 import signal
-import sys
 import threading
+
+from koopman_ros.last_resort import end_by_force
 
 PERIOD = 0.1  # s by the wall, of the executor's own watch and of the one over it
 # Looks in a row at which the executor has not come by: on a loaded machine it may be late by some.
@@ -86,17 +87,20 @@ def end_in_time(name: str) -> Callable[[], None]:
             while (number := numbers.read(1)) and number[0] not in (
                     signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
                 pass
-        if number and not over.wait(_PATIENCE):
-            print(f'{name}: busy for {_PATIENCE:g} s after a signal: ended by force',
-                  file=sys.stderr, flush=True)
-            os._exit(1)
+        if number:
+            disarm = end_by_force(_PATIENCE, 1, (
+                f'{name}: busy for {_PATIENCE:g} s after a signal: ended by force'))
+            over.wait()
+            disarm()
 
-    threading.Thread(target=listen, daemon=True).start()
+    thread = threading.Thread(target=listen, daemon=True)
+    thread.start()
 
     def leave() -> None:
         over.set()
         signal.set_wakeup_fd(-1)
-        # ends the thread
+        # ends the thread, which takes back what it has armed before others are
         os.close(writer)
+        thread.join(1.0)
 
     return leave

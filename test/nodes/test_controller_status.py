@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 The koopman_ros Authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""What the controller tells of itself: figures for an operator, internals to plot, rivals."""
+"""What the controller tells of itself: figures for an operator, internals to plot, conflicts."""
 
 from __future__ import annotations
 

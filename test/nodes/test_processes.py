@@ -120,9 +120,10 @@ def test_node_without_standard_streams_ends_cleanly(ros: Harness, tmp_path: Path
 def test_middleware_that_hangs_with_the_lock_held_does_not_keep_a_process(ros: Harness) -> None:
     program = (
         'import ctypes, os, signal, sys\n'
+        'from koopman_ros import last_resort\n'
         'from koopman_ros.nodes import process\n'
         'from koopman_ros.nodes.plant import PlantNode\n'
-        'process._LAST_RESORT = 0.2\n'
+        'process._TAKE_DOWN_PATIENCE, last_resort._LATER = 0.1, 0.1\n'
         'class Hanging(PlantNode):\n'
         '    def destroy_node(self):\n'
         '        ctypes.PyDLL(None).sleep(3600)\n'
@@ -138,11 +139,13 @@ def test_middleware_that_hangs_with_the_lock_held_does_not_keep_a_process(ros: H
 def test_a_process_that_runs_a_node_among_other_things_is_not_ended_by_force() -> None:
     program = (
         'import sys, time\n'
+        'from koopman_ros import last_resort\n'
         'from koopman_ros.nodes import process\n'
-        'process._LAST_RESORT = 0.01\n'
+        'process._TAKE_DOWN_PATIENCE = 0.2\n'
+        'last_resort._LATER = last_resort._AFTER = 0.0\n'
         'process._take_down("plant", None)\n'
         '# longer than it takes until a process is ended by force\n'
-        'time.sleep(0.7)\n'
+        'time.sleep(0.5)\n'
         'sys.exit(7)\n')
     done = subprocess.run([sys.executable, '-c', program], capture_output=True, check=False,
                           timeout=TIMEOUT)
@@ -152,8 +155,9 @@ def test_a_process_that_runs_a_node_among_other_things_is_not_ended_by_force() -
 def test_middleware_that_hangs_does_not_keep_a_process(ros: Harness) -> None:
     program = (
         'import os, signal, sys, time\n'
+        'from koopman_ros.nodes import process\n'
         'from koopman_ros.nodes.plant import PlantNode\n'
-        'from koopman_ros.nodes.process import run\n'
+        'process._TAKE_DOWN_PATIENCE = 0.3\n'
         'class Hanging(PlantNode):\n'
         '    def destroy_node(self):\n'
         '        time.sleep(3600.0)\n'
@@ -161,7 +165,7 @@ def test_middleware_that_hangs_does_not_keep_a_process(ros: Harness) -> None:
         '    os.kill(os.getpid(), signal.SIGTERM)\n'
         '    os.kill(os.getpid(), signal.SIGTERM)\n'
         '    return Hanging()\n'
-        'sys.exit(run("plant", create))\n')
+        'sys.exit(process.run("plant", create))\n')
     process = ros.start('plant', command=(sys.executable, '-c', program))
     assert ros.wait_for_end(process) == 0
     assert process.output().splitlines()[-1] == (
