@@ -123,7 +123,7 @@ def _storm_of_setpoints(values: Callable[[int], float]) -> Callable[[Rig], None]
             while sent < 1000.0 * passed:
                 rig.operator.setpoint.publish(Temperature(temperature=values(sent)))
                 sent += 1
-            rig.spin()
+            rig.linger(0.001)
         rig.course.notes.append(f'{sent} set-points at {sent / passed:.0f} 1/s')
         over = time.monotonic()
         rig.operator.insist(SETPOINT)

@@ -11,7 +11,6 @@ import shutil
 import signal
 import subprocess
 import sys
-import time
 
 from sensor_msgs.msg import Temperature
 
@@ -87,9 +86,7 @@ def _controller_stopped(rig: Rig) -> None:
 def _plant_stopped(rig: Rig) -> None:
     rig.begin()
     rig.processes['plant'].process.send_signal(signal.SIGSTOP)
-    end = time.monotonic() + 3.0
-    while time.monotonic() < end:
-        rig.spin()
+    rig.linger(3.0)
     rig.processes['plant'].process.send_signal(signal.SIGCONT)
     rig.run_for(1.0)
     rig.end()
