@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from functools import cached_property
+from functools import cached_property, partial
 
 import numpy as np
 import torch
@@ -16,9 +16,9 @@ from torch import Tensor
 
 from koopman_ros.identification.drift import DriftModel
 from koopman_ros.identification.records import Array
-from koopman_ros.identification.stretches import first_measured, runge_kutta, Stretches
-from koopman_ros.learning.levenberg_marquardt import minimise
-from koopman_ros.learning.residuals import NormalEquations
+from koopman_ros.identification.stretches import first_measured, Stretches
+from koopman_ros.solvers import runge_kutta_step
+from koopman_ros.solvers.levenberg_marquardt import minimise, NormalEquations
 
 _MAX_ITERATIONS = 40
 
@@ -38,7 +38,7 @@ def output_error(model: DriftModel, stretches: Stretches, *, learn_input_matrix:
     :param monitor: called with the step and the cost after each step; True ends it.
     """
     problem = _Problem(model, stretches, learn_input_matrix)
-    minimum = minimise(problem.evaluate, problem.start(), max_iterations=_MAX_ITERATIONS,
+    minimum = minimise(problem.add_residuals, problem.start(), max_iterations=_MAX_ITERATIONS,
                        tolerance=1e-6, patience=3, monitor=monitor)
     return problem.split(minimum.theta.numpy())[0]
 
@@ -76,36 +76,38 @@ class _Problem:
     def _n_B(self) -> int:
         return self.model.B.size if self.learn_input_matrix else 0
 
-    def evaluate(self, theta: Tensor, *, derivatives: bool = True) -> NormalEquations:
-        """Return cost, gradient and Gauss-Newton matrix of the scaled prediction errors."""
+    def add_residuals(self, theta: Tensor, equations: NormalEquations) -> None:
+        """Add the scaled prediction errors at given parameters."""
         model, x = self.split(theta.numpy())
         data, target = self.stretches, self._target
         count = int(np.sum(data.measured))
         M, n_x = x.shape
         p = model.coefficients.size + self._n_B
-        sums = _Sums(M, n_x, p) if derivatives else None
-        # S: change of the state with the model's parameters and with the start
-        S = np.concatenate((np.zeros((M, n_x, p)), np.broadcast_to(np.eye(n_x), (M, n_x, n_x))),
-                           axis=-1)
+        sums = _Sums(M, n_x, p) if equations.derivatives else None
+        # the state, and beside it its change with the model's parameters and with the start
+        y = x[..., None]
+        if sums is not None:
+            y = np.concatenate((y, np.zeros((M, n_x, p)),
+                                np.broadcast_to(np.eye(n_x), (M, n_x, n_x))), axis=-1)
         cost = 0.0
         with np.errstate(all='ignore'):
             for k in range(len(data.steps) + 1):
-                error = np.where(data.measured[k][:, None], x - target[k], 0.0)
+                measured = data.measured[k][:, None]
+                error = np.where(measured, y[..., 0] - target[k], 0.0)
                 cost += 0.5 * float(np.sum(error ** 2)) / count
                 if not np.isfinite(cost):
-                    return NormalEquations(np.inf)
+                    equations.add_sums(np.inf)
+                    return
                 if sums is not None:
-                    sums.add(np.where(data.measured[k][:, None, None], S, 0.0), error)
-                if k == len(data.steps):
-                    break
-                v, h = self._pushes[k], data.steps[k][:, None]
-                if derivatives:
-                    x, S = _step(model, x, S, v, h, self.learn_input_matrix)
-                else:
-                    x = runge_kutta(model.scaled_rate, x, v, h)
+                    sums.add(np.where(measured[..., None], y[..., 1:], 0.0), error)
+                if k < len(data.steps):
+                    y = runge_kutta_step(
+                        partial(_rates, model, self._pushes[k], self.learn_input_matrix), y,
+                        data.steps[k][:, None, None])
         if sums is None:
-            return NormalEquations(cost)
-        return NormalEquations(cost, *(torch.from_numpy(a / count) for a in sums.result()))
+            equations.add_sums(cost)
+        else:
+            equations.add_sums(cost, *(torch.from_numpy(a / count) for a in sums.result()))
 
 
 class _Sums:
@@ -135,25 +137,14 @@ class _Sums:
         return gradient, matrix
 
 
-def _step(model: DriftModel, x: Array, S: Array, v: Array, h: Array, learn: bool
-          ) -> tuple[Array, Array]:
-    """Take the Runge-Kutta step of the states (M, n_x) together with their sensitivities."""
-    ends, slopes = [], []
-    dx: Array | float = 0.0
-    dS: Array | float = 0.0
-    for fraction in (0.0, 0.5, 0.5, 1.0):
-        dx, dS = _rates(model, x + fraction * h * dx, S + fraction * h[..., None] * dS, v, learn)
-        ends.append(dx)
-        slopes.append(dS)
-    return (x + h / 6.0 * (ends[0] + 2.0 * ends[1] + 2.0 * ends[2] + ends[3]),
-            S + h[..., None] / 6.0 * (slopes[0] + 2.0 * slopes[1] + 2.0 * slopes[2] + slopes[3]))
-
-
-def _rates(model: DriftModel, x: Array, S: Array, v: Array, learn: bool) -> tuple[Array, Array]:
-    """Evaluate the rates (M, n_x) and those of the sensitivities (M, n_x, p + n_x)."""
+def _rates(model: DriftModel, v: Array, learn: bool, y: Array) -> Array:
+    """Evaluate the rates of states and, beside them, of their sensitivities: (M, n_x, 1 + ...)."""
+    x, S = y[..., 0], y[..., 1:]
     n_x = x.shape[1]
     features = model.features(x)
     rate = features @ model.coefficients + v @ model.B.T
+    if not S.shape[-1]:
+        return rate[..., None]
     dS = model.scaled_slope(x) @ S
     m, n_u = features.shape[1], v.shape[1]
     for i in range(n_x):
@@ -161,4 +152,4 @@ def _rates(model: DriftModel, x: Array, S: Array, v: Array, learn: bool) -> tupl
         if learn:
             first = m * n_x + i * n_u
             dS[:, i, first:first + n_u] += v
-    return rate, dS
+    return np.concatenate((rate[..., None], dS), axis=-1)

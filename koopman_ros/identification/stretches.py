@@ -8,12 +8,14 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import partial
 import itertools
 import math
 
 import numpy as np
 
 from koopman_ros.identification.records import Array, Record
+from koopman_ros.solvers import runge_kutta_step
 
 # dx/dt (M, n_x) of states (M, n_x) and inputs (M, n_u), all in units
 Rate = Callable[[Array, Array], Array]
@@ -70,7 +72,7 @@ class Stretches:
         path[0] = x = x0
         with np.errstate(all='ignore'):
             for k, (h, u) in enumerate(zip(self.steps[..., None], self.u, strict=True)):
-                path[k + 1] = x = runge_kutta(rate, x, u, h)
+                path[k + 1] = x = runge_kutta_step(partial(_held, rate, u), x, h)
         return path
 
     def errors(self, rate: Rate, x0: Array) -> Array:
@@ -78,13 +80,8 @@ class Stretches:
         return np.where(self.measured[..., None], self.path(rate, x0) - self.x, 0.0)
 
 
-def runge_kutta(rate: Rate, x: Array, u: Array, h: Array) -> Array:
-    """Take the classical Runge-Kutta step: states (M, n_x), inputs (M, n_u), lengths (M, 1)."""
-    k1 = rate(x, u)
-    k2 = rate(x + 0.5 * h * k1, u)
-    k3 = rate(x + 0.5 * h * k2, u)
-    k4 = rate(x + h * k3, u)
-    return x + h / 6.0 * (k1 + 2.0 * k2 + 2.0 * k3 + k4)
+def _held(rate: Rate, u: Array, x: Array) -> Array:
+    return rate(x, u)
 
 
 def longest_step(records: Sequence[Record]) -> float:

@@ -10,9 +10,9 @@ from dataclasses import dataclass
 import torch
 
 from koopman_ros.learning.growth import Grown, Monitor
-from koopman_ros.learning.levenberg_marquardt import minimise, Status
 from koopman_ros.learning.network import check_activation, Layout
 from koopman_ros.learning.residuals import Data, Problem, ResidualWeights
+from koopman_ros.solvers.levenberg_marquardt import minimise, MinimumStatus
 
 
 @dataclass(frozen=True)
@@ -90,18 +90,19 @@ class Algorithm1:
         generator = torch.Generator().manual_seed(seed)
         theta = torch.randn(layout.size, generator=generator, dtype=torch.float64).to(data.x)
         problem = Problem(layout, data, ResidualWeights())
-        status = Status.MAX_ITERATIONS
+        status = MinimumStatus.MAX_ITERATIONS
         for number in range(self.max_rounds):
             weight = self.lambda_initial / self.gamma ** number
             weighted = problem.with_weights(ResidualWeights(decoder=weight))
-            minimum = minimise(weighted.evaluate, theta, max_iterations=self.max_iterations,
+            minimum = minimise(weighted.add_residuals, theta, max_iterations=self.max_iterations,
                                monitor=monitor)
             moved = float(torch.linalg.norm(minimum.theta - theta))
             theta, status = minimum.theta, minimum.status
             # where the start itself cannot move it has not converged, but is of no use
-            if status is Status.INTERRUPTED or (status is Status.STALLED and number == 0):
+            if status is MinimumStatus.INTERRUPTED or (
+                    status is MinimumStatus.STALLED and number == 0):
                 break
             if moved <= self.tolerance:
-                status = Status.CONVERGED
+                status = MinimumStatus.CONVERGED
                 break
         return Grown(layout, theta, status)

@@ -13,9 +13,9 @@ import itertools
 import torch
 from torch import Tensor
 
-from koopman_ros.learning.levenberg_marquardt import minimise, Minimum, Status
 from koopman_ros.learning.network import check_activation, Layout, Parameters, Pass
 from koopman_ros.learning.residuals import Data, Problem, ResidualWeights
+from koopman_ros.solvers.levenberg_marquardt import minimise, Minimum, MinimumStatus
 
 # Called after every step with (iteration, cost); True ends the minimisation.
 Monitor = Callable[[int, float], bool]
@@ -33,7 +33,7 @@ class Grown:
 
     layout: Layout
     theta: Tensor
-    status: Status
+    status: MinimumStatus
 
 
 @dataclass(frozen=True)
@@ -116,11 +116,11 @@ class Growth:
                       monitor=monitor)
         problem = Problem(layout, data, ResidualWeights(self.whitening,
                                                 self.decoder_weight * bool(layout.decoder)))
-        minimum: Minimum = run(problem.evaluate, theta)
-        if layout.decoder and minimum.status is not Status.INTERRUPTED:
+        minimum: Minimum = run(problem.add_residuals, theta)
+        if layout.decoder and minimum.status is not MinimumStatus.INTERRUPTED:
             last = problem.with_weights(replace(problem.weights,
                                                 decoder=1e-3 * self.decoder_weight))
-            minimum = run(last.evaluate, minimum.theta)
+            minimum = run(last.add_residuals, minimum.theta)
         return Grown(layout, minimum.theta, minimum.status)
 
     def _root(self, data: Data) -> Grown:
@@ -138,7 +138,7 @@ class Growth:
             empty((decoder, n_z)), empty(decoder), empty((n_x, decoder)), empty(n_x))
         return Grown(layout, layout.join(Parameters(
             (), empty((layout.n_free, 0)), drift if self.identity else empty((0, 0)), B,
-            network)), Status.CONVERGED)
+            network)), MinimumStatus.CONVERGED)
 
     def _extended(self, data: Data, n_z: int, parent: Grown, seed: int
                   ) -> tuple[Layout, Tensor]:

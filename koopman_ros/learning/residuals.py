@@ -13,6 +13,7 @@ from torch import Tensor
 from koopman_ros.learning.deep import ProductSums
 from koopman_ros.learning.network import Layout, Parameters, Pass
 from koopman_ros.learning.shallow import FeatureMap, MomentSums
+from koopman_ros.solvers.levenberg_marquardt import NormalEquations
 
 
 @dataclass(frozen=True)
@@ -40,21 +41,6 @@ class Data:
 
     def __len__(self) -> int:
         return len(self.x)
-
-
-@dataclass(frozen=True)
-class NormalEquations:
-    """
-    Cost 0.5 ||r||^2 with gradient J^T r and Gauss-Newton matrix J^T J of stacked residuals.
-
-    :param cost: half the sum of squares.
-    :param gradient: (p,), or None when only the cost was asked for.
-    :param matrix: (p, p), or None likewise.
-    """
-
-    cost: float
-    gradient: Tensor | None = None
-    matrix: Tensor | None = None
 
 
 @dataclass(frozen=True)
@@ -114,42 +100,35 @@ class Problem:
         """Return the same problem with other weights."""
         return replace(self, weights=weights)
 
-    def evaluate(self, theta: Tensor, *, derivatives: bool) -> NormalEquations:
-        """Accumulate the normal equations over chunks of the data."""
+    def add_residuals(self, theta: Tensor, equations: NormalEquations) -> None:
+        """Add the residuals at parameters (p,) over chunks of the data."""
         layout, N = self.layout, len(self.data)
         parameters = layout.split(theta)
         sums: MomentSums | ProductSums | None = None
-        if derivatives:
+        if equations.derivatives:
             kind = MomentSums if len(layout.hidden) == 1 else ProductSums
             sums = kind(layout, parameters, N, self.weights.whitening > 0.0)
-        cost, gradient = theta.new_zeros(()), theta.new_zeros(layout.size)
-        matrix = theta.new_zeros((layout.size, layout.size) if derivatives else 0)
         moment = theta.new_zeros((layout.n_z, layout.n_z))
         for start in range(0, N, self.chunk):
             data = self.data.part(start, self.chunk)
             f = data.drift(parameters.B)
             lifted = Pass(layout, parameters, data.x, f)
             r = lifted.z_rate - lifted.z @ parameters.A.T
-            cost += 0.5 * torch.sum(r * r) / N
+            equations.add(r, count=N)
             moment += lifted.z.T @ lifted.z / N
             if sums is not None:
                 sums.add(data.x, f, data.u, lifted, r)
             if self.weights.decoder:
-                r, J = _decoder_block(layout, parameters, data.x, lifted,
-                                      self.weights.decoder ** 0.5, derivatives)
-                cost += 0.5 * torch.sum(r * r) / N
-                if J is not None:
-                    J = J.view(-1, layout.size)
-                    gradient += J.T @ r.reshape(-1) / N
-                    matrix.addmm_(J.T, J, alpha=1.0 / N)
+                equations.add(*_decoder_block(layout, parameters, data.x, lifted,
+                                              self.weights.decoder ** 0.5,
+                                              equations.derivatives), count=N)
         i, j, scale, r = _whitening(layout, moment, self.weights.whitening)
-        cost += 0.5 * torch.sum(r * r)
-        if sums is None:
-            return NormalEquations(float(cost))
-        of_dynamics, product, moment_rate = sums.result()
-        J = scale[:, None] * (moment_rate[i, j] + moment_rate[j, i])
-        return NormalEquations(float(cost), gradient + of_dynamics + J.T @ r,
-                               matrix + product + J.T @ J)
+        J = None
+        if sums is not None:
+            gradient, matrix, moment_rate = sums.result()
+            equations.add_sums(0.0, gradient, matrix)
+            J = scale[:, None] * (moment_rate[i, j] + moment_rate[j, i])
+        equations.add(r, J)
 
 
 def _decoder_block(layout: Layout, parameters: Parameters, x: Tensor, lifted: Pass,

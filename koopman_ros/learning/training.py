@@ -22,7 +22,6 @@ from koopman_ros import __version__
 from koopman_ros.learning.algorithm1 import Algorithm1
 from koopman_ros.learning.baselines import Edmd
 from koopman_ros.learning.growth import Grown, Growth, Monitor
-from koopman_ros.learning.levenberg_marquardt import Status
 from koopman_ros.learning.residuals import Data
 from koopman_ros.learning.samples import Plant, Samples, Scaling, split_by_episode
 from koopman_ros.learning.validation import (
@@ -34,6 +33,7 @@ from koopman_ros.learning.validation import (
     Report,
 )
 from koopman_ros.lifting import LiftedModel, NetworkObservables, Provenance, TrainingStates
+from koopman_ros.solvers.levenberg_marquardt import MinimumStatus
 
 Recipe = Growth | Algorithm1
 RECIPES: dict[str, type[Growth] | type[Algorithm1]] = {'growth': Growth, 'paper': Algorithm1}
@@ -160,7 +160,7 @@ def train(plant: Plant, samples: Samples, recipe: Recipe, *, seed: int = 0, star
                         best = candidate
                     tracker.finish(best.fit.rw if best else math.nan)
                     if tracker.stop or (not isinstance(grown, str)
-                                        and grown.status is Status.INTERRUPTED):
+                                        and grown.status is MinimumStatus.INTERRUPTED):
                         interrupted = True
                         break
         except KeyboardInterrupt:
@@ -206,7 +206,7 @@ def _conclude(plant: Plant, parts: tuple[Samples, Samples, Samples], path: list[
         metrics = reports[-1].metrics(candidate.model.states.names)
         models.append(replace(candidate.model, provenance=replace(
             candidate.model.provenance, metrics=metrics)))
-    status = Status.INTERRUPTED if interrupted else winner.grown.status
+    status = MinimumStatus.INTERRUPTED if interrupted else winner.grown.status
     return Trained(models[-1], reports[-1], judge(linear, parts[2]), closed_loop, status.value,
                    tuple(models), finished)
 
@@ -225,7 +225,7 @@ def _judged(assembly: _Assembly, grown: Grown | str, validation: Samples
     """Return what a start has found, or why it is of no use."""
     if isinstance(grown, str):
         return grown
-    if grown.status is Status.STALLED:
+    if grown.status is MinimumStatus.STALLED:
         return grown.status.value
     try:
         model = assembly.model(grown)

@@ -10,7 +10,7 @@ import pytest
 import torch
 
 from koopman_ros.learning import fit, Growth, NoUsefulLift, split_by_episode, train
-from koopman_ros.learning.levenberg_marquardt import Status
+from koopman_ros.solvers.levenberg_marquardt import MinimumStatus
 from support.small_plants import (
     BENT,
     bent_samples,
@@ -82,7 +82,8 @@ def test_a_degenerate_start_is_no_candidate():
 
 
 @pytest.mark.parametrize('change', [
-    {'status': Status.STALLED}, {'theta': torch.full((15,), torch.nan, dtype=torch.float64)}])
+    {'status': MinimumStatus.STALLED},
+    {'theta': torch.full((15,), torch.nan, dtype=torch.float64)}])
 def test_a_start_without_a_result_is_no_candidate(change):
     recorded = Recorded(SMALL)
     train(UNFORCED, unforced_samples(), recorded, starts=1)

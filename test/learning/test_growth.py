@@ -11,9 +11,9 @@ import torch
 
 from koopman_ros.learning import Growth
 from koopman_ros.learning.growth import least_squares
-from koopman_ros.learning.levenberg_marquardt import Status
 from koopman_ros.learning.network import Pass
 from koopman_ros.learning.residuals import Data
+from koopman_ros.solvers.levenberg_marquardt import MinimumStatus
 from support.disturbance import disturbed_data
 from support.small_plants import bent_samples, two_state_samples
 
@@ -151,7 +151,7 @@ def test_growth_ends_early_when_told_to():
         return iteration == 7
 
     grown = recipe.start(data, 2, None, 0, monitor)
-    assert grown.status is Status.INTERRUPTED
+    assert grown.status is MinimumStatus.INTERRUPTED
     assert len(calls) == 7
 
 

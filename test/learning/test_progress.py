@@ -11,7 +11,7 @@ import pytest
 import torch
 
 from koopman_ros.learning import NoUsefulLift, train
-from koopman_ros.learning.levenberg_marquardt import Status
+from koopman_ros.solvers.levenberg_marquardt import MinimumStatus
 from support.small_plants import bits, SMALL, UNFORCED, unforced_samples
 
 RECIPE = replace(SMALL, n_z=3)
@@ -70,7 +70,7 @@ def test_an_interrupt_keeps_the_best_so_far(act, place, n_z, starts):
     trained, seen = watched(stop)
     assert trained.model.n_z == n_z
     assert trained.starts == starts
-    assert trained.status == Status.INTERRUPTED.value
+    assert trained.status == MinimumStatus.INTERRUPTED.value
     assert trained.model.provenance.metrics['rw'] < 3e-3
     assert (seen[-1].n_z, seen[-1].finished) <= (place[0], place[1] + 1)
 
@@ -104,7 +104,7 @@ class CutShort:
         grown = replace(RECIPE, max_iterations=0).start(data, n_z, parent, seed)
         spoiled = grown.theta.clone()
         spoiled[-3:] = 5.0
-        return replace(grown, theta=spoiled, status=Status.INTERRUPTED)
+        return replace(grown, theta=spoiled, status=MinimumStatus.INTERRUPTED)
 
 
 @pytest.mark.parametrize('recipe', [CutShort(), CutShort(KeyboardInterrupt())],
@@ -113,7 +113,7 @@ def test_a_start_cut_short_does_not_displace_the_round_before(recipe):
     trained = train(UNFORCED, unforced_samples(), recipe, starts=2)
     assert trained.model.n_z == 2
     assert [model.n_z for model in trained.path] == [2]
-    assert trained.status == Status.INTERRUPTED.value
+    assert trained.status == MinimumStatus.INTERRUPTED.value
     assert bits(trained.model) == bits(train(UNFORCED, unforced_samples(), SMALL, starts=2).model)
 
 

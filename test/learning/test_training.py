@@ -22,8 +22,8 @@ from koopman_ros.learning import (
     split_by_episode,
     train,
 )
-from koopman_ros.learning.levenberg_marquardt import Status
 from koopman_ros.plants import scalar_example
+from koopman_ros.solvers.levenberg_marquardt import MinimumStatus
 from support.small_plants import (
     BENT,
     bent_samples,
@@ -86,9 +86,9 @@ def test_the_closed_loop_is_compared(small):
 
 
 def test_how_it_ended(small):
-    assert small.status == Status.MAX_ITERATIONS.value
+    assert small.status == MinimumStatus.MAX_ITERATIONS.value
     converged = train(UNFORCED, unforced_samples(), replace(SMALL, tolerance=0.99), starts=1)
-    assert converged.status == Status.CONVERGED.value
+    assert converged.status == MinimumStatus.CONVERGED.value
 
 
 @pytest.mark.parametrize('n_z', [2, 3])

@@ -11,7 +11,7 @@ import pytest
 
 import koopman_ros
 
-RUNTIME = ('lifting', 'control', 'plants', 'bags')
+RUNTIME = ('lifting', 'control', 'plants', 'bags', 'solvers')
 FOREIGN = ('rclpy', 'torch', 'matplotlib')
 
 PROGRAM = """
@@ -44,9 +44,9 @@ def test_learning_does_need_torch():
     assert 'import of torch halted; None in sys.modules' in result.stderr
 
 
-def test_lifting_and_plants_stand_alone():
+def test_packages_that_stand_alone():
     """Neither loads another package of ours."""
-    for name in ('lifting', 'plants'):
+    for name in ('lifting', 'plants', 'solvers'):
         result = run(f"""
 import koopman_ros.{name}
 ours = {{module.split('.')[1] for module in sys.modules if module.startswith('koopman_ros.')}}

@@ -13,8 +13,7 @@ import time
 
 from torch import Tensor
 
-from koopman_ros.learning.levenberg_marquardt import minimise
-from koopman_ros.learning.residuals import NormalEquations
+from koopman_ros.solvers.levenberg_marquardt import minimise, NormalEquations
 from validation.benchmarks.training.problems import artificial
 
 _STATUS, _RESET = Path('/proc/self/status'), Path('/proc/self/clear_refs')
@@ -32,17 +31,17 @@ def measure(samples: int, n_x: int, n_z: int, hidden: int, iterations: int
     """
     # what torch sets up at its first calls belongs to neither figure
     warm = artificial(256, n_x, n_z, hidden)
-    minimise(warm.problem.evaluate, warm.theta, max_iterations=2)
+    minimise(warm.problem.add_residuals, warm.theta, max_iterations=2)
     case = artificial(samples, n_x, n_z, hidden)
     problem = case.problem
     before = _restart_peak()
     taken: list[float] = []
     stamp, accepted = math.nan, False
 
-    def evaluate(theta: Tensor, *, derivatives: bool) -> NormalEquations:
+    def residuals(theta: Tensor, equations: NormalEquations) -> None:
         nonlocal accepted
-        accepted |= derivatives
-        return problem.evaluate(theta, derivatives=derivatives)
+        accepted |= equations.derivatives
+        problem.add_residuals(theta, equations)
 
     def monitor(iteration: int, cost: float) -> bool:
         nonlocal stamp, accepted
@@ -52,7 +51,7 @@ def measure(samples: int, n_x: int, n_z: int, hidden: int, iterations: int
         stamp, accepted = time.process_time(), False
         return len(taken) == iterations
 
-    minimise(evaluate, case.theta, max_iterations=10 * iterations, tolerance=0.0, monitor=monitor)
+    minimise(residuals, case.theta, max_iterations=10 * iterations, tolerance=0.0, monitor=monitor)
     after = _memory('VmHWM')
     return {'seconds_per_iteration': median(taken),
             'peak_megabytes': None if before is None or after is None else after - before}

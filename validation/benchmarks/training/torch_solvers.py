@@ -11,8 +11,7 @@ import math
 import torch
 from torch import Tensor
 
-from koopman_ros.learning.levenberg_marquardt import minimise
-from koopman_ros.learning.residuals import NormalEquations
+from koopman_ros.solvers.levenberg_marquardt import minimise, normal_equations, NormalEquations
 from validation.benchmarks.training.problems import Case, WHITENING
 from validation.benchmarks.training.trace import Finished, Trace
 
@@ -30,16 +29,16 @@ def ours(case: Case, trace: Trace) -> str:
     """Run Levenberg-Marquardt with the hand-derived Jacobian."""
     problem, accepted = case.problem, case.theta
 
-    def evaluate(theta: Tensor, *, derivatives: bool) -> NormalEquations:
+    def residuals(theta: Tensor, equations: NormalEquations) -> None:
         nonlocal accepted
-        if derivatives:
+        if equations.derivatives:
             accepted = theta
-        return problem.evaluate(theta, derivatives=derivatives)
+        problem.add_residuals(theta, equations)
 
     for derivatives in (True, False):  # what torch sets up at its first call is not timed
-        problem.evaluate(case.theta, derivatives=derivatives)
+        normal_equations(problem.add_residuals, case.theta, derivatives=derivatives)
     trace.start()
-    minimum = minimise(evaluate, case.theta, max_iterations=10 ** 9, tolerance=0.0,
+    minimum = minimise(residuals, case.theta, max_iterations=10 ** 9, tolerance=0.0,
                        monitor=lambda *_: trace.look(accepted))
     return minimum.status.value
 

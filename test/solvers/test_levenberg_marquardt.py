@@ -10,20 +10,19 @@ import numpy as np
 import pytest
 import torch
 
-from koopman_ros.learning.levenberg_marquardt import minimise, Status
-from koopman_ros.learning.residuals import NormalEquations
+from koopman_ros.solvers.levenberg_marquardt import minimise, MinimumStatus, normal_equations
 
 
 def least_squares(residual):
-    """Turn a residual function into what `minimise` evaluates."""
-    def evaluate(theta, *, derivatives):
-        r = residual(theta)
-        cost = 0.5 * float(r @ r)
-        if not derivatives:
-            return NormalEquations(cost)
-        J = torch.func.jacrev(residual)(theta)
-        return NormalEquations(cost, J.T @ r, J.T @ J)
-    return evaluate
+    """Turn a residual function into what `minimise` takes."""
+    def residuals(theta, equations):
+        J = torch.func.jacrev(residual)(theta) if equations.derivatives else None
+        equations.add(residual(theta), J)
+    return residuals
+
+
+def cost(residuals, theta):
+    return normal_equations(residuals, theta, derivatives=False).cost
 
 
 def vector(*values):
@@ -43,8 +42,8 @@ def rosenbrock(theta):
 
 def test_linear_least_squares_needs_few_steps():
     J, y = linear_problem()
-    evaluate = least_squares(lambda theta: J @ theta - y)
-    found = minimise(evaluate, vector(*[3.0] * 6), max_iterations=5)
+    found = minimise(least_squares(lambda theta: J @ theta - y), vector(*[3.0] * 6),
+                     max_iterations=5)
     expected = np.linalg.lstsq(J.numpy(), y.numpy(), rcond=None)[0]
     np.testing.assert_allclose(found.theta.numpy(), expected, rtol=0, atol=1e-8)
 
@@ -54,7 +53,7 @@ def test_linear_least_squares_converges():
     found = minimise(least_squares(lambda theta: J @ theta - y), vector(*[3.0] * 6),
                      max_iterations=100)
     expected, squares = np.linalg.lstsq(J.numpy(), y.numpy(), rcond=None)[:2]
-    assert found.status is Status.CONVERGED
+    assert found.status is MinimumStatus.CONVERGED
     assert found.cost == pytest.approx(0.5 * float(squares[0]), rel=1e-12)
     # a cost that is flat to rounding locates its minimum to the square root of that
     np.testing.assert_allclose(found.theta.numpy(), expected, rtol=0, atol=1e-8)
@@ -63,7 +62,7 @@ def test_linear_least_squares_converges():
 @pytest.mark.parametrize('start', [(-1.2, 1.0), (0.0, 0.0), (5.0, -5.0), (-3.0, 10.0)])
 def test_rosenbrock_valley(start):
     found = minimise(least_squares(rosenbrock), vector(*start), max_iterations=200)
-    assert found.status is Status.CONVERGED
+    assert found.status is MinimumStatus.CONVERGED
     assert found.iterations < 100
     np.testing.assert_allclose(found.theta.numpy(), [1.0, 1.0], rtol=0, atol=1e-9)
 
@@ -72,7 +71,7 @@ def test_a_minimum_that_is_not_zero():
     """The residuals (x, 1 + x^2 / 4) have their least squares, 1, at x = 0."""
     found = minimise(least_squares(lambda t: torch.cat([t, 1.0 + 0.25 * t * t])), vector(2.0),
                      max_iterations=200)
-    assert found.status is Status.CONVERGED
+    assert found.status is MinimumStatus.CONVERGED
     assert found.cost == pytest.approx(0.5, rel=1e-9)
     assert abs(float(found.theta[0])) < 1e-4
 
@@ -87,18 +86,18 @@ def test_units_of_parameters_do_not_matter():
 
 
 def test_iteration_limit_is_reported():
-    evaluate = least_squares(rosenbrock)
-    found = minimise(evaluate, vector(-1.2, 1.0), max_iterations=4)
-    assert found.status is Status.MAX_ITERATIONS
+    residuals = least_squares(rosenbrock)
+    found = minimise(residuals, vector(-1.2, 1.0), max_iterations=4)
+    assert found.status is MinimumStatus.MAX_ITERATIONS
     assert found.iterations == 4
-    assert found.cost == evaluate(found.theta, derivatives=False).cost
-    assert found.cost < evaluate(vector(-1.2, 1.0), derivatives=False).cost
+    assert found.cost == cost(residuals, found.theta)
+    assert found.cost < cost(residuals, vector(-1.2, 1.0))
 
 
 def test_not_a_number_at_the_start_stalls():
     start = vector(1.0, 2.0)
     found = minimise(least_squares(lambda theta: theta * math.nan), start, max_iterations=50)
-    assert found.status is Status.STALLED
+    assert found.status is MinimumStatus.STALLED
     assert (found.cost, found.iterations) == (math.inf, 0)
     assert torch.equal(found.theta, start)
 
@@ -106,12 +105,13 @@ def test_not_a_number_at_the_start_stalls():
 def test_not_a_number_everywhere_else_stalls():
     start = vector(1.0, 2.0)
 
-    def evaluate(theta, *, derivatives):
-        here = least_squares(lambda t: t + 3.0)(theta, derivatives=derivatives)
-        return here if torch.equal(theta, start) else NormalEquations(math.nan)
+    def residuals(theta, equations):
+        least_squares(lambda t: t + 3.0)(theta, equations)
+        if not torch.equal(theta, start):
+            equations.add_sums(math.nan)
 
-    found = minimise(evaluate, start, max_iterations=500)
-    assert found.status is Status.STALLED
+    found = minimise(residuals, start, max_iterations=500)
+    assert found.status is MinimumStatus.STALLED
     assert found.iterations < 100
     assert torch.equal(found.theta, start)
 
@@ -119,37 +119,36 @@ def test_not_a_number_everywhere_else_stalls():
 def test_a_gradient_that_is_not_a_number_stalls():
     start = vector(1.0, 2.0)
 
-    def evaluate(theta, *, derivatives):
-        here = least_squares(lambda t: t)(theta, derivatives=derivatives)
-        return NormalEquations(here.cost, start * math.nan, torch.eye(2).to(start))
+    def residuals(theta, equations):
+        equations.add_sums(0.5 * float(theta @ theta), start * math.nan, torch.eye(2).to(start))
 
-    found = minimise(evaluate, start, max_iterations=500)
-    assert found.status is Status.STALLED
+    found = minimise(residuals, start, max_iterations=500)
+    assert found.status is MinimumStatus.STALLED
     assert torch.equal(found.theta, start)
 
 
 @pytest.mark.parametrize('end', [1, 3])
 def test_interruption_keeps_the_best_so_far(end):
-    evaluate = least_squares(rosenbrock)
-    found = minimise(evaluate, vector(-1.2, 1.0), max_iterations=100,
+    residuals = least_squares(rosenbrock)
+    found = minimise(residuals, vector(-1.2, 1.0), max_iterations=100,
                      monitor=lambda iteration, cost: iteration == end)
-    assert found.status is Status.INTERRUPTED
+    assert found.status is MinimumStatus.INTERRUPTED
     assert found.iterations == end
-    assert found.cost == evaluate(found.theta, derivatives=False).cost
+    assert found.cost == cost(residuals, found.theta)
 
 
 def test_cost_never_rises():
     costs = []
     found = minimise(least_squares(rosenbrock), vector(-1.2, 1.0), max_iterations=100,
                      monitor=lambda iteration, cost: costs.append(cost))
-    assert found.status is Status.CONVERGED
+    assert found.status is MinimumStatus.CONVERGED
     assert all(later <= earlier for earlier, later in pairwise(costs))
 
 
 def test_every_status_says_what_to_do():
-    assert 'increase `max_iterations`' in Status.MAX_ITERATIONS.value
-    assert 'check the data and try another seed' in Status.STALLED.value
-    assert 'the best parameters so far are kept' in Status.INTERRUPTED.value
+    assert 'increase `max_iterations`' in MinimumStatus.MAX_ITERATIONS.value
+    assert 'check the data and try another seed' in MinimumStatus.STALLED.value
+    assert 'the best parameters so far are kept' in MinimumStatus.INTERRUPTED.value
 
 
 def test_the_default_tolerance_is_a_thousandth_over_twenty_steps():
@@ -157,38 +156,52 @@ def test_the_default_tolerance_is_a_thousandth_over_twenty_steps():
     def steps(share, limit):
         costs = iter(range(10 * limit))
 
-        def evaluate(theta, *, derivatives):
+        def residuals(theta, equations):
             # every trial is followed by an evaluation with derivatives at the same place
-            cost = (1.0 - share) ** ((next(costs) + 1) // 2)
-            return NormalEquations(cost, vector(-1e-3), torch.eye(1).double())
+            equations.add_sums((1.0 - share) ** ((next(costs) + 1) // 2), vector(-1e-3),
+                               torch.eye(1).double())
 
-        return minimise(evaluate, vector(0.0), max_iterations=limit)
+        return minimise(residuals, vector(0.0), max_iterations=limit)
 
-    assert steps(6e-5, 200).status is Status.MAX_ITERATIONS
+    assert steps(6e-5, 200).status is MinimumStatus.MAX_ITERATIONS
     found = steps(4e-5, 200)
-    assert (found.status, found.iterations) == (Status.CONVERGED, 20)
+    assert (found.status, found.iterations) == (MinimumStatus.CONVERGED, 20)
 
 
 @pytest.mark.parametrize('derivatives_too', [True, False])
 def test_an_interrupt_from_the_keyboard_keeps_the_best_so_far(derivatives_too):
-    residual, calls = least_squares(rosenbrock), []
+    valley, calls = least_squares(rosenbrock), []
 
-    def evaluate(theta, *, derivatives):
-        calls.append(derivatives)
-        if len(calls) > 6 and derivatives is derivatives_too:
+    def residuals(theta, equations):
+        calls.append(theta)
+        if len(calls) > 6 and equations.derivatives is derivatives_too:
             raise KeyboardInterrupt
-        return residual(theta, derivatives=derivatives)
+        valley(theta, equations)
 
     start = vector(-1.2, 1.0)
-    found = minimise(evaluate, start, max_iterations=100)
-    assert found.status is Status.INTERRUPTED
-    assert found.cost == residual(found.theta, derivatives=False).cost
-    assert found.cost < residual(start, derivatives=False).cost
+    found = minimise(residuals, start, max_iterations=100)
+    assert found.status is MinimumStatus.INTERRUPTED
+    assert found.cost == cost(valley, found.theta) < cost(valley, start)
 
 
 def test_an_interrupt_of_the_first_evaluation_passes_on():
-    def evaluate(theta, *, derivatives):
+    def residuals(theta, equations):
         raise KeyboardInterrupt
 
     with pytest.raises(KeyboardInterrupt):
-        minimise(evaluate, vector(1.0), max_iterations=10)
+        minimise(residuals, vector(1.0), max_iterations=10)
+
+
+@pytest.mark.parametrize('count', [1, 7])
+def test_blocks_of_residuals_add_up(count):
+    J, y = linear_problem()
+    theta = vector(*range(6))
+
+    def residuals(theta, equations):
+        for rows in (slice(0, 11), slice(11, 30)):
+            equations.add(J[rows] @ theta - y[rows], J[rows], count)
+
+    found, r = normal_equations(residuals, theta), J @ theta - y
+    assert found.cost == pytest.approx(0.5 * float(r @ r) / count, rel=1e-14)
+    torch.testing.assert_close(found.gradient, J.T @ r / count, rtol=1e-13, atol=1e-13)
+    torch.testing.assert_close(found.matrix, J.T @ J / count, rtol=1e-13, atol=1e-13)

@@ -1,7 +1,11 @@
 # SPDX-FileCopyrightText: 2026 The koopman_ros Authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""Levenberg-Marquardt on accumulated normal equations, in torch."""
+"""
+Levenberg-Marquardt on normal equations that it accumulates from residuals, in torch.
+
+Not imported by the package itself, whose other solvers need no torch.
+"""
 
 from __future__ import annotations
 
@@ -13,14 +17,12 @@ import math
 import torch
 from torch import Tensor
 
-from koopman_ros.learning.residuals import NormalEquations
-
-# The damping grows by this when a step is refused, and by twice as much each further time.
-_GROWTH = 2.0
+# The damping rises by this when a step is refused, and by twice as much each further time.
+_FACTOR = 2.0
 _MAX_DAMPING = 1e12
 
 
-class Status(Enum):
+class MinimumStatus(Enum):
     """How a minimisation ended; the value is the sentence for the user."""
 
     CONVERGED = 'converged: a step no longer lowers the cost noticeably'
@@ -45,10 +47,68 @@ class Minimum:
     theta: Tensor
     cost: float
     iterations: int
-    status: Status
+    status: MinimumStatus
 
 
-def minimise(evaluate: Callable[..., NormalEquations], theta: Tensor, *, max_iterations: int,
+class NormalEquations:
+    """
+    Cost 0.5 ||r||^2 with gradient J'r and Gauss-Newton matrix J'J, summed over blocks of r.
+
+    :param like: (p,) parameters, whose type and device the sums have.
+    :param derivatives: whether gradient and matrix are wanted; they stay zero otherwise.
+    """
+
+    def __init__(self, like: Tensor, *, derivatives: bool) -> None:
+        self.derivatives = derivatives
+        self.gradient = torch.zeros_like(like)
+        self.matrix = like.new_zeros((len(like), len(like)) if derivatives else (0, 0))
+        self._cost = like.new_zeros(())
+
+    @property
+    def cost(self) -> float:
+        """Half the sum of squares."""
+        return float(self._cost)
+
+    def add(self, r: Tensor, J: Tensor | None = None, count: int = 1) -> None:
+        """
+        Add residuals, their squares divided by a count.
+
+        :param r: (...) residuals.
+        :param J: (..., p) their derivatives, needed where derivatives are wanted.
+        :param count: divisor of the squares, the number of samples where their mean is meant.
+        """
+        self._cost += 0.5 * torch.sum(r * r) / count
+        if J is not None:
+            J = J.reshape(-1, len(self.gradient))
+            self.gradient += J.T @ r.reshape(-1) / count
+            if count == 1:
+                self.matrix += J.T @ J
+            else:
+                # chunk after chunk: without another matrix of this size
+                self.matrix.addmm_(J.T, J, alpha=1.0 / count)
+
+    def add_sums(self, cost: Tensor | float, gradient: Tensor | None = None,
+                 matrix: Tensor | None = None) -> None:
+        """Add residuals whose structure allows for their sums without forming their J."""
+        self._cost += cost
+        if self.derivatives and gradient is not None and matrix is not None:
+            self.gradient += gradient
+            self.matrix += matrix
+
+
+# residuals(theta, equations) adds the residuals at parameters (p,) to the equations
+Residuals = Callable[[Tensor, NormalEquations], None]
+
+
+def normal_equations(residuals: Residuals, theta: Tensor, *, derivatives: bool = True
+                     ) -> NormalEquations:
+    """Return the normal equations of residuals at parameters (p,)."""
+    equations = NormalEquations(theta, derivatives=derivatives)
+    residuals(theta, equations)
+    return equations
+
+
+def minimise(residuals: Residuals, theta: Tensor, *, max_iterations: int,
              tolerance: float = 1e-3, patience: int = 20,
              monitor: Callable[[int, float], bool] | None = None) -> Minimum:
     """
@@ -58,7 +118,7 @@ def minimise(evaluate: Callable[..., NormalEquations], theta: Tensor, *, max_ite
     method does not depend on the units of single parameters (More, 1978). An interrupt from the
     keyboard ends it like the monitor does.
 
-    :param evaluate: ``evaluate(theta, derivatives=...)`` giving the normal equations.
+    :param residuals: adds the residuals at given parameters to normal equations.
     :param theta: (p,) start, float64.
     :param max_iterations: limit on steps tried.
     :param tolerance: relative decrease over `patience` accepted steps taken as convergence.
@@ -67,28 +127,27 @@ def minimise(evaluate: Callable[..., NormalEquations], theta: Tensor, *, max_ite
     """
     state: _State | None = None
     try:
-        now = evaluate(theta, derivatives=True)
+        now = normal_equations(residuals, theta)
         if not math.isfinite(now.cost):
-            return Minimum(theta, math.inf, 0, Status.STALLED)
-        assert now.matrix is not None
+            return Minimum(theta, math.inf, 0, MinimumStatus.STALLED)
         state = _State(theta, now, torch.clamp(now.matrix.diagonal().clone(), min=1e-12))
         costs = [now.cost]
         for iteration in range(1, max_iterations + 1):
-            state = replace(_step(evaluate, state), iteration=iteration)
+            state = replace(_step(residuals, state), iteration=iteration)
             if state.damping > _MAX_DAMPING:
-                status = Status.CONVERGED if len(costs) > 1 else Status.STALLED
+                status = MinimumStatus.CONVERGED if len(costs) > 1 else MinimumStatus.STALLED
                 return state.minimum(status)
-            if state.growth == _GROWTH:
+            if state.factor == _FACTOR:
                 costs.append(state.now.cost)
                 if _converged(costs, tolerance, patience):
-                    return state.minimum(Status.CONVERGED)
+                    return state.minimum(MinimumStatus.CONVERGED)
             if monitor is not None and monitor(iteration, state.now.cost):
-                return state.minimum(Status.INTERRUPTED)
+                return state.minimum(MinimumStatus.INTERRUPTED)
     except KeyboardInterrupt:
         if state is None:
             raise
-        return state.minimum(Status.INTERRUPTED)
-    return state.minimum(Status.MAX_ITERATIONS)
+        return state.minimum(MinimumStatus.INTERRUPTED)
+    return state.minimum(MinimumStatus.MAX_ITERATIONS)
 
 
 @dataclass(frozen=True)
@@ -96,7 +155,7 @@ class _State:
     """
     Where a minimisation stands.
 
-    :param growth: by what the damping grows when a step is refused; back at _GROWTH after a step
+    :param factor: by what the damping rises when a step is refused; back at _FACTOR after a step
         that was taken.
     """
 
@@ -104,10 +163,10 @@ class _State:
     now: NormalEquations
     scaling: Tensor
     damping: float = 1e-3
-    growth: float = _GROWTH
+    factor: float = _FACTOR
     iteration: int = 0
 
-    def minimum(self, status: Status) -> Minimum:
+    def minimum(self, status: MinimumStatus) -> Minimum:
         return Minimum(self.theta, self.now.cost, self.iteration, status)
 
 
@@ -116,21 +175,19 @@ def _converged(costs: list[float], tolerance: float, patience: int) -> bool:
         costs[-1 - patience] - costs[-1] <= tolerance * costs[-1 - patience])
 
 
-def _step(evaluate: Callable[..., NormalEquations], state: _State) -> _State:
+def _step(residuals: Residuals, state: _State) -> _State:
     """Try one damped Gauss-Newton step; take it when it lowers the cost."""
     now, damping, scaling = state.now, state.damping, state.scaling
-    assert now.matrix is not None and now.gradient is not None
     factor, info = torch.linalg.cholesky_ex(now.matrix + torch.diag(damping * scaling))
     if int(info) == 0:
         step = -torch.cholesky_solve(now.gradient[:, None], factor)[:, 0]
         predicted = 0.5 * float(step @ (damping * scaling * step - now.gradient))
-        trial = evaluate(state.theta + step, derivatives=False)
+        trial = normal_equations(residuals, state.theta + step, derivatives=False)
         gain = (now.cost - trial.cost) / predicted if predicted > 0.0 else -1.0
         if math.isfinite(trial.cost) and gain > 0.0:
             theta = state.theta + step
-            now = evaluate(theta, derivatives=True)
-            assert now.matrix is not None
+            now = normal_equations(residuals, theta)
             damping *= max(1.0 / 3.0, 1.0 - (2.0 * gain - 1.0) ** 3)
             return _State(theta, now, torch.maximum(scaling, now.matrix.diagonal()),
                           max(damping, 1e-15))
-    return replace(state, damping=damping * state.growth, growth=2.0 * state.growth)
+    return replace(state, damping=damping * state.factor, factor=2.0 * state.factor)
