@@ -30,7 +30,8 @@ ALLOWED = {
     'learning': {'control', 'lifting', 'solvers'},
     'identification': {'lifting', 'solvers'},
     'retraining': {'bags', 'control', 'identification', 'learning', 'lifting'},
-    'nodes': {'control', 'lifting', 'plants', 'bags'},
+    'replay': {'bags', 'control', 'lifting'},
+    'nodes': {'control', 'lifting', 'plants', 'bags', 'replay'},
     'testing': {'nodes'},
     'demo': {'control', 'lifting', 'plants', 'bags', 'nodes', 'testing'},
 }

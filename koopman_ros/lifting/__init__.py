@@ -3,7 +3,7 @@
 
 """What a lift is: its functions, its model and the file; in numpy, imports nothing of ours."""
 
-from koopman_ros.lifting.artefact import load, ModelFileError, save
+from koopman_ros.lifting.artefact import load, load_with_digest, ModelFileError, save
 from koopman_ros.lifting.linearisation import linearised_model
 from koopman_ros.lifting.model import Coordinates, LiftedModel, Provenance
 from koopman_ros.lifting.observables import (
@@ -24,5 +24,6 @@ __all__ = [
     'TrainingStates',
     'linearised_model',
     'load',
+    'load_with_digest',
     'save',
 ]

@@ -104,6 +104,16 @@ def load(path: str | os.PathLike[str]) -> LiftedModel:
     :param path: a regular file, or a link to one.
     :raises ModelFileError: naming the file, what is wrong and what to do.
     """
+    return load_with_digest(path)[0]
+
+
+def load_with_digest(path: str | os.PathLike[str]) -> tuple[LiftedModel, str]:
+    """
+    Read a model as :func:`load` does, with the SHA-256 digest of the file that it was read from.
+
+    :param path: a regular file, or a link to one.
+    :raises ModelFileError: as :func:`load`.
+    """
     path = Path(path)
     try:
         content = read_regular(path, _MAX_FILE_BYTES)
@@ -140,7 +150,7 @@ def load(path: str | os.PathLike[str]) -> LiftedModel:
             RecursionError) as error:
         reason = f'{error.args[0]!r} is missing' if isinstance(error, KeyError) else str(error)
         _refuse(path, f'its content is inconsistent ({reason})')
-    return model
+    return model, hashlib.sha256(content).hexdigest()
 
 
 def _build(about: dict[str, Any], tensors: dict[str, np.ndarray]) -> LiftedModel:

@@ -51,8 +51,8 @@ NODES = {
         serves=('~/reset', *STANDARD_SERVICES)),
     'controller': Access(
         publishes=(topics.COOLANT_SETPOINT, topics.ACTIVE_SETPOINT,
-                   topics.PREDICTED_TEMPERATURE, topics.CONTROLLER_STATE, topics.DIAGNOSTICS,
-                   *STANDARD_TOPICS),
+                   topics.PREDICTED_TEMPERATURE, topics.CONTROLLER_STATE,
+                   topics.CONTROLLER_EVENTS, topics.DIAGNOSTICS, *STANDARD_TOPICS),
         subscribes=(topics.TEMPERATURE, topics.COOLANT_TEMPERATURE, topics.SETPOINT,
                     topics.MANUAL_COOLANT_SETPOINT, topics.CLOCK),
         serves=('~/set_automatic', '~/reload_model', *STANDARD_SERVICES)),

@@ -44,9 +44,9 @@ PROGRAMS = {
         '0 when all was played or after a signal, 1 when it cannot start or go on, 2 for an '
         'unknown argument'),
     'replay': _Program(
-        'Runs bags through the control step, offline, with the old model and a new one.',
+        'Takes the records in bags through the control step again, also with a new model.',
         '0 when the recorded commands are reproduced, 1 when not or when it cannot run, 2 for an '
-        'unknown argument, 3 when a bag is too short to compare anything, 130 when interrupted'),
+        'unknown argument, 3 when there is nothing to compare in a bag, 130 when interrupted'),
 }
 
 

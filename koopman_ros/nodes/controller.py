@@ -5,6 +5,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+from dataclasses import asdict
 import sys
 import threading
 
@@ -36,7 +38,10 @@ from koopman_ros.nodes.model_loading import load_suitable, rests_outside
 from koopman_ros.nodes.model_loading import Situation as ModelSituation
 from koopman_ros.nodes.model_reload import ModelReload
 from koopman_ros.nodes.process import LoopNode, run
+from koopman_ros.nodes.record_publisher import RecordPublisher
 from koopman_ros.nodes.watchdog import PERIOD, Watchdog
+from koopman_ros.replay import events, records
+from koopman_ros.replay.events import Event, ModeChange, Silence
 
 _WATCH_STEP = NANOSECONDS // 2  # of plant time between two commands without a measurement
 _COOLANT_PATIENCE = 0.5  # s that the first answer waits for the coolant that is in force
@@ -46,7 +51,7 @@ _ATTEMPTS = 2
 
 class ControllerNode(LoopNode):
     """
-    Carry messages to and from the control step; docs/interfaces.md has its topics and services.
+    Carry messages to and from the control step; see the README for topics and services.
 
     All runs in the executor's thread, but for the watch over silence: while that thread is busy,
     the watchdog's does it. The lock is held where the state changes and its command goes out, not
@@ -58,7 +63,8 @@ class ControllerNode(LoopNode):
         parameters = TABLE.declare(self)
         self._settings = parameters
         self._models = ModelReload(
-            self, load_suitable(parameters.model), self._model_situation, self._on_model)
+            self, load_suitable(parameters.model), self._model_situation, self._on_model,
+            lambda: self._diagnostics.publish_if_changed())
         self._controller = self._built()
         self._state = State()
         self._lock = threading.Lock()
@@ -107,6 +113,7 @@ class ControllerNode(LoopNode):
         # the plant's time may stand still, and be asked for nevertheless
         self._steady = Clock(clock_type=ClockType.STEADY_TIME)
         self.create_timer(PERIOD, self._on_watch, clock=self._steady)
+        self._records = RecordPublisher(self._matching, self._snapshot, self._on_record_subscriber)
         TABLE.follow(self, parameters, self._on_parameters, self._models.accept)
         self.get_logger().info(self._models.in_force.about)
         self._warn_of_rest()
@@ -155,17 +162,24 @@ class ControllerNode(LoopNode):
         self._frame_length = len(frame_id) if len(frame_id) > LONGEST_FRAME_ID else 0
         for _ in range(_ATTEMPTS):
             before = state = self._state
+            done: list[tuple[Event, events.Outcome]] = []
             if state.command is None and self._coolant is not None:
-                state = translation.take_over(self._controller, state, self._coolant)
-            state, command, report = translation.answer(
-                self._controller, state, message, self._coolant_at(stamp_ns))
+                initial = translation.initialisation(self._coolant)
+                done.append((initial, events.apply(self._controller, state, initial)))
+                state = done[0][1].state
+            asked = translation.measurement(message, self._coolant_at(stamp_ns))
+            outcome = events.apply(self._controller, state, asked)
+            assert outcome.command is not None
+            assert outcome.report is not None
             with self._lock:
                 if self._state is not before:
                     # the watchdog has commanded meanwhile: the answer must go on from there
                     continue
-                self._state = state
+                self._state = outcome.state
                 self._commands.publish(temperature_message(
-                    command, message.header.stamp, self._frame_id))
+                    float(outcome.command[0]), message.header.stamp, self._frame_id))
+                for event, led_to in (*done, (asked, outcome)):
+                    self._records.publish_event(event, led_to)
                 if stamp_ns != before.time_ns:
                     self._arrival.note(stamp_ns, arrived)
                 self._arrival.answered()
@@ -175,6 +189,7 @@ class ControllerNode(LoopNode):
                 'a measurement is not answered, as a control step takes longer than the watchdog '
                 'waits: choose a smaller model', throttle_duration_sec=1.0)
             return
+        report = outcome.report
         self._temperature = message.temperature
         self._counts.measurements += 1
         self._counts.late += report.late
@@ -224,12 +239,15 @@ class ControllerNode(LoopNode):
             now_ns = state.time_ns + round(silence * NANOSECONDS)
             if state.commanded_ns is not None and now_ns - state.commanded_ns < _WATCH_STEP:
                 return None
-            self._state, command, report = translation.watch(self._controller, state, now_ns)
-            if command is None:
+            silence_ends = Silence(now_ns)
+            outcome = events.apply(self._controller, state, silence_ends)
+            if outcome.command is None or outcome.report is None:
                 return None
-            stamp = stamp_message(now_ns)
-            self._commands.publish(temperature_message(command, stamp, self._frame_id))
-            return report, stamp
+            self._state, stamp = outcome.state, stamp_message(now_ns)
+            self._commands.publish(temperature_message(
+                float(outcome.command[0]), stamp, self._frame_id))
+            self._records.publish_event(silence_ends, outcome)
+            return outcome.report, stamp
 
     def _tell(self, report: Report, stamp: Time) -> None:
         """Publish and log what is known beside the command."""
@@ -267,9 +285,7 @@ class ControllerNode(LoopNode):
 
     def _on_setpoint(self, message: Temperature) -> None:
         stamp_ns = stamp_nanoseconds(message.header.stamp)
-        with self._lock:
-            self._state, self._refused = translation.ask_setpoint(
-                self._controller, self._state, message)
+        self._refused = self._change(translation.setpoint_request(message))
         if self._refused:
             self.get_logger().warning(self._refused, throttle_duration_sec=1.0)
         else:
@@ -281,9 +297,7 @@ class ControllerNode(LoopNode):
         self._diagnostics.publish_if_changed()
 
     def _on_manual_coolant_setpoint(self, message: Temperature) -> None:
-        with self._lock:
-            self._state, self._refused = translation.ask_manual_coolant(
-                self._controller, self._state, message)
+        self._refused = self._change(translation.manual_command(message))
         if self._refused:
             self.get_logger().warning(self._refused, throttle_duration_sec=1.0)
         self._diagnostics.publish_if_changed()
@@ -291,13 +305,19 @@ class ControllerNode(LoopNode):
     def _on_set_automatic(self, request: SetBool.Request, response: SetBool.Response
                           ) -> SetBool.Response:
         mode = Mode.AUTOMATIC if request.data else Mode.MANUAL
-        with self._lock:
-            self._state = self._controller.set_mode(self._state, mode)
-        self._refused = ''
+        self._refused = self._change(ModeChange(mode))
         response.success, response.message = True, f'{mode.value} mode'
         self.get_logger().info(response.message)
         self._diagnostics.publish_if_changed()
         return response
+
+    def _change(self, event: Event) -> str:
+        """Apply what is not answered by a command; return why it is refused, or ''."""
+        with self._lock:
+            outcome = events.apply(self._controller, self._state, event)
+            self._state = outcome.state
+            self._records.publish_event(event, outcome)
+        return outcome.refused
 
     # Settings and models.
 
@@ -310,16 +330,33 @@ class ControllerNode(LoopNode):
                               np.array([to_kelvin(self._temperature)]))
 
     def _on_parameters(self, parameters: ControllerParameters) -> None:
-        self._settings = parameters
-        self._models.take_over()
-        self._on_model()
+        before, self._settings = self._settings, parameters
+        fields: dict[str, object] = {'parameters': {
+            name: value for name, value in asdict(parameters).items()
+            if value != getattr(before, name)}}
+        if self._models.take_over():
+            fields['model'] = self._models.in_force.identity
+        self._exchange(records.PARAMETERS, fields)
 
     def _on_model(self) -> None:
+        self._exchange(records.MODEL, {'model': self._models.in_force.identity})
+
+    def _exchange(self, event: str, fields: Mapping[str, object]) -> None:
+        """Put the parameters and the model of now in force."""
         with self._lock:
             predecessor, self._controller = self._controller, self._built()
             self._state = self._controller.succeed(predecessor, self._state)
+            self._records.publish(event, fields)
         self._warn_of_rest()
         self._diagnostics.publish_if_changed()
+
+    def _snapshot(self) -> Mapping[str, object]:
+        return records.snapshot(
+            self._state, asdict(self._settings), self._models.in_force.identity)
+
+    def _on_record_subscriber(self) -> None:
+        with self._lock:
+            self._records.publish_snapshot()
 
     def _warn_of_rest(self) -> None:
         """Say that the safe coolant leads out of the model's range, once for each reason."""

@@ -100,11 +100,13 @@ class Matching:
                                    'qos_overriding_options' in options))
         return made
 
-    def publish(self, kind: Any, topic: str, qos: QoSProfile) -> Publisher:
-        """Create a publisher; the arguments are those of rclpy."""
+    def publish(self, kind: Any, topic: str, qos: QoSProfile,
+                matched: Callable[[Any], None] | None = None) -> Publisher:
+        """Create a publisher; the arguments are those of rclpy and of its event callbacks."""
         made = self._owned.keep(self._node.create_publisher(
             kind, topic, copy.copy(qos), event_callbacks=PublisherEventCallbacks(
-                incompatible_qos=self._found(topic), incompatible_type=lambda _: self._look())))
+                incompatible_qos=self._found(topic), incompatible_type=lambda _: self._look(),
+                matched=matched)))
         self._own.append(_Endpoint(
             made.topic_name, type_name(kind), made.qos_profile, False, False))
         return made

@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from koopman_ros.control import Controller, Settings, State
-from koopman_ros.lifting import LiftedModel, load, ModelFileError
+from koopman_ros.lifting import LiftedModel, load_with_digest, ModelFileError
 from koopman_ros.nodes.controller_parameters import ControllerParameters
 from koopman_ros.nodes.messages import in_celsius, NANOSECONDS
 from koopman_ros.nodes.shipped import model_path
@@ -41,11 +41,18 @@ class LoadedModel:
     :param name: of a shipped model, or the path of a file.
     :param model: the lift.
     :param file_time: when the file was written, in UTC.
+    :param digest: SHA-256 of the file.
     """
 
     name: str
     model: LiftedModel
     file_time: str
+    digest: str
+
+    @property
+    def identity(self) -> dict[str, str]:
+        """What records name it by."""
+        return {'name': self.name, 'digest': self.digest}
 
     @property
     def about(self) -> str:
@@ -82,7 +89,7 @@ def load_suitable(name: str) -> LoadedModel:
         raise ModelFileError(f'model = {name[:50]!r}... is no path of a file, which has at most '
                              f'{_LONGEST_PATH} bytes: check it')
     path = model_path(name)
-    model = load(path)
+    model, digest = load_with_digest(path)
     if (model.states.units, model.inputs.units) != (('K',), ('K',)):
         raise ModelFileError(
             f'{path} has states in {model.states.units} and inputs in {model.inputs.units}, the '
@@ -102,9 +109,9 @@ def load_suitable(name: str) -> LoadedModel:
     _refuse_slow(path, model)
     with contextlib.suppress(OSError):
         written = datetime.fromtimestamp(path.stat().st_mtime, UTC)
-        return LoadedModel(name, model, written.isoformat(timespec='milliseconds'))
+        return LoadedModel(name, model, written.isoformat(timespec='milliseconds'), digest)
     # gone since it was read
-    return LoadedModel(name, model, 'unknown')
+    return LoadedModel(name, model, 'unknown', digest)
 
 
 def _refuse_slow(path: Path, model: LiftedModel) -> None:

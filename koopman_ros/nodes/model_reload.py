@@ -96,18 +96,20 @@ class ModelReload:
     :param node: the controller; its service calls :meth:`on_reload`.
     :param in_force: the model it starts with.
     :param situation: returns the present situation.
-    :param changed: called in the executor, so between two measurements, when another model is in
-        force or one was refused.
+    :param reloaded: called in the executor, so between two measurements, when the service has put
+        another model in force.
+    :param refused: called there when a model was refused.
     """
 
     def __init__(self, node: Node, in_force: LoadedModel, situation: Callable[[], Situation],
-                 changed: Callable[[], None]) -> None:
+                 reloaded: Callable[[], None], refused: Callable[[], None]) -> None:
         self.in_force = in_force
         self.reloads = 0
         self.refused = ''
         self._node = node
         self._situation = situation
-        self._changed = changed
+        self._on_reloaded = reloaded
+        self._on_refused = refused
         self._accepted: LoadedModel | None = None
         self._reading: list[_Trial] = []
 
@@ -132,6 +134,7 @@ class ModelReload:
                 outcome = str(error)
         if isinstance(outcome, LoadedModel):
             self._swap(outcome)
+            self._on_reloaded()
             response.success, response.message = True, outcome.about
         else:
             response.success, response.message = False, self._refuse(outcome)
@@ -155,11 +158,12 @@ class ModelReload:
             return ''
         return self._refuse(outcome)
 
-    def take_over(self) -> None:
-        """Put the model that was accepted with the last change of parameters in force."""
-        if self._accepted is not None:
-            self._swap(self._accepted)
-            self._accepted = None
+    def take_over(self) -> bool:
+        """Put the model that was accepted with the last change of parameters in force, if any."""
+        accepted, self._accepted = self._accepted, None
+        if accepted is not None:
+            self._swap(accepted)
+        return accepted is not None
 
     def figures(self) -> dict[str, object]:
         """Return what tells an operator which model is in force."""
@@ -189,11 +193,10 @@ class ModelReload:
         self.in_force, self.refused = loaded, ''
         self.reloads += 1
         self._node.get_logger().info(loaded.about)
-        self._changed()
 
     def _refuse(self, reason: str) -> str:
         self.refused = f'the old model is kept: {reason}'
-        self._changed()
+        self._on_refused()
         return self.refused
 
 

@@ -2,7 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 
 """
-The replay: recorded bags through the control step again, with the old and with a new model.
+The replay: the records in bags through the control step again, and beside a new model.
 
 Its exit code is 0 when the recorded commands are reproduced, 1 when some are not and for every
 error, and 3 when there was nothing to compare, as in a short bag from the middle of a run.
@@ -10,24 +10,31 @@ error, and 3 when there was nothing to compare, as in a short bag from the middl
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from dataclasses import replace
+from collections.abc import Callable, Collection, Mapping
+from dataclasses import dataclass, fields
 import enum
 from pathlib import Path
 import sys
+from typing import Any
 
 import numpy as np
 
-from koopman_ros.nodes import topics
+from koopman_ros.bags import BagReadError, summary
+from koopman_ros.control import Settings
+from koopman_ros.nodes import controller_parameters, topics
+from koopman_ros.nodes.controller_parameters import ControllerParameters
 from koopman_ros.nodes.model_loading import load_suitable
 from koopman_ros.nodes.parameter_node import ParameterNode
+from koopman_ros.nodes.parameters import ConfigurationError
 from koopman_ros.nodes.process import run_task
 from koopman_ros.nodes.replay_parameters import ReplayParameters, TABLE
-from koopman_ros.nodes.replaying.comparison import compare, ReplayedBag
-from koopman_ros.nodes.replaying.record import Names, read_record
-from koopman_ros.nodes.replaying.report import reproduced, verdict, write_report
-from koopman_ros.nodes.replaying.steps import commands_of, replay
-from koopman_ros.nodes.translation import controller_of
+from koopman_ros.nodes.shipped import config_directory, model_path
+from koopman_ros.replay.bag import command_counts, read_records
+from koopman_ros.replay.comparison import ReplayedBag
+from koopman_ros.replay.loop import Alternative, replay
+from koopman_ros.replay.models import Models
+from koopman_ros.replay.records import RecordError
+from koopman_ros.replay.report import reproduced, verdict, write_report
 
 
 class Result(enum.IntEnum):
@@ -38,94 +45,134 @@ class Result(enum.IntEnum):
     NOTHING_COMPARED = 3
 
 
-def replay_bags(parameters: ReplayParameters, names: Names) -> Result:
+@dataclass(frozen=True)
+class Names:
+    """
+    The topics of a controller in a bag, as absolute names.
+
+    :param records: where it wrote down what happened.
+    :param commands: where it commanded the coolant.
+    """
+
+    records: str = f'/{topics.CONTROLLER_EVENTS}'
+    commands: str = f'/{topics.COOLANT_SETPOINT}'
+
+
+def replay_bags(parameters: ReplayParameters, names: Names, given: Collection[str] = ()) -> Result:
     """
     Replay bags and write the report.
 
     :param parameters: of the replay.
     :param names: of the controller's topics in the bags.
+    :param given: names of those parameters that are not at their defaults by themselves.
     :return: whether the recorded commands are reproduced; when none differs, yet a bag has
         nothing to compare, that.
     :raises BagReadError: for a bag that cannot be replayed.
-    :raises ModelFileError: for a model that cannot be used.
+    :raises ModelFileError: for a new model that cannot be used.
+    :raises ConfigurationError: without the package that draws.
     """
-    # drawing needs a package that a controller's machine may lack
-    from koopman_ros.nodes.replaying.figure import draw
+    try:
+        # a controller's machine may lack it
+        from koopman_ros.replay.figure import draw
+    except ImportError as error:
+        raise ConfigurationError(
+            "the picture needs matplotlib, which is missing: pip install 'koopman_ros[demo]', or "
+            'apt-get install python3-matplotlib') from error
 
-    bags = [replayed_bag(path, names, parameters) for path in parameters.bags]
-    folder = Path(parameters.output)
+    bags = [replayed_bag(path, names, parameters, given) for path in parameters.bags]
+    folder, new_model = Path(parameters.output), parameters.new_model
     folder.mkdir(parents=True, exist_ok=True)
     pictures = ['replay.png'] if len(bags) == 1 else [
         f'replay_{number}.png' for number in range(1, len(bags) + 1)]
     for bag, picture in zip(bags, pictures, strict=True):
-        draw(folder / picture, bag, parameters)
+        draw(folder / picture, bag, new_model)
         print(f'{bag.path}: {verdict(bag)}')
         if bag.new is not None:
-            print(f'{bag.path}: {np.count_nonzero(bag.new.beyond)} commands of '
-                  f'{parameters.new_model} differ by more than {parameters.tolerance:g} K')
-    write_report(folder, bags, pictures, parameters)
+            print(f'{bag.path}: {np.count_nonzero(bag.new.beyond)} commands of {new_model} '
+                  f'differ by more than {parameters.tolerance:g} K')
+    write_report(folder, bags, pictures, new_model)
     print(f'see {folder / "report.md"}')
     if any(np.any(bag.check.beyond) for bag in bags):
         return Result.DIFFERENT
     return Result.REPRODUCED if all(map(reproduced, bags)) else Result.NOTHING_COMPARED
 
 
-def replayed_bag(path: str, names: Names, parameters: ReplayParameters) -> ReplayedBag:
+def replayed_bag(path: str, names: Names, parameters: ReplayParameters,
+                 given: Collection[str] = ()) -> ReplayedBag:
     """
     Replay one bag.
 
     :param path: of the bag.
     :param names: of the controller's topics in it.
     :param parameters: of the replay.
+    :param given: names of those that replace recorded ones for the new model.
     :raises BagReadError: for a bag that cannot be replayed.
-    :raises ModelFileError: for a model that cannot be used.
+    :raises ModelFileError: for a new model that cannot be used.
     """
-    settings, tolerance = parameters.settings(), parameters.tolerance
-    old = load_suitable(parameters.model).model
-    new = load_suitable(parameters.new_model).model if parameters.new_model else None
-    record = read_record(path, names, recover=parameters.recover)
-    replayed = replay(record, controller_of(old, settings))
-    commands = np.array([sample.replayed for sample in replayed.samples])
-    bag = ReplayedBag(path, record, old.states, replayed, compare(replayed, commands, tolerance))
-    if new is None:
-        return bag
-    commands = commands_of(controller_of(new, settings), replayed)
-    return replace(bag, new_commands=commands, new=compare(replayed, commands, tolerance),
-                   new_range=new.states)
+    alternative = None
+    if parameters.new_model:
+        new = load_suitable(parameters.new_model)
+        tuning = {item.name for item in fields(ControllerParameters)} - {'model'}
+        alternative = Alternative(new.model, new.digest, {
+            name: getattr(parameters, name) for name in tuning.intersection(given)})
+    models = Models([Path(parameters.model).expanduser(), model_path(parameters.model),
+                     config_directory() / 'models'])
+    records = read_records(path, names.records, recover=parameters.recover)
+    try:
+        found = replay(records, models.find, _settings, alternative)
+    except RecordError as error:
+        raise BagReadError(f'bag {path!r}: {error}') from error
+    return ReplayedBag(
+        path, summary(path).complete, found,
+        command_counts(path, names.commands, recover=parameters.recover), parameters.tolerance,
+        None if alternative is None else alternative.model.states)
+
+
+def _settings(values: Mapping[str, Any]) -> Settings:
+    """
+    Return the tuning that a controller's parameters stand for.
+
+    :raises RecordError: where this version has other parameters, or other ranges.
+    """
+    unknown = ', '.join(sorted(set(values) - set(controller_parameters.TABLE.rows)))
+    if unknown:
+        raise RecordError(f'its controller had the parameters {unknown}, which this version has '
+                          'not: take the package that recorded it')
+    snapshot = ControllerParameters(**values)
+    reason = controller_parameters.TABLE.check(snapshot)
+    if reason:
+        raise RecordError(f'its controller had parameters that this version refuses ({reason}): '
+                          'take the package that recorded it')
+    return snapshot.settings()
 
 
 def _prepare() -> Callable[[], int]:
     """Read parameters and names, which remaps and the namespace change as for the controller."""
     node = ParameterNode('replay', start_parameter_services=False, enable_rosout=False)
     try:
+        given = set(node.get_parameters_by_prefix(''))
         parameters = TABLE.declare(node)
-        resolve = node.resolve_topic_name
-        names = Names(
-            temperature=resolve(topics.TEMPERATURE), setpoint=resolve(topics.SETPOINT),
-            manual=resolve(topics.MANUAL_COOLANT_SETPOINT),
-            command=resolve(topics.COOLANT_SETPOINT), active=resolve(topics.ACTIVE_SETPOINT),
-            coolant=resolve(topics.COOLANT_TEMPERATURE),
-            internals=resolve(topics.CONTROLLER_STATE),
-            diagnostics=resolve(topics.DIAGNOSTICS), namespace=node.get_namespace().strip('/'))
+        names = Names(node.resolve_topic_name(topics.CONTROLLER_EVENTS),
+                      node.resolve_topic_name(topics.COOLANT_SETPOINT))
     finally:
         node.destroy_node()
-    return lambda: _run(parameters, names)
+    return lambda: _run(parameters, names, given)
 
 
-def _run(parameters: ReplayParameters, names: Names) -> int:
+def _run(parameters: ReplayParameters, names: Names, given: Collection[str]) -> int:
     try:
-        result = replay_bags(parameters, names)
+        result = replay_bags(parameters, names, given)
     except MemoryError:
         print('replay: memory does not suffice for these bags: replay them one by one, or shorter '
               'ones', file=sys.stderr)
         return 1
     if result is Result.DIFFERENT:
         print('replay: not all recorded commands are reproduced within '
-              f'{parameters.tolerance:g} K: give the model and the settings of the recording',
-              file=sys.stderr)
+              f'{parameters.tolerance:g} K: see the report for the first, and replay with the '
+              'package that recorded them', file=sys.stderr)
     elif result is Result.NOTHING_COMPARED:
-        print('replay: too short, or without commands: not every bag has commands to compare; '
-              'give bags that begin with the run, or go on for longer', file=sys.stderr)
+        print('replay: nothing to compare in a bag: its records hold no snapshot before a '
+              'command; give bags that begin with the run, or go on for longer', file=sys.stderr)
     return result
 
 

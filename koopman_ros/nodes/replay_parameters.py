@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 The koopman_ros Authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""Parameters of the replay: those of the controller that was recorded, and its own."""
+"""Parameters of the replay: its own, and those of a controller for the new model."""
 
 from __future__ import annotations
 
@@ -14,13 +14,22 @@ from koopman_ros.nodes.parameters import parameter, ParameterTable
 
 @dataclass(frozen=True)
 class ReplayParameters(ControllerParameters):
-    """Snapshot of the replay's parameters: the controller's file serves it, too."""
+    """
+    Snapshot of the replay's parameters.
+
+    Those of a controller that are given replace recorded ones, for the new model alone.
+    """
+
+    model: str = parameter(
+        'reactor_nz4', 'where a recorded model is looked for beside the shipped ones: a name, a '
+        '.safetensors file or a folder of them')
 
     bags: tuple[str, ...] = parameter(
         ('run_1',), 'bags to replay, each a run of its own: .mcap files or bag folders')
     new_model: str = parameter(
-        '', 'model whose commands are compared with the recorded ones, by name or path; empty '
-        'only checks that the recorded commands are reproduced')
+        '', 'model whose commands are compared with the recorded ones, by name or path, under '
+        'the recorded parameters but for those given here; empty only checks that the recorded '
+        'commands are reproduced')
     output: str = parameter(
         'replay', 'folder for report.md, summary.json and the pictures; older ones in it are '
         'replaced')

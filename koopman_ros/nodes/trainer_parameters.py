@@ -16,7 +16,7 @@ from koopman_ros.nodes.parameters import parameter, ParameterTable
 LOOP_TOPICS = (topics.TEMPERATURE, topics.CONCENTRATION, topics.SETPOINT, topics.ACTIVE_SETPOINT,
                topics.COOLANT_SETPOINT, topics.COOLANT_TEMPERATURE,
                topics.MANUAL_COOLANT_SETPOINT, topics.PREDICTED_TEMPERATURE,
-               topics.CONTROLLER_STATE, topics.DIAGNOSTICS)
+               topics.CONTROLLER_STATE, topics.CONTROLLER_EVENTS, topics.DIAGNOSTICS)
 EXPERIMENT_TOPICS = (topics.COOLANT_SETPOINT, topics.MANUAL_COOLANT_SETPOINT)
 
 

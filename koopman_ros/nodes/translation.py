@@ -2,10 +2,9 @@
 # SPDX-License-Identifier: Apache-2.0
 
 """
-Messages into control steps: the same for the running controller and for a bag that is replayed.
+Messages into events of the control step.
 
-A message is anything with the fields of sensor_msgs/Temperature: ROS's own, or one decoded from a
-bag.
+A message is anything with the fields of sensor_msgs/Temperature.
 """
 
 from __future__ import annotations
@@ -15,14 +14,14 @@ from typing import Any
 
 import numpy as np
 
-from koopman_ros.control import Controller, Report, Settings, State
+from koopman_ros.control import Controller, Settings
 from koopman_ros.lifting import LiftedModel
-from koopman_ros.nodes.messages import (
-    in_celsius,
-    NANOSECONDS,
-    stamp_nanoseconds,
-    to_celsius,
-    to_kelvin,
+from koopman_ros.nodes.messages import in_celsius, NANOSECONDS, stamp_nanoseconds, to_kelvin
+from koopman_ros.replay.events import (
+    Initialisation,
+    ManualCommand,
+    Measurement,
+    SetpointRequest,
 )
 
 # The temperatures of reactor and coolant at an instant are stamped no further apart.
@@ -34,55 +33,31 @@ def controller_of(model: LiftedModel, settings: Settings) -> Controller:
     return Controller(model, settings, in_celsius)
 
 
-def answer(controller: Controller, state: State, message: Any, coolant: float | None = None
-           ) -> tuple[State, float, Report]:
+def measurement(message: Any, coolant: float | None = None) -> Measurement:
     """
-    Answer a measurement.
+    Return the event of a measurement.
 
-    :param controller: model and settings.
-    :param state: as returned by the step before.
     :param message: temperature in degrees Celsius with its stamp.
-    :param coolant: its temperature in force then, in degrees Celsius, where it is known.
-    :return: the new state, the coolant temperature commanded in K, and the report.
+    :param coolant: its temperature applied then, in degrees Celsius, where it is known.
     """
     kelvin = to_kelvin(message.temperature)
     # below absolute zero there is nothing to measure
-    state, command, report = controller.step(
-        state, np.array([kelvin if kelvin >= 0.0 else math.nan]),
-        stamp_nanoseconds(message.header.stamp),
-        None if coolant is None else np.array([to_kelvin(coolant)]))
-    return state, float(command[0]), report
+    return Measurement(stamp_nanoseconds(message.header.stamp),
+                       np.array([kelvin if kelvin >= 0.0 else math.nan]),
+                       None if coolant is None else np.array([to_kelvin(coolant)]))
 
 
-def watch(controller: Controller, state: State, stamp_ns: int
-          ) -> tuple[State, float | None, Report]:
-    """
-    Answer that nothing has been measured up to a time.
-
-    :return: the new state, the coolant temperature commanded in K or None, and the report.
-    """
-    state, command, report = controller.watch(state, stamp_ns)
-    return state, None if command is None else float(command[0]), report
+def initialisation(message: Any) -> Initialisation:
+    """Return the event of a start from the coolant temperature that is applied already."""
+    return Initialisation(np.array([to_kelvin(message.temperature)]))
 
 
-def take_over(controller: Controller, state: State, message: Any) -> State:
-    """Start from a coolant temperature that is in force already."""
-    return controller.take_over(state, np.array([to_kelvin(message.temperature)]))
+def setpoint_request(message: Any) -> SetpointRequest:
+    """Return the event of a set-point, whose stamp says from when it holds."""
+    return SetpointRequest(stamp_nanoseconds(message.header.stamp),
+                           np.array([to_kelvin(message.temperature)]))
 
 
-def ask_setpoint(controller: Controller, state: State, message: Any) -> tuple[State, str]:
-    """Ask for a set-point; return the new state and an empty string, or why it is refused."""
-    return controller.request_setpoint(
-        state, np.array([to_kelvin(message.temperature)]),
-        stamp_nanoseconds(message.header.stamp))
-
-
-def ask_manual_coolant(controller: Controller, state: State, message: Any) -> tuple[State, str]:
-    """Ask for a coolant temperature in manual mode; return as for a set-point."""
-    return controller.request_manual_input(state, np.array([to_kelvin(message.temperature)]))
-
-
-def tracked_celsius(report: Report) -> float:
-    """Return the set-point that was tracked in degrees Celsius; NaN where there was none."""
-    active = report.active_setpoint
-    return math.nan if active is None else to_celsius(float(active[0]))
+def manual_command(message: Any) -> ManualCommand:
+    """Return the event of a coolant temperature commanded in manual mode."""
+    return ManualCommand(np.array([to_kelvin(message.temperature)]))

@@ -5,7 +5,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Sequence
 import os
 from pathlib import Path
 import sys
@@ -17,14 +17,16 @@ import numpy as np
 import pytest
 from rosgraph_msgs.msg import Clock
 from sensor_msgs.msg import Temperature
+from std_msgs.msg import String
 
-from koopman_ros.control import State
-from koopman_ros.lifting import load
-from koopman_ros.nodes import topics, translation
+from koopman_ros.nodes import topics
 from koopman_ros.nodes.controller_parameters import ControllerParameters
-from koopman_ros.nodes.messages import stamp_nanoseconds, to_celsius
-from koopman_ros.nodes.shipped import model_path
+from koopman_ros.nodes.messages import to_celsius
+from koopman_ros.nodes.shipped import config_directory
 from koopman_ros.nodes.watchdog import Watchdog
+from koopman_ros.replay.loop import replay
+from koopman_ros.replay.models import Models
+from koopman_ros.replay.records import parse
 from koopman_ros.testing import Harness
 from support.controller_bench import STATUS, STEADY
 from support.messages import seconds, temperature
@@ -40,15 +42,16 @@ BUSY = """
 import os, sys
 from koopman_ros.nodes import watchdog
 watchdog.PERIOD, watchdog._PATIENCE = 0.02, 0.2
-from koopman_ros.nodes import controller, translation
+from koopman_ros.nodes import controller
+from koopman_ros.replay import events
 controller._WATCH_STEP //= 5
-pipe, answer = sys.argv.pop(1), translation.answer
+pipe, apply = sys.argv.pop(1), events.apply
 def slowly(*args):
-    result = answer(*args)
-    if os.path.exists(pipe):
+    result = apply(*args)
+    if isinstance(args[2], events.Measurement) and os.path.exists(pipe):
         open(pipe, 'rb').read()
     return result
-translation.answer = slowly
+events.apply = slowly
 sys.exit(controller.main())
 """
 
@@ -69,10 +72,13 @@ class BusyBench:
             'controller', SETTINGS, ('-p', f'use_sim_time:={simulated}'.lower()),
             (sys.executable, '-c', BUSY, str(pipe)))
         self.commands = ros.listen(Temperature, topics.COOLANT_SETPOINT)
+        self.records = ros.listen(String, topics.CONTROLLER_EVENTS)
         self.thermometer = ros.speak(Temperature, topics.TEMPERATURE, to='controller')
         if simulated:
             ros.wait_until(lambda: time.get_subscription_count() > 0)
             time.publish(Clock(clock=temperature(0.0, 100.0).header.stamp))
+        # with the snapshot for who listens
+        ros.wait_until(lambda: self.records)
         self._begun = clock.monotonic()
         self.thermometer.publish(temperature(STEADY, 1.0))
         ros.wait_until(lambda: self.commands)
@@ -93,22 +99,24 @@ class BusyBench:
         return any(seconds(message) == time for message in self.commands)
 
 
-def replayed(commands: list[Temperature], measured: dict[float, float]) -> list[float]:
-    """Return what the control step makes of measurements, and of silence at all other stamps."""
-    controller = translation.controller_of(
-        load(model_path('reactor_nz4')), ControllerParameters(**SETTINGS).settings())
-    state, found = State(), []
-    for message in commands:
-        if (time := seconds(message)) in measured:
-            state, kelvin, _ = translation.answer(
-                controller, state, temperature(measured[time], time))
-        else:
-            state, held, _ = translation.watch(
-                controller, state, stamp_nanoseconds(message.header.stamp))
-            assert held is not None
-            kelvin = held
-        found.append(to_celsius(kelvin))
-    return found
+def wait_for_replay(bench: BusyBench, stamps: Sequence[float]) -> None:
+    """
+    Wait until the commands are those that follow from the controller's records.
+
+    :param stamps: of the measurements that they hold, in s; all else is silence.
+    """
+    def agrees() -> bool:
+        records = [parse(message.data) for message in bench.records]
+        found = replay(records, Models([config_directory() / 'models']).find,
+                       lambda values: ControllerParameters(**values).settings())
+        assert [sample.recorded for sample in found.samples] == [
+            sample.replayed for sample in found.samples]
+        return [to_celsius(float(sample.recorded[0])) for sample in found.samples] == [
+            message.temperature for message in bench.commands] and [
+            record.stamp_ns / 1e9 for record in records if record.event == 'measurement'
+            ] == list(stamps)
+
+    bench.ros.wait_until(agrees)
 
 
 @pytest.mark.parametrize('simulated', [False, True], ids=['real time', 'simulated time'])
@@ -135,8 +143,7 @@ def test_watchdog_commands_while_the_control_step_is_busy(
     bench.thermometer.publish(temperature(STEADY, 3.03))
     ros.wait_until(lambda: bench.answered(3.03))
     # what the step had found was thrown away, and found again from what was commanded meanwhile
-    assert [message.temperature for message in bench.commands] == replayed(
-        bench.commands, dict.fromkeys((1.0, 2.03, 3.03), STEADY))
+    wait_for_replay(bench, (1.0, 2.03, 3.03))
     assert 'learned law -> ' in bench.process.output()
 
 
@@ -158,8 +165,7 @@ def test_step_that_is_always_too_slow_is_given_up_and_the_process_ends_in_it(
     assert not bench.answered(2.03)
     bench.thermometer.publish(temperature(STEADY, 3.03))
     ros.wait_until(lambda: bench.answered(3.03))
-    assert [message.temperature for message in bench.commands] == replayed(
-        bench.commands, {1.0: STEADY, 3.03: STEADY})
+    wait_for_replay(bench, (1.0, 3.03))
 
     busy = bench.get_busy(4.0)
     code = bench.process.stop()

@@ -16,6 +16,7 @@ import time
 from typing import Any, TypeVar
 
 from diagnostic_msgs.msg import DiagnosticArray
+import numpy as np
 import pytest
 import rclpy
 from rclpy.executors import SingleThreadedExecutor
@@ -24,26 +25,27 @@ from rclpy.parameter import Parameter
 from rclpy.serialization import serialize_message
 from rclpy.task import Future
 from sensor_msgs.msg import Temperature
+from std_msgs.msg import String
 from std_srvs.srv import SetBool, Trigger
 
 from koopman_ros.bags import BagReadError, BagWriter, message_definition
 from koopman_ros.nodes import topics
 from koopman_ros.nodes.controller import ControllerNode
-from koopman_ros.nodes.messages import NANOSECONDS
+from koopman_ros.nodes.messages import NANOSECONDS, to_kelvin
 from koopman_ros.nodes.parameter_files import TABLES
 from koopman_ros.nodes.parameters import ConfigurationError, Specification
 from koopman_ros.nodes.plant import PlantNode
 from koopman_ros.nodes.player import PlayerNode
 from koopman_ros.nodes.process import LoopNode
-from koopman_ros.nodes.replay import replayed_bag
+from koopman_ros.nodes.replay import Names, replayed_bag
 from koopman_ros.nodes.replay_parameters import ReplayParameters
-from koopman_ros.nodes.replaying.record import Names
 from koopman_ros.nodes.shipped import model_path
 from koopman_ros.nodes.trainer import TrainerNode
 from koopman_ros.nodes.trainer_parameters import TrainerParameters
 from koopman_ros.retraining import retrain, Task
 from koopman_ros.testing import isolated_domain
 from support.messages import seconds, temperature, TIMEOUT
+from support.recorded_controller import Recorded
 
 STEADY = 51.8  # degC, near the plant's steady state
 DENORMAL = 5e-324
@@ -185,7 +187,10 @@ def own_domain() -> Iterator[None]:
 
 @pytest.fixture(scope='module')
 def bag(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Write a bag of three measurements with their commands."""
+    """Write a bag of three measurements with their commands, and of a controller's records."""
+    controller = Recorded()
+    for _ in range(3):
+        controller.measure(to_kelvin(STEADY))
     path = tmp_path_factory.mktemp('bag') / 'short.mcap'
     with BagWriter(path) as writer:
         for topic in ('/temperature', '/coolant_setpoint'):
@@ -195,6 +200,9 @@ def bag(tmp_path_factory: pytest.TempPathFactory) -> Path:
                                                   ('/coolant_setpoint', 20.0))):
                 writer.write(topic, serialize_message(temperature(celsius, float(second))),
                              second * NANOSECONDS + k)
+        writer.add_topic('/controller_events', message_definition('std_msgs/msg/String'))
+        for k, text in enumerate(controller.texts):
+            writer.write('/controller_events', serialize_message(String(data=text)), k)
     return path
 
 
@@ -380,5 +388,7 @@ def test_replay_runs_with_every_parameter_at_its_ends(bag: Path) -> None:
         reason = TABLES['replay'].check(parameters)
         assert not reason or (DENORMAL in change.values() and ' = 5e-324' in reason)
         if not reason:
-            found = replayed_bag(str(bag), Names(), parameters)
-            assert all(math.isfinite(sample.replayed) for sample in found.replayed.samples)
+            found = replayed_bag(str(bag), Names(), replace(
+                parameters, new_model=parameters.new_model or 'reactor_nz3'), change)
+            assert found.check.identical == len(found.commands) == 3
+            assert np.all(np.isfinite(found.new_commands))

@@ -257,12 +257,13 @@ def hostile(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
         writer = Writer(stream, chunk_size=2**26, compression=CompressionType.ZSTD,
                         index_types=IndexType.NONE)
         writer.start('ros2')
-        schema = writer.register_schema(
-            TEMPERATURE, 'ros2msg', message_definition(TEMPERATURE).text.encode())
-        channels = [writer.register_channel(topic, 'cdr', schema)
-                    for topic in ('/temperature', '/coolant_setpoint')]
+        channels = [
+            writer.register_channel(topic, 'cdr', writer.register_schema(
+                kind, 'ros2msg', message_definition(kind).text.encode()))
+            for topic, kind in (('/temperature', TEMPERATURE), ('/coolant_setpoint', TEMPERATURE),
+                                ('/controller_events', 'std_msgs/msg/String'))]
         for k in range(120_000):
-            writer.add_message(channels[k % 2], 1, b'', 1)
+            writer.add_message(channels[k % 3], 1, b'', 1)
         writer.finish()
     (laughs := folder / 'laughs').mkdir()
     (laughs / 'metadata.yaml').write_text('\n'.join(['a0: &a0 [ha]', *(

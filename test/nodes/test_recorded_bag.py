@@ -21,12 +21,15 @@ import yaml
 from koopman_ros.bags import temperature_series
 from koopman_ros.demo.loop import run_loop, Scenario
 from koopman_ros.nodes import topics
+from koopman_ros.nodes.replay import Names, replayed_bag
+from koopman_ros.nodes.replay_parameters import ReplayParameters
 from koopman_ros.testing import Harness
 
 SAMPLES = 61
 SETPOINT = 315.15  # K
 TOPICS = {'/temperature', '/concentration', '/setpoint', '/active_setpoint', '/coolant_setpoint',
-          '/coolant_temperature', '/predicted_temperature', '/controller_state', '/diagnostics'}
+          '/coolant_temperature', '/predicted_temperature', '/controller_state',
+          '/controller_events', '/diagnostics'}
 LATCHED = {'/active_setpoint', '/coolant_temperature'}
 
 
@@ -78,6 +81,12 @@ def test_rosbags_finds_and_decodes_the_same(bag: Path) -> None:
     assert stamps(concentrations)[-50:] == list(range(SAMPLES - 49, SAMPLES + 1))
     assert {tuple(m.name) for m in concentrations} == {('reactant_concentration [mol/L]',)}
     assert all(0.5 < m.position[0] < 1.0 for m in concentrations)
+
+
+def test_replay_reproduces_every_command(bag: Path) -> None:
+    found = replayed_bag(str(bag), Names(), ReplayParameters())
+    assert found.check.identical == found.check.compared == SAMPLES
+    assert (found.unexplained, found.found.lost) == (0, [])
 
 
 def test_type_hashes_are_those_of_ros(ros: Harness, bag: Path) -> None:

@@ -1,0 +1,75 @@
+# SPDX-FileCopyrightText: 2026 The koopman_ros Authors
+# SPDX-License-Identifier: Apache-2.0
+
+"""A controller's records in a bag, and the commands beside them."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Iterator
+import os
+import struct
+
+from koopman_ros.bags import BagMessage, BagReadError, read_messages, summary
+from koopman_ros.replay.records import parse, Record, RecordError
+
+RECORD_TYPE, COMMAND_TYPE = 'std_msgs/msg/String', 'sensor_msgs/msg/Temperature'
+_NANOSECONDS = 1_000_000_000
+
+
+def read_records(path: str | os.PathLike[str], topic: str, *, recover: bool = False
+                 ) -> Iterator[Record]:
+    """
+    Iterate over the records in a bag, in the order of receipt.
+
+    :param path: a .mcap file or a bag directory.
+    :param topic: absolute name of the controller's records.
+    :param recover: read a bag that was not closed or is damaged as far as it is whole.
+    :raises BagReadError: for a bag that cannot be read, or holds none.
+    """
+    # first, for what it says of a bag that is none
+    messages = read_messages(path, (topic,), recover=recover)
+    content = summary(path)
+    if not content.counts.get(topic):
+        known = ', '.join(name for name, count in sorted(content.counts.items()) if count)
+        raise BagReadError(
+            f'bag {os.fspath(path)!r} has no records of a controller on {topic!r}, it has '
+            f'{known or "none"}: record that topic, too (version 0.1 had none: its bags can be '
+            f'played and trained from), or name it, e.g. -r {topic[1:]}:=NAME')
+    if content.types[topic] != RECORD_TYPE:
+        raise BagReadError(
+            f'topic {topic!r} of bag {os.fspath(path)!r} is {content.types[topic]} and not '
+            f'{RECORD_TYPE}: choose another topic by a remap, e.g. -r {topic[1:]}:=NAME')
+    return _parsed(path, messages)
+
+
+def _parsed(path: str | os.PathLike[str], messages: Iterator[BagMessage]) -> Iterator[Record]:
+    for entry in messages:
+        try:
+            yield parse(entry.message.data)
+        except (RecordError, AttributeError) as error:
+            raise BagReadError(f'bag {os.fspath(path)!r}, topic {entry.topic!r}: {error}'
+                               ) from error
+
+
+def command_counts(path: str | os.PathLike[str], topic: str, *, recover: bool = False
+                   ) -> Counter[tuple[int, bytes]]:
+    """
+    Count the commands on a topic by stamp and value.
+
+    :return: of (stamp in ns, bytes of the float64 as it was sent); empty where the bag has none.
+    :raises BagReadError: for a bag that cannot be read.
+    """
+    if summary(path).types.get(topic) != COMMAND_TYPE:
+        return Counter()
+    found: Counter[tuple[int, bytes]] = Counter()
+    for entry in read_messages(path, (topic,), recover=recover):
+        stamp = entry.message.header.stamp
+        found[command_key(stamp.sec * _NANOSECONDS + stamp.nanosec,
+                          entry.message.temperature)] += 1
+    return found
+
+
+def command_key(stamp_ns: int, value: float) -> tuple[int, bytes]:
+    """Return what is equal for commands that are bit-identical."""
+    return stamp_ns, struct.pack('<d', value)

@@ -1,0 +1,134 @@
+# SPDX-FileCopyrightText: 2026 The koopman_ros Authors
+# SPDX-License-Identifier: Apache-2.0
+
+"""
+What changes a controller's state: events, and the one function that applies them.
+
+The running controller and the replay of its records both call :func:`apply`, so that a command
+follows from the same numbers in both.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TypeAlias
+
+import numpy as np
+from numpy.typing import NDArray
+
+from koopman_ros.control import Controller, Mode, Report, State
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class Measurement:
+    """
+    A measurement that is answered.
+
+    :param stamp_ns: its stamp.
+    :param measured: (n_y,) in the model's units; NaN for what cannot be.
+    :param applied: (n_u,) measured input that goes with it, or None.
+    """
+
+    stamp_ns: int
+    measured: Array
+    applied: Array | None = None
+
+
+@dataclass(frozen=True)
+class Silence:
+    """
+    No measurement came up to a time, which is answered, too.
+
+    :param stamp_ns: that time, in the time of the measurements' stamps.
+    """
+
+    stamp_ns: int
+
+
+@dataclass(frozen=True)
+class SetpointRequest:
+    """
+    The operator asks for a set-point.
+
+    :param stamp_ns: from when it is to hold; 0 for now.
+    :param value: in the model's units.
+    """
+
+    stamp_ns: int
+    value: Array
+
+
+@dataclass(frozen=True)
+class ManualCommand:
+    """
+    The operator commands the input in manual mode.
+
+    :param value: (n_u,) in the model's units.
+    """
+
+    value: Array
+
+
+@dataclass(frozen=True)
+class ModeChange:
+    """
+    The operator switches between automatic and manual mode.
+
+    :param mode: from now on.
+    """
+
+    mode: Mode
+
+
+@dataclass(frozen=True)
+class Initialisation:
+    """
+    The controller starts from the input that is applied already.
+
+    :param applied: (n_u,) measured input in the model's units.
+    """
+
+    applied: Array
+
+
+Event: TypeAlias = (
+    Measurement | Silence | SetpointRequest | ManualCommand | ModeChange | Initialisation)
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """
+    What an event led to.
+
+    :param state: the new state; the old one when the event was refused.
+    :param command: (n_u,) in the model's units, or None where the event is not answered.
+    :param report: of the step, where there was one.
+    :param refused: why the event was refused, or empty.
+    """
+
+    state: State
+    command: Array | None = None
+    report: Report | None = None
+    refused: str = ''
+
+
+def apply(controller: Controller, state: State, event: Event) -> Outcome:
+    """Apply an event to a controller's state; pure, as the controller is."""
+    match event:
+        case Measurement():
+            return Outcome(*controller.step(
+                state, event.measured, event.stamp_ns, event.applied))
+        case Silence():
+            return Outcome(*controller.watch(state, event.stamp_ns))
+        case SetpointRequest():
+            state, refused = controller.request_setpoint(state, event.value, event.stamp_ns)
+            return Outcome(state, refused=refused)
+        case ManualCommand():
+            state, refused = controller.request_manual_input(state, event.value)
+            return Outcome(state, refused=refused)
+        case ModeChange():
+            return Outcome(controller.set_mode(state, event.mode))
+        case Initialisation():
+            return Outcome(controller.take_over(state, event.applied))

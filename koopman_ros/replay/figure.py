@@ -1,0 +1,136 @@
+# SPDX-FileCopyrightText: 2026 The koopman_ros Authors
+# SPDX-License-Identifier: Apache-2.0
+
+"""The replay's picture: what was measured, what was commanded, and where commands differ."""
+
+from __future__ import annotations
+
+from pathlib import Path
+import textwrap
+
+import matplotlib
+import numpy as np
+
+from koopman_ros.replay.comparison import ReplayedBag, shown
+from koopman_ros.replay.report import verdict
+
+matplotlib.use('Agg')
+from matplotlib import pyplot
+from matplotlib.axes import Axes
+
+_RECORDED, _CHECK, _NEW = '0.55', 'tab:blue', 'tab:orange'
+
+
+def draw(path: Path, bag: ReplayedBag, new_model: str) -> None:
+    """
+    Draw a replayed bag.
+
+    :param path: PNG file to write.
+    :param bag: what to draw.
+    :param new_model: name of the new model, or empty.
+    """
+    inputs = bag.recorded.shape[1]
+    states = bag.measured.shape[1]
+    figure, axes = pyplot.subplots(
+        states + 2 * inputs, 1, sharex=True, figsize=(9.0, 3.0 * (states + 2 * inputs)),
+        layout='constrained', height_ratios=[1.0] * states + [1.2] * inputs + [0.8] * inputs)
+    time, label = _time(bag)
+    for i in range(states):
+        _draw_measured(axes[i], time, bag, i)
+    for i in range(inputs):
+        _draw_commands(axes[states + i], time, bag, i, new_model)
+        _draw_difference(axes[states + inputs + i], time, bag, i, new_model)
+    axes[0].set_title('\n'.join([f'{Path(bag.path).name}: recorded and replayed commands',
+                                 *textwrap.wrap(verdict(bag), 90)]), fontsize='medium')
+    axes[-1].set_xlabel(label)
+    if len(time) > 1:
+        axes[-1].set_xlim(time[0], time[-1])
+    for one in axes:
+        one.grid(alpha=0.3)
+        if one.get_legend_handles_labels()[0]:
+            one.legend(loc='best', fontsize='small', framealpha=0.9)
+    figure.savefig(path, dpi=130)
+    pyplot.close(figure)
+
+
+def _time(bag: ReplayedBag) -> tuple[np.ndarray, str]:
+    """Return the axis: stamps, or the number of the command when stamps go back."""
+    if not bag.found.samples:
+        return np.zeros(0), ''
+    seconds = bag.seconds
+    if np.any(np.diff(seconds) < 0.0):
+        return np.arange(1.0, len(seconds) + 1.0), 'command (the stamps go back in this bag)'
+    if seconds[-1] > 300.0:
+        return seconds / 60.0, 'time since the first command [min]'
+    return seconds, 'time since the first command [s]'
+
+
+def _draw_measured(axes: Axes, time: np.ndarray, bag: ReplayedBag, i: int) -> None:
+    controller = bag.found.controller
+    name, unit = 'measured', ''
+    if controller is not None:
+        states = controller.model.states
+        name, unit = states.names[i], states.units[i]
+        (low, high), _ = shown(np.array([states.lower[i], states.upper[i]]), unit)
+        axes.axhspan(low, high, color='0.93', label='range of training', zorder=0)
+    setpoint, _ = shown(bag.setpoint[:, i], unit)
+    measured, unit = shown(bag.measured[:, i], unit)
+    finite = measured[np.isfinite(measured)]
+    typical = _typical(finite)
+    hidden = len(finite) - len(typical)
+    axes.step(time, setpoint, 'k--', where='post', linewidth=1.2, label='set-point tracked')
+    axes.plot(time, measured, color='tab:green', label='measured' + (
+        f' ({hidden} of {len(finite)} outside the picture)' if hidden else ''))
+    both = np.concatenate([typical, setpoint[np.isfinite(setpoint)]])
+    if both.size:
+        margin = 0.5 + 0.05 * float(np.ptp(both))
+        axes.set_ylim(float(both.min()) - margin, float(both.max()) + margin)
+    axes.set_ylabel(f'{name} [{unit}]')
+
+
+def _typical(finite: np.ndarray) -> np.ndarray:
+    """Return what a picture should show: a broken sensor's values would flatten all others."""
+    if not finite.size:
+        return finite
+    low, high = np.percentile(finite, (2.0, 98.0))
+    reach = high - low + 1.0
+    return finite[(finite >= low - reach) & (finite <= high + reach)]
+
+
+def _draw_commands(axes: Axes, time: np.ndarray, bag: ReplayedBag, i: int, new_model: str
+                   ) -> None:
+    controller = bag.found.controller
+    name, unit = 'command', ''
+    if controller is not None:
+        inputs, limits = controller.model.inputs, controller.settings.limits
+        name, unit = inputs.names[i], inputs.units[i]
+        (low, high), _ = shown(np.array([limits.lower[i], limits.upper[i]]), unit)
+        axes.axhline(high, color='0.3', linestyle=':', label='limits')
+        axes.axhline(low, color='0.3', linestyle=':')
+    axes.step(time, shown(bag.recorded[:, i], unit)[0], where='post', color=_RECORDED,
+              linewidth=4.0, label='recorded')
+    axes.step(time, shown(bag.commands[:, i], unit)[0], where='post', color=_CHECK, linewidth=1.2,
+              label='replayed')
+    if new_model:
+        axes.step(time, shown(bag.new_commands[:, i], unit)[0], where='post', color=_NEW,
+                  linewidth=1.5, label=f'{_short(new_model)} on the same measurements')
+    axes.set_ylabel(f'{name}, command [{shown(bag.recorded, unit)[1]}]')
+
+
+def _draw_difference(axes: Axes, time: np.ndarray, bag: ReplayedBag, i: int, new_model: str
+                     ) -> None:
+    axes.axhspan(-bag.tolerance, bag.tolerance, color='0.9', label=f'within ±{bag.tolerance:g}',
+                 zorder=0)
+    drawn = [(bag.check, _CHECK, 'replayed')]
+    if bag.new is not None:
+        drawn.append((bag.new, _NEW, _short(new_model)))
+    for comparison, color, name in drawn:
+        difference, spots = comparison.difference[:, i], comparison.beyond
+        axes.step(time, difference, where='post', color=color, linewidth=1.2,
+                  label=f'{name}: {np.count_nonzero(spots)} of {comparison.compared} beyond')
+        axes.plot(time[spots], difference[spots], '.', color='tab:red', markersize=4.0)
+    axes.set_ylabel('command minus recorded')
+
+
+def _short(name: str) -> str:
+    return Path(name).name.removesuffix('.safetensors')

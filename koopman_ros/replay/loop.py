@@ -1,0 +1,240 @@
+# SPDX-FileCopyrightText: 2026 The koopman_ros Authors
+# SPDX-License-Identifier: Apache-2.0
+
+"""The replay: a loop over a controller's records, which gives its commands again."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Mapping
+from dataclasses import dataclass, field, replace
+from typing import Any, TypeAlias
+
+import numpy as np
+from numpy.typing import NDArray
+
+from koopman_ros.control import Controller, Setpoint, Settings, State
+from koopman_ros.lifting import LiftedModel
+from koopman_ros.replay.events import apply, Measurement, SetpointRequest
+from koopman_ros.replay.records import (
+    event_of,
+    MODEL,
+    PARAMETERS,
+    Record,
+    RecordError,
+    SNAPSHOT,
+    START,
+    state_of,
+)
+from koopman_ros.replay.values import float_array
+
+Array = NDArray[np.float64]
+
+# The model of a name and a digest, read anew each time; raises RecordError where there is none.
+FindModel: TypeAlias = Callable[[str, str], LiftedModel]
+# The tuning that parameters by name stand for; raises ValueError where they do not fit.
+MakeSettings: TypeAlias = Callable[[Mapping[str, Any]], Settings]
+
+
+@dataclass(frozen=True)
+class Alternative:
+    """
+    Another model, whose commands are compared with the recorded ones.
+
+    :param model: the model.
+    :param digest: SHA-256 of its file.
+    :param parameters: that replace recorded ones, by name.
+    """
+
+    model: LiftedModel
+    digest: str
+    parameters: Mapping[str, Any] = field(default_factory=dict)
+
+
+@dataclass(frozen=True)
+class Sample:
+    """
+    A command: recorded, replayed, and that of the alternative; all in the model's units.
+
+    :param stamp_ns: of the measurement that it answers, or of the silence.
+    :param measured: (n_y,) or None in silence.
+    :param setpoint: (n_x,) that was tracked according to the replay, or None.
+    :param recorded: (n_u,) what was commanded.
+    :param replayed: (n_u,) the same by the replay; None where it knows no state, before the first
+        snapshot and behind a lost record.
+    :param alternative: (n_u,) what the alternative commands, or None.
+    """
+
+    stamp_ns: int
+    measured: Array | None
+    setpoint: Array | None
+    recorded: Array
+    replayed: Array | None
+    alternative: Array | None
+
+
+@dataclass(frozen=True)
+class Lost:
+    """
+    Records that are missing.
+
+    :param run: of the controller.
+    :param first: number of the first one.
+    :param last: number of the last one.
+    """
+
+    run: str
+    first: int
+    last: int
+
+
+@dataclass
+class Replay:
+    """
+    What came of a replay.
+
+    :param samples: one for each command, in the order of the records.
+    :param lost: records that are missing.
+    :param runs: how often the controller was started, as far as it shows.
+    :param begins_late: runs whose first records are missing.
+    :param refused: requests that were refused.
+    :param models: names of those in force, in the order of their use.
+    :param controller: the last one in force, or None where no state was found.
+    """
+
+    samples: list[Sample] = field(default_factory=list)
+    lost: list[Lost] = field(default_factory=list)
+    runs: int = 0
+    begins_late: int = 0
+    refused: int = 0
+    models: list[str] = field(default_factory=list)
+    controller: Controller | None = None
+
+
+def replay(records: Iterable[Record], find_model: FindModel, make_settings: MakeSettings,
+           alternative: Alternative | None = None) -> Replay:
+    """
+    Apply what is recorded again.
+
+    :param records: of a bag, in the order of receipt; those of several runs may alternate.
+    :param find_model: gives the models that the records name.
+    :param make_settings: gives the tuning that their parameters stand for.
+    :param alternative: another model that answers the same measurements under the set-points that
+        were tracked, or None.
+    :raises RecordError: for records that cannot be replayed.
+    """
+    found = Replay()
+    runs: dict[str, _Run] = {}
+    for record in records:
+        if record.run not in runs:
+            runs[record.run] = _Run(found, find_model, make_settings, alternative)
+            found.runs += 1
+            found.begins_late += record.event != START
+        try:
+            runs[record.run].take(record)
+        except (ArithmeticError, AttributeError, IndexError, KeyError, TypeError, ValueError
+                ) as error:
+            if isinstance(error, RecordError):
+                raise
+            raise RecordError(f'record {record.number} of run {record.run} cannot be replayed '
+                              f'({type(error).__name__}: {error})') from error
+    return found
+
+
+class _Run:
+    """A run of a controller on its way through the replay."""
+
+    def __init__(self, found: Replay, find_model: FindModel, make_settings: MakeSettings,
+                 alternative: Alternative | None) -> None:
+        self._found = found
+        self._find_model = find_model
+        self._make_settings = make_settings
+        self._other = alternative
+        self._next: int | None = None  # number of the next record
+        self._state: State | None = None  # None while it is not known
+        self._other_state = State()
+        self._parameters: dict[str, Any] = {}
+        self._controller: Controller
+        self._other_controller: Controller
+
+    def take(self, record: Record) -> None:
+        """Replay the next record."""
+        if self._next is not None:
+            if record.number < self._next:
+                raise RecordError(f'record {record.number} of run {record.run} comes again, or '
+                                  f'after record {self._next - 1}: the bag is not in order')
+            if record.number > self._next:
+                self._found.lost.append(Lost(record.run, self._next, record.number - 1))
+                self._state = None
+        self._next = record.number + 1
+        if record.event in (START, SNAPSHOT):
+            if self._state is None:
+                self._begin(record)
+        elif self._state is None:
+            self._keep(record, None, None, None)
+        elif record.event in (PARAMETERS, MODEL):
+            self._exchange(record, self._state)
+        else:
+            self._apply(record, self._state)
+
+    def _begin(self, record: Record) -> None:
+        self._parameters = dict(record.fields['parameters'])
+        self._controller = Controller(
+            self._model(record), self._make_settings(self._parameters))
+        self._found.controller = self._controller
+        self._state = state_of(record)
+        if self._other is not None:
+            same = self._other.digest == record.fields['model']['digest']
+            self._other_controller = self._tuned(
+                self._controller.model if same else self._other.model)
+            self._other_state = self._other_controller.succeed(self._controller, self._state)
+
+    def _exchange(self, record: Record, state: State) -> None:
+        """Put other parameters or another model in force."""
+        self._parameters.update(record.fields.get('parameters', {}))
+        predecessor = self._controller
+        self._controller = Controller(
+            self._model(record) if 'model' in record.fields else predecessor.model,
+            self._make_settings(self._parameters))
+        self._found.controller = self._controller
+        self._state = self._controller.succeed(predecessor, state)
+        if self._other is not None and 'parameters' in record.fields:
+            predecessor = self._other_controller
+            self._other_controller = self._tuned(predecessor.model)
+            self._other_state = self._other_controller.succeed(predecessor, self._other_state)
+
+    def _apply(self, record: Record, state: State) -> None:
+        event = event_of(record)
+        outcome = apply(self._controller, state, event)
+        self._state = outcome.state
+        self._found.refused += bool(outcome.refused)
+        active = None if outcome.report is None else outcome.report.active_setpoint
+        other = None
+        # it may refuse a request: it goes by what was tracked
+        if self._other is not None and not isinstance(event, SetpointRequest):
+            if active is not None and isinstance(event, Measurement):
+                self._other_state = replace(
+                    self._other_state, setpoint=Setpoint(active, active))
+            answered = apply(self._other_controller, self._other_state, event)
+            self._other_state, other = answered.state, answered.command
+        self._keep(record, active, outcome.command, other)
+
+    def _keep(self, record: Record, setpoint: Array | None, replayed: Array | None,
+              other: Array | None) -> None:
+        """Keep the command of a record, where it has one."""
+        fields = record.fields
+        if fields.get('command') is not None:
+            measured = fields.get('measured')
+            self._found.samples.append(Sample(
+                record.stamp_ns, None if measured is None else float_array(measured), setpoint,
+                float_array(fields['command']), replayed, other))
+
+    def _model(self, record: Record) -> LiftedModel:
+        name, digest = record.fields['model']['name'], record.fields['model']['digest']
+        if name not in self._found.models:
+            self._found.models.append(name)
+        return self._find_model(name, digest)
+
+    def _tuned(self, model: LiftedModel) -> Controller:
+        assert self._other is not None
+        return Controller(model, self._make_settings(
+            {**self._parameters, **self._other.parameters}))
