@@ -58,19 +58,11 @@ def start_loop(ros: Harness, plant: Mapping[str, object], arguments: tuple[str, 
     ros.start('plant', {**plant, 'lockstep_subscribers': 2}, arguments)
 
 
-@pytest.mark.parametrize('first', ['controller', 'plant'])
-def test_reaches_the_setpoint_whoever_starts_first(ros: Harness, first: str) -> None:
+def test_follows_the_setpoint_beside_a_plant_that_was_there_before(ros: Harness) -> None:
     loop = Loop(ros)
-    names = ['controller', 'plant'] if first == 'controller' else ['plant', 'controller']
-    for name in names:
-        ros.start(name, {**LOCKSTEP, 'lockstep_subscribers': 2} if name == 'plant' else {})
-        ros.wait_until(lambda name=name: name in ros.node.get_node_names())
-    loop.reach(42.0, within=0.01)
-
-
-def test_follows_the_setpoint_when_it_changes_on_the_way(ros: Harness) -> None:
-    loop = Loop(ros)
-    start_loop(ros, LOCKSTEP)
+    ros.start('plant', {**LOCKSTEP, 'lockstep_subscribers': 2})
+    ros.wait_until(lambda: 'plant' in ros.node.get_node_names())
+    ros.start('controller')
     loop.ask(47.0)
     ros.wait_until(lambda: loop.temperatures and loop.temperatures[-1].temperature < 49.0)
     loop.ask(38.0)
@@ -105,20 +97,15 @@ def test_every_measurement_has_exactly_one_command(ros: Harness) -> None:
     assert [message.header.stamp for message in loop.commands] == measured
 
 
-def test_two_loops_side_by_side_in_their_namespaces(ros: Harness) -> None:
-    loops = {unit: Loop(ros, f'/{unit}/') for unit in ('unit_1', 'unit_2')}
-    for unit in loops:
-        start_loop(ros, LOCKSTEP, ('-r', f'__ns:=/{unit}'))
+def test_two_loops_side_by_side_in_their_namespaces_and_with_another_topic(ros: Harness) -> None:
+    loops = {'unit_1': Loop(ros, '/unit_1/'),
+             'unit_2': Loop(ros, '/unit_2/', measured='reactor_temperature')}
+    for unit, remap in (('unit_1', ()), ('unit_2', ('-r', 'temperature:=reactor_temperature'))):
+        start_loop(ros, LOCKSTEP, ('-r', f'__ns:=/{unit}', *remap))
     loops['unit_1'].ask(47.0)
     loops['unit_2'].ask(42.0)
     ros.wait_until(lambda: loops['unit_1'].settled(47.0, 0.01))
     ros.wait_until(lambda: loops['unit_2'].settled(42.0, 0.01))
     assert {status.name for status in ros.statuses} >= {
         'unit_1/plant: simulation', 'unit_2/controller: control'}
-
-
-def test_topics_can_be_remapped(ros: Harness) -> None:
-    loop = Loop(ros, measured='reactor_temperature')
-    start_loop(ros, LOCKSTEP, ('-r', 'temperature:=reactor_temperature'))
-    loop.reach(45.0, within=0.01)
-    assert ros.node.count_publishers('temperature') == 0
+    assert ros.node.count_publishers('/unit_2/temperature') == 0

@@ -17,8 +17,7 @@ import time
 import pytest
 
 from koopman_ros.bags import summary
-from koopman_ros.demo.loop import run_loop, Scenario
-from koopman_ros.testing import HarnessError, reserved_output
+from koopman_ros.testing import reserved_output
 
 
 def test_demo_leaves_bag_picture_and_summary(tmp_path: Path) -> None:
@@ -127,8 +126,3 @@ def _processes(output: Path) -> list[str]:
         with contextlib.suppress(OSError):
             found.append(path.read_bytes().replace(b'\0', b' ').decode(errors='replace'))
     return [command for command in found if 'trainer' in command and str(output) in command]
-
-
-def test_loop_tells_which_process_failed(tmp_path: Path) -> None:
-    with pytest.raises(HarnessError, match=r'controller ended early.*no_such_model'):
-        run_loop(Scenario('no_such_model', 315.0), tmp_path / 'bag.mcap', tmp_path)

@@ -10,7 +10,6 @@ from collections.abc import Mapping
 from itertools import pairwise
 import math
 from pathlib import Path
-import signal
 
 from diagnostic_msgs.msg import DiagnosticStatus
 import pytest
@@ -129,28 +128,6 @@ def test_steps_drive_the_plant_as_planned(ros: Harness) -> None:
     assert progress.phase is Phase.FINISHED
 
 
-def test_service_ends_the_steps_and_then_lets_go(ros: Harness) -> None:
-    bench = Bench(ros)
-    assert ros.set_bool(SERVICE, False).message == 'no experiment is running'
-    assert bench.start() == (True, 'running on /coolant_setpoint')
-    assert not ros.set_bool(SERVICE, True).success
-    for _ in range(20):
-        bench.answer()
-    assert bench.answer() != pytest.approx(SAFE, abs=0.5)
-    assert value(bench.status('running'), 'topic') == '/coolant_setpoint'
-
-    assert 'the coolant returns to 18.85 degC' in ros.set_bool(SERVICE, False).message
-    bench.status('ended; the coolant returns')
-    for _ in range(20):
-        bench.answer()
-    assert bench.answer() == pytest.approx(SAFE)
-    assert ros.set_bool(SERVICE, False).message == LOST
-    ros.wait_until(lambda: ros.node.count_publishers(topics.COOLANT_SETPOINT) == 0)
-    ros.wait_for_status(STATUS, lambda s: s.message == 'ended')
-    # and once more, with the same steps
-    assert bench.start()[0]
-
-
 def test_names_follow_namespace_and_remaps(ros: Harness) -> None:
     bench = Bench(ros, arguments=('-r', '__ns:=/unit_1', '-r', 'coolant_setpoint:=jacket'),
                   prefix='/unit_1/', coolant='jacket',
@@ -226,7 +203,68 @@ def test_contradicting_limits_are_refused(shared_bench: Bench, name: str, given:
     assert words in result.reason
 
 
-# Aborts.
+# Ends.
+
+
+def test_service_ends_the_steps_and_then_lets_go(shared_bench: Bench) -> None:
+    bench, ros = shared_bench, shared_bench.ros
+    assert ros.set_bool(SERVICE, False).message == 'no experiment is running'
+    assert bench.start() == (True, 'running on /coolant_setpoint')
+    assert not ros.set_bool(SERVICE, True).success
+    for _ in range(20):
+        bench.answer()
+    assert bench.answer() != pytest.approx(SAFE, abs=0.5)
+    assert value(bench.status('running'), 'topic') == '/coolant_setpoint'
+
+    assert 'the coolant returns to 18.85 degC' in ros.set_bool(SERVICE, False).message
+    bench.status('ended; the coolant returns')
+    for _ in range(20):
+        bench.answer()
+    assert bench.answer() == pytest.approx(SAFE)
+    assert ros.set_bool(SERVICE, False).message == LOST
+    ros.wait_until(lambda: ros.node.count_publishers(topics.COOLANT_SETPOINT) == 0)
+    ros.wait_for_status(STATUS, lambda s: s.message == 'ended')
+    # and once more
+    assert bench.start()[0]
+    for _ in range(2):
+        assert ros.set_bool(SERVICE, False).success
+
+
+def test_silent_sensor_brings_the_safe_coolant(shared_bench: Bench) -> None:
+    bench, ros = shared_bench, shared_bench.ros
+    results = ros.set_parameters('trainer', experiment_timeout=0.5, experiment_rate_limit=600.0)
+    assert all(result.successful for result in results)
+    # which a busy machine may miss
+    ros.wait_until(lambda: bench.start()[0])
+    for _ in range(5):
+        bench.answer()
+    status = bench.status('no newer measurement for more than 0.5 s')
+    assert status.level == DiagnosticStatus.ERROR
+    ros.wait_until(lambda: bench.commands[-1].temperature == pytest.approx(SAFE, abs=1e-9))
+    heard = len(bench.commands)
+    ros.wait_until(lambda: len(bench.commands) > heard + 2)
+    # a sensor that comes back is answered, with the same
+    assert bench.answer() == pytest.approx(SAFE, abs=1e-9)
+    assert ros.set_bool(SERVICE, False).message == LOST
+    ros.set_parameters('trainer', experiment_timeout=10.0, experiment_rate_limit=60.0)
+
+
+def test_another_commander_ends_it_at_once(shared_bench: Bench) -> None:
+    bench, ros = shared_bench, shared_bench.ros
+    assert bench.start()[0]
+    bench.answer()
+    ros.start('controller')
+    status = bench.status('aborted')
+    assert status.level == DiagnosticStatus.ERROR
+    # found, perhaps, before its name is
+    assert status.message.removeprefix('aborted: ') in (
+        '/controller publishes on /coolant_setpoint, too',
+        'another node publishes on /coolant_setpoint, too')
+    ros.wait_until(lambda: ros.node.count_publishers(topics.COOLANT_SETPOINT) == 1)
+    assert ros.wait_until(lambda: '/controller publishes' in (answer := bench.start())[1]
+                          and answer) == (
+        False, 'refused: /controller publishes on /coolant_setpoint: end it, or choose another '
+        'experiment_topic')
 
 
 def test_reactor_that_leaves_its_bounds_gets_the_safe_coolant(ros: Harness) -> None:
@@ -248,47 +286,13 @@ def test_reactor_that_leaves_its_bounds_gets_the_safe_coolant(ros: Harness) -> N
     assert ros.set_bool(SERVICE, False).message == LOST
 
 
-def test_another_commander_ends_it_at_once(ros: Harness) -> None:
-    bench = Bench(ros)
-    assert bench.start()[0]
-    bench.answer()
-    ros.start('controller')
-    status = bench.status('aborted')
-    assert status.level == DiagnosticStatus.ERROR
-    # found, perhaps, before its name is
-    assert status.message.removeprefix('aborted: ') in (
-        '/controller publishes on /coolant_setpoint, too',
-        'another node publishes on /coolant_setpoint, too')
-    ros.wait_until(lambda: ros.node.count_publishers(topics.COOLANT_SETPOINT) == 1)
-    assert ros.wait_until(lambda: '/controller publishes' in (answer := bench.start())[1]
-                          and answer) == (
-        False, 'refused: /controller publishes on /coolant_setpoint: end it, or choose another '
-        'experiment_topic')
-
-
-def test_silent_sensor_brings_the_safe_coolant(ros: Harness) -> None:
-    bench = Bench(ros, {'experiment_timeout': 0.5, 'experiment_rate_limit': 600.0})
-    # which a busy machine may miss
-    ros.wait_until(lambda: bench.start()[0])
-    for _ in range(5):
-        bench.answer()
-    status = bench.status('no newer measurement for more than 0.5 s')
-    assert status.level == DiagnosticStatus.ERROR
-    ros.wait_until(lambda: bench.commands[-1].temperature == pytest.approx(SAFE, abs=1e-9))
-    heard = len(bench.commands)
-    ros.wait_until(lambda: len(bench.commands) > heard + 2)
-    # a sensor that comes back is answered, with the same
-    assert bench.answer() == pytest.approx(SAFE, abs=1e-9)
-
-
-@pytest.mark.parametrize('number', [signal.SIGINT, signal.SIGTERM])
-def test_trainer_that_is_told_to_end_leaves_the_safe_coolant(
-        ros: Harness, tmp_path: Path, number: int) -> None:
+def test_trainer_that_is_told_to_end_leaves_the_safe_coolant(ros: Harness, tmp_path: Path
+                                                             ) -> None:
     bag = tmp_path / 'run.mcap'
     commands = ros.listen(Temperature, topics.COOLANT_SETPOINT)
     start_with_plant(ros, {'record_at_start': True, 'output': bag}, {'lockstep_subscribers': 3})
     ros.wait_until(lambda: len(commands) > 100)
-    assert ros.processes[0].stop(number) == 0
+    assert ros.processes[0].stop() == 0
     status = ros.wait_for_status(
         'plant: simulation', lambda s: float(value(s, 'coolant [degC]')) == pytest.approx(SAFE))
     assert float(value(status, 'time [s]')) > 100.0

@@ -18,7 +18,6 @@ import sys
 import pytest
 from rclpy.utilities import get_rmw_implementation_identifier
 from rosgraph_msgs.msg import Clock
-from sensor_msgs.msg import Temperature
 
 from koopman_ros.bags import summary
 from koopman_ros.nodes import command_line, topics
@@ -27,19 +26,28 @@ from koopman_ros.nodes.messages import NANOSECONDS, stamp_message
 from koopman_ros.nodes.parameter_files import TABLES
 from koopman_ros.nodes.shipped import model_path
 from koopman_ros.testing import Harness, isolated_domain, NodeProcess
-from support.messages import temperature, TIMEOUT
+from support.messages import TIMEOUT
 
 # Ends.
 
 
-@pytest.mark.parametrize('number', [signal.SIGINT, signal.SIGTERM])
-@pytest.mark.parametrize('name', ['plant', 'controller', 'trainer'])
-def test_signal_ends_a_node_cleanly(ros: Harness, tmp_path: Path, name: str, number: int
-                                    ) -> None:
+@pytest.mark.parametrize(('name', 'number'), [
+    ('plant', signal.SIGINT), ('controller', signal.SIGTERM), ('trainer', signal.SIGINT)])
+def test_signal_ends_a_node_cleanly_that_needs_no_torch(
+        ros: Harness, tmp_path: Path, name: str, number: int) -> None:
+    program = (
+        'import sys\n'
+        'class NoTorch:\n'
+        '    def find_spec(self, name, path=None, target=None):\n'
+        '        if name.split(".")[0] == "torch":\n'
+        '            raise AssertionError("torch is imported")\n'
+        'sys.meta_path.insert(0, NoTorch())\n'
+        f'from koopman_ros.nodes.{name} import main\n'
+        'sys.exit(main())\n')
     # the plant is in the middle of a callback whenever the signal comes
     parameters = {'plant': {'speed': 0.0}, 'controller': {},
                   'trainer': {'output': tmp_path / 'bag'}}[name]
-    process = ros.start(name, parameters)
+    process = ros.start(name, parameters, command=(sys.executable, '-c', program))
     ros.meet(name)
     assert process.stop(number) == 0
     assert 'Traceback' not in process.output()
@@ -49,7 +57,7 @@ def test_signal_ends_a_node_cleanly(ros: Harness, tmp_path: Path, name: str, num
 
 
 @pytest.mark.parametrize(('name', 'number', 'code'), [
-    ('plant', signal.SIGINT, 0), ('plant', signal.SIGTERM, 0), ('replay', signal.SIGINT, 130)])
+    ('plant', signal.SIGTERM, 0), ('replay', signal.SIGINT, 130)])
 def test_signal_while_a_program_loads_ends_it_without_a_word(
         ros: Harness, name: str, number: int, code: int) -> None:
     program = (
@@ -72,14 +80,13 @@ def test_signal_before_the_interpreter_is_up_ends_a_node_cleanly(ros: Harness) -
     assert process.output() == ''
 
 
-@pytest.mark.parametrize('number', [signal.SIGINT, signal.SIGTERM])
-def test_signal_during_the_start_ends_a_node_cleanly(ros: Harness, number: int) -> None:
+def test_signal_during_the_start_ends_a_node_cleanly(ros: Harness) -> None:
     program = (
         'import os, sys\n'
         'from koopman_ros.nodes.plant import PlantNode\n'
         'from koopman_ros.nodes.process import run\n'
         'def create():\n'
-        f'    os.kill(os.getpid(), {int(number)})\n'
+        f'    os.kill(os.getpid(), {int(signal.SIGTERM)})\n'
         '    return PlantNode()\n'
         'sys.exit(run("plant", create))\n')
     process = ros.start('plant', command=(sys.executable, '-c', program))
@@ -87,20 +94,18 @@ def test_signal_during_the_start_ends_a_node_cleanly(ros: Harness, number: int) 
     assert 'Traceback' not in process.output()
 
 
-@pytest.mark.parametrize('number', [signal.SIGINT, signal.SIGTERM])
-def test_signal_at_the_end_of_the_interpreter_changes_nothing(ros: Harness, number: int
-                                                              ) -> None:
+def test_signal_at_the_end_of_the_interpreter_changes_nothing(ros: Harness) -> None:
     # what a module holds goes when the interpreter has given up its handlers
     program = (
         'import os, sys\n'
         'from koopman_ros.nodes.plant import PlantNode\n'
         'from koopman_ros.nodes.process import run\n'
         'class Late:\n'
-        f'    def __del__(self, kill=os.kill, own=(os.getpid(), {int(number)})):\n'
+        f'    def __del__(self, kill=os.kill, own=(os.getpid(), {int(signal.SIGINT)})):\n'
         '        kill(*own)\n'
         'late = Late()\n'
         'def create():\n'
-        f'    os.kill(os.getpid(), {int(number)})\n'
+        f'    os.kill(os.getpid(), {int(signal.SIGINT)})\n'
         '    return PlantNode()\n'
         'sys.exit(run("plant", create))\n')
     process = ros.start('plant', command=(sys.executable, '-c', program))
@@ -224,12 +229,10 @@ def test_help_is_read_as_far_as_somebody_wants_to() -> None:
     assert (done.returncode, done.stderr) == (0, b'')
 
 
-@pytest.mark.parametrize(('argument', 'code'), [('--help', 0), ('--speed=2.0', 2)])
-def test_program_answers_arguments_before_it_starts(
-        ros: Harness, argument: str, code: int) -> None:
+def test_program_answers_arguments_before_it_starts(ros: Harness) -> None:
     program = 'import sys; from koopman_ros.nodes.programs import plant; sys.exit(plant())'
-    process = ros.start('plant', command=(sys.executable, '-c', program, argument))
-    assert ros.wait_for_end(process) == code
+    process = ros.start('plant', command=(sys.executable, '-c', program, '--speed=2.0'))
+    assert process.wait() == 2
     assert 'started' not in process.output()
 
 
@@ -300,17 +303,6 @@ BAD_STARTS = {
     'out of range': BadStart(
         'controller', _parameters('controller', 'coolant_max: 500.0'),
         'coolant_max = 500.0 degC must be in [-50, 150] degC'),
-    'not a number': BadStart(
-        'controller', _parameters('controller', 'coolant_weight: .nan'),
-        'coolant_weight = nan 1/K^2 must be in (0, 1000000] 1/K^2'),
-    'no such choice': BadStart(
-        'trainer', _parameters('trainer', 'compression: gzip'),
-        "compression = 'gzip' must be one of none, zstd, lz4"),
-    'limits crossed': BadStart(
-        'plant', _parameters('plant', 'coolant_min: 120.0'),
-        'coolant_min = 120.0 degC must be below coolant_max = 100.0 degC'),
-    'no topics': BadStart(
-        'trainer', _parameters('trainer', "topics: ['']"), 'must hold at least one name'),
     'missing model': BadStart(
         'controller', _parameters('controller', 'model: /nowhere/lift.safetensors'),
         '/nowhere/lift.safetensors'),
@@ -346,32 +338,6 @@ def test_bad_start_says_why_in_one_line(bad_starts: dict[str, NodeProcess], name
     (line,) = process.output().splitlines()
     assert line.startswith(f'{case.node}: cannot start: ')
     assert case.words in line
-
-
-# What they import.
-
-
-@pytest.mark.parametrize('name', ['plant', 'controller'])
-def test_runs_where_torch_cannot_be_imported(ros: Harness, name: str) -> None:
-    program = (
-        'import sys\n'
-        'class NoTorch:\n'
-        '    def find_spec(self, name, path=None, target=None):\n'
-        '        if name.split(".")[0] == "torch":\n'
-        '            raise AssertionError("torch is imported")\n'
-        'sys.meta_path.insert(0, NoTorch())\n'
-        f'from koopman_ros.nodes.{name} import main\n'
-        'sys.exit(main())\n')
-    parameters = {'sample_period': 0.05} if name == 'plant' else {}
-    process = ros.start(name, parameters, command=(sys.executable, '-c', program))
-    if name == 'controller':
-        commands = ros.listen(Temperature, 'coolant_setpoint')
-        ros.speak(Temperature, 'temperature', to='controller').publish(temperature(51.0, 1.0))
-        ros.wait_until(lambda: commands)
-    else:
-        measurements = ros.listen(Temperature, 'temperature')
-        ros.wait_until(lambda: measurements)
-    assert process.stop() == 0
 
 
 # Where they are heard.

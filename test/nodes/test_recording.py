@@ -123,32 +123,15 @@ def test_kill_loses_no_more_than_the_last_second(killed: list[Killed]) -> None:
 
 def test_start_after_a_kill_takes_the_next_name(shared_ros: Harness, killed: list[Killed]
                                                 ) -> None:
-    left = [killed[0], next(case for case in killed if not case.bag.suffix)]
-    for case in left:
-        before = _contents(case.bag)
-        trainer = shared_ros.start('trainer', {'output': case.bag})
-        following = free_name(case.bag)
-        shared_ros.wait_until(following.exists)
-        assert trainer.stop() == 0
-        assert summary(following).complete
-        assert f'recording to {following}, because {case.bag} exists already' in trainer.output()
-        assert _contents(case.bag) == before
-
-
-@pytest.mark.parametrize('name', ['run', 'run.mcap'])
-def test_killed_before_the_first_message(ros: Harness, tmp_path: Path, name: str) -> None:
-    bag = tmp_path / name
-    first = ros.start('trainer', {'output': bag})
-    ros.wait_until(bag.exists)
-    first.stop(signal.SIGKILL)
-    second = ros.start('trainer', {'output': bag})
-    ros.wait_until(free_name(bag).exists)
-    assert second.stop() == 0
-    assert summary(tmp_path / name.replace('run', 'run_2')).complete
-
-
-def _contents(bag: Path) -> dict[Path, bytes]:
-    return {file: file.read_bytes() for file in (bag.iterdir() if bag.is_dir() else [bag])}
+    bag = next(case.bag for case in killed if not case.bag.suffix)
+    before = {file: file.read_bytes() for file in bag.iterdir()}
+    trainer = shared_ros.start('trainer', {'output': bag})
+    following = free_name(bag)
+    shared_ros.wait_until(following.exists)
+    assert trainer.stop() == 0
+    assert summary(following).complete
+    assert f'recording to {following}, because {bag} exists already' in trainer.output()
+    assert {file: file.read_bytes() for file in bag.iterdir()} == before
 
 
 @pytest.mark.parametrize(('wanted', 'free'), [
@@ -166,10 +149,9 @@ def test_free_name(tmp_path: Path, wanted: str, free: str) -> None:
 # Split.
 
 
-@pytest.mark.parametrize('limit', [{'max_bag_duration': 0.3}, {'max_bag_size': 0.01}])
-def test_split_bag_reads_as_one(ros: Harness, tmp_path: Path, limit: dict[str, float]) -> None:
+def test_split_bag_reads_as_one(ros: Harness, tmp_path: Path) -> None:
     bag = tmp_path / 'run'
-    trainer = ros.start('trainer', {'output': bag, 'topics': [TOPIC], **limit})
+    trainer = ros.start('trainer', {'output': bag, 'topics': [TOPIC], 'max_bag_size': 0.01})
     publisher = ros.speak(Temperature, topics.TEMPERATURE, to='trainer')
     sent: list[int] = []
 
@@ -249,16 +231,14 @@ def test_too_little_room_stops_the_recording_but_not_the_node(ros: Harness, tmp_
     assert trainer.stop() == 0
 
 
-@pytest.mark.parametrize(('size', 'limit', 'complete'), [(6, 4.0, True), (3, 0.0, False)])
-def test_small_disk_runs_full(ros: Harness, tmp_path: Path, size: int, limit: float,
-                              complete: bool) -> None:
+def test_small_disk_runs_full(ros: Harness, tmp_path: Path) -> None:
     (disk := tmp_path / 'disk').mkdir()
     private = ('unshare', '--user', '--map-root-user', '--mount', 'sh', '-c',
-               f'mount -t tmpfs -o size={size}m tmpfs {disk} && exec "$@"', 'sh')
+               f'mount -t tmpfs -o size=3m tmpfs {disk} && exec "$@"', 'sh')
     if subprocess.run([*private, 'true'], capture_output=True, check=False).returncode:
         pytest.skip('only some machines lend a disk of its own to a process')
     trainer = ros.start(
-        'trainer', {'output': disk / 'run.mcap', 'topics': ['notes'], 'min_free_disk': limit},
+        'trainer', {'output': disk / 'run.mcap', 'topics': ['notes'], 'min_free_disk': 0.0},
         command=(*private, sys.executable, '-m', 'koopman_ros.nodes.trainer'))
     notes = ros.speak(String, 'notes', to='trainer')
     page = 'x' * 100_000
@@ -271,7 +251,7 @@ def test_small_disk_runs_full(ros: Harness, tmp_path: Path, size: int, limit: fl
     found = [m.message.data == page for m in read_messages(bag, recover=True)]
     assert len(found) > 15
     assert all(found)
-    assert summary(bag).complete == complete
+    assert not summary(bag).complete
     assert summary(bag).message_count == len(found)
     assert trainer.stop() == 0
     assert 'Traceback' not in trainer.output()
