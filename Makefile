@@ -12,7 +12,7 @@ export ROS_AUTOMATIC_DISCOVERY_RANGE ?= LOCALHOST
 # How many seeds each experiment is run from: make studies SEEDS=5
 SEEDS ?= 20
 
-.PHONY: help demo demo-retrain test test-machines lint models studies studies-sensors studies-robustness bench faults config lock clean
+.PHONY: help demo demo-retrain test test-machines lint models studies studies-sensors studies-robustness bench faults docs config lock clean
 
 help:  ## show this list
 	@grep -E '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed 's/:.*## /\t/'
@@ -38,6 +38,10 @@ $(VENV)/train.stamp: setup.py $(LOCK) | $(BIN)/python
 
 $(VENV)/retrain.stamp: setup.py $(LOCK) $(VENV)/run.stamp
 	$(INSTALL) --editable '.[ros,demo,train]'
+	@touch $@
+
+$(VENV)/docs.stamp: setup.py $(LOCK) | $(BIN)/python
+	$(INSTALL) --editable '.[docs]'
 	@touch $@
 
 $(VENV)/bench.stamp: setup.py $(LOCK) $(VENV)/run.stamp
@@ -84,6 +88,10 @@ bench: $(VENV)/bench.stamp  ## speed beside other programs, thirteen minutes (BE
 
 faults: $(VENV)/run.stamp  ## put faults into the loop, and soak it for a day, ten minutes (FAULTS=--quick: half a one) -> out/faults
 	$(BIN)/python -m validation.faults $(FAULTS)
+
+docs: $(VENV)/docs.stamp  ## the pages and a reference of the Python API, half a minute -> out/docs
+	$(BIN)/python -m sphinx --quiet --fail-on-warning --keep-going --fresh-env \
+	  --doctree-dir out/docs/.doctrees docs out/docs
 
 config: $(VENV)/run.stamp  ## write config/*.yaml and the SROS2 policy from their tables
 	$(BIN)/python -m koopman_ros.nodes.parameter_files

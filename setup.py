@@ -49,6 +49,7 @@ setup(
         'train': ['torch==2.13.0', 'joblib', 'tqdm'],
         # what validation and benchmarks compare with
         'bench': ['casadi==3.8.2', 'control', 'psutil'],
+        'docs': ['furo', 'myst-parser', 'sphinx'],
         'test': [
             'colcon-common-extensions',
             'control',

@@ -36,9 +36,9 @@ class MessageDefinition:
     """
     What a reader needs to know of a message type to decode it without ROS.
 
-    `type_name` is the full name ('sensor_msgs/msg/Temperature'), `text` the definition followed
-    by those of all its fields (encoding 'ros2msg'), `type_hash` the REP-2016 hash
-    ('RIHS01_' and 64 hexadecimal digits).
+    :param type_name: full name, e.g. ``sensor_msgs/msg/Temperature``.
+    :param text: the definition followed by those of all its fields (encoding ``ros2msg``).
+    :param type_hash: of REP 2016, ``RIHS01_`` and 64 hexadecimal digits.
     """
 
     type_name: str

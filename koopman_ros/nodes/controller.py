@@ -51,7 +51,7 @@ _ATTEMPTS = 2
 
 class ControllerNode(LoopNode):
     """
-    Carry messages to and from the control step; see the README for topics and services.
+    Carry messages to and from the control step; docs/interfaces.md has its topics and services.
 
     All runs in the executor's thread, but for the watch over silence: while that thread is busy,
     the watchdog's does it. The lock is held where the state changes and its command goes out, not

@@ -61,7 +61,7 @@ class Phase(Enum):
 
 
 class PlantNode(LoopNode):
-    """Run a reactor in time; see the README for topics and services."""
+    """Run a reactor in time; docs/interfaces.md has its topics and services."""
 
     def __init__(self) -> None:
         super().__init__('plant')

@@ -18,7 +18,7 @@ from koopman_ros.nodes.training_job import JobState
 
 
 class TrainerNode(LoopNode):
-    """Compose what the trainer does; see the README for topics and services."""
+    """Compose what the trainer does; docs/interfaces.md has its topics and services."""
 
     def __init__(self) -> None:
         super().__init__('trainer')
