@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import os
 from pathlib import Path
+import re
 import signal
 import sys
 import time
@@ -90,6 +91,14 @@ def test_process_that_was_stopped_ends_in_order(tmp_path: Path) -> None:
                          command=(sys.executable, '-c', program))
     os.waitid(os.P_PID, halted.process.pid, os.WSTOPPED)
     assert halted.stop() == 7
+
+
+def test_example_of_the_page_passes(tmp_path: Path) -> None:
+    page = Path(__file__).parents[2] / 'docs' / 'testing.md'
+    _, example, _ = re.split('```(?:python)?\n', page.read_text())
+    exec(example, names := {})
+    (test,) = (found for name, found in names.items() if name.startswith('test_'))
+    test(tmp_path)
 
 
 # What is left when this process is killed.
