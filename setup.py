@@ -36,8 +36,8 @@ setup(
     data_files=_data_files(),
     python_requires='>=3.11',
     zip_safe=True,
-    install_requires=['setuptools', 'numpy', 'scipy', 'PyYAML', 'mcap>=1.5', 'mcap-ros2-support',
-                      'lz4', 'zstandard'],
+    install_requires=['setuptools', 'numpy', 'scipy', 'PyYAML', 'pint', 'mcap>=1.5',
+                      'mcap-ros2-support', 'lz4', 'zstandard'],
     extras_require={
         # A sourced ROS 2 installation brings these itself; elsewhere PyPI does.
         'ros': [

@@ -14,9 +14,11 @@ from numpy.typing import NDArray
 from koopman_ros.control.laws import Feedback, feedback, Weights
 from koopman_ros.control.target import steady_state_target, Target
 from koopman_ros.lifting import LiftedModel
+from koopman_ros.reasons import Code, reason, Words
+from koopman_ros.units import Displays
 
 Array = NDArray[np.float64]
-Law = Callable[..., Feedback]
+FeedbackFunction = Callable[..., Feedback]
 # dx/dt (n_x,) of a state (n_x,) and an input (n_u,), all in units
 Rate = Callable[[Array, Array], Array]
 
@@ -43,13 +45,15 @@ class ClosedLoop:
         """Return how far the path leaves the training box, in halves of its width."""
         return max(model.states.violation(x) for x in self.states)
 
+WORDS = Words(Displays({}))
+
 
 class _Failed(Exception):  # noqa: N818
     """The loop cannot go on; the message says why."""
 
 
 def run_closed_loop(model: LiftedModel, rate: Rate, x0: Array, x_ref: Array, weights: Weights,
-                    duration: float, *, law: Law = feedback, samples: int = 301,
+                    duration: float, *, law: FeedbackFunction = feedback, samples: int = 301,
                     rtol: float = 1e-8, u_ref: Array | None = None, escape: float = 10.0,
                     max_evaluations: int = 20_000) -> ClosedLoop:
     """
@@ -80,7 +84,7 @@ def run_closed_loop(model: LiftedModel, rate: Rate, x0: Array, x_ref: Array, wei
         xi = model.states.to_deviation(x)
         found = law(model, xi, target, weights)
         if not found.solved:
-            raise _Failed(found.riccati.status.value)
+            raise _Failed(WORDS(reason(Code(found.riccati.status.value))))
         return xi, found.u
 
     def flow(_: float, y: Array) -> Array:

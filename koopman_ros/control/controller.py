@@ -13,18 +13,29 @@ import numpy as np
 from numpy.typing import NDArray
 
 from koopman_ros.control import setpoint as setpoints
-from koopman_ros.control.choice import LawChoice
-from koopman_ros.control.estimation import Estimator
-from koopman_ros.control.ladder import Rung, Standing
-from koopman_ros.control.laws import Weights
+from koopman_ros.control.estimating import Estimating
+from koopman_ros.control.laws import LawResult
+from koopman_ros.control.levels import Level, levels_of
 from koopman_ros.control.limits import finite, limit
-from koopman_ros.control.observer import equivalent_bias, Estimate
-from koopman_ros.control.sensor import Verdict
-from koopman_ros.control.setpoint import NANOSECONDS
-from koopman_ros.control.state import amended, Mode, Report, Settings, State
+from koopman_ros.control.report import (
+    Arrival,
+    CommandReport,
+    EstimateReport,
+    MeasurementReport,
+    Report,
+    TargetReport,
+)
+from koopman_ros.control.settings import Settings
+from koopman_ros.control.state import amended, Mode, State
+from koopman_ros.control.supervisor import HOLD, MANUAL, Requested, SAFE, Supervisor
+from koopman_ros.control.target import Target
 from koopman_ros.control.transfer import Transfer
 from koopman_ros.control.way_back import leads_home, Rest, rest_under, WayBack
+from koopman_ros.estimation import equivalent_bias, Estimate, Verdict
 from koopman_ros.lifting import LiftedModel
+from koopman_ros.reasons import Code, Reason, reason
+from koopman_ros.signals import Outputs
+from koopman_ros.units import NANOSECONDS
 
 Array = NDArray[np.float64]
 
@@ -35,71 +46,97 @@ LATE_NANOSECONDS = NANOSECONDS
 
 
 @dataclass(frozen=True)
+class _Choice:
+    """
+    The level that acts, and what the last law that was tried gives.
+
+    :param supervisor: its new state.
+    :param target: of that law, or None when none was tried.
+    :param result: of that law, or None.
+    """
+
+    supervisor: Supervisor
+    target: Target | None = None
+    result: LawResult | None = None
+
+
+@dataclass(frozen=True)
 class Controller:
     """
     A lifted model with its tuning; every method is pure and returns a new state.
 
     :param model: the lift.
     :param settings: the tuning.
-    :param show: how values of the state are written in reasons.
+    :param outputs: what is measured; every state by default.
+    :raises ValueError: when the settings do not fit the model's signals, or what is measured
+        does not determine the state.
     """
 
     model: LiftedModel
     settings: Settings
-    show: setpoints.Show = setpoints.in_state_units
+    outputs: Outputs | None = None
+
+    def __post_init__(self) -> None:
+        self.settings.check(self.model, self.measured)
+        self.measured.state(np.zeros(len(self.measured.names)))
+        levels_of(self.model, self.settings)
 
     @cached_property
-    def _estimator(self) -> Estimator:
-        return Estimator(self.model, self.settings, self.show)
+    def measured(self) -> Outputs:
+        """What is measured: y = C x."""
+        states = self.model.states
+        return self.outputs or Outputs(states.names, states.units, np.eye(self.model.n_x))
 
     @cached_property
-    def _laws(self) -> LawChoice:
-        return LawChoice(self._estimator)
+    def levels(self) -> dict[str, Level]:
+        """The levels with a law, by name, best first."""
+        return levels_of(self.model, self.settings)
 
-    @property
-    def weights(self) -> Weights:
-        """The cost in the model's scaled deviations."""
-        return self._laws.weights
+    @cached_property
+    def _estimating(self) -> Estimating:
+        return Estimating(self.model, self.measured, self.settings, self.levels)
 
     @cached_property
     def safe_input(self) -> Array:
         """What is commanded when nothing else can be, (n_u,) in input units."""
-        given = self.settings.safe_input
-        return _kept(self.settings.limits.within(
-            self.model.inputs.center if given is None else given))
+        return _kept(self.settings.limits.within(self.settings.safe_input))
 
     @cached_property
     def _nominal_input(self) -> Array:
         return _kept(self.settings.limits.within(self.model.inputs.center))
 
     @cached_property
+    def _ranges(self) -> tuple[tuple[str, float, float], ...]:
+        states = self.model.states
+        return tuple(zip(states.names, states.lower.tolist(), states.upper.tolist(), strict=True))
+
+    @cached_property
     def rest(self) -> Rest:
         """Where the safe input leads the plant, as far as the model tells."""
-        return rest_under(self.model, self.safe_input, self.settings.ladder.return_margin)
+        return rest_under(self.model, self.safe_input, self.settings.supervisor.return_margin)
 
     # What the operator asks for.
 
     def request_setpoint(self, state: State, value: Array, effective_ns: int = 0
-                         ) -> tuple[State, str]:
+                         ) -> tuple[State, Reason | None]:
         """
         Ask for a set-point, at once or from a later time on.
 
         :param state: the present state.
         :param value: (n_x,) in state units.
         :param effective_ns: stamp from which it holds; see :func:`setpoint.request`.
-        :return: the new state with an empty string, or the old one with the reason of refusal.
+        :return: the new state and None, or the old one with the reason of refusal.
         """
-        reason = setpoints.refusal(self.model, value, self.show)
-        if reason:
-            return state, reason
+        refusal = setpoints.refusal(self.model, value)
+        if refusal is not None:
+            return state, refusal
         if (len(state.setpoint.scheduled) >= setpoints.MAX_SCHEDULED
                 and setpoints.lies_ahead(effective_ns, state.time_ns)):
-            return state, (f'{setpoints.MAX_SCHEDULED} set-points are scheduled already: wait '
-                           'until some have taken effect, or send this one with stamp 0')
+            return state, reason(Code.SCHEDULE_FULL, most=setpoints.MAX_SCHEDULED)
         return amended(state, setpoint=setpoints.request(
-            state.setpoint, _kept(value), effective_ns, state.time_ns)), ''
+            state.setpoint, _kept(value), effective_ns, state.time_ns)), None
 
-    def request_manual_input(self, state: State, value: Array) -> tuple[State, str]:
+    def request_manual_input(self, state: State, value: Array) -> tuple[State, Reason | None]:
         """
         Set the input that manual mode commands; refused in automatic mode.
 
@@ -108,10 +145,11 @@ class Controller:
         :return: as :meth:`request_setpoint`.
         """
         if state.mode is not Mode.MANUAL:
-            return state, 'manual command refused in automatic mode: switch to manual mode first'
-        if not np.all(np.isfinite(value)):
-            return state, f'manual command {value.tolist()} is not finite: the old one is kept'
-        return amended(state, manual_input=_kept(value)), ''
+            return state, reason(Code.NOT_IN_MANUAL_MODE)
+        for name, number in zip(self.model.inputs.names, value.tolist(), strict=True):
+            if not math.isfinite(number):
+                return state, reason(Code.MANUAL_NOT_FINITE, signal=name, value=number)
+        return amended(state, manual_input=_kept(value)), None
 
     def set_mode(self, state: State, mode: Mode) -> State:
         """
@@ -122,56 +160,63 @@ class Controller:
         """
         if mode is state.mode:
             return state
-        return amended(state, mode=mode, manual_input=None, standing=Standing(), way_back=None,
-                       estimate=self._estimator.rebase(state.estimate, state.linear, False))
+        estimating = self._estimating
+        best = amended(state, supervisor=Supervisor())
+        return amended(state, mode=mode, manual_input=None, supervisor=Supervisor(),
+                       way_back=None, estimate=estimating.rebase(
+                           state.estimate, estimating.level(state), estimating.level(best)))
 
     # What happens to the controller itself.
 
-    def take_over(self, state: State, command: Array) -> State:
+    def take_over(self, state: State, applied: Array) -> State:
         """
-        Start from the input that is in force already, as after a restart.
+        Start from the input that is applied already, as after a restart.
 
         :param state: before its first command; afterwards nothing is changed.
-        :param command: (n_u,) in input units; ignored when not finite.
+        :param applied: (n_u,) in input units; ignored when not finite.
         """
-        if state.command is not None or not np.all(np.isfinite(command)):
+        if state.command is not None or not np.all(np.isfinite(applied)):
             return state
-        return amended(state, command=_kept(self.settings.limits.within(command)))
+        return amended(state, command=_kept(self.settings.limits.within(applied)))
 
     def succeed(self, predecessor: Controller, state: State) -> State:
         """
         Take the place of a controller with other settings or another model, without a bump.
 
         What the two laws ask for in the present state differs by an offset that fades; what is
-        believed of the plant's rate stays.
+        estimated of the plant's rate stays.
 
-        :param predecessor: that has been in force.
+        :param predecessor: that acted so far.
         :param state: the state it left.
         :return: the state in this controller's units.
         """
-        state = self._estimator.inherit(predecessor._estimator, state)
-        if state.law_in_force is None or state.law_input is None or state.estimate is None:
+        state = self._estimating.inherit(predecessor._estimating, state)
+        if state.law is None or state.law_input is None or state.estimate is None:
             return state
-        now = self._laws.attempt(state, state.law_in_force, state.estimate)
+        level = self.levels.get(state.law)
+        if level is None or state.setpoint.active is None:
+            return state
+        now = level.compute(state.setpoint.active, state.estimate, self.settings.limits, None,
+                            0.0)[1]
         if now.u is None:
             return state
-        return amended(state, law_input=now.u, transfer=_shifted(
+        return amended(state, law_input=now.u, law_memory=now.memory, transfer=_shifted(
             state.transfer, state.law_input - now.u))
 
-    def try_law(self, x: Array, setpoint: Array) -> str:
+    def try_law(self, x: Array, setpoint: Array) -> Reason | None:
         """
-        Say why the learned law cannot act at a state (n_x,) towards a set-point (n_x,).
+        Return why the best law cannot act at a state (n_x,) towards a set-point (n_x,), or None.
 
-        :return: an empty string when it can.
+        Both are in state units.
         """
-        state = amended(State(), setpoint=setpoints.Setpoint(setpoint, setpoint))
+        level = next(iter(self.levels.values()))
         estimate = Estimate(self.model.states.to_deviation(x), np.zeros(self.model.n_x))
         with np.errstate(all='ignore'):
-            return self._laws.attempt(state, Rung.LEARNED, estimate).problem
+            return level.compute(setpoint, estimate, self.settings.limits, None, 0.0)[1].failure
 
     # Steps.
 
-    def step(self, state: State, measurement: Array, time_ns: int, acting: Array | None = None
+    def step(self, state: State, y: Array, time_ns: int, applied: Array | None = None
              ) -> tuple[State, Array, Report]:
         """
         Answer one measurement.
@@ -181,19 +226,19 @@ class Controller:
         ramp and rate limit count twice the interval before it, not the gap.
 
         :param state: as returned by the step before.
-        :param measurement: (n_x,) measured state, in state units.
+        :param y: (n_y,) measured, in the signals' units.
         :param time_ns: its stamp.
-        :param acting: (n_u,) the input that was found in force then, where it is measured; see
-            :meth:`Estimator.in_force`.
+        :param applied: (n_u,) the input that was found to act then, where it is measured; see
+            :meth:`Estimating.applied`.
         :return: the new state, the command (n_u,) in input units, always finite and within the
             limits, and the report.
         """
+        outside = self._outside(y)
         ahead = 1 if state.time_ns is None else time_ns - state.time_ns
         if state.command is not None and -LATE_NANOSECONDS <= ahead <= 0:
-            report = self._report(state, state.standing.rung, state.standing.reason)
             return state, state.command, amended(
-                report, outside=self._outside(measurement), late=ahead < 0,
-                clock_stood_still=ahead == 0)
+                self._report(state, state.supervisor.reason), measurement=MeasurementReport(
+                    Arrival.LATE if ahead < 0 else Arrival.REPEATED, outside))
         back = ahead < 0
         if back:
             state = _afresh(state)
@@ -207,25 +252,20 @@ class Controller:
         state, seconds, missed = _passed(state, time_ns, elapsed)
         # a measurement of 1e300 may overflow on its way; the result is checked and limited
         with np.errstate(all='ignore'):
-            u, follows = self._estimator.in_force(state, acting)
-            state, verdict, predicted = self._estimator.observe(
-                state, measurement, time_ns, elapsed, u)
-            if not verdict.fault:
+            u, follows = self._estimating.applied(state, applied)
+            state, verdict, predicted = self._estimating.observe(state, y, time_ns, elapsed, u)
+            if verdict.fault is None:
                 state = amended(state, setpoint=setpoints.advance(
-                    state.setpoint, measurement, self.model, self.settings.setpoint_ramp,
-                    time_ns, seconds, self.settings.setpoint_filter))
-            outside = self._outside(measurement)
-            state, wanted, report = self._wanted(
-                state, verdict, outside, time_ns, elapsed, spacing)
-        # without elapsed time the rate limit holds the last command
-        limited = limit(self.settings.limits, wanted, state.command, seconds)
-        state = amended(state, command=limited.u, commanded_ns=time_ns)
-        return state, limited.u, amended(
-            report, outside=outside, at_range=report.at_range or limited.at_range,
-            at_rate=limited.at_rate,
-            input_outside=self.model.inputs.violation(limited.u), missed=missed,
-            predicted=predicted, clock_went_back=back, follows=follows,
-            believed=not verdict.fault)
+                    state.setpoint, self.measured.state(y), self.model,
+                    self.settings.setpoint_ramp, time_ns, seconds,
+                    self.settings.setpoint_filter))
+            # without elapsed time the rate limit holds the last command
+            state, command, report = self._command(
+                state, verdict, outside, time_ns, elapsed, seconds, spacing)
+        return amended(state, commanded_ns=time_ns), command, amended(
+            report, measurement=MeasurementReport(
+                Arrival.ACCEPTED if verdict.fault is None else Arrival.REJECTED, outside,
+                predicted, missed, back, follows))
 
     def watch(self, state: State, time_ns: int) -> tuple[State, Array | None, Report]:
         """
@@ -237,17 +277,14 @@ class Controller:
         """
         since_ns = state.commanded_ns
         if state.command is None or state.time_ns is None or since_ns is None:
-            return state, None, Report(state.mode)
+            return state, None, self._report(state, None)
         elapsed = max(0.0, (time_ns - since_ns) / NANOSECONDS)
         with np.errstate(all='ignore'):
-            state = self._estimator.coast(state, elapsed, self._estimator.in_force(state)[0])
-            state, wanted, report = self._wanted(state, Verdict(
-                state.sensed, 'no measurement arrives: check sensor and plant'),
-                np.nan, time_ns, elapsed)
-        limited = limit(self.settings.limits, wanted, state.command, elapsed)
-        state = amended(state, command=limited.u, commanded_ns=max(time_ns, since_ns))
-        return state, limited.u, amended(report, at_range=limited.at_range,
-                                         at_rate=limited.at_rate)
+            state = self._estimating.coast(state, elapsed, self._estimating.applied(state)[0])
+            state, command, report = self._command(
+                state, Verdict(state.accepted, reason(Code.NO_MEASUREMENT)), np.nan, time_ns,
+                elapsed, elapsed)
+        return amended(state, commanded_ns=max(time_ns, since_ns)), command, report
 
     def equivalent_bias(self, state: State) -> Array:
         """
@@ -257,85 +294,142 @@ class Controller:
         """
         if state.estimate is None:
             return np.full(self.model.n_x, np.nan)
-        model = self._estimator.observer(state.linear).model
+        model = self._estimating.level(state).model
         return equivalent_bias(model, state.estimate) * self.model.states.scale
 
-    def _wanted(self, state: State, verdict: Verdict, outside: float, time_ns: int,
-                elapsed: float, spacing: float = 0.0) -> tuple[State, Array, Report]:
-        """Return the command before limits with what is known of it."""
-        held = self.model.inputs.center if state.command is None else state.command
+    def _command(self, state: State, verdict: Verdict, outside: float, time_ns: int,
+                 elapsed: float, seconds: float, spacing: float = 0.0
+                 ) -> tuple[State, Array, Report]:
+        """
+        Return the command within its limits, with what is known of it.
+
+        :param elapsed: seconds since the last command.
+        :param seconds: that count for the rate limit.
+        :param spacing: of the samples in seconds, 0 when it is not known.
+        """
         transfer = state.transfer and state.transfer.after(elapsed, self.settings.transfer_time)
         if state.mode is Mode.MANUAL:
+            held = self.model.inputs.center if state.command is None else state.command
             wanted = held if state.manual_input is None else state.manual_input
-            state = amended(state, law_in_force=None, law_input=None, transfer=None)
-            return state, wanted, self._report(state, Rung.LEARNED, verdict.fault)
-        standing, attempt = self._laws.choose(state, verdict, outside, time_ns, spacing)
-        was_linear = state.linear
-        state = amended(state, standing=standing, way_back=self._way_back(
-            state, standing, verdict, outside, time_ns))
-        if state.linear != was_linear:
-            state = amended(state, estimate=self._estimator.rebase(
-                state.estimate, was_linear, state.linear))
-        report = self._report(state, standing.rung, standing.reason)
-        if attempt is not None and attempt.found is not None:
-            riccati = attempt.found.riccati
-            report = amended(report, residual=riccati.residual, gain=riccati.gain,
-                             growth=attempt.growth, mismatch=attempt.target.mismatch,
-                             law=None if attempt.u is None else attempt.found.law,
-                             at_range=attempt.clipped)
-        if attempt is None or attempt.u is None or attempt.found is None:
-            if standing.rung is Rung.SAFE:
-                state = amended(state, law_in_force=None, law_input=None, transfer=None)
+            state = _without_law(state)
+            report, done = self._report(state, verdict.fault), CommandReport()
+        else:
+            choice = self._choose(state, verdict, outside, time_ns, spacing)
+            state = self._supervised(state, choice.supervisor, verdict, outside, time_ns)
+            state, wanted, done = self._act(state, choice, transfer)
+            report = self._report(state, state.supervisor.reason)
+            if choice.target is not None and report.target is not None:
+                report = amended(report, target=amended(
+                    report.target, residual=choice.target.residual))
+        limited = limit(self.settings.limits, wanted, state.command, seconds)
+        return amended(state, command=limited.u), limited.u, amended(
+            report, command=amended(
+                done, at_range=done.at_range or limited.at_range, at_rate=limited.at_rate,
+                outside=self.model.inputs.violation(limited.u)))
+
+    def _choose(self, state: State, verdict: Verdict, outside: float, time_ns: int,
+                spacing: float) -> _Choice:
+        """Find the best level that may act, and what its law gives."""
+        settings, estimating = self.settings.supervisor, self._estimating
+        if verdict.fault is not None:
+            requested = Requested(HOLD, verdict.fault, passing=True)
+        else:
+            requested = state.supervisor.allowed(settings, outside, self._ranges)
+        target, result = None, None
+        while True:
+            supervisor = state.supervisor.at(settings, requested, time_ns)
+            level = self.levels.get(supervisor.level or '')
+            if level is None or state.estimate is None or state.setpoint.active is None:
+                return _Choice(supervisor, target, result)
+            estimate = estimating.rebase(state.estimate, estimating.level(state), level)
+            assert estimate is not None
+            memory = state.law_memory if state.law == level.name else None
+            target, result = level.compute(
+                state.setpoint.active, estimate, self.settings.limits, memory, spacing)
+            if result.failure is None:
+                return _Choice(supervisor, target, result)
+            below = settings.order[settings.depth(level.name) + 1]
+            requested = Requested(below, reason(
+                Code.LAW_FAILED, level=level.name, cause=result.failure))
+
+    def _supervised(self, state: State, supervisor: Supervisor, verdict: Verdict,
+                    outside: float, time_ns: int) -> State:
+        """Take over the supervisor's new state."""
+        estimating, before = self._estimating, self._estimating.level(state)
+        state = amended(state, supervisor=supervisor, way_back=self._way_back(
+            state, supervisor, verdict, outside, time_ns))
+        now = estimating.level(state)
+        if now is not before:
+            state = amended(state, estimate=estimating.rebase(state.estimate, before, now))
+        return state
+
+    def _act(self, state: State, choice: _Choice, transfer: Transfer | None
+             ) -> tuple[State, Array, CommandReport]:
+        """Return the command before limits of the level that acts."""
+        held = self.model.inputs.center if state.command is None else state.command
+        level, result = state.supervisor.level, choice.result
+        done = CommandReport()
+        if result is not None:
+            done = CommandReport(result.figures, at_range=result.clipped)
+        if result is None or result.u is None:
+            if result is not None:
+                done = amended(done, law=amended(result.figures, form=''))
+            if level == SAFE:
+                state = _without_law(state)
                 share = 0.0 if state.way_back is None else state.way_back.share
                 if not share:
-                    return state, self.safe_input, report
+                    return state, self.safe_input, done
                 wanted = self.safe_input + share * (self._nominal_input - self.safe_input)
-                return state, wanted, amended(report, way_back=share)
-            passing = standing.resumes is not None
-            return (state if passing else amended(state, law_in_force=None, law_input=None),
-                    held, report)
-        if state.law_in_force is not standing.rung and state.command is not None:
+                return state, wanted, amended(done, way_back=share)
+            passing = state.supervisor.resumes is not None
+            return (state if passing else amended(state, law=None, law_input=None,
+                                                  law_memory=None), held, done)
+        if state.law != level and state.command is not None:
             # somebody else has commanded so far
-            transfer = _shifted(None, held - attempt.u)
-        state = amended(state, law_in_force=standing.rung, law_input=attempt.u,
+            transfer = _shifted(None, held - result.u)
+        state = amended(state, law=level, law_input=result.u, law_memory=result.memory,
                         transfer=transfer)
         if transfer is None:
-            return state, attempt.u, report
-        return state, attempt.u + transfer.offset, amended(report, transfer=transfer.offset)
+            return state, result.u, done
+        return state, result.u + transfer.offset, amended(done, transfer=transfer.offset)
 
-    def _way_back(self, state: State, standing: Standing, verdict: Verdict, outside: float,
+    def _way_back(self, state: State, supervisor: Supervisor, verdict: Verdict, outside: float,
                   time_ns: int) -> WayBack | None:
         """Return how far the plant has come back where the safe input keeps it outside."""
-        if standing.rung is not Rung.SAFE or verdict.fault or verdict.sensed is None:
+        if supervisor.level != SAFE or verdict.fault is not None or verdict.accepted is None:
             return None
-        if outside > 0.0 and not leads_home(self.model, verdict.sensed.value, self.safe_input,
-                                            self._nominal_input):
+        if outside > 0.0 and not leads_home(
+                self.model, self.measured.state(verdict.accepted.value), self.safe_input,
+                self._nominal_input):
             return None
         if state.way_back is not None:
-            return state.way_back.moved(outside, time_ns, self.settings.ladder.recovery_time)
+            return state.way_back.moved(outside, time_ns, self.settings.supervisor.recovery_time)
         # where laws failed, or one may act soon, it is not the distance that keeps them off
-        kept_out = standing.bad_since_ns is None and standing.better_since_ns is None
+        kept_out = supervisor.bad_since_ns is None and supervisor.better_since_ns is None
         return WayBack(outside, outside, time_ns) if kept_out and outside > 0.0 else None
 
-    def _outside(self, x: Array) -> float:
+    def _outside(self, y: Array) -> float:
         """Return how far a measurement is from the training data; NaN when it is none."""
-        return self.model.distance(x) if finite(x) else np.nan
+        return self.model.distance(self.measured.state(y)) if finite(y) else np.nan
 
-    def _report(self, state: State, rung: Rung, reason: str) -> Report:
+    def _report(self, state: State, why: Reason | None) -> Report:
         """Return what is known without a law."""
         estimate, active = state.estimate, state.setpoint.active
-        outside = np.nan if active is None else self.model.states.violation(active)
+        order = self.settings.supervisor.order
+        if state.mode is Mode.MANUAL:
+            level, depth = MANUAL, len(order)
+        else:
+            depth = self.settings.supervisor.depth(state.supervisor.level)
+            level = order[depth]
+        report = Report(state.mode, level, depth, why, target=None if active is None else (
+            TargetReport(active, self.model.states.violation(active))))
         if estimate is None:
-            return Report(state.mode, rung, reason, active_setpoint=active,
-                          setpoint_outside=outside)
-        observer = self._estimator.observer(state.linear)
-        disturbance = observer.as_input(estimate.w)
-        return Report(
-            state.mode, rung, reason, active_setpoint=active, setpoint_outside=outside,
-            estimate=self.model.states.to_physical(estimate.x),
-            disturbance=disturbance * self.model.inputs.scale,
-            at_bound=math.sqrt(disturbance.dot(disturbance)) >= (
-                observer.max_disturbance * (1.0 - 1e-9)))
+            return report
+        estimator = self._estimating.level(state).estimator
+        return amended(report, estimate=EstimateReport(
+            self.model.states.to_physical(estimate.x),
+            estimator.as_input(estimate.w) * self.model.inputs.scale,
+            estimator.at_bound(estimate.w)))
 
 
 def _passed(state: State, time_ns: int, elapsed: float) -> tuple[State, float, int]:
@@ -358,9 +452,13 @@ def _passed(state: State, time_ns: int, elapsed: float) -> tuple[State, float, i
 
 def _afresh(state: State) -> State:
     """Return the state after the clock was set back: what was timed by it has lost its meaning."""
-    standing = amended(state.standing, bad_since_ns=None, better_since_ns=None)
-    return amended(state, time_ns=None, commanded_ns=None, sensed=None, standing=standing,
+    supervisor = amended(state.supervisor, bad_since_ns=None, better_since_ns=None)
+    return amended(state, time_ns=None, commanded_ns=None, accepted=None, supervisor=supervisor,
                    way_back=None, setpoint=amended(state.setpoint, scheduled=()))
+
+
+def _without_law(state: State) -> State:
+    return amended(state, law=None, law_input=None, law_memory=None, transfer=None)
 
 
 def _shifted(transfer: Transfer | None, by: Array) -> Transfer:

@@ -14,12 +14,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from koopman_ros.control.controller import LATE_NANOSECONDS
-from koopman_ros.control.setpoint import in_state_units, NANOSECONDS, Show
+from koopman_ros.reasons import Code, Reason, reason
+from koopman_ros.units import NANOSECONDS
 
 Array = NDArray[np.float64]
 
-_FOLLOWS_WITHIN = 0.01  # K
-_COMES_NEARER = 1e-4  # K, less than any rate limit allows
+_FOLLOWS_WITHIN = 0.01  # in the input's unit
+_COMES_NEARER = 1e-4  # likewise, less than any rate limit allows
 
 
 class Phase(Enum):
@@ -37,15 +38,16 @@ class Experiment:
     Steps of random height and length (paper, section on the reactor), and what ends them.
 
     :param duration: s.
-    :param input_lower: lowest level, in K; levels are uniform between the two.
-    :param input_upper: highest level, in K.
+    :param input_lower: lowest level, in the input's unit; levels are uniform between the two.
+    :param input_upper: highest level.
     :param hold_shortest: shortest time of a level, in s; times are uniform between the two.
     :param hold_longest: longest time of a level, in s.
-    :param rate: largest change of the input, in K/s.
-    :param state_lower: lowest temperature of the reactor that may be measured, in K.
-    :param state_upper: highest temperature, in K.
-    :param safe_input: input that is safe whatever happened, in K.
+    :param rate: largest change of the input, per s.
+    :param state_lower: smallest state that may be measured, in its unit.
+    :param state_upper: largest state.
+    :param safe_input: input that is safe whatever happened.
     :param seed: of numpy's default generator; the same seed gives the same steps.
+    :param state: name of the measured state.
     :raises ValueError: when the limits contradict each other.
     """
 
@@ -59,12 +61,13 @@ class Experiment:
     state_upper: float
     safe_input: float
     seed: int
+    state: str = 'state'
 
     def __post_init__(self) -> None:
         for low, high in (('input_lower', 'input_upper'), ('state_lower', 'state_upper')):
             if not getattr(self, low) < getattr(self, high):
-                raise ValueError(f'{low} = {getattr(self, low)} K must be below {high} = '
-                                 f'{getattr(self, high)} K')
+                raise ValueError(f'{low} = {getattr(self, low)} must be below {high} = '
+                                 f'{getattr(self, high)}')
         if not 0.0 < self.hold_shortest <= self.hold_longest:
             raise ValueError(f'hold_shortest = {self.hold_shortest} s must be above 0 and not '
                              f'above hold_longest = {self.hold_longest} s')
@@ -74,7 +77,7 @@ class Experiment:
 
     @cached_property
     def steps(self) -> tuple[Array, Array]:
-        """When each step ends (S,), in s after the start, and its level (S,), in K."""
+        """When each step ends (S,), in s after the start, and its level (S,)."""
         rng = np.random.default_rng(self.seed)
         count = int(self.duration / self.hold_shortest) + 1
         ends = np.cumsum(rng.uniform(self.hold_shortest, self.hold_longest, count))
@@ -82,19 +85,18 @@ class Experiment:
         used = int(np.searchsorted(ends, self.duration)) + 1
         return ends[:used], levels[:used]
 
-    def refusal(self, measured: float, show: Show = in_state_units) -> str:
+    def refusal(self, measured: float) -> Reason | None:
         """
-        Say why the experiment must not go on with a measurement, or return an empty string.
+        Return why the experiment must not go on with a measurement, or None.
 
-        :param measured: temperature of the reactor, in K.
-        :param show: how values are written.
+        :param measured: of the state, in its unit.
         """
         if not np.isfinite(measured):
-            return f'the temperature {show(measured, "K")} is not finite: check the sensor'
+            return reason(Code.NOT_FINITE, signal=self.state, value=measured)
         if not self.state_lower <= measured <= self.state_upper:
-            return (f'the temperature {show(measured, "K")} is outside the bounds of the '
-                    f'experiment, {show(self.state_lower, "K")} to {show(self.state_upper, "K")}')
-        return ''
+            return reason(Code.EXPERIMENT_BOUNDS, signal=self.state, value=measured,
+                          lower=self.state_lower, upper=self.state_upper)
+        return None
 
 
 @dataclass(frozen=True)
@@ -104,10 +106,10 @@ class Progress:
 
     :param start_ns: stamp of the measurement it started with.
     :param time_ns: stamp of the last measurement.
-    :param command: last input, in K.
+    :param command: last input.
     :param interval: usual seconds between measurements; infinity before the second.
     :param phase: what it is doing; it goes on commanding the safe input when it is over.
-    :param reason: why it was aborted, in words.
+    :param reason: why it was aborted.
     """
 
     start_ns: int
@@ -115,7 +117,7 @@ class Progress:
     command: float
     interval: float = np.inf
     phase: Phase = Phase.RUNNING
-    reason: str = ''
+    reason: Reason | None = None
 
     @property
     def elapsed(self) -> float:
@@ -128,15 +130,15 @@ def begin(experiment: Experiment, time_ns: int) -> Progress:
     return Progress(time_ns, time_ns, experiment.safe_input)
 
 
-def end(progress: Progress, phase: Phase, reason: str = '') -> Progress:
+def end(progress: Progress, phase: Phase, why: Reason | None = None) -> Progress:
     """End the steps, unless they are over; the input then goes back to the safe one."""
     if progress.phase is not Phase.RUNNING:
         return progress
-    return replace(progress, phase=phase, reason=reason)
+    return replace(progress, phase=phase, reason=why)
 
 
-def advance(experiment: Experiment, progress: Progress, measured: float | None, time_ns: int,
-            show: Show = in_state_units) -> Progress:
+def advance(experiment: Experiment, progress: Progress, measured: float | None, time_ns: int
+            ) -> Progress:
     """
     Answer a measurement, or the passing of time without one.
 
@@ -145,16 +147,15 @@ def advance(experiment: Experiment, progress: Progress, measured: float | None, 
 
     :param experiment: the plan.
     :param progress: as returned by the call before.
-    :param measured: temperature of the reactor, in K, or None.
+    :param measured: of the state, in its unit, or None.
     :param time_ns: its stamp, or the present time.
-    :param show: how values are written in the reason of an abort.
     :return: the new progress with the command.
     """
     ahead = time_ns - progress.time_ns
-    if measured is not None and (reason := experiment.refusal(measured, show)):
-        progress = end(progress, Phase.ABORTED, reason)
+    if measured is not None and (why := experiment.refusal(measured)):
+        progress = end(progress, Phase.ABORTED, why)
     if ahead < -LATE_NANOSECONDS:
-        progress = end(progress, Phase.ABORTED, 'the stamps of the measurements went back')
+        progress = end(progress, Phase.ABORTED, reason(Code.CLOCK_WENT_BACK))
         return replace(progress, time_ns=time_ns)
     if ahead <= 0:
         return progress
@@ -169,7 +170,7 @@ def advance(experiment: Experiment, progress: Progress, measured: float | None, 
 
 
 def level(experiment: Experiment, progress: Progress) -> float:
-    """Return where the input goes now, in K."""
+    """Return where the input goes now."""
     if progress.phase is not Phase.RUNNING:
         return experiment.safe_input
     ends, levels = experiment.steps
@@ -181,7 +182,7 @@ class Following:
     """
     Whether a controller in manual mode passes the input on, within limits of its own.
 
-    :param heard: what it commanded last, in K, or None at first.
+    :param heard: what it commanded last, or None at first.
     :param astray: how many times in a row that was not, nor came nearer to, what was asked.
     :param since: time of the first of these, in s.
     """
@@ -194,8 +195,8 @@ class Following:
         """
         Return the same after another command of the controller.
 
-        :param heard: what it commanded, in K.
-        :param asked: what was asked, in K.
+        :param heard: what it commanded.
+        :param asked: what was asked.
         :param now: time, in s.
         """
         gap = abs(heard - asked)

@@ -1,15 +1,18 @@
 # SPDX-FileCopyrightText: 2026 The koopman_ros Authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""Limits on the manipulated variable: range and rate."""
+"""Limits on the manipulated variables: range and rate."""
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 import math
 
 import numpy as np
 from numpy.typing import NDArray
+
+from koopman_ros.signals import per_signal
 
 Array = NDArray[np.float64]
 
@@ -34,6 +37,16 @@ class InputLimits:
                              f'{self.upper.tolist()}')
         if not np.all(self.rate > 0.0):
             raise ValueError(f'input rate must be above 0, got {self.rate.tolist()}')
+
+    def check(self, names: Sequence[str]) -> None:
+        """
+        Check that there is one number for each input.
+
+        :param names: (n_u,) of the inputs.
+        :raises ValueError: naming what does not fit.
+        """
+        for name in ('lower', 'upper', 'rate'):
+            per_signal(f'input {name}', getattr(self, name), names)
 
     def within(self, u: Array) -> Array:
         """Return the input (n_u,) of the range that is nearest."""

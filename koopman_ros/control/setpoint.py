@@ -5,7 +5,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass, replace
 import math
 
@@ -13,10 +12,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from koopman_ros.lifting import LiftedModel
+from koopman_ros.reasons import Code, Reason, reason
+from koopman_ros.units import NANOSECONDS
 
 Array = NDArray[np.float64]
-
-NANOSECONDS = 1_000_000_000
 
 # A stamp further ahead than this comes from another clock and is no schedule.
 HORIZON_NANOSECONDS = 3600 * NANOSECONDS
@@ -40,32 +39,21 @@ class Setpoint:
     ramped: Array | None = None
 
 
-# Words for a state's value in the units of whoever reads them: (value, unit) -> text.
-Show = Callable[[float, str], str]
-
-
-def in_state_units(value: float, unit: str) -> str:
-    """Write a value as it is."""
-    return f'{value:.6g} {unit}'
-
-
-def refusal(model: LiftedModel, value: Array, show: Show = in_state_units) -> str:
+def refusal(model: LiftedModel, value: Array) -> Reason | None:
     """
-    Say why a set-point cannot be tracked, or return an empty string.
+    Return why a set-point cannot be tracked, or None.
 
     :param model: whose training box is the range of set-points.
     :param value: (n_x,) in state units.
-    :param show: how values are written.
     """
     states = model.states
-    for i, (name, unit) in enumerate(zip(states.names, states.units, strict=True)):
+    for i, name in enumerate(states.names):
         if not np.isfinite(value[i]):
-            return f'{name} set-point {show(value[i], unit)} is not finite: the old one is kept'
+            return reason(Code.SETPOINT_NOT_FINITE, signal=name, value=float(value[i]))
         if not states.lower[i] <= value[i] <= states.upper[i]:
-            return (f'{name} set-point {show(value[i], unit)} is outside the trained range '
-                    f'{show(states.lower[i], unit)} to {show(states.upper[i], unit)}: the old '
-                    'one is kept; choose one inside, or load a model trained over a wider range')
-    return ''
+            return reason(Code.SETPOINT_OUTSIDE, signal=name, value=float(value[i]),
+                          lower=float(states.lower[i]), upper=float(states.upper[i]))
+    return None
 
 
 def request(setpoint: Setpoint, value: Array, effective_ns: int, now_ns: int | None) -> Setpoint:
@@ -96,18 +84,18 @@ def lies_ahead(effective_ns: int, now_ns: int | None) -> bool:
     return now_ns < effective_ns <= now_ns + HORIZON_NANOSECONDS
 
 
-def advance(setpoint: Setpoint, measured: Array, model: LiftedModel, ramp: float, now_ns: int,
+def advance(setpoint: Setpoint, measured: Array, model: LiftedModel, ramp: Array, now_ns: int,
             seconds: float, lag: float = 0.0) -> Setpoint:
     """
     Bring the set-point to the present time.
 
-    Before the first request the temperature that was first measured is held, so that a
+    Before the first request the state that was first measured is held, so that a
     controller which starts on a running plant asks for no change.
 
     :param setpoint: the present state.
     :param measured: (n_x,) measured state, in state units.
     :param model: whose training box bounds the first set-point.
-    :param ramp: largest change per second, in state units; infinity for steps.
+    :param ramp: (n_x,) largest change per second, in state units; infinity for steps.
     :param now_ns: time of the measurement.
     :param seconds: time since the last measurement; 0 at the first.
     :param lag: time constant in seconds of the filter behind the ramp; 0 for none.
@@ -125,7 +113,9 @@ def advance(setpoint: Setpoint, measured: Array, model: LiftedModel, ramp: float
         active = np.clip(measured, model.states.lower, model.states.upper)
     requested = active if setpoint.requested is None else setpoint.requested
     ramped = active if setpoint.ramped is None or lag <= 0.0 else setpoint.ramped
-    reach = np.inf if np.isinf(ramp) else ramp * seconds
+    # infinity for a step, also where no time has passed
+    reach = np.full(len(ramp), np.inf)
+    np.multiply(ramp, seconds, out=reach, where=np.isfinite(ramp))
     ramped = np.minimum(np.maximum(requested, ramped - reach), ramped + reach)
     if lag <= 0.0:
         arrived = ramped.tolist() == requested.tolist()

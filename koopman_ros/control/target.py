@@ -24,15 +24,15 @@ class Target:
     :param x: (n_x,) reference state.
     :param z: (n_z,) z_ref = N(x_ref) (paper, section on the optimal control problem).
     :param u: (n_u,) input that balances the model's drift and the disturbance there.
-    :param push: (n_x,) B u_ref + w, what acts on the state beside the drift.
-    :param mismatch: size of the rate that no input balances; 0 where x can be held.
+    :param forcing: (n_x,) B u_ref + w, what acts on the state beside the drift.
+    :param residual: size of the rate that no input balances; 0 where x can be held.
     """
 
     x: Array
     z: Array
     u: Array
-    push: Array
-    mismatch: float
+    forcing: Array
+    residual: float
 
 
 def steady_state_target(model: LiftedModel, x_ref: Array, w: Array | None = None) -> Target:
@@ -73,6 +73,6 @@ def balance(model: LiftedModel, at: Reference, w: Array) -> Target:
     """Complete a reference by the input that balances drift and disturbance w (n_x,)."""
     load = at.drift + w
     u = -model.input_inverse.dot(load)
-    push = model.B.dot(u)
-    rest = load + push
-    return Target(at.x, at.z, u, push + w, math.sqrt(rest.dot(rest)))
+    forcing = model.B.dot(u)
+    rest = load + forcing
+    return Target(at.x, at.z, u, forcing + w, math.sqrt(rest.dot(rest)))

@@ -10,8 +10,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from koopman_ros.control.setpoint import NANOSECONDS
 from koopman_ros.lifting import LiftedModel
+from koopman_ros.units import NANOSECONDS
 
 Array = NDArray[np.float64]
 

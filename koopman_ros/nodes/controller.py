@@ -19,7 +19,8 @@ from rclpy.timer import Timer
 from sensor_msgs.msg import JointState, Temperature
 from std_srvs.srv import SetBool, Trigger
 
-from koopman_ros.control import Controller, Mode, Report, Rung, State
+from koopman_ros.control import Arrival as Measured
+from koopman_ros.control import Controller, MANUAL, Mode, Report, State
 from koopman_ros.nodes import topics, translation
 from koopman_ros.nodes.arrival import Arrival
 from koopman_ros.nodes.controller_parameters import ControllerParameters, TABLE
@@ -40,6 +41,8 @@ from koopman_ros.nodes.model_reload import ModelReload
 from koopman_ros.nodes.process import LoopNode, run
 from koopman_ros.nodes.record_publisher import RecordPublisher
 from koopman_ros.nodes.watchdog import PERIOD, Watchdog
+from koopman_ros.nodes.words import words_of
+from koopman_ros.reasons import level_words
 from koopman_ros.replay import events, records
 from koopman_ros.replay.events import Event, ModeChange, Silence
 
@@ -69,8 +72,8 @@ class ControllerNode(LoopNode):
         self._state = State()
         self._lock = threading.Lock()
         self._telling = threading.Lock()
-        self._report = Report(Mode.AUTOMATIC)
-        self._logged = self._report.rung
+        self._report = Report(Mode.AUTOMATIC, next(iter(self._controller.levels)))
+        self._logged = self._report
         self._refused = ''
         self._rests_outside = ''
         self._counts = Counts()
@@ -192,9 +195,9 @@ class ControllerNode(LoopNode):
         report = outcome.report
         self._temperature = message.temperature
         self._counts.measurements += 1
-        self._counts.late += report.late
-        self._counts.missed += report.missed
-        self._counts.refused += not report.believed
+        self._counts.late += report.measurement.arrival is Measured.LATE
+        self._counts.missed += report.measurement.missed
+        self._counts.refused += report.measurement.arrival is Measured.REJECTED
         self._tell(report, message.header.stamp)
 
     def _coolant_at(self, stamp_ns: int) -> float | None:
@@ -253,33 +256,34 @@ class ControllerNode(LoopNode):
         """Publish and log what is known beside the command."""
         with self._telling:
             self._publish_beside(report, stamp)
-        if report.rung is not self._logged:
+        if report.level not in (self._logged.level, MANUAL):
             self._log_transition(self._logged, report)
-            self._logged = report.rung
-        if report.clock_went_back:
+            self._logged = report
+        if report.measurement.clock_went_back:
             self.get_logger().warning('the measurement is older than the last one: time starts '
                                       'afresh', throttle_duration_sec=1.0)
         self._diagnostics.publish_if_changed()
 
     def _publish_beside(self, report: Report, stamp: Time) -> None:
         self._report = report
-        active = report.active_setpoint
-        if active is not None and active[0] != self._published_setpoint:
-            self._published_setpoint = float(active[0])
+        target, predicted = report.target, report.measurement.predicted
+        if target is not None and target.setpoint[0] != self._published_setpoint:
+            self._published_setpoint = float(target.setpoint[0])
             self._active.publish(temperature_message(
-                float(active[0]), stamp, self._frame_id))
-        if report.predicted is not None:
+                self._published_setpoint, stamp, self._frame_id))
+        if predicted is not None:
             self._predicted.publish(temperature_message(
-                float(report.predicted[0]), stamp, self._frame_id))
+                float(predicted[0]), stamp, self._frame_id))
         self._internals.publish(internals(report, stamp, self._frame_id))
 
-    def _log_transition(self, before: Rung, report: Report) -> None:
-        if report.rung.depth > before.depth:
-            self.get_logger().warning(f'{before.value} -> {report.rung.value}: {report.reason}',
-                                      throttle_duration_sec=1.0)
+    def _log_transition(self, before: Report, report: Report) -> None:
+        change = f'{level_words(before.level)} -> {level_words(report.level)}'
+        if report.depth > before.depth:
+            self.get_logger().warning(
+                f'{change}: {words_of(self._controller.model)(report.reason)}',
+                throttle_duration_sec=1.0)
         else:
-            self.get_logger().info(f'{before.value} -> {report.rung.value}',
-                                   throttle_duration_sec=1.0)
+            self.get_logger().info(change, throttle_duration_sec=1.0)
 
     # The operator.
 
@@ -312,18 +316,17 @@ class ControllerNode(LoopNode):
         return response
 
     def _change(self, event: Event) -> str:
-        """Apply what is not answered by a command; return why it is refused, or ''."""
+        """Apply what is not answered by a command; return why it is refused in words, or ''."""
         with self._lock:
             outcome = events.apply(self._controller, self._state, event)
             self._state = outcome.state
             self._records.publish_event(event, outcome)
-        return outcome.refused
+        return words_of(self._controller.model)(outcome.refused)
 
     # Settings and models.
 
     def _built(self) -> Controller:
-        return translation.controller_of(
-            self._models.in_force.model, self._settings.settings())
+        return Controller(self._models.in_force.model, self._settings.settings())
 
     def _model_situation(self) -> ModelSituation:
         return ModelSituation(self._settings.settings(), self._state,

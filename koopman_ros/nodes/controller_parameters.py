@@ -10,7 +10,8 @@ import math
 
 import numpy as np
 
-from koopman_ros.control import InputLimits, LadderSettings, SensorLimits, Settings
+from koopman_ros.control import InputLimits, LevelSettings, Settings, SupervisorSettings
+from koopman_ros.estimation import SensorLimits
 from koopman_ros.nodes.messages import SECONDS_PER_MINUTE, to_kelvin
 from koopman_ros.nodes.parameters import parameter, ParameterTable
 
@@ -110,22 +111,25 @@ class ControllerParameters:
             limits=InputLimits(np.array([to_kelvin(self.coolant_min)]),
                                np.array([to_kelvin(self.coolant_max)]),
                                np.array([self.coolant_rate_limit / SECONDS_PER_MINUTE])),
-            setpoint_ramp=self.setpoint_ramp / SECONDS_PER_MINUTE,
+            setpoint_ramp=np.array([self.setpoint_ramp / SECONDS_PER_MINUTE]),
             setpoint_filter=self.setpoint_filter,
             observer_bandwidth=self.observer_bandwidth / SECONDS_PER_MINUTE,
-            max_disturbance=self.max_disturbance,
-            input_tolerance=self.coolant_tolerance,
+            max_disturbance=np.array([self.max_disturbance]),
+            input_tolerance=np.array([self.coolant_tolerance]),
             transfer_time=self.transfer_time,
             safe_input=np.array([to_kelvin(self.safe_coolant)]),
             max_gain=self.max_gain,
             max_residual=self.max_riccati_residual or 10.0 ** -self.min_riccati_digits,
             sensor=SensorLimits(
-                lower=to_kelvin(self.sensor_min), upper=to_kelvin(self.sensor_max),
-                rate=self.max_temperature_rate / SECONDS_PER_MINUTE,
-                jump=self.max_temperature_jump,
+                lower=np.array([to_kelvin(self.sensor_min)]),
+                upper=np.array([to_kelvin(self.sensor_max)]),
+                rate=np.array([self.max_temperature_rate / SECONDS_PER_MINUTE]),
+                jump=np.array([self.max_temperature_jump]),
                 frozen_timeout=self.frozen_timeout or math.inf),
-            ladder=LadderSettings(self.validity_margin, self.linear_margin, self.hold_timeout,
-                                  self.recovery_time))
+            supervisor=SupervisorSettings(
+                (LevelSettings('sdre', self.validity_margin),
+                 LevelSettings('linear', self.linear_margin)),
+                self.hold_timeout, self.recovery_time))
 
 
 def _cross_check(values: ControllerParameters) -> str:

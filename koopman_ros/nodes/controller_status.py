@@ -12,16 +12,16 @@ from builtin_interfaces.msg import Time
 import numpy as np
 from sensor_msgs.msg import JointState
 
-from koopman_ros.control import Controller, Mode, Report, Rung, State
+from koopman_ros.control import Arrival as Measured
+from koopman_ros.control import Controller, HOLD, Mode, Report, SAFE, State
 from koopman_ros.nodes.arrival import Arrival
 from koopman_ros.nodes.controller_parameters import ControllerParameters
 from koopman_ros.nodes.diagnostics import Level, Status
 from koopman_ros.nodes.messages import in_celsius, to_celsius
+from koopman_ros.nodes.words import words_of
+from koopman_ros.reasons import level_words
 
-_LEVELS = {Rung.LEARNED: Level.OK, Rung.LINEAR: Level.WARN, Rung.HOLD: Level.ERROR,
-           Rung.SAFE: Level.ERROR}
-_ACTIONS = {Rung.LEARNED: '', Rung.LINEAR: 'linear law', Rung.HOLD: 'the last command is held',
-            Rung.SAFE: 'the safe coolant temperature is commanded'}
+_ACTIONS = {HOLD: 'the last command is held', SAFE: 'the safe coolant temperature is commanded'}
 _WAY_BACK = 'the coolant leads the reactor back from where the safe coolant keeps it'
 
 
@@ -76,28 +76,37 @@ def _verdict(now: Situation) -> tuple[Level, str]:
         command = now.state.command
         doing = '' if command is None else f', coolant at {in_celsius(float(command[0]))}'
         action = 'manual mode' if mode is Mode.MANUAL else (
-            _ACTIONS[report.rung] or _ACTIONS[Rung.HOLD])
+            _ACTIONS[HOLD] if report.depth == 0 else _action(report))
         if now.arrival.busy:
             return Level.ERROR, (f'no measurement answered for more than {timeout:g} s, as the '
                                  f'node is busy: {action}{doing}; ask for less at once')
         return Level.ERROR, (f'no measurement for more than {timeout:g} s: {action}{doing}; check '
                              'sensor and plant')
-    if report.reason and mode is Mode.MANUAL:
-        return Level.ERROR, f'{mode.value}: {report.reason}'
-    if report.rung is not Rung.LEARNED:
-        action = _WAY_BACK if report.way_back else _ACTIONS[report.rung]
-        return _LEVELS[report.rung], f'{action}: {report.reason}'
+    if report.reason is not None and mode is Mode.MANUAL:
+        return Level.ERROR, f'{mode.value}: {_reason(now)}'
+    if mode is Mode.AUTOMATIC and report.depth > 0:
+        level = Level.ERROR if report.level in _ACTIONS else Level.WARN
+        action = _WAY_BACK if report.command.way_back else _action(report)
+        return level, f'{action}: {_reason(now)}'
     warning = _warning(now)
     if warning:
         return Level.WARN, warning
     message = mode.value
     if mode is Mode.AUTOMATIC and not now.counts.setpoint_received:
         message += ', no set-point yet: the temperature first measured is held'
-    elif report.at_range:
+    elif report.command.at_range:
         message += ', coolant at its limit'
-    elif report.at_rate:
+    elif report.command.at_rate:
         message += ', coolant at its rate limit'
     return Level.OK, message
+
+
+def _action(report: Report) -> str:
+    return _ACTIONS.get(report.level) or level_words(report.level)
+
+
+def _reason(now: Situation) -> str:
+    return words_of(now.controller.model)(now.report.reason)
 
 
 def _warning(now: Situation) -> str:
@@ -106,7 +115,7 @@ def _warning(now: Situation) -> str:
     age, oldest = now.arrival.age, now.parameters.max_measurement_age
     if now.complaint:
         return now.complaint
-    if report.clock_stood_still:
+    if report.measurement.arrival is Measured.REPEATED:
         return ('the stamp of the measurement does not advance: the last command is held; stamp '
                 'measurements with their time')
     if now.arrival.without_clock:
@@ -116,18 +125,18 @@ def _warning(now: Situation) -> str:
         return f'request refused: {now.request_refused}'
     if now.model_refused:
         return now.model_refused
-    if report.outside > 0.0:
+    if report.measurement.outside > 0.0:
         return (f'temperature is outside the trained range '
                 f'[{to_celsius(states.lower[0]):.2f}, {to_celsius(states.upper[0]):.2f}] degC: '
                 'the model extrapolates')
     if oldest and abs(age) > oldest:
         return (f'measurements are {age:.1f} s old when they arrive, at most {oldest:g} s are '
                 'expected: check the connection and the clocks')
-    if not report.follows:
+    if not report.measurement.follows:
         return (f'the coolant does not follow its set-point within '
                 f'{now.parameters.coolant_tolerance:g} K: the observer goes by the coolant '
                 'temperature; check the actuator and its limits')
-    if report.at_bound:
+    if report.estimate is not None and report.estimate.at_bound:
         return (f'the disturbance estimate is at its bound of {now.parameters.max_disturbance:g} '
                 'K of coolant: the plant is far from its model; retrain')
     return ''
@@ -135,25 +144,26 @@ def _warning(now: Situation) -> str:
 
 def _figures(now: Situation) -> dict[str, object]:
     report, state, arrival = now.report, now.state, now.arrival
-    active, command = report.active_setpoint, state.command
+    target, command, law = report.target, state.command, report.command.law
     return {
         'mode': state.mode.value,
-        'active law': report.rung.value,
-        'law': 'none' if report.law is None else report.law.value,
-        'reason': report.reason or 'none',
+        'active law': level_words(report.level),
+        'law': law.form or 'none',
+        'reason': _reason(now) or 'none',
         **now.model,
         'temperature [degC]': float(now.temperature),
-        'set-point [degC]': np.nan if active is None else to_celsius(float(active[0])),
+        'set-point [degC]': _setpoint(report),
         'coolant [degC]': np.nan if command is None else to_celsius(float(command[0])),
-        'disturbance [K of coolant]': _first(report.disturbance),
+        'disturbance [K of coolant]': _disturbance(report),
         'the same as a sensor bias [K]': _bias(now),
-        'distance outside training box [half widths]': float(report.outside),
-        'set-point outside training box [half widths]': float(report.setpoint_outside),
-        'coolant outside training box [half widths]': float(report.input_outside),
-        'Riccati residual': float(report.residual),
-        'gain norm': float(report.gain),
-        'predicted growth per sample': float(report.growth),
-        'transfer [K]': 0.0 if report.transfer is None else float(report.transfer[0]),
+        'distance outside training box [half widths]': float(report.measurement.outside),
+        'set-point outside training box [half widths]': (
+            np.nan if target is None else float(target.outside)),
+        'coolant outside training box [half widths]': float(report.command.outside),
+        'Riccati residual': float(law.residual),
+        'gain norm': float(law.gain),
+        'predicted growth per sample': float(law.growth),
+        'transfer [K]': _transfer(report),
         'scheduled set-points': len(state.setpoint.scheduled),
         'measurements': now.counts.measurements,
         'late measurements': now.counts.late,
@@ -167,27 +177,37 @@ def _figures(now: Situation) -> dict[str, object]:
 
 
 def _bias(now: Situation) -> float:
-    if now.report.disturbance is None:
+    if now.report.estimate is None:
         return np.nan
     return float(now.controller.equivalent_bias(now.state)[0])
 
 
-def _first(values: np.ndarray | None) -> float:
-    return np.nan if values is None else float(values[0])
+def _setpoint(report: Report) -> float:
+    return np.nan if report.target is None else to_celsius(float(report.target.setpoint[0]))
+
+
+def _disturbance(report: Report) -> float:
+    return np.nan if report.estimate is None else float(report.estimate.disturbance[0])
+
+
+def _transfer(report: Report) -> float:
+    return 0.0 if report.command.transfer is None else float(report.command.transfer[0])
 
 
 def internals(report: Report, stamp: Time, frame_id: str) -> JointState:
     """Return what a person would plot beside the temperatures, under names with units."""
+    estimate, law = report.estimate, report.command.law
     values = {
-        'disturbance [K]': _first(report.disturbance),
-        'estimated_temperature [degC]': to_celsius(_first(report.estimate)),
-        'distance_outside [half widths]': float(report.outside),
-        'rung [0 learned, 1 linear, 2 hold, 3 safe]': float(report.rung.depth),
-        'gain': float(report.gain),
-        'riccati_residual': float(report.residual),
-        'growth_per_sample': float(report.growth),
-        'transfer [K]': 0.0 if report.transfer is None else float(report.transfer[0]),
-        'setpoint [degC]': to_celsius(_first(report.active_setpoint)),
+        'disturbance [K]': _disturbance(report),
+        'estimated_temperature [degC]': (
+            np.nan if estimate is None else to_celsius(float(estimate.state[0]))),
+        'distance_outside [half widths]': float(report.measurement.outside),
+        'level [0 learned, 1 linear, 2 hold, 3 safe, 4 manual]': float(report.depth),
+        'gain': float(law.gain),
+        'riccati_residual': float(law.residual),
+        'growth_per_sample': float(law.growth),
+        'transfer [K]': _transfer(report),
+        'setpoint [degC]': _setpoint(report),
     }
     message = JointState(name=list(values), position=list(values.values()))
     message.header.stamp = stamp

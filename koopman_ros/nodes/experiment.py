@@ -16,6 +16,8 @@ from koopman_ros.nodes.experiment_run import ExperimentRun, other_publishers
 from koopman_ros.nodes.messages import in_celsius, to_celsius
 from koopman_ros.nodes.owned import Owned
 from koopman_ros.nodes.trainer_parameters import TrainerParameters
+from koopman_ros.nodes.words import OPERATOR
+from koopman_ros.reasons import Reason
 
 
 class CoolantExperiment:
@@ -64,7 +66,7 @@ class CoolantExperiment:
         else:
             reason = self._start()
             if self._run is not None:
-                reason = await self._run.started
+                reason = OPERATOR(await self._run.started)
             response.success = not reason
             response.message = f'refused: {reason}' if reason else (
                 f'running on {self._node.resolve_topic_name(self.settings.experiment_topic)}')
@@ -104,17 +106,17 @@ class CoolantExperiment:
         assert self._run is not None
         self._say(self._verdict(self._run).message)
 
-    def _on_loss(self, reason: str) -> None:
+    def _on_loss(self, why: Reason) -> None:
         """Stop commanding at once; an experiment that was over is over as it was."""
         run = self._run
         assert run is not None
         if run.progress is None:
             if not run.started.done():
-                run.started.set_result(reason)
+                run.started.set_result(why)
             return
-        run.stop(Phase.ABORTED, reason)
+        run.stop(Phase.ABORTED, why)
         self._let_go(self._verdict(run))
-        self._say(f'the trainer does not command the coolant any more: {reason}')
+        self._say(f'the trainer does not command the coolant any more: {OPERATOR(why)}')
 
     def _let_go(self, outcome: Status) -> None:
         self._outcome = outcome
@@ -134,7 +136,7 @@ class CoolantExperiment:
         if run.progress is None:
             return Status(Level.OK, 'waiting for the first measurement')
         if run.progress.phase is Phase.ABORTED:
-            return Status(Level.ERROR, f'aborted: {run.progress.reason}')
+            return Status(Level.ERROR, f'aborted: {OPERATOR(run.progress.reason)}')
         return Status(Level.OK, run.progress.phase.value)
 
     def _status(self) -> Status:

@@ -18,7 +18,6 @@ from sensor_msgs.msg import Temperature
 from koopman_ros.control.experiment import advance, begin, end, Following, Phase, Progress
 from koopman_ros.nodes import topics
 from koopman_ros.nodes.messages import (
-    in_celsius,
     NANOSECONDS,
     stamp_message,
     stamp_nanoseconds,
@@ -27,6 +26,7 @@ from koopman_ros.nodes.messages import (
 )
 from koopman_ros.nodes.owned import Owned
 from koopman_ros.nodes.trainer_parameters import TrainerParameters
+from koopman_ros.reasons import Code, Reason, reason
 
 _TICK = 0.1  # s
 _ASTRAY = 10  # commands of a controller, and
@@ -48,11 +48,11 @@ class ExperimentRun:
     """
 
     def __init__(self, node: Node, settings: TrainerParameters, on_change: Callable[[], None],
-                 on_loss: Callable[[str], None]) -> None:
+                 on_loss: Callable[[Reason], None]) -> None:
         self.plan = settings.experiment()
         self.topic = node.resolve_topic_name(settings.experiment_topic)
         self.progress: Progress | None = None
-        # why it cannot start, or an empty string with the first measurement
+        # why it cannot start, or None with the first measurement
         self.started = Future()
         self._node = node
         self._patience = settings.experiment_timeout
@@ -79,10 +79,10 @@ class ExperimentRun:
         """Whether it waits for its first measurement, or steps."""
         return self.progress is None or self.progress.phase is Phase.RUNNING
 
-    def stop(self, phase: Phase, reason: str = '') -> None:
+    def stop(self, phase: Phase, why: Reason | None = None) -> None:
         """End the steps; the coolant then returns to the safe temperature."""
         if self.progress is not None:
-            self.progress = end(self.progress, phase, reason)
+            self.progress = end(self.progress, phase, why)
 
     def farewell(self) -> None:
         """Leave the coolant at the safe temperature before the process ends."""
@@ -109,16 +109,16 @@ class ExperimentRun:
         if self.progress is None:
             if self.started.done():
                 return
-            reason = self.plan.refusal(measured, in_celsius)
-            self.started.set_result(reason)
-            if reason:
+            refusal = self.plan.refusal(measured)
+            self.started.set_result(refusal)
+            if refusal is not None:
                 return
             self.progress = begin(self.plan, stamp_ns)
         if stamp_ns != self._stamp_ns:
             self._stamp_ns, self._heard_at = stamp_ns, time.monotonic()
         self._frame_id = message.header.frame_id
         was_running = self.running
-        self.progress = advance(self.plan, self.progress, measured, stamp_ns, in_celsius)
+        self.progress = advance(self.plan, self.progress, measured, stamp_ns)
         self._command(self.progress.command, stamp_ns)
         if was_running and not self.running:
             self._on_change()
@@ -134,29 +134,26 @@ class ExperimentRun:
         heard, now = to_kelvin(message.temperature), time.monotonic()
         self._following = self._following.after(heard, self.progress.command, now)
         if self._following.astray >= _ASTRAY and now - self._following.since >= _ASTRAY_TIME:
-            self._on_loss(
-                f'the controller commands {in_celsius(heard)} where '
-                f'{in_celsius(self.progress.command)} is asked for: switch it to manual mode, and '
-                'choose levels within its limits')
+            self._on_loss(reason(Code.NOT_FOLLOWED, signal='coolant_temperature', value=heard,
+                                 requested=self.progress.command))
 
     def _on_tick(self) -> None:
         """Look for other commanders, and for measurements that stay away."""
         if others := other_publishers(self._node, self.topic, own=1):
-            self._on_loss(f'{others} publishes on {self.topic}, too')
+            self._on_loss(reason(Code.OTHER_PUBLISHER, nodes=others, topic=self.topic))
         elif self._coolants is not None and not self._node.count_publishers(
                 self._coolants.topic_name):
-            self._on_loss('the controller is gone')
+            self._on_loss(reason(Code.CONTROLLER_GONE))
         elif time.monotonic() - self._heard_at > self._patience:
-            self._on_silence(f'no newer measurement for more than {self._patience:g} s: check '
-                             'sensor and plant')
+            self._on_silence(reason(Code.SILENCE, timeout=self._patience))
 
-    def _on_silence(self, reason: str) -> None:
+    def _on_silence(self, why: Reason) -> None:
         if self.progress is None:
             if not self.started.done():
-                self.started.set_result(reason)
+                self.started.set_result(why)
             return
         was_running = self.running
-        self.stop(Phase.ABORTED, reason)
+        self.stop(Phase.ABORTED, why)
         # the way back goes by the wall clock
         self.progress = advance(self.plan, self.progress, None,
                                 self.progress.time_ns + round(_TICK * NANOSECONDS))

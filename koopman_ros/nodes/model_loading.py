@@ -20,7 +20,7 @@ from koopman_ros.lifting import LiftedModel, load_with_digest, ModelFileError
 from koopman_ros.nodes.controller_parameters import ControllerParameters
 from koopman_ros.nodes.messages import in_celsius, NANOSECONDS
 from koopman_ros.nodes.shipped import model_path
-from koopman_ros.nodes.translation import controller_of
+from koopman_ros.nodes.words import words_of
 
 Array = NDArray[np.float64]
 
@@ -116,7 +116,7 @@ def load_suitable(name: str) -> LoadedModel:
 
 def _refuse_slow(path: Path, model: LiftedModel) -> None:
     """Refuse a model with which a control step raises an error or takes too long."""
-    controller, state = controller_of(model, ControllerParameters().settings()), State()
+    controller, state = Controller(model, ControllerParameters().settings()), State()
     needed = []
     for k in range(1, _TRIALS + 1):
         # of this thread alone, for a busy machine says nothing of a model
@@ -142,14 +142,14 @@ def refuse_setpoints(model: LiftedModel, situation: Situation) -> None:
 
     :raises ModelFileError: naming the set-point and the trained range.
     """
-    controller = controller_of(model, situation.settings)
+    controller = Controller(model, situation.settings)
     setpoint = situation.state.setpoint
     asked = [value for _, value in setpoint.scheduled]
     asked += [value for value in (setpoint.requested, setpoint.active) if value is not None]
     for value in asked:
-        reason = controller.request_setpoint(situation.state, value)[1]
-        if reason:
-            raise ModelFileError(reason)
+        refusal = controller.request_setpoint(situation.state, value)[1]
+        if refusal is not None:
+            raise ModelFileError(words_of(model)(refusal))
 
 
 def refuse_without_law(model: LiftedModel, situation: Situation) -> None:
@@ -158,18 +158,18 @@ def refuse_without_law(model: LiftedModel, situation: Situation) -> None:
 
     :raises ModelFileError: naming the temperature and the reason.
     """
-    controller = controller_of(model, situation.settings)
+    controller = Controller(model, situation.settings)
     asked = (situation.state.setpoint.active, situation.state.setpoint.requested)
     for setpoint in [value for value in asked if value is not None] or [model.states.center]:
         for place in (setpoint, situation.measured):
             # neither before the first measurement, nor where the learned law would not act
-            if not model.distance(place) <= situation.settings.ladder.validity_margin:
+            if not model.distance(place) <= situation.settings.supervisor.levels[0].margin:
                 continue
-            if problem := controller.try_law(place, setpoint):
+            if (problem := controller.try_law(place, setpoint)) is not None:
                 raise ModelFileError(
                     f'tried at {in_celsius(float(place[0]))} with the set-point '
-                    f'{in_celsius(float(setpoint[0]))} the model fails ({problem}): train it '
-                    'again, or change the weights')
+                    f'{in_celsius(float(setpoint[0]))} the model fails '
+                    f'({words_of(model)(problem)}): train it again, or change the weights')
 
 
 def rests_outside(controller: Controller) -> str:

@@ -119,7 +119,8 @@ class TrainerParameters:
             rate=self.experiment_rate_limit / SECONDS_PER_MINUTE,
             state_lower=to_kelvin(self.experiment_temperature_min),
             state_upper=to_kelvin(self.experiment_temperature_max),
-            safe_input=to_kelvin(self.safe_coolant), seed=self.experiment_seed)
+            safe_input=to_kelvin(self.safe_coolant), seed=self.experiment_seed,
+            state='temperature')
 
     def training(self) -> dict[str, Any]:
         """Return the fields of a :class:`koopman_ros.retraining.Task` that are settings."""

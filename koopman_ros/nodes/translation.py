@@ -14,9 +14,7 @@ from typing import Any
 
 import numpy as np
 
-from koopman_ros.control import Controller, Settings
-from koopman_ros.lifting import LiftedModel
-from koopman_ros.nodes.messages import in_celsius, NANOSECONDS, stamp_nanoseconds, to_kelvin
+from koopman_ros.nodes.messages import NANOSECONDS, stamp_nanoseconds, to_kelvin
 from koopman_ros.replay.events import (
     Initialisation,
     ManualCommand,
@@ -26,11 +24,6 @@ from koopman_ros.replay.events import (
 
 # The temperatures of reactor and coolant at an instant are stamped no further apart.
 SAME_TIME_NS = 2 * NANOSECONDS
-
-
-def controller_of(model: LiftedModel, settings: Settings) -> Controller:
-    """Return the controller that speaks to an operator in degrees Celsius."""
-    return Controller(model, settings, in_celsius)
 
 
 def measurement(message: Any, coolant: float | None = None) -> Measurement:

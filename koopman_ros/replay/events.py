@@ -17,6 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from koopman_ros.control import Controller, Mode, Report, State
+from koopman_ros.reasons import Reason
 
 Array = NDArray[np.float64]
 
@@ -105,13 +106,13 @@ class Outcome:
     :param state: the new state; the old one when the event was refused.
     :param command: (n_u,) in the model's units, or None where the event is not answered.
     :param report: of the step, where there was one.
-    :param refused: why the event was refused, or empty.
+    :param refused: why the event was refused, or None.
     """
 
     state: State
     command: Array | None = None
     report: Report | None = None
-    refused: str = ''
+    refused: Reason | None = None
 
 
 def apply(controller: Controller, state: State, event: Event) -> Outcome:

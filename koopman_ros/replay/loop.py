@@ -206,8 +206,9 @@ class _Run:
         event = event_of(record)
         outcome = apply(self._controller, state, event)
         self._state = outcome.state
-        self._found.refused += bool(outcome.refused)
-        active = None if outcome.report is None else outcome.report.active_setpoint
+        self._found.refused += outcome.refused is not None
+        target = None if outcome.report is None else outcome.report.target
+        active = None if target is None else target.setpoint
         other = None
         # it may refuse a request: it goes by what was tracked
         if self._other is not None and not isinstance(event, SetpointRequest):

@@ -15,7 +15,7 @@ import json
 from typing import Any
 
 from koopman_ros import __version__
-from koopman_ros.control import Mode, Report, State
+from koopman_ros.control import Mode, State
 from koopman_ros.replay.events import (
     Event,
     Initialisation,
@@ -99,15 +99,15 @@ def fields_of(event: Event, outcome: Outcome) -> tuple[str, dict[str, Any]]:
             return 'measurement', {
                 'stamp_ns': event.stamp_ns, 'measured': numbers(event.measured),
                 'applied': None if event.applied is None else numbers(event.applied),
-                'result': _result(outcome.report), **_commanded(outcome)}
+                'result': outcome.report.measurement.arrival.value, **_commanded(outcome)}
         case Silence():
             return 'silence', {'stamp_ns': event.stamp_ns, **_commanded(outcome)}
         case SetpointRequest():
             return 'setpoint', {'stamp_ns': event.stamp_ns, 'value': numbers(event.value),
-                                'accepted': not outcome.refused}
+                                'accepted': outcome.refused is None}
         case ManualCommand():
             return 'manual_command', {'value': numbers(event.value),
-                                      'accepted': not outcome.refused}
+                                      'accepted': outcome.refused is None}
         case ModeChange():
             return 'mode', {'mode': event.mode.name.lower()}
         case Initialisation():
@@ -167,16 +167,6 @@ def state_of(record: Record) -> State:
 def _commanded(outcome: Outcome) -> dict[str, Any]:
     report = outcome.report
     assert report is not None
-    active = report.active_setpoint
     return {'command': None if outcome.command is None else numbers(outcome.command),
-            'setpoint': None if active is None else numbers(active),
-            'mode': report.mode.name.lower(), 'level': report.rung.name.lower()}
-
-
-def _result(report: Report) -> str:
-    """Return what became of a measurement."""
-    if report.clock_stood_still:
-        return 'repeated'
-    if report.late:
-        return 'late'
-    return 'accepted' if report.believed else 'rejected'
+            'setpoint': None if report.target is None else numbers(report.target.setpoint),
+            'mode': report.mode.name.lower(), 'level': report.level}

@@ -21,15 +21,16 @@ _AXIS_MARGIN = float(np.sqrt(np.finfo(np.float64).eps))
 
 
 class RiccatiStatus(Enum):
-    """How a solution fared; the value is the sentence for the user."""
+    """How a solution fared."""
 
     SOLVED = 'solved'
-    NOT_STABILISABLE = ('the Hamiltonian has no stable subspace of full size: the pair (A, B) '
-                        'is not stabilisable, or a mode on the imaginary axis is not weighted')
-    INACCURATE = ('the Riccati residual is too large to trust the gain: the pair (A, B) is '
-                  'nearly not stabilisable')
-    GAIN_TOO_LARGE = ('the gain exceeds its bound: the pair (A, B) is nearly not stabilisable; '
-                      'raise the input weight or the gain bound')
+    # there is no stable subspace of full size: (A, B) is not stabilisable, or a mode on the
+    # imaginary axis is not weighted
+    NOT_STABILISABLE = 'riccati_not_stabilisable'
+    # the residual is too large to trust the gain: (A, B) is nearly not stabilisable
+    INACCURATE = 'riccati_inaccurate'
+    # likewise, seen by the gain
+    GAIN_TOO_LARGE = 'riccati_gain_too_large'
 
 
 @dataclass(frozen=True)

@@ -9,12 +9,13 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 import numpy as np
 
-from koopman_ros.control import Mode, Rung, State
+from koopman_ros.control import Mode, State
 from support.sampled_loops import controller, EPOCH, LOWER, RATE, SECOND, UPPER
 
 TUNINGS = [controller(), controller(observer_bandwidth=0.0, transfer_time=0.0),
            controller('reactor_linear'), controller('reactor_nz3', input_weight=np.array([1e-4])),
-           controller(sensor={'lower': -math.inf, 'upper': math.inf, 'rate': math.inf})]
+           controller(sensor={'lower': np.array([-math.inf]), 'upper': np.array([math.inf]),
+                              'rate': np.array([math.inf])})]
 
 values = st.one_of(
     st.floats(300.0, 332.0), st.floats(), st.sampled_from(
@@ -64,5 +65,5 @@ def test_no_sequence_of_events_brings_out_a_wild_command(sequence):
         if before is not None and earlier is not None:
             elapsed = max(0.0, (now - earlier) / SECOND)
             assert abs(command[0] - before[0]) <= RATE * elapsed + 1e-9
-        assert report.rung in Rung
+        assert report.level in ('sdre', 'linear', 'hold', 'safe', 'manual')
         assert np.all(np.isfinite(state.estimate.w)) if state.estimate is not None else True

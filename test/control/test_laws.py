@@ -13,7 +13,7 @@ from scipy.optimize import brentq
 
 from koopman_ros.control import (
     feedback,
-    Law,
+    Form,
     projected,
     recentred,
     steady_state_target,
@@ -60,7 +60,7 @@ def test_feed_forward_of_the_lift(n_z):
     target = setpoint_target(model)
     assert model.inputs.to_physical(target.u)[0] == pytest.approx(COOLANT, abs=1e-3)
     assert abs(COOLANT - 292.287569) < 1e-6
-    assert target.mismatch < 1e-12
+    assert target.residual < 1e-12
     np.testing.assert_array_equal(target.z, model.lift(target.x))
 
 
@@ -95,7 +95,7 @@ def test_a_state_that_no_input_holds_is_measured():
     x = np.array([0.3, 0.0])
     target = steady_state_target(model, x)
     # the coolant acts on the temperature alone and can balance no more than its rate
-    assert target.mismatch == pytest.approx(abs(model.A[0] @ x), rel=1e-12)
+    assert target.residual == pytest.approx(abs(model.A[0] @ x), rel=1e-12)
     assert target.u[0] == pytest.approx(-model.A[1] @ x / model.B[1, 0], rel=1e-12)
 
 
@@ -166,9 +166,9 @@ def test_laws_of_a_linear_model_are_the_regulator():
     P = solve_continuous_are(model.A, model.B, weights.Q, weights.R)
     K = np.linalg.solve(weights.R, model.B.T @ P)
     x = model.states.to_deviation(np.array([321.0]))
-    for law, name in ((recentred, Law.RECENTRED), (projected, Law.PROJECTED)):
+    for law, name in ((recentred, Form.RECENTRED), (projected, Form.PROJECTED)):
         found = law(model, x, target, weights)
-        assert found.law is name
+        assert found.form is name
         np.testing.assert_allclose(found.riccati.K, K, rtol=1e-10)
         np.testing.assert_allclose(found.u, target.u - K @ (x - target.x), rtol=1e-10)
 
@@ -213,7 +213,7 @@ def test_projected_law_on_the_two_state_example(R, cost):
     start = np.array([5.0, 5.0])
     assert not model.is_hurwitz
     assert law(model, start, steady_state_target(model, np.zeros(2)),
-               Weights(np.eye(2), R * np.eye(1))).law is Law.PROJECTED
+               Weights(np.eye(2), R * np.eye(1))).form is Form.PROJECTED
     reached, end = run_two_state(system, model, law, R, start, seconds=100.0)
     assert 1.0 - 1e-6 <= reached / cost <= 1.02
     np.testing.assert_allclose(end, [5.0 * np.exp(-10.0), 0.0], rtol=0, atol=1e-6)
@@ -231,7 +231,7 @@ def test_the_saddle_is_stabilised_by_the_projected_law():
     x = np.array([0.1, -0.2])
     found = feedback(model, x, target, weights, **BOUNDS)
     assert found.solved
-    assert found.law is Law.PROJECTED
+    assert found.form is Form.PROJECTED
     P = solve_continuous_are(model.A, model.B, weights.Q, weights.R)
     K = np.linalg.solve(weights.R, model.B.T @ P)
     np.testing.assert_allclose(found.riccati.K, K, rtol=1e-9)
@@ -257,7 +257,7 @@ def test_a_stable_lift_uses_the_recentred_law():
     found = feedback(model, np.zeros(1), setpoint_target(model), reactor_weights(model, 1.0),
                      **BOUNDS)
     assert found.solved
-    assert found.law is Law.RECENTRED
+    assert found.form is Form.RECENTRED
 
 
 def test_the_projected_law_takes_over():
@@ -269,7 +269,7 @@ def test_the_projected_law_takes_over():
     assert lifted.riccati.gain > 1.1 * plain.riccati.gain
     found = feedback(*arguments, max_gain=1.05 * plain.riccati.gain, max_residual=1e-6)
     assert found.solved
-    assert found.law is Law.PROJECTED
+    assert found.form is Form.PROJECTED
     np.testing.assert_array_equal(found.u, plain.u)
 
 
@@ -323,7 +323,7 @@ def test_projected_law_of_a_free_lift_by_hand(x):
 
 
 @pytest.mark.parametrize(('identity', 'n_free', 'law'), [
-    (True, 1, Law.RECENTRED), (False, 1, Law.RECENTRED), (False, 2, Law.PROJECTED)])
+    (True, 1, Form.RECENTRED), (False, 1, Form.RECENTRED), (False, 2, Form.PROJECTED)])
 def test_a_free_lift_with_more_coordinates_than_states_takes_the_projected_law(
         identity, n_free, law):
     model = random_lift(1, identity=identity, n_free=n_free)
@@ -331,4 +331,4 @@ def test_a_free_lift_with_more_coordinates_than_states_takes_the_projected_law(
     target = steady_state_target(model, np.array([0.1]))
     found = feedback(model, np.array([0.3]), target, Weights(np.eye(1), np.eye(1)))
     assert found.solved
-    assert found.law is law
+    assert found.form is law

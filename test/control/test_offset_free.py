@@ -30,7 +30,7 @@ def test_nominal_step_response():
     samples = loop.run(RESPONSE + MORE)
     assert settled(samples, SETPOINT, 1e-3) <= RESPONSE
     # the model is so good that there is next to nothing to estimate
-    assert max(abs(float(s.report.disturbance[0])) for s in samples) < 0.01
+    assert max(abs(float(s.report.estimate.disturbance[0])) for s in samples) < 0.01
 
 
 @pytest.mark.parametrize('change', CHANGES)
@@ -40,7 +40,7 @@ def test_a_plant_that_is_not_the_model_is_brought_to_its_setpoint(change):
     loop.ask(SETPOINT)
     samples = loop.run(RESPONSE + MORE)
     assert settled(samples, SETPOINT, 1e-3) <= RESPONSE + MORE - 10
-    assert abs(float(samples[-1].report.disturbance[0])) > 0.4
+    assert abs(float(samples[-1].report.estimate.disturbance[0])) > 0.4
 
 
 @pytest.mark.parametrize('change', ['UA - 20 %', 'T_i - 5 K'])
@@ -80,7 +80,7 @@ def test_a_biased_sensor_is_shown_for_what_it_is():
     assert last.temperature + 2.0 == pytest.approx(START, abs=1e-3)
     bias = loop.controller.equivalent_bias(loop.state)
     np.testing.assert_allclose(bias, [2.0], rtol=0, atol=2e-3)
-    assert float(last.report.disturbance[0]) == pytest.approx(1.07, abs=0.02)
+    assert float(last.report.estimate.disturbance[0]) == pytest.approx(1.07, abs=0.02)
 
 
 def test_a_quarter_of_an_hour_at_the_limit_leaves_nothing_behind():
@@ -104,7 +104,7 @@ def test_an_actuator_that_reaches_less_than_is_commanded(tells, winds_up):
     # 292.29 K would be needed
     loop.reached = (298.15, 1000.0)
     stuck = loop.run(900)
-    assert all(s.report.follows for s in stuck[20:]) is not tells
+    assert all(s.report.measurement.follows for s in stuck[20:]) is not tells
     loop.reached = (0.0, 1000.0)
     samples = loop.run(420)
     below = SETPOINT - min(s.temperature for s in samples)

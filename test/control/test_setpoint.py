@@ -9,6 +9,7 @@ import pytest
 from koopman_ros.control import Setpoint
 from koopman_ros.control.setpoint import advance, HORIZON_NANOSECONDS, refusal, request
 from support.closed_loops import shipped
+from support.sampled_loops import say
 
 MODEL = shipped('reactor_nz4')
 SECOND = 1_000_000_000
@@ -21,7 +22,7 @@ def kelvin(value):
 
 
 def moved(setpoint, now_ns=NOW, *, measured=320.0, ramp=np.inf, seconds=1.0):
-    return advance(setpoint, kelvin(measured), MODEL, ramp, now_ns, seconds)
+    return advance(setpoint, kelvin(measured), MODEL, kelvin(ramp), now_ns, seconds)
 
 
 def schedule(setpoint):
@@ -30,12 +31,12 @@ def schedule(setpoint):
 
 @pytest.mark.parametrize('value', [306.0, 314.4, 326.5])
 def test_values_in_the_box_are_accepted(value):
-    assert refusal(MODEL, kelvin(value)) == ''
+    assert refusal(MODEL, kelvin(value)) is None
 
 
 def test_the_corners_of_the_box_are_accepted():
     for corner in (MODEL.states.lower, MODEL.states.upper):
-        assert refusal(MODEL, corner) == ''
+        assert refusal(MODEL, corner) is None
 
 
 @pytest.mark.parametrize(('value', 'text'), [
@@ -49,14 +50,14 @@ def test_the_corners_of_the_box_are_accepted():
     (-np.inf, 'temperature set-point -inf K is not finite: the old one is kept'),
 ])
 def test_refusals_say_why(value, text):
-    assert refusal(MODEL, kelvin(value)) == text
+    assert say(refusal(MODEL, kelvin(value))) == text
 
 
 @pytest.mark.parametrize('corner', ['lower', 'upper'])
 def test_a_hair_outside_is_refused(corner):
     edge = getattr(MODEL.states, corner)
     outside = np.nextafter(edge, 0.0 if corner == 'lower' else np.inf)
-    assert 'is outside the trained range' in refusal(MODEL, outside)
+    assert 'is outside the trained range' in say(refusal(MODEL, outside))
 
 
 @pytest.mark.parametrize('effective_ns', [

@@ -9,18 +9,17 @@ import numpy as np
 import pytest
 from scipy.optimize import brentq
 
-from koopman_ros.control import Controller, InputLimits, Rung, Settings, State
+from koopman_ros.control import Controller, InputLimits, Settings, State
 from koopman_ros.control.way_back import leads_home, rest_under, WayBack
 from koopman_ros.lifting import Coordinates, linearised_model, Provenance
 from koopman_ros.nodes.model_loading import rests_outside
-from koopman_ros.nodes.translation import controller_of
 from support.closed_loops import REACTOR, shipped, START
 from support.sampled_loops import (
     changed_reactor,
     controller,
     largest_step,
+    levels,
     Loop,
-    rungs,
     SAFE,
     settled,
 )
@@ -61,11 +60,11 @@ def test_after_a_dead_sensor_the_loop_comes_back_by_itself(name):
     loop = Loop(controller(), plant=plant)
     loop.run(5)
     silent = loop.run(260, lambda _: None)
-    assert silent[-1].report.rung is Rung.SAFE
+    assert silent[-1].report.level == 'safe'
     assert silent[-1].command == SAFE
     assert silent[-1].temperature == pytest.approx(rest_of(plant), abs=0.1)
     samples = loop.run(320)
-    assert samples[-1].report.rung is Rung.LEARNED
+    assert samples[-1].report.level == 'sdre'
     assert settled(samples, START, 0.2) < 310
     assert max(s.temperature for s in samples) < START + 1.5
     assert largest_step(samples) <= 1.0 + 1e-9
@@ -75,13 +74,13 @@ def test_a_noisy_sensor_does_not_keep_it_there():
     loop = rested(changed_reactor(heat_transfer_coefficient=1.2))
     loop.noise = 0.1
     samples = loop.run(320)
-    assert samples[-1].report.rung is Rung.LEARNED
+    assert samples[-1].report.level == 'sdre'
     assert settled(samples, START, 0.3) < 320
 
 
 def test_even_a_lift_of_narrow_data_comes_back():
     samples = rested(REACTOR, narrow()).run(450)
-    assert samples[-1].report.rung is Rung.LEARNED
+    assert samples[-1].report.level == 'sdre'
     assert samples[-1].temperature == pytest.approx(START, abs=0.2)
 
 
@@ -91,8 +90,8 @@ def test_a_sensor_that_stands_still_brings_the_coolant_no_further_than_the_lead(
     loop = rested(plant)
     rng = np.random.default_rng(1)
     samples = loop.run(200, lambda _: 298.0 + noise * rng.standard_normal())
-    assert rungs(samples) == [Rung.SAFE]
-    assert samples[-1].report.way_back == pytest.approx(LEAD, abs=0.6 * noise)
+    assert levels(samples) == ['safe']
+    assert samples[-1].report.command.way_back == pytest.approx(LEAD, abs=0.6 * noise)
     # the plant that loses most of its cooling does not even then run away
     assert max(s.temperature for s in samples) < 327.0
 
@@ -101,10 +100,10 @@ def test_nothing_moves_before_the_plant_rests_and_the_safe_input_is_back_with_th
     loop = rested(changed_reactor(heat_transfer_coefficient=1.2))
     assert {s.command for s in loop.run(30)} == {SAFE}
     led = loop.run(4)
-    assert [s.report.way_back for s in led] == pytest.approx([LEAD] * 4, abs=0.1)
+    assert [s.report.command.way_back for s in led] == pytest.approx([LEAD] * 4, abs=0.1)
     assert led[-1].command == SAFE + 4.0
     blind = loop.run(5, lambda _: float('nan'))
-    assert {s.report.way_back for s in blind} == {0.0}
+    assert {s.report.command.way_back for s in blind} == {0.0}
     assert blind[-1].command == SAFE
     assert loop.run(1)[0].command == SAFE
 
@@ -126,19 +125,20 @@ def test_it_leads_back_from_either_side(side):
     box = Coordinates(('x',), ('1',), np.zeros(1), np.ones(1), -np.ones(1), np.ones(1))
     model = linearised_model(-np.eye(1), np.eye(1), box, replace(box, names=('u',)), 's',
                              Provenance('plant'))
-    step = Controller(model, Settings(
-        np.ones(1), np.ones(1), InputLimits(np.array([-9.0]), np.array([9.0]), np.ones(1)),
+    step = Controller(model, Settings.for_model(
+        model, state_weight=np.ones(1), input_weight=np.ones(1),
+        limits=InputLimits(np.array([-9.0]), np.array([9.0]), np.ones(1)),
         observer_bandwidth=0.5, transfer_time=5.0, safe_input=np.array([4.0 * side])))
     state = step.take_over(State(), np.array([4.0 * side]))
     state, refused = step.request_setpoint(state, np.array([-0.5 * side]))
-    assert refused == ''
+    assert refused is None
     x, shares = 4.0 * side + 0.2, []
     for second in range(1, 150):
         state, u, report = step.step(state, np.array([x]), second * SECOND)
-        shares.append(report.way_back)
+        shares.append(report.command.way_back)
         x += (u[0] + 0.2 - x) * -np.expm1(-1.0)
     assert max(shares) > 0.5
-    assert report.rung is Rung.LEARNED
+    assert report.level == 'sdre'
     assert x == pytest.approx(-0.5 * side, abs=1e-3)
 
 
@@ -185,7 +185,7 @@ def test_a_model_tells_where_the_safe_input_rests(name, coolant):
 
 @pytest.mark.parametrize('name', ['reactor_nz3', 'reactor_nz4', 'reactor_linear'])
 def test_shipped_models_are_not_complained_of(name):
-    assert rests_outside(controller_of(shipped(name), controller().settings)) == ''
+    assert rests_outside(Controller(shipped(name), controller().settings)) == ''
 
 
 def test_a_lift_of_narrow_data_says_that_the_safe_coolant_leads_out_of_its_range():
@@ -195,12 +195,12 @@ def test_a_lift_of_narrow_data_says_that_the_safe_coolant_leads_out_of_its_range
     holding = float(brentq(lambda u: REACTOR.derivative(np.array([edge]), np.array([u]))[0],
                            SAFE, 305.0))
     assert narrowed.rest.holding[0] == pytest.approx(holding, abs=0.05)
-    words = rests_outside(controller_of(narrowed.model, narrowed.settings))
+    words = rests_outside(Controller(narrowed.model, narrowed.settings))
     assert 'under safe_coolant = 5' in words
     assert 'leaves the trained range' in words
     assert 'record data from there and train again, or set safe_coolant to 25.8' in words
     warmer = replace(narrowed.settings, safe_input=np.array([holding + 0.1]))
-    assert rests_outside(controller_of(narrowed.model, warmer)) == ''
+    assert rests_outside(Controller(narrowed.model, warmer)) == ''
 
 
 def test_a_safe_input_that_drives_the_reactor_up_is_told_as_well():

@@ -101,12 +101,12 @@ def test_internals_carry_the_stamp_of_the_measurement(shared_bench: Bench) -> No
     assert predicted[-1].temperature != STEADY - 0.02 * 9
     names = internals[-1].name
     assert {name.split(' [')[0] for name in names} >= {
-        'disturbance', 'estimated_temperature', 'distance_outside', 'rung', 'gain',
+        'disturbance', 'estimated_temperature', 'distance_outside', 'level', 'gain',
         'riccati_residual', 'growth_per_sample', 'transfer', 'setpoint'}
     found = {name.split(' [')[0]: position
              for name, position in zip(names, internals[-1].position, strict=True)}
     assert found['estimated_temperature'] == pytest.approx(STEADY - 0.18, abs=0.5)
-    assert found['rung'] == 0.0
+    assert found['level'] == 0.0
     assert 0.0 < found['gain'] < 1000.0
 
 

@@ -23,8 +23,8 @@ from koopman_ros.nodes.shipped import config_directory
 # What a layout shows: topics with one value by themselves, and internals by their names.
 TEMPERATURES = {topics.TEMPERATURE, topics.ACTIVE_SETPOINT, topics.PREDICTED_TEMPERATURE,
                 topics.COOLANT_SETPOINT, topics.COOLANT_TEMPERATURE}
-INTERNALS = {'disturbance', 'transfer', 'gain', 'growth_per_sample', 'rung', 'distance_outside'}
-NAMES = list(internals(Report(Mode.AUTOMATIC), Time(), '').name)
+INTERNALS = {'disturbance', 'transfer', 'gain', 'growth_per_sample', 'level', 'distance_outside'}
+NAMES = list(internals(Report(Mode.AUTOMATIC, 'sdre'), Time(), '').name)
 
 
 def published(topic: str, field: str, name: str = '') -> str:

@@ -233,7 +233,7 @@ def test_the_day_was_not_an_easy_one(bag: Path) -> None:
     assert {record.fields['result'] for record in written if record.event == 'measurement'} == {
         'accepted', 'rejected', 'repeated', 'late'}
     assert {record.fields['level'] for record in written if 'level' in record.fields} >= {
-        'learned', 'hold', 'safe'}
+        'sdre', 'hold', 'safe'}
     assert found.found.models == ['reactor_nz4', str(bag.parent / 'own.safetensors'),
                                   'reactor_nz3']
     steps = np.abs(np.diff(found.recorded[:, 0]))
@@ -260,7 +260,8 @@ def test_bag_from_the_middle_is_reproduced_from_its_first_snapshot_on(
         unknown = sum(record.fields.get('command') is not None
                       for record in whole[place:place + before])
         assert found.check.identical == found.check.compared == len(found.recorded) - unknown
-        assert found.found.begins_late == 1
+        # a run that is cut, and a second one whose start no recorder was there for yet
+        assert 1 <= found.found.begins_late <= found.found.runs
         assert reproduced(found)
         assert found.unexplained == found.published.total() - len(found.recorded)
 

@@ -15,14 +15,14 @@ import numpy as np
 from koopman_ros.control import (
     Controller,
     InputLimits,
-    LadderSettings,
+    LevelSettings,
     Mode,
     Report,
-    Rung,
-    SensorLimits,
     Settings,
     State,
+    SupervisorSettings,
 )
+from koopman_ros.estimation import SensorLimits
 from koopman_ros.plants import (
     advance,
     ControlAffineSystem,
@@ -30,6 +30,8 @@ from koopman_ros.plants import (
     one_state_reactor,
     ReactorParameters,
 )
+from koopman_ros.reasons import Words
+from koopman_ros.units import Displays
 from support.closed_loops import REACTOR, shipped, START
 
 SECOND = 1_000_000_000
@@ -38,18 +40,29 @@ LOWER, UPPER, RATE = 278.15, 305.15, 1.0  # K, K, K/s
 SAFE = LOWER
 
 
-def controller(model: Any = 'reactor_nz4', *, ladder: Mapping[str, float] | None = None,
-               sensor: Mapping[str, float] | None = None, **changes: Any) -> Controller:
+def controller(model: Any = 'reactor_nz4', *, supervisor: Mapping[str, float] | None = None,
+               sensor: Mapping[str, Any] | None = None, **changes: Any) -> Controller:
     """Return a controller with the node's default tuning."""
-    settings = Settings(
-        np.ones(1), np.ones(1),
-        InputLimits(np.array([LOWER]), np.array([UPPER]), np.array([RATE])),
-        observer_bandwidth=6.0 / 60.0, max_disturbance=20.0, safe_input=np.array([SAFE]),
-        sensor=SensorLimits(**{'lower': 253.15, 'upper': 423.15, 'rate': 2.0, 'jump': 2.0,
-                               'frozen_timeout': 20.0, **(sensor or {})}),
-        ladder=LadderSettings(**(ladder or {})))
-    return Controller(shipped(model) if isinstance(model, str) else model,
-                      replace(settings, **changes))
+    model = shipped(model) if isinstance(model, str) else model
+    settings = Settings.for_model(
+        model, state_weight=np.ones(1), input_weight=np.ones(1),
+        limits=InputLimits(np.array([LOWER]), np.array([UPPER]), np.array([RATE])),
+        observer_bandwidth=6.0 / 60.0, max_disturbance=np.array([20.0]),
+        input_tolerance=np.array([2.0]), safe_input=np.array([SAFE]),
+        sensor=replace(SensorLimits(np.array([253.15]), np.array([423.15]), np.array([2.0]),
+                                    np.array([2.0]), 20.0), **(sensor or {})),
+        supervisor=supervisor_settings(**(supervisor or {})))
+    return Controller(model, replace(settings, **changes))
+
+
+def supervisor_settings(learned: float = 0.1, linear: float = 0.5, **times: float
+                        ) -> SupervisorSettings:
+    """Return the two levels of the node with their margins."""
+    return SupervisorSettings(
+        (LevelSettings('sdre', learned), LevelSettings('linear', linear)), **times)
+
+
+say = Words(Displays({'temperature': 'K', 'coolant_temperature': 'K'}))
 
 
 def changed_reactor(feed_shift: float = 0.0, **factors: float) -> ControlAffineSystem:
@@ -112,7 +125,7 @@ class Loop:
 
     def ask(self, kelvin: float) -> None:
         self.state, refused = self.controller.request_setpoint(self.state, np.array([kelvin]))
-        assert refused == ''
+        assert refused is None
 
     def set_mode(self, mode: Mode) -> None:
         self.state = self.controller.set_mode(self.state, mode)
@@ -171,10 +184,10 @@ def settled(samples: list[Sample], kelvin: float, tolerance: float) -> int:
     return off[-1] + 1 if off else 0
 
 
-def rungs(samples: list[Sample]) -> list[Rung]:
-    """Return the rungs in the order in which they were stood on."""
-    found: list[Rung] = []
+def levels(samples: list[Sample]) -> list[str]:
+    """Return the control levels in the order in which they acted."""
+    found: list[str] = []
     for sample in samples:
-        if not found or found[-1] is not sample.report.rung:
-            found.append(sample.report.rung)
+        if not found or found[-1] != sample.report.level:
+            found.append(sample.report.level)
     return found

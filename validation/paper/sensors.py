@@ -222,11 +222,12 @@ def _roll_out_error(model: LiftedModel, system: ControlAffineSystem, design: Ran
 def _controlled(system: ControlAffineSystem, model: LiftedModel, x0: Array, minutes: float,
                 seed: int) -> _Run:
     """Run the control step once a second on a noisy measurement."""
-    controller = Controller(model, Settings(np.ones(1), np.ones(1), InputLimits(
-        np.array([278.15]), np.array([305.15]), np.ones(1))))
-    state, reason = controller.request_setpoint(State(), np.array([SETPOINT]))
-    if reason:
-        raise ValueError(reason)
+    controller = Controller(model, Settings.for_model(
+        model, state_weight=np.ones(1), input_weight=np.ones(1),
+        limits=InputLimits(np.array([278.15]), np.array([305.15]), np.ones(1))))
+    state, refusal = controller.request_setpoint(State(), np.array([SETPOINT]))
+    if refusal is not None:
+        raise ValueError(refusal.code.value)
 
     def answer(measured: float, time_ns: int) -> float:
         nonlocal state

@@ -13,8 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import brentq
 
-from koopman_ros.control import Rung
-from koopman_ros.control.ladder import Standing
+from koopman_ros.control import SAFE, Supervisor
 from koopman_ros.plants import ControlAffineSystem, fold, two_state_reactor
 from validation.paper.outcome import Metrics
 from validation.robustness.disturbances import finite
@@ -27,6 +26,7 @@ from validation.robustness.loop import (
     reactor_controller,
     run_loop,
     shipped_model,
+    supervisor_settings,
 )
 
 Array = NDArray[np.float64]
@@ -80,12 +80,12 @@ def end_of(start: Start, *, ladder: bool, system: ControlAffineSystem = REACTOR,
     """
     near = 0
 
-    def arrived(x: Array, _: Array, rung: Rung) -> bool:
+    def arrived(x: Array, _: Array, level: str) -> bool:
         nonlocal near
         near = near + 1 if abs(x[-1] - start.setpoint) <= TOLERANCE else 0
-        # it could still fall from the rungs of recovery
+        # it could still fall back from there
         gone = x[-1] > GONE and system is REACTOR
-        return bool(gone or (near >= _SETTLED and rung is Rung.LEARNED))
+        return bool(gone or (near >= _SETTLED and level == 'sdre'))
 
     x0 = [start.temperature] if concentration is None else [concentration, start.temperature]
     course = run_loop(reactor_controller(ladder=ladder), system, np.array(x0), start.coolant,
@@ -95,7 +95,7 @@ def end_of(start: Start, *, ladder: bool, system: ControlAffineSystem = REACTOR,
     if near < _SETTLED:
         return End.ELSEWHERE
     worst = course.worst()
-    return {Rung.LEARNED: End.LEARNED, Rung.LINEAR: End.LINEAR}.get(worst, End.SAFE)
+    return {'sdre': End.LEARNED, 'linear': End.LINEAR}.get(worst, End.SAFE)
 
 
 def hottest_start(coolant: float, setpoint: float, *, ladder: bool, lowest: float = 326.0,
@@ -191,11 +191,11 @@ def back_from_safe(system: ControlAffineSystem, linear_margin: float) -> Metrics
     rest = np.array([brentq(lambda T: system.derivative(np.array([T]), np.array([coldest]))[0],
                             coldest, 320.0)])
     usual = reactor_controller()
-    ladder = replace(usual.settings.ladder, linear_margin=linear_margin)
-    controller = replace(usual, settings=replace(usual.settings, ladder=ladder))
+    ladder = supervisor_settings(linear=linear_margin)
+    controller = replace(usual, settings=replace(usual.settings, supervisor=ladder))
 
     def safe(loop: Loop) -> Loop:
-        return replace(loop, state=replace(loop.state, standing=Standing(Rung.SAFE)))
+        return replace(loop, state=replace(loop.state, supervisor=Supervisor(SAFE)))
 
     course = run_loop(controller, system, rest, coldest, _RETURN,
                       [(0.0, safe), (0.0, at_setpoint(SETPOINT))])

@@ -16,7 +16,7 @@ from matplotlib.figure import Figure
 import numpy as np
 from numpy.typing import NDArray
 
-from koopman_ros.control import Rung
+from koopman_ros.reasons import level_words
 from validation.paper import two_state
 from validation.paper.figures import Drawn, RANGE
 from validation.robustness import attraction, disturbances, narrow
@@ -39,11 +39,11 @@ _MARKS: dict[End, dict[str, Any]] = {
     End.SAFE: {'marker': 'D', 'color': 'tab:orange'},
     End.ELSEWHERE: {'marker': 'P', 'color': 'tab:purple'},
     End.RAN_AWAY: {'marker': 'x', 'color': 'tab:red'}}
-_RUNGS: dict[Rung, dict[str, Any]] = {
-    Rung.LEARNED: {'marker': 'o', 'color': 'tab:green'},
-    Rung.LINEAR: {'marker': 's', 'color': 'tab:blue'},
-    Rung.HOLD: {'marker': 'P', 'color': 'tab:purple'},
-    Rung.SAFE: {'marker': 'D', 'color': 'tab:orange'}}
+_LEVELS: dict[str, dict[str, Any]] = {
+    'sdre': {'marker': 'o', 'color': 'tab:green'},
+    'linear': {'marker': 's', 'color': 'tab:blue'},
+    'hold': {'marker': 'P', 'color': 'tab:purple'},
+    'safe': {'marker': 'D', 'color': 'tab:orange'}}
 
 _PATHS: dict[str, dict[str, Any]] = {
     'narrow': {'color': 'tab:red', 'linestyle': '--', 'label': 'narrow lift, no ladder'},
@@ -173,11 +173,11 @@ def _attraction(found: Found, path: Path) -> Drawn:
 
 
 def _mark(axis: Axes, course: Course, x: np.ndarray, y: np.ndarray) -> None:
-    """Mark where another rung is taken."""
-    for number, rung in enumerate(course.rungs):
-        if number == 0 or rung is not course.rungs[number - 1]:
+    """Mark where another level takes over."""
+    for number, level in enumerate(course.levels):
+        if number == 0 or level != course.levels[number - 1]:
             axis.plot(x[number], y[number], markersize=6, linestyle='none', markeredgecolor='k',
-                      **_RUNGS[rung])
+                      **_LEVELS[level])
 
 
 def _narrow(found: Found, path: Path) -> Drawn:
@@ -210,8 +210,8 @@ def _narrow(found: Found, path: Path) -> Drawn:
     axes[3].title.set_fontsize(9)
     handles, labels = axes[0].get_legend_handles_labels()
     handles += [pyplot.Line2D([], [], linestyle='none', markeredgecolor='k', **mark)
-                for mark in _RUNGS.values()]
-    labels += [f'takes {rung.value}' for rung in _RUNGS]
+                for mark in _LEVELS.values()]
+    labels += [f'takes {level_words(level)}' for level in _LEVELS]
     figure.legend(handles, labels, loc='outside lower center', ncols=4, fontsize=8)
     _save(figure, path)
     return Drawn(path.name, (

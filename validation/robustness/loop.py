@@ -19,12 +19,12 @@ from numpy.typing import NDArray
 from koopman_ros.control import (
     Controller,
     InputLimits,
-    LadderSettings,
-    Rung,
-    SensorLimits,
+    LevelSettings,
     Settings,
     State,
+    SupervisorSettings,
 )
+from koopman_ros.estimation import SensorLimits
 from koopman_ros.lifting import LiftedModel, load
 from koopman_ros.plants import (
     ActuatedProcess,
@@ -36,6 +36,7 @@ from koopman_ros.plants import (
     ReactorParameters,
     sensor_noise,
 )
+from koopman_ros.reasons import Reason
 
 Array = NDArray[np.float64]
 
@@ -47,7 +48,7 @@ COOLANT_RANGE = (278.15, 305.15)  # K
 BANDWIDTH = 6.0  # 1/min
 _NS = 1_000_000_000
 # A margin that is never exceeded: without the ladder the learned law acts everywhere.
-_EVERYWHERE = 1e9
+EVERYWHERE = 1e9
 
 
 @lru_cache
@@ -67,13 +68,20 @@ def reactor_controller(*, bandwidth: float = BANDWIDTH, coolant_weight: float = 
     :param model: the shipped one by default.
     """
     lower, upper = COOLANT_RANGE
+    two = np.array([2.0])
     return Controller(model or shipped_model(), Settings(
-        np.ones(1), np.array([coolant_weight]),
-        InputLimits(np.array([lower]), np.array([upper]), np.ones(1)),
-        setpoint_ramp=1000.0 / 60.0, observer_bandwidth=bandwidth / 60.0, max_disturbance=20.0,
-        transfer_time=30.0, safe_input=np.array([lower]),
-        sensor=SensorLimits(253.15, 423.15, 2.0, 2.0, 20.0),
-        ladder=LadderSettings() if ladder else LadderSettings(_EVERYWHERE, _EVERYWHERE)))
+        state_weight=np.ones(1), input_weight=np.array([coolant_weight]),
+        limits=InputLimits(np.array([lower]), np.array([upper]), np.ones(1)),
+        setpoint_ramp=np.array([1000.0 / 60.0]), max_disturbance=np.array([20.0]),
+        input_tolerance=two, safe_input=np.array([lower]),
+        sensor=SensorLimits(np.array([253.15]), np.array([423.15]), two, two, 20.0),
+        observer_bandwidth=bandwidth / 60.0, supervisor=supervisor_settings() if ladder else (
+            supervisor_settings(EVERYWHERE, EVERYWHERE))))
+
+
+def supervisor_settings(learned: float = 0.1, linear: float = 0.5) -> SupervisorSettings:
+    """Return the two levels of the node with their margins, in half widths."""
+    return SupervisorSettings((LevelSettings('sdre', learned), LevelSettings('linear', linear)))
 
 
 def changed_reactor(*, heat_transfer: float = 1.0, concentration: float = 1.0,
@@ -149,8 +157,9 @@ class Course:
     :param x: (N, n) true state of the plant.
     :param u: (N,) command.
     :param disturbance: (N,) estimated, in input units; NaN where there is none.
-    :param rungs: where on the ladder.
-    :param reasons: why there, in the words of diagnostics.
+    :param levels: that acted.
+    :param order: of the levels, best first.
+    :param reasons: why not a better one.
     :param ran_away: whether the plant left the bounds of its model.
     :param last: the loop at the end.
     """
@@ -159,8 +168,9 @@ class Course:
     x: Array
     u: Array
     disturbance: Array
-    rungs: tuple[Rung, ...]
-    reasons: tuple[str, ...]
+    levels: tuple[str, ...]
+    order: tuple[str, ...]
+    reasons: tuple[Reason | None, ...]
     ran_away: bool
     last: Loop
 
@@ -178,16 +188,16 @@ class Course:
             return math.inf
         return float(start[outside[-1] + 1] - since)
 
-    def worst(self) -> Rung:
-        """Return the lowest rung that it stood on."""
-        return max(self.rungs, key=lambda rung: rung.depth)
+    def worst(self) -> str:
+        """Return the last of the levels that acted."""
+        return max(self.levels, key=self.order.index)
 
 
 def run_loop(controller: Controller, system: ControlAffineSystem, x0: Array, coolant: float,
              seconds: float, changes: Sequence[tuple[float, Change]] = (), *,
              actuator: Actuator | None = None, tells: bool = False, noise: float = 0.0,
              seed: int = 0, period: float = PERIOD,
-             stop: Callable[[Array, Array, Rung], bool] | None = None) -> Course:
+             stop: Callable[[Array, Array, str], bool] | None = None) -> Course:
     """
     Run a loop whose controller takes over from an input in force.
 
@@ -202,14 +212,14 @@ def run_loop(controller: Controller, system: ControlAffineSystem, x0: Array, coo
     :param noise: standard deviation of the measurement, in state units.
     :param seed: of the noise.
     :param period: between samples, in s.
-    :param stop: ends the run when it is true of state, command and rung.
+    :param stop: ends the run when it is true of state, command and level.
     """
     held = np.array([coolant])
     plant = ActuatedProcess(Process(system, 0, np.asarray(x0, dtype=np.float64), held),
                             actuator or Actuator(), held)
     loop = Loop(controller, controller.take_over(State(), held), plant)
     rows: list[tuple[float, Array, float, float]] = []
-    rungs, reasons, ran_away = [], [], False
+    levels, reasons, ran_away = [], [], False
     n_x, waiting = controller.model.n_x, sorted(changes, key=lambda change: change[0])
     for number in range(round(seconds / period) + 1):
         # stamps start after 0, which has a meaning of its own to a set-point
@@ -227,12 +237,14 @@ def run_loop(controller: Controller, system: ControlAffineSystem, x0: Array, coo
         state, u, report = loop.controller.step(
             loop.state, measured, time_ns + _NS, plant.process.u if tells else None)
         loop = replace(loop, state=state, plant=loop.plant.commanded(u, time_ns))
-        disturbance = np.nan if report.disturbance is None else float(report.disturbance[0])
+        disturbance = np.nan if report.estimate is None else (
+            float(report.estimate.disturbance[0]))
         rows.append((number * period, x, float(u[0]), disturbance))
-        rungs.append(report.rung)
+        levels.append(report.level)
         reasons.append(report.reason)
-        if stop is not None and stop(x, u, report.rung):
+        if stop is not None and stop(x, u, report.level):
             break
     times, states, inputs, disturbances = zip(*rows, strict=True)
     return Course(np.array(times), np.array(states), np.array(inputs), np.array(disturbances),
-                  tuple(rungs), tuple(reasons), ran_away, loop)
+                  tuple(levels), controller.settings.supervisor.order, tuple(reasons), ran_away,
+                  loop)

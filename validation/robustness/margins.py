@@ -15,7 +15,7 @@ from scipy.signal import cont2discrete
 
 import control
 from koopman_ros.control import Controller, State
-from koopman_ros.control.observer import Estimate
+from koopman_ros.estimation import Estimate
 from koopman_ros.lifting import LiftedModel
 from koopman_ros.plants import Actuator, ControlAffineSystem, equilibrium_input
 from validation.robustness.loop import at_setpoint, PERIOD, REACTOR, run_loop

@@ -12,7 +12,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from koopman_ros.control import Controller, InputLimits, LadderSettings, Rung, Setpoint, Settings
+from koopman_ros.control import Controller, InputLimits, SAFE, Setpoint, Settings
 from koopman_ros.learning import Growth, Linearisation, train
 from koopman_ros.lifting import LiftedModel
 from koopman_ros.plants import RandomStepDesign
@@ -27,12 +27,14 @@ from validation.robustness.loop import (
     changed_reactor,
     COOLANT,
     Course,
+    EVERYWHERE,
     Loop,
     on_plant,
     REACTOR,
     reactor_controller,
     run_loop,
     START,
+    supervisor_settings,
 )
 
 Array = NDArray[np.float64]
@@ -92,7 +94,7 @@ def run_trial(trial: Trial, model: LiftedModel | None, *, ladder: bool) -> Cours
     controller = reactor_controller(bandwidth=trial.bandwidth, ladder=ladder, model=model)
     return run_loop(controller, REACTOR, np.array([trial.temperature]), COOLANT, SECONDS,
                     [(0.0, at_setpoint(START)), *trial.changes],
-                    stop=lambda x, _, rung: bool(x[0] > 420.0))
+                    stop=lambda x, _, level: bool(x[0] > 420.0))
 
 
 def reactor_courses(narrow: LiftedModel) -> dict[tuple[str, str], Course]:
@@ -114,7 +116,7 @@ def judge_reactor(course: Course, since: float = 0.0) -> Metrics:
     return {'hottest_kelvin': hottest, 'final_kelvin': float(course.x[-1, 0]),
             'seconds_to_0.2_kelvin': finite(course.settling(START, 0.2, since)),
             'ran_away': course.ran_away or hottest > 350.0,
-            'safe_share': float(np.mean([rung is Rung.SAFE for rung in course.rungs]))}
+            'safe_share': float(np.mean([level == SAFE for level in course.levels]))}
 
 
 def far_from_the_model(linear_margin: float, bandwidth: float) -> Metrics:
@@ -126,11 +128,11 @@ def far_from_the_model(linear_margin: float, bandwidth: float) -> Metrics:
     :return: as :func:`judge_reactor`, the time counting from the change.
     """
     usual = reactor_controller(bandwidth=bandwidth)
-    ladder = LadderSettings(linear_margin=linear_margin)
-    controller = replace(usual, settings=replace(usual.settings, ladder=ladder))
+    ladder = supervisor_settings(linear=linear_margin)
+    controller = replace(usual, settings=replace(usual.settings, supervisor=ladder))
     course = run_loop(controller, REACTOR, np.array([START]), COOLANT, SECONDS,
                       [(0.0, at_setpoint(START)), *TRIALS[1].changes],
-                      stop=lambda x, _, rung: bool(x[0] > 420.0))
+                      stop=lambda x, _, level: bool(x[0] > 420.0))
     return judge_reactor(course, _DISTURBED)
 
 
@@ -153,11 +155,12 @@ def two_state_course(model: LiftedModel, *, ladder: bool) -> Course:
 
     The origin is put into the controller's state, since it refuses set-points outside its data.
     """
-    controller = Controller(model, Settings(
-        np.ones(2), np.ones(1),
-        InputLimits(np.array([-_BOUND]), np.array([_BOUND]), np.array([np.inf])),
+    controller = Controller(model, Settings.for_model(
+        model, state_weight=np.ones(2), input_weight=np.ones(1),
+        limits=InputLimits(np.array([-_BOUND]), np.array([_BOUND]), np.array([np.inf])),
         safe_input=np.zeros(1), transfer_time=1.0,
-        ladder=LadderSettings(recovery_time=1.0) if ladder else LadderSettings(1e9, 1e9)))
+        supervisor=replace(supervisor_settings(), recovery_time=1.0) if ladder else (
+            supervisor_settings(EVERYWHERE, EVERYWHERE))))
 
     def to_origin(loop: Loop) -> Loop:
         origin = Setpoint(np.zeros(2), np.zeros(2))
@@ -165,7 +168,7 @@ def two_state_course(model: LiftedModel, *, ladder: bool) -> Course:
 
     return run_loop(controller, two_state.SYSTEM, two_state.START, _HOLDING, _HORIZON,
                     [(0.0, to_origin)], period=_SAMPLE,
-                    stop=lambda x, _, rung: bool(np.max(np.abs(x)) > _ESCAPED))
+                    stop=lambda x, _, level: bool(np.max(np.abs(x)) > _ESCAPED))
 
 
 def two_state_courses(models: Mapping[str, LiftedModel]) -> dict[tuple[str, str], Course]:
@@ -181,7 +184,7 @@ def judge_two_state(course: Course) -> Metrics:
     :return: `largest_x2`, `final_distance` from the origin, `escaped`, `left_after` (seconds
         until it stood below the learned law; None for never).
     """
-    below = [rung is not Rung.LEARNED for rung in course.rungs]
+    below = [level != 'sdre' for level in course.levels]
     return {'largest_x2': float(np.max(np.abs(course.x[:, 1]))),
             'final_distance': float(np.linalg.norm(course.x[-1])),
             'escaped': bool(np.max(np.abs(course.x)) > _ESCAPED),

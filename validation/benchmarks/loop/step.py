@@ -21,7 +21,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from koopman_ros.control import Controller, Law, State
+from koopman_ros.control import Controller, Form, State
 from koopman_ros.nodes.messages import NANOSECONDS
 from validation.benchmarks.loop import lifts
 from validation.benchmarks.loop.naive import NaiveLaw
@@ -110,9 +110,9 @@ def _answered(under: Controller, course: tuple[lifts.Sample, ...]) -> tuple[Aske
         if sample.requested is not None:
             state = lifts.asked(under, state, sample.requested)
         state, command, report = under.step(state, sample.measurement, sample.time_ns)
-        if report.law is not Law.RECENTRED or report.active_setpoint is None:
+        if report.command.law.form != Form.RECENTRED.value or report.target is None:
             raise ValueError(f'the re-centred law is not in force: {report}')
-        asked.append(Asked(sample.measurement, report.active_setpoint,
+        asked.append(Asked(sample.measurement, report.target.setpoint,
                            (sample.time_ns - before) / NANOSECONDS, command))
         before = sample.time_ns
     return tuple(asked)

@@ -1,42 +1,34 @@
 # SPDX-FileCopyrightText: 2026 The koopman_ros Authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""State-dependent Riccati laws on a lifted model: the re-centred and the projected one."""
+"""The state-dependent Riccati law on a lifted model, in its re-centred and projected forms."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
 from enum import Enum
+import math
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.linalg import expm
 
+from koopman_ros.control.laws.base import Figures, LawResult, Tuning, Weights
+from koopman_ros.control.limits import finite, InputLimits
 from koopman_ros.control.target import Target
+from koopman_ros.estimation import Estimate
 from koopman_ros.lifting import LiftedModel
-from koopman_ros.solvers import RiccatiSolution, RiccatiStatus, solve_riccati
+from koopman_ros.reasons import Code, reason
+from koopman_ros.solvers.riccati import RiccatiSolution, RiccatiStatus, solve_riccati
 
 Array = NDArray[np.float64]
 
 
-class Law(Enum):
-    """The feedback laws; the value is the word an operator reads."""
+class Form(Enum):
+    """The forms of the feedback; the value is the word an operator reads."""
 
     RECENTRED = 're-centred'
     PROJECTED = 'projected'
-
-
-@dataclass(frozen=True)
-class Weights:
-    """
-    Quadratic cost on scaled deviations from the target: e' Q e + v' R v.
-
-    :param Q: (n_x, n_x) symmetric, positive semidefinite, not zero.
-    :param R: (n_u, n_u) symmetric, positive definite.
-    """
-
-    Q: Array
-    R: Array
 
 
 @dataclass(frozen=True)
@@ -45,14 +37,14 @@ class Feedback:
     The outcome of one state-dependent Riccati solution.
 
     :param u: (n_u,) u_ref - K e in scaled deviations; not to be used unless solved.
-    :param law: which law produced it.
+    :param form: which form produced it.
     :param riccati: the solution with its residual, gain and status.
     :param drift: (n_x, n_x) A_x of the error e = x - x_ref, e' = A_x e + B v.
     :param action: (n_x, n_x) -B K in terms of that error, so that e' = (A_x + action) e.
     """
 
     u: Array
-    law: Law
+    form: Form
     riccati: RiccatiSolution
     drift: Array
     action: Array
@@ -128,7 +120,7 @@ def recentred(model: LiftedModel, x: Array, target: Target, weights: Weights, *,
 
     Arguments and result as in :func:`feedback`; valid where every mode of A decays.
     """
-    z, J, M, H = model.lift_and_secants(x, target.x, target.push)
+    z, J, M, H = model.lift_and_secants(x, target.x, target.forcing)
     n_x, n_z = model.n_x, model.n_z
     if model.identity:
         # C picks the first coordinates: the products are written out, which is faster
@@ -141,7 +133,7 @@ def recentred(model: LiftedModel, x: Array, target: Target, weights: Weights, *,
     # dot takes a third of the time of @ here
     riccati = solve_riccati(A, J.dot(model.B), Q, weights.R, max_gain=max_gain,
                             max_residual=max_residual)
-    return Feedback(target.u - riccati.K.dot(z - target.z), Law.RECENTRED, riccati,
+    return Feedback(target.u - riccati.K.dot(z - target.z), Form.RECENTRED, riccati,
                     model.onto_states(J, model.A.dot(M) + H), -model.B.dot(riccati.K.dot(M)))
 
 
@@ -156,9 +148,57 @@ def projected(model: LiftedModel, x: Array, target: Target, weights: Weights, *,
 
     Arguments and result as in :func:`feedback`.
     """
-    _, J, M, H = model.lift_and_secants(x, target.x, target.push)
+    _, J, M, H = model.lift_and_secants(x, target.x, target.forcing)
     A = model.onto_states(J, model.A @ M + H)
     riccati = solve_riccati(A, model.B, weights.Q, weights.R,
                             max_gain=max_gain, max_residual=max_residual)
-    return Feedback(target.u - riccati.K @ (x - target.x), Law.PROJECTED, riccati,
+    return Feedback(target.u - riccati.K @ (x - target.x), Form.PROJECTED, riccati,
                     A, -model.B @ riccati.K)
+
+
+@dataclass(frozen=True)
+class StateDependentRiccati:
+    """
+    The law of the paper: the Riccati equation solved with J_N(x) B at each sample.
+
+    :param model: the lift.
+    :param tuning: weights and bounds.
+    """
+
+    model: LiftedModel
+    tuning: Tuning
+
+    def compute(self, estimate: Estimate, target: Target, limits: InputLimits, memory: object,
+                interval: float, deadline: float = math.inf) -> LawResult:
+        """Solve the equation at the estimate; see :class:`~koopman_ros.control.laws.base.Law`."""
+        tuning = self.tuning
+        try:
+            found = feedback(self.model, estimate.x, target, tuning.weights,
+                             max_gain=tuning.max_gain, max_residual=tuning.max_residual)
+            return checked(self.model, found, limits, interval)
+        except np.linalg.LinAlgError as error:
+            return LawResult(None, reason(Code.SINGULAR, matrix=str(error)))
+
+
+def checked(model: LiftedModel, found: Feedback, limits: InputLimits, interval: float
+            ) -> LawResult:
+    """
+    Return the command of a feedback, unless it must not be used.
+
+    :param model: in whose deviations it is.
+    :param found: the feedback.
+    :param limits: of the inputs.
+    :param interval: seconds between samples; 0 when they are not known.
+    """
+    riccati = found.riccati
+    growth = found.growth(interval / model.seconds_per_time_unit) if found.solved else math.nan
+    figures = Figures(found.form.value, riccati.residual, riccati.gain, growth)
+    if not found.solved:
+        return LawResult(None, reason(Code(riccati.status.value)), figures)
+    if not growth < 1.0:
+        return LawResult(None, reason(Code.PREDICTED_UNSTABLE, interval=interval), figures)
+    u = model.inputs.to_physical(found.u)
+    if not finite(u):
+        return LawResult(None, reason(Code.COMMAND_NOT_FINITE), figures)
+    within = limits.within(u)
+    return LawResult(within, None, figures, clipped=bool((within != u).any()))

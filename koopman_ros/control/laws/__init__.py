@@ -1,0 +1,39 @@
+# SPDX-FileCopyrightText: 2026 The koopman_ros Authors
+# SPDX-License-Identifier: Apache-2.0
+
+"""Laws behind one protocol, by the names under which settings choose them."""
+
+from collections.abc import Callable
+
+from koopman_ros.control.laws.base import Figures, Law, LawResult, Tuning, Weights
+from koopman_ros.control.laws.linear import Linear
+from koopman_ros.control.laws.sdre import (
+    Feedback,
+    feedback,
+    Form,
+    projected,
+    recentred,
+    StateDependentRiccati,
+)
+from koopman_ros.lifting import LiftedModel
+
+LAWS: dict[str, Callable[[LiftedModel, Tuning], Law]] = {
+    'sdre': StateDependentRiccati,
+    'linear': Linear,
+}
+
+__all__ = [
+    'LAWS',
+    'Feedback',
+    'Figures',
+    'Form',
+    'Law',
+    'LawResult',
+    'Linear',
+    'StateDependentRiccati',
+    'Tuning',
+    'Weights',
+    'feedback',
+    'projected',
+    'recentred',
+]

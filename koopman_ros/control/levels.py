@@ -1,0 +1,98 @@
+# SPDX-FileCopyrightText: 2026 The koopman_ros Authors
+# SPDX-License-Identifier: Apache-2.0
+
+"""The control levels of a controller: a name, a model, a law and an estimator each."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.typing import NDArray
+
+from koopman_ros.control.laws import Law, LawResult, LAWS, Tuning, Weights
+from koopman_ros.control.limits import InputLimits
+from koopman_ros.control.settings import Settings
+from koopman_ros.control.target import balance, Reference, reference, Target
+from koopman_ros.estimation import DisturbanceObserver, Estimate, Estimator, MeasuredState
+from koopman_ros.lifting import LiftedModel
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class Level:
+    """
+    One level.
+
+    :param name: of its law.
+    :param law: with its model.
+    :param estimator: on the same model.
+    """
+
+    name: str
+    law: Law
+    estimator: Estimator
+    _references: list[Reference] = field(default_factory=list, init=False, compare=False)
+
+    @property
+    def model(self) -> LiftedModel:
+        """The model of law and estimator."""
+        return self.law.model
+
+    def target(self, setpoint: Array, estimate: Estimate) -> Target:
+        """
+        Return where to go under the estimated disturbance.
+
+        :param setpoint: (n_x,) in state units.
+        """
+        x_ref = self.model.states.to_deviation(setpoint)
+        # a memory of the last set-point only; what comes out does not depend on it
+        known = self._references[0] if self._references else None
+        if known is None or not (known.x == x_ref).all():
+            known = reference(self.model, x_ref)
+            self._references[:] = [known]
+        return balance(self.model, known, estimate.w)
+
+    def compute(self, setpoint: Array, estimate: Estimate, limits: InputLimits, memory: object,
+                interval: float) -> tuple[Target, LawResult]:
+        """
+        Evaluate the law.
+
+        :param setpoint: (n_x,) in state units.
+        :param estimate: in terms of the level's model.
+        :param limits: of the inputs.
+        :param memory: of the law.
+        :param interval: seconds between samples; 0 when they are not known.
+        """
+        target = self.target(setpoint, estimate)
+        return target, self.law.compute(estimate, target, limits, memory, interval)
+
+
+def weights_of(model: LiftedModel, settings: Settings) -> Weights:
+    """Return the cost in the model's scaled deviations."""
+    return Weights(np.diag(settings.state_weight * model.states.scale ** 2),
+                   np.diag(settings.input_weight * model.inputs.scale ** 2))
+
+
+def levels_of(model: LiftedModel, settings: Settings) -> dict[str, Level]:
+    """
+    Build the levels that the settings name, best first.
+
+    :raises ValueError: for a law that there is not.
+    """
+    tuning = Tuning(weights_of(model, settings), settings.max_gain, settings.max_residual)
+    levels = {}
+    for level in settings.supervisor.levels:
+        if level.law not in LAWS:
+            raise ValueError(f'there is no law {level.law!r}: choose among {", ".join(LAWS)}')
+        law = LAWS[level.law](model, tuning)
+        levels[level.law] = Level(level.law, law, _estimator(law.model, settings))
+    return levels
+
+
+def _estimator(model: LiftedModel, settings: Settings) -> Estimator:
+    if not settings.observer_bandwidth > 0.0:
+        return MeasuredState(model)
+    return DisturbanceObserver(model, settings.observer_bandwidth,
+                               settings.max_disturbance / model.inputs.scale)

@@ -1,0 +1,115 @@
+# SPDX-FileCopyrightText: 2026 The koopman_ros Authors
+# SPDX-License-Identifier: Apache-2.0
+
+"""What a controller is tuned by, one number per signal, checked against the model's signals."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from koopman_ros.control.limits import InputLimits
+from koopman_ros.control.supervisor import SupervisorSettings
+from koopman_ros.estimation import SensorLimits
+from koopman_ros.lifting import LiftedModel
+from koopman_ros.signals import Outputs, per_signal
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class Settings:
+    """
+    What an engineer tunes, in the units of the signals.
+
+    :param state_weight: (n_x,) weights of squared state errors, per state unit squared.
+    :param input_weight: (n_u,) weights of squared input deviations, per input unit squared.
+    :param limits: range and rate of the inputs.
+    :param setpoint_ramp: (n_x,) largest change of the set-point per second; infinity for steps.
+    :param max_disturbance: (n_u,) largest disturbance that is allowed for, in input units.
+    :param input_tolerance: (n_u,) how far, in input units, a measured input may be from its
+        command before the command counts as not reached.
+    :param safe_input: (n_u,) commanded when nothing else can be, in input units.
+    :param sensor: which measurements are accepted.
+    :param setpoint_filter: time constant in s with which the set-point follows its ramp.
+    :param observer_bandwidth: of the disturbance observer in 1/s; 0 for none, as in the paper.
+    :param transfer_time: time constant in s in which the difference between two laws or models,
+        or from manual mode, fades.
+    :param max_gain: bound on the norm of the Riccati gain in scaled coordinates.
+    :param max_residual: bound on the relative Riccati residual.
+    :param supervisor: which laws act, and when.
+    """
+
+    state_weight: Array
+    input_weight: Array
+    limits: InputLimits
+    setpoint_ramp: Array
+    max_disturbance: Array
+    input_tolerance: Array
+    safe_input: Array
+    sensor: SensorLimits
+    setpoint_filter: float = 0.0
+    observer_bandwidth: float = 0.0
+    transfer_time: float = 30.0
+    max_gain: float = 1e3
+    max_residual: float = 1e-8
+    supervisor: SupervisorSettings = field(default_factory=SupervisorSettings)
+
+    def __post_init__(self) -> None:
+        if not (np.all(np.isfinite(self.state_weight)) and np.all(self.state_weight >= 0.0)
+                and np.any(self.state_weight > 0.0)):
+            raise ValueError('state_weight must be finite, at least 0 and not all 0, got '
+                             f'{self.state_weight.tolist()}')
+        if not (np.all(np.isfinite(self.input_weight)) and np.all(self.input_weight > 0.0)):
+            raise ValueError('input_weight must be finite and above 0, got '
+                             f'{self.input_weight.tolist()}')
+        if not np.all(np.isfinite(self.safe_input)):
+            raise ValueError(f'safe_input must be finite, got {self.safe_input.tolist()}')
+        for name in ('setpoint_ramp', 'max_disturbance'):
+            if not np.all(getattr(self, name) > 0.0):
+                raise ValueError(f'{name} must be above 0, got {getattr(self, name).tolist()}')
+        if not np.all(self.input_tolerance >= 0.0):
+            raise ValueError('input_tolerance must be at least 0, got '
+                             f'{self.input_tolerance.tolist()}')
+        for name in ('setpoint_filter', 'observer_bandwidth', 'transfer_time'):
+            if not 0.0 <= getattr(self, name) < np.inf:
+                raise ValueError(f'{name} must be finite and at least 0, got '
+                                 f'{getattr(self, name)}')
+
+    @classmethod
+    def for_model(cls, model: LiftedModel, *, state_weight: Array, input_weight: Array,
+                  limits: InputLimits, **others: Any) -> Settings:
+        """
+        Return settings that restrict nothing but what is given.
+
+        Set-points step, every finite measurement is accepted, every command counts as reached,
+        disturbances are not bounded, and the nominal input is the safe one.
+
+        :param model: whose signals the settings are for.
+        :param others: further fields.
+        """
+        n_x, n_u = model.n_x, model.n_u
+        return cls(**{
+            'state_weight': state_weight, 'input_weight': input_weight, 'limits': limits,
+            'setpoint_ramp': np.full(n_x, np.inf), 'max_disturbance': np.full(n_u, np.inf),
+            'input_tolerance': np.full(n_u, np.inf), 'safe_input': model.inputs.center,
+            'sensor': SensorLimits.none(n_x), **others})
+
+    def check(self, model: LiftedModel, outputs: Outputs) -> None:
+        """
+        Check that there is one number for each signal.
+
+        :param model: whose states and inputs they are for.
+        :param outputs: what is measured.
+        :raises ValueError: naming the setting, what is expected and what was given.
+        """
+        states, inputs = model.states.names, model.inputs.names
+        for names, signals in ((('state_weight', 'setpoint_ramp'), states), (
+                ('input_weight', 'max_disturbance', 'input_tolerance', 'safe_input'), inputs)):
+            for name in names:
+                per_signal(name, getattr(self, name), signals)
+        self.limits.check(inputs)
+        self.sensor.check(outputs.names)

@@ -1,0 +1,164 @@
+# SPDX-FileCopyrightText: 2026 The koopman_ros Authors
+# SPDX-License-Identifier: Apache-2.0
+
+"""Checks of measurements: which are accepted, by their own stamps alone."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+import math
+
+import numpy as np
+from numpy.typing import NDArray
+
+from koopman_ros.estimation.frozen import FrozenCheck
+from koopman_ros.reasons import Code, Reason, reason
+from koopman_ros.signals import Outputs, per_signal
+from koopman_ros.units import NANOSECONDS
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class SensorLimits:
+    """
+    What the sensors can measure and their plant can do, one number per measured signal.
+
+    :param lower: (n_y,) smallest measurement accepted, in the signal's unit.
+    :param upper: (n_y,) largest measurement accepted.
+    :param rate: (n_y,) fastest change of the plant per second; a jump that stays is accepted when
+        the plant could have got there by then.
+    :param jump: (n_y,) change that noise alone may bring between two measurements.
+    :param frozen_timeout: seconds that a measurement may stay bit-identical while the model moves
+        by more than half of `jump`; infinity for ever.
+    """
+
+    lower: Array
+    upper: Array
+    rate: Array
+    jump: Array
+    frozen_timeout: float = math.inf
+
+    def __post_init__(self) -> None:
+        if not np.all(self.lower < self.upper):
+            raise ValueError(f'sensor limits must be lower < upper, got {self.lower.tolist()} '
+                             f'and {self.upper.tolist()}')
+        for name in ('rate', 'jump'):
+            if not np.all(getattr(self, name) > 0.0):
+                raise ValueError(f'sensor {name} must be above 0, got '
+                                 f'{getattr(self, name).tolist()}')
+        if not self.frozen_timeout > 0.0:
+            raise ValueError(f'frozen_timeout must be above 0, got {self.frozen_timeout}')
+
+    @classmethod
+    def none(cls, n_y: int) -> SensorLimits:
+        """Accept everything that is finite of n_y signals."""
+        endless = np.full(n_y, np.inf)
+        return cls(-endless, endless, endless, endless)
+
+    def check(self, names: Sequence[str]) -> None:
+        """
+        Check that there is one number for each signal.
+
+        :param names: (n_y,) of the measured signals.
+        :raises ValueError: naming what does not fit.
+        """
+        for name in ('lower', 'upper', 'rate', 'jump'):
+            per_signal(f'sensor {name}', getattr(self, name), names)
+
+
+@dataclass(frozen=True)
+class Accepted:
+    """
+    What is remembered of the measurements.
+
+    :param value: (n_y,) the last one that was accepted, in the signals' units.
+    :param time_ns: its stamp.
+    :param frozen: which signals stand still.
+    :param jumped: whether a later one was taken for a jump.
+    """
+
+    value: Array
+    time_ns: int
+    frozen: FrozenCheck
+    jumped: bool = False
+
+
+@dataclass(frozen=True)
+class Verdict:
+    """
+    What became of a measurement.
+
+    :param accepted: to be remembered; None as long as none was accepted.
+    :param fault: why it is rejected; None when it is accepted.
+    :param moved: whether it is accepted although the plant has jumped there.
+    """
+
+    accepted: Accepted | None
+    fault: Reason | None = None
+    moved: bool = False
+
+    @property
+    def frozen(self) -> bool:
+        """Whether a sensor stands still."""
+        return self.fault is not None and self.fault.code is Code.FROZEN
+
+
+def check(limits: SensorLimits, outputs: Outputs, last: Accepted | None, y: Array, time_ns: int,
+          w: Array, travel: Callable[[FrozenCheck], Array]) -> Verdict:
+    """
+    Accept or reject a measurement.
+
+    :param limits: of the sensors.
+    :param outputs: names of the measured signals.
+    :param last: what is remembered, or None before the first.
+    :param y: (n_y,) measured, in the signals' units.
+    :param time_ns: its stamp, later than those before.
+    :param w: (n_x,) disturbance that is estimated now.
+    :param travel: tells how far (n_y,) the model says that the signals have moved since the last
+        measurement, under the disturbance that is remembered.
+    """
+    fault = _impossible(limits, outputs, y)
+    if fault is not None:
+        return Verdict(last, fault)
+    if last is None:
+        return Verdict(Accepted(y, time_ns, FrozenCheck.started(y, time_ns, w)))
+    seconds = (time_ns - last.time_ns) / NANOSECONDS
+    unreachable = _unreachable(limits, last.value, y, seconds)
+    if unreachable is not None:
+        i = unreachable
+        return Verdict(Accepted(last.value, last.time_ns, last.frozen, True), reason(
+            Code.JUMPED, signal=outputs.names[i], before=float(last.value[i]), value=float(y[i]),
+            seconds=seconds, jump=float(limits.jump[i]), rate=float(limits.rate[i])))
+    still = y == last.value
+    frozen = last.frozen.after(still, time_ns, w, travel)
+    remembered = Accepted(y, time_ns, frozen)
+    i, stood = frozen.longest(time_ns, still, 0.5 * limits.jump)
+    if stood > limits.frozen_timeout:
+        return Verdict(remembered, reason(
+            Code.FROZEN, signal=outputs.names[i], value=float(y[i]),
+            timeout=limits.frozen_timeout, change=0.5 * float(limits.jump[i])))
+    return Verdict(remembered, moved=last.jumped and not still.all() and _unreachable(
+        limits, last.value, y, 0.0) is not None)
+
+
+def _impossible(limits: SensorLimits, outputs: Outputs, y: Array) -> Reason | None:
+    for i, (value, name) in enumerate(zip(y.tolist(), outputs.names, strict=True)):
+        if not math.isfinite(value):
+            return reason(Code.NOT_FINITE, signal=name, value=value)
+        lower, upper = float(limits.lower[i]), float(limits.upper[i])
+        if not lower <= value <= upper:
+            return reason(Code.OUTSIDE_SENSOR, signal=name, value=value, lower=lower, upper=upper)
+    return None
+
+
+def _unreachable(limits: SensorLimits, before: Array, y: Array, seconds: float) -> int | None:
+    """Return the place of the signal that is farthest beyond what it could have reached."""
+    worst, excess = None, 0.0
+    for i, (a, b) in enumerate(zip(y.tolist(), before.tolist(), strict=True)):
+        possible = float(limits.jump[i]) + (
+            float(limits.rate[i]) * seconds if seconds > 0.0 else 0.0)
+        if abs(a - b) > possible and abs(a - b) / possible > excess:
+            worst, excess = i, abs(a - b) / possible
+    return worst

@@ -1,0 +1,165 @@
+# SPDX-FileCopyrightText: 2026 The koopman_ros Authors
+# SPDX-License-Identifier: Apache-2.0
+
+"""The disturbance observer: what the plant does beside its model, from measurements and inputs."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+import math
+
+import numpy as np
+from numpy.typing import NDArray
+
+from koopman_ros.estimation.base import Estimate, simulated
+from koopman_ros.lifting import LiftedModel
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class DisturbanceObserver:
+    """
+    Two equal poles for each state: one knob between noise and speed.
+
+    With p = exp(-bandwidth dt) the state takes 1 - p^2 of what a measurement differs from its
+    prediction, and the disturbance (1 - p)^2 / dt of it, which places both poles of the error at
+    p where the model's own motion within a sample is small.
+
+    :param model: whose drift predicts.
+    :param bandwidth: in 1/s, above 0.
+    :param max_disturbance: (n_u,) bound on each input of B^+ w, in scaled deviations.
+    """
+
+    model: LiftedModel
+    bandwidth: float
+    max_disturbance: Array
+
+    @property
+    def remembers(self) -> bool:
+        """It does: the disturbance is what past measurements tell."""
+        return True
+
+    def predict(self, estimate: Estimate, u: Array, seconds: float) -> Estimate | None:
+        """Integrate the model under input and disturbance."""
+        return simulated(self.model, estimate, u, seconds)
+
+    def correct(self, predicted: Estimate, x: Array, seconds: float) -> Estimate:
+        """Divide the innovation between state and disturbance."""
+        p = math.exp(-self.bandwidth * seconds)
+        duration = seconds / self.model.seconds_per_time_unit
+        difference = x - predicted.x
+        w = predicted.w + ((1.0 - p) ** 2 / duration) * difference
+        return Estimate(predicted.x + (1.0 - p * p) * difference, self.bounded(w))
+
+    def restart(self, predicted: Estimate | None, x: Array, u: Array | None) -> Estimate:
+        """Keep a known disturbance; else take the one that makes `u` hold the plant, if given."""
+        if predicted is not None:
+            return Estimate(x, predicted.w)
+        if u is None:
+            return Estimate(x, np.zeros_like(x))
+        return Estimate(x, self.bounded(-self.model.drift(x) - self.model.B @ u))
+
+    def rebased(self, estimate: Estimate, rate: Array) -> Estimate:
+        """Let the disturbance make up for the difference between the two models."""
+        w = estimate.w + rate - self.model.drift(estimate.x)
+        return Estimate(estimate.x, self.bounded(w))
+
+    def bounded(self, w: Array) -> Array:
+        """Return a disturbance within its bound; none where it is not finite."""
+        size, bound = self._largest(w)
+        if size <= bound:
+            return w
+        return w * (bound / size) if math.isfinite(size) else np.zeros_like(w)
+
+    def as_input(self, w: Array) -> Array:
+        """Return the (n_u,) input that would act like a disturbance, in scaled deviations."""
+        found: Array = self.model.input_inverse.dot(w)
+        return found
+
+    def at_bound(self, w: Array) -> bool:
+        """Tell whether a disturbance is as large as is allowed, but for rounding."""
+        size, bound = self._largest(w)
+        return size >= bound * (1.0 - 1e-9)
+
+    def _largest(self, w: Array) -> tuple[float, float]:
+        """Return size and bound of the input that is nearest to its bound, or beyond."""
+        worst, share = (0.0, math.inf), -1.0
+        for size, bound in zip(map(abs, self.as_input(w).tolist()), self._bounds, strict=True):
+            if not math.isfinite(size):
+                return math.inf, bound
+            if size / bound > share:
+                worst, share = (size, bound), size / bound
+        return worst
+
+    @cached_property
+    def _bounds(self) -> list[float]:
+        return self.max_disturbance.tolist()
+
+
+@dataclass(frozen=True)
+class MeasuredState:
+    """
+    Every measurement is the state, and there is no disturbance, as in the paper.
+
+    :param model: whose drift predicts between measurements.
+    """
+
+    model: LiftedModel
+
+    @property
+    def remembers(self) -> bool:
+        """It does not."""
+        return False
+
+    def predict(self, estimate: Estimate, u: Array, seconds: float) -> Estimate | None:
+        """Integrate the model under the input."""
+        return simulated(self.model, estimate, u, seconds)
+
+    def correct(self, predicted: Estimate, x: Array, seconds: float) -> Estimate:
+        """Take the measurement as it is."""
+        return Estimate(x, np.zeros_like(x))
+
+    def restart(self, predicted: Estimate | None, x: Array, u: Array | None) -> Estimate:
+        """Take the measurement as it is."""
+        return Estimate(x, np.zeros_like(x))
+
+    def rebased(self, estimate: Estimate, rate: Array) -> Estimate:
+        """Keep the state."""
+        return Estimate(estimate.x, np.zeros_like(estimate.w))
+
+    def as_input(self, w: Array) -> Array:
+        """Return no disturbance."""
+        return np.zeros(self.model.n_u)
+
+    def at_bound(self, w: Array) -> bool:
+        """There is none."""
+        return False
+
+
+def equivalent_bias(model: LiftedModel, estimate: Estimate) -> Array:
+    """
+    Return the error of the measurement that would explain a disturbance just as well.
+
+    One measured state cannot tell a biased sensor from a changed plant. Solves
+    f(x - bias) = f(x) + w; what comes out is NaN where the drift does not reach that far.
+
+    :return: (n_x,) in scaled deviations.
+    """
+    wanted = model.drift(estimate.x) + estimate.w
+    bias, step = np.zeros_like(estimate.x), 1e-6
+    with np.errstate(all='ignore'):
+        for _ in range(20):
+            x = estimate.x - bias
+            slope = np.stack([(model.drift(x + d) - model.drift(x - d)) / (2.0 * step)
+                              for d in step * np.eye(len(x))], axis=-1)
+            try:
+                bias = bias + np.linalg.solve(slope, model.drift(x) - wanted)
+            except np.linalg.LinAlgError:
+                break
+            if not np.all(np.abs(bias) < 1e3):
+                break
+        solved = np.all(np.abs(bias) < 1e3) and np.allclose(
+            model.drift(estimate.x - bias), wanted, rtol=0.0, atol=1e-6)
+    return bias if solved else np.full_like(bias, np.nan)

@@ -1,0 +1,88 @@
+# SPDX-FileCopyrightText: 2026 The koopman_ros Authors
+# SPDX-License-Identifier: Apache-2.0
+
+"""Signals: one number for each by name, and what is measured of the state."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+from numpy.typing import NDArray
+
+Array = NDArray[np.float64]
+
+
+def per_signal(name: str, value: Array, signals: Sequence[str]) -> None:
+    """
+    Check that an array holds one number for each signal; nothing broadcasts.
+
+    :param name: of the quantity, for the error.
+    :param value: (n,) numbers, none of them NaN.
+    :param signals: (n,) names.
+    :raises ValueError: when the sizes differ, or a number is NaN.
+    """
+    if not isinstance(value, np.ndarray) or value.shape != (len(signals),):
+        raise ValueError(f'incompatible {name}: expected one number for each of '
+                         f'{", ".join(signals)}, got {np.asarray(value).tolist()}')
+    if np.isnan(value).any():
+        raise ValueError(f'{name} must be numbers, got {value.tolist()}')
+
+
+@dataclass(frozen=True)
+class Outputs:
+    """
+    What is measured of the state: y = C x, in the units of the signals.
+
+    :param names: (n_y,) of the measured signals.
+    :param units: (n_y,) their units.
+    :param C: (n_y, n_x) in those units per state unit.
+    """
+
+    names: tuple[str, ...]
+    units: tuple[str, ...]
+    C: Array
+
+    def __post_init__(self) -> None:
+        C = np.array(self.C, dtype=np.float64)
+        if len(self.units) != len(self.names) or C.ndim != 2 or len(C) != len(self.names):
+            raise ValueError(f'incompatible outputs: {len(self.names)} names, {len(self.units)} '
+                             f'units, C of shape {C.shape}')
+        if not np.all(np.isfinite(C)):
+            raise ValueError(f'C must be finite, got {C.tolist()}')
+        C.setflags(write=False)
+        object.__setattr__(self, 'C', C)
+
+    @cached_property
+    def all_states(self) -> bool:
+        """Whether every state is measured by itself."""
+        return self.C.shape[0] == self.C.shape[1] and bool((np.eye(len(self.C)) == self.C).all())
+
+    @cached_property
+    def _inverse(self) -> Array:
+        if self.C.shape[0] != self.C.shape[1] or np.linalg.matrix_rank(self.C) < len(self.C):
+            raise ValueError(
+                f'the measured signals {", ".join(self.names)} do not determine all '
+                f'{self.C.shape[1]} states: measure as many, or choose an estimator')
+        inverse: Array = np.asarray(np.linalg.inv(self.C), dtype=np.float64)
+        return inverse
+
+    def of(self, x: Array) -> Array:
+        """Return the outputs (n_y,) of a state (n_x,) or of a difference of states."""
+        if self.all_states:
+            return x
+        found: Array = self.C.dot(x)
+        return found
+
+    def state(self, y: Array) -> Array:
+        """
+        Return the state (n_x,) that the outputs (n_y,) determine.
+
+        :raises ValueError: when they do not.
+        """
+        if self.all_states:
+            return y
+        found: Array = self._inverse.dot(y)
+        return found

@@ -1,0 +1,109 @@
+# SPDX-FileCopyrightText: 2026 The koopman_ros Authors
+# SPDX-License-Identifier: Apache-2.0
+
+"""Units: conversion between them, and how values of a signal are written for people."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from functools import cache, cached_property
+from typing import Any
+
+NANOSECONDS = 1_000_000_000  # in a second
+
+
+@dataclass(frozen=True)
+class Conversion:
+    """
+    From one unit to another: value * factor + offset.
+
+    :param factor: of values and of differences.
+    :param offset: of values alone.
+    """
+
+    factor: float = 1.0
+    offset: float = 0.0
+
+    def __call__(self, value: float) -> float:
+        """Convert a value."""
+        if self.factor == 1.0 and self.offset == 0.0:
+            # -0.0 stays what it is
+            return value
+        return value * self.factor + self.offset
+
+
+@cache
+def conversion(unit: str, wanted: str) -> Conversion:
+    """
+    Return how values in one unit are converted to another.
+
+    :param unit: e.g. ``'K'``.
+    :param wanted: e.g. ``'degC'``.
+    :raises ValueError: for an unknown unit, or one of another dimension.
+    """
+    if unit == wanted:
+        return Conversion()
+    # in here: most programs convert nothing, and the registry takes 0.2 s
+    import pint
+
+    registry = _registry()
+    try:
+        offset = float(registry.Quantity(0.0, unit).to(wanted).magnitude)
+        factor = float(registry.Quantity(1.0, unit).to(wanted).magnitude) - offset
+        if offset != 0.0:
+            # exact, where the difference of two values is not
+            source = registry.Quantity(1.0, unit) - registry.Quantity(0.0, unit)
+            target = registry.Quantity(1.0, wanted) - registry.Quantity(0.0, wanted)
+            factor = float((source / target).to('dimensionless').magnitude)
+    except (pint.UndefinedUnitError, pint.DimensionalityError, AttributeError) as error:
+        raise ValueError(f'{unit!r} cannot be converted to {wanted!r}: {error}') from error
+    return Conversion(factor, offset)
+
+
+@cache
+def _registry() -> Any:
+    import pint
+
+    return pint.UnitRegistry(cache_folder=':auto:')
+
+
+@dataclass(frozen=True)
+class Display:
+    """
+    How the values of a signal are written.
+
+    :param unit: of the values that are given.
+    :param shown: unit in which they are written; the same by default.
+    :param format: of numbers.
+    """
+
+    unit: str
+    shown: str = ''
+    format: str = '.6g'
+
+    @cached_property
+    def conversion(self) -> Conversion:
+        """From the unit given to the one shown."""
+        return conversion(self.unit, self.shown or self.unit)
+
+    def text(self, value: float) -> str:
+        """Write a value with its unit."""
+        return f'{self.conversion(value):{self.format}} {self.shown or self.unit}'.rstrip()
+
+
+@dataclass(frozen=True)
+class Displays:
+    """
+    How all signals are written.
+
+    :param units: of the signals, by name.
+    :param shown: how values in a unit are written, by unit; as they are by default.
+    """
+
+    units: Mapping[str, str]
+    shown: Mapping[str, Display] = field(default_factory=dict)
+
+    def __getitem__(self, name: str) -> Display:
+        unit = self.units.get(name, '')
+        return self.shown.get(unit) or Display(unit)
