@@ -18,7 +18,7 @@ import koopman_ros
 
 ROOT = Path(__file__).parent.parent
 SOURCES = sorted([ROOT / 'setup.py', *(
-    path for folder in ('koopman_ros', 'examples', 'test', 'validation')
+    path for folder in ('docs', 'koopman_ros', 'examples', 'test', 'validation')
     for path in ROOT.glob(f'{folder}/**/*.py'))])
 # What each sub-package may import of the others.
 ALLOWED = {
