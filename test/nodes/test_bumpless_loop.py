@@ -147,14 +147,6 @@ def test_no_offset_is_left_when_the_heat_transfer_changes(loop: Loop) -> None:
     assert abs(float(value(status, 'disturbance [K of coolant]'))) > 1.0
 
 
-def test_manual_mode_and_back_without_a_bump(loop: Loop) -> None:
-    steps = loop.steps(lambda: loop.ros.set_bool('controller/set_automatic', False), 30)
-    assert np.max(steps) < 0.01
-    steps = loop.steps(lambda: loop.ros.set_bool('controller/set_automatic', True), 100)
-    assert np.max(steps) < 0.01
-    loop.rest()
-
-
 def test_manual_coolant_is_left_without_a_bump(loop: Loop) -> None:
     """The law would command another one."""
     law = loop.commands[-1].temperature

@@ -7,8 +7,6 @@ from __future__ import annotations
 
 import itertools
 import math
-from pathlib import Path
-import shutil
 
 from diagnostic_msgs.msg import DiagnosticStatus
 import pytest
@@ -19,7 +17,6 @@ from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 from sensor_msgs.msg import JointState, Temperature
 
 from koopman_ros.nodes import topics
-from koopman_ros.nodes.shipped import model_path
 from koopman_ros.testing import Harness
 from support.controller_bench import Bench, STATUS, STEADY
 from support.messages import seconds, temperature, value
@@ -44,14 +41,6 @@ def test_each_command_carries_the_stamp_of_its_measurement(bench: Bench) -> None
     # whatever else is still on its way would come before the answer to this
     bench.measure(STEADY, 60.0)
     assert [seconds(message) for message in bench.commands] == [1.0, *times, 60.0]
-
-
-def test_before_the_first_setpoint_the_temperature_is_held(ros: Harness) -> None:
-    bench = Bench(ros)
-    assert bench.active == pytest.approx(STEADY)
-    bench.measure(STEADY - 1.0, 2.0)
-    assert bench.active == pytest.approx(STEADY)
-    bench.status(lambda s: s.message.startswith('automatic, no set-point yet'))
 
 
 def test_active_setpoint_is_latched_for_a_late_joiner(bench: Bench) -> None:
@@ -106,20 +95,12 @@ def test_setpoint_for_now_ends_the_schedule(bench: Bench) -> None:
     assert bench.active == pytest.approx(47.0)
 
 
-def test_measurement_that_is_not_a_number_holds_the_command(bench: Bench) -> None:
-    before = bench.measure(STEADY, 2.0).temperature
-    assert bench.measure(math.nan, 3.0).temperature == before
-    status = bench.status(lambda s: s.level == DiagnosticStatus.ERROR)
-    assert 'not finite' in status.message
-    assert 'check the sensor' in status.message
-    bench.measure(STEADY, 4.0)
-    bench.status(lambda s: s.level == DiagnosticStatus.OK)
-
-
 def test_temperature_below_absolute_zero_is_no_measurement(bench: Bench) -> None:
     before = bench.measure(STEADY, 2.0).temperature
     assert bench.measure(-300.0, 3.0).temperature == before
     bench.status(lambda s: s.level == DiagnosticStatus.ERROR)
+    bench.measure(STEADY, 4.0)
+    bench.status(lambda s: s.level == DiagnosticStatus.OK)
 
 
 def test_measurement_out_of_order_repeats_the_command(bench: Bench) -> None:
@@ -138,13 +119,6 @@ def test_stamp_that_does_not_advance_is_reported(bench: Bench) -> None:
     bench.status(lambda s: s.level == DiagnosticStatus.OK)
 
 
-def test_sensor_that_falls_silent_is_reported(ros: Harness) -> None:
-    bench = Bench(ros, {'measurement_timeout': 0.1})
-    status = bench.status(lambda s: s.level == DiagnosticStatus.ERROR)
-    assert status.message.startswith('no measurement for more than 0.1 s')
-    bench.measure(STEADY, 2.0)
-
-
 def test_temperature_outside_the_trained_range_is_reported(bench: Bench) -> None:
     assert math.isfinite(bench.measure(54.5, 2.0).temperature)
     status = bench.status(lambda s: s.level == DiagnosticStatus.WARN)
@@ -152,18 +126,15 @@ def test_temperature_outside_the_trained_range_is_reported(bench: Bench) -> None
     assert value(status, 'active law') == 'learned law'
 
 
-def test_clock_that_goes_back_starts_time_afresh(ros: Harness) -> None:
-    bench = Bench(ros)
-    bench.measure(STEADY, 100.0)
-    assert math.isfinite(bench.measure(STEADY, 10.0).temperature)
-    bench.ros.wait_until(lambda: 'time starts afresh' in bench.process.output())
-
-
-def test_best_effort_thermometer_is_heard_by_override(ros: Harness) -> None:
+def test_before_the_first_setpoint_the_temperature_is_held(ros: Harness) -> None:
+    """That of a best-effort thermometer, here, which is heard by an override."""
     best_effort = QoSProfile(depth=10, reliability=ReliabilityPolicy.BEST_EFFORT)
     override = 'qos_overrides./temperature.subscription.reliability:=best_effort'
     bench = Bench(ros, arguments=('-p', override), qos=best_effort)
-    assert math.isfinite(bench.measure(STEADY, 2.0).temperature)
+    assert bench.active == pytest.approx(STEADY)
+    bench.measure(STEADY - 1.0, 2.0)
+    assert bench.active == pytest.approx(STEADY)
+    bench.status(lambda s: s.message.startswith('automatic, no set-point yet'))
 
 
 def test_publishers_that_cannot_be_heard_are_named_with_the_remedy(ros: Harness) -> None:
@@ -262,22 +233,6 @@ def test_model_is_reloaded_while_the_loop_runs(bench: Bench) -> None:
     response = bench.ros.trigger('controller/reload_model')
     assert response.success
     assert 'reactor_nz4: n_z = 4' in response.message
-
-
-def test_damaged_model_is_refused_and_the_old_one_kept(ros: Harness, tmp_path: Path) -> None:
-    model = tmp_path / 'model.safetensors'
-    shutil.copy(model_path('reactor_nz3'), model)
-    bench = Bench(ros, {'model': model})
-    before = bench.measure(STEADY, 2.0).temperature
-    model.write_bytes(model.read_bytes()[:500])
-    response = bench.ros.trigger('controller/reload_model')
-    assert not response.success
-    assert response.message.startswith('the old model is kept: ')
-    assert 'model.safetensors' in response.message
-    assert bench.measure(STEADY, 3.0).temperature == pytest.approx(before, abs=1e-6)
-
-    shutil.copy(model_path('reactor_nz4'), model)
-    assert 'n_z = 4' in ros.trigger('controller/reload_model').message
 
 
 def test_coolant_limit_changes_while_the_loop_runs(bench: Bench) -> None:
