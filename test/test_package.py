@@ -25,16 +25,17 @@ ALLOWED = {
     'plants': set(),
     'lifting': set(),
     'bags': set(),
+    'reports': set(),
     'solvers': set(),
     'estimation': {'lifting'},
     'control': {'estimation', 'lifting', 'solvers'},
     'learning': {'control', 'lifting', 'solvers'},
     'identification': {'lifting', 'solvers'},
-    'retraining': {'bags', 'control', 'identification', 'learning', 'lifting'},
-    'replay': {'bags', 'control', 'lifting'},
+    'retraining': {'bags', 'control', 'identification', 'learning', 'lifting', 'reports'},
+    'replay': {'bags', 'control', 'lifting', 'reports'},
     'nodes': {'control', 'estimation', 'lifting', 'plants', 'bags', 'replay'},
     'testing': {'nodes'},
-    'demo': {'control', 'lifting', 'plants', 'bags', 'nodes', 'testing'},
+    'demo': {'control', 'lifting', 'plants', 'bags', 'nodes', 'reports', 'testing'},
 }
 
 

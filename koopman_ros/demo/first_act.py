@@ -10,7 +10,6 @@ The disturbance observer is off, so that what is seen is what each model knows.
 from __future__ import annotations
 
 from dataclasses import replace
-import json
 from pathlib import Path
 import time
 
@@ -23,6 +22,7 @@ from koopman_ros.lifting import load
 from koopman_ros.nodes import topics
 from koopman_ros.nodes.controller_parameters import ControllerParameters
 from koopman_ros.nodes.shipped import model_path
+from koopman_ros.reports import write_figures
 from koopman_ros.testing import HarnessError
 
 STEP = -10.0  # K
@@ -68,7 +68,7 @@ def run_demo(output: Path, speed: float) -> dict[str, object]:
         'bag_messages': sum(counts.values()),
         'wall_seconds': round(time.monotonic() - begin, 3),
     }
-    (output / 'summary.json').write_text(json.dumps(result, indent=2) + '\n')
+    write_figures(output / 'summary.json', result)
     return result
 
 

@@ -8,7 +8,6 @@ from __future__ import annotations
 from dataclasses import dataclass
 from pathlib import Path
 
-import matplotlib
 import numpy as np
 from numpy.typing import NDArray
 
@@ -17,9 +16,7 @@ from koopman_ros.lifting import LiftedModel
 from koopman_ros.nodes import topics
 from koopman_ros.nodes.controller_parameters import ControllerParameters
 from koopman_ros.nodes.messages import to_celsius, ZERO_CELSIUS
-
-matplotlib.use('Agg')
-from matplotlib import pyplot
+from koopman_ros.reports import draw_limits, drawing, DRAWN_RANGE
 
 Array = NDArray[np.float64]
 SETTLED = 0.1  # K
@@ -77,37 +74,27 @@ def plot(path: Path, learned: Run, linear: Run, setpoint: float, step_time: floa
     :param model: whose training range is drawn.
     :param limits: whose coolant limits are drawn.
     """
-    figure, (upper, lower) = pyplot.subplots(2, 1, sharex=True, figsize=(9.0, 7.0),
-                                             layout='constrained')
-    minutes = [run.seconds / 60.0 for run in (learned, linear)]
-    command_minutes = [run.command_seconds / 60.0 for run in (learned, linear)]
-    steps = np.array([0.0, step_time, step_time, learned.seconds[-1]]) / 60.0
-    start = float(learned.temperature[0])
+    start, end = float(learned.temperature[0]), float(learned.seconds[-1])
     low, high = (to_celsius(float(bound[0])) for bound in (model.states.lower,
                                                            model.states.upper))
-    upper.axhspan(low, high, color='0.93', label='training range')
-    upper.plot(steps, np.array([start, start, setpoint, setpoint]) - ZERO_CELSIUS, 'k--',
-               linewidth=1.2, label='set-point')
-    upper.plot(minutes[1], linear.temperature - ZERO_CELSIUS, color='tab:red',
-               label=f'linearised controller (ends {linear.final_error(setpoint):+.2f} K off)')
-    upper.plot(minutes[0], learned.temperature - ZERO_CELSIUS, color='tab:green', linewidth=2.0,
-               label=f'learned controller (ends {learned.final_error(setpoint):+.0e} K off)')
-    upper.set_ylabel('reactor temperature [°C]')
-    upper.set_ylim(low - 1.0, high + 1.0)
-    upper.set_title(f'Set-point step of {setpoint - start:+.0f} K at {step_time / 60.0:.0f} min, '
-                    'disturbance observer off: what each model knows')
-    upper.legend(loc='upper right')
-    lower.axhline(limits.coolant_max, color='0.4', linestyle=':', label='coolant limits')
-    lower.axhline(limits.coolant_min, color='0.4', linestyle=':')
-    lower.step(command_minutes[1], linear.coolant - ZERO_CELSIUS, where='post', color='tab:red',
-               label='linearised controller')
-    lower.step(command_minutes[0], learned.coolant - ZERO_CELSIUS, where='post',
-               color='tab:green', linewidth=2.0, label='learned controller')
-    lower.set_ylabel('coolant set-point [°C]')
-    lower.set_xlabel('plant time [min]')
-    lower.set_xlim(0.0, float(minutes[0][-1]))
-    lower.legend(loc='lower right', bbox_to_anchor=(1.0, 0.1))
-    for axes in (upper, lower):
-        axes.grid(alpha=0.3)
-    figure.savefig(path, dpi=130)
-    pyplot.close(figure)
+    with drawing(path, 2, 1, size=(9.0, 7.0), sharex=True) as (_, (upper, lower)):
+        upper.axhspan(low, high, label='training range', **DRAWN_RANGE)
+        upper.step(np.array([0.0, step_time, end]) / 60.0,
+                   np.array([start, setpoint, setpoint]) - ZERO_CELSIUS, 'k--', where='post',
+                   linewidth=1.2, label='set-point')
+        draw_limits(lower, (limits.coolant_min, limits.coolant_max), 'coolant limits')
+        for name, run, digits, style in (
+                ('linearised', linear, '+.2f', {'color': 'tab:red'}),
+                ('learned', learned, '+.0e', {'color': 'tab:green', 'linewidth': 2.0})):
+            upper.plot(run.seconds / 60.0, run.temperature - ZERO_CELSIUS, **style,
+                       label=f'{name} controller '
+                       f'(ends {run.final_error(setpoint):{digits}} K off)')
+            lower.step(run.command_seconds / 60.0, run.coolant - ZERO_CELSIUS, where='post',
+                       label=f'{name} controller', **style)
+        upper.set(ylabel='reactor temperature [°C]', ylim=(low - 1.0, high + 1.0), title=(
+            f'Set-point step of {setpoint - start:+.0f} K at {step_time / 60.0:.0f} min, '
+            'disturbance observer off: what each model knows'))
+        upper.legend(loc='upper right')
+        lower.set(ylabel='coolant set-point [°C]', xlabel='plant time [min]',
+                  xlim=(0.0, end / 60.0))
+        lower.legend(loc='lower right', bbox_to_anchor=(1.0, 0.1))

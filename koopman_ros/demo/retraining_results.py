@@ -11,7 +11,6 @@ from dataclasses import dataclass
 import itertools
 from pathlib import Path
 
-import matplotlib
 import numpy as np
 from numpy.typing import NDArray
 
@@ -28,9 +27,7 @@ from koopman_ros.plants import (
     RandomStepDesign,
     simulate,
 )
-
-matplotlib.use('Agg')
-from matplotlib import pyplot
+from koopman_ros.reports import draw_limits, drawing, LIMIT
 
 Array = NDArray[np.float64]
 _AVERAGED = 600.0  # s over which an offset is averaged
@@ -117,45 +114,38 @@ def plot(path: Path, history: History, phases: Sequence[tuple[str, float]], setp
     :param learned: the lift at the end, likewise.
     :param limits: whose coolant limits are drawn.
     """
-    figure, (upper, middle, lower) = pyplot.subplots(
-        3, 1, sharex=True, figsize=(11.0, 9.0), layout='constrained', height_ratios=(3, 2, 2))
     minutes = history.seconds / 60.0
     end = float(minutes[-1])
     starts = [start / 60.0 for _, start in phases] + [end]
-    for axes in (upper, middle, lower):
-        for color, (left, right) in zip(itertools.cycle(_COLORS), itertools.pairwise(starts)):
-            axes.axvspan(left, right, color=color, linewidth=0.0)
-        axes.grid(alpha=0.3)
-    upper.plot(minutes, history.temperature - ZERO_CELSIUS, color='tab:green', linewidth=1.0,
-               label='measured')
-    upper.axhline(to_celsius(setpoint), color='k', linestyle='--', linewidth=1.0,
-                  label='set-point')
-    for model, name, style in ((present, 'shipped lift', ':'), (learned, 'new lift', '-.')):
-        for i, bound in enumerate((model.states.lower[0], model.states.upper[0])):
-            upper.axhline(to_celsius(float(bound)), color='0.4', linestyle=style, linewidth=1.0,
-                          label=f'training range of the {name}' if i == 0 else None)
-    upper.set_ylabel('reactor temperature [°C]')
-    low, high = upper.get_ylim()
-    upper.set_ylim(low, high + 0.18 * (high - low))
-    for (name, _), left, right in zip(phases, starts[:-1], starts[1:], strict=True):
-        upper.text(0.5 * (left + right), high + 0.16 * (high - low), name.replace(' ', '\n'),
-                   ha='center', va='top', fontsize=9)
-    upper.legend(loc='lower right', ncols=2, fontsize=8)
-    upper.set_title('The plant drifts, is recorded, and its controller learns it anew '
-                    '(disturbance observer off)')
-    middle.axhline(limits.coolant_max, color='0.4', linestyle=':', label='coolant limits')
-    middle.axhline(limits.coolant_min, color='0.4', linestyle=':')
-    middle.step(history.command_seconds / 60.0, history.coolant - ZERO_CELSIUS, where='post',
-                color='tab:blue', linewidth=1.0, label='commanded')
-    middle.set_ylabel('coolant [°C]')
-    middle.legend(loc='upper right', fontsize=8)
-    kernel = np.ones(60) / 60.0
-    smooth = np.convolve(history.temperature - setpoint, kernel, mode='valid')
-    lower.semilogy(minutes[30:30 + len(smooth)], np.maximum(np.abs(smooth), 1e-4),
-                   color='tab:red', linewidth=1.0, label='mean over a minute')
-    lower.set_ylabel('size of the error [K]')
-    lower.set_xlabel('plant time [min]')
-    lower.set_xlim(0.0, end)
-    lower.legend(loc='lower left', fontsize=8)
-    figure.savefig(path, dpi=120)
-    pyplot.close(figure)
+    smooth = np.convolve(history.temperature - setpoint, np.ones(60) / 60.0, mode='valid')
+    with drawing(path, 3, 1, size=(11.0, 9.0), sharex=True,
+                 height_ratios=(3, 2, 2)) as (_, panels):
+        for axes in panels:
+            for color, (left, right) in zip(itertools.cycle(_COLORS), itertools.pairwise(starts)):
+                axes.axvspan(left, right, color=color, linewidth=0.0)
+        upper, middle, lower = panels
+        upper.plot(minutes, history.temperature - ZERO_CELSIUS, color='tab:green', linewidth=1.0,
+                   label='measured')
+        upper.axhline(to_celsius(setpoint), color='k', linestyle='--', linewidth=1.0,
+                      label='set-point')
+        for model, name, style in ((present, 'shipped lift', ':'), (learned, 'new lift', '-.')):
+            for i, bound in enumerate((model.states.lower[0], model.states.upper[0])):
+                upper.axhline(to_celsius(float(bound)), **{**LIMIT, 'linestyle': style},
+                              label=f'training range of the {name}' if i == 0 else None)
+        low, high = upper.get_ylim()
+        for (name, _), left, right in zip(phases, starts[:-1], starts[1:], strict=True):
+            upper.text(0.5 * (left + right), high + 0.16 * (high - low), name.replace(' ', '\n'),
+                       ha='center', va='top', fontsize=9)
+        upper.set(ylabel='reactor temperature [°C]', ylim=(low, high + 0.18 * (high - low)),
+                  title='The plant drifts, is recorded, and its controller learns it anew '
+                  '(disturbance observer off)')
+        upper.legend(loc='lower right', ncols=2, fontsize=8)
+        draw_limits(middle, (limits.coolant_min, limits.coolant_max), 'coolant limits')
+        middle.step(history.command_seconds / 60.0, history.coolant - ZERO_CELSIUS, where='post',
+                    color='tab:blue', linewidth=1.0, label='commanded')
+        middle.set_ylabel('coolant [°C]')
+        middle.legend(loc='upper right', fontsize=8)
+        lower.semilogy(minutes[30:30 + len(smooth)], np.maximum(np.abs(smooth), 1e-4),
+                       color='tab:red', linewidth=1.0, label='mean over a minute')
+        lower.set(ylabel='size of the error [K]', xlabel='plant time [min]', xlim=(0.0, end))
+        lower.legend(loc='lower left', fontsize=8)

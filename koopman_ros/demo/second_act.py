@@ -30,6 +30,7 @@ from koopman_ros.nodes.controller_parameters import ControllerParameters
 from koopman_ros.nodes.messages import NANOSECONDS
 from koopman_ros.nodes.plant_parameters import PlantParameters
 from koopman_ros.nodes.shipped import model_path
+from koopman_ros.reports import write_figures
 from koopman_ros.testing import HarnessError
 
 STEP = -10.0  # K
@@ -113,7 +114,7 @@ def run_retraining(output: Path, speed: float) -> dict[str, object]:
         'derivative_method': trained['derivative_method'],
         'wall_seconds': round(time.monotonic() - begin, 3),
     }
-    (output / 'summary.json').write_text(json.dumps(result, indent=2) + '\n')
+    write_figures(output / 'summary.json', result)
     return result
 
 

@@ -8,15 +8,12 @@ from __future__ import annotations
 from pathlib import Path
 import textwrap
 
-import matplotlib
+import matplotlib.axes
 import numpy as np
 
 from koopman_ros.replay.comparison import ReplayedBag, shown
 from koopman_ros.replay.report import verdict
-
-matplotlib.use('Agg')
-from matplotlib import pyplot
-from matplotlib.axes import Axes
+from koopman_ros.reports import draw_limits, drawing, DRAWN_RANGE
 
 _RECORDED, _CHECK, _NEW = '0.55', 'tab:blue', 'tab:orange'
 
@@ -31,26 +28,23 @@ def draw(path: Path, bag: ReplayedBag, new_model: str) -> None:
     """
     inputs = bag.recorded.shape[1]
     states = bag.measured.shape[1]
-    figure, axes = pyplot.subplots(
-        states + 2 * inputs, 1, sharex=True, figsize=(9.0, 3.0 * (states + 2 * inputs)),
-        layout='constrained', height_ratios=[1.0] * states + [1.2] * inputs + [0.8] * inputs)
     time, label = _time(bag)
-    for i in range(states):
-        _draw_measured(axes[i], time, bag, i)
-    for i in range(inputs):
-        _draw_commands(axes[states + i], time, bag, i, new_model)
-        _draw_difference(axes[states + inputs + i], time, bag, i, new_model)
-    axes[0].set_title('\n'.join([f'{Path(bag.path).name}: recorded and replayed commands',
-                                 *textwrap.wrap(verdict(bag), 90)]), fontsize='medium')
-    axes[-1].set_xlabel(label)
-    if len(time) > 1:
-        axes[-1].set_xlim(time[0], time[-1])
-    for one in axes:
-        one.grid(alpha=0.3)
-        if one.get_legend_handles_labels()[0]:
-            one.legend(loc='best', fontsize='small', framealpha=0.9)
-    figure.savefig(path, dpi=130)
-    pyplot.close(figure)
+    rows = states + 2 * inputs
+    with drawing(path, rows, 1, size=(9.0, 3.0 * rows), sharex=True,
+                 height_ratios=[1.0] * states + [1.2] * inputs + [0.8] * inputs) as (_, axes):
+        for i in range(states):
+            _draw_measured(axes[i], time, bag, i)
+        for i in range(inputs):
+            _draw_commands(axes[states + i], time, bag, i, new_model)
+            _draw_difference(axes[states + inputs + i], time, bag, i, new_model)
+        axes[0].set_title('\n'.join([f'{Path(bag.path).name}: recorded and replayed commands',
+                                     *textwrap.wrap(verdict(bag), 90)]), fontsize='medium')
+        axes[-1].set_xlabel(label)
+        if len(time) > 1:
+            axes[-1].set_xlim(time[0], time[-1])
+        for one in axes:
+            if one.get_legend_handles_labels()[0]:
+                one.legend(loc='best', fontsize='small', framealpha=0.9)
 
 
 def _time(bag: ReplayedBag) -> tuple[np.ndarray, str]:
@@ -65,14 +59,14 @@ def _time(bag: ReplayedBag) -> tuple[np.ndarray, str]:
     return seconds, 'time since the first command [s]'
 
 
-def _draw_measured(axes: Axes, time: np.ndarray, bag: ReplayedBag, i: int) -> None:
+def _draw_measured(axes: matplotlib.axes.Axes, time: np.ndarray, bag: ReplayedBag, i: int) -> None:
     controller = bag.found.controller
     name, unit = 'measured', ''
     if controller is not None:
         states = controller.model.states
         name, unit = states.names[i], states.units[i]
         (low, high), _ = shown(np.array([states.lower[i], states.upper[i]]), unit)
-        axes.axhspan(low, high, color='0.93', label='range of training', zorder=0)
+        axes.axhspan(low, high, label='training range', **DRAWN_RANGE)
     setpoint, _ = shown(bag.setpoint[:, i], unit)
     measured, unit = shown(bag.measured[:, i], unit)
     finite = measured[np.isfinite(measured)]
@@ -97,16 +91,15 @@ def _typical(finite: np.ndarray) -> np.ndarray:
     return finite[(finite >= low - reach) & (finite <= high + reach)]
 
 
-def _draw_commands(axes: Axes, time: np.ndarray, bag: ReplayedBag, i: int, new_model: str
-                   ) -> None:
+def _draw_commands(axes: matplotlib.axes.Axes, time: np.ndarray, bag: ReplayedBag, i: int,
+                   new_model: str) -> None:
     controller = bag.found.controller
     name, unit = 'command', ''
     if controller is not None:
         inputs, limits = controller.model.inputs, controller.settings.limits
         name, unit = inputs.names[i], inputs.units[i]
         (low, high), _ = shown(np.array([limits.lower[i], limits.upper[i]]), unit)
-        axes.axhline(high, color='0.3', linestyle=':', label='limits')
-        axes.axhline(low, color='0.3', linestyle=':')
+        draw_limits(axes, (high, low), 'limits')
     axes.step(time, shown(bag.recorded[:, i], unit)[0], where='post', color=_RECORDED,
               linewidth=4.0, label='recorded')
     axes.step(time, shown(bag.commands[:, i], unit)[0], where='post', color=_CHECK, linewidth=1.2,
@@ -117,8 +110,8 @@ def _draw_commands(axes: Axes, time: np.ndarray, bag: ReplayedBag, i: int, new_m
     axes.set_ylabel(f'{name}, command [{shown(bag.recorded, unit)[1]}]')
 
 
-def _draw_difference(axes: Axes, time: np.ndarray, bag: ReplayedBag, i: int, new_model: str
-                     ) -> None:
+def _draw_difference(axes: matplotlib.axes.Axes, time: np.ndarray, bag: ReplayedBag, i: int,
+                     new_model: str) -> None:
     axes.axhspan(-bag.tolerance, bag.tolerance, color='0.9', label=f'within ±{bag.tolerance:g}',
                  zorder=0)
     drawn = [(bag.check, _CHECK, 'replayed')]

@@ -5,13 +5,13 @@
 
 from __future__ import annotations
 
-import json
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from koopman_ros.replay.comparison import Comparison, ReplayedBag
+from koopman_ros.reports import write_figures, write_page
 
 
 def write_report(folder: Path, bags: list[ReplayedBag], pictures: list[str], new_model: str
@@ -30,11 +30,11 @@ def write_report(folder: Path, bags: list[ReplayedBag], pictures: list[str], new
         'reproduced': all(reproduced(bag) for bag in bags),
         'bags': [_figures(bag) for bag in bags],
     }
-    (folder / 'summary.json').write_text(json.dumps(summary, indent=2) + '\n', encoding='utf-8')
-    lines = ['# Replay', '', _about(new_model), '']
+    write_figures(folder / 'summary.json', summary)
+    sections = [_about(new_model)]
     for bag, picture in zip(bags, pictures, strict=True):
-        lines += [f'## {bag.path}', '', *_section(bag), '', f'![commands]({picture})', '']
-    (folder / 'report.md').write_text('\n'.join(lines), encoding='utf-8')
+        sections += [f'## {bag.path}', '\n'.join(_section(bag)), f'![commands]({picture})']
+    write_page(folder / 'report.md', 'Replay', sections, ('numpy', 'scipy'))
 
 
 def reproduced(bag: ReplayedBag) -> bool:

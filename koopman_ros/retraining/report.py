@@ -1,12 +1,11 @@
 # SPDX-FileCopyrightText: 2026 The koopman_ros Authors
 # SPDX-License-Identifier: Apache-2.0
 
-
 """What a retraining leaves beside the model: figures, a page in words, a picture."""
 
 from __future__ import annotations
 
-import json
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -14,6 +13,7 @@ import numpy as np
 
 from koopman_ros.identification import Identified, longest_step, Stretches
 from koopman_ros.identification.stretches import fitted_starts, Rate
+from koopman_ros.reports import bullets, drawing, table, write_figures, write_page
 from koopman_ros.retraining.coverage import CELLS, visited_cells
 from koopman_ros.retraining.gate import lifted_rate
 from koopman_ros.retraining.task import Outcome, ZERO_CELSIUS
@@ -27,76 +27,66 @@ def write_report(outcome: Outcome) -> list[Path]:
     :return: what was written.
     """
     base = Path(outcome.task.output)
-    written = [base.with_suffix('.json'), base.with_suffix('.md')]
-    written[0].parent.mkdir(parents=True, exist_ok=True)
-    written[0].write_text(
-        json.dumps(outcome.summary(), indent=2, allow_nan=False) + '\n', encoding='utf-8')
     picture = base.with_suffix('.png')
     drawn = _draw(picture, outcome)
-    written[1].write_text(_page(outcome, picture.name if drawn else ''), encoding='utf-8')
+    written = [write_figures(base.with_suffix('.json'), outcome.summary()),
+               write_page(base.with_suffix('.md'), 'Retraining',
+                          [*_sections(outcome),
+                           f'![Data, drift and prediction]({picture.name})' if drawn else ''],
+                          ('numpy', 'scipy', 'torch'))]
     return [*written, *([picture] if drawn else [])]
 
 
-def _page(outcome: Outcome, picture: str) -> str:
+def _sections(outcome: Outcome) -> Iterator[str]:
     found, verdict, trained = outcome.found, outcome.verdict, outcome.trained
-    lines = ['# Retraining', '',
-             f'**The new lift is {"accepted" if outcome.accepted else "refused"}.**']
-    lines += [f'- {reason}' for reason in outcome.reasons]
-    if verdict is not None:
-        lines += [f'- Beware: {warning}.' for warning in verdict.warnings]
+    yield f'**The new lift is {"accepted" if outcome.accepted else "refused"}.**'
+    warnings = () if verdict is None else verdict.warnings
+    yield bullets([*outcome.reasons, *(f'Beware: {warning}.' for warning in warnings)])
     if outcome.model_file:
-        lines += ['', f'Model file: `{outcome.model_file}`']
-    lines += ['', '## Data', '', *(f'- {bag}' for bag in outcome.task.bags), '',
-              *(f'- {line}' for line in outcome.account.lines()),
-              f'- {100.0 * outcome.coverage:.0f} % of the cells of the state-input box visited '
-              f'({CELLS} along each)',
-              f'- noise from sample to sample: {found.noise[0]:.3g} K',
-              f'- {len(found.fitted)} stretches to estimate and learn from, '
-              f'{len(found.held_out)} held out to judge by']
-    lines += ['', '## Estimates of the drift', '',
-              f'Taken: {found.method}, degree {found.drift.degree}; '
-              f'B = {found.drift.input_matrix[0, 0]:.5g} K per K and time unit.', '',
-              '| degree | method | error on the stretches to choose by [K] |', '|---|---|---|']
-    lines += [f'| {score.degree} | {score.method} | {score.rmse[0]:.5f} |'
-              for score in found.scores]
-    if verdict is not None and trained is not None:
-        lines += ['', '## On held-out stretches', '',
-                  '| prediction of the measurements by | root mean square error [K] |',
-                  '|---|---|',
-                  f'| the new lift | {verdict.rmse[0]:.5f} |',
-                  f'| the drift that it was learned from | {verdict.drift_rmse[0]:.5f} |',
-                  f'| the present lift | {verdict.current_rmse[0]:.5f} |',
-                  f'| the best linear model | {verdict.linear_rmse[0]:.5f} |', '',
-                  'The noise of the measurements is part of each.', '',
-                  f'Lift: n_z = {trained.model.n_z}, rw = {trained.report.fit.rw:.2g}, '
-                  f'condition number {trained.report.fit.cond:.3g}, eigenvalues '
-                  + ', '.join(f'{value:.3g}' for value in trained.model.eigenvalues)
-                  + f' 1/{trained.model.time_unit}.',
-                  f'Closed loops on the estimated drift: {verdict.arrived} of {verdict.loops} '
-                  'reach their set-point.']
-    if picture:
-        lines += ['', f'![Data, drift and prediction]({picture})']
-    return '\n'.join(lines) + '\n'
+        yield f'Model file: `{outcome.model_file}`'
+    yield '## Data'
+    yield bullets(map(str, outcome.task.bags))
+    yield bullets([
+        *outcome.account.lines(),
+        f'{100.0 * outcome.coverage:.0f} % of the cells of the state-input box visited '
+        f'({CELLS} along each)',
+        f'noise from sample to sample: {found.noise[0]:.3g} K',
+        f'{len(found.fitted)} stretches to estimate and learn from, '
+        f'{len(found.held_out)} held out to judge by'])
+    yield '## Estimates of the drift'
+    yield (f'Taken: {found.method}, degree {found.drift.degree}; '
+           f'B = {found.drift.input_matrix[0, 0]:.5g} K per K and time unit.')
+    yield table(('degree', 'method', 'error on the stretches to choose by [K]'),
+                ((score.degree, score.method, f'{score.rmse[0]:.5f}') for score in found.scores),
+                (2,))
+    if verdict is None or trained is None:
+        return
+    yield '## On held-out stretches'
+    yield table(('prediction of the measurements by', 'root mean square error [K]'),
+                ((name, f'{rmse[0]:.5f}') for name, rmse in (
+                    ('the new lift', verdict.rmse),
+                    ('the drift that it was learned from', verdict.drift_rmse),
+                    ('the present lift', verdict.current_rmse),
+                    ('the best linear model', verdict.linear_rmse))), (1,))
+    yield 'The noise of the measurements is part of each.'
+    eigenvalues = ', '.join(f'{value:.3g}' for value in trained.model.eigenvalues)
+    yield (f'Lift: n_z = {trained.model.n_z}, rw = {trained.report.fit.rw:.2g}, condition number '
+           f'{trained.report.fit.cond:.3g}, eigenvalues {eigenvalues} '
+           f'1/{trained.model.time_unit}. Closed loops on the estimated drift: {verdict.arrived} '
+           f'of {verdict.loops} reach their set-point.')
 
 
 def _draw(path: Path, outcome: Outcome) -> bool:
     """Draw where the data lie, what was learned, and how it predicts; False without matplotlib."""
     try:
-        import matplotlib
-        matplotlib.use('Agg')
-        from matplotlib import pyplot
+        with drawing(path, 1, 3, size=(15.0, 4.6)) as (figure, (left, middle, right)):
+            _draw_coverage(left, outcome.found)
+            _draw_drift(middle, outcome)
+            _draw_prediction(right, outcome)
+            word = 'accepted' if outcome.accepted else 'refused'
+            figure.suptitle(f'Retraining: the new lift is {word}')
     except ImportError:
         return False
-    found = outcome.found
-    figure, (left, middle, right) = pyplot.subplots(1, 3, figsize=(15.0, 4.6),
-                                                    layout='constrained')
-    _draw_coverage(left, found)
-    _draw_drift(middle, outcome)
-    _draw_prediction(right, outcome)
-    word = 'accepted' if outcome.accepted else 'refused'
-    figure.suptitle(f'Retraining: the new lift is {word}')
-    figure.savefig(path, dpi=120)
-    pyplot.close(figure)
     return True
 
 
@@ -114,6 +104,7 @@ def _draw_coverage(axes: Any, found: Identified) -> None:
         axes.plot(record.x[:, 0] - ZERO_CELSIUS,
                   record.inputs_at(record.time)[:, 0] - ZERO_CELSIUS, '.', markersize=1.0,
                   color='tab:blue')
+    axes.grid(False)  # the cells are one
     axes.set(xlabel='temperature [°C]', ylabel='coolant [°C]',
              title='where the measurements lie (visited cells in green)')
 
@@ -140,7 +131,6 @@ def _draw_drift(axes: Any, outcome: Outcome) -> None:
              title=f'dT/dt at {u[0, 0] - ZERO_CELSIUS:.1f} °C of coolant, '
              'less the estimate')
     axes.legend()
-    axes.grid(alpha=0.3)
 
 
 def _draw_prediction(axes: Any, outcome: Outcome) -> None:
@@ -162,4 +152,3 @@ def _draw_prediction(axes: Any, outcome: Outcome) -> None:
     axes.set(xlabel=f'time [{current.time_unit}]', ylabel='temperature [°C]',
              title='prediction of a held-out stretch')
     axes.legend()
-    axes.grid(alpha=0.3)

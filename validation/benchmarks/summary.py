@@ -6,9 +6,10 @@
 from __future__ import annotations
 
 import json
-import os
 from pathlib import Path
 from typing import Any
+
+from koopman_ros.reports import write_figures
 
 
 class Summary:
@@ -32,8 +33,4 @@ class Summary:
 
     def write(self, part: str, figures: dict[str, Any]) -> None:
         """Put a part's figures in the place of its old ones."""
-        self.path.parent.mkdir(parents=True, exist_ok=True)
-        # written beside and renamed, so that an interrupt leaves the old file or the new one
-        beside = self.path.with_suffix('.part')
-        beside.write_text(json.dumps({**self.read(), part: figures}, indent=1) + '\n')
-        os.replace(beside, self.path)
+        write_figures(self.path, {**self.read(), part: figures})

@@ -6,12 +6,11 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-import json
 import math
 from pathlib import Path
 from typing import Any
 
-from validation.benchmarks.machine import machine
+from koopman_ros.reports import bullets, machine, table, write_figures, write_page
 from validation.faults.case import Outcome
 from validation.faults.judge import BAND, RUNAWAY
 from validation.faults.soak import Soak
@@ -22,13 +21,12 @@ FIGURE = 'cases.png'
 def write(folder: Path, outcomes: Sequence[Outcome], soak: Soak | None, pictured: bool = False
           ) -> None:
     """Write both files for what has been run so far."""
-    folder.mkdir(parents=True, exist_ok=True)
     figures = {'machine': machine(), **_counts(outcomes),
                'results': {outcome.case.name: _figures(outcome) for outcome in outcomes}}
     if soak is not None:
         figures['soak'] = _soak_figures(soak)
-    (folder / 'summary.json').write_text(json.dumps(figures, indent=1) + '\n')
-    (folder / 'report.md').write_text('\n'.join(_lines(outcomes, soak, pictured)) + '\n')
+    write_figures(folder / 'summary.json', figures)
+    write_page(folder / 'report.md', 'Fault campaign', _sections(outcomes, soak, pictured))
 
 
 def survived(outcomes: Sequence[Outcome], soak: Soak | None) -> bool:
@@ -62,22 +60,17 @@ def _figures(outcome: Outcome) -> dict[str, Any]:
     if verdict is None:
         return {**figures, 'skipped': outcome.skipped}
     return {**figures, 'reasons': list(verdict.reasons),
-            'worst_temperature_error_K': _number(verdict.worst_error),
-            'worst_coolant_step_K': _number(verdict.worst_step),
-            'time_to_recover_s': _number(verdict.recovery),
-            'offset_at_the_end_K': _number(verdict.offset)}
-
-
-def _number(value: float) -> float | None:
-    """Return a figure for JSON, which knows neither infinity nor NaN."""
-    return round(value, 6) if math.isfinite(value) else None
+            'worst_temperature_error_K': round(verdict.worst_error, 6),
+            'worst_coolant_step_K': round(verdict.worst_step, 6),
+            'time_to_recover_s': round(verdict.recovery, 6),
+            'offset_at_the_end_K': round(verdict.offset, 6)}
 
 
 def _soak_figures(soak: Soak) -> dict[str, Any]:
     return {'survived': not soak.reasons, 'reasons': list(soak.reasons), 'hours': soak.hours,
             'wall_seconds': round(soak.wall, 1), 'answers': vars(soak.answers),
             'events': soak.events, 'recorded': soak.recorded,
-            'hottest_degC': _number(soak.hottest), 'mean_error_K': _number(soak.mean_error),
+            'hottest_degC': round(soak.hottest, 6), 'mean_error_K': round(soak.mean_error, 6),
             'memory_MB': {name: {
                 'first': round(float(seen.megabytes[0]), 2),
                 'last': round(float(seen.megabytes[-1]), 2),
@@ -88,14 +81,11 @@ def _seconds(value: float) -> str:
     return f'{value:.0f} s' if math.isfinite(value) else 'never'
 
 
-def _lines(outcomes: Sequence[Outcome], soak: Soak | None, pictured: bool) -> Iterator[str]:
+def _sections(outcomes: Sequence[Outcome], soak: Soak | None, pictured: bool) -> Iterator[str]:
     counts = _counts(outcomes)
-    yield '# Fault campaign'
-    yield ''
     skipped = f', {counts["skipped"]} skipped' if counts['skipped'] else ''
     yield (f'{counts["survived"]} of {counts["cases"]} cases survived{skipped}. Plant and '
            'controller are real processes; times are plant time.')
-    yield ''
     yield ('A case is survived when every command was finite, within its range and without a '
            f'bump, the reactor stayed below {RUNAWAY:g} °C and came back to within {BAND:g} K of '
            'its set-point in time (unless the case says otherwise), diagnostics said what they '
@@ -103,56 +93,46 @@ def _lines(outcomes: Sequence[Outcome], soak: Soak | None, pictured: bool) -> It
            'the set-point, steps of the set-point included; the worst step is that between two '
            'commands, of which the rate limit allows 1 K a second.')
     for group in dict.fromkeys(outcome.case.group for outcome in outcomes):
-        yield from _group(group, [o for o in outcomes if o.case.group == group])
+        yield f'## {group.capitalize()}'
+        yield table(('case', 'what is done', 'worst error [K]', 'worst step [K]',
+                     'back after [s]', 'left [K]', ''),
+                    (_row(outcome) for outcome in outcomes if outcome.case.group == group),
+                    (2, 3, 4, 5))
     if pictured:
-        yield from ('', f'![Some of the cases]({FIGURE})')
-    failed = [o for o in outcomes if o.verdict is not None and o.verdict.reasons]
+        yield f'![Some of the cases]({FIGURE})'
+    failed = [(o.case.name, o.verdict.reasons) for o in outcomes if o.verdict is not None
+              and o.verdict.reasons]
     if failed:
-        yield from ('', '## What failed', '')
-        for outcome in failed:
-            assert outcome.verdict is not None
-            yield f'- **{outcome.case.name}**: {"; ".join(outcome.verdict.reasons)}'
+        yield '## What failed'
+        yield bullets(f'**{name}**: {"; ".join(reasons)}' for name, reasons in failed)
     if soak is not None:
-        yield from _soak_lines(soak)
+        yield from _soak_sections(soak)
 
 
-def _group(group: str, outcomes: Sequence[Outcome]) -> Iterator[str]:
-    yield from ('', f'## {group.capitalize()}', '')
-    yield ('| case | what is done | worst error [K] | worst step [K] | back after [s] | '
-           'left [K] | |')
-    yield '|---|---|---:|---:|---:|---:|---|'
-    for outcome in outcomes:
-        does = '; '.join([outcome.case.does, *outcome.course.notes])
-        verdict = outcome.verdict
-        if verdict is None:
-            yield f'| {outcome.case.name} | {does} | | | | | skipped: {outcome.skipped} |'
-            continue
-        recovery = f'{verdict.recovery:.0f}' if math.isfinite(verdict.recovery) else 'never'
-        yield (f'| {outcome.case.name} | {does} | {verdict.worst_error:.2f} | '
-               f'{verdict.worst_step:.2f} | {recovery} | {verdict.offset:.3f} | '
-               f'{"survived" if verdict.survived else "**failed**"} |')
+def _row(outcome: Outcome) -> tuple[str, ...]:
+    does = '; '.join([outcome.case.does, *outcome.course.notes])
+    verdict = outcome.verdict
+    if verdict is None:
+        return outcome.case.name, does, '', '', '', '', f'skipped: {outcome.skipped}'
+    return (outcome.case.name, does, f'{verdict.worst_error:.2f}', f'{verdict.worst_step:.2f}',
+            _seconds(verdict.recovery).removesuffix(' s'), f'{verdict.offset:.3f}',
+            'survived' if verdict.survived else '**failed**')
 
 
-def _soak_lines(soak: Soak) -> Iterator[str]:
-    yield from ('', '## Soak', '')
+def _soak_sections(soak: Soak) -> Iterator[str]:
+    yield '## Soak'
     yield (f'{"Survived" if not soak.reasons else "**Failed**"}: {soak.hours:g} h of plant time '
            f'in {soak.wall:.0f} s with {sum(soak.events.values())} events. The reactor was '
            f'{soak.mean_error:.2f} K from its set-point on average and never above '
            f'{soak.hottest:.1f} °C.')
-    for reason in soak.reasons:
-        yield from ('', f'- {reason}')
+    yield bullets(soak.reasons)
     answers = soak.answers
-    yield ''
     yield (f'{answers.measurements} measurements reached the controller, {answers.answered} were '
            f'answered as often as they came; {answers.unanswered} answers are missing, '
            f'{answers.repeated} repeated, {answers.unasked} unasked, {answers.out_of_order} out '
            'of order. Recorded: '
            f'{", ".join(f"{count} on {topic}" for topic, count in soak.recorded.items())}.')
-    yield from ('', '| process | memory at first [MB] | at last [MB] | growth when warm [MB] |',
-                '|---|---:|---:|---:|')
-    for name, seen in soak.memory.items():
-        yield (f'| {name} | {seen.megabytes[0]:.1f} | {seen.megabytes[-1]:.1f} | '
-               f'{seen.growth:.2f} |')
-    yield from ('', '| event | times |', '|---|---:|')
-    for name, times in sorted(soak.events.items()):
-        yield f'| {name} | {times} |'
+    yield table(('process', 'memory at first [MB]', 'at last [MB]', 'growth when warm [MB]'),
+                ((name, f'{seen.megabytes[0]:.1f}', f'{seen.megabytes[-1]:.1f}',
+                  f'{seen.growth:.2f}') for name, seen in soak.memory.items()), (1, 2, 3))
+    yield table(('event', 'times'), sorted(soak.events.items()), (1,))

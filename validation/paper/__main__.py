@@ -10,13 +10,13 @@ Run it as ``python -m validation.paper`` (needs the `train` and `demo` requireme
 from __future__ import annotations
 
 import argparse
-import json
 from pathlib import Path
 import signal
 import sys
 import time
 
 from koopman_ros import __version__
+from koopman_ros.reports import write_figures
 from validation.paper.campaign import run_campaign
 from validation.paper.figures import draw_figures
 from validation.paper.report import write_report
@@ -39,7 +39,6 @@ def main(args: list[str] | None = None) -> int:
         'out/studies-sensors' if options.sensors else 'out/studies')
     if options.seeds < 1:
         parser.error(f'--seeds is {options.seeds}, must be at least 1')
-    options.output.mkdir(parents=True, exist_ok=True)
     # a request to end is an interrupt: what is done is reported
     signal.signal(signal.SIGTERM, signal.default_int_handler)
     start = time.monotonic()
@@ -48,8 +47,7 @@ def main(args: list[str] | None = None) -> int:
         'package_version': __version__, 'seeds': options.seeds, 'complete': campaign.complete,
         'errors': campaign.errors, 'wall_seconds': round(time.monotonic() - start, 1),
         **campaign.summary()}
-    (options.output / 'summary.json').write_text(
-        json.dumps(summary, indent=2, allow_nan=False) + '\n')
+    write_figures(options.output / 'summary.json', summary)
     figures = draw_figures(campaign, options.output)
     write_report(summary, figures, options.output / 'report.md')
     for line in campaign.errors:

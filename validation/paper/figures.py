@@ -5,53 +5,30 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-import matplotlib
-from matplotlib.axes import Axes
-from matplotlib.figure import Figure
 import numpy as np
 
 from koopman_ros.control import ClosedLoop
 from koopman_ros.learning import roll_out, Samples
 from koopman_ros.lifting import LiftedModel
 from koopman_ros.plants import RandomStepDesign
+from koopman_ros.reports import drawing, DRAWN_RANGE, LIMIT, Picture
 from validation.paper import reactor, scalar, two_state
 from validation.paper.boxes import draw_box
 from validation.paper.campaign import Campaign
 from validation.paper.datasets import random_step_episodes
 
-matplotlib.use('Agg')
-from matplotlib import pyplot
-
 # The paper's colours.
 EXACT: dict[str, Any] = {'color': 'black', 'linewidth': 1.8}
 LEARNED: dict[str, Any] = {'color': 'tab:green', 'linestyle': '--', 'linewidth': 1.8}
 LINEAR: dict[str, Any] = {'color': 'tab:red', 'linewidth': 1.2}
-RANGE: dict[str, Any] = {'color': '0.9', 'zorder': 0}
-LIMIT: dict[str, Any] = {'color': '0.5', 'linestyle': ':', 'linewidth': 1.0}
 FIGURE_SEED = 0
 FIGURE_NARROW_BOX = '[4,5.5]x[4,5.5]'
 
 
-@dataclass(frozen=True)
-class Drawn:
-    """
-    A figure that was drawn.
-
-    :param file: name of the file.
-    :param caption: what it shows, with its numbers.
-    """
-
-    file: str
-    caption: str
-
-
-def draw_figures(campaign: Campaign, folder: Path) -> list[Drawn]:
+def draw_figures(campaign: Campaign, folder: Path) -> list[Picture]:
     """Draw every figure whose experiment has been run; return them in the paper's order."""
     drawn = []
     for name, experiments, draw in (
@@ -70,20 +47,8 @@ def draw_figures(campaign: Campaign, folder: Path) -> list[Drawn]:
                             'sensors/two_state'), _sensors)):
         if all(name in campaign.models for name in experiments):
             caption = draw(campaign, folder / f'{name}.png')
-            drawn.append(Drawn(f'{name}.png', caption))
+            drawn.append(Picture(f'{name}.png', caption))
     return drawn
-
-
-@contextmanager
-def _figure(path: Path, rows: int = 1, columns: int = 1, size: tuple[float, float] = (7.0, 4.5),
-            **options: Any) -> Iterator[tuple[Figure, list[Axes]]]:
-    figure, axes = pyplot.subplots(rows, columns, figsize=size, squeeze=False,
-                                   layout='constrained', **options)
-    try:
-        yield figure, list(axes.ravel())
-        figure.savefig(path, dpi=150)
-    finally:
-        pyplot.close(figure)
 
 
 def _models(campaign: Campaign, experiment: str) -> dict[str, LiftedModel]:
@@ -103,8 +68,8 @@ def _scalar(campaign: Campaign, path: Path) -> str:
     exact = (J[:, :, 0] * (x * x)[:, None] / model.states.scale)[:, 0]
     linear = (z @ model.A.T)[:, 0]
     scale = 1.0 / np.max(np.abs(exact[x <= 5.0]))
-    with _figure(path, 1, 2, (10.0, 4.3)) as (_, (left, right)):
-        left.axvspan(*scalar.RANGE, label='training range', **RANGE)
+    with drawing(path, 1, 2, size=(10.0, 4.3)) as (_, (left, right)):
+        left.axvspan(*scalar.RANGE, label='training range', **DRAWN_RANGE)
         left.plot(x, x * x, color='tab:blue', label='$\\dot x = x^2$')
         left.plot(x, at * at + 2.0 * at * (x - at), label='linearisation', **LINEAR)
         left.plot([at], [at * at], 'o', color='tab:red', label='operating point')
@@ -113,7 +78,7 @@ def _scalar(campaign: Campaign, path: Path) -> str:
         left.plot([], [], color='tab:red', linestyle='--', label='linearisation within 10 %')
         left.set(xlabel='x', ylabel='dx/dt  [1/s]', ylim=(-6.0, 66.0), xlim=(0.0, 8.0))
         left.legend(loc='upper left')
-        right.axvspan(*scalar.RANGE, label='training range', **RANGE)
+        right.axvspan(*scalar.RANGE, label='training range', **DRAWN_RANGE)
         right.plot(x, scale * exact, label='chain rule  $J_N(x)\\,\\dot x$', **EXACT)
         right.plot(x, scale * linear, color='tab:red', linestyle='--', linewidth=1.8,
                    label='learned  $A\\,N(x)$')
@@ -139,7 +104,7 @@ def _derivatives(model: LiftedModel, box: two_state.Box, path: Path) -> float:
     z, J = model.lift_and_jacobian(xi)
     exact = (J @ (episode.dxdt / model.states.scale)[..., None])[..., 0]
     linear = z @ model.A.T + (J @ push[..., None])[..., 0]
-    with _figure(path, 3, 1, (7.0, 6.5), sharex=True) as (_, axes):
+    with drawing(path, 3, 1, size=(7.0, 6.5), sharex=True) as (_, axes):
         for i, axis in enumerate(axes):
             axis.step(episode.time, exact[:, i], where='post',
                       label='chain rule  $J_N(x)\\,\\dot x$', **EXACT)
@@ -159,7 +124,7 @@ def _wide_derivatives(campaign: Campaign, path: Path) -> str:
 
 def _control(path: Path, loops: list[tuple[str, dict[str, Any], ClosedLoop]], until: float
              ) -> None:
-    with _figure(path, 1, 2, (10.0, 4.0)) as (_, (state, action)):
+    with drawing(path, 1, 2, size=(10.0, 4.0)) as (_, (state, action)):
         for label, style, loop in loops:
             state.plot(loop.times, loop.states[:, 1], label=label, **style)
             action.plot(loop.times, loop.inputs[:, 0], label=label, **style)
@@ -214,9 +179,10 @@ def _reactor_roll_out(campaign: Campaign, path: Path, design: RandomStepDesign) 
     truth = random_step_episodes(reactor.SYSTEM, design, 1, 60.0, 77)
     assert truth.time is not None
     errors = {}
-    with _figure(path, 2, 1, (8.0, 5.5), sharex=True, height_ratios=(3, 1)) as (_, (top, low)):
+    with drawing(path, 2, 1, size=(8.0, 5.5), sharex=True, height_ratios=(3, 1)
+                 ) as (_, (top, low)):
         box = models['nz=3'].states
-        top.axhspan(box.lower[0], box.upper[0], label='training range', **RANGE)
+        top.axhspan(box.lower[0], box.upper[0], label='training range', **DRAWN_RANGE)
         top.plot(truth.time, truth.x[:, 0], label='reactor', **EXACT)
         for name, label, style in (('nz=3', 'learned lift, n$_z$ = 3', LEARNED),
                                    ('linear', 'linearisation', LINEAR)):
@@ -226,7 +192,7 @@ def _reactor_roll_out(campaign: Campaign, path: Path, design: RandomStepDesign) 
         top.set(ylabel='temperature  [K]')
         top.legend(loc='best', ncols=2)
         inputs = models['nz=3'].inputs
-        low.axhspan(inputs.lower[0], inputs.upper[0], **RANGE)
+        low.axhspan(inputs.lower[0], inputs.upper[0], **DRAWN_RANGE)
         low.step(truth.time, truth.u[:, 0], where='post', color='tab:blue')
         low.set(ylabel='coolant  [K]', xlabel='time  [min]')
     return (f'root mean square error: learned {errors["nz=3"]:.2g} K, linearised '
@@ -246,7 +212,7 @@ def _out_of_range(campaign: Campaign, path: Path) -> str:
 def _set_point(campaign: Campaign, path: Path) -> str:
     models = _models(campaign, 'reactor')
     offsets = {}
-    with _figure(path, 2, 1, (7.0, 5.5), sharex=True) as (_, (top, low)):
+    with drawing(path, 2, 1, size=(7.0, 5.5), sharex=True) as (_, (top, low)):
         top.axhline(reactor.SETPOINT, label='set-point T$_{ss}$ − 10 K', **LIMIT)
         for name, label, style in (
                 ('linear', 'linearisation', LINEAR),
@@ -260,9 +226,6 @@ def _set_point(campaign: Campaign, path: Path) -> str:
         top.legend()
     return ('Set-point tracking to T_ss - 10 K, R = 1: the learned lift ends '
             f'{offsets["nz=3"]:.1e} K off, the linearised controller {offsets["linear"]:.3f} K.')
-
-
-Draw3D = Callable[..., None]
 
 
 def _wide_box(campaign: Campaign, path: Path) -> str:
@@ -295,7 +258,7 @@ def _sensors(campaign: Campaign, path: Path) -> str:
         found = campaign.metrics[f'sensors/{experiment}']
         return [float(found[seed][name]) for seed in sorted(found)]  # type: ignore[arg-type]
 
-    with _figure(path, 1, 3, (12.0, 4.2)) as (_, (left, middle, right)):
+    with drawing(path, 1, 3, size=(12.0, 4.2)) as (_, (left, middle, right)):
         for experiment, label, color in (('noisy', 'noise of 0.1 K', 'tab:blue'),
                                          ('noise_free', 'no noise', 'tab:green')):
             left.semilogy(values(experiment, 'rollout_kelvin'), 'o', color=color, label=label)
@@ -318,7 +281,6 @@ def _sensors(campaign: Campaign, path: Path) -> str:
         for axes in (left, middle, right):
             axes.set_xlabel('seed')
             axes.legend(fontsize=8)
-            axes.grid(alpha=0.3)
     worst = max(values('noisy', 'rollout_kelvin'))
     return (f'Lifts learned from a sensor: with noise of 0.1 K the worst of {len(before)} seeds '
             f'predicts to {worst:.2g} K; after fouling the largest offset left is '

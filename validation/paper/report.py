@@ -6,12 +6,12 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 import statistics
 from typing import Any
 
-from validation.paper.figures import Drawn
+from koopman_ros.reports import Picture, table, write_page
 
 Values = Sequence[float | bool | None]
 
@@ -58,7 +58,7 @@ _REACTOR_COLUMNS = ('rw', 'cond', 'rollout_rmse_in_kelvin', 'rollout_rmse_out_ke
                     'cost_ratio_to_optimum')
 
 
-def write_report(summary: dict[str, Any], figures: Sequence[Drawn], path: Path) -> None:
+def write_report(summary: dict[str, Any], figures: Sequence[Picture], path: Path) -> None:
     """
     Write the report in Markdown.
 
@@ -71,10 +71,10 @@ def write_report(summary: dict[str, Any], figures: Sequence[Drawn], path: Path) 
                         ('narrow', _narrow), ('paper_algorithm', _paper), ('sensors', _sensors)):
         if name in summary:
             sections.append(write(summary[name]))
-    sections.append('## Figures\n\n' + '\n\n'.join(
-        f'![{figure.file}]({figure.file})\n\n*Figure {number}. {figure.caption}*'
-        for number, figure in enumerate(figures, 1)))
-    path.write_text('\n\n'.join(sections) + '\n')
+    title = 'Learning from a sensor' if 'sensors' in summary else 'The experiments of the paper'
+    write_page(path, title, [*sections, '## Figures', *(
+        str(replace(figure, caption=f'Figure {number}. {figure.caption}'))
+        for number, figure in enumerate(figures, 1))], ('torch', 'numpy', 'scipy'))
 
 
 def _opening(summary: dict[str, Any]) -> str:
@@ -89,16 +89,13 @@ def _opening(summary: dict[str, Any]) -> str:
         rows.append((f'`{name}`', f'{target.bound:g}', worst, f'{met} of {count}'))
     state = '' if summary['complete'] else ' **Interrupted before the end.**'
     return (
-        f'# {"Learning from a sensor" if "sensors" in summary else "The experiments of the paper"}'
-        '\n\n'
-        f'Seeds 0 to {summary["seeds"] - 1}, {summary["wall_seconds"]:.0f} s, '
-        f'koopman_ros {summary["package_version"]}.{state} Figures in tables are medians over '
-        'the seeds with [smallest, largest]; what failed is counted. All are taken on fresh '
-        'simulations that no training has seen. `rw` is the relative residual of the lifted '
-        "dynamics in the lift's own metric, which no scaling of z changes; `cond` is the "
-        "condition number of E[z z'].\n\n"
+        f'Seeds 0 to {summary["seeds"] - 1}, {summary["wall_seconds"]:.0f} s.{state} Figures in '
+        'tables are medians over the seeds with [smallest, largest]; what failed is counted. All '
+        'are taken on fresh simulations that no training has seen. `rw` is the relative residual '
+        "of the lifted dynamics in the lift's own metric, which no scaling of z changes; `cond` "
+        "is the condition number of E[z z'].\n\n"
         '## What every seed is held to\n\n'
-        + _table(('figure', 'at most', 'worst seed', 'met'), rows))
+        + table(('figure', 'at most', 'worst seed', 'met'), rows))
 
 
 def _scalar(part: dict[str, Any]) -> str:
@@ -107,7 +104,7 @@ def _scalar(part: dict[str, Any]) -> str:
         ('eigenvalue', 'eigenvalue'))]
     growth = _median(part['rw_6_8']) / _median(part['rw_in'])
     return (
-        '## Motivating example, dx/dt = x^2\n\n' + _table(('', ''), rows) + '\n\n'
+        '## Motivating example, dx/dt = x^2\n\n' + table(('', ''), rows) + '\n\n'
         'As in the paper, a lift of one coordinate is exact to plotting accuracy within the '
         f'training range and fails outside it: from [0, 5] to [6, 8] rw grows {growth:.1g} '
         'times. The paper gives no numbers. It calls exp(-1/x) the exact lift; in fact '
@@ -127,7 +124,7 @@ def _two_state(part: dict[str, Any]) -> str:
     left = sum(bool(value) for value in part['left_box'])
     ratios = ', '.join(f'{_median(part["linear_cost_ratio"][R]):.3f} ({R})' for R in weights)
     return (
-        '## Two-state example\n\n' + _table(('', ''), rows) + '\n\n'
+        '## Two-state example\n\n' + table(('', ''), rows) + '\n\n'
         'The learned controller equals the exact one, as in the paper, and here to the accuracy '
         'of the simulation; ratios a little below one are that accuracy and the finite time of '
         'the simulation, too. How much worse the linearised one is depends on the weight of '
@@ -149,7 +146,7 @@ def _reactor(part: dict[str, Any]) -> str:
                if name.startswith('nz=')]
     edmd = part['edmd']
     return (
-        '## One-state reactor\n\n' + _table(('', *_REACTOR_COLUMNS), rows) + '\n\n'
+        '## One-state reactor\n\n' + table(('', *_REACTOR_COLUMNS), rows) + '\n\n'
         "In range the paper's picture holds: the learned lifts lie on the reactor "
         f'({min(inside):.1g} to {max(inside):.1g} K), the linearisation is '
         f'{_median(linear["rollout_rmse_in_kelvin"]):.2g} K off. Out of range, towards colder '
@@ -177,7 +174,7 @@ def _narrow(part: dict[str, Any]) -> str:
     counts = ', '.join(f'{count} of {len(part[name]["rw_in"])} on {name}'
                        for name, count in bad.items())
     return (
-        '## Narrow data\n\n' + _table(('box', *columns), rows) + '\n\n'
+        '## Narrow data\n\n' + table(('box', *columns), rows) + '\n\n'
         'The failure that the paper shows comes back: within their narrow boxes these lifts '
         'satisfy the lifted dynamics as well as the wide one does, the path leaves the box on '
         'its way to the origin, and there the model is invalid. Control failed or cost over 1 % '
@@ -191,14 +188,14 @@ def _paper(part: dict[str, Any]) -> str:
     if 'reactor' in part:
         rows = [(name, *(_spread(part['reactor'][name][column])
                          for column in _REACTOR_COLUMNS)) for name in part['reactor']]
-        text += _table(('reactor', *_REACTOR_COLUMNS), rows) + '\n\n'
+        text += table(('reactor', *_REACTOR_COLUMNS), rows) + '\n\n'
     if 'two_state' in part:
         two = part['two_state']
         rows = [('rw', _spread(two['rw'])), ('cond', _spread(two['cond'])),
                 ('eigenvalue error', _spread(two['eigenvalue_error']))]
         rows += [(f'cost ratio to exact - 1, {R}', _spread(values, 1.0))
                  for R, values in two['cost_ratio_to_exact'].items()]
-        text += _table(('two-state example', ''), rows) + '\n\n'
+        text += table(('two-state example', ''), rows) + '\n\n'
     return text + (
         'One standard-normal start for each seed, lambda from 10 down, both termination '
         'criteria, free lift with decoder on the reactor, identity rows on the two-state example '
@@ -230,14 +227,14 @@ def _sensors(part: dict[str, Any]) -> str:
     accepted = sum(map(bool, drifted['accepted']))
     warned = sum(map(bool, two['warned']))
     return (
-        '## An hour at 1 s, B unknown\n\n' + _table(('', 'noise of 0.1 K', 'no noise'), hour)
+        '## An hour at 1 s, B unknown\n\n' + table(('', 'noise of 0.1 K', 'no noise'), hour)
         + '\n\nThe lift is learned from the drift that output error finds, not from derivatives '
         'of noisy data; what is left is the statistical error of the drift.\n\n'
-        '## A fouled cooling jacket\n\n' + _table(('', ''), fouled) + '\n\n'
+        '## A fouled cooling jacket\n\n' + table(('', ''), fouled) + '\n\n'
         'A fifth of the heat transfer is lost. The record is ten minutes of the loop under the '
         'present lift and fifty of random steps, with noise of 0.1 K; no disturbance observer '
         f'helps. The gate accepted {accepted} of {len(drifted["accepted"])} new lifts.\n\n'
-        '## One temperature of a reactor with two states\n\n' + _table(('', ''), half) + '\n\n'
+        '## One temperature of a reactor with two states\n\n' + table(('', ''), half) + '\n\n'
         'The concentration moves, too, and is not measured: the temperature alone has no drift of '
         f'its own. The report said so in {warned} of {len(two["warned"])} seeds. The lift still '
         'predicts better than a linear model, yet no better than the two-state motion lets it.')
@@ -267,9 +264,3 @@ def _spread(values: Values, offset: float = 0.0) -> str:
         return f'failed in all {missing}'
     text = f'{statistics.median(numbers):.3g} [{min(numbers):.2g}, {max(numbers):.2g}]'
     return text + (f', failed in {missing}' if missing else '')
-
-
-def _table(head: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
-    lines = ['| ' + ' | '.join(head) + ' |', '|' + '---|' * len(head)]
-    lines += ['| ' + ' | '.join(row) + ' |' for row in rows]
-    return '\n'.join(lines)

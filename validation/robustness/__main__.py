@@ -12,7 +12,6 @@ Run it as ``python -m validation.robustness`` (needs the `train`, `demo` and
 from __future__ import annotations
 
 import argparse
-import json
 from pathlib import Path
 import sys
 import time
@@ -20,6 +19,7 @@ import time
 from tqdm import tqdm
 
 from koopman_ros import __version__
+from koopman_ros.reports import write_figures
 from validation.robustness.figures import draw
 from validation.robustness.report import write_report
 from validation.robustness.study import study
@@ -34,7 +34,6 @@ def main(args: list[str] | None = None) -> int:
     parser.add_argument('--output', type=Path, default=Path('out/studies-robustness'),
                         help='folder for figures and report (default: %(default)s)')
     output = parser.parse_args(args).output
-    output.mkdir(parents=True, exist_ok=True)
     start = time.monotonic()
     with tqdm(unit='part', disable=not sys.stderr.isatty()) as bar:
         def tell(line: str) -> None:
@@ -46,7 +45,7 @@ def main(args: list[str] | None = None) -> int:
         found = study(tell)
     seconds = round(time.monotonic() - start, 1)
     summary = {'package_version': __version__, 'wall_seconds': seconds, **found.summary()}
-    (output / 'summary.json').write_text(json.dumps(summary, indent=2, allow_nan=False) + '\n')
+    write_figures(output / 'summary.json', summary)
     figures = draw(found, output)
     write_report(found, figures, output / 'report.md')
     print(f'wrote {output}/report.md, summary.json and {len(figures)} figures in {seconds:.0f} s')

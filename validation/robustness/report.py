@@ -6,22 +6,22 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-from validation.paper.figures import Drawn
+from koopman_ros.reports import bullets, Picture, table, write_page
 from validation.robustness import attraction, narrow
 from validation.robustness.loop import START
 from validation.robustness.study import BANDWIDTHS, COOLANT_WEIGHTS, Found, TEMPERATURES
 
 
-def write_report(found: Found, figures: Sequence[Drawn], path: Path) -> None:
+def write_report(found: Found, figures: Sequence[Picture], path: Path) -> None:
     """Write tables and figures."""
-    sections = ['# How far the loop can be pushed', margin_table(found), disturbance_table(found),
-                noise_table(found), attraction_table(found), narrow_tables(found),
-                '## Figures', *(f'![{f.file}]({f.file})\n\n*{f.caption}*' for f in figures)]
-    path.write_text('\n\n'.join(sections) + '\n')
+    write_page(path, 'How far the loop can be pushed', [
+        margin_table(found), disturbance_table(found), noise_table(found),
+        attraction_table(found), narrow_tables(found), '## Figures', *map(str, figures)],
+        ('torch', 'numpy', 'scipy'))
 
 
 def margin_table(found: Found) -> str:
@@ -33,10 +33,10 @@ def margin_table(found: Found) -> str:
             rows.append((f'{weight:g}', f'{bandwidth:g}', *(
                 f'{min(getattr(m, name) for m in at):.{digits}f}' for name, digits in (
                     ('gain', 0), ('phase', 0), ('delay', 1), ('distance', 2))), _apart(found, at)))
-    checks = '\n'.join(
-        f'- {name}: 3 % less {"grows" if below else "decays"}, 3 % more '
+    checks = bullets(
+        f'{name}: 3 % less {"grows" if below else "decays"}, 3 % more '
         f'{"grows" if above else "decays"}' for name, (below, above) in found.verified.items())
-    return ('## Margins, smallest over the trained range\n\n' + _table(
+    return ('## Margins, smallest over the trained range\n\n' + table(
         ('coolant_weight', 'observer [1/min]', 'gain', 'phase [°]', 'delay [s]',
          'least distance from −1', 'delay on the lift itself differs by [s]'), rows)
         + f'\n\nIn simulation at {START:.1f} K with the default parameters:\n\n' + checks)
@@ -56,7 +56,7 @@ def disturbance_table(found: Found) -> str:
              _seconds(m['seconds_to_0.001_kelvin']), _kelvin(m['final_kelvin']),
              _kelvin(m['disturbance_kelvin']), _kelvin(m['equivalent_bias_kelvin']))
             for name, m in found.cases.items()]
-    return '## Disturbances\n\n' + _table(
+    return '## Disturbances\n\n' + table(
         ('', 'largest deviation; of steps, overshoot [K]', 'to 0.2 K [s]', 'to 0.001 K [s]',
          'left at the end [K]', 'disturbance estimate [K of coolant]',
          'sensor error that would explain it [K]'), rows)
@@ -70,7 +70,7 @@ def noise_table(found: Found) -> str:
                 'fouled_to_0.2_kelvin', 'fouled_to_0.001_kelvin', 'step_to_0.2_kelvin',
                 'step_to_0.001_kelvin')))
             for bandwidth, m in found.noise.items()]
-    return '## Noise of 0.1 K at 1 Hz\n\n' + _table(
+    return '## Noise of 0.1 K at 1 Hz\n\n' + table(
         ('observer_bandwidth [1/min]', 'coolant, st. dev. [K]', 'its change in 1 s [K]',
          'true temperature [K]', 'UA −20 %: to 0.2 K [s]', 'to 0.001 K [s]',
          '−10 K: to 0.2 K [s]', 'to 0.001 K [s]'), rows)
@@ -87,12 +87,12 @@ def attraction_table(found: Found) -> str:
                 _seconds(m['seconds_to_0.2_kelvin']))
                for (name, margin), m in found.returns.items()]
     return (f'## Region of attraction\n\nUnder the coldest coolant the reactor heats up by itself '
-            f'above {attraction.hottest_cooled():.2f} K.\n\n' + _table(
+            f'above {attraction.hottest_cooled():.2f} K.\n\n' + table(
                 ('coolant at the start [K]', 'hottest start that any coolant saves [K]',
                  'that the loop brings back [K]', 'without the ladder [K]'), rows)
-            + '\n\n' + _table(('of all starts', 'with the ladder', 'without',
+            + '\n\n' + table(('of all starts', 'with the ladder', 'without',
                                'two-state reactor'), counts)
-            + '\n\n' + _table(('back from the safe coolant', 'linear_margin', 'it rests at [K]',
+            + '\n\n' + table(('back from the safe coolant', 'linear_margin', 'it rests at [K]',
                                'outside [half widths]', 'to 0.2 K [s]'), returns))
 
 
@@ -113,12 +113,12 @@ def narrow_tables(found: Found) -> str:
         m = narrow.judge_two_state(course)
         others.append((name, kinds[kind], f'{m["largest_x2"]:.1f}', f'{m["final_distance"]:.2g}',
                        'yes' if m['escaped'] else 'no', _seconds(m['left_after'])))
-    return ('## Narrow data\n\n' + _table(
+    return ('## Narrow data\n\n' + table(
         (f'reactor, data within ±{narrow.HALF_WIDTH:g} K', '', 'hottest [K]', 'at the end [K]',
          'to 0.2 K [s]', 'ran away', 'in safe coolant'), rows)
-        + '\n\n' + _table(('UA −40 %, shipped lift: linear_margin', 'observer [1/min]',
+        + '\n\n' + table(('UA −40 %, shipped lift: linear_margin', 'observer [1/min]',
                            'hottest [K]', 'at the end [K]', 'to 0.2 K [s]', 'ran away'), far)
-        + '\n\n' + _table(('two-state example, box', '', 'largest x2', 'distance at the end',
+        + '\n\n' + table(('two-state example, box', '', 'largest x2', 'distance at the end',
                            'escaped', 'learned law left after [s]'), others))
 
 
@@ -130,9 +130,3 @@ def _kelvin(value: Any) -> str:
 
 def _seconds(value: Any) -> str:
     return 'never' if value is None else f'{value:.3g}'
-
-
-def _table(head: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
-    lines = ['| ' + ' | '.join(head) + ' |', '|' + '---|' * len(head)]
-    lines += ['| ' + ' | '.join(row) + ' |' for row in rows]
-    return '\n'.join(lines)

@@ -14,9 +14,9 @@ import sys
 import tempfile
 from typing import Any
 
+from koopman_ros.reports import machine
 from koopman_ros.testing import Harness
 from validation.benchmarks.loop import across, step, table
-from validation.benchmarks.machine import machine
 from validation.benchmarks.options import Extent, Options
 
 MEANING = {

@@ -15,8 +15,8 @@ import tempfile
 from typing import Any
 
 from koopman_ros.bags import read_messages
+from koopman_ros.reports import machine
 from koopman_ros.testing import isolated_domain
-from validation.benchmarks.machine import machine
 from validation.benchmarks.options import Extent, Options
 from validation.benchmarks.recording import memory, stream, table
 

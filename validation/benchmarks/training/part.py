@@ -16,7 +16,7 @@ from typing import Any
 
 from tqdm import tqdm
 
-from validation.benchmarks.machine import machine
+from koopman_ros.reports import machine
 from validation.benchmarks.options import Options
 from validation.benchmarks.training import picture, process, table
 from validation.benchmarks.training.plan import (

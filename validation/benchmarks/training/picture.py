@@ -8,15 +8,11 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any
 
-import matplotlib
+from matplotlib.axes import Axes
 import numpy as np
 
+from koopman_ros.reports import drawing, legend
 from validation.benchmarks.training.plan import DRAWN, SOLVERS, SYSTEMS, TARGETS
-
-matplotlib.use('Agg')
-from matplotlib import pyplot
-from matplotlib.axes import Axes
-from matplotlib.lines import Line2D
 
 _COLOURS = {'ours': '#0b6e4f', 'ipopt': '#c8553d', 'ipopt_compiled': '#e8a33d',
             'lbfgs': '#3d5a98', 'adam': '#8d7aae'}
@@ -28,27 +24,25 @@ Trace = list[tuple[float, float]]
 def draw(path: Path, traces: dict[tuple[str, int, int], dict[str, Trace]],
          figures: dict[str, Any]) -> None:
     """Draw what there is; a panel whose figures are missing is left out."""
-    figure, axes = pyplot.subplots(1, 3, figsize=(14.0, 5.0), layout='constrained',
-                                   width_ratios=(1.0, 1.0, 0.8))
-    for ax, system in zip(axes, SYSTEMS, strict=False):
-        sizes = [key[1:] for key in traces if key[0] == system]
-        if not sizes:
-            ax.set_axis_off()
-            continue
-        size = DRAWN if DRAWN in sizes else sizes[-1]
-        case = next(case for case in figures['cases'] if case['system'] == system
-                    and (case['samples'], case['hidden']) == size)
-        _draw_traces(ax, traces[system, *size], case)
-    _draw_cost(axes[2], figures)
-    figure.legend([Line2D([], [], color=_COLOURS[solver], lw=_width(solver))
-                   for solver in SOLVERS], SOLVERS.values(), loc='outside lower center',
-                  ncols=len(SOLVERS), frameon=False)
-    machine = figures['machine']
-    figure.suptitle(
-        f'Training: accuracy over time from the same start ({machine["processor"]}, one thread, '
-        f'torch {machine["torch"]}, casadi {machine["casadi"]})', fontsize=11)
-    figure.savefig(path, dpi=150)
-    pyplot.close(figure)
+    with drawing(path, 1, 3, size=(14.0, 5.0),
+                 width_ratios=(1.0, 1.0, 0.8)) as (figure, axes):
+        for ax, system in zip(axes, SYSTEMS, strict=False):
+            sizes = [key[1:] for key in traces if key[0] == system]
+            if not sizes:
+                ax.set_axis_off()
+                continue
+            size = DRAWN if DRAWN in sizes else sizes[-1]
+            case = next(case for case in figures['cases'] if case['system'] == system
+                        and (case['samples'], case['hidden']) == size)
+            _draw_traces(ax, traces[system, *size], case)
+        _draw_cost(axes[2], figures)
+        for solver, label in SOLVERS.items():
+            axes[0].plot([], [], color=_COLOURS[solver], lw=_width(solver), label=label)
+        legend(figure, axes[:1], len(SOLVERS))
+        machine = figures['machine']
+        figure.suptitle(
+            f'Training: accuracy over time from the same start ({machine["processor"]}, one '
+            f'thread, torch {machine["torch"]}, casadi {machine["casadi"]})', fontsize=11)
 
 
 def _width(solver: str) -> float:
@@ -76,7 +70,6 @@ def _draw_traces(ax: Axes, traces: dict[str, Trace], case: dict[str, Any]) -> No
            ylabel='relative residual rw on the training samples')
     ax.set_title(f'{case["system"]}: N = {case["samples"]}, n$_z$ = 3, {case["hidden"]} hidden '
                  'units', fontsize=10)
-    ax.grid(color='0.92', lw=0.6)
 
 
 def _draw_cost(ax: Axes, figures: dict[str, Any]) -> None:
@@ -100,4 +93,3 @@ def _draw_cost(ax: Axes, figures: dict[str, Any]) -> None:
            ylim=(seconds[-1] * samples[0] / samples[-1] / 5, 3 * seconds[-1]),
            xlabel='samples N', ylabel='time of an iteration [s]')
     ax.set_title('a step of ours: n$_x$ = 2, n$_z$ = 3, 16 units', fontsize=10)
-    ax.grid(color='0.92', lw=0.6)

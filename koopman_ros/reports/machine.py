@@ -1,8 +1,7 @@
 # SPDX-FileCopyrightText: 2026 The koopman_ros Authors
 # SPDX-License-Identifier: Apache-2.0
 
-
-"""What the figures were measured on."""
+"""The machine and the versions that figures were measured with."""
 
 from __future__ import annotations
 
@@ -12,6 +11,8 @@ from pathlib import Path
 import platform
 from typing import Any
 
+from koopman_ros import __version__
+
 
 def machine(*packages: str) -> dict[str, Any]:
     """Return processor, system and load of this machine, and the versions of some packages."""
@@ -19,6 +20,15 @@ def machine(*packages: str) -> dict[str, Any]:
             'system': platform.platform(), 'python': platform.python_version(),
             **{name: _version(name) for name in packages},
             'load_at_start': os.getloadavg()[0]}
+
+
+def headline(*packages: str) -> str:
+    """Return one line with the versions of this package and others, and the machine."""
+    found = machine(*packages)
+    versions = ''.join(f', {name} {found[name]}' for name in packages if found[name])
+    return (f'koopman_ros {__version__}, Python {found["python"]}{versions}; '
+            f'{found["processor"]}, {found["cpu_count"]} processors, load '
+            f'{found["load_at_start"]:.1f}')
 
 
 def _processor() -> str:
