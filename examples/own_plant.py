@@ -13,18 +13,9 @@ import sys
 import numpy as np
 
 from koopman_ros.control import run_closed_loop, Weights
-from koopman_ros.learning import (
-    Edmd,
-    Growth,
-    judge,
-    Linearisation,
-    Plant,
-    Samples,
-    Scaling,
-    split_by_episode,
-    train,
-)
-from koopman_ros.lifting import load, save
+from koopman_ros.learning import Edmd, evaluate, Growth, Linearisation, train
+from koopman_ros.lifting import Box, load, save
+from koopman_ros.plant_data import Plant, Samples, split_by_episode
 
 PLANT = Plant(
     name='two tanks', state_names=('upper', 'lower'), state_units=('m', 'm'),
@@ -68,10 +59,10 @@ def main(file):
     save(free.model, file)
 
     known, _, test = split_by_episode(samples, seed=0)
-    scaling = Scaling.of(PLANT, samples)
+    box = Box.of(PLANT, samples.x, samples.u)
     slope = np.array([[-0.1, 0.0], [10.0 / 140.0, -10.0 / 140.0]])  # of the rates, at 1 m
-    models = {'linearised': Linearisation(slope).learn(PLANT, samples, scaling)}
-    models |= {f'EDMD, degree {degree}': Edmd(degree).learn(PLANT, known, scaling)
+    models = {'linearised': Linearisation(slope).learn(PLANT, samples, box)}
+    models |= {f'EDMD, degree {degree}': Edmd(degree).learn(PLANT, known, box)
                for degree in (3, 5)}
     models |= {f'lift, n_z = {model.n_z}': model for model in trained.path}
     models['free, n_z = 2'] = load(file)
@@ -79,11 +70,11 @@ def main(file):
     weights = Weights(Q=np.eye(2), R=np.eye(1))
     print('                      rw       rx     cond  roll-out, mm   cost  offset, mm')
     for name, model in models.items():
-        report = judge(model, test)
+        figures = evaluate(model, test)
         loop = run_closed_loop(model, rate, PLANT.nominal_state, goal, weights, duration=120.0,
                                u_ref=inflow)
-        print(f'{name:15} {report.fit.rw:8.1e} {report.fit.rx:8.1e} {report.fit.cond:8.3g}'
-              f' {1e3 * report.rollout_rmse[1]:13.3f} {loop.cost:6.2f}'
+        print(f'{name:15} {figures.fit.rw:8.1e} {figures.fit.rx:8.1e} {figures.fit.cond:8.3g}'
+              f' {1e3 * figures.rollout_rmse[1]:13.3f} {loop.cost:6.2f}'
               f' {1e3 * abs(loop.states[-1, 1] - goal[1]):11.3f}')
 
 

@@ -8,7 +8,7 @@ Imports nothing of ours but the version, nothing of ROS and nothing that learns:
 be opened on any machine with Python.
 """
 
-from koopman_ros.bags.episodes import Account, Episode, loop_episodes
+from koopman_ros.bags.episodes import Account, loop_episodes
 from koopman_ros.bags.errors import BagReadError
 from koopman_ros.bags.order import in_log_order
 from koopman_ros.bags.qos import INFINITE_NS, QosProfile
@@ -29,7 +29,6 @@ __all__ = [
     'BagReadError',
     'BagSummary',
     'BagWriter',
-    'Episode',
     'MessageDefinition',
     'MessageDefinitionError',
     'QosProfile',

@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 from koopman_ros.bags.errors import BagReadError
 from koopman_ros.bags.jumps import spikes_and_jumps
 from koopman_ros.bags.reader import read_messages, summary
+from koopman_ros.plant_data import Episode
 
 _TEMPERATURE = 'sensor_msgs/msg/Temperature'
 _NS = 1_000_000_000
@@ -31,26 +32,6 @@ _SAME_CLOCK_NS = 5 * _NS
 _NO_DELAY = 0.01
 _SHORTEST = 10
 _COLDEST, _HOTTEST = -273.15, 1e4  # degC; anything else is no measurement
-
-
-@dataclass(frozen=True)
-class Episode:
-    """
-    An uninterrupted stretch of measurements; temperatures in degrees Celsius.
-
-    :param bag: where it comes from.
-    :param stamp_ns: (n,) stamps of the measurements, rising.
-    :param celsius: (n,) measured temperatures.
-    :param input_ns: (m,) times from which each coolant temperature acted, rising, the first not
-        later than the first measurement.
-    :param input_celsius: (m,) those coolant temperatures, each other than the one before.
-    """
-
-    bag: str
-    stamp_ns: NDArray[np.int64]
-    celsius: NDArray[np.float64]
-    input_ns: NDArray[np.int64]
-    input_celsius: NDArray[np.float64]
 
 
 @dataclass
@@ -79,7 +60,7 @@ class Account:
 def loop_episodes(bags: Sequence[str | os.PathLike[str]], temperature: str, coolant: str, *,
                   input_delay_ns: int = 0) -> tuple[list[Episode], Account]:
     """
-    Read the episodes of some bags.
+    Read the episodes of some bags: times in s since the first measurement of each, in degC.
 
     Nothing is resampled: measurements keep their stamps, and the coolant is held from the time
     on at which it was commanded. A command that answers a measurement carries its stamp; where
@@ -107,9 +88,9 @@ def loop_episodes(bags: Sequence[str | os.PathLike[str]], temperature: str, cool
         read.add(path)
         cuts = _Cuts()
         for run in _runs(bag, temperature, coolant, account, cuts):
-            episodes += _episodes(os.fspath(bag), run, account, cuts, input_delay_ns)
+            episodes += _episodes(run, account, cuts, input_delay_ns)
         account.notes += cuts.notes(os.fspath(bag))
-    account.used = sum(len(episode.stamp_ns) for episode in episodes)
+    account.used = sum(map(len, episodes))
     account.dropped = +account.dropped
     return episodes, account
 
@@ -188,8 +169,7 @@ def _runs(bag: str | os.PathLike[str], temperature: str, coolant: str, account: 
     yield run
 
 
-def _episodes(bag: str, run: _Run, account: Account, cuts: _Cuts, input_delay_ns: int
-              ) -> list[Episode]:
+def _episodes(run: _Run, account: Account, cuts: _Cuts, input_delay_ns: int) -> list[Episode]:
     """Sort one run by time and cut it at its gaps and jumps."""
     measured = _sorted(run.measured, account, 'measurement with a repeated stamp')
     if len(measured) < _SHORTEST or not run.commanded:
@@ -221,8 +201,10 @@ def _episodes(bag: str, run: _Run, account: Account, cuts: _Cuts, input_delay_ns
         first = np.searchsorted(input_ns, stamps[rows[0]], side='right') - 1
         last = np.searchsorted(input_ns, stamps[rows[-1]], side='left')
         keep = slice(first, max(first + 1, last))
-        found.append(Episode(bag, stamps[rows], np.array([measured[i][2] for i in rows]),
-                             input_ns[keep], values[keep]))
+        origin = stamps[rows[0]]
+        found.append(Episode((stamps[rows] - origin) / _NS,
+                             np.array([[measured[i][2]] for i in rows]),
+                             (input_ns[keep] - origin) / _NS, values[keep, None]))
     return found
 
 

@@ -85,7 +85,7 @@ def rollout_rmse(model: LiftedModel, plant: PlantParameters) -> float:
     reactor = one_state_reactor(plant.constants(), nominal_state=model.states.center)
     design = RandomStepDesign(model.inputs.lower, model.inputs.upper, model.states.lower,
                               model.states.upper, (0.5, 2.0), 1.0 / 60.0, rtol=1e-9)
-    truth = random_steps(reactor, design, 15.0, _TEST_SEED).trajectory
+    truth = random_steps(reactor, design, 15.0, _TEST_SEED)
     scale, center = model.states.scale, model.states.center
     push = scale[:, None] * model.B / model.inputs.scale
 
@@ -97,8 +97,8 @@ def rollout_rmse(model: LiftedModel, plant: PlantParameters) -> float:
         input_names=model.inputs.names, input_units=model.inputs.units,
         time_unit=model.time_unit, drift=drift, drift_jacobian=reactor.drift_jacobian, B=push,
         nominal_state=center, nominal_input=model.inputs.center)
-    predicted = simulate(lifted, truth.states[0], truth.inputs, design.sample_period)
-    return float(np.sqrt(np.mean((predicted.states - truth.states) ** 2)))
+    predicted = simulate(lifted, truth.x[0], truth.u, design.sample_period)
+    return float(np.sqrt(np.mean((predicted.x - truth.x) ** 2)))
 
 
 def plot(path: Path, history: History, phases: Sequence[tuple[str, float]], setpoint: float,

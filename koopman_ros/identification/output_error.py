@@ -2,7 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 
 
-"""Output error: the drift whose predictions, not whose derivatives, fit what was measured."""
+"""Output-error estimate: the drift whose predictions fit the measurements."""
 
 from __future__ import annotations
 
@@ -15,29 +15,29 @@ import torch
 from torch import Tensor
 
 from koopman_ros.identification.drift import DriftModel
-from koopman_ros.identification.records import Array
-from koopman_ros.identification.stretches import first_measured, Stretches
+from koopman_ros.identification.segments import first_measured, Segments
+from koopman_ros.plant_data import Array
 from koopman_ros.solvers import runge_kutta_step
 from koopman_ros.solvers.levenberg_marquardt import minimise, NormalEquations
 
 _MAX_ITERATIONS = 40
 
 
-def output_error(model: DriftModel, stretches: Stretches, *, learn_input_matrix: bool,
+def output_error(model: DriftModel, segments: Segments, *, learn_input_matrix: bool,
                  monitor: Callable[[int, float], bool] | None = None) -> DriftModel:
     """
-    Refine a drift model, B and the starts of all stretches until its predictions fit best.
+    Refine a drift model, B and the starts of all segments until its predictions fit best.
 
     The maximum-likelihood estimate where the noise of the measurements is white and nothing else
     disturbs the plant (Ljung 1999, chapter 7). Levenberg-Marquardt with the exact derivatives of
     the Runge-Kutta steps; its normal equations are gathered step by step.
 
     :param model: where to start from.
-    :param stretches: measured stretches.
+    :param segments: measured segments.
     :param learn_input_matrix: whether B is refined, too.
     :param monitor: called with the step and the cost after each step; True ends it.
     """
-    problem = _Problem(model, stretches, learn_input_matrix)
+    problem = _Problem(model, segments, learn_input_matrix)
     minimum = minimise(problem.add_residuals, problem.start(), max_iterations=_MAX_ITERATIONS,
                        tolerance=1e-6, patience=3, monitor=monitor)
     return problem.split(minimum.theta.numpy())[0]
@@ -48,11 +48,11 @@ class _Problem:
     """The parameters are coefficients, B where it is learned, then the starts."""
 
     model: DriftModel
-    stretches: Stretches
+    segments: Segments
     learn_input_matrix: bool
 
     def start(self) -> Tensor:
-        x0 = self.model.box.state_deviation(first_measured(self.stretches))
+        x0 = self.model.box.states.to_deviation(first_measured(self.segments))
         B = self.model.B.ravel()[:self._n_B]
         return torch.from_numpy(np.concatenate((self.model.coefficients.ravel(), B, x0.ravel())))
 
@@ -65,12 +65,12 @@ class _Problem:
         return model, theta[n + n_B:].reshape(-1, len(self.model.B))
 
     @cached_property
-    def _pushes(self) -> Array:
-        return self.model.box.input_deviation(self.stretches.u)
+    def _inputs(self) -> Array:
+        return self.model.box.inputs.to_deviation(self.segments.u)
 
     @cached_property
     def _target(self) -> Array:
-        return self.model.box.state_deviation(self.stretches.x)
+        return self.model.box.states.to_deviation(self.segments.x)
 
     @property
     def _n_B(self) -> int:
@@ -79,7 +79,7 @@ class _Problem:
     def add_residuals(self, theta: Tensor, equations: NormalEquations) -> None:
         """Add the scaled prediction errors at given parameters."""
         model, x = self.split(theta.numpy())
-        data, target = self.stretches, self._target
+        data, target = self.segments, self._target
         count = int(np.sum(data.measured))
         M, n_x = x.shape
         p = model.coefficients.size + self._n_B
@@ -102,7 +102,7 @@ class _Problem:
                     sums.add(np.where(measured[..., None], y[..., 1:], 0.0), error)
                 if k < len(data.steps):
                     y = runge_kutta_step(
-                        partial(_rates, model, self._pushes[k], self.learn_input_matrix), y,
+                        partial(_rates, model, self._inputs[k], self.learn_input_matrix), y,
                         data.steps[k][:, None, None])
         if sums is None:
             equations.add_sums(cost)
@@ -111,7 +111,7 @@ class _Problem:
 
 
 class _Sums:
-    """J' r and J' J, whose rows of starts touch only their own stretch."""
+    """J' r and J' J, whose rows of starts touch only their own segment."""
 
     def __init__(self, M: int, n_x: int, p: int) -> None:
         self._p = p

@@ -2,7 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 
 
-"""Drift from derivatives by total variation, taken of the motion less what the inputs did."""
+"""Drift from derivatives by total variation of x - integral(B u)."""
 
 from __future__ import annotations
 
@@ -11,16 +11,17 @@ from collections.abc import Sequence
 import numpy as np
 from scipy.linalg import solveh_banded
 
-from koopman_ros.identification.drift import Box, DriftModel, regress
-from koopman_ros.identification.records import Array, Record
+from koopman_ros.identification.drift import DriftModel, regress
+from koopman_ros.lifting import Box
+from koopman_ros.plant_data import Array, Episode
 
 _SWEEPS = 30
 _BISECTIONS = 14
-# Samples that a record needs.
+# Samples that an episode needs.
 _SHORTEST = 8
 
 
-def total_variation(records: Sequence[Record], box: Box, degree: int, B: Array | None,
+def total_variation(episodes: Sequence[Episode], box: Box, degree: int, B: Array | None,
                     assumed: Array) -> DriftModel:
     """
     Fit the drift to derivatives found by total variation on x - integral(B u).
@@ -29,59 +30,59 @@ def total_variation(records: Sequence[Record], box: Box, degree: int, B: Array |
     (Rudin, Osher, Fatemi 1992; Chartrand 2011. Here the variation of the second derivative is
     held down, so that the first one may bend and need not be made of stairs.)
 
-    :param records: what was recorded.
+    :param episodes: what was recorded.
     :param box: the deviations.
     :param degree: of the drift.
     :param B: (n_x, n_u) scaled, or None to learn it.
     :param assumed: (n_x, n_u) scaled B that is taken off before smoothing; it need not be exact.
-    :raises ValueError: when no record is long enough.
+    :raises ValueError: when no episode is long enough.
     """
     shape = DriftModel(box, degree, np.empty(0), assumed)
-    features, pushes, rates = [], [], []
-    for record in records:
-        if len(record) < _SHORTEST:
+    features, inputs, rates = [], [], []
+    for episode in episodes:
+        if len(episode) < _SHORTEST:
             continue
-        v = box.input_deviation(record.inputs_at(record.time))
-        moved = _moved(record, box, assumed)
-        smooth = smoothed(record.time, box.state_deviation(record.x) - moved)
-        rate = np.gradient(smooth, record.time, axis=0, edge_order=2)
+        v = box.inputs.to_deviation(episode.inputs_at(episode.time))
+        moved = _moved(episode, box, assumed)
+        smooth = smoothed(episode.time, box.states.to_deviation(episode.x) - moved)
+        rate = np.gradient(smooth, episode.time, axis=0, edge_order=2)
         # one-sided differences at the ends are poor
         inner = slice(2, -2)
         features.append(shape.features((smooth + moved)[inner]))
-        pushes.append(v[inner])
+        inputs.append(v[inner])
         rates.append(rate[inner] + v[inner] @ assumed.T)
     if not features:
-        raise ValueError(f'no record has {_SHORTEST} samples: record longer')
-    return regress(box, degree, np.concatenate(features), np.concatenate(pushes),
+        raise ValueError(f'no episode has {_SHORTEST} samples: record longer')
+    return regress(box, degree, np.concatenate(features), np.concatenate(inputs),
                    np.concatenate(rates), B)
 
 
-def noise_level(records: Sequence[Record], model: DriftModel) -> Array:
+def noise_level(episodes: Sequence[Episode], model: DriftModel) -> Array:
     """
     Return the standard deviation (n_x,) of the measurement noise, in state units.
 
     From third differences of x - integral(B u), in which a motion that is well resolved leaves
     nothing but noise.
 
-    :raises ValueError: when no record is long enough.
+    :raises ValueError: when no episode is long enough.
     """
     found = []
-    for record in records:
-        if len(record) >= _SHORTEST:
-            rest = model.box.state_deviation(record.x) - _moved(record, model.box, model.B)
-            D = _third_differences(record.time)
+    for episode in episodes:
+        if len(episode) >= _SHORTEST:
+            rest = model.box.states.to_deviation(episode.x) - _moved(episode, model.box, model.B)
+            D = _third_differences(episode.time)
             found.append([_noise(D, rest[:, j]) for j in range(rest.shape[1])])
     if not found:
-        raise ValueError(f'no record has {_SHORTEST} samples: record longer')
-    return model.box.state_scale * np.median(np.array(found), axis=0)
+        raise ValueError(f'no episode has {_SHORTEST} samples: record longer')
+    return model.box.states.scale * np.median(np.array(found), axis=0)
 
 
-def _moved(record: Record, box: Box, B: Array) -> Array:
+def _moved(episode: Episode, box: Box, B: Array) -> Array:
     """Return the integral of B times the input's deviation (N, n_x), in deviations."""
-    span = record.time - record.time[0]
-    center = 0.5 * (box.input_lower + box.input_upper)
-    moved: Array = (record.input_integral(record.time) - center * span[:, None]
-                    ) / box.input_scale @ B.T
+    span = episode.time - episode.time[0]
+    center = box.inputs.center
+    moved: Array = (episode.input_integral(episode.time) - center * span[:, None]
+                    ) / box.inputs.scale @ B.T
     return moved
 
 

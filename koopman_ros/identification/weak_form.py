@@ -2,7 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 
 
-"""Drift from integrals against test functions: the weak form, which needs no derivative."""
+"""Drift from integrals against test functions: the weak form, without derivatives."""
 
 from __future__ import annotations
 
@@ -10,8 +10,9 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from koopman_ros.identification.drift import Box, DriftModel, regress
-from koopman_ros.identification.records import Array, Record
+from koopman_ros.identification.drift import DriftModel, regress
+from koopman_ros.lifting import Box
+from koopman_ros.plant_data import Array, Episode
 
 # Exponent of the test functions (1 - s^2)^p.
 _POWER = 3
@@ -19,7 +20,7 @@ _POWER = 3
 _SHORTEST = 4
 
 
-def weak_form(records: Sequence[Record], box: Box, degree: int, B: Array | None,
+def weak_form(episodes: Sequence[Episode], box: Box, degree: int, B: Array | None,
               window: int) -> DriftModel:
     """
     Fit the drift to -integral(phi' x) = integral(phi f(x)) + B integral(phi u).
@@ -27,25 +28,25 @@ def weak_form(records: Sequence[Record], box: Box, degree: int, B: Array | None,
     phi = (1 - s^2)^3 on windows that overlap by three quarters; x enters as measured. (Weak SINDy:
     Messenger and Bortz 2021.)
 
-    :param records: what was recorded.
+    :param episodes: what was recorded.
     :param box: the deviations.
     :param degree: of the drift.
     :param B: (n_x, n_u) scaled, or None to learn it.
     :param window: samples of a window, at least 4.
-    :raises ValueError: when the window or the records are too short.
+    :raises ValueError: when the window or the episodes are too short.
     """
     if window < _SHORTEST:
         raise ValueError(f'a window of {window} samples is too short, at least {_SHORTEST} are '
                          'needed')
-    n_x, n_u = records[0].x.shape[1], records[0].u.shape[1]
+    n_x, n_u = episodes[0].x.shape[1], episodes[0].u.shape[1]
     shape = DriftModel(box, degree, np.empty(0), np.empty((n_x, n_u)))
-    features, pushes, rates = [], [], []
-    for record in records:
-        xi = box.state_deviation(record.x)
+    features, inputs, rates = [], [], []
+    for episode in episodes:
+        xi = box.states.to_deviation(episode.x)
         P = shape.features(xi)
-        for start in range(0, len(record) - window + 1, max(1, window // 4)):
+        for start in range(0, len(episode) - window + 1, max(1, window // 4)):
             rows = slice(start, start + window)
-            t = record.time[rows]
+            t = episode.time[rows]
             middle, half = 0.5 * (t[0] + t[-1]), 0.5 * (t[-1] - t[0])
             s = (t - middle) / half
             phi = (1.0 - s * s) ** _POWER
@@ -53,10 +54,10 @@ def weak_form(records: Sequence[Record], box: Box, degree: int, B: Array | None,
             weights = _trapezoid(t)
             features.append((weights * phi) @ P[rows])
             rates.append(-(weights * slope) @ xi[rows])
-            pushes.append(_input_integral(record, box, middle, half))
+            inputs.append(_input_integral(episode, box, middle, half))
     if not features:
-        raise ValueError(f'no record has {window} samples: record longer')
-    return regress(box, degree, np.array(features), np.array(pushes), np.array(rates), B)
+        raise ValueError(f'no episode has {window} samples: record longer')
+    return regress(box, degree, np.array(features), np.array(inputs), np.array(rates), B)
 
 
 def _trapezoid(t: Array) -> Array:
@@ -65,11 +66,11 @@ def _trapezoid(t: Array) -> Array:
     return 0.5 * (np.append(steps, 0.0) + np.insert(steps, 0, 0.0))
 
 
-def _input_integral(record: Record, box: Box, middle: float, half: float) -> Array:
+def _input_integral(episode: Episode, box: Box, middle: float, half: float) -> Array:
     """Integrate phi times the scaled input exactly: it is constant between its changes."""
-    inside = record.input_time[np.abs(record.input_time - middle) < half]
+    inside = episode.input_time[np.abs(episode.input_time - middle) < half]
     edges = np.concatenate(([middle - half], inside, [middle + half]))
-    held = box.input_deviation(record.inputs_at(edges[:-1]))
+    held = box.inputs.to_deviation(episode.inputs_at(edges[:-1]))
     return half * np.diff(_antiderivative((edges - middle) / half)) @ held
 
 

@@ -2,15 +2,14 @@
 # SPDX-License-Identifier: Apache-2.0
 
 """
-How a lift is learned from samples, in torch; imports lifting and control.
+Lifts learned from samples, their baselines and held-out figures; in torch.
 
-Nothing else imports torch, and no node imports this package where it controls or simulates.
+No node imports this package where it controls or simulates.
 """
 
 from koopman_ros.learning.algorithm1 import Algorithm1
 from koopman_ros.learning.baselines import Edmd, Linearisation
 from koopman_ros.learning.growth import Growth
-from koopman_ros.learning.samples import Plant, Samples, Scaling, split_by_episode
 from koopman_ros.learning.training import (
     NoUsefulLift,
     Progress,
@@ -20,10 +19,10 @@ from koopman_ros.learning.training import (
 )
 from koopman_ros.learning.validation import (
     compare_closed_loops,
+    evaluate,
+    Figures,
     Fit,
     fit,
-    judge,
-    Report,
     roll_out,
     rollout_rmse,
 )
@@ -32,21 +31,17 @@ __all__ = [
     'RECIPES',
     'Algorithm1',
     'Edmd',
+    'Figures',
     'Fit',
     'Growth',
     'Linearisation',
     'NoUsefulLift',
-    'Plant',
     'Progress',
-    'Report',
-    'Samples',
-    'Scaling',
     'Trained',
     'compare_closed_loops',
+    'evaluate',
     'fit',
-    'judge',
     'roll_out',
     'rollout_rmse',
-    'split_by_episode',
     'train',
 ]

@@ -11,7 +11,8 @@ import torch
 
 from koopman_ros.learning.growth import Grown, Monitor
 from koopman_ros.learning.network import check_activation, Layout
-from koopman_ros.learning.residuals import Data, Problem, ResidualWeights
+from koopman_ros.learning.residuals import Problem, ResidualWeights
+from koopman_ros.learning.scaled import ScaledSamples
 from koopman_ros.solvers.levenberg_marquardt import minimise, MinimumStatus
 
 
@@ -74,7 +75,7 @@ class Algorithm1:
             raise ValueError(f'n_z = {self.n_z} is too small for {n_x} states')
         return (self.n_z,)
 
-    def start(self, data: Data, n_z: int, parent: Grown | None, seed: int,
+    def start(self, data: ScaledSamples, n_z: int, parent: Grown | None, seed: int,
               monitor: Monitor | None = None) -> Grown:
         """
         Run the algorithm once.

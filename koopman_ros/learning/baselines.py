@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 The koopman_ros Authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""Linear and polynomial models from the same samples, to set beside a learned lift."""
+"""Baselines: linearisation and polynomial EDMD from the same samples."""
 
 from __future__ import annotations
 
@@ -10,8 +10,15 @@ from dataclasses import dataclass
 import numpy as np
 
 from koopman_ros import __version__
-from koopman_ros.learning.samples import Array, Plant, Samples, Scaling
-from koopman_ros.lifting import LiftedModel, linearised_model, PolynomialObservables, Provenance
+from koopman_ros.learning.scaled import deviations
+from koopman_ros.lifting import (
+    Box,
+    LiftedModel,
+    linearised_model,
+    PolynomialObservables,
+    Provenance,
+)
+from koopman_ros.plant_data import Array, Plant, Samples
 
 
 @dataclass(frozen=True)
@@ -24,19 +31,19 @@ class Linearisation:
 
     jacobian: Array
 
-    def learn(self, plant: Plant, samples: Samples, scaling: Scaling | None = None
+    def learn(self, plant: Plant, samples: Samples, box: Box | None = None
               ) -> LiftedModel:
         """
         Return the model.
 
-        :param scaling: its coordinates; by default from the range of the samples.
+        :param box: its coordinates; by default from the range of the samples.
         :raises ValueError: when B is not known.
         """
         if plant.B is None:
             raise ValueError('a linearisation needs the B of the plant')
-        scaling = scaling or Scaling.of(plant, samples)
-        return linearised_model(self.jacobian, plant.B, scaling.states, scaling.inputs,
-                                scaling.time_unit, _provenance(plant, samples))
+        box = box or Box.of(plant, samples.x, samples.u)
+        return linearised_model(self.jacobian, plant.B, box.states, box.inputs,
+                                box.time_unit, _provenance(plant, samples))
 
 
 @dataclass(frozen=True)
@@ -55,26 +62,26 @@ class Edmd:
 
     degree: int = 3
 
-    def learn(self, plant: Plant, samples: Samples, scaling: Scaling | None = None
+    def learn(self, plant: Plant, samples: Samples, box: Box | None = None
               ) -> LiftedModel:
         """
         Fit the model.
 
-        :param scaling: its coordinates; by default from the range of the samples.
+        :param box: its coordinates; by default from the range of the samples.
         """
-        scaling = scaling or Scaling.of(plant, samples)
-        x, rate, u = scaling.deviations(samples)
+        box = box or Box.of(plant, samples.x, samples.u)
+        x, rate, u = deviations(box, samples)
         observables = PolynomialObservables.total_degree(x.shape[1], self.degree)
         z, J = observables.lift_and_jacobian(x)
         if plant.B is None:
             both = np.linalg.lstsq(np.hstack([z, u]), rate, rcond=None)[0]
             B = both[z.shape[1]:].T
         else:
-            B = scaling.input_matrix(plant.B)
+            B = box.input_matrix(plant.B)
         drift = (J @ (rate - u @ B.T)[..., None])[..., 0]
         A = np.linalg.lstsq(z, drift, rcond=None)[0].T
         return LiftedModel(observables, A.astype(np.float64), B.astype(np.float64),
-                           scaling.states, scaling.inputs, scaling.time_unit,
+                           box.states, box.inputs, box.time_unit,
                            _provenance(plant, samples))
 
 

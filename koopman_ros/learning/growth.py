@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 The koopman_ros Authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""Growth of a lift one coordinate at a time: the recipe from which training does not collapse."""
+"""Growth of a lift one coordinate at a time, which keeps coordinates from collapsing."""
 
 from __future__ import annotations
 
@@ -14,7 +14,8 @@ import torch
 from torch import Tensor
 
 from koopman_ros.learning.network import check_activation, Layout, Parameters, Pass
-from koopman_ros.learning.residuals import Data, Problem, ResidualWeights
+from koopman_ros.learning.residuals import Problem, ResidualWeights
+from koopman_ros.learning.scaled import ScaledSamples
 from koopman_ros.solvers.levenberg_marquardt import minimise, Minimum, MinimumStatus
 
 # Called after every step with (iteration, cost); True ends the minimisation.
@@ -98,7 +99,7 @@ class Growth:
                    if self.identity else ''))
         return tuple(range(n_x + self.identity, self.n_z + 1))
 
-    def start(self, data: Data, n_z: int, parent: Grown | None, seed: int,
+    def start(self, data: ScaledSamples, n_z: int, parent: Grown | None, seed: int,
               monitor: Monitor | None = None) -> Grown:
         """
         Extend a lift to `n_z` coordinates and minimise.
@@ -123,7 +124,7 @@ class Growth:
             minimum = run(last.add_residuals, minimum.theta)
         return Grown(layout, minimum.theta, minimum.status)
 
-    def _root(self, data: Data) -> Grown:
+    def _root(self, data: ScaledSamples) -> Grown:
         """Return the lift without a network that growth starts from."""
         n_x = data.x.shape[1]
         n_z = n_x if self.identity else 0
@@ -140,7 +141,7 @@ class Growth:
             (), empty((layout.n_free, 0)), drift if self.identity else empty((0, 0)), B,
             network)), MinimumStatus.CONVERGED)
 
-    def _extended(self, data: Data, n_z: int, parent: Grown, seed: int
+    def _extended(self, data: ScaledSamples, n_z: int, parent: Grown, seed: int
                   ) -> tuple[Layout, Tensor]:
         """Add the coordinates up to `n_z`, started from what the present ones do not span."""
         old = parent.layout
@@ -169,7 +170,7 @@ class Growth:
         return layout, layout.join(replace(begun, A=A, decoder=decoder))
 
 
-def linear_drift(data: Data) -> tuple[Tensor, Tensor | None]:
+def linear_drift(data: ScaledSamples) -> tuple[Tensor, Tensor | None]:
     """
     Fit dx/dt = A x + B u by linear least squares.
 

@@ -160,7 +160,7 @@ class Layout:
 
 @dataclass(frozen=True)
 class Layer:
-    """What one layer keeps of a pass for the way back; N samples, widths g -> h."""
+    """Values of one layer kept for the backward pass; N samples, widths g -> h."""
 
     W: Tensor
     value_in: Tensor      # (N, g)

@@ -12,35 +12,9 @@ from torch import Tensor
 
 from koopman_ros.learning.deep import ProductSums
 from koopman_ros.learning.network import Layout, Parameters, Pass
+from koopman_ros.learning.scaled import ScaledSamples
 from koopman_ros.learning.shallow import FeatureMap, MomentSums
 from koopman_ros.solvers.levenberg_marquardt import NormalEquations
-
-
-@dataclass(frozen=True)
-class Data:
-    """
-    Samples that a lift is learned from, in scaled deviations from the nominal point.
-
-    :param x: (N, n_x) states, float64.
-    :param f: (N, n_x) rates dx/dt, less B u where B is known.
-    :param u: (N, n_u) inputs whose B is to be learned, or None where it is known.
-    """
-
-    x: Tensor
-    f: Tensor
-    u: Tensor | None = None
-
-    def drift(self, B: Tensor | None) -> Tensor:
-        """Return the rates without what the inputs do, (N, n_x)."""
-        return self.f if B is None or self.u is None else self.f - self.u @ B.T
-
-    def part(self, start: int, length: int) -> Data:
-        """Return some consecutive samples."""
-        rows = slice(start, start + length)
-        return Data(self.x[rows], self.f[rows], None if self.u is None else self.u[rows])
-
-    def __len__(self) -> int:
-        return len(self.x)
 
 
 @dataclass(frozen=True)
@@ -78,7 +52,7 @@ class Problem:
     """
 
     layout: Layout
-    data: Data
+    data: ScaledSamples
     weights: ResidualWeights
     chunk: int = 0
 

@@ -95,7 +95,8 @@ class FeatureMap:
         layer = lifted.layers[0]
         slope, slope_rate = layer.slope, layer.slope_rate
         phi = x.new_empty((len(x), self.size(self.layout)))
-        F, G, rates, values, states, pushed, pushes = (phi[:, place] for place in self._places)
+        F, G, rates, values, states, slope_inputs, inputs = (
+            phi[:, place] for place in self._places)
         n_W = layer.W.numel()
         at_W = F[:, :n_W].unflatten(1, layer.W.shape)
         torch.mul(slope_rate[:, :, None], x[:, None, :], out=at_W)
@@ -108,8 +109,8 @@ class FeatureMap:
         states[...] = x
         if self.layout.n_u and u is not None:
             torch.mul(slope[:, :, None], u[:, None, :],
-                      out=pushed.unflatten(1, (slope.shape[1], u.shape[1])))
-            pushes[...] = u
+                      out=slope_inputs.unflatten(1, (slope.shape[1], u.shape[1])))
+            inputs[...] = u
         return phi
 
     @cached_property
@@ -129,7 +130,7 @@ class FeatureMap:
         layout, A, V = self.layout, self.parameters.A, self.parameters.V
         first = layout.n_z - layout.n_free
         W = self.parameters.hidden[0][0]
-        F, G, rates, values, _, pushed, pushes = self._places
+        F, G, rates, values, _, slope_inputs, inputs = self._places
         T = V.new_zeros((layout.n_z, layout.size, self.size(layout)))
         hidden = slice(0, F.stop)
         of_rates = torch.cat([V.new_zeros((first, V.shape[1])), V])
@@ -147,11 +148,11 @@ class FeatureMap:
             shape = (layout.n_z, layout.n_x, layout.n_u)
             at_B = layout.slices[4]
             for k in range(layout.n_u):
-                T[:, at_B, pushed].unflatten(1, shape[1:]).unflatten(
+                T[:, at_B, slope_inputs].unflatten(1, shape[1:]).unflatten(
                     3, (V.shape[1], layout.n_u))[:, :, k, :, k] = -torch.einsum(
                         'ij,jm->imj', of_rates, W)
                 for m in range(first):
-                    T[m, at_B, pushes].unflatten(0, shape[1:])[m, k, k] = -1.0
+                    T[m, at_B, inputs].unflatten(0, shape[1:])[m, k, k] = -1.0
         return T
 
     @cached_property

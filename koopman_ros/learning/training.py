@@ -22,17 +22,17 @@ from koopman_ros import __version__
 from koopman_ros.learning.algorithm1 import Algorithm1
 from koopman_ros.learning.baselines import Edmd
 from koopman_ros.learning.growth import Grown, Growth, Monitor
-from koopman_ros.learning.residuals import Data
-from koopman_ros.learning.samples import Plant, Samples, Scaling, split_by_episode
+from koopman_ros.learning.scaled import deviations, ScaledSamples
 from koopman_ros.learning.validation import (
     ClosedLoopComparison,
     compare_closed_loops,
+    evaluate,
+    Figures,
     Fit,
     fit,
-    judge,
-    Report,
 )
-from koopman_ros.lifting import LiftedModel, NetworkObservables, Provenance, TrainingStates
+from koopman_ros.lifting import Box, LiftedModel, NetworkObservables, Provenance, TrainingStates
+from koopman_ros.plant_data import Plant, Samples, split_by_episode
 from koopman_ros.solvers.levenberg_marquardt import MinimumStatus
 
 Recipe = Growth | Algorithm1
@@ -42,7 +42,7 @@ RECIPES: dict[str, type[Growth] | type[Algorithm1]] = {'growth': Growth, 'paper'
 @dataclass(frozen=True)
 class Progress:
     """
-    Where a training stands.
+    Progress of a training.
 
     :param n_z: coordinates being learned.
     :param finished: starts that finished, over all rounds.
@@ -67,10 +67,10 @@ Watch = Callable[[Progress], bool]
 @dataclass(frozen=True)
 class Trained:
     """
-    A trained model with what it took.
+    A trained model with its figures and those of the linear model.
 
     :param model: the winner, with its figures on the untouched test episodes in its provenance.
-    :param report: those figures.
+    :param figures: those figures.
     :param linear: the figures of the linear model that fits the training episodes best.
     :param closed_loop: the winner's law beside the linear one's; None without inputs, or when
         nothing was to be refused.
@@ -80,8 +80,8 @@ class Trained:
     """
 
     model: LiftedModel
-    report: Report
-    linear: Report
+    figures: Figures
+    linear: Figures
     closed_loop: ClosedLoopComparison | None
     status: str
     path: tuple[LiftedModel, ...]
@@ -100,7 +100,7 @@ class _Candidate:
 
     @property
     def score(self) -> float:
-        """What starts are compared by: rw alone does not see a state that the lift has lost."""
+        """Figure that starts are compared by: rw alone does not see a state that is lost."""
         return self.fit.rw + self.fit.rx
 
 
@@ -137,9 +137,9 @@ def train(plant: Plant, samples: Samples, recipe: Recipe, *, seed: int = 0, star
         raise ValueError(f'starts must be at least 1, got {starts}')
     rounds = recipe.rounds(samples.x.shape[1])
     parts = split_by_episode(samples, split_seed)
-    scaling = Scaling.of(plant, samples)
-    assembly = _Assembly(plant, scaling, parts[0], samples.digest(), seed,
-                         _training_states(scaling, samples))
+    box = Box.of(plant, samples.x, samples.u)
+    assembly = _Assembly(plant, box, parts[0], samples.digest(), seed,
+                         _training_states(box, samples))
     data = assembly.data(device)
     tracker = _Tracker(watch, starts * len(rounds))
     path: list[_Candidate] = []
@@ -183,8 +183,8 @@ def _conclude(plant: Plant, parts: tuple[Samples, Samples, Samples], path: list[
               interrupted: bool, finished: int, refuse: bool) -> Trained:
     """Compare the winner with the linear model and report on the untouched episodes."""
     winner = path[-1]
-    scaling = Scaling(winner.model.states, winner.model.inputs, plant.time_unit)
-    linear = Edmd(degree=1).learn(plant, parts[0], scaling)
+    box = Box(winner.model.states, winner.model.inputs, plant.time_unit)
+    linear = Edmd(degree=1).learn(plant, parts[0], box)
     rx = fit(linear, parts[1].x, parts[1].dxdt, parts[1].u).rx
     if refuse and not winner.fit.rx < rx:
         raise NoUsefulLift(
@@ -200,20 +200,20 @@ def _conclude(plant: Plant, parts: tuple[Samples, Samples, Samples], path: list[
                 f'nominal point from {closed_loop.starts - closed_loop.arrived} of '
                 f'{closed_loop.starts} states where a linear controller does: use identity '
                 'coordinates, a smaller n_z, or more starts')
-    models, reports = [], []
+    models, figures = [], []
     for candidate in path:
-        reports.append(judge(candidate.model, parts[2]))
-        metrics = reports[-1].metrics(candidate.model.states.names)
+        figures.append(evaluate(candidate.model, parts[2]))
+        metrics = figures[-1].metrics(candidate.model.states.names)
         models.append(replace(candidate.model, provenance=replace(
             candidate.model.provenance, metrics=metrics)))
     status = MinimumStatus.INTERRUPTED if interrupted else winner.grown.status
-    return Trained(models[-1], reports[-1], judge(linear, parts[2]), closed_loop, status.value,
+    return Trained(models[-1], figures[-1], evaluate(linear, parts[2]), closed_loop, status.value,
                    tuple(models), finished)
 
 
-def _training_states(scaling: Scaling, samples: Samples) -> TrainingStates | None:
+def _training_states(box: Box, samples: Samples) -> TrainingStates | None:
     """Return where the data are, held-out ones included; None for one state: its box says it."""
-    states = scaling.states
+    states = box.states
     if len(states) == 1:
         return None
     return TrainingStates.of(states.to_deviation(samples.x),
@@ -222,7 +222,7 @@ def _training_states(scaling: Scaling, samples: Samples) -> TrainingStates | Non
 
 def _judged(assembly: _Assembly, grown: Grown | str, validation: Samples
             ) -> _Candidate | str:
-    """Return what a start has found, or why it is of no use."""
+    """Return the candidate of a start, or why it has none."""
     if isinstance(grown, str):
         return grown
     if grown.status is MinimumStatus.STALLED:
@@ -238,7 +238,7 @@ def _judged(assembly: _Assembly, grown: Grown | str, validation: Samples
 
 
 class _Tracker:
-    """What `watch` is told, and whether it asked to stop."""
+    """Reports progress to `watch`, and remembers whether it asked to stop."""
 
     def __init__(self, watch: Watch | None, total: int) -> None:
         self._watch, self._total = watch, total
@@ -246,14 +246,14 @@ class _Tracker:
         self._rw = math.nan
 
     def step(self, iteration: int, cost: float) -> bool:
-        return self._tell(iteration, math.sqrt(2.0 * cost))
+        return self._report(iteration, math.sqrt(2.0 * cost))
 
     def finish(self, rw: float) -> None:
         self.finished += 1
         self._rw = rw
-        self._tell(0, math.nan)
+        self._report(0, math.nan)
 
-    def _tell(self, iteration: int, residual: float) -> bool:
+    def _report(self, iteration: int, residual: float) -> bool:
         if self._watch is not None and not self.stop:
             self.stop = self._watch(Progress(self.n_z, self.finished, self._total, iteration,
                                              residual, self._rw))
@@ -263,14 +263,14 @@ class _Tracker:
 @dataclass(frozen=True)
 class _Assembly:
     """
-    The way from samples to what is minimised, and back to a model.
+    Conversion of samples to the scaled problem, and of its solution to a model.
 
     Time is scaled, too: rates of order one put the residuals of the dynamics beside the others
     whatever the plant's time unit.
     """
 
     plant: Plant
-    scaling: Scaling
+    box: Box
     samples: Samples
     digest: str
     seed: int
@@ -279,20 +279,21 @@ class _Assembly:
     @cached_property
     def pace(self) -> float:
         """Root mean square of the scaled rates, in 1/time unit."""
-        _, rate, _ = self.scaling.deviations(self.samples)
+        _, rate, _ = deviations(self.box, self.samples)
         return float(np.sqrt(np.mean(rate ** 2))) or 1.0
 
-    def data(self, device: str) -> Data:
-        x, rate, u = self.scaling.deviations(self.samples)
+    def data(self, device: str) -> ScaledSamples:
+        x, rate, u = deviations(self.box, self.samples)
         if self.plant.B is None:
-            return Data(*(torch.from_numpy(a).to(device) for a in (x, rate / self.pace, u)))
-        f = rate - u @ self.scaling.input_matrix(self.plant.B).T
-        return Data(*(torch.from_numpy(a).to(device) for a in (x, f / self.pace)))
+            return ScaledSamples(*(
+                torch.from_numpy(a).to(device) for a in (x, rate / self.pace, u)))
+        f = rate - u @ self.box.input_matrix(self.plant.B).T
+        return ScaledSamples(*(torch.from_numpy(a).to(device) for a in (x, f / self.pace)))
 
     def model(self, grown: Grown) -> LiftedModel:
         parts = grown.layout.split(grown.theta.cpu())
         if self.plant.B is not None:
-            B = self.scaling.input_matrix(self.plant.B)
+            B = self.box.input_matrix(self.plant.B)
         elif parts.B is not None:
             B = self.pace * parts.B.numpy()
         else:
@@ -301,13 +302,13 @@ class _Assembly:
             tuple((W.numpy(), b.numpy()) for W, b in parts.hidden), parts.V.numpy(),
             grown.layout.identity, grown.layout.activation)
         return LiftedModel(
-            observables, self.pace * parts.A.numpy(), B, self.scaling.states,
-            self.scaling.inputs, self.scaling.time_unit,
+            observables, self.pace * parts.A.numpy(), B, self.box.states,
+            self.box.inputs, self.box.time_unit,
             Provenance(self.plant.name, self.seed, self.digest, {}, __version__),
             self.training_states)
 
 
-def _run_starts(recipe: Recipe, data: Data, n_z: int, parent: Grown | None, seed: int,
+def _run_starts(recipe: Recipe, data: ScaledSamples, n_z: int, parent: Grown | None, seed: int,
                 starts: int, threads: int, tracker: _Tracker
                 ) -> Generator[Grown | str]:
     """Run one round; yield what each start has found, in their order."""
@@ -328,14 +329,14 @@ def _run_starts(recipe: Recipe, data: Data, n_z: int, parent: Grown | None, seed
 
 
 def _runs_here() -> bool:
-    """Tell whether joblib runs the starts in this process, where they can tell of their steps."""
+    """Return whether joblib runs the starts in this process, where their steps are reported."""
     backend, jobs = joblib.parallel.get_active_backend()
     return jobs in (None, 1) and isinstance(
         backend, joblib.parallel.LokyBackend | joblib.parallel.SequentialBackend)
 
 
-def _start(recipe: Recipe, data: Data, n_z: int, parent: Grown | None, seed: int, threads: int,
-           monitor: Monitor | None) -> Grown | str:
+def _start(recipe: Recipe, data: ScaledSamples, n_z: int, parent: Grown | None, seed: int,
+           threads: int, monitor: Monitor | None) -> Grown | str:
     if multiprocessing.current_process().name.startswith('LokyProcess'):
         # an interrupt of the terminal reaches the whole group: the process that waits answers it
         # and ends its workers, which between two starts would only print where they were

@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 The koopman_ros Authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""Held-out figures of a lifted model, invariant where the lift's own objective is not."""
+"""Held-out figures of a lifted model, invariant under linear maps of its coordinates."""
 
 from __future__ import annotations
 
@@ -12,8 +12,8 @@ from numpy.typing import NDArray
 from scipy.integrate import solve_ivp
 
 from koopman_ros.control import run_closed_loop, Weights
-from koopman_ros.learning.samples import Array, Samples
 from koopman_ros.lifting import LiftedModel
+from koopman_ros.plant_data import Array, Samples
 from koopman_ros.solvers import solve_riccati
 
 # Beyond it S is singular to working precision, and rw is noise.
@@ -27,7 +27,7 @@ _MAX_EVALUATIONS = 5000
 @dataclass(frozen=True)
 class Fit:
     """
-    How well a lift satisfies dz/dt = A z + J_N(x) B u on samples.
+    Residuals of a lift in dz/dt = A z + J_N(x) B u on samples.
 
     :param rw: ||(J_N f - A N) S^(-1/2)||^2 / ||J_N f S^(-1/2)||^2 with S = E[z z'], invariant
         under linear maps of z, so that it cannot be lowered by shrinking z.
@@ -60,9 +60,9 @@ class ClosedLoopComparison:
 
 
 @dataclass(frozen=True)
-class Report:
+class Figures:
     """
-    What held-out samples say of a model.
+    Figures of a model on held-out samples.
 
     :param fit: its residuals.
     :param eigenvalues: (n_z,) of A, in 1/time unit.
@@ -84,27 +84,27 @@ class Report:
         return {name: value for name, value in figures.items() if np.isfinite(value)}
 
 
-def judge(model: LiftedModel, samples: Samples) -> Report:
+def evaluate(model: LiftedModel, samples: Samples) -> Figures:
     """
     Evaluate all open-loop figures of a model.
 
     :param model: the lift.
     :param samples: held-out episodes.
-    :raises ValueError: when the samples do not tell the coordinates apart.
+    :raises ValueError: when the samples do not distinguish the coordinates.
     """
-    return Report(fit(model, samples.x, samples.dxdt, samples.u), model.eigenvalues,
+    return Figures(fit(model, samples.x, samples.dxdt, samples.u), model.eigenvalues,
                   rollout_rmse(model, samples))
 
 
 def fit(model: LiftedModel, x: Array, dxdt: Array, u: Array) -> Fit:
     """
-    Judge a lift on samples of a plant.
+    Evaluate the residuals of a lift on samples of a plant.
 
     :param model: the lift.
     :param x: (N, n_x) states, in state units.
     :param dxdt: (N, n_x) their derivatives, in state units per time unit.
     :param u: (N, n_u) inputs, in input units.
-    :raises ValueError: when the samples do not tell the coordinates apart.
+    :raises ValueError: when the samples do not distinguish the coordinates.
     """
     xi = model.states.to_deviation(x)
     f = dxdt / model.states.scale - model.inputs.to_deviation(u) @ model.B.T
@@ -140,14 +140,14 @@ def roll_out(model: LiftedModel, x0: Array, inputs: Array, sample_period: float 
     holds = inputs.shape[-2]
     xi = model.states.to_deviation(np.asarray(x0, dtype=np.float64))
     shape = xi.shape
-    pushes = model.inputs.to_deviation(inputs) @ model.B.T
+    forcing = model.inputs.to_deviation(inputs) @ model.B.T
     path = [xi]
     for k, period in enumerate(np.broadcast_to(sample_period, (holds,))):
         # a prediction that overflows is reported below
         with np.errstate(all='ignore'):
             solution = solve_ivp(
-                lambda _, y, push=pushes[..., k, :]: (
-                    model.drift(y.reshape(shape)) + push).ravel(),
+                lambda _, y, held=forcing[..., k, :]: (
+                    model.drift(y.reshape(shape)) + held).ravel(),
                 (0.0, period), xi.ravel(), method='DOP853', rtol=1e-9, atol=1e-12)
         xi = solution.y[:, -1].reshape(shape)
         if not solution.success or not np.all(np.abs(xi) < 1e6):

@@ -1,11 +1,12 @@
 # SPDX-FileCopyrightText: 2026 The koopman_ros Authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""What a lift is: its functions, its model and the file; in numpy, imports nothing of ours."""
+"""Lifted models at run time: observables, scaling, model file; in numpy alone."""
 
 from koopman_ros.lifting.artefact import load, load_with_digest, ModelFileError, save
+from koopman_ros.lifting.coordinates import Box, Coordinates
 from koopman_ros.lifting.linearisation import linearised_model
-from koopman_ros.lifting.model import Coordinates, LiftedModel, Provenance
+from koopman_ros.lifting.model import LiftedModel, Provenance
 from koopman_ros.lifting.observables import (
     NetworkObservables,
     Observables,
@@ -14,6 +15,7 @@ from koopman_ros.lifting.observables import (
 from koopman_ros.lifting.training_states import TrainingStates
 
 __all__ = [
+    'Box',
     'Coordinates',
     'LiftedModel',
     'ModelFileError',

@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 The koopman_ros Authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""What the modules of a lift share about arrays."""
+"""Checked, read-only arrays."""
 
 from __future__ import annotations
 

@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 The koopman_ros Authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""What a model file may hold: sizes that a control step can bear, and texts that can be told."""
+"""Limits of a model file: sizes that a control step has time for, and printable texts."""
 
 from __future__ import annotations
 

@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 The koopman_ros Authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""Reading a file that may be anything: neither without end nor for ever."""
+"""Reading of regular files up to a limit; devices, pipes and sockets are refused."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ _KINDS = ((stat.S_ISDIR, 'a folder'), (stat.S_ISFIFO, 'a named pipe'), (stat.S_I
 
 
 class NotRegularError(OSError):
-    """What is to be read is no regular file; its text says what it is."""
+    """The path is no regular file; the message says what it is."""
 
 
 def read_regular(path: str | os.PathLike[str], limit: int) -> bytes:

@@ -8,88 +8,23 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from functools import cached_property
-import math
 
 import numpy as np
 from numpy.typing import NDArray
 
 from koopman_ros.lifting.arrays import Array, frozen
+from koopman_ros.lifting.coordinates import Coordinates
 from koopman_ros.lifting.observables import NetworkObservables, Observables
 from koopman_ros.lifting.training_states import TrainingStates
+from koopman_ros.plant_data import Plant
 
 SECONDS_PER_TIME_UNIT = {'s': 1.0, 'min': 60.0}
 
 
 @dataclass(frozen=True)
-class Coordinates:
-    """
-    Names, units, scaling and training box of the states or of the inputs.
-
-    A physical value v maps to the deviation (v - center) / scale that the lift sees.
-
-    :param names: one name a coordinate, e.g. ``('temperature',)``.
-    :param units: one unit a coordinate, e.g. ``('K',)``.
-    :param center: (n,) nominal point, in units.
-    :param scale: (n,) positive, in units.
-    :param lower: (n,) lower corner of the training box, in units.
-    :param upper: (n,) upper corner of the training box, in units.
-    :raises ValueError: on inconsistent sizes, a scale that is not positive or an empty box.
-    """
-
-    names: tuple[str, ...]
-    units: tuple[str, ...]
-    center: Array
-    scale: Array
-    lower: Array
-    upper: Array
-
-    def __post_init__(self) -> None:
-        n = len(self.names)
-        if len(self.units) != n:
-            raise ValueError(f'incompatible units: expected {n}, got {len(self.units)}')
-        for name in ('center', 'scale', 'lower', 'upper'):
-            object.__setattr__(self, name, frozen(getattr(self, name), name, (n,)))
-        if np.any(self.scale <= 0.0):
-            raise ValueError(f'scale must be positive, got {self.scale.tolist()}')
-        if np.any(self.lower >= self.upper):
-            raise ValueError(f'the box is empty: lower {self.lower.tolist()}, '
-                             f'upper {self.upper.tolist()}')
-
-    def __len__(self) -> int:
-        return len(self.names)
-
-    def to_deviation(self, value: Array) -> Array:
-        """Map physical values (..., n) to scaled deviations (..., n)."""
-        return (value - self.center) / self.scale
-
-    def to_physical(self, deviation: Array) -> Array:
-        """Map scaled deviations (..., n) to physical values (..., n)."""
-        return self.center + deviation * self.scale
-
-    def violation(self, value: Array) -> float:
-        """
-        Measure how far a physical value (n,) lies outside the training box.
-
-        :return: largest excess over a side of the box, as a fraction of half its width; 0 inside,
-            infinity for a value that is not finite.
-        """
-        worst = 0.0
-        # in plain numbers, as the few of a measurement take numpy ten times as long
-        for v, lower, upper in zip(value.tolist(), *self._box, strict=True):
-            if not math.isfinite(v):
-                return math.inf
-            worst = max(worst, max(lower - v, v - upper) / (0.5 * (upper - lower)))
-        return worst
-
-    @cached_property
-    def _box(self) -> tuple[list[float], list[float]]:
-        return self.lower.tolist(), self.upper.tolist()
-
-
-@dataclass(frozen=True)
 class Provenance:
     """
-    Where a lift comes from and how good it was found to be.
+    Origin of a lift and its held-out figures.
 
     :param plant: name of the plant it was learned from.
     :param seed: seed of the training run, or None for a model that was not trained.
@@ -170,6 +105,13 @@ class LiftedModel:
     def identity(self) -> bool:
         """Whether z starts with the state."""
         return self.observables.identity
+
+    @property
+    def plant(self) -> Plant:
+        """What the model knows of its plant: names, units, nominal point; B is left to learn."""
+        return Plant(self.provenance.plant, self.states.names, self.states.units,
+                     self.inputs.names, self.inputs.units, self.time_unit, self.states.center,
+                     self.inputs.center, None)
 
     @property
     def seconds_per_time_unit(self) -> float:

@@ -2,7 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 
 
-"""Where a lift was learned: states of the training data that stand for all of them."""
+"""Representative states of the training data, for the distance from them."""
 
 from __future__ import annotations
 

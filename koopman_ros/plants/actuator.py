@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 The koopman_ros Authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""What stands between a command and the input of a plant: a range, a delay and a lag."""
+"""Actuators: range, delay and lag between a command and the input of a plant."""
 
 from __future__ import annotations
 
@@ -40,7 +40,7 @@ class ActuatedProcess:
     A running plant behind its actuator.
 
     :param process: the plant; its `u` is the input that acts, up to the present time.
-    :param actuator: what stands before it.
+    :param actuator: its actuator.
     :param command: what the input follows (n_u,).
     :param pending: commands that take effect later, by rising time: (time in ns, command (n_u,)).
     """
@@ -90,14 +90,14 @@ class ActuatedProcess:
 def _lagging(process: Process, goal: FloatArray, lag: float, time_ns: int) -> Process:
     """Return a process at a later time, its input on the way to a goal."""
     system = process.system
-    both = with_input_lag(system, lag / system.seconds_per_time_unit)
+    both = _with_input_lag(system, lag / system.seconds_per_time_unit)
     reached = Process(
         both, process.time_ns, np.concatenate([process.x, process.u]), goal).until(time_ns)
     x, u = np.split(reached.x, [system.n_x])
     return replace(process, time_ns=time_ns, x=x, u=u)
 
 
-def with_input_lag(system: ControlAffineSystem, time_constant: float) -> ControlAffineSystem:
+def _with_input_lag(system: ControlAffineSystem, time_constant: float) -> ControlAffineSystem:
     """
     Put a first-order lag before each input: d[x; v]/dt = [f(x) + B v; -v / tau] + [0; u / tau].
 
@@ -105,12 +105,7 @@ def with_input_lag(system: ControlAffineSystem, time_constant: float) -> Control
     act, its input u is what they follow.
 
     :param time_constant: tau, in time units, above 0.
-    :raises ValueError: when it is not.
     """
-    if not 0.0 < time_constant < np.inf:
-        raise ValueError(
-            f'time_constant is {time_constant} {system.time_unit}, must be finite and above 0; '
-            'without a lag take the system itself')
     n_x, n_u = system.n_x, system.n_u
     rate = 1.0 / time_constant
 

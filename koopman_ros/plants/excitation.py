@@ -11,6 +11,7 @@ import math
 import numpy as np
 from numpy.typing import ArrayLike
 
+from koopman_ros.plant_data import Episode
 from koopman_ros.plants.integration import (
     IntegrationError,
     IntegrationFailure,
@@ -18,7 +19,6 @@ from koopman_ros.plants.integration import (
 )
 from koopman_ros.plants.simulation import simulate
 from koopman_ros.plants.system import checked_vector, ControlAffineSystem, FloatArray
-from koopman_ros.plants.trajectory import sample_times, Trajectory
 
 
 class ExcitationError(ValueError):
@@ -74,22 +74,7 @@ class RandomStepDesign:
 
 
 @dataclass(frozen=True, eq=False)
-class Excitation:
-    """
-    A plant driven through random steps.
-
-    :param trajectory: what was applied and what followed, at every sample period.
-    :param step_starts: number of the sample at which each step begins (S,).
-    :param redraws: how many levels were drawn again because their step would have left the box.
-    """
-
-    trajectory: Trajectory
-    step_starts: tuple[int, ...]
-    redraws: int
-
-
-@dataclass(frozen=True, eq=False)
-class _Box:
+class _Bounds:
     """A design's bounds with one entry for each input and state of a system."""
 
     input_lower: FloatArray
@@ -106,7 +91,7 @@ def random_steps(
     seed: int,
     *,
     x0: ArrayLike | None = None,
-) -> Excitation:
+) -> Episode:
     """
     Drive a plant through random steps of its inputs (paper, section on the reactor).
 
@@ -124,66 +109,58 @@ def random_steps(
     if system.n_u == 0:
         raise ValueError(f'{system.name} has no input to step; choose initial states instead')
     holds = _whole_samples(duration, design.sample_period, system.time_unit)
-    box = _resolved_box(system, design)
+    bounds = _resolved_bounds(system, design)
     state = system.nominal_state if x0 is None else system.checked_state('x0', x0)
-    if not np.all((state >= box.state_lower) & (state <= box.state_upper)):
+    if not np.all((state >= bounds.state_lower) & (state <= bounds.state_upper)):
         raise ExcitationError(
-            f'{system.name}: at the start {_violation(system, box, state)}; '
+            f'{system.name}: at the start {_violation(system, bounds, state)}; '
             'choose x0 inside the box, or a box around it')
 
     rng = np.random.default_rng(seed)
-    states, inputs = [state[None, :]], []
-    step_starts, redraws, sample = [], 0, 0
+    states, inputs, sample = [state[None, :]], [], 0
     while sample < holds:
         drawn = int(rng.integers(*design.hold_samples, endpoint=True))
-        piece, tries = _safe_step(system, design, box, state, sample, min(drawn, holds - sample),
-                                  rng)
-        step_starts.append(sample)
-        states.append(piece.states[1:])
-        inputs.append(piece.inputs)
-        state, sample, redraws = piece.states[-1], sample + len(piece.inputs), redraws + tries
-    trajectory = Trajectory(
-        times=sample_times(0.0, design.sample_period, holds),
-        states=np.concatenate(states),
-        inputs=np.concatenate(inputs))
-    return Excitation(trajectory=trajectory, step_starts=tuple(step_starts), redraws=redraws)
+        step = _safe_step(system, design, bounds, state, sample, min(drawn, holds - sample), rng)
+        states.append(step.x[1:])
+        inputs.append(step.u)
+        state, sample = step.x[-1], sample + len(step.u)
+    times = design.sample_period * np.arange(holds + 1, dtype=np.float64)
+    return Episode(times, np.concatenate(states), times[:-1], np.concatenate(inputs))
 
 
 def _safe_step(
     system: ControlAffineSystem,
     design: RandomStepDesign,
-    box: _Box,
+    bounds: _Bounds,
     state: FloatArray,
     first_sample: int,
     length: int,
     rng: np.random.Generator,
-) -> tuple[Trajectory, int]:
-    """Draw levels until one keeps the state in the box; return its step and the redraws."""
+) -> Episode:
+    """Draw levels until one keeps the state in the box; return its step."""
     start_time = first_sample * design.sample_period
-    for redraws in range(design.max_redraws + 1):
-        level = rng.uniform(box.input_lower, box.input_upper)
+    for _ in range(design.max_redraws + 1):
+        level = rng.uniform(bounds.input_lower, bounds.input_upper)
         try:
-            step = simulate(
+            return simulate(
                 system, state, np.tile(level, (length, 1)), design.sample_period,
-                start_time=start_time, settings=box.settings)
+                start_time=start_time, settings=bounds.settings)
         except IntegrationError as error:
             if error.failure is not IntegrationFailure.OUT_OF_BOUNDS:
                 raise
             exit_time, exit_state = error.time, error.state
-        else:
-            return step, redraws
     levels = ', '.join(
         f'{name} in [{lower:.10g}, {upper:.10g}]' + ('' if unit == '1' else f' {unit}')
         for name, unit, lower, upper in zip(
-            system.input_names, system.input_units, box.input_lower, box.input_upper,
+            system.input_names, system.input_units, bounds.input_lower, bounds.input_upper,
             strict=True))
     raise ExcitationError(
-        f'{system.name}: {_violation(system, box, exit_state)} at {exit_time:.6g} '
+        f'{system.name}: {_violation(system, bounds, exit_state)} at {exit_time:.6g} '
         f'{system.time_unit}, and so it went with each of {design.max_redraws + 1} levels of '
         f'{levels}; narrow the input bounds, widen the box or shorten hold_time')
 
 
-def _resolved_box(system: ControlAffineSystem, design: RandomStepDesign) -> _Box:
+def _resolved_bounds(system: ControlAffineSystem, design: RandomStepDesign) -> _Bounds:
     """Fit a design to a system; the box shrinks to the states at which the model holds."""
     state_lower = np.maximum(
         system.checked_bound('state_lower', design.state_lower), system.state_lower)
@@ -196,7 +173,7 @@ def _resolved_box(system: ControlAffineSystem, design: RandomStepDesign) -> _Box
     if not np.all(input_lower < input_upper):
         raise ValueError(f'input_lower {input_lower} must lie below input_upper {input_upper}')
     settings = IntegratorSettings(rtol=design.rtol, lower=state_lower, upper=state_upper)
-    return _Box(
+    return _Bounds(
         input_lower=input_lower, input_upper=input_upper, settings=settings,
         state_lower=state_lower, state_upper=state_upper)
 
@@ -211,10 +188,10 @@ def _whole_samples(duration: float, sample_period: float, time_unit: str) -> int
     return round(count)
 
 
-def _violation(system: ControlAffineSystem, box: _Box, state: FloatArray) -> str:
+def _violation(system: ControlAffineSystem, bounds: _Bounds, state: FloatArray) -> str:
     """Name the first state variable that is outside the box, its value and its range."""
-    i = int(np.argmax((state < box.state_lower) | (state > box.state_upper)))
+    i = int(np.argmax((state < bounds.state_lower) | (state > bounds.state_upper)))
     unit = '' if system.state_units[i] == '1' else f' {system.state_units[i]}'
     return (
         f'{system.state_names[i]} reached {state[i]:.6g}{unit}, outside the box '
-        f'[{box.state_lower[i]:.10g}, {box.state_upper[i]:.10g}]{unit}')
+        f'[{bounds.state_lower[i]:.10g}, {bounds.state_upper[i]:.10g}]{unit}')

@@ -7,7 +7,6 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from enum import Enum
-import math
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -39,24 +38,16 @@ class IntegrationError(RuntimeError):
     :param failure: the cause.
     :param time: when, in time units.
     :param state: the offending state (n_x,).
-    :param trajectory: which of several trajectories simulated at once.
     """
 
-    def __init__(
-        self,
-        sentence: str,
-        failure: IntegrationFailure,
-        time: float,
-        state: FloatArray,
-        trajectory: int = 0,
-    ) -> None:
+    def __init__(self, sentence: str, failure: IntegrationFailure, time: float, state: FloatArray
+                 ) -> None:
         # All of them as args, so that the error survives pickling between processes.
-        super().__init__(sentence, failure, time, state, trajectory)
+        super().__init__(sentence, failure, time, state)
         self.sentence = sentence
         self.failure = failure
         self.time = time
         self.state = state
-        self.trajectory = trajectory
 
     def __str__(self) -> str:
         return self.sentence
@@ -65,7 +56,7 @@ class IntegrationError(RuntimeError):
 @dataclass(frozen=True, eq=False)
 class IntegratorSettings:
     """
-    How precisely to integrate, and within which states.
+    Tolerances and state bounds of an integration.
 
     :param rtol: relative tolerance of each integration step, in [2.3e-14, 1e-9].
     :param atol: absolute tolerance of each, a scalar or (n_x,), in state units and above 0; `rtol`
@@ -115,90 +106,58 @@ def resolved_limits(system: ControlAffineSystem, settings: IntegratorSettings) -
     return Limits(rtol=settings.rtol, atol=atol, lower=lower, upper=upper)
 
 
-def largest_stack(rtol: float) -> int:
-    """Return how many trajectories fit one stack before its tolerance is below the tightest."""
-    return max(1, int(min((rtol / TIGHTEST_RTOL) ** 2, 1e9)))
-
-
-def hold(
-    system: ControlAffineSystem,
-    starts: FloatArray,
-    inputs: FloatArray,
-    duration: float,
-    limits: Limits,
-    *,
-    start_time: float = 0.0,
-    first: int = 0,
-) -> FloatArray:
+def hold(system: ControlAffineSystem, start: FloatArray, u: FloatArray, duration: float,
+         limits: Limits, *, start_time: float = 0.0) -> FloatArray:
     """
-    Integrate a stack of M states over one hold with the explicit Runge-Kutta pair DOP853.
+    Integrate a state over one hold with the explicit Runge-Kutta pair DOP853.
 
     Why not LSODA: every input step is a kink after which a multistep method has to build up its
     history again, so that over one second it is no quicker, and its error at the same tolerance
     is larger by orders of magnitude. The plants are not stiff within their bounds.
 
-    :param starts: states at its start (M, n_x), M > 0.
-    :param inputs: the held inputs (M, n_u).
+    :param start: state at its start (n_x,).
+    :param u: the held input (n_u,).
     :param duration: its length, in time units.
     :param start_time: time of its start, for the message of an error.
-    :param first: number of the first trajectory of the stack, likewise.
-    :return: states at its end (M, n_x).
+    :return: state at its end (n_x,).
     :raises IntegrationError: when the end is not reached.
     """
-    shape = starts.shape
-    forcing = inputs @ system.B.T
-    # The error norm is a root mean square over the stack: of M trajectories, a single one could
-    # exceed its own tolerance by sqrt(M).
-    dilution = math.sqrt(shape[0])
+    forcing = u @ system.B.T
 
-    def rate(_: float, stacked: FloatArray) -> FloatArray:
-        return (system.drift(stacked.reshape(shape)) + forcing).ravel()
+    def rate(_: float, x: FloatArray) -> FloatArray:
+        return system.drift(x) + forcing
 
-    def failed(
-        failure: IntegrationFailure, elapsed: float, states: FloatArray,
-    ) -> IntegrationError:
-        return _integration_error(system, limits, failure, start_time + elapsed, states, first)
+    def failed(failure: IntegrationFailure, elapsed: float, x: FloatArray) -> IntegrationError:
+        return _integration_error(system, limits, failure, start_time + elapsed, x)
 
     # Stages of a step that is then rejected may overflow.
     with np.errstate(all='ignore'):
-        if not _inside(starts, limits):
-            raise failed(IntegrationFailure.OUT_OF_BOUNDS, 0.0, starts)
+        if not _inside(start, limits):
+            raise failed(IntegrationFailure.OUT_OF_BOUNDS, 0.0, start)
         # DOP853 would never return from a first step that begins with an infinite rate.
-        if not np.all(np.isfinite(rate(0.0, starts))):
-            raise failed(IntegrationFailure.NON_FINITE, 0.0, starts)
+        if not np.all(np.isfinite(rate(0.0, start))):
+            raise failed(IntegrationFailure.NON_FINITE, 0.0, start)
         if duration == 0.0:
-            return starts.copy()
-        solver = DOP853(
-            rate, 0.0, starts.ravel(), duration,
-            rtol=max(limits.rtol / dilution, TIGHTEST_RTOL),
-            atol=np.tile(limits.atol / dilution, shape[0]))
+            return start.copy()
+        solver = DOP853(rate, 0.0, start, duration, rtol=limits.rtol, atol=limits.atol)
         for _ in range(_MAX_STEPS_PER_HOLD):
             solver.step()
-            states: FloatArray = solver.y.reshape(shape)
+            x: FloatArray = solver.y
             if solver.status == 'failed':
-                raise failed(IntegrationFailure.STEP_TOO_SMALL, solver.t, states)
-            if not _inside(states, limits):
-                raise failed(IntegrationFailure.OUT_OF_BOUNDS, solver.t, states)
+                raise failed(IntegrationFailure.STEP_TOO_SMALL, solver.t, x)
+            if not _inside(x, limits):
+                raise failed(IntegrationFailure.OUT_OF_BOUNDS, solver.t, x)
             if solver.status == 'finished':
-                return states
-        raise failed(IntegrationFailure.TOO_MANY_STEPS, solver.t, states)
+                return x
+        raise failed(IntegrationFailure.TOO_MANY_STEPS, solver.t, x)
 
 
-def _inside(states: FloatArray, limits: Limits) -> bool:
-    return bool(np.all((states >= limits.lower) & (states <= limits.upper)))
+def _inside(x: FloatArray, limits: Limits) -> bool:
+    return bool(np.all((x >= limits.lower) & (x <= limits.upper)))
 
 
-def _integration_error(
-    system: ControlAffineSystem,
-    limits: Limits,
-    failure: IntegrationFailure,
-    time: float,
-    states: FloatArray,
-    first: int,
-) -> IntegrationError:
-    row = _offender(system, limits, states)
-    state = states[row].copy()
-    which = f', trajectory {first + row}' if len(states) > 1 else ''
+def _integration_error(system: ControlAffineSystem, limits: Limits, failure: IntegrationFailure,
+                       time: float, state: FloatArray) -> IntegrationError:
     outside = ''.join(
         f', {name} outside [{lower:.10g}, {upper:.10g}]{"" if unit == "1" else " " + unit}'
         for name, unit, x, lower, upper in zip(
@@ -206,15 +165,6 @@ def _integration_error(
             strict=True)
         if not lower <= x <= upper)
     sentence = (
-        f'{system.name}{which}: {system.describe_state(state)} at {time:.6g} {system.time_unit}'
+        f'{system.name}: {system.describe_state(state)} at {time:.6g} {system.time_unit}'
         f'{outside}: {failure.value}')
-    return IntegrationError(sentence, failure, time, state, first + row)
-
-
-def _offender(system: ControlAffineSystem, limits: Limits, states: FloatArray) -> int:
-    """Return which state of a stack (M, n_x) is out of bounds, or else changes fastest."""
-    outside = ~np.all((states >= limits.lower) & (states <= limits.upper), axis=1)
-    if np.any(outside):
-        return int(np.argmax(outside))
-    speed = np.max(np.abs(system.drift(states)) / system.state_scale, axis=1)
-    return int(np.argmax(np.nan_to_num(speed, nan=np.inf)))
+    return IntegrationError(sentence, failure, time, state.copy())

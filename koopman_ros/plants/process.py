@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 The koopman_ros Authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""A plant that runs in time: it is driven to instants, not by steps, under a held input."""
+"""A plant that is advanced to given instants under a held input."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ _NANOSECONDS = 1_000_000_000
 @dataclass(frozen=True, eq=False)
 class Process:
     """
-    A running plant: what it is, where it stands, and the input it holds.
+    A running plant: its equations, present time and state, and the held input.
 
     :param system: the plant.
     :param time_ns: present time, in integer nanoseconds so that instants repeat exactly.

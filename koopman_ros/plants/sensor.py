@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 The koopman_ros Authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""What a sensor adds to the truth."""
+"""Sensor noise and resolution."""
 
 from __future__ import annotations
 

@@ -9,17 +9,17 @@ Imports bags, identification, learning, lifting and control; needs the `train` r
 do not import it, they start ``python -m koopman_ros.retraining``.
 """
 
-from koopman_ros.retraining.gate import judge, Thresholds, Verdict
+from koopman_ros.retraining.gate import decide, Decision, Thresholds
 from koopman_ros.retraining.lift import learn_lift
 from koopman_ros.retraining.report import write_report
-from koopman_ros.retraining.task import Outcome, retrain, Task
+from koopman_ros.retraining.task import retrain, Retrained, Task
 
 __all__ = [
-    'Outcome',
+    'Decision',
+    'Retrained',
     'Task',
     'Thresholds',
-    'Verdict',
-    'judge',
+    'decide',
     'learn_lift',
     'retrain',
     'write_report',

@@ -7,7 +7,7 @@ The process that retrains: a task in JSON on the first line of its input, JSON l
 
 Each line holds either ``progress`` (share done) with ``text``, or at last ``summary`` and
 ``files``, or ``error``, or ``stopped``. It ends early on SIGINT, on SIGTERM, and when its input is
-closed, so that it does not outlive whoever started it.
+closed, so that it does not outlive the process that started it.
 """
 
 from __future__ import annotations
@@ -30,40 +30,40 @@ def main() -> int:
     stop = threading.Event()
     for number in (signal.SIGINT, signal.SIGTERM):
         signal.signal(number, lambda *_: stop.set())
-    # whoever controls the plant meanwhile comes first
+    # the controller of the plant has priority
     os.nice(10)
     line = sys.stdin.readline()
     threading.Thread(target=_wait_for_end_of_input, args=(stop,), daemon=True).start()
     last = -_PERIOD
 
-    def tell(share: float, text: str) -> bool:
+    def on_progress(share: float, text: str) -> bool:
         nonlocal last
         if time.monotonic() - last >= _PERIOD:
             last = time.monotonic()
-            _say(progress=round(share, 4), text=text)
+            _print(progress=round(share, 4), text=text)
         return stop.is_set()
 
     try:
         task = Task.from_json(line)
-        outcome = retrain(task, tell)
+        retrained = retrain(task, on_progress)
     except BrokenPipeError:
-        # whoever started it is gone
+        # the process that started it is gone
         return 1
     except Stopped:
-        _say(stopped=True)
+        _print(stopped=True)
         return 1
     except (ValueError, TypeError, KeyError, OSError, MemoryError) as error:
-        _say(error=' '.join(str(error).split()) or type(error).__name__)
+        _print(error=' '.join(str(error).split()) or type(error).__name__)
         return 1
-    warnings = list(outcome.verdict.warnings) if outcome.verdict else []
+    warnings = list(retrained.decision.warnings) if retrained.decision else []
     try:
-        files = [str(path) for path in write_report(outcome)]
+        files = [str(path) for path in write_report(retrained)]
     except OSError as error:
         # the lift is written already
         files = []
         warnings.append(f'the report could not be written: {error}')
-    _say(summary={**outcome.summary(), 'warnings': warnings}, files=files)
-    return 0 if outcome.accepted else 2
+    _print(summary={**retrained.summary(), 'warnings': warnings}, files=files)
+    return 0 if retrained.accepted else 2
 
 
 def _wait_for_end_of_input(stop: threading.Event) -> None:
@@ -71,7 +71,7 @@ def _wait_for_end_of_input(stop: threading.Event) -> None:
     stop.set()
 
 
-def _say(**values: object) -> None:
+def _print(**values: object) -> None:
     print(json.dumps(values), flush=True)
 
 

@@ -2,7 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 
 
-"""Whether a new lift may replace the present one: judged on what no part of it has seen."""
+"""Acceptance of a new lift, on data held out of its estimation and training."""
 
 from __future__ import annotations
 
@@ -18,9 +18,9 @@ from koopman_ros.identification import (
     Identified,
     longest_step,
     prediction_error,
-    Stretches,
+    Segments,
 )
-from koopman_ros.identification.stretches import Rate
+from koopman_ros.identification.segments import Rate
 from koopman_ros.learning import Trained
 from koopman_ros.learning.validation import settling_time
 from koopman_ros.lifting import LiftedModel, linearised_model, Provenance
@@ -42,7 +42,7 @@ _NOTICEABLE = 1e-3
 @dataclass(frozen=True)
 class Thresholds:
     """
-    What a lift has to reach.
+    Thresholds that a lift has to reach.
 
     :param margin: by this share its held-out error must be smaller than those of the present
         lift and of the best linear model.
@@ -60,12 +60,12 @@ class Thresholds:
 
 
 @dataclass(frozen=True)
-class Verdict:
+class Decision:
     """
-    Figures of a lift on held-out stretches, and what they mean.
+    Acceptance or refusal of a lift, with its figures on held-out segments.
 
     :param reasons: why it is refused; empty when it is accepted.
-    :param warnings: what the user should know in either case.
+    :param warnings: for the user, in either case.
     :param rmse: (n_x,) error of its predictions of the measurements, in state units.
     :param drift_rmse: (n_x,) the same of the drift that it was learned from.
     :param current_rmse: (n_x,) the same of the present lift.
@@ -106,26 +106,26 @@ def lifted_rate(model: LiftedModel, time_unit_seconds: float) -> Rate:
         xi = model.states.to_deviation(x)
         followed = np.all(np.abs(xi) < _DIVERGED, axis=-1, keepdims=True)
         drift = np.where(followed, model.drift(np.where(followed, xi, 0.0)), np.nan)
-        pushes = model.inputs.to_deviation(u) @ model.B.T
-        scaled: Array = factor * model.states.scale * (drift + pushes)
+        forcing = model.inputs.to_deviation(u) @ model.B.T
+        scaled: Array = factor * model.states.scale * (drift + forcing)
         return scaled
 
     return rate
 
 
-def judge(found: Identified, trained: Trained, current: LiftedModel, thresholds: Thresholds
-          ) -> Verdict:
+def decide(found: Identified, trained: Trained, current: LiftedModel, thresholds: Thresholds
+          ) -> Decision:
     """
     Compare a new lift with the present one and with a linear model, and close the loop on it.
 
-    :param found: the drift, and the stretches that were held out of its estimation.
+    :param found: the drift, and the segments that were held out of its estimation.
     :param trained: the new lift.
     :param current: the present one.
     :param thresholds: what it has to reach.
     """
-    model, scale = trained.model, found.drift.box.state_scale
+    model, scale = trained.model, found.drift.box.states.scale
     unit = model.seconds_per_time_unit
-    held_out = Stretches.of(found.held_out, longest_step(found.held_out))
+    held_out = Segments.of(found.held_out, longest_step(found.held_out))
     rmse, drift_rmse, current_rmse, linear_rmse = (
         prediction_error(rate, held_out, scale)
         for rate in (lifted_rate(model, unit), found.drift.rate, lifted_rate(current, unit),
@@ -138,7 +138,7 @@ def judge(found: Identified, trained: Trained, current: LiftedModel, thresholds:
             reasons.append(
                 f'its error on held-out records, {_text(rmse, model)}, is not '
                 f'{100.0 * thresholds.margin:.0f} % below that of {name}, {_text(other, model)}')
-    cond = trained.report.fit.cond
+    cond = trained.figures.fit.cond
     if not cond <= thresholds.condition:
         reasons.append(f'the condition number of its coordinates, {cond:.3g}, is above '
                        f'{thresholds.condition:.3g}: use fewer coordinates')
@@ -146,26 +146,26 @@ def judge(found: Identified, trained: Trained, current: LiftedModel, thresholds:
     if arrived < loops:
         reasons.append(f'its controller brings the estimated drift to the set-point in {arrived} '
                        f'of {loops} closed loops over its box')
-    return Verdict(tuple(reasons), _warnings(found, model, drift_rmse), rmse, drift_rmse,
+    return Decision(tuple(reasons), _warnings(found, model, drift_rmse), rmse, drift_rmse,
                    current_rmse, linear_rmse, found.noise, loops, arrived)
 
 
 def _warnings(found: Identified, model: LiftedModel, error: Array) -> tuple[str, ...]:
     """Say where the best drift errs by more than the noise explains."""
-    said = []
-    count = sum(len(record) for record in found.held_out)
+    warnings = []
+    count = sum(len(episode) for episode in found.held_out)
     for i, (name, unit) in enumerate(zip(model.states.names, model.states.units, strict=True)):
         noise = found.noise[i]
         excess = float(np.sqrt(max(0.0, error[i] ** 2 - noise ** 2)))
         # the mean square of `count` white errors strays by this share
         chance = noise * (_SIGMAS * np.sqrt(2.0 / count)) ** 0.5
-        if excess > max(chance, _NOTICEABLE * found.drift.box.state_scale[i]):
-            said.append(
+        if excess > max(chance, _NOTICEABLE * found.drift.box.states.scale[i]):
+            warnings.append(
                 f'the best drift errs by {error[i]:.3g} {unit} in {name}, of which {excess:.3g} '
                 f'{unit} is not noise ({noise:.3g} {unit} from sample to sample): something that '
                 'is not measured acts too, such as another state or a disturbance, and no lift '
                 'of what is measured can know it')
-    return tuple(said)
+    return tuple(warnings)
 
 
 def _closed_loops(model: LiftedModel, drift: DriftModel) -> tuple[int, int]:

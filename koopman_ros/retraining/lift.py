@@ -2,9 +2,11 @@
 # SPDX-License-Identifier: Apache-2.0
 
 
-"""From an estimated drift to a lift: samples, nominal point, training."""
+"""Training of a lift on an estimated drift: samples, nominal point, recipe."""
 
 from __future__ import annotations
+
+from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,12 +16,11 @@ from koopman_ros.identification import (
     fitted_starts,
     Identified,
     longest_step,
-    Record,
-    Stretches,
+    Segments,
 )
-from koopman_ros.learning import Growth, Plant, Samples, train, Trained
+from koopman_ros.learning import Growth, train, Trained
 from koopman_ros.learning.training import Watch
-from koopman_ros.lifting import LiftedModel
+from koopman_ros.plant_data import Episode, Plant, Samples
 
 Array = NDArray[np.float64]
 
@@ -35,28 +36,28 @@ _SLIGHTLY_OUTSIDE = 1.1
 _LOST = 1e3
 
 
-def drift_samples(drift: DriftModel, records: tuple[Record, ...]) -> Samples:
+def drift_samples(drift: DriftModel, episodes: tuple[Episode, ...]) -> Samples:
     """
-    Sample a drift along the paths that it predicts for some records, free of their noise.
+    Sample a drift along the paths that it predicts for some episodes, free of their noise.
 
     They are values of one smooth function, free of noise, so that training, choice and figures
-    may share the range among them; the plant's own held-out stretches judge the lift.
+    may share the range among them; the plant's own held-out segments judge the lift.
 
     :param drift: the estimate.
-    :param records: stretches; those that the drift does not follow are left out.
+    :param episodes: segments; those that the drift does not follow are left out.
     :raises ValueError: when it follows none.
     """
-    stretches = Stretches.of(records, longest_step(records))
-    x0, squares = fitted_starts(drift.rate, stretches, drift.box.state_scale)
-    followed = np.all(squares < drift.box.state_scale ** 2, axis=1)
+    segments = Segments.of(episodes, longest_step(episodes))
+    x0, squares = fitted_starts(drift.rate, segments, drift.box.states.scale)
+    followed = np.all(squares < drift.box.states.scale ** 2, axis=1)
     if not np.any(followed):
-        raise ValueError('the estimated drift follows none of the records: record longer, with '
+        raise ValueError('the estimated drift follows none of the episodes: record longer, with '
                          'steps of the input')
-    path = stretches.path(drift.rate, x0)[:-1]
-    inside = (stretches.steps > 0.0) & followed
-    # stretch by stretch, each in the order of its times
-    x, u = (np.swapaxes(a, 0, 1)[inside.T] for a in (path, stretches.u))
-    kept = _spread(drift.box.state_deviation(x))
+    path = segments.path(drift.rate, x0)[:-1]
+    inside = (segments.steps > 0.0) & followed
+    # segment by segment, each in the order of its times
+    x, u = (np.swapaxes(a, 0, 1)[inside.T] for a in (path, segments.u))
+    kept = _spread(drift.box.states.to_deviation(x))
     x, u = x[kept], u[kept]
     return Samples(x, drift.rate(x, u), u, np.arange(len(x)) % _SHARES)
 
@@ -74,7 +75,7 @@ def _spread(xi: Array) -> NDArray[np.int64]:
     low, high = xi.min(axis=0), xi.max(axis=0)
     cell = np.minimum((_CELLS * (xi - low) / (high - low)).astype(int), _CELLS - 1)
     cell = np.unique(cell, axis=0, return_inverse=True)[1].ravel()
-    # the rank of each sample within its cell, taken evenly along the record
+    # the rank of each sample within its cell, taken evenly along the episode
     order = np.argsort(cell, kind='stable')
     sizes = np.bincount(cell)
     quota = _quota(sizes, _MAX_SAMPLES)
@@ -108,7 +109,7 @@ def steady_point(drift: DriftModel, x: Array, u: Array) -> tuple[Array, Array]:
     :raises ValueError: when there is none nearby.
     """
     box = drift.box
-    xi, v = box.state_deviation(x), box.input_deviation(u)
+    xi, v = box.states.to_deviation(x), box.inputs.to_deviation(u)
     n_x = len(xi)
     held = np.linalg.matrix_rank(drift.B) == n_x
     for _ in range(50):
@@ -121,32 +122,30 @@ def steady_point(drift: DriftModel, x: Array, u: Array) -> tuple[Array, Array]:
             break
     near = np.all(np.abs(xi) <= _SLIGHTLY_OUTSIDE)
     if not (near and np.all(np.abs(drift.scaled_rate(xi, v)) < 1e-9)):
-        raise ValueError('no steady state was found within the range of the records: record '
+        raise ValueError('no steady state was found within the range of the episodes: record '
                          'around a state that the plant can hold')
-    center = 0.5 * (box.input_lower + box.input_upper)
-    return (0.5 * (box.state_lower + box.state_upper) + xi * box.state_scale,
-            center + v * box.input_scale)
+    return box.states.to_physical(xi), box.inputs.to_physical(v)
 
 
-def learn_lift(found: Identified, like: LiftedModel, n_z: int, *, seed: int, starts: int,
+def learn_lift(found: Identified, plant: Plant, n_z: int, *, seed: int, starts: int,
                watch: Watch | None = None) -> Trained:
     """
     Learn a lift of an estimated drift.
 
-    :param found: the estimate with the records that it was fitted to.
-    :param like: whose names, units and, where it suits, nominal point are taken over.
+    :param found: the estimate with the episodes that it was fitted to.
+    :param plant: names, units and, where the episodes surround it, the nominal point.
     :param n_z: number of coordinates.
     :param seed: of the training.
     :param starts: of each round.
     :param watch: sees the progress and can end it.
     :raises NoUsefulLift: when no lift is better than a linear model.
-    :raises ValueError: when the records hold no steady state.
+    :raises ValueError: when the episodes hold no steady state.
     """
     samples = drift_samples(found.drift, found.fitted)
     lower, upper = samples.x.min(axis=0), samples.x.max(axis=0)
-    within = (like.states.center > lower) & (like.states.center < upper)
-    x, u = steady_point(found.drift, np.where(within, like.states.center, 0.5 * (lower + upper)),
-                        like.inputs.center)
-    plant = Plant(like.provenance.plant, like.states.names, like.states.units, like.inputs.names,
-                  like.inputs.units, like.time_unit, x, u, found.drift.input_matrix)
-    return train(plant, samples, Growth(n_z), seed=seed, starts=starts, watch=watch)
+    within = (plant.nominal_state > lower) & (plant.nominal_state < upper)
+    x, u = steady_point(found.drift,
+                        np.where(within, plant.nominal_state, 0.5 * (lower + upper)),
+                        plant.nominal_input)
+    known = replace(plant, nominal_state=x, nominal_input=u, B=found.drift.input_matrix)
+    return train(known, samples, Growth(n_z), seed=seed, starts=starts, watch=watch)

@@ -2,7 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 
 
-"""Retraining from bags, from the first byte to the model file: one path for all who ask for it."""
+"""Retraining from bags to the model file."""
 
 from __future__ import annotations
 
@@ -17,27 +17,28 @@ import shutil
 
 import numpy as np
 
-from koopman_ros.bags import Account, Episode, loop_episodes
-from koopman_ros.identification import Identified, identify, Record, Stopped
+from koopman_ros.bags import Account, loop_episodes
+from koopman_ros.identification import Identified, identify, Stopped
 from koopman_ros.learning import NoUsefulLift, Progress, Trained
 from koopman_ros.lifting import LiftedModel, load, save
+from koopman_ros.plant_data import Episode
 from koopman_ros.retraining.coverage import coverage
-from koopman_ros.retraining.gate import judge, Thresholds, Verdict
+from koopman_ros.retraining.gate import decide, Decision, Thresholds
 from koopman_ros.retraining.lift import learn_lift
 
 ZERO_CELSIUS = 273.15  # K
 _NS = 1_000_000_000
 # Shares of the whole at which estimating, learning and judging begin.
-_STAGES = {'estimate': 0.05, 'learn': 0.35, 'judge': 0.9}
+_STAGES = {'estimate': 0.05, 'learn': 0.35, 'decide': 0.9}
 
-# Called with the share done in [0, 1] and what is done now; True asks for an end.
-Tell = Callable[[float, str], bool]
+# Called with the share done in [0, 1] and what is done now; True asks to stop.
+OnProgress = Callable[[float, str], bool]
 
 
 @dataclass(frozen=True)
 class Task:
     """
-    What to retrain from and with.
+    Input files, output file and settings of a retraining.
 
     :param bags: files or folders.
     :param output: model file to write, ending in ``.safetensors``.
@@ -78,17 +79,17 @@ class Task:
 
 
 @dataclass(frozen=True)
-class Outcome:
+class Retrained:
     """
-    What came of a task.
+    Result of a retraining.
 
     :param task: the task.
-    :param account: what was made of the bags.
+    :param account: counts of used and dropped measurements.
     :param found: the estimated drift.
     :param trained: the lift, None when there is none worth judging.
-    :param verdict: its figures, None without a lift.
+    :param decision: its figures, None without a lift.
     :param reasons: why it was refused; empty when it was accepted.
-    :param coverage: share of the cells of the state-input box that the records visit.
+    :param coverage: share of the cells of the state-input box that the episodes visit.
     :param present: the lift that was in use; its time unit is that of the drift.
     :param model_file: where the lift was written, or an empty string.
     """
@@ -97,7 +98,7 @@ class Outcome:
     account: Account
     found: Identified
     trained: Trained | None
-    verdict: Verdict | None
+    decision: Decision | None
     reasons: tuple[str, ...]
     coverage: float
     present: LiftedModel
@@ -114,7 +115,7 @@ class Outcome:
         figures: dict[str, object] = {
             'accepted': self.accepted,
             'reasons': list(self.reasons),
-            'warnings': list(self.verdict.warnings) if self.verdict else [],
+            'warnings': list(self.decision.warnings) if self.decision else [],
             'model_file': self.model_file,
             'measurements_read': self.account.measurements,
             'measurements_used': self.account.used,
@@ -125,22 +126,22 @@ class Outcome:
                                       * 60.0 / self.present.seconds_per_time_unit),
             'noise_kelvin': float(self.found.noise[0]),
         }
-        if self.verdict and self.trained:
+        if self.decision and self.trained:
             figures |= {
-                'heldout_error_kelvin': float(self.verdict.rmse[0]),
-                'heldout_error_of_present_lift_kelvin': float(self.verdict.current_rmse[0]),
-                'heldout_error_of_linear_model_kelvin': float(self.verdict.linear_rmse[0]),
-                'heldout_rw': self.trained.report.fit.rw,
-                'heldout_rx': self.trained.report.fit.rx,
-                'condition': self.trained.report.fit.cond,
-                'closed_loops': self.verdict.loops,
-                'closed_loops_arrived': self.verdict.arrived,
+                'heldout_error_kelvin': float(self.decision.rmse[0]),
+                'heldout_error_of_present_lift_kelvin': float(self.decision.current_rmse[0]),
+                'heldout_error_of_linear_model_kelvin': float(self.decision.linear_rmse[0]),
+                'heldout_rw': self.trained.figures.fit.rw,
+                'heldout_rx': self.trained.figures.fit.rx,
+                'condition': self.trained.figures.fit.cond,
+                'closed_loops': self.decision.loops,
+                'closed_loops_arrived': self.decision.arrived,
             }
         return {name: None if isinstance(value, float) and not np.isfinite(value) else value
                 for name, value in figures.items()}
 
 
-def retrain(task: Task, tell: Tell = lambda *_: False) -> Outcome:
+def retrain(task: Task, on_progress: OnProgress = lambda *_: False) -> Retrained:
     """
     Read the bags, estimate the drift, learn a lift of it, judge it, and write it.
 
@@ -148,55 +149,57 @@ def retrain(task: Task, tell: Tell = lambda *_: False) -> Outcome:
     ``.previous.safetensors``; a refused one goes to ``.refused.safetensors``.
 
     :param task: what to do.
-    :param tell: hears of the progress and can end it.
+    :param on_progress: receives the progress and can stop it.
     :raises BagReadError: for bags that cannot be used.
     :raises ModelFileError: when the present lift cannot be read.
-    :raises ValueError: for records that do not determine a model, or a task that does not fit.
-    :raises Stopped: when `tell` asked for it; nothing is written then.
+    :raises ValueError: for episodes that do not determine a model, or a task that does not fit.
+    :raises Stopped: when `on_progress` asked for it; nothing is written then.
     """
     thresholds = Thresholds(task.margin, task.condition)
     if Path(task.output).suffix != '.safetensors':
         raise ValueError(f'output = {task.output!r} must end in .safetensors')
     current = load(task.model)
     _check_temperatures(current, task.model)
-    # whoever cannot write there should learn it now
+    # a folder that cannot be written should fail now, not after the training
     Path(task.output).parent.mkdir(parents=True, exist_ok=True)
-    _go_on(tell(0.0, 'reading bags'))
-    episodes, account = loop_episodes(
+    _stop_if(on_progress(0.0, 'reading bags'))
+    recorded, account = loop_episodes(
         task.bags, task.temperature_topic, task.coolant_topic,
         input_delay_ns=round(task.input_delay * _NS))
-    if not episodes:
-        raise ValueError('the bags hold no usable stretch of measurements: '
+    if not recorded:
+        raise ValueError('the bags hold no usable segment of measurements: '
                          + '; '.join(account.lines()))
-    records = [_record(episode, current.seconds_per_time_unit) for episode in episodes]
+    episodes = [_in_model_units(episode, current.seconds_per_time_unit) for episode in recorded]
     B = None
     if task.input_gain:
         B = np.array([[task.input_gain * current.seconds_per_time_unit / 60.0]])
-    found = identify(records, B=B, seed=task.seed, watch=lambda done, total, text: tell(
-        _at('estimate', done / total), f'estimating: {text}'))
-    covered = coverage(records, found.drift.box)
+    found = identify(
+        replace(current.plant, B=B), episodes, seed=task.seed,
+        watch=lambda done, total, text: on_progress(
+            _at('estimate', done / total), f'estimating: {text}'))
+    covered = coverage(episodes, found.drift.box)
     trained: Trained | None = None
-    verdict: Verdict | None = None
+    decision: Decision | None = None
     reasons: tuple[str, ...] = ()
     try:
-        trained = learn_lift(found, current, task.coordinates, seed=task.seed,
-                             starts=task.starts, watch=lambda now: tell(
+        trained = learn_lift(found, current.plant, task.coordinates, seed=task.seed,
+                             starts=task.starts, watch=lambda now: on_progress(
                                  _at('learn', now.finished / now.total), _learning(now)))
     except NoUsefulLift as error:
         reasons = (str(error),)
     # a training that was stopped ends with its best so far
-    _go_on(tell(_at('judge', 0.0), 'judging'))
+    _stop_if(on_progress(_at('decide', 0.0), 'judging'))
     if trained is not None:
-        verdict = judge(found, trained, current, thresholds)
-        reasons = verdict.reasons
-        _go_on(tell(_at('judge', 0.9), 'writing'))
-    outcome = Outcome(task, account, found, trained, verdict, reasons, covered, current)
-    if trained is None or verdict is None:
-        return outcome
-    model = _with_provenance(trained.model, outcome, records)
-    path = _place(Path(task.output), outcome.accepted)
+        decision = decide(found, trained, current, thresholds)
+        reasons = decision.reasons
+        _stop_if(on_progress(_at('decide', 0.9), 'writing'))
+    retrained = Retrained(task, account, found, trained, decision, reasons, covered, current)
+    if trained is None or decision is None:
+        return retrained
+    model = _with_provenance(trained.model, retrained, episodes)
+    path = _place(Path(task.output), retrained.accepted)
     save(model, path)
-    return replace(outcome, trained=replace(trained, model=model), model_file=str(path))
+    return replace(retrained, trained=replace(trained, model=model), model_file=str(path))
 
 
 def _check_temperatures(model: LiftedModel, path: str) -> None:
@@ -213,7 +216,7 @@ def _at(stage: str, share: float) -> float:
     return begin + share * (end - begin)
 
 
-def _go_on(stop: bool) -> None:
+def _stop_if(stop: bool) -> None:
     if stop:
         raise Stopped
 
@@ -223,29 +226,26 @@ def _learning(now: Progress) -> str:
     return f'learning: n_z {now.n_z}, start {min(now.finished + 1, now.total)} of {now.total}{rw}'
 
 
-def _record(episode: Episode, seconds: float) -> Record:
-    """Convert an episode to kelvin and to time units since its first measurement."""
-    origin = episode.stamp_ns[0]
-    return Record((episode.stamp_ns - origin) / _NS / seconds,
-                  episode.celsius[:, None] + ZERO_CELSIUS,
-                  (episode.input_ns - origin) / _NS / seconds,
-                  episode.input_celsius[:, None] + ZERO_CELSIUS)
+def _in_model_units(episode: Episode, seconds: float) -> Episode:
+    return Episode(episode.time / seconds, episode.x + ZERO_CELSIUS,
+                   episode.input_time / seconds, episode.u + ZERO_CELSIUS)
 
 
-def _with_provenance(model: LiftedModel, outcome: Outcome, records: list[Record]) -> LiftedModel:
-    assert outcome.verdict is not None
+def _with_provenance(model: LiftedModel, retrained: Retrained, episodes: list[Episode]
+                     ) -> LiftedModel:
+    assert retrained.decision is not None
     sha = hashlib.sha256()
-    for record in records:
-        for array in (record.time, record.x, record.input_time, record.u):
+    for episode in episodes:
+        for array in (episode.time, episode.x, episode.input_time, episode.u):
             sha.update(np.ascontiguousarray(array).astype('<f8').tobytes())
     metrics = {**model.provenance.metrics,
-               'rollout_rmse': float(outcome.verdict.rmse[0]),
-               'noise': float(outcome.verdict.noise[0]), 'coverage': outcome.coverage}
+               'rollout_rmse': float(retrained.decision.rmse[0]),
+               'noise': float(retrained.decision.noise[0]), 'coverage': retrained.coverage}
     # a refused lift may diverge
     metrics = {name: value for name, value in metrics.items() if np.isfinite(value)}
     return replace(model, provenance=replace(
         model.provenance, data_digest=sha.hexdigest(), metrics=metrics,
-        method=f'{outcome.found.method}, drift of degree {outcome.found.drift.degree}'))
+        method=f'{retrained.found.method}, drift of degree {retrained.found.drift.degree}'))
 
 
 def _place(output: Path, accepted: bool) -> Path:

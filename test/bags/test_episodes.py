@@ -17,10 +17,10 @@ from koopman_ros.bags import (
     Account,
     BagReadError,
     BagWriter,
-    Episode,
     loop_episodes,
     message_definition,
 )
+from koopman_ros.plant_data import Episode
 
 TEMPERATURE, COOLANT = '/temperature', '/coolant_setpoint'
 TYPE = 'sensor_msgs/msg/Temperature'
@@ -82,13 +82,19 @@ def write(samples: Any, tmp_path: Path) -> Callable[..., Path]:
 
 def read(*bags: Path) -> tuple[list[Episode], Account]:
     episodes, account = loop_episodes(bags, TEMPERATURE, COOLANT)
-    assert account.used == sum(len(episode.stamp_ns) for episode in episodes)
+    assert account.used == sum(map(len, episodes))
     assert account.lines()[0] == f'{account.used} of {account.measurements} measurements used'
     return episodes, account
 
 
-def seconds(times: np.ndarray, wall: bool = False) -> list[float]:
-    return [(t - (WALL if wall else 0)) / SECOND for t in times.tolist()]
+def stamps(episode: Episode) -> list[float]:
+    """Return the seconds of the measurements, of which the value of the first one tells."""
+    return (episode.time + episode.x[0, 0]).tolist()
+
+
+def acts(episode: Episode) -> list[float]:
+    """Return the seconds from which the inputs act."""
+    return (episode.input_time + episode.x[0, 0]).tolist()
 
 
 # What acts when.
@@ -96,13 +102,12 @@ def seconds(times: np.ndarray, wall: bool = False) -> list[float]:
 
 def test_lock_step_answers_act_from_their_stamp_on(write: Callable[..., Path]) -> None:
     (episode,), account = read(write(loop(20)))
-    assert seconds(episode.stamp_ns) == list(range(1, 21))
-    assert episode.celsius.tolist() == list(range(1, 21))
+    assert stamps(episode) == list(range(1, 21))
+    assert episode.x[:, 0].tolist() == list(range(1, 21))
     # the last command acts after the last measurement, and does not count
-    assert seconds(episode.input_ns) == list(range(1, 20))
-    assert episode.input_celsius.tolist() == [100.0 + k for k in range(1, 20)]
+    assert acts(episode) == list(range(1, 20))
+    assert episode.u[:, 0].tolist() == [100.0 + k for k in range(1, 20)]
     assert account.lines() == ['20 of 20 measurements used']
-    assert episode.bag.endswith('run.mcap')
 
 
 def test_wall_clock_answers_act_when_they_arrive(write: Callable[..., Path]) -> None:
@@ -112,15 +117,15 @@ def test_wall_clock_answers_act_when_they_arrive(write: Callable[..., Path]) -> 
         Said(COOLANT, k, 100.0 + k, k + 0.14))]
     (episode,), _ = read(write(said, wall=True))
     # the first measurement was taken before any command
-    assert seconds(episode.stamp_ns, wall=True) == list(range(2, 21))
-    assert seconds(episode.input_ns, wall=True)[:3] == pytest.approx([1.12, 2.12, 3.12])
+    assert stamps(episode) == list(range(2, 21))
+    assert acts(episode)[:3] == pytest.approx([1.12, 2.12, 3.12])
 
 
 def test_short_delay_counts_as_none(write: Callable[..., Path]) -> None:
     said = [s for k in range(1, 21) for s in (
         Said(TEMPERATURE, k, float(k), k + 0.02), Said(COOLANT, k, 100.0 + k, k + 0.025))]
     (episode,), _ = read(write(said, wall=True))
-    assert seconds(episode.input_ns, wall=True) == list(range(1, 20))
+    assert acts(episode) == list(range(1, 20))
 
 
 def test_one_stray_receipt_does_not_hide_the_wall_clock(write: Callable[..., Path]) -> None:
@@ -129,7 +134,7 @@ def test_one_stray_receipt_does_not_hide_the_wall_clock(write: Callable[..., Pat
         Said(COOLANT, k, 100.0 + k, k + 0.14))]
     said.sort(key=lambda s: s.received or 0.0)
     (episode,), _ = read(write(said, wall=True))
-    assert seconds(episode.input_ns, wall=True)[0] == pytest.approx(1.12)
+    assert acts(episode)[0] == pytest.approx(1.12)
 
 
 def test_coolant_that_stays_is_one_input(write: Callable[..., Path]) -> None:
@@ -137,24 +142,25 @@ def test_coolant_that_stays_is_one_input(write: Callable[..., Path]) -> None:
     said = [s for k, level in enumerate(levels, 1)
             for s in (*measured(k), Said(COOLANT, k, level))]
     (episode,), _ = read(write(said))
-    assert seconds(episode.input_ns) == [1.0, 8.0, 15.0]
-    assert episode.input_celsius.tolist() == [20.0, 25.0, 20.0]
+    assert acts(episode) == [1.0, 8.0, 15.0]
+    assert episode.u[:, 0].tolist() == [20.0, 25.0, 20.0]
 
 
 def test_commands_between_measurements_keep_their_time(write: Callable[..., Path]) -> None:
     said = [Said(COOLANT, 0.5, 20.0), *measured(*range(1, 12)), Said(COOLANT, 5.25, 30.0),
             Said(COOLANT, 5.75, 10.0)]
     (episode,), _ = read(write(said))
-    assert seconds(episode.input_ns) == [0.5, 5.25, 5.75]
+    assert acts(episode) == [0.5, 5.25, 5.75]
 
 
 def test_dead_time_of_the_actuator(write: Callable[..., Path]) -> None:
     (episode,), account = loop_episodes([write(loop(20))], TEMPERATURE, COOLANT,
                                         input_delay_ns=2 * SECOND + 1)
-    assert episode.input_ns[:3].tolist() == [3 * SECOND + 1, 4 * SECOND + 1, 5 * SECOND + 1]
-    assert episode.input_celsius[:3].tolist() == [101.0, 102.0, 103.0]
+    # to the nanosecond, from the first measurement on, at 4 s
+    assert episode.input_time[:3].tolist() == [1e-9 - 1.0, 1e-9, 1e-9 + 1.0]
+    assert episode.u[:3, 0].tolist() == [101.0, 102.0, 103.0]
     # nobody knows what acted before
-    assert seconds(episode.stamp_ns)[0] == 4.0
+    assert stamps(episode)[0] == 4.0
     assert account.dropped == {'before the first coolant': 3}
 
 
@@ -162,8 +168,8 @@ def test_last_word_for_a_measurement_counts(write: Callable[..., Path]) -> None:
     said = [*loop(12), Said(COOLANT, 5.0, 77.0, 5.2)]
     said.sort(key=lambda s: s.stamp if s.received is None else s.received)
     (episode,), _ = read(write(said))
-    assert episode.input_celsius[4] == 77.0
-    assert len(episode.input_celsius) == 11
+    assert episode.u[4, 0] == 77.0
+    assert len(episode.u) == 11
 
 
 @pytest.mark.parametrize('wall', [True, False])
@@ -176,7 +182,7 @@ def test_commands_without_a_stamp_act_when_received(write: Callable[..., Path], 
     said.sort(key=lambda s: s.received or 0.0)
     (episode,), account = read(write(said, wall=wall))
     # the clocks' nanoseconds since 1970 are told apart to some hundred
-    assert seconds(episode.input_ns, wall) == pytest.approx([1.5, 12.25], abs=1e-5)
+    assert acts(episode) == pytest.approx([1.5, 12.25], abs=1e-5)
     assert account.lines() == ['29 of 30 measurements used', '1 dropped: before the first coolant']
 
 
@@ -184,19 +190,20 @@ def test_commands_without_a_stamp_act_when_received(write: Callable[..., Path], 
 
 
 def test_gap_ends_an_episode(write: Callable[..., Path]) -> None:
-    (first, second), account = read(write([*loop(15), *loop(12, 40)]))
-    assert seconds(first.stamp_ns)[-1] == 15.0
-    assert seconds(second.stamp_ns)[0] == 40.0
+    bag = write([*loop(15), *loop(12, 40)])
+    (first, second), account = read(bag)
+    assert stamps(first)[-1] == 15.0
+    assert stamps(second)[0] == 40.0
     # the coolant of the second one begins with the last command before it
-    assert seconds(second.input_ns)[0] == 40.0
+    assert acts(second)[0] == 40.0
     assert account.notes == [
-        f'{first.bag}: gap of 25.000 s at 15.000 s, a new episode begins']
+        f'{bag}: gap of 25.000 s at 15.000 s, a new episode begins']
 
 
 def test_a_few_lost_samples_are_no_gap(write: Callable[..., Path]) -> None:
     said = [s for s in loop(20) if not (s.topic == TEMPERATURE and s.stamp in (7.0, 8.0))]
     (episode,), account = read(write(said))
-    assert len(episode.stamp_ns) == 18
+    assert len(episode) == 18
     assert account.lines() == ['18 of 18 measurements used']
 
 
@@ -204,30 +211,33 @@ def test_spike_is_dropped_and_jump_ends_an_episode(write: Callable[..., Path]) -
     added = {k: 500.0 if k == 40 else 300.0 * (k > 70) for k in range(1, 121)}
     said = [replace(one, value=one.value + added[round(one.stamp)])
             if one.topic == TEMPERATURE else one for one in loop(120)]
-    (first, second), account = read(write(said))
-    assert seconds(first.stamp_ns) == [*range(1, 40), *range(41, 71)]
-    assert seconds(second.stamp_ns) == list(range(71, 121))
+    bag = write(said)
+    (first, second), account = read(bag)
+    assert stamps(first) == [*range(1, 40), *range(41, 71)]
+    assert (second.time + 71.0).tolist() == list(range(71, 121))
+    assert second.x[0, 0] == 371.0
     assert account.dropped == {'spike of a single sample': 1}
     assert account.notes == [
-        f'{first.bag}: jump to 371.00 degC at 70.000 s, a new episode begins']
+        f'{bag}: jump to 371.00 degC at 70.000 s, a new episode begins']
 
 
 def test_command_before_a_gap_is_held_over_it(write: Callable[..., Path]) -> None:
     said = [Said(COOLANT, 0.5, 20.0), *measured(*range(1, 13)), *measured(*range(60, 72))]
     (first, second), _ = read(write(said))
-    assert [seconds(e.input_ns) for e in (first, second)] == [[0.5], [0.5]]
+    assert [acts(e) for e in (first, second)] == [[0.5], [0.5]]
 
 
 def test_time_set_back_begins_anew(write: Callable[..., Path]) -> None:
     restarted = [Said(s.topic, s.stamp, s.value + 500.0, (s.received or s.stamp) + 100.0)
                  for s in loop(12)]
-    (first, second), account = read(write([*loop(30), *restarted]))
-    assert (len(first.stamp_ns), len(second.stamp_ns)) == (30, 12)
-    assert second.celsius[0] == 501.0
+    bag = write([*loop(30), *restarted])
+    (first, second), account = read(bag)
+    assert (len(first), len(second)) == (30, 12)
+    assert second.x[0, 0] == 501.0
     # what acted before is not what acts now
-    assert second.input_celsius[0] == 601.0
+    assert second.u[0, 0] == 601.0
     assert account.notes == [
-        f'{first.bag}: time was set back by 29.000 s, a new episode begins']
+        f'{bag}: time was set back by 29.000 s, a new episode begins']
 
 
 def test_what_happens_often_is_told_once(write: Callable[..., Path]) -> None:
@@ -252,9 +262,9 @@ def test_late_and_repeated_stamps_are_put_in_order(write: Callable[..., Path]) -
     said.insert(12, Said(TEMPERATURE, 5.5, 5.5, 6.2))
     said.insert(20, Said(TEMPERATURE, 9.0, 999.0, 9.9))
     (episode,), account = read(write(said))
-    assert 5.5 in episode.celsius
-    assert 999.0 not in episode.celsius
-    assert np.all(np.diff(episode.stamp_ns) > 0)
+    assert 5.5 in episode.x
+    assert 999.0 not in episode.x
+    assert np.all(np.diff(episode.time) > 0)
     assert account.lines() == [
         '21 of 22 measurements used', '1 dropped: measurement with a repeated stamp']
 
@@ -267,24 +277,24 @@ def test_values_that_are_no_temperature(write: Callable[..., Path], topic: str, 
             for s in loop(20)]
     (episode,), account = read(write(said))
     assert account.dropped == {'not a temperature': 1}
-    assert len(episode.stamp_ns) == (19 if topic == TEMPERATURE else 20)
-    assert np.all(np.isfinite(episode.celsius))
+    assert len(episode) == (19 if topic == TEMPERATURE else 20)
+    assert np.all(np.isfinite(episode.x))
     if topic == COOLANT:
         # the plant holds the last good one, too
-        assert 107.0 not in episode.input_celsius
-        assert len(episode.input_celsius) == 18
+        assert 107.0 not in episode.u
+        assert len(episode.u) == 18
 
 
 def test_measurements_before_the_first_command_are_dropped(write: Callable[..., Path]) -> None:
     (episode,), account = read(write([*measured(*range(1, 16)), *loop(14, 16)]))
-    assert seconds(episode.stamp_ns)[0] == 16.0
+    assert stamps(episode)[0] == 16.0
     assert account.lines() == [
         '14 of 29 measurements used', '15 dropped: before the first coolant']
 
 
 def test_short_stretches_are_dropped(write: Callable[..., Path]) -> None:
     (episode,), account = read(write([*loop(15), *loop(9, 40)]))
-    assert len(episode.stamp_ns) == 15
+    assert len(episode) == 15
     assert account.dropped == {'in a stretch of fewer than 10': 9}
 
 
@@ -311,8 +321,7 @@ def test_nothing_to_use(write: Callable[..., Path], said: list[Said], lines: lis
 def test_several_bags(write: Callable[..., Path]) -> None:
     bags = [write(loop(15), 'a.mcap'), write(loop(12, 3), 'b')]
     (first, second), account = read(*bags)
-    assert (first.bag, second.bag) == tuple(map(str, bags))
-    assert (len(first.stamp_ns), len(second.stamp_ns)) == (15, 12)
+    assert (len(first), len(second)) == (15, 12)
     assert account.lines() == ['27 of 27 measurements used']
 
 
@@ -332,7 +341,7 @@ def test_bag_that_was_not_closed(write: Callable[..., Path], cut: int, left: int
     content = bag.read_bytes()
     bag.write_bytes(content[:len(content) - cut])
     (episode,), account = read(bag)
-    assert len(episode.stamp_ns) == left
+    assert len(episode) == left
     assert account.notes == [
         f'{bag} was not closed or is damaged: read up to its last whole record']
 
@@ -344,7 +353,7 @@ def test_damage_in_a_closed_bag_is_told(write: Callable[..., Path]) -> None:
     content[content.index(np.float64(15.0).tobytes())] ^= 1
     bag.write_bytes(content)
     (episode,), account = read(bag)
-    assert len(episode.stamp_ns) == 10
+    assert len(episode) == 10
     assert account.notes == [f'{bag} is damaged: 40 messages that it counts could not be read']
 
 

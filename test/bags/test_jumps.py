@@ -16,7 +16,7 @@ DESIGN = RandomStepDesign(281.33, 300.55, 305.0, 327.0, (0.5, 2.0), 1.0 / 60.0, 
 @pytest.fixture(scope='module')
 def motion() -> np.ndarray:
     """Return twenty minutes of the reactor under random steps, a sample a second [degC]."""
-    states = random_steps(one_state_reactor(), DESIGN, 20.0, 5).trajectory.states
+    states = random_steps(one_state_reactor(), DESIGN, 20.0, 5).x
     return states[:, 0] - 273.15
 
 

@@ -6,10 +6,15 @@
 import numpy as np
 import pytest
 
-from koopman_ros.identification import Box, DriftModel, Record
-from koopman_ros.identification.drift import regress, scaled_input_matrix
+from koopman_ros.identification import (
+    box_of,
+    DriftModel,
+)
+from koopman_ros.identification.drift import regress
+from koopman_ros.plant_data import Episode
+from support.known_plants import box, CUBIC
 
-BOX = Box(np.array([300.0, 0.2]), np.array([330.0, 0.9]), np.array([280.0]), np.array([305.0]))
+BOX = box([300.0, 0.2], [330.0, 0.9], [280.0], [305.0])
 
 
 def model(degree=3, seed=0):
@@ -18,49 +23,40 @@ def model(degree=3, seed=0):
     return DriftModel(BOX, degree, rng.standard_normal((count, 2)), rng.standard_normal((2, 1)))
 
 
-def test_box_is_the_range_of_all_records():
-    records = [Record(np.arange(3.0), np.array([[1.0], [5.0], [2.0]]), np.array([0.0, 1.0]),
-                      np.array([[7.0], [9.0]])),
-               Record(np.arange(2.0), np.array([[-3.0], [0.0]]), np.array([-1.0, 0.5]),
-                      np.array([[8.0], [20.0]]))]
-    box = Box.of(records)
-    assert (box.state_lower, box.state_upper) == ([-3.0], [5.0])
-    assert (box.input_lower, box.input_upper) == ([7.0], [20.0])
-    assert box.state_deviation(np.array([-3.0, 1.0, 5.0])).tolist() == [-1.0, 0.0, 1.0]
-    assert box.input_deviation(np.array([7.0, 20.0])).tolist() == [-1.0, 1.0]
-
-
-@pytest.mark.parametrize(('x', 'u', 'words'), [
-    ([[310.0], [310.0]], [[1.0], [2.0]], 'state 0 never moves from 310: excite the plant'),
-    ([[310.0], [311.0]], [[300.0], [300.0]], 'input 0 never moves from 300: excite the plant'),
-])
-def test_box_of_what_never_moves(x, u, words):
-    with pytest.raises(ValueError, match=words):
-        Box.of([Record(np.arange(2.0), np.array(x), np.arange(2.0), np.array(u))])
+def test_box_is_the_range_of_all_episodes():
+    episodes = [Episode(np.arange(3.0), np.array([[1.0], [5.0], [2.0]]), np.array([0.0, 1.0]),
+                        np.array([[7.0], [9.0]])),
+                Episode(np.arange(2.0), np.array([[-3.0], [0.0]]), np.array([-1.0, 0.5]),
+                        np.array([[8.0], [20.0]]))]
+    found = box_of(CUBIC.plant, episodes)
+    assert (found.states.lower, found.states.upper) == ([-3.0], [5.0])
+    assert (found.inputs.lower, found.inputs.upper) == ([7.0], [20.0])
+    assert found.states.to_deviation(np.array([-3.0, 1.0, 5.0])).tolist() == [-1.0, 0.0, 1.0]
+    assert found.inputs.to_deviation(np.array([7.0, 20.0])).tolist() == [-1.0, 1.0]
 
 
 def test_rate_in_units():
     # dx/dt = 2 x - 3 u + 4 on boxes with other centers and scales
-    box = Box(np.array([1.0]), np.array([5.0]), np.array([10.0]), np.array([20.0]))
+    narrow = box([1.0], [5.0], [10.0], [20.0])
     # x = 3 + 2 xi, u = 15 + 5 v; dxi/dt = (2 (3 + 2 xi) - 3 (15 + 5 v) + 4) / 2
-    drift = DriftModel(box, 1, np.array([[-17.5], [2.0]]), np.array([[-7.5]]))
+    drift = DriftModel(narrow, 1, np.array([[-17.5], [2.0]]), np.array([[-7.5]]))
     x, u = np.array([[1.0], [4.0]]), np.array([[12.0], [0.0]])
     assert drift.rate(x, u) == pytest.approx(2.0 * x - 3.0 * u + 4.0, abs=1e-12)
     assert drift.input_matrix == pytest.approx(np.array([[-3.0]]))
     assert drift.slope(np.array([2.0])) == pytest.approx(np.array([[2.0]]))
-    assert scaled_input_matrix(box, np.array([[-3.0]])) == pytest.approx(drift.B)
+    assert narrow.input_matrix(np.array([[-3.0]])) == pytest.approx(drift.B)
 
 
 @pytest.mark.parametrize('degree', [1, 2, 3])
 def test_slopes_against_differences(degree):
     drift, x, u = model(degree), np.array([312.0, 0.7]), np.array([290.0])
-    step = 1e-6 * BOX.state_scale
+    step = 1e-6 * BOX.states.scale
     differences = np.stack([(drift.rate(x + h, u) - drift.rate(x - h, u)) / (2.0 * h.sum())
                             for h in np.diag(step)], axis=-1)
     # rounding of rates of some ten over a step of 1e-6 of the range
     assert drift.slope(x) == pytest.approx(differences, rel=1e-7)
-    scaled = drift.scaled_slope(BOX.state_deviation(x))
-    assert scaled * BOX.state_scale[:, None] / BOX.state_scale == pytest.approx(drift.slope(x))
+    scaled = drift.scaled_slope(BOX.states.to_deviation(x))
+    assert scaled * BOX.states.scale[:, None] / BOX.states.scale == pytest.approx(drift.slope(x))
 
 
 @pytest.mark.parametrize('known', [True, False])

@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 The koopman_ros Authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""Choice of a drift model on held-out stretches."""
+"""Choice of a drift model on held-out segments."""
 
 from dataclasses import replace
 import sys
@@ -11,16 +11,15 @@ import numpy as np
 import pytest
 
 from koopman_ros.identification import (
-    Box,
-    cut,
+    box_of,
     identify,
     longest_step,
-    Record,
+    Segments,
     Stopped,
-    Stretches,
     weak_form,
 )
 from koopman_ros.identification.output_error import _Problem
+from koopman_ros.plant_data import cut, Episode
 from koopman_ros.solvers.levenberg_marquardt import normal_equations
 from support.known_plants import CUBIC, PAIR
 
@@ -34,7 +33,7 @@ def noisy():
 
 @pytest.fixture(scope='module')
 def found(noisy):
-    return identify([noisy], degrees=(1, 2, 3, 4), windows=(10, 20))
+    return identify(CUBIC.plant, [noisy], degrees=(1, 2, 3, 4), windows=(10, 20))
 
 
 def test_takes_output_error_and_the_right_degree(found):
@@ -51,7 +50,7 @@ def test_scores_say_what_was_tried(found):
     assert [(score.degree, score.method.split(' from')[0]) for score in found.scores] == [
         (degree, method) for degree in (1, 2, 3, 4) for method in (
             'weak form, 10 samples', 'weak form, 20 samples', 'total variation', 'output error')]
-    scale = found.drift.box.state_scale
+    scale = found.drift.box.states.scale
     for score in found.scores:
         assert score.cost == pytest.approx(float(np.mean((score.rmse / scale) ** 2)))
     cubic = [score.rmse[0] for score in found.scores if score.degree == 3]
@@ -66,12 +65,12 @@ def test_stretches_are_fitted_to_or_held_out(noisy, found):
     assert [p.time[0] for p in pieces] == [noisy.time[0], *(p.time[-1] for p in pieces[:-1])]
     assert pieces[-1].time[-1] == noisy.time[-1]
     # the range is known from what is fitted to
-    assert np.concatenate([p.x for p in found.fitted]).min() == found.drift.box.state_lower
-    assert np.concatenate([p.x for p in found.fitted]).max() == found.drift.box.state_upper
+    assert np.concatenate([p.x for p in found.fitted]).min() == found.drift.box.states.lower
+    assert np.concatenate([p.x for p in found.fitted]).max() == found.drift.box.states.upper
 
 
 def test_split_follows_the_seed(noisy, found):
-    other = identify([noisy], degrees=(1,), windows=(20,), seed=1)
+    other = identify(CUBIC.plant, [noisy], degrees=(1,), windows=(20,), seed=1)
     assert [p.time[0] for p in other.held_out] != [p.time[0] for p in found.held_out]
 
 
@@ -81,34 +80,35 @@ def test_held_out_stretches_change_nothing(noisy, found):
     inside = ((noisy.time > start) & (noisy.time < end))[:, None]
     centre = noisy.x[inside[:, 0]].mean()
     spoilt = replace(noisy, x=np.where(inside, centre + 0.1 * (noisy.x - centre), noisy.x))
-    again = identify([spoilt], degrees=(1, 2, 3, 4), windows=(10, 20))
+    again = identify(CUBIC.plant, [spoilt], degrees=(1, 2, 3, 4), windows=(10, 20))
     assert again.drift.coefficients.tobytes() == found.drift.coefficients.tobytes()
 
 
 def test_known_input_matrix_is_kept(noisy):
-    known = identify([noisy.part(0, 500)], B=CUBIC.B, degrees=(1, 3), windows=(20,))
+    known = identify(replace(CUBIC.plant, B=CUBIC.B), [noisy.part(0, 500)], degrees=(1, 3),
+                     windows=(20,))
     assert known.drift.input_matrix == pytest.approx(CUBIC.B, rel=1e-12)
     assert known.linear.input_matrix == pytest.approx(CUBIC.B, rel=1e-12)
 
 
 def test_two_states_two_inputs_and_records_of_different_length():
     records = [PAIR.excited(n, 0.1, noise=0.01, seed=i) for i, n in enumerate((260, 120, 25, 9))]
-    found = identify(records, degrees=(1, 2), windows=(10, 20))
+    found = identify(PAIR.plant, records, degrees=(1, 2), windows=(10, 20))
     assert found.drift.degree == 2
     assert PAIR.misfit(found.drift) < 0.03
     assert found.drift.input_matrix == pytest.approx(PAIR.B, abs=0.03)
     assert found.noise == pytest.approx([0.01, 0.01], rel=0.2)
-    # the shortest one is no stretch to learn from
+    # the shortest one is no segment to learn from
     assert min(len(part) for part in (*found.fitted, *found.held_out)) >= 10
 
 
 def test_without_noise_it_is_exact():
-    found = identify([CUBIC.excited(300, 0.1)], degrees=(1, 3), windows=(20,))
+    found = identify(CUBIC.plant, [CUBIC.excited(300, 0.1)], degrees=(1, 3), windows=(20,))
     assert CUBIC.misfit(found.drift) < 3e-5
 
 
 def test_the_same_to_the_bit(noisy):
-    first, second = (identify([noisy.part(0, 400)], degrees=(1, 3), windows=(20,))
+    first, second = (identify(CUBIC.plant, [noisy.part(0, 400)], degrees=(1, 3), windows=(20,))
                      for _ in range(2))
     for a, b in ((first.drift, second.drift), (first.linear, second.linear)):
         assert a.coefficients.tobytes() == b.coefficients.tobytes()
@@ -117,10 +117,10 @@ def test_the_same_to_the_bit(noisy):
 
 
 def test_output_error_is_taken_although_chance_is_against_it():
-    """On a short record the few stretches to choose by rate luck above skill."""
+    """On a short record the few segments to choose by rate luck above skill."""
     for seed in range(2):
         record = CUBIC.excited(300, 0.1, noise=0.05, seed=seed)
-        found = identify([record], degrees=(2, 3), windows=(10, 20))
+        found = identify(CUBIC.plant, [record], degrees=(2, 3), windows=(10, 20))
         assert found.method.startswith('output error')
 
 
@@ -134,10 +134,10 @@ def test_progress_and_stop(noisy):
         seen.append((done, total, text))
         return False
 
-    identify([noisy.part(0, 200)], degrees=(1, 3), windows=(10,), watch=watch)
+    identify(CUBIC.plant, [noisy.part(0, 200)], degrees=(1, 3), windows=(10,), watch=watch)
     assert list(dict.fromkeys(seen)) == [
         (0, 3, 'drift of degree 1'), (1, 3, 'drift of degree 3'),
-        (2, 3, 'drift of degree 3 on all records')]
+        (2, 3, 'drift of degree 3 on all episodes')]
     # a refinement is watched at each of its steps
     assert all(seen.count(step) > 2 for step in seen)
 
@@ -151,7 +151,7 @@ def test_progress_and_stop(noisy):
             return calls == stop
 
         with pytest.raises(Stopped):
-            identify([noisy.part(0, 200)], degrees=(1, 3), windows=(10,), watch=end)
+            identify(CUBIC.plant, [noisy.part(0, 200)], degrees=(1, 3), windows=(10,), watch=end)
         assert calls == stop
 
 
@@ -166,31 +166,31 @@ def changed(record, **values):
 @pytest.mark.parametrize(('records', 'words'), [
     ([CUBIC.excited(159, 0.1)], '159 samples are too few .* at least 160, better some thousand'),
     ([CUBIC.excited(9, 0.1, seed=i) for i in range(30)],
-     'the records have 0 uninterrupted stretches of 10 samples, at least 8 are needed'),
-    ([changed(CUBIC.excited(300, 0.1), u=1.0)], 'input 0 never moves from 1: excite the plant'),
-    ([changed(CUBIC.excited(300, 0.1), x=310.0)], 'state 0 never moves from 310: excite'),
+     'the episodes have 0 uninterrupted segments of 10 samples, at least 8 are needed'),
+    ([changed(CUBIC.excited(300, 0.1), u=1.0)], 'u1 never moves from 1.0 A: excite the plant'),
+    ([changed(CUBIC.excited(300, 0.1), x=310.0)], 'x1 never moves from 310.0 m: excite'),
 ])
 def test_degenerate_records(records, words):
     with pytest.raises(ValueError, match=words):
-        identify(records)
+        identify(CUBIC.plant, records)
 
 
 def test_extremes_in_every_stretch():
     parts = cut([PAIR.excited(160, 0.1)], 20)[:8]
     for i, part in enumerate(parts):
         x, u = np.zeros_like(part.x), np.zeros_like(part.u)
-        # eight extremes in eight stretches
+        # eight extremes in eight segments
         (x if i < 4 else u)[0, i % 2] = 1.0 if i % 4 < 2 else -1.0
         parts[i] = replace(part, x=x, u=u)
-    with pytest.raises(ValueError, match=r'all but 0 of 8 stretches hold .* record longer'):
-        identify([*parts, parts[0].part(0, 5)] + [parts[0].part(0, 9)] * 2)
+    with pytest.raises(ValueError, match=r'all but 0 of 8 segments hold .* record longer'):
+        identify(PAIR.plant, [*parts, parts[0].part(0, 5)] + [parts[0].part(0, 9)] * 2)
 
 
 def test_state_that_is_noise_alone_is_told_apart_from_nothing():
     rng = np.random.default_rng(0)
     record = CUBIC.excited(200, 0.1)
-    noise = Record(record.time, rng.standard_normal((200, 1)), record.input_time, record.u)
-    found = identify([noise], degrees=(1, 3), windows=(10,))
+    noise = Episode(record.time, rng.standard_normal((200, 1)), record.input_time, record.u)
+    found = identify(CUBIC.plant, [noise], degrees=(1, 3), windows=(10,))
     # no drift predicts it better than its own mean
     assert min(score.rmse[0] for score in found.scores) > 0.8
 
@@ -200,24 +200,24 @@ def test_linear_model_that_diverges_does_not_stand_in_the_way(noisy, monkeypatch
     original = module.prediction_error
     monkeypatch.setattr(module, 'prediction_error', lambda rate, *others: (
         np.full(1, np.inf) if rate.__self__.degree == 1 else original(rate, *others)))
-    found = identify([noisy.part(0, 400)], degrees=(1, 3), windows=(20,))
+    found = identify(CUBIC.plant, [noisy.part(0, 400)], degrees=(1, 3), windows=(20,))
     assert (found.linear.degree, found.drift.degree) == (1, 3)
     monkeypatch.setattr(module, 'prediction_error', lambda *_: np.full(1, np.inf))
-    with pytest.raises(ValueError, match='no drift fits the records: record longer'):
-        identify([noisy.part(0, 400)], degrees=(1, 3), windows=(20,))
+    with pytest.raises(ValueError, match='no drift fits the episodes: record longer'):
+        identify(CUBIC.plant, [noisy.part(0, 400)], degrees=(1, 3), windows=(20,))
 
 
 def test_memory_of_a_long_record():
     # 20000 samples: some five hours and a half at one a second
     rng = np.random.default_rng(0)
     times = np.arange(20000.0) / 60.0
-    record = Record(times, np.cumsum(rng.standard_normal((20000, 1)), axis=0), times,
+    record = Episode(times, np.cumsum(rng.standard_normal((20000, 1)), axis=0), times,
                     rng.uniform(-1.0, 1.0, (20000, 1)))
     parts = cut([record], 240)
-    model = weak_form(parts, Box.of(parts), 6, None, 80)
+    model = weak_form(parts, box_of(CUBIC.plant, parts), 6, None, 80)
     tracemalloc.start()
-    stretches = Stretches.of(parts, longest_step(parts))
-    problem = _Problem(model, stretches, True)
+    segments = Segments.of(parts, longest_step(parts))
+    problem = _Problem(model, segments, True)
     normal_equations(problem.add_residuals, 0.0 * problem.start())
     peak = tracemalloc.get_traced_memory()[1]
     tracemalloc.stop()

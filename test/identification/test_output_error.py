@@ -9,16 +9,14 @@ from scipy.stats import chi2
 import torch
 
 from koopman_ros.identification import (
-    Box,
-    cut,
+    box_of,
     longest_step,
     output_error,
-    Record,
-    Stretches,
+    Segments,
     weak_form,
 )
-from koopman_ros.identification.drift import scaled_input_matrix
 from koopman_ros.identification.output_error import _Problem
+from koopman_ros.plant_data import cut, Episode
 from koopman_ros.solvers.levenberg_marquardt import normal_equations
 from support.known_plants import CUBIC, PAIR
 
@@ -26,11 +24,11 @@ NOISE = 0.02
 
 
 def start_of(plant, records, degree, B=None):
-    """Return a weak-form estimate of the records, and their stretches."""
-    box = Box.of(records)
-    known = None if B is None else scaled_input_matrix(box, B)
+    """Return a weak-form estimate of the records, and their segments."""
+    box = box_of(plant.plant, records)
+    known = None if B is None else box.input_matrix(B)
     model = weak_form(records, box, degree, known, 10)
-    return model, Stretches.of(records, longest_step(records))
+    return model, Segments.of(records, longest_step(records))
 
 
 def two_of_different_length(noise=0.0):
@@ -40,19 +38,19 @@ def two_of_different_length(noise=0.0):
 @pytest.mark.parametrize('learn', [True, False])
 def test_normal_equations_against_differences(learn):
     records = two_of_different_length(0.05)
-    model, stretches = start_of(PAIR, records, 2)
-    problem = _Problem(model, stretches, learn)
+    model, segments = start_of(PAIR, records, 2)
+    problem = _Problem(model, segments, learn)
     theta = problem.start()
     theta = theta + 0.03 * torch.from_numpy(np.random.default_rng(0).standard_normal(len(theta)))
-    box, count = model.box, np.sum(stretches.measured)
+    box, count = model.box, np.sum(segments.measured)
     assert count == 105
 
     def residuals(values):
         # by the path in units, which shares no line with the derivatives
         drift, starts = problem.split(values)
-        middle = 0.5 * (box.state_lower + box.state_upper)
-        errors = stretches.errors(drift.rate, middle + starts * box.state_scale)
-        return (errors / box.state_scale).ravel() / np.sqrt(count)
+        middle = box.states.center
+        errors = segments.errors(drift.rate, middle + starts * box.states.scale)
+        return (errors / box.states.scale).ravel() / np.sqrt(count)
 
     base = residuals(theta.numpy())
     steps = 1e-5 * np.eye(len(theta))
@@ -69,8 +67,8 @@ def test_normal_equations_against_differences(learn):
 
 
 def test_a_model_that_diverges_has_infinite_cost():
-    model, stretches = start_of(CUBIC, [CUBIC.excited(100, 0.1)], 3)
-    problem = _Problem(model, stretches, True)
+    model, segments = start_of(CUBIC, [CUBIC.excited(100, 0.1)], 3)
+    problem = _Problem(model, segments, True)
     theta = problem.start() + 1e8
     assert normal_equations(problem.add_residuals, theta).cost == np.inf
     assert normal_equations(problem.add_residuals, theta, derivatives=False).cost == np.inf
@@ -80,8 +78,8 @@ def test_a_model_that_diverges_has_infinite_cost():
 @pytest.mark.parametrize(('plant', 'degree'), [(CUBIC, 3), (PAIR, 2)])
 def test_recovers_the_drift_without_noise(plant, degree, known):
     records = cut([plant.excited(300, 0.1), plant.excited(170, 0.1, seed=1)], 120)
-    model, stretches = start_of(plant, records, degree, plant.B if known else None)
-    found = output_error(model, stretches, learn_input_matrix=not known)
+    model, segments = start_of(plant, records, degree, plant.B if known else None)
+    found = output_error(model, segments, learn_input_matrix=not known)
     # what Runge-Kutta steps of 0.1 leave at rates up to 2: 0.1^4 2^5 / 120
     assert plant.misfit(found) < 3e-5
     assert plant.misfit(model) > 5e-4
@@ -94,7 +92,7 @@ def test_recovers_the_drift_without_noise(plant, degree, known):
 def test_error_falls_with_the_fourth_power_of_the_step():
     records = cut([CUBIC.excited(300, 0.1)], 120)
     model, _ = start_of(CUBIC, records, 3)
-    misfits = [CUBIC.misfit(output_error(model, Stretches.of(records, h), learn_input_matrix=True))
+    misfits = [CUBIC.misfit(output_error(model, Segments.of(records, h), learn_input_matrix=True))
                for h in (0.1, 0.05)]
     assert 10.0 < misfits[0] / misfits[1] < 25.0
 
@@ -105,8 +103,8 @@ def test_irregular_samples_and_inputs_between_them():
     changes = np.concatenate(([0.0], np.sort(rng.uniform(0.0, times[-1], 120))))
     record = PAIR.record(times, changes, rng.uniform(-1.0, 1.0, (121, 2)))
     records = cut([record], 80)
-    model, stretches = start_of(PAIR, records, 2)
-    found = output_error(model, stretches, learn_input_matrix=True)
+    model, segments = start_of(PAIR, records, 2)
+    found = output_error(model, segments, learn_input_matrix=True)
     # steps of up to 0.18: 0.18^4 2^5 / 120
     assert PAIR.misfit(found) < 3e-4
 
@@ -134,9 +132,9 @@ def test_errors_are_those_of_the_best_estimate_possible(seed):
     clean = [CUBIC.excited(n, 0.1, seed=10 * seed + i) for i, n in enumerate(lengths)]
     noisy = [CUBIC.excited(n, 0.1, noise=NOISE, seed=10 * seed + i)
              for i, n in enumerate(lengths)]
-    model, stretches = start_of(CUBIC, noisy, 3)
-    found = output_error(model, stretches, learn_input_matrix=True)
-    x = np.linspace(found.box.state_lower, found.box.state_upper, 8)
+    model, segments = start_of(CUBIC, noisy, 3)
+    found = output_error(model, segments, learn_input_matrix=True)
+    x = np.linspace(found.box.states.lower, found.box.states.upper, 8)
     f = found.rate(x, np.zeros((8, 1)))[:, 0]
     error = np.append(np.polynomial.polynomial.polyfit(x[:, 0], f, 3), found.input_matrix)
     true = np.append(CUBIC.coefficients, CUBIC.B)
@@ -148,38 +146,38 @@ def test_errors_are_those_of_the_best_estimate_possible(seed):
 
 def test_the_same_to_the_bit():
     records = cut([CUBIC.excited(200, 0.1, noise=NOISE)], 60)
-    model, stretches = start_of(CUBIC, records, 3)
-    first, second = (output_error(model, stretches, learn_input_matrix=True) for _ in range(2))
+    model, segments = start_of(CUBIC, records, 3)
+    first, second = (output_error(model, segments, learn_input_matrix=True) for _ in range(2))
     assert first.coefficients.tobytes() == second.coefficients.tobytes()
     assert first.B.tobytes() == second.B.tobytes()
 
 
 def test_monitor_sees_the_cost_fall_and_ends_it():
     records = cut([CUBIC.excited(200, 0.1, noise=NOISE)], 60)
-    model, stretches = start_of(CUBIC, records, 3)
+    model, segments = start_of(CUBIC, records, 3)
     costs = []
 
     def monitor(_, cost):
         costs.append(cost)
         return len(costs) == 2
 
-    output_error(model, stretches, learn_input_matrix=True, monitor=monitor)
+    output_error(model, segments, learn_input_matrix=True, monitor=monitor)
     assert len(costs) == 2
     assert costs[1] <= costs[0]
 
 
 def test_keeps_the_start_where_the_model_diverges():
     record = CUBIC.excited(300, 0.1)
-    model, stretches = start_of(CUBIC, [record], 3)
+    model, segments = start_of(CUBIC, [record], 3)
     wild = type(model)(model.box, 3, model.coefficients + 50.0, model.B)
-    found = output_error(wild, stretches, learn_input_matrix=True)
+    found = output_error(wild, segments, learn_input_matrix=True)
     assert np.array_equal(found.coefficients, wild.coefficients)
 
 
 def test_of_one_stretch_with_few_samples():
     record = CUBIC.excited(300, 0.1)
-    short = Record(record.time[:3], record.x[:3], record.input_time[:1], record.u[:1])
+    short = Episode(record.time[:3], record.x[:3], record.input_time[:1], record.u[:1])
     model, _ = start_of(CUBIC, [record], 3)
-    found = output_error(model, Stretches.of([short], 0.2), learn_input_matrix=True)
+    found = output_error(model, Segments.of([short], 0.2), learn_input_matrix=True)
     # three samples do not determine five coefficients: damping keeps it near its start
     assert np.max(np.abs(found.coefficients - model.coefficients)) < 1.0

@@ -7,24 +7,23 @@ import numpy as np
 import pytest
 
 from koopman_ros.identification import (
-    Box,
+    box_of,
     DriftModel,
     noise_level,
-    Record,
     total_variation,
     weak_form,
 )
-from koopman_ros.identification.drift import scaled_input_matrix
 from koopman_ros.identification.total_variation import smoothed
+from koopman_ros.plant_data import Episode
 from support.known_plants import CUBIC, PAIR
 
 
 def estimate(method, plant, records, degree, B=None, window=20):
-    box = Box.of(records)
-    known = None if B is None else scaled_input_matrix(box, B)
+    box = box_of(plant.plant, records)
+    known = None if B is None else box.input_matrix(B)
     if method == 'weak form':
         return weak_form(records, box, degree, known, window)
-    return total_variation(records, box, degree, known, scaled_input_matrix(box, plant.B))
+    return total_variation(records, box, degree, known, box.input_matrix(plant.B))
 
 
 METHODS = ['weak form', 'total variation']
@@ -59,8 +58,8 @@ def test_weak_form_integrates_the_input_exactly():
     rng = np.random.default_rng(0)
     times = np.cumsum(rng.uniform(0.01, 0.02, 2000))
     changes = np.concatenate(([0.0], np.sort(rng.uniform(0.0, times[-1], 400))))
-    bare = Record(times, np.zeros((2000, 1)), changes, rng.uniform(-1.0, 1.0, (401, 1)))
-    record = Record(times, 1.7 * bare.input_integral(times), changes, bare.u)
+    bare = Episode(times, np.zeros((2000, 1)), changes, rng.uniform(-1.0, 1.0, (401, 1)))
+    record = Episode(times, 1.7 * bare.input_integral(times), changes, bare.u)
     found = estimate('weak form', CUBIC, [record], 1, window=40)
     # what is left is the trapezoidal rule on phi' x, which has kinks between samples
     assert found.input_matrix == pytest.approx(np.array([[1.7]]), rel=2e-3)
@@ -77,8 +76,8 @@ def test_irregular_samples_with_inputs_between_them(method):
 
 def test_total_variation_bears_a_rough_input_matrix():
     record = CUBIC.excited(600, 0.05)
-    box = Box.of([record])
-    rough = scaled_input_matrix(box, 1.2 * CUBIC.B)
+    box = box_of(CUBIC.plant, [record])
+    rough = box.input_matrix(1.2 * CUBIC.B)
     found = total_variation([record], box, 3, None, rough)
     assert CUBIC.misfit(found) < 5e-2
     # it is taken off again, not believed
@@ -103,13 +102,13 @@ def test_noise_does_little_harm(method, bound, seed):
 
 def test_noise_level():
     clean = PAIR.excited(1500, 0.02, hold=60)
-    box = Box.of([clean])
-    model = DriftModel(box, 1, np.zeros((3, 2)), scaled_input_matrix(box, PAIR.B))
+    box = box_of(PAIR.plant, [clean])
+    model = DriftModel(box, 1, np.zeros((3, 2)), box.input_matrix(PAIR.B))
     # the curvature that is left without noise: a period of 0.02 cubed at rates up to 2
     assert np.all(noise_level([clean], model) < 1e-4)
     sigma = np.array([0.03, 0.005])
     rng = np.random.default_rng(0)
-    noisy = Record(clean.time, clean.x + sigma * rng.standard_normal(clean.x.shape),
+    noisy = Episode(clean.time, clean.x + sigma * rng.standard_normal(clean.x.shape),
                    clean.input_time, clean.u)
     # of 1500 deviations the median strays by 3 %, twice that as third differences overlap
     assert noise_level([noisy], model) == pytest.approx(sigma, rel=0.12)
@@ -118,9 +117,9 @@ def test_noise_level():
 def test_noise_level_on_irregular_times():
     rng = np.random.default_rng(1)
     times = np.cumsum(rng.uniform(0.01, 0.03, 1500))
-    record = Record(times, np.cos(times)[:, None] + 0.02 * rng.standard_normal((1500, 1)),
+    record = Episode(times, np.cos(times)[:, None] + 0.02 * rng.standard_normal((1500, 1)),
                     np.array([0.0, 5.0]), np.array([[0.0], [1.0]]))
-    model = DriftModel(Box.of([record]), 1, np.zeros((2, 1)), np.zeros((1, 1)))
+    model = DriftModel(box_of(CUBIC.plant, [record]), 1, np.zeros((2, 1)), np.zeros((1, 1)))
     assert noise_level([record], model) == pytest.approx([0.02], rel=0.12)
 
 
@@ -155,18 +154,18 @@ def test_smoothing_leaves_what_has_no_noise():
 
 
 @pytest.mark.parametrize(('call', 'words'), [
-    (lambda r, b: weak_form([r], b, 3, None, 40), 'no record has 40 samples: record longer'),
+    (lambda r, b: weak_form([r], b, 3, None, 40), 'no episode has 40 samples: record longer'),
     (lambda r, b: weak_form([r], b, 3, None, 3), 'a window of 3 samples is too short'),
     (lambda r, b: weak_form([r], b, 3, None, 20), '3 equations do not determine 5 coefficients'),
     (lambda r, b: total_variation([r.part(0, 7)], b, 3, None, np.ones((1, 1))),
-     'no record has 8 samples'),
+     'no episode has 8 samples'),
     (lambda r, b: noise_level([r.part(0, 7)], weak_form([r], b, 1, None, 10)),
-     'no record has 8 samples'),
+     'no episode has 8 samples'),
 ])
 def test_too_short(call, words):
     record = CUBIC.excited(30, 0.1)
     with pytest.raises(ValueError, match=words):
-        call(record, Box.of([record]))
+        call(record, box_of(CUBIC.plant, [record]))
 
 
 @pytest.mark.parametrize('method', METHODS)

@@ -10,7 +10,8 @@ import torch
 
 from koopman_ros.learning import Algorithm1
 from koopman_ros.learning.network import Layout
-from koopman_ros.learning.residuals import Data, Problem, ResidualWeights
+from koopman_ros.learning.residuals import Problem, ResidualWeights
+from koopman_ros.learning.scaled import ScaledSamples
 from koopman_ros.solvers.levenberg_marquardt import MinimumStatus, normal_equations
 from support.small_plants import bent_samples
 
@@ -21,7 +22,7 @@ SMALL = {'n_z': 2, 'hidden': (3,), 'decoder': 3, 'max_iterations': 5}
 def data():
     samples = bent_samples(2)
     x, u = samples.x - 3.0, samples.u - 0.5
-    return Data(torch.from_numpy(x), torch.from_numpy(samples.dxdt - 2.0 * u))
+    return ScaledSamples(torch.from_numpy(x), torch.from_numpy(samples.dxdt - 2.0 * u))
 
 
 def minimisations(recipe, data, seed=0):
@@ -62,7 +63,7 @@ def test_fewer_coordinates_than_a_lift_needs(n_z, identity):
 
 def unmoved(seed):
     """Return a start as it was drawn: where the cost is not a number, no step is taken."""
-    nothing = Data(*(torch.full((2, 1), torch.nan, dtype=torch.float64) for _ in range(3)))
+    nothing = ScaledSamples(*(torch.full((2, 1), torch.nan).double() for _ in range(3)))
     grown = Algorithm1(4, hidden=(40, 40), decoder=30).start(nothing, 4, None, seed)
     assert grown.status is MinimumStatus.STALLED
     return grown
@@ -111,7 +112,7 @@ def test_it_ends_after_max_rounds(data):
 
 
 def test_inputs_and_identity_go_into_the_layout(data):
-    with_inputs = Data(data.x, data.f, torch.ones((len(data), 2), dtype=torch.float64))
+    with_inputs = ScaledSamples(data.x, data.f, torch.ones((len(data), 2), dtype=torch.float64))
     recipe = Algorithm1(3, identity=True, hidden=(4, 2), activation='sine', decoder=5,
                         max_rounds=1, max_iterations=1)
     grown = recipe.start(with_inputs, 3, None, 0)

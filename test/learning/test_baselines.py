@@ -9,8 +9,9 @@ import numpy as np
 import pytest
 
 from koopman_ros.control import projected, run_closed_loop, steady_state_target, Weights
-from koopman_ros.learning import Edmd, fit, judge, Linearisation, Plant, Samples, Scaling
-from koopman_ros.lifting import linearised_model
+from koopman_ros.learning import Edmd, evaluate, fit, Linearisation
+from koopman_ros.lifting import Box, linearised_model
+from koopman_ros.plant_data import Plant, Samples
 from support.small_plants import BENT, bent_samples, TWO_STATE, two_state_samples
 
 
@@ -103,7 +104,7 @@ def test_degree_one_is_linear_regression(learned):
 
 def test_scaling_may_be_given():
     samples = bent_samples()
-    scaling = Scaling.of(BENT, bent_samples(seed=1))
+    scaling = Box.of(BENT, bent_samples(seed=1).x, bent_samples(seed=1).u)
     for baseline in (Edmd(2), Linearisation(np.array([[-1.0]]))):
         model = baseline.learn(BENT, samples, scaling)
         assert model.states is scaling.states
@@ -125,7 +126,7 @@ def test_linearisation():
                                 model.provenance)
     np.testing.assert_array_equal(model.A, expected.A)
     np.testing.assert_array_equal(model.B, expected.B)
-    scaling = Scaling.of(TWO_STATE, samples)
+    scaling = Box.of(TWO_STATE, samples.x, samples.u)
     np.testing.assert_array_equal(model.states.scale, scaling.states.scale)
 
 
@@ -139,9 +140,9 @@ def test_linearisation_needs_b():
 def test_a_baseline_controls_and_is_judged_like_a_lift(baseline):
     samples = bent_samples()
     model = baseline.learn(BENT, samples)
-    report = judge(model, bent_samples(seed=1))
-    assert report.fit.rx < 0.1
-    assert report.eigenvalues.shape == (model.n_z,)
+    figures = evaluate(model, bent_samples(seed=1))
+    assert figures.fit.rx < 0.1
+    assert figures.eigenvalues.shape == (model.n_z,)
 
     def rate(x, u):
         return -(x - 3.0) - 0.3 * (x - 3.0) ** 2 + 2.0 * (u - 0.5)

@@ -9,7 +9,8 @@ import numpy as np
 import pytest
 import torch
 
-from koopman_ros.learning import fit, Growth, NoUsefulLift, split_by_episode, train
+from koopman_ros.learning import fit, Growth, NoUsefulLift, train
+from koopman_ros.plant_data import split_by_episode
 from koopman_ros.solvers.levenberg_marquardt import MinimumStatus
 from support.small_plants import (
     BENT,
@@ -105,7 +106,7 @@ def test_a_lift_of_no_use_is_returned_where_it_is_asked_for():
     samples = bent_samples()
     linear = replace(samples, dxdt=-(samples.x - 3.0) + 2.0 * (samples.u - 0.5))
     trained = train(BENT, linear, SMALL, starts=1, refuse=False)
-    assert trained.report.fit.rx > trained.linear.fit.rx
+    assert trained.figures.fit.rx > trained.linear.fit.rx
     assert trained.closed_loop is None
 
 
@@ -139,4 +140,4 @@ def test_a_lift_that_loses_a_state_is_refused_whatever_its_rw():
         train(TWO_STATE, samples, replace(exact, n_z=2), starts=1)
     # with the states as its first coordinates the same data are enough
     kept = train(TWO_STATE, samples, replace(exact, identity=True), starts=1)
-    assert kept.report.fit.rx < 1e-6
+    assert kept.figures.fit.rx < 1e-6

@@ -12,7 +12,7 @@ import torch
 from koopman_ros.learning import Growth
 from koopman_ros.learning.growth import least_squares
 from koopman_ros.learning.network import Pass
-from koopman_ros.learning.residuals import Data
+from koopman_ros.learning.scaled import ScaledSamples
 from koopman_ros.solvers.levenberg_marquardt import MinimumStatus
 from support.disturbance import disturbed_data
 from support.small_plants import bent_samples, two_state_samples
@@ -27,17 +27,17 @@ def bent_data(*, with_inputs=False):
     samples = bent_samples()
     x, u = samples.x - 3.0, samples.u - 0.5
     if with_inputs:
-        return Data(*tensors(x, samples.dxdt, u))
-    return Data(*tensors(x, samples.dxdt - 2.0 * u))
+        return ScaledSamples(*tensors(x, samples.dxdt, u))
+    return ScaledSamples(*tensors(x, samples.dxdt - 2.0 * u))
 
 
 def two_state_data(*, with_inputs=False):
     """Return the two-state example in units of (6, 7)."""
     samples, scale = two_state_samples(), np.array([6.0, 7.0])
     if with_inputs:
-        return Data(*tensors(samples.x / scale, samples.dxdt / scale, samples.u / 5.0))
+        return ScaledSamples(*tensors(samples.x / scale, samples.dxdt / scale, samples.u / 5.0))
     drift = samples.dxdt - samples.u * np.array([0.0, 1.0])
-    return Data(*tensors(samples.x / scale, drift / scale))
+    return ScaledSamples(*tensors(samples.x / scale, drift / scale))
 
 
 def grow(recipe, data, seed=0, monitor=None):
@@ -122,7 +122,7 @@ def test_a_new_coordinate_starts_near_a_product_that_the_others_do_not_span():
 def test_the_lift_of_zero_is_zero(layers, identity):
     grown = grow(Growth(3, identity=identity, layers=layers, max_iterations=10), bent_data())
     zero = torch.zeros((1, 1), dtype=torch.float64)
-    assert torch.equal(lifted(grown, Data(zero, zero)).z, torch.zeros((1, 3)).double())
+    assert torch.equal(lifted(grown, ScaledSamples(zero, zero)).z, torch.zeros((1, 3)).double())
 
 
 @pytest.mark.parametrize(('identity', 'hidden'), [(True, (6,)), (False, (8,))])
@@ -165,7 +165,7 @@ def test_the_seed_decides_on_the_random_units():
 def test_a_lift_that_cannot_grow_says_so():
     x = torch.tensor([[1.0], [-1.0], [1.0], [-1.0]], dtype=torch.float64)
     with pytest.raises(ValueError, match='no new coordinate can be started: the samples are spa'):
-        grow(Growth(4), Data(x, -x))
+        grow(Growth(4), ScaledSamples(x, -x))
 
 
 def test_the_two_state_example_is_lifted_exactly():

@@ -155,4 +155,4 @@ def test_many_samples_go_to_processes():
     with joblib.parallel_config('loky', n_jobs=2):
         other = train(BENT, some, recipe, starts=1)
     assert bits(one.model) == bits(other.model)
-    assert np.isfinite(one.report.fit.rw)
+    assert np.isfinite(one.figures.fit.rw)

@@ -13,7 +13,8 @@ import torch
 
 import koopman_ros
 from koopman_ros.learning.network import Layout
-from koopman_ros.learning.residuals import Data, Problem, ResidualWeights
+from koopman_ros.learning.residuals import Problem, ResidualWeights
+from koopman_ros.learning.scaled import ScaledSamples
 from koopman_ros.solvers.levenberg_marquardt import normal_equations
 
 FUNCTIONS = {'tanh': torch.tanh, 'sigmoid': torch.sigmoid, 'sine': torch.sin,
@@ -35,7 +36,7 @@ def random_problem(layout, weights, chunk=4, seed=1):
     def normal(*shape):
         return torch.randn(*shape, generator=generator, dtype=torch.float64)
 
-    data = Data(normal(COUNT, layout.n_x), normal(COUNT, layout.n_x),
+    data = ScaledSamples(normal(COUNT, layout.n_x), normal(COUNT, layout.n_x),
                 normal(COUNT, layout.n_u) if layout.n_u else None)
     return Problem(layout, data, weights, chunk), normal(layout.size)
 
@@ -150,19 +151,20 @@ def test_other_weights_leave_the_rest():
 
 def test_b_needs_inputs():
     with pytest.raises(ValueError, match='the inputs are needed to learn B'):
-        Problem(LAYOUT, Data(torch.zeros(3, 2), torch.zeros(3, 2)), ResidualWeights())
+        Problem(LAYOUT, ScaledSamples(torch.zeros(3, 2), torch.zeros(3, 2)), ResidualWeights())
 
 
 def test_a_decoder_weight_needs_a_decoder():
     with pytest.raises(ValueError, match='a decoder weight needs a decoder network'):
-        Problem(Layout(1, 2, (3,), True), Data(torch.zeros(3, 1), torch.zeros(3, 1)),
+        Problem(Layout(1, 2, (3,), True), ScaledSamples(torch.zeros(3, 1), torch.zeros(3, 1)),
                 ResidualWeights(decoder=1.0))
 
 
 MEMORY = """
 import resource
 from koopman_ros.learning.network import Layout
-from koopman_ros.learning.residuals import Data, Problem, ResidualWeights
+from koopman_ros.learning.residuals import Problem, ResidualWeights
+from koopman_ros.learning.scaled import ScaledSamples
 from koopman_ros.solvers.levenberg_marquardt import normal_equations
 import torch
 torch.set_num_threads(1)
@@ -171,7 +173,7 @@ theta = 0.1 * torch.ones(layout.size, dtype=torch.float64)
 peaks = []
 for count in (20_000, 200_000):
     x = torch.linspace(-1.0, 1.0, 2 * count, dtype=torch.float64).view(count, 2)
-    problem = Problem(layout, Data(x, x), ResidualWeights(1.0))
+    problem = Problem(layout, ScaledSamples(x, x), ResidualWeights(1.0))
     normal_equations(problem.add_residuals, theta)
     peaks.append(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss)
 print(peaks[1] - peaks[0])

@@ -10,18 +10,9 @@ import numpy as np
 import pytest
 import torch
 
-from koopman_ros.learning import (
-    Edmd,
-    fit,
-    Growth,
-    judge,
-    Plant,
-    RECIPES,
-    Samples,
-    Scaling,
-    split_by_episode,
-    train,
-)
+from koopman_ros.learning import Edmd, evaluate, fit, Growth, RECIPES, train
+from koopman_ros.lifting import Box
+from koopman_ros.plant_data import Plant, Samples, split_by_episode
 from koopman_ros.plants import scalar_example
 from koopman_ros.solvers.levenberg_marquardt import MinimumStatus
 from support.small_plants import (
@@ -60,11 +51,11 @@ def test_figures_come_from_the_untouched_episodes():
     everything = bent_samples()
     trained = train(BENT, everything, SMALL, starts=1, split_seed=3)
     training, _, held_out = split_by_episode(everything, 3)
-    assert trained.report.fit == fit(trained.model, held_out.x, held_out.dxdt, held_out.u)
-    assert trained.model.provenance.metrics == trained.report.metrics(('level',))
-    linear = Edmd(1).learn(BENT, training, Scaling.of(BENT, everything))
-    assert trained.linear.fit == judge(linear, held_out).fit
-    assert trained.report.fit.rw < 2e-3 < trained.linear.fit.rw
+    assert trained.figures.fit == fit(trained.model, held_out.x, held_out.dxdt, held_out.u)
+    assert trained.model.provenance.metrics == trained.figures.metrics(('level',))
+    linear = Edmd(1).learn(BENT, training, Box.of(BENT, everything.x, everything.u))
+    assert trained.linear.fit == evaluate(linear, held_out).fit
+    assert trained.figures.fit.rw < 2e-3 < trained.linear.fit.rw
 
 
 def test_there_is_a_model_for_every_size():
@@ -74,7 +65,7 @@ def test_there_is_a_model_for_every_size():
     assert trained.path[-1] is trained.model
     assert trained.starts == 6
     for model in trained.path:
-        assert model.provenance.metrics == judge(model, held_out).metrics(('level',))
+        assert model.provenance.metrics == evaluate(model, held_out).metrics(('level',))
     figures = [model.provenance.metrics['rw'] for model in trained.path]
     assert figures[0] > figures[1] > figures[2]
 
@@ -133,7 +124,7 @@ def test_b_is_learned(plant):
     model = trained.model
     B = model.B * model.states.scale[:, None] / model.inputs.scale
     np.testing.assert_allclose(B, plant.B, rtol=0, atol=1e-3)
-    assert trained.report.fit.rx < 1e-5
+    assert trained.figures.fit.rx < 1e-5
 
 
 def test_the_recipe_of_the_paper():
@@ -141,7 +132,7 @@ def test_the_recipe_of_the_paper():
                               max_iterations=60)
     trained = train(BENT, bent_samples(), recipe, starts=2)
     assert trained.model.n_z == 2
-    assert trained.report.fit.rx < trained.linear.fit.rx
+    assert trained.figures.fit.rx < trained.linear.fit.rx
     assert RECIPES['growth'] is Growth
 
 
@@ -156,7 +147,7 @@ def test_a_plant_without_inputs(B):
     trained = train(plant, samples, Growth(2, max_iterations=150), starts=1)
     assert trained.closed_loop is None
     assert (trained.model.n_u, trained.model.B.shape) == (0, (1, 0))
-    assert trained.report.fit.rx < 1e-2 * trained.linear.fit.rx
+    assert trained.figures.fit.rx < 1e-2 * trained.linear.fit.rx
 
 
 def test_the_time_unit_does_not_matter():
@@ -165,7 +156,7 @@ def test_the_time_unit_does_not_matter():
     per_second = train(BENT, samples, recipe, starts=1)
     per_minute = train(replace(BENT, time_unit='min', B=60.0 * BENT.B),
                        replace(samples, dxdt=60.0 * samples.dxdt), recipe, starts=1)
-    assert per_minute.report.fit.rw == pytest.approx(per_second.report.fit.rw, rel=1e-2)
+    assert per_minute.figures.fit.rw == pytest.approx(per_second.figures.fit.rw, rel=1e-2)
     np.testing.assert_allclose(per_minute.model.eigenvalues, 60.0 * per_second.model.eigenvalues,
                                rtol=1e-2)
 

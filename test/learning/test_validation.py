@@ -11,12 +11,11 @@ from scipy.linalg import block_diag, expm
 
 from koopman_ros.learning import (
     compare_closed_loops,
+    evaluate,
+    Figures,
     fit,
-    judge,
-    Report,
     roll_out,
     rollout_rmse,
-    Samples,
 )
 from koopman_ros.learning.validation import Fit
 from koopman_ros.lifting import (
@@ -26,6 +25,7 @@ from koopman_ros.lifting import (
     NetworkObservables,
     Provenance,
 )
+from koopman_ros.plant_data import Samples
 from support.random_lifts import coordinates, random_lift
 
 JACOBIAN = np.array([[-1.0, 4.0], [-2.0, -0.5]])
@@ -215,10 +215,10 @@ def test_a_roll_out_that_diverges_has_an_infinite_error():
 
 def test_a_report_holds_all_open_loop_figures():
     samples = linear_episodes(shift=np.array([0.3, -0.2]))
-    report = judge(linear_model(), samples)
-    assert report.fit == fit(linear_model(), samples.x, samples.dxdt, samples.u)
-    np.testing.assert_array_equal(report.eigenvalues, linear_model().eigenvalues)
-    np.testing.assert_allclose(report.rollout_rmse, [0.3, 0.2], rtol=1e-6)
+    figures = evaluate(linear_model(), samples)
+    assert figures.fit == fit(linear_model(), samples.x, samples.dxdt, samples.u)
+    np.testing.assert_array_equal(figures.eigenvalues, linear_model().eigenvalues)
+    np.testing.assert_allclose(figures.rollout_rmse, [0.3, 0.2], rtol=1e-6)
 
 
 @pytest.mark.parametrize(('error', 'names', 'expected'), [
@@ -228,12 +228,12 @@ def test_a_report_holds_all_open_loop_figures():
     (np.array([np.inf, 0.1]), ('T', 'c'), {'rollout_rmse_c': 0.1}),
 ])
 def test_figures_by_name(error, names, expected):
-    report = Report(Fit(0.1, 0.2, 3.0), np.ones(1), error)
-    assert report.metrics(names) == {'rw': 0.1, 'rx': 0.2, 'cond': 3.0, **expected}
+    figures = Figures(Fit(0.1, 0.2, 3.0), np.ones(1), error)
+    assert figures.metrics(names) == {'rw': 0.1, 'rx': 0.2, 'cond': 3.0, **expected}
 
 
 def test_figures_that_are_not_finite_are_left_out():
-    assert Report(Fit(0.1, np.inf, np.nan), np.ones(1), None).metrics(('T',)) == {'rw': 0.1}
+    assert Figures(Fit(0.1, np.inf, np.nan), np.ones(1), None).metrics(('T',)) == {'rw': 0.1}
 
 
 def test_closed_loops_of_the_same_model_cost_the_same():

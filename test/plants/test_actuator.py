@@ -14,10 +14,7 @@ from koopman_ros.plants import (
     ControlAffineSystem,
     one_state_reactor,
     Process,
-    two_state_reactor,
-    with_input_lag,
 )
-from koopman_ros.plants.system import FloatArray
 
 SECOND = 1_000_000_000
 SLOPE, GAIN = -0.7, 0.4  # 1/s, of the linear plant
@@ -82,28 +79,6 @@ def test_a_lag_that_is_taken_away_leaves_the_command() -> None:
     plant = given(actuated(Actuator(lag=10.0)), 2.0).until(1 * SECOND)
     plant = replace(plant, actuator=Actuator()).until(2 * SECOND)
     assert plant.process.u[0] == 2.0
-
-
-def test_lagged_system_is_control_affine_with_the_input_as_a_state() -> None:
-    system = two_state_reactor()
-    lagged = with_input_lag(system, 0.25)
-    assert lagged.state_names == ('concentration', 'temperature', 'coolant_temperature')
-    assert lagged.state_units == ('mol/L', 'K', 'K')
-    state, u = np.array([0.9, 320.0, 295.0]), np.array([301.0])
-    np.testing.assert_array_equal(
-        lagged.derivative(state, u), [*system.derivative(state[:2], state[2:]), 24.0])
-    step = 1e-4 * np.array([0.1, 1.0, 1.0])
-    columns: list[FloatArray] = [
-        (lagged.drift(state + shift) - lagged.drift(state - shift)) / (2.0 * size)
-        for size, shift in zip(step, np.diag(step), strict=True)]
-    np.testing.assert_allclose(
-        lagged.drift_jacobian(state), np.stack(columns, axis=-1), rtol=1e-6, atol=1e-7)
-
-
-@pytest.mark.parametrize('time_constant', [0.0, -1.0, np.inf, np.nan])
-def test_a_lagged_system_needs_a_time_constant(time_constant: float) -> None:
-    with pytest.raises(ValueError, match=r'time_constant is .* s, must be finite and above 0'):
-        with_input_lag(linear(), time_constant)
 
 
 # The delay.

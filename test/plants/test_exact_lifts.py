@@ -10,8 +10,6 @@ from scipy.linalg import solve_continuous_are
 from koopman_ros.plants import (
     ControlAffineSystem,
     ExactLift,
-    scalar_exact_lift,
-    scalar_example,
     simulate,
     two_state_exact_lift,
     two_state_example,
@@ -41,12 +39,10 @@ def _closed_loop_cost(K, lift, input_weight):
         input_names=(), input_units=(), time_unit='s', drift=rates,
         drift_jacobian=lambda y: np.zeros((*y.shape, 3)), B=np.zeros((3, 0)),
         nominal_state=np.zeros(3), nominal_input=np.zeros(0))
-    trajectory = simulate(loop, [*START, 0.0], np.zeros((1, 0)), 120.0)
-    return trajectory.states[-1, 2]
+    return simulate(loop, [*START, 0.0], np.zeros((1, 0)), 120.0).x[-1, 2]
 
 
 @pytest.mark.parametrize(('system', 'exact', 'states'), [
-    (scalar_example(), scalar_exact_lift(), np.array([[0.05], [0.5], [1.0], [5.0]])),
     (two_state_example(), two_state_exact_lift(), np.array([[5.0, 5.0], [-3.0, 0.5]])),
     (two_state_example(0.3, -2.0), two_state_exact_lift(0.3, -2.0), np.array([[1.5, -2.0]])),
 ])
@@ -55,38 +51,13 @@ def test_lift_makes_the_drift_linear(system, exact, states):
     np.testing.assert_allclose(lifted_rate, exact.lift(states) @ exact.A.T, rtol=1e-13)
 
 
-@pytest.mark.parametrize(('exact', 'states'), [
-    (scalar_exact_lift(), np.array([[0.2], [1.0], [4.0]])),
-    (two_state_exact_lift(), np.array([[5.0, 5.0], [-3.0, 0.5]])),
-])
-def test_jacobian_agrees_with_central_differences(exact, states):
+def test_jacobian_agrees_with_central_differences():
+    exact, states = two_state_exact_lift(), np.array([[5.0, 5.0], [-3.0, 0.5]])
     for j in range(states.shape[1]):
         step = np.zeros(states.shape[1])
         step[j] = 1e-6
         slope = (exact.lift(states + step) - exact.lift(states - step)) / 2e-6
         np.testing.assert_allclose(exact.jacobian(states)[..., j], slope, atol=1e-8)
-
-
-def test_scalar_eigenvalue_is_one():
-    np.testing.assert_array_equal(scalar_exact_lift().A, [[1.0]])
-
-
-def test_scalar_lift_is_zero_at_zero():
-    exact = scalar_exact_lift()
-    tiny = np.array([[0.0], [1e-300], [1e-10]])
-    np.testing.assert_array_equal(exact.lift(tiny), np.zeros((3, 1)))
-    np.testing.assert_array_equal(exact.jacobian(tiny), np.zeros((3, 1, 1)))
-
-
-def test_scalar_lift_refuses_negative_states():
-    with pytest.raises(ValueError, match=r'x is -0\.5, must be >= 0'):
-        scalar_exact_lift().lift(np.array([-0.5]))
-
-
-def test_scalar_lift_grows_as_its_eigenvalue_says():
-    trajectory = simulate(scalar_example(), [0.5], np.zeros((9, 0)), 0.2)
-    z = scalar_exact_lift().lift(trajectory.states)[:, 0]
-    np.testing.assert_allclose(z, z[0] * np.exp(trajectory.times), rtol=1e-9)
 
 
 def test_two_state_eigenvalues():

@@ -25,54 +25,54 @@ DESIGN = RandomStepDesign(
     hold_time=(1.0, 4.0), sample_period=0.25)
 
 
-def _inside(excitation, design):
-    states = excitation.trajectory.states
-    return np.all((states >= design.state_lower) & (states <= design.state_upper))
+def _inside(episode, design):
+    return np.all((episode.x >= design.state_lower) & (episode.x <= design.state_upper))
+
+
+def _changes(episode):
+    """Return the numbers of the samples at which the input steps."""
+    return np.flatnonzero(np.diff(episode.u[:, 0])) + 1
 
 
 @pytest.mark.parametrize('seed', range(5))
 def test_samples_stay_inside_box_and_bounds(seed):
-    excitation = random_steps(one_state_reactor(), DESIGN, 40.0, seed)
-    trajectory = excitation.trajectory
-    assert trajectory.states.shape == (161, 1)
-    np.testing.assert_array_equal(trajectory.times, 0.25 * np.arange(161))
-    assert _inside(excitation, DESIGN)
-    assert np.all((trajectory.inputs >= 281.3) & (trajectory.inputs <= 300.9))
-    assert np.ptp(trajectory.inputs) > 10.0
+    episode = random_steps(one_state_reactor(), DESIGN, 40.0, seed)
+    assert episode.x.shape == (161, 1)
+    np.testing.assert_array_equal(episode.time, 0.25 * np.arange(161))
+    assert _inside(episode, DESIGN)
+    assert np.all((episode.u >= 281.3) & (episode.u <= 300.9))
+    assert np.ptp(episode.u) > 10.0
 
 
 def test_same_seed_same_bits():
     first, second = (random_steps(one_state_reactor(), DESIGN, 20.0, 3) for _ in range(2))
-    np.testing.assert_array_equal(first.trajectory.states, second.trajectory.states)
-    np.testing.assert_array_equal(first.trajectory.inputs, second.trajectory.inputs)
-    assert first.step_starts == second.step_starts
+    np.testing.assert_array_equal(first.x, second.x)
+    np.testing.assert_array_equal(first.u, second.u)
 
 
 def test_different_seeds_differ():
     first, second = (random_steps(one_state_reactor(), DESIGN, 20.0, seed) for seed in (3, 4))
-    assert not np.any(first.trajectory.inputs == second.trajectory.inputs)
+    assert not np.any(first.u == second.u)
 
 
 def test_replaying_the_inputs_gives_the_states():
     system = one_state_reactor()
-    trajectory = random_steps(system, DESIGN, 20.0, 0).trajectory
-    replayed = simulate(system, trajectory.states[0], trajectory.inputs, 0.25)
-    np.testing.assert_array_equal(replayed.states, trajectory.states)
+    episode = random_steps(system, DESIGN, 20.0, 0)
+    replayed = simulate(system, episode.x[0], episode.u, 0.25)
+    np.testing.assert_array_equal(replayed.x, episode.x)
 
 
 def test_random_hold_times():
-    excitation = random_steps(one_state_reactor(), DESIGN, 100.0, 0)
-    lengths = np.diff(excitation.step_starts)
+    episode = random_steps(one_state_reactor(), DESIGN, 100.0, 0)
+    lengths = np.diff(_changes(episode))
     assert set(lengths) <= set(range(4, 17))
     assert len(set(lengths)) > 5
-    changes = np.flatnonzero(np.diff(excitation.trajectory.inputs[:, 0])) + 1
-    np.testing.assert_array_equal(changes, excitation.step_starts[1:])
 
 
 def test_fixed_hold_time_and_a_last_step_cut_short():
-    excitation = random_steps(one_state_reactor(), replace(DESIGN, hold_time=1.5), 5.0, 0)
-    assert excitation.step_starts == (0, 6, 12, 18)
-    assert len(excitation.trajectory.inputs) == 20
+    episode = random_steps(one_state_reactor(), replace(DESIGN, hold_time=1.5), 5.0, 0)
+    assert _changes(episode).tolist() == [6, 12, 18]
+    assert len(episode.u) == 20
 
 
 def test_hold_time_that_floating_point_does_not_divide():
@@ -80,26 +80,26 @@ def test_hold_time_that_floating_point_does_not_divide():
     assert replace(DESIGN, hold_time=0.3, sample_period=0.1).hold_samples == (3, 3)
 
 
-def test_levels_that_leave_the_box_are_drawn_again_and_counted():
+def test_levels_that_leave_the_box_are_drawn_again():
     design = replace(DESIGN, input_upper=315.0)
-    excitation = random_steps(one_state_reactor(), design, 40.0, 0)
-    assert excitation.redraws > 0
-    assert _inside(excitation, design)
-    assert random_steps(one_state_reactor(), DESIGN, 40.0, 0).redraws == 0
+    episode = random_steps(one_state_reactor(), design, 40.0, 0)
+    assert _inside(episode, design)
+    # the same levels without a box would have left it
+    free = replace(design, state_lower=0.0, state_upper=999.0)
+    assert not _inside(random_steps(one_state_reactor(), free, 40.0, 0), design)
 
 
 def test_initial_state_can_be_chosen():
-    excitation = random_steps(one_state_reactor(), DESIGN, 5.0, 0, x0=[306.0])
-    assert excitation.trajectory.states[0] == [306.0]
+    episode = random_steps(one_state_reactor(), DESIGN, 5.0, 0, x0=[306.0])
+    assert episode.x[0] == [306.0]
 
 
 def test_two_states_in_a_box():
     design = RandomStepDesign(
         input_lower=[285.0], input_upper=[306.0], state_lower=[0.6, 305.0],
         state_upper=[1.0, 330.0], hold_time=(0.5, 3.0), sample_period=0.25)
-    excitation = random_steps(two_state_reactor(), design, 40.0, 1)
-    assert excitation.redraws > 0
-    assert _inside(excitation, design)
+    episode = random_steps(two_state_reactor(), design, 40.0, 1)
+    assert _inside(episode, design)
 
 
 def test_level_that_no_redraw_saves():

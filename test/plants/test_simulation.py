@@ -16,9 +16,9 @@ from koopman_ros.plants import (
     IntegrationFailure,
     IntegratorSettings,
     one_state_reactor,
+    sample_derivatives,
     scalar_example,
     simulate,
-    simulate_many,
     two_state_example,
     two_state_reactor,
 )
@@ -35,26 +35,25 @@ def _two_state_closed_form(x, u, t, mu, lambda_):
     return np.array([x1 * np.exp(mu * t), x2 * fast - coupling + u * (fast - 1.0) / lambda_])
 
 
-def _random_holds(count, trajectories=None):
-    shape = (count, 1) if trajectories is None else (trajectories, count, 1)
-    return np.random.default_rng(1).uniform(281.3, 300.9, shape)
+def _random_holds(count):
+    return np.random.default_rng(1).uniform(281.3, 300.9, (count, 1))
 
 
 @pytest.mark.parametrize('x0', [0.05, 1.0, 3.0])
 def test_scalar_example_against_its_closed_form(x0):
-    trajectory = simulate(scalar_example(), [x0], np.zeros((9, 0)), 0.1 / x0)
-    expected = x0 / (1.0 - x0 * trajectory.times)
-    np.testing.assert_allclose(trajectory.states[:, 0], expected, rtol=1e-9)
+    episode = simulate(scalar_example(), [x0], np.zeros((9, 0)), 0.1 / x0)
+    expected = x0 / (1.0 - x0 * episode.time)
+    np.testing.assert_allclose(episode.x[:, 0], expected, rtol=1e-9)
 
 
 @pytest.mark.parametrize(('mu', 'lambda_'), [(-0.1, 1.0), (0.2, -1.5)])
 def test_two_state_example_against_its_closed_form(mu, lambda_):
     inputs = np.array([[1.0], [-2.0], [0.5], [40.0], [3.0]])
-    trajectory = simulate(two_state_example(mu, lambda_), [5.0, 5.0], inputs, 1.0)
+    episode = simulate(two_state_example(mu, lambda_), [5.0, 5.0], inputs, 1.0)
     expected = [np.array([5.0, 5.0])]
     for u in inputs[:, 0]:
         expected.append(_two_state_closed_form(expected[-1], u, 1.0, mu, lambda_))
-    np.testing.assert_allclose(trajectory.states, expected, rtol=1e-9)
+    np.testing.assert_allclose(episode.x, expected, rtol=1e-9)
 
 
 def test_reactor_settles_at_its_steady_state():
@@ -67,9 +66,9 @@ def test_reactor_settles_at_its_steady_state():
 def test_tolerance_is_kept(rtol):
     system, inputs = one_state_reactor(), _random_holds(40)
     exact = simulate(system, system.nominal_state, inputs, 0.5, settings=STRICT)
-    trajectory = simulate(
+    episode = simulate(
         system, system.nominal_state, inputs, 0.5, settings=IntegratorSettings(rtol=rtol))
-    np.testing.assert_allclose(trajectory.states, exact.states, rtol=10.0 * rtol)
+    np.testing.assert_allclose(episode.x, exact.x, rtol=10.0 * rtol)
 
 
 def test_absolute_tolerance_matters_near_zero():
@@ -83,67 +82,26 @@ def test_absolute_tolerance_matters_near_zero():
 
 def test_advancing_hold_by_hold_is_simulating_to_the_bit():
     system, inputs = two_state_reactor(), _random_holds(5)
-    trajectory = simulate(system, system.nominal_state, inputs, 1.0 / 60.0)
+    episode = simulate(system, system.nominal_state, inputs, 1.0 / 60.0)
     state = system.nominal_state
     for n, u in enumerate(inputs):
         state = advance(system, state, u, 1.0 / 60.0)
-        np.testing.assert_array_equal(state, trajectory.states[n + 1])
+        np.testing.assert_array_equal(state, episode.x[n + 1])
 
 
 def test_times_are_not_summed_up():
-    trajectory = simulate(scalar_example(), [0.0], np.zeros((1000, 0)), 0.1, start_time=7.0)
-    np.testing.assert_array_equal(trajectory.times, 7.0 + 0.1 * np.arange(1001))
+    episode = simulate(scalar_example(), [0.0], np.zeros((1000, 0)), 0.1, start_time=7.0)
+    np.testing.assert_array_equal(episode.time, 7.0 + 0.1 * np.arange(1001))
 
 
 def test_substeps_record_more_of_the_same_trajectory():
     system, inputs = one_state_reactor(), _random_holds(6)
     coarse = simulate(system, [320.0], inputs, 0.7)
     fine = simulate(system, [320.0], inputs, 0.7, substeps=3)
-    assert fine.states.shape == (19, 1)
-    np.testing.assert_array_equal(fine.times[::3], coarse.times)
-    np.testing.assert_array_equal(fine.inputs, np.repeat(inputs, 3, axis=0))
-    np.testing.assert_allclose(fine.states[::3], coarse.states, rtol=1e-9)
-
-
-def test_many_agree_with_one_by_one():
-    system, inputs = two_state_reactor(), _random_holds(8, trajectories=20)
-    starts = np.random.default_rng(2).uniform([0.7, 305.0], [1.0, 325.0], (20, 2))
-    together = simulate_many(system, starts, inputs, 0.5, substeps=2, start_time=3.0)
-    assert together.states.shape == (20, 17, 2)
-    assert together.inputs.shape == (20, 16, 1)
-    for x0, u, states in zip(starts, inputs, together.states, strict=True):
-        alone = simulate(system, x0, u, 0.5, substeps=2, start_time=3.0)
-        np.testing.assert_array_equal(alone.times, together.times)
-        np.testing.assert_allclose(states, alone.states, rtol=1e-9)
-
-
-def test_one_moving_trajectory_among_resting_ones_keeps_its_tolerance():
-    system = one_state_reactor()
-    starts = np.tile(system.nominal_state, (2000, 1))
-    inputs = np.full((2000, 1, 1), 300.0)
-    starts[700], inputs[700] = 306.0, 285.0
-    together = simulate_many(system, starts, inputs, 1.0)
-    exact = advance(system, starts[700], inputs[700, 0], 1.0, settings=STRICT)
-    np.testing.assert_allclose(together.states[700, 1], exact, rtol=1e-11)
-
-
-def test_stacks_are_split_where_their_tolerance_would_get_too_tight():
-    settings = IntegratorSettings(rtol=4.0 * integration.TIGHTEST_RTOL)
-    assert integration.largest_stack(settings.rtol) == 16
-    system = one_state_reactor()
-    starts, inputs = np.linspace([306.0], [325.0], 40), np.full((40, 2, 1), 290.0)
-    together = simulate_many(system, starts, inputs, 0.3, settings=settings)
-    alone = [simulate(system, x, u, 0.3, settings=settings).states
-             for x, u in zip(starts, inputs, strict=True)]
-    np.testing.assert_allclose(together.states, alone, rtol=1e-12)
-
-
-def test_no_trajectories_and_no_holds():
-    system = one_state_reactor()
-    assert simulate_many(system, np.zeros((0, 1)), np.zeros((0, 3, 1)), 1.0).states.shape == (
-        0, 4, 1)
-    nothing = simulate(system, [310.0], np.zeros((0, 1)), 1.0)
-    np.testing.assert_array_equal(nothing.states, [[310.0]])
+    assert fine.x.shape == (19, 1)
+    np.testing.assert_array_equal(fine.time[::3], coarse.time)
+    np.testing.assert_array_equal(fine.u, np.repeat(inputs, 3, axis=0))
+    np.testing.assert_allclose(fine.x[::3], coarse.x, rtol=1e-9)
 
 
 def test_no_time_no_change():
@@ -198,14 +156,6 @@ def test_time_of_a_failure_counts_from_the_start_time():
     assert 11.0 < caught.value.time < 12.0
 
 
-def test_failure_of_one_of_many_says_which():
-    inputs = np.full((4, 2, 1), 290.0)
-    inputs[2] = 310.0
-    with pytest.raises(IntegrationError, match='one-state reactor, trajectory 2: ') as caught:
-        simulate_many(one_state_reactor(), np.full((4, 1), 324.0), inputs, 5.0)
-    assert caught.value.trajectory == 2
-
-
 def test_escape_to_infinity_without_bounds():
     system, evaluations = counting(scalar_example())
     with pytest.raises(IntegrationError, match=r'at 1 s: it changes too fast') as caught:
@@ -249,11 +199,9 @@ def test_integration_error_survives_pickling():
     (lambda s: advance(s, [320.0], [300.0], np.nan), 'duration is nan min'),
     (lambda s: simulate(s, [320.0], [300.0], 1.0),
      r'incompatible inputs: expected \(any, 1\), got \(1,\)'),
+    (lambda s: simulate(s, [320.0], np.zeros((0, 1)), 1.0), 'incompatible input_time and u: exp'),
     (lambda s: simulate(s, [320.0], [[300.0]], 0.0), r'sample_period is 0\.0 min, must be'),
     (lambda s: simulate(s, [320.0], [[300.0]], 1.0, substeps=0), 'substeps is 0, must be at'),
-    (lambda s: simulate_many(s, [320.0], [[[300.0]]], 1.0), r'incompatible x0: expected \(any'),
-    (lambda s: simulate_many(s, [[320.0]], np.zeros((2, 1, 1)), 1.0),
-     r'incompatible inputs: expected \(1, any, 1\), got \(2, 1, 1\)'),
     (lambda s: IntegratorSettings(rtol=1e-6), r'rtol is 1e-06, must lie in \[2\.22e-14, 1e-09\]'),
     (lambda s: IntegratorSettings(rtol=np.nan), 'rtol is nan'),
     (lambda s: advance(s, [320.0], [300.0], 1.0, settings=IntegratorSettings(atol=0.0)),
@@ -270,3 +218,35 @@ def test_bounds_of_the_system_apply_by_default():
     system = replace(two_state_example(), state_upper=[np.inf, 20.0])
     with pytest.raises(IntegrationError, match=r'x2 outside \[-inf, 20\]: it left its bounds'):
         advance(system, [0.0, 1.0], [1.0], 10.0)
+
+
+# Samples of a simulation.
+
+
+def test_derivatives_are_exact_at_each_sample_but_the_last():
+    system = two_state_reactor()
+    inputs = np.array([[290.0], [295.0], [300.0]])
+    episodes = [simulate(system, x0, inputs, 0.5, substeps=4)
+                for x0 in ([0.9, 320.0], [0.8, 310.0])]
+    samples = sample_derivatives(system, episodes)
+    np.testing.assert_array_equal(samples.x, np.vstack([e.x[:-1] for e in episodes]))
+    np.testing.assert_array_equal(samples.u[:, 0], np.tile(np.repeat(inputs, 4), 2))
+    np.testing.assert_array_equal(samples.dxdt, system.derivative(samples.x, samples.u))
+    np.testing.assert_array_equal(samples.episode, np.repeat([0, 1], 12))
+    np.testing.assert_array_equal(samples.time, np.tile(0.125 * np.arange(12), 2))
+
+
+def test_rate_at_a_step_is_that_of_the_input_from_there_on():
+    system = one_state_reactor()
+    episode = simulate(system, system.nominal_state, [[300.0], [290.0]], 1.0)
+    samples = sample_derivatives(system, [episode])
+    np.testing.assert_allclose(samples.dxdt[:, 0], [0.0, -10.0 * system.B[0, 0]], atol=1e-6)
+
+
+def test_samples_without_input():
+    episode = simulate(scalar_example(), [0.5], np.zeros((3, 0)), 0.1)
+    samples = sample_derivatives(scalar_example(), [episode])
+    assert samples.u.shape == (3, 0)
+    np.testing.assert_array_equal(samples.dxdt, samples.x ** 2)
+    with pytest.raises(ValueError, match=r'incompatible u: expected \(\.\.\., 1\), got \(3, 0\)'):
+        sample_derivatives(one_state_reactor(), [episode])

@@ -6,15 +6,16 @@
 import numpy as np
 import pytest
 
-from koopman_ros.identification import Box, Record
+from koopman_ros.plant_data import Episode
 from koopman_ros.retraining.coverage import CELLS, coverage, visited_cells
+from support.known_plants import box
 
-BOX = Box(np.array([0.0]), np.array([10.0]), np.array([100.0]), np.array([200.0]))
+BOX = box([0.0], [10.0], [100.0], [200.0])
 
 
 def record(x, u):
     times = np.arange(float(len(x)))
-    return Record(times, np.array(x)[:, None], times, np.array(u)[:, None])
+    return Episode(times, np.array(x)[:, None], times, np.array(u)[:, None])
 
 
 def test_cells_are_counted_once():
@@ -35,14 +36,14 @@ def test_share_of_all_cells():
 
 
 def test_inputs_are_those_that_held():
-    held = Record(np.arange(3.0), np.full((3, 1), 0.5), np.array([-1.0, 0.5]),
+    held = Episode(np.arange(3.0), np.full((3, 1), 0.5), np.array([-1.0, 0.5]),
                   np.array([[105.0], [195.0]]))
     assert visited_cells([held], BOX).tolist() == [[0, 0], [0, 9]]
 
 
 def test_cells_of_two_states():
-    box = Box(np.zeros(2), np.ones(2), np.zeros(1), np.ones(1))
-    path = Record(np.arange(2.0), np.array([[0.05, 0.95], [0.55, 0.45]]), np.zeros(1),
+    unit = box([0.0, 0.0], [1.0, 1.0], [0.0], [1.0])
+    path = Episode(np.arange(2.0), np.array([[0.05, 0.95], [0.55, 0.45]]), np.zeros(1),
                   np.array([[0.35]]))
-    assert visited_cells([path], box).tolist() == [[0, 9, 3], [5, 4, 3]]
-    assert coverage([path], box) == pytest.approx(2e-3)
+    assert visited_cells([path], unit).tolist() == [[0, 9, 3], [5, 4, 3]]
+    assert coverage([path], unit) == pytest.approx(2e-3)

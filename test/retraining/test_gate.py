@@ -13,7 +13,7 @@ from koopman_ros.identification import identify
 from koopman_ros.lifting import linearised_model, load, Provenance
 from koopman_ros.nodes.shipped import model_path
 from koopman_ros.plants import two_state_reactor
-from koopman_ros.retraining import judge, learn_lift, Thresholds
+from koopman_ros.retraining import decide, learn_lift, Thresholds
 from koopman_ros.retraining.gate import lifted_rate
 from support.random_lifts import random_lift
 from support.recorded_runs import driven, linear_run, NOISE, reactor
@@ -25,14 +25,14 @@ def shipped():
 
 
 @pytest.fixture(scope='module')
-def found():
+def found(shipped):
     """Return the estimate of a reactor whose jacket has fouled."""
-    return identify([driven(reactor(0.8), 15.0).record()], degrees=(1, 2, 3))
+    return identify(shipped.plant, [driven(reactor(0.8), 15.0).episode()], degrees=(1, 2, 3))
 
 
 @pytest.fixture(scope='module')
 def trained(found, shipped):
-    return learn_lift(found, shipped, 2, seed=0, starts=1)
+    return learn_lift(found, shipped.plant, 2, seed=0, starts=1)
 
 
 def linear_lift(model, slope, input_matrix):
@@ -73,49 +73,49 @@ def test_rate_of_a_state_that_has_diverged(shipped):
 
 
 def test_a_better_lift_is_accepted(found, trained, shipped):
-    verdict = judge(found, trained, shipped, Thresholds())
-    assert verdict.accepted
-    assert (verdict.reasons, verdict.warnings) == ((), ())
-    assert (verdict.loops, verdict.arrived) == (9, 9)
+    decision = decide(found, trained, shipped, Thresholds())
+    assert decision.accepted
+    assert (decision.reasons, decision.warnings) == ((), ())
+    assert (decision.loops, decision.arrived) == (9, 9)
     # nothing but noise is left of its error, and kelvins of the present one's
-    assert verdict.rmse == pytest.approx([NOISE], rel=0.15)
-    assert verdict.noise == pytest.approx([NOISE], rel=0.15)
-    assert verdict.rmse == pytest.approx(verdict.drift_rmse, rel=0.05)
-    assert verdict.current_rmse > 10.0 * verdict.rmse
-    assert verdict.linear_rmse > 1.2 * verdict.rmse
+    assert decision.rmse == pytest.approx([NOISE], rel=0.15)
+    assert decision.noise == pytest.approx([NOISE], rel=0.15)
+    assert decision.rmse == pytest.approx(decision.drift_rmse, rel=0.05)
+    assert decision.current_rmse > 10.0 * decision.rmse
+    assert decision.linear_rmse > 1.2 * decision.rmse
 
 
 def test_the_present_lift_does_not_beat_itself(found, trained):
-    verdict = judge(found, trained, trained.model, Thresholds())
-    own = f'{verdict.rmse[0]:.4g} K'
-    assert verdict.reasons == (
+    decision = decide(found, trained, trained.model, Thresholds())
+    own = f'{decision.rmse[0]:.4g} K'
+    assert decision.reasons == (
         f'its error on held-out records, {own}, is not 10 % below that of the present lift, '
         f'{own}',)
-    assert judge(found, trained, trained.model, Thresholds(margin=0.0)).accepted
+    assert decide(found, trained, trained.model, Thresholds(margin=0.0)).accepted
 
 
 def test_an_undrifted_plant_needs_no_new_lift(shipped):
     run = driven(reactor(), 8.0, coolant=(281.33, 300.55))
-    found = identify([run.record()], degrees=(1, 3))
-    trained = learn_lift(found, shipped, 2, seed=0, starts=1)
-    verdict = judge(found, trained, shipped, Thresholds())
-    (reason,) = verdict.reasons
+    found = identify(shipped.plant, [run.episode()], degrees=(1, 3))
+    trained = learn_lift(found, shipped.plant, 2, seed=0, starts=1)
+    decision = decide(found, trained, shipped, Thresholds())
+    (reason,) = decision.reasons
     assert 'is not 10 % below that of the present lift' in reason
 
 
 def test_margin_is_a_share(found, trained, shipped):
-    verdict = judge(found, trained, shipped, Thresholds())
-    ratio = float(verdict.rmse[0] / verdict.linear_rmse[0])
-    assert judge(found, trained, shipped, Thresholds(margin=1.0 - 1.01 * ratio)).accepted
-    (reason,) = judge(found, trained, shipped, Thresholds(margin=1.0 - 0.99 * ratio)).reasons
+    decision = decide(found, trained, shipped, Thresholds())
+    ratio = float(decision.rmse[0] / decision.linear_rmse[0])
+    assert decide(found, trained, shipped, Thresholds(margin=1.0 - 1.01 * ratio)).accepted
+    (reason,) = decide(found, trained, shipped, Thresholds(margin=1.0 - 0.99 * ratio)).reasons
     assert 'the best linear model' in reason
 
 
 def test_coordinates_that_have_collapsed(found, trained, shipped):
-    limit = 0.99 * trained.report.fit.cond
-    (reason,) = judge(found, trained, shipped, Thresholds(condition=limit)).reasons
+    limit = 0.99 * trained.figures.fit.cond
+    (reason,) = decide(found, trained, shipped, Thresholds(condition=limit)).reasons
     assert reason == (
-        f'the condition number of its coordinates, {trained.report.fit.cond:.3g}, is above '
+        f'the condition number of its coordinates, {trained.figures.fit.cond:.3g}, is above '
         f'{limit:.3g}: use fewer coordinates')
 
 
@@ -124,37 +124,37 @@ def test_a_linear_model_is_no_better_than_the_best_one(found, trained, shipped):
     other = replace(trained, model=linear_lift(
         trained.model, float(found.linear.slope(scale)[0, 0]),
         float(found.linear.input_matrix[0, 0])))
-    reasons = judge(found, other, shipped, Thresholds()).reasons
+    reasons = decide(found, other, shipped, Thresholds()).reasons
     assert [reason for reason in reasons if 'the best linear model' in reason]
 
 
 def test_a_controller_that_destabilises_is_refused(found, trained, shipped):
     wrong = replace(trained, model=replace(trained.model, B=-trained.model.B))
-    verdict = judge(found, wrong, shipped, Thresholds())
-    assert verdict.arrived == 0
+    decision = decide(found, wrong, shipped, Thresholds())
+    assert decision.arrived == 0
     assert ('its controller brings the estimated drift to the set-point in 0 of 9 closed loops '
-            'over its box') in verdict.reasons
+            'over its box') in decision.reasons
 
 
 def diverging(model):
-    """Return a lift whose prediction overflows within a stretch."""
+    """Return a lift whose prediction overflows within a segment."""
     return linear_lift(model, 1e4, 1.0)
 
 
 def test_present_lift_that_diverges(found, trained):
-    verdict = judge(found, trained, diverging(trained.model), Thresholds())
-    assert verdict.current_rmse == [np.inf]
-    assert verdict.accepted
+    decision = decide(found, trained, diverging(trained.model), Thresholds())
+    assert decision.current_rmse == [np.inf]
+    assert decision.accepted
 
 
 def test_lift_that_diverges_is_refused_even_where_the_present_one_does(
         found, trained, monkeypatch):
     # stiff loops take long, and do not matter here
-    monkeypatch.setattr(sys.modules[judge.__module__], '_closed_loops', lambda *_: (9, 9))
+    monkeypatch.setattr(sys.modules[decide.__module__], '_closed_loops', lambda *_: (9, 9))
     bad = replace(trained, model=diverging(trained.model))
-    verdict = judge(found, bad, bad.model, Thresholds())
+    decision = decide(found, bad, bad.model, Thresholds())
     assert 'its error on held-out records, inf K, is not 10 % below that of the present lift' in (
-        ' '.join(verdict.reasons))
+        ' '.join(decision.reasons))
 
 
 @pytest.mark.parametrize(('values', 'words'), [
@@ -175,25 +175,25 @@ def test_thresholds_out_of_range(values, words):
 def test_warns_of_a_state_that_is_not_measured(shipped):
     """The reactor's concentration moves, too; its temperature alone does not tell where it is."""
     run = driven(two_state_reactor(), 20.0, coolant=(294.0, 302.0), seed=2, noise=0.03)
-    found = identify([run.record()], degrees=(1, 2))
-    trained = learn_lift(found, shipped, 2, seed=0, starts=1)
-    verdict = judge(found, trained, shipped, Thresholds())
-    (warning,) = verdict.warnings
+    found = identify(shipped.plant, [run.episode()], degrees=(1, 2))
+    trained = learn_lift(found, shipped.plant, 2, seed=0, starts=1)
+    decision = decide(found, trained, shipped, Thresholds())
+    (warning,) = decision.warnings
     assert warning.startswith(
-        f'the best drift errs by {verdict.drift_rmse[0]:.3g} K in temperature, of which ')
+        f'the best drift errs by {decision.drift_rmse[0]:.3g} K in temperature, of which ')
     assert 'something that is not measured acts too' in warning
     # the noise is told apart from it
-    assert verdict.noise == pytest.approx([0.03], rel=0.15)
-    assert verdict.drift_rmse > 1.5 * verdict.noise
+    assert decision.noise == pytest.approx([0.03], rel=0.15)
+    assert decision.drift_rmse > 1.5 * decision.noise
     # it is judged by what it does, not by the warning
-    assert verdict.rmse < verdict.current_rmse
+    assert decision.rmse < decision.current_rmse
 
 
 def test_does_not_warn_where_all_is_measured():
     model = load(model_path('reactor_nz3'))
-    found = identify([linear_run(600).record()], degrees=(1,))
-    verdict = judge(found, _as_trained(found, model), model, Thresholds())
-    assert verdict.warnings == ()
+    found = identify(model.plant, [linear_run(600).episode()], degrees=(1,))
+    decision = decide(found, _as_trained(found, model), model, Thresholds())
+    assert decision.warnings == ()
 
 
 def _as_trained(found, like):
@@ -201,12 +201,12 @@ def _as_trained(found, like):
     class Fit:
         cond = 1.0
 
-    class Report:
+    class Figures:
         fit = Fit
 
     class Trained:
         model = linear_lift(like, float(found.drift.slope(like.states.center)[0, 0]),
                             float(found.drift.input_matrix[0, 0]))
-        report = Report
+        figures = Figures
 
     return Trained

@@ -8,22 +8,23 @@ import pytest
 from scipy.integrate import solve_ivp
 from scipy.optimize import brentq
 
-from koopman_ros.identification import Box, cut, DriftModel, Record
-from koopman_ros.identification.drift import scaled_input_matrix
+from koopman_ros.identification import DriftModel
+from koopman_ros.plant_data import cut, Episode
 from koopman_ros.retraining.lift import _spread, drift_samples, steady_point
+from support.known_plants import box
 
-BOX = Box(np.array([-1.0]), np.array([3.0]), np.array([-2.0]), np.array([2.0]))
+BOX = box([-1.0], [3.0], [-2.0], [2.0])
 
 
-def cubic(c0=0.5, box=BOX):
+def cubic(c0=0.5):
     """Return dx/dt = c0 - x + 0.3 x^2 - 0.2 x^3 + 1.5 u as a drift model."""
-    middle, half = 0.5 * (box.state_lower + box.state_upper), box.state_scale
+    middle, half = BOX.states.center, BOX.states.scale
     xi = np.linspace(-1.0, 1.0, 4)
     x = middle + half * xi
     f = c0 - x + 0.3 * x ** 2 - 0.2 * x ** 3
-    rest = 1.5 * 0.5 * (box.input_lower + box.input_upper)
+    rest = 1.5 * BOX.inputs.center
     coefficients = np.polynomial.polynomial.polyfit(xi, (f + rest) / half, 3)
-    return DriftModel(box, 3, coefficients[:, None], scaled_input_matrix(box, np.array([[1.5]])))
+    return DriftModel(BOX, 3, coefficients[:, None], BOX.input_matrix(np.array([[1.5]])))
 
 
 def held(drift, x0, u, count=60, period=0.1):
@@ -31,7 +32,7 @@ def held(drift, x0, u, count=60, period=0.1):
     times = period * np.arange(count)
     path = solve_ivp(lambda _, x: drift.rate(x, np.array([u])), (0.0, times[-1]), [x0],
                      t_eval=times, rtol=1e-10, atol=1e-12).y.T
-    return Record(times, path, np.zeros(1), np.array([[u]]))
+    return Episode(times, path, np.zeros(1), np.array([[u]]))
 
 
 # The steady point.
@@ -47,8 +48,8 @@ def test_steady_point_keeps_a_state_that_an_input_can_hold():
 
 def test_steady_point_of_two_states_and_one_input():
     # dx1/dt = -x1 + x2, dx2/dt = -x2 - x1^2 + u on a box of halves of the width 2 and 4
-    box = Box(np.array([-2.0, -4.0]), np.array([2.0, 4.0]), np.array([-5.0]), np.array([5.0]))
-    drift = DriftModel(box, 2, np.zeros((6, 2)), scaled_input_matrix(box, np.array([[0.], [1.]])))
+    wide = box([-2.0, -4.0], [2.0, 4.0], [-5.0], [5.0])
+    drift = DriftModel(wide, 2, np.zeros((6, 2)), wide.input_matrix(np.array([[0.], [1.]])))
     orders = {tuple(row): k for k, row in enumerate(
         np.round(drift.features(np.array([[0.5, 1.0], [1.0, 0.5], [0.5, 0.5]])), 12).T)}
     for (values, row, value) in (((0.5, 1.0, 0.5), 0, -1.0), ((1.0, 0.5, 0.5), 0, 2.0),
@@ -77,7 +78,7 @@ def test_steady_point_finds_the_root_where_the_input_does_nothing():
                                           [0.1, 0.0, 0.0, 1e-9]])
 def test_no_steady_point(coefficients):
     still = DriftModel(BOX, 3, np.array(coefficients)[:, None], np.zeros((1, 1)))
-    with pytest.raises(ValueError, match='no steady state was found within the range of the rec'):
+    with pytest.raises(ValueError, match='no steady state was found within the range of the epi'):
         steady_point(still, np.array([1.0]), np.array([0.0]))
 
 
@@ -87,7 +88,7 @@ def test_no_steady_point(coefficients):
 def test_samples_lie_on_the_paths_of_the_drift():
     drift = cubic()
     records = tuple(held(drift, x0, u) for x0, u in ((2.5, -1.0), (-0.5, 1.5), (0.3, 0.2)))
-    noisy = tuple(Record(r.time, r.x + 0.05 * np.random.default_rng(k).standard_normal(r.x.shape),
+    noisy = tuple(Episode(r.time, r.x + 0.05 * np.random.default_rng(k).standard_normal(r.x.shape),
                          r.input_time, r.u) for k, r in enumerate(records))
     samples = drift_samples(drift, noisy)
     assert len(samples) == 3 * 59
@@ -96,19 +97,19 @@ def test_samples_lie_on_the_paths_of_the_drift():
     true = np.concatenate([r.x[:-1] for r in records])
     error = samples.x - true
     assert np.sqrt(np.mean(error ** 2)) < 0.05 / 4.0
-    # in the order of the stretches and of their times
+    # in the order of the segments and of their times
     assert samples.u[:, 0].tolist() == [-1.0] * 59 + [1.5] * 59 + [0.2] * 59
 
 
-def test_stretches_that_the_drift_does_not_follow_are_left_out():
+def test_segments_that_the_drift_does_not_follow_are_left_out():
     # above 1 it runs away
     drift = DriftModel(BOX, 3, np.array([[0.0], [-1.0], [0.0], [4.0]]), np.zeros((1, 1)))
     calm = held(drift, 1.4, 0.0)
-    rising = Record(calm.time, np.linspace(2.8, 3.0, 60)[:, None], calm.input_time, calm.u)
+    rising = Episode(calm.time, np.linspace(2.8, 3.0, 60)[:, None], calm.input_time, calm.u)
     samples = drift_samples(drift, (calm, rising))
     assert len(samples) == 59
     assert np.max(np.abs(samples.x)) < 3.0
-    with pytest.raises(ValueError, match='the estimated drift follows none of the records'):
+    with pytest.raises(ValueError, match='the estimated drift follows none of the episodes'):
         drift_samples(drift, (rising,))
 
 

@@ -29,19 +29,19 @@ def bag(tmp_path_factory):
 
 @pytest.fixture(scope='module')
 def accepted(bag, tmp_path_factory):
-    """Return the outcome of a training that replaces a model, its progress, and its folder."""
+    """Return the retrained of a training that replaces a model, its progress, and its folder."""
     folder = tmp_path_factory.mktemp('accepted')
     (folder / 'new.safetensors').write_bytes(Path(SHIPPED).read_bytes())
     told = []
-    outcome = retrain(Task((str(bag),), str(folder / 'new.safetensors'), SHIPPED, coordinates=2,
+    retrained = retrain(Task((str(bag),), str(folder / 'new.safetensors'), SHIPPED, coordinates=2,
                            starts=1), lambda share, text: told.append((share, text)) or False)
-    return outcome, told, folder
+    return retrained, told, folder
 
 
 def test_accepted_lift_is_written_and_the_one_before_is_kept(accepted):
-    outcome, _, folder = accepted
-    assert outcome.accepted
-    assert outcome.model_file == str(folder / 'new.safetensors')
+    retrained, _, folder = accepted
+    assert retrained.accepted
+    assert retrained.model_file == str(folder / 'new.safetensors')
     assert sorted(path.name for path in folder.glob('*.safetensors')) == [
         'new.previous.safetensors', 'new.safetensors']
     assert (folder / 'new.previous.safetensors').read_bytes() == Path(SHIPPED).read_bytes()
@@ -50,16 +50,16 @@ def test_accepted_lift_is_written_and_the_one_before_is_kept(accepted):
 
 
 def test_file_says_where_it_comes_from(accepted):
-    outcome, _, folder = accepted
+    retrained, _, folder = accepted
     origin = load(folder / 'new.safetensors').provenance
-    found = outcome.found
+    found = retrained.found
     assert origin.plant == load(SHIPPED).provenance.plant
     assert len(origin.data_digest) == 64
     assert origin.method == f'{found.method}, drift of degree {found.drift.degree}'
     assert origin.metrics['noise'] == float(found.noise[0]) == pytest.approx(NOISE, rel=0.1)
-    assert origin.metrics['rollout_rmse'] == float(outcome.verdict.rmse[0])
-    assert origin.metrics['coverage'] == outcome.coverage
-    assert 0.2 < outcome.coverage < 1.0
+    assert origin.metrics['rollout_rmse'] == float(retrained.decision.rmse[0])
+    assert origin.metrics['coverage'] == retrained.coverage
+    assert 0.2 < retrained.coverage < 1.0
     assert {'rw', 'rx', 'cond'} < set(origin.metrics)
     assert origin.seed == 0
 
@@ -94,20 +94,20 @@ def test_refused_lift_is_kept_aside_and_has_the_same_bits(bag, accepted, tmp_pat
     _, _, folder = accepted
     present = folder / 'new.safetensors'
     output = tmp_path / 'deep' / 'er' / 'new.safetensors'
-    outcome = retrain(Task((str(bag),), str(output), str(present), coordinates=2, starts=1))
-    assert not outcome.accepted
-    assert 'is not 10 % below that of the present lift' in outcome.reasons[0]
+    retrained = retrain(Task((str(bag),), str(output), str(present), coordinates=2, starts=1))
+    assert not retrained.accepted
+    assert 'is not 10 % below that of the present lift' in retrained.reasons[0]
     # nothing replaces the output, and the same data and seed give the same file
     assert [path.name for path in output.parent.iterdir()] == ['new.refused.safetensors']
-    assert Path(outcome.model_file).read_bytes() == present.read_bytes()
+    assert Path(retrained.model_file).read_bytes() == present.read_bytes()
 
 
 def test_report(accepted):
-    outcome, _, _ = accepted
-    files = write_report(outcome)
+    retrained, _, _ = accepted
+    files = write_report(retrained)
     assert [path.name for path in files] == ['new.json', 'new.md', 'new.png']
     figures = json.loads(files[0].read_text())
-    assert figures == outcome.summary()
+    assert figures == retrained.summary()
     assert figures['accepted'] is True
     assert figures['measurements_used'] == figures['measurements_read'] == 1201
     # UA is 0.8 of 2.092 1/min
@@ -115,31 +115,31 @@ def test_report(accepted):
     page = files[1].read_text()
     assert '**The new lift is accepted.**' in page
     assert '1201 of 1201 measurements used' in page
-    assert f'| the present lift | {outcome.verdict.current_rmse[0]:.5f} |' in page
+    assert f'| the present lift | {retrained.decision.current_rmse[0]:.5f} |' in page
     assert '![Data, drift and prediction](new.png)' in page
     assert files[2].read_bytes().startswith(b'\x89PNG')
 
 
 def test_figures_that_are_infinite_stay_valid_json(accepted):
-    outcome, _, _ = accepted
-    diverging = replace(outcome, verdict=replace(
-        outcome.verdict, current_rmse=np.array([np.inf])))
+    retrained, _, _ = accepted
+    diverging = replace(retrained, decision=replace(
+        retrained.decision, current_rmse=np.array([np.inf])))
     figures = json.loads(json.dumps(diverging.summary(), allow_nan=False))
     assert figures['heldout_error_of_present_lift_kelvin'] is None
 
 
 def test_refused_lift_that_diverges_is_kept_all_the_same(tmp_path, monkeypatch):
     bag = write_bag(tmp_path / 'run.mcap', driven(reactor(0.8), 5.0))
-    original = task_module.judge
+    original = task_module.decide
 
-    def judge(*arguments):
+    def decide(*arguments):
         return replace(original(*arguments), rmse=np.array([np.inf]), reasons=('it diverges',))
 
-    monkeypatch.setattr(task_module, 'judge', judge)
+    monkeypatch.setattr(task_module, 'decide', decide)
     monkeypatch.setattr(task_module, 'identify', _quick)
-    outcome = retrain(Task((str(bag),), str(tmp_path / 'new.safetensors'), SHIPPED,
+    retrained = retrain(Task((str(bag),), str(tmp_path / 'new.safetensors'), SHIPPED,
                            coordinates=2, starts=1))
-    metrics = load(outcome.model_file).provenance.metrics
+    metrics = load(retrained.model_file).provenance.metrics
     assert 'rollout_rmse' not in metrics
     assert 'noise' in metrics
 
@@ -147,9 +147,9 @@ def test_refused_lift_that_diverges_is_kept_all_the_same(tmp_path, monkeypatch):
 _identify = task_module.identify
 
 
-def _quick(records, **options):
+def _quick(plant, episodes, **options):
     """Estimate by a few methods alone."""
-    return _identify(records, degrees=(1, 3), windows=(20,), **options)
+    return _identify(plant, episodes, degrees=(1, 3), windows=(20,), **options)
 
 
 def test_previous_model_is_copied_where_there_are_no_hard_links(tmp_path, monkeypatch):
@@ -167,16 +167,16 @@ def test_previous_model_is_copied_where_there_are_no_hard_links(tmp_path, monkey
 
 def test_a_linear_plant_needs_no_lift(tmp_path):
     bag = write_bag(tmp_path / 'linear.mcap', linear_run(200))
-    outcome = retrain(Task((str(bag),), str(tmp_path / 'new.safetensors'), SHIPPED,
+    retrained = retrain(Task((str(bag),), str(tmp_path / 'new.safetensors'), SHIPPED,
                            coordinates=2, starts=1))
-    (reason,) = outcome.reasons
+    (reason,) = retrained.reasons
     assert 'does not predict the motion better than a linear model' in reason
-    assert (outcome.trained, outcome.verdict, outcome.model_file) == (None, None, '')
+    assert (retrained.trained, retrained.decision, retrained.model_file) == (None, None, '')
     assert not list(tmp_path.glob('*.safetensors'))
-    assert outcome.found.drift.degree == 1
+    assert retrained.found.drift.degree == 1
     # dT/dt = -(T - 315) / 2 + (Tc - 288)
-    assert outcome.found.drift.input_matrix == pytest.approx(np.array([[1.0]]), rel=0.02)
-    files = write_report(outcome)
+    assert retrained.found.drift.input_matrix == pytest.approx(np.array([[1.0]]), rel=0.02)
+    files = write_report(retrained)
     assert '**The new lift is refused.**' in files[1].read_text()
     assert json.loads(files[0].read_text())['accepted'] is False
 
@@ -188,11 +188,11 @@ def test_known_gain_and_a_model_in_seconds(tmp_path, monkeypatch):
     present = load(SHIPPED)
     save(replace(present, A=present.A / 60.0, B=present.B / 60.0, time_unit='s'),
          tmp_path / 'seconds.safetensors')
-    outcome = retrain(Task((str(bag),), str(tmp_path / 'new.safetensors'),
+    retrained = retrain(Task((str(bag),), str(tmp_path / 'new.safetensors'),
                            str(tmp_path / 'seconds.safetensors'), coordinates=2, starts=1,
                            input_gain=1.0))
-    assert outcome.found.drift.input_matrix == pytest.approx(np.array([[1.0 / 60.0]]), rel=1e-12)
-    assert outcome.summary()['input_gain_per_minute'] == pytest.approx(1.0, rel=1e-12)
+    assert retrained.found.drift.input_matrix == pytest.approx(np.array([[1.0 / 60.0]]), rel=1e-12)
+    assert retrained.summary()['input_gain_per_minute'] == pytest.approx(1.0, rel=1e-12)
 
 
 @pytest.mark.parametrize('text', ['reading bags', 'estimating: drift of degree 3',
@@ -257,6 +257,6 @@ def test_present_lift_of_another_plant(bag, tmp_path):
 def test_bag_without_a_usable_stretch(tmp_path):
     bag = write_bag(tmp_path / 'short.mcap', linear_run(9))
     task = Task((str(bag),), str(tmp_path / 'new.safetensors'), SHIPPED)
-    with pytest.raises(ValueError, match='no usable stretch of measurements: 0 of 9 measurements '
+    with pytest.raises(ValueError, match='no usable segment of measurements: 0 of 9 measurements '
                                          'used; 9 dropped: too short'):
         retrain(task)

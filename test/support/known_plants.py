@@ -8,8 +8,23 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.integrate import solve_ivp
 
-from koopman_ros.identification import Box, DriftModel, Record
+from koopman_ros.identification import DriftModel
+from koopman_ros.lifting import Box, Coordinates
+from koopman_ros.plant_data import Episode, Plant
 from support.disturbance import disturbed
+
+
+def names(letter: str, count: int) -> tuple[str, ...]:
+    """Return numbered names."""
+    return tuple(f'{letter}{i + 1}' for i in range(count))
+
+
+def box(state_lower, state_upper, input_lower, input_upper) -> Box:
+    """Return a box with deviations from its middle."""
+    return Box(*(Coordinates.spanning(names(letter, len(lower)), ('1',) * len(lower),
+                                      np.array(lower), np.array(upper))
+                 for letter, lower, upper in (('x', state_lower, state_upper),
+                                              ('u', input_lower, input_upper))), 's')
 
 
 @dataclass(frozen=True)
@@ -25,6 +40,13 @@ class KnownPlant:
     terms: tuple[tuple[int, ...], ...]
     coefficients: tuple[float, ...]
     B: np.ndarray
+
+    @property
+    def plant(self) -> Plant:
+        """What an identification is told: names and units, B not among it."""
+        n_x, n_u = self.B.shape
+        return Plant('known', names('x', n_x), ('m',) * n_x, names('u', n_u), ('A',) * n_u, 's',
+                     np.zeros(n_x), np.zeros(n_u), None)
 
     def rate(self, x, u):
         """Evaluate dx/dt: (..., n_x) and (..., n_u) -> (..., n_x)."""
@@ -57,7 +79,7 @@ class KnownPlant:
         start = np.zeros(len(self.B)) if x0 is None else x0
         x = self.states(start, times, input_time, u)
         noisy = x + noise * np.random.default_rng(seed).standard_normal(x.shape)
-        return Record(times, disturbed(noisy), input_time, u)
+        return Episode(times, disturbed(noisy), input_time, u)
 
     def excited(self, count, period, *, noise=0.0, seed=0, level=1.0, hold=20):
         """Return a record of random steps, each held for about `hold` samples."""
@@ -72,8 +94,8 @@ class KnownPlant:
         """Return the largest error of a model's rates over a box, relative to their size."""
         box = box or model.box
         axes = [np.linspace(low, high, 9) for low, high in (
-            *zip(box.state_lower, box.state_upper, strict=True),
-            *zip(box.input_lower, box.input_upper, strict=True))]
+            *zip(box.states.lower, box.states.upper, strict=True),
+            *zip(box.inputs.lower, box.inputs.upper, strict=True))]
         grid = np.stack([axis.ravel() for axis in np.meshgrid(*axes)], axis=-1)
         x, u = grid[:, :len(self.B)], grid[:, len(self.B):]
         true = self.rate(x, u)

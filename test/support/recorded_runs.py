@@ -11,7 +11,7 @@ import warnings
 import numpy as np
 
 from koopman_ros.bags import BagWriter, message_definition
-from koopman_ros.identification import Record
+from koopman_ros.plant_data import Episode
 from koopman_ros.plants import (
     ControlAffineSystem,
     one_state_reactor,
@@ -33,10 +33,10 @@ class Run:
     kelvin: np.ndarray
     coolant: np.ndarray
 
-    def record(self) -> Record:
+    def episode(self) -> Episode:
         """Return the run with times in minutes."""
         minutes = np.arange(len(self.kelvin)) / 60.0
-        return Record(minutes, self.kelvin[:, None], minutes, self.coolant[:, None])
+        return Episode(minutes, self.kelvin[:, None], minutes, self.coolant[:, None])
 
 
 def reactor(heat_transfer: float = 1.0) -> ControlAffineSystem:
@@ -53,10 +53,10 @@ def driven(system: ControlAffineSystem, minutes: float, *, seed: int = 0, noise:
     others = [0.0] * (system.n_x - 1), [1.0] * (system.n_x - 1)
     design = RandomStepDesign(
         *coolant, [*others[0], 305.0], [*others[1], 327.0], (0.5, 2.0), 1.0 / 60.0, rtol=1e-9)
-    path = random_steps(system, design, minutes, seed).trajectory
-    true = path.states[:, -1]
+    path = random_steps(system, design, minutes, seed)
+    true = path.x[:, -1]
     noisy = true + noise * np.random.default_rng(seed).standard_normal(len(true))
-    return Run(disturbed(noisy), np.append(path.inputs[:, 0], path.inputs[-1, 0]))
+    return Run(disturbed(noisy), np.append(path.u[:, 0], path.u[-1, 0]))
 
 
 def linear_run(count: int) -> Run:

@@ -9,14 +9,13 @@ import contextlib
 
 import numpy as np
 
-from koopman_ros.learning import Plant, Samples
+from koopman_ros.plant_data import Episode, Plant, Samples
 from koopman_ros.plants import (
     ControlAffineSystem,
     ExcitationError,
     random_steps,
     RandomStepDesign,
     sample_derivatives,
-    Trajectory,
 )
 
 # Share of the episodes that start in a corner of their box.
@@ -41,8 +40,8 @@ def random_step_episodes(system: ControlAffineSystem, design: RandomStepDesign, 
     :param duration: of each, in the plant's time unit.
     :param seed: seed of the first.
     """
-    return _joined(system, [
-        random_steps(system, design, duration, seed + number).trajectory
+    return sample_derivatives(system, [
+        random_steps(system, design, duration, seed + number)
         for number in range(episodes)])
 
 
@@ -62,22 +61,12 @@ def box_episodes(system: ControlAffineSystem, design: RandomStepDesign, episodes
     rng = np.random.default_rng(seed)
     lower = np.broadcast_to(design.state_lower, system.n_x)
     upper = np.broadcast_to(design.state_upper, system.n_x)
-    found: list[Trajectory] = []
+    found: list[Episode] = []
     while len(found) < episodes:
         x0, step_seed = rng.uniform(lower, upper), int(rng.integers(2 ** 31))
         if rng.random() < _AT_CORNERS:
             x0 = np.where(rng.random(system.n_x) < 0.5, lower, upper)
         # no input within the bounds keeps some states inside the box
         with contextlib.suppress(ExcitationError):
-            found.append(random_steps(system, design, duration, step_seed, x0=x0).trajectory)
-    return _joined(system, found)
-
-
-def _joined(system: ControlAffineSystem, trajectories: list[Trajectory]) -> Samples:
-    records = [sample_derivatives(system, trajectory) for trajectory in trajectories]
-    return Samples(
-        np.concatenate([record.x for record in records]),
-        np.concatenate([record.x_dot for record in records]),
-        np.concatenate([record.u for record in records]),
-        np.repeat(np.arange(len(records)), [len(record.x) for record in records]),
-        np.concatenate([trajectory.times[:-1] for trajectory in trajectories]))
+            found.append(random_steps(system, design, duration, step_seed, x0=x0))
+    return sample_derivatives(system, found)

@@ -11,8 +11,9 @@ from typing import Any
 import numpy as np
 
 from koopman_ros.control import ClosedLoop
-from koopman_ros.learning import roll_out, Samples
+from koopman_ros.learning import roll_out
 from koopman_ros.lifting import LiftedModel
+from koopman_ros.plant_data import Samples
 from koopman_ros.plants import RandomStepDesign
 from koopman_ros.reports import drawing, DRAWN_RANGE, LIMIT, Picture
 from validation.paper import reactor, scalar, two_state

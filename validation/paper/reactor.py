@@ -19,10 +19,10 @@ from koopman_ros.learning import (
     Linearisation,
     NoUsefulLift,
     rollout_rmse,
-    Samples,
     train,
 )
 from koopman_ros.lifting import LiftedModel
+from koopman_ros.plant_data import Samples
 from koopman_ros.plants import equilibrium_input, one_state_reactor, RandomStepDesign
 from validation.paper.datasets import box_episodes, describe, random_step_episodes
 from validation.paper.optimal_control import scalar_optimal_cost

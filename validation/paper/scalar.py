@@ -7,8 +7,9 @@ from __future__ import annotations
 
 import numpy as np
 
-from koopman_ros.learning import fit, Growth, Samples, train
+from koopman_ros.learning import fit, Growth, train
 from koopman_ros.lifting import LiftedModel
+from koopman_ros.plant_data import Samples
 from koopman_ros.plants import scalar_example
 from validation.paper.datasets import describe
 from validation.paper.outcome import Metrics, Models

@@ -14,9 +14,10 @@ from numpy.typing import NDArray
 
 from koopman_ros.control import Controller, InputLimits, Settings, State
 from koopman_ros.control import experiment as experiments
-from koopman_ros.identification import Identified, identify, Record
+from koopman_ros.identification import Identified, identify
 from koopman_ros.learning import NoUsefulLift, roll_out, Trained
 from koopman_ros.lifting import Coordinates, LiftedModel, linearised_model, Provenance
+from koopman_ros.plant_data import Episode
 from koopman_ros.plants import (
     ControlAffineSystem,
     one_state_reactor,
@@ -26,7 +27,7 @@ from koopman_ros.plants import (
     ReactorParameters,
     two_state_reactor,
 )
-from koopman_ros.retraining import judge, learn_lift, Thresholds, Verdict
+from koopman_ros.retraining import decide, Decision, learn_lift, Thresholds
 from validation.paper.outcome import Metrics, Models
 from validation.paper.reactor import SETPOINT, SYSTEM
 
@@ -93,13 +94,13 @@ def run_drifted(seed: int) -> tuple[Metrics, Models]:
         hold_longest=150.0, rate=1.0, state_lower=300.0, state_upper=328.0, safe_input=286.0,
         seed=seed)
     driven = _experiment(fouled, plan, loop.x[-1], seed + 2)
-    learned = _learn([loop.record, driven.record], present.model, seed)
-    verdict = judge(learned.found, learned.trained, present.model, Thresholds())
+    learned = _learn([loop.episode, driven.episode], present.model, seed)
+    decision = decide(learned.found, learned.trained, present.model, Thresholds())
     after = _controlled(fouled, learned.trained.model, before.x[-1], 15.0, seed)
     offsets = [abs(float(np.mean(run.x[-300:, 0])) - SETPOINT) for run in (before, after)]
     return {
         'offset_before_kelvin': offsets[0], 'offset_after_kelvin': offsets[1],
-        'offset_ratio': offsets[1] / offsets[0], 'accepted': verdict.accepted,
+        'offset_ratio': offsets[1] / offsets[0], 'accepted': decision.accepted,
         'rollout_kelvin': _roll_out_error(learned.trained.model, fouled, FOULED_DESIGN, seed),
         'input_gain_error': _gain_error(learned.found, fouled),
     }, {'present': present.model, 'new': learned.trained.model}
@@ -115,24 +116,23 @@ def run_two_state(seed: int) -> tuple[Metrics, Models]:
     """
     system = two_state_reactor()
     path = _drive(system, TWO_STATE_DESIGN, seed)
-    record = _measured(path, NOISE, seed, state=1)
-    found = identify(record, seed=seed)
     like = _like()
+    found = identify(like.plant, _measured(path, NOISE, seed, state=1), seed=seed)
     try:
-        trained = learn_lift(found, like, N_Z, seed=seed, starts=STARTS)
+        trained = learn_lift(found, like.plant, N_Z, seed=seed, starts=STARTS)
     except NoUsefulLift:
         return {'accepted': False, 'noise_kelvin': float(found.noise[0])}, {}
-    verdict: Verdict = judge(found, trained, like, Thresholds())
+    decision: Decision = decide(found, trained, like, Thresholds())
     errors = []
     for number in range(_TESTS):
         truth = _drive(system, TWO_STATE_DESIGN, 10_000 * (seed + 1) + number, _TEST_MINUTES)
         predicted = roll_out(trained.model, truth.x[0, 1:], truth.u[:-1], PERIOD)
         errors.append(predicted[:, 0] - truth.x[:, 1])
     return {
-        'heldout_kelvin': float(verdict.rmse[0]), 'noise_kelvin': float(verdict.noise[0]),
-        'linear_kelvin': float(verdict.linear_rmse[0]),
+        'heldout_kelvin': float(decision.rmse[0]), 'noise_kelvin': float(decision.noise[0]),
+        'linear_kelvin': float(decision.linear_rmse[0]),
         'rollout_kelvin': float(np.sqrt(np.mean(np.square(errors)))),
-        'warned': bool(verdict.warnings), 'accepted': verdict.accepted,
+        'warned': bool(decision.warnings), 'accepted': decision.accepted,
     }, {'new': trained.model}
 
 
@@ -154,12 +154,12 @@ class _Run:
     """A true path (N, n_x) and the record of its noisy measurements."""
 
     x: Array
-    record: Record
+    episode: Episode
 
 
 def _judged_on_truth(seed: int, noise: float) -> tuple[Metrics, Models]:
     learned = _learn(_measured(_drive(SYSTEM, DESIGN, seed), noise, seed), _like(), seed)
-    model, fitted = learned.trained.model, learned.trained.report.fit
+    model, fitted = learned.trained.model, learned.trained.figures.fit
     return {
         'rollout_kelvin': _roll_out_error(model, SYSTEM, DESIGN, seed),
         'input_gain_error': _gain_error(learned.found, SYSTEM),
@@ -189,19 +189,19 @@ def _fouled() -> ControlAffineSystem:
 
 def _drive(system: ControlAffineSystem, design: RandomStepDesign, seed: int,
            minutes: float = MINUTES) -> _Path:
-    trajectory = random_steps(system, design, minutes, seed).trajectory
-    return _Path(trajectory.states, np.vstack([trajectory.inputs, trajectory.inputs[-1:]]))
+    episode = random_steps(system, design, minutes, seed)
+    return _Path(episode.x, np.vstack([episode.u, episode.u[-1:]]))
 
 
-def _measured(path: _Path, noise: float, seed: int, state: int = 0) -> list[Record]:
+def _measured(path: _Path, noise: float, seed: int, state: int = 0) -> list[Episode]:
     rng = np.random.default_rng([seed, 1])
     x = path.x[:, [state]] + noise * rng.standard_normal((len(path.x), 1))
-    return [Record(path.time, x, path.time, path.u)]
+    return [Episode(path.time, x, path.time, path.u)]
 
 
-def _learn(records: list[Record], like: LiftedModel, seed: int) -> _Learned:
-    found = identify(records, seed=seed)
-    return _Learned(found, learn_lift(found, like, N_Z, seed=seed, starts=STARTS))
+def _learn(episodes: list[Episode], like: LiftedModel, seed: int) -> _Learned:
+    found = identify(like.plant, episodes, seed=seed)
+    return _Learned(found, learn_lift(found, like.plant, N_Z, seed=seed, starts=STARTS))
 
 
 def _gain_error(found: Identified, system: ControlAffineSystem) -> float:
@@ -263,4 +263,4 @@ def _run(system: ControlAffineSystem, x0: Array, minutes: float, seed: int,
         inputs.append(np.array([answer(float(measured[-1][0]), time_ns)]))
         process = replace(process, u=inputs[-1])
     path = _Path(np.array(states), np.array(inputs))
-    return _Run(path.x, Record(path.time, np.array(measured), path.time, path.u))
+    return _Run(path.x, Episode(path.time, np.array(measured), path.time, path.u))

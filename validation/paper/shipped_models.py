@@ -56,9 +56,9 @@ def linear_model(like: LiftedModel) -> LiftedModel:
 
 def _with_roll_out(model: LiftedModel, system: ControlAffineSystem) -> LiftedModel:
     """Add the roll-out error, in K, over a fresh episode of random steps to the metrics."""
-    truth = random_steps(system, TRAINING, 15.0, SEED - 1).trajectory
-    predicted = roll_out(model, truth.states[0], truth.inputs, TRAINING.sample_period)
-    error = float(np.sqrt(np.mean((predicted - truth.states) ** 2)))
+    truth = random_steps(system, TRAINING, 15.0, SEED - 1)
+    predicted = roll_out(model, truth.x[0], truth.u, TRAINING.sample_period)
+    error = float(np.sqrt(np.mean((predicted - truth.x) ** 2)))
     metrics = {**model.provenance.metrics, 'rollout_rmse': error}
     return replace(model, provenance=replace(model.provenance, metrics=metrics))
 

@@ -28,10 +28,10 @@ from koopman_ros.learning import (
     Growth,
     Linearisation,
     NoUsefulLift,
-    Samples,
     train,
 )
 from koopman_ros.lifting import LiftedModel
+from koopman_ros.plant_data import Samples
 from koopman_ros.plants import RandomStepDesign, two_state_exact_lift, two_state_example
 from validation.paper.datasets import box_episodes, describe
 from validation.paper.optimal_control import exact_two_state_cost, exact_two_state_gain

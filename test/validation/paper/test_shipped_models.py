@@ -40,14 +40,14 @@ def episodes():
         input_lower=model.inputs.lower, input_upper=model.inputs.upper,
         state_lower=model.states.lower, state_upper=model.states.upper,
         hold_time=(0.5, 5.0), sample_period=SAMPLE_PERIOD)
-    return [random_steps(one_state_reactor(), design, 15.0, seed).trajectory
+    return [random_steps(one_state_reactor(), design, 15.0, seed)
             for seed in FRESH_SEEDS]
 
 
 def roll_out_error(model, episodes):
     """Return the root mean square of the prediction error over all episodes, in K."""
-    squares = [np.square(roll_out(model, episode.states[0], episode.inputs, SAMPLE_PERIOD)
-                         - episode.states) for episode in episodes]
+    squares = [np.square(roll_out(model, episode.x[0], episode.u, SAMPLE_PERIOD)
+                         - episode.x) for episode in episodes]
     return float(np.sqrt(np.mean(squares)))
 
 

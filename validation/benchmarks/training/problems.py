@@ -14,7 +14,8 @@ from torch import Tensor
 
 from koopman_ros.learning.growth import Growth
 from koopman_ros.learning.network import Layout, Pass
-from koopman_ros.learning.residuals import Data, Problem, ResidualWeights
+from koopman_ros.learning.residuals import Problem, ResidualWeights
+from koopman_ros.learning.scaled import ScaledSamples
 from koopman_ros.plants import ControlAffineSystem, one_state_reactor, two_state_example
 
 WHITENING = 1.0
@@ -34,7 +35,7 @@ class Case:
     """
 
     layout: Layout
-    data: Data
+    data: ScaledSamples
     theta: Tensor
 
     @property
@@ -53,7 +54,8 @@ def load(path: Path) -> Case:
     with np.load(path) as held:
         layout = Layout(held['x'].shape[1], int(held['n_z']),
                         tuple(int(h) for h in held['hidden']), identity=True)
-        return Case(layout, Data(torch.from_numpy(held['x']), torch.from_numpy(held['f'])),
+        return Case(layout,
+                    ScaledSamples(torch.from_numpy(held['x']), torch.from_numpy(held['f'])),
                     torch.from_numpy(held['theta']))
 
 
@@ -86,13 +88,13 @@ SYSTEMS = {'two-state example': two_state, 'one-state reactor': reactor}
 
 
 def _uniform(system: ControlAffineSystem, lower: list[float], upper: list[float],
-             scale: list[float], samples: int) -> Data:
+             scale: list[float], samples: int) -> ScaledSamples:
     """Draw states uniformly from a box and evaluate the exact drift, both scaled."""
     x = np.random.default_rng(_SEED).uniform(lower, upper, (samples, len(lower)))
     f = system.derivative(x, system.nominal_input) / scale
     # time is scaled as in training: rates of order one
     f /= np.sqrt(np.mean(f ** 2))
-    return Data(torch.from_numpy((x - system.nominal_state) / scale), torch.from_numpy(f))
+    return ScaledSamples(torch.from_numpy((x - system.nominal_state) / scale), torch.from_numpy(f))
 
 
 def artificial(samples: int, n_x: int, n_z: int, hidden: int) -> Case:
@@ -102,10 +104,11 @@ def artificial(samples: int, n_x: int, n_z: int, hidden: int) -> Case:
     f = -x + 0.3 * np.sin(2.0 * x[:, ::-1]) - 0.2 * x ** 2
     layout = Layout(n_x, n_z, (hidden,), identity=True)
     theta = 0.3 * rng.standard_normal(layout.size)
-    return Case(layout, Data(torch.from_numpy(x), torch.from_numpy(f)), torch.from_numpy(theta))
+    return Case(layout, ScaledSamples(torch.from_numpy(x), torch.from_numpy(f)),
+                torch.from_numpy(theta))
 
 
-def invariant_residual(layout: Layout, data: Data, theta: Tensor) -> float:
+def invariant_residual(layout: Layout, data: ScaledSamples, theta: Tensor) -> float:
     """
     Return rw = ||(J_N f - A N) S^(-1/2)||^2 / ||J_N f S^(-1/2)||^2 with S = E[z z'].
 

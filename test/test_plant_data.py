@@ -1,16 +1,116 @@
 # SPDX-FileCopyrightText: 2026 The koopman_ros Authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""Samples, their split into episodes and the scaling: checks and round trips."""
+"""Episodes and samples: what acted when, how they are cut and split, and what is refused."""
 
 from dataclasses import replace
+from itertools import pairwise
 import math
 
 import numpy as np
 import pytest
+from scipy.integrate import quad
 
-from koopman_ros.learning import Plant, Scaling, split_by_episode
-from support.small_plants import BENT, bent_samples
+from koopman_ros.plant_data import cut, Episode, split_by_episode
+from support.small_plants import bent_samples
+
+
+def irregular(n=40, seed=0):
+    """Return a episode with irregular times, and inputs that change between the samples."""
+    rng = np.random.default_rng(seed)
+    time = 5.0 + np.cumsum(rng.uniform(0.01, 0.3, n))
+    input_time = np.concatenate(([4.0], np.sort(rng.uniform(5.0, time[-1] + 1.0, 15))))
+    return Episode(time, rng.standard_normal((n, 2)), input_time, rng.standard_normal((16, 2)))
+
+
+def held(episode, t):
+    """Return the input at a time by going through all changes."""
+    return next(u for start, u in zip(episode.input_time[::-1], episode.u[::-1], strict=True)
+                if start <= t)
+
+
+def test_inputs_hold_from_their_own_time_on():
+    episode = Episode(np.array([1.0, 2.0, 3.0]), np.zeros((3, 1)), np.array([0.5, 2.0, 2.5]),
+                    np.array([[10.0], [20.0], [30.0]]))
+    times = np.array([1.0, 1.999, 2.0, 2.25, 2.5, 9.0])
+    assert episode.inputs_at(times)[:, 0].tolist() == [10.0, 10.0, 20.0, 20.0, 30.0, 30.0]
+
+
+def test_inputs_between_irregular_samples():
+    episode = irregular()
+    times = np.random.default_rng(1).uniform(episode.time[0], episode.time[-1], 50)
+    assert np.array_equal(episode.inputs_at(times), [held(episode, t) for t in times])
+
+
+def test_input_integral_against_quadrature():
+    episode = irregular()
+    changes = episode.input_time[1:]
+    for t, found in zip(episode.time, episode.input_integral(episode.time), strict=True):
+        edges = [episode.time[0], *changes[(changes > episode.time[0]) & (changes < t)], t]
+        expected = [sum(quad(lambda s, j=j: held(episode, s)[j], a, b)[0]
+                        for a, b in pairwise(edges)) for j in (0, 1)]
+        # quad is exact on the constant pieces, but for rounding
+        assert found == pytest.approx(expected, abs=1e-12)
+
+
+def test_input_integral_by_hand():
+    episode = Episode(np.array([1.0, 3.0]), np.zeros((2, 1)), np.array([0.0, 1.5, 2.0]),
+                    np.array([[2.0], [-4.0], [8.0]]))
+    times = np.array([1.0, 1.25, 1.5, 2.0, 3.0])
+    assert episode.input_integral(times)[:, 0].tolist() == [0.0, 0.5, 1.0, -1.0, 7.0]
+
+
+def test_part_keeps_what_acted():
+    episode = irregular()
+    part = episode.part(7, 21)
+    assert np.array_equal(part.time, episode.time[7:21])
+    assert np.array_equal(part.x, episode.x[7:21])
+    assert part.input_time[0] <= part.time[0] < part.input_time[1]
+    times = np.linspace(part.time[0], part.time[-1], 500, endpoint=False)
+    assert np.array_equal(part.inputs_at(times), episode.inputs_at(times))
+    whole = episode.input_integral(part.time)
+    assert part.input_integral(part.time) == pytest.approx(whole - whole[0], abs=1e-12)
+
+
+def test_cut_leaves_no_interval_out():
+    episodes = [irregular(40, 0), irregular(23, 1)]
+    parts = cut(episodes, 8)
+    assert max(map(len, parts)) <= 8
+    # each begins where the last one ends, so that the steps add up
+    for episode, own in zip(episodes, (parts[:6], parts[6:]), strict=True):
+        assert [p.time[0] for p in own[1:]] == [p.time[-1] for p in own[:-1]]
+        assert (own[0].time[0], own[-1].time[-1]) == (episode.time[0], episode.time[-1])
+    assert sum(len(p) - 1 for p in parts) == 39 + 22
+    lengths = [len(p) for p in parts[:6]]
+    assert max(lengths) - min(lengths) <= 1
+
+
+def test_cut_leaves_short_episodes_whole():
+    assert [len(p) for p in cut([irregular(8)], 8)] == [8]
+    assert [len(p) for p in cut([irregular(9)], 8)] == [5, 5]
+    assert cut([irregular(9).part(0, 1)], 8) == []
+    with pytest.raises(ValueError, match='at least 2 samples, got 1'):
+        cut([irregular()], 1)
+
+
+@pytest.mark.parametrize(('changes', 'words'), [
+    ({'time': [0.0, 1.0]}, r'incompatible time and x: .* got \(2,\) and \(3, 1\)'),
+    ({'u': [1.0, 2.0]}, 'incompatible input_time and u'),
+    ({'time': [], 'x': np.zeros((0, 1))}, 'with n > 0'),
+    ({'x': [[1.0], [np.nan], [2.0]]}, 'not finite: drop them'),
+    ({'input_time': [0.0, np.inf]}, 'not finite: drop them'),
+    ({'time': [0.0, 1.0, 1.0]}, 'time must rise: sort the samples'),
+    ({'input_time': [0.0, 0.0]}, 'input_time must rise'),
+    ({'input_time': [0.1, 0.2]}, 'the input at the first measurement is not known'),
+])
+def test_refuses_what_is_no_episode(changes, words):
+    good = {'time': [0.0, 1.0, 2.0], 'x': np.zeros((3, 1)), 'input_time': [0.0, 1.0],
+            'u': np.zeros((2, 1))}
+    with pytest.raises(ValueError, match=words):
+        Episode(**{name: np.array(value) for name, value in {**good, **changes}.items()})
+
+
+# Samples.
 
 
 def timed(episodes=4, length=5):
@@ -116,45 +216,3 @@ def test_episodes_need_not_be_numbered_from_zero():
 def test_too_few_episodes(episodes):
     with pytest.raises(ValueError, match=f'at least 3 episodes to hold some out, got {episodes}'):
         split_by_episode(bent_samples(episodes), 0)
-
-
-def test_scaling_by_half_the_range_from_the_nominal_point():
-    samples = bent_samples()
-    scaling = Scaling.of(BENT, samples)
-    np.testing.assert_array_equal(scaling.states.center, [3.0])
-    np.testing.assert_array_equal(scaling.inputs.center, [0.5])
-    np.testing.assert_array_equal(scaling.states.lower, samples.x.min(axis=0))
-    np.testing.assert_array_equal(scaling.states.upper, samples.x.max(axis=0))
-    np.testing.assert_array_equal(scaling.states.scale, np.ptp(samples.x, axis=0) / 2.0)
-    assert (scaling.states.names, scaling.inputs.units, scaling.time_unit) == (
-        ('level',), ('m/s',), 's')
-    # the equation holds in deviations, too
-    x, rate, u = scaling.deviations(samples)
-    np.testing.assert_allclose(
-        rate, (-x - 0.3 * scaling.states.scale * x * x) + u @ scaling.input_matrix(BENT.B).T,
-        rtol=0, atol=1e-14)
-
-
-def test_scaling_without_inputs():
-    plant = Plant('free', ('x',), ('1',), (), (), 's', np.zeros(1), np.zeros(0), np.zeros((1, 0)))
-    samples = replace(bent_samples(), u=np.zeros((180, 0)))
-    scaling = Scaling.of(plant, samples)
-    assert len(scaling.inputs) == 0
-    assert scaling.input_matrix(plant.B).shape == (1, 0)
-    assert scaling.deviations(samples)[2].shape == (180, 0)
-
-
-@pytest.mark.parametrize(('name', 'value', 'message'), [
-    ('u', 0.5, r'flow never moves from 0\.5 m/s: excite the plant'),
-    ('x', 3.0, r'level never moves from 3\.0 m: excite the plant')])
-def test_what_never_moves(name, value, message):
-    still = replace(bent_samples(), **{name: np.full((180, 1), value)})
-    with pytest.raises(ValueError, match=message):
-        Scaling.of(BENT, still)
-
-
-def test_a_plant_of_another_size():
-    with pytest.raises(ValueError, match='the samples have 2 inputs, the plant 1: flow'):
-        Scaling.of(BENT, replace(bent_samples(), u=np.zeros((180, 2))))
-    with pytest.raises(ValueError, match=r'incompatible B: expected \(1, 1\), got \(2, 1\)'):
-        Scaling.of(BENT, bent_samples()).input_matrix(np.ones((2, 1)))

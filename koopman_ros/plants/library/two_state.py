@@ -5,17 +5,41 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from functools import partial
 import math
 
 import numpy as np
 
-from koopman_ros.plants.exact_lift import ExactLift
-from koopman_ros.plants.system import ControlAffineSystem, FloatArray
+from koopman_ros.plants.system import (
+    ArrayFunction,
+    checked_array,
+    ControlAffineSystem,
+    FloatArray,
+)
 
 # The paper's choice: a stable first state and an unstable second one.
 PAPER_MU = -0.1
 PAPER_LAMBDA = 1.0
+
+
+@dataclass(frozen=True, eq=False)
+class ExactLift:
+    """
+    A lift z = N(x) under which dz/dt = A z + J(x) B u holds exactly (paper, eq. 27).
+
+    :param A: lifted dynamics (n_z, n_z), in 1 per time unit.
+    :param lift: N, states (..., n_x) to lifted states (..., n_z).
+    :param jacobian: J = dN/dx, states (..., n_x) to (..., n_z, n_x).
+    :raises ValueError: when `A` is not a finite square matrix.
+    """
+
+    A: FloatArray
+    lift: ArrayFunction
+    jacobian: ArrayFunction
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, 'A', checked_array('A', self.A, (len(self.A), len(self.A))))
 
 
 def two_state_example(mu: float = PAPER_MU, lambda_: float = PAPER_LAMBDA) -> ControlAffineSystem:

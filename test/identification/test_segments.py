@@ -1,27 +1,21 @@
 # SPDX-FileCopyrightText: 2026 The koopman_ros Authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""Stretches: grids, the Runge-Kutta path against the plants' integrator, and fitted starts."""
+"""Segments: grids, the Runge-Kutta path against the plants' integrator, and fitted starts."""
 
 import numpy as np
 import pytest
 
-from koopman_ros.identification import (
-    cut,
-    fitted_starts,
-    longest_step,
-    prediction_error,
-    Record,
-    Stretches,
-)
+from koopman_ros.identification import fitted_starts, longest_step, prediction_error, Segments
+from koopman_ros.plant_data import cut, Episode
 from koopman_ros.plants import one_state_reactor, simulate, two_state_example
 from support.known_plants import CUBIC, PAIR
 
 
 def test_grid_has_samples_changes_and_steps_between():
-    record = Record(np.array([0.0, 1.0, 3.5]), np.array([[1.0], [2.0], [3.0]]),
+    record = Episode(np.array([0.0, 1.0, 3.5]), np.array([[1.0], [2.0], [3.0]]),
                     np.array([-1.0, 0.25, 9.0]), np.array([[5.0], [6.0], [7.0]]))
-    grid = Stretches.of([record], 1.0)
+    grid = Segments.of([record], 1.0)
     # 2.5 from the second to the third sample is halved twice at most 1 apart
     assert np.concatenate(([0.0], np.cumsum(grid.steps[:, 0]))) == pytest.approx(
         [0.0, 0.25, 1.0, 1.0 + 2.5 / 3, 1.0 + 5.0 / 3, 3.5])
@@ -31,23 +25,23 @@ def test_grid_has_samples_changes_and_steps_between():
 
 
 def test_a_step_that_fits_is_not_halved():
-    record = Record(0.1 * np.arange(4), np.ones((4, 1)), np.zeros(1), np.ones((1, 1)))
-    assert Stretches.of([record], 0.1).steps.shape == (3, 1)
+    record = Episode(0.1 * np.arange(4), np.ones((4, 1)), np.zeros(1), np.ones((1, 1)))
+    assert Segments.of([record], 0.1).steps.shape == (3, 1)
 
 
 def test_longest_step_is_two_usual_periods():
-    record = Record(np.array([0.0, 1.0, 2.0, 3.0, 30.0]), np.zeros((5, 1)), np.zeros(1),
+    record = Episode(np.array([0.0, 1.0, 2.0, 3.0, 30.0]), np.zeros((5, 1)), np.zeros(1),
                     np.zeros((1, 1)))
     assert longest_step([record]) == 2.0
 
 
 def test_shorter_stretches_are_padded():
     records = [CUBIC.excited(30, 0.1), CUBIC.excited(11, 0.1, seed=1)]
-    both = Stretches.of(records, 0.2)
+    both = Segments.of(records, 0.2)
     x0 = np.stack([record.x[0] for record in records])
     path = both.path(CUBIC.rate, x0)
     for j, record in enumerate(records):
-        alone = Stretches.of([record], 0.2)
+        alone = Segments.of([record], 0.2)
         k = len(alone.steps)
         assert np.array_equal(path[:k + 1, j], alone.path(CUBIC.rate, x0[[j]])[:, 0])
         # it stands still to the end, and nothing is measured there
@@ -61,9 +55,8 @@ def test_path_against_the_plants_integrator(system):
     rng = np.random.default_rng(0)
     inputs = system.nominal_input + rng.uniform(-1.0, 1.0, (30, 1))
     start = system.nominal_state + 0.1
-    trajectory = simulate(system, start, inputs, 0.05)
-    record = Record(trajectory.times, trajectory.states, trajectory.times[:-1], inputs)
-    errors = [np.max(np.abs(Stretches.of([record], h).errors(system.derivative, start[None])))
+    record = simulate(system, start, inputs, 0.05)
+    errors = [np.max(np.abs(Segments.of([record], h).errors(system.derivative, start[None])))
               for h in (0.05, 0.025)]
     # one step a sample; the method is of fourth order, halving the step takes the error to 1/16
     assert 1e-11 < errors[0] < 1e-5
@@ -75,17 +68,17 @@ def test_path_follows_inputs_that_change_between_samples():
     times = np.cumsum(rng.uniform(0.05, 0.15, 60))
     changes = np.concatenate(([0.0], np.sort(rng.uniform(0.1, times[-1], 40))))
     record = PAIR.record(times, changes, rng.uniform(-1.0, 1.0, (41, 2)))
-    errors = Stretches.of([record], 0.05).errors(PAIR.rate, record.x[:1])
+    errors = Segments.of([record], 0.05).errors(PAIR.rate, record.x[:1])
     # the classical Runge-Kutta method at rates up to 2: 0.05^4 2^5 / 120
     assert np.max(np.abs(errors)) < 2e-6
 
 
 def test_model_that_diverges_has_infinite_error():
     record = CUBIC.excited(200, 0.1, noise=0.01)
-    stretches = Stretches.of(cut([record], 50), 0.2)
+    segments = Segments.of(cut([record], 50), 0.2)
     for rate in (lambda x, u: x ** 3 + 2.0, lambda x, u: 1e6 * x):
-        assert np.all(prediction_error(rate, stretches, np.ones(1)) == np.inf)
-        assert not np.all(np.isfinite(stretches.path(rate, np.ones((5, 1)))))
+        assert np.all(prediction_error(rate, segments, np.ones(1)) == np.inf)
+        assert not np.all(np.isfinite(segments.path(rate, np.ones((5, 1)))))
 
 
 def test_starts_are_fitted_to_all_measurements():
@@ -93,8 +86,8 @@ def test_starts_are_fitted_to_all_measurements():
     rng = np.random.default_rng(0)
     t = 0.1 * np.arange(30)
     x = 2.0 * np.exp(-t) + 0.05 * rng.standard_normal(30)
-    record = Record(t, x[:, None], np.zeros(1), np.zeros((1, 1)))
-    starts, squares = fitted_starts(lambda x, u: u - x, Stretches.of([record], 0.1), np.ones(1))
+    record = Episode(t, x[:, None], np.zeros(1), np.zeros((1, 1)))
+    starts, squares = fitted_starts(lambda x, u: u - x, Segments.of([record], 0.1), np.ones(1))
     basis = np.exp(-t)
     expected = basis @ x / (basis @ basis)
     # Runge-Kutta steps of 0.1 are exact to 0.1^5 / 120
@@ -104,10 +97,10 @@ def test_starts_are_fitted_to_all_measurements():
 
 def test_starts_do_not_depend_on_units():
     record = PAIR.excited(60, 0.1, noise=0.05)
-    stretches = Stretches.of([record], 0.1)
+    segments = Segments.of([record], 0.1)
     units = np.array([1e3, 1e-3])
-    other = Stretches.of([Record(record.time, record.x * units, record.input_time, record.u)], 0.1)
-    starts, squares = fitted_starts(PAIR.rate, stretches, np.ones(2))
+    other = Segments.of([Episode(record.time, record.x * units, record.input_time, record.u)], 0.1)
+    starts, squares = fitted_starts(PAIR.rate, segments, np.ones(2))
     scaled, scaled_squares = fitted_starts(
         lambda x, u: units * PAIR.rate(x / units, u), other, units)
     # differences of 1e-4 of the scale are exact to 1e-8 of the slope
@@ -117,6 +110,6 @@ def test_starts_do_not_depend_on_units():
 
 def test_prediction_error_weighs_stretches_by_their_measurements():
     records = [CUBIC.excited(30, 0.1, noise=0.1), CUBIC.excited(90, 0.1, noise=0.2, seed=1)]
-    both = prediction_error(CUBIC.rate, Stretches.of(records, 0.2), np.ones(1))
-    single = [prediction_error(CUBIC.rate, Stretches.of([r], 0.2), np.ones(1)) for r in records]
+    both = prediction_error(CUBIC.rate, Segments.of(records, 0.2), np.ones(1))
+    single = [prediction_error(CUBIC.rate, Segments.of([r], 0.2), np.ones(1)) for r in records]
     assert both == pytest.approx(np.sqrt((30 * single[0] ** 2 + 90 * single[1] ** 2) / 120))

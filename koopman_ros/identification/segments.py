@@ -2,7 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 
 
-"""Stretches of records side by side on common steps, so that models roll them out at once."""
+"""Segments of episodes on common steps, rolled out together."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ import math
 
 import numpy as np
 
-from koopman_ros.identification.records import Array, Record
+from koopman_ros.plant_data import Array, Episode
 from koopman_ros.solvers import runge_kutta_step
 
 # dx/dt (M, n_x) of states (M, n_x) and inputs (M, n_u), all in units
@@ -25,9 +25,9 @@ _STEP = 1e-4
 
 
 @dataclass(frozen=True)
-class Stretches:
+class Segments:
     """
-    M stretches on grids of K steps, between which inputs are constant; short ones are padded.
+    M segments on grids of K steps, between which inputs are constant; short ones are padded.
 
     :param steps: (K, M) lengths of the steps, 0 in the padding, in time units.
     :param u: (K, M, n_u) inputs held over them.
@@ -41,25 +41,25 @@ class Stretches:
     measured: np.ndarray
 
     @classmethod
-    def of(cls, records: Sequence[Record], longest_step: float) -> Stretches:
+    def of(cls, episodes: Sequence[Episode], longest_step: float) -> Segments:
         """
-        Put records on grids of their own: their samples, their input changes and steps between.
+        Put episodes on grids of their own: their samples, their input changes and steps between.
 
-        :param records: what was recorded.
+        :param episodes: what was recorded.
         :param longest_step: in time units.
         """
-        grids = [_grid(record, longest_step) for record in records]
-        K, M = max(len(grid) for grid in grids) - 1, len(records)
-        n_x, n_u = records[0].x.shape[1], records[0].u.shape[1]
+        grids = [_grid(episode, longest_step) for episode in episodes]
+        K, M = max(len(grid) for grid in grids) - 1, len(episodes)
+        n_x, n_u = episodes[0].x.shape[1], episodes[0].u.shape[1]
         steps, u = np.zeros((K, M)), np.zeros((K, M, n_u))
         x, measured = np.zeros((K + 1, M, n_x)), np.zeros((K + 1, M), dtype=bool)
-        for j, (record, grid) in enumerate(zip(records, grids, strict=True)):
+        for j, (episode, grid) in enumerate(zip(episodes, grids, strict=True)):
             k = len(grid) - 1
             steps[:k, j] = np.diff(grid)
-            u[:k, j] = record.inputs_at(grid[:-1])
-            u[k:, j] = record.u[-1]
-            rows = np.searchsorted(grid, record.time)
-            x[rows, j], measured[rows, j] = record.x, True
+            u[:k, j] = episode.inputs_at(grid[:-1])
+            u[k:, j] = episode.u[-1]
+            rows = np.searchsorted(grid, episode.time)
+            x[rows, j], measured[rows, j] = episode.x, True
         return cls(steps, u, x, measured)
 
     def path(self, rate: Rate, x0: Array) -> Array:
@@ -84,31 +84,31 @@ def _held(rate: Rate, u: Array, x: Array) -> Array:
     return rate(x, u)
 
 
-def longest_step(records: Sequence[Record]) -> float:
-    """Return a step over which a Runge-Kutta method follows motion that the records resolve."""
+def longest_step(episodes: Sequence[Episode]) -> float:
+    """Return a step over which a Runge-Kutta method follows motion that the episodes resolve."""
     # a motion is resolved where it takes several samples
-    return 2.0 * float(np.median(np.concatenate([np.diff(record.time) for record in records])))
+    return 2.0 * float(np.median(np.concatenate([np.diff(episode.time) for episode in episodes])))
 
 
-def fitted_starts(rate: Rate, stretches: Stretches, scale: Array) -> tuple[Array, Array]:
+def fitted_starts(rate: Rate, segments: Segments, scale: Array) -> tuple[Array, Array]:
     """
-    Predict every stretch by a model, from the start that suits it best, and compare.
+    Predict every segment by a model, from the start that suits it best, and compare.
 
     The start is fitted, for a measurement of it would bring its noise into the prediction.
 
     :param rate: the model.
-    :param stretches: measured stretches.
+    :param segments: measured segments.
     :param scale: (n_x,) size of the states, in which their errors are weighed.
     :return: the starts (M, n_x), and the mean squared errors from there (M, n_x), in state units
         squared, infinite on divergence.
     """
-    x0 = first_measured(stretches)
+    x0 = first_measured(segments)
     n_x = x0.shape[1]
-    count = np.sum(stretches.measured, axis=0)[:, None]
+    count = np.sum(segments.measured, axis=0)[:, None]
     best, least = x0, np.full_like(x0, np.inf)
     # errors in units of the scale: states of different units weigh alike
     for last in (False, False, True):
-        errors = stretches.errors(rate, x0) / scale
+        errors = segments.errors(rate, x0) / scale
         # a model may diverge from any of the starts
         with np.errstate(all='ignore'):
             squares = np.sum(errors ** 2, axis=0) / count
@@ -119,7 +119,7 @@ def fitted_starts(rate: Rate, stretches: Stretches, scale: Array) -> tuple[Array
                 break
             # (K + 1, M, n_x, n_x): change of every state with each start
             slopes = np.stack([
-                (stretches.errors(rate, x0 + _STEP * scale * unit) / scale - errors) / _STEP
+                (segments.errors(rate, x0 + _STEP * scale * unit) / scale - errors) / _STEP
                 for unit in np.eye(n_x)], axis=-1)
             normal = np.einsum('kmij,kmil->mjl', slopes, slopes)
             right = np.einsum('kmij,kmi->mj', slopes, errors)
@@ -130,21 +130,21 @@ def fitted_starts(rate: Rate, stretches: Stretches, scale: Array) -> tuple[Array
     return best, least * scale ** 2
 
 
-def prediction_error(rate: Rate, stretches: Stretches, scale: Array) -> Array:
+def prediction_error(rate: Rate, segments: Segments, scale: Array) -> Array:
     """Return the root mean square error (n_x,) of :func:`fitted_starts`, in state units."""
-    squares = fitted_starts(rate, stretches, scale)[1]
-    weights = np.sum(stretches.measured, axis=0)
+    squares = fitted_starts(rate, segments, scale)[1]
+    weights = np.sum(segments.measured, axis=0)
     return np.sqrt(np.average(squares, axis=0, weights=weights))
 
 
-def first_measured(stretches: Stretches) -> Array:
-    """Return the first measurement of each stretch (M, n_x)."""
-    return stretches.x[0].copy()
+def first_measured(segments: Segments) -> Array:
+    """Return the first measurement of each segment (M, n_x)."""
+    return segments.x[0].copy()
 
 
-def _grid(record: Record, longest: float) -> Array:
-    inside = (record.input_time > record.time[0]) & (record.input_time < record.time[-1])
-    knots = np.union1d(record.time, record.input_time[inside])
+def _grid(episode: Episode, longest: float) -> Array:
+    inside = (episode.input_time > episode.time[0]) & (episode.input_time < episode.time[-1])
+    knots = np.union1d(episode.time, episode.input_time[inside])
     pieces = [np.linspace(a, b, math.ceil((b - a) / longest * (1.0 - 1e-9)) + 1)[:-1]
               if b - a > longest else np.array([a])
               for a, b in itertools.pairwise(knots)]

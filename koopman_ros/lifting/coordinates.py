@@ -1,0 +1,149 @@
+# SPDX-FileCopyrightText: 2026 The koopman_ros Authors
+# SPDX-License-Identifier: Apache-2.0
+
+"""Names, units, scaling and range of the signals that a model was learned over."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+import math
+
+import numpy as np
+
+from koopman_ros.lifting.arrays import Array, frozen
+from koopman_ros.plant_data import Plant
+
+
+@dataclass(frozen=True)
+class Coordinates:
+    """
+    Names, units, scaling and training box of the states or of the inputs.
+
+    A physical value v maps to the deviation (v - center) / scale that the lift sees.
+
+    :param names: one name a coordinate, e.g. ``('temperature',)``.
+    :param units: one unit a coordinate, e.g. ``('K',)``.
+    :param center: (n,) nominal point, in units.
+    :param scale: (n,) positive, in units.
+    :param lower: (n,) lower corner of the training box, in units.
+    :param upper: (n,) upper corner of the training box, in units.
+    :raises ValueError: on inconsistent sizes, a scale that is not positive or an empty box.
+    """
+
+    names: tuple[str, ...]
+    units: tuple[str, ...]
+    center: Array
+    scale: Array
+    lower: Array
+    upper: Array
+
+    def __post_init__(self) -> None:
+        n = len(self.names)
+        if len(self.units) != n:
+            raise ValueError(f'incompatible units: expected {n}, got {len(self.units)}')
+        for name in ('center', 'scale', 'lower', 'upper'):
+            object.__setattr__(self, name, frozen(getattr(self, name), name, (n,)))
+        if np.any(self.scale <= 0.0):
+            raise ValueError(f'scale must be positive, got {self.scale.tolist()}')
+        if np.any(self.lower >= self.upper):
+            raise ValueError(f'the box is empty: lower {self.lower.tolist()}, '
+                             f'upper {self.upper.tolist()}')
+
+    @classmethod
+    def spanning(cls, names: tuple[str, ...], units: tuple[str, ...], lower: Array, upper: Array,
+                 center: Array | None = None) -> Coordinates:
+        """
+        Scale by half the width of a range, from its middle or from a given center.
+
+        :param names: one name a coordinate.
+        :param units: one unit a coordinate.
+        :param lower: (n,) lower end of the range, in units.
+        :param upper: (n,) upper end of the range, in units.
+        :param center: (n,) nominal point, in units.
+        :raises ValueError: when a range is empty, naming the coordinate, or the sizes do not fit.
+        """
+        if not len(names) == len(lower) == len(upper):
+            raise ValueError(f'there are values of {len(lower)} signals for {len(names)} names: '
+                             f'{", ".join(names)}')
+        for name, unit, low, high in zip(names, units, lower, upper, strict=True):
+            if not low < high:
+                raise ValueError(f'{name} never moves from {low} {unit}: excite the plant')
+        if center is None:
+            center = 0.5 * (lower + upper)
+        return cls(names, units, center, 0.5 * (upper - lower), lower, upper)
+
+    def __len__(self) -> int:
+        return len(self.names)
+
+    def to_deviation(self, value: Array) -> Array:
+        """Map physical values (..., n) to scaled deviations (..., n)."""
+        return (value - self.center) / self.scale
+
+    def to_physical(self, deviation: Array) -> Array:
+        """Map scaled deviations (..., n) to physical values (..., n)."""
+        return self.center + deviation * self.scale
+
+    def violation(self, value: Array) -> float:
+        """
+        Measure how far a physical value (n,) lies outside the training box.
+
+        :return: largest excess over a side of the box, as a fraction of half its width; 0 inside,
+            infinity for a value that is not finite.
+        """
+        worst = 0.0
+        # in plain numbers, as the few of a measurement take numpy ten times as long
+        for v, lower, upper in zip(value.tolist(), *self._box, strict=True):
+            if not math.isfinite(v):
+                return math.inf
+            worst = max(worst, max(lower - v, v - upper) / (0.5 * (upper - lower)))
+        return worst
+
+    @cached_property
+    def _box(self) -> tuple[list[float], list[float]]:
+        return self.lower.tolist(), self.upper.tolist()
+
+
+@dataclass(frozen=True)
+class Box:
+    """
+    The range of states and inputs that a model is learned over, and its scaled coordinates.
+
+    :param states: the states' names, units, scaling and range.
+    :param inputs: the inputs' likewise.
+    :param time_unit: ``'s'`` or ``'min'``.
+    """
+
+    states: Coordinates
+    inputs: Coordinates
+    time_unit: str
+
+    @staticmethod
+    def of(plant: Plant, x: Array, u: Array, *, nominal: bool = True) -> Box:
+        """
+        Return the range of some values.
+
+        :param plant: names, units and the nominal point.
+        :param x: (N, n_x) states, in state units.
+        :param u: (N, n_u) inputs, in input units.
+        :param nominal: whether deviations are from the nominal point or from the middle.
+        :raises ValueError: when a state or an input never moves, or the sizes do not fit.
+        """
+        states, inputs = (
+            Coordinates.spanning(names, units, values.min(axis=0), values.max(axis=0),
+                                 center if nominal else None)
+            for names, units, center, values in (
+                (plant.state_names, plant.state_units, plant.nominal_state, x),
+                (plant.input_names, plant.input_units, plant.nominal_input, u)))
+        return Box(states, inputs, plant.time_unit)
+
+    def input_matrix(self, B: Array) -> Array:
+        """
+        Scale B (n_x, n_u) from units to deviations.
+
+        :raises ValueError: when its shape does not fit.
+        """
+        n_x, n_u = len(self.states), len(self.inputs)
+        if np.shape(B) != (n_x, n_u):
+            raise ValueError(f'incompatible B: expected {(n_x, n_u)}, got {np.shape(B)}')
+        return np.asarray(B) * self.inputs.scale / self.states.scale[:, None]

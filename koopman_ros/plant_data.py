@@ -1,0 +1,201 @@
+# SPDX-FileCopyrightText: 2026 The koopman_ros Authors
+# SPDX-License-Identifier: Apache-2.0
+
+"""What is known and recorded of a plant: names and units, episodes, samples with derivatives."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+import hashlib
+import itertools
+
+import numpy as np
+from numpy.typing import NDArray
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class Plant:
+    """
+    What is known of the plant beside its data.
+
+    :param name: name of the plant.
+    :param state_names: one name a state.
+    :param state_units: one unit a state.
+    :param input_names: one name an input.
+    :param input_units: one unit an input.
+    :param time_unit: ``'s'`` or ``'min'``.
+    :param nominal_state: (n_x,) fixed point under the nominal input.
+    :param nominal_input: (n_u,) nominal input.
+    :param B: (n_x, n_u) input matrix, in units, or None to learn it.
+    """
+
+    name: str
+    state_names: tuple[str, ...]
+    state_units: tuple[str, ...]
+    input_names: tuple[str, ...]
+    input_units: tuple[str, ...]
+    time_unit: str
+    nominal_state: Array
+    nominal_input: Array
+    B: Array | None
+
+
+@dataclass(frozen=True)
+class Episode:
+    """
+    Uninterrupted measurements of a plant, with inputs that are held between their changes.
+
+    :param time: (N,) times of the measurements, rising, in time units.
+    :param x: (N, n_x) measured states, in state units, with their noise.
+    :param input_time: (M,) times from which each input was held, rising, the first not later
+        than the first measurement.
+    :param u: (M, n_u) those inputs, in input units.
+    :raises ValueError: on unequal lengths, times that do not rise, values that are not finite,
+        or an input that is not known at the first measurement.
+    """
+
+    time: Array
+    x: Array
+    input_time: Array
+    u: Array
+
+    def __post_init__(self) -> None:
+        for times, values in (('time', 'x'), ('input_time', 'u')):
+            t = np.ascontiguousarray(getattr(self, times), dtype=np.float64)
+            v = np.ascontiguousarray(getattr(self, values), dtype=np.float64)
+            if t.ndim != 1 or v.ndim != 2 or len(t) != len(v) or len(t) == 0:
+                raise ValueError(f'incompatible {times} and {values}: expected (n,) and (n, m) '
+                                 f'with n > 0, got {t.shape} and {v.shape}')
+            if not (np.all(np.isfinite(t)) and np.all(np.isfinite(v))):
+                raise ValueError(f'{times} or {values} hold values that are not finite: drop them')
+            if not np.all(np.diff(t) > 0.0):
+                raise ValueError(f'{times} must rise: sort the samples and drop repeated ones')
+            object.__setattr__(self, times, t)
+            object.__setattr__(self, values, v)
+        if self.input_time[0] > self.time[0]:
+            raise ValueError('the input at the first measurement is not known: begin the episode '
+                             'with the first measurement after an input')
+
+    def __len__(self) -> int:
+        return len(self.time)
+
+    def inputs_at(self, times: Array) -> Array:
+        """Return the inputs (n, n_u) that hold from `times` (n,) on."""
+        return self.u[np.searchsorted(self.input_time, times, side='right') - 1]
+
+    def input_integral(self, times: Array) -> Array:
+        """Return the integral of u (n, n_u) from the first measurement to `times` (n,)."""
+        knots = np.concatenate((self.time[:1], self.input_time[self.input_time > self.time[0]]))
+        held = self.inputs_at(knots)
+        areas = np.vstack((np.zeros((1, held.shape[1])),
+                           np.cumsum(np.diff(knots)[:, None] * held[:-1], axis=0)))
+        last = np.maximum(np.searchsorted(knots, times, side='right') - 1, 0)
+        return areas[last] + (times - knots[last])[:, None] * held[last]
+
+    def part(self, start: int, stop: int) -> Episode:
+        """Return the measurements `start` to `stop` with the inputs that acted on them."""
+        time = self.time[start:stop]
+        first = np.searchsorted(self.input_time, time[0], side='right') - 1
+        last = np.searchsorted(self.input_time, time[-1], side='left')
+        keep = slice(first, max(first + 1, last))
+        return Episode(time, self.x[start:stop], self.input_time[keep], self.u[keep])
+
+
+def cut(episodes: Sequence[Episode], samples: int) -> list[Episode]:
+    """
+    Cut episodes into segments of nearly equal length, each beginning where the last one ends.
+
+    :param episodes: what was recorded.
+    :param samples: most measurements of a segment, at least 2.
+    """
+    if samples < 2:
+        raise ValueError(f'a segment needs at least 2 samples, got {samples}')
+    parts = []
+    for episode in episodes:
+        count = max(1, -(-(len(episode) - 1) // (samples - 1)))
+        edges = np.round(np.linspace(0, len(episode) - 1, count + 1)).astype(int)
+        parts += [episode.part(a, b + 1) for a, b in itertools.pairwise(edges) if b > a]
+    return parts
+
+
+@dataclass(frozen=True)
+class Samples:
+    """
+    States, their derivatives and the inputs that acted, from one or more episodes.
+
+    :param x: (N, n_x) states, in state units.
+    :param dxdt: (N, n_x) derivatives, in state units per time unit.
+    :param u: (N, n_u) inputs, in input units.
+    :param episode: (N,) number of the episode that each sample belongs to.
+    :param time: (N,) times of the samples, in time units, rising within an episode, where the
+        input of a sample was held until the next one; None when samples do not follow each other
+        (then no roll-out can be judged).
+    :raises ValueError: on unequal lengths, values that are not finite, or times that do not rise.
+    """
+
+    x: Array
+    dxdt: Array
+    u: Array
+    episode: np.ndarray
+    time: Array | None = None
+
+    def __post_init__(self) -> None:
+        for name in ('x', 'dxdt', 'u'):
+            array = np.ascontiguousarray(getattr(self, name), dtype=np.float64)
+            if array.ndim != 2 or len(array) != len(self.episode):
+                raise ValueError(f'incompatible {name}: expected ({len(self.episode)}, n), '
+                                 f'got {array.shape}')
+            if not np.all(np.isfinite(array)):
+                raise ValueError(f'{name} holds {np.count_nonzero(~np.isfinite(array))} values '
+                                 'that are not finite: drop those samples')
+            object.__setattr__(self, name, array)
+        if self.x.shape != self.dxdt.shape:
+            raise ValueError(f'incompatible dxdt: expected {self.x.shape}, '
+                             f'got {self.dxdt.shape}')
+        if self.time is not None:
+            time = np.ascontiguousarray(self.time, dtype=np.float64)
+            if time.shape != (len(self.episode),):
+                raise ValueError(f'incompatible time: expected ({len(self.episode)},), '
+                                 f'got {time.shape}')
+            # an episode's samples need not lie side by side
+            order = np.argsort(self.episode, kind='stable')
+            within = np.diff(np.asarray(self.episode)[order]) == 0
+            if not (np.all(np.isfinite(time)) and np.all(np.diff(time[order])[within] > 0.0)):
+                raise ValueError('time must rise from sample to sample within an episode: '
+                                 'sort the samples and drop repeated ones')
+            object.__setattr__(self, 'time', time)
+
+    def __len__(self) -> int:
+        return len(self.episode)
+
+    def take(self, episodes: np.ndarray) -> Samples:
+        """Return the samples of some episodes."""
+        keep = np.isin(self.episode, episodes)
+        return Samples(self.x[keep], self.dxdt[keep], self.u[keep], self.episode[keep],
+                       None if self.time is None else self.time[keep])
+
+    def digest(self) -> str:
+        """Return the SHA-256 of the samples, in hexadecimal."""
+        sha = hashlib.sha256()
+        for array in (self.x, self.dxdt, self.u, np.asarray(self.episode, dtype=np.int64)):
+            sha.update(np.ascontiguousarray(array).astype('<f8').tobytes())
+        return sha.hexdigest()
+
+
+def split_by_episode(samples: Samples, seed: int) -> tuple[Samples, Samples, Samples]:
+    """
+    Split samples into training (three fifths), validation and test by whole episodes.
+
+    :raises ValueError: with fewer than three episodes.
+    """
+    episodes = np.unique(samples.episode)
+    if len(episodes) < 3:
+        raise ValueError(f'training needs at least 3 episodes to hold some out, got '
+                         f'{len(episodes)}: record more, or cut the record into episodes')
+    order = np.random.default_rng(seed).permutation(episodes)
+    held = max(1, len(episodes) // 5)
+    return (samples.take(order[2 * held:]), samples.take(order[:held]),
+            samples.take(order[held:2 * held]))
