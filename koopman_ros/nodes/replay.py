@@ -10,7 +10,7 @@ error, and 3 when there was nothing to compare, as in a short bag from the middl
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection, Mapping
+from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass, fields
 import enum
 from pathlib import Path
@@ -31,9 +31,9 @@ from koopman_ros.nodes.replay_parameters import ReplayParameters, TABLE
 from koopman_ros.nodes.shipped import config_directory, model_path
 from koopman_ros.replay.bag import command_counts, read_records
 from koopman_ros.replay.comparison import ReplayedBag
-from koopman_ros.replay.loop import Alternative, replay
+from koopman_ros.replay.loop import Alternative, Replay, replay
 from koopman_ros.replay.models import Models
-from koopman_ros.replay.records import RecordError
+from koopman_ros.replay.records import Record, RecordError
 from koopman_ros.replay.report import reproduced, verdict, write_report
 
 
@@ -115,17 +115,30 @@ def replayed_bag(path: str, names: Names, parameters: ReplayParameters,
         tuning = {item.name for item in fields(ControllerParameters)} - {'model'}
         alternative = Alternative(new.model, new.digest, {
             name: getattr(parameters, name) for name in tuning.intersection(given)})
-    models = Models([Path(parameters.model).expanduser(), model_path(parameters.model),
-                     config_directory() / 'models'])
     records = read_records(path, names.records, recover=parameters.recover)
     try:
-        found = replay(records, models.find, _settings, alternative)
+        found = replay_records(records, [Path(parameters.model).expanduser(),
+                                         model_path(parameters.model)], alternative)
     except RecordError as error:
         raise BagReadError(f'bag {path!r}: {error}') from error
     return ReplayedBag(
         path, summary(path).complete, found,
         command_counts(path, names.commands, recover=parameters.recover), parameters.tolerance,
         None if alternative is None else alternative.model.states)
+
+
+def replay_records(records: Iterable[Record], models: Sequence[Path] = (),
+                   alternative: Alternative | None = None) -> Replay:
+    """
+    Replay records of this package's controller node.
+
+    :param records: in the order of receipt.
+    :param models: files or folders in which models are looked for beside the shipped ones.
+    :param alternative: another model, or None.
+    :raises RecordError: for records that cannot be replayed.
+    """
+    return replay(records, Models([*models, config_directory() / 'models']).find, _settings,
+                  alternative)
 
 
 def _settings(values: Mapping[str, Any]) -> Settings:

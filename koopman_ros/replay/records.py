@@ -10,12 +10,16 @@ Numbers are in the model's units, times in nanoseconds.
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
+from enum import Enum
 import json
 from typing import Any
 
+import numpy as np
+
 from koopman_ros import __version__
 from koopman_ros.control import Mode, State
+from koopman_ros.reasons import Reason
 from koopman_ros.replay.events import (
     Event,
     Initialisation,
@@ -30,7 +34,12 @@ from koopman_ros.replay.values import decoded, encoded, float_array, numbers
 
 VERSION = 1
 
-# Names of the events that carry the controller's whole state.
+# Events by the names that they have in records.
+EVENTS: dict[str, type[Event]] = {
+    'measurement': Measurement, 'silence': Silence, 'setpoint': SetpointRequest,
+    'manual_command': ManualCommand, 'mode': ModeChange, 'initialisation': Initialisation}
+_NAMES = {kind: name for name, kind in EVENTS.items()}
+# Names of records that carry the controller's whole state.
 START, SNAPSHOT = 'start', 'snapshot'
 # Names of those by which it is exchanged for one with other parameters or another model.
 PARAMETERS, MODEL = 'parameters', 'model'
@@ -93,25 +102,19 @@ def parse(text: str) -> Record:
 
 def fields_of(event: Event, outcome: Outcome) -> tuple[str, dict[str, Any]]:
     """Return the name of an event, and what is written of it and of what it led to."""
-    match event:
-        case Measurement():
-            assert outcome.report is not None
-            return 'measurement', {
-                'stamp_ns': event.stamp_ns, 'measured': numbers(event.measured),
-                'applied': None if event.applied is None else numbers(event.applied),
-                'result': outcome.report.measurement.arrival.value, **_commanded(outcome)}
-        case Silence():
-            return 'silence', {'stamp_ns': event.stamp_ns, **_commanded(outcome)}
-        case SetpointRequest():
-            return 'setpoint', {'stamp_ns': event.stamp_ns, 'value': numbers(event.value),
-                                'accepted': outcome.refused is None}
-        case ManualCommand():
-            return 'manual_command', {'value': numbers(event.value),
-                                      'accepted': outcome.refused is None}
-        case ModeChange():
-            return 'mode', {'mode': event.mode.name.lower()}
-        case Initialisation():
-            return 'initialisation', {'applied': numbers(event.applied)}
+    written = {item.name: _written(getattr(event, item.name)) for item in fields(event)}
+    report = outcome.report
+    if report is None:
+        if not isinstance(event, (ModeChange, Initialisation)):
+            written['accepted'] = outcome.refused is None
+            written['reason'] = _codes(outcome.refused)
+        return _NAMES[type(event)], written
+    if isinstance(event, Measurement):
+        written['result'] = report.measurement.arrival.value
+    return _NAMES[type(event)], {
+        **written, 'command': _written(outcome.command),
+        'setpoint': None if report.target is None else numbers(report.target.setpoint),
+        'mode': _written(report.mode), 'level': report.level, 'reason': _codes(report.reason)}
 
 
 def event_of(record: Record) -> Event:
@@ -120,23 +123,10 @@ def event_of(record: Record) -> Event:
 
     :raises KeyError, TypeError, ValueError: for a record that is none of an event.
     """
-    fields = record.fields
-    match record.event:
-        case 'measurement':
-            applied = fields['applied']
-            return Measurement(record.stamp_ns, float_array(fields['measured']),
-                               None if applied is None else float_array(applied))
-        case 'silence':
-            return Silence(record.stamp_ns)
-        case 'setpoint':
-            return SetpointRequest(record.stamp_ns, float_array(fields['value']))
-        case 'manual_command':
-            return ManualCommand(float_array(fields['value']))
-        case 'mode':
-            return ModeChange(Mode[fields['mode'].upper()])
-        case 'initialisation':
-            return Initialisation(float_array(fields['applied']))
-    raise ValueError(f'the event {record.event!r} is not known')
+    if record.event not in EVENTS:
+        raise ValueError(f'the event {record.event!r} is not known')
+    kind = EVENTS[record.event]
+    return kind(**{item.name: _read(record.fields[item.name]) for item in fields(kind)})
 
 
 def snapshot(state: State, parameters: Mapping[str, Any], model: Mapping[str, str]
@@ -164,9 +154,20 @@ def state_of(record: Record) -> State:
     return state
 
 
-def _commanded(outcome: Outcome) -> dict[str, Any]:
-    report = outcome.report
-    assert report is not None
-    return {'command': None if outcome.command is None else numbers(outcome.command),
-            'setpoint': None if report.target is None else numbers(report.target.setpoint),
-            'mode': report.mode.name.lower(), 'level': report.level}
+def _written(value: Any) -> Any:
+    """Return an array, an enum, an integer or None as it stands in the fields of an event."""
+    if isinstance(value, Enum):
+        return value.name.lower()
+    return numbers(value) if isinstance(value, np.ndarray) else value
+
+
+def _read(value: Any) -> Any:
+    """Return what was written."""
+    if isinstance(value, str):
+        return Mode[value.upper()]
+    return value if value is None or isinstance(value, int) else float_array(value)
+
+
+def _codes(reason: Reason | None) -> list[str]:
+    """Return the code of a reason, and those of the reasons behind it."""
+    return [] if reason is None else [reason.code.value, *_codes(reason.cause)]

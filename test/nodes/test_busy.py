@@ -20,12 +20,9 @@ from sensor_msgs.msg import Temperature
 from std_msgs.msg import String
 
 from koopman_ros.nodes import topics
-from koopman_ros.nodes.controller_parameters import ControllerParameters
 from koopman_ros.nodes.messages import to_celsius
-from koopman_ros.nodes.shipped import config_directory
+from koopman_ros.nodes.replay import replay_records
 from koopman_ros.nodes.watchdog import Watchdog
-from koopman_ros.replay.loop import replay
-from koopman_ros.replay.models import Models
 from koopman_ros.replay.records import parse
 from koopman_ros.testing import Harness
 from support.controller_bench import STATUS, STEADY
@@ -107,8 +104,7 @@ def wait_for_replay(bench: BusyBench, stamps: Sequence[float]) -> None:
     """
     def agrees() -> bool:
         records = [parse(message.data) for message in bench.records]
-        found = replay(records, Models([config_directory() / 'models']).find,
-                       lambda values: ControllerParameters(**values).settings())
+        found = replay_records(records)
         assert [sample.recorded for sample in found.samples] == [
             sample.replayed for sample in found.samples]
         return [to_celsius(float(sample.recorded[0])) for sample in found.samples] == [

@@ -124,6 +124,8 @@ def run(case: Case, folder: Path, check: Callable[[], None] = lambda: None) -> O
             rig.run_until(case.settle)
             case.play(rig)
             rig.run_for(case.afterwards)
+            rig.expect(any('"command"' in record for record in rig.course.records),
+                       'the controller recorded no command')
         except HarnessError as error:
             rig.course.complaints.append(str(error))
         except SkipError as reason:

@@ -14,6 +14,8 @@ import re
 
 import numpy as np
 
+from koopman_ros.nodes.replay import replay_records
+from koopman_ros.replay.records import parse, RecordError
 from validation.faults.course import Course
 
 RUNAWAY = 60.0  # degC; the reactor's operating points end below 54 degC
@@ -104,6 +106,7 @@ def judge(course: Course, bounds: Bounds) -> Verdict:
         reasons.append(f'the coolant command stepped by {step:.3f} K after the fault, '
                        f'{bounds.bump:g} K are allowed')
     reasons += _words(course, bounds.says, bounds.excused)
+    reasons += _replay(course)
     return Verdict(tuple(reasons), worst, step, recovery, offset)
 
 
@@ -150,6 +153,19 @@ def _words(course: Course, says: Sequence[str], excused: Sequence[str]) -> list[
     reasons += [f'at the end diagnostics still say ERROR: {name}: {said.message}'
                 for name, said in sorted(last.items()) if said.level >= 2 and name not in excused]
     return reasons
+
+
+def _replay(course: Course) -> list[str]:
+    """Say where the controller's commands do not follow from what it recorded of itself."""
+    try:
+        found = replay_records(map(parse, course.records))
+    except RecordError as error:
+        return [f'its records cannot be replayed: {error}']
+    wrong = [sample.stamp_ns for sample in found.samples if sample.replayed is not None
+             and sample.replayed.tobytes() != sample.recorded.tobytes()]
+    reasons = [f'{len(wrong)} commands do not follow from the records, the first at stamp '
+               f'{wrong[0]} ns'] if wrong else []
+    return reasons + [f'records {lost.first} to {lost.last} are missing' for lost in found.lost]
 
 
 @dataclass(frozen=True)

@@ -8,6 +8,7 @@ from __future__ import annotations
 from diagnostic_msgs.msg import DiagnosticArray
 from rclpy.node import Node
 from sensor_msgs.msg import Temperature
+from std_msgs.msg import String
 
 from koopman_ros.nodes import topics
 from koopman_ros.nodes.messages import NANOSECONDS, stamp_message, stamp_nanoseconds
@@ -53,6 +54,8 @@ class Line:
             self._to_plant = node.create_publisher(Temperature, PLANT_COOLANT, topics.LOOP_QOS)
         node.create_subscription(
             DiagnosticArray, topics.DIAGNOSTICS, self._on_diagnostics, topics.LOOP_QOS)
+        node.create_subscription(
+            String, topics.CONTROLLER_EVENTS, self._on_record, topics.LOOP_QOS)
         node.create_subscription(
             Temperature, topics.COOLANT_TEMPERATURE, self._on_coolant, topics.LATCHED_QOS)
         node.create_subscription(
@@ -107,6 +110,9 @@ class Line:
         self._to_plant.publish(_message(Packet(self._stamp_ns, self._held)))
         for packet in arriving[:-1]:
             self._to_plant.publish(_message(packet))
+
+    def _on_record(self, message: String) -> None:
+        self.course.records.append(message.data)
 
     def _on_diagnostics(self, message: DiagnosticArray) -> None:
         self.course.said += [

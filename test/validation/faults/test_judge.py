@@ -10,6 +10,8 @@ import math
 
 import pytest
 
+from koopman_ros.replay.records import parse
+from support.recorded_controller import Recorded, STEADY
 from validation.faults.course import Command, Course, Said, Sample
 from validation.faults.judge import Account, account, Bounds, judge
 
@@ -41,6 +43,23 @@ def test_figures_of_a_case_that_is_survived():
     assert verdict.worst_error == pytest.approx(1.0)
     assert verdict.worst_step == pytest.approx(0.01)
     assert verdict.recovery == 20.0
+
+
+def test_commands_that_do_not_follow_from_the_records_are_not_survived():
+    controller = Recorded()
+    for k in range(5):
+        controller.measure(STEADY + 0.1 * k)
+    found = course()
+    found.records = controller.texts
+    assert judge(found, BOUNDS).survived
+    altered = parse(controller.texts[3])
+    altered.fields['command'][0] += 1e-12
+    found.records = [*controller.texts[:3], altered.text(), *controller.texts[4:]]
+    assert reasons(found).startswith('1 commands do not follow from the records, the first at')
+    found.records = [*controller.texts[:3], *controller.texts[4:]]
+    assert reasons(found) == 'records 3 to 3 are missing'
+    found.records = ['{}']
+    assert 'its records cannot be replayed' in reasons(found)
 
 
 @pytest.mark.parametrize('celsius', [4.9, 32.1, math.nan, math.inf, -math.inf])
