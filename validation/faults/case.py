@@ -12,6 +12,7 @@ from pathlib import Path
 import time
 
 from koopman_ros.nodes.controller_parameters import ControllerParameters
+from koopman_ros.reasons import Code
 from koopman_ros.testing import HarnessError
 from validation.faults.course import Course
 from validation.faults.judge import BAND, Bounds, judge, Verdict
@@ -35,6 +36,7 @@ class Case:
     :param plant: parameters on top of lock-step at full speed.
     :param controller: parameters.
     :param says: regular expressions that diagnostics must match, see :class:`Bounds`.
+    :param codes: of reasons that must be in the controller's records, see there.
     :param excused: statuses that may end in ERROR.
     :param recovery: plant time to be back in, s.
     :param band: what counts as back, K.
@@ -57,6 +59,7 @@ class Case:
     plant: Mapping[str, object] = field(default_factory=lambda: LOCKSTEP)
     controller: Mapping[str, object] = field(default_factory=dict)
     says: tuple[str, ...] = ()
+    codes: tuple[Code, ...] = ()
     excused: tuple[str, ...] = ()
     recovery: float = 300.0
     band: float = BAND
@@ -76,7 +79,7 @@ class Case:
             coolant_min=usual.coolant_min, coolant_max=usual.coolant_max,
             largest_step=self.largest_step, bump=self.bump, recovery=self.recovery,
             band=self.band, offset=self.offset,
-            worst=self.worst, says=self.says, excused=self.excused)
+            worst=self.worst, says=self.says, codes=self.codes, excused=self.excused)
 
 
 @dataclass(frozen=True)
@@ -124,7 +127,7 @@ def run(case: Case, folder: Path, check: Callable[[], None] = lambda: None) -> O
             rig.run_until(case.settle)
             case.play(rig)
             rig.run_for(case.afterwards)
-            rig.expect(any('"command"' in record for record in rig.course.records),
+            rig.expect(any('"command"' in text for _, text in rig.course.records),
                        'the controller recorded no command')
         except HarnessError as error:
             rig.course.complaints.append(str(error))

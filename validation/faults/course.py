@@ -51,7 +51,7 @@ class Course:
     :ivar coolants: the coolant that was in force at a measurement, degC by the plant's stamp.
     :ivar delivered: stamps of the measurements that reached the controller.
     :ivar said: statuses of all nodes.
-    :ivar records: what the controller recorded of itself, as texts.
+    :ivar records: what the controller recorded of itself: (plant time, text).
     :ivar begin: when the fault began.
     :ivar end: when the fault was over, or had been put in where it stays.
     :ivar complaints: what the case itself, or the rig, found wrong, in sentences.
@@ -64,7 +64,7 @@ class Course:
     coolants: dict[int, float] = field(default_factory=dict)
     delivered: list[int] = field(default_factory=list)
     said: list[Said] = field(default_factory=list)
-    records: list[str] = field(default_factory=list)
+    records: list[tuple[float, str]] = field(default_factory=list)
     begin: float = np.inf
     end: float = np.inf
     complaints: list[str] = field(default_factory=list)

@@ -15,6 +15,7 @@ import re
 import numpy as np
 
 from koopman_ros.nodes.replay import replay_records
+from koopman_ros.reasons import Code
 from koopman_ros.replay.records import parse, RecordError
 from validation.faults.course import Course
 
@@ -38,6 +39,7 @@ class Bounds:
     :param worst: largest distance from the set-point from the fault on, K.
     :param says: regular expressions that diagnostics (``<node>: <task>: <sentence>``) must have
         matched from the beginning of the fault on.
+    :param codes: of reasons that the controller's records must have given since then.
     :param excused: statuses (``<node>: <task>``) that may end in ERROR.
     """
 
@@ -50,6 +52,7 @@ class Bounds:
     offset: float = math.inf
     worst: float = math.inf
     says: tuple[str, ...] = ()
+    codes: tuple[Code, ...] = ()
     excused: tuple[str, ...] = ()
 
 
@@ -106,7 +109,7 @@ def judge(course: Course, bounds: Bounds) -> Verdict:
         reasons.append(f'the coolant command stepped by {step:.3f} K after the fault, '
                        f'{bounds.bump:g} K are allowed')
     reasons += _words(course, bounds.says, bounds.excused)
-    reasons += _replay(course)
+    reasons += _replay(course, bounds.codes)
     return Verdict(tuple(reasons), worst, step, recovery, offset)
 
 
@@ -155,16 +158,22 @@ def _words(course: Course, says: Sequence[str], excused: Sequence[str]) -> list[
     return reasons
 
 
-def _replay(course: Course) -> list[str]:
-    """Say where the controller's commands do not follow from what it recorded of itself."""
+def _replay(course: Course, codes: Sequence[Code]) -> list[str]:
+    """Say which reasons the records lack, and where commands do not follow from them."""
     try:
-        found = replay_records(map(parse, course.records))
+        records = [(seconds, parse(text)) for seconds, text in course.records]
+        found = replay_records(record for _, record in records)
     except RecordError as error:
         return [f'its records cannot be replayed: {error}']
+    given = {code for seconds, record in records if seconds >= course.begin
+             for code in record.fields.get('reason', ())}
+    reasons = [f'no record gives the reason {code.value}' for code in codes
+               if code.value not in given]
     wrong = [sample.stamp_ns for sample in found.samples if sample.replayed is not None
              and sample.replayed.tobytes() != sample.recorded.tobytes()]
-    reasons = [f'{len(wrong)} commands do not follow from the records, the first at stamp '
-               f'{wrong[0]} ns'] if wrong else []
+    if wrong:
+        reasons.append(f'{len(wrong)} commands do not follow from the records, the first at stamp '
+                       f'{wrong[0]} ns')
     return reasons + [f'records {lost.first} to {lost.last} are missing' for lost in found.lost]
 
 

@@ -112,7 +112,7 @@ class Line:
             self._to_plant.publish(_message(packet))
 
     def _on_record(self, message: String) -> None:
-        self.course.records.append(message.data)
+        self.course.records.append((self.now, message.data))
 
     def _on_diagnostics(self, message: DiagnosticArray) -> None:
         self.course.said += [

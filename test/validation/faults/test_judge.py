@@ -10,6 +10,7 @@ import math
 
 import pytest
 
+from koopman_ros.reasons import Code
 from koopman_ros.replay.records import parse
 from support.recorded_controller import Recorded, STEADY
 from validation.faults.course import Command, Course, Said, Sample
@@ -50,16 +51,28 @@ def test_commands_that_do_not_follow_from_the_records_are_not_survived():
     for k in range(5):
         controller.measure(STEADY + 0.1 * k)
     found = course()
-    found.records = controller.texts
+    found.records = [(60.0, text) for text in controller.texts]
     assert judge(found, BOUNDS).survived
     altered = parse(controller.texts[3])
     altered.fields['command'][0] += 1e-12
-    found.records = [*controller.texts[:3], altered.text(), *controller.texts[4:]]
+    found.records[3] = 60.0, altered.text()
     assert reasons(found).startswith('1 commands do not follow from the records, the first at')
-    found.records = [*controller.texts[:3], *controller.texts[4:]]
+    del found.records[3]
     assert reasons(found) == 'records 3 to 3 are missing'
-    found.records = ['{}']
+    found.records = [(60.0, '{}')]
     assert 'its records cannot be replayed' in reasons(found)
+
+
+def test_reason_is_looked_for_in_the_records_from_the_fault_on():
+    controller = Recorded()
+    controller.measure(STEADY)
+    controller.measure(math.nan)
+    bounds = replace(BOUNDS, codes=(Code.NOT_FINITE,))
+    found = course()
+    for seconds, words in ((BEGIN, ''), (BEGIN - 1.0, 'no record gives the reason')):
+        found.records = [(seconds, text) for text in controller.texts]
+        assert words in '; '.join(judge(found, bounds).reasons)
+        assert judge(found, bounds).survived is not bool(words)
 
 
 @pytest.mark.parametrize('celsius', [4.9, 32.1, math.nan, math.inf, -math.inf])

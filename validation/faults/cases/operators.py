@@ -19,6 +19,7 @@ from rclpy.task import Future
 from sensor_msgs.msg import Temperature
 from std_srvs.srv import SetBool
 
+from koopman_ros.reasons import Code
 from validation.faults.case import Case, SETPOINT
 from validation.faults.rig import Rig
 
@@ -174,10 +175,10 @@ CASES = (
     _case('setpoint-storm', 'set-points at 1 kHz, all the same',
           _storm_of_setpoints(lambda _: SETPOINT)),
     _case('setpoint-storm-nan', 'set-points at 1 kHz: NaN',
-          _storm_of_setpoints(lambda _: math.nan), says=('^controller: control: .*not finite',)),
+          _storm_of_setpoints(lambda _: math.nan), codes=(Code.SETPOINT_NOT_FINITE,)),
     _case('setpoint-storm-outside', 'set-points at 1 kHz: 500 and -1e308 degC',
           _storm_of_setpoints(lambda number: (500.0, -1e308)[number % 2]),
-          says=('^controller: control: .*outside the trained range',)),
+          codes=(Code.SETPOINT_OUTSIDE,)),
     _case('setpoint-storm-alternating', 'set-points at 1 kHz: 41 and 51 degC in turn',
           _storm_of_setpoints(lambda number: (41.0, 51.0)[number % 2])),
     _case('mode-once', 'manual mode for a minute, and back, without a bump', _mode_once,
