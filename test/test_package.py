@@ -140,6 +140,12 @@ def test_numerics_do_not_import_ros(package: str) -> None:
         assert not roots & {'rclpy', 'sensor_msgs', 'std_msgs', 'diagnostic_msgs'}, path
 
 
+def test_nothing_that_is_installed_imports_what_is_not() -> None:
+    for path in ROOT.glob('koopman_ros/**/*.py'):
+        roots = {name.split('.')[0] for name in _imports(path)}
+        assert not roots & {'validation', 'examples', 'support', 'test'}, path
+
+
 def test_every_package_has_its_rule() -> None:
     packages = {path.parent.name for path in ROOT.glob('koopman_ros/*/__init__.py')}
     assert packages == set(ALLOWED)

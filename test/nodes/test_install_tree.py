@@ -1,84 +1,217 @@
 # SPDX-FileCopyrightText: 2026 The koopman_ros Authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""The install tree that colcon builds, as `ros2 run` finds it, and processes started from it."""
+"""
+The package as it is installed: by colcon, as `ros2 run` finds it, and as a wheel by pip.
+
+Processes are started from either. Those of the wheel have an environment of their own, which
+notes every file of the repository that is opened in it.
+"""
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+import os
 from pathlib import Path
 import shutil
 import subprocess
 import sys
+import sysconfig
+import venv
 
 import pytest
 
 from koopman_ros.testing import Harness, isolated_domain
 
 ROOT = Path(__file__).parents[2]
-NAMES = ('plant', 'controller', 'trainer', 'player', 'replay')
+NODES = {'plant': 'simulation', 'controller': 'control', 'trainer': 'recording'}
+# what ends by itself, and what it says of a bag that is not there
+TOOLS = {'player': "cannot start: bag 'none' does not exist",
+         'replay': "bag 'none' does not exist"}
+# Notes what is opened below the repository, but for the environment that the tests run in. `open`
+# is an audit event of imports and of files alike.
+NOTING = f"""
+import os, sys
+
+def note(event, arguments):
+    if event == 'open' and isinstance(arguments[0], (str, bytes)):
+        path = os.path.realpath(os.fsdecode(arguments[0]))
+        if path.startswith({f'{ROOT}/'!r}) and not path.startswith({f'{sys.prefix}/'!r}):
+            os.write(notes, (path + chr(10)).encode())
+
+notes = os.open({{file!r}}, os.O_WRONLY | os.O_APPEND | os.O_CREAT, 0o600)
+sys.addaudithook(note)
+"""
+EVERYTHING = """
+import importlib, pkgutil, koopman_ros
+for module in pkgutil.walk_packages(koopman_ros.__path__, 'koopman_ros.'):
+    if not module.name.endswith('__main__'):
+        importlib.import_module(module.name)
+        print(module.name)
+"""
+
+
+@dataclass(frozen=True)
+class Installation:
+    """
+    Where the package was installed.
+
+    :param executables: folder of the nodes.
+    :param share: folder of manifest and configuration.
+    :param package: folder of the package.
+    :param before: what a shell does before it starts a process.
+    :param python: the interpreter.
+    :param notes: names the files of the repository that its processes opened.
+    """
+
+    executables: Path
+    share: Path
+    package: Path
+    before: str
+    python: Path
+    notes: Path
+
+    def opened(self) -> str:
+        """Return the files of the repository that were opened so far, a line each."""
+        return self.notes.read_text() if self.notes.exists() else ''
+
+    def command(self, *command: str) -> tuple[str, ...]:
+        """Return a command that runs another in this installation, in a folder beside it."""
+        program = f'cd {self.notes.parent} && {self.before} && exec "$0" "$@"'
+        return ('bash', '-c', program, *command)
+
+
+def sources(folder: Path) -> Path:
+    """Copy what the package is built from, but none of its builds."""
+    folder.mkdir(parents=True)
+    for name in ('package.xml', 'setup.py', 'setup.cfg', 'resource', 'config', 'koopman_ros'):
+        if (ROOT / name).is_dir():
+            shutil.copytree(ROOT / name, folder / name,
+                            ignore=shutil.ignore_patterns('__pycache__'))
+        else:
+            shutil.copy(ROOT / name, folder / name)
+    return folder
+
+
+def run(command: tuple[str, ...], **options: object) -> subprocess.CompletedProcess[str]:
+    return subprocess.run(command, capture_output=True, text=True, timeout=240, check=False,
+                          **options)  # type: ignore[call-overload]
+
+
+def by_colcon(folder: Path) -> Installation:
+    """Build the package in a workspace of its own."""
+    sources(folder / 'src' / 'koopman_ros')
+    built = run((sys.executable, '-m', 'colcon', 'build', '--event-handlers', 'console_direct+'),
+                cwd=folder)
+    assert built.returncode == 0, built.stdout + built.stderr
+    prefix = folder / 'install' / 'koopman_ros'
+    (site,) = prefix.glob('lib/python*/site-packages')
+    return Installation(
+        prefix / 'lib' / 'koopman_ros', prefix / 'share' / 'koopman_ros', site / 'koopman_ros',
+        f'. {folder}/install/setup.bash', Path(sys.executable), folder / 'notes')
+
+
+def by_pip(folder: Path) -> Installation:
+    """Build a wheel and install it into an empty environment; requirements are those of here."""
+    wheels = folder / 'wheels'
+    wheels.mkdir()
+    built = run((sys.executable, '-c', 'import sys; from setuptools import build_meta; '
+                 'build_meta.build_wheel(sys.argv[1])', str(wheels)),
+                cwd=sources(folder / 'source'))
+    assert built.returncode == 0, built.stdout + built.stderr
+    (wheel,) = wheels.glob('*.whl')
+    venv.create(folder / 'environment', symlinks=True)
+    environment = folder / 'environment'
+    installed = run((sys.executable, '-m', 'pip', '--python', str(environment / 'bin/python'),
+                     'install', '--quiet', '--no-deps', '--no-index', str(wheel)))
+    assert installed.returncode == 0, installed.stderr
+    (site,) = environment.glob('lib/python*/site-packages')
+    notes = folder / 'notes'
+    (site / 'noting.py').write_text(NOTING.format(file=str(notes)))
+    # a folder that a .pth adds is not searched for further .pth: an editable install stays out
+    (site / 'here.pth').write_text(f'{sysconfig.get_path("purelib")}\nimport noting\n')
+    return Installation(
+        environment / 'bin', environment / 'share' / 'koopman_ros', site / 'koopman_ros',
+        'unset PYTHONPATH AMENT_PREFIX_PATH', environment / 'bin' / 'python', notes)
 
 
 @pytest.fixture(scope='module')
-def install_tree(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Build the package in a workspace of its own; return the workspace's install folder."""
-    workspace = tmp_path_factory.mktemp('workspace')
-    source = workspace / 'src' / 'koopman_ros'
-    source.mkdir(parents=True)
-    for name in ('package.xml', 'setup.py', 'setup.cfg', 'resource', 'config', 'koopman_ros'):
-        if (ROOT / name).is_dir():
-            shutil.copytree(ROOT / name, source / name,
-                            ignore=shutil.ignore_patterns('__pycache__'))
-        else:
-            shutil.copy(ROOT / name, source / name)
-    built = subprocess.run(
-        [sys.executable, '-m', 'colcon', 'build', '--event-handlers', 'console_direct+'],
-        cwd=workspace, capture_output=True, text=True, timeout=240, check=False)
-    assert built.returncode == 0, built.stdout + built.stderr
-    return workspace / 'install'
+def colcon(tmp_path_factory: pytest.TempPathFactory) -> Installation:
+    return by_colcon(tmp_path_factory.mktemp('workspace'))
 
 
-def test_the_tree_is_what_ros2_run_looks_for(install_tree: Path) -> None:
-    prefix = install_tree / 'koopman_ros'
-    for name in NAMES:
-        executable = prefix / 'lib' / 'koopman_ros' / name
+@pytest.fixture(scope='module')
+def wheel(tmp_path_factory: pytest.TempPathFactory) -> Installation:
+    return by_pip(tmp_path_factory.mktemp('wheel'))
+
+
+@pytest.fixture(params=['colcon', 'wheel'])
+def installation(request: pytest.FixtureRequest) -> Installation:
+    found: Installation = request.getfixturevalue(request.param)
+    return found
+
+
+def test_everything_is_installed(installation: Installation) -> None:
+    for name in (*NODES, *TOOLS):
+        executable = installation.executables / name
         assert executable.is_file()
-        assert executable.stat().st_mode & 0o111
-    share = prefix / 'share'
-    assert (share / 'ament_index/resource_index/packages/koopman_ros').is_file()
-    assert (share / 'koopman_ros/package.xml').is_file()
+        assert os.access(executable, os.X_OK)
+    share = installation.share
+    assert (share.parent / 'ament_index/resource_index/packages/koopman_ros').is_file()
+    assert (share / 'package.xml').is_file()
     shipped = {path.relative_to(ROOT / 'config') for path in (ROOT / 'config').rglob('*.*')}
-    installed = {path.relative_to(share / 'koopman_ros/config')
-                 for path in (share / 'koopman_ros/config').rglob('*.*')}
-    assert installed == shipped
-    assert Path('models/reactor_nz4.safetensors') in installed
+    assert {path.relative_to(share / 'config')
+            for path in (share / 'config').rglob('*.*')} == shipped
+    assert Path('models/reactor_nz4.safetensors') in shipped
+    # the package alone, not what validates it
+    beside = {path.name for path in installation.package.parent.iterdir()}
+    assert 'koopman_ros' in beside
+    assert not {'validation', 'test', 'examples', 'support'} & beside
 
 
-def test_the_sourced_tree_is_what_python_imports(install_tree: Path) -> None:
+def test_it_is_what_python_imports(installation: Installation) -> None:
     program = ('import koopman_ros; from koopman_ros.nodes.shipped import config_directory; '
                'print(koopman_ros.__file__); print(config_directory())')
-    printed = subprocess.run(
-        ['bash', '-c', f'. {install_tree}/setup.bash && "$0" -c "$1"', sys.executable, program],
-        cwd=install_tree, capture_output=True, text=True, timeout=240, check=True).stdout.split()
-    prefix = install_tree / 'koopman_ros'
-    assert prefix in Path(printed[0]).parents
-    assert Path(printed[1]) == prefix / 'share' / 'koopman_ros' / 'config'
+    ended = run(installation.command(str(installation.python), '-c', program))
+    assert ended.stdout.split() == [str(installation.package / '__init__.py'),
+                                    str(installation.share / 'config')], ended.stderr
 
 
-def test_a_node_of_the_tree_starts_and_ends(ros: Harness, install_tree: Path) -> None:
-    executable = install_tree / 'koopman_ros' / 'lib' / 'koopman_ros' / 'controller'
-    program = f'. {install_tree}/setup.bash && exec {executable} "$@"'
-    process = ros.start('controller', command=('bash', '-c', program))
-    ros.wait_for_status('controller: control', lambda status: True)
+@pytest.mark.parametrize('name', NODES)
+def test_a_node_starts_with_its_parameter_file_and_ends(
+        ros: Harness, installation: Installation, tmp_path: Path, name: str) -> None:
+    parameters = {'output': tmp_path / 'bag'} if name == 'trainer' else {}
+    process = ros.start(
+        name, parameters, ('--params-file', str(installation.share / 'config' / f'{name}.yaml')),
+        command=installation.command(str(installation.executables / name)))
+    ros.wait_for_status(f'{name}: {NODES[name]}', lambda status: True)
     assert process.stop() == 0
+    assert installation.opened() == ''
 
 
-def test_a_tool_of_the_tree_reads_its_parameters(install_tree: Path) -> None:
-    executable = install_tree / 'koopman_ros' / 'lib' / 'koopman_ros' / 'player'
+@pytest.mark.parametrize('name', TOOLS)
+def test_a_tool_reads_its_parameters(installation: Installation, name: str) -> None:
+    parameter = {'player': 'bag:=none', 'replay': 'bags:=[none]'}[name]
     with isolated_domain():
-        ended = subprocess.run(
-            ['bash', '-c', f'. {install_tree}/setup.bash && exec {executable} "$@"', 'player',
-             '--ros-args', '-p', 'bag:=none'],
-            cwd=install_tree, capture_output=True, text=True, timeout=240, check=False)
+        ended = run(installation.command(str(installation.executables / name), '--ros-args', '-p',
+                                         parameter))
     assert ended.returncode == 1
-    assert ended.stderr.strip() == (
-        "player: cannot start: bag 'none' does not exist: check the path")
+    assert ended.stderr.strip() == f'{name}: {TOOLS[name]}: check the path'
+
+
+def test_what_is_opened_of_the_repository_is_noted(wheel: Installation) -> None:
+    file = ROOT / 'setup.py'
+    assert run(wheel.command(str(wheel.python), '-c', f'open({str(file)!r})')).returncode == 0
+    assert wheel.opened() == f'{file}\n'
+    wheel.notes.unlink()
+
+
+def test_no_module_of_the_wheel_needs_the_repository(wheel: Installation) -> None:
+    """Neither validation, nor the configuration or the package as they lie there."""
+    ended = run(wheel.command(str(wheel.python), '-c', EVERYTHING))
+    assert ended.returncode == 0, ended.stderr
+    modules = {'.'.join(path.relative_to(wheel.package.parent).with_suffix('').parts)
+               for path in wheel.package.rglob('*.py') if not path.stem.startswith('__')}
+    assert modules <= set(ended.stdout.split())
+    assert 'koopman_ros.learning.training' in modules
+    assert wheel.opened() == ''
