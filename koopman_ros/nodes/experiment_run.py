@@ -15,7 +15,7 @@ from rclpy.qos import QoSProfile, ReliabilityPolicy
 from rclpy.task import Future
 from sensor_msgs.msg import Temperature
 
-from koopman_ros.control.experiment import advance, begin, end, Following, Phase, Progress
+from koopman_ros.experiment import advance, begin, end, Following, Phase, Progress
 from koopman_ros.nodes import topics
 from koopman_ros.nodes.messages import (
     NANOSECONDS,

@@ -8,7 +8,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Any
 
-from koopman_ros.control.experiment import Experiment
+from koopman_ros.experiment import Experiment
 from koopman_ros.nodes import topics
 from koopman_ros.nodes.messages import SECONDS_PER_MINUTE, to_kelvin
 from koopman_ros.nodes.parameters import parameter, ParameterTable

@@ -17,7 +17,7 @@ from rclpy.qos import QoSProfile, ReliabilityPolicy
 from sensor_msgs.msg import Temperature
 
 from koopman_ros.bags import read_messages
-from koopman_ros.control.experiment import advance, begin, Phase
+from koopman_ros.experiment import advance, begin, Phase
 from koopman_ros.nodes import topics
 from koopman_ros.nodes.messages import stamp_nanoseconds, to_celsius, to_kelvin
 from koopman_ros.nodes.trainer_parameters import TrainerParameters
@@ -148,7 +148,7 @@ def shared_bench(shared_ros: Harness) -> Bench:
     (60.0, 'the temperature 60.00 degC is outside the bounds of the experiment, 31.85 degC to '
      '53.85 degC'),
     (20.0, 'the temperature 20.00 degC is outside'),
-    (math.nan, 'is not finite: check the sensor'),
+    (math.nan, 'is nan, not finite: check the sensor'),
 ])
 def test_does_not_start_at_a_bad_temperature(shared_bench: Bench, celsius: float, words: str
                                              ) -> None:

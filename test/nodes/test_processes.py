@@ -31,17 +31,18 @@ from support.messages import TIMEOUT
 # Ends.
 
 
-@pytest.mark.parametrize(('name', 'number'), [
-    ('plant', signal.SIGINT), ('controller', signal.SIGTERM), ('trainer', signal.SIGINT)])
-def test_signal_ends_a_node_cleanly_that_needs_no_torch(
-        ros: Harness, tmp_path: Path, name: str, number: int) -> None:
+@pytest.mark.parametrize(('name', 'number', 'unneeded'), [
+    ('plant', signal.SIGINT, ('torch',)), ('controller', signal.SIGTERM, ('torch',)),
+    ('trainer', signal.SIGINT, ('torch', 'scipy'))])
+def test_signal_ends_a_node_cleanly_that_loads_only_what_it_needs(
+        ros: Harness, tmp_path: Path, name: str, number: int, unneeded: tuple[str, ...]) -> None:
     program = (
         'import sys\n'
-        'class NoTorch:\n'
+        'class Missing:\n'
         '    def find_spec(self, name, path=None, target=None):\n'
-        '        if name.split(".")[0] == "torch":\n'
-        '            raise AssertionError("torch is imported")\n'
-        'sys.meta_path.insert(0, NoTorch())\n'
+        f'        if name.split(".")[0] in {unneeded}:\n'
+        '            raise AssertionError(f"{name} is imported")\n'
+        'sys.meta_path.insert(0, Missing())\n'
         f'from koopman_ros.nodes.{name} import main\n'
         'sys.exit(main())\n')
     # the plant is in the middle of a callback whenever the signal comes

@@ -12,8 +12,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from koopman_ros import experiment as experiments
 from koopman_ros.control import Controller, InputLimits, Settings, State
-from koopman_ros.control import experiment as experiments
 from koopman_ros.identification import Identified, identify
 from koopman_ros.learning import NoUsefulLift, roll_out, Trained
 from koopman_ros.lifting import Coordinates, LiftedModel, linearised_model, Provenance

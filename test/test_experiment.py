@@ -10,7 +10,7 @@ import math
 import numpy as np
 import pytest
 
-from koopman_ros.control.experiment import (
+from koopman_ros.experiment import (
     advance,
     begin,
     end,
