@@ -1,0 +1,172 @@
+# SPDX-FileCopyrightText: 2026 The koopman_ros Authors
+# SPDX-License-Identifier: Apache-2.0
+
+"""Any number of states and inputs: limits, levels, noise and silence, one number per signal."""
+
+from dataclasses import fields, replace
+import math
+
+from hypothesis import given, settings
+from hypothesis import strategies as st
+import numpy as np
+import pytest
+from scipy.linalg import expm
+
+from koopman_ros.control import Controller, InputLimits, Mode, Settings, State
+from koopman_ros.estimation import SensorLimits
+from koopman_ros.lifting import LiftedModel, linearised_model, Provenance
+from koopman_ros.reasons import Code
+from koopman_ros.signals import Outputs
+from support.random_lifts import coordinates, random_lift
+from support.sampled_loops import supervisor_settings
+
+SECOND = 1_000_000_000
+
+
+def tuned(model: LiftedModel, outputs: Outputs | None = None, **changes: object) -> Controller:
+    """Return a controller whose numbers differ from signal to signal."""
+    states, inputs, n_u = model.states, model.inputs, np.arange(1.0, model.n_u + 1.0)
+    measured = outputs or Outputs(states.names, states.units, np.eye(model.n_x))
+    reach = np.abs(measured.C) @ (20.0 * states.scale)
+    middle = measured.of(states.center)
+    return Controller(model, replace(Settings.for_model(
+        model, state_weight=1.0 / states.scale ** 2, input_weight=n_u / inputs.scale ** 2,
+        limits=InputLimits(inputs.lower - n_u, inputs.upper + n_u, 0.5 * n_u),
+        setpoint_ramp=0.1 * states.scale, max_disturbance=2.0 * inputs.scale,
+        sensor=SensorLimits(middle - reach, middle + reach, 0.1 * reach, 0.2 * reach, 5.0),
+        observer_bandwidth=0.2, supervisor=supervisor_settings(hold_timeout=5.0),
+        transfer_time=3.0), **changes), outputs)
+
+
+def mixed(model: LiftedModel) -> Outputs:
+    """Return measurements that each see two states."""
+    n = model.n_x
+    return Outputs(tuple(f'y{i}' for i in range(n)), ('1',) * n,
+                   np.eye(n) + 0.5 * np.eye(n, k=1))
+
+
+shares = st.floats(-3.0, 3.0)
+kinds = st.sampled_from(['measure'] * 6 + [
+    'silence', 'setpoint', 'manual', 'mode', 'broken', 'frozen', 'restart', 'successor'])
+events = st.lists(st.tuples(kinds, st.lists(shares, min_size=4, max_size=4),
+                            st.sampled_from([1.0, 1.0, 1.0, 0.3, 4.0, 0.0, -30.0])),
+                  min_size=1, max_size=25)
+
+
+@settings(max_examples=60, deadline=None, derandomize=True)
+@given(n_x=st.integers(1, 4), n_u=st.integers(1, 3), seed=st.integers(0, 5),
+       all_states=st.booleans(), sequence=events)
+def test_every_command_keeps_the_limits_of_each_input(n_x, n_u, seed, all_states, sequence):
+    model = random_lift(n_x, n_u=n_u, seed=seed)
+    loop = tuned(model, None if all_states else mixed(model))
+    limits, state, now = loop.settings.limits, State(), 10 * SECOND
+    last = loop.measured.of(model.states.center)
+    for kind, values, wait in sequence:
+        before, earlier = state.command, state.commanded_ns
+        x = model.states.to_physical(np.array(values[:n_x]))
+        u = model.inputs.to_physical(np.array(values[-n_u:]))
+        now = max(SECOND, now + round(wait * SECOND))
+        command = None
+        match kind:
+            case 'measure' | 'broken' | 'frozen':
+                y = last if kind == 'frozen' else loop.measured.of(x)
+                if kind == 'broken':
+                    y = np.where(np.arange(n_x) == 0, values[0] * math.inf, y)
+                else:
+                    last = y
+                state, command, report = loop.step(state, y, now)
+                assert (report.reason is not None) or kind != 'broken' or wait <= 0.0
+            case 'silence':
+                state, command, report = loop.watch(state, now)
+            case 'setpoint':
+                state, refused = loop.request_setpoint(state, x)
+                assert (refused is None) == (model.states.violation(x) == 0.0)
+            case 'manual':
+                state, _ = loop.request_manual_input(state, u)
+            case 'mode':
+                state = loop.set_mode(state, Mode.MANUAL if values[0] > 0.0 else Mode.AUTOMATIC)
+            case 'restart':
+                state = loop.take_over(State(), u)
+            case 'successor':
+                other = tuned(model, loop.outputs, observer_bandwidth=float(values[0] > 0.0))
+                state, loop = other.succeed(loop, state), other
+        if command is None:
+            continue
+        assert command.shape == (n_u,)
+        assert np.all((limits.lower <= command) & (command <= limits.upper))
+        assert report.level in ('sdre', 'linear', 'hold', 'safe', 'manual')
+        if before is not None and earlier is not None:
+            elapsed = max(0.0, (now - earlier) / SECOND)
+            assert np.all(np.abs(command - before) <= limits.rate * elapsed + 1e-9)
+
+
+@pytest.mark.parametrize('all_states', [True, False], ids=['each state', 'mixtures'])
+@pytest.mark.parametrize('n', [1, 2, 3])
+def test_a_disturbed_plant_is_brought_to_its_setpoint(n, all_states):
+    rng = np.random.default_rng(n)
+    A, B = rng.normal(size=(n, n)) - 1.5 * np.eye(n), np.eye(n) + 0.2 * rng.normal(size=(n, n))
+    model = linearised_model(
+        A, B, coordinates('x', n), coordinates('u', n), 'min', Provenance('linear'))
+    loop = tuned(model, None if all_states else mixed(model))
+    A, B = model.A, model.B
+    # the plant's exact motion over a second, with a load that the model does not know
+    load = 0.2 * rng.normal(size=n)
+    block = expm(np.block([[A, np.eye(n)], [np.zeros((n, 2 * n))]]) / 60.0)
+    motion, integral = block[:n, :n], block[:n, n:]
+    wanted = model.states.to_physical(np.full(n, 0.4))
+    state, refused = loop.request_setpoint(State(), wanted)
+    assert refused is None
+    x = np.zeros(n)
+    for k in range(1500):
+        state, command, report = loop.step(
+            state, loop.measured.of(model.states.to_physical(x)), (k + 10) * SECOND)
+        x = motion @ x + integral @ (B @ model.inputs.to_deviation(command) + load)
+    assert report.level == 'sdre'
+    np.testing.assert_allclose(x, 0.4, rtol=0, atol=1e-6)
+    np.testing.assert_allclose(state.estimate.w, load, rtol=0, atol=1e-5)
+
+
+PER_SIGNAL = ('state_weight', 'input_weight', 'setpoint_ramp', 'max_disturbance',
+              'input_tolerance', 'safe_input')
+
+
+def test_nothing_broadcasts():
+    good = tuned(random_lift(2, n_u=2))
+    assert {item.name for item in fields(Settings)} >= set(PER_SIGNAL)
+    for name in PER_SIGNAL:
+        for wrong in (np.ones(1), np.ones(3), 1.0, np.ones((2, 1))):
+            with pytest.raises((ValueError, TypeError), match='one number for each of'):
+                Controller(good.model, replace(good.settings, **{name: wrong}))
+    for part, names in (('limits', ('lower', 'upper', 'rate')),
+                        ('sensor', ('lower', 'upper', 'rate', 'jump'))):
+        whole = getattr(good.settings, part)
+        for name in names:
+            short = replace(whole, **{item: getattr(whole, item)[:1] for item in names})
+            with pytest.raises(ValueError, match=f'{names[0]}: expected one number for each of'):
+                Controller(good.model, replace(good.settings, **{part: short}))
+            assert name
+
+
+def test_outputs_that_do_not_determine_the_state_are_refused():
+    model = random_lift(2, n_u=1)
+    one = Outputs(('x0',), ('K',), np.array([[1.0, 0.0]]))
+    with pytest.raises(ValueError, match='x0 do not determine all 2 states'):
+        tuned(model, one, sensor=SensorLimits.none(1))
+
+
+def test_a_frozen_sensor_is_found_beside_another_that_moves():
+    model = linearised_model(-np.eye(2), np.eye(2), coordinates('x', 2), coordinates('u', 2),
+                             'min', Provenance('linear'))
+    jump = 0.05 * model.states.scale
+    endless = np.full(2, np.inf)
+    loop = tuned(model, sensor=SensorLimits(-endless, endless, endless, jump, 5.0))
+    state, reasons = loop.set_mode(State(), Mode.MANUAL), []
+    for k in range(12):
+        # both relax towards the nominal point, but for what the first sensor says
+        x = np.exp(-np.array([0.0, k / 60.0])) * 0.8
+        state, _, report = loop.step(
+            state, model.states.to_physical(x), (k + 10) * SECOND)
+        reasons.append(report.reason)
+    assert reasons[:6] == [None] * 6
+    assert {(found.code, found.values['signal']) for found in reasons[6:]} == {
+        (Code.FROZEN, 'x0')}
