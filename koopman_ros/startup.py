@@ -26,6 +26,11 @@ from koopman_ros.last_resort import end_by_force
 
 SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
 
+# Their steps take a fraction of a millisecond; where threads are to share it, and others use the
+# cores, one takes twenty.
+_IN_THE_LOOP = ('koopman_ros.nodes.plant', 'koopman_ros.nodes.controller',
+                'koopman_ros.nodes.player')
+
 _PR_SET_PDEATHSIG = 1  # of prctl(2)
 _END = 8.0  # s from the end of a program to that by force
 _QUIET = 1.0  # s after an interrupt in which another one is the same
@@ -43,6 +48,8 @@ def run_program(module: str, interrupted: int) -> int:
     # numpy, scipy and rclpy take half a second, in which there is nothing to complete
     for number in SIGNALS:
         signal.signal(number, lambda *_: os._exit(interrupted))
+    if module in _IN_THE_LOOP:
+        os.environ.setdefault('OPENBLAS_NUM_THREADS', '1')
     main = importlib.import_module(module).main
     _raise_interrupts()
     code = 1

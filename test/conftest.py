@@ -8,6 +8,10 @@ import sys
 
 import pytest
 
+# Before numpy is imported: small problems are slower on several threads, and far slower where
+# others use the cores.
+os.environ.setdefault('OPENBLAS_NUM_THREADS', '1')
+
 from support.disturbance import disturb_training
 
 # An int in a float64 field, say, passes unnoticed here, and aborts the process where the message

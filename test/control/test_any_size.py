@@ -100,8 +100,7 @@ def test_every_command_keeps_the_limits_of_each_input(n_x, n_u, seed, all_states
             assert np.all(np.abs(command - before) <= limits.rate * elapsed + 1e-9)
 
 
-@pytest.mark.parametrize('all_states', [True, False], ids=['each state', 'mixtures'])
-@pytest.mark.parametrize('n', [1, 2, 3])
+@pytest.mark.parametrize(('n', 'all_states'), [(1, True), (2, False), (3, True)])
 def test_a_disturbed_plant_is_brought_to_its_setpoint(n, all_states):
     rng = np.random.default_rng(n)
     A, B = rng.normal(size=(n, n)) - 1.5 * np.eye(n), np.eye(n) + 0.2 * rng.normal(size=(n, n))
@@ -117,7 +116,7 @@ def test_a_disturbed_plant_is_brought_to_its_setpoint(n, all_states):
     state, refused = loop.request_setpoint(State(), wanted)
     assert refused is None
     x = np.zeros(n)
-    for k in range(1500):
+    for k in range(900):
         state, command, report = loop.step(
             state, loop.measured.of(model.states.to_physical(x)), (k + 10) * SECOND)
         x = motion @ x + integral @ (B @ model.inputs.to_deviation(command) + load)
