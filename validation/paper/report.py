@@ -99,9 +99,8 @@ def _opening(summary: dict[str, Any]) -> str:
 
 
 def _scalar(part: dict[str, Any]) -> str:
-    rows = [(label, _spread(part[name])) for label, name in (
-        ('rw in [0, 5]', 'rw_in'), ('rw in [5, 6]', 'rw_5_6'), ('rw in [6, 8]', 'rw_6_8'),
-        ('eigenvalue', 'eigenvalue'))]
+    rows = _rows({'rw in [0, 5]': 'rw_in', 'rw in [5, 6]': 'rw_5_6', 'rw in [6, 8]': 'rw_6_8',
+                  'eigenvalue': 'eigenvalue'}, part)
     growth = _median(part['rw_6_8']) / _median(part['rw_in'])
     return (
         '## Motivating example, dx/dt = x^2\n\n' + table(('', ''), rows) + '\n\n'
@@ -113,14 +112,10 @@ def _scalar(part: dict[str, Any]) -> str:
 
 def _two_state(part: dict[str, Any]) -> str:
     weights = list(part['cost_ratio_to_exact'])
-    rows = [('rw', _spread(part['rw'])), ('cond', _spread(part['cond'])),
-            ('eigenvalue error', _spread(part['eigenvalue_error']))]
-    rows += [(f'cost ratio to exact - 1, {R}', _spread(part['cost_ratio_to_exact'][R], 1.0))
-             for R in weights]
-    rows += [(f'cost ratio of the linearised law, {R}', _spread(part['linear_cost_ratio'][R]))
-             for R in weights]
-    rows += [('cost ratio of EDMD (degree 2), projected law, R=1',
-              _spread(part['edmd_cost_ratio']['R=1']))]
+    rows = [*_exact_rows(part), *(
+        (f'cost ratio of the linearised law, {R}', _spread(part['linear_cost_ratio'][R]))
+        for R in weights), ('cost ratio of EDMD (degree 2), projected law, R=1',
+                            _spread(part['edmd_cost_ratio']['R=1']))]
     left = sum(bool(value) for value in part['left_box'])
     ratios = ', '.join(f'{_median(part["linear_cost_ratio"][R]):.3f} ({R})' for R in weights)
     return (
@@ -137,8 +132,6 @@ def _two_state(part: dict[str, Any]) -> str:
 
 
 def _reactor(part: dict[str, Any]) -> str:
-    rows = [(name, *(_spread(part[name][column]) for column in _REACTOR_COLUMNS))
-            for name in part]
     linear = part['linear']
     inside = [_median(part[name]['rollout_rmse_in_kelvin']) for name in part
               if name.startswith('nz=')]
@@ -146,7 +139,7 @@ def _reactor(part: dict[str, Any]) -> str:
                if name.startswith('nz=')]
     edmd = part['edmd']
     return (
-        '## One-state reactor\n\n' + table(('', *_REACTOR_COLUMNS), rows) + '\n\n'
+        '## One-state reactor\n\n' + _reactor_table('', part) + '\n\n'
         "In range the paper's picture holds: the learned lifts lie on the reactor "
         f'({min(inside):.1g} to {max(inside):.1g} K), the linearisation is '
         f'{_median(linear["rollout_rmse_in_kelvin"]):.2g} K off. Out of range, towards colder '
@@ -186,16 +179,9 @@ def _narrow(part: dict[str, Any]) -> str:
 def _paper(part: dict[str, Any]) -> str:
     text = '## Algorithm 1 as printed\n\n'
     if 'reactor' in part:
-        rows = [(name, *(_spread(part['reactor'][name][column])
-                         for column in _REACTOR_COLUMNS)) for name in part['reactor']]
-        text += table(('reactor', *_REACTOR_COLUMNS), rows) + '\n\n'
+        text += _reactor_table('reactor', part['reactor']) + '\n\n'
     if 'two_state' in part:
-        two = part['two_state']
-        rows = [('rw', _spread(two['rw'])), ('cond', _spread(two['cond'])),
-                ('eigenvalue error', _spread(two['eigenvalue_error']))]
-        rows += [(f'cost ratio to exact - 1, {R}', _spread(values, 1.0))
-                 for R, values in two['cost_ratio_to_exact'].items()]
-        text += table(('two-state example', ''), rows) + '\n\n'
+        text += table(('two-state example', ''), _exact_rows(part['two_state'])) + '\n\n'
     return text + (
         'One standard-normal start for each seed, lambda from 10 down, both termination '
         'criteria, free lift with decoder on the reactor, identity rows on the two-state example '
@@ -210,20 +196,20 @@ def _paper(part: dict[str, Any]) -> str:
 def _sensors(part: dict[str, Any]) -> str:
     noisy, free, drifted, two = (
         part[name] for name in ('noisy', 'noise_free', 'drifted', 'two_state'))
-    hour = [(label, _spread(noisy[name]), _spread(free[name])) for label, name in (
-        ('roll-out over fresh random steps [K]', 'rollout_kelvin'),
-        ('relative error of B', 'input_gain_error'), ('rw', 'rw'), ('cond', 'cond'),
-        ('degree of the drift', 'degree'), ('noise as estimated [K]', 'noise_kelvin'))]
-    fouled = [(label, _spread(drifted[name])) for label, name in (
-        ('offset with the present lift [K]', 'offset_before_kelvin'),
-        ('offset with the new lift [K]', 'offset_after_kelvin'),
-        ('new over present', 'offset_ratio'), ('roll-out [K]', 'rollout_kelvin'),
-        ('relative error of B', 'input_gain_error'))]
-    half = [(label, _spread(two[name])) for label, name in (
-        ('error on held-out measurements [K]', 'heldout_kelvin'),
-        ('noise as estimated [K]', 'noise_kelvin'),
-        ('error of the best linear model [K]', 'linear_kelvin'),
-        ('roll-out over fresh random steps [K]', 'rollout_kelvin'))]
+    hour = _rows({
+        'roll-out over fresh random steps [K]': 'rollout_kelvin',
+        'relative error of B': 'input_gain_error', 'rw': 'rw', 'cond': 'cond',
+        'degree of the drift': 'degree', 'noise as estimated [K]': 'noise_kelvin'}, noisy, free)
+    fouled = _rows({
+        'offset with the present lift [K]': 'offset_before_kelvin',
+        'offset with the new lift [K]': 'offset_after_kelvin',
+        'new over present': 'offset_ratio', 'roll-out [K]': 'rollout_kelvin',
+        'relative error of B': 'input_gain_error'}, drifted)
+    half = _rows({
+        'error on held-out measurements [K]': 'heldout_kelvin',
+        'noise as estimated [K]': 'noise_kelvin',
+        'error of the best linear model [K]': 'linear_kelvin',
+        'roll-out over fresh random steps [K]': 'rollout_kelvin'}, two)
     accepted = sum(map(bool, drifted['accepted']))
     warned = sum(map(bool, two['warned']))
     return (
@@ -238,6 +224,24 @@ def _sensors(part: dict[str, Any]) -> str:
         'The concentration moves, too, and is not measured: the temperature alone has no drift of '
         f'its own. The report said so in {warned} of {len(two["warned"])} seeds. The lift still '
         'predicts better than a linear model, yet no better than the two-state motion lets it.')
+
+
+def _rows(names: dict[str, str], *parts: dict[str, Any]) -> list[tuple[str, ...]]:
+    """Return a row a figure, by its label, with a column a part."""
+    return [(label, *(_spread(part[name]) for part in parts)) for label, name in names.items()]
+
+
+def _exact_rows(part: dict[str, Any]) -> list[tuple[str, ...]]:
+    """Compare the two-state example with its exact solution."""
+    return [*_rows({'rw': 'rw', 'cond': 'cond', 'eigenvalue error': 'eigenvalue_error'}, part), *(
+        (f'cost ratio to exact - 1, {R}', _spread(values, 1.0))
+        for R, values in part['cost_ratio_to_exact'].items())]
+
+
+def _reactor_table(title: str, part: dict[str, Any]) -> str:
+    return table((title, *_REACTOR_COLUMNS), (
+        (name, *(_spread(figures[column]) for column in _REACTOR_COLUMNS))
+        for name, figures in part.items()))
 
 
 def _at(summary: dict[str, Any], path: str) -> Values:

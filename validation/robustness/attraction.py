@@ -15,6 +15,7 @@ from scipy.optimize import brentq
 
 from koopman_ros.control import SAFE, Supervisor
 from koopman_ros.plants import ControlAffineSystem, fold, two_state_reactor
+from koopman_ros.solvers import runge_kutta_step
 from validation.paper.outcome import Metrics
 from validation.robustness.disturbances import finite
 from validation.robustness.loop import (
@@ -131,23 +132,17 @@ def hottest_saved(coolant: float) -> float:
 
     :param coolant: at the start, in K.
     """
-    coldest = COOLANT_RANGE[0]
-    temperature, seconds = hottest_cooled(), coolant - coldest
+    seconds = coolant - COOLANT_RANGE[0]
     steps = max(1, round(seconds / _SHORT_STEP))
-    h = -seconds / steps / 60.0
 
-    def rate(T: float, u: float) -> float:
-        return float(REACTOR.derivative(np.array([T]), np.array([u]))[0])
+    def rate(state: Array) -> Array:
+        """Return the rates of reactor and coolant, in K/min."""
+        return np.array([REACTOR.derivative(state[:1], state[1:])[0], -60.0])
 
-    for number in range(steps):
-        u, v = (coldest + (number + part) * seconds / steps for part in (0.0, 1.0))
-        middle = 0.5 * (u + v)
-        k1 = rate(temperature, u)
-        k2 = rate(temperature + 0.5 * h * k1, middle)
-        k3 = rate(temperature + 0.5 * h * k2, middle)
-        k4 = rate(temperature + h * k3, v)
-        temperature += h / 6.0 * (k1 + 2.0 * k2 + 2.0 * k3 + k4)
-    return temperature
+    state = np.array([hottest_cooled(), COOLANT_RANGE[0]])
+    for _ in range(steps):
+        state = runge_kutta_step(rate, state, -seconds / steps / 60.0)
+    return float(state[0])
 
 
 def grid(*, ladder: bool) -> dict[tuple[float, float], End]:

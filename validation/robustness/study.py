@@ -64,12 +64,12 @@ class Found:
     two_state: dict[tuple[str, str], Course] = field(default_factory=dict)
 
     def summary(self) -> dict[str, Any]:
-        """Return the figures as JSON takes them."""
+        """Return the figures by name; those that are infinite have none in JSON."""
         return {
             'margins': {
                 f'coolant_weight={weight:g}/bandwidth={bandwidth:g}/{kelvin:g}K': {
-                    'gain': _number(m.gain), 'phase_degrees': _number(m.phase),
-                    'delay_seconds': _number(m.delay), 'distance': m.distance}
+                    'gain': m.gain, 'phase_degrees': m.phase,
+                    'delay_seconds': m.delay, 'distance': m.distance}
                 for (weight, bandwidth, kelvin), m in self.margins.items()},
             'verified': {name: {'grows_below': below, 'grows_above': above}
                          for name, (below, above) in self.verified.items()},
@@ -150,7 +150,3 @@ def trained_range() -> tuple[float, float]:
     """Return the range of the shipped lift, in K."""
     states = shipped_model().states
     return float(states.lower[0]), float(states.upper[0])
-
-
-def _number(value: float) -> float | None:
-    return disturbances.finite(float(value))
