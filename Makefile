@@ -102,4 +102,4 @@ lock: | $(BIN)/python  ## take the newest versions within the ranges of setup.py
 	  --python-version 3.11 --all-extras --no-annotate setup.py --output-file $(LOCK)
 
 clean:  ## remove the environment and the results
-	rm -rf $(VENV) out build install log
+	rm -rf $(VENV) out build install log docs/api
