@@ -58,6 +58,12 @@ def test_page_is_in_the_table_of_contents(page: Path) -> None:
     assert page.stem in [*listed, 'index']
 
 
+def test_contributing_lists_the_packages() -> None:
+    text = (ROOT / 'CONTRIBUTING.md').read_text()
+    for package in ROOT.glob('koopman_ros/*/__init__.py'):
+        assert f' koopman_ros/{package.parent.name}/ ' in text
+
+
 def test_readme_is_short() -> None:
     assert len((ROOT / 'README.md').read_text().splitlines()) <= 130
 
