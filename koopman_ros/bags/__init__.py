@@ -8,7 +8,7 @@ Imports nothing of ours but the version, nothing of ROS and nothing that learns:
 be opened on any machine with Python.
 """
 
-from koopman_ros.bags.episodes import Account, loop_episodes
+from koopman_ros.bags.episodes import Account, EPISODE_UNIT, loop_episodes
 from koopman_ros.bags.errors import BagReadError
 from koopman_ros.bags.order import in_log_order
 from koopman_ros.bags.qos import INFINITE_NS, QosProfile
@@ -23,6 +23,7 @@ from koopman_ros.bags.series import temperature_series, TemperatureSeries
 from koopman_ros.bags.writer import BagWriter
 
 __all__ = [
+    'EPISODE_UNIT',
     'INFINITE_NS',
     'Account',
     'BagMessage',

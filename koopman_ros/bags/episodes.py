@@ -20,6 +20,7 @@ from koopman_ros.bags.jumps import spikes_and_jumps
 from koopman_ros.bags.reader import read_messages, summary
 from koopman_ros.plant_data import Episode
 
+EPISODE_UNIT = 'degC'  # of states and inputs alike
 _TEMPERATURE = 'sensor_msgs/msg/Temperature'
 _NS = 1_000_000_000
 # A stamp earlier by more than this means that time was set back, e.g. by a restart of the plant.
@@ -60,7 +61,7 @@ class Account:
 def loop_episodes(bags: Sequence[str | os.PathLike[str]], temperature: str, coolant: str, *,
                   input_delay_ns: int = 0) -> tuple[list[Episode], Account]:
     """
-    Read the episodes of some bags: times in s since the first measurement of each, in degC.
+    Read the episodes of some bags: times in s since the first measurement of each.
 
     Nothing is resampled: measurements keep their stamps, and the coolant is held from the time
     on at which it was commanded. A command that answers a measurement carries its stamp; where
@@ -73,7 +74,7 @@ def loop_episodes(bags: Sequence[str | os.PathLike[str]], temperature: str, cool
     is read as far as it goes. The account tells all that.
 
     :param bags: files or folders.
-    :param temperature: topic of the measurements, sensor_msgs/Temperature.
+    :param temperature: topic of the measurements, sensor_msgs/Temperature in `EPISODE_UNIT`.
     :param coolant: topic of the coolant temperature that acts, likewise.
     :param input_delay_ns: dead time of the actuator, after which a command begins to act.
     :raises BagReadError: for a bag that cannot be read, lacks a topic, or has another type there.

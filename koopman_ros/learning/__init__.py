@@ -13,7 +13,6 @@ from koopman_ros.learning.growth import Growth
 from koopman_ros.learning.training import (
     NoUsefulLift,
     Progress,
-    RECIPES,
     train,
     Trained,
 )
@@ -28,7 +27,6 @@ from koopman_ros.learning.validation import (
 )
 
 __all__ = [
-    'RECIPES',
     'Algorithm1',
     'Edmd',
     'Figures',

@@ -36,7 +36,6 @@ from koopman_ros.plant_data import Plant, Samples, split_by_episode
 from koopman_ros.solvers.levenberg_marquardt import MinimumStatus
 
 Recipe = Growth | Algorithm1
-RECIPES: dict[str, type[Growth] | type[Algorithm1]] = {'growth': Growth, 'paper': Algorithm1}
 
 
 @dataclass(frozen=True)

@@ -10,13 +10,19 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
+from koopman_ros.bags import EPISODE_UNIT
 from koopman_ros.identification import Identified, longest_step, Segments
 from koopman_ros.identification.segments import fitted_starts, Rate
+from koopman_ros.lifting import Coordinates
 from koopman_ros.reports import bullets, drawing, table, write_figures, write_page
 from koopman_ros.retraining.coverage import CELLS, visited_cells
 from koopman_ros.retraining.gate import lifted_rate
-from koopman_ros.retraining.task import Retrained, ZERO_CELSIUS
+from koopman_ros.retraining.task import Retrained
+from koopman_ros.units import conversion
+
+Array = NDArray[np.float64]
 
 
 def write_report(retrained: Retrained) -> list[Path]:
@@ -39,6 +45,7 @@ def write_report(retrained: Retrained) -> list[Path]:
 
 def _sections(retrained: Retrained) -> Iterator[str]:
     found, decision, trained = retrained.found, retrained.decision, retrained.trained
+    unit, input_unit = retrained.present.states.units[0], retrained.present.inputs.units[0]
     yield f'**The new lift is {"accepted" if retrained.accepted else "refused"}.**'
     warnings = () if decision is None else decision.warnings
     yield bullets([*retrained.reasons, *(f'Beware: {warning}.' for warning in warnings)])
@@ -50,19 +57,19 @@ def _sections(retrained: Retrained) -> Iterator[str]:
         *retrained.account.lines(),
         f'{100.0 * retrained.coverage:.0f} % of the cells of the state-input box visited '
         f'({CELLS} along each)',
-        f'noise from sample to sample: {found.noise[0]:.3g} K',
+        f'noise from sample to sample: {found.noise[0]:.3g} {unit}',
         f'{len(found.fitted)} segments to estimate and learn from, '
         f'{len(found.held_out)} held out to judge by'])
     yield '## Estimates of the drift'
     yield (f'Taken: {found.method}, degree {found.drift.degree}; '
-           f'B = {found.drift.input_matrix[0, 0]:.5g} K per K and time unit.')
-    yield table(('degree', 'method', 'error on the segments to choose by [K]'),
+           f'B = {found.drift.input_matrix[0, 0]:.5g} {unit} per {input_unit} and time unit.')
+    yield table(('degree', 'method', f'error on the segments to choose by [{unit}]'),
                 ((score.degree, score.method, f'{score.rmse[0]:.5f}') for score in found.scores),
                 (2,))
     if decision is None or trained is None:
         return
     yield '## On held-out segments'
-    yield table(('prediction of the measurements by', 'root mean square error [K]'),
+    yield table(('prediction of the measurements by', f'root mean square error [{unit}]'),
                 ((name, f'{rmse[0]:.5f}') for name, rmse in (
                     ('the new lift', decision.rmse),
                     ('the drift that it was learned from', decision.drift_rmse),
@@ -74,6 +81,15 @@ def _sections(retrained: Retrained) -> Iterator[str]:
            f'{trained.figures.fit.cond:.3g}, eigenvalues {eigenvalues} '
            f'1/{trained.model.time_unit}. Closed loops on the estimated drift: {decision.arrived} '
            f'of {decision.loops} reach their set-point.')
+
+
+def _shown(signals: Coordinates, values: Array) -> Array:
+    to = conversion(signals.units[0], EPISODE_UNIT)
+    return values * to.factor + to.offset
+
+
+def _label(signals: Coordinates) -> str:
+    return f'{signals.names[0].replace("_", " ")} [{EPISODE_UNIT.replace("deg", "°")}]'
 
 
 def _draw(path: Path, retrained: Retrained) -> bool:
@@ -93,19 +109,18 @@ def _draw(path: Path, retrained: Retrained) -> bool:
 def _draw_coverage(axes: Any, found: Identified) -> None:
     box = found.drift.box
     episodes = [*found.fitted, *found.held_out]
-    low = np.append(box.states.lower, box.inputs.lower) - ZERO_CELSIUS
-    size = 2.0 * np.append(box.states.scale, box.inputs.scale) / CELLS
     visited = np.full((CELLS, CELLS), np.nan)
     for i, j in visited_cells(episodes, box):
         visited[j, i] = 1.0
-    edges = [low[k] + size[k] * np.arange(CELLS + 1) for k in (0, 1)]
+    edges = [_shown(a, np.linspace(a.lower[0], a.upper[0], CELLS + 1))
+             for a in (box.states, box.inputs)]
     axes.pcolormesh(*edges, visited, cmap='Greens', vmin=0.0, vmax=3.0)
     for episode in episodes:
-        axes.plot(episode.x[:, 0] - ZERO_CELSIUS,
-                  episode.inputs_at(episode.time)[:, 0] - ZERO_CELSIUS, '.', markersize=1.0,
+        axes.plot(_shown(box.states, episode.x[:, 0]),
+                  _shown(box.inputs, episode.inputs_at(episode.time)[:, 0]), '.', markersize=1.0,
                   color='tab:blue')
     axes.grid(False)  # the cells are one
-    axes.set(xlabel='temperature [°C]', ylabel='coolant [°C]',
+    axes.set(xlabel=_label(box.states), ylabel=_label(box.inputs),
              title='where the measurements lie (visited cells in green)')
 
 
@@ -122,24 +137,24 @@ def _draw_drift(axes: Any, retrained: Retrained) -> None:
         rates.append(('new lift', lifted_rate(retrained.trained.model, unit), 'tab:green'))
     estimated = found.drift.rate(x, u)[:, 0]
     for name, rate, color in rates:
-        axes.plot(x[:, 0] - ZERO_CELSIUS, rate(x, u)[:, 0] - estimated,
-                  color=color, label=name)
+        axes.plot(_shown(box.states, x[:, 0]), rate(x, u)[:, 0] - estimated, color=color,
+                  label=name)
     axes.axhline(0.0, color='k', linestyle='--', linewidth=1.0,
                  label='estimated from the data')
-    axes.set(xlabel='temperature [°C]',
-             ylabel=f'difference of dT/dt [K/{current.time_unit}]',
-             title=f'dT/dt at {u[0, 0] - ZERO_CELSIUS:.1f} °C of coolant, '
-             'less the estimate')
+    held = float(_shown(box.inputs, u[0])[0])
+    axes.set(xlabel=_label(box.states),
+             ylabel=f'difference of the rate [{box.states.units[0]}/{current.time_unit}]',
+             title=f'rate at {held:.1f} {_label(box.inputs)}, less the estimate')
     axes.legend()
 
 
 def _draw_prediction(axes: Any, retrained: Retrained) -> None:
-    found, current = retrained.found, retrained.present
+    found, current, states = retrained.found, retrained.present, retrained.present.states
     episode = found.held_out[0]
     segments = Segments.of([episode], longest_step([episode]))
     minutes = np.concatenate(([0.0], np.cumsum(segments.steps[:, 0])))
     measured = segments.measured[:, 0]
-    axes.plot(minutes[measured], segments.x[measured, 0, 0] - ZERO_CELSIUS,
+    axes.plot(minutes[measured], _shown(states, segments.x[measured, 0, 0]),
               '.', color='0.6', markersize=3.0, label='measured')
     unit = current.seconds_per_time_unit
     models = [('present lift', lifted_rate(current, unit), 'tab:red')]
@@ -148,7 +163,7 @@ def _draw_prediction(axes: Any, retrained: Retrained) -> None:
     for name, rate, color in models:
         x0, _ = fitted_starts(rate, segments, found.drift.box.states.scale)
         path = segments.path(rate, x0)[:, 0, 0]
-        axes.plot(minutes, path - ZERO_CELSIUS, color=color, label=name)
-    axes.set(xlabel=f'time [{current.time_unit}]', ylabel='temperature [°C]',
+        axes.plot(minutes, _shown(states, path), color=color, label=name)
+    axes.set(xlabel=f'time [{current.time_unit}]', ylabel=_label(states),
              title='prediction of a held-out segment')
     axes.legend()

@@ -7,7 +7,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-import dataclasses
 from dataclasses import dataclass, field, replace
 import hashlib
 import json
@@ -17,7 +16,7 @@ import shutil
 
 import numpy as np
 
-from koopman_ros.bags import Account, loop_episodes
+from koopman_ros.bags import Account, EPISODE_UNIT, loop_episodes
 from koopman_ros.identification import Identified, identify, Stopped
 from koopman_ros.learning import NoUsefulLift, Progress, Trained
 from koopman_ros.lifting import LiftedModel, load, save
@@ -25,8 +24,8 @@ from koopman_ros.plant_data import Episode
 from koopman_ros.retraining.coverage import coverage
 from koopman_ros.retraining.gate import decide, Decision, Thresholds
 from koopman_ros.retraining.lift import learn_lift
+from koopman_ros.units import conversion
 
-ZERO_CELSIUS = 273.15  # K
 _NS = 1_000_000_000
 # Shares of the whole at which estimating, learning and judging begin.
 _STAGES = {'estimate': 0.05, 'learn': 0.35, 'decide': 0.9}
@@ -72,10 +71,6 @@ class Task:
         """Read a task; unknown or missing fields are a TypeError."""
         values = json.loads(text)
         return cls(**{**values, 'bags': tuple(values['bags'])})
-
-    def to_json(self) -> str:
-        """Write the task on one line."""
-        return json.dumps(dataclasses.asdict(self))
 
 
 @dataclass(frozen=True)
@@ -159,7 +154,7 @@ def retrain(task: Task, on_progress: OnProgress = lambda *_: False) -> Retrained
     if Path(task.output).suffix != '.safetensors':
         raise ValueError(f'output = {task.output!r} must end in .safetensors')
     current = load(task.model)
-    _check_temperatures(current, task.model)
+    _check_signals(current, task.model)
     # a folder that cannot be written should fail now, not after the training
     Path(task.output).parent.mkdir(parents=True, exist_ok=True)
     _stop_if(on_progress(0.0, 'reading bags'))
@@ -169,7 +164,7 @@ def retrain(task: Task, on_progress: OnProgress = lambda *_: False) -> Retrained
     if not recorded:
         raise ValueError('the bags hold no usable segment of measurements: '
                          + '; '.join(account.lines()))
-    episodes = [_in_model_units(episode, current.seconds_per_time_unit) for episode in recorded]
+    episodes = [_in_model_units(episode, current) for episode in recorded]
     B = None
     if task.input_gain:
         B = np.array([[task.input_gain * current.seconds_per_time_unit / 60.0]])
@@ -202,12 +197,19 @@ def retrain(task: Task, on_progress: OnProgress = lambda *_: False) -> Retrained
     return replace(retrained, trained=replace(trained, model=model), model_file=str(path))
 
 
-def _check_temperatures(model: LiftedModel, path: str) -> None:
-    if (model.states.units, model.inputs.units) != (('K',), ('K',)):
+def _check_signals(model: LiftedModel, path: str) -> None:
+    try:
+        if (model.n_x, model.n_u) != (1, 1):
+            raise ValueError('expected one state and one input')
+        for unit in (*model.states.units, *model.inputs.units):
+            conversion(EPISODE_UNIT, unit)
+    except ValueError:
+        states, inputs = (
+            ', '.join(f'{name} [{unit}]' for name, unit in zip(a.names, a.units, strict=True))
+            for a in (model.states, model.inputs))
         raise ValueError(
-            f'the present lift {path} has {", ".join(model.states.names)} as states and '
-            f'{", ".join(model.inputs.names)} as inputs, bags of the loop hold one temperature '
-            'and the coolant: name a lift of these')
+            f'the present lift {path} has {states} as states and {inputs} as inputs, bags of the '
+            f'loop hold one of each in {EPISODE_UNIT}: name a lift of these') from None
 
 
 def _at(stage: str, share: float) -> float:
@@ -226,9 +228,12 @@ def _learning(now: Progress) -> str:
     return f'learning: n_z {now.n_z}, start {min(now.finished + 1, now.total)} of {now.total}{rw}'
 
 
-def _in_model_units(episode: Episode, seconds: float) -> Episode:
-    return Episode(episode.time / seconds, episode.x + ZERO_CELSIUS,
-                   episode.input_time / seconds, episode.u + ZERO_CELSIUS)
+def _in_model_units(episode: Episode, model: LiftedModel) -> Episode:
+    seconds = model.seconds_per_time_unit
+    of_state, of_input = (conversion(EPISODE_UNIT, a.units[0])
+                          for a in (model.states, model.inputs))
+    return Episode(episode.time / seconds, episode.x * of_state.factor + of_state.offset,
+                   episode.input_time / seconds, episode.u * of_input.factor + of_input.offset)
 
 
 def _with_provenance(model: LiftedModel, retrained: Retrained, episodes: list[Episode]

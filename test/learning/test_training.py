@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 import torch
 
-from koopman_ros.learning import Edmd, evaluate, fit, Growth, RECIPES, train
+from koopman_ros.learning import Algorithm1, Edmd, evaluate, fit, Growth, train
 from koopman_ros.lifting import Box
 from koopman_ros.plant_data import Plant, Samples, split_by_episode
 from koopman_ros.plants import scalar_example
@@ -128,12 +128,10 @@ def test_b_is_learned(plant):
 
 
 def test_the_recipe_of_the_paper():
-    recipe = RECIPES['paper'](2, identity=True, hidden=(4,), decoder=4, max_rounds=3,
-                              max_iterations=60)
+    recipe = Algorithm1(2, identity=True, hidden=(4,), decoder=4, max_rounds=3, max_iterations=60)
     trained = train(BENT, bent_samples(), recipe, starts=2)
     assert trained.model.n_z == 2
     assert trained.figures.fit.rx < trained.linear.fit.rx
-    assert RECIPES['growth'] is Growth
 
 
 @pytest.mark.parametrize('B', [np.zeros((1, 0)), None], ids=['known B', 'no B'])
