@@ -14,8 +14,9 @@ from koopman_ros.control.laws import Law, LawResult, LAWS, Tuning, Weights
 from koopman_ros.control.limits import InputLimits
 from koopman_ros.control.settings import Settings
 from koopman_ros.control.target import balance, Reference, reference, Target
-from koopman_ros.estimation import DisturbanceObserver, Estimate, Estimator, MeasuredState
+from koopman_ros.estimation import Estimate, Estimator, ESTIMATORS
 from koopman_ros.lifting import LiftedModel
+from koopman_ros.plugs import plug
 
 Array = NDArray[np.float64]
 
@@ -79,20 +80,18 @@ def levels_of(model: LiftedModel, settings: Settings) -> dict[str, Level]:
     """
     Build the levels that the settings name, best first.
 
-    :raises ValueError: for a law that there is not.
+    :raises ValueError: for a law or an estimator that there is not.
     """
     tuning = Tuning(weights_of(model, settings), settings.max_gain, settings.max_residual)
     levels = {}
     for level in settings.supervisor.levels:
-        if level.law not in LAWS:
-            raise ValueError(f'there is no law {level.law!r}: choose among {", ".join(LAWS)}')
-        law = LAWS[level.law](model, tuning)
+        law = plug(level.law, 'law', LAWS)(model, tuning)
         levels[level.law] = Level(level.law, law, _estimator(law.model, settings))
     return levels
 
 
 def _estimator(model: LiftedModel, settings: Settings) -> Estimator:
-    if not settings.observer_bandwidth > 0.0:
-        return MeasuredState(model)
-    return DisturbanceObserver(model, settings.observer_bandwidth,
-                               settings.max_disturbance / model.inputs.scale)
+    name = settings.estimator or (
+        'disturbance_observer' if settings.observer_bandwidth > 0.0 else 'measured_state')
+    return plug(name, 'estimator', ESTIMATORS)(
+        model, settings.observer_bandwidth, settings.max_disturbance / model.inputs.scale)

@@ -36,6 +36,8 @@ class Settings:
     :param sensor: which measurements are accepted.
     :param setpoint_filter: time constant in s with which the set-point follows its ramp.
     :param observer_bandwidth: of the disturbance observer in 1/s; 0 for none, as in the paper.
+    :param estimator: its name in :data:`koopman_ros.estimation.ESTIMATORS`, or module:class;
+        empty for the disturbance observer, or none of it where its bandwidth is 0.
     :param transfer_time: time constant in s in which the difference between two laws or models,
         or from manual mode, fades.
     :param max_gain: bound on the norm of the Riccati gain in scaled coordinates.
@@ -53,6 +55,7 @@ class Settings:
     sensor: SensorLimits
     setpoint_filter: float = 0.0
     observer_bandwidth: float = 0.0
+    estimator: str = ''
     transfer_time: float = 30.0
     max_gain: float = 1e3
     max_residual: float = 1e-8

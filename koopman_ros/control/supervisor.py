@@ -24,7 +24,7 @@ class LevelSettings:
     """
     One control level.
 
-    :param law: its name in :data:`koopman_ros.control.laws.LAWS`.
+    :param law: its name in :data:`koopman_ros.control.laws.LAWS`, or module:class.
     :param margin: distance outside the training data, in half widths of their box, up to which
         it acts.
     """

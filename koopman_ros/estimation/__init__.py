@@ -3,6 +3,8 @@
 
 """Estimation of state and disturbance from measured outputs; imports lifting and signals."""
 
+from collections.abc import Callable
+
 from koopman_ros.estimation.base import Estimate, Estimator
 from koopman_ros.estimation.frozen import FrozenCheck
 from koopman_ros.estimation.measurement import Accepted, check, SensorLimits, Verdict
@@ -12,7 +14,15 @@ from koopman_ros.estimation.observer import (
     MeasuredState,
 )
 
+# From a model, the observer's bandwidth in 1/s, and the largest disturbance (n_u,), as an input in
+# scaled deviations.
+ESTIMATORS: dict[str, Callable[..., Estimator]] = {
+    'disturbance_observer': DisturbanceObserver,
+    'measured_state': MeasuredState,
+}
+
 __all__ = [
+    'ESTIMATORS',
     'Accepted',
     'DisturbanceObserver',
     'Estimate',

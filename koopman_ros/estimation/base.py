@@ -41,8 +41,8 @@ class Estimator(Protocol):
     """
     From the measured state to an estimate with its disturbance; pure, without memory of its own.
 
-    To add one: write a class like :class:`~koopman_ros.estimation.observer.DisturbanceObserver`
-    in a file of this package, and name it where the controller's levels are built.
+    To add one: write a class like :class:`~koopman_ros.estimation.observer.DisturbanceObserver`,
+    with the same three arguments, in any module, and name it in the settings as module:class.
     """
 
     @property

@@ -104,9 +104,13 @@ class MeasuredState:
     Every measurement is the state, and there is no disturbance, as in the paper.
 
     :param model: whose drift predicts between measurements.
+    :param bandwidth: of no meaning.
+    :param max_disturbance: likewise.
     """
 
     model: LiftedModel
+    bandwidth: float = 0.0
+    max_disturbance: Array | None = None
 
     @property
     def remembers(self) -> bool:

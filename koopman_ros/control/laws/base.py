@@ -92,9 +92,9 @@ class Law(Protocol):
     """
     A control law on a model; pure, what it remembers goes out and comes in.
 
-    To add one: write a class like :class:`~koopman_ros.control.laws.linear.Linear` in a file of
-    this package, whose constructor takes the lift and a :class:`Tuning`, and register it by its
-    name, under which `levels` of the settings chooses it.
+    To add one: write a class like :class:`~koopman_ros.control.laws.linear.Linear` in any module,
+    whose constructor takes the lift and a :class:`Tuning`, and name it in the levels of the
+    settings as module:class.
     """
 
     @property
