@@ -39,6 +39,8 @@ EVENTS: dict[str, type[Event]] = {
     'measurement': Measurement, 'silence': Silence, 'setpoint': SetpointRequest,
     'manual_command': ManualCommand, 'mode': ModeChange, 'initialisation': Initialisation}
 _NAMES = {kind: name for name, kind in EVENTS.items()}
+_FIELDS = {kind: tuple(item.name for item in fields(kind)) for kind in _NAMES}
+_ENCODER = json.JSONEncoder(separators=(',', ':'), allow_nan=False)
 # Names of records that carry the controller's whole state.
 START, SNAPSHOT = 'start', 'snapshot'
 # Names of those by which it is exchanged for one with other parameters or another model.
@@ -67,9 +69,8 @@ class Record:
 
     def text(self) -> str:
         """Return the record as a line of JSON."""
-        return json.dumps({'version': VERSION, 'run': self.run, 'number': self.number,
-                           'event': self.event, **self.fields},
-                          separators=(',', ':'), allow_nan=False)
+        return _ENCODER.encode({'version': VERSION, 'run': self.run, 'number': self.number,
+                                'event': self.event, **self.fields})
 
     @property
     def stamp_ns(self) -> int:
@@ -102,7 +103,7 @@ def parse(text: str) -> Record:
 
 def fields_of(event: Event, outcome: Outcome) -> tuple[str, dict[str, Any]]:
     """Return the name of an event, and what is written of it and of what it led to."""
-    written = {item.name: _written(getattr(event, item.name)) for item in fields(event)}
+    written = {name: _written(getattr(event, name)) for name in _FIELDS[type(event)]}
     report = outcome.report
     if report is None:
         if not isinstance(event, (ModeChange, Initialisation)):
@@ -126,7 +127,7 @@ def event_of(record: Record) -> Event:
     if record.event not in EVENTS:
         raise ValueError(f'the event {record.event!r} is not known')
     kind = EVENTS[record.event]
-    return kind(**{item.name: _read(record.fields[item.name]) for item in fields(kind)})
+    return kind(**{name: _read(record.fields[name]) for name in _FIELDS[kind]})
 
 
 def snapshot(state: State, parameters: Mapping[str, Any], model: Mapping[str, str]

@@ -23,6 +23,7 @@ from std_msgs.msg import String
 
 from koopman_ros.bags import BagMessage, BagReadError, BagWriter, message_definition, read_messages
 from koopman_ros.nodes import replay, topics
+from koopman_ros.nodes.messages import to_kelvin
 from koopman_ros.nodes.replay import Names
 from koopman_ros.nodes.replay_parameters import ReplayParameters
 from koopman_ros.nodes.shipped import config_directory, model_path
@@ -32,6 +33,7 @@ from koopman_ros.replay.records import parse, Record, SNAPSHOT, START
 from koopman_ros.replay.report import reproduced, verdict
 from koopman_ros.testing import Harness, isolated_domain
 from support.messages import seconds, temperature, value
+from support.recorded_controller import Recorded
 
 STEADY = 51.8  # degC
 COOLANT = 24.5  # degC, not what the law would command
@@ -375,6 +377,26 @@ def test_what_cannot_be_replayed_is_refused_in_one_line(
     (line,) = capfd.readouterr().err.splitlines()
     assert line.startswith('replay: ')
     assert words in line
+
+
+def test_controllers_in_namespaces_are_replayed_by_their_own_records(tmp_path: Path) -> None:
+    path = tmp_path / 'units.mcap'
+    with BagWriter(path) as writer:
+        for unit, model in ((1, 'reactor_nz4'), (2, 'reactor_nz3')):
+            controller = Recorded(model)
+            for k in range(10 * unit):
+                controller.measure(to_kelvin(STEADY) - 0.1 * k)
+            writer.add_topic(f'/unit_{unit}{RECORDS}', message_definition('std_msgs/msg/String'))
+            for number, text in enumerate(controller.texts):
+                writer.write(f'/unit_{unit}{RECORDS}', serialize_message(String(data=text)),
+                             number)
+    for unit in (1, 2):
+        with isolated_domain():
+            assert replay.main([
+                'replay', '--ros-args', '-r', f'__ns:=/unit_{unit}', '-p', f'bags:=[{path}]',
+                '-p', f'output:={tmp_path}']) == 0
+        (figures,) = json.loads((tmp_path / 'summary.json').read_text())['bags']
+        assert figures['recorded_model']['identical'] == figures['measurements'] == 10 * unit
 
 
 def test_bag_of_version_0_1_is_refused_with_what_to_do(
