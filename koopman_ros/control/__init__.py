@@ -5,6 +5,15 @@
 
 from koopman_ros.control.closed_loop import ClosedLoop, run_closed_loop
 from koopman_ros.control.controller import Controller
+from koopman_ros.control.events import (
+    Event,
+    Initialisation,
+    ManualCommand,
+    Measurement,
+    ModeChange,
+    SetpointRequest,
+    Silence,
+)
 from koopman_ros.control.laws import (
     Feedback,
     feedback,
@@ -19,6 +28,19 @@ from koopman_ros.control.limits import InputLimits, limit, LimitedInput
 from koopman_ros.control.report import Arrival, Report
 from koopman_ros.control.setpoint import Setpoint
 from koopman_ros.control.settings import Settings
+from koopman_ros.control.simulate import (
+    at,
+    Change,
+    exchange,
+    Loop,
+    perfect,
+    Plant,
+    restart,
+    Sensor,
+    simulate,
+    Simulation,
+    Timed,
+)
 from koopman_ros.control.state import Mode, State
 from koopman_ros.control.supervisor import (
     HOLD,
@@ -36,27 +58,45 @@ __all__ = [
     'MANUAL',
     'SAFE',
     'Arrival',
+    'Change',
     'ClosedLoop',
     'Controller',
+    'Event',
     'Feedback',
     'Form',
+    'Initialisation',
     'InputLimits',
     'LevelSettings',
     'LimitedInput',
+    'Loop',
+    'ManualCommand',
+    'Measurement',
     'Mode',
+    'ModeChange',
+    'Plant',
     'Report',
+    'Sensor',
     'Setpoint',
+    'SetpointRequest',
     'Settings',
+    'Silence',
+    'Simulation',
     'State',
     'Supervisor',
     'SupervisorSettings',
     'Target',
+    'Timed',
     'Weights',
+    'at',
+    'exchange',
     'feedback',
     'limit',
+    'perfect',
     'projected',
     'recentred',
+    'restart',
     'run_closed_loop',
+    'simulate',
     'steady_state_target',
     'weights_of',
 ]

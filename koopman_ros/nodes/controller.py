@@ -20,7 +20,8 @@ from sensor_msgs.msg import JointState, Temperature
 from std_srvs.srv import SetBool, Trigger
 
 from koopman_ros.control import Arrival as Measured
-from koopman_ros.control import Controller, MANUAL, Mode, Report, State
+from koopman_ros.control import Controller, events, MANUAL, Mode, Report, State
+from koopman_ros.control.events import Event, ModeChange, Silence
 from koopman_ros.nodes import topics, translation
 from koopman_ros.nodes.arrival import Arrival
 from koopman_ros.nodes.controller_parameters import ControllerParameters, TABLE
@@ -43,8 +44,7 @@ from koopman_ros.nodes.record_publisher import RecordPublisher
 from koopman_ros.nodes.watchdog import PERIOD, Watchdog
 from koopman_ros.nodes.words import words_of
 from koopman_ros.reasons import level_words
-from koopman_ros.replay import events, records
-from koopman_ros.replay.events import Event, ModeChange, Silence
+from koopman_ros.replay import records
 
 _WATCH_STEP = NANOSECONDS // 2  # of plant time between two commands without a measurement
 _COOLANT_PATIENCE = 0.5  # s that the first answer waits for the coolant that is in force

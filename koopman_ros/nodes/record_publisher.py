@@ -12,9 +12,9 @@ from typing import Any
 
 from std_msgs.msg import String
 
+from koopman_ros.control.events import Event, Outcome
 from koopman_ros.nodes import topics
 from koopman_ros.nodes.matching import Matching
-from koopman_ros.replay.events import Event, Outcome
 from koopman_ros.replay.records import fields_of, Record, SNAPSHOT, START
 
 _SNAPSHOT_PERIOD = 10.0  # s by the wall

@@ -14,13 +14,13 @@ from typing import Any
 
 import numpy as np
 
-from koopman_ros.nodes.messages import NANOSECONDS, stamp_nanoseconds, to_kelvin
-from koopman_ros.replay.events import (
+from koopman_ros.control.events import (
     Initialisation,
     ManualCommand,
     Measurement,
     SetpointRequest,
 )
+from koopman_ros.nodes.messages import NANOSECONDS, stamp_nanoseconds, to_kelvin
 
 # The temperatures of reactor and coolant at an instant are stamped no further apart.
 SAME_TIME_NS = 2 * NANOSECONDS

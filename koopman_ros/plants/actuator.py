@@ -50,6 +50,21 @@ class ActuatedProcess:
     command: FloatArray
     pending: tuple[tuple[int, FloatArray], ...] = ()
 
+    @property
+    def time_ns(self) -> int:
+        """Present time."""
+        return self.process.time_ns
+
+    @property
+    def x(self) -> FloatArray:
+        """Present state (n_x,)."""
+        return self.process.x
+
+    @property
+    def u(self) -> FloatArray:
+        """Input (n_u,) that acts, up to the present time."""
+        return self.process.u
+
     def commanded(self, command: FloatArray, time_ns: int) -> ActuatedProcess:
         """
         Return the process with a command given at a time.

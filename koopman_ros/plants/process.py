@@ -29,6 +29,10 @@ class Process:
     x: FloatArray
     u: FloatArray
 
+    def commanded(self, command: FloatArray, time_ns: int) -> Process:
+        """Return the process under another input from a time on, which is the present one."""
+        return replace(self.until(time_ns), u=command)
+
     def until(self, time_ns: int) -> Process:
         """
         Return the process at a later time; an earlier one returns it unchanged.

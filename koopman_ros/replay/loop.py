@@ -13,8 +13,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from koopman_ros.control import Controller, Setpoint, Settings, State
+from koopman_ros.control.events import apply, Measurement, SetpointRequest
 from koopman_ros.lifting import LiftedModel
-from koopman_ros.replay.events import apply, Measurement, SetpointRequest
 from koopman_ros.replay.records import (
     event_of,
     MODEL,

@@ -19,8 +19,7 @@ import numpy as np
 
 from koopman_ros import __version__
 from koopman_ros.control import Mode, State
-from koopman_ros.reasons import Reason
-from koopman_ros.replay.events import (
+from koopman_ros.control.events import (
     Event,
     Initialisation,
     ManualCommand,
@@ -30,6 +29,7 @@ from koopman_ros.replay.events import (
     SetpointRequest,
     Silence,
 )
+from koopman_ros.reasons import Reason
 from koopman_ros.replay.values import decoded, encoded, float_array, numbers
 
 VERSION = 1

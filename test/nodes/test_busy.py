@@ -40,7 +40,7 @@ import os, sys
 from koopman_ros.nodes import watchdog
 watchdog.PERIOD, watchdog._PATIENCE = 0.02, 0.2
 from koopman_ros.nodes import controller
-from koopman_ros.replay import events
+from koopman_ros.control import events
 controller._WATCH_STEP //= 5
 pipe, apply = sys.argv.pop(1), events.apply
 def slowly(*args):

@@ -14,16 +14,16 @@ import numpy as np
 import pytest
 
 from koopman_ros.control import Mode
-from koopman_ros.lifting import load_with_digest, save
-from koopman_ros.nodes.replay import replay_records
-from koopman_ros.nodes.shipped import config_directory
-from koopman_ros.replay.events import (
+from koopman_ros.control.events import (
     Initialisation,
     ManualCommand,
     ModeChange,
     SetpointRequest,
     Silence,
 )
+from koopman_ros.lifting import load_with_digest, save
+from koopman_ros.nodes.replay import replay_records
+from koopman_ros.nodes.shipped import config_directory
 from koopman_ros.replay.loop import Alternative, Lost, Replay
 from koopman_ros.replay.models import Models
 from koopman_ros.replay.records import parse, RecordError, SNAPSHOT, START

@@ -11,10 +11,10 @@ from dataclasses import asdict, replace
 import numpy as np
 
 from koopman_ros.control import Controller, State
+from koopman_ros.control.events import apply, Event, Measurement, Outcome, Silence
 from koopman_ros.lifting import load_with_digest
 from koopman_ros.nodes.controller_parameters import ControllerParameters
 from koopman_ros.nodes.shipped import model_path
-from koopman_ros.replay.events import apply, Event, Measurement, Outcome, Silence
 from koopman_ros.replay.records import (
     fields_of,
     MODEL,

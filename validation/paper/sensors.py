@@ -6,14 +6,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
 from koopman_ros import experiment as experiments
-from koopman_ros.control import Controller, InputLimits, Settings, State
+from koopman_ros.control import at, Controller, InputLimits, SetpointRequest, Settings, simulate
 from koopman_ros.identification import Identified, identify
 from koopman_ros.learning import NoUsefulLift, roll_out, Trained
 from koopman_ros.lifting import Coordinates, LiftedModel, linearised_model, Provenance
@@ -225,42 +224,30 @@ def _controlled(system: ControlAffineSystem, model: LiftedModel, x0: Array, minu
     controller = Controller(model, Settings.for_model(
         model, state_weight=np.ones(1), input_weight=np.ones(1),
         limits=InputLimits(np.array([278.15]), np.array([305.15]), np.ones(1))))
-    state, refusal = controller.request_setpoint(State(), np.array([SETPOINT]))
-    if refusal is not None:
-        raise ValueError(refusal.code.value)
-
-    def answer(measured: float, time_ns: int) -> float:
-        nonlocal state
-        state, command, _ = controller.step(state, np.array([measured]), time_ns)
-        return float(command[0])
-
-    return _run(system, x0, minutes, seed, answer)
+    rng = np.random.default_rng([seed, 2])
+    run = simulate(
+        controller, Process(system, 0, np.asarray(x0), system.nominal_input),
+        [at(0.0, SetpointRequest(0, np.array([SETPOINT])))], duration=60.0 * minutes - 1.0,
+        sensor=lambda x, _: x + NOISE * rng.standard_normal(len(x)))
+    return _recorded(run.states, run.measured, run.commands)
 
 
 def _experiment(system: ControlAffineSystem, plan: experiments.Experiment, x0: Array, seed: int
                 ) -> _Run:
     """Run an experiment as the trainer does."""
-    progress = experiments.begin(plan, _NS)
-
-    def answer(measured: float, time_ns: int) -> float:
-        nonlocal progress
-        progress = experiments.advance(plan, progress, measured, time_ns)
-        return progress.command
-
-    return _run(system, x0, plan.duration / 60.0, seed, answer)
-
-
-def _run(system: ControlAffineSystem, x0: Array, minutes: float, seed: int,
-         answer: Callable[[float, int], float]) -> _Run:
-    rng = np.random.default_rng([seed, 2])
+    progress, rng = experiments.begin(plan, _NS), np.random.default_rng([seed, 2])
     process = Process(system, _NS, np.asarray(x0), system.nominal_input)
     states, measured, inputs = [], [], []
-    for number in range(round(60.0 * minutes)):
-        time_ns = (number + 1) * _NS
-        process = process.until(time_ns)
+    for number in range(round(plan.duration)):
+        process = process.until((number + 1) * _NS)
         states.append(process.x)
         measured.append(process.x + NOISE * rng.standard_normal(system.n_x))
-        inputs.append(np.array([answer(float(measured[-1][0]), time_ns)]))
+        progress = experiments.advance(plan, progress, float(measured[-1][0]), process.time_ns)
+        inputs.append(np.array([progress.command]))
         process = replace(process, u=inputs[-1])
-    path = _Path(np.array(states), np.array(inputs))
-    return _Run(path.x, Episode(path.time, np.array(measured), path.time, path.u))
+    return _recorded(np.array(states), np.array(measured), np.array(inputs))
+
+
+def _recorded(x: Array, measured: Array, u: Array) -> _Run:
+    path = _Path(x, u)
+    return _Run(path.x, Episode(path.time, measured, path.time, path.u))

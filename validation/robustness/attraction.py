@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import brentq
 
-from koopman_ros.control import SAFE, Supervisor
+from koopman_ros.control import at, Loop, Report, SAFE, Supervisor
 from koopman_ros.plants import ControlAffineSystem, fold, two_state_reactor
 from koopman_ros.solvers import runge_kutta_step
 from validation.paper.outcome import Metrics
@@ -22,12 +22,13 @@ from validation.robustness.loop import (
     at_setpoint,
     COOLANT,
     COOLANT_RANGE,
-    Loop,
     REACTOR,
     reactor_controller,
     run_loop,
+    settling,
     shipped_model,
     supervisor_settings,
+    worst,
 )
 
 Array = NDArray[np.float64]
@@ -81,22 +82,21 @@ def end_of(start: Start, *, ladder: bool, system: ControlAffineSystem = REACTOR,
     """
     near = 0
 
-    def arrived(x: Array, _: Array, level: str) -> bool:
+    def arrived(x: Array, _: Array, report: Report) -> bool:
         nonlocal near
         near = near + 1 if abs(x[-1] - start.setpoint) <= TOLERANCE else 0
         # it could still fall back from there
         gone = x[-1] > GONE and system is REACTOR
-        return bool(gone or (near >= _SETTLED and level == 'sdre'))
+        return bool(gone or (near >= _SETTLED and report.level == 'sdre'))
 
     x0 = [start.temperature] if concentration is None else [concentration, start.temperature]
     course = run_loop(reactor_controller(ladder=ladder), system, np.array(x0), start.coolant,
-                      HORIZON, [(0.0, at_setpoint(start.setpoint))], stop=arrived)
-    if course.ran_away or course.x[-1, -1] > GONE:
+                      HORIZON, [at(0.0, at_setpoint(start.setpoint))], stop=arrived)
+    if course.failure or course.states[-1, -1] > GONE:
         return End.RAN_AWAY
     if near < _SETTLED:
         return End.ELSEWHERE
-    worst = course.worst()
-    return {'sdre': End.LEARNED, 'linear': End.LINEAR}.get(worst, End.SAFE)
+    return {'sdre': End.LEARNED, 'linear': End.LINEAR}.get(worst(course), End.SAFE)
 
 
 def hottest_start(coolant: float, setpoint: float, *, ladder: bool, lowest: float = 326.0,
@@ -193,6 +193,6 @@ def back_from_safe(system: ControlAffineSystem, linear_margin: float) -> Metrics
         return replace(loop, state=replace(loop.state, supervisor=Supervisor(SAFE)))
 
     course = run_loop(controller, system, rest, coldest, _RETURN,
-                      [(0.0, safe), (0.0, at_setpoint(SETPOINT))])
+                      [at(0.0, safe), at(0.0, at_setpoint(SETPOINT))])
     return {'rest_kelvin': float(rest[0]), 'outside': shipped_model().states.violation(rest),
-            'seconds_to_0.2_kelvin': finite(course.settling(SETPOINT, TOLERANCE))}
+            'seconds_to_0.2_kelvin': finite(settling(course, SETPOINT, TOLERANCE))}

@@ -12,22 +12,24 @@ import math
 
 import numpy as np
 
+from koopman_ros.control import at, perfect, Sensor, Simulation, Timed
 from koopman_ros.plants import Actuator, ControlAffineSystem, equilibrium_input, two_state_reactor
 from validation.paper.outcome import Metrics
 from validation.robustness.loop import (
     at_setpoint,
     BANDWIDTH,
     behind,
-    Change,
+    biased,
     changed_reactor,
     COOLANT,
-    Course,
+    errors,
     on_plant,
     REACTOR,
     reactor_controller,
     run_loop,
+    settling,
     START,
-    with_bias,
+    worst,
 )
 
 SETPOINT = START - 10.0
@@ -62,32 +64,34 @@ class Case:
     :param actuator: between command and plant; perfect when None.
     :param tells: whether the coolant in force is measured.
     :param seconds: how long.
+    :param sensor: of the temperature.
     """
 
     name: str
     system: ControlAffineSystem
     x0: Sequence[float]
-    changes: Sequence[tuple[float, Change]]
+    changes: Sequence[Timed]
     reference: float
     since: float = LEAD
     overshoot: bool = False
     actuator: Actuator | None = None
     tells: bool = False
     seconds: float = SECONDS
+    sensor: Sensor = perfect
 
-    def run(self, bandwidth: float = BANDWIDTH) -> Course:
+    def run(self, bandwidth: float = BANDWIDTH) -> Simulation:
         """Simulate it with the default controller, from rest."""
         coolant = float(equilibrium_input(self.system, self.x0)[0])
         return run_loop(reactor_controller(bandwidth=bandwidth), self.system, np.array(self.x0),
                         coolant, self.seconds, self.changes, actuator=self.actuator,
-                        tells=self.tells)
+                        tells=self.tells, sensor=self.sensor)
 
 
 def cases() -> Iterator[Case]:
     """Make the cases of the table of offsets."""
-    step = [(LEAD, at_setpoint(SETPOINT))]
+    step = [at(LEAD, at_setpoint(SETPOINT))]
     for name, system in CHANGED.items():
-        yield Case(f'{name}, in the loop', REACTOR, [START], [(LEAD, on_plant(system))], START)
+        yield Case(f'{name}, in the loop', REACTOR, [START], [at(LEAD, on_plant(system))], START)
     yield Case('set-point −10 K', REACTOR, [START], step, SETPOINT, overshoot=True)
     for name, system in CHANGED.items():
         yield Case(f'set-point −10 K, {name} all along', system, [START], step, SETPOINT,
@@ -103,22 +107,23 @@ def cases() -> Iterator[Case]:
     for change in (-3.0, 1.5):
         words = f'{change:+g} K'.replace('-', '−')
         yield Case(f'set-point {words} on the two-state reactor', two,
-                   two.nominal_state.tolist(), [(LEAD, at_setpoint(warm + change))],
+                   two.nominal_state.tolist(), [at(LEAD, at_setpoint(warm + change))],
                    warm + change, overshoot=True)
     yield Case('sensor bias +2 K', REACTOR, [START - 5.0], [
-        (0.0, at_setpoint(START - 5.0)), (LEAD, with_bias(BIAS))], START - 5.0)
+        at(0.0, at_setpoint(START - 5.0))], START - 5.0, sensor=biased(BIAS, LEAD))
     end = LEAD + SATURATED_SECONDS
     for setpoint, words in ((SATURATED_SETPOINT, 'coolant saturated'),
                             (START, 'coolant in its range')):
         yield Case(f'T_i +{WARM_FEED:g} K for 15 min, {words}, after its end', REACTOR, [setpoint],
-                   [(0.0, at_setpoint(setpoint)),
-                    (LEAD, on_plant(changed_reactor(feed=WARM_FEED))), (end, on_plant(REACTOR))],
+                   [at(0.0, at_setpoint(setpoint)),
+                    at(LEAD, on_plant(changed_reactor(feed=WARM_FEED))),
+                    at(end, on_plant(REACTOR))],
                    setpoint, since=end, overshoot=setpoint == SATURATED_SETPOINT,
                    seconds=end + SECONDS)
     for tells in (False, True):
         yield Case(f'set-point −10 K, coolant stuck at {REACHED:g} K for 15 min, after its end'
                    f'{_MEASURED[tells]}', REACTOR, [START],
-                   [*step, (end, behind(Actuator()))], SETPOINT, since=end, overshoot=True,
+                   [*step, at(end, behind(Actuator()))], SETPOINT, since=end, overshoot=True,
                    actuator=Actuator(lower=REACHED), tells=tells, seconds=end + SECONDS)
 
 
@@ -132,18 +137,19 @@ def judge(case: Case) -> Metrics:
         (whether the learned law acted all the time).
     """
     course = case.run()
-    errors = course.errors(case.reference, case.since)
-    bias = course.last.controller.equivalent_bias(course.last.state)[0]
+    away = errors(course, case.reference, case.since)
+    last = course.reports[-1].estimate
+    bias = course.loop.controller.equivalent_bias(course.loop.state)[0]
     if case.overshoot:
-        errors = -math.copysign(1.0, errors[0]) * errors
+        away = -math.copysign(1.0, away[0]) * away
     return {
-        'largest_kelvin': float(np.max(errors if case.overshoot else np.abs(errors))),
-        'seconds_to_0.2_kelvin': finite(course.settling(case.reference, 0.2, case.since)),
-        'seconds_to_0.001_kelvin': finite(course.settling(case.reference, 1e-3, case.since)),
-        'final_kelvin': float(np.mean(course.errors(case.reference)[-60:])),
-        'disturbance_kelvin': float(course.disturbance[-1]),
+        'largest_kelvin': float(np.max(away if case.overshoot else np.abs(away))),
+        'seconds_to_0.2_kelvin': finite(settling(course, case.reference, 0.2, case.since)),
+        'seconds_to_0.001_kelvin': finite(settling(course, case.reference, 1e-3, case.since)),
+        'final_kelvin': float(np.mean(errors(course, case.reference)[-60:])),
+        'disturbance_kelvin': math.nan if last is None else float(last.disturbance[0]),
         'equivalent_bias_kelvin': finite(float(bias)),
-        'learned': course.worst() == 'sdre'}
+        'learned': worst(course) == 'sdre'}
 
 
 def noise_against_speed(bandwidth: float) -> Metrics:
@@ -157,21 +163,21 @@ def noise_against_speed(bandwidth: float) -> Metrics:
         `<change>_final_kelvin` after UA -20 % (`fouled`) and a step by -10 K (`step`).
     """
     noisy = run_loop(reactor_controller(bandwidth=bandwidth), REACTOR, np.array([START]), COOLANT,
-                     2400.0, [(0.0, at_setpoint(START))], noise=NOISE)
-    settled = noisy.seconds >= 600.0
-    coolant = noisy.u[settled]
+                     2400.0, [at(0.0, at_setpoint(START))], noise=NOISE)
+    settled = noisy.times >= 600.0
+    coolant = noisy.commands[settled, 0]
     metrics: Metrics = {
         'coolant_kelvin': float(np.std(coolant)),
         'coolant_change_kelvin': float(np.std(np.diff(coolant))),
-        'temperature_kelvin': float(np.std(noisy.x[settled, 0]))}
+        'temperature_kelvin': float(np.std(noisy.states[settled, 0]))}
     for name, change, reference in (
             ('fouled', on_plant(CHANGED['UA −20 %']), START),
             ('step', at_setpoint(SETPOINT), SETPOINT)):
-        course = Case(name, REACTOR, [START], [(LEAD, change)], reference).run(bandwidth)
+        course = Case(name, REACTOR, [START], [at(LEAD, change)], reference).run(bandwidth)
         for tolerance in (0.2, 1e-3):
             metrics[f'{name}_to_{tolerance:g}_kelvin'] = finite(
-                course.settling(reference, tolerance, LEAD))
-        metrics[f'{name}_final_kelvin'] = float(course.errors(reference)[-1])
+                settling(course, reference, tolerance, LEAD))
+        metrics[f'{name}_final_kelvin'] = float(errors(course, reference)[-1])
     return metrics
 
 

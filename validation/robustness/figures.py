@@ -14,12 +14,13 @@ from matplotlib.axes import Axes
 import numpy as np
 from numpy.typing import NDArray
 
+from koopman_ros.control import Simulation
 from koopman_ros.reasons import level_words
 from koopman_ros.reports import drawing, DRAWN_RANGE, legend, Picture
 from validation.paper import two_state
 from validation.robustness import attraction, disturbances, narrow
 from validation.robustness.attraction import End
-from validation.robustness.loop import BANDWIDTH, Course, START
+from validation.robustness.loop import BANDWIDTH, START
 from validation.robustness.study import (
     BANDWIDTHS,
     COOLANT_WEIGHTS,
@@ -148,7 +149,7 @@ def _attraction(found: Found, path: Path) -> Picture:
         f'{found.boundaries[300.0]["physics_kelvin"]:.1f} K.'))
 
 
-def _mark(axis: Axes, course: Course, x: np.ndarray, y: np.ndarray) -> None:
+def _mark(axis: Axes, course: Simulation, x: np.ndarray, y: np.ndarray) -> None:
     """Mark where another level takes over."""
     for number, level in enumerate(course.levels):
         if number == 0 or level != course.levels[number - 1]:
@@ -161,10 +162,10 @@ def _narrow(found: Found, path: Path) -> Picture:
         for axis, trial in zip(axes, narrow.TRIALS, strict=False):
             for kind, style in _PATHS.items():
                 course = found.reactor[trial.name, kind]
-                minutes = course.seconds / 60.0
-                axis.plot(minutes, course.x[:, 0], **style)
+                minutes = course.times / 60.0
+                axis.plot(minutes, course.states[:, 0], **style)
                 if kind == 'guarded':
-                    _mark(axis, course, minutes, course.x[:, 0])
+                    _mark(axis, course, minutes, course.states[:, 0])
             axis.axhspan(START - narrow.HALF_WIDTH, START + narrow.HALF_WIDTH, **DRAWN_RANGE)
             axis.set(title=trial.name, xlabel='time [min]', ylim=(295.0, 350.0))
             axis.title.set_fontsize(9)
@@ -172,11 +173,11 @@ def _narrow(found: Found, path: Path) -> Picture:
         for kind, style in _PATHS.items():
             key = ('wide', 'guarded') if kind == 'wide' else (narrow.NARROWEST, kind)
             course = found.two_state[key]
-            axes[3].plot(course.x[:, 0], course.x[:, 1], **{**style, 'label': None})
+            axes[3].plot(course.states[:, 0], course.states[:, 1], **{**style, 'label': None})
             if kind == 'guarded':
-                _mark(axes[3], course, course.x[:, 0], course.x[:, 1])
+                _mark(axes[3], course, course.states[:, 0], course.states[:, 1])
         course = found.two_state['true linearisation', 'narrow']
-        axes[3].plot(course.x[:, 0], course.x[:, 1], color='k', linewidth=0.8,
+        axes[3].plot(course.states[:, 0], course.states[:, 1], color='k', linewidth=0.8,
                      label='true linearisation')
         axes[3].legend(fontsize=8, loc='lower right')
         box = two_state.NARROW[narrow.NARROWEST]

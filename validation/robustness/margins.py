@@ -14,11 +14,11 @@ from numpy.typing import NDArray
 from scipy.signal import cont2discrete
 
 import control
-from koopman_ros.control import Controller, State
+from koopman_ros.control import at, Controller, State
 from koopman_ros.estimation import Estimate
 from koopman_ros.lifting import LiftedModel
 from koopman_ros.plants import Actuator, ControlAffineSystem, equilibrium_input
-from validation.robustness.loop import at_setpoint, PERIOD, REACTOR, run_loop
+from validation.robustness.loop import at_setpoint, errors, PERIOD, REACTOR, run_loop
 
 Array = NDArray[np.float64]
 
@@ -165,7 +165,7 @@ def grows(controller: Controller, temperature: float, *, factor: float = 1.0, de
     plant = amplified(temperature, factor)
     course = run_loop(controller, plant, np.array([temperature + _KICK]),
                       holding_coolant(temperature), seconds,
-                      [(0.0, at_setpoint(temperature))], actuator=Actuator(delay=delay))
+                      [at(0.0, at_setpoint(temperature))], actuator=Actuator(delay=delay))
     # the swing at the end: without an observer an offset is left
-    late = course.errors(temperature)[-len(course.seconds) // 3:]
+    late = errors(course, temperature)[-len(course.times) // 3:]
     return bool(np.ptp(late) > 2.0 * _KICK)

@@ -12,7 +12,17 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from koopman_ros.control import Controller, InputLimits, SAFE, Setpoint, Settings
+from koopman_ros.control import (
+    at,
+    Controller,
+    InputLimits,
+    Loop,
+    SAFE,
+    Setpoint,
+    Settings,
+    Simulation,
+    Timed,
+)
 from koopman_ros.learning import Growth, Linearisation, train
 from koopman_ros.lifting import LiftedModel
 from koopman_ros.plants import RandomStepDesign
@@ -23,16 +33,14 @@ from validation.robustness.disturbances import finite
 from validation.robustness.loop import (
     at_setpoint,
     BANDWIDTH,
-    Change,
     changed_reactor,
     COOLANT,
-    Course,
     EVERYWHERE,
-    Loop,
     on_plant,
     REACTOR,
     reactor_controller,
     run_loop,
+    settling,
     START,
     supervisor_settings,
 )
@@ -69,13 +77,13 @@ class Trial:
     name: str
     temperature: float
     bandwidth: float = BANDWIDTH
-    changes: Sequence[tuple[float, Change]] = ()
+    changes: Sequence[Timed] = ()
 
 
 TRIALS = (
     Trial('start at 338 K', 338.0),
     Trial('UA −40 % after 1 min, no observer', START, 0.0,
-          ((_DISTURBED, on_plant(changed_reactor(heat_transfer=0.6))),)),
+          (at(_DISTURBED, on_plant(changed_reactor(heat_transfer=0.6))),)),
     Trial('start at 300 K', 300.0))
 
 
@@ -85,7 +93,7 @@ def narrow_lift() -> LiftedModel:
     return train(describe(REACTOR), samples, Growth(3), seed=0, starts=1, refuse=False).model
 
 
-def run_trial(trial: Trial, model: LiftedModel | None, *, ladder: bool) -> Course:
+def run_trial(trial: Trial, model: LiftedModel | None, *, ladder: bool) -> Simulation:
     """
     Drive the true reactor to its steady state.
 
@@ -93,18 +101,18 @@ def run_trial(trial: Trial, model: LiftedModel | None, *, ladder: bool) -> Cours
     """
     controller = reactor_controller(bandwidth=trial.bandwidth, ladder=ladder, model=model)
     return run_loop(controller, REACTOR, np.array([trial.temperature]), COOLANT, SECONDS,
-                    [(0.0, at_setpoint(START)), *trial.changes],
-                    stop=lambda x, _, level: bool(x[0] > 420.0))
+                    [at(0.0, at_setpoint(START)), *trial.changes],
+                    stop=lambda x, *_: bool(x[0] > 420.0))
 
 
-def reactor_courses(narrow: LiftedModel) -> dict[tuple[str, str], Course]:
+def reactor_courses(narrow: LiftedModel) -> dict[tuple[str, str], Simulation]:
     """Run all trials: by their name and ``narrow``, ``guarded`` (with the ladder) or ``wide``."""
     return {(trial.name, kind): run_trial(trial, model, ladder=ladder) for trial in TRIALS
             for kind, model, ladder in (('narrow', narrow, False), ('guarded', narrow, True),
                                         ('wide', None, True))}
 
 
-def judge_reactor(course: Course, since: float = 0.0) -> Metrics:
+def judge_reactor(course: Simulation, since: float = 0.0) -> Metrics:
     """
     Say what became of a trial.
 
@@ -112,10 +120,10 @@ def judge_reactor(course: Course, since: float = 0.0) -> Metrics:
     :return: `hottest_kelvin`, `final_kelvin`, `seconds_to_0.2_kelvin` (None for never),
         `ran_away` (above 350 K), `safe_share` of the time.
     """
-    hottest = float(np.max(course.x))
-    return {'hottest_kelvin': hottest, 'final_kelvin': float(course.x[-1, 0]),
-            'seconds_to_0.2_kelvin': finite(course.settling(START, 0.2, since)),
-            'ran_away': course.ran_away or hottest > 350.0,
+    hottest = float(np.max(course.states))
+    return {'hottest_kelvin': hottest, 'final_kelvin': float(course.states[-1, 0]),
+            'seconds_to_0.2_kelvin': finite(settling(course, START, 0.2, since)),
+            'ran_away': bool(course.failure) or hottest > 350.0,
             'safe_share': float(np.mean([level == SAFE for level in course.levels]))}
 
 
@@ -131,8 +139,8 @@ def far_from_the_model(linear_margin: float, bandwidth: float) -> Metrics:
     ladder = supervisor_settings(linear=linear_margin)
     controller = replace(usual, settings=replace(usual.settings, supervisor=ladder))
     course = run_loop(controller, REACTOR, np.array([START]), COOLANT, SECONDS,
-                      [(0.0, at_setpoint(START)), *TRIALS[1].changes],
-                      stop=lambda x, _, level: bool(x[0] > 420.0))
+                      [at(0.0, at_setpoint(START)), *TRIALS[1].changes],
+                      stop=lambda x, *_: bool(x[0] > 420.0))
     return judge_reactor(course, _DISTURBED)
 
 
@@ -149,7 +157,7 @@ def two_state_models() -> dict[str, LiftedModel]:
     return {**learned, 'true linearisation': linear}
 
 
-def two_state_course(model: LiftedModel, *, ladder: bool) -> Course:
+def two_state_course(model: LiftedModel, *, ladder: bool) -> Simulation:
     """
     Regulate the two-state example from (5, 5) to the origin, sampled 20 times a second.
 
@@ -167,17 +175,17 @@ def two_state_course(model: LiftedModel, *, ladder: bool) -> Course:
         return replace(loop, state=replace(loop.state, setpoint=origin))
 
     return run_loop(controller, two_state.SYSTEM, two_state.START, _HOLDING, _HORIZON,
-                    [(0.0, to_origin)], period=_SAMPLE,
-                    stop=lambda x, _, level: bool(np.max(np.abs(x)) > _ESCAPED))
+                    [at(0.0, to_origin)], period=_SAMPLE,
+                    stop=lambda x, *_: bool(np.max(np.abs(x)) > _ESCAPED))
 
 
-def two_state_courses(models: Mapping[str, LiftedModel]) -> dict[tuple[str, str], Course]:
+def two_state_courses(models: Mapping[str, LiftedModel]) -> dict[tuple[str, str], Simulation]:
     """Run the example with each lift: by box and ``narrow`` or ``guarded`` (with the ladder)."""
     return {(name, kind): two_state_course(model, ladder=kind == 'guarded')
             for name, model in models.items() for kind in ('narrow', 'guarded')}
 
 
-def judge_two_state(course: Course) -> Metrics:
+def judge_two_state(course: Simulation) -> Metrics:
     """
     Say what became of the example.
 
@@ -185,7 +193,7 @@ def judge_two_state(course: Course) -> Metrics:
         until it stood below the learned law; None for never).
     """
     below = [level != 'sdre' for level in course.levels]
-    return {'largest_x2': float(np.max(np.abs(course.x[:, 1]))),
-            'final_distance': float(np.linalg.norm(course.x[-1])),
-            'escaped': bool(np.max(np.abs(course.x)) > _ESCAPED),
-            'left_after': float(course.seconds[below.index(True)]) if any(below) else None}
+    return {'largest_x2': float(np.max(np.abs(course.states[:, 1]))),
+            'final_distance': float(np.linalg.norm(course.states[-1])),
+            'escaped': bool(np.max(np.abs(course.states)) > _ESCAPED),
+            'left_after': float(course.times[below.index(True)]) if any(below) else None}

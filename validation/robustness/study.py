@@ -13,11 +13,11 @@ from typing import Any
 
 import numpy as np
 
+from koopman_ros.control import Simulation
 from validation.paper.outcome import Metrics
 from validation.robustness import attraction, disturbances, narrow
 from validation.robustness.attraction import End
 from validation.robustness.loop import (
-    Course,
     REACTOR,
     reactor_controller,
     shipped_model,
@@ -59,9 +59,9 @@ class Found:
     two_state_grid: dict[tuple[float, float], End] = field(default_factory=dict)
     boundaries: dict[float, Metrics] = field(default_factory=dict)
     returns: dict[tuple[str, float], Metrics] = field(default_factory=dict)
-    reactor: dict[tuple[str, str], Course] = field(default_factory=dict)
+    reactor: dict[tuple[str, str], Simulation] = field(default_factory=dict)
     far: dict[tuple[float, float], Metrics] = field(default_factory=dict)
-    two_state: dict[tuple[str, str], Course] = field(default_factory=dict)
+    two_state: dict[tuple[str, str], Simulation] = field(default_factory=dict)
 
     def summary(self) -> dict[str, Any]:
         """Return the figures by name; those that are infinite have none in JSON."""

@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 from scipy.integrate import solve_ivp
 
+from koopman_ros.control import at
 from koopman_ros.nodes.controller_parameters import ControllerParameters
 from koopman_ros.plants import Actuator
 from validation.robustness import attraction, disturbances
@@ -18,12 +19,13 @@ from validation.robustness.attraction import End, Start
 from validation.robustness.disturbances import Case
 from validation.robustness.loop import (
     at_setpoint,
+    biased,
     REACTOR,
     reactor_controller,
     run_loop,
+    settling,
     shipped_model,
     START,
-    with_bias,
 )
 from validation.robustness.margins import (
     grows,
@@ -149,20 +151,21 @@ def test_a_disturbance_leaves_no_offset_and_a_biased_sensor_its_bias():
     assert found['seconds_to_0.2_kelvin'] < 180.0
     # the coolant that makes up for it: UA (T_c - T) as before, from the heat balance
     assert found['disturbance_kelvin'] == pytest.approx(0.25 * (START - 300.0), abs=0.01)
-    biased = disturbances.judge(Case('', REACTOR, [START - 5.0], [
-        (0.0, at_setpoint(START - 5.0)), (10.0, with_bias(1.0))], START - 5.0, seconds=600.0))
-    assert biased['final_kelvin'] == pytest.approx(-1.0, abs=1e-3)
-    assert biased['equivalent_bias_kelvin'] == pytest.approx(1.0, abs=1e-2)
+    found = disturbances.judge(Case('', REACTOR, [START - 5.0], [
+        at(0.0, at_setpoint(START - 5.0))], START - 5.0, seconds=600.0,
+        sensor=biased(1.0, 10.0)))
+    assert found['final_kelvin'] == pytest.approx(-1.0, abs=1e-3)
+    assert found['equivalent_bias_kelvin'] == pytest.approx(1.0, abs=1e-2)
 
 
 def test_settling_counts_from_the_change():
     course = run_loop(reactor_controller(), REACTOR, np.array([START]), 300.0, 60.0,
-                      [(20.0, at_setpoint(START - 1.0))])
-    assert course.settling(START, 0.01, 0.0) == math.inf
-    assert course.settling(START - 1.0, 2.0, 20.0) == 0.0
-    errors = course.x[:, 0] - (START - 1.0)
-    first = course.seconds[np.flatnonzero(np.abs(errors) > 0.9)[-1] + 1]
-    assert course.settling(START - 1.0, 0.9, 20.0) == first - 20.0
+                      [at(20.0, at_setpoint(START - 1.0))])
+    assert settling(course, START, 0.01, 0.0) == math.inf
+    assert settling(course, START - 1.0, 2.0, 20.0) == 0.0
+    errors = course.states[:, 0] - (START - 1.0)
+    first = course.times[np.flatnonzero(np.abs(errors) > 0.9)[-1] + 1]
+    assert settling(course, START - 1.0, 0.9, 20.0) == first - 20.0
 
 
 def test_what_rests_outside_the_data_comes_back_from_the_safe_coolant():
@@ -177,10 +180,11 @@ def test_what_rests_outside_the_data_comes_back_from_the_safe_coolant():
 
 
 def test_only_a_measured_coolant_tells_that_the_actuator_is_stuck():
-    estimates = [run_loop(
+    runs = [run_loop(
         reactor_controller(), REACTOR, np.array([START]), 300.0, 300.0,
-        [(0.0, at_setpoint(disturbances.SETPOINT))],
-        actuator=Actuator(lower=disturbances.REACHED), tells=tells).disturbance[-1]
+        [at(0.0, at_setpoint(disturbances.SETPOINT))],
+        actuator=Actuator(lower=disturbances.REACHED), tells=tells)
         for tells in (False, True)]
+    estimates = [run.reports[-1].estimate.disturbance[0] for run in runs]
     # the bound, and the tolerance
     np.testing.assert_allclose(estimates, [20.0, 2.0], rtol=0, atol=0.1)

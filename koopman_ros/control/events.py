@@ -4,8 +4,8 @@
 """
 What changes a controller's state: events, and the one function that applies them.
 
-The running controller and the replay of its records both call :func:`apply`, so that a command
-follows from the same numbers in both.
+The running controller, the simulated loop and the replay of records all call :func:`apply`, so
+that a command follows from the same numbers in each.
 """
 
 from __future__ import annotations
@@ -16,7 +16,9 @@ from typing import TypeAlias
 import numpy as np
 from numpy.typing import NDArray
 
-from koopman_ros.control import Controller, Mode, Report, State
+from koopman_ros.control.controller import Controller
+from koopman_ros.control.report import Report
+from koopman_ros.control.state import Mode, State
 from koopman_ros.reasons import Reason
 
 Array = NDArray[np.float64]

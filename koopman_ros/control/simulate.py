@@ -1,0 +1,251 @@
+# SPDX-FileCopyrightText: 2026 The koopman_ros Authors
+# SPDX-License-Identifier: Apache-2.0
+
+"""One sampled closed loop: a controller, a plant, and what happens to them when."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass, replace
+import math
+from typing import Protocol, Self, TypeAlias
+
+import numpy as np
+from numpy.typing import NDArray
+
+from koopman_ros.control.controller import Controller
+from koopman_ros.control.events import apply, Event, Measurement, Silence
+from koopman_ros.control.report import Report
+from koopman_ros.control.state import State
+from koopman_ros.reasons import Reason, Words
+from koopman_ros.signals import per_signal
+from koopman_ros.units import Displays, NANOSECONDS
+
+Array = NDArray[np.float64]
+# what is measured (n,) of a value (n,) at a time in s; NaN for what is not, None for no message
+Sensor: TypeAlias = Callable[[Array, float], Array | None]
+
+
+class Plant(Protocol):
+    """What runs under the controller, such as ``plants.Process`` and ``ActuatedProcess``."""
+
+    @property
+    def time_ns(self) -> int:
+        """Present time."""
+
+    @property
+    def x(self) -> Array:
+        """Present state (n,)."""
+
+    @property
+    def u(self) -> Array:
+        """Input (n_u,) that acts."""
+
+    def commanded(self, command: Array, time_ns: int) -> Self:
+        """Return the plant with a command (n_u,) given at its present time."""
+
+    def until(self, time_ns: int) -> Self:
+        """
+        Return the plant at a later time.
+
+        :raises RuntimeError: when it cannot get there, e.g. because it ran away.
+        """
+
+
+@dataclass(frozen=True)
+class Loop:
+    """
+    A closed loop at one time.
+
+    :param controller: that acts.
+    :param state: what it remembers.
+    :param plant: under it.
+    """
+
+    controller: Controller
+    state: State
+    plant: Plant
+
+
+Change: TypeAlias = Callable[[Loop], Loop]
+
+
+@dataclass(frozen=True)
+class Timed:
+    """
+    What happens at a time.
+
+    :param seconds: from the start of the simulation.
+    :param what: an event of the controller, or a function of the loop.
+    """
+
+    seconds: float
+    what: Event | Change
+
+
+def at(seconds: float, what: Event | Change) -> Timed:
+    """Say what happens at a time in s, before the measurement of that time."""
+    return Timed(seconds, what)
+
+
+def exchange(controller: Controller) -> Change:
+    """Let another controller take over, with other settings or another model."""
+    return lambda loop: replace(
+        loop, controller=controller, state=controller.succeed(loop.controller, loop.state))
+
+
+def restart(loop: Loop) -> Loop:
+    """Start the controller anew; it finds the input that acts."""
+    return replace(loop, state=loop.controller.take_over(State(), loop.plant.u))
+
+
+def perfect(value: Array, _: float) -> Array:
+    """Measure a value as it is."""
+    return value
+
+
+def after_a_second(time_ns: int) -> int:
+    """Stamp the plant's time 0 with 1 s: a stamp of 0 means 'now' to a set-point."""
+    return time_ns + NANOSECONDS
+
+
+@dataclass(frozen=True, eq=False)
+class Simulation:
+    """
+    What a loop did, one row a sample.
+
+    :param times: (N,) in s from the start.
+    :param states: (N, n) of the plant.
+    :param measured: (N, n_y) what the controller received; NaN where nothing.
+    :param inputs: (N, n_u) that acted when it was measured.
+    :param commands: (N, n_u) answered; NaN before the first.
+    :param setpoints: (N, n_x) active; NaN before the first.
+    :param reports: (N) of the controller.
+    :param failure: why the plant could not go on to the end; empty when it could.
+    :param loop: after the last sample, to go on from.
+    """
+
+    times: Array
+    states: Array
+    measured: Array
+    inputs: Array
+    commands: Array
+    setpoints: Array
+    reports: tuple[Report, ...]
+    failure: str
+    loop: Loop
+
+    @property
+    def levels(self) -> tuple[str, ...]:
+        """The control levels that acted."""
+        return tuple(report.level for report in self.reports)
+
+    @property
+    def reasons(self) -> tuple[Reason | None, ...]:
+        """Why not better ones."""
+        return tuple(report.reason for report in self.reports)
+
+
+def simulate(controller: Controller, plant: Plant, events: Iterable[Timed] = (), *,
+             duration: float, period: float = 1.0, C: Array | None = None,
+             noise: Array | None = None, seed: int = 0, sensor: Sensor = perfect,
+             input_sensor: Sensor | None = None, state: State | None = None,
+             stamp: Callable[[int], int] = after_a_second,
+             stop: Callable[[Array, Array, Report], bool] | None = None) -> Simulation:
+    """
+    Run a controller and a plant, sampled at 0, period, 2 period, ... up to the duration.
+
+    A sample measures, lets the controller answer and gives its command to the plant. The same
+    arguments give the same numbers.
+
+    :param controller: at the start.
+    :param plant: at the start; its present time is that of the first sample.
+    :param events: what happens when; of the same time, in the order given.
+    :param duration: in s.
+    :param period: between samples, in s.
+    :param C: (n_y, n) what is measured of the plant's state, y = C x; by default that of the
+        controller, whose model then has the plant's states.
+    :param noise: (n_y,) standard deviations of what is added to y; none by default.
+    :param seed: of the noise.
+    :param sensor: what it makes of that, by value and time: a bias, a fault, silence.
+    :param input_sensor: the same of the input that acts; None where it is not measured.
+    :param state: of the controller at the start; knowing nothing by default.
+    :param stamp: the stamp of a measurement at a time of the plant, both in ns.
+    :param stop: ends the simulation when it is true of state, command and report.
+    :raises ValueError: when arguments do not fit each other, or the controller refuses an event.
+    """
+    _check(duration, period)
+    observe = _outputs(controller, plant, C)
+    if noise is not None:
+        per_signal('noise', noise, controller.measured.names)
+    waiting = sorted(events, key=lambda event: event.seconds)
+    loop = Loop(controller, state or State(), plant)
+    start_ns, rows, reports, failure = plant.time_ns, [], [], ''
+    for number in range(round(duration / period) + 1):
+        seconds = number * period
+        time_ns = start_ns + round(seconds * NANOSECONDS)
+        try:
+            loop = replace(loop, plant=loop.plant.until(time_ns))
+        except RuntimeError as error:
+            failure = str(error)
+            break
+        while waiting and waiting[0].seconds <= seconds:
+            loop = _changed(loop, waiting.pop(0).what)
+        x, u = loop.plant.x, loop.plant.u
+        y = observe(x)
+        if noise is not None:
+            y = y + noise * np.random.default_rng((seed, number)).standard_normal(len(noise))
+        received = sensor(y, seconds)
+        event = Silence(stamp(time_ns)) if received is None else Measurement(
+            stamp(time_ns), received, None if input_sensor is None else input_sensor(u, seconds))
+        loop, command, report = _answered(loop, event)
+        reports.append(report)
+        active = loop.state.setpoint.active
+        rows.append((seconds, x, _or_nan(received, len(y)), u, _or_nan(command, len(u)),
+                     _or_nan(active, controller.model.n_x)))
+        if stop is not None and stop(x, rows[-1][4], report):
+            break
+    return Simulation(*(np.array(column) for column in zip(*rows, strict=True)),
+                      tuple(reports), failure, loop)
+
+
+def _check(duration: float, period: float) -> None:
+    for name, value, fits in (('duration', duration, duration >= 0.0),
+                              ('period', period, period > 0.0)):
+        if not (fits and math.isfinite(value)):
+            raise ValueError(f'{name} is {value} s, must be finite and '
+                             f'{"above" if name == "period" else "at least"} 0')
+
+
+def _outputs(controller: Controller, plant: Plant, C: Array | None) -> Callable[[Array], Array]:
+    n, outputs = len(plant.x), controller.measured
+    if C is not None:
+        if C.shape != (len(outputs.names), n):
+            raise ValueError(f'incompatible C: expected ({len(outputs.names)}, {n}) for '
+                             f'{", ".join(outputs.names)} of the plant, got {C.shape}')
+        return C.dot
+    if n != controller.model.n_x:
+        raise ValueError(f'the plant has {n} states and the model {controller.model.n_x}: give C '
+                         f'({len(outputs.names)}, {n}), what is measured of the plant')
+    return outputs.of
+
+
+def _changed(loop: Loop, what: Event | Change) -> Loop:
+    return what(loop) if callable(what) else _answered(loop, what)[0]
+
+
+def _answered(loop: Loop, event: Event) -> tuple[Loop, Array | None, Report | None]:
+    outcome = apply(loop.controller, loop.state, event)
+    if outcome.refused is not None:
+        model = loop.controller.model
+        units = dict(zip((*model.states.names, *model.inputs.names),
+                         (*model.states.units, *model.inputs.units), strict=True))
+        raise ValueError(Words(Displays(units))(outcome.refused))
+    plant = loop.plant
+    if outcome.command is not None:
+        plant = plant.commanded(outcome.command, plant.time_ns)
+    return replace(loop, state=outcome.state, plant=plant), outcome.command, outcome.report
+
+
+def _or_nan(value: Array | None, size: int) -> Array:
+    return np.full(size, np.nan) if value is None else value
