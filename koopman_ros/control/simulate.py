@@ -199,14 +199,16 @@ def simulate(controller: Controller, plant: Plant, events: Iterable[Timed] = (),
         event = Silence(stamp(time_ns)) if received is None else Measurement(
             stamp(time_ns), received, None if input_sensor is None else input_sensor(u, seconds))
         loop, command, report = _answered(loop, event)
+        assert report is not None  # of a measurement as of silence
         reports.append(report)
         active = loop.state.setpoint.active
         rows.append((seconds, x, _or_nan(received, len(y)), u, _or_nan(command, len(u)),
                      _or_nan(active, controller.model.n_x)))
         if stop is not None and stop(x, rows[-1][4], report):
             break
-    return Simulation(*(np.array(column) for column in zip(*rows, strict=True)),
-                      tuple(reports), failure, loop)
+    times, states, measured, inputs, commands, setpoints = map(np.array, zip(*rows, strict=True))
+    return Simulation(times, states, measured, inputs, commands, setpoints, tuple(reports),
+                      failure, loop)
 
 
 def _check(duration: float, period: float) -> None:
