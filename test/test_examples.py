@@ -82,7 +82,7 @@ def test_example_of_the_readme_brings_the_reactor_to_its_set_point(tmp_path: Pat
     # about twenty lines, as a reader counts them
     assert len(block.splitlines()) < 30
     file = tmp_path / 'step.py'
-    file.write_text(f'{block}\nprint(reactor[-1])\n')
+    file.write_text(f'{block}\nprint(run.states[-1, 0])\n')
     (tmp_path / 'config').symlink_to(ROOT / 'config')
     done = subprocess.run([sys.executable, str(file)], cwd=tmp_path, capture_output=True,
                           text=True, timeout=500, check=False)

@@ -56,8 +56,9 @@ def test_settings_are_the_defaults_of_the_node():
     arrays = [[s.state_weight, s.input_weight, s.limits.lower, s.limits.upper, s.limits.rate,
                s.safe_input] for s in (theirs, ours)]
     np.testing.assert_allclose(*arrays, rtol=1e-12)
-    assert theirs.ladder == ours.ladder
-    np.testing.assert_allclose(astuple(theirs.sensor), astuple(ours.sensor), rtol=1e-12)
+    assert theirs.supervisor == ours.supervisor
+    for one, other in zip(astuple(theirs.sensor), astuple(ours.sensor), strict=True):
+        np.testing.assert_allclose(one, other, rtol=1e-12)
     for name in ('setpoint_ramp', 'setpoint_filter', 'observer_bandwidth', 'max_disturbance',
                  'input_tolerance', 'transfer_time', 'max_gain', 'max_residual'):
         assert getattr(theirs, name) == pytest.approx(getattr(ours, name)), name
