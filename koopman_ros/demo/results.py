@@ -8,6 +8,8 @@ from __future__ import annotations
 from dataclasses import dataclass
 from pathlib import Path
 
+# where it is missing, the demo ends before it has run and not after
+import matplotlib.figure  # noqa: F401
 import numpy as np
 from numpy.typing import NDArray
 

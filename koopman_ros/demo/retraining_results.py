@@ -11,6 +11,8 @@ from dataclasses import dataclass
 import itertools
 from pathlib import Path
 
+# where it is missing, the demo ends before it has run and not after
+import matplotlib.figure  # noqa: F401
 import numpy as np
 from numpy.typing import NDArray
 
