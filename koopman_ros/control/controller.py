@@ -168,7 +168,7 @@ class Controller:
 
     # What happens to the controller itself.
 
-    def take_over(self, state: State, applied: Array) -> State:
+    def initialise(self, state: State, applied: Array) -> State:
         """
         Start from the input that is applied already, as after a restart.
 
@@ -179,7 +179,7 @@ class Controller:
             return state
         return amended(state, command=_kept(self.settings.limits.within(applied)))
 
-    def succeed(self, predecessor: Controller, state: State) -> State:
+    def hand_over(self, predecessor: Controller, state: State) -> State:
         """
         Take the place of a controller with other settings or another model, without a bump.
 
@@ -267,9 +267,9 @@ class Controller:
                 Arrival.ACCEPTED if verdict.fault is None else Arrival.REJECTED, outside,
                 predicted, missed, back, follows))
 
-    def watch(self, state: State, time_ns: int) -> tuple[State, Array | None, Report]:
+    def hold(self, state: State, time_ns: int) -> tuple[State, Array | None, Report]:
         """
-        Answer that nothing has been measured: hold the command, later go to the safe input.
+        Hold the command as nothing has been measured, and later go to the safe input.
 
         :param state: as returned by the step before.
         :param time_ns: up to which nothing came, in the time of the measurements' stamps.

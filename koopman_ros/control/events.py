@@ -124,7 +124,7 @@ def apply(controller: Controller, state: State, event: Event) -> Outcome:
             return Outcome(*controller.step(
                 state, event.measured, event.stamp_ns, event.applied))
         case Silence():
-            return Outcome(*controller.watch(state, event.stamp_ns))
+            return Outcome(*controller.hold(state, event.stamp_ns))
         case SetpointRequest():
             state, refused = controller.request_setpoint(state, event.value, event.stamp_ns)
             return Outcome(state, refused=refused)
@@ -134,4 +134,4 @@ def apply(controller: Controller, state: State, event: Event) -> Outcome:
         case ModeChange():
             return Outcome(controller.set_mode(state, event.mode))
         case Initialisation():
-            return Outcome(controller.take_over(state, event.applied))
+            return Outcome(controller.initialise(state, event.applied))

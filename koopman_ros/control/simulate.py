@@ -91,12 +91,12 @@ def at(seconds: float, what: Event | Change) -> Timed:
 def exchange(controller: Controller) -> Change:
     """Let another controller take over, with other settings or another model."""
     return lambda loop: replace(
-        loop, controller=controller, state=controller.succeed(loop.controller, loop.state))
+        loop, controller=controller, state=controller.hand_over(loop.controller, loop.state))
 
 
 def restart(loop: Loop) -> Loop:
     """Start the controller anew; it finds the input that acts."""
-    return replace(loop, state=loop.controller.take_over(State(), loop.plant.u))
+    return replace(loop, state=loop.controller.initialise(State(), loop.plant.u))
 
 
 def perfect(value: Array, _: float) -> Array:

@@ -348,7 +348,7 @@ class ControllerNode(LoopNode):
         """Put the parameters and the model of now in force."""
         with self._lock:
             predecessor, self._controller = self._controller, self._built()
-            self._state = self._controller.succeed(predecessor, self._state)
+            self._state = self._controller.hand_over(predecessor, self._state)
             self._records.publish(event, fields)
         self._warn_of_rest()
         self._diagnostics.publish_if_changed()

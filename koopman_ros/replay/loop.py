@@ -186,7 +186,7 @@ class _Run:
             same = self._other.digest == record.fields['model']['digest']
             self._other_controller = self._tuned(
                 self._controller.model if same else self._other.model)
-            self._other_state = self._other_controller.succeed(self._controller, self._state)
+            self._other_state = self._other_controller.hand_over(self._controller, self._state)
 
     def _exchange(self, record: Record, state: State) -> None:
         """Put other parameters or another model in force."""
@@ -196,11 +196,11 @@ class _Run:
             self._model(record) if 'model' in record.fields else predecessor.model,
             self._make_settings(self._parameters))
         self._found.controller = self._controller
-        self._state = self._controller.succeed(predecessor, state)
+        self._state = self._controller.hand_over(predecessor, state)
         if self._other is not None and 'parameters' in record.fields:
             predecessor = self._other_controller
             self._other_controller = self._tuned(predecessor.model)
-            self._other_state = self._other_controller.succeed(predecessor, self._other_state)
+            self._other_state = self._other_controller.hand_over(predecessor, self._other_state)
 
     def _apply(self, record: Record, state: State) -> None:
         event = event_of(record)

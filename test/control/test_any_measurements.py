@@ -46,7 +46,7 @@ def test_no_sequence_of_events_brings_out_a_wild_command(sequence):
             state, command, report = loop.step(state, np.array([value]), now)
         elif kind == 'silence':
             now = max(0, now + wait)
-            state, command, report = loop.watch(state, now)
+            state, command, report = loop.hold(state, now)
         elif kind == 'setpoint':
             state, _ = loop.request_setpoint(state, np.array([value]), max(0, now + wait))
         elif kind == 'manual':
@@ -55,9 +55,9 @@ def test_no_sequence_of_events_brings_out_a_wild_command(sequence):
             state = loop.set_mode(state, Mode.MANUAL if value else Mode.AUTOMATIC)
         elif kind == 'tuning':
             other = TUNINGS[int(value)]
-            state, loop = other.succeed(loop, state), other
+            state, loop = other.hand_over(loop, state), other
         else:
-            state = loop.take_over(State(), np.array([value]))
+            state = loop.initialise(State(), np.array([value]))
         if command is None:
             continue
         assert math.isfinite(command[0])

@@ -77,7 +77,7 @@ def test_every_command_keeps_the_limits_of_each_input(n_x, n_u, seed, all_states
                 state, command, report = loop.step(state, y, now)
                 assert (report.reason is not None) or kind != 'broken' or wait <= 0.0
             case 'silence':
-                state, command, report = loop.watch(state, now)
+                state, command, report = loop.hold(state, now)
             case 'setpoint':
                 state, refused = loop.request_setpoint(state, x)
                 assert (refused is None) == (model.states.violation(x) == 0.0)
@@ -86,10 +86,10 @@ def test_every_command_keeps_the_limits_of_each_input(n_x, n_u, seed, all_states
             case 'mode':
                 state = loop.set_mode(state, Mode.MANUAL if values[0] > 0.0 else Mode.AUTOMATIC)
             case 'restart':
-                state = loop.take_over(State(), u)
+                state = loop.initialise(State(), u)
             case 'successor':
                 other = tuned(model, loop.outputs, observer_bandwidth=float(values[0] > 0.0))
-                state, loop = other.succeed(loop, state), other
+                state, loop = other.hand_over(loop, state), other
         if command is None:
             continue
         assert command.shape == (n_u,)

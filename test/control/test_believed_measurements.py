@@ -137,7 +137,7 @@ def test_steps_of_the_sensor_are_no_fault():
 def test_rare_measurements_are_not_taken_for_a_gap():
     model = shipped('reactor_nz4')
     loop = controller(model)
-    state = loop.take_over(State(), np.array([300.0]))
+    state = loop.initialise(State(), np.array([300.0]))
     for k in range(30):
         state, command, report = loop.step(
             state, np.array([START + 1e-9 * k]), EPOCH + 60 * k * SECOND)
@@ -157,7 +157,7 @@ def test_missed_measurements_are_counted():
 
 def test_nobody_watches_before_the_first_measurement():
     loop = controller()
-    state, command, report = loop.watch(State(), EPOCH)
+    state, command, report = loop.hold(State(), EPOCH)
     assert (state.command, command, report.reason) == (None, None, None)
 
 
@@ -167,7 +167,7 @@ def test_stamps_that_stood_still_while_it_was_watched_do_not_stop_the_law(ahead)
     loop = Loop(controller())
     loop.run(10)
     loop.ask(START - 2.0)
-    loop.state, _, report = loop.controller.watch(
+    loop.state, _, report = loop.controller.hold(
         loop.state, loop.state.time_ns + ahead * SECOND)
     assert report.level == 'hold'
     samples = loop.run(300)

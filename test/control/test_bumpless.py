@@ -128,11 +128,11 @@ def test_a_restart_takes_over_from_the_coolant_in_force(at_rest):
 
 def test_a_coolant_that_is_no_number_is_not_taken_over():
     loop = controller()
-    assert loop.take_over(State(), np.array([np.nan])).command is None
-    state = loop.take_over(State(), np.array([1e300]))
+    assert loop.initialise(State(), np.array([np.nan])).command is None
+    state = loop.initialise(State(), np.array([1e300]))
     np.testing.assert_array_equal(state.command, [305.15])
     # later it is no news
-    assert loop.take_over(state, np.array([290.0])) is state
+    assert loop.initialise(state, np.array([290.0])) is state
 
 
 def test_without_a_transfer_time_the_rate_limit_alone_counts():
@@ -149,6 +149,6 @@ def test_a_controller_succeeds_itself_without_a_trace():
     loop = loop_at(START)
     state = loop.state
     again = Controller(loop.controller.model, loop.controller.settings)
-    succeeded = again.succeed(loop.controller, state)
+    succeeded = again.hand_over(loop.controller, state)
     first = loop.controller.step(state, loop.x, loop.state.time_ns + 10 ** 9)[1]
     np.testing.assert_array_equal(again.step(succeeded, loop.x, state.time_ns + 10 ** 9)[1], first)

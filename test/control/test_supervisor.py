@@ -133,7 +133,7 @@ def test_far_below_the_safe_input_is_commanded_and_left_again():
 def test_a_reactor_about_to_run_away_is_cooled_whatever_the_sensor_does(blind):
     loop = Loop(controller(), kelvin=340.0)
     loop.coolant = 300.0
-    loop.state = loop.controller.take_over(State(), np.array([300.0]))
+    loop.state = loop.controller.initialise(State(), np.array([300.0]))
     loop.run(5)
     blinded = loop.run(blind, lambda _: float('nan'))
     assert {s.report.level for s in blinded} <= {'safe'}

@@ -113,7 +113,7 @@ def test_a_hot_reactor_that_stands_still_keeps_the_safe_coolant():
                             335.0, 380.0))
     loop = Loop(controller(), kelvin=boundary - 1e-6)
     loop.coolant = SAFE
-    loop.state = loop.controller.take_over(State(), np.array([SAFE]))
+    loop.state = loop.controller.initialise(State(), np.array([SAFE]))
     samples = loop.run(120)
     assert samples[60].temperature > boundary - 0.2
     assert {s.command for s in samples} == {SAFE}
@@ -129,7 +129,7 @@ def test_it_leads_back_from_either_side(side):
         model, state_weight=np.ones(1), input_weight=np.ones(1),
         limits=InputLimits(np.array([-9.0]), np.array([9.0]), np.ones(1)),
         observer_bandwidth=0.5, transfer_time=5.0, safe_input=np.array([4.0 * side])))
-    state = step.take_over(State(), np.array([4.0 * side]))
+    state = step.initialise(State(), np.array([4.0 * side]))
     state, refused = step.request_setpoint(state, np.array([-0.5 * side]))
     assert refused is None
     x, shares = 4.0 * side + 0.2, []

@@ -209,7 +209,7 @@ def jumps_of(thermometer: Thermometer, names: list[str]) -> list[float]:
         while to_celsius(float(u[0])) != command.temperature:
             assert left, (seconds(measured), command.temperature)
             predecessor, controller = controller, controllers[left.pop(0)]
-            state = controller.succeed(predecessor, state)
+            state = controller.hand_over(predecessor, state)
             after, u, _ = controller.step(state, x, stamp_ns)
         if u is not kept:
             jumps.append(abs(float(u[0] - kept[0])))

@@ -81,5 +81,5 @@ class Recorded:
             fields['model'] = {'name': name, 'digest': MODELS[name][1]}
         predecessor = self.controller
         self.controller = Controller(model, self.parameters.settings())
-        self.state = self.controller.succeed(predecessor, self.state)
+        self.state = self.controller.hand_over(predecessor, self.state)
         self.write(PARAMETERS if len(parameters) > ('model' in parameters) else MODEL, fields)

@@ -115,7 +115,7 @@ class Loop:
         self.x = self.plant.nominal_state.copy()
         self.x[-1] = self.kelvin
         self.coolant = float(equilibrium_input(self.plant, self.x)[0])
-        self.state = self.controller.take_over(self.state, np.array([self.coolant]))
+        self.state = self.controller.initialise(self.state, np.array([self.coolant]))
         self._late = [self.coolant] * self.delay
         self._rng = np.random.default_rng(0)
 
@@ -131,12 +131,12 @@ class Loop:
         self.state = self.controller.set_mode(self.state, mode)
 
     def replace(self, other: Controller) -> None:
-        self.state = other.succeed(self.controller, self.state)
+        self.state = other.hand_over(self.controller, self.state)
         self.controller = other
 
     def restart(self) -> None:
         """Kill the controller; the next one finds the coolant in force."""
-        self.state = self.controller.take_over(State(), np.array([self.coolant]))
+        self.state = self.controller.initialise(State(), np.array([self.coolant]))
 
     def run(self, seconds: int, sensor: Callable[[float], float | None] = lambda kelvin: kelvin
             ) -> list[Sample]:
@@ -152,7 +152,7 @@ class Loop:
                               + self.noise * float(self._rng.standard_normal()))
             now = EPOCH + self.second * SECOND
             if measured is None:
-                self.state, command, report = self.controller.watch(self.state, now)
+                self.state, command, report = self.controller.hold(self.state, now)
                 assert command is not None
             else:
                 self.state, command, report = self.controller.step(
