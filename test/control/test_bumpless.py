@@ -8,28 +8,28 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from koopman_ros.control import Controller, InputLimits, Mode, State
+from koopman_ros.control import Controller, exchange, InputLimits, Mode, ModeChange, restart, State
 from support.closed_loops import SETPOINT, shipped, START
-from support.sampled_loops import changed_reactor, controller, largest_step, Loop, settled
+from support.sampled_loops import changed_reactor, controller, largest_step, Reactor, settled
 
 DRIFTED = {'heat_transfer_coefficient': 0.8}
 
 
-def loop_at(setpoint: float, **changes: float) -> Loop:
+def loop_at(setpoint: float, **changes: float) -> Reactor:
     """Return a loop at rest at a set-point, on a plant that is not the model."""
-    loop = Loop(controller(), plant=changed_reactor(**changes))
+    loop = Reactor(controller(), changed_reactor(**changes))
     loop.run(10)
     loop.ask(setpoint)
     loop.run(480)
-    assert abs(float(loop.x[-1]) - setpoint) < 1e-6
+    assert abs(loop.kelvin - setpoint) < 1e-6
     return loop
 
 
 def test_automatic_to_manual_and_back_at_rest():
     loop = loop_at(SETPOINT, **DRIFTED)
-    loop.set_mode(Mode.MANUAL)
+    loop.do(ModeChange(Mode.MANUAL))
     loop.run(60)
-    loop.set_mode(Mode.AUTOMATIC)
+    loop.do(ModeChange(Mode.AUTOMATIC))
     loop.run(300)
     assert largest_step(loop.samples[480:]) < 1e-6
 
@@ -37,26 +37,15 @@ def test_automatic_to_manual_and_back_at_rest():
 @pytest.mark.parametrize('by', [-4.0, 0.5])
 def test_from_a_coolant_that_the_law_would_not_choose(by):
     loop = loop_at(START)
-    loop.set_mode(Mode.MANUAL)
-    loop.state, refused = loop.controller.request_manual_input(
-        loop.state, np.array([loop.coolant + by]))
-    assert refused is None
+    loop.manual(loop.samples[-1].command + by)
     before = loop.run(1200)[-1]
-    loop.set_mode(Mode.AUTOMATIC)
+    loop.do(ModeChange(Mode.AUTOMATIC))
     samples = loop.run(420)
     assert abs(samples[0].command - before.command) < 0.01
     assert abs(samples[1].command - samples[0].command) < 0.01
     # and smoothly on its way from there
     assert largest_step(samples) < 0.12
     assert settled(samples, START, 1e-3) < 420
-
-
-def test_to_manual_under_way_holds_the_last_command():
-    loop = loop_at(START)
-    loop.ask(SETPOINT)
-    before = loop.run(20)[-1]
-    loop.set_mode(Mode.MANUAL)
-    assert {s.command for s in loop.run(30)} == {before.command}
 
 
 @pytest.mark.parametrize('change', [
@@ -67,23 +56,23 @@ def test_to_manual_under_way_holds_the_last_command():
 def test_retuning(change):
     # at rest nothing is felt
     loop = loop_at(SETPOINT, **DRIFTED)
-    loop.replace(controller(**change))
+    loop.do(exchange(controller(**change)))
     assert largest_step(loop.run(200)) < 1e-6
     # and under way the command goes on where it was
     loop.ask(START)
     before = loop.run(25)
-    loop.replace(controller())
+    loop.do(exchange(controller()))
     after = loop.run(2)
     assert abs(after[0].command - before[-1].command) < 0.2 + largest_step(before[-2:])
 
 
 def test_a_storm_of_tunings_does_not_stop_the_feedback():
     tunings = [controller(), controller(input_weight=np.array([0.05]))]
-    loop = Loop(tunings[0])
+    loop = Reactor(tunings[0])
     loop.run(10)
     loop.ask(SETPOINT)
     for second in range(300):
-        loop.replace(tunings[second % 2])
+        loop.do(exchange(tunings[second % 2]))
         loop.run(1)
     assert settled(loop.samples[10:], SETPOINT, 0.05) < 290
 
@@ -92,7 +81,7 @@ def test_a_storm_of_tunings_does_not_stop_the_feedback():
 def test_another_model_at_rest(name):
     loop = loop_at(SETPOINT, **DRIFTED)
     for model in (name, 'reactor_nz4', name):
-        loop.replace(controller(model))
+        loop.do(exchange(controller(model)))
         samples = loop.run(300)
         assert largest_step(samples) < 1e-6
         assert settled(samples, SETPOINT, 1e-3) == 0
@@ -104,7 +93,7 @@ def test_another_model_in_other_units_of_scale():
     model = shipped('reactor_linear')
     states = model.states
     scaled = replace(model, states=replace(states, scale=states.scale * 2.0), B=model.B / 2.0)
-    loop.replace(controller(scaled))
+    loop.do(exchange(controller(scaled)))
     samples = loop.run(300)
     assert largest_step(samples) < 1e-6
     # the linear model leaves more to the disturbance
@@ -118,7 +107,7 @@ def test_a_restart_takes_over_from_the_coolant_in_force(at_rest):
         loop.ask(START)
         loop.run(25)
     before = loop.samples[-1].command
-    loop.restart()
+    loop.do(restart)
     samples = loop.run(400)
     assert samples[0].command == before
     assert largest_step(samples) < (1e-6 if at_rest else 0.5)
@@ -136,19 +125,18 @@ def test_a_coolant_that_is_no_number_is_not_taken_over():
 
 
 def test_without_a_transfer_time_the_rate_limit_alone_counts():
-    loop = Loop(controller(transfer_time=0.0))
+    loop = Reactor(controller(transfer_time=0.0))
     loop.run(10)
-    loop.set_mode(Mode.MANUAL)
-    loop.state = loop.controller.request_manual_input(loop.state, np.array([296.0]))[0]
+    loop.manual(296.0)
     loop.run(600)
-    loop.set_mode(Mode.AUTOMATIC)
+    loop.do(ModeChange(Mode.AUTOMATIC))
     assert largest_step(loop.run(20)) == pytest.approx(1.0)
 
 
 def test_a_controller_succeeds_itself_without_a_trace():
     loop = loop_at(START)
-    state = loop.state
-    again = Controller(loop.controller.model, loop.controller.settings)
-    succeeded = again.hand_over(loop.controller, state)
-    first = loop.controller.step(state, loop.x, loop.state.time_ns + 10 ** 9)[1]
-    np.testing.assert_array_equal(again.step(succeeded, loop.x, state.time_ns + 10 ** 9)[1], first)
+    before, state, x = loop.loop.controller, loop.loop.state, np.array([loop.kelvin])
+    again = Controller(before.model, before.settings)
+    later = state.time_ns + 10 ** 9
+    np.testing.assert_array_equal(again.step(again.hand_over(before, state), x, later)[1],
+                                  before.step(state, x, later)[1])

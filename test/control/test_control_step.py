@@ -12,9 +12,20 @@ from typing import Any
 import numpy as np
 import pytest
 
-from koopman_ros.control import Arrival, Controller, Form, InputLimits, Mode, Settings, State
+from koopman_ros.control import (
+    Arrival,
+    at,
+    Controller,
+    Form,
+    InputLimits,
+    Mode,
+    SetpointRequest,
+    Settings,
+    simulate,
+    State,
+)
 from koopman_ros.lifting import Coordinates, LiftedModel, NetworkObservables, Provenance
-from koopman_ros.plants import advance
+from koopman_ros.plants import Process
 from support.closed_loops import COOLANT, REACTOR, SETPOINT, shipped, START, two_state_model
 from support.sampled_loops import say
 
@@ -181,22 +192,6 @@ def test_scaling_beyond_what_numbers_hold(first, second):
 
 # Sensor failures.
 
-def test_a_failed_sensor_holds_the_last_command():
-    loop = controller()
-    state = loop.request_setpoint(started(loop), np.array([316.0]))[0]
-    state, command, _ = loop.step(state, np.array([320.0]), NOW + SECOND)
-    state, held, report = loop.step(state, np.array([math.nan]), NOW + 2 * SECOND)
-    np.testing.assert_array_equal(held, command)
-    assert report.command.law.form == ''
-    assert say(report.reason) == 'the measured temperature is nan, not finite: check the sensor'
-    assert report.level == 'hold'
-    assert math.isnan(report.measurement.outside)
-    # the set-point stays, and the loop goes on when the sensor does
-    np.testing.assert_array_equal(report.target.setpoint, [316.0])
-    report = loop.step(state, np.array([319.0]), NOW + 3 * SECOND)[2]
-    assert (report.command.law.form, report.reason) == (Form.RECENTRED.value, None)
-
-
 def test_a_sensor_that_fails_from_the_start_gives_the_nominal_input():
     state, command, report = controller().step(State(), np.array([math.nan]), NOW)
     np.testing.assert_array_equal(command, [300.0])
@@ -223,18 +218,6 @@ def test_outside_the_box_the_distance_is_reported():
     assert report.measurement.outside == pytest.approx(0.05, rel=1e-9)
     assert report.level == 'sdre'
     assert report.command.law.form == Form.RECENTRED.value
-
-
-def test_without_a_gain_the_last_command_is_held():
-    loop = controller()
-    state, command, _ = loop.step(started(loop), np.array([323.0]), NOW + SECOND)
-    strict = replace(loop, settings=replace(loop.settings, max_gain=1e-6))
-    state, held, report = strict.step(state, np.array([315.0]), NOW + 2 * SECOND)
-    np.testing.assert_array_equal(held, command)
-    assert report.command.law.form == ''
-    assert say(report.reason).startswith('the linear law fails: no feedback')
-    assert 'the gain exceeds its bound' in say(report.reason)
-    assert report.command.law.gain > 1e-6
 
 
 # Time.
@@ -437,20 +420,12 @@ def test_back_in_automatic_mode_the_law_acts():
 
 # The loop: the true reactor, sampled every second.
 
-def drive(loop, seconds, *, plant=REACTOR, kelvin=START, setpoint=SETPOINT):
+def drive(loop, seconds, *, kelvin=START, setpoint=SETPOINT):
     """Return the temperatures and commands of a closed loop after a change of set-point."""
-    state = loop.step(State(), np.array([kelvin]), NOW)[0]
-    state, refused = loop.request_setpoint(state, np.array([setpoint]))
-    assert refused is None
-    temperature = np.array([kelvin])
-    temperatures, commands = [], []
-    for second in range(1, seconds + 1):
-        state, command, report = loop.step(state, temperature, NOW + second * SECOND)
-        assert report.reason is None
-        temperature = advance(plant, temperature, command, 1.0 / 60.0)
-        temperatures.append(float(temperature[0]))
-        commands.append(float(command[0]))
-    return np.array(temperatures), np.array(commands)
+    run = simulate(loop, Process(REACTOR, 0, np.array([kelvin]), REACTOR.nominal_input), [
+        at(1.0, SetpointRequest(0, np.array([setpoint])))], duration=seconds)
+    assert set(run.reasons) == {None}
+    return run.states[1:, 0], run.commands[1:, 0]
 
 
 @pytest.mark.parametrize('name', ['reactor_nz3', 'reactor_nz4'])

@@ -19,7 +19,7 @@ from support.sampled_loops import (
     controller,
     largest_step,
     levels,
-    Loop,
+    Reactor,
     SAFE,
     settled,
 )
@@ -47,9 +47,9 @@ def narrow(model=None):
     return replace(model, states=replace(model.states, lower=center - 1.5, upper=center + 1.5))
 
 
-def rested(plant, model='reactor_nz4'):
+def rested(plant, model='reactor_nz4', noise=0.0):
     """Return a loop that finds its plant at rest under the safe coolant, far outside."""
-    loop = Loop(controller(model), plant=plant, kelvin=rest_of(plant))
+    loop = Reactor(controller(model), plant, rest_of(plant), noise=noise)
     loop.ask(START)
     return loop
 
@@ -57,7 +57,7 @@ def rested(plant, model='reactor_nz4'):
 @pytest.mark.parametrize('name', CHANGED)
 def test_after_a_dead_sensor_the_loop_comes_back_by_itself(name):
     plant = changed_reactor(**CHANGED[name])
-    loop = Loop(controller(), plant=plant)
+    loop = Reactor(controller(), plant)
     loop.run(5)
     silent = loop.run(260, lambda _: None)
     assert silent[-1].report.level == 'safe'
@@ -71,8 +71,7 @@ def test_after_a_dead_sensor_the_loop_comes_back_by_itself(name):
 
 
 def test_a_noisy_sensor_does_not_keep_it_there():
-    loop = rested(changed_reactor(heat_transfer_coefficient=1.2))
-    loop.noise = 0.1
+    loop = rested(changed_reactor(heat_transfer_coefficient=1.2), noise=0.1)
     samples = loop.run(320)
     assert samples[-1].report.level == 'sdre'
     assert settled(samples, START, 0.3) < 320
@@ -111,9 +110,7 @@ def test_nothing_moves_before_the_plant_rests_and_the_safe_input_is_back_with_th
 def test_a_hot_reactor_that_stands_still_keeps_the_safe_coolant():
     boundary = float(brentq(lambda T: REACTOR.derivative(np.array([T]), np.array([SAFE]))[0],
                             335.0, 380.0))
-    loop = Loop(controller(), kelvin=boundary - 1e-6)
-    loop.coolant = SAFE
-    loop.state = loop.controller.initialise(State(), np.array([SAFE]))
+    loop = Reactor(controller(), kelvin=boundary - 1e-6, coolant=SAFE)
     samples = loop.run(120)
     assert samples[60].temperature > boundary - 0.2
     assert {s.command for s in samples} == {SAFE}

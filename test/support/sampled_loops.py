@@ -6,34 +6,47 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field, replace
-import math
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from koopman_ros.control import (
+    at,
+    Change,
     Controller,
+    Event,
     InputLimits,
     LevelSettings,
+    Loop,
+    ManualCommand,
     Mode,
+    ModeChange,
+    perfect,
     Report,
+    Sensor,
+    SetpointRequest,
     Settings,
+    simulate,
     State,
     SupervisorSettings,
 )
 from koopman_ros.estimation import SensorLimits
 from koopman_ros.plants import (
-    advance,
+    ActuatedProcess,
+    Actuator,
     ControlAffineSystem,
     equilibrium_input,
     one_state_reactor,
+    Process,
     ReactorParameters,
 )
 from koopman_ros.reasons import Words
 from koopman_ros.units import Displays
 from support.closed_loops import REACTOR, shipped, START
 
+Array = NDArray[np.float64]
 SECOND = 1_000_000_000
 EPOCH = 1_785_000_000 * SECOND
 LOWER, UPPER, RATE = 278.15, 305.15, 1.0  # K, K, K/s
@@ -83,94 +96,84 @@ class Sample:
     report: Report
 
 
-@dataclass
-class Loop:
+class Reactor:
     """
-    A controller and a plant, one second a sample.
+    A loop on the true reactor that a test leads from one simulation to the next, each second.
 
+    :param controller: it finds the coolant that holds the plant at the start.
     :param plant: temperature last in its state.
-    :param bias: error of the sensor in K.
-    :param lag: time constant of the coolant in s.
-    :param delay: samples that a command is late.
-    :param noise: of the sensor in K, from a fixed seed.
-    :param reached: range of the coolant that the actuator reaches.
-    :param tells: whether the coolant in force is measured.
-    :param coolant_error: of that measurement in K.
+    :param kelvin: at the start.
+    :param sensor: what it makes of the temperature.
+    :param input_sensor: the same of the coolant; None where it is not measured.
     """
 
-    controller: Controller
-    plant: ControlAffineSystem = REACTOR
-    kelvin: float = START
-    bias: float = 0.0
-    lag: float = 0.0
-    delay: int = 0
-    noise: float = 0.0
-    reached: tuple[float, float] = (0.0, 1000.0)
-    tells: bool = False
-    coolant_error: float = 0.0
-    state: State = field(default_factory=State)
-    samples: list[Sample] = field(default_factory=list)
-
-    def __post_init__(self) -> None:
-        self.x = self.plant.nominal_state.copy()
-        self.x[-1] = self.kelvin
-        self.coolant = float(equilibrium_input(self.plant, self.x)[0])
-        self.state = self.controller.initialise(self.state, np.array([self.coolant]))
-        self._late = [self.coolant] * self.delay
-        self._rng = np.random.default_rng(0)
+    def __init__(self, controller: Controller, plant: ControlAffineSystem = REACTOR,
+                 kelvin: float = START, *, actuator: Actuator | None = None, noise: float = 0.0,
+                 sensor: Sensor = perfect, input_sensor: Sensor | None = None,
+                 coolant: float | None = None) -> None:
+        x = np.append(plant.nominal_state[:-1], kelvin)
+        u = equilibrium_input(plant, x) if coolant is None else np.array([coolant])
+        process = Process(plant, 0, x, u)
+        self.loop = Loop(controller, controller.initialise(State(), u),
+                         ActuatedProcess(process, actuator or Actuator(), u))
+        self.noise, self.sensor, self.input_sensor = noise, sensor, input_sensor
+        self.waiting: list[Event | Change] = []
+        self.samples: list[Sample] = []
 
     @property
-    def second(self) -> int:
-        return len(self.samples)
+    def process(self) -> Process:
+        return self.loop.plant.process
+
+    @property
+    def kelvin(self) -> float:
+        """The temperature at the next sample."""
+        second = len(self.samples)
+        return float(self.loop.plant.until(second * SECOND).x[-1])
+
+    def do(self, *what: Event | Change) -> None:
+        """Let something happen before the next sample."""
+        self.waiting += what
 
     def ask(self, kelvin: float) -> None:
-        self.state, refused = self.controller.request_setpoint(self.state, np.array([kelvin]))
-        assert refused is None
+        self.do(SetpointRequest(0, np.array([kelvin])))
 
-    def set_mode(self, mode: Mode) -> None:
-        self.state = self.controller.set_mode(self.state, mode)
+    def manual(self, kelvin: float) -> None:
+        self.do(ModeChange(Mode.MANUAL), ManualCommand(np.array([kelvin])))
 
-    def replace(self, other: Controller) -> None:
-        self.state = other.hand_over(self.controller, self.state)
-        self.controller = other
+    def act(self, actuator: Actuator) -> None:
+        """Put another actuator before the plant."""
+        self.do(lambda loop: replace(loop, plant=replace(loop.plant, actuator=actuator)))
 
-    def restart(self) -> None:
-        """Kill the controller; the next one finds the coolant in force."""
-        self.state = self.controller.initialise(State(), np.array([self.coolant]))
+    def change(self, **changes: Any) -> None:
+        """Go on with another state or system."""
+        self.do(lambda loop: replace(loop, plant=replace(
+            loop.plant, process=replace(loop.plant.process, **changes))))
 
-    def run(self, seconds: int, sensor: Callable[[float], float | None] = lambda kelvin: kelvin
+    def run(self, seconds: int, sensor: Callable[[float], float | None] | None = None
             ) -> list[Sample]:
         """
         Let the loop run.
 
-        :param sensor: what is measured of a temperature; None for nothing.
+        :param sensor: what is measured of the temperature meanwhile; None for nothing.
         :return: the samples of this run.
         """
-        first = self.second
-        for _ in range(seconds):
-            measured = sensor(float(self.x[-1]) + self.bias
-                              + self.noise * float(self._rng.standard_normal()))
-            now = EPOCH + self.second * SECOND
-            if measured is None:
-                self.state, command, report = self.controller.hold(self.state, now)
-                assert command is not None
-            else:
-                self.state, command, report = self.controller.step(
-                    self.state, np.array([measured]), now,
-                    np.array([self.coolant + self.coolant_error]) if self.tells else None)
-            self.samples.append(Sample(self.second, float(self.x[-1]), float(command[0]), report))
-            self._move(float(command[0]))
-        return self.samples[first:]
+        first = len(self.samples)
 
-    def _move(self, command: float) -> None:
-        self._late.append(command)
-        command = min(max(self._late.pop(0), self.reached[0]), self.reached[1])
-        # a lag in steps that are short beside it
-        parts = 5 if self.lag else 1
-        for _ in range(parts):
-            share = -math.expm1(-1.0 / parts / self.lag) if self.lag else 1.0
-            self.coolant += share * (command - self.coolant)
-            self.x = advance(self.plant, self.x, np.array([self.coolant]), 1.0 / 60.0 / parts)
+        def measure(y: Array, second: float) -> Array | None:
+            found = sensor(float(y[0])) if sensor else self.sensor(y, second)
+            return None if found is None else np.reshape(found, 1)
+
+        run = simulate(
+            self.loop.controller, self.loop.plant.until(first * SECOND),
+            [at(0.0, what) for what in self.waiting], duration=seconds - 1.0,
+            C=np.eye(len(self.process.x))[-1:], seed=first, sensor=measure,
+            noise=np.array([self.noise]) if self.noise else None, state=self.loop.state,
+            input_sensor=self.input_sensor, stamp=lambda time_ns: EPOCH + time_ns)
+        assert not run.failure
+        self.loop, self.waiting = run.loop, []
+        self.samples += [Sample(first + n, *row) for n, row in enumerate(zip(
+            run.states[:, -1].tolist(), run.commands[:, 0].tolist(), run.reports, strict=True))]
+        return self.samples[first:]
 
 
 def largest_step(samples: list[Sample]) -> float:
