@@ -11,7 +11,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from koopman_ros.control import Controller, State
+from koopman_ros.control import at, Controller, SetpointRequest, simulate, State
 from koopman_ros.lifting import LiftedModel, load, NetworkObservables
 from koopman_ros.nodes.controller_parameters import ControllerParameters
 from koopman_ros.nodes.messages import NANOSECONDS
@@ -64,23 +64,42 @@ def controller(model: LiftedModel) -> Controller:
     return Controller(model, ControllerParameters().settings())
 
 
+@dataclass(frozen=True)
+class _Euler:
+    """A model as a plant, from sample to sample by one step of Euler's method."""
+
+    model: LiftedModel
+    deviation: Array
+    u: Array
+    time_ns: int = 0
+
+    @property
+    def x(self) -> Array:
+        return self.model.states.to_physical(self.deviation)
+
+    def commanded(self, command: Array, time_ns: int) -> _Euler:
+        return replace(self, u=command)
+
+    def until(self, time_ns: int) -> _Euler:
+        seconds = (time_ns - self.time_ns) / NANOSECONDS
+        rate = self.model.drift(self.deviation) + self.model.B @ self.model.inputs.to_deviation(
+            self.u)
+        return replace(self, time_ns=time_ns, deviation=self.deviation + rate * (
+            seconds / self.model.seconds_per_time_unit))
+
+
 def course(under: Controller, samples: int) -> tuple[Sample, ...]:
     """Return what is measured while a controller leads its own model through set-point steps."""
-    model, state = under.model, State()
-    rng = np.random.default_rng(0)
-    x, found = np.zeros(1), []
-    for k in range(samples):
-        requested = None if k % _HELD else (
-            model.states.center + _SETPOINTS[k // _HELD % len(_SETPOINTS)])
-        sample = Sample(model.states.to_physical(x) + _NOISE * rng.normal(size=1),
-                        round((k + 1) * _PERIOD * NANOSECONDS), requested)
-        found.append(sample)
-        if requested is not None:
-            state = asked(under, state, requested)
-        state, command, _ = under.step(state, sample.measurement, sample.time_ns)
-        rate = model.drift(x) + model.B @ model.inputs.to_deviation(command)
-        x = x + rate * (_PERIOD / model.seconds_per_time_unit)
-    return tuple(found)
+    model, rng = under.model, np.random.default_rng(0)
+    requested = {k: model.states.center + _SETPOINTS[k // _HELD % len(_SETPOINTS)]
+                 for k in range(0, samples, _HELD)}
+    run = simulate(
+        under, _Euler(model, np.zeros(1), model.inputs.center),
+        [at(k * _PERIOD, SetpointRequest(0, value)) for k, value in requested.items()],
+        duration=(samples - 1) * _PERIOD, period=_PERIOD,
+        sensor=lambda y, _: y + _NOISE * rng.normal(size=1))
+    return tuple(Sample(measured, round((k + 1) * _PERIOD * NANOSECONDS), requested.get(k))
+                 for k, measured in enumerate(run.measured))
 
 
 def asked(under: Controller, state: State, requested: Array) -> State:
