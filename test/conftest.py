@@ -3,7 +3,9 @@
 
 """What holds for all tests: their order, checked messages, threads, disturbed trainings."""
 
+from collections.abc import Iterator
 import os
+import signal
 import sys
 
 import pytest
@@ -12,6 +14,7 @@ import pytest
 # others use the cores.
 os.environ.setdefault('OPENBLAS_NUM_THREADS', '1')
 
+from koopman_ros.startup import SIGNALS
 from support.disturbance import disturb_training
 
 # An int in a float64 field, say, passes unnoticed here, and aborts the process where the message
@@ -30,6 +33,16 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     """Put the longest files first, the others in their order."""
     order = {name: place for place, name in enumerate(LONGEST)}
     items.sort(key=lambda item: order.get(item.path.stem, len(order)))
+
+
+@pytest.fixture(autouse=True)
+def own_signals() -> Iterator[None]:
+    """Restore the handlers of signals: what a program ignores at its end, children inherit."""
+    before = {number: signal.getsignal(number) for number in SIGNALS}
+    yield
+    for number, handler in before.items():
+        if signal.getsignal(number) is not handler:
+            signal.signal(number, handler)
 
 
 @pytest.fixture(autouse=True, scope='session')

@@ -28,7 +28,7 @@ print(torch.backends.cpu.get_cpu_capability(), torch.get_num_threads())
 def disturbed(monkeypatch):
     """Disturb trainings until the end of the test."""
     monkeypatch.setattr(disturbance, 'SIZE', 1e-13)
-    monkeypatch.setattr(training, 'Data', training.Data)
+    monkeypatch.setattr(training, 'ScaledSamples', training.ScaledSamples)
     disturbance.disturb_training()
 
 
@@ -64,10 +64,10 @@ def test_one_machine_that_fails_is_a_failure(monkeypatch, capsys):
 
 def test_nothing_is_disturbed_unless_it_is_asked_for(monkeypatch):
     monkeypatch.setattr(disturbance, 'SIZE', 0.0)
-    values, before = np.ones(3), training.Data
+    values, before = np.ones(3), training.ScaledSamples
     assert disturbance.disturbed(values) is values
     disturbance.disturb_training()
-    assert training.Data is before
+    assert training.ScaledSamples is before
 
 
 @pytest.mark.usefixtures('disturbed')

@@ -89,8 +89,9 @@ class DisturbanceObserver:
         for size, bound in zip(map(abs, self.as_input(w).tolist()), self._bounds, strict=True):
             if not math.isfinite(size):
                 return math.inf, bound
-            if size / bound > share:
-                worst, share = (size, bound), size / bound
+            ratio = size / bound if bound else (math.inf if size else 0.0)
+            if ratio > share:
+                worst, share = (size, bound), ratio
         return worst
 
     @cached_property

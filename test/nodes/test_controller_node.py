@@ -225,7 +225,7 @@ def test_manual_command_stays_within_the_limits(bench: Bench) -> None:
     manual = bench.ros.speak(Temperature, topics.MANUAL_COOLANT_SETPOINT, to='controller')
     for wild in (90.0, math.nan):
         manual.publish(temperature(wild))
-    bench.status(lambda s: 'manual command [nan] is not finite' in s.message)
+    bench.status(lambda s: 'manual coolant_temperature nan degC is not finite' in s.message)
     assert bench.measure(STEADY, 1000.0).temperature == pytest.approx(28.0)
 
 

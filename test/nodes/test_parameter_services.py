@@ -77,9 +77,9 @@ def test_change_that_does_not_fit_is_refused_with_the_reason(
     ('coolant_rate_limit', 5e-324, 'coolant_rate_limit = 5e-324 K/min cannot be used: input rate '
      'must be above 0, got [0.0]; choose another value in (0, 1000000] K/min'),
     ('setpoint_ramp', 5e-324, 'setpoint_ramp = 5e-324 K/min cannot be used: setpoint_ramp must be '
-     'above 0, got 0.0; choose another value in (0, 1000000] K/min'),
-    ('max_temperature_rate', 5e-324, 'max_temperature_rate = 5e-324 K/min cannot be used: rate '
-     'must be above 0, got 0.0; choose another value in (0, 1000000] K/min'),
+     'above 0, got [0.0]; choose another value in (0, 1000000] K/min'),
+    ('max_temperature_rate', 5e-324, 'max_temperature_rate = 5e-324 K/min cannot be used: sensor '
+     'rate must be above 0, got [0.0]; choose another value in (0, 1000000] K/min'),
 ])
 def test_new_value_out_of_range_is_refused_with_value_range_and_unit(
         running: Harness, name: str, bad: float, words: str) -> None:

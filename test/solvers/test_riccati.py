@@ -8,7 +8,9 @@ import pytest
 from scipy.linalg import block_diag, solve_continuous_are
 
 import control
+from koopman_ros.reasons import Code, reason, Words
 from koopman_ros.solvers import RiccatiStatus, solve_riccati
+from koopman_ros.units import Displays
 
 SIZES = [(n, m) for n in range(1, 9) for m in range(1, 4)]
 every_size = pytest.mark.parametrize(('n', 'm'), SIZES)
@@ -217,6 +219,8 @@ def test_a_singular_input_weight_is_an_error():
 
 
 def test_every_status_says_what_to_do():
-    assert 'not stabilisable' in RiccatiStatus.NOT_STABILISABLE.value
-    assert 'nearly not stabilisable' in RiccatiStatus.INACCURATE.value
-    assert 'raise the input weight or the gain bound' in RiccatiStatus.GAIN_TOO_LARGE.value
+    words = {status: Words(Displays({}))(reason(Code(status.value)))
+             for status in RiccatiStatus if status is not RiccatiStatus.SOLVED}
+    assert 'not stabilisable' in words[RiccatiStatus.NOT_STABILISABLE]
+    assert 'nearly not stabilisable' in words[RiccatiStatus.INACCURATE]
+    assert 'raise the input weight or the gain bound' in words[RiccatiStatus.GAIN_TOO_LARGE]

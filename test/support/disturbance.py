@@ -41,8 +41,8 @@ def disturb_training() -> None:
     if not SIZE:
         return
     from koopman_ros.learning import training
-    original = training.Data
-    training.Data = lambda *arrays: disturbed_data(original(*arrays))
+    original = training.ScaledSamples
+    training.ScaledSamples = lambda *arrays: disturbed_data(original(*arrays))
 
 
 def script(path: Path) -> list[str]:
