@@ -9,10 +9,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from koopman_ros.control import Controller, LevelSettings, State, SupervisorSettings
+from koopman_ros.control import Controller, exchange, LevelSettings, State, SupervisorSettings
 from koopman_ros.estimation import ESTIMATORS
 from koopman_ros.plugs import plug
-from support.sampled_loops import controller, Loop
+from support.sampled_loops import controller, Reactor
 
 LAW = """
 from dataclasses import dataclass
@@ -54,7 +54,7 @@ def test_law_of_another_module_controls_and_falls_back(folder: Path) -> None:
     (folder / 'proportional_law.py').write_text(LAW)
     name = 'proportional_law:Proportional'
     usual = controller()
-    loop = Loop(replace(usual, settings=replace(
+    loop = Reactor(replace(usual, settings=replace(
         usual.settings, supervisor=levels(name, 'sdre'))))
     loop.run(10)
     loop.ask(320.0)
@@ -62,9 +62,9 @@ def test_law_of_another_module_controls_and_falls_back(folder: Path) -> None:
     assert {sample.report.level for sample in samples} == {name}
     assert samples[-1].temperature == pytest.approx(320.0, abs=1e-3)
     # what a law remembers goes in again
-    assert loop.state.law_memory == 410
-    loop.replace(replace(loop.controller, settings=replace(
-        loop.controller.settings, supervisor=levels('sdre', name))))
+    assert loop.loop.state.law_memory == 410
+    loop.do(exchange(replace(usual, settings=replace(
+        usual.settings, supervisor=levels('sdre', name)))))
     assert loop.run(20)[-1].report.level == 'sdre'
 
 
@@ -74,13 +74,12 @@ def levels(*laws: str) -> SupervisorSettings:
 
 def test_estimator_of_another_module_estimates(folder: Path) -> None:
     (folder / 'slow_estimator.py').write_text(ESTIMATOR)
-    quick, slow = (Loop(controller(estimator=name)) for name in (
-        '', 'slow_estimator:Slow'))
-    for loop in (quick, slow):
+    estimates = []
+    for name in ('', 'slow_estimator:Slow'):
+        loop = Reactor(controller(estimator=name))
         loop.run(5)
-        loop.bias = 0.5
-        loop.run(5)
-    estimates = [float(loop.state.estimate.w[0]) for loop in (quick, slow)]
+        loop.run(5, lambda kelvin: kelvin + 0.5)
+        estimates.append(float(loop.loop.state.estimate.w[0]))
     assert abs(estimates[0]) > 2.0 * abs(estimates[1]) > 0.0
 
 
