@@ -39,8 +39,8 @@ def steady_state_target(model: LiftedModel, x_ref: Array, w: Array | None = None
     """
     Solve f(x_ref) + B u_ref + w = 0 for u_ref by least squares, f the model's drift.
 
-    The feed-forward comes from the lifted model: the linearisation's would leave an offset of
-    kelvins far from the nominal point.
+    The feed-forward comes from the lifted model: the linearisation's would leave a large
+    offset far from the nominal point.
 
     :param model: the lift.
     :param x_ref: (n_x,) scaled deviation.

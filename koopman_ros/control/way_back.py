@@ -20,7 +20,7 @@ Array = NDArray[np.float64]
 _LEAD = 0.25
 # Moved is what changes its distance from the middle of the training box by this share of it.
 _MOVED = 0.03
-# At rest is what has not moved for so many times as a better rung is waited for.
+# At rest is what has not moved for so many times as a better level is waited for.
 _REST = 3.0
 # A model is followed in steps of this share of its box and of the time in which its rate changes,
 # until less than a share of the box is left of its way.
@@ -58,7 +58,7 @@ class WayBack:
 
         :param outside: in half widths.
         :param time_ns: now.
-        :param recovery_time: of the ladder, in s.
+        :param recovery_time: of the supervisor, in s.
         """
         change, still = outside - self.farthest, _MOVED * (1.0 + self.farthest)
         if change > still or (change < -still and not self.led):
