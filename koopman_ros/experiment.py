@@ -14,12 +14,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from koopman_ros.reasons import Code, Reason, reason
-from koopman_ros.units import NANOSECONDS
+from koopman_ros.units import LATE_NANOSECONDS, NANOSECONDS
 
 Array = NDArray[np.float64]
 
 _FOLLOWS_WITHIN = 0.01  # in the input's unit
-_LATE = NANOSECONDS  # a stamp that is earlier by more sets time back, as in control
 _COMES_NEARER = 1e-4  # likewise, less than any rate limit allows
 
 
@@ -154,7 +153,7 @@ def advance(experiment: Experiment, progress: Progress, measured: float | None, 
     ahead = time_ns - progress.time_ns
     if measured is not None and (why := experiment.refusal(measured)):
         progress = end(progress, Phase.ABORTED, why)
-    if ahead < -_LATE:
+    if ahead < -LATE_NANOSECONDS:
         progress = end(progress, Phase.ABORTED, reason(Code.CLOCK_WENT_BACK))
         return replace(progress, time_ns=time_ns)
     if ahead <= 0:

@@ -11,6 +11,9 @@ from functools import cache, cached_property
 from typing import Any
 
 NANOSECONDS = 1_000_000_000  # in a second
+# A stamp that is earlier than the last by no more than this is out of order; one that is earlier
+# still means that time itself was set back.
+LATE_NANOSECONDS = NANOSECONDS
 
 
 @dataclass(frozen=True)

@@ -35,14 +35,9 @@ from koopman_ros.estimation import equivalent_bias, Estimate, Verdict
 from koopman_ros.lifting import LiftedModel
 from koopman_ros.reasons import Code, Reason, reason
 from koopman_ros.signals import Outputs
-from koopman_ros.units import NANOSECONDS
+from koopman_ros.units import LATE_NANOSECONDS, NANOSECONDS
 
 Array = NDArray[np.float64]
-
-
-# A measurement earlier than the last by no more than this is out of order; one that is earlier
-# still means that time itself was set back.
-LATE_NANOSECONDS = NANOSECONDS
 
 
 @dataclass(frozen=True)
@@ -79,7 +74,8 @@ class Controller:
     def __post_init__(self) -> None:
         self.settings.check(self.model, self.measured)
         self.measured.state(np.zeros(len(self.measured.names)))
-        levels_of(self.model, self.settings)
+        # what cannot be built is refused now, and what was built is kept
+        assert self.levels
 
     @cached_property
     def measured(self) -> Outputs:

@@ -107,7 +107,7 @@ def simulated(model: LiftedModel, estimate: Estimate, u: Array, seconds: float
               ) -> Estimate | None:
     """Integrate the model from an estimate; see :meth:`Estimator.predict`."""
     duration = seconds / model.seconds_per_time_unit
-    fastest = float(np.max(np.abs(model.linearised.eigenvalues)))
+    fastest = model.linearised.fastest_rate
     longest = _STEP_SHARE / fastest if fastest > 0.0 else math.inf
     steps = max(1, math.ceil(duration / longest))
     if steps > _MAX_STEPS:

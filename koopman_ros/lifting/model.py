@@ -125,6 +125,11 @@ class LiftedModel:
         return values[np.argsort(-values.real)]
 
     @cached_property
+    def fastest_rate(self) -> float:
+        """Largest size of an eigenvalue of A in 1/time unit."""
+        return float(np.max(np.abs(self.eigenvalues)))
+
+    @cached_property
     def is_hurwitz(self) -> bool:
         """Whether every mode of A decays."""
         return bool(np.all(self.eigenvalues.real < 0.0))

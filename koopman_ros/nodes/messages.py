@@ -8,7 +8,8 @@ from __future__ import annotations
 from builtin_interfaces.msg import Time
 from sensor_msgs.msg import Temperature
 
-NANOSECONDS = 1_000_000_000
+from koopman_ros.units import NANOSECONDS as NANOSECONDS
+
 SECONDS_PER_MINUTE = 60.0
 ZERO_CELSIUS = 273.15  # K
 LAST_STAMP_SECONDS = 2 ** 31 - 1  # of a stamp, whose seconds are an int32

@@ -11,8 +11,8 @@ import numpy as np
 
 from koopman_ros.plants.process import Process
 from koopman_ros.plants.system import ControlAffineSystem, FloatArray
+from koopman_ros.units import NANOSECONDS
 
-_NANOSECONDS = 1_000_000_000
 # After so many time constants exp(-40) of a step is left, less than a double can tell.
 _SETTLED = 40.0
 
@@ -72,7 +72,7 @@ class ActuatedProcess:
         It supersedes commands that would take effect at the same time or later, such as those
         given before the delay was shortened.
         """
-        effect_ns = time_ns + round(self.actuator.delay * _NANOSECONDS)
+        effect_ns = time_ns + round(self.actuator.delay * NANOSECONDS)
         earlier = tuple(entry for entry in self.pending if entry[0] < effect_ns)
         return replace(self, pending=(*earlier, (effect_ns, command)))
 
@@ -94,7 +94,7 @@ class ActuatedProcess:
         if time_ns <= process.time_ns:
             return self
         goal = np.clip(self.command, self.actuator.lower, self.actuator.upper)
-        settled_ns = process.time_ns + round(_SETTLED * self.actuator.lag * _NANOSECONDS)
+        settled_ns = process.time_ns + round(_SETTLED * self.actuator.lag * NANOSECONDS)
         if settled_ns > process.time_ns and np.any(process.u != goal):
             process = _lagging(process, goal, self.actuator.lag, min(time_ns, settled_ns))
             if time_ns < settled_ns:

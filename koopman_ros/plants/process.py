@@ -9,8 +9,7 @@ from dataclasses import dataclass, replace
 
 from koopman_ros.plants.simulation import advance
 from koopman_ros.plants.system import ControlAffineSystem, FloatArray
-
-_NANOSECONDS = 1_000_000_000
+from koopman_ros.units import NANOSECONDS
 
 
 @dataclass(frozen=True, eq=False)
@@ -42,6 +41,6 @@ class Process:
         """
         if time_ns <= self.time_ns:
             return self
-        seconds = (time_ns - self.time_ns) / _NANOSECONDS
+        seconds = (time_ns - self.time_ns) / NANOSECONDS
         x = advance(self.system, self.x, self.u, seconds / self.system.seconds_per_time_unit)
         return replace(self, time_ns=time_ns, x=x)

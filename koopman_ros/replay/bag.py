@@ -12,9 +12,9 @@ import struct
 
 from koopman_ros.bags import BagMessage, BagReadError, read_messages, summary
 from koopman_ros.replay.records import parse, Record, RecordError
+from koopman_ros.units import NANOSECONDS
 
 RECORD_TYPE, COMMAND_TYPE = 'std_msgs/msg/String', 'sensor_msgs/msg/Temperature'
-_NANOSECONDS = 1_000_000_000
 
 
 def read_records(path: str | os.PathLike[str], topic: str, *, recover: bool = False
@@ -65,7 +65,7 @@ def command_counts(path: str | os.PathLike[str], topic: str, *, recover: bool = 
     found: Counter[tuple[int, bytes]] = Counter()
     for entry in read_messages(path, (topic,), recover=recover):
         stamp = entry.message.header.stamp
-        found[command_key(stamp.sec * _NANOSECONDS + stamp.nanosec,
+        found[command_key(stamp.sec * NANOSECONDS + stamp.nanosec,
                           entry.message.temperature)] += 1
     return found
 

@@ -15,10 +15,11 @@ from numpy.typing import NDArray
 from koopman_ros.lifting import Coordinates
 from koopman_ros.replay.bag import command_key
 from koopman_ros.replay.loop import Replay
+from koopman_ros.units import conversion
 
 Array = NDArray[np.float64]
 
-_ZERO_CELSIUS = 273.15  # K
+_CELSIUS = conversion('K', 'degC')
 
 
 @dataclass(frozen=True)
@@ -136,7 +137,7 @@ class ReplayedBag:
     @cached_property
     def unexplained(self) -> int:
         """The number of commands on the topic of which there is no record with their bits."""
-        recorded = Counter(command_key(sample.stamp_ns, float(sample.recorded[0]) - _ZERO_CELSIUS)
+        recorded = Counter(command_key(sample.stamp_ns, _CELSIUS(float(sample.recorded[0])))
                            for sample in self.found.samples)
         return (self.published - recorded).total()
 
@@ -148,7 +149,7 @@ class ReplayedBag:
 
 def shown(values: Array, unit: str) -> tuple[Array, str]:
     """Return values as they are shown, with their unit: temperatures in degrees Celsius."""
-    return (values - _ZERO_CELSIUS, '°C') if unit == 'K' else (values, unit)
+    return (values + _CELSIUS.offset, '°C') if unit == 'K' else (values, unit)
 
 
 def _rows(values: list[Array | None], like: Array | None = None) -> Array:
