@@ -45,11 +45,11 @@ def test_learning_does_need_torch():
 
 
 def test_packages_that_stand_alone():
-    """Neither loads another package of ours."""
+    """Neither loads another package of ours: data of plants and units are modules beside them."""
     for name in ('lifting', 'plants', 'solvers'):
         result = run(f"""
 import koopman_ros.{name}
 ours = {{module.split('.')[1] for module in sys.modules if module.startswith('koopman_ros.')}}
-assert ours <= {{{name!r}, 'plant_data'}}, ours
+assert ours <= {{{name!r}, 'plant_data', 'units'}}, ours
 """)
         assert (result.returncode, result.stderr) == (0, '')
