@@ -68,11 +68,11 @@ setup(
     },
     entry_points={
         'console_scripts': [
-            'plant = koopman_ros.nodes.programs:plant',
-            'controller = koopman_ros.nodes.programs:controller',
-            'trainer = koopman_ros.nodes.programs:trainer',
-            'player = koopman_ros.nodes.programs:player',
-            'replay = koopman_ros.nodes.programs:replay',
+            'plant = koopman_ros.startup:plant',
+            'controller = koopman_ros.startup:controller',
+            'trainer = koopman_ros.startup:trainer',
+            'player = koopman_ros.startup:player',
+            'replay = koopman_ros.startup:replay',
         ],
     },
 )

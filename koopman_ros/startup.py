@@ -15,6 +15,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 import contextlib
+from functools import partial
 import importlib
 import os
 import signal
@@ -150,6 +151,14 @@ def main() -> int:
     signal.pthread_sigmask(signal.SIG_UNBLOCK, SIGNALS)
     return run_program(module, int(interrupted))
 
+
+# The programs on the path. A node that is ended by a signal has done its work: 0. A replay has
+# not: 130.
+plant = partial(run_program, 'koopman_ros.nodes.plant', 0)
+controller = partial(run_program, 'koopman_ros.nodes.controller', 0)
+trainer = partial(run_program, 'koopman_ros.nodes.trainer', 0)
+player = partial(run_program, 'koopman_ros.nodes.player', 0)
+replay = partial(run_program, 'koopman_ros.nodes.replay', 130)
 
 if __name__ == '__main__':
     sys.exit(main())

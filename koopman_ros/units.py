@@ -11,6 +11,9 @@ from functools import cache, cached_property
 from typing import Any
 
 NANOSECONDS = 1_000_000_000  # in a second
+SECONDS_PER_MINUTE = 60.0
+LAST_STAMP_SECONDS = 2 ** 31 - 1  # of a stamp of ROS, whose seconds are an int32
+ZERO_CELSIUS = 273.15  # K
 # A stamp that is earlier than the last by no more than this is out of order; one that is earlier
 # still means that time itself was set back.
 LATE_NANOSECONDS = NANOSECONDS
@@ -37,7 +40,8 @@ class Conversion:
 
 
 # What each node needs at its start, without the registry.
-_AT_HAND = {('K', 'degC'): Conversion(offset=-273.15), ('degC', 'K'): Conversion(offset=273.15)}
+_AT_HAND = {('K', 'degC'): Conversion(offset=-ZERO_CELSIUS),
+            ('degC', 'K'): Conversion(offset=ZERO_CELSIUS)}
 
 
 @cache
@@ -117,3 +121,25 @@ class Displays:
     def __getitem__(self, name: str) -> Display:
         unit = self.units.get(name, '')
         return self.shown.get(unit) or Display(unit)
+
+
+def to_kelvin(celsius: float) -> float:
+    """Convert a temperature from degrees Celsius."""
+    return celsius + ZERO_CELSIUS
+
+
+def to_celsius(kelvin: float) -> float:
+    """Convert a temperature to degrees Celsius."""
+    return kelvin - ZERO_CELSIUS
+
+
+def in_celsius(kelvin: float, unit: str = 'K') -> str:
+    """Write a temperature given in K for the operator."""
+    return f'{to_celsius(kelvin):.2f} degC'
+
+
+def seconds_text(nanoseconds: int) -> str:
+    """Write integer nanoseconds in seconds, with all digits, e.g. '1700000000.25'."""
+    seconds, rest = divmod(abs(nanoseconds), NANOSECONDS)
+    sign = '-' if nanoseconds < 0 else ''
+    return f'{sign}{seconds}.{rest:09d}'.rstrip('0').rstrip('.')

@@ -20,7 +20,7 @@ from koopman_ros.experiment import (
     Phase,
     Progress,
 )
-from koopman_ros.nodes.words import OPERATOR
+from koopman_ros.ros.diagnostics import OPERATOR
 from support.sampled_loops import say
 
 SECOND = 1_000_000_000

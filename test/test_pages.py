@@ -11,7 +11,7 @@ import re
 
 import pytest
 
-from koopman_ros.nodes import access, topics
+from koopman_ros.ros import access, topics
 
 ROOT = Path(__file__).parent.parent
 PAGES = [ROOT / 'README.md', ROOT / 'CONTRIBUTING.md', *sorted(ROOT.glob('docs/*.md'))]

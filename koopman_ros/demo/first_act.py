@@ -19,10 +19,10 @@ from koopman_ros.demo.loop import run_loop, Scenario
 from koopman_ros.demo.results import plot, read_run
 from koopman_ros.demo.table import LiveTable
 from koopman_ros.lifting import load
-from koopman_ros.nodes import topics
-from koopman_ros.nodes.controller_parameters import ControllerParameters
-from koopman_ros.nodes.shipped import model_path
+from koopman_ros.parameters.controller import ControllerParameters
 from koopman_ros.reports import write_figures
+from koopman_ros.resources import model_path
+from koopman_ros.ros import topics
 from koopman_ros.testing import HarnessError
 
 STEP = -10.0  # K

@@ -14,9 +14,10 @@ import rclpy
 from rclpy.node import Node
 from sensor_msgs.msg import Temperature
 
-from koopman_ros.nodes import topics
-from koopman_ros.nodes.messages import NANOSECONDS, stamp_nanoseconds, temperature_message
+from koopman_ros.ros import topics
+from koopman_ros.ros.codec import stamp_nanoseconds, temperature_message
 from koopman_ros.testing import deferred_interrupt, Harness, HarnessError
+from koopman_ros.units import NANOSECONDS
 
 _START_TIME = 1.0  # s of plant time at the first measurement
 _TIMEOUT = 30.0  # s for the processes to find each other, and from one command to the next

@@ -15,10 +15,10 @@ from numpy.typing import NDArray
 
 from koopman_ros.bags import temperature_series
 from koopman_ros.lifting import LiftedModel
-from koopman_ros.nodes import topics
-from koopman_ros.nodes.controller_parameters import ControllerParameters
-from koopman_ros.nodes.messages import to_celsius, ZERO_CELSIUS
+from koopman_ros.parameters.controller import ControllerParameters
 from koopman_ros.reports import draw_limits, drawing, DRAWN_RANGE
+from koopman_ros.ros import topics
+from koopman_ros.units import to_celsius, ZERO_CELSIUS
 
 Array = NDArray[np.float64]
 SETTLED = 0.1  # K

@@ -18,10 +18,8 @@ from numpy.typing import NDArray
 
 from koopman_ros.bags import temperature_series
 from koopman_ros.lifting import LiftedModel
-from koopman_ros.nodes import topics
-from koopman_ros.nodes.controller_parameters import ControllerParameters
-from koopman_ros.nodes.messages import to_celsius, ZERO_CELSIUS
-from koopman_ros.nodes.plant_parameters import PlantParameters
+from koopman_ros.parameters.controller import ControllerParameters
+from koopman_ros.parameters.plant import PlantParameters
 from koopman_ros.plants import (
     ControlAffineSystem,
     one_state_reactor,
@@ -30,6 +28,8 @@ from koopman_ros.plants import (
     simulate,
 )
 from koopman_ros.reports import draw_limits, drawing, LIMIT
+from koopman_ros.ros import topics
+from koopman_ros.units import to_celsius, ZERO_CELSIUS
 
 Array = NDArray[np.float64]
 _AVERAGED = 600.0  # s over which an offset is averaged

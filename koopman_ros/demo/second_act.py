@@ -25,13 +25,13 @@ from koopman_ros.demo.loop import Loop, running_loop, Scenario
 from koopman_ros.demo.retraining_results import plot, read_history, rollout_rmse
 from koopman_ros.demo.table import LiveTable
 from koopman_ros.lifting import load
-from koopman_ros.nodes import topics
-from koopman_ros.nodes.controller_parameters import ControllerParameters
-from koopman_ros.nodes.messages import NANOSECONDS
-from koopman_ros.nodes.plant_parameters import PlantParameters
-from koopman_ros.nodes.shipped import model_path
+from koopman_ros.parameters.controller import ControllerParameters
+from koopman_ros.parameters.plant import PlantParameters
 from koopman_ros.reports import write_figures
+from koopman_ros.resources import model_path
+from koopman_ros.ros import topics
 from koopman_ros.testing import HarnessError
+from koopman_ros.units import NANOSECONDS
 
 STEP = -10.0  # K
 FOULING = 0.8  # share of the heat transfer that is left

@@ -22,29 +22,24 @@ from std_srvs.srv import SetBool, Trigger
 from koopman_ros.control import Arrival as Measured
 from koopman_ros.control import Controller, events, MANUAL, Mode, Report, State
 from koopman_ros.control.events import Event, ModeChange, Silence
-from koopman_ros.nodes import topics, translation
-from koopman_ros.nodes.arrival import Arrival
-from koopman_ros.nodes.controller_parameters import ControllerParameters, TABLE
-from koopman_ros.nodes.controller_status import Counts, internals, Situation, status
-from koopman_ros.nodes.diagnostics import DiagnosticsPublisher, Status
-from koopman_ros.nodes.matching import Matching
-from koopman_ros.nodes.messages import (
-    LONGEST_FRAME_ID,
-    NANOSECONDS,
-    stamp_message,
-    stamp_nanoseconds,
-    temperature_message,
-    to_kelvin,
-)
-from koopman_ros.nodes.model_loading import load_suitable, rests_outside
-from koopman_ros.nodes.model_loading import Situation as ModelSituation
-from koopman_ros.nodes.model_reload import ModelReload
-from koopman_ros.nodes.process import LoopNode, run
-from koopman_ros.nodes.record_publisher import RecordPublisher
-from koopman_ros.nodes.watchdog import PERIOD, Watchdog
-from koopman_ros.nodes.words import words_of
+from koopman_ros.parameters.controller import ControllerParameters, TABLE
+from koopman_ros.parameters.wire import LONGEST_FRAME_ID
 from koopman_ros.reasons import level_words
 from koopman_ros.replay import records
+from koopman_ros.ros import events as messages
+from koopman_ros.ros import topics
+from koopman_ros.ros.codec import stamp_message, stamp_nanoseconds, temperature_message
+from koopman_ros.ros.controller_status import Counts, internals, Situation, status
+from koopman_ros.ros.diagnostics import DiagnosticsPublisher, Status, words_of
+from koopman_ros.ros.matching import Matching
+from koopman_ros.ros.model_loading import load_suitable, rests_outside
+from koopman_ros.ros.model_loading import Situation as ModelSituation
+from koopman_ros.ros.model_reload import ModelReload
+from koopman_ros.ros.process import LoopNode, run
+from koopman_ros.ros.record_publisher import RecordPublisher
+from koopman_ros.ros.timing import Arrival
+from koopman_ros.ros.watchdog import PERIOD, Watchdog
+from koopman_ros.units import NANOSECONDS, to_kelvin
 
 _WATCH_STEP = NANOSECONDS // 2  # of plant time between two commands without a measurement
 _COOLANT_PATIENCE = 0.5  # s that the first answer waits for the coolant that is in force
@@ -63,7 +58,7 @@ class ControllerNode(LoopNode):
 
     def __init__(self) -> None:
         super().__init__('controller')
-        parameters = TABLE.declare(self)
+        parameters = self.declare_table(TABLE)
         self._settings = parameters
         self._models = ModelReload(
             self, load_suitable(parameters.model), self._model_situation, self._on_model,
@@ -117,7 +112,7 @@ class ControllerNode(LoopNode):
         self._steady = Clock(clock_type=ClockType.STEADY_TIME)
         self.create_timer(PERIOD, self._on_watch, clock=self._steady)
         self._records = RecordPublisher(self._matching, self._snapshot, self._on_record_subscriber)
-        TABLE.follow(self, parameters, self._on_parameters, self._models.accept)
+        self.follow_table(TABLE, parameters, self._on_parameters, self._models.accept)
         self.get_logger().info(self._models.in_force.about)
         self._warn_of_rest()
         self._watchdog = Watchdog(self._on_busy)
@@ -167,10 +162,10 @@ class ControllerNode(LoopNode):
             before = state = self._state
             done: list[tuple[Event, events.Outcome]] = []
             if state.command is None and self._coolant is not None:
-                initial = translation.initialisation(self._coolant)
+                initial = messages.initialisation(self._coolant)
                 done.append((initial, events.apply(self._controller, state, initial)))
                 state = done[0][1].state
-            asked = translation.measurement(message, self._coolant_at(stamp_ns))
+            asked = messages.measurement(message, self._coolant_at(stamp_ns))
             outcome = events.apply(self._controller, state, asked)
             assert outcome.command is not None
             assert outcome.report is not None
@@ -204,7 +199,7 @@ class ControllerNode(LoopNode):
         """Return the coolant temperature in force at a time, if it is known."""
         heard = self._coolant
         if heard is None or (abs(stamp_nanoseconds(heard.header.stamp) - stamp_ns)
-                             > translation.SAME_TIME_NS):
+                             > messages.SAME_TIME_NS):
             return None
         return float(heard.temperature)
 
@@ -289,7 +284,7 @@ class ControllerNode(LoopNode):
 
     def _on_setpoint(self, message: Temperature) -> None:
         stamp_ns = stamp_nanoseconds(message.header.stamp)
-        self._refused = self._change(translation.setpoint_request(message))
+        self._refused = self._change(messages.setpoint_request(message))
         if self._refused:
             self.get_logger().warning(self._refused, throttle_duration_sec=1.0)
         else:
@@ -301,7 +296,7 @@ class ControllerNode(LoopNode):
         self._diagnostics.publish_if_changed()
 
     def _on_manual_coolant_setpoint(self, message: Temperature) -> None:
-        self._refused = self._change(translation.manual_command(message))
+        self._refused = self._change(messages.manual_command(message))
         if self._refused:
             self.get_logger().warning(self._refused, throttle_duration_sec=1.0)
         self._diagnostics.publish_if_changed()

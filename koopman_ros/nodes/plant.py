@@ -17,20 +17,7 @@ from rclpy.clock import Clock, ClockType
 from sensor_msgs.msg import Temperature
 from std_srvs.srv import Trigger
 
-from koopman_ros.nodes import topics
-from koopman_ros.nodes.diagnostics import DiagnosticsPublisher, Level, Status
-from koopman_ros.nodes.instruments import Instruments
-from koopman_ros.nodes.matching import Matching
-from koopman_ros.nodes.messages import (
-    LAST_STAMP_SECONDS,
-    NANOSECONDS,
-    seconds_text,
-    stamp_nanoseconds,
-    to_celsius,
-    to_kelvin,
-)
-from koopman_ros.nodes.plant_parameters import PlantParameters, REACTORS, TABLE
-from koopman_ros.nodes.process import LoopNode, run
+from koopman_ros.parameters.plant import PlantParameters, REACTORS, TABLE
 from koopman_ros.plants import (
     ActuatedProcess,
     ControlAffineSystem,
@@ -38,6 +25,13 @@ from koopman_ros.plants import (
     IntegrationError,
     Process,
 )
+from koopman_ros.ros import topics
+from koopman_ros.ros.codec import stamp_nanoseconds
+from koopman_ros.ros.diagnostics import DiagnosticsPublisher, Level, Status
+from koopman_ros.ros.matching import Matching
+from koopman_ros.ros.process import LoopNode, run
+from koopman_ros.ros.sensors import Instruments
+from koopman_ros.units import LAST_STAMP_SECONDS, NANOSECONDS, seconds_text, to_celsius, to_kelvin
 
 _POLL_PERIOD = 0.01  # s; for what no message announces
 _LAST_STAMP_NS = (LAST_STAMP_SECONDS + 1) * NANOSECONDS - 1
@@ -65,7 +59,7 @@ class PlantNode(LoopNode):
 
     def __init__(self) -> None:
         super().__init__('plant')
-        self._settings = parameters = TABLE.declare(self)
+        self._settings = parameters = self.declare_table(TABLE)
         system = self._build(parameters)
         self._real_time = parameters.speed == 1.0 and not parameters.lockstep
         self._period_ns = round(parameters.sample_period * NANOSECONDS)
@@ -102,7 +96,7 @@ class PlantNode(LoopNode):
                 self.create_timer(wall_period, self._step_in_lockstep, clock=wall_clock)
         else:
             self._tick = self.create_timer(wall_period, self._step_in_time, clock=wall_clock)
-        TABLE.follow(self, parameters, self._on_parameters)
+        self.follow_table(TABLE, parameters, self._on_parameters)
         self.get_logger().info(self._started())
 
     def _started(self) -> str:

@@ -25,11 +25,12 @@ from koopman_ros.bags import (
     read_messages,
     summary,
 )
-from koopman_ros.nodes import topics
-from koopman_ros.nodes.messages import NANOSECONDS, stamp_message, stamp_nanoseconds
-from koopman_ros.nodes.parameters import ConfigurationError
-from koopman_ros.nodes.player_parameters import TABLE
-from koopman_ros.nodes.process import LoopNode, run
+from koopman_ros.parameters.player import TABLE
+from koopman_ros.parameters.table import ConfigurationError
+from koopman_ros.ros import topics
+from koopman_ros.ros.codec import stamp_message, stamp_nanoseconds
+from koopman_ros.ros.process import LoopNode, run
+from koopman_ros.units import NANOSECONDS
 
 _POLL_PERIOD_NS = 10_000_000  # for what no message announces
 _PROGRESS_PERIOD = 3.0  # s
@@ -51,7 +52,10 @@ class PlayerNode(LoopNode):
 
     def __init__(self) -> None:
         super().__init__('player')
-        self._settings = settings = TABLE.declare(self)
+        self._settings = settings = self.declare_table(TABLE)
+        if reason := topics.unusable(
+                self, (*settings.topics, settings.measurement, settings.answer)):
+            raise ConfigurationError(reason)
         # what stands for a name in the bag
         names = {_in_bag(name): name for name in settings.topics}
         content = summary(settings.bag)

@@ -21,20 +21,21 @@ import numpy as np
 
 from koopman_ros.bags import BagReadError, summary
 from koopman_ros.control import Settings
-from koopman_ros.nodes import controller_parameters, topics
-from koopman_ros.nodes.controller_parameters import ControllerParameters
-from koopman_ros.nodes.model_loading import load_suitable
-from koopman_ros.nodes.parameter_node import ParameterNode
-from koopman_ros.nodes.parameters import ConfigurationError
-from koopman_ros.nodes.process import run_task
-from koopman_ros.nodes.replay_parameters import ReplayParameters, TABLE
-from koopman_ros.nodes.shipped import config_directory, model_path
+from koopman_ros.parameters.controller import ControllerParameters
+from koopman_ros.parameters.controller import TABLE as CONTROLLER
+from koopman_ros.parameters.replay import ReplayParameters, TABLE
+from koopman_ros.parameters.table import ConfigurationError
 from koopman_ros.replay.bag import command_counts, read_records
 from koopman_ros.replay.comparison import ReplayedBag
 from koopman_ros.replay.loop import Alternative, Replay, replay
 from koopman_ros.replay.models import Models
 from koopman_ros.replay.records import Record, RecordError
 from koopman_ros.replay.report import reproduced, verdict, write_report
+from koopman_ros.resources import config_directory, model_path
+from koopman_ros.ros import topics
+from koopman_ros.ros.model_loading import load_suitable
+from koopman_ros.ros.parameters import ParameterNode
+from koopman_ros.ros.process import run_task
 
 
 class Result(enum.IntEnum):
@@ -147,12 +148,12 @@ def _settings(values: Mapping[str, Any]) -> Settings:
 
     :raises RecordError: where this version has other parameters, or other ranges.
     """
-    unknown = ', '.join(sorted(set(values) - set(controller_parameters.TABLE.rows)))
+    unknown = ', '.join(sorted(set(values) - set(CONTROLLER.rows)))
     if unknown:
         raise RecordError(f'its controller had the parameters {unknown}, which this version has '
                           'not: take the package that recorded it')
     snapshot = ControllerParameters(**values)
-    reason = controller_parameters.TABLE.check(snapshot)
+    reason = CONTROLLER.check(snapshot)
     if reason:
         raise RecordError(f'its controller had parameters that this version refuses ({reason}): '
                           'take the package that recorded it')
@@ -164,7 +165,7 @@ def _prepare() -> Callable[[], int]:
     node = ParameterNode('replay', start_parameter_services=False, enable_rosout=False)
     try:
         given = set(node.get_parameters_by_prefix(''))
-        parameters = TABLE.declare(node)
+        parameters = node.declare_table(TABLE)
         names = Names(node.resolve_topic_name(topics.CONTROLLER_EVENTS),
                       node.resolve_topic_name(topics.COOLANT_SETPOINT))
     finally:

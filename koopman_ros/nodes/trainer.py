@@ -7,14 +7,14 @@ from __future__ import annotations
 
 import sys
 
-from koopman_ros.nodes import topics
-from koopman_ros.nodes.experiment import CoolantExperiment
-from koopman_ros.nodes.parameters import ConfigurationError
-from koopman_ros.nodes.process import LoopNode, run
-from koopman_ros.nodes.recording import Recording
-from koopman_ros.nodes.trainer_parameters import TABLE, TrainerParameters
-from koopman_ros.nodes.training import Training
-from koopman_ros.nodes.training_job import JobState
+from koopman_ros.jobs.training import JobState
+from koopman_ros.parameters.table import ConfigurationError
+from koopman_ros.parameters.trainer import TABLE, TrainerParameters
+from koopman_ros.ros import topics
+from koopman_ros.ros.experiment import CoolantExperiment
+from koopman_ros.ros.process import LoopNode, run
+from koopman_ros.ros.recording import Recording
+from koopman_ros.ros.training import Training
 
 
 class TrainerNode(LoopNode):
@@ -22,14 +22,14 @@ class TrainerNode(LoopNode):
 
     def __init__(self) -> None:
         super().__init__('trainer')
-        settings = TABLE.declare(self)
-        if reason := topics.unresolvable(self, settings.topics):
+        settings = self.declare_table(TABLE)
+        if reason := topics.unusable(self, settings.topics):
             raise ConfigurationError(reason)
         self._recording = Recording(self, settings)
         self._experiment = CoolantExperiment(self, settings)
         self._training = Training(self, settings, self._recording.flushed, self._on_trained)
-        TABLE.follow(self, settings, self._on_parameters, lambda changed, _: topics.unresolvable(
-            self, changed.topics))
+        self.follow_table(TABLE, settings, self._on_parameters,
+                          lambda changed, _: topics.unusable(self, changed.topics))
         try:
             if settings.task == 'train':
                 self._training.start()

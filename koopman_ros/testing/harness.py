@@ -26,7 +26,7 @@ from rclpy.qos import QoSProfile
 from rclpy.task import Future
 from std_srvs.srv import SetBool, Trigger
 
-from koopman_ros.nodes.topics import DIAGNOSTICS, LOOP_QOS
+from koopman_ros.ros.topics import DIAGNOSTICS, LOOP_QOS
 from koopman_ros.testing.process import NodeProcess
 from koopman_ros.testing.reservations import isolated_domain
 

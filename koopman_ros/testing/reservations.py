@@ -12,8 +12,8 @@ import os
 from pathlib import Path
 import socket
 
-from koopman_ros.nodes.exposure import LOOPBACK_PROFILE
-from koopman_ros.nodes.shipped import config_directory
+from koopman_ros.resources import config_directory
+from koopman_ros.ros.exposure import LOOPBACK_PROFILE
 
 _DOMAINS = range(1, 102)
 

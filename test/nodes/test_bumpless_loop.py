@@ -14,8 +14,8 @@ import pytest
 from rosgraph_msgs.msg import Clock
 from sensor_msgs.msg import Temperature
 
-from koopman_ros.nodes import topics
-from koopman_ros.nodes.plant_parameters import PlantParameters
+from koopman_ros.parameters.plant import PlantParameters
+from koopman_ros.ros import topics
 from koopman_ros.testing import Harness
 from support.messages import seconds, temperature, value
 

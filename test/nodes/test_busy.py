@@ -19,12 +19,12 @@ from rosgraph_msgs.msg import Clock
 from sensor_msgs.msg import Temperature
 from std_msgs.msg import String
 
-from koopman_ros.nodes import topics
-from koopman_ros.nodes.messages import to_celsius
 from koopman_ros.nodes.replay import replay_records
-from koopman_ros.nodes.watchdog import Watchdog
 from koopman_ros.replay.records import parse
+from koopman_ros.ros import topics
+from koopman_ros.ros.watchdog import Watchdog
 from koopman_ros.testing import Harness
+from koopman_ros.units import to_celsius
 from support.controller_bench import STATUS, STEADY
 from support.messages import seconds, temperature
 from support.pipes import opened
@@ -37,7 +37,7 @@ SETTINGS = {'measurement_timeout': 0.3, 'hold_timeout': 0.2, 'coolant_rate_limit
 # watchdog that is five times as quick as it is.
 BUSY = """
 import os, sys
-from koopman_ros.nodes import watchdog
+from koopman_ros.ros import watchdog
 watchdog.PERIOD, watchdog._PATIENCE = 0.02, 0.2
 from koopman_ros.nodes import controller
 from koopman_ros.control import events

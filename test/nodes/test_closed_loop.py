@@ -11,7 +11,7 @@ import pytest
 from rosgraph_msgs.msg import Clock
 from sensor_msgs.msg import Temperature
 
-from koopman_ros.nodes import topics
+from koopman_ros.ros import topics
 from koopman_ros.testing import Harness
 from support.messages import seconds, temperature
 

@@ -16,7 +16,7 @@ from rclpy.node import Node
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 from sensor_msgs.msg import JointState, Temperature
 
-from koopman_ros.nodes import topics
+from koopman_ros.ros import topics
 from koopman_ros.testing import Harness
 from support.controller_bench import Bench, STATUS, STEADY
 from support.messages import seconds, temperature, value

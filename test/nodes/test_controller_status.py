@@ -17,8 +17,8 @@ from rclpy.node import Node
 from sensor_msgs.msg import JointState, Temperature
 
 from koopman_ros.lifting import load, save
-from koopman_ros.nodes import topics
-from koopman_ros.nodes.shipped import model_path
+from koopman_ros.resources import model_path
+from koopman_ros.ros import topics
 from koopman_ros.testing import Harness
 from support.controller_bench import Bench, STATUS, STEADY
 from support.messages import seconds, temperature, value

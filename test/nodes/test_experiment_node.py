@@ -18,10 +18,11 @@ from sensor_msgs.msg import Temperature
 
 from koopman_ros.bags import read_messages
 from koopman_ros.experiment import advance, begin, Phase
-from koopman_ros.nodes import topics
-from koopman_ros.nodes.messages import stamp_nanoseconds, to_celsius, to_kelvin
-from koopman_ros.nodes.trainer_parameters import TrainerParameters
+from koopman_ros.parameters.trainer import TrainerParameters
+from koopman_ros.ros import topics
+from koopman_ros.ros.codec import stamp_nanoseconds
 from koopman_ros.testing import Harness
+from koopman_ros.units import to_celsius, to_kelvin
 from support.messages import seconds, temperature, value
 
 STATUS = 'trainer: experiment'

@@ -170,7 +170,7 @@ def test_everything_is_installed(installation: Installation) -> None:
 
 
 def test_it_is_what_python_imports(installation: Installation) -> None:
-    program = ('import koopman_ros; from koopman_ros.nodes.shipped import config_directory; '
+    program = ('import koopman_ros; from koopman_ros.resources import config_directory; '
                'print(koopman_ros.__file__); print(config_directory())')
     ended = run(installation.command(str(installation.python), '-c', program))
     assert ended.stdout.split() == [str(installation.package / '__init__.py'),

@@ -16,9 +16,9 @@ import pytest
 from sensor_msgs.msg import JointState
 
 from koopman_ros.control import Mode, Report
-from koopman_ros.nodes import topics
-from koopman_ros.nodes.controller_status import internals
-from koopman_ros.nodes.shipped import config_directory
+from koopman_ros.resources import config_directory
+from koopman_ros.ros import topics
+from koopman_ros.ros.controller_status import internals
 
 # What a layout shows: topics with one value by themselves, and internals by their names.
 TEMPERATURES = {topics.TEMPERATURE, topics.ACTIVE_SETPOINT, topics.PREDICTED_TEMPERATURE,

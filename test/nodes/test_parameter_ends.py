@@ -29,21 +29,21 @@ from std_msgs.msg import String
 from std_srvs.srv import SetBool, Trigger
 
 from koopman_ros.bags import BagReadError, BagWriter, message_definition
-from koopman_ros.nodes import topics
 from koopman_ros.nodes.controller import ControllerNode
-from koopman_ros.nodes.messages import NANOSECONDS, to_kelvin
-from koopman_ros.nodes.parameter_files import TABLES
-from koopman_ros.nodes.parameters import ConfigurationError, Specification
 from koopman_ros.nodes.plant import PlantNode
 from koopman_ros.nodes.player import PlayerNode
-from koopman_ros.nodes.process import LoopNode
 from koopman_ros.nodes.replay import Names, replayed_bag
-from koopman_ros.nodes.replay_parameters import ReplayParameters
-from koopman_ros.nodes.shipped import model_path
 from koopman_ros.nodes.trainer import TrainerNode
-from koopman_ros.nodes.trainer_parameters import TrainerParameters
+from koopman_ros.parameters.replay import ReplayParameters
+from koopman_ros.parameters.table import ConfigurationError, Specification
+from koopman_ros.parameters.trainer import TrainerParameters
+from koopman_ros.resources import model_path
 from koopman_ros.retraining import retrain, Task
+from koopman_ros.ros import topics
+from koopman_ros.ros.parameter_files import TABLES
+from koopman_ros.ros.process import LoopNode
 from koopman_ros.testing import isolated_domain
+from koopman_ros.units import NANOSECONDS, to_kelvin
 from support.messages import seconds, temperature, TIMEOUT
 from support.recorded_controller import Recorded
 

@@ -15,11 +15,12 @@ import pytest
 from rclpy.node import Node
 from sensor_msgs.msg import JointState, Temperature
 
-from koopman_ros.nodes import topics
-from koopman_ros.nodes.messages import LAST_STAMP_SECONDS, seconds_text, stamp_nanoseconds
-from koopman_ros.nodes.plant_parameters import PlantParameters, TABLE
+from koopman_ros.parameters.plant import PlantParameters, TABLE
 from koopman_ros.plants import sensor_noise
+from koopman_ros.ros import topics
+from koopman_ros.ros.codec import stamp_nanoseconds
 from koopman_ros.testing import Harness
+from koopman_ros.units import LAST_STAMP_SECONDS, seconds_text
 from support.messages import seconds, temperature, value
 
 STATUS = 'plant: simulation'

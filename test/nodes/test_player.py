@@ -30,10 +30,12 @@ from koopman_ros.bags import (
     temperature_series,
 )
 from koopman_ros.demo.loop import run_loop, Scenario
-from koopman_ros.nodes import player, replay, topics
-from koopman_ros.nodes.messages import NANOSECONDS, stamp_nanoseconds
-from koopman_ros.nodes.shipped import config_directory
+from koopman_ros.nodes import player, replay
+from koopman_ros.resources import config_directory
+from koopman_ros.ros import topics
+from koopman_ros.ros.codec import stamp_nanoseconds
 from koopman_ros.testing import Harness, isolated_domain, NodeProcess
+from koopman_ros.units import NANOSECONDS
 from support.messages import temperature, TIMEOUT
 
 SAMPLES = 61

@@ -20,9 +20,9 @@ import yaml
 
 from koopman_ros.bags import temperature_series
 from koopman_ros.demo.loop import run_loop, Scenario
-from koopman_ros.nodes import topics
 from koopman_ros.nodes.replay import Names, replayed_bag
-from koopman_ros.nodes.replay_parameters import ReplayParameters
+from koopman_ros.parameters.replay import ReplayParameters
+from koopman_ros.ros import topics
 from koopman_ros.testing import Harness
 
 SAMPLES = 61

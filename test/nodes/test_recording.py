@@ -28,9 +28,9 @@ from std_msgs.msg import String
 import yaml
 
 from koopman_ros.bags import read_messages, summary
-from koopman_ros.nodes import topics
-from koopman_ros.nodes.recording import free_name
-from koopman_ros.nodes.trainer_parameters import TABLE, TrainerParameters
+from koopman_ros.parameters.trainer import TABLE, TrainerParameters
+from koopman_ros.ros import topics
+from koopman_ros.ros.recording import free_name
 from koopman_ros.testing import Harness
 from support.messages import temperature, TIMEOUT
 

@@ -28,11 +28,12 @@ from std_srvs.srv import Trigger
 
 from koopman_ros.control import Controller, State
 from koopman_ros.lifting import LiftedModel, load, save
-from koopman_ros.nodes import model_reload, topics
-from koopman_ros.nodes.controller_parameters import ControllerParameters
-from koopman_ros.nodes.messages import stamp_nanoseconds, to_celsius, to_kelvin
-from koopman_ros.nodes.shipped import model_path
+from koopman_ros.parameters.controller import ControllerParameters
+from koopman_ros.resources import model_path
+from koopman_ros.ros import model_reload, topics
+from koopman_ros.ros.codec import stamp_nanoseconds
 from koopman_ros.testing import Harness
+from koopman_ros.units import to_celsius, to_kelvin
 from support.messages import seconds, temperature, value
 from support.pipes import opened
 
@@ -341,7 +342,8 @@ def test_pipes_and_devices_are_refused_at_once_and_a_good_model_is_taken_after_t
 
 SLOW_DISK = """
 import os, sys
-from koopman_ros.nodes import controller, model_reload
+from koopman_ros.nodes import controller
+from koopman_ros.ros import model_reload
 read = model_reload.load_suitable
 def slowly(name):
     if os.path.exists(name + '.disk'):

@@ -22,16 +22,17 @@ from sensor_msgs.msg import Temperature
 from std_msgs.msg import String
 
 from koopman_ros.bags import BagMessage, BagReadError, BagWriter, message_definition, read_messages
-from koopman_ros.nodes import replay, topics
-from koopman_ros.nodes.messages import to_kelvin
+from koopman_ros.nodes import replay
 from koopman_ros.nodes.replay import Names
-from koopman_ros.nodes.replay_parameters import ReplayParameters
-from koopman_ros.nodes.shipped import config_directory, model_path
+from koopman_ros.parameters.replay import ReplayParameters
 from koopman_ros.replay.bag import read_records
 from koopman_ros.replay.comparison import ReplayedBag
 from koopman_ros.replay.records import parse, Record, SNAPSHOT, START
 from koopman_ros.replay.report import reproduced, verdict
+from koopman_ros.resources import config_directory, model_path
+from koopman_ros.ros import topics
 from koopman_ros.testing import Harness, isolated_domain
+from koopman_ros.units import to_kelvin
 from support.messages import seconds, temperature, value
 from support.recorded_controller import Recorded
 

@@ -19,7 +19,7 @@ from sensor_msgs.msg import Temperature
 from std_msgs.msg import String
 
 from koopman_ros.bags import BagMessage, read_messages, summary
-from koopman_ros.nodes import topics
+from koopman_ros.ros import topics
 from koopman_ros.testing import Harness, NodeProcess
 from support.messages import temperature, TIMEOUT
 

@@ -11,8 +11,8 @@ import pytest
 
 from koopman_ros.identification import identify
 from koopman_ros.lifting import linearised_model, load, Provenance
-from koopman_ros.nodes.shipped import model_path
 from koopman_ros.plants import two_state_reactor
+from koopman_ros.resources import model_path
 from koopman_ros.retraining import decide, learn_lift, Thresholds
 from koopman_ros.retraining.gate import lifted_rate
 from support.random_lifts import random_lift

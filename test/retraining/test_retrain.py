@@ -13,7 +13,7 @@ import pytest
 from koopman_ros.bags import BagReadError
 from koopman_ros.identification import Stopped
 from koopman_ros.lifting import load, ModelFileError, save
-from koopman_ros.nodes.shipped import model_path
+from koopman_ros.resources import model_path
 from koopman_ros.retraining import retrain, Task, write_report
 from koopman_ros.retraining import task as task_module
 from support.random_lifts import random_lift

@@ -14,8 +14,8 @@ import pytest
 from rclpy.qos import QoSProfile
 from sensor_msgs.msg import Temperature
 
-from koopman_ros.nodes import topics
-from koopman_ros.nodes.controller_parameters import TABLE
+from koopman_ros.parameters.controller import TABLE
+from koopman_ros.ros import topics
 from koopman_ros.testing import Harness
 from support.messages import seconds, temperature, TIMEOUT, value
 

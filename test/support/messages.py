@@ -10,7 +10,8 @@ from typing import Any
 from diagnostic_msgs.msg import DiagnosticStatus
 from sensor_msgs.msg import Temperature
 
-from koopman_ros.nodes.messages import NANOSECONDS, stamp_message, stamp_nanoseconds
+from koopman_ros.ros.codec import stamp_message, stamp_nanoseconds
+from koopman_ros.units import NANOSECONDS
 
 TIMEOUT = 120.0  # s; a test that waits this long has failed, on a busy machine, too
 

@@ -13,8 +13,7 @@ import numpy as np
 from koopman_ros.control import Controller, State
 from koopman_ros.control.events import apply, Event, Measurement, Outcome, Silence
 from koopman_ros.lifting import load_with_digest
-from koopman_ros.nodes.controller_parameters import ControllerParameters
-from koopman_ros.nodes.shipped import model_path
+from koopman_ros.parameters.controller import ControllerParameters
 from koopman_ros.replay.records import (
     fields_of,
     MODEL,
@@ -24,6 +23,7 @@ from koopman_ros.replay.records import (
     snapshot,
     START,
 )
+from koopman_ros.resources import model_path
 
 SECOND = 1_000_000_000
 STEADY, COOLANT = 324.9, 300.0  # K

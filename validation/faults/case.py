@@ -11,7 +11,7 @@ import math
 from pathlib import Path
 import time
 
-from koopman_ros.nodes.controller_parameters import ControllerParameters
+from koopman_ros.parameters.controller import ControllerParameters
 from koopman_ros.reasons import Code
 from koopman_ros.testing import HarnessError
 from validation.faults.course import Course

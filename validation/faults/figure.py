@@ -10,7 +10,7 @@ import math
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from koopman_ros.nodes.controller_parameters import ControllerParameters
+from koopman_ros.parameters.controller import ControllerParameters
 from koopman_ros.reports import draw_limits, drawing
 from validation.faults.case import Outcome
 from validation.faults.course import Course

@@ -10,8 +10,9 @@ from rclpy.node import Node
 from sensor_msgs.msg import Temperature
 from std_msgs.msg import String
 
-from koopman_ros.nodes import topics
-from koopman_ros.nodes.messages import NANOSECONDS, stamp_message, stamp_nanoseconds
+from koopman_ros.ros import topics
+from koopman_ros.ros.codec import stamp_message, stamp_nanoseconds
+from koopman_ros.units import NANOSECONDS
 from validation.faults.alterations import Alteration, Packet, unchanged
 from validation.faults.course import Command, Course, Said, Sample
 

@@ -17,7 +17,7 @@ from rclpy.task import Future
 from sensor_msgs.msg import Temperature
 from std_srvs.srv import SetBool, Trigger
 
-from koopman_ros.nodes import topics
+from koopman_ros.ros import topics
 from koopman_ros.testing import Harness
 from validation.faults.line import Line
 

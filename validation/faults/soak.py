@@ -17,7 +17,7 @@ import time
 import numpy as np
 
 from koopman_ros.bags import summary
-from koopman_ros.nodes.controller_parameters import ControllerParameters
+from koopman_ros.parameters.controller import ControllerParameters
 from koopman_ros.testing import HarnessError
 from validation.faults.course import Array, Course
 from validation.faults.events import EVENTS

@@ -12,7 +12,7 @@ import pytest
 from scipy.integrate import solve_ivp
 
 from koopman_ros.control import at
-from koopman_ros.nodes.controller_parameters import ControllerParameters
+from koopman_ros.parameters.controller import ControllerParameters
 from koopman_ros.plants import Actuator
 from validation.robustness import attraction, disturbances
 from validation.robustness.attraction import End, Start

@@ -15,9 +15,9 @@ import psutil
 from sensor_msgs.msg import Temperature
 from std_srvs.srv import Trigger
 
-from koopman_ros.nodes import topics
-from koopman_ros.nodes.messages import NANOSECONDS
+from koopman_ros.ros import topics
 from koopman_ros.testing import Harness, NodeProcess
+from koopman_ros.units import NANOSECONDS
 from validation.benchmarks.loop.probe import Loop
 
 _ROUND = 50  # measurements of one side, then of the other

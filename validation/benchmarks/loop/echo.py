@@ -13,7 +13,7 @@ from rclpy.executors import ExternalShutdownException
 from rclpy.node import Node
 from sensor_msgs.msg import Temperature
 
-from koopman_ros.nodes import topics
+from koopman_ros.ros import topics
 
 
 def main(args: list[str] | None = None) -> int:

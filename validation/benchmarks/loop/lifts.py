@@ -13,9 +13,9 @@ from numpy.typing import NDArray
 
 from koopman_ros.control import at, Controller, SetpointRequest, simulate, State
 from koopman_ros.lifting import LiftedModel, load, NetworkObservables
-from koopman_ros.nodes.controller_parameters import ControllerParameters
-from koopman_ros.nodes.messages import NANOSECONDS
-from koopman_ros.nodes.shipped import model_path
+from koopman_ros.parameters.controller import ControllerParameters
+from koopman_ros.resources import model_path
+from koopman_ros.units import NANOSECONDS
 
 Array = NDArray[np.float64]
 

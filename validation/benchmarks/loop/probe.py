@@ -11,9 +11,10 @@ import time
 import numpy as np
 from sensor_msgs.msg import Temperature
 
-from koopman_ros.nodes import topics
-from koopman_ros.nodes.messages import NANOSECONDS, stamp_message, stamp_nanoseconds
+from koopman_ros.ros import topics
+from koopman_ros.ros.codec import stamp_message, stamp_nanoseconds
 from koopman_ros.testing import Harness, HarnessError
+from koopman_ros.units import NANOSECONDS
 
 TIMEOUT = 30.0  # s, until somebody answers
 _CELSIUS = 51.0  # about the nominal point of the shipped lifts

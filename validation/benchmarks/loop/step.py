@@ -22,7 +22,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from koopman_ros.control import Controller, Form, State
-from koopman_ros.nodes.messages import NANOSECONDS
+from koopman_ros.units import NANOSECONDS
 from validation.benchmarks.loop import lifts
 from validation.benchmarks.loop.naive import NaiveLaw
 

@@ -15,7 +15,7 @@ import sys
 from sensor_msgs.msg import Temperature
 
 from koopman_ros.bags import read_messages
-from koopman_ros.nodes.shipped import model_path
+from koopman_ros.resources import model_path
 from validation.faults.case import Case, SETPOINT, SkipError
 from validation.faults.rig import LOCKSTEP, Rig
 

@@ -1,0 +1,42 @@
+# SPDX-FileCopyrightText: 2026 The koopman_ros Authors
+# SPDX-License-Identifier: Apache-2.0
+
+"""Places of the shipped configuration: installed by colcon or pip, or beside the source tree."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+import sys
+
+_PACKAGE = 'koopman_ros'
+
+
+def config_directory() -> Path:
+    """
+    Return the folder of the shipped parameter files and models.
+
+    :raises FileNotFoundError: when the package was installed without them.
+    """
+    prefixes = [Path(p) for p in os.environ.get('AMENT_PREFIX_PATH', '').split(os.pathsep) if p]
+    here = Path(__file__).resolve()
+    # an install tree without its environment: <prefix>/lib/python3.x/site-packages/koopman_ros
+    prefixes += [Path(sys.prefix), *here.parents[3:5]]
+    candidates = [here.parents[1] / 'config']
+    candidates += [prefix / 'share' / _PACKAGE / 'config' for prefix in prefixes]
+    for candidate in candidates:
+        if (candidate / 'models').is_dir():
+            return candidate
+    raise FileNotFoundError(f'the folder share/{_PACKAGE}/config is missing: install the package '
+                            'again, or source the workspace it was built in')
+
+
+def model_path(model: str) -> Path:
+    """
+    Return the file of a model given by name or by path.
+
+    :param model: name of a shipped model, e.g. ``reactor_nz4``, or a path to a model file.
+    """
+    if model.endswith('.safetensors') or os.sep in model:
+        return Path(model).expanduser()
+    return config_directory() / 'models' / f'{model}.safetensors'

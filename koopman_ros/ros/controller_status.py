@@ -1,0 +1,214 @@
+# SPDX-FileCopyrightText: 2026 The koopman_ros Authors
+# SPDX-License-Identifier: Apache-2.0
+
+"""What the controller says of itself: its status for /diagnostics, and its internals to plot."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+from builtin_interfaces.msg import Time
+import numpy as np
+from sensor_msgs.msg import JointState
+
+from koopman_ros.control import Arrival as Measured
+from koopman_ros.control import Controller, HOLD, Mode, Report, SAFE, State
+from koopman_ros.parameters.controller import ControllerParameters
+from koopman_ros.reasons import level_words
+from koopman_ros.ros.diagnostics import Level, Status, words_of
+from koopman_ros.ros.timing import Arrival
+from koopman_ros.units import in_celsius, to_celsius
+
+_ACTIONS = {HOLD: 'the last command is held', SAFE: 'the safe coolant temperature is commanded'}
+_WAY_BACK = 'the coolant leads the reactor back from where the safe coolant keeps it'
+
+
+@dataclass
+class Counts:
+    """How many measurements came, late or not at all, and whether the operator spoke."""
+
+    measurements: int = 0
+    late: int = 0
+    missed: int = 0
+    refused: int = 0
+    setpoint_received: bool = False
+
+
+@dataclass(frozen=True)
+class Situation:
+    """
+    All that a status tells of.
+
+    :param complaint: what is wrong around the node, e.g. a second controller; or empty.
+    :param request_refused: why the operator's last request was refused, or empty.
+    :param model_refused: why the last model was refused, or empty.
+    :param model: figures of the model in force.
+    :param temperature: last measured, in degrees Celsius.
+    """
+
+    controller: Controller
+    parameters: ControllerParameters
+    state: State
+    report: Report
+    counts: Counts
+    arrival: Arrival
+    complaint: str
+    request_refused: str
+    model_refused: str
+    model: Mapping[str, object]
+    temperature: float
+
+
+def status(now: Situation) -> Status:
+    """Return the status of the control task."""
+    level, message = _verdict(now)
+    return Status(level, message, lambda: _figures(now))
+
+
+def _verdict(now: Situation) -> tuple[Level, str]:
+    report, mode = now.report, now.state.mode
+    timeout = now.parameters.measurement_timeout
+    if not now.counts.measurements:
+        return Level.WARN, now.complaint or 'waiting for the first temperature measurement'
+    if timeout and max(now.arrival.silence, now.arrival.wall_silence) > timeout:
+        command = now.state.command
+        doing = '' if command is None else f', coolant at {in_celsius(float(command[0]))}'
+        action = 'manual mode' if mode is Mode.MANUAL else (
+            _ACTIONS[HOLD] if report.depth == 0 else _action(report))
+        if now.arrival.busy:
+            return Level.ERROR, (f'no measurement answered for more than {timeout:g} s, as the '
+                                 f'node is busy: {action}{doing}; ask for less at once')
+        return Level.ERROR, (f'no measurement for more than {timeout:g} s: {action}{doing}; check '
+                             'sensor and plant')
+    if report.reason is not None and mode is Mode.MANUAL:
+        return Level.ERROR, f'{mode.value}: {_reason(now)}'
+    if mode is Mode.AUTOMATIC and report.depth > 0:
+        level = Level.ERROR if report.level in _ACTIONS else Level.WARN
+        action = _WAY_BACK if report.command.way_back else _action(report)
+        return level, f'{action}: {_reason(now)}'
+    warning = _warning(now)
+    if warning:
+        return Level.WARN, warning
+    message = mode.value
+    if mode is Mode.AUTOMATIC and not now.counts.setpoint_received:
+        message += ', no set-point yet: the temperature first measured is held'
+    elif report.command.at_range:
+        message += ', coolant at its limit'
+    elif report.command.at_rate:
+        message += ', coolant at its rate limit'
+    return Level.OK, message
+
+
+def _action(report: Report) -> str:
+    return _ACTIONS.get(report.level) or level_words(report.level)
+
+
+def _reason(now: Situation) -> str:
+    return words_of(now.controller.model)(now.report.reason)
+
+
+def _warning(now: Situation) -> str:
+    """Return the first thing that an operator should know of, or an empty string."""
+    report, states = now.report, now.controller.model.states
+    age, oldest = now.arrival.age, now.parameters.max_measurement_age
+    if now.complaint:
+        return now.complaint
+    if report.measurement.arrival is Measured.REPEATED:
+        return ('the stamp of the measurement does not advance: the last command is held; stamp '
+                'measurements with their time')
+    if now.arrival.without_clock:
+        return ('use_sim_time is set and nobody publishes /clock: time-outs count by the wall '
+                'clock; set use_sim_time to false, or publish_clock of the plant to true')
+    if now.request_refused:
+        return f'request refused: {now.request_refused}'
+    if now.model_refused:
+        return now.model_refused
+    if report.measurement.outside > 0.0:
+        return (f'temperature is outside the trained range '
+                f'[{to_celsius(states.lower[0]):.2f}, {to_celsius(states.upper[0]):.2f}] degC: '
+                'the model extrapolates')
+    if oldest and abs(age) > oldest:
+        return (f'measurements are {age:.1f} s old when they arrive, at most {oldest:g} s are '
+                'expected: check the connection and the clocks')
+    if not report.measurement.follows:
+        return (f'the coolant does not follow its set-point within '
+                f'{now.parameters.coolant_tolerance:g} K: the observer goes by the coolant '
+                'temperature; check the actuator and its limits')
+    if report.estimate is not None and report.estimate.at_bound:
+        return (f'the disturbance estimate is at its bound of {now.parameters.max_disturbance:g} '
+                'K of coolant: the plant is far from its model; retrain')
+    return ''
+
+
+def _figures(now: Situation) -> dict[str, object]:
+    report, state, arrival = now.report, now.state, now.arrival
+    target, command, law = report.target, state.command, report.command.law
+    return {
+        'mode': state.mode.value,
+        'active law': level_words(report.level),
+        'law': law.form or 'none',
+        'reason': _reason(now) or 'none',
+        **now.model,
+        'temperature [degC]': float(now.temperature),
+        'set-point [degC]': _setpoint(report),
+        'coolant [degC]': np.nan if command is None else to_celsius(float(command[0])),
+        'disturbance [K of coolant]': _disturbance(report),
+        'the same as a sensor bias [K]': _bias(now),
+        'distance outside training box [half widths]': float(report.measurement.outside),
+        'set-point outside training box [half widths]': (
+            np.nan if target is None else float(target.outside)),
+        'coolant outside training box [half widths]': float(report.command.outside),
+        'Riccati residual': float(law.residual),
+        'gain norm': float(law.gain),
+        'predicted growth per sample': float(law.growth),
+        'transfer [K]': _transfer(report),
+        'scheduled set-points': len(state.setpoint.scheduled),
+        'measurements': now.counts.measurements,
+        'late measurements': now.counts.late,
+        'missed measurements': now.counts.missed,
+        'measurements not believed': now.counts.refused,
+        'since last measurement [s]': arrival.wall_silence,
+        'age of measurement [s]': arrival.age,
+        'latency from stamp to command [s]': arrival.age + arrival.answer_seconds,
+        'latency from arrival to command [s]': arrival.answer_seconds,
+    }
+
+
+def _bias(now: Situation) -> float:
+    if now.report.estimate is None:
+        return np.nan
+    return float(now.controller.equivalent_bias(now.state)[0])
+
+
+def _setpoint(report: Report) -> float:
+    return np.nan if report.target is None else to_celsius(float(report.target.setpoint[0]))
+
+
+def _disturbance(report: Report) -> float:
+    return np.nan if report.estimate is None else float(report.estimate.disturbance[0])
+
+
+def _transfer(report: Report) -> float:
+    return 0.0 if report.command.transfer is None else float(report.command.transfer[0])
+
+
+def internals(report: Report, stamp: Time, frame_id: str) -> JointState:
+    """Return what a person would plot beside the temperatures, under names with units."""
+    estimate, law = report.estimate, report.command.law
+    values = {
+        'disturbance [K]': _disturbance(report),
+        'estimated_temperature [degC]': (
+            np.nan if estimate is None else to_celsius(float(estimate.state[0]))),
+        'distance_outside [half widths]': float(report.measurement.outside),
+        'level [0 learned, 1 linear, 2 hold, 3 safe, 4 manual]': float(report.depth),
+        'gain': float(law.gain),
+        'riccati_residual': float(law.residual),
+        'growth_per_sample': float(law.growth),
+        'transfer [K]': _transfer(report),
+        'setpoint [degC]': _setpoint(report),
+    }
+    message = JointState(name=list(values), position=list(values.values()))
+    message.header.stamp = stamp
+    message.header.frame_id = frame_id
+    return message

@@ -1,0 +1,167 @@
+# SPDX-FileCopyrightText: 2026 The koopman_ros Authors
+# SPDX-License-Identifier: Apache-2.0
+
+"""A node whose parameters are those of a table: declared, checked, and followed from then on."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+import copy
+from dataclasses import replace
+import difflib
+from functools import partial
+import math
+from typing import Any, TypeVar
+
+from rcl_interfaces.msg import (
+    FloatingPointRange,
+    IntegerRange,
+    ParameterDescriptor,
+    SetParametersResult,
+)
+from rclpy.exceptions import InvalidParameterTypeException
+from rclpy.node import Node
+from rclpy.parameter import Parameter
+
+from koopman_ros.parameters.table import ConfigurationError, ParameterTable, Specification
+
+T = TypeVar('T')
+
+# Parameters that rclpy itself declares or reads.
+_RCLPY_PARAMETERS = ('use_sim_time', 'start_type_description_service')
+
+
+class ParameterNode(Node):
+    """
+    A node whose parameters are those of a :class:`ParameterTable`.
+
+    Every value that it was given is declared, so that the table finds names it does not know, and
+    the table answers what rclpy would answer less clearly itself.
+    """
+
+    def __init__(self, name: str, **options: Any) -> None:
+        self._ranges: dict[str, FloatingPointRange | IntegerRange] = {}
+        super().__init__(name, automatically_declare_parameters_from_overrides=True, **options)
+
+    def declare_parameters(self, namespace: str, parameters: list[Any],
+                           ignore_override: bool = False) -> list[Parameter]:
+        """
+        Declare parameters, but for those given as ``[]``, at which rclpy gives up.
+
+        An empty list has no type: the table asks for one that has, or it belongs to another node.
+        """
+        typed = [entry for entry in parameters if not (len(entry) > 1 and entry[1] is None)]
+        declared: list[Parameter] = super().declare_parameters(namespace, typed, ignore_override)
+        return declared
+
+    def describe_parameter(self, name: str) -> ParameterDescriptor:
+        """
+        Return the descriptor of a parameter with its range.
+
+        The one that rclpy keeps has none: rclpy would refuse a value by it before the table does,
+        in words without the unit, and let pass what exceeds it by a rounding.
+        """
+        descriptor = copy.copy(super().describe_parameter(name))
+        limits = self._ranges.get(name)
+        if isinstance(limits, IntegerRange):
+            descriptor.integer_range = [limits]
+        elif limits is not None:
+            descriptor.floating_point_range = [limits]
+        return descriptor
+
+    def declare_table(self, table: ParameterTable[T]) -> T:
+        """
+        Declare every parameter of a table, and validate the whole.
+
+        Names that no table knows are ignored with a warning: a parameter file may serve several
+        nodes.
+
+        :raises ConfigurationError: naming the parameter, its value and the allowed range.
+        """
+        given: dict[str, Any] = dict(self.get_parameters_by_prefix(''))
+        # as if they had not been given, like in any node
+        unknown = [name for name in given if name not in table.rows
+                   and name not in _RCLPY_PARAMETERS and not name.startswith('qos_overrides')]
+        for name in [*unknown, *set(given).intersection(table.rows)]:
+            self.undeclare_parameter(name)
+        if unknown:
+            self.get_logger().warning('parameters that this node does not have are ignored: '
+                                      + ', '.join(map(partial(_with_hint, table), unknown)))
+        snapshot = table.kind(**{
+            name: self._declare_row(row, given[name].value if name in given else row.default)
+            for name, row in table.rows.items()})
+        if reason := table.check(snapshot):
+            raise ConfigurationError(reason)
+        return snapshot
+
+    def _declare_row(self, row: Specification, given: Any) -> Any:
+        unit = f' [{row.unit}]' if row.unit else ''
+        default = list(row.default) if isinstance(row.default, tuple) else row.default
+        try:
+            declared = self.declare_parameter(row.name, default, ParameterDescriptor(
+                description=row.description + unit, additional_constraints=row.range_text,
+                read_only=row.read_only))
+        except InvalidParameterTypeException:
+            raise ConfigurationError(row.type_error(given)) from None
+        if declared.value is None:
+            # a list without an element has no type
+            raise ConfigurationError(row.type_error([]))
+        if (limits := range_of(row)) is not None:
+            self._ranges[row.name] = limits
+        return _as_python(declared.value)
+
+    def follow_table(self, table: ParameterTable[T], snapshot: T, apply: Callable[[T], None],
+                     accept: Callable[[T, set[str]], str] = lambda *_: '') -> None:
+        """
+        Keep a snapshot in step with the parameters from now on.
+
+        :param table: all of whose parameters are declared.
+        :param snapshot: the present values.
+        :param apply: called with each new snapshot, after the change took effect.
+        :param accept: called before with a snapshot that fits and the names of what was set;
+            returns why it cannot be, or an empty string.
+        """
+        current = snapshot
+
+        def changed(changes: list[Parameter]) -> dict[str, Any]:
+            return {change.name: _as_python(change.value) for change in changes
+                    if change.name in table.rows}
+
+        def validate(changes: list[Parameter]) -> SetParametersResult:
+            # rclpy has refused values of another type
+            values = changed(changes)
+            merged = replace(current, **values)  # type: ignore[type-var]
+            reason = table.check(merged, current) or accept(merged, set(values))
+            if reason:
+                self.get_logger().warning(f'parameter change refused: {reason}')
+            return SetParametersResult(successful=not reason, reason=reason)
+
+        def take_over(changes: list[Parameter]) -> None:
+            nonlocal current
+            if values := changed(changes):
+                current = replace(current, **values)  # type: ignore[type-var]
+                apply(current)
+
+        self.add_on_set_parameters_callback(validate)
+        self.add_post_set_parameters_callback(take_over)
+
+
+def range_of(row: Specification) -> FloatingPointRange | IntegerRange | None:
+    """Return the range for a slider, which holds an open minimum, too; None without an end."""
+    if math.isinf(row.minimum) or math.isinf(row.maximum):
+        return None
+    if isinstance(row.default, int):
+        return IntegerRange(from_value=int(row.minimum), to_value=int(row.maximum))
+    return FloatingPointRange(from_value=float(row.minimum), to_value=float(row.maximum))
+
+
+def _with_hint(table: ParameterTable[Any], name: str) -> str:
+    near = difflib.get_close_matches(name, table.rows, n=1)
+    return f'{name!r}' + (f' (did you mean {near[0]}?)' if near else '')
+
+
+def _as_python(value: Any) -> Any:
+    """Return a parameter's value with arrays as tuples; the service hands over array.array."""
+    if isinstance(value, (str, bytes, bool, int, float)) or value is None:
+        return value
+    return tuple(value)

@@ -1,0 +1,232 @@
+# SPDX-FileCopyrightText: 2026 The koopman_ros Authors
+# SPDX-License-Identifier: Apache-2.0
+
+"""Recording of topics as they come: raw subscriptions into a bag."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass
+import heapq
+import time
+from typing import Any
+
+from rclpy.callback_groups import CallbackGroup
+from rclpy.node import Node
+from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
+from rclpy.subscription import Subscription
+from rclpy.topic_endpoint_info import TopicEndpointInfo
+
+from koopman_ros.bags import BagWriter, INFINITE_NS, message_definition, QosProfile
+from koopman_ros.ros import topics
+
+# Five seconds at 1 kHz wait here while the disk is slow; Fast DDS keeps no more than this.
+_QUEUE_DEPTH = 5000
+
+_LINGER = 0.1  # s
+# From sending to receipt, on a machine that is busy.
+_LONGEST_WAY_NS = 1_000_000_000
+
+
+@dataclass(frozen=True)
+class _Taken:
+    """A message with when it was received and sent, in ns."""
+
+    topic: str
+    data: bytes
+    received_ns: int
+    sent_ns: int
+
+
+class _OutsideTheExecutor(CallbackGroup):
+    """
+    Keeps subscriptions out of the executor, for us to take from.
+
+    The executor builds its wait set anew for each message, which costs many times what it costs
+    to record one.
+    """
+
+    def can_execute(self, entity: object) -> bool:
+        """Let nothing be waited for or executed."""
+        return False
+
+    def beginning_execution(self, entity: object) -> bool:
+        """Let nothing be executed."""
+        return False
+
+    def ending_execution(self, entity: object) -> None:
+        """Do nothing, as nothing was executed."""
+
+
+class Recorder:
+    """
+    Write every message of some topics to a bag, byte for byte, from now until :meth:`close`.
+
+    Messages wait in the middleware until :meth:`take`, which a timer should call often. Any
+    method raises OSError where the bag cannot be written, and LookupError where the definition of
+    a type is not installed; then :meth:`close` is all that is left to do.
+
+    :param node: that subscribes.
+    :param writer: the open bag; closed by :meth:`close`.
+    :param names: topics, relative or absolute; types are looked up for those outside the loop.
+    """
+
+    def __init__(self, node: Node, writer: BagWriter, names: tuple[str, ...]) -> None:
+        self._node = node
+        self._writer = writer
+        self._names = {node.resolve_topic_name(name): name for name in names}
+        self._types = {topic: topics.TYPES.get(name) for topic, name in self._names.items()}
+        self._group = _OutsideTheExecutor()
+        self._subscriptions: dict[str, Subscription] = {}
+        self._empty_ns: dict[str, int] = {}  # when nothing waited in each
+        self.counts: dict[str, int] = dict.fromkeys(self._types, 0)
+        self.look_for_publishers()
+
+    @property
+    def path(self) -> str:
+        """The file or folder that is written."""
+        return str(self._writer.path)
+
+    def look_for_publishers(self) -> None:
+        """Subscribe to what has become known, matching what its publishers offer."""
+        for topic in list(self._types):
+            publishers = self._node.get_publishers_info_by_topic(topic)
+            if self._types[topic] is None and publishers:
+                try:
+                    self._types[topic] = topics.message_class(publishers[0].topic_type)
+                except LookupError as error:
+                    self._node.get_logger().error(f'{topic} is not recorded: {error}')
+                    del self._types[topic]
+                    continue
+            message_type = self._types[topic]
+            if message_type is None:
+                continue
+            wanted = _matching_qos(self._names[topic], publishers)
+            existing = self._subscriptions.get(topic)
+            if existing is not None:
+                present = existing.qos_profile
+                # without publishers it waits for those that were there
+                if not publishers or (present.reliability, present.durability) == (
+                        wanted.reliability, wanted.durability):
+                    continue
+                self._end([topic])
+            self._empty_ns[topic] = time.time_ns()
+            self._subscriptions[topic] = self._node.create_subscription(
+                message_type, topic, lambda _: None, wanted, callback_group=self._group,
+                raw=True)
+
+    def take(self) -> None:
+        """Record what has arrived."""
+        self._record_in_order(self._waiting(topic, subscription)
+                              for topic, subscription in self._subscriptions.items())
+
+    def flush(self) -> None:
+        """Hand what is recorded to the operating system."""
+        self._writer.flush()
+
+    def close(self) -> None:
+        """Complete the bag with all that was sent; the subscriptions end with it."""
+        # what others have heard already may still be on its way to us
+        time.sleep(_LINGER)
+        try:
+            self._end(list(self._subscriptions))
+        finally:
+            self._writer.close()
+
+    def _end(self, ended: list[str]) -> None:
+        """End subscriptions after recording what waits in them."""
+        subscriptions = {topic: self._subscriptions.pop(topic) for topic in ended}
+        try:
+            self._record_in_order(self._waiting(topic, subscription)
+                                  for topic, subscription in subscriptions.items())
+        finally:
+            for subscription in subscriptions.values():
+                self._node.destroy_subscription(subscription)
+
+    def _waiting(self, topic: str, subscription: Subscription) -> list[_Taken]:
+        """Take what waits in the middleware."""
+        waiting: list[_Taken] = []
+        with (handle := subscription.handle):
+            # no more than can wait, lest a fast publisher keeps us here
+            while len(waiting) < _QUEUE_DEPTH:
+                now_ns = time.time_ns()
+                taken = take_raw(handle, subscription.msg_type)
+                if taken is None:
+                    self._empty_ns[topic] = now_ns
+                    break
+                data, info = taken
+                received_ns = receipt_ns(info, now_ns, self._empty_ns[topic])
+                waiting.append(_Taken(
+                    topic, data, received_ns, info['source_timestamp'] or received_ns))
+        return waiting
+
+    def _record_in_order(self, waiting: Iterable[list[_Taken]]) -> None:
+        """Record in the order of receipt; the order within a topic stays whatever the clock."""
+        for taken in heapq.merge(*waiting, key=lambda taken: taken.received_ns):
+            if not self.counts[taken.topic]:
+                self._announce(taken.topic)
+            # rosbag2, too, logs the time of receipt
+            self._writer.write(taken.topic, taken.data, taken.received_ns, taken.sent_ns)
+            self.counts[taken.topic] += 1
+
+    def _announce(self, topic: str) -> None:
+        """Add a topic to the bag with what its publishers offer now."""
+        publishers = self._node.get_publishers_info_by_topic(topic)
+        message_type = self._types[topic]
+        assert message_type is not None
+        name = f'{message_type.__module__.split(".")[0]}/msg/{message_type.__name__}'
+        self._writer.add_topic(topic, message_definition(name),
+                               [_offered(info.qos_profile) for info in publishers])
+
+
+def take_raw(handle: Any, message_type: Any) -> tuple[bytes, Mapping[str, int]] | None:
+    """Take one serialized message with its times from the middleware, None when none waits."""
+    return handle.take_message(message_type, True)
+
+
+def receipt_ns(info: Mapping[str, int], take_ns: int, empty_ns: int) -> int:
+    """
+    Return when a message was received, for its place in the recording.
+
+    rmw_fastrtps tells when it arrived; rmw_cyclonedds when it was taken, which puts all that
+    waited on one topic before all that waited on the next. The sender's time is what is left
+    then. Where its clock is another, the nearest time at which the message can have arrived is.
+
+    :param info: received and source timestamp in ns, 0 where unknown.
+    :param take_ns: a time just before it was taken.
+    :param empty_ns: when nothing waited on its topic for the last time.
+    """
+    received_ns, source_ns = info['received_timestamp'], info['source_timestamp']
+    if 0 < received_ns < take_ns:
+        return received_ns
+    latest_ns = received_ns or take_ns
+    if not source_ns:
+        return latest_ns
+    return source_ns if empty_ns - _LONGEST_WAY_NS <= source_ns <= latest_ns else min(
+        max(source_ns, empty_ns), latest_ns)
+
+
+def _matching_qos(topic: str, publishers: list[TopicEndpointInfo]) -> QoSProfile:
+    """Ask for reliability and history only where every publisher offers them."""
+    offers = [info.qos_profile for info in publishers] or [topics.qos(topic)]
+    reliable = all(o.reliability is not ReliabilityPolicy.BEST_EFFORT for o in offers)
+    latched = all(o.durability is DurabilityPolicy.TRANSIENT_LOCAL for o in offers)
+    return QoSProfile(
+        depth=_QUEUE_DEPTH,
+        reliability=ReliabilityPolicy.RELIABLE if reliable else ReliabilityPolicy.BEST_EFFORT,
+        durability=(DurabilityPolicy.TRANSIENT_LOCAL if latched else DurabilityPolicy.VOLATILE))
+
+
+def _offered(profile: QoSProfile) -> QosProfile:
+    return QosProfile(
+        history=profile.history.short_key, depth=profile.depth,
+        reliability=profile.reliability.short_key, durability=profile.durability.short_key,
+        deadline_ns=_nanoseconds(profile.deadline.nanoseconds),
+        lifespan_ns=_nanoseconds(profile.lifespan.nanoseconds),
+        liveliness=profile.liveliness.short_key,
+        liveliness_lease_duration_ns=_nanoseconds(
+            profile.liveliness_lease_duration.nanoseconds))
+
+
+def _nanoseconds(value: int) -> int:
+    return value if 0 <= value <= INFINITE_NS else INFINITE_NS

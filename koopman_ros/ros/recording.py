@@ -1,0 +1,197 @@
+# SPDX-FileCopyrightText: 2026 The koopman_ros Authors
+# SPDX-License-Identifier: Apache-2.0
+
+
+"""Recording as the trainer does it: starts and stops, names, room on the disk, what went wrong."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+import datetime
+from functools import partial
+import os
+from pathlib import Path
+import shutil
+
+from rclpy.clock import Clock, ClockType
+from rclpy.node import Node
+from std_srvs.srv import SetBool
+
+from koopman_ros.bags import BagWriter
+from koopman_ros.parameters.trainer import TrainerParameters
+from koopman_ros.ros.diagnostics import DiagnosticsPublisher, Level, Status
+from koopman_ros.ros.owned import Owned
+from koopman_ros.ros.recorder import Recorder
+
+_TAKE_PERIOD = 0.05  # s, for new messages
+_LOOK_PERIOD = 0.2  # s, for new publishers
+_FLUSH_PERIOD = 0.5  # s; what a killed process may lose
+_MEGABYTE = 1_000_000
+
+
+class Recording:
+    """
+    Record the loop to one bag after another, on the service ``~/record``; reports by diagnostics.
+
+    :param node: whose executor does the work.
+    :param settings: what the next recording starts with; the node replaces it when they change.
+    """
+
+    def __init__(self, node: Node, settings: TrainerParameters) -> None:
+        self.settings = settings
+        self._node = node
+        self._recorder: Recorder | None = None
+        self._problem = ''
+        self._path = ''
+        self._diagnostics = DiagnosticsPublisher(node, 'recording', 'trainer', self._status)
+        self._owned = Owned(node)
+        self._owned.keep(node.create_service(SetBool, '~/record', self._on_record))
+        wall_clock = Clock(clock_type=ClockType.STEADY_TIME)
+        self._timers = [
+            self._owned.keep(node.create_timer(
+                period, partial(self._attempt, work), clock=wall_clock, autostart=False))
+            for period, work in ((_TAKE_PERIOD, Recorder.take), (_FLUSH_PERIOD, self._flush),
+                                 (_LOOK_PERIOD, Recorder.look_for_publishers))]
+
+    def start(self) -> str:
+        """
+        Start a bag and return a sentence that names it.
+
+        :raises OSError: when the bag cannot be made, or the disk has too little room for it.
+        """
+        # to the millisecond: recordings may follow each other quickly
+        wanted = Path(self.settings.output or datetime.datetime.now().strftime(
+            'koopman_ros_%Y_%m_%d-%H_%M_%S_%f')[:-3])
+        output = free_name(wanted)
+        if reason := self._too_little_room(output):
+            raise OSError(f'{reason}: free some space, or choose another disk')
+        writer = BagWriter(
+            output, compression=self.settings.compression,
+            max_file_bytes=round(self.settings.max_bag_size * _MEGABYTE),
+            max_file_duration_s=self.settings.max_bag_duration)
+        self._problem = ''
+        self._recorder = Recorder(self._node, writer, self.settings.topics)
+        self._path = str(output)
+        for timer in self._timers:
+            timer.reset()
+        said = f'recording to {output}'
+        if output == wanted:
+            self._node.get_logger().info(said)
+        else:
+            said += f', because {wanted} exists already'
+            self._node.get_logger().warning(said)
+        return said
+
+    def stop(self) -> str:
+        """
+        Complete the bag with all that has arrived and return a sentence that counts it.
+
+        :raises OSError: when the bag could not be completed.
+        """
+        recorder = self._end()
+        if self._problem:
+            raise OSError(self._problem)
+        return self._counted(recorder)
+
+    def flushed(self) -> str:
+        """Return the path of the present or the last bag with all of it on disk, or ''."""
+        if self._recorder is not None:
+            self._attempt(Recorder.flush)
+        return self._path
+
+    def complete(self) -> None:
+        """Complete the bag, if there is one, with all that has arrived, and say what it holds."""
+        if self._recorder is not None:
+            recorder = self._end()
+            if not self._problem:
+                self._counted(recorder)
+
+    def destroy(self) -> None:
+        """Complete the bag, if there is one, and take the service down."""
+        self.complete()
+        self._owned.destroy()
+        self._diagnostics.destroy()
+
+    def _counted(self, recorder: Recorder) -> str:
+        said = f'recorded {sum(recorder.counts.values())} messages to {recorder.path}'
+        self._node.get_logger().info(said)
+        return said
+
+    def _end(self) -> Recorder:
+        assert self._recorder is not None
+        recorder, self._recorder = self._recorder, None
+        for timer in self._timers:
+            timer.cancel()
+        try:
+            recorder.close()
+        except (OSError, LookupError) as error:
+            said = f'{recorder.path} is not complete: {error}'
+            self._node.get_logger().error(said)
+            # what went wrong first tells more
+            self._problem = self._problem or said
+        return recorder
+
+    def _attempt(self, work: Callable[[Recorder], None]) -> None:
+        """Do a part of the recording, or else give it up: what was flushed stays readable."""
+        if self._recorder is None:
+            return
+        try:
+            work(self._recorder)
+        except (OSError, LookupError) as error:
+            remedy = 'free some space and ' if isinstance(error, OSError) else ''
+            self._problem = (f'recording to {self._recorder.path} stopped: {error}; {remedy}call '
+                             '~/record again')
+            self._node.get_logger().error(self._problem)
+            self._end()
+            self._diagnostics.publish_if_changed()
+
+    def _flush(self, recorder: Recorder) -> None:
+        recorder.flush()
+        if reason := self._too_little_room(Path(recorder.path)):
+            raise OSError(reason)
+
+    def _on_record(self, request: SetBool.Request, response: SetBool.Response
+                   ) -> SetBool.Response:
+        recording = self._recorder is not None
+        response.success = request.data != recording
+        if not response.success:
+            response.message = 'already recording' if recording else 'not recording'
+            return response
+        try:
+            response.message = self.start() if request.data else self.stop()
+        except (OSError, ValueError) as error:
+            response.success, response.message = False, str(error)
+            self._problem = f'cannot record: {error}' if request.data else str(error)
+            self._node.get_logger().error(self._problem)
+        self._diagnostics.publish_if_changed()
+        return response
+
+    def _too_little_room(self, output: Path) -> str:
+        """Return in words that the disk of a bag is too full, or an empty string."""
+        limit = self.settings.min_free_disk
+        if not limit:
+            return ''
+        folder = next(parent for parent in output.absolute().parents if parent.is_dir())
+        free = shutil.disk_usage(folder).free / _MEGABYTE
+        return '' if free >= limit else (
+            f'{free:.0f} MB are free on the disk of {folder}, below min_free_disk = '
+            f'{limit:.10g} MB')
+
+    def _status(self) -> Status:
+        if self._recorder is None:
+            return Status(Level.ERROR, self._problem) if self._problem else Status(
+                Level.OK, 'not recording')
+        counts = self._recorder.counts
+        return Status(Level.OK, f'recording to {self._recorder.path}', {
+            'messages': sum(counts.values()),
+            **{f'messages on {topic}': count for topic, count in counts.items()}})
+
+
+def free_name(wanted: Path) -> Path:
+    """Return the path, or the first of run_2, run_3, ... (run_2.mcap, ...) that does not exist."""
+    path, number = wanted, 1
+    while os.path.lexists(path):
+        number += 1
+        path = wanted.with_name(f'{wanted.stem}_{number}.mcap' if wanted.suffix == '.mcap'
+                                else f'{wanted.name}_{number}')
+    return path

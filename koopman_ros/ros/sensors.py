@@ -1,0 +1,76 @@
+# SPDX-FileCopyrightText: 2026 The koopman_ros Authors
+# SPDX-License-Identifier: Apache-2.0
+
+"""What the plant publishes at an instant: the time, and what its instruments show."""
+
+from __future__ import annotations
+
+from rclpy.node import Node
+from rosgraph_msgs.msg import Clock
+from sensor_msgs.msg import JointState, Temperature
+
+from koopman_ros.parameters.plant import PlantParameters
+from koopman_ros.plants import in_steps, Process, sensor_noise
+from koopman_ros.ros import topics
+from koopman_ros.ros.codec import stamp_message, temperature_message
+from koopman_ros.ros.matching import Matching
+from koopman_ros.ros.owned import Owned
+
+_CONCENTRATION_NAME = 'reactant_concentration [mol/L]'
+
+
+class Instruments:
+    """
+    Publish the measurements of a plant.
+
+    :param node: the plant.
+    :param matching: makes the publishers that the loop hears.
+    :param clock: whether to publish the time, too.
+    :param concentration: whether the plant has a concentration, as its first state.
+    """
+
+    def __init__(self, node: Node, matching: Matching, clock: bool, concentration: bool) -> None:
+        self._owned = owned = Owned(node)
+        self._clock = owned.keep(node.create_publisher(
+            Clock, topics.CLOCK, topics.CLOCK_QOS)) if clock else None
+        self._concentration = owned.keep(node.create_publisher(
+            JointState, topics.CONCENTRATION, topics.LOOP_QOS)) if concentration else None
+        # the temperature last: who has found it has found the coolant, too
+        self._coolant = matching.publish(
+            Temperature, topics.COOLANT_TEMPERATURE, topics.LATCHED_QOS)
+        self._temperature = matching.publish(
+            Temperature, topics.TEMPERATURE, topics.LOOP_QOS)
+
+    def destroy(self) -> None:
+        """Take down what `matching` has not made."""
+        self._owned.destroy()
+
+    @property
+    def subscribers(self) -> int:
+        """How many listen to the temperature."""
+        return self._temperature.get_subscription_count()
+
+    def publish(self, process: Process, sample: int, settings: PlantParameters) -> None:
+        """
+        Publish the plant as it stands: the temperature, which is answered, comes last.
+
+        :param process: the plant, at the instant of the measurement.
+        :param sample: number of the measurement.
+        :param settings: present properties of the sensor.
+        """
+        stamp, frame_id = stamp_message(process.time_ns), settings.frame_id
+        if self._clock is not None:
+            self._clock.publish(Clock(clock=stamp))
+        if self._concentration is not None:
+            message = JointState(name=[_CONCENTRATION_NAME], position=[float(process.x[0])])
+            message.header.stamp = stamp
+            message.header.frame_id = frame_id
+            self._concentration.publish(message)
+        self._coolant.publish(temperature_message(float(process.u[0]), stamp, frame_id))
+        noise = sensor_noise(settings.noise, settings.seed, sample)
+        # the steps of the scale have the variance of a uniform error
+        variance = settings.noise ** 2 + settings.sensor_resolution ** 2 / 12.0
+        measured = temperature_message(
+            float(process.x[-1]) + noise + settings.sensor_bias, stamp, frame_id, variance)
+        measured.temperature = in_steps(measured.temperature, settings.sensor_resolution)
+        self._temperature.publish(measured)

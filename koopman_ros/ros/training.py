@@ -1,0 +1,167 @@
+# SPDX-FileCopyrightText: 2026 The koopman_ros Authors
+# SPDX-License-Identifier: Apache-2.0
+
+
+"""Training as the trainer offers it: on request, or as the one task of the process."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+import os
+import sys
+import time
+
+from rclpy.clock import Clock, ClockType
+from rclpy.node import Node
+from std_srvs.srv import Trigger
+
+from koopman_ros.jobs.training import JobState, RetrainingJob
+from koopman_ros.parameters.trainer import TrainerParameters
+from koopman_ros.resources import model_path
+from koopman_ros.ros import topics
+from koopman_ros.ros.diagnostics import DiagnosticsPublisher, Level, Status
+from koopman_ros.ros.owned import Owned
+
+_POLL_PERIOD = 0.1  # s
+_LINE_PERIOD = 5.0  # s between plain lines of progress
+_BAR_WIDTH = 30
+
+
+class Training:
+    """
+    Retrain in a process of its own, on ``~/train``; ``~/cancel_training`` ends it.
+
+    :param node: whose executor looks after it.
+    :param settings: what the next training starts with; the node replaces it when they change.
+    :param recorded: returns the bag that is being recorded or was last, flushed, or ''.
+    :param on_end: called when a training has ended.
+    """
+
+    def __init__(self, node: Node, settings: TrainerParameters, recorded: Callable[[], str],
+                 on_end: Callable[[JobState], None] = lambda _: None) -> None:
+        self.settings = settings
+        self._node = node
+        self._recorded = recorded
+        self._on_end = on_end
+        self._job: RetrainingJob | None = None
+        self._state: JobState | None = None
+        self._last_line = 0.0
+        self._diagnostics = DiagnosticsPublisher(node, 'training', 'trainer', self._status)
+        self._owned = owned = Owned(node)
+        owned.keep(node.create_service(Trigger, '~/train', self._on_train))
+        owned.keep(node.create_service(Trigger, '~/cancel_training', self._on_cancel))
+        self._timer = owned.keep(node.create_timer(
+            _POLL_PERIOD, self._on_poll, autostart=False,
+            clock=Clock(clock_type=ClockType.STEADY_TIME)))
+
+    def start(self) -> str:
+        """
+        Start a training and return a sentence that says from what.
+
+        :raises ValueError: when there is nothing to train from.
+        :raises OSError: when the process cannot be started.
+        """
+        settings = self.settings
+        bags = [bag for bag in (settings.bags if any(settings.bags) else (self._recorded(),))
+                if bag]
+        if not bags:
+            raise ValueError('there is no bag to train from: record one, or name it in bags')
+        name = self._node.resolve_topic_name
+        self._job = RetrainingJob({
+            'bags': [os.path.abspath(bag) for bag in bags],
+            'output': os.path.abspath(settings.model_output),
+            'model': os.path.abspath(model_path(settings.model)),
+            'temperature_topic': name(topics.TEMPERATURE),
+            'coolant_topic': name(topics.COOLANT_SETPOINT), **settings.training()})
+        self._state = self._job.state
+        self._last_line = time.monotonic()
+        self._timer.reset()
+        said = f'training from {", ".join(bags)}'
+        self._node.get_logger().info(said)
+        return said
+
+    def complete(self) -> None:
+        """End a training that is under way; nothing is written then."""
+        if self._job is not None:
+            self._job.close()
+            # it may have ended well just before
+            state = self._job.poll()
+            self._job = None
+            print(f'training: {state.text}', file=sys.stderr, flush=True)
+            self._on_end(state)
+
+    def destroy(self) -> None:
+        """End a training that is under way, and take the services down."""
+        self.complete()
+        self._owned.destroy()
+        self._diagnostics.destroy()
+
+    def _on_train(self, _: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
+        if self._job is not None:
+            response.success, response.message = False, 'already training'
+            return response
+        try:
+            response.success, response.message = True, self.start()
+        except (OSError, ValueError) as error:
+            response.success, response.message = False, f'cannot train: {error}'
+            self._node.get_logger().error(response.message)
+        self._diagnostics.publish_if_changed()
+        return response
+
+    def _on_cancel(self, _: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
+        response.success = self._job is not None
+        response.message = 'the training is being cancelled' if self._job else 'not training'
+        if self._job is not None:
+            self._job.cancel()
+        return response
+
+    def _on_poll(self) -> None:
+        if self._job is None:
+            return
+        self._state = self._job.poll()
+        self._show(self._state)
+        if not self._state.ended:
+            return
+        self._timer.cancel()
+        self._job.close()
+        self._job = None
+        log = self._node.get_logger()
+        # a line each, because rclpy allows one severity a line
+        if self._state.accepted:
+            log.info(self._state.text)
+        elif self._state.refused:
+            log.warning(self._state.text)
+        else:
+            log.error(self._state.text)
+        for warning in (self._state.summary or {}).get('warnings', ()):
+            log.warning(warning)
+        self._diagnostics.publish_if_changed()
+        self._on_end(self._state)
+
+    def _show(self, state: JobState) -> None:
+        """Show the progress: a bar on a terminal, a line now and then elsewhere."""
+        if sys.stderr.isatty():
+            full = round(_BAR_WIDTH * state.share)
+            bar = '#' * full + '-' * (_BAR_WIDTH - full)
+            text, end = ('', '\n') if state.ended else (state.text, '')
+            print(f'\r\x1b[K|{bar}| {100.0 * state.share:3.0f} % {text}', end=end,
+                  file=sys.stderr, flush=True)
+        elif not state.ended and time.monotonic() - self._last_line > _LINE_PERIOD:
+            self._last_line = time.monotonic()
+            self._node.get_logger().info(f'{100.0 * state.share:.0f} %: {state.text}')
+
+    def _status(self) -> Status:
+        state = self._state
+        if state is None:
+            return Status(Level.OK, 'not training')
+        values = {'done [%]': 100.0 * state.share, **_figures(state)}
+        if not state.ended or state.accepted:
+            # the sentence stays while the figures move, or there would be a status a step
+            text = state.text if state.ended else state.text.split(',')[0]
+            return Status(Level.OK, text, {**values, 'step': state.text})
+        return Status(Level.WARN if state.refused else Level.ERROR, state.text, values)
+
+
+def _figures(state: JobState) -> dict[str, object]:
+    return {key: value for key, value in (state.summary or {}).items()
+            if isinstance(value, (bool, int, float, str))}

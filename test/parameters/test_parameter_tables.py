@@ -1,0 +1,323 @@
+# SPDX-FileCopyrightText: 2026 The koopman_ros Authors
+# SPDX-License-Identifier: Apache-2.0
+
+"""Parameter tables: words for ranges and refusals, and the shipped files that they write."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, fields
+import math
+from pathlib import Path
+from typing import Any
+
+import pytest
+from rclpy.node import Node
+from rclpy.parameter import parameter_dict_from_yaml_file, parameter_value_to_python
+import yaml
+
+from koopman_ros.parameters.controller import ControllerParameters
+from koopman_ros.parameters.plant import PlantParameters
+from koopman_ros.parameters.replay import ReplayParameters
+from koopman_ros.parameters.table import (
+    ConfigurationError,
+    parameter,
+    ParameterTable,
+    Specification,
+)
+from koopman_ros.resources import config_directory
+from koopman_ros.ros.access import policy, POLICY_FILE
+from koopman_ros.ros.parameter_files import main, parameter_file, TABLES
+from koopman_ros.ros.parameters import ParameterNode, range_of
+from koopman_ros.testing import Harness
+
+
+def row(default: Any, **details: Any) -> Specification:
+    return Specification('level', default, **{'unit': 'm', 'description': 'fill', **details})
+
+
+# Words.
+
+
+@pytest.mark.parametrize(('specification', 'words'), [
+    (row(1.0), ''),
+    (row(1.0, minimum=0.0), 'at least 0 m'),
+    (row(1.0, minimum=0.0, open_minimum=True), 'above 0 m'),
+    (row(1.0, minimum=0.0, maximum=5.0), '[0, 5] m'),
+    (row(1.0, minimum=0.0, maximum=5.0, open_minimum=True), '(0, 5] m'),
+    (row(1, minimum=1, maximum=1000, unit=''), '[1, 1000]'),
+    (row(1.0, minimum=0.0, smallest=0.01, maximum=5.0), '0, or in [0.01, 5] m'),
+    (row('low', choices=('low', 'high'), unit=''), 'one of low, high'),
+])
+def test_range_in_words(specification: Specification, words: str) -> None:
+    assert specification.range_text == words
+
+
+@pytest.mark.parametrize(('specification', 'given', 'words'), [
+    (row(1.0, minimum=0.0), -1.0, 'level = -1.0 m must be at least 0 m'),
+    (row(1.0, minimum=0.0, open_minimum=True), 0.0, 'level = 0.0 m must be above 0 m'),
+    (row(1.0, minimum=0.0, maximum=5.0), 5.5, 'level = 5.5 m must be in [0, 5] m'),
+    (row(1.0, minimum=0.0, maximum=5.0), math.nan, 'level = nan m must be in [0, 5] m'),
+    (row(1.0, minimum=0.0), math.inf, 'level = inf m must be at least 0 m'),
+    (row(1.0), math.nan, 'level = nan m must be finite'),
+    (row(1.0), -math.inf, 'level = -inf m must be finite'),
+    (row(1, minimum=1, unit=''), 0, 'level = 0 must be at least 1'),
+    (row(1.0, minimum=0.0, smallest=0.01, maximum=5.0), 0.001,
+     'level = 0.001 m must be 0, or in [0.01, 5] m'),
+    (row(1.0, minimum=0.0, smallest=0.01, maximum=5.0), math.nan,
+     'level = nan m must be 0, or in [0.01, 5] m'),
+    (row('low', choices=('low', 'high'), unit=''), 'up', "level = 'up' must be one of low, high"),
+])
+def test_refusal_names_value_and_range_with_unit(
+        specification: Specification, given: Any, words: str) -> None:
+    assert specification.check(given) == words
+
+
+@pytest.mark.parametrize(('specification', 'given'), [
+    (row(1.0), 1e300),
+    (row(1.0, minimum=0.0, maximum=5.0), 0.0),
+    (row(1.0, minimum=0.0, maximum=5.0), 5.0),
+    (row(1.0, minimum=0.0, open_minimum=True), 1e-300),
+    (row(1, minimum=0), 0),
+    (row(1.0, minimum=0.0, smallest=0.01, maximum=5.0), 0.0),
+    (row(1.0, minimum=0.0, smallest=0.01, maximum=5.0), 0.01),
+    (row(True), False),
+    (row('low', choices=('low', 'high')), 'high'),
+    (row('anything'), ''),
+])
+def test_value_that_fits_has_no_refusal(specification: Specification, given: Any) -> None:
+    assert specification.check(given) == ''
+
+
+@pytest.mark.parametrize(('default', 'given', 'words'), [
+    (1.0, 1, 'level = 1 must be a double, e.g. 1.0'),
+    (1, 1.5, 'level = 1.5 must be an integer, e.g. 1'),
+    (True, 'yes', "level = 'yes' must be a boolean, e.g. true"),
+    ('low', 3, 'level = 3 must be a string, e.g. text'),
+    (('a',), 'a', "level = 'a' must be a list of strings, e.g. [a, b]"),
+    (('a',), [], 'level = [] must be a list of at least one string, e.g. [a, b]'),
+])
+def test_other_type_is_named_with_an_example(default: Any, given: Any, words: str) -> None:
+    assert row(default).type_error(given) == words
+
+
+@dataclass(frozen=True)
+class Odd:
+    """A parameter of every type, with values that are hard to write."""
+
+    tiny: float = parameter(1e-6, 'a small number', unit='m', minimum=0.0, maximum=1.0)
+    huge: float = parameter(7.2e30, 'a large number')
+    whole: float = parameter(-3.0, 'a whole number that is a double')
+    exact: float = parameter(0.87725294608097, 'all digits')
+    count: int = parameter(-7, 'an integer')
+    switch: bool = parameter(True, 'a switch', read_only=True)
+    word: str = parameter('on', 'a string that YAML could take for a switch')
+    empty: str = parameter('', 'nothing')
+    names: tuple[str, ...] = parameter(('temperature', '/diagnostics'), 'a list')
+
+
+ODD = ParameterTable(Odd, lambda odd: 'count must be odd' if odd.count % 2 == 0 else '')
+
+
+def test_cross_check_comes_after_the_ranges() -> None:
+    assert ODD.check(Odd()) == ''
+    assert ODD.check(Odd(count=2)) == 'count must be odd'
+    assert ODD.check(Odd(count=2, tiny=2.0)) == 'tiny = 2.0 m must be in [0, 1] m'
+
+
+def _reciprocal(odd: Odd) -> float:
+    if odd.whole == -1.0:
+        raise ValueError('whole and count\nare no pair')
+    return 1.0 / (odd.whole + odd.count)
+
+
+BUILT = ParameterTable(Odd, build=_reciprocal)
+
+
+@pytest.mark.parametrize(('before', 'now', 'reason'), [
+    (Odd(), Odd(), ''),
+    (Odd(), Odd(count=3), 'count = 3 cannot be used: float division by zero'),
+    (Odd(), Odd(count=4, whole=-4.0, tiny=0.5),
+     'whole = -4.0 and count = 4 cannot be used: float division by zero'),
+    (Odd(count=4), Odd(count=4, whole=-4.0),
+     'whole = -4.0 cannot be used: float division by zero'),
+    (Odd(), Odd(whole=-1.0), 'whole = -1.0 cannot be used: whole and count are no pair'),
+])
+def test_what_cannot_be_built_is_refused_with_the_error_and_what_was_changed(
+        before: Odd, now: Odd, reason: str) -> None:
+    assert BUILT.check(now, before) == (reason and f'{reason}; choose another value')
+
+
+@pytest.mark.parametrize('node', TABLES)
+def test_every_number_has_a_range_that_a_slider_can_show(node: str) -> None:
+    for item in TABLES[node].rows.values():
+        if isinstance(item.default, bool) or not isinstance(item.default, (int, float)):
+            assert range_of(item) is None
+            continue
+        limits = range_of(item)
+        assert limits is not None
+        assert (limits.from_value, limits.to_value) == (item.minimum, item.maximum)
+        assert limits.step == 0
+
+
+@pytest.mark.parametrize('node', TABLES)
+def test_what_is_dumped_can_be_loaded_again(ros: Harness, tmp_path: Path, node: str) -> None:
+    """As `ros2 param dump` writes it, and as `ros2 param load` and a node at its start read."""
+    defaults = {name: list(item.default) if isinstance(item.default, tuple) else item.default
+                for name, item in TABLES[node].rows.items()}
+    file = tmp_path / 'dumped.yaml'
+    file.write_text(yaml.dump({f'/{node}': {'ros__parameters': defaults}},
+                              default_flow_style=False))
+    loaded = {name: parameter_value_to_python(message.value)
+              for name, message in parameter_dict_from_yaml_file(str(file)).items()}
+    reader = ParameterNode(node, context=ros.node.context,
+                           cli_args=['--ros-args', '--params-file', str(file)])
+    started = {name: reader.get_parameter(name).value for name in defaults}
+    reader.destroy_node()
+    for read in (loaded, started):
+        assert read == defaults
+        assert {name: type(value) for name, value in read.items()} == {
+            name: type(value) for name, value in defaults.items()}
+
+
+def declared(ros: Harness, *arguments: str, name: str = 'odd',
+             table: ParameterTable[Any] = ODD) -> Any:
+    """Return the snapshot of a node started with arguments, and if it has what is not its own."""
+    node = ParameterNode(name, context=ros.node.context, cli_args=['--ros-args', *arguments])
+    try:
+        return node.declare_table(table), node.has_parameter('foreign')
+    finally:
+        node.destroy_node()
+
+
+def test_names_of_other_nodes_are_ignored_with_one_warning(
+        ros: Harness, tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:
+    file = tmp_path / 'shared.yaml'
+    file.write_text('/**:\n  ros__parameters:\n    count: 5\n    foreign: 1.0\n    cuont: 7\n'
+                    '    nothing: []\n    more:\n      than: one\n')
+    assert declared(ros, '--params-file', str(file)) == (Odd(count=5), False)
+    (line,) = capfd.readouterr().err.splitlines()
+    assert '[WARN]' in line
+    assert line.endswith("[odd]: parameters that this node does not have are ignored: 'foreign', "
+                         "'cuont' (did you mean count?), 'more.than'")
+
+
+@pytest.mark.parametrize(('node', 'name', 'words'), [
+    ('trainer', 'topics', 'a list of at least one string, e.g. [a, b]'),
+    ('trainer', 'bags', 'a list of at least one string, e.g. [a, b]'),
+    ('player', 'topics', 'a list of at least one string, e.g. [a, b]'),
+    ('replay', 'bags', 'a list of at least one string, e.g. [a, b]'),
+    ('plant', 'speed', 'a double, e.g. 1.0'),
+])
+def test_empty_list_is_refused_with_its_name(
+        ros: Harness, node: str, name: str, words: str) -> None:
+    with pytest.raises(ConfigurationError) as refusal:
+        declared(ros, '-p', f'{name}:=[]', table=TABLES[node])
+    assert str(refusal.value) == f'{name} = [] must be {words}'
+
+
+@pytest.mark.parametrize(('node', 'given', 'words'), [
+    ('controller', ('coolant_min:=20.0', 'coolant_max:=20.00000000000001'),
+     'coolant_min = 20.0 degC and coolant_max = 20.00000000000001 degC cannot be used: '),
+    ('replay', ('sensor_min:=20.0', 'sensor_max:=20.00000000000001'),
+     'sensor_min = 20.0 degC and sensor_max = 20.00000000000001 degC cannot be used: '),
+    ('trainer', ('experiment_coolant_max:=8.500000000000002',),
+     'experiment_coolant_max = 8.500000000000002 degC cannot be used: '),
+    ('trainer', ('max_bag_size:=1.0e+308',),
+     'max_bag_size = 1e+308 MB must be 0, or in [1e-06, 1000000000] MB'),
+])
+def test_start_with_what_cannot_be_used_is_refused(
+        ros: Harness, node: str, given: tuple[str, ...], words: str) -> None:
+    arguments = [part for argument in given for part in ('-p', argument)]
+    with pytest.raises(ConfigurationError) as refusal:
+        declared(ros, *arguments, table=TABLES[node])
+    assert str(refusal.value).startswith(words)
+    assert '\n' not in str(refusal.value)
+
+
+def test_concentration_too_small_to_integrate_is_refused() -> None:
+    table = TABLES['plant']
+    assert table.check(PlantParameters(feed_concentration=1e-315)) == ''
+    assert table.check(PlantParameters(reactor='two_state', feed_concentration=1e-315)).startswith(
+        'reactor = two_state and feed_concentration = 1e-315 mol/L cannot be used: atol is ')
+    for harmless in (0.0, 1e-100):
+        assert table.check(PlantParameters(
+            reactor='two_state', feed_concentration=harmless)) == ''
+
+
+@pytest.mark.parametrize(('given', 'residual'), [
+    ({}, 1e-8),
+    ({'min_riccati_digits': 6.0}, 1e-6),
+    ({'max_riccati_residual': 1e-5}, 1e-5),
+    ({'max_riccati_residual': 1e-9, 'min_riccati_digits': 3.0}, 1e-9),
+])
+def test_former_form_of_the_riccati_bound_still_counts(
+        given: dict[str, float], residual: float) -> None:
+    for kind in (ControllerParameters, ReplayParameters):
+        assert kind(**given).settings().max_residual == pytest.approx(residual, rel=1e-15)
+
+
+def test_rcl_reads_back_what_the_table_writes(ros: Harness, tmp_path: Path) -> None:
+    file = tmp_path / 'odd.yaml'
+    file.write_text(ODD.yaml())
+    node = Node('odd', context=ros.node.context,
+                cli_args=['--ros-args', '--params-file', str(file)],
+                automatically_declare_parameters_from_overrides=True)
+    read = {name: node.get_parameter(name).value for name in ODD.rows}
+    node.destroy_node()
+    default = {name: item.default for name, item in ODD.rows.items()}
+    assert read == {**default, 'names': list(default['names'])}
+    assert [type(found) for found in read.values()] == [
+        float, float, float, float, int, bool, str, str, list]
+
+
+def test_yaml_of_a_table() -> None:
+    assert ODD.yaml().splitlines()[:16] == [
+        '/**:',
+        '  ros__parameters:',
+        '',
+        '    # a small number [m]',
+        '    #   [0, 1] m',
+        '    tiny: 1.0e-06',
+        '',
+        '    # a large number',
+        '    huge: 7.2e+30',
+        '',
+        '    # a whole number that is a double',
+        '    whole: -3.0',
+        '',
+        '    # all digits',
+        '    exact: 0.87725294608097',
+        '',
+    ]
+    assert '    # a switch\n    #   fixed at start\n    switch: true\n' in ODD.yaml()
+
+
+# The shipped files.
+
+
+@pytest.mark.parametrize('node', TABLES)
+def test_shipped_file_is_what_the_table_writes(node: str) -> None:
+    assert (config_directory() / f'{node}.yaml').read_text() == parameter_file(node)
+
+
+def test_shipped_files_are_written_by_one_command(tmp_path: Path) -> None:
+    assert main(['--output', str(tmp_path)]) == 0
+    assert {path.name: path.read_text() for path in tmp_path.iterdir()} == {
+        **{f'{node}.yaml': parameter_file(node) for node in TABLES}, POLICY_FILE: policy()}
+
+
+@pytest.mark.parametrize('node', TABLES)
+def test_every_parameter_has_a_comment(node: str) -> None:
+    lines = (config_directory() / f'{node}.yaml').read_text().splitlines()
+    for item in fields(TABLES[node].kind):
+        (index,) = (k for k, line in enumerate(lines) if line.startswith(f'    {item.name}:'))
+        assert lines[index - 1].startswith('    # ')
+
+
+# player and replay need a bag, and have tests of their own
+@pytest.mark.parametrize('node', ['plant', 'controller', 'trainer'])
+def test_node_started_with_its_shipped_file_has_the_defaults(ros: Harness, node: str) -> None:
+    table = TABLES[node]
+    snapshot, _ = declared(ros, '--params-file', str(config_directory() / f'{node}.yaml'),
+                           name=node, table=table)
+    assert snapshot == type(snapshot)()

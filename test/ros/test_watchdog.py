@@ -1,0 +1,231 @@
+# SPDX-FileCopyrightText: 2026 The koopman_ros Authors
+# SPDX-License-Identifier: Apache-2.0
+
+"""The controller when measurements are nonsense, stay away, or come with stamps that jump."""
+
+from __future__ import annotations
+
+import itertools
+import math
+
+from diagnostic_msgs.msg import DiagnosticStatus
+import numpy as np
+import pytest
+from rosgraph_msgs.msg import Clock
+from sensor_msgs.msg import Temperature
+
+from koopman_ros.ros import topics
+from koopman_ros.testing import Harness
+from koopman_ros.units import LAST_STAMP_SECONDS
+from support.controller_bench import Bench, RESET, STEADY
+from support.messages import seconds, temperature, value
+
+SAFE = 5.0  # degC
+
+
+def around(k: float) -> float:
+    """Return what a reactor near its steady state may show."""
+    return STEADY + 0.05 * math.sin(0.3 * k)
+
+
+def measured(bench: Bench, first: int, count: int) -> list[float]:
+    """Measure once a second; return the commands."""
+    return [bench.measure(around(k), float(k)).temperature for k in range(first, first + count)]
+
+
+def own_commands(bench: Bench, after: float) -> list[Temperature]:
+    """Return what was commanded later than the last measurement."""
+    return [message for message in bench.commands if seconds(message) > after]
+
+
+# Measurements that are not to be believed.
+
+
+@pytest.fixture(scope='module')
+def shared_bench(shared_ros: Harness) -> Bench:
+    return Bench(shared_ros)
+
+
+@pytest.fixture
+def bench(shared_bench: Bench) -> Bench:
+    """Return a controller with its shipped settings that has measured for 20 s, up to 20 s."""
+    del shared_bench.commands[:], shared_bench.ros.statuses[:]
+    measured(shared_bench, 1, 20)
+    shared_bench.status(lambda s: s.level == DiagnosticStatus.OK)
+    del shared_bench.ros.statuses[:-1]
+    return shared_bench
+
+
+@pytest.mark.parametrize(('celsius', 'words'), [
+    (math.nan, 'the measured temperature is nan, not finite: check the sensor'),
+    (400.0, 'the measured temperature 400.00 degC is outside the range of the sensor, -20.00 degC '
+            'to 150.00 degC: check it'),
+    (30.0, 'to 30.00 degC in 2 s, at most 2 K and 2 K/s are possible: check the sensor'),
+])
+def test_burst_of_nonsense_holds_the_coolant_which_goes_on_smoothly(
+        bench: Bench, celsius: float, words: str) -> None:
+    held = bench.commands[-1].temperature
+    count = 2 if celsius == 30.0 else 5
+    for k in range(21, 21 + count):
+        assert bench.measure(celsius, float(k)).temperature == held
+    status = bench.status()
+    assert status.level == DiagnosticStatus.ERROR
+    assert status.message.startswith('the last command is held: ')
+    assert words in status.message
+    assert value(status, 'active law') == 'hold'
+    after = measured(bench, 21 + count, 10)
+    assert np.max(np.abs(np.diff([held, *after]))) < 0.2
+    status = bench.status()
+    assert status.level == DiagnosticStatus.OK
+    assert value(status, 'active law') == 'learned law'
+
+
+def test_frozen_sensor_is_found_out_by_what_the_model_says(bench: Bench) -> None:
+    """The coolant moves, the measurement does not."""
+    bench.ask(STEADY - 6.0)
+    frozen = around(20)
+    status, k = None, 21
+    while status is None and k < 120:
+        bench.measure(frozen, float(k))
+        status = next((s for s in bench.ros.statuses if s.level == DiagnosticStatus.ERROR), None)
+        k += 1
+    assert status is not None
+    assert 'the sensor is frozen' in status.message
+    assert k > 40
+    bench.ask(STEADY)
+    measured(bench, k, 30)
+    bench.status(lambda s: s.level == DiagnosticStatus.OK)
+
+
+def test_runaway_beyond_the_trained_range_goes_down_the_ladder_and_up_again(bench: Bench
+                                                                            ) -> None:
+    way = [*np.arange(STEADY, 67.0, 1.0), *np.arange(67.0, 51.0, -0.15)]
+    laws, before = [], bench.commands[-1].temperature
+    for k, celsius in enumerate(way, 21):
+        command = bench.measure(float(celsius), float(k)).temperature
+        # 60 K/min
+        assert abs(command - before) <= 1.0 + 1e-9
+        before = command
+    bench.status()
+    statuses = [(value(s, 'active law'), s.level) for s in bench.ros.statuses]
+    laws = [law for law, _ in itertools.groupby(law for law, _ in statuses)]
+    assert laws == ['learned law', 'linear law', 'safe input', 'linear law', 'learned law']
+    assert {level for law, level in statuses if law == 'linear law'} == {DiagnosticStatus.WARN}
+    assert {level for law, level in statuses if law == 'safe input'} == {DiagnosticStatus.ERROR}
+
+
+# Clocks.
+
+
+def test_time_may_begin_at_zero_and_jump_by_an_hour_and_back(ros: Harness) -> None:
+    bench = Bench(ros, first=0.0)
+    assert seconds(bench.commands[0]) == 0.0
+    commands = [bench.commands[0].temperature]
+    for first in (1, 3621, 26):
+        commands += measured(bench, first, 5)
+    assert np.max(np.abs(np.diff(commands))) < 0.05
+    assert np.ptp(commands) > 0.0
+    ros.wait_until(lambda: 'time starts afresh' in bench.process.output())
+    status = bench.status()
+    assert value(status, 'measurements') == '16'
+    assert status.level == DiagnosticStatus.OK
+
+
+def test_simulated_time_that_nobody_publishes_is_told(ros: Harness) -> None:
+    bench = Bench(ros, arguments=('-p', 'use_sim_time:=true'))
+    times = iter(range(2, 10000))
+
+    def told() -> bool:
+        # measurements come all the time
+        bench.measure(STEADY, float(next(times)))
+        return any('nobody publishes /clock' in status.message for status in ros.statuses)
+
+    ros.wait_until(told)
+    status = next(s for s in ros.statuses if 'nobody publishes /clock' in s.message)
+    assert status.level == DiagnosticStatus.WARN
+    assert 'set use_sim_time to false' in status.message
+    assert value(status, 'age of measurement [s]') == 'nan'
+
+
+# Measurements that stay away.
+
+
+def test_silence_in_simulated_time_ends_at_the_safe_coolant(ros: Harness) -> None:
+    """The clock goes fifty times faster than the wall's."""
+    # a plant of which the controller hears the time alone
+    elsewhere = [part for name in (topics.TEMPERATURE, topics.COOLANT_SETPOINT,
+                                   topics.COOLANT_TEMPERATURE)
+                 for part in ('-r', f'{name}:=elsewhere/{name}')]
+    clock = ros.listen(Clock, topics.CLOCK, topics.CLOCK_QOS)
+    ros.start('plant', {'speed': 50.0}, tuple(elsewhere))
+    bench = Bench(ros, {'measurement_timeout': 10.0, 'hold_timeout': 20.0},
+                  ('-p', 'use_sim_time:=true'))
+    ros.wait_until(lambda: clock)
+    held = bench.measure(STEADY, 2.0).temperature
+    begun = clock[-1].clock.sec
+    status = bench.status(lambda s: s.level == DiagnosticStatus.ERROR)
+    assert status.message.startswith(
+        f'no measurement for more than 10 s: the last command is held, coolant at {held:.2f} degC')
+    ros.wait_until(lambda: bench.commands[-1].temperature == SAFE)
+    # what the bench has heard of the clock may be older
+    ticks = len(clock)
+    ros.wait_until(lambda: len(clock) > ticks + 1)
+    status = bench.status(lambda s: 'safe coolant temperature' in s.message)
+    assert status.level == DiagnosticStatus.ERROR
+    assert value(status, 'active law') == 'safe input'
+    # 10 s until it holds and 20 s until it gives up, then at 60 K/min
+    assert clock[-1].clock.sec - begun > 30.0 + (held - SAFE)
+    own = own_commands(bench, 2.0)
+    stamps = np.array([seconds(message) for message in own])
+    commands = np.array([message.temperature for message in own])
+    assert stamps[0] > 12.0
+    assert np.all(np.diff(stamps) > 0.0)
+    assert np.all(commands[stamps < 32.0] == held)
+    assert np.all(-np.diff(commands) <= np.diff(stamps) * (1.0 + 1e-6))
+    # the plant was not forgotten: the law takes over from there
+    command = bench.measure(STEADY - 0.5, stamps[-1] + 5.0).temperature
+    assert command == pytest.approx(SAFE, abs=5.0)
+    bench.status(lambda s: 'the measured' not in s.message)
+
+
+def test_silence_by_the_wall_clock_ends_at_the_safe_coolant(ros: Harness) -> None:
+    bench = Bench(ros, {'measurement_timeout': 0.3, 'hold_timeout': 1.5,
+                        'coolant_rate_limit': 6000.0, 'safe_coolant': 10.0})
+    held = bench.commands[0].temperature
+    ros.wait_until(lambda: bench.commands[-1].temperature == 10.0)
+    own = own_commands(bench, 1.0)
+    assert own[0].temperature == held
+    # it is held for 1.5 s, within which a busy machine looks for it
+    assert 1.3 < seconds(own[0]) < 2.8
+    bench.status(lambda s: s.level == DiagnosticStatus.ERROR and (
+        'the safe coolant temperature is commanded, coolant at 10.00 degC' in s.message))
+    assert 'learned law -> hold' in bench.process.output()
+
+
+def test_silence_in_manual_mode_leaves_the_coolant_to_the_operator(ros: Harness) -> None:
+    bench = Bench(ros, {'measurement_timeout': 0.3, 'hold_timeout': 0.0})
+    ros.set_bool('controller/set_automatic', False)
+    held = bench.measure(STEADY, 2.0).temperature
+    manual = ros.speak(Temperature, topics.MANUAL_COOLANT_SETPOINT, to='controller')
+    manual.publish(temperature(held - 0.5))
+    ros.wait_until(lambda: bench.commands[-1].temperature == pytest.approx(held - 0.5))
+    assert own_commands(bench, 2.0)
+    bench.status(lambda s: s.level == DiagnosticStatus.ERROR and (
+        'no measurement for more than 0.3 s: manual mode' in s.message))
+
+
+def test_measurements_may_stay_away_where_the_timeout_is_off(bench: Bench) -> None:
+    bench.ros.set_parameters('controller', hold_timeout=0.0)
+    count = len(bench.commands)
+    status = bench.status(lambda s: float(value(s, 'since last measurement [s]')) > 1.5)
+    assert status.level == DiagnosticStatus.OK
+    assert len(bench.commands) == count
+    bench.ros.set_parameters('controller', hold_timeout=RESET['hold_timeout'])
+
+
+def test_silence_at_the_end_of_the_stamps_is_answered(ros: Harness) -> None:
+    last = float(LAST_STAMP_SECONDS)
+    bench = Bench(ros, {'measurement_timeout': 0.1}, first=last)
+    ros.wait_until(lambda: len(own_commands(bench, last)) >= 2)
+    assert {message.header.stamp.sec for message in bench.commands} == {LAST_STAMP_SECONDS}
+    assert all(math.isfinite(message.temperature) for message in bench.commands)
