@@ -74,6 +74,11 @@ def conversion(unit: str, wanted: str) -> Conversion:
     return Conversion(factor, offset)
 
 
+def display_unit(unit: str) -> str:
+    """Return the unit in which people read values: degrees Celsius in place of kelvins."""
+    return 'degC' if unit == 'K' else unit
+
+
 @cache
 def _registry() -> Any:
     import pint

@@ -2,13 +2,13 @@
 # SPDX-License-Identifier: Apache-2.0
 
 """
-How it is remembered: bags in the layout of rosbag2 (MCAP), written and read without ROS.
+Bags in the layout of rosbag2 (MCAP), written and read without ROS.
 
-Imports nothing of ours but the version, nothing of ROS and nothing that learns: a recording can
-be opened on any machine with Python.
+Imports nothing of ROS and nothing that learns: a recording can be opened on any machine with
+Python.
 """
 
-from koopman_ros.bags.episodes import Account, EPISODE_UNIT, loop_episodes
+from koopman_ros.bags.episodes import Account, loop_episodes
 from koopman_ros.bags.errors import BagReadError
 from koopman_ros.bags.order import in_log_order
 from koopman_ros.bags.qos import INFINITE_NS, QosProfile
@@ -19,11 +19,10 @@ from koopman_ros.bags.schemas import (
     MessageDefinitionError,
     search_prefixes,
 )
-from koopman_ros.bags.series import temperature_series, TemperatureSeries
+from koopman_ros.bags.series import read_series, Series
 from koopman_ros.bags.writer import BagWriter
 
 __all__ = [
-    'EPISODE_UNIT',
     'INFINITE_NS',
     'Account',
     'BagMessage',
@@ -33,12 +32,12 @@ __all__ = [
     'MessageDefinition',
     'MessageDefinitionError',
     'QosProfile',
-    'TemperatureSeries',
+    'Series',
     'in_log_order',
     'loop_episodes',
     'message_definition',
     'read_messages',
+    'read_series',
     'search_prefixes',
     'summary',
-    'temperature_series',
 ]

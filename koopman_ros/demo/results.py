@@ -13,7 +13,7 @@ import matplotlib.figure  # noqa: F401
 import numpy as np
 from numpy.typing import NDArray
 
-from koopman_ros.bags import temperature_series
+from koopman_ros.bags import read_series
 from koopman_ros.lifting import LiftedModel
 from koopman_ros.parameters.controller import ControllerParameters
 from koopman_ros.reports import draw_limits, drawing, DRAWN_RANGE
@@ -55,12 +55,12 @@ class Run:
 
 def read_run(bag: Path) -> Run:
     """Read a run from its bag."""
-    measured = temperature_series(bag, '/' + topics.TEMPERATURE)
+    measured = read_series(bag, '/' + topics.TEMPERATURE)
     origin = int(measured.stamp_ns[0])
-    measured = temperature_series(bag, '/' + topics.TEMPERATURE, origin_ns=origin)
-    commands = temperature_series(bag, '/' + topics.COOLANT_SETPOINT, origin_ns=origin)
-    return Run(measured.stamp_s, measured.celsius + ZERO_CELSIUS,
-               commands.stamp_s, commands.celsius + ZERO_CELSIUS)
+    measured = read_series(bag, '/' + topics.TEMPERATURE, origin_ns=origin)
+    commands = read_series(bag, '/' + topics.COOLANT_SETPOINT, origin_ns=origin)
+    return Run(measured.stamp_s, measured.values + ZERO_CELSIUS,
+               commands.stamp_s, commands.values + ZERO_CELSIUS)
 
 
 def plot(path: Path, learned: Run, linear: Run, setpoint: float, step_time: float,

@@ -16,7 +16,7 @@ import matplotlib.figure  # noqa: F401
 import numpy as np
 from numpy.typing import NDArray
 
-from koopman_ros.bags import temperature_series
+from koopman_ros.bags import read_series
 from koopman_ros.lifting import LiftedModel
 from koopman_ros.parameters.controller import ControllerParameters
 from koopman_ros.parameters.plant import PlantParameters
@@ -66,13 +66,13 @@ class History:
 
 def read_history(bags: Sequence[Path]) -> History:
     """Read the bags of one run, in their order."""
-    series = [[temperature_series(bag, '/' + topic) for bag in bags]
+    series = [[read_series(bag, '/' + topic) for bag in bags]
               for topic in (topics.TEMPERATURE, topics.COOLANT_SETPOINT)]
     origin = int(series[0][0].stamp_ns[0])
     joined = []
     for parts in series:
         joined.append(np.concatenate([(part.stamp_ns - origin) * 1e-9 for part in parts]))
-        joined.append(np.concatenate([part.celsius for part in parts]) + ZERO_CELSIUS)
+        joined.append(np.concatenate([part.values for part in parts]) + ZERO_CELSIUS)
     return History(*joined)
 
 

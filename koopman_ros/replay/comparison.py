@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from koopman_ros.lifting import Coordinates
 from koopman_ros.replay.bag import command_key
 from koopman_ros.replay.loop import Replay
-from koopman_ros.units import conversion
+from koopman_ros.units import conversion, display_unit
 
 Array = NDArray[np.float64]
 
@@ -148,8 +148,10 @@ class ReplayedBag:
 
 
 def shown(values: Array, unit: str) -> tuple[Array, str]:
-    """Return values as they are shown, with their unit: temperatures in degrees Celsius."""
-    return (values + _CELSIUS.offset, '°C') if unit == 'K' else (values, unit)
+    """Return values as people read them, with their unit."""
+    wanted = display_unit(unit)
+    to = conversion(unit, wanted)
+    return values * to.factor + to.offset, wanted.replace('deg', '°')
 
 
 def _rows(values: list[Array | None], like: Array | None = None) -> Array:

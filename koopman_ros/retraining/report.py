@@ -12,7 +12,6 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from koopman_ros.bags import EPISODE_UNIT
 from koopman_ros.identification import Identified, longest_step, Segments
 from koopman_ros.identification.segments import fitted_starts, Rate
 from koopman_ros.lifting import Coordinates
@@ -20,7 +19,7 @@ from koopman_ros.reports import bullets, drawing, table, write_figures, write_pa
 from koopman_ros.retraining.coverage import CELLS, visited_cells
 from koopman_ros.retraining.gate import lifted_rate
 from koopman_ros.retraining.task import Retrained
-from koopman_ros.units import conversion
+from koopman_ros.units import conversion, display_unit
 
 Array = NDArray[np.float64]
 
@@ -84,12 +83,13 @@ def _sections(retrained: Retrained) -> Iterator[str]:
 
 
 def _shown(signals: Coordinates, values: Array) -> Array:
-    to = conversion(signals.units[0], EPISODE_UNIT)
+    to = conversion(signals.units[0], display_unit(signals.units[0]))
     return values * to.factor + to.offset
 
 
 def _label(signals: Coordinates) -> str:
-    return f'{signals.names[0].replace("_", " ")} [{EPISODE_UNIT.replace("deg", "°")}]'
+    unit = display_unit(signals.units[0]).replace('deg', '°')
+    return f'{signals.names[0].replace("_", " ")} [{unit}]'
 
 
 def _draw(path: Path, retrained: Retrained) -> bool:

@@ -16,7 +16,7 @@ import shutil
 
 import numpy as np
 
-from koopman_ros.bags import Account, EPISODE_UNIT, loop_episodes
+from koopman_ros.bags import Account, loop_episodes
 from koopman_ros.identification import Identified, identify, Stopped
 from koopman_ros.learning import NoUsefulLift, Progress, Trained
 from koopman_ros.lifting import LiftedModel, load, save
@@ -24,7 +24,6 @@ from koopman_ros.plant_data import Episode
 from koopman_ros.retraining.coverage import coverage
 from koopman_ros.retraining.gate import decide, Decision, Thresholds
 from koopman_ros.retraining.lift import learn_lift
-from koopman_ros.units import conversion
 
 _NS = 1_000_000_000
 # Shares of the whole at which estimating, learning and judging begin.
@@ -160,11 +159,14 @@ def retrain(task: Task, on_progress: OnProgress = lambda *_: False) -> Retrained
     _stop_if(on_progress(0.0, 'reading bags'))
     recorded, account = loop_episodes(
         task.bags, task.temperature_topic, task.coolant_topic,
+        (current.states.units[0], current.inputs.units[0]),
         input_delay_ns=round(task.input_delay * _NS))
     if not recorded:
         raise ValueError('the bags hold no usable segment of measurements: '
                          + '; '.join(account.lines()))
-    episodes = [_in_model_units(episode, current) for episode in recorded]
+    seconds = current.seconds_per_time_unit
+    episodes = [replace(episode, time=episode.time / seconds,
+                        input_time=episode.input_time / seconds) for episode in recorded]
     B = None
     if task.input_gain:
         B = np.array([[task.input_gain * current.seconds_per_time_unit / 60.0]])
@@ -198,18 +200,14 @@ def retrain(task: Task, on_progress: OnProgress = lambda *_: False) -> Retrained
 
 
 def _check_signals(model: LiftedModel, path: str) -> None:
-    try:
-        if (model.n_x, model.n_u) != (1, 1):
-            raise ValueError('expected one state and one input')
-        for unit in (*model.states.units, *model.inputs.units):
-            conversion(EPISODE_UNIT, unit)
-    except ValueError:
-        states, inputs = (
-            ', '.join(f'{name} [{unit}]' for name, unit in zip(a.names, a.units, strict=True))
-            for a in (model.states, model.inputs))
-        raise ValueError(
-            f'the present lift {path} has {states} as states and {inputs} as inputs, bags of the '
-            f'loop hold one of each in {EPISODE_UNIT}: name a lift of these') from None
+    if (model.n_x, model.n_u) == (1, 1):
+        return
+    states, inputs = (
+        ', '.join(f'{name} [{unit}]' for name, unit in zip(a.names, a.units, strict=True))
+        for a in (model.states, model.inputs))
+    raise ValueError(
+        f'the present lift {path} has {states} as states and {inputs} as inputs, bags of the '
+        'loop hold one of each: name a lift of these')
 
 
 def _at(stage: str, share: float) -> float:
@@ -226,14 +224,6 @@ def _stop_if(stop: bool) -> None:
 def _learning(now: Progress) -> str:
     rw = '' if np.isnan(now.rw) else f', rw {now.rw:.1e}'
     return f'learning: n_z {now.n_z}, start {min(now.finished + 1, now.total)} of {now.total}{rw}'
-
-
-def _in_model_units(episode: Episode, model: LiftedModel) -> Episode:
-    seconds = model.seconds_per_time_unit
-    of_state, of_input = (conversion(EPISODE_UNIT, a.units[0])
-                          for a in (model.states, model.inputs))
-    return Episode(episode.time / seconds, episode.x * of_state.factor + of_state.offset,
-                   episode.input_time / seconds, episode.u * of_input.factor + of_input.offset)
 
 
 def _with_provenance(model: LiftedModel, retrained: Retrained, episodes: list[Episode]

@@ -45,8 +45,8 @@ def write_bag(samples: list[Sample]) -> Callable[..., Path]:
         # A clock that moves 0.1 s a message gives chunks of a known number of messages.
         ticks: Iterator[float] = (0.1 * count for count in range(10**6))
         with BagWriter(path, **{'clock': lambda: next(ticks), **options}) as writer:
-            for topic, type_name in TOPICS.items():
-                writer.add_topic(topic, message_definition(type_name), OFFERED_QOS[topic])
+            for topic in dict.fromkeys(sample.topic for sample in samples):
+                writer.add_topic(topic, message_definition(TOPICS[topic]), OFFERED_QOS[topic])
             for sample in samples:
                 writer.write(
                     sample.topic, sample.data, sample.log_time_ns, sample.publish_time_ns)

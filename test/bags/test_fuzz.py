@@ -21,8 +21,8 @@ from koopman_ros.bags import (
     BagReadError,
     BagSummary,
     read_messages,
+    read_series,
     summary,
-    temperature_series,
 )
 from support.bag_mutants import mutate, Specimen, specimens
 from support.bag_samples import Sample, TOPICS
@@ -79,7 +79,7 @@ def _check(path: Path, sent: list[tuple[str, bytes, int, int]], guarded: bool) -
                 or content.message_count == len(sent))
     _attempt(lambda: summary(path))
     for recover in (False, True):
-        _attempt(lambda recover=recover: temperature_series(
+        _attempt(lambda recover=recover: read_series(
             path, '/temperature', recover=recover))
 
 
@@ -94,7 +94,7 @@ def test_whole_bag_is_read(
     content = summary(path)
     assert (content.counts, content.types) == (dict.fromkeys(TOPICS, ROUNDS), TOPICS)
     assert content.complete
-    assert len(temperature_series(path, '/temperature').celsius) == ROUNDS
+    assert len(read_series(path, '/temperature').values) == ROUNDS
 
 
 @pytest.mark.parametrize('kind', KINDS)

@@ -25,7 +25,7 @@ def motion() -> np.ndarray:
 def test_motion_under_steps_is_neither(motion: np.ndarray, noise: float, stride: int) -> None:
     values = motion[::stride] + noise * np.random.default_rng(1).standard_normal(
         len(motion[::stride]))
-    spike, jump = spikes_and_jumps(values)
+    spike, jump = spikes_and_jumps(values, 1.0)
     assert not spike.any()
     assert not jump.any()
 
@@ -33,7 +33,7 @@ def test_motion_under_steps_is_neither(motion: np.ndarray, noise: float, stride:
 def test_a_step_from_long_rest_is_neither() -> None:
     time = np.arange(3000.0)
     values = 51.0 - 10.0 * (1.0 - np.exp(-np.maximum(time - 2950.0, 0.0) / 25.0))
-    spike, jump = spikes_and_jumps(values)
+    spike, jump = spikes_and_jumps(values, 1.0)
     assert not spike.any()
     assert not jump.any()
 
@@ -43,18 +43,18 @@ def test_spikes_and_jumps_are_found(motion: np.ndarray, noise: float) -> None:
     values = motion + noise * np.random.default_rng(2).standard_normal(len(motion))
     values[[100, 700]] += [40.0, -35.0]
     values[900:] += 30.0
-    spike, jump = spikes_and_jumps(values)
+    spike, jump = spikes_and_jumps(values, 1.0)
     assert np.flatnonzero(spike).tolist() == [100, 700]
     assert np.flatnonzero(jump).tolist() == [900]
 
 
 def test_a_reset_while_all_rests_is_found() -> None:
     values = np.r_[np.full(200, 40.0), np.full(200, 51.0)]
-    spike, jump = spikes_and_jumps(values)
+    spike, jump = spikes_and_jumps(values, 1.0)
     assert not spike.any()
     assert np.flatnonzero(jump).tolist() == [200]
 
 
 def test_few_samples_tell_nothing() -> None:
     values = np.r_[np.zeros(20), 100.0, np.zeros(20)]
-    assert not np.any(spikes_and_jumps(values))
+    assert not np.any(spikes_and_jumps(values, 1.0))

@@ -27,7 +27,7 @@ from koopman_ros.bags import (
     message_definition,
     QosProfile,
     read_messages,
-    temperature_series,
+    read_series,
 )
 from koopman_ros.demo.loop import run_loop, Scenario
 from koopman_ros.nodes import player, replay
@@ -81,7 +81,7 @@ def stamps(messages: Sequence[Any]) -> list[int]:
 
 
 def test_lockstep_gives_the_recorded_commands_to_the_bit(ros: Harness, bag: Path) -> None:
-    recorded = temperature_series(bag, '/coolant_setpoint')
+    recorded = read_series(bag, '/coolant_setpoint')
     commands = ros.listen(Temperature, topics.COOLANT_SETPOINT)
     ros.start('controller', {'observer_bandwidth': 0.0})
     ros.meet('controller')
@@ -89,7 +89,7 @@ def test_lockstep_gives_the_recorded_commands_to_the_bit(ros: Harness, bag: Path
     assert ros.wait_for_end(process) == 0
     ros.wait_until(lambda: len(commands) >= SAMPLES)
     assert stamps(commands) == recorded.stamp_ns.tolist()
-    assert [command.temperature for command in commands] == recorded.celsius.tolist()
+    assert [command.temperature for command in commands] == recorded.values.tolist()
     # the coolant in force with each measurement, and one set-point
     assert f'played {2 * SAMPLES + 1} messages' in process.output()
 

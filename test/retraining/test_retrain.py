@@ -249,7 +249,7 @@ def test_present_lift_of_another_plant(bag, tmp_path):
     save(random_lift(), tmp_path / 'two.safetensors')
     task = Task((str(bag),), str(tmp_path / 'new.safetensors'), str(tmp_path / 'two.safetensors'))
     with pytest.raises(ValueError, match=r'x0 \[K\], x1 \[K\] as states and u0 \[K\] as inputs'
-                                         ', bags of the loop hold one of each in degC'):
+                                         ', bags of the loop hold one of each: name a lift'):
         retrain(task)
 
 

@@ -1,13 +1,16 @@
 # SPDX-FileCopyrightText: 2026 The koopman_ros Authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""The content of the bags that the tests write: four topics, their types, offers and messages."""
+"""The content of the bags that the tests write: four topics of ROS's messages, and numbers."""
 
+from collections.abc import Iterable
 from dataclasses import dataclass
 import importlib
+from pathlib import Path
+import struct
 from typing import Any
 
-from koopman_ros.bags import QosProfile
+from koopman_ros.bags import BagWriter, MessageDefinition, QosProfile
 
 START_NS = 1_700_000_000_123_456_789
 PERIOD_NS = 100_000_000
@@ -28,6 +31,34 @@ OFFERED_QOS = {
     ),
     '/clock': (QosProfile(reliability='best_effort', depth=1),),
 }
+HASH = 'RIHS01_705ba9c3d1a09df43737eb67095534de36fd426c0587779bda2bc51fe790182a'
+NUMBER = MessageDefinition('std_msgs/msg/Float64', 'float64 data\n', HASH)
+TEXT = MessageDefinition('std_msgs/msg/String', 'string data', 'RIHS01_' + 'a' * 64)
+HEAD = b'\x00\x01\x00\x00'  # of each message in CDR
+
+
+def number(value: float) -> bytes:
+    """Return a message of the type NUMBER."""
+    return HEAD + struct.pack('<d', value)
+
+
+def text(characters: bytes) -> bytes:
+    """Return a message of the type TEXT."""
+    return HEAD + struct.pack('<I', len(characters) + 1) + characters + b'\0'
+
+
+def write_numbers(writer: BagWriter, values: Iterable[int], period_ns: int = 1) -> None:
+    """Write numbers on /x, each at a log time of so many periods."""
+    writer.add_topic('/x', NUMBER)
+    for value in values:
+        writer.write('/x', number(value), value * period_ns)
+
+
+def record(path: Path, values: Iterable[int] = (), period_ns: int = 1, **options: Any) -> Path:
+    """Record a bag of numbers, with the writer's options."""
+    with BagWriter(path, **options) as writer:
+        write_numbers(writer, values, period_ns)
+    return path
 
 
 @dataclass(frozen=True)
