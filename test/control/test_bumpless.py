@@ -3,7 +3,9 @@
 
 """Hand-overs that the coolant does not feel: modes, tunings, models, restarts."""
 
+from copy import copy
 from dataclasses import replace
+from functools import cache
 
 import numpy as np
 import pytest
@@ -12,12 +14,12 @@ from koopman_ros.control import Controller, exchange, InputLimits, Mode, ModeCha
 from support.closed_loops import SETPOINT, shipped, START
 from support.sampled_loops import changed_reactor, controller, largest_step, Reactor, settled
 
-DRIFTED = {'heat_transfer_coefficient': 0.8}
+DRIFTED = 0.8
 
 
-def loop_at(setpoint: float, **changes: float) -> Reactor:
-    """Return a loop at rest at a set-point, on a plant that is not the model."""
-    loop = Reactor(controller(), changed_reactor(**changes))
+@cache
+def at_rest(setpoint: float, heat_transfer: float) -> Reactor:
+    loop = Reactor(controller(), changed_reactor(heat_transfer_coefficient=heat_transfer))
     loop.run(10)
     loop.ask(setpoint)
     loop.run(480)
@@ -25,8 +27,15 @@ def loop_at(setpoint: float, **changes: float) -> Reactor:
     return loop
 
 
+def loop_at(setpoint: float, heat_transfer: float = 1.0) -> Reactor:
+    """Return a loop at rest at a set-point; with another heat transfer than the model's."""
+    loop = copy(at_rest(setpoint, heat_transfer))
+    loop.samples = list(loop.samples)
+    return loop
+
+
 def test_automatic_to_manual_and_back_at_rest():
-    loop = loop_at(SETPOINT, **DRIFTED)
+    loop = loop_at(SETPOINT, DRIFTED)
     loop.do(ModeChange(Mode.MANUAL))
     loop.run(60)
     loop.do(ModeChange(Mode.AUTOMATIC))
@@ -38,7 +47,7 @@ def test_automatic_to_manual_and_back_at_rest():
 def test_from_a_coolant_that_the_law_would_not_choose(by):
     loop = loop_at(START)
     loop.manual(loop.samples[-1].command + by)
-    before = loop.run(1200)[-1]
+    before = loop.run(600)[-1]
     loop.do(ModeChange(Mode.AUTOMATIC))
     samples = loop.run(420)
     assert abs(samples[0].command - before.command) < 0.01
@@ -55,7 +64,7 @@ def test_from_a_coolant_that_the_law_would_not_choose(by):
 ], ids=lambda change: next(iter(change)))
 def test_retuning(change):
     # at rest nothing is felt
-    loop = loop_at(SETPOINT, **DRIFTED)
+    loop = loop_at(SETPOINT, DRIFTED)
     loop.do(exchange(controller(**change)))
     assert largest_step(loop.run(200)) < 1e-6
     # and under way the command goes on where it was
@@ -79,7 +88,7 @@ def test_a_storm_of_tunings_does_not_stop_the_feedback():
 
 @pytest.mark.parametrize('name', ['reactor_nz3', 'reactor_linear'])
 def test_another_model_at_rest(name):
-    loop = loop_at(SETPOINT, **DRIFTED)
+    loop = loop_at(SETPOINT, DRIFTED)
     for model in (name, 'reactor_nz4', name):
         loop.do(exchange(controller(model)))
         samples = loop.run(300)
@@ -88,7 +97,7 @@ def test_another_model_at_rest(name):
 
 
 def test_another_model_in_other_units_of_scale():
-    loop = loop_at(SETPOINT, **DRIFTED)
+    loop = loop_at(SETPOINT, DRIFTED)
     before = loop.samples[-1].report.estimate.disturbance
     model = shipped('reactor_linear')
     states = model.states
@@ -102,7 +111,7 @@ def test_another_model_in_other_units_of_scale():
 
 @pytest.mark.parametrize('at_rest', [True, False])
 def test_a_restart_takes_over_from_the_coolant_in_force(at_rest):
-    loop = loop_at(SETPOINT, **DRIFTED)
+    loop = loop_at(SETPOINT, DRIFTED)
     if not at_rest:
         loop.ask(START)
         loop.run(25)
@@ -128,7 +137,7 @@ def test_without_a_transfer_time_the_rate_limit_alone_counts():
     loop = Reactor(controller(transfer_time=0.0))
     loop.run(10)
     loop.manual(296.0)
-    loop.run(600)
+    loop.run(200)
     loop.do(ModeChange(Mode.AUTOMATIC))
     assert largest_step(loop.run(20)) == pytest.approx(1.0)
 

@@ -30,6 +30,7 @@ def test_nominal_step_response():
     loop.ask(SETPOINT)
     samples = loop.run(RESPONSE + MORE)
     assert settled(samples, SETPOINT, 1e-3) <= RESPONSE
+    assert min(s.temperature for s in samples) > SETPOINT - 0.1
     # the model is so good that there is next to nothing to estimate
     assert max(abs(float(s.report.estimate.disturbance[0])) for s in samples) < 0.01
 
@@ -37,11 +38,11 @@ def test_nominal_step_response():
 @pytest.mark.parametrize(('change', 'others'), [
     *((change, {}) for change in CHANGES.values()),
     *(({}, {'actuator': Actuator(lag=lag, delay=delay)})
-      for lag, delay in ((5.0, 0.0), (10.0, 0.0), (0.0, 1.0), (10.0, 1.0))),
+      for lag, delay in ((10.0, 0.0), (0.0, 1.0), (10.0, 1.0))),
     # a biased measurement of the coolant brings no offset
     *((CHANGES['UA - 20 %'], {'input_sensor': lambda u, _, error=error: u + error})
       for error in (-1.5, 1.5))],
-    ids=[*CHANGES, 'lag 5 s', 'lag 10 s', 'delay', 'lag and delay', 'told less', 'told more'])
+    ids=[*CHANGES, 'lag 10 s', 'delay', 'lag and delay', 'told less', 'told more'])
 def test_what_is_not_the_model_is_brought_to_its_setpoint(change, others):
     loop = Reactor(controller(), changed_reactor(**change), **others)
     loop.run(10)
@@ -49,15 +50,6 @@ def test_what_is_not_the_model_is_brought_to_its_setpoint(change, others):
     samples = loop.run(RESPONSE + MORE)
     assert settled(samples, SETPOINT, 1e-3) <= RESPONSE + MORE - 10
     assert not change or abs(float(samples[-1].report.estimate.disturbance[0])) > 0.4
-
-
-@pytest.mark.parametrize('change', ['UA - 20 %', 'T_i - 5 K'])
-def test_a_plant_that_changes_under_way_is_brought_back(change):
-    loop = Reactor(controller())
-    loop.run(10)
-    loop.change(system=changed_reactor(**CHANGES[change]))
-    samples = loop.run(RESPONSE + MORE)
-    assert settled(samples, START, 1e-3) <= RESPONSE + MORE - 10
 
 
 @pytest.mark.parametrize('step', [-3.0, 1.5])
@@ -75,7 +67,7 @@ def test_a_biased_sensor_is_shown_for_what_it_is():
     loop = Reactor(controller(), sensor=lambda y, _: y + 2.0)
     loop.run(1)
     loop.ask(START)
-    last = loop.run(600)[-1]
+    last = loop.run(400)[-1]
     # what is measured has no offset; the reactor has, and nobody in the loop can know
     assert last.temperature + 2.0 == pytest.approx(START, abs=1e-3)
     bias = loop.loop.controller.equivalent_bias(loop.loop.state)
@@ -83,15 +75,15 @@ def test_a_biased_sensor_is_shown_for_what_it_is():
     assert float(last.report.estimate.disturbance[0]) == pytest.approx(1.07, abs=0.02)
 
 
-def test_a_quarter_of_an_hour_at_the_limit_leaves_nothing_behind():
+def test_minutes_at_the_limit_leave_nothing_behind():
     loop = Reactor(controller())
     loop.run(10)
     loop.change(system=changed_reactor(feed_shift=-40.0))
-    saturated = loop.run(900)
-    assert all(s.command == UPPER for s in saturated[-800:])
+    saturated = loop.run(300)
+    assert all(s.command == UPPER for s in saturated[-200:])
     assert START - saturated[-1].temperature > 10.0
     loop.change(system=REACTOR)
-    samples = loop.run(600)
+    samples = loop.run(RESPONSE + MORE)
     assert max(s.temperature for s in samples) - START < 0.5
     assert settled(samples, START, 1e-3) <= RESPONSE + MORE
 
@@ -103,10 +95,10 @@ def test_an_actuator_that_reaches_less_than_is_commanded(tells):
     loop.ask(SETPOINT)
     # 292.29 K would be needed
     loop.act(Actuator(lower=298.15))
-    stuck = loop.run(900)
+    stuck = loop.run(300)
     assert all(s.report.measurement.follows for s in stuck[20:]) is not tells
     loop.act(Actuator())
-    samples = loop.run(420)
+    samples = loop.run(RESPONSE + MORE)
     below = SETPOINT - min(s.temperature for s in samples)
     assert below < 0.5 if tells else below > 1.0
     assert settled(samples, SETPOINT, 1e-3) <= RESPONSE + MORE or not tells
@@ -117,14 +109,14 @@ def test_without_the_observer_the_offset_stays():
         heat_transfer_coefficient=0.8))
     loop.run(10)
     loop.ask(SETPOINT)
-    assert abs(loop.run(600)[-1].temperature - SETPOINT) > 3.0
+    assert abs(loop.run(300)[-1].temperature - SETPOINT) > 3.0
 
 
 @pytest.mark.parametrize(('bandwidth', 'low', 'high'), [(2.0, 0.0, 0.03), (6.0, 0.04, 0.09),
                                                        (12.0, 0.09, 0.4)])
 def test_bandwidth_trades_noise_for_speed(bandwidth, low, high):
     loop = Reactor(controller(observer_bandwidth=bandwidth / 60.0), noise=0.1)
-    commands = np.array([s.command for s in loop.run(1200)[300:]])
+    commands = np.array([s.command for s in loop.run(800)[200:]])
     assert low < np.std(commands) < high
     # the filter adds no offset
-    assert abs(np.mean([s.temperature for s in loop.samples[300:]]) - START) < 0.02
+    assert abs(np.mean([s.temperature for s in loop.samples[200:]]) - START) < 0.02
