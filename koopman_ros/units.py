@@ -14,6 +14,7 @@ NANOSECONDS = 1_000_000_000  # in a second
 SECONDS_PER_MINUTE = 60.0
 LAST_STAMP_SECONDS = 2 ** 31 - 1  # of a stamp of ROS, whose seconds are an int32
 ZERO_CELSIUS = 273.15  # K
+SECONDS_PER_TIME_UNIT = {'min': 60.0, 's': 1.0}
 # A stamp that is earlier than the last by no more than this is out of order; one that is earlier
 # still means that time itself was set back.
 LATE_NANOSECONDS = NANOSECONDS

@@ -17,7 +17,7 @@ from types import MappingProxyType
 
 import numpy as np
 
-from koopman_ros.lifting.arrays import Array
+from koopman_ros.arrays import Array
 
 
 @dataclass(frozen=True)

@@ -11,7 +11,7 @@ import math
 
 import numpy as np
 
-from koopman_ros.lifting.arrays import Array, frozen
+from koopman_ros.arrays import Array, frozen
 from koopman_ros.plant_data import Plant
 
 

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from koopman_ros.lifting.arrays import Array
+from koopman_ros.arrays import Array
 from koopman_ros.lifting.coordinates import Coordinates
 from koopman_ros.lifting.model import LiftedModel, Provenance
 from koopman_ros.lifting.observables import NetworkObservables

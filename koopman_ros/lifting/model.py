@@ -12,13 +12,12 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
-from koopman_ros.lifting.arrays import Array, frozen
+from koopman_ros.arrays import Array, frozen
 from koopman_ros.lifting.coordinates import Coordinates
 from koopman_ros.lifting.observables import NetworkObservables, Observables
 from koopman_ros.lifting.training_states import TrainingStates
 from koopman_ros.plant_data import Plant
-
-SECONDS_PER_TIME_UNIT = {'s': 1.0, 'min': 60.0}
+from koopman_ros.units import SECONDS_PER_TIME_UNIT
 
 
 @dataclass(frozen=True)

@@ -14,8 +14,8 @@ from typing import final
 import numpy as np
 from numpy.typing import NDArray
 
+from koopman_ros.arrays import Array, frozen
 from koopman_ros.lifting.activations import Activation, activation_named
-from koopman_ros.lifting.arrays import Array, frozen
 
 
 class Observables(ABC):

@@ -4,13 +4,7 @@
 """Control-affine systems, their steady states, actuators and simulation; imports plant data."""
 
 from koopman_ros.plants.actuator import ActuatedProcess, Actuator
-from koopman_ros.plants.equilibria import (
-    eigenvalues,
-    equilibrium,
-    equilibrium_input,
-    EquilibriumError,
-    fold,
-)
+from koopman_ros.plants.equilibria import equilibrium_input, EquilibriumError
 from koopman_ros.plants.excitation import ExcitationError, random_steps, RandomStepDesign
 from koopman_ros.plants.integration import (
     IntegrationError,
@@ -24,11 +18,7 @@ from koopman_ros.plants.library.reactor import (
     two_state_reactor,
 )
 from koopman_ros.plants.library.scalar import scalar_example
-from koopman_ros.plants.library.two_state import (
-    ExactLift,
-    two_state_exact_lift,
-    two_state_example,
-)
+from koopman_ros.plants.library.two_state import two_state_example
 from koopman_ros.plants.process import Process
 from koopman_ros.plants.sensor import in_steps, sensor_noise
 from koopman_ros.plants.simulation import advance, sample_derivatives, simulate
@@ -40,7 +30,6 @@ __all__ = [
     'Actuator',
     'ControlAffineSystem',
     'EquilibriumError',
-    'ExactLift',
     'ExcitationError',
     'FloatArray',
     'IntegrationError',
@@ -50,10 +39,7 @@ __all__ = [
     'RandomStepDesign',
     'ReactorParameters',
     'advance',
-    'eigenvalues',
-    'equilibrium',
     'equilibrium_input',
-    'fold',
     'in_steps',
     'one_state_reactor',
     'random_steps',
@@ -61,7 +47,6 @@ __all__ = [
     'scalar_example',
     'sensor_noise',
     'simulate',
-    'two_state_exact_lift',
     'two_state_example',
     'two_state_reactor',
 ]

@@ -73,25 +73,8 @@ class RandomStepDesign:
                 math.floor(longest / self.sample_period + 1e-9))
 
 
-@dataclass(frozen=True, eq=False)
-class _Bounds:
-    """A design's bounds with one entry for each input and state of a system."""
-
-    input_lower: FloatArray
-    input_upper: FloatArray
-    settings: IntegratorSettings
-    state_lower: FloatArray
-    state_upper: FloatArray
-
-
-def random_steps(
-    system: ControlAffineSystem,
-    design: RandomStepDesign,
-    duration: float,
-    seed: int,
-    *,
-    x0: ArrayLike | None = None,
-) -> Episode:
+def random_steps(system: ControlAffineSystem, design: RandomStepDesign, duration: float, seed: int,
+                 *, x0: ArrayLike | None = None) -> Episode:
     """
     Drive a plant through random steps of its inputs (paper, section on the reactor).
 
@@ -109,18 +92,39 @@ def random_steps(
     if system.n_u == 0:
         raise ValueError(f'{system.name} has no input to step; choose initial states instead')
     holds = _whole_samples(duration, design.sample_period, system.time_unit)
-    bounds = _resolved_bounds(system, design)
+    levels, box = _bounds(system, design)
     state = system.nominal_state if x0 is None else system.checked_state('x0', x0)
-    if not np.all((state >= bounds.state_lower) & (state <= bounds.state_upper)):
+    if not np.all((state >= box.lower) & (state <= box.upper)):
         raise ExcitationError(
-            f'{system.name}: at the start {_violation(system, bounds, state)}; '
+            f'{system.name}: at the start {_violation(system, box, state)}; '
             'choose x0 inside the box, or a box around it')
+
+    def safe_step(length: int) -> Episode:
+        """Draw levels until one keeps the state in the box; return its step."""
+        for _ in range(design.max_redraws + 1):
+            level = rng.uniform(*levels)
+            try:
+                return simulate(
+                    system, state, np.tile(level, (length, 1)), design.sample_period,
+                    start_time=sample * design.sample_period, settings=box)
+            except IntegrationError as error:
+                if error.failure is not IntegrationFailure.OUT_OF_BOUNDS:
+                    raise
+                out = error
+        tried = ', '.join(
+            f'{name} in [{lower:.10g}, {upper:.10g}]' + ('' if unit == '1' else f' {unit}')
+            for name, unit, lower, upper in zip(
+                system.input_names, system.input_units, *levels, strict=True))
+        raise ExcitationError(
+            f'{system.name}: {_violation(system, box, out.state)} at {out.time:.6g} '
+            f'{system.time_unit}, and so it went with each of {design.max_redraws + 1} levels of '
+            f'{tried}; narrow the input bounds, widen the box or shorten hold_time')
 
     rng = np.random.default_rng(seed)
     states, inputs, sample = [state[None, :]], [], 0
     while sample < holds:
         drawn = int(rng.integers(*design.hold_samples, endpoint=True))
-        step = _safe_step(system, design, bounds, state, sample, min(drawn, holds - sample), rng)
+        step = safe_step(min(drawn, holds - sample))
         states.append(step.x[1:])
         inputs.append(step.u)
         state, sample = step.x[-1], sample + len(step.u)
@@ -128,54 +132,19 @@ def random_steps(
     return Episode(times, np.concatenate(states), times[:-1], np.concatenate(inputs))
 
 
-def _safe_step(
-    system: ControlAffineSystem,
-    design: RandomStepDesign,
-    bounds: _Bounds,
-    state: FloatArray,
-    first_sample: int,
-    length: int,
-    rng: np.random.Generator,
-) -> Episode:
-    """Draw levels until one keeps the state in the box; return its step."""
-    start_time = first_sample * design.sample_period
-    for _ in range(design.max_redraws + 1):
-        level = rng.uniform(bounds.input_lower, bounds.input_upper)
-        try:
-            return simulate(
-                system, state, np.tile(level, (length, 1)), design.sample_period,
-                start_time=start_time, settings=bounds.settings)
-        except IntegrationError as error:
-            if error.failure is not IntegrationFailure.OUT_OF_BOUNDS:
-                raise
-            exit_time, exit_state = error.time, error.state
-    levels = ', '.join(
-        f'{name} in [{lower:.10g}, {upper:.10g}]' + ('' if unit == '1' else f' {unit}')
-        for name, unit, lower, upper in zip(
-            system.input_names, system.input_units, bounds.input_lower, bounds.input_upper,
-            strict=True))
-    raise ExcitationError(
-        f'{system.name}: {_violation(system, bounds, exit_state)} at {exit_time:.6g} '
-        f'{system.time_unit}, and so it went with each of {design.max_redraws + 1} levels of '
-        f'{levels}; narrow the input bounds, widen the box or shorten hold_time')
-
-
-def _resolved_bounds(system: ControlAffineSystem, design: RandomStepDesign) -> _Bounds:
-    """Fit a design to a system; the box shrinks to the states at which the model holds."""
-    state_lower = np.maximum(
+def _bounds(system: ControlAffineSystem, design: RandomStepDesign
+            ) -> tuple[tuple[FloatArray, FloatArray], IntegratorSettings]:
+    """Return bounds of the levels, and the box, shrunk to the states at which the model holds."""
+    lower = np.maximum(
         system.checked_bound('state_lower', design.state_lower), system.state_lower)
-    state_upper = np.minimum(
+    upper = np.minimum(
         system.checked_bound('state_upper', design.state_upper), system.state_upper)
-    if not np.all(state_lower < state_upper):
-        raise ValueError(f'state_lower {state_lower} must lie below state_upper {state_upper}')
-    input_lower = checked_vector('input_lower', design.input_lower, system.n_u)
-    input_upper = checked_vector('input_upper', design.input_upper, system.n_u)
-    if not np.all(input_lower < input_upper):
-        raise ValueError(f'input_lower {input_lower} must lie below input_upper {input_upper}')
-    settings = IntegratorSettings(rtol=design.rtol, lower=state_lower, upper=state_upper)
-    return _Bounds(
-        input_lower=input_lower, input_upper=input_upper, settings=settings,
-        state_lower=state_lower, state_upper=state_upper)
+    levels = (checked_vector('input_lower', design.input_lower, system.n_u),
+              checked_vector('input_upper', design.input_upper, system.n_u))
+    for name, low, high in (('state', lower, upper), ('input', *levels)):
+        if not np.all(low < high):
+            raise ValueError(f'{name}_lower {low} must lie below {name}_upper {high}')
+    return levels, IntegratorSettings(rtol=design.rtol, lower=lower, upper=upper)
 
 
 def _whole_samples(duration: float, sample_period: float, time_unit: str) -> int:
@@ -188,10 +157,11 @@ def _whole_samples(duration: float, sample_period: float, time_unit: str) -> int
     return round(count)
 
 
-def _violation(system: ControlAffineSystem, bounds: _Bounds, state: FloatArray) -> str:
+def _violation(system: ControlAffineSystem, box: IntegratorSettings, state: FloatArray) -> str:
     """Name the first state variable that is outside the box, its value and its range."""
-    i = int(np.argmax((state < bounds.state_lower) | (state > bounds.state_upper)))
+    lower, upper = np.asarray(box.lower), np.asarray(box.upper)
+    i = int(np.argmax((state < lower) | (state > upper)))
     unit = '' if system.state_units[i] == '1' else f' {system.state_units[i]}'
     return (
         f'{system.state_names[i]} reached {state[i]:.6g}{unit}, outside the box '
-        f'[{bounds.state_lower[i]:.10g}, {bounds.state_upper[i]:.10g}]{unit}')
+        f'[{lower[i]:.10g}, {upper[i]:.10g}]{unit}')

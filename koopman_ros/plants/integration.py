@@ -7,6 +7,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from enum import Enum
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -28,6 +29,15 @@ class IntegrationFailure(Enum):
     NON_FINITE = 'its rate is not finite there; start where the model is defined'
     STEP_TOO_SMALL = 'it changes too fast to follow; stop before it escapes, or set bounds'
     TOO_MANY_STEPS = 'it needs too many integration steps; simulate shorter holds'
+
+
+class Limits(NamedTuple):
+    """Tolerances and state bounds (n_x,) of an integration, for one system."""
+
+    rtol: float
+    atol: FloatArray
+    lower: FloatArray
+    upper: FloatArray
 
 
 class IntegrationError(RuntimeError):
@@ -77,16 +87,6 @@ class IntegratorSettings:
                 f'rtol is {self.rtol:.3g}, must lie in [{TIGHTEST_RTOL:.3g}, {LOOSEST_RTOL:.3g}]')
 
 
-@dataclass(frozen=True, eq=False)
-class Limits:
-    """Settings with every default filled in for one system."""
-
-    rtol: float
-    atol: FloatArray
-    lower: FloatArray
-    upper: FloatArray
-
-
 def resolved_limits(system: ControlAffineSystem, settings: IntegratorSettings) -> Limits:
     """
     Fill in what `settings` leaves to the system.
@@ -98,12 +98,11 @@ def resolved_limits(system: ControlAffineSystem, settings: IntegratorSettings) -
     # Zero would divide zero by zero in the error norm of a state that is exactly zero.
     if not np.all((atol > 0.0) & (atol < np.inf)):
         raise ValueError(f'atol is {atol}, must be finite and above 0')
-    lower, upper = system.state_lower, system.state_upper
-    if settings.lower is not None:
-        lower = system.checked_bound('lower', settings.lower)
-    if settings.upper is not None:
-        upper = system.checked_bound('upper', settings.upper)
-    return Limits(rtol=settings.rtol, atol=atol, lower=lower, upper=upper)
+    lower, upper = (
+        own if bound is None else system.checked_bound(name, bound) for name, bound, own in (
+            ('lower', settings.lower, system.state_lower),
+            ('upper', settings.upper, system.state_upper)))
+    return Limits(settings.rtol, atol, lower, upper)
 
 
 def hold(system: ControlAffineSystem, start: FloatArray, u: FloatArray, duration: float,

@@ -11,9 +11,10 @@ import math
 import numpy as np
 from numpy.typing import ArrayLike
 
+from koopman_ros.arrays import frozen
 from koopman_ros.plant_data import Episode, Samples
 from koopman_ros.plants.integration import hold, IntegratorSettings, resolved_limits
-from koopman_ros.plants.system import checked_array, ControlAffineSystem, FloatArray
+from koopman_ros.plants.system import ControlAffineSystem, FloatArray
 
 _DEFAULT_SETTINGS = IntegratorSettings()
 
@@ -66,7 +67,7 @@ def simulate(
     :raises IntegrationError: when the end is not reached.
     """
     x = system.checked_state('x0', x0)
-    held = checked_array('inputs', inputs, (None, system.n_u))
+    held = frozen(inputs, 'inputs', (None, system.n_u))
     if not 0.0 < sample_period < math.inf:
         raise ValueError(
             f'sample_period is {sample_period} {system.time_unit}, must be finite and above 0')

@@ -9,66 +9,20 @@ from collections.abc import Callable
 from dataclasses import dataclass, field
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
-FloatArray = NDArray[np.float64]
+from koopman_ros.arrays import Array as FloatArray
+from koopman_ros.arrays import frozen
+from koopman_ros.units import SECONDS_PER_TIME_UNIT
+
 ArrayFunction = Callable[[FloatArray], FloatArray]
 
-SECONDS_PER_TIME_UNIT = {'min': 60.0, 's': 1.0}
 
-
-def checked_array(
-    name: str, value: ArrayLike, shape: tuple[int | None, ...], *, finite: bool = True,
-) -> FloatArray:
-    """
-    Return a read-only float64 copy of `value`.
-
-    :param shape: the expected shape, None where any length will do.
-    :raises ValueError: naming the argument and both shapes, or the argument and the first entry
-        that is not a number (with `finite`, that is infinite either).
-    """
-    array = np.array(value, dtype=np.float64)
-    fits = array.ndim == len(shape) and all(
-        expected is None or length == expected
-        for length, expected in zip(array.shape, shape, strict=True))
-    if not fits:
-        raise ValueError(
-            f'incompatible {name}: expected {_shape_text(shape)}, got {_shape_text(array.shape)}')
-    refused = ~np.isfinite(array) if finite else np.isnan(array)
-    if refused.any():
-        position = tuple(int(i) for i in np.argwhere(refused)[0])
-        raise ValueError(
-            f'{name} must be finite: entry {list(position)} is {array[position]}; '
-            'check where that number was computed or measured')
-    array.flags.writeable = False
-    return array
-
-
-def checked_vector(
-    name: str, value: ArrayLike, length: int, *, finite: bool = True,
-) -> FloatArray:
-    """
-    Return a read-only float64 vector of `value`, which may be one number for all of it.
-
-    :raises ValueError: as `checked_array` does.
-    """
+def checked_vector(name: str, value: ArrayLike, length: int, *, finite: bool = True) -> FloatArray:
+    """Return :func:`frozen` of a vector, which may be given by one number for all of it."""
     array = np.asarray(value, dtype=np.float64)
-    if array.ndim == 0:
-        array = np.broadcast_to(array, (length,))
-    return checked_array(name, array, (length,), finite=finite)
-
-
-def _shape_text(shape: tuple[int | None, ...]) -> str:
-    lengths = ['any' if length is None else str(length) for length in shape]
-    return f'({lengths[0]},)' if len(lengths) == 1 else f'({", ".join(lengths)})'
-
-
-def _unbounded_below() -> FloatArray:
-    return np.array(-np.inf)
-
-
-def _unbounded_above() -> FloatArray:
-    return np.array(np.inf)
+    return frozen(np.broadcast_to(array, (length,)) if array.ndim == 0 else array, name, (length,),
+                  finite=finite)
 
 
 @dataclass(frozen=True, eq=False)
@@ -101,8 +55,8 @@ class ControlAffineSystem:
     B: FloatArray
     nominal_state: FloatArray
     nominal_input: FloatArray
-    state_lower: FloatArray = field(default_factory=_unbounded_below)
-    state_upper: FloatArray = field(default_factory=_unbounded_above)
+    state_lower: FloatArray = field(default_factory=lambda: np.array(-np.inf))
+    state_upper: FloatArray = field(default_factory=lambda: np.array(np.inf))
 
     def __post_init__(self) -> None:
         if self.time_unit not in SECONDS_PER_TIME_UNIT:
@@ -118,7 +72,7 @@ class ControlAffineSystem:
                     f'got ({len(getattr(self, units))},)')
         if not self.state_names:
             raise ValueError('state_names is empty, a system has at least one state')
-        self._set('B', checked_array('B', self.B, (self.n_x, self.n_u)))
+        self._set('B', frozen(self.B, 'B', (self.n_x, self.n_u)))
         self._set('nominal_state', self.checked_state('nominal_state', self.nominal_state))
         self._set('nominal_input', self.checked_input('nominal_input', self.nominal_input))
         self._set('state_lower', self.checked_bound('state_lower', self.state_lower))
@@ -184,11 +138,11 @@ class ControlAffineSystem:
 
     def checked_state(self, name: str, value: ArrayLike) -> FloatArray:
         """Return `value` as a read-only state (n_x,); raise ValueError naming it if it is none."""
-        return checked_array(name, value, (self.n_x,))
+        return frozen(value, name, (self.n_x,))
 
     def checked_input(self, name: str, value: ArrayLike) -> FloatArray:
         """Return `value` as a read-only input (n_u,); raise ValueError naming it if it is none."""
-        return checked_array(name, value, (self.n_u,))
+        return frozen(value, name, (self.n_u,))
 
     def checked_bound(self, name: str, value: ArrayLike) -> FloatArray:
         """Return `value`, a scalar or (n_x,) and possibly infinite, as a bound on the states."""

@@ -4,6 +4,7 @@
 """Any number of states and inputs: limits, levels, noise and silence, one number per signal."""
 
 from dataclasses import fields, replace
+import json
 import math
 
 from hypothesis import given, settings
@@ -12,15 +13,14 @@ import numpy as np
 import pytest
 from scipy.linalg import expm
 
-from koopman_ros.control import Controller, InputLimits, Mode, Settings, State
+from koopman_ros.control import Arrival, Controller, InputLimits, Mode, Settings, State
 from koopman_ros.estimation import SensorLimits
 from koopman_ros.lifting import LiftedModel, linearised_model, Provenance
 from koopman_ros.reasons import Code
+from koopman_ros.replay.values import decoded
 from koopman_ros.signals import Outputs
 from support.random_lifts import coordinates, random_lift
-from support.sampled_loops import supervisor_settings
-
-SECOND = 1_000_000_000
+from support.sampled_loops import content, controller, EPOCH, SECOND, supervisor_settings
 
 
 def tuned(model: LiftedModel, outputs: Outputs | None = None, **changes: object) -> Controller:
@@ -45,56 +45,87 @@ def mixed(model: LiftedModel) -> Outputs:
                    np.eye(n) + 0.5 * np.eye(n, k=1))
 
 
-shares = st.floats(-3.0, 3.0)
+WILD = [math.nan, math.inf, -math.inf, 1e300, -1e300, 1.7e308, 0.0, -0.0, 5e-324, -40.0]
+shares = st.one_of(st.floats(-3.0, 3.0), st.floats(-3.0, 3.0), st.sampled_from(WILD), st.floats())
+waits = st.one_of(st.just(1.0), st.sampled_from(
+    [0.3, 4.0, 0.0, 1e-9, -1e-9, -1.0, -30.0, 3600.0, -3600.0, -1e9, 1e9]))
 kinds = st.sampled_from(['measure'] * 6 + [
-    'silence', 'setpoint', 'manual', 'mode', 'broken', 'frozen', 'restart', 'successor'])
-events = st.lists(st.tuples(kinds, st.lists(shares, min_size=4, max_size=4),
-                            st.sampled_from([1.0, 1.0, 1.0, 0.3, 4.0, 0.0, -30.0])),
-                  min_size=1, max_size=25)
+    'silence', 'setpoint', 'schedule', 'manual', 'mode', 'frozen', 'restart', 'successor'])
+events = st.lists(st.tuples(kinds, st.lists(shares, min_size=4, max_size=4), waits),
+                  min_size=1, max_size=30)
+ENDLESS = {'lower': np.array([-math.inf]), 'upper': np.array([math.inf]),
+           'rate': np.array([math.inf])}
+REACTORS = [[first, first, *others] for first, *others in (
+    [controller(), controller(observer_bandwidth=0.0, transfer_time=0.0),
+     controller(input_weight=np.array([1e-4]))],
+    [controller('reactor_linear'), controller(sensor=ENDLESS)],
+    [controller('reactor_nz3', setpoint_ramp=np.array([0.2])), controller('reactor_linear')])]
 
 
-@settings(max_examples=60, deadline=None, derandomize=True)
-@given(n_x=st.integers(1, 4), n_u=st.integers(1, 3), seed=st.integers(0, 5),
-       all_states=st.booleans(), sequence=events)
-def test_every_command_keeps_the_limits_of_each_input(n_x, n_u, seed, all_states, sequence):
+def random_controllers(n_x: int, n_u: int, seed: int, all_states: bool) -> list[Controller]:
     model = random_lift(n_x, n_u=n_u, seed=seed)
-    loop = tuned(model, None if all_states else mixed(model))
-    limits, state, now = loop.settings.limits, State(), 10 * SECOND
+    outputs = None if all_states else mixed(model)
+    return [tuned(model, outputs), tuned(model, outputs),
+            tuned(model, outputs, observer_bandwidth=0.0)]
+
+
+controllers = st.one_of(st.sampled_from(REACTORS), st.builds(
+    random_controllers, st.integers(1, 4), st.integers(1, 3), st.integers(0, 5), st.booleans()))
+
+
+@settings(max_examples=150, deadline=None, derandomize=True)
+@given(controllers=controllers, sequence=events)
+@np.errstate(all='ignore')
+def test_every_command_keeps_the_limits_of_each_input(controllers, sequence):
+    loop, model = controllers[0], controllers[0].model
+    limits, state, now = loop.settings.limits, State(), EPOCH
     last = loop.measured.of(model.states.center)
     for kind, values, wait in sequence:
-        before, earlier = state.command, state.commanded_ns
-        x = model.states.to_physical(np.array(values[:n_x]))
-        u = model.inputs.to_physical(np.array(values[-n_u:]))
+        before, earlier, then = state.command, state.commanded_ns, state.time_ns
+        x = model.states.to_physical(np.array(values[:model.n_x]))
+        u = model.inputs.to_physical(np.array(values[-model.n_u:]))
         now = max(SECOND, now + round(wait * SECOND))
         command = None
         match kind:
-            case 'measure' | 'broken' | 'frozen':
+            case 'measure' | 'frozen':
                 y = last if kind == 'frozen' else loop.measured.of(x)
-                if kind == 'broken':
-                    y = np.where(np.arange(n_x) == 0, values[0] * math.inf, y)
-                else:
-                    last = y
-                state, command, report = loop.step(state, y, now)
-                assert (report.reason is not None) or kind != 'broken' or wait <= 0.0
+                last, kept = y, content(state)
+                state, command, report = result = loop.step(state, y, now)
+                # pure: a controller built afresh, with nothing cached, gives the same
+                again = decoded(json.loads(kept))
+                assert content(replace(loop).step(again, y, now)) == content(result)
+                ahead = SECOND if then is None else now - then
+                arrival = report.measurement.arrival
+                assert report.measurement.clock_went_back is (ahead < -SECOND)
+                if before is not None:
+                    assert (arrival is Arrival.LATE) is (-SECOND <= ahead < 0)
+                    assert (arrival is Arrival.REPEATED) is (ahead == 0)
+                if arrival is Arrival.REJECTED:
+                    assert report.reason is not None or state.mode is Mode.MANUAL
+                assert arrival is not Arrival.ACCEPTED or np.all(np.isfinite(y))
             case 'silence':
                 state, command, report = loop.hold(state, now)
-            case 'setpoint':
-                state, refused = loop.request_setpoint(state, x)
+            case 'setpoint' | 'schedule':
+                ahead = now if kind == 'schedule' else 0
+                state, refused = loop.request_setpoint(state, x, ahead)
                 assert (refused is None) == (model.states.violation(x) == 0.0)
             case 'manual':
-                state, _ = loop.request_manual_input(state, u)
+                state, refused = loop.request_manual_input(state, u)
+                assert refused is None or state.mode is not Mode.MANUAL or (
+                    not np.all(np.isfinite(u)))
             case 'mode':
                 state = loop.set_mode(state, Mode.MANUAL if values[0] > 0.0 else Mode.AUTOMATIC)
             case 'restart':
                 state = loop.initialise(State(), u)
             case 'successor':
-                other = tuned(model, loop.outputs, observer_bandwidth=float(values[0] > 0.0))
+                other = controllers[(values[0] > 0.0) + (values[1] > 0.0)]
                 state, loop = other.hand_over(loop, state), other
         if command is None:
             continue
-        assert command.shape == (n_u,)
+        assert command.shape == (model.n_u,)
         assert np.all((limits.lower <= command) & (command <= limits.upper))
         assert report.level in ('sdre', 'linear', 'hold', 'safe', 'manual')
+        assert state.estimate is None or np.all(np.isfinite(state.estimate.w))
         if before is not None and earlier is not None:
             elapsed = max(0.0, (now - earlier) / SECOND)
             assert np.all(np.abs(command - before) <= limits.rate * elapsed + 1e-9)

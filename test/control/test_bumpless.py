@@ -12,14 +12,15 @@ import pytest
 
 from koopman_ros.control import Controller, exchange, InputLimits, Mode, ModeChange, restart, State
 from support.closed_loops import SETPOINT, shipped, START
-from support.sampled_loops import changed_reactor, controller, largest_step, Reactor, settled
+from support.sampled_loops import controller, largest_step, Reactor, settled
+from validation.robustness.loop import changed_reactor
 
 DRIFTED = 0.8
 
 
 @cache
 def at_rest(setpoint: float, heat_transfer: float) -> Reactor:
-    loop = Reactor(controller(), changed_reactor(heat_transfer_coefficient=heat_transfer))
+    loop = Reactor(controller(), changed_reactor(heat_transfer=heat_transfer))
     loop.run(10)
     loop.ask(setpoint)
     loop.run(480)

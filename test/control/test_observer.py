@@ -9,7 +9,8 @@ from scipy.integrate import solve_ivp
 
 from koopman_ros.control import Controller, InputLimits, Settings, State
 from koopman_ros.estimation import DisturbanceObserver, equivalent_bias, Estimate
-from support.closed_loops import shipped, START, two_state_model
+from support.closed_loops import shipped, START
+from validation.paper.optimal_control import exact_two_state_model
 
 MODEL = shipped('reactor_nz4')
 NO_BOUND = np.array([np.inf])
@@ -77,7 +78,7 @@ def test_no_bias_explains_a_disturbance_that_is_too_large():
 
 
 def test_several_states_have_a_disturbance_each():
-    model = two_state_model()
+    model = exact_two_state_model()
     bounds = InputLimits(np.array([-50.0]), np.array([50.0]), np.array([np.inf]))
     loop = Controller(model, Settings.for_model(
         model, state_weight=np.ones(2), input_weight=np.ones(1), limits=bounds,

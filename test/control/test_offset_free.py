@@ -9,20 +9,12 @@ import pytest
 from koopman_ros.control import perfect
 from koopman_ros.plants import Actuator, two_state_reactor
 from support.closed_loops import REACTOR, SETPOINT, START
-from support.sampled_loops import changed_reactor, controller, Reactor, settled, UPPER
+from support.sampled_loops import controller, Reactor, settled, UPPER
+from validation.robustness.disturbances import CHANGED
+from validation.robustness.loop import changed_reactor
 
 # The nominal loop's step response of 10 K takes 192 s to stay within 1e-3 K.
 RESPONSE, MORE = 192, 120  # s
-
-CHANGES = {
-    'UA - 20 %': {'heat_transfer_coefficient': 0.8},
-    'UA + 20 %': {'heat_transfer_coefficient': 1.2},
-    'C_A + 10 %': {'concentration': 1.1},
-    'C_A - 10 %': {'concentration': 0.9},
-    'T_i + 5 K': {'feed_shift': 5.0},
-    'T_i - 5 K': {'feed_shift': -5.0},
-}
-
 
 def test_nominal_step_response():
     loop = Reactor(controller())
@@ -35,21 +27,21 @@ def test_nominal_step_response():
     assert max(abs(float(s.report.estimate.disturbance[0])) for s in samples) < 0.01
 
 
-@pytest.mark.parametrize(('change', 'others'), [
-    *((change, {}) for change in CHANGES.values()),
-    *(({}, {'actuator': Actuator(lag=lag, delay=delay)})
+@pytest.mark.parametrize(('plant', 'others'), [
+    *((plant, {}) for plant in CHANGED.values()),
+    *((REACTOR, {'actuator': Actuator(lag=lag, delay=delay)})
       for lag, delay in ((10.0, 0.0), (0.0, 1.0), (10.0, 1.0))),
     # a biased measurement of the coolant brings no offset
-    *((CHANGES['UA - 20 %'], {'input_sensor': lambda u, _, error=error: u + error})
+    *((CHANGED['UA −20 %'], {'input_sensor': lambda u, _, error=error: u + error})
       for error in (-1.5, 1.5))],
-    ids=[*CHANGES, 'lag 10 s', 'delay', 'lag and delay', 'told less', 'told more'])
-def test_what_is_not_the_model_is_brought_to_its_setpoint(change, others):
-    loop = Reactor(controller(), changed_reactor(**change), **others)
+    ids=[*CHANGED, 'lag 10 s', 'delay', 'lag and delay', 'told less', 'told more'])
+def test_what_is_not_the_model_is_brought_to_its_setpoint(plant, others):
+    loop = Reactor(controller(), plant, **others)
     loop.run(10)
     loop.ask(SETPOINT)
     samples = loop.run(RESPONSE + MORE)
     assert settled(samples, SETPOINT, 1e-3) <= RESPONSE + MORE - 10
-    assert not change or abs(float(samples[-1].report.estimate.disturbance[0])) > 0.4
+    assert plant is REACTOR or abs(float(samples[-1].report.estimate.disturbance[0])) > 0.4
 
 
 @pytest.mark.parametrize('step', [-3.0, 1.5])
@@ -78,7 +70,7 @@ def test_a_biased_sensor_is_shown_for_what_it_is():
 def test_minutes_at_the_limit_leave_nothing_behind():
     loop = Reactor(controller())
     loop.run(10)
-    loop.change(system=changed_reactor(feed_shift=-40.0))
+    loop.change(system=changed_reactor(feed=-40.0))
     saturated = loop.run(300)
     assert all(s.command == UPPER for s in saturated[-200:])
     assert START - saturated[-1].temperature > 10.0
@@ -105,8 +97,7 @@ def test_an_actuator_that_reaches_less_than_is_commanded(tells):
 
 
 def test_without_the_observer_the_offset_stays():
-    loop = Reactor(controller(observer_bandwidth=0.0), changed_reactor(
-        heat_transfer_coefficient=0.8))
+    loop = Reactor(controller(observer_bandwidth=0.0), CHANGED['UA −20 %'])
     loop.run(10)
     loop.ask(SETPOINT)
     assert abs(loop.run(300)[-1].temperature - SETPOINT) > 3.0

@@ -29,75 +29,50 @@ def schedule(setpoint):
     return [(time_ns, float(value[0])) for time_ns, value in setpoint.scheduled]
 
 
-@pytest.mark.parametrize('value', [306.0, 314.4, 326.5])
-def test_values_in_the_box_are_accepted(value):
-    assert refusal(MODEL, kelvin(value)) is None
+OUTSIDE = (' is outside the trained range 305 K to 327 K: the old one is kept; choose one inside, '
+           'or load a model trained over a wider range')
 
 
-def test_the_corners_of_the_box_are_accepted():
-    for corner in (MODEL.states.lower, MODEL.states.upper):
-        assert refusal(MODEL, corner) is None
+def test_values_in_the_box_are_accepted():
+    for value in (306.0, 314.4, 326.5, *MODEL.states.lower, *MODEL.states.upper):
+        assert refusal(MODEL, kelvin(value)) is None
 
 
 @pytest.mark.parametrize(('value', 'text'), [
-    (300.0, 'temperature set-point 300 K is outside the trained range 305 K to 327 K: '
-            'the old one is kept; choose one inside, or load a model trained over a wider range'),
-    (330.123, 'temperature set-point 330.123 K is outside the trained range 305 K to '
-              '327 K: the old one is kept; choose one inside, or load a model trained '
-              'over a wider range'),
-    (np.nan, 'temperature set-point nan K is not finite: the old one is kept'),
-    (np.inf, 'temperature set-point inf K is not finite: the old one is kept'),
-    (-np.inf, 'temperature set-point -inf K is not finite: the old one is kept'),
+    (300.0, 'temperature set-point 300 K' + OUTSIDE),
+    (330.123, 'temperature set-point 330.123 K' + OUTSIDE),
+    # by a hair
+    (np.nextafter(MODEL.states.lower[0], 0.0), 'temperature set-point 305 K' + OUTSIDE),
+    (np.nextafter(MODEL.states.upper[0], np.inf), 'temperature set-point 327 K' + OUTSIDE),
+    *((value, f'temperature set-point {value} K is not finite: the old one is kept')
+      for value in (np.nan, np.inf, -np.inf)),
 ])
 def test_refusals_say_why(value, text):
     assert say(refusal(MODEL, kelvin(value))) == text
 
 
-@pytest.mark.parametrize('corner', ['lower', 'upper'])
-def test_a_hair_outside_is_refused(corner):
-    edge = getattr(MODEL.states, corner)
-    outside = np.nextafter(edge, 0.0 if corner == 'lower' else np.inf)
-    assert 'is outside the trained range' in say(refusal(MODEL, outside))
-
-
-@pytest.mark.parametrize('effective_ns', [
-    0, 1, NOW - 1, NOW, NOW + HORIZON_NANOSECONDS + 1, 2 * NOW])
-def test_past_and_foreign_stamps_act_at_once(effective_ns):
-    setpoint = request(Setpoint(), kelvin(310.0), effective_ns, NOW)
-    np.testing.assert_array_equal(setpoint.requested, [310.0])
-    assert schedule(setpoint) == []
-
-
-@pytest.mark.parametrize('ahead', [1, SECOND, HORIZON_NANOSECONDS])
-def test_later_stamps_wait(ahead):
-    setpoint = request(Setpoint(), kelvin(310.0), NOW + ahead, NOW)
-    assert setpoint.requested is None
-    assert schedule(setpoint) == [(NOW + ahead, 310.0)]
-
-
 @pytest.mark.parametrize(('effective_ns', 'waits'), [
-    (0, False), (SECOND, False), (NOW, False), (NOW + SECOND, True),
-    (NOW + HORIZON_NANOSECONDS, True), (NOW + HORIZON_NANOSECONDS + 1, False)])
-def test_the_first_measurement_tells_what_lies_ahead(effective_ns, waits):
+    (0, False), (1, False), (SECOND, False), (NOW - 1, False), (NOW, False), (NOW + 1, True),
+    (NOW + SECOND, True), (NOW + HORIZON_NANOSECONDS, True),
+    (NOW + HORIZON_NANOSECONDS + 1, False), (2 * NOW, False)])
+def test_past_and_foreign_stamps_act_at_once_and_others_wait(effective_ns, waits):
+    setpoint = request(Setpoint(), kelvin(310.0), effective_ns, NOW)
+    assert schedule(setpoint) == ([(effective_ns, 310.0)] if waits else [])
+    assert (setpoint.requested is None) is waits
+    # before the first measurement nobody knows; that tells what lies ahead
     setpoint = request(Setpoint(), kelvin(310.0), effective_ns, None)
     setpoint = moved(setpoint, NOW, measured=320.0, seconds=0.0)
     assert bool(setpoint.scheduled) is waits
     np.testing.assert_array_equal(setpoint.requested, [320.0 if waits else 310.0])
 
 
-def test_scheduled_requests_are_kept_in_time_order():
+def test_scheduled_requests_take_effect_in_time_order():
     setpoint = Setpoint()
     for ahead, value in ((30, 310.0), (10, 312.0), (20, 314.0), (10, 316.0)):
         setpoint = request(setpoint, kelvin(value), NOW + ahead * SECOND, NOW)
     # the later request for the same time replaces the earlier one
     assert schedule(setpoint) == [
         (NOW + 10 * SECOND, 316.0), (NOW + 20 * SECOND, 314.0), (NOW + 30 * SECOND, 310.0)]
-
-
-def test_scheduled_requests_take_effect_in_time_order():
-    setpoint = Setpoint()
-    for ahead, value in ((30, 310.0), (10, 316.0), (20, 314.0)):
-        setpoint = request(setpoint, kelvin(value), NOW + ahead * SECOND, NOW)
     active = []
     for elapsed in range(0, 41, 5):
         setpoint = moved(setpoint, NOW + elapsed * SECOND)
@@ -160,13 +135,9 @@ def test_the_ramp_reaches_its_goal_and_stays(goal):
     assert setpoint.active[0] == goal
 
 
-def test_the_ramp_stands_still_without_elapsed_time():
-    setpoint = request(moved(Setpoint(), seconds=0.0), kelvin(310.0), 0, NOW)
-    np.testing.assert_array_equal(moved(setpoint, ramp=0.5, seconds=0.0).active, [320.0])
-
-
-def test_the_ramp_starts_from_the_first_measurement():
-    setpoint = request(Setpoint(), kelvin(310.0), 0, None)
+@pytest.mark.parametrize('before', [moved(Setpoint(), seconds=0.0), Setpoint()])
+def test_the_ramp_starts_from_the_first_measurement_and_with_time(before):
+    setpoint = request(before, kelvin(310.0), 0, NOW)
     np.testing.assert_array_equal(moved(setpoint, ramp=0.5, seconds=0.0).active, [320.0])
 
 

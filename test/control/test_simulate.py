@@ -38,7 +38,8 @@ from koopman_ros.plants import (
     two_state_reactor,
 )
 from koopman_ros.signals import Outputs
-from support.closed_loops import COOLANT, REACTOR, SETPOINT, shipped, START, two_state_model
+from support.closed_loops import COOLANT, REACTOR, SETPOINT, shipped, START
+from validation.paper.optimal_control import exact_two_state_model
 
 NAN = math.nan
 EVERYWHERE = 1e9  # half widths: the margin of a law that acts anywhere
@@ -95,8 +96,8 @@ CASES = {
     **{name: Case(shipped(name), REACTOR, np.array([START]), np.array([SETPOINT]),
                   np.array([COOLANT]), 5.0, (278.15, 305.15))
        for name in ('reactor_nz3', 'reactor_nz4')},
-    'two states': Case(two_state_model(), two_state_example(), np.array([0.1, 1.0]), np.zeros(2),
-                       np.zeros(1), 0.5, (-50.0, 50.0)),
+    'two states': Case(exact_two_state_model(), two_state_example(), np.array([0.1, 1.0]),
+                       np.zeros(2), np.zeros(1), 0.5, (-50.0, 50.0)),
     'random pair': Case(
         exact(PAIR), PAIR, np.array([-2.0, 1.0]), GOAL,
         np.linalg.solve(PAIR.B, -PAIR.drift(GOAL)), 12.0, (-50.0, 50.0))}

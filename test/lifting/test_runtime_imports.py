@@ -50,6 +50,6 @@ def test_packages_that_stand_alone():
         result = run(f"""
 import koopman_ros.{name}
 ours = {{module.split('.')[1] for module in sys.modules if module.startswith('koopman_ros.')}}
-assert ours <= {{{name!r}, 'plant_data', 'units'}}, ours
+assert ours <= {{{name!r}, 'arrays', 'plant_data', 'units'}}, ours
 """)
         assert (result.returncode, result.stderr) == (0, '')

@@ -1,16 +1,16 @@
 # SPDX-FileCopyrightText: 2026 The koopman_ros Authors
 # SPDX-License-Identifier: Apache-2.0
 
+"""Representative states of the training data, and the distance from them."""
 
 from dataclasses import replace
-import json
 import math
 
 import numpy as np
 import pytest
 
 from koopman_ros.learning import Growth, train
-from koopman_ros.lifting import load, ModelFileError, save, TrainingStates
+from koopman_ros.lifting import TrainingStates
 from support.random_lifts import random_lift
 from support.small_plants import BENT, bent_samples, TWO_STATE, two_state_samples
 
@@ -77,39 +77,6 @@ def test_what_does_not_fit_is_refused(states, fill, words):
 def test_states_of_another_size_do_not_fit_the_model():
     with pytest.raises(ValueError, match='incompatible training_states: expected 2 states, got 3'):
         replace(_model(), training_states=TrainingStates(np.zeros((1, 3)), 0.0))
-
-
-def test_file_holds_them_bit_for_bit_and_one_without_them_loads(tmp_path):
-    path, model = tmp_path / 'model.safetensors', _model()
-    save(model, path)
-    found = load(path).training_states
-    assert found is not None
-    assert found.states.tobytes() == model.training_states.states.tobytes()
-    assert found.fill_distance == model.training_states.fill_distance
-    save(replace(model, training_states=None), path)
-    assert load(path).training_states is None
-
-
-@pytest.mark.parametrize(('change', 'words'), [
-    (lambda about: about.pop('fill_distance'), 'expected the arrays'),
-    (lambda about: about.update(fill_distance=-0.5), 'fill_distance must be finite'),
-    (lambda about: about.update(fill_distance=math.nan), 'fill_distance must be finite'),
-    (lambda about: about.update(fill_distance='0'), 'fill_distance must be a number'),
-    (lambda about: about.update(fill_distance=True), 'fill_distance must be a number'),
-    (lambda about: about.update(fill_distance=0.25), 'checksum')])
-def test_file_with_another_fill_distance_is_refused(tmp_path, change, words):
-    path = tmp_path / 'model.safetensors'
-    save(_model(), path)
-    content = path.read_bytes()
-    end = 8 + int.from_bytes(content[:8], 'little')
-    header = json.loads(content[8:end])
-    about = json.loads(header['__metadata__']['description'])
-    change(about)
-    header['__metadata__']['description'] = json.dumps(about)
-    text = json.dumps(header).encode()
-    path.write_bytes(len(text).to_bytes(8, 'little') + text + content[end:])
-    with pytest.raises(ModelFileError, match=words):
-        load(path)
 
 
 def test_training_on_several_states_notes_them_and_on_one_does_not():

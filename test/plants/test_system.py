@@ -146,3 +146,12 @@ def test_construction_names_what_does_not_fit(changes, message):
 def test_derivative_names_what_does_not_fit(x, u, message):
     with pytest.raises(ValueError, match=message):
         two_state_example().derivative(x, u)
+
+
+@pytest.mark.parametrize(('rates', 'message'), [
+    ({'mu': np.nan}, 'mu is nan 1/s, must be finite'),
+    ({'lambda_': np.inf}, 'lambda_ is inf 1/s, must be finite'),
+])
+def test_rates_must_be_finite(rates, message):
+    with pytest.raises(ValueError, match=message):
+        two_state_example(**rates)

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
+import json
 from typing import Any
 
 import numpy as np
@@ -17,7 +18,6 @@ from koopman_ros.control import (
     Change,
     Controller,
     Event,
-    InputLimits,
     LevelSettings,
     Loop,
     ManualCommand,
@@ -27,22 +27,20 @@ from koopman_ros.control import (
     Report,
     Sensor,
     SetpointRequest,
-    Settings,
     simulate,
     State,
     SupervisorSettings,
 )
-from koopman_ros.estimation import SensorLimits
+from koopman_ros.nodes.controller_parameters import ControllerParameters
 from koopman_ros.plants import (
     ActuatedProcess,
     Actuator,
     ControlAffineSystem,
     equilibrium_input,
-    one_state_reactor,
     Process,
-    ReactorParameters,
 )
 from koopman_ros.reasons import Words
+from koopman_ros.replay.values import encoded
 from koopman_ros.units import Displays
 from support.closed_loops import REACTOR, shipped, START
 
@@ -55,17 +53,12 @@ SAFE = LOWER
 
 def controller(model: Any = 'reactor_nz4', *, supervisor: Mapping[str, float] | None = None,
                sensor: Mapping[str, Any] | None = None, **changes: Any) -> Controller:
-    """Return a controller with the node's default tuning."""
+    """Return a controller with the default parameters of its node."""
     model = shipped(model) if isinstance(model, str) else model
-    settings = Settings.for_model(
-        model, state_weight=np.ones(1), input_weight=np.ones(1),
-        limits=InputLimits(np.array([LOWER]), np.array([UPPER]), np.array([RATE])),
-        observer_bandwidth=6.0 / 60.0, max_disturbance=np.array([20.0]),
-        input_tolerance=np.array([2.0]), safe_input=np.array([SAFE]),
-        sensor=replace(SensorLimits(np.array([253.15]), np.array([423.15]), np.array([2.0]),
-                                    np.array([2.0]), 20.0), **(sensor or {})),
-        supervisor=supervisor_settings(**(supervisor or {})))
-    return Controller(model, replace(settings, **changes))
+    usual = ControllerParameters().settings()
+    return Controller(model, replace(
+        usual, sensor=replace(usual.sensor, **(sensor or {})),
+        supervisor=supervisor_settings(**(supervisor or {})), **changes))
 
 
 def supervisor_settings(learned: float = 0.1, linear: float = 0.5, **times: float
@@ -78,12 +71,9 @@ def supervisor_settings(learned: float = 0.1, linear: float = 0.5, **times: floa
 say = Words(Displays({'temperature': 'K', 'coolant_temperature': 'K'}))
 
 
-def changed_reactor(feed_shift: float = 0.0, **factors: float) -> ControlAffineSystem:
-    """Return the reactor with constants multiplied, and the feed's temperature shifted."""
-    before = ReactorParameters()
-    constants = {name: getattr(before, name) * factor for name, factor in factors.items()}
-    constants['feed_temperature'] = before.feed_temperature + feed_shift
-    return one_state_reactor(replace(before, **constants), nominal_state=REACTOR.nominal_state)
+def content(value: Any) -> str:
+    """Write states, commands and reports so that they compare bit for bit."""
+    return json.dumps(encoded(value), sort_keys=True)
 
 
 @dataclass

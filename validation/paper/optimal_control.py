@@ -10,7 +10,8 @@ from numpy.typing import NDArray
 from scipy.integrate import quad
 from scipy.linalg import solve_continuous_lyapunov
 
-from koopman_ros.plants import ControlAffineSystem, equilibrium_input, two_state_exact_lift
+from koopman_ros.lifting import Coordinates, LiftedModel, PolynomialObservables, Provenance
+from koopman_ros.plants import ControlAffineSystem, equilibrium_input
 from koopman_ros.solvers import solve_riccati
 
 Array = NDArray[np.float64]
@@ -20,9 +21,25 @@ _Q = np.diag([1.0, 1.0, 0.0])
 _B = np.array([[0.0], [1.0], [0.0]])
 
 
+def exact_two_state_model(mu: float = -0.1, lambda_: float = 1.0) -> LiftedModel:
+    """
+    Return the lift z = (x1, x2, x1^2) of the paper's two-state example (eq. 33 and 34), unscaled.
+
+    J(x) B = (0, 1, 0) at every state, so the lifted system is linear in state and input.
+    """
+    return LiftedModel(
+        PolynomialObservables(np.array([[1, 0], [0, 1], [2, 0]])),
+        np.array([[mu, 0.0, 0.0], [0.0, lambda_, -lambda_], [0.0, 0.0, 2.0 * mu]]), _B[:2],
+        Coordinates(('x1', 'x2'), ('1', '1'), np.zeros(2), np.ones(2), np.array([-6.0, -6.0]),
+                    np.array([6.0, 8.0])),
+        Coordinates(('u',), ('1/s',), np.zeros(1), np.ones(1), np.array([-50.0]),
+                    np.array([50.0])),
+        's', Provenance('two-state example'))
+
+
 def exact_two_state_gain(R: float) -> Array:
     """Return the gain K (1, 3) on (x1, x2, x1^2) that is optimal for x1^2 + x2^2 + R u^2."""
-    return solve_riccati(two_state_exact_lift().A, _B, _Q, np.array([[R]])).K
+    return solve_riccati(exact_two_state_model().A, _B, _Q, np.array([[R]])).K
 
 
 def exact_two_state_cost(x0: Array, R: float) -> float:
@@ -33,7 +50,7 @@ def exact_two_state_cost(x0: Array, R: float) -> float:
     equation of the closed loop.
     """
     K = exact_two_state_gain(R)
-    closed = two_state_exact_lift().A - _B @ K
+    closed = exact_two_state_model().A - _B @ K
     P = solve_continuous_lyapunov(closed.T, -(_Q + R * K.T @ K))
     z = np.array([x0[0], x0[1], x0[0] ** 2])
     return float(z @ P @ z)

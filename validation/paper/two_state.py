@@ -32,9 +32,13 @@ from koopman_ros.learning import (
 )
 from koopman_ros.lifting import LiftedModel
 from koopman_ros.plant_data import Samples
-from koopman_ros.plants import RandomStepDesign, two_state_exact_lift, two_state_example
+from koopman_ros.plants import RandomStepDesign, two_state_example
 from validation.paper.datasets import box_episodes, describe
-from validation.paper.optimal_control import exact_two_state_cost, exact_two_state_gain
+from validation.paper.optimal_control import (
+    exact_two_state_cost,
+    exact_two_state_gain,
+    exact_two_state_model,
+)
 from validation.paper.outcome import Metrics, Models
 
 Array = NDArray[np.float64]
@@ -112,7 +116,7 @@ def close_loop(model: LiftedModel, R: float, law: Callable[..., Feedback] = _law
 
 def exact_loop(R: float) -> ClosedLoop:
     """Regulate the system from (5, 5) by the linear-quadratic law of its exact lift."""
-    lift = two_state_exact_lift()
+    lift = exact_two_state_model()
     K = exact_two_state_gain(R)
     times = np.linspace(0.0, HORIZON, 1601)
 
@@ -186,7 +190,7 @@ def run_paper(seed: int) -> tuple[Metrics, Models]:
 
 def _judged(model: LiftedModel, test: Samples) -> Metrics:
     found = fit(model, test.x, test.dxdt, test.u)
-    exact = np.sort(np.linalg.eigvals(two_state_exact_lift().A).real)
+    exact = np.sort(np.linalg.eigvals(exact_two_state_model().A).real)
     error = np.abs(np.sort_complex(model.eigenvalues) - exact)
     loops = {R: close_loop(model, R) for R in INPUT_WEIGHTS}
     return {'rw': found.rw, 'rx': found.rx, 'cond': found.cond,

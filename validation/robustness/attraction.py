@@ -1,7 +1,6 @@
 # SPDX-FileCopyrightText: 2026 The koopman_ros Authors
 # SPDX-License-Identifier: Apache-2.0
 
-
 """From where the loop gets back to its set-point, and from where no coolant could bring it."""
 
 from __future__ import annotations
@@ -14,7 +13,7 @@ from numpy.typing import NDArray
 from scipy.optimize import brentq
 
 from koopman_ros.control import at, Loop, Report, SAFE, Supervisor
-from koopman_ros.plants import ControlAffineSystem, fold, two_state_reactor
+from koopman_ros.plants import ControlAffineSystem, two_state_reactor
 from koopman_ros.solvers import runge_kutta_step
 from validation.paper.outcome import Metrics
 from validation.robustness.disturbances import finite
@@ -27,7 +26,6 @@ from validation.robustness.loop import (
     run_loop,
     settling,
     shipped_model,
-    supervisor_settings,
     worst,
 )
 
@@ -119,7 +117,8 @@ def hottest_start(coolant: float, setpoint: float, *, ladder: bool, lowest: floa
 def hottest_cooled() -> float:
     """Return the temperature above which the reactor heats up under the coldest coolant, in K."""
     coldest = np.array(COOLANT_RANGE[:1])
-    knee = float(fold(REACTOR, 320.0, 335.0)[0][0])
+    # where the slope of the heat balance changes sign
+    knee = brentq(lambda T: REACTOR.drift_jacobian(np.array([T]))[0, 0], 320.0, 335.0)
     return float(brentq(lambda T: REACTOR.derivative(np.array([T]), coldest)[0], knee, 400.0))
 
 
@@ -185,14 +184,10 @@ def back_from_safe(system: ControlAffineSystem, linear_margin: float) -> Metrics
     coldest = COOLANT_RANGE[0]
     rest = np.array([brentq(lambda T: system.derivative(np.array([T]), np.array([coldest]))[0],
                             coldest, 320.0)])
-    usual = reactor_controller()
-    ladder = supervisor_settings(linear=linear_margin)
-    controller = replace(usual, settings=replace(usual.settings, supervisor=ladder))
-
     def safe(loop: Loop) -> Loop:
         return replace(loop, state=replace(loop.state, supervisor=Supervisor(SAFE)))
 
-    course = run_loop(controller, system, rest, coldest, _RETURN,
-                      [at(0.0, safe), at(0.0, at_setpoint(SETPOINT))])
+    course = run_loop(reactor_controller(linear_margin=linear_margin), system, rest, coldest,
+                      _RETURN, [at(0.0, safe), at(0.0, at_setpoint(SETPOINT))])
     return {'rest_kelvin': float(rest[0]), 'outside': shipped_model().states.violation(rest),
             'seconds_to_0.2_kelvin': finite(settling(course, SETPOINT, TOLERANCE))}

@@ -1,7 +1,6 @@
 # SPDX-FileCopyrightText: 2026 The koopman_ros Authors
 # SPDX-License-Identifier: Apache-2.0
 
-
 """What changed plants, lags, biases, saturation and noise do to the loop."""
 
 from __future__ import annotations

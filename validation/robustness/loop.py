@@ -1,7 +1,6 @@
 # SPDX-FileCopyrightText: 2026 The koopman_ros Authors
 # SPDX-License-Identifier: Apache-2.0
 
-
 """The control step on a true plant, sampled once a second, as the nodes run it."""
 
 from __future__ import annotations
@@ -22,20 +21,17 @@ from koopman_ros.control import (
     Controller,
     Event,
     Initialisation,
-    InputLimits,
     LevelSettings,
     Loop,
     perfect,
     Sensor,
     SetpointRequest,
-    Settings,
     simulate,
     Simulation,
-    SupervisorSettings,
     Timed,
 )
-from koopman_ros.estimation import SensorLimits
 from koopman_ros.lifting import LiftedModel, load
+from koopman_ros.nodes.controller_parameters import ControllerParameters
 from koopman_ros.plants import (
     ActuatedProcess,
     Actuator,
@@ -53,8 +49,8 @@ COOLANT = float(REACTOR.nominal_input[0])
 PERIOD = 1.0  # s
 COOLANT_RANGE = (278.15, 305.15)  # K
 BANDWIDTH = 6.0  # 1/min
-# A margin that is never exceeded: without the ladder the learned law acts everywhere.
-EVERYWHERE = 1e9
+# Margins that are never exceeded: without the ladder the learned law acts everywhere.
+NO_LADDER = (LevelSettings('sdre', 1e9), LevelSettings('linear', 1e9))
 
 
 @lru_cache
@@ -64,30 +60,22 @@ def shipped_model() -> LiftedModel:
 
 
 def reactor_controller(*, bandwidth: float = BANDWIDTH, coolant_weight: float = 1.0,
-                       ladder: bool = True, model: LiftedModel | None = None) -> Controller:
+                       ladder: bool = True, linear_margin: float = 0.5,
+                       model: LiftedModel | None = None) -> Controller:
     """
     Return the controller with the default parameters of its node.
 
     :param bandwidth: of the observer, in 1/min.
     :param coolant_weight: in 1/K^2.
     :param ladder: whether the distance from the training data decides which law acts.
+    :param linear_margin: up to which the linear law does, in half widths.
     :param model: the shipped one by default.
     """
-    lower, upper = COOLANT_RANGE
-    two = np.array([2.0])
-    return Controller(model or shipped_model(), Settings(
-        state_weight=np.ones(1), input_weight=np.array([coolant_weight]),
-        limits=InputLimits(np.array([lower]), np.array([upper]), np.ones(1)),
-        setpoint_ramp=np.array([1000.0 / 60.0]), max_disturbance=np.array([20.0]),
-        input_tolerance=two, safe_input=np.array([lower]),
-        sensor=SensorLimits(np.array([253.15]), np.array([423.15]), two, two, 20.0),
-        observer_bandwidth=bandwidth / 60.0, supervisor=supervisor_settings() if ladder else (
-            supervisor_settings(EVERYWHERE, EVERYWHERE))))
-
-
-def supervisor_settings(learned: float = 0.1, linear: float = 0.5) -> SupervisorSettings:
-    """Return the two levels of the node with their margins, in half widths."""
-    return SupervisorSettings((LevelSettings('sdre', learned), LevelSettings('linear', linear)))
+    settings = ControllerParameters(
+        observer_bandwidth=bandwidth, coolant_weight=coolant_weight, linear_margin=linear_margin
+        ).settings()
+    return Controller(model or shipped_model(), settings if ladder else replace(
+        settings, supervisor=replace(settings.supervisor, levels=NO_LADDER)))
 
 
 def changed_reactor(*, heat_transfer: float = 1.0, concentration: float = 1.0,

@@ -1,7 +1,6 @@
 # SPDX-FileCopyrightText: 2026 The koopman_ros Authors
 # SPDX-License-Identifier: Apache-2.0
 
-
 """Gain, phase and delay margins of the loop, linearised at a set-point and opened at the plant."""
 
 from __future__ import annotations

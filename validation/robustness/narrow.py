@@ -1,7 +1,6 @@
 # SPDX-FileCopyrightText: 2026 The koopman_ros Authors
 # SPDX-License-Identifier: Apache-2.0
 
-
 """Lifts of too narrow data, asked for more than they know, without the ladder and with it."""
 
 from __future__ import annotations
@@ -21,6 +20,7 @@ from koopman_ros.control import (
     Setpoint,
     Settings,
     Simulation,
+    SupervisorSettings,
     Timed,
 )
 from koopman_ros.learning import Growth, Linearisation, train
@@ -35,14 +35,13 @@ from validation.robustness.loop import (
     BANDWIDTH,
     changed_reactor,
     COOLANT,
-    EVERYWHERE,
+    NO_LADDER,
     on_plant,
     REACTOR,
     reactor_controller,
     run_loop,
     settling,
     START,
-    supervisor_settings,
 )
 
 Array = NDArray[np.float64]
@@ -99,7 +98,11 @@ def run_trial(trial: Trial, model: LiftedModel | None, *, ladder: bool) -> Simul
 
     :param model: the lift; the shipped one when None.
     """
-    controller = reactor_controller(bandwidth=trial.bandwidth, ladder=ladder, model=model)
+    return _driven(reactor_controller(
+        bandwidth=trial.bandwidth, ladder=ladder, model=model), trial)
+
+
+def _driven(controller: Controller, trial: Trial) -> Simulation:
     return run_loop(controller, REACTOR, np.array([trial.temperature]), COOLANT, SECONDS,
                     [at(0.0, at_setpoint(START)), *trial.changes],
                     stop=lambda x, *_: bool(x[0] > 420.0))
@@ -135,13 +138,8 @@ def far_from_the_model(linear_margin: float, bandwidth: float) -> Metrics:
     :param bandwidth: of the observer, in 1/min.
     :return: as :func:`judge_reactor`, the time counting from the change.
     """
-    usual = reactor_controller(bandwidth=bandwidth)
-    ladder = supervisor_settings(linear=linear_margin)
-    controller = replace(usual, settings=replace(usual.settings, supervisor=ladder))
-    course = run_loop(controller, REACTOR, np.array([START]), COOLANT, SECONDS,
-                      [at(0.0, at_setpoint(START)), *TRIALS[1].changes],
-                      stop=lambda x, *_: bool(x[0] > 420.0))
-    return judge_reactor(course, _DISTURBED)
+    controller = reactor_controller(bandwidth=bandwidth, linear_margin=linear_margin)
+    return judge_reactor(_driven(controller, TRIALS[1]), _DISTURBED)
 
 
 def two_state_models() -> dict[str, LiftedModel]:
@@ -167,8 +165,8 @@ def two_state_course(model: LiftedModel, *, ladder: bool) -> Simulation:
         model, state_weight=np.ones(2), input_weight=np.ones(1),
         limits=InputLimits(np.array([-_BOUND]), np.array([_BOUND]), np.array([np.inf])),
         safe_input=np.zeros(1), transfer_time=1.0,
-        supervisor=replace(supervisor_settings(), recovery_time=1.0) if ladder else (
-            supervisor_settings(EVERYWHERE, EVERYWHERE))))
+        supervisor=SupervisorSettings(recovery_time=1.0) if ladder else (
+            SupervisorSettings(NO_LADDER))))
 
     def to_origin(loop: Loop) -> Loop:
         origin = Setpoint(np.zeros(2), np.zeros(2))

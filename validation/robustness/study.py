@@ -1,7 +1,6 @@
 # SPDX-FileCopyrightText: 2026 The koopman_ros Authors
 # SPDX-License-Identifier: Apache-2.0
 
-
 """The study of robustness: everything that is computed for it, by name."""
 
 from __future__ import annotations

@@ -92,79 +92,61 @@ class ReactorParameters:
         return -self.reaction_enthalpy / (self.density * self.heat_capacity)
 
 
-def one_state_reactor(
-    parameters: ReactorParameters | None = None, *, nominal_state: ArrayLike | None = None,
-) -> ControlAffineSystem:
+def one_state_reactor(parameters: ReactorParameters | None = None, *,
+                      nominal_state: ArrayLike | None = None) -> ControlAffineSystem:
     """
     Build the reactor of the paper (eq. 36): temperature as state, concentration held fixed.
 
     Its nominal input is a coolant at 300 K.
 
     :param parameters: the physical constants; the benchmark's when None.
-    :param nominal_state: the temperature (1,) to measure deviations from; when None, the stable
+    :param nominal_state: the state (n_x,) to measure deviations from; when None, the stable
         steady state on the cold branch at the nominal input. Give it where that may not exist, as
         when a running plant changes.
-    :raises ValueError: when `nominal_state` is not one temperature.
+    :raises ValueError: when `nominal_state` is none of this reactor.
     :raises EquilibriumError: when `nominal_state` is None and there is no stable steady state.
     """
-    constants = ReactorParameters() if parameters is None else parameters
-    drift = partial(_one_state_drift, constants)
-    jacobian = partial(_one_state_jacobian, constants)
-    if nominal_state is None:
-        nominal_state = _cold_stable_state(constants, drift, jacobian, _temperature_alone)
-    return ControlAffineSystem(
-        name='one-state reactor',
-        state_names=('temperature',),
-        state_units=('K',),
-        input_names=('coolant_temperature',),
-        input_units=('K',),
-        time_unit='min',
-        drift=drift,
-        drift_jacobian=jacobian,
-        B=np.array([[constants.cooling_rate]]),
-        nominal_state=np.asarray(nominal_state, dtype=np.float64),
-        nominal_input=np.array([NOMINAL_COOLANT_TEMPERATURE]),
-        state_lower=np.array(TEMPERATURE_RANGE[:1]),
-        state_upper=np.array(TEMPERATURE_RANGE[1:]),
-    )
+    constants = parameters or ReactorParameters()
+    return _reactor('one-state reactor', constants, partial(_one_state_drift, constants),
+                    partial(_one_state_jacobian, constants), _temperature_alone, nominal_state)
 
 
-def two_state_reactor(
-    parameters: ReactorParameters | None = None, *, nominal_state: ArrayLike | None = None,
-) -> ControlAffineSystem:
+def two_state_reactor(parameters: ReactorParameters | None = None, *,
+                      nominal_state: ArrayLike | None = None) -> ControlAffineSystem:
     """
     Build the benchmark reactor of Seborg and Henson: concentration and temperature as states.
 
     dC_A/dt = q/V (C_Af - C_A) - k exp(-E_A/(R T)) C_A; the temperature as in the paper's eq. 36.
-    Its nominal input is a coolant at 300 K.
-
-    :param parameters: the physical constants; the benchmark's when None.
-    :param nominal_state: concentration and temperature (2,) to measure deviations from; when
-        None, the stable steady state on the cold branch at the nominal input. Give it where that
-        may not exist, as when a running plant changes.
-    :raises ValueError: when `nominal_state` is not one concentration and one temperature.
-    :raises EquilibriumError: when `nominal_state` is None and there is no stable steady state.
+    Parameters and errors are those of :func:`one_state_reactor`.
     """
-    constants = ReactorParameters() if parameters is None else parameters
-    drift = partial(_two_state_drift, constants)
-    jacobian = partial(_two_state_jacobian, constants)
+    constants = parameters or ReactorParameters()
+    return _reactor('two-state reactor', constants, partial(_two_state_drift, constants),
+                    partial(_two_state_jacobian, constants),
+                    partial(_with_steady_concentration, constants), nominal_state,
+                    ('concentration',), ('mol/L',))
+
+
+def _reactor(name: str, constants: ReactorParameters, drift: ArrayFunction,
+             jacobian: ArrayFunction, state_at: ArrayFunction, nominal_state: ArrayLike | None,
+             others: tuple[str, ...] = (), units: tuple[str, ...] = ()) -> ControlAffineSystem:
+    """Build a reactor whose states are `others`, not negative, and the temperature."""
     if nominal_state is None:
-        nominal_state = _cold_stable_state(
-            constants, drift, jacobian, partial(_with_steady_concentration, constants))
+        nominal_state = _cold_stable_state(constants, drift, jacobian, state_at)
+    lowest, highest = TEMPERATURE_RANGE
     return ControlAffineSystem(
-        name='two-state reactor',
-        state_names=('concentration', 'temperature'),
-        state_units=('mol/L', 'K'),
+        name=name,
+        state_names=(*others, 'temperature'),
+        state_units=(*units, 'K'),
         input_names=('coolant_temperature',),
         input_units=('K',),
         time_unit='min',
         drift=drift,
         drift_jacobian=jacobian,
-        B=np.array([[0.0], [constants.cooling_rate]]),
+        B=np.array([*([0.0] for _ in others), [constants.cooling_rate]]),
         nominal_state=np.asarray(nominal_state, dtype=np.float64),
         nominal_input=np.array([NOMINAL_COOLANT_TEMPERATURE]),
-        state_lower=np.array([0.0, TEMPERATURE_RANGE[0]]),
-        state_upper=np.array([np.inf, TEMPERATURE_RANGE[1]]),
+        state_lower=np.array([*(0.0 for _ in others), lowest]),
+        state_upper=np.array([*(np.inf for _ in others), highest]),
     )
 
 

@@ -1,45 +1,20 @@
 # SPDX-FileCopyrightText: 2026 The koopman_ros Authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""The paper's two-state example, linear in three coordinates."""
+"""The paper's two-state example, linear in (x1, x2, x1^2)."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from functools import partial
 import math
 
 import numpy as np
 
-from koopman_ros.plants.system import (
-    ArrayFunction,
-    checked_array,
-    ControlAffineSystem,
-    FloatArray,
-)
+from koopman_ros.plants.system import ControlAffineSystem, FloatArray
 
 # The paper's choice: a stable first state and an unstable second one.
 PAPER_MU = -0.1
 PAPER_LAMBDA = 1.0
-
-
-@dataclass(frozen=True, eq=False)
-class ExactLift:
-    """
-    A lift z = N(x) under which dz/dt = A z + J(x) B u holds exactly (paper, eq. 27).
-
-    :param A: lifted dynamics (n_z, n_z), in 1 per time unit.
-    :param lift: N, states (..., n_x) to lifted states (..., n_z).
-    :param jacobian: J = dN/dx, states (..., n_x) to (..., n_z, n_x).
-    :raises ValueError: when `A` is not a finite square matrix.
-    """
-
-    A: FloatArray
-    lift: ArrayFunction
-    jacobian: ArrayFunction
-
-    def __post_init__(self) -> None:
-        object.__setattr__(self, 'A', checked_array('A', self.A, (len(self.A), len(self.A))))
 
 
 def two_state_example(mu: float = PAPER_MU, lambda_: float = PAPER_LAMBDA) -> ControlAffineSystem:
@@ -50,7 +25,9 @@ def two_state_example(mu: float = PAPER_MU, lambda_: float = PAPER_LAMBDA) -> Co
     :param lambda_: growth rate of the second state, in 1/s.
     :raises ValueError: when a rate is not finite.
     """
-    _check_rates(mu, lambda_)
+    for name, rate in (('mu', mu), ('lambda_', lambda_)):
+        if not math.isfinite(rate):
+            raise ValueError(f'{name} is {rate} 1/s, must be finite')
     return ControlAffineSystem(
         name='two-state example',
         state_names=('x1', 'x2'),
@@ -66,25 +43,6 @@ def two_state_example(mu: float = PAPER_MU, lambda_: float = PAPER_LAMBDA) -> Co
     )
 
 
-def two_state_exact_lift(mu: float = PAPER_MU, lambda_: float = PAPER_LAMBDA) -> ExactLift:
-    """
-    Build the lift z = (x1, x2, x1^2) with its A (3, 3) (paper, eq. 33 and 34).
-
-    J(x) B = (0, 1, 0) at every state, so the lifted system is linear in state and input.
-
-    :raises ValueError: when a rate is not finite.
-    """
-    _check_rates(mu, lambda_)
-    A = np.array([[mu, 0.0, 0.0], [0.0, lambda_, -lambda_], [0.0, 0.0, 2.0 * mu]])
-    return ExactLift(A=A, lift=_lift, jacobian=_lift_jacobian)
-
-
-def _check_rates(mu: float, lambda_: float) -> None:
-    for name, rate in (('mu', mu), ('lambda_', lambda_)):
-        if not math.isfinite(rate):
-            raise ValueError(f'{name} is {rate} 1/s, must be finite')
-
-
 def _drift(mu: float, lambda_: float, x: FloatArray) -> FloatArray:
     x1, x2 = x[..., 0], x[..., 1]
     return np.stack([mu * x1, lambda_ * (x2 - x1 * x1)], axis=-1)
@@ -95,17 +53,4 @@ def _drift_jacobian(mu: float, lambda_: float, x: FloatArray) -> FloatArray:
     jacobian[..., 0, 0] = mu
     jacobian[..., 1, 0] = -2.0 * lambda_ * x[..., 0]
     jacobian[..., 1, 1] = lambda_
-    return jacobian
-
-
-def _lift(x: FloatArray) -> FloatArray:
-    x1, x2 = x[..., 0], x[..., 1]
-    return np.stack([x1, x2, x1 * x1], axis=-1)
-
-
-def _lift_jacobian(x: FloatArray) -> FloatArray:
-    jacobian = np.zeros((*x.shape[:-1], 3, 2))
-    jacobian[..., 0, 0] = 1.0
-    jacobian[..., 1, 1] = 1.0
-    jacobian[..., 2, 0] = 2.0 * x[..., 0]
     return jacobian

@@ -4,7 +4,7 @@
 
 """Figures of the robustness study against references that do not use its code."""
 
-from dataclasses import astuple, replace
+from dataclasses import replace
 import math
 
 import numpy as np
@@ -12,7 +12,6 @@ import pytest
 from scipy.integrate import solve_ivp
 
 from koopman_ros.control import at
-from koopman_ros.parameters.controller import ControllerParameters
 from koopman_ros.plants import Actuator
 from validation.robustness import attraction, disturbances
 from validation.robustness.attraction import End, Start
@@ -49,19 +48,6 @@ def _pole(a, b):
     """Return pole and gain of the plant between samples."""
     pole = math.exp(a * PERIOD)
     return pole, b * (pole - 1.0) / a
-
-
-def test_settings_are_the_defaults_of_the_node():
-    theirs, ours = ControllerParameters().settings(), reactor_controller().settings
-    arrays = [[s.state_weight, s.input_weight, s.limits.lower, s.limits.upper, s.limits.rate,
-               s.safe_input] for s in (theirs, ours)]
-    np.testing.assert_allclose(*arrays, rtol=1e-12)
-    assert theirs.supervisor == ours.supervisor
-    for one, other in zip(astuple(theirs.sensor), astuple(ours.sensor), strict=True):
-        np.testing.assert_allclose(one, other, rtol=1e-12)
-    for name in ('setpoint_ramp', 'setpoint_filter', 'observer_bandwidth', 'max_disturbance',
-                 'input_tolerance', 'transfer_time', 'max_gain', 'max_residual'):
-        assert getattr(theirs, name) == pytest.approx(getattr(ours, name)), name
 
 
 @pytest.mark.parametrize(('temperature', 'weight'), [(310.0, 1.0), (START, 0.1)])
