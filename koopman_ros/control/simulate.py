@@ -27,7 +27,7 @@ Sensor: TypeAlias = Callable[[Array, float], Array | None]
 
 
 class Plant(Protocol):
-    """What runs under the controller, such as ``plants.Process`` and ``ActuatedProcess``."""
+    """What runs under the controller, such as ``plants.Process``."""
 
     @property
     def time_ns(self) -> int:

@@ -10,7 +10,6 @@ from enum import Enum
 import math
 import sys
 import time
-from typing import Any
 
 import numpy as np
 from rclpy.clock import Clock, ClockType
@@ -19,7 +18,6 @@ from std_srvs.srv import Trigger
 
 from koopman_ros.parameters.plant import PlantParameters, REACTORS, TABLE
 from koopman_ros.plants import (
-    ActuatedProcess,
     ControlAffineSystem,
     EquilibriumError,
     IntegrationError,
@@ -121,20 +119,11 @@ class PlantNode(LoopNode):
                 f'{error}; the plant starts at {to_celsius(float(nominal[-1])):.3f} degC instead')
             return build(parameters.constants(), nominal_state=nominal)
 
-    def _initial(self, system: ControlAffineSystem, time_ns: int) -> ActuatedProcess:
+    def _initial(self, system: ControlAffineSystem, time_ns: int) -> Process:
         x = system.nominal_state.copy()
         x[-1] += self._settings.initial_temperature_offset
         u = system.nominal_input
-        return ActuatedProcess(Process(system, time_ns, x, u), self._settings.actuator(), u)
-
-    @property
-    def _process(self) -> Process:
-        """The reactor as it stands, with the coolant that is in force."""
-        return self._plant.process
-
-    def _alter(self, **changes: Any) -> None:
-        """Change the reactor, or its time."""
-        self._plant = replace(self._plant, process=replace(self._process, **changes))
+        return Process(system, time_ns, x, u, self._settings.actuator(), u)
 
     # Time: in lock-step by commands, otherwise by the wall clock.
 
@@ -162,7 +151,7 @@ class PlantNode(LoopNode):
         self._wall_start = time.monotonic()
         if self._real_time:
             self._start_ns = time.time_ns()
-            self._alter(time_ns=self._start_ns)
+            self._plant = replace(self._plant, time_ns=self._start_ns)
 
     def _on_poll(self) -> None:
         """Start lock-step when the loop is complete, and watch for a command that is missing."""
@@ -180,7 +169,7 @@ class PlantNode(LoopNode):
             self._missed += 1
             self._waiting_in_vain = True
             self.get_logger().warning(
-                f'no command for the measurement at {seconds_text(self._process.time_ns)} s '
+                f'no command for the measurement at {seconds_text(self._plant.time_ns)} s '
                 f'within {self._settings.lockstep_timeout} s: the last one is held',
                 throttle_duration_sec=10.0)
             self._answered = True
@@ -216,7 +205,7 @@ class PlantNode(LoopNode):
         self._sample += 1
         self._answered = False
         self._wall_published = time.monotonic()
-        self._instruments.publish(self._process, sample, self._settings)
+        self._instruments.publish(self._plant, sample, self._settings)
         self._diagnostics.publish_if_changed()
 
     def _advance(self, time_ns: int) -> bool:
@@ -233,7 +222,7 @@ class PlantNode(LoopNode):
     def _on_command(self, message: Temperature) -> None:
         stamp_ns = stamp_nanoseconds(message.header.stamp)
         lockstep = self._settings.lockstep
-        if lockstep and stamp_ns != self._process.time_ns:
+        if lockstep and stamp_ns != self._plant.time_ns:
             # it answers no measurement that is open: late, or from somebody else
             self._foreign += 1
             return
@@ -244,7 +233,7 @@ class PlantNode(LoopNode):
             # in lock-step it was given at its measurement, otherwise now
             if lockstep or self._advance_to_now():
                 command = np.array([to_kelvin(message.temperature)])
-                self._plant = self._plant.commanded(command, self._process.time_ns)
+                self._plant = self._plant.commanded(command, self._plant.time_ns)
         else:
             self._rejected += 1
             self._rejection = (f'coolant command {message.temperature} degC is not finite and '
@@ -261,7 +250,7 @@ class PlantNode(LoopNode):
             return False
         # never past the next sample, which is measured under the command of its time
         ahead = self._start_ns + self._sample * self._period_ns
-        now = self._now_ns() if self._settings.speed else self._process.time_ns
+        now = self._now_ns() if self._settings.speed else self._plant.time_ns
         return self._advance(min(now, ahead))
 
     def _on_reset(self, _: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
@@ -271,8 +260,8 @@ class PlantNode(LoopNode):
             response.message = ('the duration is over: start the plant again'
                                 if self._phase is Phase.FINISHED else self._phase.value)
             return response
-        self._plant = self._initial(self._process.system, self._process.time_ns)
-        fresh = self._process
+        self._plant = self._initial(self._plant.system, self._plant.time_ns)
+        fresh = self._plant
         if self._phase is Phase.TRIPPED:
             self._phase, self._trip = Phase.RUNNING, ''
             self._resynchronise()
@@ -288,9 +277,9 @@ class PlantNode(LoopNode):
             self._answered = True
             self._continue_lockstep()
             return
-        passed = self._now_ns() if self._settings.speed else self._process.time_ns
+        passed = self._now_ns() if self._settings.speed else self._plant.time_ns
         self._sample = max(self._sample, -(-(passed - self._start_ns) // self._period_ns))
-        self._alter(time_ns=max(passed, self._process.time_ns))
+        self._plant = replace(self._plant, time_ns=max(passed, self._plant.time_ns))
 
     def _on_parameters(self, parameters: PlantParameters) -> None:
         if not self._settings.lockstep:
@@ -298,8 +287,8 @@ class PlantNode(LoopNode):
         self._settings = parameters
         build = REACTORS[parameters.reactor]
         # the changed plant may have no steady state near; the nominal point stays what it was
-        self._alter(system=build(
-            parameters.constants(), nominal_state=self._process.system.nominal_state))
+        self._plant = replace(self._plant, system=build(
+            parameters.constants(), nominal_state=self._plant.system.nominal_state))
         self._plant = replace(self._plant, actuator=parameters.actuator())
 
     def _on_neighbours(self) -> None:
@@ -321,9 +310,9 @@ class PlantNode(LoopNode):
             level, message = Level.WARN, (
                 'running, but no command arrives: the last one is held; is the controller alive?')
         return Status(level, message, {
-            'time [s]': seconds_text(self._process.time_ns),
-            'temperature [degC]': to_celsius(float(self._process.x[-1])),
-            'coolant [degC]': to_celsius(float(self._process.u[0])),
+            'time [s]': seconds_text(self._plant.time_ns),
+            'temperature [degC]': to_celsius(float(self._plant.x[-1])),
+            'coolant [degC]': to_celsius(float(self._plant.u[0])),
             'coolant command [degC]': to_celsius(float(self._plant.command[0])),
             'measurements': self._sample,
             'commands': self._commands,

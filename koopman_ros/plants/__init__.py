@@ -3,7 +3,6 @@
 
 """Control-affine systems, their steady states, actuators and simulation; imports plant data."""
 
-from koopman_ros.plants.actuator import ActuatedProcess, Actuator
 from koopman_ros.plants.equilibria import equilibrium_input, EquilibriumError
 from koopman_ros.plants.excitation import ExcitationError, random_steps, RandomStepDesign
 from koopman_ros.plants.integration import (
@@ -19,14 +18,13 @@ from koopman_ros.plants.library.reactor import (
 )
 from koopman_ros.plants.library.scalar import scalar_example
 from koopman_ros.plants.library.two_state import two_state_example
-from koopman_ros.plants.process import Process
+from koopman_ros.plants.process import Actuator, Process
 from koopman_ros.plants.sensor import in_steps, sensor_noise
 from koopman_ros.plants.simulation import advance, sample_derivatives, simulate
 from koopman_ros.plants.system import ControlAffineSystem, FloatArray
 
 __all__ = [
     'NOMINAL_COOLANT_TEMPERATURE',
-    'ActuatedProcess',
     'Actuator',
     'ControlAffineSystem',
     'EquilibriumError',

@@ -1,46 +1,147 @@
 # SPDX-FileCopyrightText: 2026 The koopman_ros Authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""A plant that is advanced to given instants under a held input."""
+"""A plant that runs in time, behind the actuators of its inputs: range, delay and lag."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
 
+import numpy as np
+
 from koopman_ros.plants.simulation import advance
 from koopman_ros.plants.system import ControlAffineSystem, FloatArray
 from koopman_ros.units import NANOSECONDS
+
+# After so many time constants exp(-40) of a step is left, less than a double can tell.
+_SETTLED = 40.0
+
+
+@dataclass(frozen=True)
+class Actuator:
+    """
+    How an input follows its command; by default it is the command.
+
+    :param lower: lowest value that each input reaches, in input units.
+    :param upper: highest such value.
+    :param delay: how long after it was given a command takes effect, in s.
+    :param lag: time constant with which the input then follows, in s.
+    """
+
+    lower: float = -np.inf
+    upper: float = np.inf
+    delay: float = 0.0
+    lag: float = 0.0
 
 
 @dataclass(frozen=True, eq=False)
 class Process:
     """
-    A running plant: its equations, present time and state, and the held input.
+    A running plant: its equations, present time and state, and its input.
 
     :param system: the plant.
     :param time_ns: present time, in integer nanoseconds so that instants repeat exactly.
     :param x: present state (n_x,).
-    :param u: held input (n_u,).
+    :param u: input (n_u,) that acts, up to the present time.
+    :param actuator: between commands and input.
+    :param command: what the input follows (n_u,); None for what it is.
+    :param pending: commands that take effect later, by rising time: (time in ns, command (n_u,)).
     """
 
     system: ControlAffineSystem
     time_ns: int
     x: FloatArray
     u: FloatArray
+    actuator: Actuator = Actuator()
+    command: FloatArray | None = None
+    pending: tuple[tuple[int, FloatArray], ...] = ()
 
     def commanded(self, command: FloatArray, time_ns: int) -> Process:
-        """Return the process under another input from a time on, which is the present one."""
-        return replace(self.until(time_ns), u=command)
+        """
+        Return the process with a command given at a time.
+
+        It supersedes commands that would take effect at the same time or later, such as those
+        given before the delay was shortened.
+        """
+        effect_ns = time_ns + round(self.actuator.delay * NANOSECONDS)
+        earlier = tuple(entry for entry in self.pending if entry[0] < effect_ns)
+        return replace(self, pending=(*earlier, (effect_ns, command)))
 
     def until(self, time_ns: int) -> Process:
         """
-        Return the process at a later time; an earlier one returns it unchanged.
+        Return the process at a later time, under the commands that took effect before it.
+
+        An earlier time returns it unchanged.
 
         :raises IntegrationError: when the state leaves the bounds of the system, e.g. because
             the reactor ran away.
         """
+        now = self
+        while now.pending and now.pending[0][0] < time_ns:
+            (effect_ns, command), *later = now.pending
+            now = replace(now._following(effect_ns), command=command, pending=tuple(later))
+        return now._following(time_ns)
+
+    def _following(self, time_ns: int) -> Process:
+        """Return the process at a later time, its input following the present command."""
         if time_ns <= self.time_ns:
             return self
-        seconds = (time_ns - self.time_ns) / NANOSECONDS
-        x = advance(self.system, self.x, self.u, seconds / self.system.seconds_per_time_unit)
-        return replace(self, time_ns=time_ns, x=x)
+        now, goal = self, self.u if self.command is None else self.command
+        goal = np.clip(goal, self.actuator.lower, self.actuator.upper)
+        settled_ns = self.time_ns + round(_SETTLED * self.actuator.lag * NANOSECONDS)
+        if settled_ns > self.time_ns and np.any(self.u != goal):
+            end_ns = min(time_ns, settled_ns)
+            both = _with_input_lag(
+                self.system, self.actuator.lag / self.system.seconds_per_time_unit)
+            reached = _moved(both, np.concatenate([self.x, self.u]), goal, end_ns - self.time_ns)
+            x, u = np.split(reached, [self.system.n_x])
+            now = replace(self, time_ns=end_ns, x=x, u=u)
+            if time_ns < settled_ns:
+                return now
+        return replace(now, time_ns=time_ns, u=goal, x=_moved(
+            self.system, now.x, goal, time_ns - now.time_ns))
+
+
+def _moved(system: ControlAffineSystem, x: FloatArray, u: FloatArray, time_ns: int) -> FloatArray:
+    """Return a state (n_x,) so many nanoseconds later."""
+    if time_ns == 0:
+        return x
+    return advance(system, x, u, time_ns / NANOSECONDS / system.seconds_per_time_unit)
+
+
+def _with_input_lag(system: ControlAffineSystem, time_constant: float) -> ControlAffineSystem:
+    """
+    Put a first-order lag before each input: d[x; v]/dt = [f(x) + B v; -v / tau] + [0; u / tau].
+
+    The system that results is control-affine again; its last n_u states are the inputs v that
+    act, its input u is what they follow.
+
+    :param time_constant: tau, in time units, above 0.
+    """
+    n_x, n_u = system.n_x, system.n_u
+    rate = 1.0 / time_constant
+
+    def drift(state: FloatArray) -> FloatArray:
+        x, v = state[..., :n_x], state[..., n_x:]
+        return np.concatenate([system.derivative(x, v), -rate * v], axis=-1)
+
+    def drift_jacobian(state: FloatArray) -> FloatArray:
+        jacobian = np.zeros((*state.shape, n_x + n_u))
+        jacobian[..., :n_x, :n_x] = system.drift_jacobian(state[..., :n_x])
+        jacobian[..., :n_x, n_x:] = system.B
+        jacobian[..., n_x:, n_x:] = -rate * np.eye(n_u)
+        return jacobian
+
+    unbounded = np.full(n_u, np.inf)
+    return replace(
+        system,
+        name=f'{system.name} with input lag',
+        state_names=(*system.state_names, *system.input_names),
+        state_units=(*system.state_units, *system.input_units),
+        drift=drift,
+        drift_jacobian=drift_jacobian,
+        B=np.concatenate([np.zeros((n_x, n_u)), rate * np.eye(n_u)]),
+        nominal_state=np.concatenate([system.nominal_state, system.nominal_input]),
+        state_lower=np.concatenate([system.state_lower, -unbounded]),
+        state_upper=np.concatenate([system.state_upper, unbounded]),
+    )

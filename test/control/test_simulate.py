@@ -30,7 +30,6 @@ from koopman_ros.control import (
 )
 from koopman_ros.lifting import Coordinates, LiftedModel, linearised_model, Provenance
 from koopman_ros.plants import (
-    ActuatedProcess,
     Actuator,
     ControlAffineSystem,
     Process,
@@ -291,7 +290,7 @@ def test_an_actuator_is_late_and_reaches_less(case):
     low, high = case.bounds
     held = case.plant.nominal_input
     reach = Actuator(0.5 * (low + held[0]), 0.5 * (high + held[0]), delay=2.0 * case.seconds)
-    found = run(case, plant=ActuatedProcess(process(case), reach, held), samples=20)
+    found = run(case, plant=replace(process(case), actuator=reach), samples=20)
     np.testing.assert_array_equal(found.inputs[:3], [held] * 3)
     np.testing.assert_array_equal(
         found.inputs[3:], np.clip(found.commands[:-3], reach.lower, reach.upper))
@@ -301,7 +300,7 @@ def test_an_actuator_is_late_and_reaches_less(case):
     (None, True), (perfect, False), (lambda u, seconds: u + 4.0 * (seconds > 30.0), True)])
 def test_a_measured_input_shows_whether_it_follows(sensor, follows):
     case = CASES['reactor_nz4']
-    stuck = ActuatedProcess(process(case), Actuator(lower=298.15), case.plant.nominal_input)
+    stuck = replace(process(case), actuator=Actuator(lower=298.15))
     tolerance = np.array([2.0 if follows is False else 30.0])
     found = simulate(controller(case, input_tolerance=tolerance), stuck,
                      [at(0.0, SetpointRequest(0, case.goal))], duration=60.0, input_sensor=sensor)

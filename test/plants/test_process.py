@@ -1,15 +1,17 @@
 # SPDX-FileCopyrightText: 2026 The koopman_ros Authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""Tests of a plant that runs in time."""
+"""A plant that runs in time, and what stands between a command and its input."""
 
-import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
 
 from koopman_ros.plants import (
+    Actuator,
     advance,
+    ControlAffineSystem,
     IntegrationError,
     one_state_reactor,
     Process,
@@ -17,46 +19,156 @@ from koopman_ros.plants import (
 )
 
 SECOND = 1_000_000_000
+SLOPE, GAIN = -0.7, 0.4  # 1/s, of the linear plant
 
 
-@pytest.fixture
-def process() -> Process:
+def linear() -> ControlAffineSystem:
+    """Return dx/dt = SLOPE x + GAIN u, in seconds."""
+    return ControlAffineSystem(
+        name='linear', state_names=('x',), state_units=('1',), input_names=('u',),
+        input_units=('1',), time_unit='s', drift=lambda x: SLOPE * x,
+        drift_jacobian=lambda x: np.full((*x.shape, 1), SLOPE), B=np.array([[GAIN]]),
+        nominal_state=np.zeros(1), nominal_input=np.zeros(1))
+
+
+def analytic(x: float, v: float, u: float, lag: float, seconds: float) -> tuple[float, float]:
+    """Solve the linear plant whose input v goes to u with a lag."""
+    grown, decayed = np.exp(SLOPE * seconds), np.exp(-seconds / lag)
+    steady = GAIN * u * (grown - 1.0) / SLOPE
+    transient = GAIN * (v - u) * (grown - decayed) / (SLOPE + 1.0 / lag)
+    return x * grown + steady + transient, u + (v - u) * decayed
+
+
+def actuated(actuator: Actuator, system: ControlAffineSystem | None = None) -> Process:
+    system = linear() if system is None else system
+    return Process(system, 0, system.nominal_state, system.nominal_input, actuator)
+
+
+def given(plant: Process, value: float) -> Process:
+    """Return a plant with a command given at its present time."""
+    return plant.commanded(np.array([value]), plant.time_ns)
+
+
+# Time.
+
+def test_an_instant_is_reached_in_the_units_of_the_plant() -> None:
     system = one_state_reactor()
-    return Process(system, 5 * SECOND, system.nominal_state - 3.0, system.nominal_input)
-
-
-def test_reaches_an_instant_in_the_units_of_the_plant(process: Process) -> None:
-    later = process.until(65 * SECOND)
+    start = Process(system, 5 * SECOND, system.nominal_state - 3.0, system.nominal_input)
+    later = start.until(65 * SECOND)
     assert later.time_ns == 65 * SECOND
     # one minute of a plant whose time unit is the minute
-    np.testing.assert_array_equal(
-        later.x, advance(process.system, process.x, process.u, 1.0))
+    np.testing.assert_array_equal(later.x, advance(system, start.x, start.u, 1.0))
+    # xdot = x^2 has x(t) = x0 / (1 - x0 t), here in seconds
+    start = Process(scalar_example(), 0, np.array([0.5]), np.zeros(0))
+    assert start.until(3 * SECOND // 2).x[0] == pytest.approx(0.5 / (1.0 - 0.75), rel=1e-9)
 
 
-def test_seconds_and_time_units_agree_for_a_plant_in_seconds() -> None:
-    system = scalar_example()
-    start = Process(system, 0, np.array([0.5]), np.zeros(0))
-    seconds = 1.5 / system.seconds_per_time_unit
-    # xdot = x^2 has x(t) = x0 / (1 - x0 t)
-    reached = start.until(round(1.5 * SECOND)).x[0]
-    assert math.isclose(reached, 0.5 / (1.0 - 0.5 * seconds), rel_tol=1e-9)
-
-
-def test_an_earlier_instant_changes_nothing(process: Process) -> None:
-    assert process.until(4 * SECOND) is process
-    assert process.until(5 * SECOND) is process
-
-
-def test_a_steady_state_stays_to_the_bit_whatever_the_steps() -> None:
-    system = one_state_reactor()
-    process = Process(system, 0, system.nominal_state, system.nominal_input)
+def test_a_steady_state_stays_whatever_the_steps() -> None:
+    process = actuated(Actuator(), one_state_reactor())
     for n in range(1, 11):
         process = process.until(n * SECOND)
-    np.testing.assert_allclose(process.x, system.nominal_state, rtol=0.0, atol=1e-9)
+    np.testing.assert_allclose(process.x, process.system.nominal_state, rtol=0.0, atol=1e-9)
 
 
 def test_a_runaway_is_an_error() -> None:
-    system = one_state_reactor()
-    process = Process(system, 0, system.nominal_state, np.array([320.0]))
+    process = given(actuated(Actuator(), one_state_reactor()), 320.0)
     with pytest.raises(IntegrationError, match='temperature'):
         process.until(3600 * SECOND)
+
+
+# The lag.
+
+@pytest.mark.parametrize('lag', [0.02, 1.0, 30.0])
+def test_a_lag_is_that_of_the_analytic_solution(lag: float) -> None:
+    plant = given(actuated(Actuator(lag=lag)), 2.0).until(3 * SECOND)
+    expected = analytic(0.0, 0.0, 2.0, lag, 3.0)
+    assert (plant.x[0], plant.u[0]) == pytest.approx(expected, abs=1e-9)
+    plant = given(plant, -1.0).until(5 * SECOND)
+    expected = analytic(*expected, -1.0, lag, 2.0)
+    assert (plant.x[0], plant.u[0]) == pytest.approx(expected, abs=1e-9)
+
+
+def test_a_lag_is_in_the_seconds_of_a_plant_in_minutes() -> None:
+    system = one_state_reactor()
+    late, at_once = (given(actuated(Actuator(lag=lag), system), 310.0).until(60 * SECOND)
+                     for lag in (30.0, 0.0))
+    assert late.u[0] == pytest.approx(310.0 - 10.0 * np.exp(-2.0), abs=1e-7)
+    assert system.nominal_state[0] < late.x[0] < at_once.x[0] - 1.0
+
+
+def test_a_short_lag_in_a_long_hold_settles_to_the_bit() -> None:
+    plant = given(actuated(Actuator(lag=1e-3)), 2.0).until(3600 * SECOND)
+    assert plant.u[0] == 2.0
+    assert plant.x[0] == pytest.approx(-2.0 * GAIN / SLOPE, rel=1e-9)
+
+
+def test_a_lag_that_is_taken_away_leaves_the_command() -> None:
+    plant = given(actuated(Actuator(lag=10.0)), 2.0).until(1 * SECOND)
+    plant = replace(plant, actuator=Actuator()).until(2 * SECOND)
+    assert plant.u[0] == 2.0
+
+
+# The delay.
+
+def test_without_an_actuator_the_plant_is_the_same_to_the_bit() -> None:
+    system = one_state_reactor()
+    plant, alone = actuated(Actuator(), system), actuated(Actuator(), system)
+    for n in range(1, 20):
+        value = 300.0 + 3.0 * np.sin(n)
+        plant = given(plant, value).until(n * SECOND)
+        alone = replace(alone, u=np.array([value])).until(n * SECOND)
+        assert (plant.x[0], plant.u[0]) == (alone.x[0], alone.u[0])
+
+
+@pytest.mark.parametrize('samples', [0, 1, 3])
+def test_a_delay_of_samples_shifts_the_commands(samples: int) -> None:
+    values = [float(n * n) for n in range(10)]
+    plant = actuated(Actuator(delay=0.1 * samples))
+    acted = []
+    for n, value in enumerate(values, start=1):
+        # what acts in a hold is known at its end
+        plant = given(plant, value).until(n * SECOND // 10)
+        acted.append(plant.u[0])
+    assert acted == [0.0] * samples + values[:len(values) - samples]
+
+
+def test_a_delay_within_a_hold_takes_effect_in_the_middle_of_it() -> None:
+    plant = given(actuated(Actuator(delay=0.4)), 2.0).until(SECOND)
+    assert plant.x[0] == pytest.approx(
+        2.0 * GAIN / SLOPE * (np.exp(SLOPE * 0.6) - 1.0), abs=1e-10)
+
+
+def test_a_lag_follows_the_delay() -> None:
+    plant = given(actuated(Actuator(delay=0.5, lag=0.3)), 2.0).until(SECOND)
+    assert (plant.x[0], plant.u[0]) == pytest.approx(
+        analytic(0.0, 0.0, 2.0, 0.3, 0.5), abs=1e-9)
+
+
+def test_a_command_supersedes_those_that_would_act_later() -> None:
+    plant = given(given(actuated(Actuator(delay=5.0)), 1.0).until(SECOND), 2.0)
+    plant = given(replace(plant, actuator=Actuator(delay=4.5)), 3.0)
+    assert [(time_ns, u[0]) for time_ns, u in plant.pending] == [
+        (5 * SECOND, 1.0), (11 * SECOND // 2, 3.0)]
+    plant = given(replace(plant, actuator=Actuator()), 4.0).until(20 * SECOND)
+    assert plant.u[0] == plant.command[0] == 4.0
+
+
+def test_an_earlier_instant_changes_nothing() -> None:
+    plant = given(actuated(Actuator(delay=1.0)), 1.0).until(2 * SECOND)
+    assert plant.until(2 * SECOND) is plant
+    assert plant.until(SECOND) is plant
+
+
+# The range.
+
+def test_an_input_reaches_no_further_than_its_range() -> None:
+    plant = given(actuated(Actuator(lower=-1.0, upper=1.5)), 2.0).until(SECOND)
+    assert plant.u[0] == 1.5
+    assert given(plant, -2.0).until(2 * SECOND).u[0] == -1.0
+
+
+def test_a_range_that_narrows_moves_the_held_input() -> None:
+    plant = given(actuated(Actuator()), 2.0).until(SECOND)
+    plant = replace(plant, actuator=Actuator(upper=1.0)).until(2 * SECOND)
+    assert plant.u[0] == 1.0
+    assert replace(plant, actuator=Actuator()).until(3 * SECOND).u[0] == 2.0

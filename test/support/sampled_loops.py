@@ -33,7 +33,6 @@ from koopman_ros.control import (
 )
 from koopman_ros.nodes.controller_parameters import ControllerParameters
 from koopman_ros.plants import (
-    ActuatedProcess,
     Actuator,
     ControlAffineSystem,
     equilibrium_input,
@@ -103,16 +102,11 @@ class Reactor:
                  coolant: float | None = None) -> None:
         x = np.append(plant.nominal_state[:-1], kelvin)
         u = equilibrium_input(plant, x) if coolant is None else np.array([coolant])
-        process = Process(plant, 0, x, u)
         self.loop = Loop(controller, controller.initialise(State(), u),
-                         ActuatedProcess(process, actuator or Actuator(), u))
+                         Process(plant, 0, x, u, actuator or Actuator(), u))
         self.noise, self.sensor, self.input_sensor = noise, sensor, input_sensor
         self.waiting: list[Event | Change] = []
         self.samples: list[Sample] = []
-
-    @property
-    def process(self) -> Process:
-        return self.loop.plant.process
 
     @property
     def kelvin(self) -> float:
@@ -132,12 +126,11 @@ class Reactor:
 
     def act(self, actuator: Actuator) -> None:
         """Put another actuator before the plant."""
-        self.do(lambda loop: replace(loop, plant=replace(loop.plant, actuator=actuator)))
+        self.change(actuator=actuator)
 
     def change(self, **changes: Any) -> None:
-        """Go on with another state or system."""
-        self.do(lambda loop: replace(loop, plant=replace(
-            loop.plant, process=replace(loop.plant.process, **changes))))
+        """Go on with another state, system or actuator."""
+        self.do(lambda loop: replace(loop, plant=replace(loop.plant, **changes)))
 
     def run(self, seconds: int, sensor: Callable[[float], float | None] | None = None
             ) -> list[Sample]:
@@ -156,7 +149,7 @@ class Reactor:
         run = simulate(
             self.loop.controller, self.loop.plant.until(first * SECOND),
             [at(0.0, what) for what in self.waiting], duration=seconds - 1.0,
-            C=np.eye(len(self.process.x))[-1:], seed=first, sensor=measure,
+            C=np.eye(len(self.loop.plant.x))[-1:], seed=first, sensor=measure,
             noise=np.array([self.noise]) if self.noise else None, state=self.loop.state,
             input_sensor=self.input_sensor, stamp=lambda time_ns: EPOCH + time_ns)
         assert not run.failure

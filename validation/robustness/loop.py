@@ -33,7 +33,6 @@ from koopman_ros.control import (
 from koopman_ros.lifting import LiftedModel, load
 from koopman_ros.nodes.controller_parameters import ControllerParameters
 from koopman_ros.plants import (
-    ActuatedProcess,
     Actuator,
     ControlAffineSystem,
     one_state_reactor,
@@ -101,13 +100,12 @@ def at_setpoint(value: float) -> Event:
 
 def on_plant(system: ControlAffineSystem) -> Change:
     """Go on with another plant from the same state."""
-    return lambda loop: replace(loop, plant=replace(
-        _actuated(loop), process=replace(_actuated(loop).process, system=system)))
+    return lambda loop: replace(loop, plant=replace(_process(loop), system=system))
 
 
 def behind(actuator: Actuator) -> Change:
     """Put another actuator before the plant."""
-    return lambda loop: replace(loop, plant=replace(_actuated(loop), actuator=actuator))
+    return lambda loop: replace(loop, plant=replace(_process(loop), actuator=actuator))
 
 
 def biased(bias: float, since: float = 0.0) -> Sensor:
@@ -115,8 +113,8 @@ def biased(bias: float, since: float = 0.0) -> Sensor:
     return lambda y, seconds: y + (bias if seconds >= since else 0.0)
 
 
-def _actuated(loop: Loop) -> ActuatedProcess:
-    assert isinstance(loop.plant, ActuatedProcess)
+def _process(loop: Loop) -> Process:
+    assert isinstance(loop.plant, Process)
     return loop.plant
 
 
@@ -160,8 +158,8 @@ def run_loop(controller: Controller, system: ControlAffineSystem, x0: Array, coo
     :param others: of :func:`simulate`.
     """
     held = np.array([coolant])
-    plant = ActuatedProcess(Process(system, 0, np.asarray(x0, dtype=np.float64), held),
-                            actuator or Actuator(), held)
+    plant = Process(system, 0, np.asarray(x0, dtype=np.float64), held, actuator or Actuator(),
+                    held)
     n_x = controller.model.n_x
     return simulate(
         controller, plant, [at(0.0, Initialisation(held)), *events], duration=seconds,
