@@ -43,43 +43,52 @@ def test_the_cost_of_the_linear_regulator():
     np.testing.assert_array_equal(loop.states[0], x0)
     np.testing.assert_allclose(loop.states[-1], STATES.center, rtol=0, atol=1e-5)
     np.testing.assert_allclose(loop.inputs[-1], INPUTS.center, rtol=0, atol=1e-5)
-
-
-def test_the_first_input_is_that_of_the_law():
-    model, x0 = linear_model(), np.array([3.6, -0.4])
-    loop = run_closed_loop(model, rate, x0, STATES.center, WEIGHTS, 1.0, samples=2)
     K = solve_riccati(model.A, model.B, WEIGHTS.Q, WEIGHTS.R).K
-    expected = INPUTS.to_physical(-K @ STATES.to_deviation(x0))
-    np.testing.assert_allclose(loop.inputs[0], expected, rtol=1e-12)
+    np.testing.assert_allclose(
+        loop.inputs[0], INPUTS.to_physical(-K @ STATES.to_deviation(x0)), rtol=1e-12)
 
 
+# A plant of one state, in deviations of its scale from its center.
 SCALAR = linear_model(np.array([[-0.8]]), np.array([[0.6]]))
 ONE = Weights(np.eye(1), np.eye(1))
+CENTER, SCALE = SCALAR.states.center, SCALAR.states.scale
 
 
 def scalar_rate(x, u):
-    return -0.8 * (x - SCALAR.states.center) + 0.6 * (u - INPUTS.center)
+    return -0.8 * (x - CENTER) + 0.6 * (u - INPUTS.center)
+
+
+def run(start=0.0, duration=10.0, *, goal=CENTER, model=SCALAR, rate=scalar_rate, weights=ONE,
+        **others):
+    return run_closed_loop(
+        model, rate, CENTER + start * SCALE, goal, weights, duration, **others)
 
 
 def test_another_setpoint_is_held_by_an_input_that_costs_nothing():
-    x0, x_ref = np.array([3.7]), np.array([3.2])
-    loop = run_closed_loop(SCALAR, scalar_rate, x0, x_ref, ONE, 40.0)
-    distance = (x0 - x_ref) / SCALAR.states.scale
-    assert loop.cost == pytest.approx(optimal_cost(SCALAR, distance, ONE), rel=1e-7)
+    goal = np.array([3.2])
+    loop = run(1.4, 40.0, goal=goal)
+    assert loop.cost == pytest.approx(optimal_cost(
+        SCALAR, 1.4 - (goal - CENTER) / SCALE, ONE), rel=1e-7)
     np.testing.assert_allclose(
-        loop.inputs[-1], INPUTS.center + 0.8 / 0.6 * (x_ref - SCALAR.states.center), rtol=1e-7)
+        loop.inputs[-1], INPUTS.center + 0.8 / 0.6 * (goal - CENTER), rtol=1e-7)
 
 
 def test_u_ref_shifts_what_the_cost_counts_from():
     """At rest on the set-point the law costs R d^2 a minute, d from the reference to its input."""
-    center, weights = SCALAR.states.center, Weights(np.eye(1), np.array([[0.3]]))
+    weights = Weights(np.eye(1), np.array([[0.3]]))
     u_ref = INPUTS.center + 2.0 * INPUTS.scale
-    loop = run_closed_loop(SCALAR, scalar_rate, center, center, weights, 5.0, u_ref=u_ref)
-    assert loop.cost == pytest.approx(5.0 * 0.3 * 2.0 ** 2, rel=1e-9)
-    held = run_closed_loop(SCALAR, scalar_rate, center, center, weights, 5.0,
-                           u_ref=INPUTS.center)
-    assert held.cost == 0.0
+    assert run(0.0, 5.0, weights=weights, u_ref=u_ref).cost == pytest.approx(
+        5.0 * 0.3 * 2.0 ** 2, rel=1e-9)
+    assert run(0.0, 5.0, weights=weights, u_ref=INPUTS.center).cost == 0.0
 
+
+def test_distance_from_the_training_box():
+    """The box reaches two scales below and one above the center, three halves as its half."""
+    for start, expected in ((0.5, 0.0), (1.75, 0.5), (-2.5, 1.0 / 3.0)):
+        assert run(start, 5.0).distance(SCALAR) == pytest.approx(expected, abs=1e-9)
+
+
+# Failures.
 
 def failing(law_input=None, solved=lambda x: True):
     """Return a law that pushes with `law_input` and has an answer where `solved` says so."""
@@ -93,100 +102,58 @@ def failing(law_input=None, solved=lambda x: True):
     return law
 
 
-def test_a_state_that_escapes():
-    """Under u = 3 x the state grows as exp(t) and is twice its scale away after log 5."""
-    scale = SCALAR.states.scale[0]
-    law = failing(lambda x: 1.8 * scale * x / (0.6 * INPUTS.scale))
-    loop = run_closed_loop(SCALAR, scalar_rate, SCALAR.states.center + 0.4 * scale,
-                           SCALAR.states.center, ONE, 10.0, law=law, escape=2.0)
-    assert loop.failure == 'the state escaped'
+UNSOLVED = 'no feedback gain: the Hamiltonian has no stable subspace'
+STUCK = linear_model(np.array([[0.5]]), np.zeros((1, 1)))
+# u = 3 x lets the state grow as exp(t), so that it is twice its scale away after log 5
+PUSHING = failing(lambda x: 1.8 * SCALE * x / (0.6 * INPUTS.scale))
+
+
+@pytest.mark.parametrize(('start', 'others', 'failure', 'earliest', 'latest'), [
+    # noticed at the end of a step
+    (0.4, {'law': PUSHING, 'escape': 2.0}, 'the state escaped', np.log(5.0) - 10.0 / 300, 4.0),
+    (3.0, {'escape': 2.0}, 'the state escaped', 0.0, 1.0),
+    # a law with a jump at the set-point keeps the steps tiny
+    (0.1, {'law': failing(lambda x: -5.0 * np.sign(x)), 'max_evaluations': 500},
+     'the law was evaluated 500 times before the end', 0.0, 10.0),
+    # once the state is half a scale away, the rate grows without bound in finite time
+    (0.0, {'rate': lambda x, u: 1e3 * (1.0 + (x - CENTER) ** 2), 'escape': 1e200},
+     'the integration failed', 0.0, 1.0),
+    (0.2, {'model': STUCK}, UNSOLVED, 0.0, 0.0),
+    (1.0, {'law': failing(solved=lambda x: x[0] > 0.5)}, UNSOLVED, 0.1, 2.0),
+], ids=['escapes', 'has escaped', 'chatters', 'explodes', 'not stabilisable', 'on the way'])
+def test_a_loop_that_fails_returns_the_path_up_to_there(start, others, failure, earliest, latest):
+    loop = run(start, **others)
+    assert loop.failure.startswith(failure)
     assert loop.cost == np.inf
-    # it is noticed at the end of a step
-    assert np.log(5.0) - 10.0 / 300 < loop.times[-1] < 4.0
-    np.testing.assert_allclose(
-        loop.states[:, 0], SCALAR.states.center + 0.4 * scale * np.exp(loop.times), rtol=1e-6)
-    assert len(loop.inputs) == len(loop.times)
-
-
-def test_a_start_that_has_escaped():
-    loop = run_closed_loop(SCALAR, scalar_rate, SCALAR.states.center + 3.0 * SCALAR.states.scale,
-                           SCALAR.states.center, ONE, 10.0, escape=2.0)
-    assert (loop.failure, loop.cost) == ('the state escaped', np.inf)
-    assert loop.times[-1] < 1.0
-
-
-def test_a_law_that_chatters():
-    """A law with a jump at the set-point keeps the steps tiny."""
-    law = failing(lambda x: -5.0 * np.sign(x))
-    loop = run_closed_loop(SCALAR, scalar_rate, SCALAR.states.center + 0.1 * SCALAR.states.scale,
-                           SCALAR.states.center, ONE, 10.0, law=law, max_evaluations=500)
-    assert loop.failure == 'the law was evaluated 500 times before the end'
-    assert loop.cost == np.inf
-
-
-def assert_unsolved(loop, x0):
-    assert loop.failure.startswith('no feedback gain: the Hamiltonian has no stable subspace')
-    assert loop.cost == np.inf
-    np.testing.assert_array_equal(loop.states[0], x0)
+    np.testing.assert_array_equal(loop.states[0], CENTER + start * SCALE)
     assert len(loop.times) == len(loop.states) == len(loop.inputs)
-
-
-def test_a_model_that_cannot_be_stabilised():
-    model = linear_model(np.array([[0.5]]), np.zeros((1, 1)))
-    x0 = np.array([3.1])
-    loop = run_closed_loop(model, scalar_rate, x0, model.states.center, ONE, 5.0)
-    assert_unsolved(loop, x0)
-    assert loop.times.tolist() == [0.0]
-    assert np.all(np.isnan(loop.inputs))
-
-
-def test_a_law_without_an_answer_on_the_way():
-    x0 = SCALAR.states.center + SCALAR.states.scale
-    law = failing(solved=lambda x: x[0] > 0.5)
-    loop = run_closed_loop(SCALAR, scalar_rate, x0, SCALAR.states.center, ONE, 5.0, law=law)
-    assert_unsolved(loop, x0)
-    # the path up to there is returned, under the law of the regulator: e' = -1 e
-    assert 1 < len(loop.times) < 300
+    assert earliest <= loop.times[-1] <= latest
     deviation = SCALAR.states.to_deviation(loop.states[:, 0])
-    assert np.min(deviation) > 0.5
-    np.testing.assert_allclose(deviation, np.exp(-np.hypot(0.8, SCALAR.B[0, 0]) * loop.times),
-                               rtol=1e-6)
+    if others.get('law') is PUSHING:
+        np.testing.assert_allclose(deviation, 0.4 * np.exp(loop.times), rtol=1e-6)
+    elif failure == UNSOLVED and 'law' in others:
+        # under the law of the regulator: e' = -1 e
+        assert np.min(deviation) > 0.5
+        np.testing.assert_allclose(
+            deviation, np.exp(-np.hypot(0.8, SCALAR.B[0, 0]) * loop.times), rtol=1e-6)
+    elif failure == UNSOLVED:
+        assert np.all(np.isnan(loop.inputs))
 
 
 def test_a_law_without_an_answer_at_a_time_of_the_report():
     """The integration steps over the state; the inputs to return need the law there."""
-    x0 = SCALAR.states.center + SCALAR.states.scale
     calls = []
 
-    def run(limit):
+    def limited(limit):
         calls.clear()
 
         def solved(x):
             calls.append(x)
             return len(calls) <= limit
 
-        return run_closed_loop(SCALAR, scalar_rate, x0, SCALAR.states.center, ONE, 5.0,
-                               law=failing(solved=solved), samples=3)
+        return run(1.0, 5.0, law=failing(solved=solved), samples=3)
 
-    assert run(10_000).failure == ''
-    assert_unsolved(run(len(calls) - 1), x0)
-
-
-def test_an_integration_that_fails():
-    """Once the state is half a scale away, the rate grows without bound in finite time."""
-    def explosive(x, u):
-        return 1e3 * (1.0 + (x - SCALAR.states.center) ** 2)
-
-    loop = run_closed_loop(SCALAR, explosive, SCALAR.states.center, SCALAR.states.center, ONE,
-                           1.0, escape=1e200)
-    assert 'integration failed' in loop.failure
-    assert loop.cost == np.inf
-
-
-def test_distance_from_the_training_box():
-    """The box reaches two scales below and one above the center, three halves as its half."""
-    scale = SCALAR.states.scale
-    for start, expected in ((0.5, 0.0), (1.75, 0.5), (-2.5, 1.0 / 3.0)):
-        loop = run_closed_loop(SCALAR, scalar_rate, SCALAR.states.center + start * scale,
-                               SCALAR.states.center, ONE, 5.0)
-        assert loop.distance(SCALAR) == pytest.approx(expected, abs=1e-9)
+    assert limited(10_000).failure == ''
+    loop = limited(len(calls) - 1)
+    assert loop.failure.startswith(UNSOLVED)
+    assert len(loop.times) == len(loop.states) == len(loop.inputs)

@@ -12,7 +12,6 @@ import pytest
 from scipy.integrate import solve_ivp
 
 from koopman_ros.control import at
-from koopman_ros.plants import Actuator
 from validation.robustness import attraction, disturbances
 from validation.robustness.attraction import End, Start
 from validation.robustness.disturbances import Case
@@ -164,14 +163,3 @@ def test_what_rests_outside_the_data_comes_back_from_the_safe_coolant():
     better_cooled = attraction.back_from_safe(disturbances.CHANGED['UA +20 %'], 0.5)
     assert better_cooled['outside'] > 0.5
     assert better_cooled['seconds_to_0.2_kelvin'] < 300.0
-
-
-def test_only_a_measured_coolant_tells_that_the_actuator_is_stuck():
-    runs = [run_loop(
-        reactor_controller(), REACTOR, np.array([START]), 300.0, 300.0,
-        [at(0.0, at_setpoint(disturbances.SETPOINT))],
-        actuator=Actuator(lower=disturbances.REACHED), tells=tells)
-        for tells in (False, True)]
-    estimates = [run.reports[-1].estimate.disturbance[0] for run in runs]
-    # the bound, and the tolerance
-    np.testing.assert_allclose(estimates, [20.0, 2.0], rtol=0, atol=0.1)
