@@ -31,7 +31,7 @@ from koopman_ros.control import (
     State,
     SupervisorSettings,
 )
-from koopman_ros.nodes.controller_parameters import ControllerParameters
+from koopman_ros.parameters.controller import ControllerParameters
 from koopman_ros.plants import (
     Actuator,
     ControlAffineSystem,

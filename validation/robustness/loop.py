@@ -31,7 +31,7 @@ from koopman_ros.control import (
     Timed,
 )
 from koopman_ros.lifting import LiftedModel, load
-from koopman_ros.nodes.controller_parameters import ControllerParameters
+from koopman_ros.parameters.controller import ControllerParameters
 from koopman_ros.plants import (
     Actuator,
     ControlAffineSystem,
