@@ -93,8 +93,9 @@ def random_steps(system: ControlAffineSystem, design: RandomStepDesign, duration
         raise ValueError(f'{system.name} has no input to step; choose initial states instead')
     holds = _whole_samples(duration, design.sample_period, system.time_unit)
     levels, box = _bounds(system, design)
+    settings = IntegratorSettings(rtol=design.rtol, lower=box[0], upper=box[1])
     state = system.nominal_state if x0 is None else system.checked_state('x0', x0)
-    if not np.all((state >= box.lower) & (state <= box.upper)):
+    if not np.all((state >= box[0]) & (state <= box[1])):
         raise ExcitationError(
             f'{system.name}: at the start {_violation(system, box, state)}; '
             'choose x0 inside the box, or a box around it')
@@ -106,7 +107,7 @@ def random_steps(system: ControlAffineSystem, design: RandomStepDesign, duration
             try:
                 return simulate(
                     system, state, np.tile(level, (length, 1)), design.sample_period,
-                    start_time=sample * design.sample_period, settings=box)
+                    start_time=sample * design.sample_period, settings=settings)
             except IntegrationError as error:
                 if error.failure is not IntegrationFailure.OUT_OF_BOUNDS:
                     raise
@@ -133,8 +134,8 @@ def random_steps(system: ControlAffineSystem, design: RandomStepDesign, duration
 
 
 def _bounds(system: ControlAffineSystem, design: RandomStepDesign
-            ) -> tuple[tuple[FloatArray, FloatArray], IntegratorSettings]:
-    """Return bounds of the levels, and the box, shrunk to the states at which the model holds."""
+            ) -> tuple[tuple[FloatArray, FloatArray], tuple[FloatArray, FloatArray]]:
+    """Return ranges of the levels and of the states, as far as the model holds there."""
     lower = np.maximum(
         system.checked_bound('state_lower', design.state_lower), system.state_lower)
     upper = np.minimum(
@@ -144,7 +145,7 @@ def _bounds(system: ControlAffineSystem, design: RandomStepDesign
     for name, low, high in (('state', lower, upper), ('input', *levels)):
         if not np.all(low < high):
             raise ValueError(f'{name}_lower {low} must lie below {name}_upper {high}')
-    return levels, IntegratorSettings(rtol=design.rtol, lower=lower, upper=upper)
+    return levels, (lower, upper)
 
 
 def _whole_samples(duration: float, sample_period: float, time_unit: str) -> int:
@@ -157,9 +158,10 @@ def _whole_samples(duration: float, sample_period: float, time_unit: str) -> int
     return round(count)
 
 
-def _violation(system: ControlAffineSystem, box: IntegratorSettings, state: FloatArray) -> str:
+def _violation(system: ControlAffineSystem, box: tuple[FloatArray, FloatArray], state: FloatArray
+               ) -> str:
     """Name the first state variable that is outside the box, its value and its range."""
-    lower, upper = np.asarray(box.lower), np.asarray(box.upper)
+    lower, upper = box
     i = int(np.argmax((state < lower) | (state > upper)))
     unit = '' if system.state_units[i] == '1' else f' {system.state_units[i]}'
     return (
