@@ -11,9 +11,8 @@ import hashlib
 import itertools
 
 import numpy as np
-from numpy.typing import NDArray
 
-Array = NDArray[np.float64]
+from koopman_ros.arrays import Array
 
 
 @dataclass(frozen=True)

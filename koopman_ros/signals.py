@@ -10,9 +10,8 @@ from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
-from numpy.typing import NDArray
 
-Array = NDArray[np.float64]
+from koopman_ros.arrays import Array, frozen
 
 
 def per_signal(name: str, value: Array, signals: Sequence[str]) -> None:
@@ -50,10 +49,7 @@ class Outputs:
         if len(self.units) != len(self.names) or C.ndim != 2 or len(C) != len(self.names):
             raise ValueError(f'incompatible outputs: {len(self.names)} names, {len(self.units)} '
                              f'units, C of shape {C.shape}')
-        if not np.all(np.isfinite(C)):
-            raise ValueError(f'C must be finite, got {C.tolist()}')
-        C.setflags(write=False)
-        object.__setattr__(self, 'C', C)
+        object.__setattr__(self, 'C', frozen(C, 'C', C.shape))
 
     @cached_property
     def all_states(self) -> bool:

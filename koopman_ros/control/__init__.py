@@ -23,8 +23,7 @@ from koopman_ros.control.laws import (
     recentred,
     Weights,
 )
-from koopman_ros.control.levels import weights_of
-from koopman_ros.control.limits import InputLimits, limit, LimitedInput
+from koopman_ros.control.limits import InputLimits, limit
 from koopman_ros.control.report import Arrival, Report
 from koopman_ros.control.setpoint import Setpoint
 from koopman_ros.control.settings import Settings
@@ -67,7 +66,6 @@ __all__ = [
     'Initialisation',
     'InputLimits',
     'LevelSettings',
-    'LimitedInput',
     'Loop',
     'ManualCommand',
     'Measurement',
@@ -98,5 +96,4 @@ __all__ = [
     'run_closed_loop',
     'simulate',
     'steady_state_target',
-    'weights_of',
 ]

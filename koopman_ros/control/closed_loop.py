@@ -9,15 +9,14 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
+from koopman_ros.arrays import Array
 from koopman_ros.control.laws import Feedback, feedback, Weights
 from koopman_ros.control.target import steady_state_target, Target
 from koopman_ros.lifting import LiftedModel
 from koopman_ros.reasons import Code, reason, Words
 from koopman_ros.units import Displays
 
-Array = NDArray[np.float64]
 FeedbackFunction = Callable[..., Feedback]
 # dx/dt (n_x,) of a state (n_x,) and an input (n_u,), all in units
 Rate = Callable[[Array, Array], Array]

@@ -10,8 +10,8 @@ from functools import cached_property
 import math
 
 import numpy as np
-from numpy.typing import NDArray
 
+from koopman_ros.arrays import Array
 from koopman_ros.control import setpoint as setpoints
 from koopman_ros.control.estimating import Estimating
 from koopman_ros.control.laws import LawResult
@@ -36,8 +36,6 @@ from koopman_ros.lifting import LiftedModel
 from koopman_ros.reasons import Code, Reason, reason
 from koopman_ros.signals import Outputs
 from koopman_ros.units import LATE_NANOSECONDS, NANOSECONDS
-
-Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True)

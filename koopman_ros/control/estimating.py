@@ -8,8 +8,8 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
+from koopman_ros.arrays import Array
 from koopman_ros.control.levels import Level
 from koopman_ros.control.limits import finite
 from koopman_ros.control.settings import Settings
@@ -18,8 +18,6 @@ from koopman_ros.estimation import check, Estimate, FrozenCheck, Verdict
 from koopman_ros.lifting import LiftedModel
 from koopman_ros.signals import Outputs
 from koopman_ros.units import NANOSECONDS
-
-Array = NDArray[np.float64]
 
 # After so many time constants without an accepted measurement the state is not known.
 _LOST = 2.0

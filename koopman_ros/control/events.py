@@ -13,15 +13,11 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import TypeAlias
 
-import numpy as np
-from numpy.typing import NDArray
-
+from koopman_ros.arrays import Array
 from koopman_ros.control.controller import Controller
 from koopman_ros.control.report import Report
 from koopman_ros.control.state import Mode, State
 from koopman_ros.reasons import Reason
-
-Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True)

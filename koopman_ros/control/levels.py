@@ -8,8 +8,8 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 
 import numpy as np
-from numpy.typing import NDArray
 
+from koopman_ros.arrays import Array
 from koopman_ros.control.laws import Law, LawResult, LAWS, Tuning, Weights
 from koopman_ros.control.limits import InputLimits
 from koopman_ros.control.settings import Settings
@@ -17,8 +17,6 @@ from koopman_ros.control.target import balance, Reference, reference, Target
 from koopman_ros.estimation import Estimate, Estimator, ESTIMATORS
 from koopman_ros.lifting import LiftedModel
 from koopman_ros.plugs import plug
-
-Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True)

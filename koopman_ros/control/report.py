@@ -9,14 +9,10 @@ from dataclasses import dataclass, field
 from enum import Enum
 import math
 
-import numpy as np
-from numpy.typing import NDArray
-
+from koopman_ros.arrays import Array
 from koopman_ros.control.laws.base import Figures, NO_FIGURES
 from koopman_ros.control.state import Mode
 from koopman_ros.reasons import Reason
-
-Array = NDArray[np.float64]
 
 
 class Arrival(Enum):

@@ -9,13 +9,11 @@ from dataclasses import dataclass, replace
 import math
 
 import numpy as np
-from numpy.typing import NDArray
 
+from koopman_ros.arrays import Array
 from koopman_ros.lifting import LiftedModel
 from koopman_ros.reasons import Code, Reason, reason
 from koopman_ros.units import NANOSECONDS
-
-Array = NDArray[np.float64]
 
 # A stamp further ahead than this comes from another clock and is no schedule.
 HORIZON_NANOSECONDS = 3600 * NANOSECONDS

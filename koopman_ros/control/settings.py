@@ -9,15 +9,13 @@ from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from koopman_ros.arrays import Array
 from koopman_ros.control.limits import InputLimits
 from koopman_ros.control.supervisor import SupervisorSettings
 from koopman_ros.estimation import SensorLimits
 from koopman_ros.lifting import LiftedModel
 from koopman_ros.signals import Outputs, per_signal
-
-Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True)

@@ -11,8 +11,8 @@ import math
 from typing import Protocol, Self, TypeAlias
 
 import numpy as np
-from numpy.typing import NDArray
 
+from koopman_ros.arrays import Array
 from koopman_ros.control.controller import Controller
 from koopman_ros.control.events import apply, Event, Measurement, Silence
 from koopman_ros.control.report import Report
@@ -21,7 +21,6 @@ from koopman_ros.reasons import Reason, Words
 from koopman_ros.signals import per_signal
 from koopman_ros.units import Displays, NANOSECONDS
 
-Array = NDArray[np.float64]
 # what is measured (n,) of a value (n,) at a time in s; NaN for what is not, None for no message
 Sensor: TypeAlias = Callable[[Array, float], Array | None]
 

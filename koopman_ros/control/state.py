@@ -10,16 +10,13 @@ from enum import Enum
 from typing import TypeVar
 
 import numpy as np
-from numpy.typing import NDArray
 
+from koopman_ros.arrays import Array
 from koopman_ros.control.setpoint import Setpoint
 from koopman_ros.control.supervisor import Supervisor
 from koopman_ros.control.transfer import Transfer
 from koopman_ros.control.way_back import WayBack
 from koopman_ros.estimation import Accepted, Estimate
-
-Array = NDArray[np.float64]
-
 
 Record = TypeVar('Record')
 

@@ -9,11 +9,9 @@ from dataclasses import dataclass
 import math
 
 import numpy as np
-from numpy.typing import NDArray
 
+from koopman_ros.arrays import Array
 from koopman_ros.lifting import LiftedModel
-
-Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True)

@@ -9,9 +9,8 @@ from dataclasses import dataclass
 import math
 
 import numpy as np
-from numpy.typing import NDArray
 
-Array = NDArray[np.float64]
+from koopman_ros.arrays import Array
 
 # In input units; what is left then is below the resolution of any actuator.
 _NEGLIGIBLE = 1e-9

@@ -8,12 +8,10 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
+from koopman_ros.arrays import Array
 from koopman_ros.lifting import LiftedModel
 from koopman_ros.units import NANOSECONDS
-
-Array = NDArray[np.float64]
 
 # The input is ahead of the plant by this share of the way from the safe input to the nominal
 # one; a sensor that stands still out there brings it no further.

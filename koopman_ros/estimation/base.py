@@ -9,12 +9,8 @@ from dataclasses import dataclass
 import math
 from typing import Protocol
 
-import numpy as np
-from numpy.typing import NDArray
-
+from koopman_ros.arrays import Array
 from koopman_ros.lifting import LiftedModel
-
-Array = NDArray[np.float64]
 
 # One step of integration spans at most this share of the model's fastest time constant.
 _STEP_SHARE = 0.1

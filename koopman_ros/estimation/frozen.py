@@ -11,9 +11,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from koopman_ros.arrays import Array
 from koopman_ros.units import NANOSECONDS
-
-Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True)

@@ -10,14 +10,12 @@ from dataclasses import dataclass
 import math
 
 import numpy as np
-from numpy.typing import NDArray
 
+from koopman_ros.arrays import Array
 from koopman_ros.estimation.frozen import FrozenCheck
 from koopman_ros.reasons import Code, Reason, reason
 from koopman_ros.signals import Outputs, per_signal
 from koopman_ros.units import NANOSECONDS
-
-Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True)

@@ -10,12 +10,10 @@ from functools import cached_property
 import math
 
 import numpy as np
-from numpy.typing import NDArray
 
+from koopman_ros.arrays import Array
 from koopman_ros.estimation.base import Estimate, simulated
 from koopman_ros.lifting import LiftedModel
-
-Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True)

@@ -21,7 +21,7 @@ from koopman_ros.plants.library.two_state import two_state_example
 from koopman_ros.plants.process import Actuator, Process
 from koopman_ros.plants.sensor import in_steps, sensor_noise
 from koopman_ros.plants.simulation import advance, sample_derivatives, simulate
-from koopman_ros.plants.system import ControlAffineSystem, FloatArray
+from koopman_ros.plants.system import ControlAffineSystem
 
 __all__ = [
     'NOMINAL_COOLANT_TEMPERATURE',
@@ -29,7 +29,6 @@ __all__ = [
     'ControlAffineSystem',
     'EquilibriumError',
     'ExcitationError',
-    'FloatArray',
     'IntegrationError',
     'IntegrationFailure',
     'IntegratorSettings',

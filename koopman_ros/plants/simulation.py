@@ -19,14 +19,8 @@ from koopman_ros.plants.system import ControlAffineSystem, FloatArray
 _DEFAULT_SETTINGS = IntegratorSettings()
 
 
-def advance(
-    system: ControlAffineSystem,
-    x: ArrayLike,
-    u: ArrayLike,
-    duration: float,
-    *,
-    settings: IntegratorSettings = _DEFAULT_SETTINGS,
-) -> FloatArray:
+def advance(system: ControlAffineSystem, x: ArrayLike, u: ArrayLike, duration: float, *,
+            settings: IntegratorSettings = _DEFAULT_SETTINGS) -> FloatArray:
     """
     Integrate a plant over one interval with its input held constant.
 
@@ -44,16 +38,9 @@ def advance(
     return hold(system, start, held, duration, resolved_limits(system, settings))
 
 
-def simulate(
-    system: ControlAffineSystem,
-    x0: ArrayLike,
-    inputs: ArrayLike,
-    sample_period: float,
-    *,
-    substeps: int = 1,
-    start_time: float = 0.0,
-    settings: IntegratorSettings = _DEFAULT_SETTINGS,
-) -> Episode:
+def simulate(system: ControlAffineSystem, x0: ArrayLike, inputs: ArrayLike, sample_period: float,
+             *, substeps: int = 1, start_time: float = 0.0,
+             settings: IntegratorSettings = _DEFAULT_SETTINGS) -> Episode:
     """
     Simulate a plant under zero-order-hold inputs.
 

@@ -10,10 +10,9 @@ from enum import Enum
 import math
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.linalg import blas, lapack
 
-Array = NDArray[np.float64]
+from koopman_ros.arrays import Array
 
 # A double eigenvalue of the Hamiltonian on the imaginary axis comes out split by about the square
 # root of the rounding error: modes within that of the axis cannot be told from undamped ones.

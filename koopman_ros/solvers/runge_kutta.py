@@ -7,10 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 
-import numpy as np
-from numpy.typing import NDArray
-
-Array = NDArray[np.float64]
+from koopman_ros.arrays import Array
 
 
 def runge_kutta_step(rate: Callable[[Array], Array], x: Array, h: Array | float) -> Array:

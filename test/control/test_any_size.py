@@ -147,7 +147,7 @@ def test_a_disturbed_plant_is_brought_to_its_setpoint(n, all_states):
     state, refused = loop.request_setpoint(State(), wanted)
     assert refused is None
     x = np.zeros(n)
-    for k in range(900):
+    for k in range(600):
         state, command, report = loop.step(
             state, loop.measured.of(model.states.to_physical(x)), (k + 10) * SECOND)
         x = motion @ x + integral @ (B @ model.inputs.to_deviation(command) + load)

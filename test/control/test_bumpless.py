@@ -67,7 +67,7 @@ def test_retuning(change):
     # at rest nothing is felt
     loop = loop_at(SETPOINT, DRIFTED)
     loop.do(exchange(controller(**change)))
-    assert largest_step(loop.run(200)) < 1e-6
+    assert largest_step(loop.run(60)) < 1e-6
     # and under way the command goes on where it was
     loop.ask(START)
     before = loop.run(25)
@@ -92,7 +92,7 @@ def test_another_model_at_rest(name):
     loop = loop_at(SETPOINT, DRIFTED)
     for model in (name, 'reactor_nz4', name):
         loop.do(exchange(controller(model)))
-        samples = loop.run(300)
+        samples = loop.run(100)
         assert largest_step(samples) < 1e-6
         assert settled(samples, SETPOINT, 1e-3) == 0
 

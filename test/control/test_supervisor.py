@@ -166,10 +166,9 @@ def test_without_a_law_the_command_is_held_then_safe_and_the_loop_comes_back(cha
     assert samples[0].report.command.law.form == ''
     assert {s.command for s in samples[:61]} == {held}
     loop.do(exchange(controller()))
-    back = loop.run(500)
-    assert back[-1].report.level == 'sdre'
+    back = loop.run(40)
+    assert levels(back) == ['safe', 'sdre']
     assert largest_step(back) <= 1.0 + 1e-9
-    assert settled(back, START, 1e-3) < 480
 
 
 def test_far_out_the_supervisor_keeps_the_learned_law_from_acting():

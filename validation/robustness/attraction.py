@@ -9,9 +9,9 @@ from dataclasses import dataclass, replace
 from enum import Enum
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.optimize import brentq
 
+from koopman_ros.arrays import Array
 from koopman_ros.control import at, Loop, Report, SAFE, Supervisor
 from koopman_ros.plants import ControlAffineSystem, two_state_reactor
 from koopman_ros.solvers import runge_kutta_step
@@ -28,8 +28,6 @@ from validation.robustness.loop import (
     shipped_model,
     worst,
 )
-
-Array = NDArray[np.float64]
 
 HORIZON = 2400.0  # s
 TOLERANCE = 0.2  # K

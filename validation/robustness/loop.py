@@ -13,8 +13,8 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from koopman_ros.arrays import Array
 from koopman_ros.control import (
     at,
     Change,
@@ -39,8 +39,6 @@ from koopman_ros.plants import (
     Process,
     ReactorParameters,
 )
-
-Array = NDArray[np.float64]
 
 REACTOR = one_state_reactor()
 START = float(REACTOR.nominal_state[0])

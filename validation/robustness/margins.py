@@ -9,17 +9,15 @@ from dataclasses import dataclass, replace
 import math
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.signal import cont2discrete
 
 import control
+from koopman_ros.arrays import Array
 from koopman_ros.control import at, Controller, State
 from koopman_ros.estimation import Estimate
 from koopman_ros.lifting import LiftedModel
 from koopman_ros.plants import Actuator, ControlAffineSystem, equilibrium_input
 from validation.robustness.loop import at_setpoint, errors, PERIOD, REACTOR, run_loop
-
-Array = NDArray[np.float64]
 
 _NS = 1_000_000_000
 _STEP = 1e-5  # of scaled deviations and K, for differences

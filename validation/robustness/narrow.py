@@ -9,7 +9,6 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
 from koopman_ros.control import (
     at,
@@ -43,8 +42,6 @@ from validation.robustness.loop import (
     settling,
     START,
 )
-
-Array = NDArray[np.float64]
 
 HALF_WIDTH = 1.5  # K
 # Coolant and reactor in K, times in min.

@@ -9,16 +9,12 @@ from dataclasses import dataclass
 import math
 from typing import Protocol
 
-import numpy as np
-from numpy.typing import NDArray
-
+from koopman_ros.arrays import Array
 from koopman_ros.control.limits import InputLimits
 from koopman_ros.control.target import Target
 from koopman_ros.estimation import Estimate
 from koopman_ros.lifting import LiftedModel
 from koopman_ros.reasons import Reason
-
-Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True)

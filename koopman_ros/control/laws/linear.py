@@ -10,7 +10,6 @@ from functools import cached_property
 import math
 
 import numpy as np
-from numpy.typing import NDArray
 
 from koopman_ros.control.laws.base import LawResult, Tuning
 from koopman_ros.control.laws.sdre import checked, Feedback, feedback
@@ -19,8 +18,6 @@ from koopman_ros.control.target import steady_state_target, Target
 from koopman_ros.estimation import Estimate
 from koopman_ros.lifting import LiftedModel
 from koopman_ros.reasons import Code, reason
-
-Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True)

@@ -10,9 +10,9 @@ from enum import Enum
 import math
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.linalg import expm
 
+from koopman_ros.arrays import Array
 from koopman_ros.control.laws.base import Figures, LawResult, Tuning, Weights
 from koopman_ros.control.limits import finite, InputLimits
 from koopman_ros.control.target import Target
@@ -20,8 +20,6 @@ from koopman_ros.estimation import Estimate
 from koopman_ros.lifting import LiftedModel
 from koopman_ros.reasons import Code, reason
 from koopman_ros.solvers.riccati import RiccatiSolution, RiccatiStatus, solve_riccati
-
-Array = NDArray[np.float64]
 
 
 class Form(Enum):
