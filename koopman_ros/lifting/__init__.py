@@ -5,8 +5,7 @@
 
 from koopman_ros.lifting.artefact import load, load_with_digest, ModelFileError, save
 from koopman_ros.lifting.coordinates import Box, Coordinates
-from koopman_ros.lifting.linearisation import linearised_model
-from koopman_ros.lifting.model import LiftedModel, Provenance
+from koopman_ros.lifting.model import LiftedModel, linearised_model, Provenance
 from koopman_ros.lifting.observables import (
     NetworkObservables,
     Observables,

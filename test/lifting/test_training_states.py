@@ -67,7 +67,7 @@ def test_distance_of_a_model_is_the_larger_of_box_and_data():
 
 @pytest.mark.parametrize(('states', 'fill', 'words'), [
     (np.zeros((0, 2)), 0.0, 'M from 1 to 256'), (np.zeros((257, 2)), 0.0, 'M from 1 to 256'),
-    (np.zeros(2), 0.0, 'M from 1 to 256'), (np.full((1, 2), np.nan), 0.0, 'not finite'),
+    (np.zeros(2), 0.0, 'M from 1 to 256'), (np.full((1, 2), np.nan), 0.0, 'must be finite'),
     (np.zeros((1, 2)), -1.0, 'fill_distance must be'), (np.zeros((1, 2)), math.inf, 'fill_dis')])
 def test_what_does_not_fit_is_refused(states, fill, words):
     with pytest.raises(ValueError, match=words):
