@@ -173,23 +173,9 @@ class LiftedModel:
         """Evaluate N(x) and J_N(x) at once; shapes as in the single methods."""
         return self.observables.lift_and_jacobian(x)
 
-    def secants(self, x: Array, x_ref: Array, w: Array) -> tuple[Array, Array]:
-        """
-        Evaluate the secants of N and of J_N w between two states, exactly.
-
-        With e = x - x_ref they satisfy N(x) - N(x_ref) = M e and
-        J_N(x) w - J_N(x_ref) w = H e; nothing cancels as e goes to 0.
-
-        :param x: (n_x,) state.
-        :param x_ref: (n_x,) reference.
-        :param w: (n_x,) constant direction, e.g. B u_ref.
-        :return: M (n_z, n_x) and H (n_z, n_x).
-        """
-        return self.observables.secants(x, x_ref, w)
-
     def lift_and_secants(self, x: Array, x_ref: Array, w: Array
                          ) -> tuple[Array, Array, Array, Array]:
-        """Evaluate N(x), J_N(x), M and H at once; arguments and shapes as in :meth:`secants`."""
+        """Evaluate N(x), J_N(x) and their secants; see :meth:`Observables.lift_and_secants`."""
         return self.observables.lift_and_secants(x, x_ref, w)
 
     def onto_states(self, J: Array, rate: Array) -> Array:

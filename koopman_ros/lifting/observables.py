@@ -49,7 +49,17 @@ class Observables(ABC):
     @abstractmethod
     def lift_and_secants(self, x: Array, x_ref: Array, w: Array
                          ) -> tuple[Array, Array, Array, Array]:
-        """Evaluate N(x) and J_N(x), which a feedback law needs, too, before the secants."""
+        """
+        Evaluate N(x) and J_N(x), and the secants of N and of J_N w between two states, exactly.
+
+        With e = x - x_ref the secants satisfy N(x) - N(x_ref) = M e and
+        J_N(x) w - J_N(x_ref) w = H e; nothing cancels as e goes to 0.
+
+        :param x: (n_x,) state.
+        :param x_ref: (n_x,) reference.
+        :param w: (n_x,) constant direction, e.g. B u_ref.
+        :return: (n_z,), (n_z, n_x), M (n_z, n_x) and H (n_z, n_x).
+        """
 
     @abstractmethod
     def onto_states(self, J: Array, rate: Array) -> Array:
@@ -59,21 +69,6 @@ class Observables(ABC):
         :param J: (..., n_z, n_x) from the state x in question.
         :param rate: what the rate of the state is wanted of; (n_z,) gives (n_x,).
         """
-
-    @final
-    def secants(self, x: Array, x_ref: Array, w: Array) -> tuple[Array, Array]:
-        """
-        Evaluate the secants of N and of J_N w between two states, exactly.
-
-        With e = x - x_ref they satisfy N(x) - N(x_ref) = M e and
-        J_N(x) w - J_N(x_ref) w = H e, also where e is tiny or zero.
-
-        :param x: (n_x,) state.
-        :param x_ref: (n_x,) reference.
-        :param w: (n_x,) constant direction, e.g. B u_ref.
-        :return: M (n_z, n_x) and H (n_z, n_x).
-        """
-        return self.lift_and_secants(x, x_ref, w)[2:]
 
 
 @final

@@ -313,7 +313,7 @@ class PlantNode(LoopNode):
             'time [s]': seconds_text(self._plant.time_ns),
             'temperature [degC]': to_celsius(float(self._plant.x[-1])),
             'coolant [degC]': to_celsius(float(self._plant.u[0])),
-            'coolant command [degC]': to_celsius(float(self._plant.command[0])),
+            'coolant command [degC]': to_celsius(float(self._plant.followed[0])),
             'measurements': self._sample,
             'commands': self._commands,
             'rejected commands': self._rejected,

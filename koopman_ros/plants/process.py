@@ -56,6 +56,11 @@ class Process:
     command: FloatArray | None = None
     pending: tuple[tuple[int, FloatArray], ...] = ()
 
+    @property
+    def followed(self) -> FloatArray:
+        """What the input follows (n_u,)."""
+        return self.u if self.command is None else self.command
+
     def commanded(self, command: FloatArray, time_ns: int) -> Process:
         """
         Return the process with a command given at a time.
@@ -86,8 +91,7 @@ class Process:
         """Return the process at a later time, its input following the present command."""
         if time_ns <= self.time_ns:
             return self
-        now, goal = self, self.u if self.command is None else self.command
-        goal = np.clip(goal, self.actuator.lower, self.actuator.upper)
+        now, goal = self, np.clip(self.followed, self.actuator.lower, self.actuator.upper)
         settled_ns = self.time_ns + round(_SETTLED * self.actuator.lag * NANOSECONDS)
         if settled_ns > self.time_ns and np.any(self.u != goal):
             end_ns = min(time_ns, settled_ns)
