@@ -150,14 +150,6 @@ class ControlAffineSystem:
 
     def describe_state(self, x: FloatArray) -> str:
         """Write a state (n_x,) with names and units, for a message."""
-        return _named(self.state_names, x, self.state_units)
-
-    def describe_input(self, u: FloatArray) -> str:
-        """Write an input (n_u,) with names and units, for a message."""
-        return _named(self.input_names, u, self.input_units) or 'no input'
-
-
-def _named(names: tuple[str, ...], values: FloatArray, units: tuple[str, ...]) -> str:
-    return ', '.join(
-        f'{name} = {value:.10g}' + ('' if unit == '1' else f' {unit}')
-        for name, value, unit in zip(names, values, units, strict=True))
+        return ', '.join(
+            f'{name} = {value:.10g}' + ('' if unit == '1' else f' {unit}')
+            for name, value, unit in zip(self.state_names, x, self.state_units, strict=True))
