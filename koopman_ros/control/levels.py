@@ -68,19 +68,16 @@ class Level:
         return target, self.law.compute(estimate, target, limits, memory, interval)
 
 
-def weights_of(model: LiftedModel, settings: Settings) -> Weights:
-    """Return the cost in the model's scaled deviations."""
-    return Weights(np.diag(settings.state_weight * model.states.scale ** 2),
-                   np.diag(settings.input_weight * model.inputs.scale ** 2))
-
-
 def levels_of(model: LiftedModel, settings: Settings) -> dict[str, Level]:
     """
     Build the levels that the settings name, best first.
 
     :raises ValueError: for a law or an estimator that there is not.
     """
-    tuning = Tuning(weights_of(model, settings), settings.max_gain, settings.max_residual)
+    # the cost in the model's scaled deviations
+    weights = Weights(np.diag(settings.state_weight * model.states.scale ** 2),
+                      np.diag(settings.input_weight * model.inputs.scale ** 2))
+    tuning = Tuning(weights, settings.max_gain, settings.max_residual)
     levels = {}
     for level in settings.supervisor.levels:
         law = plug(level.law, 'law', LAWS)(model, tuning)

@@ -60,21 +60,17 @@ class Settings:
     supervisor: SupervisorSettings = field(default_factory=SupervisorSettings)
 
     def __post_init__(self) -> None:
-        if not (np.all(np.isfinite(self.state_weight)) and np.all(self.state_weight >= 0.0)
-                and np.any(self.state_weight > 0.0)):
-            raise ValueError('state_weight must be finite, at least 0 and not all 0, got '
-                             f'{self.state_weight.tolist()}')
-        if not (np.all(np.isfinite(self.input_weight)) and np.all(self.input_weight > 0.0)):
-            raise ValueError('input_weight must be finite and above 0, got '
-                             f'{self.input_weight.tolist()}')
-        if not np.all(np.isfinite(self.safe_input)):
-            raise ValueError(f'safe_input must be finite, got {self.safe_input.tolist()}')
-        for name in ('setpoint_ramp', 'max_disturbance'):
-            if not np.all(getattr(self, name) > 0.0):
-                raise ValueError(f'{name} must be above 0, got {getattr(self, name).tolist()}')
-        if not np.all(self.input_tolerance >= 0.0):
-            raise ValueError('input_tolerance must be at least 0, got '
-                             f'{self.input_tolerance.tolist()}')
+        weights, costs = np.asarray(self.state_weight), np.asarray(self.input_weight)
+        for name, fits, words in (
+                ('state_weight', np.isfinite(weights) & (weights >= 0.0) & np.any(weights > 0.0),
+                 'finite, at least 0 and not all 0'),
+                ('input_weight', np.isfinite(costs) & (costs > 0.0), 'finite and above 0'),
+                ('safe_input', np.isfinite(self.safe_input), 'finite'),
+                ('setpoint_ramp', self.setpoint_ramp > 0.0, 'above 0'),
+                ('max_disturbance', self.max_disturbance > 0.0, 'above 0'),
+                ('input_tolerance', self.input_tolerance >= 0.0, 'at least 0')):
+            if not np.all(fits):
+                raise ValueError(f'{name} must be {words}, got {getattr(self, name).tolist()}')
         for name in ('setpoint_filter', 'observer_bandwidth', 'transfer_time'):
             if not 0.0 <= getattr(self, name) < np.inf:
                 raise ValueError(f'{name} must be finite and at least 0, got '

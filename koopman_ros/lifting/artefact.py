@@ -229,21 +229,15 @@ def _split_file(path: Path, content: bytes) -> tuple[dict[str, Any], bytes]:
     if len(content) < 8:
         _refuse(path, f'it is only {len(content)} bytes long, so it was cut off or is empty')
     length = int.from_bytes(content[:8], 'little')
-    if length > _MAX_HEADER_BYTES:
-        _refuse(path, 'it is not a safetensors file')
-    if len(content) < 8 + length:
+    if length <= _MAX_HEADER_BYTES and len(content) < 8 + length:
         _refuse(path, 'it ends within its header, so it was cut off')
-    try:
-        header = _parsed(content[8:8 + length])
-    except (ValueError, RecursionError):
-        _refuse(path, 'it is not a safetensors file')
-    if not isinstance(header, dict):
-        _refuse(path, 'it is not a safetensors file')
     data = content[8 + length:]
     try:
+        header = _parsed(content[8:8 + length] if length <= _MAX_HEADER_BYTES else b'')
         end = max((int(entry['data_offsets'][1]) for name, entry in header.items()
                    if name != '__metadata__'), default=0)
-    except (KeyError, TypeError, ValueError, IndexError, OverflowError):
+    except (AttributeError, KeyError, TypeError, ValueError, IndexError, OverflowError,
+            RecursionError):
         _refuse(path, 'it is not a safetensors file')
     if len(data) < end:
         _refuse(path, f'{end - len(data)} bytes of its arrays are missing, so it was cut off')

@@ -10,8 +10,8 @@ import numpy as np
 import pytest
 
 from koopman_ros.control import Arrival, Controller, Form, InputLimits, Mode, Settings, State
-from koopman_ros.lifting import Coordinates, LiftedModel, NetworkObservables, Provenance
 from support.closed_loops import COOLANT, SETPOINT, shipped, START
+from support.random_lifts import change_of_variable
 from support.sampled_loops import content, say
 from validation.paper.optimal_control import exact_two_state_model
 
@@ -78,13 +78,6 @@ def test_a_law_with_unstable_modes_is_reported_as_projected():
     assert refused is None
     report = loop.step(state, np.array([1.0, 2.0]), NOW + SECOND)[2]
     assert (report.command.law.form, report.reason) == (Form.PROJECTED.value, None)
-
-
-def change_of_variable(scale: float) -> LiftedModel:
-    """Return the free lift tanh(x) of one state."""
-    c = Coordinates(('x',), ('1',), np.zeros(1), np.array([scale]), -np.ones(1), np.ones(1))
-    itself = NetworkObservables(((np.eye(1), np.zeros(1)),), np.eye(1), identity=False)
-    return LiftedModel(itself, -np.eye(1), np.eye(1), c, c, 's', Provenance('change of variable'))
 
 
 @pytest.mark.parametrize('first', [math.nan, LARGEST, -LARGEST, 1e300, 0.0])

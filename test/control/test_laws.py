@@ -23,9 +23,7 @@ from koopman_ros.control import (
 from koopman_ros.learning import fit
 from koopman_ros.lifting import (
     Coordinates,
-    LiftedModel,
     linearised_model,
-    NetworkObservables,
     Provenance,
 )
 from koopman_ros.plants import two_state_example, two_state_reactor
@@ -41,7 +39,7 @@ from support.closed_loops import (
     steady_state,
     UNIT,
 )
-from support.random_lifts import random_lift
+from support.random_lifts import change_of_variable, random_lift
 from validation.paper.optimal_control import exact_two_state_model, scalar_optimal_cost
 
 BOUNDS = {'max_gain': 1e3, 'max_residual': 1e-6}
@@ -268,17 +266,10 @@ def test_no_law_within_a_tiny_bound():
 
 # A free lift, z = tanh(x) with dz/dt = -z + J(x) B u, whose equations are scalar.
 
-def change_of_variable():
-    c = Coordinates(('x',), ('1',), np.zeros(1), np.ones(1), -2.0 * np.ones(1), 2.0 * np.ones(1))
-    itself = NetworkObservables(((np.eye(1), np.zeros(1)),), np.eye(1), identity=False)
-    return LiftedModel(itself, -np.eye(1), np.array([[0.7]]), c, c, 's',
-                       Provenance('change of variable'))
-
-
 @pytest.mark.parametrize('x', [1.3, -0.8, 1e-3])
 @pytest.mark.parametrize('reference', [0.0, 0.4])
 def test_recentred_law_of_a_free_lift_by_hand(x, reference):
-    model = change_of_variable()
+    model = change_of_variable(gain=0.7)
     q, r = 2.0, 0.3
     target = steady_state_target(model, np.array([reference]))
     t, t_ref = np.tanh(x), np.tanh(reference)
@@ -296,7 +287,7 @@ def test_recentred_law_of_a_free_lift_by_hand(x, reference):
 
 @pytest.mark.parametrize('x', [1.3, -0.8, 1e-3])
 def test_projected_law_of_a_free_lift_by_hand(x):
-    model = change_of_variable()
+    model = change_of_variable(gain=0.7)
     q, r, b = 2.0, 0.3, 0.7
     target = steady_state_target(model, np.zeros(1))
     # the drift -tanh(x) cosh(x)^2 = -sinh(x) cosh(x), as a factor of x

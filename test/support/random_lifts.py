@@ -46,3 +46,11 @@ def random_lift(n_x: int = 2, widths: tuple[int, ...] = (5,), *, identity: bool 
         inputs=coordinates('u', n_u),
         time_unit='min',
         provenance=Provenance('random', seed, 'ab12', {'rw': 0.25, 'cond': 1e3}, '0.1.0'))
+
+
+def change_of_variable(scale: float = 1.0, gain: float = 1.0) -> LiftedModel:
+    """Return the free lift z = tanh(x) of one state, dz/dt = -z + J(x) gain u."""
+    c = Coordinates(('x',), ('1',), np.zeros(1), np.array([scale]), -np.ones(1), np.ones(1))
+    itself = NetworkObservables(((np.eye(1), np.zeros(1)),), np.eye(1), identity=False)
+    return LiftedModel(itself, -np.eye(1), np.array([[gain]]), c, c, 's',
+                       Provenance('change of variable'))
