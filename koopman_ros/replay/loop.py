@@ -9,9 +9,7 @@ from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, field, replace
 from typing import Any, TypeAlias
 
-import numpy as np
-from numpy.typing import NDArray
-
+from koopman_ros.arrays import Array
 from koopman_ros.control import Controller, Setpoint, Settings, State
 from koopman_ros.control.events import apply, Measurement, SetpointRequest
 from koopman_ros.lifting import LiftedModel
@@ -26,8 +24,6 @@ from koopman_ros.replay.records import (
     state_of,
 )
 from koopman_ros.replay.values import float_array
-
-Array = NDArray[np.float64]
 
 # The model of a name and a digest, read anew each time; raises RecordError where there is none.
 FindModel: TypeAlias = Callable[[str, str], LiftedModel]

@@ -11,8 +11,8 @@ import json
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from koopman_ros.arrays import Array
 from koopman_ros.control import (
     at,
     Change,
@@ -43,7 +43,6 @@ from koopman_ros.replay.values import encoded
 from koopman_ros.units import Displays
 from support.closed_loops import REACTOR, shipped, START
 
-Array = NDArray[np.float64]
 SECOND = 1_000_000_000
 EPOCH = 1_785_000_000 * SECOND
 LOWER, UPPER, RATE = 278.15, 305.15, 1.0  # K, K, K/s

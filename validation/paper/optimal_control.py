@@ -6,16 +6,13 @@
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.integrate import quad
 from scipy.linalg import solve_continuous_lyapunov
 
+from koopman_ros.arrays import Array
 from koopman_ros.lifting import Coordinates, LiftedModel, PolynomialObservables, Provenance
 from koopman_ros.plants import ControlAffineSystem, equilibrium_input
 from koopman_ros.solvers import solve_riccati
-
-Array = NDArray[np.float64]
-
 
 _Q = np.diag([1.0, 1.0, 0.0])
 _B = np.array([[0.0], [1.0], [0.0]])

@@ -64,7 +64,7 @@ def linearised_reactor(temperature: float, system: ControlAffineSystem = REACTOR
                          float(system.B[0, 0]))
 
 
-def linearised_model(model: LiftedModel, temperature: float) -> control.StateSpace:
+def linearised_lift(model: LiftedModel, temperature: float) -> control.StateSpace:
     """Linearise the drift that a lift of one state implies at a temperature in K."""
     x = model.states.to_deviation(np.array([temperature]))
     slope = (model.drift(x + _STEP) - model.drift(x - _STEP)) / (2.0 * _STEP)
@@ -133,7 +133,7 @@ def margins(plant: control.StateSpace, law: control.StateSpace) -> Margins:
 
 def margins_at(controller: Controller, temperature: float, *, of_model: bool = False) -> Margins:
     """Calculate the margins at a set-point in K, on the true reactor or on the lift itself."""
-    plant = (linearised_model(controller.model, temperature) if of_model
+    plant = (linearised_lift(controller.model, temperature) if of_model
              else linearised_reactor(temperature))
     return margins(plant, linearised_controller(controller, temperature))
 
