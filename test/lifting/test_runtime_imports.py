@@ -7,8 +7,6 @@ from pathlib import Path
 import subprocess
 import sys
 
-import pytest
-
 import koopman_ros
 
 RUNTIME = ('lifting', 'control', 'plants', 'bags', 'solvers')
@@ -31,9 +29,8 @@ def run(statements):
         timeout=240, check=False, cwd=Path(koopman_ros.__file__).parents[1])
 
 
-@pytest.mark.parametrize('packages', [*((name,) for name in RUNTIME), RUNTIME], ids=str)
-def test_runtime_needs_neither_ros_nor_torch(packages):
-    result = run('import ' + ', '.join(f'koopman_ros.{name}' for name in packages))
+def test_runtime_needs_neither_ros_nor_torch():
+    result = run('import ' + ', '.join(f'koopman_ros.{name}' for name in RUNTIME))
     assert (result.returncode, result.stdout, result.stderr) == (0, '', '')
 
 
