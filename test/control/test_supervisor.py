@@ -17,12 +17,12 @@ from support.sampled_loops import (
     Reactor,
     SAFE,
     say,
+    SECOND,
     settled,
     supervisor_settings,
 )
 from validation.robustness.loop import changed_reactor
 
-SECOND = 1_000_000_000
 SETTINGS = supervisor_settings(0.2, 1.0, hold_timeout=60.0, recovery_time=10.0)
 
 

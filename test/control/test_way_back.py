@@ -20,12 +20,12 @@ from support.sampled_loops import (
     levels,
     Reactor,
     SAFE,
+    SECOND,
     settled,
 )
 from validation.robustness.disturbances import CHANGED
 from validation.robustness.loop import changed_reactor
 
-SECOND = 1_000_000_000
 NOMINAL = 300.0  # K, of the coolant
 LEAD = 0.25
 

@@ -5,7 +5,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from enum import Enum
 
 import numpy as np
@@ -53,41 +53,29 @@ class End(Enum):
     RAN_AWAY = 'runs away'
 
 
-@dataclass(frozen=True)
-class Start:
-    """
-    Where a loop starts and where it is to go.
-
-    :param temperature: of the reactor, in K.
-    :param coolant: in force, in K.
-    :param setpoint: in K.
-    """
-
-    temperature: float
-    coolant: float
-    setpoint: float
-
-
-def end_of(start: Start, *, ladder: bool, system: ControlAffineSystem = REACTOR,
-           concentration: float | None = None) -> End:
+def end_of(temperature: float, setpoint: float, *, ladder: bool, coolant: float = COOLANT,
+           system: ControlAffineSystem = REACTOR, concentration: float | None = None) -> End:
     """
     Simulate the default loop from a start until it has arrived, ran away or two thirds of an hour.
 
+    :param temperature: of the reactor at the start, in K.
+    :param setpoint: where it is to go, in K.
     :param ladder: whether the controller has one.
+    :param coolant: in force at the start, in K.
     :param concentration: in mol/L, at the start; for the two-state reactor.
     """
     near = 0
 
     def arrived(x: Array, _: Array, report: Report) -> bool:
         nonlocal near
-        near = near + 1 if abs(x[-1] - start.setpoint) <= TOLERANCE else 0
+        near = near + 1 if abs(x[-1] - setpoint) <= TOLERANCE else 0
         # it could still fall back from there
         gone = x[-1] > GONE and system is REACTOR
         return bool(gone or (near >= _SETTLED and report.level == 'sdre'))
 
-    x0 = [start.temperature] if concentration is None else [concentration, start.temperature]
-    course = run_loop(reactor_controller(ladder=ladder), system, np.array(x0), start.coolant,
-                      HORIZON, [at(0.0, at_setpoint(start.setpoint))], stop=arrived)
+    x0 = [temperature] if concentration is None else [concentration, temperature]
+    course = run_loop(reactor_controller(ladder=ladder), system, np.array(x0), coolant,
+                      HORIZON, [at(0.0, at_setpoint(setpoint))], stop=arrived)
     if course.failure or course.states[-1, -1] > GONE:
         return End.RAN_AWAY
     if near < _SETTLED:
@@ -106,7 +94,7 @@ def hottest_start(coolant: float, setpoint: float, *, ladder: bool, lowest: floa
     """
     while highest - lowest > _BOUNDARY:
         middle = 0.5 * (lowest + highest)
-        back = end_of(Start(middle, coolant, setpoint), ladder=ladder)
+        back = end_of(middle, setpoint, coolant=coolant, ladder=ladder)
         lowest, highest = ((lowest, middle) if back in (End.RAN_AWAY, End.ELSEWHERE)
                            else (middle, highest))
     return lowest
@@ -144,7 +132,7 @@ def hottest_saved(coolant: float) -> float:
 
 def grid(*, ladder: bool) -> dict[tuple[float, float], End]:
     """Return the ends by start and set-point, both in K, with a coolant of 300 K at the start."""
-    return {(float(start), setpoint): end_of(Start(float(start), COOLANT, setpoint), ladder=ladder)
+    return {(float(start), setpoint): end_of(float(start), setpoint, ladder=ladder)
             for setpoint in SETPOINTS for start in STARTS}
 
 
@@ -164,8 +152,7 @@ def two_state_grid() -> dict[tuple[float, float], End]:
     system = two_state_reactor()
     rest = float(system.nominal_state[1])
     return {(T, concentration): end_of(
-        Start(T, COOLANT, round(rest, 3)), ladder=True, system=system,
-        concentration=concentration)
+        T, round(rest, 3), ladder=True, system=system, concentration=concentration)
         for T in (300.0, 310.0, 320.0, 330.0, 340.0, 350.0, 360.0, 380.0, 400.0)
         for concentration in (0.6, 0.75, float(system.nominal_state[0]), 0.95)}
 

@@ -34,14 +34,12 @@ class Margins:
     :param phase: in degrees.
     :param delay: additional dead time, in s.
     :param distance: smallest distance of the Nyquist curve from -1.
-    :param crossover: frequency of the smallest delay margin, in rad/min.
     """
 
     gain: float
     phase: float
     delay: float
     distance: float
-    crossover: float
 
 
 def sampled_plant(slope: float, gain: float) -> control.StateSpace:
@@ -124,11 +122,9 @@ def margins(plant: control.StateSpace, law: control.StateSpace) -> Margins:
     # a lead at the crossover is a lag of the rest of the turn to whoever delays it
     delays = [math.radians(phase % 360.0) / frequency
               for phase, frequency in zip(phases, crossings, strict=True)]
-    first = int(np.argmin(delays)) if delays else -1
     return Margins(
         min(rising, default=math.inf), min(map(abs, phases), default=math.inf),
-        delays[first] if delays else math.inf, float(np.min(np.abs(1.0 + response))),
-        60.0 * float(crossings[first]) if delays else math.nan)
+        min(delays, default=math.inf), float(np.min(np.abs(1.0 + response))))
 
 
 def margins_at(controller: Controller, temperature: float, *, of_model: bool = False) -> Margins:

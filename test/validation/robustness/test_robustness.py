@@ -13,7 +13,7 @@ from scipy.integrate import solve_ivp
 
 from koopman_ros.control import at
 from validation.robustness import attraction, disturbances
-from validation.robustness.attraction import End, Start
+from validation.robustness.attraction import End
 from validation.robustness.disturbances import Case
 from validation.robustness.loop import (
     at_setpoint,
@@ -127,7 +127,7 @@ _runaway.terminal = True
 @pytest.mark.parametrize(('temperature', 'ladder', 'end'), [
     (340.0, True, End.SAFE), (340.0, False, End.RAN_AWAY), (343.0, True, End.RAN_AWAY)])
 def test_the_ladder_widens_the_region_of_attraction(temperature, ladder, end):
-    assert attraction.end_of(Start(temperature, 300.0, 316.0), ladder=ladder) is end
+    assert attraction.end_of(temperature, 316.0, ladder=ladder) is end
 
 
 def test_a_disturbance_leaves_no_offset_and_a_biased_sensor_its_bias():
