@@ -29,7 +29,6 @@ from koopman_ros.lifting import (
 from koopman_ros.plants import two_state_example, two_state_reactor
 from koopman_ros.solvers import RiccatiStatus
 from support.closed_loops import (
-    COOLANT,
     REACTOR,
     reactor_weights,
     run_reactor,
@@ -51,26 +50,17 @@ def setpoint_target(model, kelvin=SETPOINT):
 
 # The steady state.
 
-@pytest.mark.parametrize('n_z', [3, 4])
-def test_feed_forward_of_the_lift(n_z):
-    model = shipped(f'reactor_nz{n_z}')
+@pytest.mark.parametrize(('name', 'coolant', 'tolerance'), [
+    ('reactor_nz3', 292.287569, 1e-3), ('reactor_nz4', 292.287569, 1e-3),
+    ('reactor_linear', 295.421299, 1e-5)])
+def test_feed_forward(name, coolant, tolerance):
+    model = shipped(name)
     target = setpoint_target(model)
-    assert model.inputs.to_physical(target.u)[0] == pytest.approx(COOLANT, abs=1e-3)
-    assert abs(COOLANT - 292.287569) < 1e-6
+    assert model.inputs.to_physical(target.u)[0] == pytest.approx(coolant, abs=tolerance)
     assert target.residual < 1e-12
     np.testing.assert_array_equal(target.z, model.lift(target.x))
-
-
-def test_feed_forward_of_the_linear_model():
-    model = shipped('reactor_linear')
-    target = setpoint_target(model)
-    assert model.inputs.to_physical(target.u)[0] == pytest.approx(295.421299, abs=1e-5)
-
-
-def test_nominal_state_needs_the_nominal_input():
-    for name in ('reactor_nz3', 'reactor_nz4', 'reactor_linear'):
-        target = setpoint_target(shipped(name), START)
-        np.testing.assert_allclose(target.u, [0.0], rtol=0, atol=1e-12)
+    # the nominal state needs the nominal input
+    np.testing.assert_allclose(setpoint_target(model, START).u, [0.0], rtol=0, atol=1e-12)
 
 
 def saddle_model():
