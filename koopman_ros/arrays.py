@@ -3,8 +3,6 @@
 
 """Checked, read-only arrays."""
 
-from __future__ import annotations
-
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 

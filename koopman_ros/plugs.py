@@ -3,8 +3,6 @@
 
 """Plugs by name: those of the package, and those of any module as ``module:attribute``."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Mapping
 import importlib
 from typing import Any, TypeVar

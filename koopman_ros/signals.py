@@ -3,8 +3,6 @@
 
 """Signals: one number for each by name, and what is measured of the state."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property

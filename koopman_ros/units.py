@@ -3,8 +3,6 @@
 
 """Units: conversion between them, and how values of a signal are written for people."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from functools import cache, cached_property

@@ -3,8 +3,6 @@
 
 """A loop's measurements with the input that acted on them, cut from bags into episodes."""
 
-from __future__ import annotations
-
 from collections import Counter
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field

@@ -4,8 +4,6 @@
 
 """The files of a bag being written, one after the other, and the metadata that lists them."""
 
-from __future__ import annotations
-
 from collections.abc import Iterable, Mapping
 from concurrent.futures import Future, ThreadPoolExecutor
 from pathlib import Path

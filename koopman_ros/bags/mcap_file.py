@@ -4,8 +4,6 @@
 
 """One MCAP file of a bag being written: complete in itself, with schemas, topics and metadata."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 import contextlib
 import os

@@ -3,8 +3,6 @@
 
 """Recording: serialized messages into a bag that rosbag2 and every MCAP reader can open."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Mapping, Sequence
 import math
 import operator

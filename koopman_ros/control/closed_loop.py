@@ -3,8 +3,6 @@
 
 """A feedback law in continuous time on any plant: what it costs and where it ends."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import dataclass
 

@@ -8,8 +8,6 @@ The running controller, the simulated loop and the replay of records all call :f
 that a command follows from the same numbers in each.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from typing import TypeAlias
 

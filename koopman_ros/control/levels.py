@@ -3,8 +3,6 @@
 
 """The control levels of a controller: a name, a model, a law and an estimator each."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass, field
 
 import numpy as np

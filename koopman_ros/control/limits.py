@@ -3,8 +3,6 @@
 
 """Limits on the manipulated variables: range and rate."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 import math

@@ -3,8 +3,6 @@
 
 """What a step did, for diagnostics: the results of its parts side by side."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass, field
 from enum import Enum
 import math

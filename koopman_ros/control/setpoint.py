@@ -3,8 +3,6 @@
 
 """The set-point: requested by the operator, at once or for a later time, checked and ramped."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass, replace
 import math
 

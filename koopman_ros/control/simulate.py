@@ -3,8 +3,6 @@
 
 """One sampled closed loop: a controller, a plant, and what happens to them when."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass, replace
 import math

@@ -3,8 +3,6 @@
 
 """What a controller remembers between two measurements."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass, field
 from enum import Enum
 from typing import TypeVar

@@ -3,8 +3,6 @@
 
 """The steady state of the lifted model that holds a set-point."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 import math
 

@@ -7,8 +7,6 @@ The demo: bring the reactor 10 K down with the learned lift, and with the linear
 The disturbance observer is off, so that what is seen is what each model knows.
 """
 
-from __future__ import annotations
-
 from dataclasses import replace
 from pathlib import Path
 import time

@@ -3,8 +3,6 @@
 
 """What an estimator is: a plug between measured outputs and the laws."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 import math
 from typing import Protocol

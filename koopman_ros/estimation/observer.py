@@ -3,8 +3,6 @@
 
 """The disturbance observer: what the plant does beside its model, from measurements and inputs."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from functools import cached_property
 import math

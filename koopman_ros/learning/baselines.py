@@ -3,8 +3,6 @@
 
 """Baselines: linearisation and polynomial EDMD from the same samples."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np

@@ -3,8 +3,6 @@
 
 """Held-out figures of a lifted model, invariant under linear maps of its coordinates."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass, field
 
 import numpy as np

@@ -9,8 +9,6 @@ Each is rewritten by an identity of its function, so that it stays correct to ro
 to the largest slope, however close a and b are.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from types import MappingProxyType

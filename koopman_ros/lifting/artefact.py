@@ -3,8 +3,6 @@
 
 """The model file: one .safetensors file, written atomically and read with numpy alone."""
 
-from __future__ import annotations
-
 from collections.abc import Iterable
 import contextlib
 import hashlib

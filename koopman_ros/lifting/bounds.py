@@ -3,8 +3,6 @@
 
 """Limits of a model file: sizes that a control step has time for, and printable texts."""
 
-from __future__ import annotations
-
 from collections.abc import Iterable
 import math
 

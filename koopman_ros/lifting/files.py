@@ -3,8 +3,6 @@
 
 """Reading of regular files up to a limit; devices, pipes and sockets are refused."""
 
-from __future__ import annotations
-
 import os
 import stat
 

@@ -3,8 +3,6 @@
 
 """The inputs that hold a plant at a state."""
 
-from __future__ import annotations
-
 import numpy as np
 from numpy.typing import ArrayLike
 

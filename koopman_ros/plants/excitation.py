@@ -3,8 +3,6 @@
 
 """Random step inputs that excite a plant without driving it out of a box of states."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 import math
 

@@ -3,8 +3,6 @@
 
 """Integration of a plant over one hold of its input, with its precision, bounds and failures."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from enum import Enum
 from typing import NamedTuple

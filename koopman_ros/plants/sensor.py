@@ -3,8 +3,6 @@
 
 """Sensor noise and resolution."""
 
-from __future__ import annotations
-
 import math
 
 import numpy as np

@@ -3,8 +3,6 @@
 
 """Simulation of a plant whose input is held constant over each sample period."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 import math
 

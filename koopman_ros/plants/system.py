@@ -3,8 +3,6 @@
 
 """The control-affine system dx/dt = f(x) + B u that every plant of this package is."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import dataclass, field
 

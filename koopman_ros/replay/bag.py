@@ -3,8 +3,6 @@
 
 """A controller's records in a bag, and the commands beside them."""
 
-from __future__ import annotations
-
 from collections import Counter
 from collections.abc import Iterator
 import os

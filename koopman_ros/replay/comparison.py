@@ -3,8 +3,6 @@
 
 """Recorded and replayed commands side by side, in numbers."""
 
-from __future__ import annotations
-
 from collections import Counter
 from dataclasses import dataclass
 from functools import cached_property

@@ -3,8 +3,6 @@
 
 """The replay's picture: what was measured, what was commanded, and where commands differ."""
 
-from __future__ import annotations
-
 from pathlib import Path
 import textwrap
 

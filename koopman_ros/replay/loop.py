@@ -3,8 +3,6 @@
 
 """The replay: a loop over a controller's records, which gives its commands again."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, field, replace
 from typing import Any, TypeAlias

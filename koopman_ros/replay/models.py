@@ -3,8 +3,6 @@
 
 """Models by the digest of their file, wherever that lies."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator, Sequence
 import contextlib
 from pathlib import Path

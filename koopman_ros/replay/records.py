@@ -7,8 +7,6 @@ Records: numbered lines of JSON, one for each event that changed a controller; s
 Numbers are in the model's units, times in nanoseconds.
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from dataclasses import dataclass, fields
 from enum import Enum

@@ -3,8 +3,6 @@
 
 """The replay's report: for a reader, and for a program."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import Any
 

@@ -9,8 +9,6 @@ says what it is: ``float`` for one that is not finite, ``array``, or the class o
 an enum as ``module:name``. Lists become tuples.
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from dataclasses import fields, is_dataclass
 from enum import Enum

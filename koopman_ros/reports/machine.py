@@ -3,8 +3,6 @@
 
 """The machine and the versions that figures were measured with."""
 
-from __future__ import annotations
-
 from importlib.metadata import PackageNotFoundError, version
 import os
 from pathlib import Path

@@ -3,8 +3,6 @@
 
 """Pages for people, in Markdown, and figures for programs, in JSON."""
 
-from __future__ import annotations
-
 from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 import json

@@ -7,8 +7,6 @@ Levenberg-Marquardt on normal equations that it accumulates from residuals, in t
 Not imported by the package itself, whose other solvers need no torch.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from enum import Enum

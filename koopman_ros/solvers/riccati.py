@@ -3,8 +3,6 @@
 
 """The continuous algebraic Riccati equation by an ordered Schur form, checked at every call."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from enum import Enum
 import math

@@ -3,8 +3,6 @@
 
 """The classical Runge-Kutta method of order four, for many states at once."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 
 from koopman_ros.arrays import Array

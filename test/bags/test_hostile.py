@@ -3,8 +3,6 @@
 
 """Bags of some kilobytes that would take gigabytes or minutes, and large ones that do not."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path

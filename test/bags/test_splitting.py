@@ -3,8 +3,6 @@
 
 """Bags of several files: where they are split, what is written where, and what a kill leaves."""
 
-from __future__ import annotations
-
 from pathlib import Path
 import shutil
 from typing import Any

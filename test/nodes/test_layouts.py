@@ -3,8 +3,6 @@
 
 """The shipped plot layouts name what the nodes publish."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 import json
 import re

@@ -3,8 +3,6 @@
 
 """Records of any sequence of events give the same commands again, from any snapshot on."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from pathlib import Path
 

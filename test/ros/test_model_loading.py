@@ -3,8 +3,6 @@
 
 """Models for the controller: which it takes, and why it refuses the others."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from pathlib import Path
 

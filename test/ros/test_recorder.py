@@ -3,8 +3,6 @@
 
 """The order and the times in which what waited on several topics is recorded."""
 
-from __future__ import annotations
-
 from pathlib import Path
 import time
 from typing import Any

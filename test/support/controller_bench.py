@@ -3,8 +3,6 @@
 
 """A controller as a process, with a thermometer and an operator in the test."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Mapping
 import math
 import time as clock

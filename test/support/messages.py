@@ -3,8 +3,6 @@
 
 """Messages and statuses of the node tests."""
 
-from __future__ import annotations
-
 from typing import Any
 
 from diagnostic_msgs.msg import DiagnosticStatus

@@ -3,8 +3,6 @@
 
 """A controller in the test's own process that writes down what happens to it."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from dataclasses import asdict, replace
 

@@ -3,8 +3,6 @@
 
 """A sampled closed loop on the true reactor, in which anything may go wrong at any time."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 import json

@@ -3,8 +3,6 @@
 
 """Training boxes and closed-loop paths in three dimensions."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 import itertools
 from pathlib import Path

@@ -3,8 +3,6 @@
 
 """What is known exactly of the plants under control, to measure learned controllers by."""
 
-from __future__ import annotations
-
 import numpy as np
 from scipy.integrate import quad
 from scipy.linalg import solve_continuous_lyapunov

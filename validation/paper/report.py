@@ -3,8 +3,6 @@
 
 """The report on the experiments: tables, what was held to, and how it compares with the paper."""
 
-from __future__ import annotations
-
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path

@@ -3,8 +3,6 @@
 
 """The figures of the robustness study."""
 
-from __future__ import annotations
-
 from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Any

@@ -3,8 +3,6 @@
 
 """The control step on a true plant, sampled once a second, as the nodes run it."""
 
-from __future__ import annotations
-
 from collections.abc import Iterable
 from dataclasses import replace
 from functools import lru_cache

@@ -3,8 +3,6 @@
 
 """Gain, phase and delay margins of the loop, linearised at a set-point and opened at the plant."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass, replace
 import math
 

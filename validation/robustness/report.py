@@ -3,8 +3,6 @@
 
 """The report of the robustness study, in Markdown."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any

@@ -3,8 +3,6 @@
 
 """What a law is: a plug that turns an estimate and a target into an input."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 import math
 from typing import Protocol

@@ -3,8 +3,6 @@
 
 """The linear law: the regulator of the model linearised at its nominal point."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass, replace
 from functools import cached_property
 import math

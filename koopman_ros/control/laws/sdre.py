@@ -3,8 +3,6 @@
 
 """The state-dependent Riccati law on a lifted model, in its re-centred and projected forms."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from enum import Enum
 import math

@@ -3,8 +3,6 @@
 
 """The continuous stirred tank reactor (CSTR) with a cooling jacket, as one state and as two."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass, field, fields
 from functools import partial
 

@@ -3,8 +3,6 @@
 
 """The paper's motivating example dx/dt = x^2: one state, no input."""
 
-from __future__ import annotations
-
 import numpy as np
 
 from koopman_ros.plants.system import ControlAffineSystem, FloatArray

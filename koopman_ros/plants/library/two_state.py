@@ -3,8 +3,6 @@
 
 """The paper's two-state example, linear in (x1, x2, x1^2)."""
 
-from __future__ import annotations
-
 from functools import partial
 import math
 

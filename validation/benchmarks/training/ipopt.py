@@ -10,8 +10,6 @@ of one sample, its derivatives compiled by the C compiler and summed over the sa
 Hessian of the whitening term put together by hand. Both take the same steps.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Sequence
 import os
 import shutil

@@ -3,8 +3,6 @@
 
 """The picture: rw over time for all solvers, and the cost of an iteration over the samples."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import Any
 

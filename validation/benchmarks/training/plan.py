@@ -3,8 +3,6 @@
 
 """What is measured: systems, sizes, limits."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 from validation.benchmarks.options import Extent

@@ -3,8 +3,6 @@
 
 """The least-squares problems that all solvers are given, from the same data and start."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from pathlib import Path
 

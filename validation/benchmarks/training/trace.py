@@ -9,8 +9,6 @@ the wall, and which other programs on the same machine disturb less; the time on
 beside it.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable
 import time
 from typing import Any

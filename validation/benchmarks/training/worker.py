@@ -8,8 +8,6 @@ What is noted goes line by line to a file, so that a process that has to be kill
 had reached.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable
 import json
 from pathlib import Path
