@@ -3,10 +3,8 @@
 
 """What a controller is tuned by, one number per signal, checked against the model's signals."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass, field
-from typing import Any
+from typing import Any, Self
 
 import numpy as np
 
@@ -78,7 +76,7 @@ class Settings:
 
     @classmethod
     def for_model(cls, model: LiftedModel, *, state_weight: Array, input_weight: Array,
-                  limits: InputLimits, **others: Any) -> Settings:
+                  limits: InputLimits, **others: Any) -> Self:
         """
         Return settings that restrict nothing but what is given.
 

@@ -3,13 +3,11 @@
 
 """The functions of the state that make up a lift: of a network, or of a dictionary."""
 
-from __future__ import annotations
-
 from abc import ABC, abstractmethod
 from dataclasses import dataclass, field
 from functools import cached_property
 from itertools import combinations_with_replacement
-from typing import final
+from typing import final, Self
 
 import numpy as np
 from numpy.typing import NDArray
@@ -255,7 +253,7 @@ class PolynomialObservables(Observables):
         object.__setattr__(self, 'exponents', E)
 
     @classmethod
-    def total_degree(cls, n_x: int, degree: int) -> PolynomialObservables:
+    def total_degree(cls, n_x: int, degree: int) -> Self:
         """
         Return all monomials of n_x states from degree 1 to `degree`, by rising degree.
 
