@@ -1,14 +1,12 @@
 # SPDX-FileCopyrightText: 2026 The koopman_ros Authors
 # SPDX-License-Identifier: Apache-2.0
 
-
 """What the command lines of both acts have in common."""
 
 from __future__ import annotations
 
 import argparse
-from collections.abc import Callable, Iterator, Mapping
-import contextlib
+from collections.abc import Callable, Mapping
 from pathlib import Path
 import sys
 
@@ -46,7 +44,10 @@ def run_act(act: Callable[[Path, float], Mapping[str, object]], options: argpars
     :return: the exit code.
     """
     try:
-        with _chosen_output(options.output) as output:
+        with reserved_output(options.output) as output:
+            if output != options.output:
+                print(f'another run writes to {options.output}: this one writes to {output}',
+                      flush=True)
             result = act(output, options.speed)
     except errors as error:
         print(f'demo: {error}', file=sys.stderr)
@@ -58,12 +59,3 @@ def run_act(act: Callable[[Path, float], Mapping[str, object]], options: argpars
         print(f'{key}: {value:.6g}' if isinstance(value, float) else f'{key}: {value}')
     print(f'wrote {output}/{files}')
     return 0
-
-
-@contextlib.contextmanager
-def _chosen_output(wanted: Path) -> Iterator[Path]:
-    """Reserve the folder for the results, and say when it is another one."""
-    with reserved_output(wanted) as folder:
-        if folder != wanted:
-            print(f'another run writes to {wanted}: this one writes to {folder}', flush=True)
-        yield folder

@@ -1,7 +1,6 @@
 # SPDX-FileCopyrightText: 2026 The koopman_ros Authors
 # SPDX-License-Identifier: Apache-2.0
 
-
 """
 The demo's second act: the plant drifts, and its controller learns it anew from its record.
 
@@ -18,15 +17,18 @@ import shutil
 import time
 
 from diagnostic_msgs.msg import DiagnosticStatus
+import numpy as np
 from std_srvs.srv import SetBool, Trigger
 
 from koopman_ros.demo.command import read_options, run_act
 from koopman_ros.demo.loop import Loop, running_loop, Scenario
-from koopman_ros.demo.retraining_results import plot, read_history, rollout_rmse
+from koopman_ros.demo.results import plot_retraining, read_run
 from koopman_ros.demo.table import LiveTable
-from koopman_ros.lifting import load
+from koopman_ros.learning import roll_out
+from koopman_ros.lifting import LiftedModel, load
 from koopman_ros.parameters.controller import ControllerParameters
 from koopman_ros.parameters.plant import PlantParameters
+from koopman_ros.plants import one_state_reactor, random_steps, RandomStepDesign
 from koopman_ros.reports import write_figures
 from koopman_ros.resources import model_path
 from koopman_ros.ros import topics
@@ -41,6 +43,7 @@ _DRIFT_TIME = 360.0
 _EXPERIMENT_TIME = 960.0
 _EXPERIMENT_MINUTES = 45.0
 _AFTER = 960.0  # s of plant time from the reload to the end
+_TEST_SEED = 7
 _TRAINING_TIMEOUT = 300.0  # s
 _EXPERIMENT_TIMEOUT = 600.0  # s
 _TASKS = {task: f'trainer: {task}' for task in ('experiment', 'training')}
@@ -95,10 +98,11 @@ def run_retraining(output: Path, speed: float) -> dict[str, object]:
         _Actor(loop, table, story).act(bags[1], new_model)
     drifted = PlantParameters(heat_transfer_coefficient=FOULING * PlantParameters(
         ).heat_transfer_coefficient)
-    history = read_history(bags)
+    history = read_run(*bags)
     learned = load(new_model)
     trained = json.loads(new_model.with_suffix('.json').read_text())
-    plot(output / 'retraining.png', history, story.phases, setpoint, present, learned, parameters)
+    plot_retraining(output / 'retraining.png', history, story.phases, setpoint, present, learned,
+                    parameters)
     reload = story.start_of('new lift')
     result: dict[str, object] = {
         'setpoint_kelvin': setpoint,
@@ -116,6 +120,22 @@ def run_retraining(output: Path, speed: float) -> dict[str, object]:
     }
     write_figures(output / 'summary.json', result)
     return result
+
+
+def rollout_rmse(model: LiftedModel, plant: PlantParameters) -> float:
+    """
+    Predict the reactor over 15 min of fresh random steps without noise, from the projected drift.
+
+    :param model: the lift.
+    :param plant: the reactor as it is now.
+    :return: root mean square error in K.
+    """
+    reactor = one_state_reactor(plant.constants(), nominal_state=model.states.center)
+    design = RandomStepDesign(model.inputs.lower, model.inputs.upper, model.states.lower,
+                              model.states.upper, (0.5, 2.0), 1.0 / 60.0, rtol=1e-9)
+    truth = random_steps(reactor, design, 15.0, _TEST_SEED)
+    predicted = roll_out(model, truth.x[0], truth.u, design.sample_period)
+    return float(np.sqrt(np.mean((predicted - truth.x) ** 2)))
 
 
 class ActError(RuntimeError):

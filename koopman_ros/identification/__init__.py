@@ -10,6 +10,7 @@ dx/dt = f(x) + B u is found from the measurements first; the lift is then learne
 
 from koopman_ros.identification.drift import box_of, DriftModel
 from koopman_ros.identification.identify import Identified, identify, Score, Stopped
+from koopman_ros.identification.methods import Method, METHODS, weak_forms
 from koopman_ros.identification.output_error import output_error
 from koopman_ros.identification.segments import (
     fitted_starts,
@@ -21,8 +22,10 @@ from koopman_ros.identification.total_variation import noise_level, total_variat
 from koopman_ros.identification.weak_form import weak_form
 
 __all__ = [
+    'METHODS',
     'DriftModel',
     'Identified',
+    'Method',
     'Score',
     'Segments',
     'Stopped',
@@ -35,4 +38,5 @@ __all__ = [
     'prediction_error',
     'total_variation',
     'weak_form',
+    'weak_forms',
 ]

@@ -1,7 +1,6 @@
 # SPDX-FileCopyrightText: 2026 The koopman_ros Authors
 # SPDX-License-Identifier: Apache-2.0
 
-
 """A polynomial model of a plant's drift, linear in what is estimated."""
 
 from __future__ import annotations

@@ -1,12 +1,11 @@
 # SPDX-FileCopyrightText: 2026 The koopman_ros Authors
 # SPDX-License-Identifier: Apache-2.0
 
-
 """Choice of a drift model among all methods and degrees, by held-out segments."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 import contextlib
 from dataclasses import dataclass
 import math
@@ -14,17 +13,14 @@ import math
 import numpy as np
 
 from koopman_ros.identification.drift import box_of, DriftModel
+from koopman_ros.identification.methods import Method, METHODS
 from koopman_ros.identification.output_error import output_error
 from koopman_ros.identification.segments import longest_step, prediction_error, Segments
-from koopman_ros.identification.total_variation import noise_level, total_variation
-from koopman_ros.identification.weak_form import weak_form
+from koopman_ros.identification.total_variation import noise_level
 from koopman_ros.lifting import Box
 from koopman_ros.plant_data import Array, cut, Episode, Plant
 
-WINDOWS = (10, 20, 40, 80)
 DEGREES = (1, 2, 3, 4, 5, 6)
-TOTAL_VARIATION = 'total variation'
-WEAK_FORM = 'weak form'
 OUTPUT_ERROR = 'output error'
 
 _SEGMENT_SAMPLES = (20, 240)
@@ -84,21 +80,21 @@ class Identified:
 
 
 def identify(plant: Plant, episodes: Sequence[Episode], *, degrees: Sequence[int] = DEGREES,
-             windows: Sequence[int] = WINDOWS, seed: int = 0,
+             methods: Mapping[str, Method] = METHODS, seed: int = 0,
              watch: Watch = lambda *_: False) -> Identified:
     """
     Estimate dx/dt = f(x) + B u from sampled, noisy measurements.
 
-    For each degree of f, derivatives by total variation and the weak form with several windows
-    each give an estimate; the best on segments held out for the choice is refined by output
-    error, where that pays. Of the degrees that predict about as well as the best, the one with
-    the least Bayesian information criterion (Schwarz 1978) over the fitted segments is taken,
-    which reach further than the others, and refitted to all but those held out for good.
+    For each degree of f every method gives an estimate; the best on segments held out for the
+    choice is refined by output error, where that pays. Of the degrees that predict about as well
+    as the best, the one with the least Bayesian information criterion (Schwarz 1978) over the
+    fitted segments is taken, which reach further than the others, and refitted to all but those
+    held out for good.
 
     :param plant: names, units, and B where it is known.
     :param episodes: what was recorded.
     :param degrees: of f that are tried, rising, the first one 1.
-    :param windows: samples of the weak form's windows.
+    :param methods: by name; those that go by a rough B come after one that learns it.
     :param seed: of the split.
     :param watch: sees the progress and can end it.
     :raises ValueError: when the episodes are too short, or nothing fits.
@@ -124,7 +120,7 @@ def identify(plant: Plant, episodes: Sequence[Episode], *, degrees: Sequence[int
     for number, degree in enumerate(degrees):
         monitor = progress(number, f'drift of degree {degree}')
         monitor()
-        found = _estimates(fit, box, degree, known, windows)
+        found = _estimates(fit, box, degree, known, methods)
         rated = [(model, _score(model, chooser, method)) for method, model in found]
         model, score = min(rated, key=lambda pair: pair[1].cost, default=(None, None))
         if model is None or score is None:
@@ -192,17 +188,15 @@ def _split(parts: list[Episode], seed: int) -> tuple[list[Episode], list[Episode
 
 
 def _estimates(episodes: Sequence[Episode], box: Box, degree: int, B: Array | None,
-               windows: Sequence[int]) -> list[tuple[str, DriftModel]]:
+               methods: Mapping[str, Method]) -> list[tuple[str, DriftModel]]:
     """Return the estimate of each method; a method that fails is left out."""
     found: list[tuple[str, DriftModel]] = []
-    for window in windows:
+    assumed = B
+    for name, method in methods.items():
         with contextlib.suppress(ValueError, np.linalg.LinAlgError):
-            found.append((f'{WEAK_FORM}, {window} samples',
-                          weak_form(episodes, box, degree, B, window)))
-    with contextlib.suppress(ValueError, np.linalg.LinAlgError, IndexError):
-        # the widest window knows B best
-        assumed = B if B is not None else found[-1][1].B
-        found.append((TOTAL_VARIATION, total_variation(episodes, box, degree, B, assumed)))
+            model = method(episodes, box, degree, B, assumed)
+            found.append((name, model))
+            assumed = model.B
     return found
 
 

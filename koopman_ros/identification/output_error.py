@@ -1,7 +1,6 @@
 # SPDX-FileCopyrightText: 2026 The koopman_ros Authors
 # SPDX-License-Identifier: Apache-2.0
 
-
 """Output-error estimate: the drift whose predictions fit the measurements."""
 
 from __future__ import annotations
@@ -16,9 +15,9 @@ from torch import Tensor
 
 from koopman_ros.identification.drift import DriftModel
 from koopman_ros.identification.segments import first_measured, Segments
+from koopman_ros.learning.levenberg_marquardt import minimise, NormalEquations
 from koopman_ros.plant_data import Array
 from koopman_ros.solvers import runge_kutta_step
-from koopman_ros.solvers.levenberg_marquardt import minimise, NormalEquations
 
 _MAX_ITERATIONS = 40
 

@@ -1,7 +1,6 @@
 # SPDX-FileCopyrightText: 2026 The koopman_ros Authors
 # SPDX-License-Identifier: Apache-2.0
 
-
 """Drift from derivatives by total variation of x - integral(B u)."""
 
 from __future__ import annotations
@@ -22,7 +21,7 @@ _SHORTEST = 8
 
 
 def total_variation(episodes: Sequence[Episode], box: Box, degree: int, B: Array | None,
-                    assumed: Array) -> DriftModel:
+                    assumed: Array | None) -> DriftModel:
     """
     Fit the drift to derivatives found by total variation on x - integral(B u).
 
@@ -35,8 +34,10 @@ def total_variation(episodes: Sequence[Episode], box: Box, degree: int, B: Array
     :param degree: of the drift.
     :param B: (n_x, n_u) scaled, or None to learn it.
     :param assumed: (n_x, n_u) scaled B that is taken off before smoothing; it need not be exact.
-    :raises ValueError: when no episode is long enough.
+    :raises ValueError: when no episode is long enough, or without a B to take off.
     """
+    if assumed is None:
+        raise ValueError('total variation needs a rough B: take one from the weak form')
     shape = DriftModel(box, degree, np.empty(0), assumed)
     features, inputs, rates = [], [], []
     for episode in episodes:

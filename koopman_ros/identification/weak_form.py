@@ -1,7 +1,6 @@
 # SPDX-FileCopyrightText: 2026 The koopman_ros Authors
 # SPDX-License-Identifier: Apache-2.0
 
-
 """Drift from integrals against test functions: the weak form, without derivatives."""
 
 from __future__ import annotations

@@ -10,10 +10,10 @@ from dataclasses import dataclass
 import torch
 
 from koopman_ros.learning.growth import Grown, Monitor
+from koopman_ros.learning.levenberg_marquardt import minimise, MinimumStatus
 from koopman_ros.learning.network import check_activation, Layout
 from koopman_ros.learning.residuals import Problem, ResidualWeights
 from koopman_ros.learning.scaled import ScaledSamples
-from koopman_ros.solvers.levenberg_marquardt import minimise, MinimumStatus
 
 
 @dataclass(frozen=True)

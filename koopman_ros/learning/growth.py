@@ -13,10 +13,10 @@ import itertools
 import torch
 from torch import Tensor
 
+from koopman_ros.learning.levenberg_marquardt import minimise, Minimum, MinimumStatus
 from koopman_ros.learning.network import check_activation, Layout, Parameters, Pass
 from koopman_ros.learning.residuals import Problem, ResidualWeights
 from koopman_ros.learning.scaled import ScaledSamples
-from koopman_ros.solvers.levenberg_marquardt import minimise, Minimum, MinimumStatus
 
 # Called after every step with (iteration, cost); True ends the minimisation.
 Monitor = Callable[[int, float], bool]

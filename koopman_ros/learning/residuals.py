@@ -11,10 +11,10 @@ import torch
 from torch import Tensor
 
 from koopman_ros.learning.deep import ProductSums
+from koopman_ros.learning.levenberg_marquardt import NormalEquations
 from koopman_ros.learning.network import Layout, Parameters, Pass
 from koopman_ros.learning.scaled import ScaledSamples
 from koopman_ros.learning.shallow import FeatureMap, MomentSums
-from koopman_ros.solvers.levenberg_marquardt import NormalEquations
 
 
 @dataclass(frozen=True)

@@ -22,6 +22,7 @@ from koopman_ros import __version__
 from koopman_ros.learning.algorithm1 import Algorithm1
 from koopman_ros.learning.baselines import Edmd
 from koopman_ros.learning.growth import Grown, Growth, Monitor
+from koopman_ros.learning.levenberg_marquardt import MinimumStatus
 from koopman_ros.learning.scaled import deviations, ScaledSamples
 from koopman_ros.learning.validation import (
     ClosedLoopComparison,
@@ -33,7 +34,6 @@ from koopman_ros.learning.validation import (
 )
 from koopman_ros.lifting import Box, LiftedModel, NetworkObservables, Provenance, TrainingStates
 from koopman_ros.plant_data import Plant, Samples, split_by_episode
-from koopman_ros.solvers.levenberg_marquardt import MinimumStatus
 
 Recipe = Growth | Algorithm1
 

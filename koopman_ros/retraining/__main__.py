@@ -1,7 +1,6 @@
 # SPDX-FileCopyrightText: 2026 The koopman_ros Authors
 # SPDX-License-Identifier: Apache-2.0
 
-
 """
 The process that retrains: a task in JSON on the first line of its input, JSON lines on its output.
 

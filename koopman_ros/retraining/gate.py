@@ -1,7 +1,6 @@
 # SPDX-FileCopyrightText: 2026 The koopman_ros Authors
 # SPDX-License-Identifier: Apache-2.0
 
-
 """Acceptance of a new lift, on data held out of its estimation and training."""
 
 from __future__ import annotations
@@ -10,8 +9,8 @@ from dataclasses import dataclass
 import itertools
 
 import numpy as np
-from numpy.typing import NDArray
 
+from koopman_ros.arrays import Array
 from koopman_ros.control import run_closed_loop, Weights
 from koopman_ros.identification import (
     DriftModel,
@@ -24,8 +23,6 @@ from koopman_ros.identification.segments import Rate
 from koopman_ros.learning import Trained
 from koopman_ros.learning.validation import settling_time
 from koopman_ros.lifting import LiftedModel, linearised_model, Provenance
-
-Array = NDArray[np.float64]
 
 # A closed loop has arrived when it ends this close to the set-point, in units of the scale.
 _ARRIVED = 0.05

@@ -1,7 +1,6 @@
 # SPDX-FileCopyrightText: 2026 The koopman_ros Authors
 # SPDX-License-Identifier: Apache-2.0
 
-
 """Training of a lift on an estimated drift: samples, nominal point, recipe."""
 
 from __future__ import annotations
@@ -11,6 +10,7 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
+from koopman_ros.arrays import Array
 from koopman_ros.identification import (
     DriftModel,
     fitted_starts,
@@ -21,8 +21,6 @@ from koopman_ros.identification import (
 from koopman_ros.learning import Growth, train, Trained
 from koopman_ros.learning.training import Watch
 from koopman_ros.plant_data import Episode, Plant, Samples
-
-Array = NDArray[np.float64]
 
 # More samples of a smooth drift tell nothing new.
 _MAX_SAMPLES = 2000

@@ -10,8 +10,8 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from koopman_ros.arrays import Array
 from koopman_ros.identification import Identified, longest_step, Segments
 from koopman_ros.identification.segments import fitted_starts, Rate
 from koopman_ros.lifting import Coordinates
@@ -20,8 +20,6 @@ from koopman_ros.retraining.coverage import CELLS, visited_cells
 from koopman_ros.retraining.gate import lifted_rate
 from koopman_ros.retraining.task import Retrained
 from koopman_ros.units import conversion, display_unit
-
-Array = NDArray[np.float64]
 
 
 def write_report(retrained: Retrained) -> list[Path]:

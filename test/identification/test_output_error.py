@@ -16,8 +16,8 @@ from koopman_ros.identification import (
     weak_form,
 )
 from koopman_ros.identification.output_error import _Problem
+from koopman_ros.learning.levenberg_marquardt import normal_equations
 from koopman_ros.plant_data import cut, Episode
-from koopman_ros.solvers.levenberg_marquardt import normal_equations
 from support.known_plants import CUBIC, PAIR
 
 NOISE = 0.02
@@ -90,7 +90,7 @@ def test_recovers_the_drift_without_noise(plant, degree, known):
 
 
 def test_error_falls_with_the_fourth_power_of_the_step():
-    records = cut([CUBIC.excited(300, 0.1)], 120)
+    records = cut([CUBIC.excited(200, 0.1)], 100)
     model, _ = start_of(CUBIC, records, 3)
     misfits = [CUBIC.misfit(output_error(model, Segments.of(records, h), learn_input_matrix=True))
                for h in (0.1, 0.05)]
@@ -126,12 +126,10 @@ def cramer_rao(records, polynomial):
     return np.linalg.inv(covariance[:5, :5])
 
 
-@pytest.mark.parametrize('seed', range(2))
-def test_errors_are_those_of_the_best_estimate_possible(seed):
+def test_errors_are_those_of_the_best_estimate_possible():
     lengths = (100, 60, 80)
-    clean = [CUBIC.excited(n, 0.1, seed=10 * seed + i) for i, n in enumerate(lengths)]
-    noisy = [CUBIC.excited(n, 0.1, noise=NOISE, seed=10 * seed + i)
-             for i, n in enumerate(lengths)]
+    clean = [CUBIC.excited(n, 0.1, seed=i) for i, n in enumerate(lengths)]
+    noisy = [CUBIC.excited(n, 0.1, noise=NOISE, seed=i) for i, n in enumerate(lengths)]
     model, segments = start_of(CUBIC, noisy, 3)
     found = output_error(model, segments, learn_input_matrix=True)
     x = np.linspace(found.box.states.lower, found.box.states.upper, 8)
@@ -142,14 +140,6 @@ def test_errors_are_those_of_the_best_estimate_possible(seed):
     # in units of the Cramer-Rao bound the error is chi-squared with as many degrees of freedom
     distance = error @ cramer_rao(clean, true) @ error
     assert chi2.ppf(1e-3, 5) < distance < chi2.ppf(0.999, 5)
-
-
-def test_the_same_to_the_bit():
-    records = cut([CUBIC.excited(200, 0.1, noise=NOISE)], 60)
-    model, segments = start_of(CUBIC, records, 3)
-    first, second = (output_error(model, segments, learn_input_matrix=True) for _ in range(2))
-    assert first.coefficients.tobytes() == second.coefficients.tobytes()
-    assert first.B.tobytes() == second.B.tobytes()
 
 
 def test_monitor_sees_the_cost_fall_and_ends_it():

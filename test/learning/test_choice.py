@@ -10,8 +10,8 @@ import pytest
 import torch
 
 from koopman_ros.learning import fit, Growth, NoUsefulLift, train
+from koopman_ros.learning.levenberg_marquardt import MinimumStatus
 from koopman_ros.plant_data import split_by_episode
-from koopman_ros.solvers.levenberg_marquardt import MinimumStatus
 from support.small_plants import (
     BENT,
     bent_samples,
@@ -77,6 +77,8 @@ class Given:
 
 def test_a_degenerate_start_is_no_candidate():
     error = torch.linalg.LinAlgError('singular')
+    # a ValueError to whoever does not know it
+    assert issubclass(NoUsefulLift, ValueError)
     with pytest.raises(NoUsefulLift, match=r'no start gave a usable lift with n_z = 2: a start is '
                                            r'degenerate \(singular\): check that all states'):
         train(UNFORCED, unforced_samples(), Given(error), starts=2)
@@ -93,25 +95,16 @@ def test_a_start_without_a_result_is_no_candidate(change):
         train(UNFORCED, unforced_samples(), Given(grown), starts=2)
 
 
-def test_a_linear_plant_needs_no_lift():
+def test_a_linear_plant_needs_no_lift_and_gets_one_where_it_is_asked_for():
     samples = bent_samples()
     linear = replace(samples, dxdt=-(samples.x - 3.0) + 2.0 * (samples.u - 0.5))
     with pytest.raises(NoUsefulLift, match=r'the lift with n_z = 2 does not predict the motion '
                                            r'better than a linear model \(relative error rx = '
                                            r'[0-9.e-]+ against [0-9.e-]+ on validation'):
         train(BENT, linear, SMALL, starts=1)
-
-
-def test_a_lift_of_no_use_is_returned_where_it_is_asked_for():
-    samples = bent_samples()
-    linear = replace(samples, dxdt=-(samples.x - 3.0) + 2.0 * (samples.u - 0.5))
     trained = train(BENT, linear, SMALL, starts=1, refuse=False)
     assert trained.figures.fit.rx > trained.linear.fit.rx
     assert trained.closed_loop is None
-
-
-def test_no_useful_lift_is_a_value_error():
-    assert issubclass(NoUsefulLift, ValueError)
 
 
 def test_a_held_out_episode_at_rest():
@@ -122,14 +115,12 @@ def test_a_held_out_episode_at_rest():
         train(BENT, replace(at_rest, x=x), SMALL)
 
 
-def test_no_start():
-    with pytest.raises(ValueError, match='starts must be at least 1, got 0'):
-        train(BENT, bent_samples(), SMALL, starts=0)
-
-
-def test_fewer_coordinates_than_a_lift_needs():
-    with pytest.raises(ValueError, match='n_z = 1 is too small for 1 states'):
-        train(BENT, bent_samples(), Growth(1))
+@pytest.mark.parametrize(('recipe', 'starts', 'words'), [
+    (SMALL, 0, 'starts must be at least 1, got 0'),
+    (Growth(1), 1, 'n_z = 1 is too small for 1 states')])
+def test_what_cannot_be_trained(recipe, starts, words):
+    with pytest.raises(ValueError, match=words):
+        train(BENT, bent_samples(), recipe, starts=starts)
 
 
 def test_a_lift_that_loses_a_state_is_refused_whatever_its_rw():

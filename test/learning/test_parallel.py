@@ -62,70 +62,6 @@ def test_the_bits_do_not_depend_on_where_starts_run(backend, expected):
     assert torch.get_num_threads() == threads
 
 
-def test_the_watch_can_end_starts_in_processes():
-    seen = []
-
-    def watch(now):
-        seen.append(now)
-        return now.finished == 4
-
-    with joblib.parallel_config('loky', n_jobs=2):
-        kept = train(BENT, bent_samples(), RECIPE, starts=3, seed=5, watch=watch)
-    # processes tell of whole starts only
-    assert [(now.n_z, now.finished, now.iteration) for now in seen] == [
-        (2, 1, 0), (2, 2, 0), (2, 3, 0), (3, 4, 0)]
-    assert kept.status.startswith('interrupted')
-    assert (kept.model.n_z, kept.starts) == (3, 4)
-
-
-PROGRAM = """
-import contextlib, dataclasses, signal, sys
-import joblib
-from koopman_ros.learning import Growth, train
-from support.small_plants import BENT, bent_samples
-
-def watch(now):
-    print(now.n_z, now.finished, now.iteration, flush=True)
-    return False
-
-# started in the background of a shell, it would ignore it
-signal.signal(signal.SIGINT, signal.default_int_handler)
-parallel = {'loky': lambda: joblib.parallel_config('loky', n_jobs=2),
-            'sequential': contextlib.nullcontext}[sys.argv[1]]
-if __name__ == '__main__':
-    with parallel():
-        # endless, or it could be over before a busy machine interrupts it
-        recipe = Growth(200, max_iterations=60, tolerance=0.0)
-        found = train(BENT, bent_samples(length=300), recipe, starts=2, watch=watch)
-    print('model', found.model.n_z, found.status)
-"""
-
-
-@pytest.mark.parametrize('backend', ['sequential', 'loky'])
-def test_an_interrupt_from_the_keyboard(backend):
-    """Interrupt the whole process group, as a terminal does, once the first round is over."""
-    here = Path(__file__).parents[1]
-    path = os.pathsep.join([str(here), str(Path(koopman_ros.__file__).parents[1])])
-    with subprocess.Popen(
-            [sys.executable, '-c', PROGRAM, backend], stdout=subprocess.PIPE,
-            stderr=subprocess.PIPE, text=True, start_new_session=True,
-            env={**os.environ, 'PYTHONPATH': path, 'OMP_NUM_THREADS': '1'}) as process:
-        try:
-            for line in process.stdout:
-                if line.startswith('3 '):
-                    break
-            os.killpg(process.pid, signal.SIGINT)
-            output, errors = process.communicate(timeout=240)
-        finally:
-            with contextlib.suppress(ProcessLookupError):
-                os.killpg(process.pid, signal.SIGKILL)
-    assert errors == ''
-    assert process.returncode == 0
-    last = output.splitlines()[-1]
-    assert last.startswith('model ')
-    assert last.endswith('interrupted: the best parameters so far are kept')
-
-
 @pytest.mark.parametrize(('backend', 'leaves'), [('loky', True), ('threading', False)])
 def test_workers_leave_an_interrupt_to_the_process_that_waits(backend, leaves):
     """Between two starts they would print where they were."""
@@ -156,3 +92,64 @@ def test_many_samples_go_to_processes():
         other = train(BENT, some, recipe, starts=1)
     assert bits(one.model) == bits(other.model)
     assert np.isfinite(one.figures.fit.rw)
+
+
+def test_the_watch_can_end_starts_in_processes():
+    seen = []
+
+    def watch(now):
+        seen.append(now)
+        return now.finished == 4
+
+    with joblib.parallel_config('loky', n_jobs=2):
+        kept = train(BENT, bent_samples(), RECIPE, starts=3, seed=5, watch=watch)
+    # processes tell of whole starts only
+    assert [(now.n_z, now.finished, now.iteration) for now in seen] == [
+        (2, 1, 0), (2, 2, 0), (2, 3, 0), (3, 4, 0)]
+    assert kept.status.startswith('interrupted')
+    assert (kept.model.n_z, kept.starts) == (3, 4)
+
+
+PROGRAM = """
+import signal
+import joblib
+from koopman_ros.learning import Growth, train
+from support.small_plants import BENT, bent_samples
+
+def watch(now):
+    print(now.n_z, now.finished, now.iteration, flush=True)
+    return False
+
+# started in the background of a shell, it would ignore it
+signal.signal(signal.SIGINT, signal.default_int_handler)
+if __name__ == '__main__':
+    with joblib.parallel_config('loky', n_jobs=2):
+        # endless, or it could be over before a busy machine interrupts it
+        recipe = Growth(200, max_iterations=60, tolerance=0.0)
+        found = train(BENT, bent_samples(length=300), recipe, starts=2, watch=watch)
+    print('model', found.model.n_z, found.status)
+"""
+
+
+def test_an_interrupt_from_the_keyboard():
+    """Interrupt the whole process group, as a terminal does, once the first round is over."""
+    here = Path(__file__).parents[1]
+    path = os.pathsep.join([str(here), str(Path(koopman_ros.__file__).parents[1])])
+    with subprocess.Popen(
+            [sys.executable, '-c', PROGRAM], stdout=subprocess.PIPE,
+            stderr=subprocess.PIPE, text=True, start_new_session=True,
+            env={**os.environ, 'PYTHONPATH': path, 'OMP_NUM_THREADS': '1'}) as process:
+        try:
+            for line in process.stdout:
+                if line.startswith('3 '):
+                    break
+            os.killpg(process.pid, signal.SIGINT)
+            output, errors = process.communicate(timeout=240)
+        finally:
+            with contextlib.suppress(ProcessLookupError):
+                os.killpg(process.pid, signal.SIGKILL)
+    assert errors == ''
+    assert process.returncode == 0
+    last = output.splitlines()[-1]
+    assert last.startswith('model ')
+    assert last.endswith('interrupted: the best parameters so far are kept')

@@ -6,12 +6,13 @@
 from dataclasses import replace
 import itertools
 import math
+import signal
 
 import pytest
 import torch
 
 from koopman_ros.learning import NoUsefulLift, train
-from koopman_ros.solvers.levenberg_marquardt import MinimumStatus
+from koopman_ros.learning.levenberg_marquardt import MinimumStatus
 from support.small_plants import bits, SMALL, UNFORCED, unforced_samples
 
 RECIPE = replace(SMALL, n_z=3)
@@ -54,11 +55,15 @@ def test_the_watch_sees_the_best_start_so_far():
     assert {now.rw for now in between} == {ends[0].rw}
 
 
-def raise_interrupt(now):
-    raise KeyboardInterrupt
+def press_interrupt(now):
+    before = signal.signal(signal.SIGINT, signal.default_int_handler)
+    try:
+        signal.raise_signal(signal.SIGINT)
+    finally:
+        signal.signal(signal.SIGINT, before)
 
 
-@pytest.mark.parametrize('act', [lambda now: True, raise_interrupt],
+@pytest.mark.parametrize('act', [lambda now: True, press_interrupt],
                          ids=['the watch', 'the keyboard'])
 @pytest.mark.parametrize(('place', 'n_z', 'starts'), [
     ((2, 0, 30), 2, 1), ((2, 1, 0), 2, 1), ((2, 1, 5), 2, 2), ((2, 2, 0), 2, 2),

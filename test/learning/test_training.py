@@ -11,10 +11,10 @@ import pytest
 import torch
 
 from koopman_ros.learning import Algorithm1, Edmd, evaluate, fit, Growth, train
+from koopman_ros.learning.levenberg_marquardt import MinimumStatus
 from koopman_ros.lifting import Box
 from koopman_ros.plant_data import Plant, Samples, split_by_episode
 from koopman_ros.plants import scalar_example
-from koopman_ros.solvers.levenberg_marquardt import MinimumStatus
 from support.small_plants import (
     BENT,
     bent_samples,
@@ -120,7 +120,7 @@ def test_the_recipe_shapes_the_model(sizes, identity):
 @pytest.mark.parametrize('plant', [BENT, TWO_STATE], ids=lambda plant: plant.name)
 def test_b_is_learned(plant):
     samples = bent_samples() if plant is BENT else two_state_samples()
-    trained = train(replace(plant, B=None), samples, Growth(3, max_iterations=300), starts=1)
+    trained = train(replace(plant, B=None), samples, Growth(3, max_iterations=150), starts=1)
     model = trained.model
     B = model.B * model.states.scale[:, None] / model.inputs.scale
     np.testing.assert_allclose(B, plant.B, rtol=0, atol=1e-3)

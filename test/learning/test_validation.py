@@ -142,12 +142,9 @@ def test_roll_out_follows_the_projected_drift():
     np.testing.assert_allclose(path[:, 0], expected, rtol=0, atol=1e-8)
 
 
-def test_roll_out_without_inputs_is_the_start():
+def test_a_roll_out_without_inputs_and_one_that_diverges():
     x0 = np.array([2.2, 1.7])
     np.testing.assert_array_equal(roll_out(linear_model(), x0, np.zeros((0, 1)), 0.3), [x0])
-
-
-def test_a_diverging_roll_out_is_reported():
     with pytest.raises(RuntimeError, match=r'diverged after \d+ samples: keep the inputs within'):
         roll_out(linear_model(50.0 * np.eye(2)), np.ones(2), np.zeros((40, 1)), 1.0)
 
@@ -204,12 +201,9 @@ def test_episodes_of_one_sample_predict_nothing():
     assert rollout_rmse(linear_model(), linear_episodes(lengths=(1, 1))) is None
 
 
-def test_samples_without_times_have_no_roll_out():
-    assert rollout_rmse(linear_model(), replace(linear_episodes(), time=None)) is None
-
-
-def test_a_roll_out_that_diverges_has_an_infinite_error():
+def test_without_times_there_is_no_roll_out_and_one_that_diverges_errs_infinitely():
     samples = linear_episodes()
+    assert rollout_rmse(linear_model(), replace(samples, time=None)) is None
     assert np.all(np.isinf(rollout_rmse(linear_model(50.0 * np.eye(2)), samples)))
 
 
@@ -236,14 +230,11 @@ def test_figures_that_are_not_finite_are_left_out():
     assert Figures(Fit(0.1, np.inf, np.nan), np.ones(1), None).metrics(('T',)) == {'rw': 0.1}
 
 
-def test_closed_loops_of_the_same_model_cost_the_same():
-    found = compare_closed_loops(linear_model(), linear_model(), linear_episodes())
-    assert (found.cost_ratio, found.arrived, found.linear_arrived, found.starts) == (1.0, 3, 3, 3)
-
-
-def test_closed_loops_from_as_many_starts_as_asked_for():
-    found = compare_closed_loops(linear_model(), linear_model(), linear_episodes(), starts=2)
-    assert (found.arrived, found.starts) == (2, 2)
+@pytest.mark.parametrize('starts', [2, 3])
+def test_closed_loops_of_the_same_model_cost_the_same(starts):
+    found = compare_closed_loops(linear_model(), linear_model(), linear_episodes(), starts=starts)
+    assert (found.cost_ratio, found.arrived, found.linear_arrived, found.starts) == (
+        1.0, starts, starts, starts)
 
 
 def test_a_worse_law_costs_more():

@@ -15,6 +15,7 @@ from koopman_ros.plants import two_state_reactor
 from koopman_ros.resources import model_path
 from koopman_ros.retraining import decide, learn_lift, Thresholds
 from koopman_ros.retraining.gate import lifted_rate
+from support.known_plants import methods
 from support.random_lifts import random_lift
 from support.recorded_runs import driven, linear_run, NOISE, reactor
 
@@ -27,7 +28,8 @@ def shipped():
 @pytest.fixture(scope='module')
 def found(shipped):
     """Return the estimate of a reactor whose jacket has fouled."""
-    return identify(shipped.plant, [driven(reactor(0.8), 15.0).episode()], degrees=(1, 2, 3))
+    return identify(shipped.plant, [driven(reactor(0.8), 15.0).episode()], degrees=(1, 2, 3),
+                    methods=methods(20))
 
 
 @pytest.fixture(scope='module')
@@ -96,7 +98,7 @@ def test_the_present_lift_does_not_beat_itself(found, trained):
 
 def test_an_undrifted_plant_needs_no_new_lift(shipped):
     run = driven(reactor(), 8.0, coolant=(281.33, 300.55))
-    found = identify(shipped.plant, [run.episode()], degrees=(1, 3))
+    found = identify(shipped.plant, [run.episode()], degrees=(1, 3), methods=methods(20))
     trained = learn_lift(found, shipped.plant, 2, seed=0, starts=1)
     decision = decide(found, trained, shipped, Thresholds())
     (reason,) = decision.reasons
@@ -175,7 +177,7 @@ def test_thresholds_out_of_range(values, words):
 def test_warns_of_a_state_that_is_not_measured(shipped):
     """The reactor's concentration moves, too; its temperature alone does not tell where it is."""
     run = driven(two_state_reactor(), 20.0, coolant=(294.0, 302.0), seed=2, noise=0.03)
-    found = identify(shipped.plant, [run.episode()], degrees=(1, 2))
+    found = identify(shipped.plant, [run.episode()], degrees=(1, 2), methods=methods(20))
     trained = learn_lift(found, shipped.plant, 2, seed=0, starts=1)
     decision = decide(found, trained, shipped, Thresholds())
     (warning,) = decision.warnings
@@ -191,7 +193,7 @@ def test_warns_of_a_state_that_is_not_measured(shipped):
 
 def test_does_not_warn_where_all_is_measured():
     model = load(model_path('reactor_nz3'))
-    found = identify(model.plant, [linear_run(600).episode()], degrees=(1,))
+    found = identify(model.plant, [linear_run(400).episode()], degrees=(1,), methods=methods(20))
     decision = decide(found, _as_trained(found, model), model, Thresholds())
     assert decision.warnings == ()
 

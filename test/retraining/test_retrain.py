@@ -4,6 +4,7 @@
 """Retraining from bags, end to end within one process."""
 
 from dataclasses import asdict, replace
+from functools import partial
 import json
 from pathlib import Path
 
@@ -16,6 +17,7 @@ from koopman_ros.lifting import load, ModelFileError, save
 from koopman_ros.resources import model_path
 from koopman_ros.retraining import retrain, Task, write_report
 from koopman_ros.retraining import task as task_module
+from support.known_plants import methods
 from support.random_lifts import random_lift
 from support.recorded_runs import driven, linear_run, NOISE, reactor, write_bag
 
@@ -25,6 +27,21 @@ SHIPPED = str(model_path('reactor_nz4'))
 @pytest.fixture(scope='module')
 def bag(tmp_path_factory):
     return write_bag(tmp_path_factory.mktemp('bag') / 'run.mcap', driven(reactor(0.8), 20.0))
+
+
+@pytest.fixture(scope='module', autouse=True)
+def few_methods():
+    """Estimate by a few methods alone; what all of them find is the matter of test_identify."""
+    original = task_module.identify
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(task_module, 'identify',
+                      partial(original, degrees=(1, 3), methods=methods(10, 20)))
+        yield
+
+
+@pytest.fixture(scope='module')
+def short_bag(tmp_path_factory):
+    return write_bag(tmp_path_factory.mktemp('short') / 'run.mcap', driven(reactor(0.8), 5.0))
 
 
 @pytest.fixture(scope='module')
@@ -128,28 +145,18 @@ def test_figures_that_are_infinite_stay_valid_json(accepted):
     assert figures['heldout_error_of_present_lift_kelvin'] is None
 
 
-def test_refused_lift_that_diverges_is_kept_all_the_same(tmp_path, monkeypatch):
-    bag = write_bag(tmp_path / 'run.mcap', driven(reactor(0.8), 5.0))
+def test_refused_lift_that_diverges_is_kept_all_the_same(short_bag, tmp_path, monkeypatch):
     original = task_module.decide
 
     def decide(*arguments):
         return replace(original(*arguments), rmse=np.array([np.inf]), reasons=('it diverges',))
 
     monkeypatch.setattr(task_module, 'decide', decide)
-    monkeypatch.setattr(task_module, 'identify', _quick)
-    retrained = retrain(Task((str(bag),), str(tmp_path / 'new.safetensors'), SHIPPED,
+    retrained = retrain(Task((str(short_bag),), str(tmp_path / 'new.safetensors'), SHIPPED,
                            coordinates=2, starts=1))
     metrics = load(retrained.model_file).provenance.metrics
     assert 'rollout_rmse' not in metrics
     assert 'noise' in metrics
-
-
-_identify = task_module.identify
-
-
-def _quick(plant, episodes, **options):
-    """Estimate by a few methods alone."""
-    return _identify(plant, episodes, degrees=(1, 3), windows=(20,), **options)
 
 
 def test_previous_model_is_copied_where_there_are_no_hard_links(tmp_path, monkeypatch):
@@ -181,9 +188,8 @@ def test_a_linear_plant_needs_no_lift(tmp_path):
     assert json.loads(files[0].read_text())['accepted'] is False
 
 
-def test_known_gain_and_a_model_in_seconds(tmp_path, monkeypatch):
+def test_known_gain_and_a_model_in_seconds(tmp_path):
     """The gain is given in 1/min whatever the time unit of the present lift."""
-    monkeypatch.setattr(task_module, 'identify', _quick)
     bag = write_bag(tmp_path / 'linear.mcap', linear_run(200))
     present = load(SHIPPED)
     save(replace(present, A=present.A / 60.0, B=present.B / 60.0, time_unit='s'),
@@ -197,10 +203,9 @@ def test_known_gain_and_a_model_in_seconds(tmp_path, monkeypatch):
 
 @pytest.mark.parametrize('text', ['reading bags', 'estimating: drift of degree 3',
                                   'learning: n_z 2', 'judging', 'writing'])
-def test_stops_at_any_stage_and_writes_nothing(tmp_path_factory, tmp_path, monkeypatch, text):
-    monkeypatch.setattr(task_module, 'identify', _quick)
-    bag = write_bag(tmp_path_factory.mktemp('short') / 'run.mcap', driven(reactor(0.8), 4.0))
-    task = Task((str(bag),), str(tmp_path / 'new.safetensors'), SHIPPED, coordinates=2, starts=1)
+def test_stops_at_any_stage_and_writes_nothing(short_bag, tmp_path, text):
+    task = Task((str(short_bag),), str(tmp_path / 'new.safetensors'), SHIPPED, coordinates=2,
+                starts=1)
     stopped = False
 
     def tell(_, said):

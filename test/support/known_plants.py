@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.integrate import solve_ivp
 
-from koopman_ros.identification import DriftModel
+from koopman_ros.identification import DriftModel, Method, METHODS, weak_forms
 from koopman_ros.lifting import Box, Coordinates
 from koopman_ros.plant_data import Episode, Plant
 from support.disturbance import disturbed
@@ -25,6 +25,11 @@ def box(state_lower, state_upper, input_lower, input_upper) -> Box:
                                       np.array(lower), np.array(upper))
                  for letter, lower, upper in (('x', state_lower, state_upper),
                                               ('u', input_lower, input_upper))), 's')
+
+
+def methods(*windows: int) -> dict[str, Method]:
+    """Return few methods to choose from: the weak form with some windows, total variation."""
+    return {**weak_forms(*windows), 'total variation': METHODS['total variation']}
 
 
 @dataclass(frozen=True)

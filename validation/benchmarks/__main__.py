@@ -8,14 +8,15 @@ from __future__ import annotations
 import argparse
 from collections.abc import Callable
 from functools import partial
+import json
 from pathlib import Path
 import sys
 from typing import Any
 
+from koopman_ros.reports import write_figures
 from validation.benchmarks.loop import part as loop
 from validation.benchmarks.options import Extent, Options
 from validation.benchmarks.recording import part as recording
-from validation.benchmarks.summary import Summary
 from validation.benchmarks.training import part as training
 
 # A part is a module with a function that returns its figures.
@@ -44,18 +45,26 @@ def main(args: list[str] | None = None) -> int:
         parser.error(f'there is no part {", ".join(unknown)}: choose from {", ".join(PARTS)}')
     if given.limit is not None and not given.limit > 0.0:
         parser.error(f'--limit is {given.limit} s, must be above 0 s')
-    summary = Summary(given.output / 'summary.json')
+    summary = given.output / 'summary.json'
     given.output.mkdir(parents=True, exist_ok=True)
     for part in given.parts or PARTS:
         options = Options(given.output, given.extent or Extent.DEFAULT, given.limit,
-                          partial(summary.write, part))
+                          partial(_write, summary, part))
         try:
-            summary.write(part, PARTS[part](options))
+            _write(summary, part, PARTS[part](options))
         except KeyboardInterrupt:
             print(f'\ninterrupted; what was finished is in {given.output}', file=sys.stderr)
             return 130
-    print(f'\n{summary.path} holds all figures')
+    print(f'\n{summary} holds all figures')
     return 0
+
+
+def _write(path: Path, part: str, figures: dict[str, Any]) -> None:
+    """Put a part's figures in the place of its old ones; those of the other parts stay."""
+    before = json.loads(path.read_text()) if path.exists() else {}
+    if not isinstance(before, dict):
+        raise ValueError(f'{path} does not hold the figures of a benchmark: move it away')
+    write_figures(path, {**before, part: figures})
 
 
 if __name__ == '__main__':

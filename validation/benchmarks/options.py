@@ -1,15 +1,19 @@
 # SPDX-FileCopyrightText: 2026 The koopman_ros Authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""What the user asks of a part of the benchmark."""
+"""What the user asks of a part of the benchmark, and what all parts say."""
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from enum import Enum
 from pathlib import Path
+import sys
 from typing import Any
+
+# With so few numbers other threads only wait and spin.
+ONE_THREAD = {'OMP_NUM_THREADS': '1', 'OPENBLAS_NUM_THREADS': '1', 'MKL_NUM_THREADS': '1'}
 
 
 class Extent(Enum):
@@ -35,3 +39,13 @@ class Options:
     extent: Extent
     limit: float | None
     save: Callable[[dict[str, Any]], None]
+
+
+def tell(label: str) -> None:
+    """Tell what begins."""
+    print(label, file=sys.stderr, flush=True)
+
+
+def say(lines: Iterable[str]) -> None:
+    """Print a result."""
+    print('\n'.join(lines) + '\n', flush=True)

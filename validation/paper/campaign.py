@@ -15,9 +15,10 @@ from typing import Any
 import joblib
 from tqdm import tqdm
 
+from koopman_ros.control import ClosedLoop
 from koopman_ros.lifting import LiftedModel
 from validation.paper import reactor, scalar, sensors, two_state
-from validation.paper.outcome import Metrics, Models
+from validation.paper.datasets import Metrics, Models
 
 # Each experiment with the place of its figures in the summary; the slow ones first.
 EXPERIMENTS: dict[str, Callable[[int], tuple[Metrics, Models]]] = {
@@ -46,12 +47,14 @@ class Campaign:
     :param models: learned models by experiment and seed, for the figures.
     :param errors: one line for each run that failed.
     :param complete: whether every run was made.
+    :param loops: closed loops of models, by the identity of the model.
     """
 
     metrics: dict[str, dict[int, Metrics]] = field(default_factory=dict)
     models: dict[str, dict[int, Mapping[str, LiftedModel]]] = field(default_factory=dict)
     errors: list[str] = field(default_factory=list)
     complete: bool = False
+    loops: dict[int, ClosedLoop] = field(default_factory=dict)
 
     def summary(self) -> dict[str, Any]:
         """Nest the figures: experiment, its parts, then one list over the seeds."""

@@ -1,14 +1,17 @@
 # SPDX-FileCopyrightText: 2026 The koopman_ros Authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""Samples of the simulated plants, in the form that training takes."""
+"""Samples of the simulated plants, and what an experiment on them hands back."""
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 import contextlib
+from typing import TypeAlias
 
 import numpy as np
 
+from koopman_ros.lifting import LiftedModel
 from koopman_ros.plant_data import Episode, Plant, Samples
 from koopman_ros.plants import (
     ControlAffineSystem,
@@ -18,6 +21,10 @@ from koopman_ros.plants import (
     sample_derivatives,
 )
 
+# Figures by name; None where there is none, e.g. after a divergence.
+Metrics: TypeAlias = dict[str, float | bool | dict[str, 'float | bool | None'] | None]
+# Models by name, for the figures.
+Models: TypeAlias = Mapping[str, LiftedModel]
 # Share of the episodes that start in a corner of their box.
 _AT_CORNERS = 0.2
 

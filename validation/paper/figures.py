@@ -58,6 +58,13 @@ def _models(campaign: Campaign, experiment: str) -> dict[str, LiftedModel]:
     return dict(by_seed[min(by_seed)])
 
 
+def _loop(campaign: Campaign, model: LiftedModel) -> ClosedLoop:
+    """Regulate the two-state example with R = 1 by one of the models, once for all figures."""
+    if id(model) not in campaign.loops:
+        campaign.loops[id(model)] = two_state.close_loop(model, 1.0)
+    return campaign.loops[id(model)]
+
+
 def _scalar(campaign: Campaign, path: Path) -> str:
     model = _models(campaign, 'scalar')['scalar']
     x = np.linspace(0.0, 8.0, 801)
@@ -139,7 +146,7 @@ def _control(path: Path, loops: list[tuple[str, dict[str, Any], ClosedLoop]], un
 def _wide_control(campaign: Campaign, path: Path) -> str:
     models = _models(campaign, 'two_state')
     exact = two_state.exact_loop(1.0)
-    loops = {name: two_state.close_loop(models[name], 1.0) for name in ('linear', 'wide')}
+    loops = {name: _loop(campaign, models[name]) for name in ('linear', 'wide')}
     _control(path, [('linearisation', LINEAR, loops['linear']), ('exact lift', EXACT, exact),
                     ('learned lift', LEARNED, loops['wide'])], 30.0)
     return ('Control of the two-state example from (5, 5), R = 1. Costs: exact '
@@ -150,8 +157,8 @@ def _wide_control(campaign: Campaign, path: Path) -> str:
 def _narrow_control(campaign: Campaign, path: Path) -> str:
     seed, model = worst_narrow(campaign)
     linear = _models(campaign, 'two_state')['linear']
-    loop = two_state.close_loop(model, 1.0)
-    _control(path, [('linearisation', LINEAR, two_state.close_loop(linear, 1.0)),
+    loop = _loop(campaign, model)
+    _control(path, [('linearisation', LINEAR, _loop(campaign, linear)),
                     ('exact lift', EXACT, two_state.exact_loop(1.0)),
                     (f'learned on {FIGURE_NARROW_BOX}', LEARNED, loop)], 30.0)
     end = loop.failure or f'x2 ends at {loop.states[-1, 1]:.3g}'
@@ -230,7 +237,7 @@ def _set_point(campaign: Campaign, path: Path) -> str:
 
 
 def _wide_box(campaign: Campaign, path: Path) -> str:
-    loop = two_state.close_loop(_models(campaign, 'two_state')['wide'], 1.0)
+    loop = _loop(campaign, _models(campaign, 'two_state')['wide'])
     draw_box(path, [('wide box', 'gold', two_state.WIDE, loop, 'tab:red')])
     return 'The wide training box holds the whole path of the controlled system.'
 
@@ -238,7 +245,7 @@ def _wide_box(campaign: Campaign, path: Path) -> str:
 def _narrow_box(campaign: Campaign, path: Path) -> str:
     seed, model = worst_narrow(campaign)
     box = two_state.NARROW[FIGURE_NARROW_BOX]
-    loop = two_state.close_loop(model, 1.0)
+    loop = _loop(campaign, model)
     draw_box(path, [('narrow box', 'gold', box, loop, 'tab:red')])
     return (f'The narrow training box, seed {seed}: the path starts in it and leaves it, by up '
             f'to {loop.distance(model):.2g} times half its width.')
@@ -248,9 +255,9 @@ def _both_boxes(campaign: Campaign, path: Path) -> str:
     _, narrow = worst_narrow(campaign)
     wide = _models(campaign, 'two_state')['wide']
     draw_box(path, [
-        ('wide box', 'none', two_state.WIDE, two_state.close_loop(wide, 1.0), 'tab:green'),
+        ('wide box', 'none', two_state.WIDE, _loop(campaign, wide), 'tab:green'),
         ('narrow box', 'grey', two_state.NARROW[FIGURE_NARROW_BOX],
-         two_state.close_loop(narrow, 1.0), 'tab:red')])
+         _loop(campaign, narrow), 'tab:red')])
     return 'Both boxes and paths in one picture: the same start, another training range.'
 
 

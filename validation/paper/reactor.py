@@ -24,9 +24,8 @@ from koopman_ros.learning import (
 from koopman_ros.lifting import LiftedModel
 from koopman_ros.plant_data import Samples
 from koopman_ros.plants import equilibrium_input, one_state_reactor, RandomStepDesign
-from validation.paper.datasets import box_episodes, describe, random_step_episodes
+from validation.paper.datasets import box_episodes, describe, Metrics, Models, random_step_episodes
 from validation.paper.optimal_control import scalar_optimal_cost
-from validation.paper.outcome import Metrics, Models
 
 SYSTEM = one_state_reactor()
 START = float(SYSTEM.nominal_state[0])

@@ -11,8 +11,7 @@ from koopman_ros.learning import fit, Growth, train
 from koopman_ros.lifting import LiftedModel
 from koopman_ros.plant_data import Samples
 from koopman_ros.plants import scalar_example
-from validation.paper.datasets import describe
-from validation.paper.outcome import Metrics, Models
+from validation.paper.datasets import describe, Metrics, Models
 
 RANGE = (0.0, 5.0)
 BEYOND = {'rw_5_6': (5.0, 6.0), 'rw_6_8': (6.0, 8.0)}

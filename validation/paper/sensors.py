@@ -1,7 +1,6 @@
 # SPDX-FileCopyrightText: 2026 The koopman_ros Authors
 # SPDX-License-Identifier: Apache-2.0
 
-
 """Lifts from what a sensor sees: sampled, noisy, of a plant that drifted, of half the state."""
 
 from __future__ import annotations
@@ -9,13 +8,13 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
 from koopman_ros import experiment as experiments
+from koopman_ros.arrays import Array
 from koopman_ros.control import at, Controller, InputLimits, SetpointRequest, Settings, simulate
 from koopman_ros.identification import Identified, identify
 from koopman_ros.learning import NoUsefulLift, roll_out, Trained
-from koopman_ros.lifting import Coordinates, LiftedModel, linearised_model, Provenance
+from koopman_ros.lifting import Box, LiftedModel, linearised_model, Provenance
 from koopman_ros.plant_data import Episode
 from koopman_ros.plants import (
     ControlAffineSystem,
@@ -27,10 +26,8 @@ from koopman_ros.plants import (
     two_state_reactor,
 )
 from koopman_ros.retraining import decide, Decision, learn_lift, Thresholds
-from validation.paper.outcome import Metrics, Models
+from validation.paper.datasets import describe, Metrics, Models
 from validation.paper.reactor import SETPOINT, SYSTEM
-
-Array = NDArray[np.float64]
 
 NOISE = 0.1  # K
 MINUTES = 60.0
@@ -86,17 +83,17 @@ def run_drifted(seed: int) -> tuple[Metrics, Models]:
     """
     present = _learn(_measured(_drive(SYSTEM, DESIGN, seed), NOISE, seed), _like(), seed).trained
     fouled = _fouled()
-    before = _controlled(fouled, present.model, SYSTEM.nominal_state, 15.0, seed)
-    loop = _controlled(fouled, present.model, SYSTEM.nominal_state, 10.0, seed + 1)
+    before, _ = _controlled(fouled, present.model, SYSTEM.nominal_state, 15.0, seed)
+    loop, record = _controlled(fouled, present.model, SYSTEM.nominal_state, 10.0, seed + 1)
     plan = experiments.Experiment(
         duration=3000.0, input_lower=276.0, input_upper=293.6, hold_shortest=30.0,
         hold_longest=150.0, rate=1.0, state_lower=300.0, state_upper=328.0, safe_input=286.0,
         seed=seed)
-    driven = _experiment(fouled, plan, loop.x[-1], seed + 2)
-    learned = _learn([loop.episode, driven.episode], present.model, seed)
+    driven = _experiment(fouled, plan, loop[-1], seed + 2)
+    learned = _learn([record, driven], present.model, seed)
     decision = decide(learned.found, learned.trained, present.model, Thresholds())
-    after = _controlled(fouled, learned.trained.model, before.x[-1], 15.0, seed)
-    offsets = [abs(float(np.mean(run.x[-300:, 0])) - SETPOINT) for run in (before, after)]
+    after, _ = _controlled(fouled, learned.trained.model, before[-1], 15.0, seed)
+    offsets = [abs(float(np.mean(x[-300:, 0])) - SETPOINT) for x in (before, after)]
     return {
         'offset_before_kelvin': offsets[0], 'offset_after_kelvin': offsets[1],
         'offset_ratio': offsets[1] / offsets[0], 'accepted': decision.accepted,
@@ -122,38 +119,12 @@ def run_two_state(seed: int) -> tuple[Metrics, Models]:
     except NoUsefulLift:
         return {'accepted': False, 'noise_kelvin': float(found.noise[0])}, {}
     decision: Decision = decide(found, trained, like, Thresholds())
-    errors = []
-    for number in range(_TESTS):
-        truth = _drive(system, TWO_STATE_DESIGN, 10_000 * (seed + 1) + number, _TEST_MINUTES)
-        predicted = roll_out(trained.model, truth.x[0, 1:], truth.u[:-1], PERIOD)
-        errors.append(predicted[:, 0] - truth.x[:, 1])
     return {
         'heldout_kelvin': float(decision.rmse[0]), 'noise_kelvin': float(decision.noise[0]),
         'linear_kelvin': float(decision.linear_rmse[0]),
-        'rollout_kelvin': float(np.sqrt(np.mean(np.square(errors)))),
+        'rollout_kelvin': _roll_out_error(trained.model, system, TWO_STATE_DESIGN, seed, state=1),
         'warned': bool(decision.warnings), 'accepted': decision.accepted,
     }, {'new': trained.model}
-
-
-@dataclass(frozen=True)
-class _Path:
-    """True states (N, n_x) and inputs (N, n_u) held from each sample on, one a second."""
-
-    x: Array
-    u: Array
-
-    @property
-    def time(self) -> Array:
-        """Times of the samples (N,), in min."""
-        return PERIOD * np.arange(len(self.x), dtype=np.float64)
-
-
-@dataclass(frozen=True)
-class _Run:
-    """A true path (N, n_x) and the record of its noisy measurements."""
-
-    x: Array
-    episode: Episode
 
 
 def _judged_on_truth(seed: int, noise: float) -> tuple[Metrics, Models]:
@@ -169,14 +140,10 @@ def _judged_on_truth(seed: int, noise: float) -> tuple[Metrics, Models]:
 
 def _like() -> LiftedModel:
     """Return a model with the names, units and nominal point of the reactor."""
-    lower, upper = np.array([305.0]), np.array([327.0])
-    states = Coordinates(SYSTEM.state_names, SYSTEM.state_units, SYSTEM.nominal_state,
-                         0.5 * (upper - lower), lower, upper)
-    lower, upper = np.array([281.3]), np.array([301.1])
-    inputs = Coordinates(SYSTEM.input_names, SYSTEM.input_units, SYSTEM.nominal_input,
-                         0.5 * (upper - lower), lower, upper)
-    return linearised_model(SYSTEM.drift_jacobian(SYSTEM.nominal_state), SYSTEM.B, states, inputs,
-                            SYSTEM.time_unit, Provenance(SYSTEM.name))
+    plant = describe(SYSTEM)
+    box = Box.of(plant, np.array([[305.0], [327.0]]), np.array([[281.3], [301.1]]))
+    return linearised_model(SYSTEM.drift_jacobian(SYSTEM.nominal_state), SYSTEM.B, box.states,
+                            box.inputs, SYSTEM.time_unit, Provenance(SYSTEM.name))
 
 
 def _fouled() -> ControlAffineSystem:
@@ -187,15 +154,15 @@ def _fouled() -> ControlAffineSystem:
 
 
 def _drive(system: ControlAffineSystem, design: RandomStepDesign, seed: int,
-           minutes: float = MINUTES) -> _Path:
+           minutes: float = MINUTES) -> Episode:
     episode = random_steps(system, design, minutes, seed)
-    return _Path(episode.x, np.vstack([episode.u, episode.u[-1:]]))
+    return _recorded(episode.x, np.vstack([episode.u, episode.u[-1:]]))
 
 
-def _measured(path: _Path, noise: float, seed: int, state: int = 0) -> list[Episode]:
+def _measured(path: Episode, noise: float, seed: int, state: int = 0) -> list[Episode]:
     rng = np.random.default_rng([seed, 1])
-    x = path.x[:, [state]] + noise * rng.standard_normal((len(path.x), 1))
-    return [Episode(path.time, x, path.time, path.u)]
+    x = path.x[:, [state]] + noise * rng.standard_normal((len(path), 1))
+    return [replace(path, x=x)]
 
 
 def _learn(episodes: list[Episode], like: LiftedModel, seed: int) -> _Learned:
@@ -208,19 +175,19 @@ def _gain_error(found: Identified, system: ControlAffineSystem) -> float:
 
 
 def _roll_out_error(model: LiftedModel, system: ControlAffineSystem, design: RandomStepDesign,
-                    seed: int) -> float:
+                    seed: int, state: int = 0) -> float:
     """Return the root mean square error, in K, over an hour of fresh steps without noise."""
     errors = []
     for number in range(_TESTS):
         truth = _drive(system, design, 10_000 * (seed + 1) + number, _TEST_MINUTES)
-        predicted = roll_out(model, truth.x[0], truth.u[:-1], PERIOD)
-        errors.append(predicted - truth.x)
+        predicted = roll_out(model, truth.x[0, [state]], truth.u[:-1], PERIOD)
+        errors.append(predicted - truth.x[:, [state]])
     return float(np.sqrt(np.mean(np.square(errors))))
 
 
 def _controlled(system: ControlAffineSystem, model: LiftedModel, x0: Array, minutes: float,
-                seed: int) -> _Run:
-    """Run the control step once a second on a noisy measurement."""
+                seed: int) -> tuple[Array, Episode]:
+    """Run the control step once a second; return the true path (N, n_x) and the noisy record."""
     controller = Controller(model, Settings.for_model(
         model, state_weight=np.ones(1), input_weight=np.ones(1),
         limits=InputLimits(np.array([278.15]), np.array([305.15]), np.ones(1))))
@@ -229,25 +196,25 @@ def _controlled(system: ControlAffineSystem, model: LiftedModel, x0: Array, minu
         controller, Process(system, 0, np.asarray(x0), system.nominal_input),
         [at(0.0, SetpointRequest(0, np.array([SETPOINT])))], duration=60.0 * minutes - 1.0,
         sensor=lambda x, _: x + NOISE * rng.standard_normal(len(x)))
-    return _recorded(run.states, run.measured, run.commands)
+    return run.states, _recorded(run.measured, run.commands)
 
 
 def _experiment(system: ControlAffineSystem, plan: experiments.Experiment, x0: Array, seed: int
-                ) -> _Run:
-    """Run an experiment as the trainer does."""
+                ) -> Episode:
+    """Run an experiment as the trainer does; return its noisy record."""
     progress, rng = experiments.begin(plan, _NS), np.random.default_rng([seed, 2])
     process = Process(system, _NS, np.asarray(x0), system.nominal_input)
-    states, measured, inputs = [], [], []
+    measured, inputs = [], []
     for number in range(round(plan.duration)):
         process = process.until((number + 1) * _NS)
-        states.append(process.x)
         measured.append(process.x + NOISE * rng.standard_normal(system.n_x))
         progress = experiments.advance(plan, progress, float(measured[-1][0]), process.time_ns)
         inputs.append(np.array([progress.command]))
         process = replace(process, u=inputs[-1])
-    return _recorded(np.array(states), np.array(measured), np.array(inputs))
+    return _recorded(np.array(measured), np.array(inputs))
 
 
-def _recorded(x: Array, measured: Array, u: Array) -> _Run:
-    path = _Path(x, u)
-    return _Run(path.x, Episode(path.time, measured, path.time, path.u))
+def _recorded(x: Array, u: Array) -> Episode:
+    """Return states (N, n_x) and inputs (N, n_u) held from each of them on, one a second."""
+    time = PERIOD * np.arange(len(x), dtype=np.float64)
+    return Episode(time, x, time, u)

@@ -29,17 +29,19 @@ STARTS = 3
 LIFTED_SIZES = (3, 4)
 
 
-def train_lifts(progress: TrainingProgress | None = None) -> dict[int, LiftedModel]:
+def train_lifts(progress: TrainingProgress | None = None, starts: int = STARTS
+                ) -> dict[int, LiftedModel]:
     """
     Train the shipped lifts of the one-state reactor; the larger one is grown from the smaller.
 
     :param progress: what shows the progress.
+    :param starts: of each round.
     :return: models by n_z.
     """
     system = one_state_reactor()
     # a fixed number of steps: where they end depends least on how a processor rounds
     recipe = Growth(max(LIFTED_SIZES), tolerance=0.0)
-    trained = train(describe(system), training_samples(SEED), recipe, seed=SEED, starts=STARTS,
+    trained = train(describe(system), training_samples(SEED), recipe, seed=SEED, starts=starts,
                     watch=progress)
     return {model.n_z: _with_roll_out(model, system) for model in trained.path
             if model.n_z in LIFTED_SIZES}

@@ -7,11 +7,12 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import cache
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.integrate import solve_ivp
 
+from koopman_ros.arrays import Array
 from koopman_ros.control import (
     ClosedLoop,
     Feedback,
@@ -33,15 +34,12 @@ from koopman_ros.learning import (
 from koopman_ros.lifting import LiftedModel
 from koopman_ros.plant_data import Samples
 from koopman_ros.plants import RandomStepDesign, two_state_example
-from validation.paper.datasets import box_episodes, describe
+from validation.paper.datasets import box_episodes, describe, Metrics, Models
 from validation.paper.optimal_control import (
     exact_two_state_cost,
     exact_two_state_gain,
     exact_two_state_model,
 )
-from validation.paper.outcome import Metrics, Models
-
-Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True)
@@ -114,6 +112,7 @@ def close_loop(model: LiftedModel, R: float, law: Callable[..., Feedback] = _law
                            max_evaluations=_MAX_EVALUATIONS[R])
 
 
+@cache
 def exact_loop(R: float) -> ClosedLoop:
     """Regulate the system from (5, 5) by the linear-quadratic law of its exact lift."""
     lift = exact_two_state_model()

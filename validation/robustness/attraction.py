@@ -15,7 +15,7 @@ from koopman_ros.arrays import Array
 from koopman_ros.control import at, Loop, Report, SAFE, Supervisor
 from koopman_ros.plants import ControlAffineSystem, two_state_reactor
 from koopman_ros.solvers import runge_kutta_step
-from validation.paper.outcome import Metrics
+from validation.paper.datasets import Metrics
 from validation.robustness.disturbances import finite
 from validation.robustness.loop import (
     at_setpoint,

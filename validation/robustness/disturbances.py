@@ -13,7 +13,7 @@ import numpy as np
 
 from koopman_ros.control import at, perfect, Sensor, Simulation, Timed
 from koopman_ros.plants import Actuator, ControlAffineSystem, equilibrium_input, two_state_reactor
-from validation.paper.outcome import Metrics
+from validation.paper.datasets import Metrics
 from validation.robustness.loop import (
     at_setpoint,
     BANDWIDTH,

@@ -26,8 +26,7 @@ from koopman_ros.learning import Growth, Linearisation, train
 from koopman_ros.lifting import LiftedModel
 from koopman_ros.plants import RandomStepDesign
 from validation.paper import two_state
-from validation.paper.datasets import box_episodes, describe
-from validation.paper.outcome import Metrics
+from validation.paper.datasets import box_episodes, describe, Metrics
 from validation.robustness.disturbances import finite
 from validation.robustness.loop import (
     at_setpoint,

@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 
 from koopman_ros.control import Simulation
-from validation.paper.outcome import Metrics
+from validation.paper.datasets import Metrics
 from validation.robustness import attraction, disturbances, narrow
 from validation.robustness.attraction import End
 from validation.robustness.loop import (

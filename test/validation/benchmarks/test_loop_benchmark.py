@@ -1,36 +1,15 @@
 # SPDX-FileCopyrightText: 2026 The koopman_ros Authors
 # SPDX-License-Identifier: Apache-2.0
 
-
 """The benchmark of the loop: the figures it leaves, from real processes."""
 
-import warnings
-
 import pytest
-from rclpy.serialization import serialize_message
-from sensor_msgs.msg import Temperature
 
 from validation.benchmarks.loop import part, step, table
 from validation.benchmarks.loop.naive import NaiveLaw
-from validation.benchmarks.options import Extent, Options
 
 PLAN = part.Plan(coordinates=(2, 4), steps=60, rounds=1, rate_seconds=0.1, lowest_rate=400.0,
                  starts=1, plant_seconds=50.0)
-
-
-@pytest.fixture(scope='module')
-def run(tmp_path_factory):
-    """Return the figures of a short run, and the keys of those saved on the way."""
-    with warnings.catch_warnings():
-        # the parser of the type support imports a module that Python deprecated
-        warnings.simplefilter('ignore', DeprecationWarning)
-        serialize_message(Temperature())
-    saved = []
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setitem(part.PLANS, Extent.QUICK, PLAN)
-        figures = part.run(Options(tmp_path_factory.mktemp('bench'), Extent.QUICK, None,
-                                   lambda so_far: saved.append(set(so_far))))
-    return figures, saved
 
 
 def test_every_figure_is_there_and_explained(run):

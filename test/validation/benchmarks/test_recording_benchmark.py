@@ -1,26 +1,13 @@
 # SPDX-FileCopyrightText: 2026 The koopman_ros Authors
 # SPDX-License-Identifier: Apache-2.0
 
-
 """The benchmark of recording: the figures it leaves, from real processes."""
 
 import pytest
 
-from validation.benchmarks.options import Extent, Options
 from validation.benchmarks.recording import part, table
 
 PLAN = part.Plan(seconds=1.0, rates=(500.0, 2000.0), ladder_seconds=0.5, messages=3000, runs=1)
-
-
-@pytest.fixture(scope='module')
-def run(tmp_path_factory):
-    """Return the figures of a short run, and those saved on the way."""
-    saved = []
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setitem(part.PLANS, Extent.QUICK, PLAN)
-        figures = part.run(Options(tmp_path_factory.mktemp('bench'), Extent.QUICK, None,
-                                   lambda so_far: saved.append(set(so_far))))
-    return figures, saved
 
 
 def test_nothing_is_lost_and_the_recorder_is_measured(run):

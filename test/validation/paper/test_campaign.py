@@ -12,7 +12,7 @@ import matplotlib.image
 import numpy as np
 import pytest
 
-from koopman_ros.learning import Edmd, Growth, Linearisation, train
+from koopman_ros.learning import Edmd, fit, Growth, Linearisation, train
 from koopman_ros.lifting import load
 from validation.paper import campaign as campaigns
 from validation.paper import figures, reactor, report, scalar, two_state
@@ -69,25 +69,22 @@ def test_an_interrupt_keeps_what_is_done(monkeypatch):
 
 @pytest.fixture(scope='module')
 def campaign():
-    """Return a campaign of one seed with quickly trained models and its real figures."""
+    """Return a campaign of one seed with models of few starts and steps, and its real figures."""
     found = Campaign(complete=True)
 
     def add(name, outcome):
         found.metrics[name], found.models[name] = {0: outcome[0]}, {0: outcome[1]}
 
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(scalar, 'STARTS', 1)
-        add('scalar', scalar.run(0))
-    plant = describe(two_state.SYSTEM)
-    recipe = Growth(3, max_iterations=60)
-    lifts = {name: train(plant, two_state.samples(box, 0, episodes=20), recipe, starts=1,
-                         refuse=False).model
-             for name, box in (('wide', two_state.WIDE),
-                               (figures.FIGURE_NARROW_BOX,
-                                two_state.NARROW[figures.FIGURE_NARROW_BOX]))}
+    add('scalar', scalar.run(0))
+    plant, data = describe(two_state.SYSTEM), two_state.samples(two_state.WIDE, 0)
+    recipe = Growth(3, hidden_first=16, max_iterations=300)
+    lifts = {'wide': train(plant, data, recipe, starts=1).model}
+    narrow = two_state.samples(two_state.NARROW[figures.FIGURE_NARROW_BOX], 0, episodes=20)
+    lifts[figures.FIGURE_NARROW_BOX] = train(
+        plant, narrow, Growth(3, max_iterations=60), starts=1, refuse=False).model
     lifts['linear'] = Linearisation(two_state.SYSTEM.drift_jacobian(np.zeros(2))).learn(
-        plant, two_state.samples(two_state.WIDE, 0, episodes=20))
-    metrics = two_state._judged(lifts['wide'], two_state.samples(two_state.WIDE, 1, episodes=20))
+        plant, data)
+    metrics = two_state._judged(lifts['wide'], two_state.samples(two_state.WIDE, 1000))
     metrics['linear_cost_ratio'] = {'R=1': 4.5, 'R=0.1': 1.9, 'R=0.001': 1.0}
     metrics['edmd_cost_ratio'] = {'R=1': None}
     add('two_state', (metrics, lifts))
@@ -102,6 +99,31 @@ def campaign():
     add('reactor', ({f'{name}/{figure}': value for name, model in models.items()
                      for figure, value in judge.figures(model).items()}, models))
     return found
+
+
+def test_scalar_example(campaign):
+    metrics, model = campaign.metrics['scalar'][0], campaign.models['scalar'][0]['scalar']
+    assert metrics['rw_in'] < 1e-6
+    assert metrics['rw_in'] < metrics['rw_5_6'] < metrics['rw_6_8']
+    x = np.linspace(0.5, 5.0, 50)
+    # any power of the eigenfunction exp(-1/x) is one, too
+    exact = np.exp(-model.A[0, 0] / x)
+    z = model.lift(model.states.to_deviation(x[:, None]))[:, 0]
+    scale = z @ exact / (exact @ exact)
+    np.testing.assert_allclose(z, scale * exact, atol=2e-3 * np.max(np.abs(z)))
+    points = scalar.points(*scalar.RANGE, 300)
+    assert fit(model, points.x, points.dxdt, points.u).rw == pytest.approx(
+        metrics['rw_in'], rel=1.0)
+
+
+def test_learned_control_of_the_two_state_example(campaign):
+    """Its third coordinate is x1^2, and with it the eigenvalues are 2 mu, mu and lambda."""
+    metrics = campaign.metrics['two_state'][0]
+    assert metrics['rw'] <= 1e-8
+    assert metrics['eigenvalue_error'] <= 1e-4
+    assert metrics['left_box'] is False
+    for ratio in metrics['cost_ratio_to_exact'].values():
+        assert abs(ratio - 1.0) <= 1e-6
 
 
 def reactor_figures(campaign, name):

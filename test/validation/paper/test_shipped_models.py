@@ -115,19 +115,16 @@ def assert_drift(model):
         np.sqrt(PROMISED_FIT[model.n_z]) * np.max(np.abs(true)))
 
 
-@pytest.mark.parametrize('n_z', [3, 4])
-def test_fit_on_fresh_data(n_z):
-    assert_fit(shipped(f'reactor_nz{n_z}'))
+def assert_promise(model, episodes):
+    """Hold a lift to all that is promised of it without a controller."""
+    assert_fit(model)
+    assert_drift(model)
+    assert roll_out_error(model, episodes) <= PROMISED_KELVIN[model.n_z]
 
 
 @pytest.mark.parametrize('n_z', [3, 4])
-def test_drift_is_that_of_the_plant(n_z):
-    assert_drift(shipped(f'reactor_nz{n_z}'))
-
-
-@pytest.mark.parametrize('n_z', [3, 4])
-def test_roll_out_on_fresh_data(n_z, episodes):
-    assert roll_out_error(shipped(f'reactor_nz{n_z}'), episodes) <= PROMISED_KELVIN[n_z]
+def test_shipped_lifts_keep_their_promise_on_fresh_data(n_z, episodes):
+    assert_promise(shipped(f'reactor_nz{n_z}'), episodes)
 
 
 def test_the_linear_model_predicts_far_worse(episodes):
@@ -143,10 +140,11 @@ def test_the_linear_model_is_the_linearisation():
 
 @pytest.fixture(scope='module')
 def retrained():
-    return train_lifts()
+    # the best of three is shipped; one is to keep the promise, too
+    return train_lifts(starts=1)
 
 
-# half a minute of computing, several of them beside other programs
+# ten seconds of computing, several times as long beside other programs
 @pytest.mark.timeout(900)
 @pytest.mark.parametrize('n_z', [3, 4])
 def test_a_retrained_lift_keeps_what_the_shipped_one_promises(n_z, retrained, episodes):
@@ -159,9 +157,7 @@ def test_a_retrained_lift_keeps_what_the_shipped_one_promises(n_z, retrained, ep
     """
     model, shipped_one = retrained[n_z], shipped(f'reactor_nz{n_z}')
     assert model.is_hurwitz
-    assert_fit(model)
-    assert_drift(model)
-    assert roll_out_error(model, episodes) <= PROMISED_KELVIN[n_z]
+    assert_promise(model, episodes)
     assert model.provenance.metrics['rollout_rmse'] <= PROMISED_KELVIN[n_z]
     # of a step of 10 K, without an observer
     assert feed_forward_offset(model) <= PROMISED_KELVIN[n_z]

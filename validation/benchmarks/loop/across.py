@@ -1,7 +1,6 @@
 # SPDX-FileCopyrightText: 2026 The koopman_ros Authors
 # SPDX-License-Identifier: Apache-2.0
 
-
 """The loop across processes: its latency and rate, the nodes' start and memory, lock-step."""
 
 from __future__ import annotations

@@ -1,7 +1,6 @@
 # SPDX-FileCopyrightText: 2026 The koopman_ros Authors
 # SPDX-License-Identifier: Apache-2.0
 
-
 """A bare node that answers each temperature with the same message, on the controller's topics."""
 
 from __future__ import annotations

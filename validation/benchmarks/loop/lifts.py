@@ -1,7 +1,6 @@
 # SPDX-FileCopyrightText: 2026 The koopman_ros Authors
 # SPDX-License-Identifier: Apache-2.0
 
-
 """The lifts and the noisy course of set-point steps on which the control step is timed."""
 
 from __future__ import annotations
@@ -9,15 +8,13 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
+from koopman_ros.arrays import Array
 from koopman_ros.control import at, Controller, SetpointRequest, simulate, State
 from koopman_ros.lifting import LiftedModel, load, NetworkObservables
 from koopman_ros.parameters.controller import ControllerParameters
 from koopman_ros.resources import model_path
 from koopman_ros.units import NANOSECONDS
-
-Array = NDArray[np.float64]
 
 SHIPPED = (3, 4)
 _HIDDEN = 14

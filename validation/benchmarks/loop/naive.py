@@ -1,21 +1,18 @@
 # SPDX-FileCopyrightText: 2026 The koopman_ros Authors
 # SPDX-License-Identifier: Apache-2.0
 
-
 """The controller's law written down with general tools: torch's jacrev and control's lqr."""
 
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 import torch
 from torch.func import jacrev
 
 import control
+from koopman_ros.arrays import Array
 from koopman_ros.control import Settings
 from koopman_ros.lifting import LiftedModel, NetworkObservables
-
-Array = NDArray[np.float64]
 
 # Where the state is so near to its reference, the secant of the Jacobian is its derivative.
 _NEAR = 1e-6

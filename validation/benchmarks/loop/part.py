@@ -1,23 +1,20 @@
 # SPDX-FileCopyrightText: 2026 The koopman_ros Authors
 # SPDX-License-Identifier: Apache-2.0
 
-
 """The part *loop* of the benchmark: the control step, and the loop across processes."""
 
 from __future__ import annotations
 
-from collections.abc import Iterable
 from dataclasses import dataclass
 import os
 from pathlib import Path
-import sys
 import tempfile
 from typing import Any
 
 from koopman_ros.reports import machine
 from koopman_ros.testing import Harness
 from validation.benchmarks.loop import across, step, table
-from validation.benchmarks.options import Extent, Options
+from validation.benchmarks.options import Extent, Options, say, tell
 
 MEANING = {
     'step_us': 'median time of a control step, by n_z; step has the 99th percentiles, too',
@@ -73,45 +70,37 @@ def run(options: Options) -> dict[str, Any]:
                                'extent': options.extent.value, 'meaning': MEANING}
     _add_steps(figures, plan)
     options.save(figures)
-    _say(table.of_step(figures))
+    say(table.of_step(figures))
     with tempfile.TemporaryDirectory() as name, Harness(Path(name), name='probe') as harness:
-        _tell('latency beside an echo')
+        tell('loop: latency beside an echo')
         latency = figures['latency'] = across.latency(harness, plan.rounds)
         for quantile in ('median', 'p99'):
             ours, echo = (latency[side][f'{quantile}_us'] for side in ('controller', 'echo'))
             figures[f'latency_ratio_{quantile}'] = ours / echo
         options.save(figures)
-        _say(table.of_latency(figures))
-        _tell('highest rate')
+        say(table.of_latency(figures))
+        tell('loop: highest rate')
         figures['rate'] = across.highest_rate(
             harness, plan.rate_seconds, plan.lowest_rate)
         figures['max_rate_hz'] = figures['rate']['max_rate_hz']
         options.save(figures)
-        _say(table.of_rate(figures))
-        _tell('start-up, memory and lock-step')
+        say(table.of_rate(figures))
+        tell('loop: start-up, memory and lock-step')
         figures['startup'] = across.start_up(harness, plan.starts)
         figures['startup_seconds'] = figures['startup']['seconds']
         figures['lockstep'] = across.lockstep(harness, plan.plant_seconds)
         figures['speedup_over_real_time'] = figures['lockstep']['speed_over_real_time']
         figures['rss_megabytes'] = {**figures['lockstep'].pop('rss_megabytes'),
                                     'echo': latency['echo_rss_megabytes']}
-        _say(table.of_nodes(figures))
+        say(table.of_nodes(figures))
     figures['machine']['load_at_end'] = os.getloadavg()[0]
     return figures
 
 
 def _add_steps(figures: dict[str, Any], plan: Plan) -> None:
     """Time the control step by the number of coordinates."""
-    _tell(f'{plan.steps} control steps with each lift')
+    tell(f'loop: {plan.steps} control steps with each lift')
     found = figures['step'] = step.measured(plan.coordinates, plan.steps)
     figures['step_us'] = {n_z: one['median_us'] for n_z, one in found.items()}
     figures['step_ratio_to_naive'] = {
         n_z: one['naive_cpu_median_us'] / one['cpu_median_us'] for n_z, one in found.items()}
-
-
-def _tell(label: str) -> None:
-    print(f'loop: {label}', file=sys.stderr, flush=True)
-
-
-def _say(lines: Iterable[str]) -> None:
-    print('\n'.join(lines) + '\n', flush=True)

@@ -1,7 +1,6 @@
 # SPDX-FileCopyrightText: 2026 The koopman_ros Authors
 # SPDX-License-Identifier: Apache-2.0
 
-
 """A sensor and an actuator in one: publishes measurements, and notes when their commands come."""
 
 from __future__ import annotations

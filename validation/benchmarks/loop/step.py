@@ -1,7 +1,6 @@
 # SPDX-FileCopyrightText: 2026 The koopman_ros Authors
 # SPDX-License-Identifier: Apache-2.0
 
-
 """
 What a control step takes, beside the same law with general tools.
 
@@ -19,18 +18,16 @@ from time import perf_counter_ns, thread_time_ns
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from koopman_ros.arrays import Array
 from koopman_ros.control import Controller, Form, State
 from koopman_ros.units import NANOSECONDS
 from validation.benchmarks.loop import lifts
 from validation.benchmarks.loop.naive import NaiveLaw
-
-Array = NDArray[np.float64]
+from validation.benchmarks.options import ONE_THREAD
 
 _BLOCK = 50  # steps of one side, then of the other
 _TOLERANCE = 1e-6  # K between the commands of both sides
-_ONE_THREAD = {'OMP_NUM_THREADS': '1', 'OPENBLAS_NUM_THREADS': '1', 'MKL_NUM_THREADS': '1'}
 
 
 # by the wall and of the processor, ns
@@ -62,7 +59,7 @@ def measured(coordinates: tuple[int, ...], samples: int) -> dict[str, dict[str, 
     """
     command = [sys.executable, '-m', 'validation.benchmarks.loop.step',
                *map(str, (samples, *coordinates))]
-    done = subprocess.run(command, env={**os.environ, **_ONE_THREAD}, check=True, text=True,
+    done = subprocess.run(command, env={**os.environ, **ONE_THREAD}, check=True, text=True,
                           stdout=subprocess.PIPE)
     found: dict[str, dict[str, Any]] = json.loads(done.stdout)
     return found

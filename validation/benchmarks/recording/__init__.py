@@ -1,7 +1,6 @@
 # SPDX-FileCopyrightText: 2026 The koopman_ros Authors
 # SPDX-License-Identifier: Apache-2.0
 
-
 """
 What recording costs: a trainer fed by a publisher, our writer and mcap's fed from memory.
 

@@ -1,7 +1,6 @@
 # SPDX-FileCopyrightText: 2026 The koopman_ros Authors
 # SPDX-License-Identifier: Apache-2.0
 
-
 """Writers fed from memory: ours beside mcap's own with the same chunks."""
 
 from __future__ import annotations

@@ -1,23 +1,21 @@
 # SPDX-FileCopyrightText: 2026 The koopman_ros Authors
 # SPDX-License-Identifier: Apache-2.0
 
-
 """The part *recording* of the benchmark: a minute at 1 kHz, a ladder of rates, and from memory."""
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass
 import os
 from pathlib import Path
-import sys
 import tempfile
 from typing import Any
 
 from koopman_ros.bags import read_messages
 from koopman_ros.reports import machine
 from koopman_ros.testing import isolated_domain
-from validation.benchmarks.options import Extent, Options
+from validation.benchmarks.options import Extent, Options, say, tell
 from validation.benchmarks.recording import memory, stream, table
 
 _STEADY_RATE = 1000.0  # Hz
@@ -55,22 +53,22 @@ def run(options: Options) -> dict[str, Any]:
     figures: dict[str, Any] = {'machine': machine('mcap'), 'extent': options.extent.value}
     with tempfile.TemporaryDirectory() as name, isolated_domain() as environment:
         folder = Path(name)
-        _tell(f'{plan.seconds:g} s at {_STEADY_RATE:.0f} Hz')
+        tell(f'recording: {plan.seconds:g} s at {_STEADY_RATE:.0f} Hz')
         steady = stream.record(folder / 'steady.mcap', _STEADY_RATE, plan.seconds, environment)
         figures['steady'] = steady
         options.save(figures)
-        _say(table.of_steady(steady))
+        say(table.of_steady(steady))
         messages = list(read_messages(folder / 'steady.mcap', [stream.TOPIC]))
         figures.update(_climbed(plan, folder, environment))
         options.save(figures)
-        _say(table.of_ladder(figures))
-        _tell(f'{plan.messages} messages from memory')
+        say(table.of_ladder(figures))
+        tell(f'recording: {plan.messages} messages from memory')
         figures['from_memory'] = memory.compare(messages, plan.messages, plan.runs, folder)
         plain = figures['from_memory']['none']['plain_mcap']['cpu_seconds_per_message']
         figures['recorder_cpu_ratio_to_plain_mcap'] = {
             f'{step["rate_hz"]:.0f}': step['cpu_seconds_per_message'] / plain
             for step in (steady, *figures['ladder'])}
-        _say(table.of_memory(figures))
+        say(table.of_memory(figures))
     figures['machine']['load_at_end'] = os.getloadavg()[0]
     return figures
 
@@ -80,7 +78,7 @@ def _climbed(plan: Plan, folder: Path, environment: Mapping[str, str]) -> dict[s
     steps: list[dict[str, Any]] = []
     highest, ended = None, 'the last step of the ladder'
     for rate in plan.rates:
-        _tell(f'{plan.ladder_seconds:g} s at {rate:.0f} Hz')
+        tell(f'recording: {plan.ladder_seconds:g} s at {rate:.0f} Hz')
         bag = folder / f'{rate:.0f}.mcap'
         step = stream.record(bag, rate, plan.ladder_seconds, environment)
         bag.unlink()
@@ -93,11 +91,3 @@ def _climbed(plan: Plan, folder: Path, environment: Mapping[str, str]) -> dict[s
             ended = ' and '.join(reasons)
             break
     return {'ladder': steps, 'highest_hz_without_loss': highest, 'ladder_ended_by': ended}
-
-
-def _tell(label: str) -> None:
-    print(f'recording: {label}', file=sys.stderr, flush=True)
-
-
-def _say(lines: Iterable[str]) -> None:
-    print('\n'.join(lines) + '\n', flush=True)

@@ -1,7 +1,6 @@
 # SPDX-FileCopyrightText: 2026 The koopman_ros Authors
 # SPDX-License-Identifier: Apache-2.0
 
-
 """
 A process that publishes numbered temperatures at a steady rate, and says what it has sent.
 

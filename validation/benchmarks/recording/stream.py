@@ -1,7 +1,6 @@
 # SPDX-FileCopyrightText: 2026 The koopman_ros Authors
 # SPDX-License-Identifier: Apache-2.0
 
-
 """A trainer that records what a publisher sends at a steady rate, and what that takes."""
 
 from __future__ import annotations

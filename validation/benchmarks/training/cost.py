@@ -13,7 +13,7 @@ import time
 
 from torch import Tensor
 
-from koopman_ros.solvers.levenberg_marquardt import minimise, NormalEquations
+from koopman_ros.learning.levenberg_marquardt import minimise, NormalEquations
 from validation.benchmarks.training.problems import artificial
 
 _STATUS, _RESET = Path('/proc/self/status'), Path('/proc/self/clear_refs')

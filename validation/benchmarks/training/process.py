@@ -19,6 +19,8 @@ import tempfile
 import time
 from typing import Any
 
+from validation.benchmarks.options import ONE_THREAD
+
 _POLL = 0.05   # s
 _START = 30.0  # s for imports and data
 # A solver looks at its own limit between two steps, and a step may be long; besides, its iterates
@@ -29,9 +31,9 @@ _SLACK = 2.0
 _CROWDED = 4.0
 _PAGE = os.sysconf('SC_PAGE_SIZE') / 2 ** 20  # MB
 _TICK = 1.0 / os.sysconf('SC_CLK_TCK')  # s
-_ONE_THREAD = {'OMP_NUM_THREADS': '1', 'OPENBLAS_NUM_THREADS': '1', 'MKL_NUM_THREADS': '1'}
 # Imported once; every process is forked from the one that has them.
-_PRELOAD = ['validation.benchmarks.training.part', 'validation.benchmarks.training.worker']
+_PRELOAD = ['validation.benchmarks.training.part', 'validation.benchmarks.training.worker',
+            'casadi', 'torch._dynamo']
 
 
 @dataclass(frozen=True)
@@ -63,7 +65,7 @@ def run(job: dict[str, Any], *, build_limit: float, limit: float, megabytes: flo
     lifetime = _CROWDED * (_START + build_limit + _SLACK * limit + _GRACE) + _GRACE
     context = multiprocessing.get_context('forkserver')
     context.set_forkserver_preload(_PRELOAD)
-    with _environment(_ONE_THREAD):
+    with _environment(ONE_THREAD):
         forkserver.ensure_running()
     with tempfile.TemporaryDirectory(prefix='koopman_bench_') as folder:
         events, output = Path(folder, 'events'), Path(folder, 'output')

@@ -11,7 +11,7 @@ import math
 import torch
 from torch import Tensor
 
-from koopman_ros.solvers.levenberg_marquardt import minimise, normal_equations, NormalEquations
+from koopman_ros.learning.levenberg_marquardt import minimise, normal_equations, NormalEquations
 from validation.benchmarks.training.problems import Case, WHITENING
 from validation.benchmarks.training.trace import Finished, Trace
 

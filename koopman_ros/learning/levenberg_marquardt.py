@@ -1,11 +1,7 @@
 # SPDX-FileCopyrightText: 2026 The koopman_ros Authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""
-Levenberg-Marquardt on normal equations that it accumulates from residuals, in torch.
-
-Not imported by the package itself, whose other solvers need no torch.
-"""
+"""Levenberg-Marquardt on normal equations that it accumulates from residuals, in torch."""
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 import torch
 
-from koopman_ros.solvers.levenberg_marquardt import minimise, MinimumStatus, normal_equations
+from koopman_ros.learning.levenberg_marquardt import minimise, MinimumStatus, normal_equations
 
 
 def least_squares(residual):
