@@ -4,5 +4,5 @@
 """
 What the loop survives: faults put into it on purpose, each judged by figures.
 
-``python -m validation.faults`` runs the cases and the soak across real processes.
+``python -m validation.faults`` runs the cases and the endurance run across real processes.
 """

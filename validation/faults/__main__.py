@@ -14,8 +14,8 @@ from koopman_ros.testing import deferred_interrupt
 from validation.faults import report
 from validation.faults.case import Case, Outcome, run
 from validation.faults.cases import CASES
+from validation.faults.endurance import Endurance, HOURS, run_endurance
 from validation.faults.figure import draw
-from validation.faults.soak import HOURS, Soak, soak
 
 SOAK = 'soak'
 # One of each group, quick ones that say much.
@@ -24,7 +24,7 @@ QUICK = ('nan-short', 'measurements-lost', 'clock-zero', 'controller-killed', 'b
 
 
 def main(args: list[str] | None = None) -> int:
-    """Run the cases asked for and the soak; return 1 where one was not survived."""
+    """Run the cases asked for and the endurance run; return 1 where one was not survived."""
     groups = dict.fromkeys(case.group for case in CASES.values())
     parser = argparse.ArgumentParser(
         prog='python -m validation.faults',
@@ -34,7 +34,7 @@ def main(args: list[str] | None = None) -> int:
     parser.add_argument('--quick', action='store_true', help='six cases, no soak: half a minute')
     parser.add_argument('--list', action='store_true', help='show the cases, and run none')
     parser.add_argument('--hours', type=float, default=HOURS,
-                        help='plant time of the soak (default: %(default)g)')
+                        help='plant time of the endurance run (default: %(default)g)')
     parser.add_argument('--output', type=Path, default=Path('out/faults'),
                         help='folder for the report (default: %(default)s)')
     given = parser.parse_args(args)
@@ -53,7 +53,7 @@ def main(args: list[str] | None = None) -> int:
 
 def _run(cases: Sequence[Case], hours: float, folder: Path) -> int:
     outcomes: list[Outcome] = []
-    soaked: Soak | None = None
+    endured: Endurance | None = None
     try:
         with deferred_interrupt() as check:
             for number, case in enumerate(cases, 1):
@@ -62,15 +62,15 @@ def _run(cases: Sequence[Case], hours: float, folder: Path) -> int:
                 print(report.line(outcomes[-1]), flush=True)
                 report.write(folder, outcomes, None)
             if hours:
-                soaked = soak(folder / 'logs' / SOAK, check, hours, _progress(hours))
-                print('\n'.join(soaked.reasons) or 'survived')
+                endured = run_endurance(folder / 'logs' / SOAK, check, hours, _progress(hours))
+                print('\n'.join(endured.reasons) or 'survived')
     except KeyboardInterrupt:
         print(f'\ninterrupted; what was finished is in {folder}', file=sys.stderr)
         return 130
-    report.write(folder, outcomes, soaked, draw(outcomes, folder / report.FIGURE))
+    report.write(folder, outcomes, endured, draw(outcomes, folder / report.FIGURE))
     print(f'\n{sum(outcome.survived for outcome in outcomes)} of {len(outcomes)} cases survived; '
           f'see {folder / "report.md"}')
-    return 0 if report.survived(outcomes, soaked) else 1
+    return 0 if report.survived(outcomes, endured) else 1
 
 
 def _progress(hours: float) -> Callable[[float], None]:

@@ -15,7 +15,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-NANOSECONDS = 1_000_000_000
+from koopman_ros.units import NANOSECONDS
 
 
 class Packet(NamedTuple):
@@ -33,40 +33,41 @@ def unchanged(packet: Packet) -> list[Packet]:
     return [packet]
 
 
+def changed(change: Callable[[Packet, Packet], Packet]) -> Alteration:
+    """
+    Replace each message.
+
+    :param change: takes the first message and this one, returns the new one.
+    """
+    first: list[Packet] = []
+
+    def alter(packet: Packet) -> list[Packet]:
+        first.append(packet)
+        del first[1:]
+        return [change(first[0], packet)]
+
+    return alter
+
+
 def value(change: Callable[[float, float], float]) -> Alteration:
     """
     Replace the value.
 
     :param change: takes the seconds since the first message and its value, returns the new one.
     """
-    first: list[int] = []
-
-    def alter(packet: Packet) -> list[Packet]:
-        first.append(packet.stamp_ns)
-        del first[1:]
-        seconds = (packet.stamp_ns - first[0]) / NANOSECONDS
-        return [packet._replace(celsius=change(seconds, packet.celsius))]
-
-    return alter
+    return changed(lambda first, packet: packet._replace(celsius=change(
+        (packet.stamp_ns - first.stamp_ns) / NANOSECONDS, packet.celsius)))
 
 
 def frozen() -> Alteration:
     """Repeat the first value for ever."""
-    shown: list[float] = []
-
-    def alter(packet: Packet) -> list[Packet]:
-        shown.append(packet.celsius)
-        del shown[1:]
-        return [packet._replace(celsius=shown[0])]
-
-    return alter
+    return changed(lambda first, packet: packet._replace(celsius=first.celsius))
 
 
 def noise(deviation: float, seed: int = 0) -> Alteration:
     """Add normal noise of a standard deviation in K."""
     random = np.random.default_rng(seed)
-    return lambda packet: [
-        packet._replace(celsius=packet.celsius + float(random.normal(0.0, deviation)))]
+    return value(lambda _, celsius: celsius + float(random.normal(0.0, deviation)))
 
 
 def lost(share: float = 1.0, seed: int = 0) -> Alteration:
@@ -111,11 +112,4 @@ def stamped(change: Callable[[int], int]) -> Alteration:
 
 def stamps_frozen() -> Alteration:
     """Give every message the stamp of the first."""
-    shown: list[int] = []
-
-    def alter(packet: Packet) -> list[Packet]:
-        shown.append(packet.stamp_ns)
-        del shown[1:]
-        return [packet._replace(stamp_ns=shown[0])]
-
-    return alter
+    return changed(lambda first, packet: packet._replace(stamp_ns=first.stamp_ns))

@@ -6,20 +6,19 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field
-import math
+from dataclasses import dataclass, field, fields
 from pathlib import Path
 import time
+from typing import Any
 
-from koopman_ros.parameters.controller import ControllerParameters
-from koopman_ros.reasons import Code
 from koopman_ros.testing import HarnessError
-from validation.faults.course import Course
-from validation.faults.judge import BAND, Bounds, judge, Verdict
-from validation.faults.rig import LOCKSTEP, Rig
+from validation.faults.harness import FaultHarness, LOCKSTEP
+from validation.faults.judge import Bounds, judge, Verdict
+from validation.faults.trace import Trace
 
 SETPOINT = 46.0  # degC; 5 K below the steady state that the reactor starts from
 SETTLED = 240.0  # s of plant time from the start until the reactor stays there
+LIMIT = 300.0  # s of wall time for a case, on a machine that is busy otherwise
 
 
 @dataclass(frozen=True)
@@ -32,54 +31,37 @@ class Case:
     :param does: what is done, for the report.
     :param play: does it: waits, begins, puts the fault in, ends it. The runner has let the loop
         settle before, and lets it recover afterwards.
+    :param bounds: what the loop must keep to.
     :param between: whether messages are altered.
     :param plant: parameters on top of lock-step at full speed.
     :param controller: parameters.
-    :param says: regular expressions that diagnostics must match, see :class:`Bounds`.
-    :param codes: of reasons that must be in the controller's records, see there.
-    :param excused: statuses that may end in ERROR.
-    :param recovery: plant time to be back in, s.
-    :param band: what counts as back, K.
-    :param offset: largest one that may be left at the end, K.
-    :param worst: largest distance from the set-point, K.
-    :param largest_step: of the coolant between two commands, K; by default what the rate limit
-        allows between two samples. After a gap it allows twice that.
-    :param bump: the same from the fault on, where nothing calls for any.
-    :param setpoint: degC, asked for at the start.
+    :param setpoint: degC, requested at the start.
     :param settle: plant time before the case is played, s.
     :param afterwards: plant time that the loop runs on after the fault, s.
-    :param limit: wall time, s.
     """
 
     name: str
     group: str
     does: str
-    play: Callable[[Rig], None]
+    play: Callable[[FaultHarness], None]
+    bounds: Bounds = field(default_factory=Bounds)
     between: bool = False
     plant: Mapping[str, object] = field(default_factory=lambda: LOCKSTEP)
     controller: Mapping[str, object] = field(default_factory=dict)
-    says: tuple[str, ...] = ()
-    codes: tuple[Code, ...] = ()
-    excused: tuple[str, ...] = ()
-    recovery: float = 300.0
-    band: float = BAND
-    offset: float = math.inf
-    worst: float = math.inf
-    largest_step: float = 1.0
-    bump: float = math.inf
     setpoint: float = SETPOINT
     settle: float = SETTLED
     afterwards: float = 360.0
-    limit: float = 40.0
 
-    def bounds(self) -> Bounds:
-        """Return what the course is judged by."""
-        usual = ControllerParameters()
-        return Bounds(
-            coolant_min=usual.coolant_min, coolant_max=usual.coolant_max,
-            largest_step=self.largest_step, bump=self.bump, recovery=self.recovery,
-            band=self.band, offset=self.offset,
-            worst=self.worst, says=self.says, codes=self.codes, excused=self.excused)
+
+_OF_BOUNDS = frozenset(item.name for item in fields(Bounds))
+
+
+def case(group: str, name: str, does: str, play: Callable[[FaultHarness], None], **details: Any
+         ) -> Case:
+    """Build a case; the details are fields of it, or of its bounds."""
+    of_case = {key: value for key, value in details.items() if key not in _OF_BOUNDS}
+    bounds = Bounds(**{key: details[key] for key in details if key in _OF_BOUNDS})
+    return Case(name, group, does, play, bounds, **of_case)
 
 
 @dataclass(frozen=True)
@@ -88,14 +70,14 @@ class Outcome:
     What became of a case.
 
     :param case: the case.
-    :param course: what happened.
+    :param trace: what happened.
     :param verdict: what is held against it, and its figures; None where it could not be tried.
     :param skipped: why it could not be tried here.
     :param wall: what it took, s.
     """
 
     case: Case
-    course: Course
+    trace: Trace
     verdict: Verdict | None
     skipped: str
     wall: float
@@ -120,18 +102,18 @@ def run(case: Case, folder: Path, check: Callable[[], None] = lambda: None) -> O
     started = time.monotonic()
     folder.mkdir(parents=True, exist_ok=True)
     skipped = ''
-    rig = Rig(folder, case.limit, check, case.between)
-    with rig:
+    loop = FaultHarness(folder, LIMIT, check, case.between)
+    with loop:
         try:
-            rig.start_loop(case.setpoint, case.plant, case.controller)
-            rig.run_until(case.settle)
-            case.play(rig)
-            rig.run_for(case.afterwards)
-            rig.expect(any('"command"' in text for _, text in rig.course.records),
-                       'the controller recorded no command')
+            loop.start_loop(case.setpoint, case.plant, case.controller)
+            loop.run_until(case.settle)
+            case.play(loop)
+            loop.run_for(case.afterwards)
+            loop.expect(any('"command"' in text for _, text in loop.trace.records),
+                        'the controller recorded no command')
         except HarnessError as error:
-            rig.course.complaints.append(str(error))
+            loop.trace.complaints.append(str(error))
         except SkipError as reason:
             skipped = str(reason)
-    verdict = None if skipped else judge(rig.course, case.bounds())
-    return Outcome(case, rig.course, verdict, skipped, time.monotonic() - started)
+    verdict = None if skipped else judge(loop.trace, case.bounds)
+    return Outcome(case, loop.trace, verdict, skipped, time.monotonic() - started)

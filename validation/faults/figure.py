@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING
 from koopman_ros.parameters.controller import ControllerParameters
 from koopman_ros.reports import draw_limits, drawing
 from validation.faults.case import Outcome
-from validation.faults.course import Course
+from validation.faults.trace import Trace
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -27,13 +27,13 @@ _BEFORE, _AFTER = 30.0, 300.0  # s around the fault
 def draw(outcomes: Sequence[Outcome], path: Path) -> bool:
     """Draw the telling cases into a file; return whether there was one."""
     shown = [outcome for name in TELLING for outcome in outcomes
-             if outcome.case.name == name and outcome.course.commands
-             and math.isfinite(outcome.course.end)]
+             if outcome.case.name == name and outcome.trace.commands
+             and math.isfinite(outcome.trace.end)]
     if not shown:
         return False
     with drawing(path, 2, len(shown), size=(3.2 * len(shown), 5.2), sharex='col') as (_, panels):
         for upper, lower, outcome in zip(panels, panels[len(shown):], shown, strict=False):
-            _draw_case(upper, lower, outcome.course)
+            _draw_case(upper, lower, outcome.trace)
             upper.set_title(outcome.case.name, fontsize='medium')
         for panel, quantity in ((panels[0], 'temperature'), (panels[len(shown)], 'coolant')):
             panel.set_ylabel(f'{quantity} [°C]')
@@ -41,20 +41,20 @@ def draw(outcomes: Sequence[Outcome], path: Path) -> bool:
     return True
 
 
-def _draw_case(upper: Axes, lower: Axes, course: Course) -> None:
-    times, temperatures = zip(*course.samples, strict=True)
+def _draw_case(upper: Axes, lower: Axes, trace: Trace) -> None:
+    times, temperatures = zip(*trace.samples, strict=True)
     upper.plot(times, temperatures, label='reactor, true')
-    since, wanted = zip(*course.setpoints, strict=True)
+    since, wanted = zip(*trace.setpoints, strict=True)
     upper.step([*since, times[-1]], [*wanted, wanted[-1]], where='post', linestyle='--',
                color='black', linewidth=1.0, label='set-point')
-    lower.plot([command.seconds for command in course.commands],
-               [command.celsius for command in course.commands], label='command')
+    lower.plot([command.seconds for command in trace.commands],
+               [command.celsius for command in trace.commands], label='command')
     limits = ControllerParameters()
     draw_limits(lower, (limits.coolant_min, limits.coolant_max), 'limits')
     for axes in (upper, lower):
-        axes.axvspan(course.begin, max(course.end, course.begin + 2.0), alpha=0.2,
+        axes.axvspan(trace.begin, max(trace.end, trace.begin + 2.0), alpha=0.2,
                      color='tab:red', linewidth=0.0, label='fault')
-    upper.set_xlim(course.begin - _BEFORE, min(course.end + _AFTER, times[-1]))
-    near = [celsius for seconds, celsius in course.samples if seconds > course.begin - _BEFORE]
+    upper.set_xlim(trace.begin - _BEFORE, min(trace.end + _AFTER, times[-1]))
+    near = [celsius for seconds, celsius in trace.samples if seconds > trace.begin - _BEFORE]
     upper.set_ylim(min(*near, *wanted) - 0.5, max(*near, *wanted) + 0.5)
     lower.set_xlabel('plant time [s]')

@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 The koopman_ros Authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""Whether a case was survived, and by how much: from the course alone, without ROS."""
+"""Whether a case was survived, and by how much: from the trace alone, without ROS."""
 
 from __future__ import annotations
 
@@ -15,12 +15,13 @@ import re
 import numpy as np
 
 from koopman_ros.nodes.replay import replay_records
+from koopman_ros.parameters.controller import ControllerParameters
 from koopman_ros.reasons import Code
 from koopman_ros.replay.records import parse, RecordError
-from validation.faults.course import Course
+from validation.faults.trace import Trace
 
 RUNAWAY = 60.0  # degC; the reactor's operating points end below 54 degC
-_LAST = 30.0  # s at the end of a course, in which an offset is looked for
+_LAST = 30.0  # s at the end of a trace, in which an offset is looked for
 BAND = 0.3  # K around the set-point that counts as back
 
 
@@ -31,7 +32,8 @@ class Bounds:
 
     :param coolant_min: lowest command, degC.
     :param coolant_max: highest command, degC.
-    :param largest_step: between two commands, K.
+    :param largest_step: between two commands, K; by default what the rate limit allows between
+        two samples. After a gap it allows twice that.
     :param recovery: plant time from the end of the fault within which the reactor must be back, s.
     :param bump: largest step from the fault on, K, where nothing calls for any.
     :param band: distance from the set-point that counts as back, K; infinity where none is asked.
@@ -40,20 +42,20 @@ class Bounds:
     :param says: regular expressions that diagnostics (``<node>: <task>: <sentence>``) must have
         matched from the beginning of the fault on.
     :param codes: of reasons that the controller's records must have given since then.
-    :param excused: statuses (``<node>: <task>``) that may end in ERROR.
+    :param allowed_errors: statuses (``<node>: <task>``) that may end in ERROR.
     """
 
-    coolant_min: float
-    coolant_max: float
-    largest_step: float
-    recovery: float
+    coolant_min: float = ControllerParameters.coolant_min
+    coolant_max: float = ControllerParameters.coolant_max
+    largest_step: float = 1.0
+    recovery: float = 300.0
     bump: float = math.inf
     band: float = BAND
     offset: float = math.inf
     worst: float = math.inf
     says: tuple[str, ...] = ()
     codes: tuple[Code, ...] = ()
-    excused: tuple[str, ...] = ()
+    allowed_errors: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True)
@@ -81,13 +83,13 @@ class Verdict:
         return not self.reasons
 
 
-def judge(course: Course, bounds: Bounds) -> Verdict:
-    """Judge the course of a case."""
-    reasons = [*course.complaints]
-    times, errors = course.errors()
-    since = times >= course.begin
+def judge(trace: Trace, bounds: Bounds) -> Verdict:
+    """Judge the trace of a case."""
+    reasons = [*trace.complaints]
+    times, errors = trace.errors()
+    since = times >= trace.begin
     worst = float(np.max(errors[since])) if np.any(since) else math.nan
-    recovery = _recovery(course, bounds.band)
+    recovery = _recovery(trace, bounds.band)
     if math.isnan(worst):
         reasons.append('no temperature was measured after the fault began')
     elif not recovery <= bounds.recovery:
@@ -100,40 +102,40 @@ def judge(course: Course, bounds: Bounds) -> Verdict:
     if worst > bounds.worst:
         reasons.append(f'the temperature was {worst:.2f} K from the set-point, {bounds.worst:g} K '
                        'are allowed')
-    hottest = max((sample.celsius for sample in course.samples), default=-math.inf)
+    hottest = max((sample.celsius for sample in trace.samples), default=-math.inf)
     if not hottest < RUNAWAY:
         reasons.append(f'the reactor reached {hottest:.1f} degC, {RUNAWAY:g} degC is a runaway')
-    reasons += _commands(course, bounds)
-    step = _worst_step(course)
+    reasons += _commands(trace, bounds)
+    step = _worst_step(trace)
     if step > bounds.bump:
         reasons.append(f'the coolant command stepped by {step:.3f} K after the fault, '
                        f'{bounds.bump:g} K are allowed')
-    reasons += _words(course, bounds.says, bounds.excused)
-    reasons += _replay(course, bounds.codes)
+    reasons += _reports(trace, bounds)
+    reasons += _replay(trace, bounds.codes)
     return Verdict(tuple(reasons), worst, step, recovery, offset)
 
 
-def _recovery(course: Course, band: float) -> float:
-    times, errors = course.errors()
-    after = times >= course.end
+def _recovery(trace: Trace, band: float) -> float:
+    times, errors = trace.errors()
+    after = times >= trace.end
     times, out = times[after], errors[after] > band
     if not len(times) or out[-1]:
         return math.inf
     # back with the first sample after the last one that was outside
-    return float(times[np.flatnonzero(out)[-1] + 1] - course.end) if np.any(out) else 0.0
+    return float(times[np.flatnonzero(out)[-1] + 1] - trace.end) if np.any(out) else 0.0
 
 
-def _commands(course: Course, bounds: Bounds) -> list[str]:
-    if not course.commands:
+def _commands(trace: Trace, bounds: Bounds) -> list[str]:
+    if not trace.commands:
         return ['the controller never commanded']
     reasons = []
-    for command in course.commands:
+    for command in trace.commands:
         if not bounds.coolant_min <= command.celsius <= bounds.coolant_max:
             reasons.append(
                 f'the command {command.celsius:g} degC at {command.seconds:.0f} s is not within '
                 f'{bounds.coolant_min:g} to {bounds.coolant_max:g} degC')
             break
-    times, steps = course.steps()
+    times, steps = trace.steps()
     # written so that NaN counts
     large = np.flatnonzero(~(steps <= bounds.largest_step + 1e-6))
     if len(large):
@@ -142,30 +144,30 @@ def _commands(course: Course, bounds: Bounds) -> list[str]:
     return reasons
 
 
-def _worst_step(course: Course) -> float:
-    times, steps = course.steps()
-    return float(np.max(steps[times >= course.begin], initial=0.0))
+def _worst_step(trace: Trace) -> float:
+    times, steps = trace.steps()
+    return float(np.max(steps[times >= trace.begin], initial=0.0))
 
 
-def _words(course: Course, says: Sequence[str], excused: Sequence[str]) -> list[str]:
-    lasted = [f'{said.name}: {said.message}' for said in course.said
-              if said.seconds >= course.begin]
-    reasons = [f'diagnostics never said "{words}"' for words in says
-               if not any(re.search(words, said) for said in lasted)]
-    last = {said.name: said for said in course.said}
-    reasons += [f'at the end diagnostics still say ERROR: {name}: {said.message}'
-                for name, said in sorted(last.items()) if said.level >= 2 and name not in excused]
-    return reasons
+def _reports(trace: Trace, bounds: Bounds) -> list[str]:
+    reported = trace.reported()
+    reasons = [f'diagnostics never said "{words}"' for words in bounds.says
+               if not any(re.search(words, text) for text in reported)]
+    last = {status.name: status for status in trace.statuses}
+    return reasons + [
+        f'at the end diagnostics still say ERROR: {name}: {status.message}'
+        for name, status in sorted(last.items())
+        if status.level >= 2 and name not in bounds.allowed_errors]
 
 
-def _replay(course: Course, codes: Sequence[Code]) -> list[str]:
+def _replay(trace: Trace, codes: Sequence[Code]) -> list[str]:
     """Say which reasons the records lack, and where commands do not follow from them."""
     try:
-        records = [(seconds, parse(text)) for seconds, text in course.records]
+        records = [(seconds, parse(text)) for seconds, text in trace.records]
         found = replay_records(record for _, record in records)
     except RecordError as error:
         return [f'its records cannot be replayed: {error}']
-    given = {code for seconds, record in records if seconds >= course.begin
+    given = {code for seconds, record in records if seconds >= trace.begin
              for code in record.fields.get('reason', ())}
     reasons = [f'no record gives the reason {code.value}' for code in codes
                if code.value not in given]
@@ -178,7 +180,7 @@ def _replay(course: Course, codes: Sequence[Code]) -> list[str]:
 
 
 @dataclass(frozen=True)
-class Account:
+class Responses:
     """
     How the commands answer the measurements that reached the controller, by their stamps.
 
@@ -204,9 +206,9 @@ class Account:
             self.repeated or self.unasked or self.out_of_order)
 
 
-def account(delivered: Sequence[int], answers: Sequence[int]) -> Account:
+def responses(delivered: Sequence[int], answers: Sequence[int]) -> Responses:
     """
-    Count answers by their stamps.
+    Count commands by their stamps.
 
     :param delivered: stamps of the measurements as they reached the controller; one that came
         twice is to be answered twice.
@@ -217,10 +219,10 @@ def account(delivered: Sequence[int], answers: Sequence[int]) -> Account:
     for number, stamp in enumerate(delivered):
         place.setdefault(stamp, number)
     order = [place[stamp] for stamp in answers if stamp in place]
-    return Account(
+    return Responses(
         measurements=len(delivered),
         answered=sum(count for stamp, count in asked.items() if given[stamp] == count),
-        unanswered=sum(max(count - given[stamp], 0) for stamp, count in asked.items()),
-        repeated=sum(max(given[stamp] - count, 0) for stamp, count in asked.items()),
+        unanswered=(asked - given).total(),
+        repeated=sum(count for stamp, count in (given - asked).items() if stamp in asked),
         unasked=sum(count for stamp, count in given.items() if stamp not in asked),
         out_of_order=sum(after < before for before, after in itertools.pairwise(order)))

@@ -12,27 +12,27 @@ from typing import Any
 
 from koopman_ros.reports import bullets, machine, table, write_figures, write_page
 from validation.faults.case import Outcome
+from validation.faults.endurance import Endurance
 from validation.faults.judge import BAND, RUNAWAY
-from validation.faults.soak import Soak
 
 FIGURE = 'cases.png'
 
 
-def write(folder: Path, outcomes: Sequence[Outcome], soak: Soak | None, pictured: bool = False
+def write(folder: Path, outcomes: Sequence[Outcome], run: Endurance | None, pictured: bool = False
           ) -> None:
     """Write both files for what has been run so far."""
     figures = {'machine': machine(), **_counts(outcomes),
                'results': {outcome.case.name: _figures(outcome) for outcome in outcomes}}
-    if soak is not None:
-        figures['soak'] = _soak_figures(soak)
+    if run is not None:
+        figures['soak'] = _endurance_figures(run)
     write_figures(folder / 'summary.json', figures)
-    write_page(folder / 'report.md', 'Fault campaign', _sections(outcomes, soak, pictured))
+    write_page(folder / 'report.md', 'Fault campaign', _sections(outcomes, run, pictured))
 
 
-def survived(outcomes: Sequence[Outcome], soak: Soak | None) -> bool:
-    """Tell whether nothing is held against any case that could be tried, nor the soak."""
+def survived(outcomes: Sequence[Outcome], run: Endurance | None) -> bool:
+    """Tell whether nothing is held against any case that could be tried, nor the run run."""
     return all(outcome.survived or outcome.skipped for outcome in outcomes) and (
-        soak is None or not soak.reasons)
+        run is None or not run.reasons)
 
 
 def line(outcome: Outcome) -> str:
@@ -55,7 +55,7 @@ def _counts(outcomes: Sequence[Outcome]) -> dict[str, int]:
 def _figures(outcome: Outcome) -> dict[str, Any]:
     figures: dict[str, Any] = {
         'group': outcome.case.group, 'does': outcome.case.does, 'survived': outcome.survived,
-        'wall_seconds': round(outcome.wall, 2), 'notes': outcome.course.notes}
+        'wall_seconds': round(outcome.wall, 2), 'notes': outcome.trace.notes}
     verdict = outcome.verdict
     if verdict is None:
         return {**figures, 'skipped': outcome.skipped}
@@ -66,22 +66,22 @@ def _figures(outcome: Outcome) -> dict[str, Any]:
             'offset_at_the_end_K': round(verdict.offset, 6)}
 
 
-def _soak_figures(soak: Soak) -> dict[str, Any]:
-    return {'survived': not soak.reasons, 'reasons': list(soak.reasons), 'hours': soak.hours,
-            'wall_seconds': round(soak.wall, 1), 'answers': vars(soak.answers),
-            'events': soak.events, 'recorded': soak.recorded,
-            'hottest_degC': round(soak.hottest, 6), 'mean_error_K': round(soak.mean_error, 6),
+def _endurance_figures(run: Endurance) -> dict[str, Any]:
+    return {'survived': not run.reasons, 'reasons': list(run.reasons), 'hours': run.hours,
+            'wall_seconds': round(run.wall, 1), 'answers': vars(run.answers),
+            'events': run.events, 'recorded': run.recorded,
+            'hottest_degC': round(run.hottest, 6), 'mean_error_K': round(run.mean_error, 6),
             'memory_MB': {name: {
                 'first': round(float(seen.megabytes[0]), 2),
                 'last': round(float(seen.megabytes[-1]), 2),
-                'growth_when_warm': round(seen.growth, 3)} for name, seen in soak.memory.items()}}
+                'growth_when_warm': round(seen.growth, 3)} for name, seen in run.memory.items()}}
 
 
 def _seconds(value: float) -> str:
     return f'{value:.0f} s' if math.isfinite(value) else 'never'
 
 
-def _sections(outcomes: Sequence[Outcome], soak: Soak | None, pictured: bool) -> Iterator[str]:
+def _sections(outcomes: Sequence[Outcome], run: Endurance | None, pictured: bool) -> Iterator[str]:
     counts = _counts(outcomes)
     skipped = f', {counts["skipped"]} skipped' if counts['skipped'] else ''
     yield (f'{counts["survived"]} of {counts["cases"]} cases survived{skipped}. Plant and '
@@ -105,12 +105,12 @@ def _sections(outcomes: Sequence[Outcome], soak: Soak | None, pictured: bool) ->
     if failed:
         yield '## What failed'
         yield bullets(f'**{name}**: {"; ".join(reasons)}' for name, reasons in failed)
-    if soak is not None:
-        yield from _soak_sections(soak)
+    if run is not None:
+        yield from _endurance_sections(run)
 
 
 def _row(outcome: Outcome) -> tuple[str, ...]:
-    does = '; '.join([outcome.case.does, *outcome.course.notes])
+    does = '; '.join([outcome.case.does, *outcome.trace.notes])
     verdict = outcome.verdict
     if verdict is None:
         return outcome.case.name, does, '', '', '', '', f'skipped: {outcome.skipped}'
@@ -119,20 +119,20 @@ def _row(outcome: Outcome) -> tuple[str, ...]:
             'survived' if verdict.survived else '**failed**')
 
 
-def _soak_sections(soak: Soak) -> Iterator[str]:
-    yield '## Soak'
-    yield (f'{"Survived" if not soak.reasons else "**Failed**"}: {soak.hours:g} h of plant time '
-           f'in {soak.wall:.0f} s with {sum(soak.events.values())} events. The reactor was '
-           f'{soak.mean_error:.2f} K from its set-point on average and never above '
-           f'{soak.hottest:.1f} °C.')
-    yield bullets(soak.reasons)
-    answers = soak.answers
+def _endurance_sections(run: Endurance) -> Iterator[str]:
+    yield '## Endurance'
+    yield (f'{"Survived" if not run.reasons else "**Failed**"}: {run.hours:g} h of plant time '
+           f'in {run.wall:.0f} s with {sum(run.events.values())} events. The reactor was '
+           f'{run.mean_error:.2f} K from its set-point on average and never above '
+           f'{run.hottest:.1f} °C.')
+    yield bullets(run.reasons)
+    answers = run.answers
     yield (f'{answers.measurements} measurements reached the controller, {answers.answered} were '
            f'answered as often as they came; {answers.unanswered} answers are missing, '
            f'{answers.repeated} repeated, {answers.unasked} unasked, {answers.out_of_order} out '
            'of order. Recorded: '
-           f'{", ".join(f"{count} on {topic}" for topic, count in soak.recorded.items())}.')
+           f'{", ".join(f"{count} on {topic}" for topic, count in run.recorded.items())}.')
     yield table(('process', 'memory at first [MB]', 'at last [MB]', 'growth when warm [MB]'),
                 ((name, f'{seen.megabytes[0]:.1f}', f'{seen.megabytes[-1]:.1f}',
-                  f'{seen.growth:.2f}') for name, seen in soak.memory.items()), (1, 2, 3))
-    yield table(('event', 'times'), sorted(soak.events.items()), (1,))
+                  f'{seen.growth:.2f}') for name, seen in run.memory.items()), (1, 2, 3))
+    yield table(('event', 'times'), sorted(run.events.items()), (1,))

@@ -12,47 +12,49 @@ import numpy as np
 import pytest
 
 from validation.faults.__main__ import main
-from validation.faults.case import Case, Outcome, run
+from validation.faults.case import case, Outcome, run, SETTLED
 from validation.faults.cases import CASES
-from validation.faults.course import Course
-from validation.faults.judge import Account, Verdict
+from validation.faults.endurance import Endurance, Memory, run_endurance
+from validation.faults.judge import Responses, Verdict
 from validation.faults.report import survived, write
-from validation.faults.soak import Memory, Soak, soak
+from validation.faults.trace import Trace
 
 # the type support's parser imports a module that Python deprecated
 pytestmark = pytest.mark.filterwarnings('ignore::DeprecationWarning')
 
 
-def quick(case, **changes):
-    # in the wall time of a busy machine
-    return replace(case, **{'settle': 120.0, 'afterwards': 120.0, 'limit': 200.0, **changes})
+def test_faults_of_messages_models_and_processes_are_survived(tmp_path):
+    """Of a case each, one after the other in one loop."""
+    names = ('nan-short', 'model-garbage', 'controller-killed')
 
+    def play(loop):
+        for name in names:
+            CASES[name].play(loop)
+            loop.run_for(20.0)
+        loop.trace.begin = SETTLED
 
-@pytest.mark.parametrize('name', ['nan-short', 'model-garbage'])
-def test_quick_case_is_survived(name, tmp_path):
-    outcome = run(quick(CASES[name]), tmp_path)
+    nan, garbage, killed = (CASES[name] for name in names)
+    bounds = replace(nan.bounds, says=garbage.bounds.says, bump=killed.bounds.bump)
+    outcome = run(replace(nan, play=play, bounds=bounds, plant=killed.plant, afterwards=150.0),
+                  tmp_path)
     assert outcome.verdict is not None
     assert outcome.verdict.reasons == ()
-    assert len(outcome.course.samples) > 240
-
-
-def test_controller_is_killed_and_comes_back(tmp_path):
-    outcome = run(quick(CASES['controller-killed'], settle=240.0, recovery=100.0), tmp_path)
-    assert outcome.survived, outcome.verdict
+    assert outcome.survived
+    assert len(outcome.trace.samples) > 300
     assert len(list(tmp_path.glob('controller_*.log'))) == 2
 
 
 def test_what_goes_wrong_is_held_against_the_case(tmp_path):
-    """A process that dies, words that nobody says, and a reactor that stays away."""
-    def play(rig):
-        rig.begin()
-        rig.end()
+    """A process that dies, words that nobody reports, and a reactor that stays away."""
+    def play(loop):
+        loop.begin()
+        loop.end()
         # where it does not come by on its way from 51.8 to 46 degC, however far it has come
-        rig.operator.ask(53.0)
-        rig.processes['controller'].process.kill()
+        loop.request(53.0)
+        loop.processes['controller'].process.kill()
 
-    outcome = run(Case('doomed', 'test', '', play, settle=20.0, afterwards=60.0,
-                       says=('nobody says this',), limit=200.0), tmp_path)
+    outcome = run(case('test', 'doomed', '', play, settle=20.0, afterwards=60.0,
+                       says=('nobody says this',)), tmp_path)
     assert not outcome.survived
     reasons = '; '.join(outcome.verdict.reasons)
     assert 'controller ended early, with code -9' in reasons
@@ -61,9 +63,9 @@ def test_what_goes_wrong_is_held_against_the_case(tmp_path):
     assert 'diagnostics never said "nobody says this"' in reasons
 
 
-def test_short_soak_accounts_for_everything(tmp_path):
+def test_short_endurance_run_accounts_for_everything(tmp_path):
     shares = []
-    found = soak(tmp_path / 'soak', lambda: None, hours=0.05, on_progress=shares.append)
+    found = run_endurance(tmp_path / 'soak', lambda: None, hours=0.05, on_progress=shares.append)
     assert found.reasons == ()
     assert found.answers.complete
     assert found.answers.measurements > 170
@@ -82,16 +84,17 @@ def test_growth_is_that_of_a_warm_process():
     assert leaking.growth == pytest.approx(7.5)
 
 
-GOOD = Outcome(CASES['nan-short'], Course(notes=['a note']), Verdict((), 1.0, 0.5, 20.0, 0.0), '',
+GOOD = Outcome(CASES['nan-short'], Trace(notes=['a note']), Verdict((), 1.0, 0.5, 20.0, 0.0), '',
                2.0)
-BAD = Outcome(CASES['bias'], Course(), Verdict(('not back',), 9.0, 0.5, np.inf, 3.0), '', 2.0)
-SKIPPED = Outcome(CASES['disk-full'], Course(), None, 'no disk', 0.5)
-SOAK = Soak((), 1.0, 9.0, Account(3, 3, 0, 0, 0, 0), {'weights': 2},
-            {'plant': Memory(np.arange(9.0), np.full(9, 80.0))}, {'/temperature': 3}, 52.0, 0.5)
+BAD = Outcome(CASES['bias'], Trace(), Verdict(('not back',), 9.0, 0.5, np.inf, 3.0), '', 2.0)
+SKIPPED = Outcome(CASES['disk-full'], Trace(), None, 'no disk', 0.5)
+ENDURED = Endurance((), 1.0, 9.0, Responses(3, 3, 0, 0, 0, 0), {'weights': 2},
+                    {'plant': Memory(np.arange(9.0), np.full(9, 80.0))}, {'/temperature': 3},
+                    52.0, 0.5)
 
 
 def test_report_says_what_failed_and_why(tmp_path):
-    write(tmp_path, [GOOD, BAD, SKIPPED], SOAK)
+    write(tmp_path, [GOOD, BAD, SKIPPED], ENDURED)
     text = (tmp_path / 'report.md').read_text()
     assert '1 of 3 cases survived, 1 skipped' in text
     assert '- **bias**: not back' in text
@@ -107,17 +110,14 @@ def test_report_says_what_failed_and_why(tmp_path):
 
 
 def test_campaign_is_survived_when_nothing_failed():
-    assert survived([GOOD, SKIPPED], SOAK)
-    assert not survived([GOOD, BAD], SOAK)
-    assert not survived([GOOD], replace(SOAK, reasons=('it grew',)))
-
-
-def test_cases_are_many_and_each_says_what_it_does():
-    assert len(CASES) >= 40
-    assert all(case.does and case.group for case in CASES.values())
+    assert survived([GOOD, SKIPPED], ENDURED)
+    assert not survived([GOOD, BAD], ENDURED)
+    assert not survived([GOOD], replace(ENDURED, reasons=('it grew',)))
 
 
 def test_command_line(capsys):
+    assert len(CASES) >= 80
+    assert all(case.does and case.group for case in CASES.values())
     assert main(['sensor', 'feed-warm', '--list']) == 0
     listed = capsys.readouterr().out
     assert 'nan-short' in listed

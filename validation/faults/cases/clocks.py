@@ -1,17 +1,18 @@
 # SPDX-FileCopyrightText: 2026 The koopman_ros Authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""Faults of clocks: stamps that jump, stand still or say nothing, and a clock that is missing."""
+"""Faults of clocks: stamps that jump, stand still or are zero, and a clock that is missing."""
 
 from __future__ import annotations
 
 from collections.abc import Callable
 from typing import Any
 
-from validation.faults.alterations import Alteration, NANOSECONDS, Packet, stamped, stamps_frozen
-from validation.faults.case import Case
-from validation.faults.cases.messages import altered_in_a_step
-from validation.faults.rig import LOCKSTEP, Rig
+from koopman_ros.units import NANOSECONDS
+from validation.faults.alterations import Alteration, Packet, stamped, stamps_frozen
+from validation.faults.case import Case, case
+from validation.faults.cases.sensor import altered
+from validation.faults.harness import FaultHarness, LOCKSTEP
 
 GROUP = 'clocks'
 
@@ -22,11 +23,14 @@ def _jittered(stamp_ns: int) -> int:
     return stamp_ns + milliseconds * 1_000_000
 
 
-def _stopped(rig: Rig) -> None:
-    rig.begin()
-    rig.operator.ask(44.0)
-    rig.linger(2.5)
-    rig.end()
+_NO_CLOCK = '^controller: control: use_sim_time is set and nobody publishes /clock'
+
+
+def _stopped(loop: FaultHarness) -> None:
+    loop.begin()
+    loop.request(44.0)
+    loop.wait_for_report(_NO_CLOCK)
+    loop.end()
 
 
 def _twin(packet: Packet) -> list[Packet]:
@@ -35,8 +39,8 @@ def _twin(packet: Packet) -> list[Packet]:
 
 def _case(name: str, does: str, make: Callable[[], Alteration], seconds: float, **details: Any
           ) -> Case:
-    return Case(name, GROUP, f'{does}, while the set-point steps, {seconds:g} s',
-                altered_in_a_step(make, seconds), between=True, largest_step=2.0, **details)
+    return case(GROUP, name, f'{does}, while the set-point steps, {seconds:g} s',
+                altered(make, seconds, 44.0), between=True, largest_step=2.0, **details)
 
 
 def _shifted(seconds: int) -> Callable[[], Alteration]:
@@ -53,7 +57,7 @@ CASES = (
           says=('^controller: control: .*does not advance',)),
     _case('clock-jitter', 'stamps are up to 0.4 s wrong', lambda: stamped(_jittered), 120.0),
     _case('clock-twins', 'two measurements with each stamp', lambda: _twin, 60.0),
-    Case('no-clock', GROUP, 'use_sim_time is set, and nobody publishes /clock', _stopped,
+    case(GROUP, 'no-clock', 'use_sim_time is set, and nobody publishes /clock', _stopped,
          plant={**LOCKSTEP, 'publish_clock': False}, controller={'use_sim_time': True},
-         says=('^controller: control: use_sim_time is set and nobody publishes /clock',)),
+         says=(_NO_CLOCK,)),
 )

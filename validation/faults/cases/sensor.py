@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 The koopman_ros Authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""Faults of the sensor: what it says is not the temperature of the reactor."""
+"""Faults of the sensor: what it shows is not the temperature of the reactor."""
 
 from __future__ import annotations
 
@@ -11,20 +11,31 @@ from typing import Any
 
 from koopman_ros.reasons import Code
 from validation.faults.alterations import Alteration, frozen, lost, noise, unchanged, value
-from validation.faults.case import Case
-from validation.faults.rig import Rig
+from validation.faults.case import Case, case
+from validation.faults.harness import FaultHarness
 
 GROUP = 'sensor'
+_BIAS = 'the same as a sensor bias [K]'
 
 
-def altered(make: Callable[[], Alteration], seconds: float) -> Callable[[Rig], None]:
-    """Return the play that alters measurements for so many seconds of plant time."""
-    def play(rig: Rig) -> None:
-        rig.begin()
-        rig.line.measurements = make()
-        rig.run_for(seconds)
-        rig.line.measurements = unchanged
-        rig.end()
+def altered(make: Callable[[], Alteration], seconds: float, setpoint: float | None = None,
+            wait: float = 0.0, commands: bool = False) -> Callable[[FaultHarness], None]:
+    """
+    Return the play that alters measurements, or commands, for so many seconds of plant time.
+
+    :param make: makes the alteration.
+    :param seconds: of plant time.
+    :param setpoint: requested before, or None.
+    :param wait: s of plant time between both.
+    :param commands: whether commands are altered instead.
+    """
+    def play(loop: FaultHarness) -> None:
+        if setpoint is not None:
+            loop.request(setpoint)
+            loop.run_for(wait)
+        loop.begin()
+        loop.alter(seconds, **{'commands' if commands else 'measurements': make()})
+        loop.end()
 
     return play
 
@@ -32,7 +43,7 @@ def altered(make: Callable[[], Alteration], seconds: float) -> Callable[[Rig], N
 def fault(name: str, does: str, make: Callable[[], Alteration], seconds: float, **expected: Any
           ) -> Case:
     """Build a case in which measurements are altered for some time."""
-    return Case(name, GROUP, f'{does}, {seconds:g} s', altered(make, seconds), between=True,
+    return case(GROUP, name, f'{does}, {seconds:g} s', altered(make, seconds), between=True,
                 **expected)
 
 
@@ -46,35 +57,21 @@ def shifted(shift: Callable[[float], float]) -> Callable[[], Alteration]:
     return lambda: value(lambda seconds, measured: measured + shift(seconds))
 
 
-def _frozen_in_a_step(rig: Rig) -> None:
-    rig.operator.ask(42.0)
-    rig.run_for(10.0)
-    rig.begin()
-    rig.line.measurements = frozen()
-    rig.run_for(90.0)
-    rig.line.measurements = unchanged
-    rig.end()
-
-
-def _biased(rig: Rig) -> None:
+def _biased(loop: FaultHarness) -> None:
     """Nobody can correct a biased sensor, but an operator can be told."""
-    rig.begin()
-    rig.line.measurements = shifted(lambda _: 2.0)()
-    rig.run_for(300.0)
+    loop.begin()
+    loop.interceptor.measurements = shifted(lambda _: 2.0)()
+    loop.run_for(300.0)
     # until figures are published, which happens once a second of wall time
-    before = len(rig.course.said)
-    rig.wait(lambda: _shown_bias(rig, before) is not None, 'no bias is shown')
-    shown = _shown_bias(rig, before)
-    rig.course.notes.append(f'shown as a bias of {shown} K')
-    rig.expect(shown is not None and abs(float(shown) - 2.0) < 0.1,
-               f'a bias of 2 K is shown as {shown} K')
-    rig.line.measurements = unchanged
-    rig.end()
-
-
-def _shown_bias(rig: Rig, since: int) -> str | None:
-    return next((said.values['the same as a sensor bias [K]'] for said in rig.course.said[since:]
-                 if said.name == 'controller: control'), None)
+    since = len(loop.trace.statuses)
+    shown = loop.wait(lambda: next(
+        (status.values[_BIAS] for status in loop.trace.statuses[since:]
+         if status.name == 'controller: control'), None), 'no bias is shown')
+    loop.trace.notes.append(f'shown as a bias of {shown} K')
+    loop.expect(shown is not None and abs(float(shown) - 2.0) < 0.1,
+                f'a bias of 2 K is shown as {shown} K')
+    loop.interceptor.measurements = unchanged
+    loop.end()
 
 
 CASES = (
@@ -95,11 +92,11 @@ CASES = (
     fault('spikes', 'a spike of +20 K in every seventh sample',
           shifted(lambda seconds: 20.0 * (seconds % 7.0 == 0.0)), 140.0, codes=(Code.JUMPED,)),
     fault('frozen-at-rest', 'the same value to the bit', frozen, 120.0),
-    Case('frozen-in-a-step', GROUP, 'the same value to the bit, 10 s after a step of the '
-         'set-point, 90 s', _frozen_in_a_step, between=True,
+    case(GROUP, 'frozen-in-a-step', 'the same value to the bit, 10 s after a step of the '
+         'set-point, 90 s', altered(frozen, 90.0, 42.0, 10.0), between=True,
          codes=(Code.FROZEN,)),
     fault('drift', 'drifts by 1 K/min', shifted(lambda seconds: seconds / 60.0), 180.0),
-    Case('bias', GROUP, 'wrong by +2 K, 300 s and more', _biased, between=True, recovery=360.0,
+    case(GROUP, 'bias', 'wrong by +2 K, 300 s and more', _biased, between=True, recovery=360.0,
          afterwards=420.0),
     fault('noise-burst', 'noise of 1 K', lambda: noise(1.0), 60.0),
     fault('noise-wild', 'noise of 10 K', lambda: noise(10.0), 60.0, codes=(Code.JUMPED,)),

@@ -19,15 +19,15 @@ import numpy as np
 from koopman_ros.bags import summary
 from koopman_ros.parameters.controller import ControllerParameters
 from koopman_ros.testing import HarnessError
-from validation.faults.course import Array, Course
 from validation.faults.events import EVENTS
-from validation.faults.judge import Account, account, RUNAWAY
-from validation.faults.rig import LOCKSTEP, Rig
+from validation.faults.harness import FaultHarness, LOCKSTEP
+from validation.faults.judge import Responses, responses, RUNAWAY
+from validation.faults.trace import Array, Trace
 
 HOURS = 24.0
 SEED = 0
 _EVENT_PERIOD = 300.0  # s, mean time between two events
-_WALL_PER_HOUR = 60.0  # s, at most
+_WALL_PER_HOUR = 240.0  # s, at most
 _LOOKS = 200  # at the memory
 _WARM = 0.25  # share of the run after which memory is to be flat
 _GROWTH = 4.0  # MB that a process may grow from then on
@@ -60,9 +60,9 @@ class Memory:
 
 
 @dataclass(frozen=True)
-class Soak:
+class Endurance:
     """
-    What a soak found.
+    What an endurance run found.
 
     :param reasons: what is held against it, in sentences.
     :param hours: of plant time.
@@ -78,7 +78,7 @@ class Soak:
     reasons: tuple[str, ...]
     hours: float
     wall: float
-    answers: Account
+    answers: Responses
     events: dict[str, int]
     memory: dict[str, Memory]
     recorded: dict[str, int]
@@ -86,8 +86,8 @@ class Soak:
     mean_error: float
 
 
-def soak(folder: Path, check: Callable[[], None], hours: float = HOURS,
-         on_progress: Callable[[float], None] = lambda _: None) -> Soak:
+def run_endurance(folder: Path, check: Callable[[], None], hours: float = HOURS,
+         on_progress: Callable[[float], None] = lambda _: None) -> Endurance:
     """
     Run plant, controller and trainer for some hours of plant time, and account for everything.
 
@@ -101,48 +101,51 @@ def soak(folder: Path, check: Callable[[], None], hours: float = HOURS,
     random = np.random.default_rng(SEED)
     happened: Counter[str] = Counter()
     looks: dict[str, list[tuple[float, float]]] = {}
-    rig = Rig(folder, 60.0 + _WALL_PER_HOUR * hours, check, between=True)
-    with rig:
+    loop = FaultHarness(folder, 60.0 + _WALL_PER_HOUR * hours, check, between=True)
+    with loop:
         try:
-            rig.start('trainer', {'output': folder / 'bag', 'min_free_disk': 0.0,
+            loop.start('trainer', {'output': folder / 'bag', 'min_free_disk': 0.0,
                                   'topics': _RECORDED})
-            rig.start_loop(46.0, LOCKSTEP, {})
-            _let_happen(rig, 3600.0 * hours, random, happened, looks, on_progress)
+            loop.start_loop(46.0, LOCKSTEP, {})
+            _let_happen(loop, 3600.0 * hours, random, happened, looks, on_progress)
             # what is on its way arrives, so that the counts can agree
-            rig.kill('plant', signal.SIGINT)
-            rig.wait(lambda: len(rig.course.commands) >= len(rig.course.delivered),
+            loop.kill('plant', signal.SIGINT)
+            loop.wait(lambda: len(loop.trace.commands) >= len(loop.trace.delivered),
                      'measurements are left without an answer')
-            rig.linger(0.5)
+            sent = len(loop.trace.commands) + len(loop.trace.delivered)
+            loop.wait(lambda: (status := loop.trace.last('trainer: recording')) is not None
+                     and int(status.values.get('messages', 0)) >= sent,
+                     'the trainer has not recorded all messages')
         except HarnessError as error:
-            rig.course.complaints.append(str(error))
+            loop.trace.complaints.append(str(error))
     bag, recorded = folder / 'bag', {}
     if bag.exists():
         recorded = dict(summary(bag).counts)
         shutil.rmtree(bag)
     memory = {name: Memory(*np.array(seen).T) for name, seen in looks.items()}
-    course = rig.course
-    answers = account(course.delivered, [command.stamp_ns for command in course.commands])
-    hottest = max((sample.celsius for sample in course.samples), default=math.nan)
-    return Soak(tuple(_held_against(course, answers, memory, recorded, hottest)), hours,
+    trace = loop.trace
+    answers = responses(trace.delivered, [command.stamp_ns for command in trace.commands])
+    hottest = max((sample.celsius for sample in trace.samples), default=math.nan)
+    return Endurance(tuple(_held_against(trace, answers, memory, recorded, hottest)), hours,
                 time.monotonic() - started, answers, dict(happened), memory, recorded, hottest,
-                float(np.mean(course.errors()[1])) if course.samples else math.nan)
+                float(np.mean(trace.errors()[1])) if trace.samples else math.nan)
 
 
-def _let_happen(rig: Rig, until: float, random: np.random.Generator, happened: Counter[str],
-                looks: dict[str, list[tuple[float, float]]],
+def _let_happen(loop: FaultHarness, until: float, random: np.random.Generator,
+                happened: Counter[str], looks: dict[str, list[tuple[float, float]]],
                 on_progress: Callable[[float], None]) -> None:
     look = until / _LOOKS
-    due = rig.now + random.exponential(_EVENT_PERIOD)
+    due = loop.now + random.exponential(_EVENT_PERIOD)
     for number in range(1, _LOOKS + 1):
         while due < number * look:
-            rig.run_until(due)
+            loop.run_until(due)
             name, play = EVENTS[random.integers(len(EVENTS))]
             happened[name] += 1
-            play(rig, random)
-            due = rig.now + random.exponential(_EVENT_PERIOD)
-        rig.run_until(number * look)
-        for name, process in rig.processes.items():
-            looks.setdefault(name, []).append((rig.now, _resident(process.process.pid)))
+            play(loop, random)
+            due = loop.now + random.exponential(_EVENT_PERIOD)
+        loop.run_until(number * look)
+        for name, process in loop.processes.items():
+            looks.setdefault(name, []).append((loop.now, _resident(process.process.pid)))
         on_progress(number / _LOOKS)
 
 
@@ -153,15 +156,15 @@ def _resident(pid: int) -> float:
     return int(kilobytes) * 1024 / _MEGABYTE
 
 
-def _held_against(course: Course, answers: Account, memory: dict[str, Memory],
+def _held_against(trace: Trace, answers: Responses, memory: dict[str, Memory],
                   recorded: dict[str, int], hottest: float) -> Iterator[str]:
-    yield from course.complaints
+    yield from trace.complaints
     if not answers.complete:
         yield (f'of {answers.measurements} measurements {answers.unanswered} were not answered; '
                f'{answers.repeated} answers were repeated, {answers.unasked} unasked, '
                f'{answers.out_of_order} out of order')
     usual = ControllerParameters()
-    wild = [command for command in course.commands
+    wild = [command for command in trace.commands
             if not usual.coolant_min <= command.celsius <= usual.coolant_max]
     if wild:
         yield (f'{len(wild)} commands are not within {usual.coolant_min:g} to '
@@ -173,7 +176,7 @@ def _held_against(course: Course, answers: Account, memory: dict[str, Memory],
         if not seen.growth <= _GROWTH:
             yield (f'{name} grew by {seen.growth:.1f} MB after it was warm, {_GROWTH:g} MB are '
                    'allowed')
-    for topic, heard in (('/temperature', len(course.delivered)),
-                         ('/coolant_setpoint', len(course.commands))):
-        if recorded.get(topic) != heard:
-            yield f'the bag holds {recorded.get(topic, 0)} of {heard} messages on {topic}'
+    for topic, sent in (('/temperature', len(trace.delivered)),
+                         ('/coolant_setpoint', len(trace.commands))):
+        if recorded.get(topic) != sent:
+            yield f'the bag holds {recorded.get(topic, 0)} of {sent} messages on {topic}'

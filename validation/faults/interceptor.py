@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 The koopman_ros Authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""The line between plant and controller: heard, timed, and altered where a case wants that."""
+"""What lies between plant and controller: traces messages, and alters them where asked to."""
 
 from __future__ import annotations
 
@@ -14,24 +14,24 @@ from koopman_ros.ros import topics
 from koopman_ros.ros.codec import stamp_message, stamp_nanoseconds
 from koopman_ros.units import NANOSECONDS
 from validation.faults.alterations import Alteration, Packet, unchanged
-from validation.faults.course import Command, Course, Said, Sample
+from validation.faults.trace import Command, Sample, Status, Trace
 
 PLANT_TEMPERATURE = 'plant/temperature'
 PLANT_COOLANT = 'plant/coolant_setpoint'
-# What a plant is started with when the line alters messages.
+# What a plant is started with when messages are altered.
 REMAPPED = ('-r', f'{topics.TEMPERATURE}:={PLANT_TEMPERATURE}',
             '-r', f'{topics.COOLANT_SETPOINT}:={PLANT_COOLANT}')
 
 
-class Line:
+class Interceptor:
     """
-    What is said between plant and controller, kept as a course.
+    A trace of what plant and controller publish.
 
-    Where it stands between them it plays the actuator, too, which holds its last command when
-    none arrives: so lock-step goes on whatever is lost.
+    Where it stands between them it is the actuator, too, which holds its last command when none
+    arrives: so lock-step goes on whatever is lost.
 
     :param node: whose executor does the work.
-    :param between: whether plant and controller hear each other through it alone.
+    :param between: whether all messages between plant and controller pass through it.
 
     :ivar measurements: what is done to measurements on their way to the controller.
     :ivar commands: what is done to commands on their way to the plant.
@@ -39,7 +39,7 @@ class Line:
     """
 
     def __init__(self, node: Node, between: bool) -> None:
-        self.course = Course()
+        self.trace = Trace()
         self.measurements: Alteration = unchanged
         self.commands: Alteration = unchanged
         self.now = 0.0
@@ -47,7 +47,7 @@ class Line:
         self._between = between
         self._stamp_ns: int | None = None  # of the last true temperature
         self._origin_ns = 0
-        self._awaited = 0  # answers to what was delivered
+        self._awaited = 0  # commands, for what was delivered
         self._held: float | None = None  # the command that the actuator stands at
         if between:
             self._to_controller = node.create_publisher(
@@ -63,7 +63,7 @@ class Line:
             Temperature, topics.COOLANT_SETPOINT, self._on_command, topics.LOOP_QOS)
 
     def open(self) -> None:
-        """Hear the plant from now on."""
+        """Trace the plant from now on."""
         self._node.create_subscription(
             Temperature, PLANT_TEMPERATURE if self._between else topics.TEMPERATURE,
             self._on_temperature, topics.LOOP_QOS)
@@ -77,24 +77,24 @@ class Line:
             self._origin_ns += stamp_ns - self._stamp_ns - NANOSECONDS
         self._stamp_ns = stamp_ns
         self.now = (stamp_ns - self._origin_ns) / NANOSECONDS
-        self.course.samples.append(Sample(self.now, message.temperature))
+        self.trace.samples.append(Sample(self.now, message.temperature))
         if not self._between:
-            self.course.delivered.append(stamp_ns)
+            self.trace.delivered.append(stamp_ns)
             return
         arriving = self.measurements(Packet(stamp_ns, message.temperature))
         self._awaited = len(arriving)
         for packet in arriving:
-            self.course.delivered.append(packet.stamp_ns)
+            self.trace.delivered.append(packet.stamp_ns)
             self._to_controller.publish(_message(packet))
         if not arriving:
             self._actuate([])
 
     def _on_coolant(self, message: Temperature) -> None:
-        self.course.coolants[stamp_nanoseconds(message.header.stamp)] = message.temperature
+        self.trace.coolants[stamp_nanoseconds(message.header.stamp)] = message.temperature
 
     def _on_command(self, message: Temperature) -> None:
         packet = Packet(stamp_nanoseconds(message.header.stamp), message.temperature)
-        self.course.commands.append(Command(self.now, packet.celsius, packet.stamp_ns))
+        self.trace.commands.append(Command(self.now, packet.celsius, packet.stamp_ns))
         if not self._between:
             return
         self._awaited -= 1
@@ -113,12 +113,12 @@ class Line:
             self._to_plant.publish(_message(packet))
 
     def _on_record(self, message: String) -> None:
-        self.course.records.append((self.now, message.data))
+        self.trace.records.append((self.now, message.data))
 
     def _on_diagnostics(self, message: DiagnosticArray) -> None:
-        self.course.said += [
-            Said(self.now, status.name, status.level[0], status.message,
-                 {item.key: item.value for item in status.values}) for status in message.status]
+        self.trace.statuses += [
+            Status(self.now, status.name, status.level[0], status.message,
+                   {item.key: item.value for item in status.values}) for status in message.status]
 
 
 def _message(packet: Packet) -> Temperature:

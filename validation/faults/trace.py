@@ -30,7 +30,7 @@ class Command(NamedTuple):
     stamp_ns: int
 
 
-class Said(NamedTuple):
+class Status(NamedTuple):
     """A status of diagnostics: whose, how bad (0 is OK, 1 WARN, 2 ERROR), and the sentence."""
 
     seconds: float
@@ -41,20 +41,20 @@ class Said(NamedTuple):
 
 
 @dataclass
-class Course:
+class Trace:
     """
-    All that the rig saw of a case; times are plant time in seconds since the first measurement.
+    All that was seen of a case; times are plant time in seconds since the first measurement.
 
     :ivar samples: true temperatures, before any fault of the sensor.
     :ivar setpoints: what the operator wanted: (from when on, degrees Celsius).
     :ivar commands: as the controller published them.
-    :ivar coolants: the coolant that was in force at a measurement, degC by the plant's stamp.
+    :ivar coolants: measured input: the coolant at a measurement, degC by the plant's stamp.
     :ivar delivered: stamps of the measurements that reached the controller.
-    :ivar said: statuses of all nodes.
+    :ivar statuses: of all nodes.
     :ivar records: what the controller recorded of itself: (plant time, text).
     :ivar begin: when the fault began.
     :ivar end: when the fault was over, or had been put in where it stays.
-    :ivar complaints: what the case itself, or the rig, found wrong, in sentences.
+    :ivar complaints: what went wrong while it ran, in sentences.
     :ivar notes: figures worth a line in the report.
     """
 
@@ -63,19 +63,28 @@ class Course:
     commands: list[Command] = field(default_factory=list)
     coolants: dict[int, float] = field(default_factory=dict)
     delivered: list[int] = field(default_factory=list)
-    said: list[Said] = field(default_factory=list)
+    statuses: list[Status] = field(default_factory=list)
     records: list[tuple[float, str]] = field(default_factory=list)
     begin: float = np.inf
     end: float = np.inf
     complaints: list[str] = field(default_factory=list)
     notes: list[str] = field(default_factory=list)
 
+    def reported(self) -> list[str]:
+        """Return what diagnostics reported from the fault on: ``<node>: <task>: <sentence>``."""
+        return [f'{status.name}: {status.message}' for status in self.statuses
+                if status.seconds >= self.begin]
+
+    def last(self, name: str) -> Status | None:
+        """Return the last status of a task."""
+        return next((s for s in reversed(self.statuses) if s.name == name), None)
+
     def steps(self) -> tuple[Array, Array]:
         """
         Return the times (N - 1,) of the commands after the first and their steps in K.
 
-        A step is that from the command before, or from the coolant that is in force, whichever
-        is less: when messages are lost it is not the one, and when the controller is a new one
+        A step is that from the command before, or from the measured input, whichever is
+        less: when messages are lost it is not the one, and when the controller is a new one
         it need not be the other.
         """
         times = np.array([command.seconds for command in self.commands[1:]])

@@ -1,0 +1,224 @@
+# SPDX-FileCopyrightText: 2026 The koopman_ros Authors
+# SPDX-License-Identifier: Apache-2.0
+
+"""Plant and controller as real processes, to put faults into, with an operator beside them."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from pathlib import Path
+import re
+import signal
+import time
+from types import TracebackType
+from typing import Any, TypeVar
+
+from rclpy.publisher import Publisher
+from sensor_msgs.msg import Temperature
+
+from koopman_ros.ros import topics
+from koopman_ros.testing import Harness, HarnessError, NodeProcess
+from validation.faults.alterations import Alteration, unchanged
+from validation.faults.interceptor import Interceptor, REMAPPED
+
+T = TypeVar('T')
+LOCKSTEP = {'lockstep': True, 'speed': 0.0, 'lockstep_timeout': 0.5}
+_STEADY = 0.3  # s of wall time that a set-point must stay the one tracked
+_ASK_AGAIN = 0.2  # s of wall time
+# s of wall time for anything that is waited for, also on a machine that is busy otherwise
+PATIENCE = 120.0
+
+
+class FaultHarness:
+    """
+    A loop to put faults into; leaving the context ends its processes.
+
+    :param folder: for what the processes print.
+    :param limit: wall time of the case, s.
+    :param check: called at every turn; may raise to end the case.
+    :param between: whether the interceptor stands between plant and controller.
+
+    :ivar ros: the processes' harness, whose node is the operator's.
+    :ivar interceptor: traces the messages between plant and controller, and alters them.
+    :ivar processes: by name; those that are missed when they end.
+    :ivar setpoint: the publisher of set-points, for those that the trace is not to hold.
+    """
+
+    def __init__(self, folder: Path, limit: float, check: Callable[[], None],
+                 between: bool = False) -> None:
+        self.folder = folder
+        self.processes: dict[str, NodeProcess] = {}
+        self._deadline = time.monotonic() + limit
+        self._check = check
+        self._between = between
+        self.ros = Harness(folder, name='operator', timeout=PATIENCE, lasting=True,
+                           each_turn=self._each_turn)
+        self.interceptor = Interceptor(self.ros.node, between)
+        self.trace = self.interceptor.trace
+        self.setpoint = self.publisher(topics.SETPOINT)
+
+    def __enter__(self) -> FaultHarness:
+        return self
+
+    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None,
+                 traceback: TracebackType | None) -> None:
+        for name, code in self.ros.close().items():
+            if code:
+                self.trace.complaints.append(
+                    f'{name} ended with code {code}, see {self.folder / name}.log')
+        for process in self.ros.processes:
+            if 'Traceback' in process.output():
+                self.trace.complaints.append(f'{process.log} holds a traceback')
+
+    def _each_turn(self) -> None:
+        self._check()
+        if time.monotonic() > self._deadline:
+            raise HarnessError('the case takes too long')
+
+    # Processes.
+
+    def start(self, name: str, parameters: Mapping[str, object] | None = None,
+              arguments: tuple[str, ...] = (), command: tuple[str, ...] | None = None,
+              called: str = '') -> NodeProcess:
+        """
+        Start a process as :class:`Harness` does.
+
+        :param called: its name here, that of the node by default.
+        """
+        called = called or name
+        if self._between and called == 'plant':
+            arguments += REMAPPED
+        process = self.ros.start(name, parameters, arguments, command, called)
+        self.processes[called] = process
+        return process
+
+    def start_loop(self, celsius: float, plant: Mapping[str, object],
+                   controller: Mapping[str, object]) -> None:
+        """Start plant and controller, and ask for a set-point before the first measurement."""
+        lockstep = bool(plant.get('lockstep'))
+        # the plant is traced once the controller is known: a lock-step waits for it
+        subscribers = {'lockstep_subscribers': 1 if self._between else 2} if lockstep else {}
+        self.start('controller', controller)
+        if lockstep:
+            self.start('plant', {**plant, **subscribers})
+        self._meet_controller()
+        self.request(celsius)
+        if 'trainer' in self.processes:
+            self.wait(lambda: self.trace.last('trainer: recording'), 'the trainer does not start')
+            # it finds the controller meanwhile
+            self.linger(3.0)
+        self.interceptor.open()
+        if not lockstep:
+            self.start('plant', plant)
+        self.wait(lambda: self.trace.samples, 'no measurement')
+
+    def kill(self, called: str, number: int = signal.SIGKILL) -> None:
+        """End a process the hard way; it is not missed."""
+        self.processes.pop(called).stop(number)
+
+    def pause(self, name: str, seconds: float) -> None:
+        """Stop a process for a wall time, and let it go on."""
+        self.processes[name].process.send_signal(signal.SIGSTOP)
+        self.linger(seconds)
+        self.processes[name].process.send_signal(signal.SIGCONT)
+
+    # The operator.
+
+    def publisher(self, topic: str) -> Publisher:
+        """Return a publisher of temperatures."""
+        return self.ros.node.create_publisher(Temperature, topic, topics.LOOP_QOS)
+
+    def _meet_controller(self) -> None:
+        self.ros.meet('controller')
+        self.wait(self.setpoint.get_subscription_count, 'nobody subscribes to the set-point')
+
+    def request(self, celsius: float) -> None:
+        """Request a set-point."""
+        self.trace.setpoints.append((self.now, celsius))
+        self.setpoint.publish(Temperature(temperature=celsius))
+
+    def request_until_tracked(self, celsius: float) -> None:
+        """Request a set-point until the controller, which may be new, reports to track it."""
+        tracked: list[Any] = []
+        subscription = self.ros.node.create_subscription(
+            Temperature, topics.ACTIVE_SETPOINT, tracked.append, topics.LATCHED_QOS)
+        self._meet_controller()
+        due = steady_since = 0.0
+
+        def steady() -> bool:
+            nonlocal due, steady_since
+            if (now := time.monotonic()) >= due:
+                self.setpoint.publish(Temperature(temperature=celsius))
+                due = now + _ASK_AGAIN
+            if not tracked or abs(tracked[-1].temperature - celsius) > 1e-6:
+                steady_since = now
+            return now - steady_since > _STEADY
+
+        self.wait(steady, 'the controller does not track the set-point requested')
+        self.ros.node.destroy_subscription(subscription)
+        self.trace.setpoints.append((self.now, celsius))
+
+    def set_parameters(self, node: str, **values: Any) -> list[str]:
+        """Set parameters one by one; return why they were refused, if any was."""
+        return [result.reason for result in self.ros.set_parameters(node, **values)
+                if not result.successful]
+
+    # Time.
+
+    @property
+    def now(self) -> float:
+        """Plant time in s since the first measurement."""
+        return self.interceptor.now
+
+    def wait(self, done: Callable[[], T], complaint: str) -> T:
+        """
+        Wait until a condition holds and return what it returned.
+
+        :raises HarnessError: when it never does, or a process ends by itself.
+        """
+        return self.ros.wait_until(done, lambda: f'{complaint}; plant time is {self.now:.0f} s')
+
+    def run_until(self, seconds: float) -> None:
+        """Let the loop run until a plant time."""
+        while self.now < seconds:
+            reached = self.now
+            self.wait(lambda reached=reached: self.now > reached,  # type: ignore[misc]
+                      'no measurement arrives')
+
+    def run_for(self, seconds: float) -> None:
+        """Let the loop run for a plant time."""
+        self.run_until(self.now + seconds)
+
+    def linger(self, seconds: float) -> None:
+        """Let the loop run for a wall time."""
+        end = time.monotonic() + seconds
+        self.wait(lambda: time.monotonic() > end, 'no time to linger')
+
+    # The fault.
+
+    def begin(self) -> None:
+        """Mark that the fault begins."""
+        self.trace.begin = self.now
+
+    def end(self) -> None:
+        """Mark that the fault is over, or stays from now on."""
+        self.trace.end = self.now
+
+    def alter(self, seconds: float, measurements: Alteration = unchanged,
+              commands: Alteration = unchanged) -> None:
+        """Alter messages on their way for a plant time."""
+        self.interceptor.measurements, self.interceptor.commands = measurements, commands
+        self.run_for(seconds)
+        self.interceptor.measurements = self.interceptor.commands = unchanged
+
+    def expect(self, holds: bool, complaint: str) -> None:
+        """Hold a sentence against the case where something does not hold."""
+        if not holds:
+            self.trace.complaints.append(complaint)
+
+    def wait_for_report(self, *patterns: str) -> None:
+        """Wait until diagnostics have reported what matches each pattern since the fault began."""
+        for pattern in patterns:
+            self.wait(lambda pattern=pattern: any(  # type: ignore[misc]
+                re.search(pattern, text) for text in self.trace.reported()),
+                f'diagnostics do not report "{pattern}"')
