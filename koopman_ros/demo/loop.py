@@ -10,6 +10,7 @@ import contextlib
 from dataclasses import dataclass, field
 from pathlib import Path
 
+from diagnostic_msgs.msg import DiagnosticStatus
 import rclpy
 from rclpy.node import Node
 from sensor_msgs.msg import Temperature
@@ -188,7 +189,18 @@ def run_loop(scenario: Scenario, bag: Path, logs: Path,
     """
     Run a loop until the scenario's end; see :func:`running_loop`.
 
-    :param bag: where the trainer records; must not exist.
+    :param bag: where the trainer records, the last measurement and its command among the rest;
+        must not exist.
     """
+    samples = round(scenario.duration / scenario.sample_period) + 1
+
+    def recorded(status: DiagnosticStatus) -> bool:
+        counts = {item.key: item.value for item in status.values}
+        return all(int(counts.get(f'messages on /{topic}', 0)) >= samples
+                   for topic in (topics.TEMPERATURE, topics.COOLANT_SETPOINT))
+
     with running_loop(scenario, logs, {'output': bag}, on_row) as loop:
         loop.run_until(scenario.duration)
+        # what the operator has heard may still be on its way to the trainer, where it is lost
+        # with its sender
+        loop.harness.wait_for_status('trainer: recording', recorded)

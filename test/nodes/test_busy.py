@@ -27,7 +27,7 @@ from koopman_ros.testing import Harness
 from koopman_ros.units import to_celsius
 from support.controller_bench import STATUS, STEADY
 from support.messages import seconds, temperature
-from support.pipes import opened
+from support.processes import opened
 
 SAFE = 10.0  # degC
 SETTINGS = {'measurement_timeout': 0.3, 'hold_timeout': 0.2, 'coolant_rate_limit': 1200.0,

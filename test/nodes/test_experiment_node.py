@@ -18,6 +18,7 @@ from sensor_msgs.msg import Temperature
 
 from koopman_ros.bags import read_messages
 from koopman_ros.experiment import advance, begin, Phase
+from koopman_ros.parameters.plant import PlantParameters
 from koopman_ros.parameters.trainer import TrainerParameters
 from koopman_ros.ros import topics
 from koopman_ros.ros.codec import stamp_nanoseconds
@@ -98,13 +99,15 @@ def start_with_plant(ros: Harness, trainer: Mapping[str, object],
 
 def test_steps_drive_the_plant_as_planned(ros: Harness) -> None:
     commands = ros.listen(Temperature, topics.COOLANT_SETPOINT)
-    measured = start_with_plant(ros, {'experiment_duration': 10.0, 'experiment_seed': 5})
+    given = {'experiment_duration': 5.0, 'experiment_seed': 5, 'experiment_hold_min': 0.25,
+             'experiment_hold_max': 1.0}
+    measured = start_with_plant(ros, given)
     status = ros.wait_for_status(STATUS, lambda s: s.message.startswith('finished'))
     assert status.level == DiagnosticStatus.OK
     assert status.message == 'finished; the coolant returns to 18.85 degC and is held there'
-    ros.wait_until(lambda: len(commands) > 650)
+    ros.wait_until(lambda: len(commands) > 350)
 
-    values = TrainerParameters(experiment_duration=10.0, experiment_seed=5)
+    values = TrainerParameters(**given)
     # the first ones may have been given before the bench was known
     heard = {seconds(message): message for message in commands}
     assert all(late - early == 1.0 for early, late in pairwise(heard))
@@ -268,12 +271,15 @@ def test_another_commander_ends_it_at_once(shared_bench: Bench) -> None:
         'experiment_topic')
 
 
-def test_reactor_that_leaves_its_bounds_gets_the_safe_coolant(ros: Harness) -> None:
+def test_reactor_that_leaves_its_bounds_and_trainer_that_ends_leave_the_safe_coolant(
+        ros: Harness, tmp_path: Path) -> None:
+    bag = tmp_path / 'run.mcap'
     commands = ros.listen(Temperature, topics.COOLANT_SETPOINT)
-    measured = start_with_plant(ros, {'experiment_duration': 1000.0})
+    measured = start_with_plant(
+        ros, {'experiment_duration': 1000.0, 'record_at_start': True, 'output': bag},
+        {'lockstep_subscribers': 3})
     ros.wait_until(lambda: len(commands) > 50)
-    (result,) = ros.set_parameters('plant', feed_temperature=-20.0)
-    assert result.successful, result.reason
+    ros.set_parameters('plant', feed_temperature=-20.0)
     status = ros.wait_for_status(STATUS, lambda s: s.level == DiagnosticStatus.ERROR)
     assert status.message.startswith('aborted: the temperature ')
     assert 'is outside the bounds of the experiment, 31.85 degC to 53.85 degC' in status.message
@@ -286,17 +292,15 @@ def test_reactor_that_leaves_its_bounds_gets_the_safe_coolant(ros: Harness) -> N
     assert {round(message.temperature, 9) for message in commands[first + 12:]} == {SAFE}
     assert ros.set_bool(SERVICE, False).message == LOST
 
-
-def test_trainer_that_is_told_to_end_leaves_the_safe_coolant(ros: Harness, tmp_path: Path
-                                                             ) -> None:
-    bag = tmp_path / 'run.mcap'
-    commands = ros.listen(Temperature, topics.COOLANT_SETPOINT)
-    start_with_plant(ros, {'record_at_start': True, 'output': bag}, {'lockstep_subscribers': 3})
-    ros.wait_until(lambda: len(commands) > 100)
+    ros.set_parameters('plant', feed_temperature=PlantParameters().feed_temperature)
+    assert ros.trigger('plant/reset').success
+    assert ros.set_bool(SERVICE, True).success
+    ros.wait_until(lambda: abs(commands[-1].temperature - SAFE) > 2.0)
+    last = seconds(commands[-1])
     assert ros.processes[0].stop() == 0
-    status = ros.wait_for_status(
-        'plant: simulation', lambda s: float(value(s, 'coolant [degC]')) == pytest.approx(SAFE))
-    assert float(value(status, 'time [s]')) > 100.0
+    ros.wait_for_status('plant: simulation', lambda s: (
+        float(value(s, 'time [s]')) > last
+        and float(value(s, 'coolant [degC]')) == pytest.approx(SAFE)))
     recorded = list(read_messages(bag, ['/coolant_setpoint']))
     assert recorded[-1].message.temperature == pytest.approx(SAFE)
     assert 'Traceback' not in ros.printed()
@@ -311,14 +315,15 @@ def test_experiment_through_a_controller_in_manual_mode(ros: Harness) -> None:
     ros.meet('controller')
     ros.set_bool('controller/set_automatic', False)
     ros.start('trainer', {**IDLE, 'experiment_topic': topics.MANUAL_COOLANT_SETPOINT,
-                          'experiment_duration': 1000.0})
+                          'experiment_duration': 1000.0, 'experiment_hold_min': 0.1,
+                          'experiment_hold_max': 0.2})
     ros.meet('trainer')
-    ros.start('plant', {'lockstep': True, 'speed': 400.0})
+    ros.start('plant', {'lockstep': True, 'speed': 200.0})
     ros.wait_until(lambda: commands)
     response = ros.set_bool(SERVICE, True)
     assert response.message == 'running on /manual_coolant_setpoint'
     first = len(commands)
-    ros.wait_until(lambda: len(commands) > first + 300)
+    ros.wait_until(lambda: len(commands) > first + 100)
     levels = [message.temperature for message in commands[first:]]
     assert max(levels) - min(levels) > 5.0
     assert max(abs(b - a) for a, b in pairwise(levels)) <= 1.0 + 1e-9

@@ -10,7 +10,6 @@ from pathlib import Path
 import re
 import signal
 import sys
-import time
 
 import pytest
 
@@ -24,6 +23,7 @@ from koopman_ros.testing import (
     reservations,
 )
 from support.messages import TIMEOUT
+from support.processes import wait_until_ended
 
 SLEEPER = (sys.executable, '-c', 'import time; time.sleep(600)')
 
@@ -133,28 +133,12 @@ def orphan(ros: Harness, log: Path, patience: float = TIMEOUT, **child: object) 
     return int(parent.output())
 
 
-def wait_until_gone(pid: int) -> None:
-    deadline = time.monotonic() + TIMEOUT
-    while not _has_ended(pid):
-        assert time.monotonic() < deadline
-        time.sleep(0.01)
-
-
-def _has_ended(pid: int) -> bool:
-    try:
-        stat = Path(f'/proc/{pid}/stat').read_text()
-    except OSError:
-        return True
-    # nobody may be there who waits for it
-    return stat.rpartition(') ')[2][0] == 'Z'
-
-
 def test_node_of_a_process_that_is_killed_completes_its_work(ros: Harness, tmp_path: Path) -> None:
     bag = tmp_path / 'bag.mcap'
     child = orphan(ros, tmp_path / 'child.log', name='trainer', parameters={'output': str(bag)})
     ros.meet('trainer')
     ros.processes[0].stop(signal.SIGKILL)
-    wait_until_gone(child)
+    wait_until_ended(child)
     assert summary(bag).complete
 
 
@@ -166,7 +150,7 @@ def test_no_process_outlives_one_that_is_killed(
     child = orphan(ros, log, patience, name='child', command=(sys.executable, '-c', program))
     ros.wait_until(lambda: 'ready' in log.read_text())
     ros.processes[0].stop(signal.SIGKILL)
-    wait_until_gone(child)
+    wait_until_ended(child)
 
 
 # Reservations.

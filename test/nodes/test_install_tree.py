@@ -177,19 +177,21 @@ def test_it_is_what_python_imports(installation: Installation) -> None:
                                     str(installation.share / 'config')], ended.stderr
 
 
-@pytest.mark.parametrize('name', NODES)
-def test_a_node_starts_with_its_parameter_file_and_ends(
-        ros: Harness, installation: Installation, tmp_path: Path, name: str) -> None:
-    parameters = {'output': tmp_path / 'bag'} if name == 'trainer' else {}
-    process = ros.start(
-        name, parameters, ('--params-file', str(installation.share / 'config' / f'{name}.yaml')),
-        command=installation.command(str(installation.executables / name)))
-    ros.wait_for_status(f'{name}: {NODES[name]}', lambda status: True)
-    assert process.stop() == 0
-    assert installation.opened() == ''
+def test_nodes_of_the_wheel_start_with_their_parameter_files_and_end(
+        ros: Harness, wheel: Installation, tmp_path: Path) -> None:
+    started = [ros.start(
+        name, {'output': tmp_path / 'bag'} if name == 'trainer' else {},
+        ('--params-file', str(wheel.share / 'config' / f'{name}.yaml')),
+        command=wheel.command(str(wheel.executables / name))) for name in NODES]
+    for name, task in NODES.items():
+        ros.wait_for_status(f'{name}: {task}', lambda status: True)
+    assert [process.stop() for process in started] == [0, 0, 0]
+    assert wheel.opened() == ''
 
 
-@pytest.mark.parametrize('name', TOOLS)
+# one is enough to see that what colcon lays out is found: the programs are the same
+@pytest.mark.parametrize(('installation', 'name'), [
+    ('colcon', 'player'), *(('wheel', name) for name in TOOLS)], indirect=['installation'])
 def test_a_tool_reads_its_parameters(installation: Installation, name: str) -> None:
     parameter = {'player': 'bag:=none', 'replay': 'bags:=[none]'}[name]
     with isolated_domain():

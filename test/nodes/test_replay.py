@@ -15,6 +15,7 @@ import signal
 import subprocess
 import sys
 
+from diagnostic_msgs.msg import DiagnosticStatus
 import numpy as np
 import pytest
 from rclpy.serialization import serialize_message
@@ -34,6 +35,7 @@ from koopman_ros.ros import topics
 from koopman_ros.testing import Harness, isolated_domain
 from koopman_ros.units import to_kelvin
 from support.messages import seconds, temperature, value
+from support.processes import complaint, run_here
 from support.recorded_controller import Recorded
 
 STEADY = 51.8  # degC
@@ -81,14 +83,19 @@ class Operator:
         self.ros.wait_until(lambda: self.answered[self.time] > answers)
 
     def wait_for_records(self, count: int) -> None:
-        """Wait until the trainer says that it has recorded so many."""
-        self.ros.wait_for_status('trainer: recording', lambda status: int(
-            value(status, f'messages on {RECORDS}')) >= count)
+        """Wait until the trainer says that it has recorded so many, and all commands."""
+        def recorded(status: DiagnosticStatus) -> bool:
+            return int(value(status, f'messages on {RECORDS}')) >= count and int(value(
+                status, 'messages on /coolant_setpoint')) >= self.answered.total()
 
-    def join(self) -> None:
-        """Subscribe to the records, as another recorder would, for a snapshot."""
+        self.ros.wait_for_status('trainer: recording', recorded)
+
+    def join(self) -> int:
+        """Subscribe to the records, as another recorder would; return the snapshot's number."""
         heard = self.ros.listen(String, topics.CONTROLLER_EVENTS)
-        self.ros.wait_until(lambda: any(parse(m.data).event == SNAPSHOT for m in heard))
+        return self.ros.wait_until(lambda: next(
+            (record.number for record in (parse(message.data) for message in heard)
+             if record.event == SNAPSHOT), 0))
 
     def set(self, **parameters: object) -> bool:
         """Set parameters of the controller in one go; tell whether it took them."""
@@ -168,6 +175,8 @@ def bag(tmp_path_factory: pytest.TempPathFactory) -> Path:
         run_a_day(operator)
         tune_and_swap(operator)
         fall_silent(operator)
+        # what is on its way to the trainer is lost with its sender
+        operator.wait_for_records(operator.join() + 1)
         operator.controller.send(signal.SIGINT)
         assert ros.wait_for_end(operator.controller) == 0
         ros.start('controller', SETTINGS | {'model': 'reactor_nz3'})
@@ -229,7 +238,8 @@ def test_the_day_was_not_an_easy_one(bag: Path) -> None:
     assert found.found.refused == 2
     # on a busy machine there may be more
     assert events['silence'] >= 6
-    assert events['initialisation'] == 2
+    # that of the second controller may come before the trainer has found it
+    assert events['initialisation'] in (1, 2)
     assert events['model'] == 2
     assert events['parameters'] >= 7
     assert events[SNAPSHOT] >= 3
@@ -276,9 +286,7 @@ def test_lost_record_is_named(bag: Path, tmp_path: Path) -> None:
     # up to the next snapshot, which comes after 47 measurements at the latest
     assert 0 < len(found.recorded) - found.check.compared < 47
     assert found.check.identical == found.check.compared > 100
-    with isolated_domain():
-        assert replay.main(['replay', '--ros-args', '-p', f'bags:=[{tmp_path / "part.mcap"}]',
-                            '-p', f'output:={tmp_path}']) == 0
+    assert run_here(replay, bags=f'[{tmp_path / "part.mcap"}]', output=tmp_path) == 0
     report = (tmp_path / 'report.md').read_text()
     assert f'Records {lost.first} to {lost.last} of run {lost.run} are missing' in report
 
@@ -312,15 +320,14 @@ def altered(whole: list[Record]) -> list[Record]:
      'ran with the model reactor_nz4 (SHA-256 abababababab...), which is neither shipped nor'),
     (lambda whole: [whole[0].fields['parameters'].update(knob=1.0)] and whole, 1,
      'had the parameters knob, which this version has not: take the package that recorded it'),
+    (lambda whole: [], 1, 'version 0.1 had none: its bags can be played and trained from'),
 ])
 def test_records_that_are_not_reproduced_end_with_their_code_and_one_line(
         bag: Path, tmp_path: Path, capfd: pytest.CaptureFixture[str],
         change: Callable[[list[Record]], list[Record]], code: int, words: str) -> None:
     path = rewrite(tmp_path / 'part.mcap', bag, change)
-    with isolated_domain():
-        assert replay.main(['replay', '--ros-args', '-p', f'bags:=[{path}]', '-p',
-                            f'output:={tmp_path}']) == code
-    (line,) = capfd.readouterr().err.splitlines()
+    assert run_here(replay, bags=f'[{path}]', output=tmp_path) == code
+    line = complaint(capfd)
     assert line.startswith('replay: ')
     assert words in line
 
@@ -347,11 +354,8 @@ def test_report_tells_where_the_new_model_differs(bag: Path, tmp_path: Path) -> 
 
 
 def test_several_bags_and_the_shipped_parameter_file(bag: Path, tmp_path: Path) -> None:
-    with isolated_domain():
-        code = replay.main([
-            'replay', '--ros-args', '--params-file', str(config_directory() / 'replay.yaml'),
-            '-p', f'bags:=[{bag}, {bag}]', '-p', f'output:={tmp_path}'])
-    assert code == 0
+    assert run_here(replay, '--params-file', str(config_directory() / 'replay.yaml'),
+                    '-p', f'bags:=[{bag}, {bag}]', '-p', f'output:={tmp_path}') == 0
     assert {path.name for path in tmp_path.iterdir()} == {
         'report.md', 'summary.json', 'replay_1.png', 'replay_2.png'}
     assert len(json.loads((tmp_path / 'summary.json').read_text())['bags']) == 2
@@ -371,11 +375,8 @@ def test_several_bags_and_the_shipped_parameter_file(bag: Path, tmp_path: Path) 
 def test_what_cannot_be_replayed_is_refused_in_one_line(
         bag: Path, tmp_path: Path, capfd: pytest.CaptureFixture[str], arguments: tuple[str, ...],
         words: str) -> None:
-    with isolated_domain():
-        code = replay.main(['replay', '--ros-args', '-p', f'bags:=[{bag}]', '-p',
-                            f'output:={tmp_path}', *arguments])
-    assert code == 1
-    (line,) = capfd.readouterr().err.splitlines()
+    assert run_here(replay, *arguments, bags=f'[{bag}]', output=tmp_path) == 1
+    line = complaint(capfd)
     assert line.startswith('replay: ')
     assert words in line
 
@@ -392,29 +393,16 @@ def test_controllers_in_namespaces_are_replayed_by_their_own_records(tmp_path: P
                 writer.write(f'/unit_{unit}{RECORDS}', serialize_message(String(data=text)),
                              number)
     for unit in (1, 2):
-        with isolated_domain():
-            assert replay.main([
-                'replay', '--ros-args', '-r', f'__ns:=/unit_{unit}', '-p', f'bags:=[{path}]',
-                '-p', f'output:={tmp_path}']) == 0
+        assert run_here(replay, '-r', f'__ns:=/unit_{unit}', bags=f'[{path}]',
+                        output=tmp_path) == 0
         (figures,) = json.loads((tmp_path / 'summary.json').read_text())['bags']
         assert figures['recorded_model']['identical'] == figures['measurements'] == 10 * unit
-
-
-def test_bag_of_version_0_1_is_refused_with_what_to_do(
-        bag: Path, tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:
-    path = rewrite(tmp_path / 'old.mcap', bag, lambda whole: [])
-    with isolated_domain():
-        assert replay.main(['replay', '--ros-args', '-p', f'bags:=[{path}]']) == 1
-    (line,) = capfd.readouterr().err.splitlines()
-    assert "no records of a controller on '/controller_events'" in line
-    assert 'version 0.1 had none: its bags can be played and trained from' in line
 
 
 def test_missing_matplotlib_is_told_in_one_line(
         bag: Path, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]) -> None:
     monkeypatch.delitem(sys.modules, 'koopman_ros.replay.figure', raising=False)
     monkeypatch.setitem(sys.modules, 'matplotlib', None)
-    with isolated_domain():
-        assert replay.main(['replay', '--ros-args', '-p', f'bags:=[{bag}]']) == 1
-    (line,) = capfd.readouterr().err.splitlines()
-    assert line.startswith('replay: the picture needs matplotlib, which is missing: pip install')
+    assert run_here(replay, bags=f'[{bag}]') == 1
+    assert complaint(capfd).startswith(
+        'replay: the picture needs matplotlib, which is missing: pip install')

@@ -20,13 +20,14 @@ from std_msgs.msg import String
 
 from koopman_ros.bags import BagMessage, read_messages, summary
 from koopman_ros.ros import topics
-from koopman_ros.testing import Harness, NodeProcess
+from koopman_ros.testing import Harness
 from support.messages import temperature, TIMEOUT
 
 BEST_EFFORT = QoSProfile(depth=1000, reliability=ReliabilityPolicy.BEST_EFFORT)
+TOPIC = '/temperature'
 
 
-def recorded(bag: Path, topic: str = '/temperature') -> list[BagMessage]:
+def recorded(bag: Path, topic: str = TOPIC) -> list[BagMessage]:
     """Return the messages of a topic, of a bag that was closed."""
     assert summary(bag).complete
     return list(read_messages(bag, [topic]))
@@ -62,53 +63,81 @@ def test_signal_completes_the_bag_with_all_that_arrived(
     assert (tmp_path / 'run' / 'metadata.yaml').exists() == (name == 'run')
 
 
-def test_recording_stops_and_starts_by_service(ros: Harness, tmp_path: Path) -> None:
-    trainer = ros.start(
-        'trainer', {'output': tmp_path / 'first.mcap', 'record_at_start': False})
+@pytest.fixture(scope='module')
+def shared(shared_ros: Harness) -> Harness:
+    """Start one trainer, which each test leaves without a recording."""
+    shared_ros.start('trainer', {'record_at_start': False})
+    return shared_ros
+
+
+def record(ros: Harness, output: Path, qos: QoSProfile = topics.LOOP_QOS, subscribers: int = 1
+           ) -> Publisher:
+    """Start to record into a file; return a publisher that is recorded from now on."""
+    (result,) = ros.set_parameters('trainer', output=str(output))
+    assert result.successful, result.reason
+    response = ros.set_bool('trainer/record', True)
+    assert response.success, response.message
+    return ros.speak(Temperature, topics.TEMPERATURE, qos, to='trainer', subscribers=subscribers)
+
+
+def test_recording_stops_and_starts_by_service(shared: Harness, tmp_path: Path) -> None:
+    ros, first, second = shared, tmp_path / 'first.mcap', tmp_path / 'second'
     status = ros.wait_for_status('trainer: recording', lambda _: True)
     assert status.message == 'not recording'
     response = ros.set_bool('trainer/record', False)
     assert (response.success, response.message) == (False, 'not recording')
-    assert not (tmp_path / 'first.mcap').exists()
-    assert ros.set_bool('trainer/record', True).success
+    publisher = record(ros, first)
     response = ros.set_bool('trainer/record', True)
     assert (response.success, response.message) == (False, 'already recording')
-    publisher = ros.speak(Temperature, topics.TEMPERATURE, to='trainer')
     say(publisher, 900)
     response = ros.set_bool('trainer/record', False)
     assert response.success, response.message
     assert 'first.mcap' in response.message
-    assert values(recorded(tmp_path / 'first.mcap')) == list(range(900))
+    assert values(recorded(first)) == list(range(900))
     ros.wait_until(lambda: publisher.get_subscription_count() == 0)
     say(publisher, 10, first=900)
+    ros.node.destroy_publisher(publisher)
 
-    (result,) = ros.set_parameters('trainer', output=str(tmp_path / 'second'))
-    assert result.successful, result.reason
-    assert ros.set_bool('trainer/record', True).success
-    ros.wait_until(publisher.get_subscription_count)
-    ros.meet('trainer')
+    publisher = record(ros, second)
     say(publisher, 10, first=1000)
-    assert trainer.stop() == 0
-    assert values(recorded(tmp_path / 'second')) == list(range(1000, 1010))
+    assert ros.set_bool('trainer/record', False).success
+    assert values(recorded(second)) == list(range(1000, 1010))
+    ros.node.destroy_publisher(publisher)
 
 
-def test_takes_the_next_name_beside_an_existing_recording(ros: Harness, tmp_path: Path) -> None:
-    bag, second, third = (tmp_path / name for name in ('run.mcap', 'run_2.mcap', 'run_3.mcap'))
-    bag.write_text('precious')
-    trainer = ros.start('trainer', {'output': bag})
-    publisher = ros.speak(Temperature, topics.TEMPERATURE, to='trainer')
+def test_takes_the_next_name_beside_an_existing_recording(shared: Harness, tmp_path: Path
+                                                          ) -> None:
+    bag, second, third = (tmp_path / name for name in ('run', 'run_2', 'run_3'))
+    bag.mkdir()
+    (bag / 'run_0.mcap').write_text('precious')
+    publisher = record(shared, bag)
     say(publisher, 5)
-    assert ros.set_bool('trainer/record', False).message.endswith(str(second))
-    response = ros.set_bool('trainer/record', True)
+    assert shared.set_bool('trainer/record', False).message.endswith(str(second))
+    response = shared.set_bool('trainer/record', True)
     assert response.success
     assert response.message == f'recording to {third}, because {bag} exists already'
-    assert trainer.stop() == 0
+    assert shared.set_bool('trainer/record', False).success
     assert values(recorded(second)) == list(range(5))
     assert summary(third).complete
-    assert bag.read_text() == 'precious'
-    warnings = [line for line in trainer.output().splitlines() if 'WARN' in line]
+    assert [path.read_text() for path in bag.iterdir()] == ['precious']
+    warnings = [line for line in shared.printed().splitlines() if 'WARN' in line]
     assert [line.partition(': ')[2] for line in warnings] == [
         f'recording to {path}, because {bag} exists already' for path in (second, third)]
+    shared.node.destroy_publisher(publisher)
+
+
+def test_best_effort_publisher_is_recorded(shared: Harness, tmp_path: Path) -> None:
+    bag = tmp_path / 'run.mcap'
+    received = shared.listen(Temperature, topics.TEMPERATURE, BEST_EFFORT)
+    publisher = record(shared, bag, BEST_EFFORT, subscribers=2)
+    for k in range(20):
+        publisher.publish(temperature(float(k)))
+        shared.wait_until(lambda k=k: len(received) > k)
+    # which is flushed twice a second
+    shared.wait_until(lambda: summary(bag).counts.get(TOPIC, 0) >= 20)
+    assert shared.set_bool('trainer/record', False).success
+    assert values(recorded(bag)) == list(range(20))
+    shared.node.destroy_publisher(publisher)
 
 
 def test_topic_outside_the_loop_is_recorded_by_name_in_a_namespace(
@@ -130,25 +159,6 @@ def test_topic_outside_the_loop_is_recorded_by_name_in_a_namespace(
     assert {entry.type_name for entry in messages} == {'std_msgs/msg/String'}
 
 
-def test_best_effort_publisher_is_recorded(ros: Harness, tmp_path: Path) -> None:
-    bag = tmp_path / 'run.mcap'
-    trainer = ros.start('trainer', {'output': bag})
-    received = ros.listen(Temperature, topics.TEMPERATURE, BEST_EFFORT)
-    publisher = ros.speak(
-        Temperature, topics.TEMPERATURE, BEST_EFFORT, to='trainer', subscribers=2)
-    for k in range(20):
-        publisher.publish(temperature(float(k)))
-        ros.wait_until(lambda k=k: len(received) > k)
-    assert _stop_after(ros, trainer, bag, 20) == 0
-    assert values(recorded(bag)) == list(range(20))
-
-
-def _stop_after(ros: Harness, trainer: NodeProcess, bag: Path, count: int) -> int:
-    """Stop once so many messages are in the bag, which is flushed twice a second."""
-    ros.wait_until(lambda: summary(bag).message_count >= count)
-    return trainer.stop()
-
-
 def test_full_disk_stops_the_recording_but_not_the_node(ros: Harness, tmp_path: Path) -> None:
     bag = tmp_path / 'run.mcap'
     # no file of this process may grow beyond 60 kB
@@ -158,12 +168,17 @@ def test_full_disk_stops_the_recording_but_not_the_node(ros: Harness, tmp_path: 
                'sys.exit(main())\n')
     trainer = ros.start('trainer', {'output': bag}, command=(sys.executable, '-c', program))
     publisher = ros.speak(Temperature, topics.TEMPERATURE, to='trainer')
-    say(publisher, 900)
+    say(publisher, 100)
+    # which is flushed twice a second
+    ros.wait_until(lambda: summary(bag).counts.get(TOPIC, 0) >= 100)
+    say(publisher, 900, first=100)
     status = ros.wait_for_status(
         'trainer: recording', lambda s: s.level == DiagnosticStatus.ERROR)
     assert status.message.startswith(f'recording to {bag} stopped: ')
     kept = values(list(read_messages(bag, ['/temperature'], recover=True)))
     assert kept == list(range(len(kept)))
+    assert len(kept) >= 100
+    assert not summary(bag).complete
 
     (tmp_path / 'next').mkdir()
     ros.set_parameters('trainer', output=str(tmp_path / 'next' / 'run.mcap'))

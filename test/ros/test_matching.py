@@ -6,6 +6,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
+import re
 import time
 
 import pytest
@@ -14,29 +15,40 @@ from rclpy.context import Context
 from rclpy.duration import Duration
 from rclpy.executors import SingleThreadedExecutor
 from rclpy.node import Node
-from rclpy.qos import DurabilityPolicy, LivelinessPolicy, QoSProfile, ReliabilityPolicy
-from sensor_msgs.msg import Temperature
+from rclpy.qos import (
+    DurabilityPolicy,
+    LivelinessPolicy,
+    QoSPolicyKind,
+    QoSProfile,
+    ReliabilityPolicy,
+)
+from rclpy.qos_overriding_options import QoSOverridingOptions
+from sensor_msgs.msg import JointState, Temperature
 
 from koopman_ros.ros import topics
 from koopman_ros.ros.matching import Matching
 from koopman_ros.testing import isolated_domain
-
-TIMEOUT = 20.0  # s
+from support.messages import TIMEOUT
 
 
 class Pair:
     """A node that watches what matches it, and another one."""
 
     def __init__(self) -> None:
-        self.context = Context()
-        rclpy.init(context=self.context)
-        self.own, self.other = (Node(name, context=self.context) for name in ('own', 'other'))
-        self.executor = SingleThreadedExecutor(context=self.context)
+        # no participant may use a topic for two types
+        self.own, self.other = (self._node(name) for name in ('own', 'other'))
+        self.executor = SingleThreadedExecutor(context=self.own.context)
         self.executor.add_node(self.own)
-        self.executor.add_node(self.other)
         self.matching = Matching(self.own, lambda: None)
         self.speaker = self.matching.publish(Temperature, 'command', topics.LOOP_QOS)
-        self.matching.subscribe(Temperature, 'temperature', lambda _: None, topics.LOOP_QOS)
+        self.matching.subscribe(
+            Temperature, 'temperature', lambda _: None, topics.LOOP_QOS,
+            qos_overriding_options=QoSOverridingOptions((QoSPolicyKind.RELIABILITY,)))
+
+    def _node(self, name: str) -> Node:
+        context = Context()
+        rclpy.init(context=context)
+        return Node(name, context=context)
 
     def wait(self, condition: Callable[[], bool]) -> None:
         deadline = time.monotonic() + TIMEOUT
@@ -46,9 +58,9 @@ class Pair:
 
     def close(self) -> None:
         self.executor.shutdown()
-        self.own.destroy_node()
-        self.other.destroy_node()
-        rclpy.shutdown(context=self.context)
+        for node in (self.own, self.other):
+            node.destroy_node()
+            rclpy.shutdown(context=node.context)
 
 
 @pytest.fixture(scope='module')
@@ -78,14 +90,24 @@ def test_subscription_that_asks_for_more_than_is_offered(
     pair.wait(lambda: not pair.matching.complaint)
 
 
-def test_publisher_that_offers_less_than_is_asked_for(pair: Pair) -> None:
-    offering = pair.other.create_publisher(
-        Temperature, 'temperature', QoSProfile(depth=1, reliability=ReliabilityPolicy.BEST_EFFORT))
-    pair.wait(lambda: pair.matching.complaint == (
-        '/temperature: /other publishes with best_effort, which is incompatible in reliability, '
-        'so that no message passes: use reliable there'))
+@pytest.mark.parametrize(('kind', 'qos', 'complaint'), [
+    (Temperature, QoSProfile(depth=1, reliability=ReliabilityPolicy.BEST_EFFORT),
+     '/temperature: /other publishes with best_effort, which is incompatible in reliability, '
+     'so that no message passes: use reliable there, or start this node with -p '
+     'qos_overrides./temperature.subscription.reliability:=best_effort'),
+    (JointState, topics.LOOP_QOS,
+     '/temperature: /other uses it for sensor_msgs/msg/JointState, here it is '
+     'sensor_msgs/msg/Temperature: end that node, or remap its topic'),
+])
+def test_publisher_whose_messages_cannot_be_heard(
+        pair: Pair, capfd: pytest.CaptureFixture[str], kind: type, qos: QoSProfile, complaint: str
+        ) -> None:
+    offering = pair.other.create_publisher(kind, 'temperature', qos)
+    # found, perhaps, before its name is
+    pair.wait(lambda: pair.matching.complaint == complaint)
     pair.other.destroy_publisher(offering)
     pair.wait(lambda: not pair.matching.complaint)
+    assert f'[WARN] [own]: {complaint}\n' in re.sub(r' \[[0-9.]+\]', '', capfd.readouterr().err)
 
 
 @pytest.mark.parametrize('qos', [

@@ -89,7 +89,10 @@ def watchdog(_: Node, __: Path) -> Callable[[], object]:
 @pytest.mark.parametrize('make', [diagnostics, matching, instruments, recorder, recording,
                                   experiment_run, experiment, training, watchdog])
 def test_what_a_part_has_created_goes_with_it(
-        shared_ros: Harness, tmp_path: Path, make: Make) -> None:
+        shared_ros: Harness, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, make: Make) -> None:
+    # a training that loads no library, and ends when it is asked to
+    monkeypatch.setattr('koopman_ros.jobs.training._command', lambda: (
+        'sh', '-c', 'cat > /dev/null'))
     node = shared_ros.node
 
     def created() -> tuple[object, ...]:

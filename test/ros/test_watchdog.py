@@ -56,25 +56,27 @@ def bench(shared_bench: Bench) -> Bench:
     return shared_bench
 
 
-@pytest.mark.parametrize(('celsius', 'words'), [
-    (math.nan, 'the measured temperature is nan, not finite: check the sensor'),
-    (400.0, 'the measured temperature 400.00 degC is outside the range of the sensor, -20.00 degC '
-            'to 150.00 degC: check it'),
-    (30.0, 'to 30.00 degC in 2 s, at most 2 K and 2 K/s are possible: check the sensor'),
-])
-def test_burst_of_nonsense_holds_the_coolant_which_goes_on_smoothly(
-        bench: Bench, celsius: float, words: str) -> None:
-    held = bench.commands[-1].temperature
-    count = 2 if celsius == 30.0 else 5
-    for k in range(21, 21 + count):
-        assert bench.measure(celsius, float(k)).temperature == held
-    status = bench.status()
-    assert status.level == DiagnosticStatus.ERROR
-    assert status.message.startswith('the last command is held: ')
-    assert words in status.message
-    assert value(status, 'active law') == 'hold'
-    after = measured(bench, 21 + count, 10)
-    assert np.max(np.abs(np.diff([held, *after]))) < 0.2
+def test_bursts_of_nonsense_hold_the_coolant_which_goes_on_smoothly(bench: Bench) -> None:
+    k = 21
+    for celsius, count, words in (
+            (math.nan, 5, 'the measured temperature is nan, not finite: check the sensor'),
+            # which is no temperature
+            (-300.0, 5, 'the measured temperature is nan, not finite: check the sensor'),
+            (400.0, 5, 'the measured temperature 400.00 degC is outside the range of the sensor, '
+             '-20.00 degC to 150.00 degC: check it'),
+            (30.0, 2, 'to 30.00 degC in 2 s, at most 2 K and 2 K/s are possible: check the '
+             'sensor')):
+        held = bench.commands[-1].temperature
+        for second in range(k, k + count):
+            assert bench.measure(celsius, float(second)).temperature == held
+        status = bench.status()
+        assert status.level == DiagnosticStatus.ERROR
+        assert status.message.startswith('the last command is held: ')
+        assert words in status.message
+        assert value(status, 'active law') == 'hold'
+        after = measured(bench, k + count, 10)
+        assert np.max(np.abs(np.diff([held, *after]))) < 0.2
+        k += count + 10
     status = bench.status()
     assert status.level == DiagnosticStatus.OK
     assert value(status, 'active law') == 'learned law'
@@ -114,10 +116,19 @@ def test_runaway_beyond_the_trained_range_goes_down_the_ladder_and_up_again(benc
     assert {level for law, level in statuses if law == 'safe input'} == {DiagnosticStatus.ERROR}
 
 
-# Clocks.
+def test_measurements_may_stay_away_where_the_timeout_is_off(bench: Bench) -> None:
+    bench.ros.set_parameters('controller', hold_timeout=0.0)
+    count = len(bench.commands)
+    status = bench.status(lambda s: float(value(s, 'since last measurement [s]')) > 1.5)
+    assert status.level == DiagnosticStatus.OK
+    assert len(bench.commands) == count
+    bench.ros.set_parameters('controller', hold_timeout=RESET['hold_timeout'])
 
 
-def test_time_may_begin_at_zero_and_jump_by_an_hour_and_back(ros: Harness) -> None:
+# Clocks, and measurements that stay away.
+
+
+def test_time_may_begin_at_zero_jump_by_an_hour_and_back_and_come_to_its_end(ros: Harness) -> None:
     bench = Bench(ros, first=0.0)
     assert seconds(bench.commands[0]) == 0.0
     commands = [bench.commands[0].temperature]
@@ -130,38 +141,41 @@ def test_time_may_begin_at_zero_and_jump_by_an_hour_and_back(ros: Harness) -> No
     assert value(status, 'measurements') == '16'
     assert status.level == DiagnosticStatus.OK
 
+    ros.set_parameters('controller', measurement_timeout=0.1)
+    last = float(LAST_STAMP_SECONDS)
+    bench.measure(STEADY, last)
+    ros.wait_until(lambda: len(own_commands(bench, last)) >= 2)
+    assert {message.header.stamp.sec for message in own_commands(bench, last)} == {
+        LAST_STAMP_SECONDS}
+    assert all(math.isfinite(message.temperature) for message in bench.commands)
 
-def test_simulated_time_that_nobody_publishes_is_told(ros: Harness) -> None:
-    bench = Bench(ros, arguments=('-p', 'use_sim_time:=true'))
-    times = iter(range(2, 10000))
 
-    def told() -> bool:
+def test_simulated_time_that_nobody_publishes_is_told_and_silence_in_it_ends_at_the_safe_coolant(
+        ros: Harness) -> None:
+    """The clock goes fifty times faster than the wall's."""
+    bench = Bench(ros, {'measurement_timeout': 10.0, 'hold_timeout': 20.0},
+                  ('-p', 'use_sim_time:=true'))
+    times = itertools.count(2)
+
+    def told() -> DiagnosticStatus | None:
         # measurements come all the time
         bench.measure(STEADY, float(next(times)))
-        return any('nobody publishes /clock' in status.message for status in ros.statuses)
+        return next((s for s in ros.statuses if 'nobody publishes /clock' in s.message), None)
 
-    ros.wait_until(told)
-    status = next(s for s in ros.statuses if 'nobody publishes /clock' in s.message)
+    status = ros.wait_until(told)
     assert status.level == DiagnosticStatus.WARN
     assert 'set use_sim_time to false' in status.message
     assert value(status, 'age of measurement [s]') == 'nan'
 
-
-# Measurements that stay away.
-
-
-def test_silence_in_simulated_time_ends_at_the_safe_coolant(ros: Harness) -> None:
-    """The clock goes fifty times faster than the wall's."""
     # a plant of which the controller hears the time alone
     elsewhere = [part for name in (topics.TEMPERATURE, topics.COOLANT_SETPOINT,
                                    topics.COOLANT_TEMPERATURE)
                  for part in ('-r', f'{name}:=elsewhere/{name}')]
     clock = ros.listen(Clock, topics.CLOCK, topics.CLOCK_QOS)
     ros.start('plant', {'speed': 50.0}, tuple(elsewhere))
-    bench = Bench(ros, {'measurement_timeout': 10.0, 'hold_timeout': 20.0},
-                  ('-p', 'use_sim_time:=true'))
     ros.wait_until(lambda: clock)
-    held = bench.measure(STEADY, 2.0).temperature
+    last = float(next(times))
+    held = bench.measure(STEADY, last).temperature
     begun = clock[-1].clock.sec
     status = bench.status(lambda s: s.level == DiagnosticStatus.ERROR)
     assert status.message.startswith(
@@ -175,12 +189,12 @@ def test_silence_in_simulated_time_ends_at_the_safe_coolant(ros: Harness) -> Non
     assert value(status, 'active law') == 'safe input'
     # 10 s until it holds and 20 s until it gives up, then at 60 K/min
     assert clock[-1].clock.sec - begun > 30.0 + (held - SAFE)
-    own = own_commands(bench, 2.0)
+    own = own_commands(bench, last)
     stamps = np.array([seconds(message) for message in own])
     commands = np.array([message.temperature for message in own])
-    assert stamps[0] > 12.0
+    assert stamps[0] > last + 10.0
     assert np.all(np.diff(stamps) > 0.0)
-    assert np.all(commands[stamps < 32.0] == held)
+    assert np.all(commands[stamps < last + 30.0] == held)
     assert np.all(-np.diff(commands) <= np.diff(stamps) * (1.0 + 1e-6))
     # the plant was not forgotten: the law takes over from there
     command = bench.measure(STEADY - 0.5, stamps[-1] + 5.0).temperature
@@ -188,44 +202,30 @@ def test_silence_in_simulated_time_ends_at_the_safe_coolant(ros: Harness) -> Non
     bench.status(lambda s: 'the measured' not in s.message)
 
 
-def test_silence_by_the_wall_clock_ends_at_the_safe_coolant(ros: Harness) -> None:
+def test_silence_by_the_wall_clock_ends_at_the_safe_coolant_or_with_the_operator(
+        ros: Harness) -> None:
     bench = Bench(ros, {'measurement_timeout': 0.3, 'hold_timeout': 1.5,
                         'coolant_rate_limit': 6000.0, 'safe_coolant': 10.0})
     held = bench.commands[0].temperature
     ros.wait_until(lambda: bench.commands[-1].temperature == 10.0)
     own = own_commands(bench, 1.0)
     assert own[0].temperature == held
-    # it is held for 1.5 s, within which a busy machine looks for it
-    assert 1.3 < seconds(own[0]) < 2.8
+    # it is held for 1.5 s, or longer where a busy machine looks for it late
+    safe = next(message for message in own if message.temperature != held)
+    assert seconds(own[0]) > 1.3
+    assert seconds(safe) > 2.8
     bench.status(lambda s: s.level == DiagnosticStatus.ERROR and (
         'the safe coolant temperature is commanded, coolant at 10.00 degC' in s.message))
     assert 'learned law -> hold' in bench.process.output()
 
-
-def test_silence_in_manual_mode_leaves_the_coolant_to_the_operator(ros: Harness) -> None:
-    bench = Bench(ros, {'measurement_timeout': 0.3, 'hold_timeout': 0.0})
+    # in manual mode the coolant is left to the operator
+    ros.set_parameters('controller', hold_timeout=0.0)
     ros.set_bool('controller/set_automatic', False)
-    held = bench.measure(STEADY, 2.0).temperature
+    last = seconds(bench.commands[-1]) + 60.0
+    held = bench.measure(STEADY, last).temperature
     manual = ros.speak(Temperature, topics.MANUAL_COOLANT_SETPOINT, to='controller')
     manual.publish(temperature(held - 0.5))
     ros.wait_until(lambda: bench.commands[-1].temperature == pytest.approx(held - 0.5))
-    assert own_commands(bench, 2.0)
+    assert own_commands(bench, last)
     bench.status(lambda s: s.level == DiagnosticStatus.ERROR and (
         'no measurement for more than 0.3 s: manual mode' in s.message))
-
-
-def test_measurements_may_stay_away_where_the_timeout_is_off(bench: Bench) -> None:
-    bench.ros.set_parameters('controller', hold_timeout=0.0)
-    count = len(bench.commands)
-    status = bench.status(lambda s: float(value(s, 'since last measurement [s]')) > 1.5)
-    assert status.level == DiagnosticStatus.OK
-    assert len(bench.commands) == count
-    bench.ros.set_parameters('controller', hold_timeout=RESET['hold_timeout'])
-
-
-def test_silence_at_the_end_of_the_stamps_is_answered(ros: Harness) -> None:
-    last = float(LAST_STAMP_SECONDS)
-    bench = Bench(ros, {'measurement_timeout': 0.1}, first=last)
-    ros.wait_until(lambda: len(own_commands(bench, last)) >= 2)
-    assert {message.header.stamp.sec for message in bench.commands} == {LAST_STAMP_SECONDS}
-    assert all(math.isfinite(message.temperature) for message in bench.commands)

@@ -91,9 +91,11 @@ def mutate(dice: random.Random, content: bytes) -> bytes:
     return content
 
 
-def _range(dice: random.Random, content: bytes) -> tuple[int, int]:
+def _pieces(dice: random.Random, content: bytes) -> tuple[bytes, bytes, bytes]:
+    """Return what is before a place, a piece from there on, and the rest."""
     start = dice.randrange(len(content) + 1)
-    return start, min(len(content), start + int(2 ** dice.uniform(0, 12)))
+    end = start + int(2 ** dice.uniform(0, 12))
+    return content[:start], content[start:end], content[end:]
 
 
 def _flip(dice: random.Random, content: bytes) -> bytes:
@@ -107,36 +109,22 @@ def _cut(dice: random.Random, content: bytes) -> bytes:
     return content[:dice.randrange(len(content) + 1)]
 
 
-def _delete(dice: random.Random, content: bytes) -> bytes:
-    start, end = _range(dice, content)
-    return content[:start] + content[end:]
-
-
-def _repeat(dice: random.Random, content: bytes) -> bytes:
-    start, end = _range(dice, content)
-    return content[:end] + content[start:end] + content[end:]
-
-
-def _swap(dice: random.Random, content: bytes) -> bytes:
-    start, end = _range(dice, content)
-    later, last = _range(dice, content[end:])
-    later, last = later + end, last + end
-    return (content[:start] + content[later:last] + content[end:later] + content[start:end]
-            + content[last:])
-
-
-def _zero(dice: random.Random, content: bytes) -> bytes:
-    start, end = _range(dice, content)
-    return content[:start] + bytes(end - start) + content[end:]
+def _rearrange(dice: random.Random, content: bytes) -> bytes:
+    """Delete a piece, repeat it, blank it, or change its place with a later one."""
+    head, piece, tail = _pieces(dice, content)
+    between, later, end = _pieces(dice, tail)
+    return head + dice.choice([b'', 2 * piece, bytes(len(piece)), later]) + (
+        between + piece + end if dice.random() < 0.25 else tail)
 
 
 def _overwrite(dice: random.Random, content: bytes) -> bytes:
     word = struct.pack('<Q', dice.choice(_WORDS))[:dice.choice([2, 4, 8])]
-    start = dice.randrange(len(content) + 1)
-    return content[:start] + word + content[start + len(word):]
+    head, piece, tail = _pieces(dice, content)
+    return head + word + (piece + tail)[len(word):]
 
 
-_DAMAGES = [_flip, _flip, _cut, _delete, _repeat, _swap, _zero, _overwrite, _overwrite]
+_DAMAGES = [_flip, _flip, _cut, _rearrange, _rearrange, _rearrange, _rearrange, _overwrite,
+            _overwrite]
 
 
 def fill(writer: BagWriter, samples: list[Sample]) -> None:
