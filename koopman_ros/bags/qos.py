@@ -10,11 +10,11 @@ from typing import Any
 import yaml
 
 from koopman_ros.bags.plain_yaml import load_plain
+from koopman_ros.units import NANOSECONDS
 
 # An unlimited duration [ns]: RMW_DURATION_INFINITE, 9223372036 s and 854775807 ns.
 INFINITE_NS = 2**63 - 1
 
-_NS_PER_S = 1_000_000_000
 # The spellings of rmw/qos_string_conversions.h; 'unknown' is what discovery reports when a
 # publisher's history is not on the wire.
 _POLICIES = {
@@ -115,9 +115,9 @@ def _profile(mapping: Mapping[str, Any]) -> QosProfile:
 
 
 def _nanoseconds(duration: Mapping[str, int]) -> int:
-    return min(int(duration['sec']) * _NS_PER_S + int(duration['nsec']), INFINITE_NS)
+    return min(int(duration['sec']) * NANOSECONDS + int(duration['nsec']), INFINITE_NS)
 
 
 def _duration(nanoseconds: int) -> dict[str, int]:
-    seconds, rest = divmod(nanoseconds, _NS_PER_S)
+    seconds, rest = divmod(nanoseconds, NANOSECONDS)
     return {'sec': seconds, 'nsec': rest}

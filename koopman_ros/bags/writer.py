@@ -17,9 +17,9 @@ from koopman_ros.bags.mcap_file import COMPRESSIONS
 from koopman_ros.bags.metadata import RecordedTopic
 from koopman_ros.bags.qos import QosProfile
 from koopman_ros.bags.schemas import MessageDefinition
+from koopman_ros.units import NANOSECONDS
 
 _MAX_TIME_NS = 2**63 - 1
-_NS_PER_S = 1_000_000_000
 _BYTES = (bytes, bytearray, memoryview)
 
 
@@ -92,7 +92,7 @@ class BagWriter:
         self._closed = False
         self._files = FileSequence(
             self.path, compression, _string_pairs(custom_data or {}),
-            max_file_bytes or math.inf, round(max_file_duration_s * _NS_PER_S) or math.inf)
+            max_file_bytes or math.inf, round(max_file_duration_s * NANOSECONDS) or math.inf)
 
     @property
     def mcap_path(self) -> Path:

@@ -30,14 +30,6 @@ def test_motion_under_steps_is_neither(motion: np.ndarray, noise: float, stride:
     assert not jump.any()
 
 
-def test_a_step_from_long_rest_is_neither() -> None:
-    time = np.arange(3000.0)
-    values = 51.0 - 10.0 * (1.0 - np.exp(-np.maximum(time - 2950.0, 0.0) / 25.0))
-    spike, jump = spikes_and_jumps(values, 1.0)
-    assert not spike.any()
-    assert not jump.any()
-
-
 @pytest.mark.parametrize('noise', [0.0, 0.1])
 def test_spikes_and_jumps_are_found(motion: np.ndarray, noise: float) -> None:
     values = motion + noise * np.random.default_rng(2).standard_normal(len(motion))
@@ -48,13 +40,15 @@ def test_spikes_and_jumps_are_found(motion: np.ndarray, noise: float) -> None:
     assert np.flatnonzero(jump).tolist() == [900]
 
 
-def test_a_reset_while_all_rests_is_found() -> None:
-    values = np.r_[np.full(200, 40.0), np.full(200, 51.0)]
+@pytest.mark.parametrize(('values', 'jumps'), [
+    # a step of the input after a long rest
+    (51.0 - 10.0 * (1.0 - np.exp(-np.maximum(np.arange(3000.0) - 2950.0, 0.0) / 25.0)), []),
+    # a reset while all rests, and one that is too small
+    (np.r_[np.full(200, 40.0), np.full(200, 51.0)], [200]),
+    (np.r_[np.full(200, 40.0), np.full(200, 40.9)], []),
+    # few samples tell nothing
+    (np.r_[np.zeros(20), 100.0, np.zeros(20)], [])])
+def test_jumps_after_a_rest(values: np.ndarray, jumps: list[int]) -> None:
     spike, jump = spikes_and_jumps(values, 1.0)
     assert not spike.any()
-    assert np.flatnonzero(jump).tolist() == [200]
-
-
-def test_few_samples_tell_nothing() -> None:
-    values = np.r_[np.zeros(20), 100.0, np.zeros(20)]
-    assert not np.any(spikes_and_jumps(values, 1.0))
+    assert np.flatnonzero(jump).tolist() == jumps

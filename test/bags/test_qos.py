@@ -29,25 +29,15 @@ DISCOVERED = """\
   avoid_ros_namespace_conventions: false"""
 
 
-def test_text_of_one_profile() -> None:
-    assert dump_offered_qos([QosProfile(history='unknown', depth=0)]) == DISCOVERED
-
-
-def test_no_profile_is_an_empty_sequence() -> None:
+def test_text_of_profiles() -> None:
     assert dump_offered_qos([]) == '[]'
-
-
-def test_finite_duration_splits_into_seconds_and_nanoseconds() -> None:
-    mapping = qos_mappings([QosProfile(deadline_ns=2_500_000_001)])[0]
-    assert mapping['deadline'] == {'sec': 2, 'nsec': 500_000_001}
-
-
-def test_equal_profiles_are_written_out_each() -> None:
-    profile = QosProfile()
+    assert dump_offered_qos([QosProfile(history='unknown', depth=0)]) == DISCOVERED
+    # those that are equal are written out each
+    profile = QosProfile(deadline_ns=2_500_000_001)
     text = dump_offered_qos([profile, profile])
-    assert '&' not in text
-    assert '*' not in text
+    assert not {'&', '*'}.intersection(text)
     assert yaml.safe_load(text) == qos_mappings([profile, profile])
+    assert yaml.safe_load(text)[0]['deadline'] == {'sec': 2, 'nsec': 500_000_001}
 
 
 @pytest.mark.parametrize(('field', 'value', 'sentence'), [
@@ -67,12 +57,6 @@ def test_bad_values(field: str, value: Any, sentence: str) -> None:
 
 def test_words_are_those_of_rclpy() -> None:
     qos = importlib.import_module('rclpy.qos')
-    policies = {
-        'history': qos.HistoryPolicy,
-        'reliability': qos.ReliabilityPolicy,
-        'durability': qos.DurabilityPolicy,
-        'liveliness': qos.LivelinessPolicy,
-    }
-    for field, policy in policies.items():
-        for word in policy.short_keys():
+    for field in ('history', 'reliability', 'durability', 'liveliness'):
+        for word in getattr(qos, f'{field.capitalize()}Policy').short_keys():
             assert getattr(QosProfile(**{field: word}), field) == word

@@ -17,11 +17,10 @@ import time
 import numpy as np
 
 from koopman_ros.bags import summary
-from koopman_ros.parameters.controller import ControllerParameters
 from koopman_ros.testing import HarnessError
 from validation.faults.events import EVENTS
 from validation.faults.harness import FaultHarness, LOCKSTEP
-from validation.faults.judge import Responses, responses, RUNAWAY
+from validation.faults.judge import Bounds, out_of_range, Responses, responses, RUNAWAY
 from validation.faults.trace import Array, Trace
 
 HOURS = 24.0
@@ -163,13 +162,7 @@ def _held_against(trace: Trace, answers: Responses, memory: dict[str, Memory],
         yield (f'of {answers.measurements} measurements {answers.unanswered} were not answered; '
                f'{answers.repeated} answers were repeated, {answers.unasked} unasked, '
                f'{answers.out_of_order} out of order')
-    usual = ControllerParameters()
-    wild = [command for command in trace.commands
-            if not usual.coolant_min <= command.celsius <= usual.coolant_max]
-    if wild:
-        yield (f'{len(wild)} commands are not within {usual.coolant_min:g} to '
-               f'{usual.coolant_max:g} degC, the first {wild[0].celsius:g} degC at '
-               f'{wild[0].seconds:.0f} s')
+    yield from out_of_range(trace, Bounds())
     if not hottest < RUNAWAY:
         yield f'the reactor reached {hottest:.1f} degC'
     for name, seen in memory.items():

@@ -125,16 +125,19 @@ def _recovery(trace: Trace, band: float) -> float:
     return float(times[np.flatnonzero(out)[-1] + 1] - trace.end) if np.any(out) else 0.0
 
 
+def out_of_range(trace: Trace, bounds: Bounds) -> list[str]:
+    """Say which command is the first outside its range, if any is."""
+    wrong = next((command for command in trace.commands if not
+                  bounds.coolant_min <= command.celsius <= bounds.coolant_max), None)
+    return [] if wrong is None else [
+        f'the command {wrong.celsius:g} degC at {wrong.seconds:.0f} s is not within '
+        f'{bounds.coolant_min:g} to {bounds.coolant_max:g} degC']
+
+
 def _commands(trace: Trace, bounds: Bounds) -> list[str]:
     if not trace.commands:
         return ['the controller never commanded']
-    reasons = []
-    for command in trace.commands:
-        if not bounds.coolant_min <= command.celsius <= bounds.coolant_max:
-            reasons.append(
-                f'the command {command.celsius:g} degC at {command.seconds:.0f} s is not within '
-                f'{bounds.coolant_min:g} to {bounds.coolant_max:g} degC')
-            break
+    reasons = out_of_range(trace, bounds)
     times, steps = trace.steps()
     # written so that NaN counts
     large = np.flatnonzero(~(steps <= bounds.largest_step + 1e-6))
