@@ -3,8 +3,6 @@
 
 """A polynomial model of a plant's drift, linear in what is estimated."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property

@@ -3,8 +3,6 @@
 
 """Choice of a drift model among all methods and degrees, by held-out segments."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Mapping, Sequence
 import contextlib
 from dataclasses import dataclass

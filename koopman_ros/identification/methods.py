@@ -3,8 +3,6 @@
 
 """The methods that identification chooses from: a row each."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Mapping, Sequence
 
 from koopman_ros.identification.drift import DriftModel

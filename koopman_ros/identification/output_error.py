@@ -3,8 +3,6 @@
 
 """Output-error estimate: the drift whose predictions fit the measurements."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import cached_property, partial

@@ -3,8 +3,6 @@
 
 """Drift from derivatives by total variation of x - integral(B u)."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 
 import numpy as np

@@ -3,8 +3,6 @@
 
 """Drift from integrals against test functions: the weak form, without derivatives."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 
 import numpy as np

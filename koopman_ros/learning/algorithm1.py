@@ -3,8 +3,6 @@
 
 """Algorithm 1 of the paper, as printed: random start, decoder term, decreasing lambda."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import torch

@@ -3,8 +3,6 @@
 
 """Share of the range of states and inputs that episodes visit."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 
 import numpy as np

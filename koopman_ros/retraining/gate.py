@@ -3,8 +3,6 @@
 
 """Acceptance of a new lift, on data held out of its estimation and training."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 import itertools
 

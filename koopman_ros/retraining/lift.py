@@ -3,8 +3,6 @@
 
 """Training of a lift on an estimated drift: samples, nominal point, recipe."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

@@ -3,8 +3,6 @@
 
 """Report of a retraining beside the model: figures as JSON, a page, a picture."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any

@@ -3,8 +3,6 @@
 
 """A day of plant time with whatever may happen in one: nothing is lost, and nothing grows."""
 
-from __future__ import annotations
-
 from collections import Counter
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass

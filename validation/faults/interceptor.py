@@ -3,8 +3,6 @@
 
 """What lies between plant and controller: traces messages, and alters them where asked to."""
 
-from __future__ import annotations
-
 from diagnostic_msgs.msg import DiagnosticArray
 from rclpy.node import Node
 from sensor_msgs.msg import Temperature

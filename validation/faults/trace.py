@@ -3,16 +3,13 @@
 
 """What happened in a case: plain figures, gathered while it ran and judged afterwards."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass, field
 import itertools
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
-Array = NDArray[np.float64]
+from koopman_ros.arrays import Array
 
 
 class Sample(NamedTuple):
