@@ -3,8 +3,6 @@
 
 """The process that retrains, as its parent sees it."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 import itertools
 import os

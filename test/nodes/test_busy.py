@@ -3,8 +3,6 @@
 
 """The controller whose executor does not come to its timers: who commands, and who ends it."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterable, Sequence
 import os
 from pathlib import Path

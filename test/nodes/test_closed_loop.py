@@ -3,8 +3,6 @@
 
 """Plant and controller in a loop: any order of start, any names, no offset, and no bump."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 import signal
 

@@ -3,8 +3,6 @@
 
 """The controller as a process: what it answers to measurements, set-points and operators."""
 
-from __future__ import annotations
-
 import itertools
 import math
 

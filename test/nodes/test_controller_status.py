@@ -3,8 +3,6 @@
 
 """What the controller tells of itself: figures for an operator, internals to plot, conflicts."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 import math
 from pathlib import Path

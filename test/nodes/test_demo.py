@@ -3,8 +3,6 @@
 
 """The demo as a user runs it, and the closed loop behind it."""
 
-from __future__ import annotations
-
 import contextlib
 import json
 from pathlib import Path

@@ -4,8 +4,6 @@
 
 """The identification experiment across processes: steps on a plant, refusals, ways back."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from itertools import pairwise
 import math

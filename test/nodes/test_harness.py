@@ -3,8 +3,6 @@
 
 """The harness: its processes end whatever happens, and it says what went wrong."""
 
-from __future__ import annotations
-
 import os
 from pathlib import Path
 import re

@@ -8,8 +8,6 @@ Processes are started from either. Those of the wheel have an environment of the
 notes every file of the repository that is opened in it.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 import os
 from pathlib import Path

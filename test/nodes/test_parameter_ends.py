@@ -3,8 +3,6 @@
 
 """Every parameter of every table at both ends of its range: what is accepted can be used."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterator, Mapping
 import contextlib
 from dataclasses import replace

@@ -3,8 +3,6 @@
 
 """The plant as a process: its measurements, its time, and what it does with commands."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Mapping
 from itertools import pairwise
 import math

@@ -3,8 +3,6 @@
 
 """The player as a process: recorded inputs into a fresh controller, which answers as before."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from pathlib import Path
 import time

@@ -3,8 +3,6 @@
 
 """The bag of a closed loop: opened with readers that are not ours, and recorded twice."""
 
-from __future__ import annotations
-
 from pathlib import Path
 import re
 from typing import Any

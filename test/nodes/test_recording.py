@@ -4,8 +4,6 @@
 
 """Recording that goes wrong or goes on for long: kills, split bags, full disks, fast topics."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from dataclasses import dataclass
 from itertools import pairwise

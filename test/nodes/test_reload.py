@@ -4,8 +4,6 @@
 
 """Another model in the running controller: nothing unanswered, no jump, reasons in words."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 import itertools

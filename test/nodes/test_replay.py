@@ -3,8 +3,6 @@
 
 """A controller recorded by a trainer, and replayed: bit-identical, and with another model."""
 
-from __future__ import annotations
-
 from collections import Counter
 from collections.abc import Callable, Iterable
 import json

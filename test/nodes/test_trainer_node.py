@@ -3,8 +3,6 @@
 
 """The trainer as a process: what it records, how it starts and stops, and how the bag ends."""
 
-from __future__ import annotations
-
 from pathlib import Path
 import signal
 import sys

@@ -3,8 +3,6 @@
 
 """The trainer trains: as a task of its own, on request beside a running loop, to its end."""
 
-from __future__ import annotations
-
 import json
 from pathlib import Path
 import re

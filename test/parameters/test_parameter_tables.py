@@ -3,8 +3,6 @@
 
 """Parameter tables: words for ranges and refusals, and the shipped files that they write."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 import math
 from pathlib import Path

@@ -3,8 +3,6 @@
 
 """Complaints about others whose messages cannot pass, between two nodes of one process."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterator
 import re
 import time

@@ -3,8 +3,6 @@
 
 """What a part of a node has created goes with the part."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from pathlib import Path
 import threading

@@ -3,8 +3,6 @@
 
 """Parameters of running nodes, changed and read through their services as `ros2 param` does."""
 
-from __future__ import annotations
-
 import math
 from typing import Any
 

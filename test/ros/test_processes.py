@@ -3,8 +3,6 @@
 
 """Life of the processes: clean ends, bad starts in one line, imports, and how they are kept."""
 
-from __future__ import annotations
-
 import contextlib
 import ipaddress
 import os

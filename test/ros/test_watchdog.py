@@ -3,8 +3,6 @@
 
 """The controller when measurements are nonsense, stay away, or come with stamps that jump."""
 
-from __future__ import annotations
-
 import itertools
 import math
 
