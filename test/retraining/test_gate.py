@@ -191,24 +191,10 @@ def test_warns_of_a_state_that_is_not_measured(shipped):
     assert decision.rmse < decision.current_rmse
 
 
-def test_does_not_warn_where_all_is_measured():
+def test_does_not_warn_where_all_is_measured(trained):
     model = load(model_path('reactor_nz3'))
     found = identify(model.plant, [linear_run(400).episode()], degrees=(1,), methods=methods(20))
-    decision = decide(found, _as_trained(found, model), model, Thresholds())
-    assert decision.warnings == ()
-
-
-def _as_trained(found, like):
-    """Return the linear drift as if it were a lift that was trained."""
-    class Fit:
-        cond = 1.0
-
-    class Figures:
-        fit = Fit
-
-    class Trained:
-        model = linear_lift(like, float(found.drift.slope(like.states.center)[0, 0]),
-                            float(found.drift.input_matrix[0, 0]))
-        figures = Figures
-
-    return Trained
+    drift = replace(trained, model=linear_lift(
+        model, float(found.drift.slope(model.states.center)[0, 0]),
+        float(found.drift.input_matrix[0, 0])))
+    assert decide(found, drift, model, Thresholds()).warnings == ()

@@ -5,19 +5,17 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Callable
 from dataclasses import dataclass, field, replace
+import itertools
 import math
 import os
 from pathlib import Path
-import sys
 import tempfile
 from typing import Any
 
-from tqdm import tqdm
-
 from koopman_ros.reports import machine
-from validation.benchmarks.options import Options
+from validation.benchmarks.options import Options, say, tell
 from validation.benchmarks.training import picture, process, table
 from validation.benchmarks.training.plan import (
     Plan,
@@ -49,7 +47,8 @@ class _Comparison:
     traces: Traces = field(default_factory=dict)
     unbuilt: dict[str, tuple[int, int, str]] = field(default_factory=dict)
 
-    def case(self, system: str, samples: int, hidden: int, progress: _Progress) -> dict[str, Any]:
+    def case(self, system: str, samples: int, hidden: int, begin: Callable[[str], None]
+             ) -> dict[str, Any]:
         """Run all solvers on one case."""
         path = self.folder / 'case.npz'
         prepared = process.run(
@@ -59,7 +58,7 @@ class _Comparison:
             raise RuntimeError(f'the start for {system} could not be built: {prepared.failure}')
         outcomes = {}
         for solver in SOLVERS:
-            progress.next(f'{system}, N = {samples}, {hidden} hidden units: {SOLVERS[solver]}')
+            begin(f'{system}, N = {samples}, {hidden} hidden units: {SOLVERS[solver]}')
             outcomes[solver] = self._solve(solver, path, system, samples, hidden)
         self.traces[system, samples, hidden] = {
             solver: _drawn(outcome) for solver, outcome in outcomes.items()}
@@ -104,21 +103,26 @@ def run(options: Options) -> dict[str, Any]:
         'extent': options.extent.value, 'limit_seconds': plan.limit,
         'clock': 'processor time of one thread; wall_seconds are those on the wall', 'cases': []}
     total = len(cases) * len(SOLVERS) + len(plan.samples) + 2
-    with tempfile.TemporaryDirectory() as folder, _Progress(total) as progress:
+    steps = itertools.count(1)
+
+    def begin(label: str) -> None:
+        tell(f'training [{next(steps)}/{total}]: {label}')
+
+    with tempfile.TemporaryDirectory() as folder:
         comparison = _Comparison(plan, Path(folder))
         try:
             for system, samples, hidden in cases:
-                case = comparison.case(system, samples, hidden, progress)
+                case = comparison.case(system, samples, hidden, begin)
                 figures['cases'].append(case)
                 options.save(figures)
-                progress.say(table.of_case(case))
+                say(table.of_case(case))
             for name, sizes in costs.items():
                 # memory is measured in a fresh process each
                 for group in ([[size] for size in sizes] if name == 'samples' else [sizes]):
-                    progress.next(f'cost of an iteration by {name}')
+                    begin(f'cost of an iteration by {name}')
                     figures = _with_cost(figures, name, group, plan)
                     options.save(figures)
-            progress.say(table.of_cost(figures))
+            say(table.of_cost(figures))
         finally:
             picture.draw(options.output / 'training.png', comparison.traces, figures)
     figures['machine']['load_at_end'] = os.getloadavg()[0]
@@ -190,31 +194,3 @@ def _with_cost(figures: dict[str, Any], name: str, sizes: list[dict[str, int]], 
         figures[key] = {**figures.get(key, {}), **{
             str(event[name]): event['peak_megabytes'] for event in outcome.events}}
     return figures
-
-
-class _Progress:
-    """A bar on a terminal, plain lines elsewhere."""
-
-    def __init__(self, total: int) -> None:
-        self._bar = tqdm(total=total, unit='run', disable=not sys.stderr.isatty(), leave=False,
-                         bar_format='{bar:20} {n_fmt}/{total_fmt} {elapsed} {desc}')
-        self._begun, self._total = 0, total
-
-    def next(self, label: str) -> None:
-        """Tell what begins."""
-        if self._bar.disable:
-            print(f'[{self._begun + 1}/{self._total}] {label}', file=sys.stderr, flush=True)
-        else:
-            self._bar.update(self._begun - self._bar.n)
-            self._bar.set_description_str(label)
-        self._begun += 1
-
-    def say(self, lines: Iterable[str]) -> None:
-        """Print a result above the bar."""
-        tqdm.write('\n'.join(lines) + '\n', file=sys.stdout)
-
-    def __enter__(self) -> _Progress:
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self._bar.close()
