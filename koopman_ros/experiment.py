@@ -1,7 +1,6 @@
 # SPDX-FileCopyrightText: 2026 The koopman_ros Authors
 # SPDX-License-Identifier: Apache-2.0
 
-
 """The identification experiment: random steps of the input on a running plant, with a way back."""
 
 from __future__ import annotations
@@ -36,31 +35,20 @@ class Experiment:
     """
     Steps of random height and length (paper, section on the reactor), and what ends them.
 
-    :param duration: s.
-    :param input_lower: lowest level, in the input's unit; levels are uniform between the two.
-    :param input_upper: highest level.
-    :param hold_shortest: shortest time of a level, in s; times are uniform between the two.
-    :param hold_longest: longest time of a level, in s.
-    :param rate: largest change of the input, per s.
-    :param state_lower: smallest state that may be measured, in its unit.
-    :param state_upper: largest state.
-    :param safe_input: input that is safe whatever happened.
-    :param seed: of numpy's default generator; the same seed gives the same steps.
-    :param state: name of the measured state.
     :raises ValueError: when the limits contradict each other.
     """
 
-    duration: float
-    input_lower: float
-    input_upper: float
-    hold_shortest: float
-    hold_longest: float
-    rate: float
-    state_lower: float
-    state_upper: float
-    safe_input: float
-    seed: int
-    state: str = 'state'
+    duration: float  # s
+    input_lower: float  # lowest level, in the input's unit; levels are uniform between the two
+    input_upper: float  # highest level
+    hold_shortest: float  # shortest time of a level, in s; times are uniform between the two
+    hold_longest: float  # longest time of a level, in s
+    rate: float  # largest change of the input, per s
+    state_lower: float  # smallest state that may be measured, in its unit
+    state_upper: float  # largest state
+    safe_input: float  # input that is safe whatever happened
+    seed: int  # of numpy's default generator; the same seed gives the same steps
+    state: str = 'state'  # name of the measured state
 
     def __post_init__(self) -> None:
         for low, high in (('input_lower', 'input_upper'), ('state_lower', 'state_upper')):
@@ -85,11 +73,7 @@ class Experiment:
         return ends[:used], levels[:used]
 
     def refusal(self, measured: float) -> Reason | None:
-        """
-        Return why the experiment must not go on with a measurement, or None.
-
-        :param measured: of the state, in its unit.
-        """
+        """Return why the experiment must not go on with a measurement, or None."""
         if not np.isfinite(measured):
             return reason(Code.NOT_FINITE, signal=self.state, value=measured)
         if not self.state_lower <= measured <= self.state_upper:
@@ -100,23 +84,14 @@ class Experiment:
 
 @dataclass(frozen=True)
 class Progress:
-    """
-    How far an experiment is.
+    """How far an experiment is; it goes on commanding the safe input when it is over."""
 
-    :param start_ns: stamp of the measurement it started with.
-    :param time_ns: stamp of the last measurement.
-    :param command: last input.
-    :param interval: usual seconds between measurements; infinity before the second.
-    :param phase: what it is doing; it goes on commanding the safe input when it is over.
-    :param reason: why it was aborted.
-    """
-
-    start_ns: int
-    time_ns: int
-    command: float
-    interval: float = np.inf
+    start_ns: int  # stamp of the measurement it started with
+    time_ns: int  # stamp of the last measurement
+    command: float  # last input
+    interval: float = np.inf  # usual seconds between measurements; infinity before the second
     phase: Phase = Phase.RUNNING
-    reason: Reason | None = None
+    reason: Reason | None = None  # why it was aborted
 
     @property
     def elapsed(self) -> float:
@@ -144,11 +119,8 @@ def advance(experiment: Experiment, progress: Progress, measured: float | None, 
     As in the control step, a stamp that is not later moves nothing, and the rate limit counts a
     gap in the measurements as twice the interval before it.
 
-    :param experiment: the plan.
-    :param progress: as returned by the call before.
     :param measured: of the state, in its unit, or None.
     :param time_ns: its stamp, or the present time.
-    :return: the new progress with the command.
     """
     ahead = time_ns - progress.time_ns
     if measured is not None and (why := experiment.refusal(measured)):
@@ -178,26 +150,14 @@ def level(experiment: Experiment, progress: Progress) -> float:
 
 @dataclass(frozen=True)
 class Following:
-    """
-    Whether a controller in manual mode passes the input on, within limits of its own.
+    """Whether a controller in manual mode passes the input on, within limits of its own."""
 
-    :param heard: what it commanded last, or None at first.
-    :param astray: how many times in a row that was not, nor came nearer to, what was asked.
-    :param since: time of the first of these, in s.
-    """
-
-    heard: float | None = None
-    astray: int = 0
-    since: float = 0.0
+    heard: float | None = None  # what it commanded last, or None at first
+    astray: int = 0  # how many times in a row that was not, nor came nearer to, what was asked
+    since: float = 0.0  # time of the first of these, in s
 
     def after(self, heard: float, asked: float, now: float) -> Following:
-        """
-        Return the same after another command of the controller.
-
-        :param heard: what it commanded.
-        :param asked: what was asked.
-        :param now: time, in s.
-        """
+        """Return the same after the controller commanded `heard` where `asked` was asked."""
         gap = abs(heard - asked)
         nearer = self.heard is None or gap < abs(self.heard - asked) - _COMES_NEARER
         if gap <= _FOLLOWS_WITHIN or nearer:

@@ -3,11 +3,11 @@
 
 """Places of the shipped configuration: installed by colcon or pip, or beside the source tree."""
 
-from __future__ import annotations
-
 import os
 from pathlib import Path
 import sys
+
+LOOPBACK_PROFILE = 'loopback_discovery.xml'
 
 _PACKAGE = 'koopman_ros'
 

@@ -2,7 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 
 """
-First steps of a program, before anything large is loaded: signals, standard streams, parent.
+First steps of a program, before anything large is loaded, and its end by force.
 
 What is imported here is imported before signals are handled, so it is little.
 
@@ -11,19 +11,18 @@ tens of milliseconds an interrupt ends it with SIGINT or a traceback. A child th
 :func:`command` and :func:`blocked_signals` has no such time.
 """
 
-from __future__ import annotations
-
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 import contextlib
+import ctypes
+import faulthandler
 from functools import partial
 import importlib
 import os
 import signal
 import sys
+import threading
 import time
 from types import FrameType
-
-from koopman_ros.last_resort import end_by_force
 
 SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
 
@@ -35,6 +34,10 @@ _IN_THE_LOOP = ('koopman_ros.nodes.plant', 'koopman_ros.nodes.controller',
 _PR_SET_PDEATHSIG = 1  # of prctl(2)
 _END = 8.0  # s from the end of a program to that by force
 _QUIET = 1.0  # s after an interrupt in which another one is the same
+
+_SIGEV_THREAD = 2  # of sigevent(3type): the function is called in a thread of its own
+_LATER = 3.0  # s from the sentence, which some thread can say, to the stack
+_AFTER = 0.5  # s from the stack that is printed to the end
 
 
 def run_program(module: str, interrupted: int) -> int:
@@ -103,6 +106,64 @@ def _raise_interrupts() -> None:
         signal.signal(number, interrupt)
 
 
+class _Event(ctypes.Structure):
+    """sigevent of timer_create(2), with room to spare."""
+
+    _fields_ = (('value', ctypes.c_void_p), ('signal', ctypes.c_int), ('notify', ctypes.c_int),
+                ('function', ctypes.c_void_p), ('rest', ctypes.c_char * 64))
+
+
+def end_by_force(seconds: float, code: int = 0, sentence: str = '') -> Callable[[], None]:
+    """
+    End the process then, with a sentence; where no Python runs, print where it hangs and end it.
+
+    The latter comes some seconds later, and takes no lock of the interpreter's: Python prints
+    from a thread of its own, and the C library ends the process.
+
+    :param code: its exit code.
+    :param sentence: without one the latter comes at once.
+    :return: takes that back.
+    """
+    def give_up() -> None:
+        print(sentence, file=sys.stderr, flush=True)
+        os._exit(code)
+
+    said = threading.Timer(seconds, give_up)
+    if sentence:
+        said.daemon = True
+        said.start()
+        seconds += _LATER
+    cancel = _exit_later(seconds + _AFTER, code)
+    # where standard error is no file it says nothing
+    with contextlib.suppress(OSError, ValueError, RuntimeError):
+        faulthandler.dump_traceback_later(seconds, exit=cancel is None)
+
+    def disarm() -> None:
+        said.cancel()
+        faulthandler.cancel_dump_traceback_later()
+        if cancel is not None:
+            cancel()
+
+    return disarm
+
+
+def _exit_later(seconds: float, code: int) -> Callable[[], object] | None:
+    """Let the C library end the process then; return what takes it back, None where it cannot."""
+    libc = ctypes.CDLL(None)
+    if not hasattr(libc, 'timer_create'):
+        return None
+    # _exit(value)
+    event = _Event(code, 0, _SIGEV_THREAD, ctypes.cast(libc._exit, ctypes.c_void_p))
+    timer = ctypes.c_void_p()
+    if libc.timer_create(time.CLOCK_MONOTONIC, ctypes.byref(event), ctypes.byref(timer)):
+        return None
+    # the interval, and the time until the first; each in seconds and nanoseconds
+    due = (ctypes.c_long * 4)(0, 0, int(seconds), int(seconds % 1.0 * 1e9))
+    if libc.timer_settime(timer, 0, ctypes.byref(due), None):
+        return None
+    return lambda: libc.timer_delete(timer)
+
+
 def command(module: str, number: int, interrupted: int) -> tuple[str, ...]:
     """
     Return the command line of a child that does not outlive this process.
@@ -111,8 +172,6 @@ def command(module: str, number: int, interrupted: int) -> tuple[str, ...]:
     :param number: signal that the child gets when this process ends, however it ends.
     :param interrupted: as for :func:`run_program`.
     """
-    import threading
-
     # the signal comes when the thread ends that started the child
     parent = os.getpid() if threading.current_thread() is threading.main_thread() else 0
     return (sys.executable, '-m', 'koopman_ros.startup', str(parent), str(int(number)),
@@ -130,8 +189,6 @@ def blocked_signals() -> Iterator[None]:
 
 
 def _end_with_parent(parent: int, number: int) -> None:
-    import ctypes
-
     libc = ctypes.CDLL(None)
     if not parent or not hasattr(libc, 'prctl'):
         return

@@ -11,7 +11,7 @@ import re
 
 import pytest
 
-from koopman_ros.ros import access, topics
+from koopman_ros.ros import programs, topics
 
 ROOT = Path(__file__).parent.parent
 PAGES = [ROOT / 'README.md', ROOT / 'CONTRIBUTING.md', *sorted(ROOT.glob('docs/*.md'))]
@@ -86,8 +86,8 @@ def test_interfaces_list_the_topics_with_their_types() -> None:
 def test_interfaces_list_the_services() -> None:
     rows = {row[0].strip('`') for row in _rows('interfaces.md') if row[1].startswith('std_srvs/')}
     assert rows == {
-        service.replace('~', f'/{name}') for name, node in access.NODES.items()
-        for service in node.serves if service not in access.STANDARD_SERVICES}
+        service.replace('~', f'/{name}') for name, node in programs.PROGRAMS.items()
+        for service in node.serves if service not in programs.STANDARD_SERVICES}
 
 
 def test_operation_quotes_what_diagnostics_say() -> None:

@@ -1,14 +1,11 @@
 # SPDX-FileCopyrightText: 2026 The koopman_ros Authors
 # SPDX-License-Identifier: Apache-2.0
 
-
 """A retraining in a process of its own: start, progress, outcome, cancel; without ROS."""
-
-from __future__ import annotations
 
 from collections.abc import Mapping
 import contextlib
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 import json
 import os
 import queue
@@ -27,19 +24,12 @@ _PATIENCE = 5.0  # s from the request to end until the process is killed
 
 @dataclass(frozen=True)
 class JobState:
-    """
-    Where a retraining stands.
+    """Where a retraining stands, with the figures of a lift that was judged."""
 
-    :param share: done, in [0, 1].
-    :param text: what is done now, or how it ended.
-    :param ended: whether it has ended.
-    :param summary: figures of a lift that was judged, or None.
-    """
-
-    share: float = 0.0
-    text: str = 'starting'
-    ended: bool = False
-    summary: Mapping[str, Any] | None = field(default=None)
+    share: float = 0.0  # done, in [0, 1]
+    text: str = 'starting'  # what is done now, or how it ended
+    ended: bool = False  # whether it has ended
+    summary: Mapping[str, Any] | None = None
 
     @property
     def accepted(self) -> bool:

@@ -3,8 +3,6 @@
 
 """The controller node: answers each temperature measurement with a coolant set-point."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from dataclasses import asdict
 import sys
@@ -13,14 +11,12 @@ import threading
 from builtin_interfaces.msg import Time
 import numpy as np
 from rclpy.callback_groups import MutuallyExclusiveCallbackGroup
-from rclpy.clock import Clock, ClockType
 from rclpy.qos_overriding_options import QoSOverridingOptions
 from rclpy.timer import Timer
-from sensor_msgs.msg import JointState, Temperature
+from sensor_msgs.msg import Temperature
 from std_srvs.srv import SetBool, Trigger
 
-from koopman_ros.control import Arrival as Measured
-from koopman_ros.control import Controller, events, MANUAL, Mode, Report, State
+from koopman_ros.control import Arrival, Controller, events, MANUAL, Mode, Report, State
 from koopman_ros.control.events import Event, ModeChange, Silence
 from koopman_ros.parameters.controller import ControllerParameters, TABLE
 from koopman_ros.parameters.wire import LONGEST_FRAME_ID
@@ -31,13 +27,14 @@ from koopman_ros.ros import topics
 from koopman_ros.ros.codec import stamp_message, stamp_nanoseconds, temperature_message
 from koopman_ros.ros.controller_status import Counts, internals, Situation, status
 from koopman_ros.ros.diagnostics import DiagnosticsPublisher, Status, words_of
-from koopman_ros.ros.matching import Matching
+from koopman_ros.ros.matching import Matching, SINGLE
 from koopman_ros.ros.model_loading import load_suitable, rests_outside
 from koopman_ros.ros.model_loading import Situation as ModelSituation
 from koopman_ros.ros.model_reload import ModelReload
+from koopman_ros.ros.owned import wall_timer
 from koopman_ros.ros.process import LoopNode, run
 from koopman_ros.ros.record_publisher import RecordPublisher
-from koopman_ros.ros.timing import Arrival
+from koopman_ros.ros.timing import Timing
 from koopman_ros.ros.watchdog import PERIOD, Watchdog
 from koopman_ros.units import NANOSECONDS, to_kelvin
 
@@ -73,44 +70,34 @@ class ControllerNode(LoopNode):
         self._rests_outside = ''
         self._counts = Counts()
         self._temperature = np.nan
-        self._arrival = Arrival(self)
+        self._timing = Timing(self)
         self._coolant: Temperature | None = None
         self._waiting: list[Temperature] = []  # measurements that came before the coolant
         self._patience: Timer | None = None
         self._frame_id = ''
         self._frame_length = 0  # of the last measurement's, where it is too long
 
-        self._matching = Matching(self, self._on_neighbours, {
-            topics.COOLANT_SETPOINT: 'command the coolant',
-            topics.TEMPERATURE: 'publish the temperature'})
-        self._commands = self._matching.publish(
-            Temperature, topics.COOLANT_SETPOINT, topics.LOOP_QOS)
-        self._active = self.create_publisher(
-            Temperature, topics.ACTIVE_SETPOINT, topics.LATCHED_QOS)
-        self._predicted = self.create_publisher(
-            Temperature, topics.PREDICTED_TEMPERATURE, topics.LOOP_QOS)
-        self._internals = self.create_publisher(
-            JointState, topics.CONTROLLER_STATE, topics.LOOP_QOS)
+        self._matching = Matching(
+            self, lambda: self._diagnostics.publish_if_changed(), SINGLE)
+        self._commands = self._matching.publish(topics.COOLANT_SETPOINT)
+        self._active = self.create_publisher(*topics.of(topics.ACTIVE_SETPOINT))
+        self._predicted = self.create_publisher(*topics.of(topics.PREDICTED_TEMPERATURE))
+        self._internals = self.create_publisher(*topics.of(topics.CONTROLLER_STATE))
         self._published_setpoint: float | None = None
         self._diagnostics = DiagnosticsPublisher(self, 'control', 'controller', self._status)
         # volatile, so that `ros2 topic pub` matches
-        self._matching.subscribe(
-            Temperature, topics.SETPOINT, self._on_setpoint, topics.LOOP_QOS)
-        self._matching.subscribe(Temperature, topics.MANUAL_COOLANT_SETPOINT,
-                                 self._on_manual_coolant_setpoint, topics.LOOP_QOS)
-        self._coolants = self._matching.subscribe(
-            Temperature, topics.COOLANT_TEMPERATURE, self._on_coolant, topics.LATCHED_QOS)
+        self._matching.subscribe(topics.SETPOINT, self._on_setpoint)
+        self._matching.subscribe(topics.MANUAL_COOLANT_SETPOINT, self._on_manual_coolant_setpoint)
+        self._coolants = self._matching.subscribe(topics.COOLANT_TEMPERATURE, self._on_coolant)
         # a sensor driver that publishes best effort needs this overridden to match
         self._measurements = self._matching.subscribe(
-            Temperature, topics.TEMPERATURE, self._on_temperature, topics.LOOP_QOS,
+            topics.TEMPERATURE, self._on_temperature,
             qos_overriding_options=QoSOverridingOptions.with_default_policies())
         self.create_service(SetBool, '~/set_automatic', self._on_set_automatic)
         # a group of its own, or measurements would wait until a model is read
         self.create_service(Trigger, '~/reload_model', self._models.on_reload,
                             callback_group=MutuallyExclusiveCallbackGroup())
-        # the plant's time may stand still, and be asked for nevertheless
-        self._steady = Clock(clock_type=ClockType.STEADY_TIME)
-        self.create_timer(PERIOD, self._on_watch, clock=self._steady)
+        wall_timer(self, PERIOD, self._on_watch)
         self._records = RecordPublisher(self._matching, self._snapshot, self._on_record_subscriber)
         self.follow_table(TABLE, parameters, self._on_parameters, self._models.accept)
         self.get_logger().info(self._models.in_force.about)
@@ -128,8 +115,7 @@ class ControllerNode(LoopNode):
         if self._waiting or self._lacks_coolant():
             self._waiting.append(message)
             if self._patience is None:
-                self._patience = self.create_timer(
-                    _COOLANT_PATIENCE, self._answer_waiting, clock=self._steady)
+                self._patience = wall_timer(self, _COOLANT_PATIENCE, self._answer_waiting)
             return
         self._answer(message)
 
@@ -154,7 +140,7 @@ class ControllerNode(LoopNode):
             self._answer(message)
 
     def _answer(self, message: Temperature) -> None:
-        stamp_ns, arrived = stamp_nanoseconds(message.header.stamp), self._arrival.now()
+        stamp_ns, arrived = stamp_nanoseconds(message.header.stamp), self._timing.now()
         frame_id = message.header.frame_id
         self._frame_id = frame_id[:LONGEST_FRAME_ID]
         self._frame_length = len(frame_id) if len(frame_id) > LONGEST_FRAME_ID else 0
@@ -179,8 +165,8 @@ class ControllerNode(LoopNode):
                 for event, led_to in (*done, (asked, outcome)):
                     self._records.publish_event(event, led_to)
                 if stamp_ns != before.time_ns:
-                    self._arrival.note(stamp_ns, arrived)
-                self._arrival.answered()
+                    self._timing.note(stamp_ns, arrived)
+                self._timing.answered()
             break
         else:
             self.get_logger().error(
@@ -190,9 +176,9 @@ class ControllerNode(LoopNode):
         report = outcome.report
         self._temperature = message.temperature
         self._counts.measurements += 1
-        self._counts.late += report.measurement.arrival is Measured.LATE
+        self._counts.late += report.measurement.arrival is Arrival.LATE
         self._counts.missed += report.measurement.missed
-        self._counts.refused += report.measurement.arrival is Measured.REJECTED
+        self._counts.refused += report.measurement.arrival is Arrival.REJECTED
         self._tell(report, message.header.stamp)
 
     def _coolant_at(self, stamp_ns: int) -> float | None:
@@ -204,18 +190,18 @@ class ControllerNode(LoopNode):
         return float(heard.temperature)
 
     def _on_watch(self) -> None:
-        self._arrival.busy = False
+        self._timing.busy = False
         self._watchdog.beat()
-        watched = self._watch(self._arrival.silence)
+        watched = self._watch(self._timing.silence)
         if watched is not None:
             self._tell(*watched)
 
     def _on_busy(self, seconds: float) -> None:
         """Stand in for the executor; called in the watchdog's thread."""
-        watched = self._watch(self._arrival.busy_silence(seconds))
+        watched = self._watch(self._timing.busy_silence(seconds))
         if watched is None:
             return
-        self._arrival.busy = True
+        self._timing.busy = True
         # the executor may be stuck in there
         if self._telling.acquire(blocking=False):
             try:
@@ -284,10 +270,7 @@ class ControllerNode(LoopNode):
 
     def _on_setpoint(self, message: Temperature) -> None:
         stamp_ns = stamp_nanoseconds(message.header.stamp)
-        self._refused = self._change(messages.setpoint_request(message))
-        if self._refused:
-            self.get_logger().warning(self._refused, throttle_duration_sec=1.0)
-        else:
+        if self._change(messages.setpoint_request(message)):
             self._counts.setpoint_received = True
             scheduled = any(entry[0] == stamp_ns for entry in self._state.setpoint.scheduled)
             when = f', holds from {stamp_ns / NANOSECONDS:.3f} s on' if scheduled else ''
@@ -296,27 +279,28 @@ class ControllerNode(LoopNode):
         self._diagnostics.publish_if_changed()
 
     def _on_manual_coolant_setpoint(self, message: Temperature) -> None:
-        self._refused = self._change(messages.manual_command(message))
-        if self._refused:
-            self.get_logger().warning(self._refused, throttle_duration_sec=1.0)
+        self._change(messages.manual_command(message))
         self._diagnostics.publish_if_changed()
 
     def _on_set_automatic(self, request: SetBool.Request, response: SetBool.Response
                           ) -> SetBool.Response:
         mode = Mode.AUTOMATIC if request.data else Mode.MANUAL
-        self._refused = self._change(ModeChange(mode))
+        self._change(ModeChange(mode))
         response.success, response.message = True, f'{mode.value} mode'
         self.get_logger().info(response.message)
         self._diagnostics.publish_if_changed()
         return response
 
-    def _change(self, event: Event) -> str:
-        """Apply what is not answered by a command; return why it is refused in words, or ''."""
+    def _change(self, event: Event) -> bool:
+        """Apply what is not answered by a command; return whether it is not refused."""
         with self._lock:
             outcome = events.apply(self._controller, self._state, event)
             self._state = outcome.state
             self._records.publish_event(event, outcome)
-        return words_of(self._controller.model)(outcome.refused)
+        self._refused = words_of(self._controller.model)(outcome.refused)
+        if self._refused:
+            self.get_logger().warning(self._refused, throttle_duration_sec=1.0)
+        return not self._refused
 
     # Settings and models.
 
@@ -364,9 +348,6 @@ class ControllerNode(LoopNode):
 
     # Diagnostics.
 
-    def _on_neighbours(self) -> None:
-        self._diagnostics.publish_if_changed()
-
     def _complaint(self) -> str:
         """Return what is wrong around the node, or an empty string."""
         frame = (f'the frame_id of the measurement has {self._frame_length} characters, of which '
@@ -377,7 +358,7 @@ class ControllerNode(LoopNode):
     def _status(self) -> Status:
         return status(Situation(
             self._controller, self._settings, self._state, self._report, self._counts,
-            self._arrival, self._complaint(), self._refused, self._models.refused,
+            self._timing, self._complaint(), self._refused, self._models.refused,
             {**self._models.figures(), 'safe coolant': self._rests_outside or 'within reach'},
             self._temperature))
 

@@ -3,8 +3,6 @@
 
 """The plant node: a simulated reactor that publishes its temperature and takes a coolant."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from enum import Enum
 import math
@@ -12,7 +10,6 @@ import sys
 import time
 
 import numpy as np
-from rclpy.clock import Clock, ClockType
 from sensor_msgs.msg import Temperature
 from std_srvs.srv import Trigger
 
@@ -26,7 +23,8 @@ from koopman_ros.plants import (
 from koopman_ros.ros import topics
 from koopman_ros.ros.codec import stamp_nanoseconds
 from koopman_ros.ros.diagnostics import DiagnosticsPublisher, Level, Status
-from koopman_ros.ros.matching import Matching
+from koopman_ros.ros.matching import Matching, SINGLE
+from koopman_ros.ros.owned import wall_timer
 from koopman_ros.ros.process import LoopNode, run
 from koopman_ros.ros.sensors import Instruments
 from koopman_ros.units import LAST_STAMP_SECONDS, NANOSECONDS, seconds_text, to_celsius, to_kelvin
@@ -74,26 +72,23 @@ class PlantNode(LoopNode):
         self._wall_start = self._wall_published = time.monotonic()
 
         # the subscription first: a controller that hears the measurement has then seen it, too
-        self._matching = Matching(self, self._on_neighbours, {
-            topics.COOLANT_SETPOINT: 'command the coolant',
-            topics.TEMPERATURE: 'publish the temperature'})
+        self._matching = Matching(
+            self, lambda: self._diagnostics.publish_if_changed(), SINGLE)
         self._command_subscription = self._matching.subscribe(
-            Temperature, topics.COOLANT_SETPOINT, self._on_command, topics.LOOP_QOS)
+            topics.COOLANT_SETPOINT, self._on_command)
         self._instruments = Instruments(
             self, self._matching, clock=parameters.publish_clock and not self._real_time,
             concentration=system.n_x == 2)
         self._diagnostics = DiagnosticsPublisher(
             self, 'simulation', parameters.reactor, self._status)
         self.create_service(Trigger, '~/reset', self._on_reset)
-        # simulated time comes from here, so nothing in here may wait for it
-        wall_clock = Clock(clock_type=ClockType.STEADY_TIME)
         wall_period = parameters.sample_period / parameters.speed if parameters.speed else 0.0
         if parameters.lockstep:
-            self.create_timer(_POLL_PERIOD, self._on_poll, clock=wall_clock)
+            wall_timer(self, _POLL_PERIOD, self._on_poll)
             if parameters.speed:
-                self.create_timer(wall_period, self._step_in_lockstep, clock=wall_clock)
+                wall_timer(self, wall_period, self._step_in_lockstep)
         else:
-            self._tick = self.create_timer(wall_period, self._step_in_time, clock=wall_clock)
+            self._tick = wall_timer(self, wall_period, self._step_in_time)
         self.follow_table(TABLE, parameters, self._on_parameters)
         self.get_logger().info(self._started())
 
@@ -290,9 +285,6 @@ class PlantNode(LoopNode):
         self._plant = replace(self._plant, system=build(
             parameters.constants(), nominal_state=self._plant.system.nominal_state))
         self._plant = replace(self._plant, actuator=parameters.actuator())
-
-    def _on_neighbours(self) -> None:
-        self._diagnostics.publish_if_changed()
 
     def _status(self) -> Status:
         level, message = Level.OK, self._phase.value

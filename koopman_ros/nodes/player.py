@@ -3,23 +3,18 @@
 
 """The player: the inputs of a controller from a bag, as they were recorded."""
 
-from __future__ import annotations
-
-from collections.abc import Iterator
 import sys
 import time
 
-from rclpy.clock import Clock, ClockType
 from rclpy.duration import Duration
 from rclpy.publisher import Publisher
-from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
+from rclpy.qos import QoSProfile
 from rosgraph_msgs.msg import Clock as ClockMessage
 from sensor_msgs.msg import Temperature
 
 from koopman_ros.bags import (
     BagMessage,
     BagReadError,
-    BagSummary,
     in_log_order,
     QosProfile,
     read_messages,
@@ -29,6 +24,7 @@ from koopman_ros.parameters.player import TABLE
 from koopman_ros.parameters.table import ConfigurationError
 from koopman_ros.ros import topics
 from koopman_ros.ros.codec import stamp_message, stamp_nanoseconds
+from koopman_ros.ros.owned import wall_timer
 from koopman_ros.ros.process import LoopNode, run
 from koopman_ros.units import NANOSECONDS
 
@@ -59,8 +55,10 @@ class PlayerNode(LoopNode):
         # what stands for a name in the bag
         names = {_in_bag(name): name for name in settings.topics}
         content = summary(settings.bag)
-        self._messages = self._from_offset(content, in_log_order(
-            read_messages(settings.bag, names, recover=settings.recover)))
+        begin_ns = (content.start_ns or 0) + round(settings.start_offset * NANOSECONDS)
+        self._messages = (message for message in in_log_order(
+            read_messages(settings.bag, names, recover=settings.recover))
+            if message.log_time_ns >= begin_ns)
         played = {topic: name for topic, name in names.items() if content.counts.get(topic)}
         if not played:
             known = ', '.join(sorted(t for t, count in content.counts.items() if count))
@@ -75,7 +73,7 @@ class PlayerNode(LoopNode):
             Temperature, settings.answer, self._on_answer, topics.LOOP_QOS
         ) if self._lockstep and self._measured in played else None
         self._clock_publisher = self.create_publisher(
-            ClockMessage, topics.CLOCK, topics.CLOCK_QOS) if settings.clock else None
+            *topics.of(topics.CLOCK)) if settings.clock else None
         self._outlets: dict[str, Publisher] = {
             topic: self.create_publisher(_message_class(content.types[topic]), name,
                                          recorded_offer(content.offered_qos.get(topic, ())))
@@ -87,14 +85,7 @@ class PlayerNode(LoopNode):
         self._sent = 0
         self._received: set[str] = set()  # topics of which subscribers have received a message
         self._due = self._wall_start = self._said = self._asked = time.monotonic()
-        self._timer = self.create_timer(_POLL_PERIOD_NS / NANOSECONDS, self._on_timer,
-                                        clock=Clock(clock_type=ClockType.STEADY_TIME))
-
-    def _from_offset(self, content: BagSummary, messages: Iterator[BagMessage]
-                     ) -> Iterator[BagMessage]:
-        """Leave out what comes before the offset."""
-        begin_ns = (content.start_ns or 0) + round(self._settings.start_offset * NANOSECONDS)
-        return (message for message in messages if message.log_time_ns >= begin_ns)
+        self._timer = wall_timer(self, _POLL_PERIOD_NS / NANOSECONDS, self._on_timer)
 
     def _on_timer(self) -> None:
         try:
@@ -252,10 +243,9 @@ def recorded_offer(offered: tuple[QosProfile, ...]) -> QoSProfile:
     """Offer what all publishers of the recording offered."""
     best_effort = bool(offered) and all(o.reliability == 'best_effort' for o in offered)
     latched = bool(offered) and all(o.durability == 'transient_local' for o in offered)
-    return QoSProfile(
-        depth=max(1, *(o.depth for o in offered)) if latched else topics.LOOP_QOS.depth,
-        reliability=(ReliabilityPolicy.BEST_EFFORT if best_effort else ReliabilityPolicy.RELIABLE),
-        durability=(DurabilityPolicy.TRANSIENT_LOCAL if latched else DurabilityPolicy.VOLATILE))
+    return topics.profile(
+        max(1, *(o.depth for o in offered)) if latched else topics.LOOP_QOS.depth,
+        reliable=not best_effort, latched=latched)
 
 
 def main(args: list[str] | None = None) -> int:

@@ -8,8 +8,6 @@ Its exit code is 0 when the recorded commands are reproduced, 1 when some are no
 error, and 3 when there was nothing to compare, as in a short bag from the middle of a run.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass, fields
 import enum
@@ -48,28 +46,17 @@ class Result(enum.IntEnum):
 
 @dataclass(frozen=True)
 class Names:
-    """
-    The topics of a controller in a bag, as absolute names.
+    """The topics of a controller in a bag, as absolute names."""
 
-    :param records: where it wrote down what happened.
-    :param commands: where it commanded the coolant.
-    """
-
-    records: str = f'/{topics.CONTROLLER_EVENTS}'
-    commands: str = f'/{topics.COOLANT_SETPOINT}'
+    records: str = f'/{topics.CONTROLLER_EVENTS}'  # where it wrote down what happened
+    commands: str = f'/{topics.COOLANT_SETPOINT}'  # where it commanded the coolant
 
 
 def replay_bags(parameters: ReplayParameters, names: Names, given: Collection[str] = ()) -> Result:
     """
-    Replay bags and write the report.
+    Replay bags and write the report; `given` are the parameters that replace recorded ones.
 
-    :param parameters: of the replay.
-    :param names: of the controller's topics in the bags.
-    :param given: names of those parameters that are not at their defaults by themselves.
-    :return: whether the recorded commands are reproduced; when none differs, yet a bag has
-        nothing to compare, that.
-    :raises BagReadError: for a bag that cannot be replayed.
-    :raises ModelFileError: for a new model that cannot be used.
+    :raises BagReadError, ModelFileError: for a bag or a new model that cannot be used.
     :raises ConfigurationError: without the package that draws.
     """
     try:
@@ -100,16 +87,7 @@ def replay_bags(parameters: ReplayParameters, names: Names, given: Collection[st
 
 def replayed_bag(path: str, names: Names, parameters: ReplayParameters,
                  given: Collection[str] = ()) -> ReplayedBag:
-    """
-    Replay one bag.
-
-    :param path: of the bag.
-    :param names: of the controller's topics in it.
-    :param parameters: of the replay.
-    :param given: names of those that replace recorded ones for the new model.
-    :raises BagReadError: for a bag that cannot be replayed.
-    :raises ModelFileError: for a new model that cannot be used.
-    """
+    """Replay one bag; arguments and errors are those of :func:`replay_bags`."""
     alternative = None
     if parameters.new_model:
         new = load_suitable(parameters.new_model)
@@ -131,11 +109,9 @@ def replayed_bag(path: str, names: Names, parameters: ReplayParameters,
 def replay_records(records: Iterable[Record], models: Sequence[Path] = (),
                    alternative: Alternative | None = None) -> Replay:
     """
-    Replay records of this package's controller node.
+    Replay records of this package's controller node, in the order of receipt.
 
-    :param records: in the order of receipt.
     :param models: files or folders in which models are looked for beside the shipped ones.
-    :param alternative: another model, or None.
     :raises RecordError: for records that cannot be replayed.
     """
     return replay(records, Models([*models, config_directory() / 'models']).find, _settings,
@@ -143,11 +119,7 @@ def replay_records(records: Iterable[Record], models: Sequence[Path] = (),
 
 
 def _settings(values: Mapping[str, Any]) -> Settings:
-    """
-    Return the tuning that a controller's parameters stand for.
-
-    :raises RecordError: where this version has other parameters, or other ranges.
-    """
+    """Return the tuning that a controller's parameters stand for, if this version has them."""
     unknown = ', '.join(sorted(set(values) - set(CONTROLLER.rows)))
     if unknown:
         raise RecordError(f'its controller had the parameters {unknown}, which this version has '

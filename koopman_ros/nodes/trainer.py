@@ -3,8 +3,6 @@
 
 """The trainer node: records the loop, drives the plant through experiments, trains from bags."""
 
-from __future__ import annotations
-
 import sys
 
 from koopman_ros.jobs.training import JobState

@@ -3,8 +3,6 @@
 
 """Parameters of the controller node."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 import math
 
@@ -23,85 +21,77 @@ class ControllerParameters:
     model: str = parameter(
         'reactor_nz4', 'name of a shipped model, or path of a .safetensors model file')
     temperature_weight: float = parameter(
-        1.0, 'cost of a squared temperature error', unit='1/K^2', minimum=0.0, maximum=1e6,
-        open_minimum=True)
+        1.0, 'cost of a squared temperature error', '1/K^2', 0.0, 1e6, open_minimum=True)
     coolant_weight: float = parameter(
-        1.0, 'cost of a squared deviation of the coolant from its steady value', unit='1/K^2',
-        minimum=0.0, maximum=1e6, open_minimum=True)
-    coolant_min: float = parameter(
-        5.0, 'lowest coolant temperature commanded', unit='degC', minimum=-50.0, maximum=150.0)
-    coolant_max: float = parameter(
-        32.0, 'highest coolant temperature commanded', unit='degC', minimum=-50.0, maximum=150.0)
-    coolant_rate_limit: float = parameter(
-        60.0, 'fastest change of the coolant command', unit='K/min', minimum=0.0, maximum=1e6,
+        1.0, 'cost of a squared deviation of the coolant from its steady value', '1/K^2', 0.0, 1e6,
         open_minimum=True)
+    coolant_min: float = parameter(
+        5.0, 'lowest coolant temperature commanded', 'degC', -50.0, 150.0)
+    coolant_max: float = parameter(
+        32.0, 'highest coolant temperature commanded', 'degC', -50.0, 150.0)
+    coolant_rate_limit: float = parameter(
+        60.0, 'fastest change of the coolant command', 'K/min', 0.0, 1e6, open_minimum=True)
     setpoint_ramp: float = parameter(
-        1000.0, 'fastest change of the tracked set-point; a large value makes it a step',
-        unit='K/min', minimum=0.0, maximum=1e6, open_minimum=True)
+        1000.0, 'fastest change of the tracked set-point; a large value makes it a step', 'K/min',
+        0.0, 1e6, open_minimum=True)
     setpoint_filter: float = parameter(
-        0.0, 'time constant with which the tracked set-point follows its ramp; 0 for none',
-        unit='s', minimum=0.0, maximum=86400.0)
+        0.0, 'time constant with which the tracked set-point follows its ramp; 0 for none', 's',
+        0.0, 86400.0)
     observer_bandwidth: float = parameter(
         6.0, 'how fast disturbances are estimated: more removes offsets sooner, less lets less '
-        'noise through to the coolant; 0 switches the observer off', unit='1/min', minimum=0.0,
-        maximum=600.0)
+        'noise through to the coolant; 0 switches the observer off', '1/min', 0.0, 600.0)
     max_disturbance: float = parameter(
-        20.0, 'largest disturbance that is believed, as a change of the coolant', unit='K',
-        minimum=0.0, maximum=1000.0, open_minimum=True)
+        20.0, 'largest disturbance that is believed, as a change of the coolant', 'K', 0.0, 1000.0,
+        open_minimum=True)
     coolant_tolerance: float = parameter(
         2.0, 'how far the coolant temperature in force may be from its command before the '
-        'observer goes by it, as at a limit of the actuator', unit='K', minimum=0.0,
-        maximum=1000.0)
+        'observer goes by it, as at a limit of the actuator', 'K', 0.0, 1000.0)
     transfer_time: float = parameter(
         30.0, 'time constant in which the coolant moves to what another law, model, tuning or '
-        'mode asks for', unit='s', minimum=0.0, maximum=86400.0)
+        'mode asks for', 's', 0.0, 86400.0)
     safe_coolant: float = parameter(
         5.0, 'coolant temperature that is safe whatever happened, commanded when nothing else can '
-        'be; brought within coolant_min and coolant_max', unit='degC', minimum=-50.0,
-        maximum=150.0)
+        'be; brought within coolant_min and coolant_max', 'degC', -50.0, 150.0)
     validity_margin: float = parameter(
         0.1, 'how far outside the trained range the learned law acts, in halves of its width; '
-        'beyond, the linear law does', minimum=0.0, maximum=100.0)
+        'beyond, the linear law does', '', 0.0, 100.0)
     linear_margin: float = parameter(
         0.5, 'how far outside the trained range the linear law acts, in halves of its width; '
-        'beyond, the safe coolant is commanded', minimum=0.0, maximum=100.0)
+        'beyond, the safe coolant is commanded', '', 0.0, 100.0)
     hold_timeout: float = parameter(
         60.0, 'how long the coolant is held without a usable measurement or law before it goes to '
-        'safe_coolant', unit='s', minimum=0.0, maximum=86400.0)
+        'safe_coolant', 's', 0.0, 86400.0)
     recovery_time: float = parameter(
-        10.0, 'how long a better law must have been possible before it acts again', unit='s',
-        minimum=0.0, maximum=86400.0)
+        10.0, 'how long a better law must have been possible before it acts again', 's', 0.0,
+        86400.0)
     measurement_timeout: float = parameter(
         10.0, 'plant time without a measurement after which the coolant is held and diagnostics '
-        'turn to ERROR; 0 switches this off', unit='s', minimum=0.0, maximum=86400.0)
+        'turn to ERROR; 0 switches this off', 's', 0.0, 86400.0)
     max_measurement_age: float = parameter(
         5.0, 'age of a measurement at its arrival from which on diagnostics warn; 0 switches this '
-        'off', unit='s', minimum=0.0, maximum=86400.0)
+        'off', 's', 0.0, 86400.0)
     sensor_min: float = parameter(
-        -20.0, 'lowest temperature that the sensor can measure', unit='degC', minimum=-273.15,
-        maximum=1000.0)
+        -20.0, 'lowest temperature that the sensor can measure', 'degC', -273.15, 1000.0)
     sensor_max: float = parameter(
-        150.0, 'highest temperature that the sensor can measure', unit='degC', minimum=-273.15,
-        maximum=1000.0)
+        150.0, 'highest temperature that the sensor can measure', 'degC', -273.15, 1000.0)
     max_temperature_rate: float = parameter(
-        120.0, 'fastest change of the temperature that is physically possible', unit='K/min',
-        minimum=0.0, maximum=1e6, open_minimum=True)
+        120.0, 'fastest change of the temperature that is physically possible', 'K/min', 0.0, 1e6,
+        open_minimum=True)
     max_temperature_jump: float = parameter(
-        2.0, 'change between two measurements that is believed beside that rate, for noise',
-        unit='K', minimum=0.0, maximum=1e6, open_minimum=True)
+        2.0, 'change between two measurements that is believed beside that rate, for noise', 'K',
+        0.0, 1e6, open_minimum=True)
     frozen_timeout: float = parameter(
         20.0, 'how long a measurement may stay the same to the bit while the model moves by more '
-        'than half of max_temperature_jump; 0 for ever', unit='s', minimum=0.0, maximum=86400.0)
+        'than half of max_temperature_jump; 0 for ever', 's', 0.0, 86400.0)
     max_gain: float = parameter(
         1000.0, 'largest Riccati gain, in scaled coordinates, that is acted on; small weights '
-        'need a large one', minimum=0.0,
-        maximum=1e9, open_minimum=True)
+        'need a large one', '', 0.0, 1e9, open_minimum=True)
     min_riccati_digits: float = parameter(
         8.0, 'decimal digits to which a solution must fulfil its Riccati equation to be acted on',
-        minimum=0.0, maximum=15.0)
+        '', 0.0, 15.0)
     max_riccati_residual: float = parameter(
         0.0, 'the same as a relative residual, as in former files: 1.0e-08 for 8 digits; 0 leaves '
-        'it to min_riccati_digits', minimum=0.0, maximum=1.0)
+        'it to min_riccati_digits', '', 0.0, 1.0)
 
     def settings(self) -> Settings:
         """Return the tuning of the control step in SI units."""
@@ -133,14 +123,12 @@ class ControllerParameters:
 
 
 def _cross_check(values: ControllerParameters) -> str:
-    for low, high in (('coolant_min', 'coolant_max'), ('sensor_min', 'sensor_max')):
-        if not getattr(values, low) < getattr(values, high):
-            return (f'{low} = {getattr(values, low)} degC must be below {high} = '
-                    f'{getattr(values, high)} degC: change the other one first')
     if values.validity_margin > values.linear_margin:
         return (f'validity_margin = {values.validity_margin} must be at most linear_margin = '
                 f'{values.linear_margin}: change the other one first')
     return ''
 
 
-TABLE = ParameterTable(ControllerParameters, _cross_check, ControllerParameters.settings)
+TABLE = ParameterTable(
+    ControllerParameters, _cross_check, ControllerParameters.settings,
+    (('coolant_min', 'coolant_max'), ('sensor_min', 'sensor_max')))

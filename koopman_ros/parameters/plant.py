@@ -3,8 +3,6 @@
 
 """Parameters of the plant node."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass, fields
 from typing import Any
 
@@ -40,55 +38,46 @@ class PlantParameters:
         'one_state', 'one_state holds the concentration fixed, two_state lets it move',
         choices=tuple(REACTORS), read_only=True)
     sample_period: float = parameter(
-        1.0, 'time between measurements', unit='s', minimum=1e-3, maximum=3600.0, read_only=True)
+        1.0, 'time between measurements', 's', 1e-3, 3600.0, read_only=True)
     noise: float = parameter(
-        0.0, 'standard deviation of the measured temperature', unit='K', minimum=0.0,
-        maximum=100.0)
+        0.0, 'standard deviation of the measured temperature', 'K', 0.0, 100.0)
     sensor_bias: float = parameter(
-        0.0, 'by how much the temperature is measured too high', unit='K', minimum=-100.0,
-        maximum=100.0)
+        0.0, 'by how much the temperature is measured too high', 'K', -100.0, 100.0)
     sensor_resolution: float = parameter(
-        0.0, 'smallest difference that the measurement shows; 0 for all', unit='K', minimum=0.0,
-        maximum=100.0)
-    seed: int = parameter(
-        0, 'seed of the measurement noise', minimum=0, maximum=2 ** 31, read_only=True)
+        0.0, 'smallest difference that the measurement shows; 0 for all', 'K', 0.0, 100.0)
+    seed: int = parameter(0, 'seed of the measurement noise', '', 0, 2 ** 31, read_only=True)
     initial_temperature_offset: float = parameter(
-        0.0, 'start this far from the steady state', unit='K', minimum=-100.0, maximum=100.0,
-        read_only=True)
+        0.0, 'start this far from the steady state', 'K', -100.0, 100.0, read_only=True)
     speed: float = parameter(
-        1.0, 'simulated seconds per second; 0 for as fast as it can', minimum=0.0, smallest=1e-6,
-        maximum=1e6, read_only=True)
+        1.0, 'simulated seconds per second; 0 for as fast as it can', '', 0.0, 1e6, smallest=1e-6,
+        read_only=True)
     lockstep: bool = parameter(
         False, 'advance only when the command for the last measurement has arrived',
         read_only=True)
     lockstep_timeout: float = parameter(
-        5.0, 'wall time after which lock-step goes on with the command held', unit='s',
-        minimum=0.01, maximum=3600.0, read_only=True)
+        5.0, 'wall time after which lock-step goes on with the command held', 's', 0.01, 3600.0,
+        read_only=True)
     lockstep_subscribers: int = parameter(
-        1, 'subscribers of the temperature that lock-step waits for before it starts',
-        minimum=1, maximum=1000, read_only=True)
+        1, 'subscribers of the temperature that lock-step waits for before it starts', '', 1, 1000,
+        read_only=True)
     duration: float = parameter(
-        0.0, 'simulated time after which the plant stands still; 0 for endless', unit='s',
-        minimum=0.0, maximum=1e9, read_only=True)
+        0.0, 'simulated time after which the plant stands still; 0 for endless', 's', 0.0, 1e9,
+        read_only=True)
     start_time: float = parameter(
-        1.0, 'time of the first measurement when not in real time', unit='s', minimum=1e-3,
-        maximum=LAST_STAMP_SECONDS, read_only=True)
-    publish_clock: bool = parameter(
-        True, 'publish /clock when not in real time', read_only=True)
-    frame_id: str = parameter(
-        'reactor', 'frame_id of the messages', read_only=True)
+        1.0, 'time of the first measurement when not in real time', 's', 1e-3, LAST_STAMP_SECONDS,
+        read_only=True)
+    publish_clock: bool = parameter(True, 'publish /clock when not in real time', read_only=True)
+    frame_id: str = parameter('reactor', 'frame_id of the messages', read_only=True)
     coolant_min: float = parameter(
-        -20.0, 'lowest coolant temperature that the actuator reaches', unit='degC',
-        minimum=-50.0, maximum=150.0)
+        -20.0, 'lowest coolant temperature that the actuator reaches', 'degC', -50.0, 150.0)
     coolant_max: float = parameter(
-        100.0, 'highest coolant temperature that the actuator reaches', unit='degC',
-        minimum=-50.0, maximum=150.0)
+        100.0, 'highest coolant temperature that the actuator reaches', 'degC', -50.0, 150.0)
     command_delay: float = parameter(
-        0.0, 'how much later a command takes effect; the sample_period for one sample', unit='s',
-        minimum=0.0, maximum=3600.0)
+        0.0, 'how much later a command takes effect; the sample_period for one sample', 's', 0.0,
+        3600.0)
     coolant_lag: float = parameter(
-        0.0, 'time constant with which the coolant follows its command; 0 for at once', unit='s',
-        minimum=0.0, maximum=3600.0)
+        0.0, 'time constant with which the coolant follows its command; 0 for at once', 's', 0.0,
+        3600.0)
     flow_rate: float = _constant('flow_rate', 'feed and product flow', read_only=True)
     volume: float = _constant('volume', 'volume of the liquid', read_only=True)
     density: float = _constant('density', 'density of the liquid', read_only=True)
@@ -103,8 +92,7 @@ class PlantParameters:
         'pre_exponential_factor', 'rate constant at infinite temperature', read_only=True)
     heat_transfer_coefficient: float = _constant(
         'heat_transfer_coefficient', 'coefficient times area of the cooling jacket')
-    feed_temperature: float = parameter(
-        76.85, 'temperature of the feed', unit='degC', minimum=-20.0, maximum=200.0)
+    feed_temperature: float = parameter(76.85, 'temperature of the feed', 'degC', -20.0, 200.0)
     feed_concentration: float = _constant(
         'feed_concentration', 'reactant in the feed (two_state)')
     concentration: float = _constant(
@@ -123,9 +111,6 @@ class PlantParameters:
 
 
 def _cross_check(values: PlantParameters) -> str:
-    if not values.coolant_min < values.coolant_max:
-        return (f'coolant_min = {values.coolant_min} degC must be below coolant_max = '
-                f'{values.coolant_max} degC')
     if values.start_time + values.duration > LAST_STAMP_SECONDS:
         return (f'start_time + duration = {values.start_time + values.duration:.10g} s must be at '
                 f'most {LAST_STAMP_SECONDS} s, where the stamps of messages end: choose a smaller '
@@ -148,4 +133,4 @@ def _build(values: PlantParameters) -> None:
     resolved_limits(system, IntegratorSettings())
 
 
-TABLE = ParameterTable(PlantParameters, _cross_check, _build)
+TABLE = ParameterTable(PlantParameters, _cross_check, _build, (('coolant_min', 'coolant_max'),))

@@ -3,8 +3,6 @@
 
 """Parameters of the replay: its own, and those of a controller for the new model."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 from koopman_ros.parameters.controller import ControllerParameters
@@ -27,15 +25,14 @@ class ReplayParameters(ControllerParameters):
     bags: tuple[str, ...] = parameter(
         ('run_1',), 'bags to replay, each a run of its own: .mcap files or bag folders')
     new_model: str = parameter(
-        '', 'model whose commands are compared with the recorded ones, by name or path, under '
-        'the recorded parameters but for those given here; empty only checks that the recorded '
+        '', 'model whose commands are compared with the recorded ones, by name or path, under the '
+        'recorded parameters but for those given here; empty only checks that the recorded '
         'commands are reproduced')
     output: str = parameter(
         'replay', 'folder for report.md, summary.json and the pictures; older ones in it are '
         'replaced')
     tolerance: float = parameter(
-        0.1, 'difference of two commands from which on it is counted and marked', unit='K',
-        minimum=0.0, maximum=100.0)
+        0.1, 'difference of two commands from which on it is counted and marked', 'K', 0.0, 100.0)
     recover: bool = parameter(
         False, 'read bags that were not closed or are damaged as far as they are whole')
 
@@ -48,4 +45,5 @@ def _cross_check(values: ReplayParameters) -> str:
     return CONTROLLER.cross_check(values)
 
 
-TABLE = ParameterTable(ReplayParameters, _cross_check, ReplayParameters.settings)
+TABLE = ParameterTable(
+    ReplayParameters, _cross_check, ReplayParameters.settings, CONTROLLER.ordered)

@@ -3,8 +3,6 @@
 
 """Parameter tables: one frozen dataclass a node gives declarations, checks, snapshot and YAML."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import dataclass, field, fields, MISSING, replace
 import math
@@ -27,31 +25,18 @@ class ConfigurationError(ValueError):
 
 @dataclass(frozen=True)
 class Specification:
-    """
-    One row of a parameter table.
+    """One row of a parameter table."""
 
-    :param name: name of the ROS parameter.
-    :param default: default, whose type is the parameter's type (a tuple is a string array).
-    :param unit: unit, empty for none.
-    :param description: one sentence without the unit.
-    :param minimum: smallest value.
-    :param maximum: largest value.
-    :param open_minimum: whether the minimum itself is excluded.
-    :param smallest: smallest value above a minimum of 0 that stands for something of its own.
-    :param choices: allowed strings, empty for any.
-    :param read_only: whether it can be changed while the node runs.
-    """
-
-    name: str
-    default: Any
-    unit: str
-    description: str
-    minimum: float = -math.inf
-    maximum: float = math.inf
-    open_minimum: bool = False
-    smallest: float = 0.0
-    choices: tuple[str, ...] = ()
-    read_only: bool = False
+    name: str  # name of the ROS parameter
+    default: Any  # default, whose type is the parameter's type (a tuple is a string array)
+    unit: str  # unit, empty for none
+    description: str  # one sentence without the unit
+    minimum: float = -math.inf  # smallest value
+    maximum: float = math.inf  # largest value
+    open_minimum: bool = False  # whether the minimum itself is excluded
+    smallest: float = 0.0  # above a minimum of 0 that stands for something of its own
+    choices: tuple[str, ...] = ()  # allowed strings, empty for any
+    read_only: bool = False  # whether it can be changed while the node runs
 
     @property
     def range_text(self) -> str:
@@ -94,14 +79,12 @@ class Specification:
         return f'{self.name} = {value!r} must be {word}, e.g. {example}'
 
 
-def parameter(default: Any, description: str, **details: Any) -> Any:
-    """
-    Declare a field of a parameter dataclass; `details` are those of :class:`Specification`.
-
-    :param default: default value.
-    :param description: one sentence without the unit.
-    """
-    return field(default=default, metadata={'description': description, **details})
+def parameter(default: Any, description: str, unit: str = '', minimum: float = -math.inf,
+              maximum: float = math.inf, **details: Any) -> Any:
+    """Declare a field of a parameter dataclass; the arguments are those of a specification."""
+    return field(default=default, metadata={
+        'unit': unit, 'description': description, 'minimum': minimum, 'maximum': maximum,
+        **details})
 
 
 class ParameterTable(Generic[T]):
@@ -109,21 +92,23 @@ class ParameterTable(Generic[T]):
     The parameters of a node, from the dataclass that is also their typed, frozen snapshot.
 
     :param kind: a frozen dataclass whose fields come from :func:`parameter`.
+    :param ordered: names of which the first must be below the second.
     :param cross_check: returns what is wrong with a whole snapshot, or an empty string.
     :param build: builds from a snapshot what the node will use, of which a ValueError or an
         ArithmeticError is the reason to refuse the snapshot.
     """
 
     def __init__(self, kind: type[T], cross_check: Callable[[T], str] = lambda _: '',
-                 build: Callable[[T], object] = lambda _: None) -> None:
+                 build: Callable[[T], object] = lambda _: None,
+                 ordered: tuple[tuple[str, str], ...] = ()) -> None:
         self.kind = kind
+        self.ordered = ordered
         self.cross_check = cross_check
         self.build = build
         self.rows: dict[str, Specification] = {}
         for item in fields(kind):  # type: ignore[arg-type]
             assert item.default is not MISSING
-            details = {'unit': '', **item.metadata}
-            self.rows[item.name] = Specification(item.name, item.default, **details)
+            self.rows[item.name] = Specification(item.name, item.default, **item.metadata)
 
     def check(self, snapshot: T, before: T | None = None) -> str:
         """
@@ -136,6 +121,10 @@ class ParameterTable(Generic[T]):
             reason = row.check(getattr(snapshot, name))
             if reason:
                 return reason
+        for low, high in self.ordered:
+            if not getattr(snapshot, low) < getattr(snapshot, high):
+                return (f'{self._given(snapshot, low)} must be below '
+                        f'{self._given(snapshot, high)}: change the other one first')
         return self.cross_check(snapshot) or self._unusable(
             snapshot, self.kind() if before is None else before)
 
@@ -148,10 +137,12 @@ class ParameterTable(Generic[T]):
                    if getattr(snapshot, name) != getattr(before, name)]
         guilty = [row for row in changed if not self._build_error(replace(
             snapshot, **{row.name: getattr(before, row.name)}))] or changed  # type: ignore
-        given = ' and '.join(f'{row.name} = {getattr(snapshot, row.name)} {row.unit}'.rstrip()
-                             for row in guilty)
+        given = ' and '.join(self._given(snapshot, row.name) for row in guilty)
         ranges = dict.fromkeys(f' in {row.range_text}' for row in guilty if row.range_text)
         return f'{given} cannot be used: {error}; choose another value{" or".join(ranges)}'
+
+    def _given(self, snapshot: T, name: str) -> str:
+        return f'{name} = {getattr(snapshot, name)} {self.rows[name].unit}'.rstrip()
 
     def _build_error(self, snapshot: T) -> str:
         try:

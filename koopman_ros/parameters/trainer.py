@@ -3,8 +3,6 @@
 
 """Parameters of the trainer node."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from typing import Any
 
@@ -28,8 +26,7 @@ class TrainerParameters:
         'record', 'record: the node, which records, drives experiments and trains on request; '
         'train: train from the bags, and end', choices=('record', 'train'), read_only=True)
     record_at_start: bool = parameter(
-        True, 'start recording when the node starts, without waiting for ~/record',
-        read_only=True)
+        True, 'start recording when the node starts, without waiting for ~/record', read_only=True)
     output: str = parameter(
         '', 'where to record: a file ending in .mcap, or the folder of a new bag; empty names a '
         'folder after the date and time; never overwritten: where run exists, run_2 is taken')
@@ -41,44 +38,41 @@ class TrainerParameters:
         choices=('none', 'zstd', 'lz4'))
     max_bag_size: float = parameter(
         0.0, 'size from which the recording goes on in the next file of the folder; 0 for never',
-        unit='MB', minimum=0.0, smallest=1e-6, maximum=1e9)
+        'MB', 0.0, 1e9, smallest=1e-6)
     max_bag_duration: float = parameter(
         0.0, 'time after which the recording goes on in the next file of the folder; 0 for never',
-        unit='s', minimum=0.0, smallest=1e-6, maximum=1e9)
+        's', 0.0, 1e9, smallest=1e-6)
     min_free_disk: float = parameter(
-        100.0, 'room that the disk must have; with less, recording does not start, or stops',
-        unit='MB', minimum=0.0, maximum=1e12)
+        100.0, 'room that the disk must have; with less, recording does not start, or stops', 'MB',
+        0.0, 1e12)
     experiment_topic: str = parameter(
         EXPERIMENT_TOPICS[0], 'where the experiment commands the coolant: the plant, or a '
         'controller in manual mode', choices=EXPERIMENT_TOPICS)
     experiment_duration: float = parameter(
-        60.0, 'length of the experiment', unit='min', minimum=0.0, maximum=1e4,
-        open_minimum=True)
+        60.0, 'length of the experiment', 'min', 0.0, 1e4, open_minimum=True)
     experiment_coolant_min: float = parameter(
-        8.5, 'lowest coolant temperature of a step', unit='degC', minimum=-50.0, maximum=150.0)
+        8.5, 'lowest coolant temperature of a step', 'degC', -50.0, 150.0)
     experiment_coolant_max: float = parameter(
-        27.5, 'highest coolant temperature of a step', unit='degC', minimum=-50.0, maximum=150.0)
-    experiment_hold_min: float = parameter(
-        0.5, 'shortest step', unit='min', minimum=0.01, maximum=1e4)
-    experiment_hold_max: float = parameter(
-        2.0, 'longest step', unit='min', minimum=0.01, maximum=1e4)
+        27.5, 'highest coolant temperature of a step', 'degC', -50.0, 150.0)
+    experiment_hold_min: float = parameter(0.5, 'shortest step', 'min', 0.01, 1e4)
+    experiment_hold_max: float = parameter(2.0, 'longest step', 'min', 0.01, 1e4)
     experiment_rate_limit: float = parameter(
-        60.0, 'fastest change of the coolant in the experiment', unit='K/min', minimum=0.0,
-        maximum=1e6, open_minimum=True)
+        60.0, 'fastest change of the coolant in the experiment', 'K/min', 0.0, 1e6,
+        open_minimum=True)
     experiment_temperature_min: float = parameter(
-        31.85, 'temperature of the reactor below which the experiment is aborted', unit='degC',
-        minimum=-50.0, maximum=300.0)
+        31.85, 'temperature of the reactor below which the experiment is aborted', 'degC', -50.0,
+        300.0)
     experiment_temperature_max: float = parameter(
-        53.85, 'temperature of the reactor above which the experiment is aborted', unit='degC',
-        minimum=-50.0, maximum=300.0)
+        53.85, 'temperature of the reactor above which the experiment is aborted', 'degC', -50.0,
+        300.0)
     experiment_timeout: float = parameter(
-        10.0, 'wall time without a newer measurement after which the experiment is aborted',
-        unit='s', minimum=0.0, maximum=86400.0, open_minimum=True)
+        10.0, 'wall time without a newer measurement after which the experiment is aborted', 's',
+        0.0, 86400.0, open_minimum=True)
     experiment_seed: int = parameter(
-        0, 'seed of the steps; the same seed gives the same steps', minimum=0, maximum=2 ** 31)
+        0, 'seed of the steps; the same seed gives the same steps', '', 0, 2 ** 31)
     safe_coolant: float = parameter(
         18.85, 'coolant temperature that is safe whatever happened; the experiment starts and '
-        'ends with it', unit='degC', minimum=-50.0, maximum=150.0)
+        'ends with it', 'degC', -50.0, 150.0)
 
     bags: tuple[str, ...] = parameter(
         ('',), 'what to train from: .mcap files or bag folders; an empty name for what this '
@@ -89,24 +83,23 @@ class TrainerParameters:
     model_output: str = parameter(
         'retrained.safetensors', 'model file that an accepted lift is written to; the one before '
         'it is kept as .previous.safetensors')
-    model_coordinates: int = parameter(
-        3, 'coordinates n_z of the new lift', minimum=2, maximum=8)
+    model_coordinates: int = parameter(3, 'coordinates n_z of the new lift', '', 2, 8)
     training_starts: int = parameter(
-        3, 'starts of which each coordinate keeps the best', minimum=1, maximum=100)
+        3, 'starts of which each coordinate keeps the best', '', 1, 100)
     training_seed: int = parameter(
-        0, 'seed of the training and of what is held out', minimum=0, maximum=2 ** 31)
+        0, 'seed of the training and of what is held out', '', 0, 2 ** 31)
     input_gain: float = parameter(
         0.0, 'change of dT/dt with the coolant temperature where it is known; 0 to learn it',
-        unit='1/min', minimum=-1e6, maximum=1e6)
+        '1/min', -1e6, 1e6)
     input_delay: float = parameter(
-        0.0, 'dead time of the actuator: a coolant acts this long after its command', unit='s',
-        minimum=0.0, maximum=3600.0)
+        0.0, 'dead time of the actuator: a coolant acts this long after its command', 's', 0.0,
+        3600.0)
     gate_margin: float = parameter(
         0.1, 'share by which the held-out error of a new lift must be below those of the present '
-        'lift and of the best linear model', minimum=0.0, maximum=0.99)
+        'lift and of the best linear model', '', 0.0, 0.99)
     gate_condition: float = parameter(
-        1e4, 'largest condition number of the coordinates of a new lift', minimum=1.0,
-        maximum=1e12, open_minimum=True)
+        1e4, 'largest condition number of the coordinates of a new lift', '', 1.0, 1e12,
+        open_minimum=True)
 
     def experiment(self) -> Experiment:
         """Return the plan of an experiment in SI units."""
@@ -138,16 +131,10 @@ def _cross_check(values: TrainerParameters) -> str:
                 'max_bag_duration cannot split: give the name of a folder, without .mcap')
     if not values.model_output.endswith('.safetensors'):
         return f'model_output = {values.model_output!r} must end in .safetensors'
-    return _check_experiment(values)
-
-
-def _check_experiment(values: TrainerParameters) -> str:
-    for name, unit in (('coolant', 'degC'), ('temperature', 'degC'), ('hold', 'min')):
-        low, high = f'experiment_{name}_min', f'experiment_{name}_max'
-        if not getattr(values, low) < getattr(values, high):
-            return (f'{low} = {getattr(values, low)} {unit} must be below {high} = '
-                    f'{getattr(values, high)} {unit}: change the other one first')
     return ''
 
 
-TABLE = ParameterTable(TrainerParameters, _cross_check, TrainerParameters.experiment)
+TABLE = ParameterTable(
+    TrainerParameters, _cross_check, TrainerParameters.experiment,
+    tuple((f'experiment_{name}_min', f'experiment_{name}_max')
+          for name in ('coolant', 'temperature', 'hold')))

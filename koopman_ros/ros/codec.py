@@ -3,8 +3,6 @@
 
 """Messages to SI values and back, once, at the boundary (REP 103)."""
 
-from __future__ import annotations
-
 from builtin_interfaces.msg import Time
 from sensor_msgs.msg import Temperature
 

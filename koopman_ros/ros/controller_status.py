@@ -3,21 +3,19 @@
 
 """What the controller says of itself: its status for /diagnostics, and its internals to plot."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from dataclasses import dataclass
 
 from builtin_interfaces.msg import Time
 import numpy as np
+from numpy.typing import NDArray
 from sensor_msgs.msg import JointState
 
-from koopman_ros.control import Arrival as Measured
-from koopman_ros.control import Controller, HOLD, Mode, Report, SAFE, State
+from koopman_ros.control import Arrival, Controller, HOLD, Mode, Report, SAFE, State
 from koopman_ros.parameters.controller import ControllerParameters
 from koopman_ros.reasons import level_words
 from koopman_ros.ros.diagnostics import Level, Status, words_of
-from koopman_ros.ros.timing import Arrival
+from koopman_ros.ros.timing import Timing
 from koopman_ros.units import in_celsius, to_celsius
 
 _ACTIONS = {HOLD: 'the last command is held', SAFE: 'the safe coolant temperature is commanded'}
@@ -37,27 +35,24 @@ class Counts:
 
 @dataclass(frozen=True)
 class Situation:
-    """
-    All that a status tells of.
-
-    :param complaint: what is wrong around the node, e.g. a second controller; or empty.
-    :param request_refused: why the operator's last request was refused, or empty.
-    :param model_refused: why the last model was refused, or empty.
-    :param model: figures of the model in force.
-    :param temperature: last measured, in degrees Celsius.
-    """
+    """All that a status tells of."""
 
     controller: Controller
     parameters: ControllerParameters
     state: State
     report: Report
     counts: Counts
-    arrival: Arrival
-    complaint: str
-    request_refused: str
-    model_refused: str
-    model: Mapping[str, object]
-    temperature: float
+    timing: Timing
+    complaint: str  # what is wrong around the node, e.g. a second controller; or empty
+    request_refused: str  # why the operator's last request was refused, or empty
+    model_refused: str  # why the last model was refused, or empty
+    model: Mapping[str, object]  # figures of the model in force
+    temperature: float  # last measured, in degrees Celsius
+
+    @property
+    def reason(self) -> str:
+        """Why the level acts, in words, or empty."""
+        return words_of(self.controller.model)(self.report.reason)
 
 
 def status(now: Situation) -> Status:
@@ -71,22 +66,22 @@ def _verdict(now: Situation) -> tuple[Level, str]:
     timeout = now.parameters.measurement_timeout
     if not now.counts.measurements:
         return Level.WARN, now.complaint or 'waiting for the first temperature measurement'
-    if timeout and max(now.arrival.silence, now.arrival.wall_silence) > timeout:
+    if timeout and max(now.timing.silence, now.timing.wall_silence) > timeout:
         command = now.state.command
         doing = '' if command is None else f', coolant at {in_celsius(float(command[0]))}'
         action = 'manual mode' if mode is Mode.MANUAL else (
             _ACTIONS[HOLD] if report.depth == 0 else _action(report))
-        if now.arrival.busy:
+        if now.timing.busy:
             return Level.ERROR, (f'no measurement answered for more than {timeout:g} s, as the '
                                  f'node is busy: {action}{doing}; ask for less at once')
         return Level.ERROR, (f'no measurement for more than {timeout:g} s: {action}{doing}; check '
                              'sensor and plant')
     if report.reason is not None and mode is Mode.MANUAL:
-        return Level.ERROR, f'{mode.value}: {_reason(now)}'
+        return Level.ERROR, f'{mode.value}: {now.reason}'
     if mode is Mode.AUTOMATIC and report.depth > 0:
         level = Level.ERROR if report.level in _ACTIONS else Level.WARN
         action = _WAY_BACK if report.command.way_back else _action(report)
-        return level, f'{action}: {_reason(now)}'
+        return level, f'{action}: {now.reason}'
     warning = _warning(now)
     if warning:
         return Level.WARN, warning
@@ -104,20 +99,16 @@ def _action(report: Report) -> str:
     return _ACTIONS.get(report.level) or level_words(report.level)
 
 
-def _reason(now: Situation) -> str:
-    return words_of(now.controller.model)(now.report.reason)
-
-
 def _warning(now: Situation) -> str:
     """Return the first thing that an operator should know of, or an empty string."""
     report, states = now.report, now.controller.model.states
-    age, oldest = now.arrival.age, now.parameters.max_measurement_age
+    age, oldest = now.timing.age, now.parameters.max_measurement_age
     if now.complaint:
         return now.complaint
-    if report.measurement.arrival is Measured.REPEATED:
+    if report.measurement.arrival is Arrival.REPEATED:
         return ('the stamp of the measurement does not advance: the last command is held; stamp '
                 'measurements with their time')
-    if now.arrival.without_clock:
+    if now.timing.without_clock:
         return ('use_sim_time is set and nobody publishes /clock: time-outs count by the wall '
                 'clock; set use_sim_time to false, or publish_clock of the plant to true')
     if now.request_refused:
@@ -142,19 +133,20 @@ def _warning(now: Situation) -> str:
 
 
 def _figures(now: Situation) -> dict[str, object]:
-    report, state, arrival = now.report, now.state, now.arrival
-    target, command, law = report.target, state.command, report.command.law
+    report, state, timing = now.report, now.state, now.timing
+    target, law = report.target, report.command.law
+    bias = None if report.estimate is None else now.controller.equivalent_bias(state)
     return {
         'mode': state.mode.value,
         'active law': level_words(report.level),
         'law': law.form or 'none',
-        'reason': _reason(now) or 'none',
+        'reason': now.reason or 'none',
         **now.model,
         'temperature [degC]': float(now.temperature),
         'set-point [degC]': _setpoint(report),
-        'coolant [degC]': np.nan if command is None else to_celsius(float(command[0])),
+        'coolant [degC]': to_celsius(_first(state.command)),
         'disturbance [K of coolant]': _disturbance(report),
-        'the same as a sensor bias [K]': _bias(now),
+        'the same as a sensor bias [K]': _first(bias),
         'distance outside training box [half widths]': float(report.measurement.outside),
         'set-point outside training box [half widths]': (
             np.nan if target is None else float(target.outside)),
@@ -168,38 +160,36 @@ def _figures(now: Situation) -> dict[str, object]:
         'late measurements': now.counts.late,
         'missed measurements': now.counts.missed,
         'measurements not believed': now.counts.refused,
-        'since last measurement [s]': arrival.wall_silence,
-        'age of measurement [s]': arrival.age,
-        'latency from stamp to command [s]': arrival.age + arrival.answer_seconds,
-        'latency from arrival to command [s]': arrival.answer_seconds,
+        'since last measurement [s]': timing.wall_silence,
+        'age of measurement [s]': timing.age,
+        'latency from stamp to command [s]': timing.age + timing.answer_seconds,
+        'latency from arrival to command [s]': timing.answer_seconds,
     }
 
 
-def _bias(now: Situation) -> float:
-    if now.report.estimate is None:
-        return np.nan
-    return float(now.controller.equivalent_bias(now.state)[0])
+def _first(values: NDArray[np.float64] | None) -> float:
+    return np.nan if values is None else float(values[0])
 
 
 def _setpoint(report: Report) -> float:
-    return np.nan if report.target is None else to_celsius(float(report.target.setpoint[0]))
+    return to_celsius(_first(report.target.setpoint if report.target else None))
 
 
 def _disturbance(report: Report) -> float:
-    return np.nan if report.estimate is None else float(report.estimate.disturbance[0])
+    return _first(report.estimate.disturbance if report.estimate else None)
 
 
 def _transfer(report: Report) -> float:
-    return 0.0 if report.command.transfer is None else float(report.command.transfer[0])
+    return 0.0 if report.command.transfer is None else _first(report.command.transfer)
 
 
 def internals(report: Report, stamp: Time, frame_id: str) -> JointState:
     """Return what a person would plot beside the temperatures, under names with units."""
-    estimate, law = report.estimate, report.command.law
+    law = report.command.law
     values = {
         'disturbance [K]': _disturbance(report),
-        'estimated_temperature [degC]': (
-            np.nan if estimate is None else to_celsius(float(estimate.state[0]))),
+        'estimated_temperature [degC]': to_celsius(
+            _first(report.estimate.state if report.estimate else None)),
         'distance_outside [half widths]': float(report.measurement.outside),
         'level [0 learned, 1 linear, 2 hold, 3 safe, 4 manual]': float(report.depth),
         'gain': float(law.gain),

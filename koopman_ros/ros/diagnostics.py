@@ -3,15 +3,12 @@
 
 """Diagnostics of a node, once a second and when the state changes, and an operator's words."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from enum import Enum
 import time
 
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
-from rclpy.clock import Clock, ClockType
 from rclpy.node import Node
 
 from koopman_ros.lifting import LiftedModel
@@ -36,12 +33,9 @@ class Level(Enum):
 @dataclass(frozen=True)
 class Status:
     """
-    What a node says of itself.
+    What a node says of itself: a sentence, and figures with their units in the key.
 
-    :param level: severity.
-    :param message: one sentence an operator reads.
-    :param values: figures with their units in the key, e.g. ``{'temperature [degC]': 51.3}``, or
-        what returns them, to be called only when they are published.
+    The figures may be a function, which is called only when they are published.
     """
 
     level: Level
@@ -51,14 +45,7 @@ class Status:
 
 
 class DiagnosticsPublisher:
-    """
-    Publish the status of one task of a node (diagnostic_updater's conventions).
-
-    :param node: the node.
-    :param task: name of the task; the status is named ``<node>: <task>``.
-    :param hardware_id: what the status is about.
-    :param collect: returns the present status.
-    """
+    """Publish the status ``<node>: <task>`` of a node, as diagnostic_updater would."""
 
     def __init__(self, node: Node, task: str, hardware_id: str,
                  collect: Callable[[], Status]) -> None:
@@ -69,9 +56,7 @@ class DiagnosticsPublisher:
         self._owned = Owned(node)
         self._publisher = self._owned.keep(
             node.create_publisher(DiagnosticArray, DIAGNOSTICS, 10))
-        # the wall clock: diagnostics go on while simulated time stands still
-        self._owned.keep(node.create_timer(
-            1.0, self.publish, clock=Clock(clock_type=ClockType.STEADY_TIME)))
+        self._owned.timer(1.0, self.publish)
 
     def destroy(self) -> None:
         """Report no more."""

@@ -7,8 +7,6 @@ Messages into events of the control step.
 A message is anything with the fields of sensor_msgs/Temperature.
 """
 
-from __future__ import annotations
-
 import math
 from typing import Any
 

@@ -5,18 +5,31 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+import time
+
 from rclpy.callback_groups import MutuallyExclusiveCallbackGroup
+from rclpy.duration import Duration
 from rclpy.node import Node
+from rclpy.qos import QoSProfile, ReliabilityPolicy
+from rclpy.task import Future
+from sensor_msgs.msg import Temperature
 from std_srvs.srv import SetBool
 
-from koopman_ros.experiment import level, Phase
+from koopman_ros.experiment import advance, begin, end, Following, level, Phase, Progress
 from koopman_ros.parameters.trainer import TrainerParameters
-from koopman_ros.reasons import Reason
+from koopman_ros.reasons import Code, Reason, reason
 from koopman_ros.ros import topics
+from koopman_ros.ros.codec import stamp_message, stamp_nanoseconds, temperature_message
 from koopman_ros.ros.diagnostics import DiagnosticsPublisher, Level, OPERATOR, Status
-from koopman_ros.ros.experiment_run import ExperimentRun, other_publishers
+from koopman_ros.ros.matching import node_name
 from koopman_ros.ros.owned import Owned
-from koopman_ros.units import in_celsius, to_celsius
+from koopman_ros.units import in_celsius, NANOSECONDS, to_celsius, to_kelvin
+
+_TICK = 0.1  # s
+_ASTRAY = 10  # commands of a controller, and
+_ASTRAY_TIME = 1.0  # s, after which it is said not to follow
+_FAREWELL = 0.2  # s in which a last measurement is answered
 
 
 class CoolantExperiment:
@@ -29,7 +42,6 @@ class CoolantExperiment:
     commanders are worse than none: beside another publisher no experiment starts, and when one
     comes the experiment stops at once and leaves the coolant to it.
 
-    :param node: whose executor does the work.
     :param settings: what the next experiment starts with; the node replaces it when they change.
     """
 
@@ -85,7 +97,7 @@ class CoolantExperiment:
         if topic != answers and not self._node.count_publishers(answers):
             return (f'nobody publishes on {answers}: start the controller and switch it to '
                     'manual mode')
-        self._run = ExperimentRun(self._node, self.settings, self._on_change, self._on_loss)
+        self._run = ExperimentRun(self._node, self.settings, self._on_end)
         self._diagnostics.publish_if_changed()
         return ''
 
@@ -101,18 +113,14 @@ class CoolantExperiment:
         self._let_go(self._verdict(self._run))
         return True, 'the trainer does not command the coolant any more'
 
-    def _on_change(self) -> None:
-        assert self._run is not None
-        self._say(self._verdict(self._run).message)
-
-    def _on_loss(self, why: Reason) -> None:
-        """Stop commanding at once; an experiment that was over is over as it was."""
+    def _on_end(self, why: Reason | None) -> None:
+        """Say that the steps are over, or stop commanding at once for a reason."""
         run = self._run
         assert run is not None
-        if run.progress is None:
-            if not run.started.done():
-                run.started.set_result(why)
+        if why is None:
+            self._say(self._verdict(run).message)
             return
+        # an experiment that was over is over as it was
         run.stop(Phase.ABORTED, why)
         self._let_go(self._verdict(run))
         self._say(f'the trainer does not command the coolant any more: {OPERATOR(why)}')
@@ -153,3 +161,149 @@ class CoolantExperiment:
             'left [s]': left,
             'seed': run.plan.seed,
         })
+
+
+class ExperimentRun:
+    """
+    Command the coolant from the first measurement on until :meth:`destroy`.
+
+    Publisher, subscriptions and timer exist as long as the run: nobody takes an idle trainer for
+    a commander, and a plant in lock-step that waits for one starts.
+
+    :param on_end: called when the steps are over, and with the reason when it must not command
+        any more.
+    """
+
+    def __init__(self, node: Node, settings: TrainerParameters,
+                 on_end: Callable[[Reason | None], None]) -> None:
+        self.plan = settings.experiment()
+        self.topic = node.resolve_topic_name(settings.experiment_topic)
+        self.progress: Progress | None = None
+        # why it cannot start, or None with the first measurement
+        self.started = Future()
+        self._node = node
+        self._patience = settings.experiment_timeout
+        self._on_end = on_end
+        self._frame_id = ''
+        self._stamp_ns = 0
+        self._heard_at = time.monotonic()
+        self._following = Following()
+        self._owned = owned = Owned(node)
+        self._temperatures = owned.keep(node.create_subscription(
+            Temperature, topics.TEMPERATURE, self._on_temperature, _sensor_qos(node)))
+        self._coolants = owned.keep(node.create_subscription(
+            Temperature, topics.COOLANT_SETPOINT, self._on_coolant, topics.LOOP_QOS)) if (
+                settings.experiment_topic == topics.MANUAL_COOLANT_SETPOINT) else None
+        self._publisher = owned.keep(
+            node.create_publisher(Temperature, self.topic, topics.LOOP_QOS))
+        owned.timer(_TICK, self._on_tick)
+
+    @property
+    def running(self) -> bool:
+        """Whether it waits for its first measurement, or steps."""
+        return self.progress is None or self.progress.phase is Phase.RUNNING
+
+    def stop(self, phase: Phase, why: Reason | None = None) -> None:
+        """End the steps; the coolant then returns to the safe temperature."""
+        if self.progress is not None:
+            self.progress = end(self.progress, phase, why)
+
+    def farewell(self) -> None:
+        """Leave the coolant at the safe temperature before the process ends."""
+        if self.progress is None:
+            return
+        self._command(self.plan.safe_input, self._stamp_ns)
+        # a plant in lock-step takes only the answer to its next measurement
+        deadline = time.monotonic() + _FAREWELL
+        with (handle := self._temperatures.handle):
+            while time.monotonic() < deadline:
+                if taken := handle.take_message(Temperature, False):
+                    self._command(self.plan.safe_input, stamp_nanoseconds(taken[0].header.stamp))
+                else:
+                    time.sleep(0.001)
+        self._publisher.wait_for_all_acked(Duration(seconds=_FAREWELL))
+
+    def destroy(self) -> None:
+        """Command no more."""
+        self._owned.destroy()
+
+    def _on_temperature(self, message: Temperature) -> None:
+        measured = to_kelvin(message.temperature)
+        stamp_ns = stamp_nanoseconds(message.header.stamp)
+        if self.progress is None:
+            if self.started.done():
+                return
+            refusal = self.plan.refusal(measured)
+            self.started.set_result(refusal)
+            if refusal is not None:
+                return
+            self.progress = begin(self.plan, stamp_ns)
+        if stamp_ns != self._stamp_ns:
+            self._stamp_ns, self._heard_at = stamp_ns, time.monotonic()
+        self._frame_id = message.header.frame_id
+        was_running = self.running
+        self.progress = advance(self.plan, self.progress, measured, stamp_ns)
+        self._command(self.progress.command, stamp_ns)
+        if was_running and not self.running:
+            self._on_end(None)
+
+    def _command(self, kelvin: float, stamp_ns: int) -> None:
+        self._publisher.publish(
+            temperature_message(kelvin, stamp_message(stamp_ns), self._frame_id))
+
+    def _on_coolant(self, message: Temperature) -> None:
+        """Watch a controller that should be in manual mode."""
+        if self.progress is None:
+            return
+        heard, now = to_kelvin(message.temperature), time.monotonic()
+        self._following = self._following.after(heard, self.progress.command, now)
+        if self._following.astray >= _ASTRAY and now - self._following.since >= _ASTRAY_TIME:
+            self._on_end(reason(Code.NOT_FOLLOWED, signal='coolant_temperature', value=heard,
+                                requested=self.progress.command))
+
+    def _on_tick(self) -> None:
+        """Look for other commanders, and for measurements that stay away."""
+        if others := other_publishers(self._node, self.topic, own=1):
+            self._lose(reason(Code.OTHER_PUBLISHER, nodes=others, topic=self.topic))
+        elif self._coolants is not None and not self._node.count_publishers(
+                self._coolants.topic_name):
+            self._lose(reason(Code.CONTROLLER_GONE))
+        elif time.monotonic() - self._heard_at > self._patience:
+            self._on_silence(reason(Code.SILENCE, timeout=self._patience))
+
+    def _lose(self, why: Reason) -> None:
+        if self.progress is not None:
+            self._on_end(why)
+        elif not self.started.done():
+            self.started.set_result(why)
+
+    def _on_silence(self, why: Reason) -> None:
+        if self.progress is None:
+            self._lose(why)
+            return
+        was_running = self.running
+        self.stop(Phase.ABORTED, why)
+        # the way back goes by the wall clock
+        self.progress = advance(self.plan, self.progress, None,
+                                self.progress.time_ns + round(_TICK * NANOSECONDS))
+        self._command(self.progress.command, self.progress.time_ns)
+        if was_running:
+            self._on_end(None)
+
+
+def other_publishers(node: Node, topic: str, own: int = 0) -> str:
+    """Name the nodes that publish on a topic, but for so many publishers of a node's own."""
+    # a publisher may be known before its node is
+    names = ['another node' if 'UNKNOWN' in info.node_name else node_name(info)
+             for info in node.get_publishers_info_by_topic(topic)]
+    me = node.get_fully_qualified_name()
+    # another node may have the same name
+    others = {name for name in names if name != me}
+    return ' and '.join(sorted(others | ({me} if names.count(me) > own else set())))
+
+
+def _sensor_qos(node: Node) -> QoSProfile:
+    """Hear a sensor driver that publishes best effort."""
+    offers = node.get_publishers_info_by_topic(node.resolve_topic_name(topics.TEMPERATURE))
+    return topics.profile(topics.LOOP_QOS.depth, reliable=all(
+        info.qos_profile.reliability is not ReliabilityPolicy.BEST_EFFORT for info in offers))

@@ -3,14 +3,10 @@
 
 """Others on a node's topics that should not be: whose messages cannot pass, or who conflict."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Mapping
 import copy
-from dataclasses import dataclass
-from typing import Any
+from typing import Any, TypeAlias
 
-from rclpy.clock import Clock, ClockType
 from rclpy.duration import Infinite
 from rclpy.event_handler import PublisherEventCallbacks, SubscriptionEventCallbacks
 from rclpy.node import Node
@@ -30,29 +26,16 @@ from rclpy.topic_endpoint_info import TopicEndpointInfo
 from koopman_ros.ros import topics
 from koopman_ros.ros.owned import Owned
 
+_Own: TypeAlias = Publisher | Subscription
+
+# Topics of the loop on which only one node may publish, and what it does.
+SINGLE = {topics.COOLANT_SETPOINT: 'command the coolant',
+          topics.TEMPERATURE: 'publish the temperature'}
+
 _LOOK_PERIOD = 0.5  # s
 # What does not pass: policy, offered, asked for.
 _CONFLICTS = (('reliability', ReliabilityPolicy.BEST_EFFORT, ReliabilityPolicy.RELIABLE),
               ('durability', DurabilityPolicy.VOLATILE, DurabilityPolicy.TRANSIENT_LOCAL))
-
-
-@dataclass(frozen=True)
-class _Endpoint:
-    """
-    One of the node's own.
-
-    :param topic: with its namespace.
-    :param type_name: of its messages.
-    :param qos: what it offers or asks for.
-    :param subscribes: whether it hears.
-    :param overridable: whether a parameter can change its quality of service.
-    """
-
-    topic: str
-    type_name: str
-    qos: QoSProfile
-    subscribes: bool
-    overridable: bool
 
 
 class Matching:
@@ -61,10 +44,8 @@ class Matching:
 
     The middleware tells when one is found; whether it is still there is looked up.
 
-    :param node: whose endpoints they are.
     :param on_change: called when the complaint is another.
-    :param single: what a publisher does, e.g. 'command the coolant', by topic of the loop on
-        which only one node may publish.
+    :param single: topics that only one node may publish, as in `SINGLE`.
     """
 
     def __init__(self, node: Node, on_change: Callable[[], None],
@@ -73,11 +54,11 @@ class Matching:
         self._on_change = on_change
         self._single = single or {}
         self._owned = Owned(node)
-        self._own: list[_Endpoint] = []
+        self._own: list[_Own] = []
+        self._overridable: set[str] = set()  # subscribed, with quality of service by parameter
         self._policies: dict[str, str] = {}  # last reported by the middleware, by topic
         self._said: tuple[str, ...] = ('', '')
-        self._owned.keep(node.create_timer(
-            _LOOK_PERIOD, self._look, clock=Clock(clock_type=ClockType.STEADY_TIME)))
+        self._owned.timer(_LOOK_PERIOD, self._look)
 
     @property
     def complaint(self) -> str:
@@ -88,27 +69,29 @@ class Matching:
         """Take down the publishers and subscriptions that were made here, and look no more."""
         self._owned.destroy()
 
-    def subscribe(self, kind: Any, topic: str, callback: Callable[[Any], None], qos: QoSProfile,
+    def subscribe(self, topic: str, callback: Callable[[Any], None], kind: Any = None,
                   **options: Any) -> Subscription:
-        """Create a subscription; the arguments are those of rclpy."""
+        """Subscribe to a topic of the loop, or to another one of a type; options as in rclpy."""
         # overriding parameters change the profile itself
         made = self._owned.keep(self._node.create_subscription(
-            kind, topic, callback, copy.copy(qos), event_callbacks=SubscriptionEventCallbacks(
+            kind or topics.TYPES[topic], topic, callback, copy.copy(topics.qos(topic)),
+            event_callbacks=SubscriptionEventCallbacks(
                 incompatible_qos=self._found(topic), incompatible_type=lambda _: self._look()),
             **options))
-        self._own.append(_Endpoint(made.topic_name, type_name(kind), made.qos_profile, True,
-                                   'qos_overriding_options' in options))
+        self._own.append(made)
+        if 'qos_overriding_options' in options:
+            self._overridable.add(made.topic_name)
         return made
 
-    def publish(self, kind: Any, topic: str, qos: QoSProfile,
-                matched: Callable[[Any], None] | None = None) -> Publisher:
-        """Create a publisher; the arguments are those of rclpy and of its event callbacks."""
+    def publish(self, topic: str, kind: Any = None, matched: Callable[[Any], None] | None = None
+                ) -> Publisher:
+        """Publish a topic of the loop, or another one of a type; matched is an event of rclpy."""
         made = self._owned.keep(self._node.create_publisher(
-            kind, topic, copy.copy(qos), event_callbacks=PublisherEventCallbacks(
+            kind or topics.TYPES[topic], topic, copy.copy(topics.qos(topic)),
+            event_callbacks=PublisherEventCallbacks(
                 incompatible_qos=self._found(topic), incompatible_type=lambda _: self._look(),
                 matched=matched)))
-        self._own.append(_Endpoint(
-            made.topic_name, type_name(kind), made.qos_profile, False, False))
+        self._own.append(made)
         return made
 
     def _found(self, topic: str) -> Callable[[Any], None]:
@@ -132,7 +115,6 @@ class Matching:
             self._on_change()
 
     def _conflict(self, topic: str) -> str:
-        """Return who publishes a topic if there are several, or an empty string."""
         # who publishes something else there is not in conflict
         publishers = [info for info in self._node.get_publishers_info_by_topic(topic)
                       if info.topic_type == type_name(topics.TYPES[topic])]
@@ -141,42 +123,44 @@ class Matching:
         return '' if len(names) < 2 else (
             f'{len(names)} nodes {self._single[topic]}: {", ".join(names)}; end all but one')
 
-    def _complaints(self, own: _Endpoint) -> list[str]:
-        publishers = self._node.get_publishers_info_by_topic(own.topic)
-        subscriptions = self._node.get_subscriptions_info_by_topic(own.topic)
-        said = [f'{own.topic}: {node_name(other)} uses it for {other.topic_type[:100]}, here it '
-                f'is {own.type_name}: end that node, or remap its topic'
-                for other in (*publishers, *subscriptions) if other.topic_type != own.type_name]
-        others = publishers if own.subscribes else subscriptions
+    def _complaints(self, own: _Own) -> list[str]:
+        topic, kind = own.topic_name, type_name(own.msg_type)
+        subscribes = isinstance(own, Subscription)
+        publishers = self._node.get_publishers_info_by_topic(topic)
+        subscriptions = self._node.get_subscriptions_info_by_topic(topic)
+        said = [f'{topic}: {node_name(other)} uses it for {other.topic_type[:100]}, here it is '
+                f'{kind}: end that node, or remap its topic'
+                for other in (*publishers, *subscriptions) if other.topic_type != kind]
+        others = publishers if subscribes else subscriptions
         return said + [self._qos_complaint(own, other) for other in others
-                       if other.topic_type == own.type_name and not _passes(own, other)]
+                       if other.topic_type == kind and not _passes(own, other)]
 
-    def _qos_complaint(self, own: _Endpoint, other: TopicEndpointInfo) -> str:
+    def _qos_complaint(self, own: _Own, other: TopicEndpointInfo) -> str:
+        topic, subscribes = own.topic_name, isinstance(own, Subscription)
         offered, asked = _in_order(own, other)
-        policy, wanted = self._policies.get(own.topic, 'quality of service'), 'the default'
-        does = 'publishes' if own.subscribes else 'subscribes'
+        policy, wanted = self._policies.get(topic, 'quality of service'), 'the default'
+        does = 'publishes' if subscribes else 'subscribes'
         for name, too_little, too_much in _CONFLICTS:
             if (getattr(offered, name), getattr(asked, name)) == (too_little, too_much):
-                policy, wanted = name, (too_much if own.subscribes else too_little).short_key
-                does += f' with {(too_little if own.subscribes else too_much).short_key}'
+                policy, wanted = name, (too_much if subscribes else too_little).short_key
+                does += f' with {(too_little if subscribes else too_much).short_key}'
                 break
         remedy = f'use {wanted} there'
-        if own.overridable and policy == 'reliability':
-            remedy += (f', or start this node with -p qos_overrides.{own.topic}.subscription.'
+        if subscribes and topic in self._overridable and policy == 'reliability':
+            remedy += (f', or start this node with -p qos_overrides.{topic}.subscription.'
                        'reliability:=best_effort')
-        return (f'{own.topic}: {node_name(other)} {does}, which is incompatible in {policy}, so '
+        return (f'{topic}: {node_name(other)} {does}, which is incompatible in {policy}, so '
                 f'that no message passes: {remedy}')
 
 
-def _passes(own: _Endpoint, other: TopicEndpointInfo) -> bool:
+def _passes(own: _Own, other: TopicEndpointInfo) -> bool:
     compatible, _ = qos_check_compatible(*_in_order(own, other))
     return bool(compatible != QoSCompatibility.ERROR)
 
 
-def _in_order(own: _Endpoint, other: TopicEndpointInfo) -> tuple[QoSProfile, QoSProfile]:
-    """Return what is offered and what is asked for."""
-    ours, theirs = _explicit(own.qos), _explicit(other.qos_profile)
-    return (theirs, ours) if own.subscribes else (ours, theirs)
+def _in_order(own: _Own, other: TopicEndpointInfo) -> tuple[QoSProfile, QoSProfile]:
+    ours, theirs = _explicit(own.qos_profile), _explicit(other.qos_profile)
+    return (theirs, ours) if isinstance(own, Subscription) else (ours, theirs)
 
 
 def _explicit(profile: QoSProfile) -> QoSProfile:

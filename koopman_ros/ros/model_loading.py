@@ -1,10 +1,7 @@
 # SPDX-FileCopyrightText: 2026 The koopman_ros Authors
 # SPDX-License-Identifier: Apache-2.0
 
-
 """Models for the controller: read, and tried in the situation that they shall take over."""
-
-from __future__ import annotations
 
 import contextlib
 from dataclasses import dataclass
@@ -35,19 +32,12 @@ _TRIALS = 3
 
 @dataclass(frozen=True)
 class LoadedModel:
-    """
-    A model with what tells its versions apart.
+    """A model with what tells its versions apart."""
 
-    :param name: of a shipped model, or the path of a file.
-    :param model: the lift.
-    :param file_time: when the file was written, in UTC.
-    :param digest: SHA-256 of the file.
-    """
-
-    name: str
+    name: str  # of a shipped model, or the path of a file
     model: LiftedModel
-    file_time: str
-    digest: str
+    file_time: str  # when the file was written, in UTC
+    digest: str  # SHA-256 of the file
 
     @property
     def identity(self) -> dict[str, str]:
@@ -64,24 +54,17 @@ class LoadedModel:
 
 @dataclass(frozen=True)
 class Situation:
-    """
-    What a new model has to cope with.
-
-    :param settings: the tuning.
-    :param state: of the running controller.
-    :param measured: (1,) last temperature in K; NaN before the first.
-    """
+    """What a new model has to cope with."""
 
     settings: Settings
     state: State
-    measured: Array
+    measured: Array  # (1,) last temperature in K; NaN before the first
 
 
 def load_suitable(name: str) -> LoadedModel:
     """
-    Load a model and refuse one that is not for one temperature and one coolant temperature.
+    Load a model by name or path, if it is for one temperature and one coolant temperature.
 
-    :param name: of a shipped model, or the path of a file.
     :raises ModelFileError: naming the file, what is wrong and what to do; also for a model that
         a control step fails with, or takes too long for.
     """
@@ -115,7 +98,6 @@ def load_suitable(name: str) -> LoadedModel:
 
 
 def _refuse_slow(path: Path, model: LiftedModel) -> None:
-    """Refuse a model with which a control step raises an error or takes too long."""
     controller, state = Controller(model, ControllerParameters().settings()), State()
     needed = []
     for k in range(1, _TRIALS + 1):
@@ -137,11 +119,7 @@ def _refuse_slow(path: Path, model: LiftedModel) -> None:
 
 
 def refuse_setpoints(model: LiftedModel, situation: Situation) -> None:
-    """
-    Refuse a model that cannot track what the operator asked for.
-
-    :raises ModelFileError: naming the set-point and the trained range.
-    """
+    """Raise ModelFileError for a model that cannot track what the operator asked for."""
     controller = Controller(model, situation.settings)
     setpoint = situation.state.setpoint
     asked = [value for _, value in setpoint.scheduled]
@@ -153,11 +131,7 @@ def refuse_setpoints(model: LiftedModel, situation: Situation) -> None:
 
 
 def refuse_without_law(model: LiftedModel, situation: Situation) -> None:
-    """
-    Refuse a model with which the control step cannot act where the plant is or shall go.
-
-    :raises ModelFileError: naming the temperature and the reason.
-    """
+    """Raise ModelFileError for a model without a law where the plant is or shall go."""
     controller = Controller(model, situation.settings)
     asked = (situation.state.setpoint.active, situation.state.setpoint.requested)
     for setpoint in [value for value in asked if value is not None] or [model.states.center]:

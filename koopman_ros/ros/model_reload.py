@@ -3,8 +3,6 @@
 
 """Another model in a running controller: read and tried aside, swapped between measurements."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Collection
 import contextlib
 from dataclasses import replace
@@ -34,13 +32,7 @@ _MOUNTS = Path('/proc/self/mountinfo')
 
 
 class _Trial:
-    """
-    A model file on its way, in a thread of its own that does not keep the process.
-
-    :param node: whose executor is woken when the file was read and tried.
-    :param name: of the model.
-    :param situation: that of now.
-    """
+    """A model file on its way, in a thread of its own that does not keep the process."""
 
     def __init__(self, node: Node, name: str, situation: Situation) -> None:
         self.outcome = Future()
@@ -93,9 +85,6 @@ class ModelReload:
     A read from a disk that does not answer cannot be ended. No file is read twice at once, and no
     more than eight from one file system, so that little piles up and a model elsewhere is read.
 
-    :param node: the controller; its service calls :meth:`on_reload`.
-    :param in_force: the model it starts with.
-    :param situation: returns the present situation.
     :param reloaded: called in the executor, so between two measurements, when the service has put
         another model in force.
     :param refused: called there when a model was refused.
@@ -115,7 +104,7 @@ class ModelReload:
 
     async def on_reload(self, _: Trigger.Request, response: Trigger.Response
                         ) -> Trigger.Response:
-        """Read the file of the model in force again."""
+        """Read the file of the model in force again, for the service."""
         name = self.in_force.name
         trial = self._start(name, self._situation())
         patience = threading.Timer(_LONG_WAIT, trial.end, [
@@ -166,7 +155,7 @@ class ModelReload:
         return accepted is not None
 
     def figures(self) -> dict[str, object]:
-        """Return what tells an operator which model is in force."""
+        """Return what diagnostics show of the model in force."""
         return {
             'model': self.in_force.name,
             'model file time': self.in_force.file_time,

@@ -3,8 +3,6 @@
 
 """A node whose parameters are those of a table: declared, checked, and followed from then on."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 import copy
 from dataclasses import replace

@@ -3,10 +3,9 @@
 
 """Life of a node's process: start, one-line reason on a bad start, clean end on a signal."""
 
-from __future__ import annotations
-
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 import os
+from pathlib import Path
 import signal
 import sys
 from typing import Any
@@ -17,19 +16,21 @@ from rclpy.executors import SingleThreadedExecutor
 from rclpy.logging import LoggingSeverity, set_logger_level
 from rclpy.signals import SignalHandlerOptions
 from rclpy.subscription import Subscription
+from rclpy.utilities import remove_ros_args
 from rosgraph_msgs.msg import Clock
 
-from koopman_ros.last_resort import end_by_force
-from koopman_ros.ros import command_line
-from koopman_ros.ros.exposure import open_to_the_network
+from koopman_ros.resources import LOOPBACK_PROFILE
 from koopman_ros.ros.parameters import ParameterNode
 from koopman_ros.ros.watchdog import end_in_time
-from koopman_ros.startup import ignore_signals, SIGNALS
+from koopman_ros.startup import end_by_force, ignore_signals, SIGNALS
 from koopman_ros.units import NANOSECONDS
 
 # A parameter or a model that does not fit is a ValueError; rclpy raises RCLError for an unreadable
 # parameter file, a RuntimeError whose class is private to the extension.
 _START_ERRORS = (OSError, ParameterException, RuntimeError, ValueError)
+
+_PROFILES = ('FASTDDS_DEFAULT_PROFILES_FILE', 'FASTRTPS_DEFAULT_PROFILES_FILE')
+_CLOSED_RANGES = ('LOCALHOST', 'OFF')
 
 _LONGEST_WAIT = 0.1  # s from a signal to the end
 _TAKE_DOWN_PATIENCE = 5.0  # s; taking down a participant needs some ten milliseconds
@@ -77,8 +78,6 @@ def run(name: str, create: Callable[[], LoopNode], args: list[str] | None = None
     One that is still in a callback after five seconds is ended by force.
 
     :param name: word that starts an error line.
-    :param create: builds the node.
-    :param args: command line, or None for the process's own.
     :return: exit code, 0 after a signal and for `--help`, 1 when the node could not start, 2 for
         an unknown argument, or the node's own.
     """
@@ -86,7 +85,7 @@ def run(name: str, create: Callable[[], LoopNode], args: list[str] | None = None
     arrived: list[int] = []
     for number in SIGNALS:
         signal.signal(number, lambda number, _: arrived.append(number))
-    if (said := command_line.answer(name, args)) is not None:
+    if (said := answer(name, args)) is not None:
         return said
     leave = end_in_time(name)
     node = None
@@ -120,13 +119,11 @@ def run_task(name: str, prepare: Callable[[], Callable[[], int]],
     """
     Run what needs ROS for its parameters and names alone; an interrupt ends it.
 
-    :param name: word that starts an error line.
     :param prepare: reads them with a node of its own, and returns the task, which runs without
         the middleware and returns the exit code.
-    :param args: command line, or None for the process's own.
     :return: exit code; 1 when it could not start or complete, 2 for an unknown argument.
     """
-    if (said := command_line.answer(name, args)) is not None:
+    if (said := answer(name, args)) is not None:
         return said
     try:
         try:
@@ -171,3 +168,47 @@ def _one_line(error: Exception) -> str:
     """Return an error's text on one line; rcl repeats itself over several."""
     text = str(error).split(', at ./')[0].split(', at /')[0]
     return ' '.join(text.split()) or type(error).__name__
+
+
+def answer(name: str, args: list[str] | None) -> int | None:
+    """Print the help, or refuse what is not ROS's; return an exit code, or None to go on."""
+    try:
+        rest = remove_ros_args(args)[1:]
+    except RuntimeError:
+        # the start says what is wrong with them
+        return None
+    if not rest:
+        return None
+    if '--help' in rest or '-h' in rest:
+        # it imports the tables of all nodes
+        from koopman_ros.ros.programs import help_text
+
+        _show(help_text(name))
+        return 0
+    print(f'{name}: unknown argument {rest[0][:100]!r}: parameters are given as --ros-args -p '
+          'name:=value; --help says more', file=sys.stderr)
+    return 2
+
+
+def _show(text: str) -> None:
+    """Print a text to whoever reads it; `--help | head` stops half-way."""
+    try:
+        print(text, flush=True)
+    except BrokenPipeError:
+        # the interpreter flushes once more when it ends
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+
+
+def open_to_the_network(environment: Mapping[str, str]) -> str:
+    """Return a warning for a node that others on the network can command, or ''."""
+    closed = (
+        environment.get('ROS_AUTOMATIC_DISCOVERY_RANGE', '').upper() in _CLOSED_RANGES
+        or environment.get('ROS_LOCALHOST_ONLY') == '1'
+        or any(Path(environment.get(name, '')).name == LOOPBACK_PROFILE for name in _PROFILES)
+        # with keys, or not at all
+        or (environment.get('ROS_SECURITY_ENABLE', '').lower() == 'true'
+            and environment.get('ROS_SECURITY_STRATEGY', '') == 'Enforce'))
+    return '' if closed else (
+        'open to the network: whoever is on a network of this machine, in ROS domain '
+        f'{environment.get("ROS_DOMAIN_ID") or 0}, can command this node; '
+        'ROS_AUTOMATIC_DISCOVERY_RANGE=LOCALHOST keeps it to this machine')

@@ -3,8 +3,6 @@
 
 """Records of what changes the controller, published as it happens; see docs/records.md."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Mapping
 import secrets
 import time
@@ -27,7 +25,6 @@ class RecordPublisher:
     A replay begins at a snapshot of that state. There is one at the start, one for each new
     subscriber, and one every ten seconds while something is recorded.
 
-    :param matching: makes the publisher.
     :param snapshot: returns the fields of a snapshot, as :func:`records.snapshot` does.
     :param joined: called in the executor when there is another subscriber, to call
         :meth:`publish_snapshot` under the lock.
@@ -40,8 +37,8 @@ class RecordPublisher:
         self._number = 0
         self._due = 0.0
         self._publisher = matching.publish(
-            String, topics.CONTROLLER_EVENTS, topics.LOOP_QOS,
-            lambda info: joined() if info.current_count_change > 0 else None)
+            topics.CONTROLLER_EVENTS,
+            matched=lambda info: joined() if info.current_count_change > 0 else None)
         self.publish_snapshot(START)
 
     def publish_snapshot(self, event: str = SNAPSHOT) -> None:

@@ -3,13 +3,10 @@
 
 """Recording of topics as they come: raw subscriptions into a bag."""
 
-from __future__ import annotations
-
 from collections.abc import Iterable, Mapping
-from dataclasses import dataclass
 import heapq
 import time
-from typing import Any
+from typing import Any, NamedTuple
 
 from rclpy.callback_groups import CallbackGroup
 from rclpy.node import Node
@@ -19,6 +16,7 @@ from rclpy.topic_endpoint_info import TopicEndpointInfo
 
 from koopman_ros.bags import BagWriter, INFINITE_NS, message_definition, QosProfile
 from koopman_ros.ros import topics
+from koopman_ros.ros.matching import type_name
 
 # Five seconds at 1 kHz wait here while the disk is slow; Fast DDS keeps no more than this.
 _QUEUE_DEPTH = 5000
@@ -28,10 +26,7 @@ _LINGER = 0.1  # s
 _LONGEST_WAY_NS = 1_000_000_000
 
 
-@dataclass(frozen=True)
-class _Taken:
-    """A message with when it was received and sent, in ns."""
-
+class _Taken(NamedTuple):
     topic: str
     data: bytes
     received_ns: int
@@ -47,15 +42,13 @@ class _OutsideTheExecutor(CallbackGroup):
     """
 
     def can_execute(self, entity: object) -> bool:
-        """Let nothing be waited for or executed."""
         return False
 
     def beginning_execution(self, entity: object) -> bool:
-        """Let nothing be executed."""
         return False
 
     def ending_execution(self, entity: object) -> None:
-        """Do nothing, as nothing was executed."""
+        pass
 
 
 class Recorder:
@@ -66,8 +59,6 @@ class Recorder:
     method raises OSError where the bag cannot be written, and LookupError where the definition of
     a type is not installed; then :meth:`close` is all that is left to do.
 
-    :param node: that subscribes.
-    :param writer: the open bag; closed by :meth:`close`.
     :param names: topics, relative or absolute; types are looked up for those outside the loop.
     """
 
@@ -134,7 +125,6 @@ class Recorder:
             self._writer.close()
 
     def _end(self, ended: list[str]) -> None:
-        """End subscriptions after recording what waits in them."""
         subscriptions = {topic: self._subscriptions.pop(topic) for topic in ended}
         try:
             self._record_in_order(self._waiting(topic, subscription)
@@ -172,10 +162,7 @@ class Recorder:
     def _announce(self, topic: str) -> None:
         """Add a topic to the bag with what its publishers offer now."""
         publishers = self._node.get_publishers_info_by_topic(topic)
-        message_type = self._types[topic]
-        assert message_type is not None
-        name = f'{message_type.__module__.split(".")[0]}/msg/{message_type.__name__}'
-        self._writer.add_topic(topic, message_definition(name),
+        self._writer.add_topic(topic, message_definition(type_name(self._types[topic])),
                                [_offered(info.qos_profile) for info in publishers])
 
 
@@ -211,10 +198,7 @@ def _matching_qos(topic: str, publishers: list[TopicEndpointInfo]) -> QoSProfile
     offers = [info.qos_profile for info in publishers] or [topics.qos(topic)]
     reliable = all(o.reliability is not ReliabilityPolicy.BEST_EFFORT for o in offers)
     latched = all(o.durability is DurabilityPolicy.TRANSIENT_LOCAL for o in offers)
-    return QoSProfile(
-        depth=_QUEUE_DEPTH,
-        reliability=ReliabilityPolicy.RELIABLE if reliable else ReliabilityPolicy.BEST_EFFORT,
-        durability=(DurabilityPolicy.TRANSIENT_LOCAL if latched else DurabilityPolicy.VOLATILE))
+    return topics.profile(_QUEUE_DEPTH, reliable=reliable, latched=latched)
 
 
 def _offered(profile: QoSProfile) -> QosProfile:

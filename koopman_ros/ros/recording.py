@@ -1,10 +1,7 @@
 # SPDX-FileCopyrightText: 2026 The koopman_ros Authors
 # SPDX-License-Identifier: Apache-2.0
 
-
 """Recording as the trainer does it: starts and stops, names, room on the disk, what went wrong."""
-
-from __future__ import annotations
 
 from collections.abc import Callable
 import datetime
@@ -13,7 +10,6 @@ import os
 from pathlib import Path
 import shutil
 
-from rclpy.clock import Clock, ClockType
 from rclpy.node import Node
 from std_srvs.srv import SetBool
 
@@ -33,7 +29,6 @@ class Recording:
     """
     Record the loop to one bag after another, on the service ``~/record``; reports by diagnostics.
 
-    :param node: whose executor does the work.
     :param settings: what the next recording starts with; the node replaces it when they change.
     """
 
@@ -46,10 +41,8 @@ class Recording:
         self._diagnostics = DiagnosticsPublisher(node, 'recording', 'trainer', self._status)
         self._owned = Owned(node)
         self._owned.keep(node.create_service(SetBool, '~/record', self._on_record))
-        wall_clock = Clock(clock_type=ClockType.STEADY_TIME)
         self._timers = [
-            self._owned.keep(node.create_timer(
-                period, partial(self._attempt, work), clock=wall_clock, autostart=False))
+            self._owned.timer(period, partial(self._attempt, work), autostart=False)
             for period, work in ((_TAKE_PERIOD, Recorder.take), (_FLUSH_PERIOD, self._flush),
                                  (_LOOK_PERIOD, Recorder.look_for_publishers))]
 
@@ -167,7 +160,6 @@ class Recording:
         return response
 
     def _too_little_room(self, output: Path) -> str:
-        """Return in words that the disk of a bag is too full, or an empty string."""
         limit = self.settings.min_free_disk
         if not limit:
             return ''

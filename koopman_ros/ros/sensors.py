@@ -3,11 +3,9 @@
 
 """What the plant publishes at an instant: the time, and what its instruments show."""
 
-from __future__ import annotations
-
 from rclpy.node import Node
 from rosgraph_msgs.msg import Clock
-from sensor_msgs.msg import JointState, Temperature
+from sensor_msgs.msg import JointState
 
 from koopman_ros.parameters.plant import PlantParameters
 from koopman_ros.plants import in_steps, Process, sensor_noise
@@ -20,26 +18,17 @@ _CONCENTRATION_NAME = 'reactant_concentration [mol/L]'
 
 
 class Instruments:
-    """
-    Publish the measurements of a plant.
-
-    :param node: the plant.
-    :param matching: makes the publishers that the loop hears.
-    :param clock: whether to publish the time, too.
-    :param concentration: whether the plant has a concentration, as its first state.
-    """
+    """Publish the measurements of a plant, with the time and its first state if wanted."""
 
     def __init__(self, node: Node, matching: Matching, clock: bool, concentration: bool) -> None:
         self._owned = owned = Owned(node)
-        self._clock = owned.keep(node.create_publisher(
-            Clock, topics.CLOCK, topics.CLOCK_QOS)) if clock else None
-        self._concentration = owned.keep(node.create_publisher(
-            JointState, topics.CONCENTRATION, topics.LOOP_QOS)) if concentration else None
+        self._clock = owned.keep(
+            node.create_publisher(*topics.of(topics.CLOCK))) if clock else None
+        self._concentration = owned.keep(
+            node.create_publisher(*topics.of(topics.CONCENTRATION))) if concentration else None
         # the temperature last: who has found it has found the coolant, too
-        self._coolant = matching.publish(
-            Temperature, topics.COOLANT_TEMPERATURE, topics.LATCHED_QOS)
-        self._temperature = matching.publish(
-            Temperature, topics.TEMPERATURE, topics.LOOP_QOS)
+        self._coolant = matching.publish(topics.COOLANT_TEMPERATURE)
+        self._temperature = matching.publish(topics.TEMPERATURE)
 
     def destroy(self) -> None:
         """Take down what `matching` has not made."""
@@ -51,13 +40,7 @@ class Instruments:
         return self._temperature.get_subscription_count()
 
     def publish(self, process: Process, sample: int, settings: PlantParameters) -> None:
-        """
-        Publish the plant as it stands: the temperature, which is answered, comes last.
-
-        :param process: the plant, at the instant of the measurement.
-        :param sample: number of the measurement.
-        :param settings: present properties of the sensor.
-        """
+        """Publish the plant as it stands, the temperature, which is answered, last."""
         stamp, frame_id = stamp_message(process.time_ns), settings.frame_id
         if self._clock is not None:
             self._clock.publish(Clock(clock=stamp))

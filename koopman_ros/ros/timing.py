@@ -3,11 +3,9 @@
 
 """When measurements arrive: how long ago, how old, and by which clock."""
 
-from __future__ import annotations
-
-from dataclasses import dataclass
 import math
 import time
+from typing import NamedTuple
 
 from rclpy.node import Node
 
@@ -18,29 +16,21 @@ _SAME_CLOCK = 3600.0  # s
 _CLOCK_PATIENCE = 1.0  # s from the start until somebody should publish the time
 
 
-@dataclass(frozen=True)
-class Moment:
-    """
-    A time by all clocks.
-
-    :param wall: of the steady clock, in s.
-    :param sim: on /clock, in ns; 0 where it does not count.
-    :param node_ns: of the node's clock.
-    """
+class Moment(NamedTuple):
+    """A time by the steady clock, in s, on /clock (0 where it does not count) and the node's."""
 
     wall: float
-    sim: int
+    sim_ns: int
     node_ns: int
 
 
-class Arrival:
+class Timing:
     """
     The time of the last measurement that brought news, by the plant's time where it is known.
 
     With `use_sim_time` that is the time on /clock, as long as there is one; otherwise the steady
     clock, which no correction of the system's time upsets.
 
-    :param node: whose clock and parameter `use_sim_time` count.
     """
 
     def __init__(self, node: Node) -> None:
@@ -60,7 +50,7 @@ class Arrival:
 
     def note(self, stamp_ns: int, at: Moment) -> None:
         """Take down that a measurement with a new stamp has arrived at a time."""
-        self._wall, self._sim = at.wall, at.sim
+        self._wall, self._sim = at.wall, at.sim_ns
         age = (at.node_ns - stamp_ns) / NANOSECONDS
         # at time zero the clock has not begun
         self.age = age if at.node_ns and abs(age) < _SAME_CLOCK else math.nan

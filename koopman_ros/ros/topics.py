@@ -3,8 +3,6 @@
 
 """The topics of the loop: names, types and quality of service, the same for every node."""
 
-from __future__ import annotations
-
 from collections.abc import Collection
 import importlib
 import reprlib
@@ -69,6 +67,11 @@ def qos(topic: str) -> QoSProfile:
     return _QOS.get(topic, LOOP_QOS)
 
 
+def of(topic: str) -> tuple[Any, str, QoSProfile]:
+    """Return type, name and quality of service of a topic of the loop."""
+    return TYPES[topic], topic, qos(topic)
+
+
 def unusable(node: Node, names: Collection[str]) -> str:
     """Say which name a node cannot make a topic of, as with a substitution; '' for none."""
     for name in names:
@@ -82,6 +85,14 @@ def unusable(node: Node, names: Collection[str]) -> str:
             reason = ' '.join(str(error).split(', at /')[0].split())
             return f'topics: {reprlib.repr(name)} cannot be used ({reason}): choose another name'
     return ''
+
+
+def profile(depth: int, *, reliable: bool, latched: bool = False) -> QoSProfile:
+    """Return a quality of service that keeps the last messages, so many of them."""
+    return QoSProfile(
+        depth=depth,
+        reliability=ReliabilityPolicy.RELIABLE if reliable else ReliabilityPolicy.BEST_EFFORT,
+        durability=DurabilityPolicy.TRANSIENT_LOCAL if latched else DurabilityPolicy.VOLATILE)
 
 
 def message_class(type_name: str) -> Any:

@@ -1,17 +1,13 @@
 # SPDX-FileCopyrightText: 2026 The koopman_ros Authors
 # SPDX-License-Identifier: Apache-2.0
 
-
 """Training as the trainer offers it: on request, or as the one task of the process."""
-
-from __future__ import annotations
 
 from collections.abc import Callable
 import os
 import sys
 import time
 
-from rclpy.clock import Clock, ClockType
 from rclpy.node import Node
 from std_srvs.srv import Trigger
 
@@ -31,7 +27,6 @@ class Training:
     """
     Retrain in a process of its own, on ``~/train``; ``~/cancel_training`` ends it.
 
-    :param node: whose executor looks after it.
     :param settings: what the next training starts with; the node replaces it when they change.
     :param recorded: returns the bag that is being recorded or was last, flushed, or ''.
     :param on_end: called when a training has ended.
@@ -50,9 +45,7 @@ class Training:
         self._owned = owned = Owned(node)
         owned.keep(node.create_service(Trigger, '~/train', self._on_train))
         owned.keep(node.create_service(Trigger, '~/cancel_training', self._on_cancel))
-        self._timer = owned.keep(node.create_timer(
-            _POLL_PERIOD, self._on_poll, autostart=False,
-            clock=Clock(clock_type=ClockType.STEADY_TIME)))
+        self._timer = owned.timer(_POLL_PERIOD, self._on_poll, autostart=False)
 
     def start(self) -> str:
         """
@@ -139,7 +132,6 @@ class Training:
         self._on_end(self._state)
 
     def _show(self, state: JobState) -> None:
-        """Show the progress: a bar on a terminal, a line now and then elsewhere."""
         if sys.stderr.isatty():
             full = round(_BAR_WIDTH * state.share)
             bar = '#' * full + '-' * (_BAR_WIDTH - full)

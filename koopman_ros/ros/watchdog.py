@@ -3,14 +3,12 @@
 
 """What goes on when the executor's thread does not: the watch over silence, and the end."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 import os
 import signal
 import threading
 
-from koopman_ros.last_resort import end_by_force
+from koopman_ros.startup import end_by_force
 
 PERIOD = 0.1  # s by the wall, of the executor's own watch and of the one over it
 # Looks in a row at which the executor has not come by: on a loaded machine it may be late by some.

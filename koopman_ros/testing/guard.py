@@ -8,8 +8,6 @@ A signal at the parent's death (prctl) is not enough: it comes when the thread e
 the child, and neither a stopped process nor one that hangs in the middleware ends by it.
 """
 
-from __future__ import annotations
-
 import contextlib
 import os
 import select

@@ -5,7 +5,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Iterator, Mapping
 import contextlib
 import os
 from pathlib import Path
@@ -13,7 +13,7 @@ import signal
 import subprocess
 from types import TracebackType
 
-from koopman_ros.startup import blocked_signals
+from koopman_ros.startup import blocked_signals, SIGNALS
 from koopman_ros.startup import command as child_command
 from koopman_ros.testing.guard import guard
 
@@ -109,3 +109,28 @@ def _as_argument(value: object) -> str:
     if isinstance(value, (tuple, list)):
         return '[' + ','.join(str(item) for item in value) + ']'
     return str(value)
+
+
+@contextlib.contextmanager
+def deferred_interrupt() -> Iterator[Callable[[], None]]:
+    """
+    Let a signal raise KeyboardInterrupt where the yielded function is called, and at the end.
+
+    One that comes while Python looks after a child leaves the child's lock taken for ever, and
+    one inside the middleware's extension comes out as another error. The processes live in
+    sessions of their own: without us nobody would end them.
+    """
+    pending: list[bool] = []
+
+    def check() -> None:
+        if pending:
+            raise KeyboardInterrupt
+
+    before = {number: signal.signal(number, lambda *_: pending.append(True))
+              for number in SIGNALS}
+    try:
+        yield check
+    finally:
+        for number, handler in before.items():
+            signal.signal(number, handler)
+    check()

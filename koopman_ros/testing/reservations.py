@@ -3,8 +3,6 @@
 
 """Names that one run on this machine reserves: its ROS domain, its folder for results."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 import contextlib
 import hashlib
@@ -12,8 +10,7 @@ import os
 from pathlib import Path
 import socket
 
-from koopman_ros.resources import config_directory
-from koopman_ros.ros.exposure import LOOPBACK_PROFILE
+from koopman_ros.resources import config_directory, LOOPBACK_PROFILE
 
 _DOMAINS = range(1, 102)
 

@@ -23,9 +23,8 @@ from koopman_ros.parameters.table import (
     Specification,
 )
 from koopman_ros.resources import config_directory
-from koopman_ros.ros.access import POLICY_FILE
-from koopman_ros.ros.parameter_files import main, TABLES
 from koopman_ros.ros.parameters import ParameterNode, range_of
+from koopman_ros.ros.programs import main, POLICY_FILE, TABLES
 from koopman_ros.testing import Harness
 
 

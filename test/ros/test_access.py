@@ -19,13 +19,13 @@ from koopman_ros.bags import BagWriter, message_definition
 from koopman_ros.nodes import replay
 from koopman_ros.parameters.player import PlayerParameters
 from koopman_ros.ros import topics
-from koopman_ros.ros.access import Access, NODES, OPERATOR, policy
 from koopman_ros.ros.parameters import ParameterNode
+from koopman_ros.ros.programs import OPERATOR, policy, Program, PROGRAMS
 from koopman_ros.testing import Harness
 from support.messages import temperature
 
 
-def resolved(access: Access, node: str) -> dict[str, set[str]]:
+def resolved(access: Program, node: str) -> dict[str, set[str]]:
     """Return the names of a node in the root namespace in full, by what it does with them."""
     def full(names: tuple[str, ...]) -> set[str]:
         return {name if name.startswith('/') else f'/{name.replace("~", node, 1)}'
@@ -63,7 +63,7 @@ def watch(ros: Harness, node: str, seen: Seen, **wanted: set[str]) -> None:
 
 def check(ros: Harness, node: str, seen: Seen) -> None:
     """Compare what a node does, and did, with what is granted."""
-    granted = resolved(NODES[node], node)
+    granted = resolved(PROGRAMS[node], node)
     watch(ros, node, seen, **granted)
     assert seen == granted
 
@@ -129,12 +129,12 @@ def test_the_replay_does_what_it_is_granted(context: None, monkeypatch: pytest.M
 
     monkeypatch.setattr(replay, 'ParameterNode', Asked)
     replay._prepare()
-    assert seen == [resolved(NODES['replay'], 'replay')]
+    assert seen == [resolved(PROGRAMS['replay'], 'replay')]
 
 
 def test_an_operator_asks_and_watches_all_and_commands_by_the_set_points_alone() -> None:
     operator = resolved(OPERATOR, 'operator')
-    loop = {node: resolved(access, node) for node, access in NODES.items() if node != 'replay'}
+    loop = {node: resolved(access, node) for node, access in PROGRAMS.items() if node != 'replay'}
     assert operator['subscribes'] >= set().union(*(do['publishes'] for do in loop.values()))
     assert operator['calls'] == set().union(*(do['serves'] for do in loop.values()))
     assert operator['publishes'] == {
@@ -147,14 +147,14 @@ def test_policy_has_the_form_that_sros2_reads() -> None:
     assert (root.tag, root.attrib) == ('policy', {'version': '0.2.0'})
     assert [child.tag for child in root] == ['enclaves']
     assert {enclave.get('path') for enclave in root[0]} == {
-        f'/koopman_ros/{name}' for name in (*NODES, 'operator')}
+        f'/koopman_ros/{name}' for name in (*PROGRAMS, 'operator')}
     for enclave in root[0]:
         (profiles,) = enclave
         (profile,) = profiles
         assert (enclave.tag, profiles.tag, profile.tag) == ('enclave', 'profiles', 'profile')
         name = enclave.get('path', '').removeprefix('/koopman_ros/')
         assert profile.attrib == {'ns': '/', 'node': name}
-        access = OPERATOR if name == 'operator' else NODES[name]
+        access = OPERATOR if name == 'operator' else PROGRAMS[name]
         granted: dict[str, set[str]] = {}
         for rules in profile:
             ((verb, qualifier),) = rules.attrib.items()

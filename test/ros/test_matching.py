@@ -38,9 +38,9 @@ class Pair:
         self.executor = SingleThreadedExecutor(context=self.own.context)
         self.executor.add_node(self.own)
         self.matching = Matching(self.own, lambda: None)
-        self.speaker = self.matching.publish(Temperature, 'command', topics.LOOP_QOS)
+        self.speaker = self.matching.publish('command', Temperature)
         self.matching.subscribe(
-            Temperature, 'temperature', lambda _: None, topics.LOOP_QOS,
+            'temperature', lambda _: None,
             qos_overriding_options=QoSOverridingOptions((QoSPolicyKind.RELIABILITY,)))
 
     def _node(self, name: str) -> Node:

@@ -16,7 +16,6 @@ from koopman_ros.parameters.trainer import TrainerParameters
 from koopman_ros.ros import topics
 from koopman_ros.ros.diagnostics import DiagnosticsPublisher, Level, Status
 from koopman_ros.ros.experiment import CoolantExperiment
-from koopman_ros.ros.experiment_run import ExperimentRun
 from koopman_ros.ros.matching import Matching
 from koopman_ros.ros.recorder import Recorder
 from koopman_ros.ros.recording import Recording
@@ -36,8 +35,8 @@ def diagnostics(node: Node, _: Path) -> Callable[[], object]:
 
 def matching(node: Node, _: Path) -> Callable[[], object]:
     part = Matching(node, lambda: None, {topics.TEMPERATURE: 'publish the temperature'})
-    part.publish(Temperature, 'mine', topics.LOOP_QOS)
-    part.subscribe(Temperature, 'other', lambda _: None, topics.LOOP_QOS)
+    part.publish('mine', Temperature)
+    part.subscribe('other', lambda _: None, Temperature)
     return part.destroy
 
 
@@ -62,10 +61,6 @@ def recording(node: Node, folder: Path) -> Callable[[], object]:
     return part.destroy
 
 
-def experiment_run(node: Node, _: Path) -> Callable[[], object]:
-    return ExperimentRun(node, TrainerParameters(), lambda: None, lambda _: None).destroy
-
-
 def experiment(node: Node, _: Path) -> Callable[[], object]:
     part = CoolantExperiment(node, TrainerParameters(experiment_topic=topics.COOLANT_SETPOINT))
     assert part._start() == ''
@@ -85,7 +80,7 @@ def watchdog(_: Node, __: Path) -> Callable[[], object]:
 
 
 @pytest.mark.parametrize('make', [diagnostics, matching, instruments, recorder, recording,
-                                  experiment_run, experiment, training, watchdog])
+                                  experiment, training, watchdog])
 def test_what_a_part_has_created_goes_with_it(
         shared_ros: Harness, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, make: Make) -> None:
     # a training that loads no library, and ends when it is asked to

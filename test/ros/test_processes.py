@@ -20,10 +20,11 @@ from rosgraph_msgs.msg import Clock
 from koopman_ros.bags import summary
 from koopman_ros.nodes import controller, plant, player, trainer
 from koopman_ros.resources import model_path
-from koopman_ros.ros import command_line, topics
+from koopman_ros.ros import process as node_process
+from koopman_ros.ros import topics
 from koopman_ros.ros.codec import stamp_message
-from koopman_ros.ros.exposure import open_to_the_network
-from koopman_ros.ros.parameter_files import TABLES
+from koopman_ros.ros.process import open_to_the_network
+from koopman_ros.ros.programs import TABLES
 from koopman_ros.testing import Harness
 from koopman_ros.units import NANOSECONDS
 from support.messages import TIMEOUT
@@ -117,7 +118,7 @@ ENDS = {
         'PlantNode.destroy_node = lambda _: time.sleep(3600.0)\n',
         r'.*plant: the middleware does not shut down: left to the operating system\n'),
     'a middleware that hangs with the lock held': (
-        'process._TAKE_DOWN_PATIENCE, last_resort._LATER = 0.1, 0.1\n'
+        'process._TAKE_DOWN_PATIENCE, startup._LATER = 0.1, 0.1\n'
         'def destroy_node(self):\n'
         '    ctypes.PyDLL(None).sleep(3600)\n'
         'PlantNode.destroy_node = destroy_node\n', r'.*in destroy_node.*'),
@@ -129,7 +130,7 @@ def test_signals_during_the_start_end_a_node_cleanly(shared_ros: Harness, name: 
     before, words = ENDS[name]
     program = (
         'import ctypes, os, signal, sys, time\n'
-        'from koopman_ros import last_resort\n'
+        'from koopman_ros import startup\n'
         'from koopman_ros.ros import process\n'
         'from koopman_ros.nodes.plant import PlantNode\n'
         f'{before}'
@@ -156,10 +157,10 @@ def test_node_without_standard_streams_ends_cleanly(ros: Harness, tmp_path: Path
 def test_a_process_that_runs_a_node_among_other_things_is_not_ended_by_force() -> None:
     program = (
         'import sys, time\n'
-        'from koopman_ros import last_resort\n'
+        'from koopman_ros import startup\n'
         'from koopman_ros.ros import process\n'
         'process._TAKE_DOWN_PATIENCE = 0.2\n'
-        'last_resort._LATER = last_resort._AFTER = 0.0\n'
+        'startup._LATER = startup._AFTER = 0.0\n'
         'process._take_down("plant", None)\n'
         '# longer than it takes until a process is ended by force\n'
         'time.sleep(0.5)\n'
@@ -193,16 +194,16 @@ def test_impossible_time_does_not_end_a_node(ros: Harness) -> None:
 @pytest.mark.parametrize('name', ['plant', 'controller', 'trainer', 'player', 'replay'])
 def test_help_and_unknown_arguments(
         name: str, capsys: pytest.CaptureFixture[str]) -> None:
-    assert command_line.answer(name, [name, '--ros-args', '-p', 'a:=1.0']) is None
-    assert command_line.answer(name, [name, '--help']) == 0
+    assert node_process.answer(name, [name, '--ros-args', '-p', 'a:=1.0']) is None
+    assert node_process.answer(name, [name, '--help']) == 0
     said = capsys.readouterr().out
     assert said.startswith(f'usage: ros2 run koopman_ros {name} ')
     assert 'exit codes: 0 ' in said
     assert f'config/{name}.yaml' in said
     assert all(f'\n  {row} ' in said for row in TABLES[name].rows)
     # rules as in ROS 1, which rcl still takes
-    assert command_line.answer(name, [name, '__ns:=/unit']) is None
-    assert command_line.answer(name, [name, 'speed:=2.0', 'more']) == 2
+    assert node_process.answer(name, [name, '__ns:=/unit']) is None
+    assert node_process.answer(name, [name, 'speed:=2.0', 'more']) == 2
     assert capsys.readouterr().err == (
         f"{name}: unknown argument 'speed:=2.0': parameters are given as --ros-args -p "
         'name:=value; --help says more\n')

@@ -1,0 +1,166 @@
+# SPDX-FileCopyrightText: 2026 The koopman_ros Authors
+# SPDX-License-Identifier: Apache-2.0
+
+"""
+What each program does, and the help, parameter files and SROS2 policy that follow from it.
+
+Run it as ``python -m koopman_ros.ros.programs`` after a change to a table or in here.
+"""
+
+import argparse
+from dataclasses import dataclass
+from pathlib import Path
+import sys
+from typing import Any
+from xml.etree import ElementTree
+
+from koopman_ros.parameters import controller, plant, player, replay, trainer
+from koopman_ros.parameters.table import ParameterTable
+from koopman_ros.resources import config_directory
+from koopman_ros.ros import topics
+
+POLICY_FILE = 'sros2_policy.xml'
+
+# what rclpy gives every node
+_ROSOUT, _PARAMETER_EVENTS = '/rosout', '/parameter_events'
+_PARAMETER_SERVICES = (
+    '~/describe_parameters', '~/get_parameter_types', '~/get_parameters', '~/list_parameters',
+    '~/set_parameters', '~/set_parameters_atomically')
+_TYPE_SERVICE = '~/get_type_description'
+STANDARD_TOPICS = (_ROSOUT, _PARAMETER_EVENTS)
+STANDARD_SERVICES = (*_PARAMETER_SERVICES, _TYPE_SERVICE)
+# `ros2 topic pub` and its like start a node with this service, named after their process
+_COMMAND_LINE_SERVICE = '/_ros2cli_*/get_type_description'
+
+_LOOP = tuple(name for name in topics.TYPES if name != topics.CLOCK)
+
+
+@dataclass(frozen=True)
+class Program:
+    """What a program does, and on the network by names as in the node."""
+
+    does: str = ''  # a sentence
+    codes: str = '0 after a signal, 1 when it cannot start, 2 for an unknown argument'
+    publishes: tuple[str, ...] = ()  # topics
+    subscribes: tuple[str, ...] = ()  # topics; /clock where it follows simulated time
+    serves: tuple[str, ...] = ()  # services
+    calls: tuple[str, ...] = ()  # services of others
+
+
+PROGRAMS = {
+    'plant': Program(
+        'Simulates the reactor: publishes its temperature and takes a coolant temperature.',
+        publishes=(topics.TEMPERATURE, topics.CONCENTRATION, topics.COOLANT_TEMPERATURE,
+                   topics.CLOCK, topics.DIAGNOSTICS, *STANDARD_TOPICS),
+        subscribes=(topics.COOLANT_SETPOINT,),
+        serves=('~/reset', *STANDARD_SERVICES)),
+    'controller': Program(
+        'Answers each measured temperature with a coolant set-point, by a learned model.',
+        publishes=(topics.COOLANT_SETPOINT, topics.ACTIVE_SETPOINT,
+                   topics.PREDICTED_TEMPERATURE, topics.CONTROLLER_STATE,
+                   topics.CONTROLLER_EVENTS, topics.DIAGNOSTICS, *STANDARD_TOPICS),
+        subscribes=(topics.TEMPERATURE, topics.COOLANT_TEMPERATURE, topics.SETPOINT,
+                    topics.MANUAL_COOLANT_SETPOINT, topics.CLOCK),
+        serves=('~/set_automatic', '~/reload_model', *STANDARD_SERVICES)),
+    'trainer': Program(
+        'Records the loop to MCAP bags, excites the plant, and learns models from bags.',
+        f'{Program.codes}; with task:=train 0 for an accepted model, 2 for a refused one, 1 for a '
+        'failure',
+        publishes=(*trainer.EXPERIMENT_TOPICS, topics.DIAGNOSTICS, *STANDARD_TOPICS),
+        subscribes=(*trainer.LOOP_TOPICS, topics.CLOCK),
+        serves=('~/record', '~/experiment', '~/train', '~/cancel_training',
+                *STANDARD_SERVICES)),
+    'player': Program(
+        'Publishes the measurements and set-points of a bag again, by the clock or in lock-step.',
+        '0 when all was played or after a signal, 1 when it cannot start or go on, 2 for an '
+        'unknown argument',
+        publishes=(*player.PlayerParameters().topics, topics.CLOCK, *STANDARD_TOPICS),
+        subscribes=(topics.COOLANT_SETPOINT,),
+        serves=STANDARD_SERVICES),
+    'replay': Program(
+        'Takes the records in bags through the control step again, also with a new model.',
+        '0 when the recorded commands are reproduced, 1 when not or when it cannot run, 2 for an '
+        'unknown argument, 3 when there is nothing to compare in a bag, 130 when interrupted',
+        publishes=(_PARAMETER_EVENTS,), serves=(_TYPE_SERVICE,)),
+}
+
+TABLES: dict[str, ParameterTable[Any]] = {
+    'plant': plant.TABLE, 'controller': controller.TABLE, 'trainer': trainer.TABLE,
+    'player': player.TABLE, 'replay': replay.TABLE}
+
+# whoever moves the set-point, calls the services, tunes and watches: a person or a panel
+OPERATOR = Program(
+    publishes=(topics.SETPOINT, topics.MANUAL_COOLANT_SETPOINT, *STANDARD_TOPICS),
+    subscribes=(*_LOOP, topics.CLOCK, *STANDARD_TOPICS),
+    serves=(*STANDARD_SERVICES, _COMMAND_LINE_SERVICE),
+    calls=tuple(f'{node}/{service.removeprefix("~/")}' for node, program in PROGRAMS.items()
+                if node != 'replay' for service in program.serves))
+
+
+def policy() -> str:
+    """Return the text of the SROS2 policy: one enclave for each node, and one for operators."""
+    root = ElementTree.Element('policy', version='0.2.0')
+    root.append(ElementTree.Comment(
+        ' Least privilege for each node, written by `make config`: see docs/security.md. For '
+        'nodes in\n       a namespace replace every ns="/" by it. '))
+    enclaves = ElementTree.SubElement(root, 'enclaves')
+    for name, own in {**PROGRAMS, 'operator': OPERATOR}.items():
+        enclave = ElementTree.SubElement(enclaves, 'enclave', path=f'/koopman_ros/{name}')
+        profiles = ElementTree.SubElement(enclave, 'profiles')
+        profile = ElementTree.SubElement(profiles, 'profile', ns='/', node=name)
+        for kind, verb, names in (
+                ('topic', 'publish', own.publishes), ('topic', 'subscribe', own.subscribes),
+                ('service', 'reply', own.serves), ('service', 'request', own.calls)):
+            if names:
+                rules = ElementTree.SubElement(profile, f'{kind}s', {verb: 'ALLOW'})
+                for granted in sorted(set(names)):
+                    ElementTree.SubElement(rules, kind).text = granted
+    ElementTree.indent(root)
+    return ('<?xml version="1.0" encoding="UTF-8"?>\n'
+            + ElementTree.tostring(root, encoding='unicode') + '\n')
+
+
+def help_text(name: str) -> str:
+    """Return what `--help` prints."""
+    program = PROGRAMS[name]
+    rows = TABLES[name].rows.values()
+    width = max(len(row.name) for row in rows)
+    parameters = '\n'.join(
+        f'  {row.name:{width}}  {row.description}' + (f' [{row.unit}]' if row.unit else '')
+        for row in rows)
+    lists = ''.join(
+        f'{title}: {", ".join(own)}\n' for title, names in (
+            ('subscribes to', program.subscribes), ('publishes', program.publishes),
+            ('serves', program.serves))
+        if (own := [item for item in names if item not in STANDARD_TOPICS + STANDARD_SERVICES]))
+    return f"""\
+usage: ros2 run koopman_ros {name} [--ros-args [-p name:=value ...] [--params-file file] ...]
+
+{program.does}
+
+{lists}exit codes: {program.codes}
+
+Parameters, whose defaults and ranges are in {config_directory() / f'{name}.yaml'}:
+{parameters}"""
+
+
+def parameter_file(node: str) -> str:
+    """Return the text of a node's parameter file, every parameter at its default."""
+    return (f'# Parameters of the {node} node, all at their defaults. Use a copy with\n'
+            f'#   ros2 run koopman_ros {node} --ros-args --params-file {node}.yaml\n'
+            f'{TABLES[node].yaml()}')
+
+
+def main(args: list[str] | None = None) -> int:
+    """Write all parameter files and the policy."""
+    parser = argparse.ArgumentParser(description=main.__doc__)
+    parser.add_argument('--output', type=Path, default=Path('config'))
+    output = parser.parse_args(args).output
+    for node in TABLES:
+        (output / f'{node}.yaml').write_text(parameter_file(node))
+    (output / POLICY_FILE).write_text(policy())
+    return 0
+
+
+if __name__ == '__main__':
+    sys.exit(main())
