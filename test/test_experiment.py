@@ -1,7 +1,6 @@
 # SPDX-FileCopyrightText: 2026 The koopman_ros Authors
 # SPDX-License-Identifier: Apache-2.0
 
-
 """The identification experiment without a plant: its steps, its limits, and every way it ends."""
 
 from dataclasses import replace

@@ -1,7 +1,6 @@
 # SPDX-FileCopyrightText: 2026 The koopman_ros Authors
 # SPDX-License-Identifier: Apache-2.0
 
-
 """The files of a bag being written, one after the other, and the metadata that lists them."""
 
 from collections.abc import Iterable, Mapping

@@ -1,7 +1,6 @@
 # SPDX-FileCopyrightText: 2026 The koopman_ros Authors
 # SPDX-License-Identifier: Apache-2.0
 
-
 """One MCAP file of a bag being written: complete in itself, with schemas, topics and metadata."""
 
 from collections.abc import Mapping

@@ -3,8 +3,6 @@
 
 """What the command lines of both acts have in common."""
 
-from __future__ import annotations
-
 import argparse
 from collections.abc import Callable, Mapping
 from pathlib import Path

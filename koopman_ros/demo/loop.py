@@ -3,8 +3,6 @@
 
 """One closed loop of plant, controller and trainer in lock-step, with an operator beside it."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterator, Mapping
 import contextlib
 from dataclasses import dataclass, field

@@ -3,8 +3,6 @@
 
 """Results of both acts, from their bags: series, figures and the pictures."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 import itertools

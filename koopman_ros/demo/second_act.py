@@ -8,8 +8,6 @@ Plant, controller and trainer run as three processes in lock-step; none is stopp
 The disturbance observer is off: it would make up for the drift, and for what a lift lacks.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass, field
 import json
 from pathlib import Path

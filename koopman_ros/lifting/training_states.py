@@ -1,7 +1,6 @@
 # SPDX-FileCopyrightText: 2026 The koopman_ros Authors
 # SPDX-License-Identifier: Apache-2.0
 
-
 """Representative states of the training data, for the distance from them."""
 
 from __future__ import annotations

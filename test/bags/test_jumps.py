@@ -1,7 +1,6 @@
 # SPDX-FileCopyrightText: 2026 The koopman_ros Authors
 # SPDX-License-Identifier: Apache-2.0
 
-
 """What counts as a spike or a jump, and what is a plant's own motion."""
 
 import numpy as np

@@ -1,7 +1,6 @@
 # SPDX-FileCopyrightText: 2026 The koopman_ros Authors
 # SPDX-License-Identifier: Apache-2.0
 
-
 """The identification experiment across processes: steps on a plant, refusals, ways back."""
 
 from collections.abc import Mapping

@@ -1,7 +1,6 @@
 # SPDX-FileCopyrightText: 2026 The koopman_ros Authors
 # SPDX-License-Identifier: Apache-2.0
 
-
 """Recording that goes wrong or goes on for long: kills, split bags, full disks, fast topics."""
 
 from collections.abc import Iterator

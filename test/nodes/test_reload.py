@@ -1,7 +1,6 @@
 # SPDX-FileCopyrightText: 2026 The koopman_ros Authors
 # SPDX-License-Identifier: Apache-2.0
 
-
 """Another model in the running controller: nothing unanswered, no jump, reasons in words."""
 
 from collections.abc import Callable

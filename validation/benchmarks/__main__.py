@@ -3,8 +3,6 @@
 
 """Run parts of it: ``python -m validation.benchmarks [part ...] [--quick | --full]``."""
 
-from __future__ import annotations
-
 import argparse
 from collections.abc import Callable
 from functools import partial

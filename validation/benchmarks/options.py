@@ -3,8 +3,6 @@
 
 """What the user asks of a part of the benchmark, and what all parts say."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from enum import Enum

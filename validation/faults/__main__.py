@@ -3,8 +3,6 @@
 
 """Run the campaign: ``python -m validation.faults [case | group | soak ...] [--quick]``."""
 
-from __future__ import annotations
-
 import argparse
 from collections.abc import Callable, Sequence
 from pathlib import Path

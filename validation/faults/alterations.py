@@ -7,8 +7,6 @@ What may happen to a message on its way: each alteration turns one message into 
 Those with a memory are made anew for each case.
 """
 
-from __future__ import annotations
-
 from collections import deque
 from collections.abc import Callable
 from typing import NamedTuple

@@ -3,8 +3,6 @@
 
 """A case of the campaign: what is done to a running loop, and what is expected of it."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, fields
 from pathlib import Path

@@ -3,8 +3,6 @@
 
 """What may happen in a day: faults of messages, requests, disturbances; each ends by itself."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterator
 import functools
 import math

@@ -3,8 +3,6 @@
 
 """A neighbour that floods the domain: ``python -m validation.faults.flood SECONDS COUNT``."""
 
-from __future__ import annotations
-
 import sys
 import time
 

@@ -3,8 +3,6 @@
 
 """Whether a case was survived, and by how much: from the trace alone, without ROS."""
 
-from __future__ import annotations
-
 from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass

@@ -3,8 +3,6 @@
 
 """What the campaign leaves behind: ``report.md`` for people, ``summary.json`` for programs."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator, Sequence
 import math
 from pathlib import Path

@@ -7,8 +7,6 @@ The paper's experiments, and those on data from a sensor: figures, tables and a 
 Run it as ``python -m validation.paper`` (needs the `train` and `demo` requirements).
 """
 
-from __future__ import annotations
-
 import argparse
 from pathlib import Path
 import signal

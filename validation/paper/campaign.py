@@ -3,8 +3,6 @@
 
 """All experiments over a number of seeds, side by side on the cores of the machine."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field
 import math

@@ -3,8 +3,6 @@
 
 """Samples of the simulated plants, and what an experiment on them hands back."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 import contextlib
 from typing import TypeAlias

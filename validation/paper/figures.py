@@ -3,8 +3,6 @@
 
 """The figures of the paper's results, one file each."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import Any
 

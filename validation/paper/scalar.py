@@ -3,8 +3,6 @@
 
 """The paper's motivating example dx/dt = x^2, learned on [0, 5] and judged inside and beyond."""
 
-from __future__ import annotations
-
 import numpy as np
 
 from koopman_ros.learning import fit, Growth, train

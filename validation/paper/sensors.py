@@ -3,8 +3,6 @@
 
 """Lifts from what a sensor sees: sampled, noisy, of a plant that drifted, of half the state."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass, replace
 
 import numpy as np

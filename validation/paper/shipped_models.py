@@ -8,8 +8,6 @@ Run it as ``python -m validation.paper.shipped_models`` (needs the `train` requi
 seeds are fixed, so that the same machine writes the same files bit for bit.
 """
 
-from __future__ import annotations
-
 import argparse
 from dataclasses import replace
 from pathlib import Path

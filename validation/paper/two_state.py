@@ -3,8 +3,6 @@
 
 """The paper's two-state example: learned on a wide box, on narrow boxes, and by Algorithm 1."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cache

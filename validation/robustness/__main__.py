@@ -8,8 +8,6 @@ Run it as ``python -m validation.robustness`` (needs the `train`, `demo` and
 `bench` requirements).
 """
 
-from __future__ import annotations
-
 import argparse
 from pathlib import Path
 import sys

@@ -3,8 +3,6 @@
 
 """From where the loop gets back to its set-point, and from where no coolant could bring it."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from enum import Enum
 

@@ -3,8 +3,6 @@
 
 """What changed plants, lags, biases, saturation and noise do to the loop."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 import math

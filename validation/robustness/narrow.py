@@ -3,8 +3,6 @@
 
 """Lifts of too narrow data, asked for more than they know, without the ladder and with it."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 

@@ -3,8 +3,6 @@
 
 """The study of robustness: everything that is computed for it, by name."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from itertools import product

@@ -3,8 +3,6 @@
 
 """What may happen to a message on its way."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

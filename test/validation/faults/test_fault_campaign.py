@@ -3,8 +3,6 @@
 
 """Cases of the campaign across real processes, and what the campaign leaves behind."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 import json
 

@@ -3,8 +3,6 @@
 
 """The judge of the fault campaign: whatever is wrong with a trace is found."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 import math
 

@@ -1,7 +1,6 @@
 # SPDX-FileCopyrightText: 2026 The koopman_ros Authors
 # SPDX-License-Identifier: Apache-2.0
 
-
 """Figures of the robustness study against references that do not use its code."""
 
 from dataclasses import replace

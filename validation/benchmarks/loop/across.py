@@ -3,8 +3,6 @@
 
 """The loop across processes: its latency and rate, the nodes' start and memory, lock-step."""
 
-from __future__ import annotations
-
 import sys
 import time
 from typing import Any

@@ -3,8 +3,6 @@
 
 """A bare node that answers each temperature with the same message, on the controller's topics."""
 
-from __future__ import annotations
-
 import sys
 
 import rclpy

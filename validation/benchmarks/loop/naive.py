@@ -3,8 +3,6 @@
 
 """The controller's law written down with general tools: torch's jacrev and control's lqr."""
 
-from __future__ import annotations
-
 import numpy as np
 import torch
 from torch.func import jacrev

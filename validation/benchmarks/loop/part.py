@@ -3,8 +3,6 @@
 
 """The part *loop* of the benchmark: the control step, and the loop across processes."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 import os
 from pathlib import Path

@@ -3,8 +3,6 @@
 
 """A sensor and an actuator in one: publishes measurements, and notes when their commands come."""
 
-from __future__ import annotations
-
 import time
 
 import numpy as np

@@ -7,8 +7,6 @@ What a control step takes, beside the same law with general tools.
 As a program, given the number of steps and those of coordinates, it prints the figures as JSON.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 import json
 import os

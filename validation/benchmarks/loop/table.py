@@ -3,8 +3,6 @@
 
 """The figures as text, ratios first."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from typing import Any
 

@@ -3,8 +3,6 @@
 
 """Writers fed from memory: ours beside mcap's own with the same chunks."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Sequence
 from pathlib import Path
 import time

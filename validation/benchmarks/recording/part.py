@@ -3,8 +3,6 @@
 
 """The part *recording* of the benchmark: a minute at 1 kHz, a ladder of rates, and from memory."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from dataclasses import dataclass
 import os

@@ -9,8 +9,6 @@ message and, once the listener has them all, a line of JSON: the messages sent, 
 the first to the last, and the largest delay behind the schedule in seconds.
 """
 
-from __future__ import annotations
-
 import argparse
 import json
 import sys

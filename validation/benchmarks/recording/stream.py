@@ -3,8 +3,6 @@
 
 """A trainer that records what a publisher sends at a steady rate, and what that takes."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 import itertools
 import json

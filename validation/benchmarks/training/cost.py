@@ -3,8 +3,6 @@
 
 """What one iteration of our learner takes, in seconds and in memory."""
 
-from __future__ import annotations
-
 import ctypes
 import math
 from pathlib import Path

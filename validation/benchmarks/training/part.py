@@ -3,8 +3,6 @@
 
 """The part *training* of the benchmark: the loop over its measurements."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 import itertools

@@ -3,8 +3,6 @@
 
 """Processes that are given a bounded time and memory."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass

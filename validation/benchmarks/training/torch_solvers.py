@@ -3,8 +3,6 @@
 
 """The solvers in torch: our learner, L-BFGS and Adam."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 import math
 

@@ -3,8 +3,6 @@
 
 """Faults of clocks: stamps that jump, stand still or are zero, and a clock that is missing."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from typing import Any
 

@@ -3,8 +3,6 @@
 
 """What the model does not know: a plant that changes, an actuator that is slow or stuck."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from typing import Any
 

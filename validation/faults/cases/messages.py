@@ -3,8 +3,6 @@
 
 """Messages between plant and controller that are lost, doubled, overtaken and late."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 
 from validation.faults.alterations import Alteration, delayed, lost, swapped, twice

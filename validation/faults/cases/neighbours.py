@@ -3,8 +3,6 @@
 
 """Others on the same topics, in the same domain, on the same processor."""
 
-from __future__ import annotations
-
 import os
 import signal
 import sys

@@ -3,8 +3,6 @@
 
 """Storms of requests: parameters, set-points and modes, good and bad, as fast as they go."""
 
-from __future__ import annotations
-
 from collections import deque
 from collections.abc import Callable, Iterator, Mapping
 import functools

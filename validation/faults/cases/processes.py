@@ -3,8 +3,6 @@
 
 """Processes that end, hang and come back, and the files that they live on."""
 
-from __future__ import annotations
-
 import functools
 from pathlib import Path
 import re

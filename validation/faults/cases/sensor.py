@@ -3,8 +3,6 @@
 
 """Faults of the sensor: what it shows is not the temperature of the reactor."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 import math
 from typing import Any
