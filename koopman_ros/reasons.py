@@ -88,7 +88,7 @@ _TEMPLATES = {
         'the measured {signal} jumped from {before:value} to {value:value} in {seconds:.3g} s, '
         'at most {jump:change} and {rate:rate} are possible: check the sensor'),
     Code.FROZEN: (
-        'the measured {signal} has been {value:value} to the bit for longer than {timeout:g} s '
+        'the measured {signal} has been exactly {value:value} for longer than {timeout:g} s '
         'while the model moved by more than {change:change}: the sensor is frozen; check it'),
     Code.NO_MEASUREMENT: 'no measurement arrives: check sensor and plant',
     Code.OUTSIDE_TRAINING: (

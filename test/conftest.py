@@ -6,13 +6,14 @@
 from collections.abc import Iterator
 import os
 import signal
-import sys
 
 import pytest
 
-# Before numpy is imported: small problems are slower on several threads, and far slower where
-# others use the cores.
+# Before numpy is imported, and for the processes that tests start: small problems are slower on
+# several threads, and far slower where others use the cores.
+os.environ.setdefault('OMP_NUM_THREADS', '1')
 os.environ.setdefault('OPENBLAS_NUM_THREADS', '1')
+os.environ.setdefault('MKL_NUM_THREADS', '1')
 
 from koopman_ros.startup import SIGNALS
 from support.disturbance import disturb_training
@@ -43,13 +44,6 @@ def own_signals() -> Iterator[None]:
     for number, handler in before.items():
         if signal.getsignal(number) is not handler:
             signal.signal(number, handler)
-
-
-@pytest.fixture(autouse=True, scope='session')
-def one_thread() -> None:
-    """Small problems are slower on several threads, and far slower where others use the cores."""
-    if 'OMP_NUM_THREADS' not in os.environ and (torch := sys.modules.get('torch')):
-        torch.set_num_threads(1)
 
 
 def pytest_configure() -> None:

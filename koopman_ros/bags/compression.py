@@ -4,7 +4,7 @@
 """
 Decompression with bounds: of chunks, and of rosbag2's compressed files and messages.
 
-The sizes that a damaged file declares are believed only within limits, and what expands beyond
+The sizes that a damaged file declares are accepted only within limits, and what expands beyond
 them is refused: a few bytes can be made to ask for all the memory there is.
 """
 

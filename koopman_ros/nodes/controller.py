@@ -39,7 +39,7 @@ from koopman_ros.ros.watchdog import PERIOD, Watchdog
 from koopman_ros.units import NANOSECONDS, to_kelvin
 
 _WATCH_STEP = NANOSECONDS // 2  # of plant time between two commands without a measurement
-_COOLANT_PATIENCE = 0.5  # s that the first answer waits for the coolant that is in force
+_COOLANT_PATIENCE = 0.5  # s that the first answer waits for the applied coolant temperature
 # A step that the watchdog has overtaken so often is given up, and its measurement with it.
 _ATTEMPTS = 2
 
@@ -120,7 +120,7 @@ class ControllerNode(LoopNode):
         self._answer(message)
 
     def _lacks_coolant(self) -> bool:
-        """Tell whether the coolant in force will be known in a moment."""
+        """Tell whether the applied coolant temperature will be known in a moment."""
         return (self._state.command is None and self._coolant is None
                 and self._patience is None
                 and self.count_publishers(self._coolants.topic_name) > 0)
@@ -182,7 +182,7 @@ class ControllerNode(LoopNode):
         self._tell(report, message.header.stamp)
 
     def _coolant_at(self, stamp_ns: int) -> float | None:
-        """Return the coolant temperature in force at a time, if it is known."""
+        """Return the applied coolant temperature at a time, if it is known."""
         heard = self._coolant
         if heard is None or (abs(stamp_nanoseconds(heard.header.stamp) - stamp_ns)
                              > messages.SAME_TIME_NS):

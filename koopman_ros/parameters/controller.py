@@ -41,10 +41,10 @@ class ControllerParameters:
         6.0, 'how fast disturbances are estimated: more removes offsets sooner, less lets less '
         'noise through to the coolant; 0 switches the observer off', '1/min', 0.0, 600.0)
     max_disturbance: float = parameter(
-        20.0, 'largest disturbance that is believed, as a change of the coolant', 'K', 0.0, 1000.0,
+        20.0, 'largest disturbance that is accepted, as a change of the coolant', 'K', 0.0, 1000.0,
         open_minimum=True)
     coolant_tolerance: float = parameter(
-        2.0, 'how far the coolant temperature in force may be from its command before the '
+        2.0, 'how far the applied coolant temperature may be from its command before the '
         'observer goes by it, as at a limit of the actuator', 'K', 0.0, 1000.0)
     transfer_time: float = parameter(
         30.0, 'time constant in which the coolant moves to what another law, model, tuning or '
@@ -78,10 +78,10 @@ class ControllerParameters:
         120.0, 'fastest change of the temperature that is physically possible', 'K/min', 0.0, 1e6,
         open_minimum=True)
     max_temperature_jump: float = parameter(
-        2.0, 'change between two measurements that is believed beside that rate, for noise', 'K',
+        2.0, 'change between two measurements that is accepted beside that rate, for noise', 'K',
         0.0, 1e6, open_minimum=True)
     frozen_timeout: float = parameter(
-        20.0, 'how long a measurement may stay the same to the bit while the model moves by more '
+        20.0, 'how long a measurement may stay bit-identical while the model moves by more '
         'than half of max_temperature_jump; 0 for ever', 's', 0.0, 86400.0)
     max_gain: float = parameter(
         1000.0, 'largest Riccati gain, in scaled coordinates, that is acted on; small weights '

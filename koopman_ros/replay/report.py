@@ -47,9 +47,9 @@ def verdict(bag: ReplayedBag) -> str:
         return ('nothing is compared: the records hold no command' if not bag.found.samples else
                 'nothing is compared: no snapshot of the controller comes before a command')
     if check.identical == check.compared:
-        return f'all {check.compared} recorded commands are reproduced to the bit'
+        return f'all {check.compared} recorded commands are reproduced bit for bit'
     beyond = int(np.count_nonzero(check.beyond))
-    return (f'{check.identical} of {check.compared} recorded commands are reproduced to the bit, '
+    return (f'{check.identical} of {check.compared} recorded commands are reproduced bit for bit, '
             f'{beyond} differ by more than {check.tolerance:g} K; {_worst(bag, check)}')
 
 

@@ -146,7 +146,7 @@ def _figures(now: Situation) -> dict[str, object]:
         'set-point [degC]': _setpoint(report),
         'coolant [degC]': to_celsius(_first(state.command)),
         'disturbance [K of coolant]': _disturbance(report),
-        'the same as a sensor bias [K]': _first(bias),
+        'equivalent sensor bias [K]': _first(bias),
         'distance outside training box [half widths]': float(report.measurement.outside),
         'set-point outside training box [half widths]': (
             np.nan if target is None else float(target.outside)),
@@ -159,7 +159,7 @@ def _figures(now: Situation) -> dict[str, object]:
         'measurements': now.counts.measurements,
         'late measurements': now.counts.late,
         'missed measurements': now.counts.missed,
-        'measurements not believed': now.counts.refused,
+        'measurements rejected': now.counts.refused,
         'since last measurement [s]': timing.wall_silence,
         'age of measurement [s]': timing.age,
         'latency from stamp to command [s]': timing.age + timing.answer_seconds,

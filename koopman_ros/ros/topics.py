@@ -54,7 +54,7 @@ TYPES = {
 # Every message of the loop counts: reliable, with room for a receiver that falls behind while
 # the plant runs hundreds of times faster than real time, or is not found by all yet.
 LOOP_QOS = QoSProfile(depth=1000)
-# A late joiner learns what is tracked, and which coolant is in force (REP 2003 leaves latching to
+# A late joiner learns what is tracked, and which coolant is applied (REP 2003 leaves latching to
 # the publisher).
 LATCHED_QOS = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
 CLOCK_QOS = QoSProfile(depth=1, reliability=ReliabilityPolicy.BEST_EFFORT)

@@ -88,7 +88,7 @@ def test_a_sensor_that_freezes_under_way_is_found_out():
     assert levels(frozen) == ['sdre', 'hold']
     first = next(s for s in frozen if s.report.level == 'hold')
     assert first.second - frozen[0].second == 21
-    assert 'to the bit for longer than 20 s while the model moved' in say(first.report.reason)
+    assert 'for longer than 20 s while the model moved' in say(first.report.reason)
     # what the observer made of it is forgotten
     assert abs(float(first.report.estimate.disturbance[0])) < 0.05
 

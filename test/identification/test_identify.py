@@ -76,7 +76,7 @@ def test_split_follows_the_seed(noisy, found):
 
 
 def test_held_out_stretches_change_nothing(noisy, found):
-    """An estimate that had seen them would move with them; all else is the same to the bit."""
+    """An estimate that had seen them would move with them; all else is bit-identical."""
     start, end = found.held_out[0].time[[5, -5]]
     inside = ((noisy.time > start) & (noisy.time < end))[:, None]
     centre = noisy.x[inside[:, 0]].mean()

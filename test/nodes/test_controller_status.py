@@ -47,7 +47,7 @@ def test_status_tells_mode_law_reason_and_figures(shared_bench: Bench) -> None:
     assert float(figures['coolant [degC]']) == pytest.approx(
         bench.commands[-1].temperature, abs=1e-6)
     assert float(figures['disturbance [K of coolant]']) < -0.1
-    bias = float(figures['the same as a sensor bias [K]'])
+    bias = float(figures['equivalent sensor bias [K]'])
     assert math.isfinite(bias)
     assert bias != 0.0
     assert 0.0 < float(figures['gain norm']) < 1000.0

@@ -171,7 +171,7 @@ def test_forty_reloads_under_load_leave_no_trace(ros: Harness, tmp_path: Path) -
 
 def jumps_of(bench: Bench, names: list[str]) -> list[float]:
     """
-    Follow the commands to the bit, from state to state and from model to model.
+    Follow the commands bit for bit, from state to state and from model to model.
 
     :param names: of the models in the order in which they were loaded.
     :return: by how much the command to the next measurement differed from what the model before

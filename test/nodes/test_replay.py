@@ -173,8 +173,10 @@ def bag(tmp_path_factory: pytest.TempPathFactory) -> Path:
         run_a_day(operator)
         tune_and_swap(operator)
         fall_silent(operator)
-        # what is on its way to the trainer is lost with its sender
-        operator.wait_for_records(operator.join() + 1)
+        # what is on its way to the trainer is lost with its sender: one record to spare, which
+        # stands for the first, where that came before the trainer had found the controller
+        operator.join()
+        operator.wait_for_records(operator.join())
         operator.controller.send(signal.SIGINT)
         assert ros.wait_for_end(operator.controller) == 0
         ros.start('controller', SETTINGS | {'model': 'reactor_nz3'})
@@ -223,7 +225,7 @@ def test_every_recorded_command_is_reproduced_to_the_bit(bag: Path) -> None:
     assert (found.found.runs, found.found.lost) == (2, [])
     assert found.complete
     assert verdict(found) == (
-        f'all {len(found.recorded)} recorded commands are reproduced to the bit')
+        f'all {len(found.recorded)} recorded commands are reproduced bit for bit')
 
 
 def test_the_day_was_not_an_easy_one(bag: Path) -> None:
@@ -236,8 +238,8 @@ def test_the_day_was_not_an_easy_one(bag: Path) -> None:
     assert found.found.refused == 2
     # on a busy machine there may be more
     assert events['silence'] >= 6
-    # that of the second controller may come before the trainer has found it
-    assert events['initialisation'] in (1, 2)
+    # that of a controller may come before the trainer has found it
+    assert events['initialisation'] <= 2
     assert events['model'] == 2
     assert events['parameters'] >= 7
     assert events[SNAPSHOT] >= 3
@@ -338,7 +340,7 @@ def test_report_tells_where_the_new_model_differs(bag: Path, tmp_path: Path) -> 
              '-p', 'new_model:=reactor_linear', '-p', 'output:=out'],
             cwd=tmp_path, capture_output=True, text=True, timeout=240, check=False)
     assert (ended.returncode, ended.stderr) == (0, '')
-    assert 'reproduced to the bit' in ended.stdout
+    assert 'reproduced bit for bit' in ended.stdout
     summary = json.loads((tmp_path / 'out' / 'summary.json').read_text())
     (figures,) = summary['bags']
     assert summary['reproduced']

@@ -39,7 +39,7 @@ VALUES = st.recursive(
 
 
 def same(a: object, b: object) -> bool:
-    """Compare to the bit; all NaN are one."""
+    """Compare bits; all NaN are one."""
     if isinstance(a, np.ndarray):
         return (isinstance(b, np.ndarray) and (a.shape, a.dtype) == (b.shape, b.dtype)
                 and same(tuple(a.ravel().tolist()), tuple(b.ravel().tolist())))

@@ -36,7 +36,7 @@ _BOUNDARY = 0.02  # K
 STARTS = np.concatenate([np.arange(260.0, 325.0, 10.0), np.arange(325.0, 346.0, 2.5), [355.0]])
 SETPOINTS = (306.0, 310.0, 314.475, 319.0, 324.475, 326.5)  # K
 COOLANTS = (278.15, 285.0, 290.0, 295.0, 300.0, 305.15)  # K
-SETPOINT = 314.475  # K, for the coolant in force at the start
+SETPOINT = 314.475  # K, for the applied coolant at the start
 _SHORT_STEP = 0.25  # s
 _RETURN = 600.0  # s
 
@@ -51,15 +51,15 @@ class End(Enum):
     RAN_AWAY = 'runs away'
 
 
-def end_of(temperature: float, setpoint: float, *, ladder: bool, coolant: float = COOLANT,
+def end_of(temperature: float, setpoint: float, *, fallback: bool, coolant: float = COOLANT,
            system: ControlAffineSystem = REACTOR, concentration: float | None = None) -> End:
     """
     Simulate the default loop from a start until it has arrived, ran away or two thirds of an hour.
 
     :param temperature: of the reactor at the start, in K.
     :param setpoint: where it is to go, in K.
-    :param ladder: whether the controller has one.
-    :param coolant: in force at the start, in K.
+    :param fallback: whether the controller falls back to another level.
+    :param coolant: applied at the start, in K.
     :param concentration: in mol/L, at the start; for the two-state reactor.
     """
     near = 0
@@ -72,7 +72,7 @@ def end_of(temperature: float, setpoint: float, *, ladder: bool, coolant: float 
         return bool(gone or (near >= _SETTLED and report.level == 'sdre'))
 
     x0 = [temperature] if concentration is None else [concentration, temperature]
-    course = run_loop(reactor_controller(ladder=ladder), system, np.array(x0), coolant,
+    course = run_loop(reactor_controller(fallback=fallback), system, np.array(x0), coolant,
                       HORIZON, [at(0.0, at_setpoint(setpoint))], stop=arrived)
     if course.failure or course.states[-1, -1] > GONE:
         return End.RAN_AWAY
@@ -81,18 +81,18 @@ def end_of(temperature: float, setpoint: float, *, ladder: bool, coolant: float 
     return {'sdre': End.LEARNED, 'linear': End.LINEAR}.get(worst(course), End.SAFE)
 
 
-def hottest_start(coolant: float, setpoint: float, *, ladder: bool, lowest: float = 326.0,
+def hottest_start(coolant: float, setpoint: float, *, fallback: bool, lowest: float = 326.0,
                   highest: float = 350.0) -> float:
     """
     Find by bisection the hottest start from which the default loop gets back, in K.
 
-    :param coolant: in force at the start, in K.
+    :param coolant: applied at the start, in K.
     :param lowest: a start that gets back.
     :param highest: one that does not.
     """
     while highest - lowest > _BOUNDARY:
         middle = 0.5 * (lowest + highest)
-        back = end_of(middle, setpoint, coolant=coolant, ladder=ladder)
+        back = end_of(middle, setpoint, coolant=coolant, fallback=fallback)
         lowest, highest = ((lowest, middle) if back in (End.RAN_AWAY, End.ELSEWHERE)
                            else (middle, highest))
     return lowest
@@ -128,9 +128,9 @@ def hottest_saved(coolant: float) -> float:
     return float(state[0])
 
 
-def grid(*, ladder: bool) -> dict[tuple[float, float], End]:
+def grid(*, fallback: bool) -> dict[tuple[float, float], End]:
     """Return the ends by start and set-point, both in K, with a coolant of 300 K at the start."""
-    return {(float(start), setpoint): end_of(float(start), setpoint, ladder=ladder)
+    return {(float(start), setpoint): end_of(float(start), setpoint, fallback=fallback)
             for setpoint in SETPOINTS for start in STARTS}
 
 
@@ -141,8 +141,8 @@ def boundary(coolant: float) -> Metrics:
     :return: `physics_kelvin`, `ladder_kelvin`, `no_ladder_kelvin`.
     """
     return {'physics_kelvin': hottest_saved(coolant),
-            'ladder_kelvin': hottest_start(coolant, SETPOINT, ladder=True),
-            'no_ladder_kelvin': hottest_start(coolant, SETPOINT, ladder=False)}
+            'ladder_kelvin': hottest_start(coolant, SETPOINT, fallback=True),
+            'no_ladder_kelvin': hottest_start(coolant, SETPOINT, fallback=False)}
 
 
 def two_state_grid() -> dict[tuple[float, float], End]:
@@ -150,7 +150,7 @@ def two_state_grid() -> dict[tuple[float, float], End]:
     system = two_state_reactor()
     rest = float(system.nominal_state[1])
     return {(T, concentration): end_of(
-        T, round(rest, 3), ladder=True, system=system, concentration=concentration)
+        T, round(rest, 3), fallback=True, system=system, concentration=concentration)
         for T in (300.0, 310.0, 320.0, 330.0, 340.0, 350.0, 360.0, 380.0, 400.0)
         for concentration in (0.6, 0.75, float(system.nominal_state[0]), 0.95)}
 
@@ -160,7 +160,7 @@ def back_from_safe(system: ControlAffineSystem, linear_margin: float) -> Metrics
     Let the loop start at rest under the safe coolant, where a dead sensor leads it.
 
     :param system: the reactor, changed or not.
-    :param linear_margin: of the ladder, in half widths.
+    :param linear_margin: of the fallback, in half widths.
     :return: `rest_kelvin`, `outside` the trained range in half widths, `seconds_to_0.2_kelvin`
         from there (None for never).
     """

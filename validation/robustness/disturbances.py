@@ -59,7 +59,7 @@ class Case:
     :param since: when the time to get there starts, in s.
     :param overshoot: whether its deviation counts from the first time that it gets there.
     :param actuator: between command and plant; perfect when None.
-    :param tells: whether the coolant in force is measured.
+    :param tells: whether the applied coolant is measured.
     :param seconds: how long.
     :param sensor: of the temperature.
     """

@@ -39,9 +39,9 @@ _LEVELS: dict[str, dict[str, Any]] = {
     'safe': {'marker': 'D', 'color': 'tab:orange'}}
 
 _PATHS: dict[str, dict[str, Any]] = {
-    'narrow': {'color': 'tab:red', 'linestyle': '--', 'label': 'narrow lift, no ladder'},
-    'guarded': {'color': 'tab:green', 'label': 'narrow lift, ladder'},
-    'wide': {'color': '0.5', 'linestyle': ':', 'label': 'lift of wide data, ladder'}}
+    'narrow': {'color': 'tab:red', 'linestyle': '--', 'label': 'narrow lift, no fallback'},
+    'guarded': {'color': 'tab:green', 'label': 'narrow lift, fallback'},
+    'wide': {'color': '0.5', 'linestyle': ':', 'label': 'lift of wide data, fallback'}}
 
 
 def draw(found: Found, folder: Path) -> list[Picture]:
@@ -120,16 +120,16 @@ def _scatter(axis: Axes, ends: Iterable[tuple[float, float, End]]) -> None:
 
 def _attraction(found: Found, path: Path) -> Picture:
     with drawing(path, 1, 4, size=(11.0, 4.6)) as (figure, axes):
-        for axis, ladder in zip(axes, (True, False), strict=False):
+        for axis, fallback in zip(axes, (True, False), strict=False):
             _scatter(axis, ((goal, start, end)
-                            for (start, goal), end in found.grids[ladder].items()))
+                            for (start, goal), end in found.grids[fallback].items()))
             axis.axhspan(*trained_range(), **DRAWN_RANGE)
-            axis.set(title=f'{"with" if ladder else "without"} the ladder', xlabel='set-point [K]',
+            axis.set(title=f'{"with" if fallback else "without"} fallback', xlabel='set-point [K]',
                      ylabel='temperature at the start [K]')
         coolants = list(found.boundaries)
         for name, label, style in (
                 ('physics_kelvin', 'no coolant saves it above', 'k-'),
-                ('ladder_kelvin', 'the loop with the ladder', 'o--'),
+                ('ladder_kelvin', 'the loop with fallback', 'o--'),
                 ('no_ladder_kelvin', 'the learned law alone', 'x:')):
             axes[2].plot(coolants, _column(found.boundaries, coolants, name), style, label=label)
         axes[2].set(title='hottest start that comes back', xlabel='coolant at the start [K]',
@@ -189,5 +189,5 @@ def _narrow(found: Found, path: Path) -> Picture:
         legend(figure, axes[:1], 4)
     return Picture(path.name, (
         'Lifts of narrow data (grey: the data) asked for more than they know. On the reactor the '
-        'ladder keeps the loop from running away, and leads it back from the cold; the '
+        'fallback keeps the loop from running away, and leads it back from the cold; the '
         'two-state example is unstable by itself and no constant input saves it.'))

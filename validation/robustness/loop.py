@@ -44,7 +44,7 @@ COOLANT = float(REACTOR.nominal_input[0])
 PERIOD = 1.0  # s
 COOLANT_RANGE = (278.15, 305.15)  # K
 BANDWIDTH = 6.0  # 1/min
-# Margins that are never exceeded: without the ladder the learned law acts everywhere.
+# Margins that are never exceeded: without fallback the learned law acts everywhere.
 NO_LADDER = (LevelSettings('sdre', 1e9), LevelSettings('linear', 1e9))
 
 
@@ -55,21 +55,21 @@ def shipped_model() -> LiftedModel:
 
 
 def reactor_controller(*, bandwidth: float = BANDWIDTH, coolant_weight: float = 1.0,
-                       ladder: bool = True, linear_margin: float = 0.5,
+                       fallback: bool = True, linear_margin: float = 0.5,
                        model: LiftedModel | None = None) -> Controller:
     """
     Return the controller with the default parameters of its node.
 
     :param bandwidth: of the observer, in 1/min.
     :param coolant_weight: in 1/K^2.
-    :param ladder: whether the distance from the training data decides which law acts.
+    :param fallback: whether the distance from the training data decides which law acts.
     :param linear_margin: up to which the linear law does, in half widths.
     :param model: the shipped one by default.
     """
     settings = ControllerParameters(
         observer_bandwidth=bandwidth, coolant_weight=coolant_weight, linear_margin=linear_margin
         ).settings()
-    return Controller(model or shipped_model(), settings if ladder else replace(
+    return Controller(model or shipped_model(), settings if fallback else replace(
         settings, supervisor=replace(settings.supervisor, levels=NO_LADDER)))
 
 
@@ -140,16 +140,16 @@ def run_loop(controller: Controller, system: ControlAffineSystem, x0: Array, coo
              seconds: float, events: Iterable[Timed] = (), *, actuator: Actuator | None = None,
              tells: bool = False, noise: float = 0.0, **others: Any) -> Simulation:
     """
-    Simulate a loop whose controller takes over from an input in force.
+    Simulate a loop whose controller takes over from an applied input.
 
     :param controller: it measures the plant's last n_x states.
     :param system: the plant.
     :param x0: (n,) state at time 0.
-    :param coolant: input in force at time 0.
+    :param coolant: applied input at time 0.
     :param seconds: how long.
     :param events: what happens when.
     :param actuator: between command and plant; perfect by default.
-    :param tells: whether the input in force is measured.
+    :param tells: whether the applied input is measured.
     :param noise: standard deviation of the measurement, in state units.
     :param others: of :func:`simulate`.
     """

@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 The koopman_ros Authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""Lifts of too narrow data, asked for more than they know, without the ladder and with it."""
+"""Lifts of too narrow data, asked for more than they know, without fallback and with it."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -86,14 +86,14 @@ def narrow_lift() -> LiftedModel:
     return train(describe(REACTOR), samples, Growth(3), seed=0, starts=1, refuse=False).model
 
 
-def run_trial(trial: Trial, model: LiftedModel | None, *, ladder: bool) -> Simulation:
+def run_trial(trial: Trial, model: LiftedModel | None, *, fallback: bool) -> Simulation:
     """
     Drive the true reactor to its steady state.
 
     :param model: the lift; the shipped one when None.
     """
     return _driven(reactor_controller(
-        bandwidth=trial.bandwidth, ladder=ladder, model=model), trial)
+        bandwidth=trial.bandwidth, fallback=fallback, model=model), trial)
 
 
 def _driven(controller: Controller, trial: Trial) -> Simulation:
@@ -103,9 +103,9 @@ def _driven(controller: Controller, trial: Trial) -> Simulation:
 
 
 def reactor_courses(narrow: LiftedModel) -> dict[tuple[str, str], Simulation]:
-    """Run all trials: by their name and ``narrow``, ``guarded`` (with the ladder) or ``wide``."""
-    return {(trial.name, kind): run_trial(trial, model, ladder=ladder) for trial in TRIALS
-            for kind, model, ladder in (('narrow', narrow, False), ('guarded', narrow, True),
+    """Run all trials: by their name and ``narrow``, ``guarded`` (with fallback) or ``wide``."""
+    return {(trial.name, kind): run_trial(trial, model, fallback=fallback) for trial in TRIALS
+            for kind, model, fallback in (('narrow', narrow, False), ('guarded', narrow, True),
                                         ('wide', None, True))}
 
 
@@ -128,7 +128,7 @@ def far_from_the_model(linear_margin: float, bandwidth: float) -> Metrics:
     """
     Take away 40 % of UA from the loop with the shipped lift.
 
-    :param linear_margin: of the ladder, in half widths.
+    :param linear_margin: of the fallback, in half widths.
     :param bandwidth: of the observer, in 1/min.
     :return: as :func:`judge_reactor`, the time counting from the change.
     """
@@ -149,7 +149,7 @@ def two_state_models() -> dict[str, LiftedModel]:
     return {**learned, 'true linearisation': linear}
 
 
-def two_state_course(model: LiftedModel, *, ladder: bool) -> Simulation:
+def two_state_course(model: LiftedModel, *, fallback: bool) -> Simulation:
     """
     Regulate the two-state example from (5, 5) to the origin, sampled 20 times a second.
 
@@ -159,7 +159,7 @@ def two_state_course(model: LiftedModel, *, ladder: bool) -> Simulation:
         model, state_weight=np.ones(2), input_weight=np.ones(1),
         limits=InputLimits(np.array([-_BOUND]), np.array([_BOUND]), np.array([np.inf])),
         safe_input=np.zeros(1), transfer_time=1.0,
-        supervisor=SupervisorSettings(recovery_time=1.0) if ladder else (
+        supervisor=SupervisorSettings(recovery_time=1.0) if fallback else (
             SupervisorSettings(NO_LADDER))))
 
     def to_origin(loop: Loop) -> Loop:
@@ -172,8 +172,8 @@ def two_state_course(model: LiftedModel, *, ladder: bool) -> Simulation:
 
 
 def two_state_courses(models: Mapping[str, LiftedModel]) -> dict[tuple[str, str], Simulation]:
-    """Run the example with each lift: by box and ``narrow`` or ``guarded`` (with the ladder)."""
-    return {(name, kind): two_state_course(model, ladder=kind == 'guarded')
+    """Run the example with each lift: by box and ``narrow`` or ``guarded`` (with fallback)."""
+    return {(name, kind): two_state_course(model, fallback=kind == 'guarded')
             for name, model in models.items() for kind in ('narrow', 'guarded')}
 
 

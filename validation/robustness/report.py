@@ -86,8 +86,8 @@ def attraction_table(found: Found) -> str:
     return (f'## Region of attraction\n\nUnder the coldest coolant the reactor heats up by itself '
             f'above {attraction.hottest_cooled():.2f} K.\n\n' + table(
                 ('coolant at the start [K]', 'hottest start that any coolant saves [K]',
-                 'that the loop brings back [K]', 'without the ladder [K]'), rows)
-            + '\n\n' + table(('of all starts', 'with the ladder', 'without',
+                 'that the loop brings back [K]', 'without fallback [K]'), rows)
+            + '\n\n' + table(('of all starts', 'with fallback', 'without',
                                'two-state reactor'), counts)
             + '\n\n' + table(('back from the safe coolant', 'linear_margin', 'it rests at [K]',
                                'outside [half widths]', 'to 0.2 K [s]'), returns))
@@ -95,7 +95,7 @@ def attraction_table(found: Found) -> str:
 
 def narrow_tables(found: Found) -> str:
     """Write what became of the lifts of narrow data."""
-    kinds = {'narrow': 'no ladder', 'guarded': 'ladder', 'wide': 'shipped lift, ladder'}
+    kinds = {'narrow': 'no fallback', 'guarded': 'fallback', 'wide': 'shipped lift, fallback'}
     rows = []
     for (name, kind), course in found.reactor.items():
         m = narrow.judge_reactor(course)

@@ -38,9 +38,9 @@ class Found:
     :param verified: whether the loop at 3 % below and above a margin grows, by what was raised.
     :param cases: figures by name of the case.
     :param noise: figures by bandwidth in 1/min.
-    :param grids: ends by start and set-point in K, with and without the ladder.
+    :param grids: ends by start and set-point in K, with and without fallback.
     :param two_state_grid: ends by temperature in K and concentration in mol/L.
-    :param boundaries: hottest starts by the coolant in force at the start, in K.
+    :param boundaries: hottest starts by the applied coolant at the start, in K.
     :param returns: figures of the way back from the safe coolant, by plant and `linear_margin`.
     :param reactor: courses of the lift of narrow data.
     :param far: figures after UA -40 % by `linear_margin` and bandwidth in 1/min.
@@ -75,9 +75,9 @@ class Found:
             'attraction': {
                 'hottest_cooled_kelvin': attraction.hottest_cooled(),
                 'hottest_start': {f'coolant={u:g}K': m for u, m in self.boundaries.items()},
-                **{f'ladder={ladder}': {f'{start:g}K to {end:g}K': found.value
+                **{f'ladder={fallback}': {f'{start:g}K to {end:g}K': found.value
                                         for (start, end), found in grid.items()}
-                   for ladder, grid in self.grids.items()},
+                   for fallback, grid in self.grids.items()},
                 'from_the_safe_coolant': {f'{name}/linear_margin={margin:g}': m
                                           for (name, margin), m in self.returns.items()},
                 'two_state': {f'{kelvin:g}K, {c:.3g}mol/L': found.value
@@ -123,9 +123,9 @@ def study(tell: Callable[[str], None]) -> Found:
     for bandwidth in disturbances.BANDWIDTHS:
         tell(f'noise, observer at {bandwidth:g} 1/min')
         found.noise[bandwidth] = disturbances.noise_against_speed(bandwidth)
-    for ladder in (True, False):
-        tell(f'region of attraction, {"with" if ladder else "without"} the ladder')
-        found.grids[ladder] = attraction.grid(ladder=ladder)
+    for fallback in (True, False):
+        tell(f'region of attraction, {"with" if fallback else "without"} fallback')
+        found.grids[fallback] = attraction.grid(fallback=fallback)
     for coolant in attraction.COOLANTS:
         tell(f'hottest start with the coolant at {coolant:g} K')
         found.boundaries[coolant] = attraction.boundary(coolant)

@@ -123,10 +123,10 @@ def _runaway(t, x):
 _runaway.terminal = True
 
 
-@pytest.mark.parametrize(('temperature', 'ladder', 'end'), [
+@pytest.mark.parametrize(('temperature', 'fallback', 'end'), [
     (340.0, True, End.SAFE), (340.0, False, End.RAN_AWAY), (343.0, True, End.RAN_AWAY)])
-def test_the_ladder_widens_the_region_of_attraction(temperature, ladder, end):
-    assert attraction.end_of(temperature, 316.0, ladder=ladder) is end
+def test_fallback_widens_the_region_of_attraction(temperature, fallback, end):
+    assert attraction.end_of(temperature, 316.0, fallback=fallback) is end
 
 
 def test_a_disturbance_leaves_no_offset_and_a_biased_sensor_its_bias():

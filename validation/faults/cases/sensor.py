@@ -13,7 +13,7 @@ from validation.faults.case import Case, case
 from validation.faults.harness import FaultHarness
 
 GROUP = 'sensor'
-_BIAS = 'the same as a sensor bias [K]'
+_BIAS = 'equivalent sensor bias [K]'
 
 
 def altered(make: Callable[[], Alteration], seconds: float, setpoint: float | None = None,
@@ -89,8 +89,8 @@ CASES = (
     fault('spike-long', '+15 K', shifted(lambda _: 15.0), 20.0, codes=(Code.JUMPED,)),
     fault('spikes', 'a spike of +20 K in every seventh sample',
           shifted(lambda seconds: 20.0 * (seconds % 7.0 == 0.0)), 140.0, codes=(Code.JUMPED,)),
-    fault('frozen-at-rest', 'the same value to the bit', frozen, 120.0),
-    case(GROUP, 'frozen-in-a-step', 'the same value to the bit, 10 s after a step of the '
+    fault('frozen-at-rest', 'bit-identical values', frozen, 120.0),
+    case(GROUP, 'frozen-in-a-step', 'bit-identical values, 10 s after a step of the '
          'set-point, 90 s', altered(frozen, 90.0, 42.0, 10.0), between=True,
          codes=(Code.FROZEN,)),
     fault('drift', 'drifts by 1 K/min', shifted(lambda seconds: seconds / 60.0), 180.0),
