@@ -17,29 +17,17 @@ from koopman_ros.arrays import Array
 
 @dataclass(frozen=True)
 class Plant:
-    """
-    What is known of the plant beside its data.
+    """What is known of the plant beside its data."""
 
-    :param name: name of the plant.
-    :param state_names: one name a state.
-    :param state_units: one unit a state.
-    :param input_names: one name an input.
-    :param input_units: one unit an input.
-    :param time_unit: ``'s'`` or ``'min'``.
-    :param nominal_state: (n_x,) fixed point under the nominal input.
-    :param nominal_input: (n_u,) nominal input.
-    :param B: (n_x, n_u) input matrix, in units, or None to learn it.
-    """
-
-    name: str
-    state_names: tuple[str, ...]
-    state_units: tuple[str, ...]
-    input_names: tuple[str, ...]
-    input_units: tuple[str, ...]
-    time_unit: str
-    nominal_state: Array
-    nominal_input: Array
-    B: Array | None
+    name: str  #: name of the plant
+    state_names: tuple[str, ...]  #: one name a state
+    state_units: tuple[str, ...]  #: one unit a state
+    input_names: tuple[str, ...]  #: one name an input
+    input_units: tuple[str, ...]  #: one unit an input
+    time_unit: str  #: ``'s'`` or ``'min'``
+    nominal_state: Array  #: (n_x,) fixed point under the nominal input
+    nominal_input: Array  #: (n_u,) nominal input
+    B: Array | None  #: (n_x, n_u) input matrix, in units, or None to learn it
 
 
 @dataclass(frozen=True)
@@ -47,19 +35,16 @@ class Episode:
     """
     Uninterrupted measurements of a plant, with inputs that are held between their changes.
 
-    :param time: (N,) times of the measurements, rising, in time units.
-    :param x: (N, n_x) measured states, in state units, with their noise.
-    :param input_time: (M,) times from which each input was held, rising, the first not later
-        than the first measurement.
-    :param u: (M, n_u) those inputs, in input units.
     :raises ValueError: on unequal lengths, times that do not rise, values that are not finite,
         or an input that is not known at the first measurement.
     """
 
-    time: Array
-    x: Array
+    time: Array  #: (N,) times of the measurements, rising, in time units
+    x: Array  #: (N, n_x) measured states, in state units, with their noise
+    #: (M,) times from which each input was held, rising, the first not later than the first
+    #: measurement
     input_time: Array
-    u: Array
+    u: Array  #: (M, n_u) those inputs, in input units
 
     def __post_init__(self) -> None:
         for times, values in (('time', 'x'), ('input_time', 'u')):
@@ -125,20 +110,16 @@ class Samples:
     """
     States, their derivatives and the inputs that acted, from one or more episodes.
 
-    :param x: (N, n_x) states, in state units.
-    :param dxdt: (N, n_x) derivatives, in state units per time unit.
-    :param u: (N, n_u) inputs, in input units.
-    :param episode: (N,) number of the episode that each sample belongs to.
-    :param time: (N,) times of the samples, in time units, rising within an episode, where the
-        input of a sample was held until the next one; None when samples do not follow each other
-        (then no roll-out can be judged).
     :raises ValueError: on unequal lengths, values that are not finite, or times that do not rise.
     """
 
-    x: Array
-    dxdt: Array
-    u: Array
-    episode: np.ndarray
+    x: Array  #: (N, n_x) states, in state units
+    dxdt: Array  #: (N, n_x) derivatives, in state units per time unit
+    u: Array  #: (N, n_u) inputs, in input units
+    episode: np.ndarray  #: (N,) number of the episode that each sample belongs to
+    #: (N,) times of the samples, in time units, rising within an episode, where the input of a
+    #: sample was held until the next one; None when samples do not follow each other (then no
+    #: roll-out can be judged)
     time: Array | None = None
 
     def __post_init__(self) -> None:

@@ -53,15 +53,11 @@ class Code(Enum):
 
 @dataclass(frozen=True)
 class Reason:
-    """
-    A code with its values.
+    """A code with its values."""
 
-    :param code: what is the matter.
-    :param values: numbers in the signal's own unit, names, and the reason behind this one as
-        `cause`; `signal` names the signal whose unit they have.
-    """
-
-    code: Code
+    code: Code  #: what is the matter
+    #: numbers in the signal's own unit, names, and the reason behind this one as `cause`; `signal`
+    #: names the signal whose unit they have
     values: Mapping[str, Value] = field(default_factory=dict)
 
     @property
@@ -146,13 +142,9 @@ def level_words(name: str) -> str:
 
 @dataclass(frozen=True)
 class Words:
-    """
-    The renderer of reasons.
+    """The renderer of reasons."""
 
-    :param displays: units and digits of the signals.
-    """
-
-    displays: Displays
+    displays: Displays  #: units and digits of the signals
 
     def __call__(self, about: Reason | None) -> str:
         """Write a reason as a sentence; an empty string for none."""

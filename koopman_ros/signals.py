@@ -30,17 +30,11 @@ def per_signal(name: str, value: Array, signals: Sequence[str]) -> None:
 
 @dataclass(frozen=True)
 class Outputs:
-    """
-    What is measured of the state: y = C x, in the units of the signals.
+    """What is measured of the state: y = C x, in the units of the signals."""
 
-    :param names: (n_y,) of the measured signals.
-    :param units: (n_y,) their units.
-    :param C: (n_y, n_x) in those units per state unit.
-    """
-
-    names: tuple[str, ...]
-    units: tuple[str, ...]
-    C: Array
+    names: tuple[str, ...]  #: (n_y,) of the measured signals
+    units: tuple[str, ...]  #: (n_y,) their units
+    C: Array  #: (n_y, n_x) in those units per state unit
 
     def __post_init__(self) -> None:
         C = np.array(self.C, dtype=np.float64)

@@ -20,15 +20,10 @@ LATE_NANOSECONDS = NANOSECONDS
 
 @dataclass(frozen=True)
 class Conversion:
-    """
-    From one unit to another: value * factor + offset.
+    """From one unit to another: value * factor + offset."""
 
-    :param factor: of values and of differences.
-    :param offset: of values alone.
-    """
-
-    factor: float = 1.0
-    offset: float = 0.0
+    factor: float = 1.0  #: of values and of differences
+    offset: float = 0.0  #: of values alone
 
     def __call__(self, value: float) -> float:
         """Convert a value."""
@@ -88,17 +83,11 @@ def _registry() -> Any:
 
 @dataclass(frozen=True)
 class Display:
-    """
-    How the values of a signal are written.
+    """How the values of a signal are written."""
 
-    :param unit: of the values that are given.
-    :param shown: unit in which they are written; the same by default.
-    :param format: of numbers.
-    """
-
-    unit: str
-    shown: str = ''
-    format: str = '.6g'
+    unit: str  #: of the values that are given
+    shown: str = ''  #: unit in which they are written; the same by default
+    format: str = '.6g'  #: of numbers
 
     @cached_property
     def conversion(self) -> Conversion:
@@ -112,14 +101,10 @@ class Display:
 
 @dataclass(frozen=True)
 class Displays:
-    """
-    How all signals are written.
+    """How all signals are written."""
 
-    :param units: of the signals, by name.
-    :param shown: how values in a unit are written, by unit; as they are by default.
-    """
-
-    units: Mapping[str, str]
+    units: Mapping[str, str]  #: of the signals, by name
+    #: how values in a unit are written, by unit; as they are by default
     shown: Mapping[str, Display] = field(default_factory=dict)
 
     def __getitem__(self, name: str) -> Display:

@@ -36,19 +36,13 @@ _Entry = tuple[int, int, float]
 
 @dataclass
 class Account:
-    """
-    What was made of some bags.
+    """What was made of some bags."""
 
-    :param measurements: number of measurements read.
-    :param used: number of those in an episode.
-    :param dropped: number of messages left out, by reason.
-    :param notes: what else is worth knowing, in words.
-    """
-
-    measurements: int = 0
-    used: int = 0
+    measurements: int = 0  #: number of measurements read
+    used: int = 0  #: number of those in an episode
+    #: number of messages left out, by reason
     dropped: Counter[str] = field(default_factory=Counter)
-    notes: list[str] = field(default_factory=list)
+    notes: list[str] = field(default_factory=list)  #: what else is worth knowing, in words
 
     def lines(self) -> list[str]:
         """Return the account in words."""

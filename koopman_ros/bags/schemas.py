@@ -33,17 +33,11 @@ class MessageDefinitionError(LookupError):
 
 @dataclass(frozen=True)
 class MessageDefinition:
-    """
-    What a reader needs to know of a message type to decode it without ROS.
+    """What a reader needs to know of a message type to decode it without ROS."""
 
-    :param type_name: full name, e.g. ``sensor_msgs/msg/Temperature``.
-    :param text: the definition followed by those of all its fields (encoding ``ros2msg``).
-    :param type_hash: of REP 2016, ``RIHS01_`` and 64 hexadecimal digits.
-    """
-
-    type_name: str
-    text: str
-    type_hash: str
+    type_name: str  #: full name, e.g. ``sensor_msgs/msg/Temperature``
+    text: str  #: the definition followed by those of all its fields (encoding ``ros2msg``)
+    type_hash: str  #: of REP 2016, ``RIHS01_`` and 64 hexadecimal digits
 
 
 def search_prefixes() -> tuple[Path, ...]:

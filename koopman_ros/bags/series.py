@@ -17,21 +17,13 @@ from koopman_ros.units import NANOSECONDS
 
 @dataclass(frozen=True)
 class Scalar:
-    """
-    How messages of a type carry a number.
+    """How messages of a type carry a number."""
 
-    :param field: its name in the message.
-    :param unit: of the number.
-    :param lowest: that it can be, in this unit; what is below is no measurement.
-    :param highest: likewise.
-    :param least_jump: smallest change that may be one to another level, as after a reset.
-    """
-
-    field: str
-    unit: str
-    lowest: float
-    highest: float
-    least_jump: float
+    field: str  #: its name in the message
+    unit: str  #: of the number
+    lowest: float  #: that it can be, in this unit; what is below is no measurement
+    highest: float  #: likewise
+    least_jump: float  #: smallest change that may be one to another level, as after a reset
 
 
 # The types that can be read as signals, in the units of REP 103.

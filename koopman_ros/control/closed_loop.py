@@ -22,21 +22,13 @@ Rate = Callable[[Array, Array], Array]
 
 @dataclass(frozen=True)
 class ClosedLoop:
-    """
-    A plant under a law.
+    """A plant under a law."""
 
-    :param times: (K,) in the model's time unit.
-    :param states: (K, n_x) in state units, up to a failure.
-    :param inputs: (K, n_u) in input units.
-    :param cost: integral of e' Q e + v' R v; infinite when the loop failed.
-    :param failure: why it ended early, empty when it did not.
-    """
-
-    times: Array
-    states: Array
-    inputs: Array
-    cost: float
-    failure: str = ''
+    times: Array  #: (K,) in the model's time unit
+    states: Array  #: (K, n_x) in state units, up to a failure
+    inputs: Array  #: (K, n_u) in input units
+    cost: float  #: integral of e' Q e + v' R v; infinite when the loop failed
+    failure: str = ''  #: why it ended early, empty when it did not
 
     def distance(self, model: LiftedModel) -> float:
         """Return how far the path leaves the training box, in halves of its width."""

@@ -40,17 +40,11 @@ from koopman_ros.units import LATE_NANOSECONDS, NANOSECONDS
 
 @dataclass(frozen=True)
 class _Choice:
-    """
-    The level that acts, and what the last law that was tried gives.
+    """The level that acts, and what the last law that was tried gives."""
 
-    :param supervisor: its new state.
-    :param target: of that law, or None when none was tried.
-    :param result: of that law, or None.
-    """
-
-    supervisor: Supervisor
-    target: Target | None = None
-    result: LawResult | None = None
+    supervisor: Supervisor  #: its new state
+    target: Target | None = None  #: of that law, or None when none was tried
+    result: LawResult | None = None  #: of that law, or None
 
 
 @dataclass(frozen=True)
@@ -58,16 +52,13 @@ class Controller:
     """
     A lifted model with its tuning; every method is pure and returns a new state.
 
-    :param model: the lift.
-    :param settings: the tuning.
-    :param outputs: what is measured; every state by default.
     :raises ValueError: when the settings do not fit the model's signals, or what is measured
         does not determine the state.
     """
 
-    model: LiftedModel
-    settings: Settings
-    outputs: Outputs | None = None
+    model: LiftedModel  #: the lift
+    settings: Settings  #: the tuning
+    outputs: Outputs | None = None  #: what is measured; every state by default
 
     def __post_init__(self) -> None:
         self.settings.check(self.model, self.measured)

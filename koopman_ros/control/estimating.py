@@ -32,17 +32,12 @@ class Estimating:
 
     While another level acts its model takes the better one's place, and the disturbance makes up
     for the difference, so that the plant's estimated rate stays.
-
-    :param model: the lift.
-    :param outputs: what is measured of its states.
-    :param settings: the tuning.
-    :param levels: by name, best first.
     """
 
-    model: LiftedModel
-    outputs: Outputs
-    settings: Settings
-    levels: dict[str, Level]
+    model: LiftedModel  #: the lift
+    outputs: Outputs  #: what is measured of its states
+    settings: Settings  #: the tuning
+    levels: dict[str, Level]  #: by name, best first
 
     def level(self, state: State) -> Level:
         """Return the level in terms of whose model the estimate is: without a law, the last."""

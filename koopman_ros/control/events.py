@@ -20,74 +20,47 @@ from koopman_ros.reasons import Reason
 
 @dataclass(frozen=True)
 class Measurement:
-    """
-    A measurement that is answered.
+    """A measurement that is answered."""
 
-    :param stamp_ns: its stamp.
-    :param measured: (n_y,) in the model's units; NaN for what cannot be.
-    :param applied: (n_u,) measured input that goes with it, or None.
-    """
-
-    stamp_ns: int
-    measured: Array
-    applied: Array | None = None
+    stamp_ns: int  #: its stamp
+    measured: Array  #: (n_y,) in the model's units; NaN for what cannot be
+    applied: Array | None = None  #: (n_u,) measured input that goes with it, or None
 
 
 @dataclass(frozen=True)
 class Silence:
-    """
-    No measurement came up to a time, which is answered, too.
+    """No measurement came up to a time, which is answered, too."""
 
-    :param stamp_ns: that time, in the time of the measurements' stamps.
-    """
-
-    stamp_ns: int
+    stamp_ns: int  #: that time, in the time of the measurements' stamps
 
 
 @dataclass(frozen=True)
 class SetpointRequest:
-    """
-    The operator asks for a set-point.
+    """The operator asks for a set-point."""
 
-    :param stamp_ns: from when it is to hold; 0 for now.
-    :param value: in the model's units.
-    """
-
-    stamp_ns: int
-    value: Array
+    stamp_ns: int  #: from when it is to hold; 0 for now
+    value: Array  #: in the model's units
 
 
 @dataclass(frozen=True)
 class ManualCommand:
-    """
-    The operator commands the input in manual mode.
+    """The operator commands the input in manual mode."""
 
-    :param value: (n_u,) in the model's units.
-    """
-
-    value: Array
+    value: Array  #: (n_u,) in the model's units
 
 
 @dataclass(frozen=True)
 class ModeChange:
-    """
-    The operator switches between automatic and manual mode.
+    """The operator switches between automatic and manual mode."""
 
-    :param mode: from now on.
-    """
-
-    mode: Mode
+    mode: Mode  #: from now on
 
 
 @dataclass(frozen=True)
 class Initialisation:
-    """
-    The controller starts from the input that is applied already.
+    """The controller starts from the input that is applied already."""
 
-    :param applied: (n_u,) measured input in the model's units.
-    """
-
-    applied: Array
+    applied: Array  #: (n_u,) measured input in the model's units
 
 
 Event: TypeAlias = (
@@ -96,19 +69,13 @@ Event: TypeAlias = (
 
 @dataclass(frozen=True)
 class Outcome:
-    """
-    What an event led to.
+    """What an event led to."""
 
-    :param state: the new state; the old one when the event was refused.
-    :param command: (n_u,) in the model's units, or None where the event is not answered.
-    :param report: of the step, where there was one.
-    :param refused: why the event was refused, or None.
-    """
-
-    state: State
+    state: State  #: the new state; the old one when the event was refused
+    #: (n_u,) in the model's units, or None where the event is not answered
     command: Array | None = None
-    report: Report | None = None
-    refused: Reason | None = None
+    report: Report | None = None  #: of the step, where there was one
+    refused: Reason | None = None  #: why the event was refused, or None
 
 
 def apply(controller: Controller, state: State, event: Event) -> Outcome:

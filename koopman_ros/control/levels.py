@@ -19,17 +19,11 @@ from koopman_ros.plugs import plug
 
 @dataclass(frozen=True)
 class Level:
-    """
-    One level.
+    """One level."""
 
-    :param name: of its law.
-    :param law: with its model.
-    :param estimator: on the same model.
-    """
-
-    name: str
-    law: Law
-    estimator: Estimator
+    name: str  #: of its law
+    law: Law  #: with its model
+    estimator: Estimator  #: on the same model
     _references: list[Reference] = field(default_factory=list, init=False, compare=False)
 
     @property

@@ -15,17 +15,11 @@ from koopman_ros.signals import per_signal
 
 @dataclass(frozen=True)
 class InputLimits:
-    """
-    Range and rate limits of the inputs, in physical units.
+    """Range and rate limits of the inputs, in physical units."""
 
-    :param lower: (n_u,) smallest command.
-    :param upper: (n_u,) largest command.
-    :param rate: (n_u,) largest change per second; infinity for none.
-    """
-
-    lower: Array
-    upper: Array
-    rate: Array
+    lower: Array  #: (n_u,) smallest command
+    upper: Array  #: (n_u,) largest command
+    rate: Array  #: (n_u,) largest change per second; infinity for none
 
     def __post_init__(self) -> None:
         if not np.all(self.lower < self.upper):
@@ -57,17 +51,11 @@ def finite(value: Array) -> bool:
 
 @dataclass(frozen=True)
 class LimitedInput:
-    """
-    A command within its limits.
+    """A command within its limits."""
 
-    :param u: (n_u,) command.
-    :param at_range: whether the range was active.
-    :param at_rate: whether the rate was active.
-    """
-
-    u: Array
-    at_range: bool
-    at_rate: bool
+    u: Array  #: (n_u,) command
+    at_range: bool  #: whether the range was active
+    at_rate: bool  #: whether the rate was active
 
 
 def limit(limits: InputLimits, wanted: Array, previous: Array | None, seconds: float

@@ -20,18 +20,15 @@ MAX_SCHEDULED = 1000
 
 @dataclass(frozen=True)
 class Setpoint:
-    """
-    The state of the set-point.
+    """The state of the set-point."""
 
-    :param requested: (n_x,) where the operator wants to be, or None before the first request.
-    :param active: (n_x,) what is tracked now, on its ramp to the requested value; None at first.
-    :param scheduled: (time in ns, value) of requests that take effect later, in time order.
-    :param ramped: (n_x,) where the ramp is, which the filter follows; None for where it is.
-    """
-
+    #: (n_x,) where the operator wants to be, or None before the first request
     requested: Array | None = None
+    #: (n_x,) what is tracked now, on its ramp to the requested value; None at first
     active: Array | None = None
+    #: (time in ns, value) of requests that take effect later, in time order
     scheduled: tuple[tuple[int, Array], ...] = ()
+    #: (n_x,) where the ramp is, which the filter follows; None for where it is
     ramped: Array | None = None
 
 

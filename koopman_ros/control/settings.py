@@ -18,43 +18,30 @@ from koopman_ros.signals import Outputs, per_signal
 
 @dataclass(frozen=True)
 class Settings:
-    """
-    What an engineer tunes, in the units of the signals.
+    """What an engineer tunes, in the units of the signals."""
 
-    :param state_weight: (n_x,) weights of squared state errors, per state unit squared.
-    :param input_weight: (n_u,) weights of squared input deviations, per input unit squared.
-    :param limits: range and rate of the inputs.
-    :param setpoint_ramp: (n_x,) largest change of the set-point per second; infinity for steps.
-    :param max_disturbance: (n_u,) largest disturbance that is allowed for, in input units.
-    :param input_tolerance: (n_u,) how far, in input units, a measured input may be from its
-        command before the command counts as not reached.
-    :param safe_input: (n_u,) commanded when nothing else can be, in input units.
-    :param sensor: which measurements are accepted.
-    :param setpoint_filter: time constant in s with which the set-point follows its ramp.
-    :param observer_bandwidth: of the disturbance observer in 1/s; 0 for none, as in the paper.
-    :param estimator: its name in :data:`koopman_ros.estimation.ESTIMATORS`, or module:class;
-        empty for the disturbance observer, or none of it where its bandwidth is 0.
-    :param transfer_time: time constant in s in which the difference between two laws or models,
-        or from manual mode, fades.
-    :param max_gain: bound on the norm of the Riccati gain in scaled coordinates.
-    :param max_residual: bound on the relative Riccati residual.
-    :param supervisor: which laws act, and when.
-    """
-
-    state_weight: Array
-    input_weight: Array
-    limits: InputLimits
-    setpoint_ramp: Array
-    max_disturbance: Array
+    state_weight: Array  #: (n_x,) weights of squared state errors, per state unit squared
+    input_weight: Array  #: (n_u,) weights of squared input deviations, per input unit squared
+    limits: InputLimits  #: range and rate of the inputs
+    setpoint_ramp: Array  #: (n_x,) largest change of the set-point per second; infinity for steps
+    max_disturbance: Array  #: (n_u,) largest disturbance that is allowed for, in input units
+    #: (n_u,) how far, in input units, a measured input may be from its command before the command
+    #: counts as not reached
     input_tolerance: Array
-    safe_input: Array
-    sensor: SensorLimits
-    setpoint_filter: float = 0.0
+    safe_input: Array  #: (n_u,) commanded when nothing else can be, in input units
+    sensor: SensorLimits  #: which measurements are accepted
+    setpoint_filter: float = 0.0  #: time constant in s with which the set-point follows its ramp
+    #: of the disturbance observer in 1/s; 0 for none, as in the paper
     observer_bandwidth: float = 0.0
+    #: its name in :data:`koopman_ros.estimation.ESTIMATORS`, or module:class; empty for the
+    #: disturbance observer, or none of it where its bandwidth is 0
     estimator: str = ''
+    #: time constant in s in which the difference between two laws or models, or from manual mode,
+    #: fades
     transfer_time: float = 30.0
-    max_gain: float = 1e3
-    max_residual: float = 1e-8
+    max_gain: float = 1e3  #: bound on the norm of the Riccati gain in scaled coordinates
+    max_residual: float = 1e-8  #: bound on the relative Riccati residual
+    #: which laws act, and when
     supervisor: SupervisorSettings = field(default_factory=SupervisorSettings)
 
     def __post_init__(self) -> None:

@@ -51,17 +51,11 @@ class Plant(Protocol):
 
 @dataclass(frozen=True)
 class Loop:
-    """
-    A closed loop at one time.
+    """A closed loop at one time."""
 
-    :param controller: that acts.
-    :param state: what it remembers.
-    :param plant: under it.
-    """
-
-    controller: Controller
-    state: State
-    plant: Plant
+    controller: Controller  #: that acts
+    state: State  #: what it remembers
+    plant: Plant  #: under it
 
 
 Change: TypeAlias = Callable[[Loop], Loop]
@@ -69,15 +63,10 @@ Change: TypeAlias = Callable[[Loop], Loop]
 
 @dataclass(frozen=True)
 class Timed:
-    """
-    What happens at a time.
+    """What happens at a time."""
 
-    :param seconds: from the start of the simulation.
-    :param what: an event of the controller, or a function of the loop.
-    """
-
-    seconds: float
-    what: Event | Change
+    seconds: float  #: from the start of the simulation
+    what: Event | Change  #: an event of the controller, or a function of the loop
 
 
 def at(seconds: float, what: Event | Change) -> Timed:
@@ -108,29 +97,17 @@ def after_a_second(time_ns: int) -> int:
 
 @dataclass(frozen=True, eq=False)
 class Simulation:
-    """
-    What a loop did, one row a sample.
+    """What a loop did, one row a sample."""
 
-    :param times: (N,) in s from the start.
-    :param states: (N, n) of the plant.
-    :param measured: (N, n_y) what the controller received; NaN where nothing.
-    :param inputs: (N, n_u) that acted when it was measured.
-    :param commands: (N, n_u) answered; NaN before the first.
-    :param setpoints: (N, n_x) active; NaN before the first.
-    :param reports: (N) of the controller.
-    :param failure: why the plant could not go on to the end; empty when it could.
-    :param loop: after the last sample, to go on from.
-    """
-
-    times: Array
-    states: Array
-    measured: Array
-    inputs: Array
-    commands: Array
-    setpoints: Array
-    reports: tuple[Report, ...]
-    failure: str
-    loop: Loop
+    times: Array  #: (N,) in s from the start
+    states: Array  #: (N, n) of the plant
+    measured: Array  #: (N, n_y) what the controller received; NaN where nothing
+    inputs: Array  #: (N, n_u) that acted when it was measured
+    commands: Array  #: (N, n_u) answered; NaN before the first
+    setpoints: Array  #: (N, n_x) active; NaN before the first
+    reports: tuple[Report, ...]  #: (N) of the controller
+    failure: str  #: why the plant could not go on to the end; empty when it could
+    loop: Loop  #: after the last sample, to go on from
 
     @property
     def levels(self) -> tuple[str, ...]:

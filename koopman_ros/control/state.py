@@ -41,38 +41,24 @@ class Mode(Enum):
 
 @dataclass(frozen=True)
 class State:
-    """
-    All that a controller remembers between two measurements.
+    """All that a controller remembers between two measurements."""
 
-    :param mode: who commands.
-    :param setpoint: requested, active and scheduled set-points.
-    :param manual_input: (n_u,) what the operator asked for in manual mode, or None.
-    :param time_ns: stamp of the last measurement, or None before the first.
-    :param command: (n_u,) last command, or None before the first.
-    :param commanded_ns: when it was given, or None.
-    :param interval: usual seconds between measurements; infinity before the second.
-    :param accepted: what is remembered of the measurements.
-    :param estimate: state and disturbance, in the deviations of the acting level's model.
-    :param supervisor: which level acts.
-    :param way_back: from the safe input, while it is applied where no law may act, or None.
-    :param law: the level whose law gave the last command; None when none did.
-    :param law_input: (n_u,) what that law asked for, within the range.
-    :param law_memory: what that law remembers.
-    :param transfer: what is added to it for a while, or None.
-    """
-
-    mode: Mode = Mode.AUTOMATIC
+    mode: Mode = Mode.AUTOMATIC  #: who commands
+    #: requested, active and scheduled set-points
     setpoint: Setpoint = field(default_factory=Setpoint)
+    #: (n_u,) what the operator asked for in manual mode, or None
     manual_input: Array | None = None
-    time_ns: int | None = None
-    command: Array | None = None
-    commanded_ns: int | None = None
-    interval: float = np.inf
-    accepted: Accepted | None = None
+    time_ns: int | None = None  #: stamp of the last measurement, or None before the first
+    command: Array | None = None  #: (n_u,) last command, or None before the first
+    commanded_ns: int | None = None  #: when it was given, or None
+    interval: float = np.inf  #: usual seconds between measurements; infinity before the second
+    accepted: Accepted | None = None  #: what is remembered of the measurements
+    #: state and disturbance, in the deviations of the acting level's model
     estimate: Estimate | None = None
-    supervisor: Supervisor = field(default_factory=Supervisor)
+    supervisor: Supervisor = field(default_factory=Supervisor)  #: which level acts
+    #: from the safe input, while it is applied where no law may act, or None
     way_back: WayBack | None = None
-    law: str | None = None
-    law_input: Array | None = None
-    law_memory: object = None
-    transfer: Transfer | None = None
+    law: str | None = None  #: the level whose law gave the last command; None when none did
+    law_input: Array | None = None  #: (n_u,) what that law asked for, within the range
+    law_memory: object = None  #: what that law remembers
+    transfer: Transfer | None = None  #: what is added to it for a while, or None

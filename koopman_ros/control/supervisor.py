@@ -21,31 +21,22 @@ _HYSTERESIS = 0.5
 
 @dataclass(frozen=True)
 class LevelSettings:
-    """
-    One control level.
+    """One control level."""
 
-    :param law: its name in :data:`koopman_ros.control.laws.LAWS`, or module:class.
-    :param margin: distance outside the training data, in half widths of their box, up to which
-        it acts.
-    """
-
-    law: str
+    law: str  #: its name in :data:`koopman_ros.control.laws.LAWS`, or module:class
+    #: distance outside the training data, in half widths of their box, up to which it acts
     margin: float
 
 
 @dataclass(frozen=True)
 class SupervisorSettings:
-    """
-    When to fall back and when to recover.
+    """When to fall back and when to recover."""
 
-    :param levels: best first; beyond the last one's margin the safe input is commanded.
-    :param hold_timeout: seconds without a law or a measurement, after which the safe input is
-        commanded.
-    :param recovery_time: seconds that a better level must have been possible before it is taken.
-    """
-
+    #: best first; beyond the last one's margin the safe input is commanded
     levels: tuple[LevelSettings, ...] = (LevelSettings('sdre', 0.1), LevelSettings('linear', 0.5))
+    #: seconds without a law or a measurement, after which the safe input is commanded
     hold_timeout: float = 60.0
+    #: seconds that a better level must have been possible before it is taken
     recovery_time: float = 10.0
 
     def __post_init__(self) -> None:
@@ -86,37 +77,24 @@ class SupervisorSettings:
 
 @dataclass(frozen=True)
 class Requested:
-    """
-    The best level that is possible now.
+    """The best level that is possible now."""
 
-    :param level: which.
-    :param reason: why none above it; None for the best.
-    :param passing: whether it is left as soon as the reason is gone, as when a measurement was
-        missing: nothing was lost then.
-    """
-
-    level: str
-    reason: Reason | None = None
+    level: str  #: which
+    reason: Reason | None = None  #: why none above it; None for the best
+    #: whether it is left as soon as the reason is gone, as when a measurement was missing: nothing
+    #: was lost then
     passing: bool = False
 
 
 @dataclass(frozen=True)
 class Supervisor:
-    """
-    The state of the supervisor.
+    """The state of the supervisor."""
 
-    :param level: that acts; None before the first measurement.
-    :param reason: why none above it.
-    :param resumes: the level that follows when a passing reason is gone, or None.
-    :param bad_since_ns: since when no law could act, or None.
-    :param better_since_ns: since when a better level has been possible, or None.
-    """
-
-    level: str | None = None
-    reason: Reason | None = None
-    resumes: str | None = None
-    bad_since_ns: int | None = None
-    better_since_ns: int | None = None
+    level: str | None = None  #: that acts; None before the first measurement
+    reason: Reason | None = None  #: why none above it
+    resumes: str | None = None  #: the level that follows when a passing reason is gone, or None
+    bad_since_ns: int | None = None  #: since when no law could act, or None
+    better_since_ns: int | None = None  #: since when a better level has been possible, or None
 
     @property
     def settled(self) -> str | None:

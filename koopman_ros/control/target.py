@@ -14,21 +14,13 @@ from koopman_ros.lifting import LiftedModel
 
 @dataclass(frozen=True)
 class Target:
-    """
-    A set-point with the input that holds it, in scaled deviations.
+    """A set-point with the input that holds it, in scaled deviations."""
 
-    :param x: (n_x,) reference state.
-    :param z: (n_z,) z_ref = N(x_ref) (paper, section on the optimal control problem).
-    :param u: (n_u,) input that balances the model's drift and the disturbance there.
-    :param forcing: (n_x,) B u_ref + w, what acts on the state beside the drift.
-    :param residual: size of the rate that no input balances; 0 where x can be held.
-    """
-
-    x: Array
-    z: Array
-    u: Array
-    forcing: Array
-    residual: float
+    x: Array  #: (n_x,) reference state
+    z: Array  #: (n_z,) z_ref = N(x_ref) (paper, section on the optimal control problem)
+    u: Array  #: (n_u,) input that balances the model's drift and the disturbance there
+    forcing: Array  #: (n_x,) B u_ref + w, what acts on the state beside the drift
+    residual: float  #: size of the rate that no input balances; 0 where x can be held
 
 
 def steady_state_target(model: LiftedModel, x_ref: Array, w: Array | None = None) -> Target:
@@ -47,17 +39,11 @@ def steady_state_target(model: LiftedModel, x_ref: Array, w: Array | None = None
 
 @dataclass(frozen=True)
 class Reference:
-    """
-    What a target has of its set-point alone, in scaled deviations.
+    """What a target has of its set-point alone, in scaled deviations."""
 
-    :param x: (n_x,) reference state.
-    :param z: (n_z,) N(x_ref).
-    :param drift: (n_x,) the model's drift there.
-    """
-
-    x: Array
-    z: Array
-    drift: Array
+    x: Array  #: (n_x,) reference state
+    z: Array  #: (n_z,) N(x_ref)
+    drift: Array  #: (n_x,) the model's drift there
 
 
 def reference(model: LiftedModel, x_ref: Array) -> Reference:

@@ -22,13 +22,10 @@ class Transfer:
     An offset to the command that fades with d (1 + t/T) exp(-t/T), flat at first.
 
     Steps add up: after a second change the rest of the first fades on.
-
-    :param offset: (n_u,) now, in input units.
-    :param feed: (n_u,) what it follows, which fades exponentially.
     """
 
-    offset: Array
-    feed: Array
+    offset: Array  #: (n_u,) now, in input units
+    feed: Array  #: (n_u,) what it follows, which fades exponentially
 
     def shifted(self, by: Array) -> Transfer:
         """Return the transfer with a further step (n_u,)."""

@@ -35,17 +35,12 @@ class WayBack:
     help. The input then moves towards the nominal one: by :data:`_LEAD`, and by the share of the
     distance that the plant has left behind already. No model is asked how the plant moves out
     there. One that does not follow, or a sensor that does not, stops the input where it is.
-
-    :param farthest: where it rested under the safe input, in half widths of the training box.
-    :param nearest: smallest distance since then.
-    :param since_ns: from when it has rested.
-    :param led: whether the input has begun to move.
     """
 
-    farthest: float
-    nearest: float
-    since_ns: int
-    led: bool = False
+    farthest: float  #: where it rested under the safe input, in half widths of the training box
+    nearest: float  #: smallest distance since then
+    since_ns: int  #: from when it has rested
+    led: bool = False  #: whether the input has begun to move
 
     def moved(self, outside: float, time_ns: int, recovery_time: float) -> WayBack:
         """
@@ -86,18 +81,14 @@ def leads_home(model: LiftedModel, x: Array, safe: Array, nominal: Array) -> boo
 
 @dataclass(frozen=True)
 class Rest:
-    """
-    Where the safe input leads the plant, according to its model.
+    """Where the safe input leads the plant, according to its model."""
 
-    :param x: (n_x,) in state units; where it leaves what the model knows, a linear extrapolation
-        from there, and NaN where that does not come to rest.
-    :param outside: its distance from the training data in half widths, NaN likewise.
-    :param holding: (n_u,) input that would keep the plant where it leaves what the model knows,
-        in input units; None where it comes to rest before.
-    """
-
+    #: (n_x,) in state units; where it leaves what the model knows, a linear extrapolation from
+    #: there, and NaN where that does not come to rest
     x: Array
-    outside: float
+    outside: float  #: its distance from the training data in half widths, NaN likewise
+    #: (n_u,) input that would keep the plant where it leaves what the model knows, in input units;
+    #: None where it comes to rest before
     holding: Array | None = None
 
 

@@ -24,24 +24,15 @@ _TIMEOUT = 30.0  # s for the processes to find each other, and from one command 
 
 @dataclass(frozen=True)
 class Scenario:
-    """
-    What a closed loop does.
+    """What a closed loop does."""
 
-    :param model: name or path of the controller's model.
-    :param setpoint: new set-point in K.
-    :param step_time: when it takes effect, in s after the first measurement.
-    :param duration: length of the run in s of plant time, 0 for endless.
-    :param sample_period: s between measurements.
-    :param speed: simulated seconds per second, 0 for as fast as the machine can.
-    :param plant: further parameters of the plant node.
-    """
-
-    model: str
-    setpoint: float
-    step_time: float = 60.0
-    duration: float = 600.0
-    sample_period: float = 1.0
-    speed: float = 0.0
+    model: str  #: name or path of the controller's model
+    setpoint: float  #: new set-point in K
+    step_time: float = 60.0  #: when it takes effect, in s after the first measurement
+    duration: float = 600.0  #: length of the run in s of plant time, 0 for endless
+    sample_period: float = 1.0  #: s between measurements
+    speed: float = 0.0  #: simulated seconds per second, 0 for as fast as the machine can
+    #: further parameters of the plant node
     plant: Mapping[str, object] = field(default_factory=dict)
 
     @property
@@ -52,19 +43,12 @@ class Scenario:
 
 @dataclass(frozen=True)
 class Row:
-    """
-    What the operator sees at one command, temperatures in degrees Celsius.
+    """What the operator sees at one command, temperatures in degrees Celsius."""
 
-    :param seconds: plant time since the first measurement.
-    :param temperature: measured.
-    :param setpoint: tracked, or None before it is known.
-    :param coolant: commanded.
-    """
-
-    seconds: float
-    temperature: float
-    setpoint: float | None
-    coolant: float
+    seconds: float  #: plant time since the first measurement
+    temperature: float  #: measured
+    setpoint: float | None  #: tracked, or None before it is known
+    coolant: float  #: commanded
 
 
 class Operator:
@@ -126,15 +110,10 @@ class Operator:
 
 @dataclass(frozen=True)
 class Loop:
-    """
-    Plant, controller and trainer as three processes, with an operator beside them.
+    """Plant, controller and trainer as three processes, with an operator beside them."""
 
-    :param harness: which runs them.
-    :param operator: sets the set-point and watches.
-    """
-
-    harness: Harness
-    operator: Operator
+    harness: Harness  #: which runs them
+    operator: Operator  #: sets the set-point and watches
 
     def run_until(self, seconds: float) -> None:
         """Let the loop go on until so many seconds of plant time after its first measurement."""

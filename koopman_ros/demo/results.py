@@ -27,19 +27,12 @@ _COLORS = ('0.96', '#fde8e4', '#e6eefa', '#fdf5dc', '#e4f3e4')  # of phases
 
 @dataclass(frozen=True)
 class Run:
-    """
-    A recorded loop, possibly over several bags; times in s since the first measurement.
+    """A recorded loop, possibly over several bags; times in s since the first measurement."""
 
-    :param seconds: (n,) of the measurements.
-    :param temperature: (n,) K.
-    :param command_seconds: (m,) of the commands.
-    :param coolant: (m,) K.
-    """
-
-    seconds: Array
-    temperature: Array
-    command_seconds: Array
-    coolant: Array
+    seconds: Array  #: (n,) of the measurements
+    temperature: Array  #: (n,) K
+    command_seconds: Array  #: (m,) of the commands
+    coolant: Array  #: (m,) K
 
     def final_error(self, setpoint: float) -> float:
         """Return the last temperature minus the set-point, in K."""

@@ -56,13 +56,9 @@ _EXPERIMENT = {
 
 @dataclass
 class Story:
-    """
-    What happens when, in seconds of plant time since the first measurement.
+    """What happens when, in seconds of plant time since the first measurement."""
 
-    :param phases: name and start of each phase.
-    """
-
-    phases: list[tuple[str, float]] = field(default_factory=list)
+    phases: list[tuple[str, float]] = field(default_factory=list)  #: name and start of each phase
 
     def start_of(self, name: str) -> float:
         """Return when a phase began."""

@@ -22,13 +22,10 @@ class Estimate:
 
     dx/dt = f(x) + B u + w with f the model's projected drift, the same that the target is
     calculated from: any difference between the two would be left as an offset.
-
-    :param x: (n_x,) state.
-    :param w: (n_x,) disturbance of its rate, taken as constant.
     """
 
-    x: Array
-    w: Array
+    x: Array  #: (n_x,) state
+    w: Array  #: (n_x,) disturbance of its rate, taken as constant
 
 
 class Estimator(Protocol):

@@ -17,17 +17,13 @@ from koopman_ros.units import NANOSECONDS
 
 @dataclass(frozen=True)
 class FrozenCheck:
-    """
-    Since when each signal has stood still, and how far the model says that it has moved.
+    """Since when each signal has stood still, and how far the model says that it has moved."""
 
-    :param since_ns: (n_y,) stamps of the first of the measurements that are bit-identical.
-    :param travel: (n_y,) predicted since then, in the signals' units.
-    :param w: (n_x,) disturbance that was estimated when all signals last changed: what an
-        observer makes of a sensor that does not move is no disturbance.
-    """
-
+    #: (n_y,) stamps of the first of the measurements that are bit-identical
     since_ns: tuple[int, ...]
-    travel: Array
+    travel: Array  #: (n_y,) predicted since then, in the signals' units
+    #: (n_x,) disturbance that was estimated when all signals last changed: what an observer makes
+    #: of a sensor that does not move is no disturbance
     w: Array
 
     @classmethod

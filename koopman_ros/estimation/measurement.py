@@ -20,22 +20,16 @@ from koopman_ros.units import NANOSECONDS
 
 @dataclass(frozen=True)
 class SensorLimits:
-    """
-    What the sensors can measure and their plant can do, one number per measured signal.
+    """What the sensors can measure and their plant can do, one number per measured signal."""
 
-    :param lower: (n_y,) smallest measurement accepted, in the signal's unit.
-    :param upper: (n_y,) largest measurement accepted.
-    :param rate: (n_y,) fastest change of the plant per second; a jump that stays is accepted when
-        the plant could have got there by then.
-    :param jump: (n_y,) change that noise alone may bring between two measurements.
-    :param frozen_timeout: seconds that a measurement may stay bit-identical while the model moves
-        by more than half of `jump`; infinity for ever.
-    """
-
-    lower: Array
-    upper: Array
+    lower: Array  #: (n_y,) smallest measurement accepted, in the signal's unit
+    upper: Array  #: (n_y,) largest measurement accepted
+    #: (n_y,) fastest change of the plant per second; a jump that stays is accepted when the plant
+    #: could have got there by then
     rate: Array
-    jump: Array
+    jump: Array  #: (n_y,) change that noise alone may bring between two measurements
+    #: seconds that a measurement may stay bit-identical while the model moves by more than half of
+    #: `jump`; infinity for ever
     frozen_timeout: float = math.inf
 
     def __post_init__(self) -> None:
@@ -68,34 +62,21 @@ class SensorLimits:
 
 @dataclass(frozen=True)
 class Accepted:
-    """
-    What is remembered of the measurements.
+    """What is remembered of the measurements."""
 
-    :param value: (n_y,) the last one that was accepted, in the signals' units.
-    :param time_ns: its stamp.
-    :param frozen: which signals stand still.
-    :param jumped: whether a later one was taken for a jump.
-    """
-
-    value: Array
-    time_ns: int
-    frozen: FrozenCheck
-    jumped: bool = False
+    value: Array  #: (n_y,) the last one that was accepted, in the signals' units
+    time_ns: int  #: its stamp
+    frozen: FrozenCheck  #: which signals stand still
+    jumped: bool = False  #: whether a later one was taken for a jump
 
 
 @dataclass(frozen=True)
 class Verdict:
-    """
-    What became of a measurement.
+    """What became of a measurement."""
 
-    :param accepted: to be remembered; None as long as none was accepted.
-    :param fault: why it is rejected; None when it is accepted.
-    :param moved: whether it is accepted although the plant has jumped there.
-    """
-
-    accepted: Accepted | None
-    fault: Reason | None = None
-    moved: bool = False
+    accepted: Accepted | None  #: to be remembered; None as long as none was accepted
+    fault: Reason | None = None  #: why it is rejected; None when it is accepted
+    moved: bool = False  #: whether it is accepted although the plant has jumped there
 
     @property
     def frozen(self) -> bool:

@@ -22,15 +22,11 @@ class DisturbanceObserver:
     With p = exp(-bandwidth dt) the state takes 1 - p^2 of what a measurement differs from its
     prediction, and the disturbance (1 - p)^2 / dt of it, which places both poles of the error at
     p where the model's own motion within a sample is small.
-
-    :param model: whose drift predicts.
-    :param bandwidth: in 1/s, above 0.
-    :param max_disturbance: (n_u,) bound on each input of B^+ w, in scaled deviations.
     """
 
-    model: LiftedModel
-    bandwidth: float
-    max_disturbance: Array
+    model: LiftedModel  #: whose drift predicts
+    bandwidth: float  #: in 1/s, above 0
+    max_disturbance: Array  #: (n_u,) bound on each input of B^+ w, in scaled deviations
 
     @property
     def remembers(self) -> bool:
@@ -97,17 +93,11 @@ class DisturbanceObserver:
 
 @dataclass(frozen=True)
 class MeasuredState:
-    """
-    Every measurement is the state, and there is no disturbance, as in the paper.
+    """Every measurement is the state, and there is no disturbance, as in the paper."""
 
-    :param model: whose drift predicts between measurements.
-    :param bandwidth: of no meaning.
-    :param max_disturbance: likewise.
-    """
-
-    model: LiftedModel
-    bandwidth: float = 0.0
-    max_disturbance: Array | None = None
+    model: LiftedModel  #: whose drift predicts between measurements
+    bandwidth: float = 0.0  #: of no meaning
+    max_disturbance: Array | None = None  #: likewise
 
     @property
     def remembers(self) -> bool:

@@ -25,19 +25,12 @@ def box_of(plant: Plant, episodes: Sequence[Episode]) -> Box:
 
 @dataclass(frozen=True)
 class DriftModel:
-    """
-    dx/dt = f(x) + B u with f a polynomial, in deviations within a box.
+    """dx/dt = f(x) + B u with f a polynomial, in deviations within a box."""
 
-    :param box: the deviations' origin and scale.
-    :param degree: highest total degree of the monomials.
-    :param coefficients: (1 + m, n_x) of 1 and of the m monomials, in scale units a time unit.
-    :param B: (n_x, n_u) likewise.
-    """
-
-    box: Box
-    degree: int
-    coefficients: Array
-    B: Array
+    box: Box  #: the deviations' origin and scale
+    degree: int  #: highest total degree of the monomials
+    coefficients: Array  #: (1 + m, n_x) of 1 and of the m monomials, in scale units a time unit
+    B: Array  #: (n_x, n_u) likewise
 
     @cached_property
     def monomials(self) -> PolynomialObservables:

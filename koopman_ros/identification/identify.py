@@ -39,42 +39,25 @@ class Stopped(Exception):  # noqa: N818
 
 @dataclass(frozen=True)
 class Score:
-    """
-    Prediction error of one estimate on the segments held out for the choice.
+    """Prediction error of one estimate on the segments held out for the choice."""
 
-    :param method: its name, e.g. ``'weak form, 40 samples'``.
-    :param degree: of the drift.
-    :param rmse: (n_x,) root mean square error, in state units; infinite when it diverges.
-    :param cost: mean squared error in units of the states' scale, by which estimates compare.
-    """
-
-    method: str
-    degree: int
-    rmse: Array
-    cost: float
+    method: str  #: its name, e.g. ``'weak form, 40 samples'``
+    degree: int  #: of the drift
+    rmse: Array  #: (n_x,) root mean square error, in state units; infinite when it diverges
+    cost: float  #: mean squared error in units of the states' scale, by which estimates compare
 
 
 @dataclass(frozen=True)
 class Identified:
-    """
-    An estimated drift with the scores of all candidates.
+    """An estimated drift with the scores of all candidates."""
 
-    :param drift: the estimate.
-    :param method: how it was found.
-    :param linear: the best linear model of the same episodes, by output error.
-    :param scores: of all estimates, in the order of their making.
-    :param noise: (n_x,) standard deviation of the measurement noise, from sample to sample.
-    :param fitted: the segments that it was fitted to.
-    :param held_out: segments that neither fit nor choice has seen.
-    """
-
-    drift: DriftModel
-    method: str
-    linear: DriftModel
-    scores: tuple[Score, ...]
-    noise: Array
-    fitted: tuple[Episode, ...]
-    held_out: tuple[Episode, ...]
+    drift: DriftModel  #: the estimate
+    method: str  #: how it was found
+    linear: DriftModel  #: the best linear model of the same episodes, by output error
+    scores: tuple[Score, ...]  #: of all estimates, in the order of their making
+    noise: Array  #: (n_x,) standard deviation of the measurement noise, from sample to sample
+    fitted: tuple[Episode, ...]  #: the segments that it was fitted to
+    held_out: tuple[Episode, ...]  #: segments that neither fit nor choice has seen
 
 
 def identify(plant: Plant, episodes: Sequence[Episode], *, degrees: Sequence[int] = DEGREES,

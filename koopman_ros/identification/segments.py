@@ -25,19 +25,12 @@ _STEP = 1e-4
 
 @dataclass(frozen=True)
 class Segments:
-    """
-    M segments on grids of K steps, between which inputs are constant; short ones are padded.
+    """M segments on grids of K steps, between which inputs are constant; short ones are padded."""
 
-    :param steps: (K, M) lengths of the steps, 0 in the padding, in time units.
-    :param u: (K, M, n_u) inputs held over them.
-    :param x: (K + 1, M, n_x) measured states, 0 where none was measured.
-    :param measured: (K + 1, M) whether one was.
-    """
-
-    steps: Array
-    u: Array
-    x: Array
-    measured: np.ndarray
+    steps: Array  #: (K, M) lengths of the steps, 0 in the padding, in time units
+    u: Array  #: (K, M, n_u) inputs held over them
+    x: Array  #: (K + 1, M, n_x) measured states, 0 where none was measured
+    measured: np.ndarray  #: (K + 1, M) whether one was
 
     @classmethod
     def of(cls, episodes: Sequence[Episode], longest_step: float) -> Segments:

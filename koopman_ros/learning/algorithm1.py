@@ -28,29 +28,19 @@ class Algorithm1:
 
     The objective falls when z shrinks and the decoder grows, so that it does not tell a good lift
     from a useless one; see :class:`~koopman_ros.learning.growth.Growth` for what does.
-
-    :param n_z: number of lifted coordinates.
-    :param identity: whether z starts with the state (the paper's choice in its two-state example).
-    :param hidden: units of each hidden layer of the lift.
-    :param activation: as in :class:`~koopman_ros.learning.growth.Growth`.
-    :param decoder: units of the decoder network.
-    :param lambda_initial: first weight of the decoder term.
-    :param gamma: decay rate of lambda, above 1.
-    :param tolerance: distance between successive parameter vectors taken as convergence.
-    :param max_rounds: limit of minimisations.
-    :param max_iterations: limit of steps in each.
     """
 
-    n_z: int
+    n_z: int  #: number of lifted coordinates
+    #: whether z starts with the state (the paper's choice in its two-state example)
     identity: bool = False
-    hidden: tuple[int, ...] = (8,)
-    activation: str = 'tanh'
-    decoder: int = 8
-    lambda_initial: float = 10.0
-    gamma: float = 10.0
-    tolerance: float = 1e-3
-    max_rounds: int = 8
-    max_iterations: int = 300
+    hidden: tuple[int, ...] = (8,)  #: units of each hidden layer of the lift
+    activation: str = 'tanh'  #: as in :class:`~koopman_ros.learning.growth.Growth`
+    decoder: int = 8  #: units of the decoder network
+    lambda_initial: float = 10.0  #: first weight of the decoder term
+    gamma: float = 10.0  #: decay rate of lambda, above 1
+    tolerance: float = 1e-3  #: distance between successive parameter vectors taken as convergence
+    max_rounds: int = 8  #: limit of minimisations
+    max_iterations: int = 300  #: limit of steps in each
 
     def __post_init__(self) -> None:
         if not self.gamma > 1.0:

@@ -21,13 +21,9 @@ from koopman_ros.plant_data import Array, Plant, Samples
 
 @dataclass(frozen=True)
 class Linearisation:
-    """
-    The linearisation at the nominal point.
+    """The linearisation at the nominal point."""
 
-    :param jacobian: (n_x, n_x) df/dx there, in units.
-    """
-
-    jacobian: Array
+    jacobian: Array  #: (n_x, n_x) df/dx there, in units
 
     def learn(self, plant: Plant, samples: Samples, box: Box | None = None
               ) -> LiftedModel:
@@ -54,11 +50,9 @@ class Edmd:
     drift is read off the rows of the states, which are a fit to dx/dt by itself. Where B is not
     known it comes from them, too. (Williams, Kevrekidis, Rowley 2015;
     generator with control-affine inputs: Peitz, Otto, Rowley 2020.)
-
-    :param degree: highest total degree of the monomials.
     """
 
-    degree: int = 3
+    degree: int = 3  #: highest total degree of the monomials
 
     def learn(self, plant: Plant, samples: Samples, box: Box | None = None
               ) -> LiftedModel:

@@ -22,17 +22,11 @@ Monitor = Callable[[int, float], bool]
 
 @dataclass(frozen=True)
 class Grown:
-    """
-    A trained parameter vector.
+    """A trained parameter vector."""
 
-    :param layout: its sizes.
-    :param theta: (p,) parameters.
-    :param status: how the last minimisation ended.
-    """
-
-    layout: Layout
-    theta: Tensor
-    status: MinimumStatus
+    layout: Layout  #: its sizes
+    theta: Tensor  #: (p,) parameters
+    status: MinimumStatus  #: how the last minimisation ended
 
 
 @dataclass(frozen=True)
@@ -43,36 +37,23 @@ class Growth:
     A new coordinate starts as a ridge fit of the product of eigenfunctions that the present
     coordinates span least (products of eigenfunctions are eigenfunctions themselves), on hidden
     units of which a few are new and random. Levenberg-Marquardt then moves all parameters.
-
-    :param n_z: number of lifted coordinates.
-    :param identity: whether z starts with the state.
-    :param hidden_first: units of the first free coordinates, in each hidden layer.
-    :param hidden_more: units added with each further coordinate, in each hidden layer.
-    :param layers: number of hidden layers, 1 or 2.
-    :param activation: ``'tanh'``, ``'sigmoid'``, ``'sine'`` or ``'softplus'``.
-    :param whitening: weight of the residual that keeps E[z z'] near the identity.
-    :param decoder: units of the decoder network, which holds on to the states where they are no
-        coordinates themselves; None for 8 with two or more states in a free lift and none
-        otherwise.
-    :param decoder_weight: weight of its residual (the paper's lambda), divided by 1000 for the
-        last steps.
-    :param ridge: ridge weight in the fit that starts a new coordinate.
-    :param max_iterations: limit of Levenberg-Marquardt steps for each coordinate.
-    :param tolerance: relative decrease of the cost over 20 steps taken as convergence.
     """
 
-    n_z: int
-    identity: bool = True
-    hidden_first: int = 8
-    hidden_more: int = 3
-    layers: int = 1
-    activation: str = 'tanh'
-    whitening: float = 1.0
+    n_z: int  #: number of lifted coordinates
+    identity: bool = True  #: whether z starts with the state
+    hidden_first: int = 8  #: units of the first free coordinates, in each hidden layer
+    hidden_more: int = 3  #: units added with each further coordinate, in each hidden layer
+    layers: int = 1  #: number of hidden layers, 1 or 2
+    activation: str = 'tanh'  #: ``'tanh'``, ``'sigmoid'``, ``'sine'`` or ``'softplus'``
+    whitening: float = 1.0  #: weight of the residual that keeps E[z z'] near the identity
+    #: units of the decoder network, which holds on to the states where they are no coordinates
+    #: themselves; None for 8 with two or more states in a free lift and none otherwise
     decoder: int | None = None
+    #: weight of its residual (the paper's lambda), divided by 1000 for the last steps
     decoder_weight: float = 0.1
-    ridge: float = 1e-6
-    max_iterations: int = 1000
-    tolerance: float = 1e-3
+    ridge: float = 1e-6  #: ridge weight in the fit that starts a new coordinate
+    max_iterations: int = 1000  #: limit of Levenberg-Marquardt steps for each coordinate
+    tolerance: float = 1e-3  #: relative decrease of the cost over 20 steps taken as convergence
 
     def __post_init__(self) -> None:
         if self.n_z < 1:

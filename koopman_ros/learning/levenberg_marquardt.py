@@ -29,19 +29,12 @@ class MinimumStatus(Enum):
 
 @dataclass(frozen=True)
 class Minimum:
-    """
-    The outcome of a minimisation.
+    """The outcome of a minimisation."""
 
-    :param theta: (p,) parameters with the lowest cost seen.
-    :param cost: half the sum of squares there.
-    :param iterations: accepted and rejected steps together.
-    :param status: why it ended.
-    """
-
-    theta: Tensor
-    cost: float
-    iterations: int
-    status: MinimumStatus
+    theta: Tensor  #: (p,) parameters with the lowest cost seen
+    cost: float  #: half the sum of squares there
+    iterations: int  #: accepted and rejected steps together
+    status: MinimumStatus  #: why it ended
 
 
 class NormalEquations:
@@ -146,17 +139,14 @@ def minimise(residuals: Residuals, theta: Tensor, *, max_iterations: int,
 
 @dataclass(frozen=True)
 class _State:
-    """
-    Where a minimisation stands.
-
-    :param factor: by what the damping rises when a step is refused; back at _FACTOR after a step
-        that was taken.
-    """
+    """Where a minimisation stands."""
 
     theta: Tensor
     now: NormalEquations
     scaling: Tensor
     damping: float = 1e-3
+    #: by what the damping rises when a step is refused; back at _FACTOR after a step that was
+    #: taken
     factor: float = _FACTOR
     iteration: int = 0
 

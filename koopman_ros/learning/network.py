@@ -51,21 +51,14 @@ def check_activation(name: str) -> None:
 
 @dataclass(frozen=True)
 class Parameters:
-    """
-    The parameters of a lift by name, as views of one flat vector.
+    """The parameters of a lift by name, as views of one flat vector."""
 
-    :param hidden: (W (h_i, h_{i-1}), b (h_i,)) of each hidden layer, h_0 = n_x.
-    :param V: (n_free, h) output weights.
-    :param A: (n_z, n_z) dynamics.
-    :param B: (n_x, n_u) input matrix where it is learned, else None.
-    :param decoder: (W (g, n_z), b (g,), V (n_x, g), c (n_x,)) where there is a decoder network,
-        else None.
-    """
-
+    #: (W (h_i, h_{i-1}), b (h_i,)) of each hidden layer, h_0 = n_x
     hidden: tuple[tuple[Tensor, Tensor], ...]
-    V: Tensor
-    A: Tensor
-    B: Tensor | None = None
+    V: Tensor  #: (n_free, h) output weights
+    A: Tensor  #: (n_z, n_z) dynamics
+    B: Tensor | None = None  #: (n_x, n_u) input matrix where it is learned, else None
+    #: (W (g, n_z), b (g,), V (n_x, g), c (n_x,)) where there is a decoder network, else None
     decoder: tuple[Tensor, Tensor, Tensor, Tensor] | None = None
 
 
@@ -77,23 +70,16 @@ class Layout:
     N(x) = [x; V (h(x) - h(0))] with identity coordinates and without x otherwise, where h is the
     last hidden layer. The vector stacks the hidden layers, V, A, B and the decoder, row by row.
 
-    :param n_x: number of states.
-    :param n_z: number of lifted coordinates.
-    :param hidden: units of each hidden layer.
-    :param identity: whether z starts with the state.
-    :param activation: name of the activation, a key of :data:`ACTIVATIONS`.
-    :param n_u: number of inputs whose B is learned, 0 where B is known.
-    :param decoder: units of the decoder network x = D(z; q), 0 for none.
     :raises ValueError: on sizes that do not fit or an unknown activation.
     """
 
-    n_x: int
-    n_z: int
-    hidden: tuple[int, ...]
-    identity: bool
-    activation: str = 'tanh'
-    n_u: int = 0
-    decoder: int = 0
+    n_x: int  #: number of states
+    n_z: int  #: number of lifted coordinates
+    hidden: tuple[int, ...]  #: units of each hidden layer
+    identity: bool  #: whether z starts with the state
+    activation: str = 'tanh'  #: name of the activation, a key of :data:`ACTIVATIONS`
+    n_u: int = 0  #: number of inputs whose B is learned, 0 where B is known
+    decoder: int = 0  #: units of the decoder network x = D(z; q), 0 for none
 
     def __post_init__(self) -> None:
         check_activation(self.activation)

@@ -19,15 +19,10 @@ from koopman_ros.learning.shallow import FeatureMap, MomentSums
 
 @dataclass(frozen=True)
 class ResidualWeights:
-    """
-    Weights of the residuals beside that of the dynamics, whose weight is 1.
+    """Weights of the residuals beside that of the dynamics, whose weight is 1."""
 
-    :param whitening: of E[z z'] - I, 0 to leave it out.
-    :param decoder: of x - D(N(x)), the paper's lambda; 0 to leave it out.
-    """
-
-    whitening: float = 0.0
-    decoder: float = 0.0
+    whitening: float = 0.0  #: of E[z z'] - I, 0 to leave it out
+    decoder: float = 0.0  #: of x - D(N(x)), the paper's lambda; 0 to leave it out
 
 
 @dataclass(frozen=True)
@@ -43,17 +38,13 @@ class Problem:
       (paper's decoder term).
 
     Sums run over chunks of the samples, so that memory does not grow with their number.
-
-    :param layout: sizes of the lift.
-    :param data: the samples.
-    :param weights: weights of the residuals.
-    :param chunk: samples at a time; by default as many as keep the residual Jacobian in 2 MiB,
-        the cache of a core.
     """
 
-    layout: Layout
-    data: ScaledSamples
-    weights: ResidualWeights
+    layout: Layout  #: sizes of the lift
+    data: ScaledSamples  #: the samples
+    weights: ResidualWeights  #: weights of the residuals
+    #: samples at a time; by default as many as keep the residual Jacobian in 2 MiB, the cache of a
+    #: core
     chunk: int = 0
 
     def __post_init__(self) -> None:

@@ -21,17 +21,11 @@ def deviations(box: Box, samples: Samples) -> tuple[Array, Array, Array]:
 
 @dataclass(frozen=True)
 class ScaledSamples:
-    """
-    Samples that a lift is learned from, in scaled deviations from the nominal point.
+    """Samples that a lift is learned from, in scaled deviations from the nominal point."""
 
-    :param x: (N, n_x) states, float64.
-    :param f: (N, n_x) rates dx/dt, less B u where B is known.
-    :param u: (N, n_u) inputs whose B is to be learned, or None where it is known.
-    """
-
-    x: Tensor
-    f: Tensor
-    u: Tensor | None = None
+    x: Tensor  #: (N, n_x) states, float64
+    f: Tensor  #: (N, n_x) rates dx/dt, less B u where B is known
+    u: Tensor | None = None  #: (N, n_u) inputs whose B is to be learned, or None where it is known
 
     def drift(self, B: Tensor | None) -> Tensor:
         """Return the rates without what the inputs do, (N, n_x)."""

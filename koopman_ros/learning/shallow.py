@@ -65,13 +65,10 @@ class FeatureMap:
     phi stacks F (h (n_x + 1)), what the rates of the features give the hidden layer; G likewise,
     what the features give it; the rates of the features (h); the features (h); x (n_x); and where
     B is learned slope times u (h n_u) and u (n_u).
-
-    :param layout: sizes, with one hidden layer.
-    :param parameters: the lift's parameters.
     """
 
-    layout: Layout
-    parameters: Parameters
+    layout: Layout  #: sizes, with one hidden layer
+    parameters: Parameters  #: the lift's parameters
 
     @cached_property
     def _places(self) -> tuple[slice, ...]:

@@ -40,23 +40,14 @@ Recipe = Growth | Algorithm1
 
 @dataclass(frozen=True)
 class Progress:
-    """
-    Progress of a training.
+    """Progress of a training."""
 
-    :param n_z: coordinates being learned.
-    :param finished: starts that finished, over all rounds.
-    :param total: starts in all.
-    :param iteration: step within a start that is under way in this process, else 0.
-    :param residual: root mean square of the residuals there, else NaN.
-    :param rw: best validation figure so far, NaN before the first.
-    """
-
-    n_z: int
-    finished: int
-    total: int
-    iteration: int
-    residual: float
-    rw: float
+    n_z: int  #: coordinates being learned
+    finished: int  #: starts that finished, over all rounds
+    total: int  #: starts in all
+    iteration: int  #: step within a start that is under way in this process, else 0
+    residual: float  #: root mean square of the residuals there, else NaN
+    rw: float  #: best validation figure so far, NaN before the first
 
 
 # Called after every step and start; True ends the training with the best so far.
@@ -65,26 +56,19 @@ Watch = Callable[[Progress], bool]
 
 @dataclass(frozen=True)
 class Trained:
-    """
-    A trained model with its figures and those of the linear model.
+    """A trained model with its figures and those of the linear model."""
 
-    :param model: the winner, with its figures on the untouched test episodes in its provenance.
-    :param figures: those figures.
-    :param linear: the figures of the linear model that fits the training episodes best.
-    :param closed_loop: the winner's law beside the linear one's; None without inputs, or when
-        nothing was to be refused.
-    :param status: the sentence with which its training ended.
-    :param path: the winner of every round, smallest n_z first, each with its figures.
-    :param starts: number of starts that finished.
-    """
-
+    #: the winner, with its figures on the untouched test episodes in its provenance
     model: LiftedModel
-    figures: Figures
-    linear: Figures
+    figures: Figures  #: those figures
+    linear: Figures  #: the figures of the linear model that fits the training episodes best
+    #: the winner's law beside the linear one's; None without inputs, or when nothing was to be
+    #: refused
     closed_loop: ClosedLoopComparison | None
-    status: str
+    status: str  #: the sentence with which its training ended
+    #: the winner of every round, smallest n_z first, each with its figures
     path: tuple[LiftedModel, ...]
-    starts: int
+    starts: int  #: number of starts that finished
 
 
 class NoUsefulLift(ValueError):  # noqa: N818

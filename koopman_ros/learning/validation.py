@@ -24,52 +24,35 @@ _MAX_EVALUATIONS = 5000
 
 @dataclass(frozen=True)
 class Fit:
-    """
-    Residuals of a lift in dz/dt = A z + J_N(x) B u on samples.
+    """Residuals of a lift in dz/dt = A z + J_N(x) B u on samples."""
 
-    :param rw: ||(J_N f - A N) S^(-1/2)||^2 / ||J_N f S^(-1/2)||^2 with S = E[z z'], invariant
-        under linear maps of z, so that it cannot be lowered by shrinking z.
-    :param rx: relative mean-square error of the drift of x that the lift implies.
-    :param cond: condition number of S; large when coordinates have collapsed onto each other.
-    """
-
+    #: ||(J_N f - A N) S^(-1/2)||^2 / ||J_N f S^(-1/2)||^2 with S = E[z z'], invariant under linear
+    #: maps of z, so that it cannot be lowered by shrinking z
     rw: float
-    rx: float
-    cond: float
+    rx: float  #: relative mean-square error of the drift of x that the lift implies
+    cond: float  #: condition number of S; large when coordinates have collapsed onto each other
 
 
 @dataclass(frozen=True)
 class ClosedLoopComparison:
-    """
-    The lift's controller beside the linear model's, both on the lift's own drift.
+    """The lift's controller beside the linear model's, both on the lift's own drift."""
 
-    :param cost_ratio: cost with the lift's law over cost with the linear law, summed over the
-        starts; 0 when only the lift arrives, infinite when only the linear law does, NaN when
-        neither does.
-    :param arrived: number of starts from which the lift's law reaches the nominal point.
-    :param linear_arrived: the same of the linear law.
-    :param starts: number of starts.
-    """
-
+    #: cost with the lift's law over cost with the linear law, summed over the starts; 0 when only
+    #: the lift arrives, infinite when only the linear law does, NaN when neither does
     cost_ratio: float
-    arrived: int
-    linear_arrived: int
-    starts: int
+    arrived: int  #: number of starts from which the lift's law reaches the nominal point
+    linear_arrived: int  #: the same of the linear law
+    starts: int  #: number of starts
 
 
 @dataclass(frozen=True)
 class Figures:
-    """
-    Figures of a model on held-out samples.
+    """Figures of a model on held-out samples."""
 
-    :param fit: its residuals.
-    :param eigenvalues: (n_z,) of A, in 1/time unit.
-    :param rollout_rmse: (n_x,) root mean square error of the prediction over the held-out
-        episodes, in state units; infinite when it diverges, None when the samples have no times.
-    """
-
-    fit: Fit
-    eigenvalues: NDArray[np.complex128] = field(compare=False)
+    fit: Fit  #: its residuals
+    eigenvalues: NDArray[np.complex128] = field(compare=False)  #: (n_z,) of A, in 1/time unit
+    #: (n_x,) root mean square error of the prediction over the held-out episodes, in state units;
+    #: infinite when it diverges, None when the samples have no times
     rollout_rmse: Array | None = field(compare=False)
 
     def metrics(self, names: tuple[str, ...]) -> dict[str, float]:

@@ -20,16 +20,11 @@ from koopman_ros.arrays import Array
 
 @dataclass(frozen=True)
 class Activation:
-    """
-    An activation f, applied to each element; every array has the same shape.
+    """An activation f, applied to each element; every array has the same shape."""
 
-    :param value: a -> f(a).
-    :param slope: a, f(a) -> f'(a).
-    :param divided_differences: a, b, f(a), f(b) -> those of f and of f' between a and b.
-    """
-
-    value: Callable[[Array], Array]
-    slope: Callable[[Array, Array], Array]
+    value: Callable[[Array], Array]  #: a -> f(a)
+    slope: Callable[[Array, Array], Array]  #: a, f(a) -> f'(a)
+    #: a, b, f(a), f(b) -> those of f and of f' between a and b
     divided_differences: Callable[[Array, Array, Array, Array], tuple[Array, Array]]
 
 

@@ -22,21 +22,15 @@ class Coordinates:
 
     A physical value v maps to the deviation (v - center) / scale that the lift sees.
 
-    :param names: one name a coordinate, e.g. ``('temperature',)``.
-    :param units: one unit a coordinate, e.g. ``('K',)``.
-    :param center: (n,) nominal point, in units.
-    :param scale: (n,) positive, in units.
-    :param lower: (n,) lower corner of the training box, in units.
-    :param upper: (n,) upper corner of the training box, in units.
     :raises ValueError: on inconsistent sizes, a scale that is not positive or an empty box.
     """
 
-    names: tuple[str, ...]
-    units: tuple[str, ...]
-    center: Array
-    scale: Array
-    lower: Array
-    upper: Array
+    names: tuple[str, ...]  #: one name a coordinate, e.g. ``('temperature',)``
+    units: tuple[str, ...]  #: one unit a coordinate, e.g. ``('K',)``
+    center: Array  #: (n,) nominal point, in units
+    scale: Array  #: (n,) positive, in units
+    lower: Array  #: (n,) lower corner of the training box, in units
+    upper: Array  #: (n,) upper corner of the training box, in units
 
     def __post_init__(self) -> None:
         n = len(self.names)
@@ -106,17 +100,11 @@ class Coordinates:
 
 @dataclass(frozen=True)
 class Box:
-    """
-    The range of states and inputs that a model is learned over, and its scaled coordinates.
+    """The range of states and inputs that a model is learned over, and its scaled coordinates."""
 
-    :param states: the states' names, units, scaling and range.
-    :param inputs: the inputs' likewise.
-    :param time_unit: ``'s'`` or ``'min'``.
-    """
-
-    states: Coordinates
-    inputs: Coordinates
-    time_unit: str
+    states: Coordinates  #: the states' names, units, scaling and range
+    inputs: Coordinates  #: the inputs' likewise
+    time_unit: str  #: ``'s'`` or ``'min'``
 
     @staticmethod
     def of(plant: Plant, x: Array, u: Array, *, nominal: bool = True) -> Box:

@@ -22,25 +22,17 @@ from koopman_ros.units import SECONDS_PER_TIME_UNIT
 
 @dataclass(frozen=True)
 class Provenance:
-    """
-    Origin of a lift and its held-out figures.
+    """Origin of a lift and its held-out figures."""
 
-    :param plant: name of the plant it was learned from.
-    :param seed: seed of the training run, or None for a model that was not trained.
-    :param data_digest: SHA-256 of the training samples, in hexadecimal.
-    :param metrics: held-out figures: ``rw``, ``rx`` and ``cond`` without unit,
-        ``rollout_rmse`` in state units; from measured data also ``noise`` in state units and
-        ``coverage``, the visited share of the training box.
-    :param package_version: version of koopman_ros that made it.
-    :param method: how derivatives were found; empty where they were given.
-    """
-
-    plant: str
-    seed: int | None = None
-    data_digest: str = ''
+    plant: str  #: name of the plant it was learned from
+    seed: int | None = None  #: seed of the training run, or None for a model that was not trained
+    data_digest: str = ''  #: SHA-256 of the training samples, in hexadecimal
+    #: held-out figures: ``rw``, ``rx`` and ``cond`` without unit, ``rollout_rmse`` in state units;
+    #: from measured data also ``noise`` in state units and ``coverage``, the visited share of the
+    #: training box
     metrics: Mapping[str, float] = field(default_factory=dict)
-    package_version: str = ''
-    method: str = ''
+    package_version: str = ''  #: version of koopman_ros that made it
+    method: str = ''  #: how derivatives were found; empty where they were given
 
 
 @dataclass(frozen=True)
@@ -53,24 +45,17 @@ class LiftedModel:
     `observables`; with those of :class:`NetworkObservables` without hidden layers the model is a
     linearisation.
 
-    :param observables: the lift N, with N(0) = 0.
-    :param A: (n_z, n_z) in 1/time unit.
-    :param B: (n_x, n_u) in scaled coordinates.
-    :param states: the states' names, units, scaling and training box.
-    :param inputs: the inputs' names, units, scaling and training box.
-    :param time_unit: ``'s'`` or ``'min'``.
-    :param provenance: origin and held-out figures.
-    :param training_states: where the data were, within their box; None when that is not known.
     :raises ValueError: naming the array that does not fit and both shapes.
     """
 
-    observables: Observables
-    A: Array
-    B: Array
-    states: Coordinates
-    inputs: Coordinates
-    time_unit: str
-    provenance: Provenance
+    observables: Observables  #: the lift N, with N(0) = 0
+    A: Array  #: (n_z, n_z) in 1/time unit
+    B: Array  #: (n_x, n_u) in scaled coordinates
+    states: Coordinates  #: the states' names, units, scaling and training box
+    inputs: Coordinates  #: the inputs' names, units, scaling and training box
+    time_unit: str  #: ``'s'`` or ``'min'``
+    provenance: Provenance  #: origin and held-out figures
+    #: where the data were, within their box; None when that is not known
     training_states: TrainingStates | None = None
 
     def __post_init__(self) -> None:

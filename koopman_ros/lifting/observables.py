@@ -77,17 +77,14 @@ class NetworkObservables(Observables):
 
     Without hidden layers and with `identity` this is the linear lift z = x.
 
-    :param hidden: (weight (h_i, h_{i-1}), bias (h_i,)) of each hidden layer, h_0 = n_x.
-    :param output: (n_z - n_x, h) with `identity`, else (n_z, h): weights of the last layer.
-    :param identity: whether z starts with the state.
-    :param activation: of every hidden layer, a name in ``ACTIVATIONS``.
     :raises ValueError: naming the array that does not fit and both shapes, or the activations.
     """
 
+    #: (weight (h_i, h_{i-1}), bias (h_i,)) of each hidden layer, h_0 = n_x
     hidden: tuple[tuple[Array, Array], ...]
-    output: Array
-    identity: bool
-    activation: str = 'tanh'
+    output: Array  #: (n_z - n_x, h) with `identity`, else (n_z, h): weights of the last layer
+    identity: bool  #: whether z starts with the state
+    activation: str = 'tanh'  #: of every hidden layer, a name in ``ACTIVATIONS``
 
     def __post_init__(self) -> None:
         activation_named(self.activation)

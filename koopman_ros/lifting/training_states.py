@@ -22,13 +22,12 @@ class TrainingStates:
 
     A box around the data of several states holds corners where no data are.
 
-    :param states: (M, n_x) in scaled deviations, M from 1 to 256.
-    :param fill_distance: largest distance of any training state from the nearest of these, in
-        half widths of the training box.
     :raises ValueError: naming what does not fit.
     """
 
-    states: Array
+    states: Array  #: (M, n_x) in scaled deviations, M from 1 to 256
+    #: largest distance of any training state from the nearest of these, in half widths of the
+    #: training box
     fill_distance: float
 
     def __post_init__(self) -> None:

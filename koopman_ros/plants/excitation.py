@@ -28,27 +28,20 @@ class RandomStepDesign:
     """
     Steps of random height and length, and the box of states they may not leave.
 
-    :param input_lower: lowest input, a scalar or (n_u,), in input units.
-    :param input_upper: highest input, likewise; levels are uniform between the two.
-    :param state_lower: lower corner of the box, a scalar or (n_x,), in state units.
-    :param state_upper: upper corner of the box, likewise.
-    :param hold_time: how long each level is held, in time units: a number, or a shortest and a
-        longest between which whole sample periods are equally likely.
-    :param sample_period: time between samples, in time units.
-    :param max_redraws: how many other levels are tried for a step that would leave the box.
-    :param rtol: relative tolerance of the simulation, as in `IntegratorSettings`.
     :raises ValueError: when a time is not above 0, or no whole number of sample periods fits
         `hold_time`.
     """
 
-    input_lower: ArrayLike
-    input_upper: ArrayLike
-    state_lower: ArrayLike
-    state_upper: ArrayLike
+    input_lower: ArrayLike  #: lowest input, a scalar or (n_u,), in input units
+    input_upper: ArrayLike  #: highest input, likewise; levels are uniform between the two
+    state_lower: ArrayLike  #: lower corner of the box, a scalar or (n_x,), in state units
+    state_upper: ArrayLike  #: upper corner of the box, likewise
+    #: how long each level is held, in time units: a number, or a shortest and a longest between
+    #: which whole sample periods are equally likely
     hold_time: float | tuple[float, float]
-    sample_period: float
-    max_redraws: int = 100
-    rtol: float = 1e-10
+    sample_period: float  #: time between samples, in time units
+    max_redraws: int = 100  #: how many other levels are tried for a step that would leave the box
+    rtol: float = 1e-10  #: relative tolerance of the simulation, as in `IntegratorSettings`
 
     def __post_init__(self) -> None:
         if not 0.0 < self.sample_period < math.inf:

@@ -66,17 +66,16 @@ class IntegratorSettings:
     """
     Tolerances and state bounds of an integration.
 
-    :param rtol: relative tolerance of each integration step, in [2.3e-14, 1e-9].
-    :param atol: absolute tolerance of each, a scalar or (n_x,), in state units and above 0; `rtol`
-        times the magnitude of each nominal state when None.
-    :param lower: lowest states allowed, a scalar or (n_x,); the system's own when None.
-    :param upper: highest states allowed, a scalar or (n_x,); the system's own when None.
     :raises ValueError: when `rtol` is outside its range.
     """
 
-    rtol: float = 1e-10
+    rtol: float = 1e-10  #: relative tolerance of each integration step, in [2.3e-14, 1e-9]
+    #: absolute tolerance of each, a scalar or (n_x,), in state units and above 0; `rtol` times the
+    #: magnitude of each nominal state when None
     atol: ArrayLike | None = None
+    #: lowest states allowed, a scalar or (n_x,); the system's own when None
     lower: ArrayLike | None = None
+    #: highest states allowed, a scalar or (n_x,); the system's own when None
     upper: ArrayLike | None = None
 
     def __post_init__(self) -> None:

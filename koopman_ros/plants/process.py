@@ -19,41 +19,25 @@ _SETTLED = 40.0
 
 @dataclass(frozen=True)
 class Actuator:
-    """
-    How an input follows its command; by default it is the command.
+    """How an input follows its command; by default it is the command."""
 
-    :param lower: lowest value that each input reaches, in input units.
-    :param upper: highest such value.
-    :param delay: how long after it was given a command takes effect, in s.
-    :param lag: time constant with which the input then follows, in s.
-    """
-
-    lower: float = -np.inf
-    upper: float = np.inf
-    delay: float = 0.0
-    lag: float = 0.0
+    lower: float = -np.inf  #: lowest value that each input reaches, in input units
+    upper: float = np.inf  #: highest such value
+    delay: float = 0.0  #: how long after it was given a command takes effect, in s
+    lag: float = 0.0  #: time constant with which the input then follows, in s
 
 
 @dataclass(frozen=True, eq=False)
 class Process:
-    """
-    A running plant: its equations, present time and state, and its input.
+    """A running plant: its equations, present time and state, and its input."""
 
-    :param system: the plant.
-    :param time_ns: present time, in integer nanoseconds so that instants repeat exactly.
-    :param x: present state (n_x,).
-    :param u: input (n_u,) that acts, up to the present time.
-    :param actuator: between commands and input.
-    :param command: what the input follows (n_u,); None for what it is.
-    :param pending: commands that take effect later, by rising time: (time in ns, command (n_u,)).
-    """
-
-    system: ControlAffineSystem
-    time_ns: int
-    x: FloatArray
-    u: FloatArray
-    actuator: Actuator = Actuator()
-    command: FloatArray | None = None
+    system: ControlAffineSystem  #: the plant
+    time_ns: int  #: present time, in integer nanoseconds so that instants repeat exactly
+    x: FloatArray  #: present state (n_x,)
+    u: FloatArray  #: input (n_u,) that acts, up to the present time
+    actuator: Actuator = Actuator()  #: between commands and input
+    command: FloatArray | None = None  #: what the input follows (n_u,); None for what it is
+    #: commands that take effect later, by rising time: (time in ns, command (n_u,))
     pending: tuple[tuple[int, FloatArray], ...] = ()
 
     @property

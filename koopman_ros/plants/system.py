@@ -28,32 +28,25 @@ class ControlAffineSystem:
     """
     A plant dx/dt = f(x) + B u (paper, eq. 22), with names, units and a nominal point.
 
-    :param name: what the plant is called in messages.
-    :param state_names: n_x names; their units, one each, in `state_units`.
-    :param input_names: n_u names (n_u may be 0); their units, one each, in `input_units`.
-    :param time_unit: 'min' or 's', the unit of every duration and of the rates.
-    :param drift: f, states (..., n_x) to rates (..., n_x).
-    :param drift_jacobian: df/dx, states (..., n_x) to (..., n_x, n_x).
-    :param B: input matrix (n_x, n_u).
-    :param nominal_state: the point (n_x,) that deviations are measured from.
-    :param nominal_input: the input (n_u,) that goes with it.
-    :param state_lower: lowest states (n_x,) at which the model means anything; none by default.
-    :param state_upper: highest such states (n_x,); none by default.
     :raises ValueError: when a shape, a unit or a bound does not fit, naming it.
     """
 
-    name: str
-    state_names: tuple[str, ...]
+    name: str  #: what the plant is called in messages
+    state_names: tuple[str, ...]  #: n_x names; their units, one each, in `state_units`
     state_units: tuple[str, ...]
+    #: n_u names (n_u may be 0); their units, one each, in `input_units`
     input_names: tuple[str, ...]
     input_units: tuple[str, ...]
-    time_unit: str
-    drift: ArrayFunction = field(repr=False)
+    time_unit: str  #: 'min' or 's', the unit of every duration and of the rates
+    drift: ArrayFunction = field(repr=False)  #: f, states (..., n_x) to rates (..., n_x)
+    #: df/dx, states (..., n_x) to (..., n_x, n_x)
     drift_jacobian: ArrayFunction = field(repr=False)
-    B: FloatArray
-    nominal_state: FloatArray
-    nominal_input: FloatArray
+    B: FloatArray  #: input matrix (n_x, n_u)
+    nominal_state: FloatArray  #: the point (n_x,) that deviations are measured from
+    nominal_input: FloatArray  #: the input (n_u,) that goes with it
+    #: lowest states (n_x,) at which the model means anything; none by default
     state_lower: FloatArray = field(default_factory=lambda: np.array(-np.inf))
+    #: highest such states (n_x,); none by default
     state_upper: FloatArray = field(default_factory=lambda: np.array(np.inf))
 
     def __post_init__(self) -> None:

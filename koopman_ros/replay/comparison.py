@@ -22,18 +22,13 @@ _CELSIUS = conversion('K', 'degC')
 
 @dataclass(frozen=True)
 class Comparison:
-    """
-    How commands differ from the recorded ones.
+    """How commands differ from the recorded ones."""
 
-    :param difference: (n, n_u) command minus recorded command in input units; NaN where there is
-        none to be compared.
-    :param identical: number of commands that are bit-identical.
-    :param tolerance: in input units.
-    """
-
+    #: (n, n_u) command minus recorded command in input units; NaN where there is none to be
+    #: compared
     difference: Array
-    identical: int
-    tolerance: float
+    identical: int  #: number of commands that are bit-identical
+    tolerance: float  #: in input units
 
     @property
     def compared(self) -> int:
@@ -55,24 +50,16 @@ class Comparison:
 
 @dataclass(frozen=True)
 class ReplayedBag:
-    """
-    A bag with what was made of it.
+    """A bag with what was made of it."""
 
-    :param path: of the bag.
-    :param complete: whether its recorder closed it.
-    :param found: what came of the replay.
-    :param published: commands on their topic by stamp and value, as :func:`command_counts` has
-        them; empty where the bag has none.
-    :param tolerance: difference in input units from which on a command is counted.
-    :param new_range: of the new model's training, or None without one.
-    """
-
-    path: str
-    complete: bool
-    found: Replay
+    path: str  #: of the bag
+    complete: bool  #: whether its recorder closed it
+    found: Replay  #: what came of the replay
+    #: commands on their topic by stamp and value, as :func:`command_counts` has them; empty where
+    #: the bag has none
     published: Counter[tuple[int, bytes]]
-    tolerance: float
-    new_range: Coordinates | None = None
+    tolerance: float  #: difference in input units from which on a command is counted
+    new_range: Coordinates | None = None  #: of the new model's training, or None without one
 
     @cached_property
     def stamps_ns(self) -> NDArray[np.int64]:

@@ -31,76 +31,50 @@ MakeSettings: TypeAlias = Callable[[Mapping[str, Any]], Settings]
 
 @dataclass(frozen=True)
 class Alternative:
-    """
-    Another model, whose commands are compared with the recorded ones.
+    """Another model, whose commands are compared with the recorded ones."""
 
-    :param model: the model.
-    :param digest: SHA-256 of its file.
-    :param parameters: that replace recorded ones, by name.
-    """
-
-    model: LiftedModel
-    digest: str
+    model: LiftedModel  #: the model
+    digest: str  #: SHA-256 of its file
+    #: that replace recorded ones, by name
     parameters: Mapping[str, Any] = field(default_factory=dict)
 
 
 @dataclass(frozen=True)
 class Sample:
-    """
-    A command: recorded, replayed, and that of the alternative; all in the model's units.
+    """A command: recorded, replayed, and that of the alternative; all in the model's units."""
 
-    :param stamp_ns: of the measurement that it answers, or of the silence.
-    :param measured: (n_y,) or None in silence.
-    :param setpoint: (n_x,) that was tracked according to the replay, or None.
-    :param recorded: (n_u,) what was commanded.
-    :param replayed: (n_u,) the same by the replay; None where it knows no state, before the first
-        snapshot and behind a lost record.
-    :param alternative: (n_u,) what the alternative commands, or None.
-    """
-
-    stamp_ns: int
-    measured: Array | None
-    setpoint: Array | None
-    recorded: Array
+    stamp_ns: int  #: of the measurement that it answers, or of the silence
+    measured: Array | None  #: (n_y,) or None in silence
+    setpoint: Array | None  #: (n_x,) that was tracked according to the replay, or None
+    recorded: Array  #: (n_u,) what was commanded
+    #: (n_u,) the same by the replay; None where it knows no state, before the first snapshot and
+    #: behind a lost record
     replayed: Array | None
-    alternative: Array | None
+    alternative: Array | None  #: (n_u,) what the alternative commands, or None
 
 
 @dataclass(frozen=True)
 class Lost:
-    """
-    Records that are missing.
+    """Records that are missing."""
 
-    :param run: of the controller.
-    :param first: number of the first one.
-    :param last: number of the last one.
-    """
-
-    run: str
-    first: int
-    last: int
+    run: str  #: of the controller
+    first: int  #: number of the first one
+    last: int  #: number of the last one
 
 
 @dataclass
 class Replay:
-    """
-    What came of a replay.
+    """What came of a replay."""
 
-    :param samples: one for each command, in the order of the records.
-    :param lost: records that are missing.
-    :param runs: how often the controller was started, as far as it shows.
-    :param begins_late: runs whose first records are missing.
-    :param refused: requests that were refused.
-    :param models: names of those in force, in the order of their use.
-    :param controller: the last one in force, or None where no state was found.
-    """
-
+    #: one for each command, in the order of the records
     samples: list[Sample] = field(default_factory=list)
-    lost: list[Lost] = field(default_factory=list)
-    runs: int = 0
-    begins_late: int = 0
-    refused: int = 0
+    lost: list[Lost] = field(default_factory=list)  #: records that are missing
+    runs: int = 0  #: how often the controller was started, as far as it shows
+    begins_late: int = 0  #: runs whose first records are missing
+    refused: int = 0  #: requests that were refused
+    #: names of those in force, in the order of their use
     models: list[str] = field(default_factory=list)
+    #: the last one in force, or None where no state was found
     controller: Controller | None = None
 
 

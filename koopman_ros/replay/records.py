@@ -51,19 +51,12 @@ class RecordError(ValueError):
 
 @dataclass(frozen=True)
 class Record:
-    """
-    One record.
+    """One record."""
 
-    :param run: of the controller, another one each time it is started.
-    :param number: counts within a run, from 0 without a gap.
-    :param event: name of the event.
-    :param fields: what else is written.
-    """
-
-    run: str
-    number: int
-    event: str
-    fields: Mapping[str, Any]
+    run: str  #: of the controller, another one each time it is started
+    number: int  #: counts within a run, from 0 without a gap
+    event: str  #: name of the event
+    fields: Mapping[str, Any]  #: what else is written
 
     def text(self) -> str:
         """Return the record as a line of JSON."""

@@ -16,15 +16,10 @@ from koopman_ros.reports.machine import headline
 
 @dataclass(frozen=True)
 class Picture:
-    """
-    A picture of a page.
+    """A picture of a page."""
 
-    :param file: its name, in the folder of the page.
-    :param caption: what it shows, with its numbers.
-    """
-
-    file: str
-    caption: str
+    file: str  #: its name, in the folder of the page
+    caption: str  #: what it shows, with its numbers
 
     def __str__(self) -> str:
         """Return the picture with its caption, in Markdown."""

@@ -9,8 +9,6 @@ Each line holds either ``progress`` (share done) with ``text``, or at last ``sum
 closed, so that it does not outlive the process that started it.
 """
 
-from __future__ import annotations
-
 import json
 import os
 import signal

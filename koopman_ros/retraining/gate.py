@@ -36,16 +36,12 @@ _NOTICEABLE = 1e-3
 
 @dataclass(frozen=True)
 class Thresholds:
-    """
-    Thresholds that a lift has to reach.
+    """Thresholds that a lift has to reach."""
 
-    :param margin: by this share its held-out error must be smaller than those of the present
-        lift and of the best linear model.
-    :param condition: largest condition number of E[z z'].
-    """
-
+    #: by this share its held-out error must be smaller than those of the present lift and of the
+    #: best linear model
     margin: float = 0.1
-    condition: float = 1e4
+    condition: float = 1e4  #: largest condition number of E[z z']
 
     def __post_init__(self) -> None:
         if not 0.0 <= self.margin < 1.0:
@@ -56,29 +52,17 @@ class Thresholds:
 
 @dataclass(frozen=True)
 class Decision:
-    """
-    Acceptance or refusal of a lift, with its figures on held-out segments.
+    """Acceptance or refusal of a lift, with its figures on held-out segments."""
 
-    :param reasons: why it is refused; empty when it is accepted.
-    :param warnings: for the user, in either case.
-    :param rmse: (n_x,) error of its predictions of the measurements, in state units.
-    :param drift_rmse: (n_x,) the same of the drift that it was learned from.
-    :param current_rmse: (n_x,) the same of the present lift.
-    :param linear_rmse: (n_x,) the same of the best linear model.
-    :param noise: (n_x,) standard deviation of the measurements from sample to sample.
-    :param loops: number of closed loops on the estimated drift that were tried.
-    :param arrived: number of those that reached their set-point.
-    """
-
-    reasons: tuple[str, ...]
-    warnings: tuple[str, ...]
-    rmse: Array
-    drift_rmse: Array
-    current_rmse: Array
-    linear_rmse: Array
-    noise: Array
-    loops: int
-    arrived: int
+    reasons: tuple[str, ...]  #: why it is refused; empty when it is accepted
+    warnings: tuple[str, ...]  #: for the user, in either case
+    rmse: Array  #: (n_x,) error of its predictions of the measurements, in state units
+    drift_rmse: Array  #: (n_x,) the same of the drift that it was learned from
+    current_rmse: Array  #: (n_x,) the same of the present lift
+    linear_rmse: Array  #: (n_x,) the same of the best linear model
+    noise: Array  #: (n_x,) standard deviation of the measurements from sample to sample
+    loops: int  #: number of closed loops on the estimated drift that were tried
+    arrived: int  #: number of those that reached their set-point
 
     @property
     def accepted(self) -> bool:

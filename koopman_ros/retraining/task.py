@@ -34,35 +34,20 @@ OnProgress = Callable[[float, str], bool]
 
 @dataclass(frozen=True)
 class Task:
-    """
-    Input files, output file and settings of a retraining.
+    """Input files, output file and settings of a retraining."""
 
-    :param bags: files or folders.
-    :param output: model file to write, ending in ``.safetensors``.
-    :param model: file of the present lift.
-    :param temperature_topic: absolute name of the measurements.
-    :param coolant_topic: absolute name of the coolant temperature that acts.
-    :param coordinates: n_z of the new lift.
-    :param seed: of the split and of the training.
-    :param starts: of each round of the training.
-    :param input_gain: B in 1/min where it is known, 0 to learn it.
-    :param input_delay: dead time of the actuator, in s.
-    :param margin: see :class:`Thresholds`.
-    :param condition: likewise.
-    """
-
-    bags: tuple[str, ...]
-    output: str
-    model: str
-    temperature_topic: str = '/temperature'
-    coolant_topic: str = '/coolant_setpoint'
-    coordinates: int = 3
-    seed: int = 0
-    starts: int = 3
-    input_gain: float = 0.0
-    input_delay: float = 0.0
-    margin: float = 0.1
-    condition: float = 1e4
+    bags: tuple[str, ...]  #: files or folders
+    output: str  #: model file to write, ending in ``.safetensors``
+    model: str  #: file of the present lift
+    temperature_topic: str = '/temperature'  #: absolute name of the measurements
+    coolant_topic: str = '/coolant_setpoint'  #: absolute name of the coolant temperature that acts
+    coordinates: int = 3  #: n_z of the new lift
+    seed: int = 0  #: of the split and of the training
+    starts: int = 3  #: of each round of the training
+    input_gain: float = 0.0  #: B in 1/min where it is known, 0 to learn it
+    input_delay: float = 0.0  #: dead time of the actuator, in s
+    margin: float = 0.1  #: see :class:`Thresholds`
+    condition: float = 1e4  #: likewise
 
     @classmethod
     def from_json(cls, text: str) -> Task:
@@ -73,29 +58,17 @@ class Task:
 
 @dataclass(frozen=True)
 class Retrained:
-    """
-    Result of a retraining.
+    """Result of a retraining."""
 
-    :param task: the task.
-    :param account: counts of used and dropped measurements.
-    :param found: the estimated drift.
-    :param trained: the lift, None when there is none worth judging.
-    :param decision: its figures, None without a lift.
-    :param reasons: why it was refused; empty when it was accepted.
-    :param coverage: share of the cells of the state-input box that the episodes visit.
-    :param present: the lift that was in use; its time unit is that of the drift.
-    :param model_file: where the lift was written, or an empty string.
-    """
-
-    task: Task
-    account: Account
-    found: Identified
-    trained: Trained | None
-    decision: Decision | None
-    reasons: tuple[str, ...]
-    coverage: float
-    present: LiftedModel
-    model_file: str = field(default='')
+    task: Task  #: the task
+    account: Account  #: counts of used and dropped measurements
+    found: Identified  #: the estimated drift
+    trained: Trained | None  #: the lift, None when there is none worth judging
+    decision: Decision | None  #: its figures, None without a lift
+    reasons: tuple[str, ...]  #: why it was refused; empty when it was accepted
+    coverage: float  #: share of the cells of the state-input box that the episodes visit
+    present: LiftedModel  #: the lift that was in use; its time unit is that of the drift
+    model_file: str = field(default='')  #: where the lift was written, or an empty string
 
     @property
     def accepted(self) -> bool:

@@ -32,21 +32,13 @@ class RiccatiStatus(Enum):
 
 @dataclass(frozen=True)
 class RiccatiSolution:
-    """
-    Solution of A'P + PA - P B R^-1 B' P + Q = 0 with the gain K = R^-1 B' P.
+    """Solution of A'P + PA - P B R^-1 B' P + Q = 0 with the gain K = R^-1 B' P."""
 
-    :param P: (n, n) symmetric; zeros when there is no stable subspace to take it from.
-    :param K: (m, n); zeros likewise.
-    :param residual: Frobenius norm of the equation's left side over the sum of its terms' norms.
-    :param gain: spectral norm of K.
-    :param status: whether K may be used.
-    """
-
-    P: Array
-    K: Array
-    residual: float
-    gain: float
-    status: RiccatiStatus
+    P: Array  #: (n, n) symmetric; zeros when there is no stable subspace to take it from
+    K: Array  #: (m, n); zeros likewise
+    residual: float  #: Frobenius norm of the equation's left side over the sum of its terms' norms
+    gain: float  #: spectral norm of K
+    status: RiccatiStatus  #: whether K may be used
 
 
 def _in_left_half_plane(real: float, imaginary: float) -> bool:

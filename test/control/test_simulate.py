@@ -70,23 +70,15 @@ def exact(system: ControlAffineSystem) -> LiftedModel:
 
 @dataclass(frozen=True)
 class Case:
-    """
-    A model on its plant.
-
-    :param start: (n,) of the plant.
-    :param goal: (n,) of the set-point.
-    :param held: (n_u,) input that holds it, by other means.
-    :param seconds: between samples; sixty of them are simulated.
-    :param bounds: of each input.
-    """
+    """A model on its plant."""
 
     model: LiftedModel
     plant: ControlAffineSystem
-    start: np.ndarray
-    goal: np.ndarray
-    held: np.ndarray
-    seconds: float
-    bounds: tuple[float, float]
+    start: np.ndarray  #: (n,) of the plant
+    goal: np.ndarray  #: (n,) of the set-point
+    held: np.ndarray  #: (n_u,) input that holds it, by other means
+    seconds: float  #: between samples; sixty of them are simulated
+    bounds: tuple[float, float]  #: of each input
 
 
 PAIR = random_pair()

@@ -51,23 +51,14 @@ for module in pkgutil.walk_packages(koopman_ros.__path__, 'koopman_ros.'):
 
 @dataclass(frozen=True)
 class Installation:
-    """
-    Where the package was installed.
+    """Where the package was installed."""
 
-    :param executables: folder of the nodes.
-    :param share: folder of manifest and configuration.
-    :param package: folder of the package.
-    :param before: what a shell does before it starts a process.
-    :param python: the interpreter.
-    :param notes: names the files of the repository that its processes opened.
-    """
-
-    executables: Path
-    share: Path
-    package: Path
-    before: str
-    python: Path
-    notes: Path
+    executables: Path  #: folder of the nodes
+    share: Path  #: folder of manifest and configuration
+    package: Path  #: folder of the package
+    before: str  #: what a shell does before it starts a process
+    python: Path  #: the interpreter
+    notes: Path  #: names the files of the repository that its processes opened
 
     def opened(self) -> str:
         """Return the files of the repository that were opened so far, a line each."""

@@ -325,15 +325,10 @@ model_reload.load_suitable = slowly
 
 @dataclass
 class SlowDisk:
-    """
-    Model files that are on a disk which does not answer until it is told to.
+    """Model files that are on a disk which does not answer until it is told to."""
 
-    :param ros: where the controller runs.
-    :param folder: for the files.
-    """
-
-    ros: Harness
-    folder: Path
+    ros: Harness  #: where the controller runs
+    folder: Path  #: for the files
 
     def start_controller(self, changes: str = '') -> Path:
         """Start a controller whose model, not slow yet, is returned."""

@@ -34,17 +34,12 @@ def methods(*windows: int) -> dict[str, Method]:
 
 @dataclass(frozen=True)
 class KnownPlant:
-    """
-    dx/dt = f(x) + B u, f a polynomial.
+    """dx/dt = f(x) + B u, f a polynomial."""
 
-    :param terms: (m, n_x + 1) exponents of the states in each term, then the row that it is in.
-    :param coefficients: (m,) of the terms.
-    :param B: (n_x, n_u).
-    """
-
+    #: (m, n_x + 1) exponents of the states in each term, then the row that it is in
     terms: tuple[tuple[int, ...], ...]
-    coefficients: tuple[float, ...]
-    B: np.ndarray
+    coefficients: tuple[float, ...]  #: (m,) of the terms
+    B: np.ndarray  #: (n_x, n_u)
 
     @property
     def plant(self) -> Plant:

@@ -24,18 +24,12 @@ class Extent(Enum):
 
 @dataclass(frozen=True)
 class Options:
-    """
-    What a part is called with.
+    """What a part is called with."""
 
-    :param output: folder for pictures.
-    :param extent: how much is measured.
-    :param limit: time limit of one solver in one case, s; None for that of the extent.
-    :param save: takes the figures so far, so that an interrupt keeps them.
-    """
-
-    output: Path
-    extent: Extent
-    limit: float | None
+    output: Path  #: folder for pictures
+    extent: Extent  #: how much is measured
+    limit: float | None  #: time limit of one solver in one case, s; None for that of the extent
+    #: takes the figures so far, so that an interrupt keeps them
     save: Callable[[dict[str, Any]], None]
 
 

@@ -21,34 +21,22 @@ LIMIT = 300.0  # s of wall time for a case, on a machine that is busy otherwise
 
 @dataclass(frozen=True)
 class Case:
-    """
-    A fault, and what the loop is to make of it.
+    """A fault, and what the loop is to make of it."""
 
-    :param name: by which it is called on the command line.
-    :param group: heading in the report.
-    :param does: what is done, for the report.
-    :param play: does it: waits, begins, puts the fault in, ends it. The runner has let the loop
-        settle before, and lets it recover afterwards.
-    :param bounds: what the loop must keep to.
-    :param between: whether messages are altered.
-    :param plant: parameters on top of lock-step at full speed.
-    :param controller: parameters.
-    :param setpoint: degC, requested at the start.
-    :param settle: plant time before the case is played, s.
-    :param afterwards: plant time that the loop runs on after the fault, s.
-    """
-
-    name: str
-    group: str
-    does: str
+    name: str  #: by which it is called on the command line
+    group: str  #: heading in the report
+    does: str  #: what is done, for the report
+    #: does it: waits, begins, puts the fault in, ends it. The runner has let the loop settle
+    #: before, and lets it recover afterwards
     play: Callable[[FaultHarness], None]
-    bounds: Bounds = field(default_factory=Bounds)
-    between: bool = False
+    bounds: Bounds = field(default_factory=Bounds)  #: what the loop must keep to
+    between: bool = False  #: whether messages are altered
+    #: parameters on top of lock-step at full speed
     plant: Mapping[str, object] = field(default_factory=lambda: LOCKSTEP)
-    controller: Mapping[str, object] = field(default_factory=dict)
-    setpoint: float = SETPOINT
-    settle: float = SETTLED
-    afterwards: float = 360.0
+    controller: Mapping[str, object] = field(default_factory=dict)  #: parameters
+    setpoint: float = SETPOINT  #: degC, requested at the start
+    settle: float = SETTLED  #: plant time before the case is played, s
+    afterwards: float = 360.0  #: plant time that the loop runs on after the fault, s
 
 
 _OF_BOUNDS = frozenset(item.name for item in fields(Bounds))
@@ -64,21 +52,14 @@ def case(group: str, name: str, does: str, play: Callable[[FaultHarness], None],
 
 @dataclass(frozen=True)
 class Outcome:
-    """
-    What became of a case.
+    """What became of a case."""
 
-    :param case: the case.
-    :param trace: what happened.
-    :param verdict: what is held against it, and its figures; None where it could not be tried.
-    :param skipped: why it could not be tried here.
-    :param wall: what it took, s.
-    """
-
-    case: Case
-    trace: Trace
+    case: Case  #: the case
+    trace: Trace  #: what happened
+    #: what is held against it, and its figures; None where it could not be tried
     verdict: Verdict | None
-    skipped: str
-    wall: float
+    skipped: str  #: why it could not be tried here
+    wall: float  #: what it took, s
 
     @property
     def survived(self) -> bool:

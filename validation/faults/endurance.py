@@ -34,15 +34,10 @@ _MEGABYTE = 1e6
 
 @dataclass(frozen=True)
 class Memory:
-    """
-    The resident memory of a process over the run.
+    """The resident memory of a process over the run."""
 
-    :param seconds: (N,) plant time.
-    :param megabytes: (N,) resident.
-    """
-
-    seconds: Array
-    megabytes: Array
+    seconds: Array  #: (N,) plant time
+    megabytes: Array  #: (N,) resident
 
     @property
     def growth(self) -> float:
@@ -58,29 +53,17 @@ class Memory:
 
 @dataclass(frozen=True)
 class Endurance:
-    """
-    What an endurance run found.
+    """What an endurance run found."""
 
-    :param reasons: what is held against it, in sentences.
-    :param hours: of plant time.
-    :param wall: what it took, s.
-    :param answers: how measurements were answered.
-    :param events: how often each happened.
-    :param memory: by process.
-    :param recorded: messages in the bag by topic.
-    :param hottest: the highest true temperature, degC.
-    :param mean_error: mean |T - set-point| in K.
-    """
-
-    reasons: tuple[str, ...]
-    hours: float
-    wall: float
-    answers: Responses
-    events: dict[str, int]
-    memory: dict[str, Memory]
-    recorded: dict[str, int]
-    hottest: float
-    mean_error: float
+    reasons: tuple[str, ...]  #: what is held against it, in sentences
+    hours: float  #: of plant time
+    wall: float  #: what it took, s
+    answers: Responses  #: how measurements were answered
+    events: dict[str, int]  #: how often each happened
+    memory: dict[str, Memory]  #: by process
+    recorded: dict[str, int]  #: messages in the bag by topic
+    hottest: float  #: the highest true temperature, degC
+    mean_error: float  #: mean |T - set-point| in K
 
 
 def run_endurance(folder: Path, check: Callable[[], None], hours: float = HOURS,

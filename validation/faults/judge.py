@@ -25,55 +25,39 @@ BAND = 0.3  # K around the set-point that counts as back
 
 @dataclass(frozen=True)
 class Bounds:
-    """
-    What a case must keep to.
+    """What a case must keep to."""
 
-    :param coolant_min: lowest command, degC.
-    :param coolant_max: highest command, degC.
-    :param largest_step: between two commands, K; by default what the rate limit allows between
-        two samples. After a gap it allows twice that.
-    :param recovery: plant time from the end of the fault within which the reactor must be back, s.
-    :param bump: largest step from the fault on, K, where nothing calls for any.
-    :param band: distance from the set-point that counts as back, K; infinity where none is asked.
-    :param offset: largest distance from the set-point in the last seconds, K.
-    :param worst: largest distance from the set-point from the fault on, K.
-    :param says: regular expressions that diagnostics (``<node>: <task>: <sentence>``) must have
-        matched from the beginning of the fault on.
-    :param codes: of reasons that the controller's records must have given since then.
-    :param allowed_errors: statuses (``<node>: <task>``) that may end in ERROR.
-    """
-
-    coolant_min: float = ControllerParameters.coolant_min
-    coolant_max: float = ControllerParameters.coolant_max
+    coolant_min: float = ControllerParameters.coolant_min  #: lowest command, degC
+    coolant_max: float = ControllerParameters.coolant_max  #: highest command, degC
+    #: between two commands, K; by default what the rate limit allows between two samples. After a
+    #: gap it allows twice that
     largest_step: float = 1.0
+    #: plant time from the end of the fault within which the reactor must be back, s
     recovery: float = 300.0
-    bump: float = math.inf
+    bump: float = math.inf  #: largest step from the fault on, K, where nothing calls for any
+    #: distance from the set-point that counts as back, K; infinity where none is asked
     band: float = BAND
-    offset: float = math.inf
-    worst: float = math.inf
+    offset: float = math.inf  #: largest distance from the set-point in the last seconds, K
+    worst: float = math.inf  #: largest distance from the set-point from the fault on, K
+    #: regular expressions that diagnostics (``<node>: <task>: <sentence>``) must have matched from
+    #: the beginning of the fault on
     says: tuple[str, ...] = ()
+    #: of reasons that the controller's records must have given since then
     codes: tuple[Code, ...] = ()
-    allowed_errors: tuple[str, ...] = ()
+    allowed_errors: tuple[str, ...] = ()  #: statuses (``<node>: <task>``) that may end in ERROR
 
 
 @dataclass(frozen=True)
 class Verdict:
-    """
-    What became of a case.
+    """What became of a case."""
 
-    :param reasons: why it was not survived, in sentences; empty when it was.
-    :param worst_error: largest |T - set-point| from the fault on, K; NaN when nothing was seen.
-    :param worst_step: largest step between two commands from the fault on, K.
-    :param recovery: plant time from the end of the fault until the temperature stays within the
-        band, s; infinity when it never does.
-    :param offset: largest |T - set-point| in the last seconds, K.
-    """
-
-    reasons: tuple[str, ...]
-    worst_error: float
-    worst_step: float
+    reasons: tuple[str, ...]  #: why it was not survived, in sentences; empty when it was
+    worst_error: float  #: largest |T - set-point| from the fault on, K; NaN when nothing was seen
+    worst_step: float  #: largest step between two commands from the fault on, K
+    #: plant time from the end of the fault until the temperature stays within the band, s;
+    #: infinity when it never does
     recovery: float
-    offset: float
+    offset: float  #: largest |T - set-point| in the last seconds, K
 
     @property
     def survived(self) -> bool:
@@ -182,23 +166,14 @@ def _replay(trace: Trace, codes: Sequence[Code]) -> list[str]:
 
 @dataclass(frozen=True)
 class Responses:
-    """
-    How the commands answer the measurements that reached the controller, by their stamps.
+    """How the commands answer the measurements that reached the controller, by their stamps."""
 
-    :param measurements: that reached it.
-    :param answered: of these, exactly once.
-    :param unanswered: of these, not at all.
-    :param repeated: answers beyond the first.
-    :param unasked: commands with a stamp that no measurement had.
-    :param out_of_order: answers that came before the answer to an earlier measurement.
-    """
-
-    measurements: int
-    answered: int
-    unanswered: int
-    repeated: int
-    unasked: int
-    out_of_order: int
+    measurements: int  #: that reached it
+    answered: int  #: of these, exactly once
+    unanswered: int  #: of these, not at all
+    repeated: int  #: answers beyond the first
+    unasked: int  #: commands with a stamp that no measurement had
+    out_of_order: int  #: answers that came before the answer to an earlier measurement
 
     @property
     def complete(self) -> bool:

@@ -38,20 +38,15 @@ SENSOR_EXPERIMENTS: dict[str, Callable[[int], tuple[Metrics, Models]]] = {
 
 @dataclass
 class Campaign:
-    """
-    What has been computed so far.
+    """What has been computed so far."""
 
-    :param metrics: figures by experiment and seed.
-    :param models: learned models by experiment and seed, for the figures.
-    :param errors: one line for each run that failed.
-    :param complete: whether every run was made.
-    :param loops: closed loops of models, by the identity of the model.
-    """
-
+    #: figures by experiment and seed
     metrics: dict[str, dict[int, Metrics]] = field(default_factory=dict)
+    #: learned models by experiment and seed, for the figures
     models: dict[str, dict[int, Mapping[str, LiftedModel]]] = field(default_factory=dict)
-    errors: list[str] = field(default_factory=list)
-    complete: bool = False
+    errors: list[str] = field(default_factory=list)  #: one line for each run that failed
+    complete: bool = False  #: whether every run was made
+    #: closed loops of models, by the identity of the model
     loops: dict[int, ClosedLoop] = field(default_factory=dict)
 
     def summary(self) -> dict[str, Any]:

@@ -85,17 +85,11 @@ def feed_forward_offset(model: LiftedModel) -> float:
 
 @dataclass(frozen=True)
 class Judge:
-    """
-    Fresh episodes to judge models on.
+    """Fresh episodes to judge models on."""
 
-    :param held_out: made like the training episodes.
-    :param inside: longer ones within the range.
-    :param outside: longer ones that leave it.
-    """
-
-    held_out: Samples
-    inside: Samples
-    outside: Samples
+    held_out: Samples  #: made like the training episodes
+    inside: Samples  #: longer ones within the range
+    outside: Samples  #: longer ones that leave it
 
     @staticmethod
     def of(seed: int) -> Judge:

@@ -16,17 +16,11 @@ Values = Sequence[float | bool | None]
 
 @dataclass(frozen=True)
 class Target:
-    """
-    A bound that every seed is held to.
+    """A bound that every seed is held to."""
 
-    :param path: place of the list in the summary.
-    :param bound: largest value allowed.
-    :param offset: subtracted first, 1 for ratios.
-    """
-
-    path: str
-    bound: float
-    offset: float = 0.0
+    path: str  #: place of the list in the summary
+    bound: float  #: largest value allowed
+    offset: float = 0.0  #: subtracted first, 1 for ratios
 
     def met(self, summary: dict[str, Any]) -> tuple[int, int]:
         """Return how many seeds meet it, and of how many."""

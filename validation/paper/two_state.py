@@ -42,17 +42,11 @@ from validation.paper.optimal_control import (
 
 @dataclass(frozen=True)
 class Box:
-    """
-    A training box.
+    """A training box."""
 
-    :param lower: lower corner in (x1, x2).
-    :param upper: upper corner.
-    :param inputs: lowest and highest input of the random steps.
-    """
-
-    lower: tuple[float, float]
-    upper: tuple[float, float]
-    inputs: tuple[float, float]
+    lower: tuple[float, float]  #: lower corner in (x1, x2)
+    upper: tuple[float, float]  #: upper corner
+    inputs: tuple[float, float]  #: lowest and highest input of the random steps
 
 
 START = np.array([5.0, 5.0])

@@ -48,33 +48,19 @@ _MEASURED = {False: '', True: ', measured'}
 
 @dataclass(frozen=True)
 class Case:
-    """
-    A loop that is disturbed or whose set-point steps.
+    """A loop that is disturbed or whose set-point steps."""
 
-    :param name: for the tables.
-    :param system: the plant.
-    :param x0: its state at the start.
-    :param changes: what happens when, in s.
-    :param reference: where the true temperature ought to go, in K.
-    :param since: when the time to get there starts, in s.
-    :param overshoot: whether its deviation counts from the first time that it gets there.
-    :param actuator: between command and plant; perfect when None.
-    :param tells: whether the applied coolant is measured.
-    :param seconds: how long.
-    :param sensor: of the temperature.
-    """
-
-    name: str
-    system: ControlAffineSystem
-    x0: Sequence[float]
-    changes: Sequence[Timed]
-    reference: float
-    since: float = LEAD
-    overshoot: bool = False
-    actuator: Actuator | None = None
-    tells: bool = False
-    seconds: float = SECONDS
-    sensor: Sensor = perfect
+    name: str  #: for the tables
+    system: ControlAffineSystem  #: the plant
+    x0: Sequence[float]  #: its state at the start
+    changes: Sequence[Timed]  #: what happens when, in s
+    reference: float  #: where the true temperature ought to go, in K
+    since: float = LEAD  #: when the time to get there starts, in s
+    overshoot: bool = False  #: whether its deviation counts from the first time that it gets there
+    actuator: Actuator | None = None  #: between command and plant; perfect when None
+    tells: bool = False  #: whether the applied coolant is measured
+    seconds: float = SECONDS  #: how long
+    sensor: Sensor = perfect  #: of the temperature
 
     def run(self, bandwidth: float = BANDWIDTH) -> Simulation:
         """Simulate it with the default controller, from rest."""

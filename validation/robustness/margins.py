@@ -25,19 +25,12 @@ _FREQUENCIES = 1500
 
 @dataclass(frozen=True)
 class Margins:
-    """
-    What the loop bears at the plant's input before it oscillates without end.
+    """What the loop bears at the plant's input before it oscillates without end."""
 
-    :param gain: factor of the gain.
-    :param phase: in degrees.
-    :param delay: additional dead time, in s.
-    :param distance: smallest distance of the Nyquist curve from -1.
-    """
-
-    gain: float
-    phase: float
-    delay: float
-    distance: float
+    gain: float  #: factor of the gain
+    phase: float  #: in degrees
+    delay: float  #: additional dead time, in s
+    distance: float  #: smallest distance of the Nyquist curve from -1
 
 
 def sampled_plant(slope: float, gain: float) -> control.StateSpace:

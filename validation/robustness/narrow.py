@@ -58,19 +58,12 @@ NARROWEST = '[3,6]x[3,8]'
 
 @dataclass(frozen=True)
 class Trial:
-    """
-    What a lift of narrow data is asked for.
+    """What a lift of narrow data is asked for."""
 
-    :param name: for the tables.
-    :param temperature: of the reactor at the start, in K.
-    :param bandwidth: of the observer, in 1/min.
-    :param changes: what happens when, in s.
-    """
-
-    name: str
-    temperature: float
-    bandwidth: float = BANDWIDTH
-    changes: Sequence[Timed] = ()
+    name: str  #: for the tables
+    temperature: float  #: of the reactor at the start, in K
+    bandwidth: float = BANDWIDTH  #: of the observer, in 1/min
+    changes: Sequence[Timed] = ()  #: what happens when, in s
 
 
 TRIALS = (

@@ -30,34 +30,29 @@ _NEAR = 0.03  # share of a margin by which it is missed and passed in simulation
 
 @dataclass
 class Found:
-    """
-    What the study found.
+    """What the study found."""
 
-    :param margins: by (coolant weight, bandwidth in 1/min, set-point in K).
-    :param model_margins: those of the loop on the lift itself, likewise.
-    :param verified: whether the loop at 3 % below and above a margin grows, by what was raised.
-    :param cases: figures by name of the case.
-    :param noise: figures by bandwidth in 1/min.
-    :param grids: ends by start and set-point in K, with and without fallback.
-    :param two_state_grid: ends by temperature in K and concentration in mol/L.
-    :param boundaries: hottest starts by the applied coolant at the start, in K.
-    :param returns: figures of the way back from the safe coolant, by plant and `linear_margin`.
-    :param reactor: courses of the lift of narrow data.
-    :param far: figures after UA -40 % by `linear_margin` and bandwidth in 1/min.
-    :param two_state: those of the two-state example.
-    """
-
+    #: by (coolant weight, bandwidth in 1/min, set-point in K)
     margins: dict[tuple[float, float, float], Margins] = field(default_factory=dict)
+    #: those of the loop on the lift itself, likewise
     model_margins: dict[tuple[float, float, float], Margins] = field(default_factory=dict)
+    #: whether the loop at 3 % below and above a margin grows, by what was raised
     verified: dict[str, tuple[bool, bool]] = field(default_factory=dict)
-    cases: dict[str, Metrics] = field(default_factory=dict)
-    noise: dict[float, Metrics] = field(default_factory=dict)
+    cases: dict[str, Metrics] = field(default_factory=dict)  #: figures by name of the case
+    noise: dict[float, Metrics] = field(default_factory=dict)  #: figures by bandwidth in 1/min
+    #: ends by start and set-point in K, with and without fallback
     grids: dict[bool, dict[tuple[float, float], End]] = field(default_factory=dict)
+    #: ends by temperature in K and concentration in mol/L
     two_state_grid: dict[tuple[float, float], End] = field(default_factory=dict)
+    #: hottest starts by the applied coolant at the start, in K
     boundaries: dict[float, Metrics] = field(default_factory=dict)
+    #: figures of the way back from the safe coolant, by plant and `linear_margin`
     returns: dict[tuple[str, float], Metrics] = field(default_factory=dict)
+    #: courses of the lift of narrow data
     reactor: dict[tuple[str, str], Simulation] = field(default_factory=dict)
+    #: figures after UA -40 % by `linear_margin` and bandwidth in 1/min
     far: dict[tuple[float, float], Metrics] = field(default_factory=dict)
+    #: those of the two-state example
     two_state: dict[tuple[str, str], Simulation] = field(default_factory=dict)
 
     def summary(self) -> dict[str, Any]:

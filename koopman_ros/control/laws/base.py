@@ -17,46 +17,29 @@ from koopman_ros.reasons import Reason
 
 @dataclass(frozen=True)
 class Weights:
-    """
-    Quadratic cost on scaled deviations from the target: e' Q e + v' R v.
+    """Quadratic cost on scaled deviations from the target: e' Q e + v' R v."""
 
-    :param Q: (n_x, n_x) symmetric, positive semidefinite, not zero.
-    :param R: (n_u, n_u) symmetric, positive definite.
-    """
-
-    Q: Array
-    R: Array
+    Q: Array  #: (n_x, n_x) symmetric, positive semidefinite, not zero
+    R: Array  #: (n_u, n_u) symmetric, positive definite
 
 
 @dataclass(frozen=True)
 class Tuning:
-    """
-    What every law is built from, beside its model.
+    """What every law is built from, beside its model."""
 
-    :param weights: the cost.
-    :param max_gain: bound on the spectral norm of a gain in scaled coordinates.
-    :param max_residual: bound on the relative residual of a Riccati equation.
-    """
-
-    weights: Weights
-    max_gain: float = 1e6
-    max_residual: float = 1e-8
+    weights: Weights  #: the cost
+    max_gain: float = 1e6  #: bound on the spectral norm of a gain in scaled coordinates
+    max_residual: float = 1e-8  #: bound on the relative residual of a Riccati equation
 
 
 @dataclass(frozen=True)
 class Figures:
-    """
-    What a law says of its solution; NaN and '' for what it does not have.
+    """What a law says of its solution; NaN and '' for what it does not have."""
 
-    :param form: which form of the law was used, for the operator.
-    :param residual: relative residual of the Riccati equation.
-    :param gain: norm of the gain.
-    :param growth: factor by which the error is predicted to change from a sample to the next.
-    """
-
-    form: str = ''
-    residual: float = math.nan
-    gain: float = math.nan
+    form: str = ''  #: which form of the law was used, for the operator
+    residual: float = math.nan  #: relative residual of the Riccati equation
+    gain: float = math.nan  #: norm of the gain
+    #: factor by which the error is predicted to change from a sample to the next
     growth: float = math.nan
 
 
@@ -65,21 +48,13 @@ NO_FIGURES = Figures()
 
 @dataclass(frozen=True)
 class LawResult:
-    """
-    What a law gives, or why it gives nothing.
+    """What a law gives, or why it gives nothing."""
 
-    :param u: (n_u,) in input units, within the range of the limits; None with a failure.
-    :param failure: why it may not be used; None when it may.
-    :param figures: of the solution, as far as there is one.
-    :param memory: what the law wants to be given at the next sample.
-    :param clipped: whether the range cut it.
-    """
-
-    u: Array | None
-    failure: Reason | None = None
-    figures: Figures = NO_FIGURES
-    memory: object = None
-    clipped: bool = False
+    u: Array | None  #: (n_u,) in input units, within the range of the limits; None with a failure
+    failure: Reason | None = None  #: why it may not be used; None when it may
+    figures: Figures = NO_FIGURES  #: of the solution, as far as there is one
+    memory: object = None  #: what the law wants to be given at the next sample
+    clipped: bool = False  #: whether the range cut it
 
 
 class Law(Protocol):

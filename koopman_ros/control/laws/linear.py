@@ -20,15 +20,10 @@ from koopman_ros.reasons import Code, reason
 
 @dataclass(frozen=True)
 class Linear:
-    """
-    One gain for all states, of the Riccati equation of the linearised model.
+    """One gain for all states, of the Riccati equation of the linearised model."""
 
-    :param lift: that is linearised.
-    :param tuning: weights and bounds.
-    """
-
-    lift: LiftedModel
-    tuning: Tuning
+    lift: LiftedModel  #: that is linearised
+    tuning: Tuning  #: weights and bounds
 
     @property
     def model(self) -> LiftedModel:

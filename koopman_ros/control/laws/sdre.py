@@ -29,21 +29,13 @@ class Form(Enum):
 
 @dataclass(frozen=True)
 class Feedback:
-    """
-    The outcome of one state-dependent Riccati solution.
+    """The outcome of one state-dependent Riccati solution."""
 
-    :param u: (n_u,) u_ref - K e in scaled deviations; not to be used unless solved.
-    :param form: which form produced it.
-    :param riccati: the solution with its residual, gain and status.
-    :param drift: (n_x, n_x) A_x of the error e = x - x_ref, e' = A_x e + B v.
-    :param action: (n_x, n_x) -B K in terms of that error, so that e' = (A_x + action) e.
-    """
-
-    u: Array
-    form: Form
-    riccati: RiccatiSolution
-    drift: Array
-    action: Array
+    u: Array  #: (n_u,) u_ref - K e in scaled deviations; not to be used unless solved
+    form: Form  #: which form produced it
+    riccati: RiccatiSolution  #: the solution with its residual, gain and status
+    drift: Array  #: (n_x, n_x) A_x of the error e = x - x_ref, e' = A_x e + B v
+    action: Array  #: (n_x, n_x) -B K in terms of that error, so that e' = (A_x + action) e
 
     @property
     def solved(self) -> bool:
@@ -154,15 +146,10 @@ def projected(model: LiftedModel, x: Array, target: Target, weights: Weights, *,
 
 @dataclass(frozen=True)
 class StateDependentRiccati:
-    """
-    The law of the paper: the Riccati equation solved with J_N(x) B at each sample.
+    """The law of the paper: the Riccati equation solved with J_N(x) B at each sample."""
 
-    :param model: the lift.
-    :param tuning: weights and bounds.
-    """
-
-    model: LiftedModel
-    tuning: Tuning
+    model: LiftedModel  #: the lift
+    tuning: Tuning  #: weights and bounds
 
     def compute(self, estimate: Estimate, target: Target, limits: InputLimits, memory: object,
                 interval: float, deadline: float = math.inf) -> LawResult:

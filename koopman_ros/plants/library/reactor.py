@@ -37,31 +37,24 @@ class ReactorParameters:
     Source of the values: the CSTR of Seborg, Edgar and Mellichamp, *Process Dynamics and Control*,
     as in Henson and Seborg, *Nonlinear Process Control*; the paper, eq. 36, lists none.
 
-    :param flow_rate: q, feed and product flow, in L/min.
-    :param volume: V, of the liquid, in L.
-    :param density: rho, in g/L.
-    :param heat_capacity: C_p, in J/(g K).
-    :param reaction_enthalpy: Delta H_R, in J/mol, negative for this exothermic reaction.
-    :param activation_temperature: E_A/R, in K.
-    :param pre_exponential_factor: k, in 1/min.
-    :param heat_transfer_coefficient: UA, coefficient times area of the jacket, in J/(min K).
-    :param feed_temperature: T_i, in K.
-    :param feed_concentration: C_Af, in mol/L; the two-state reactor's alone.
-    :param concentration: C_A as the one-state reactor holds it, in mol/L: by default that of the
-        two-state reactor's stable steady state at a coolant of 300 K.
     :raises ValueError: when a value is no number or outside its range.
     """
 
-    flow_rate: float = _constant(100.0, 'L/min', 1.0, 1e4)
-    volume: float = _constant(100.0, 'L', 1.0, 1e5)
-    density: float = _constant(1000.0, 'g/L', 100.0, 1e4)
-    heat_capacity: float = _constant(0.239, 'J/(g K)', 0.01, 100.0)
+    flow_rate: float = _constant(100.0, 'L/min', 1.0, 1e4)  #: q, feed and product flow, in L/min
+    volume: float = _constant(100.0, 'L', 1.0, 1e5)  #: V, of the liquid, in L
+    density: float = _constant(1000.0, 'g/L', 100.0, 1e4)  #: rho, in g/L
+    heat_capacity: float = _constant(0.239, 'J/(g K)', 0.01, 100.0)  #: C_p, in J/(g K)
+    #: Delta H_R, in J/mol, negative for this exothermic reaction
     reaction_enthalpy: float = _constant(-5e4, 'J/mol', -1e6, -1.0)
-    activation_temperature: float = _constant(8750.0, 'K', 2e3, 1e5)
-    pre_exponential_factor: float = _constant(7.2e10, '1/min', 0.0, 1e30)
+    activation_temperature: float = _constant(8750.0, 'K', 2e3, 1e5)  #: E_A/R, in K
+    pre_exponential_factor: float = _constant(7.2e10, '1/min', 0.0, 1e30)  #: k, in 1/min
+    #: UA, coefficient times area of the jacket, in J/(min K)
     heat_transfer_coefficient: float = _constant(5e4, 'J/(min K)', 0.0, 1e7)
-    feed_temperature: float = _constant(350.0, 'K', 250.0, 500.0)
+    feed_temperature: float = _constant(350.0, 'K', 250.0, 500.0)  #: T_i, in K
+    #: C_Af, in mol/L; the two-state reactor's alone
     feed_concentration: float = _constant(1.0, 'mol/L', 0.0, 100.0)
+    #: C_A as the one-state reactor holds it, in mol/L: by default that of the two-state reactor's
+    #: stable steady state at a coolant of 300 K
     concentration: float = _constant(0.87725294608097, 'mol/L', 0.0, 100.0)
 
     def __post_init__(self) -> None:

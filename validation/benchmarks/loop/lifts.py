@@ -26,17 +26,11 @@ _SETPOINTS, _HELD = (0.0, -10.0, -4.0, -8.0), 100
 
 @dataclass(frozen=True)
 class Sample:
-    """
-    One measurement with what a controller has to know at it.
+    """One measurement with what a controller has to know at it."""
 
-    :param measurement: (1,) in K.
-    :param time_ns: its stamp.
-    :param requested: (1,) set-point that was asked for just before, or None.
-    """
-
-    measurement: Array
-    time_ns: int
-    requested: Array | None
+    measurement: Array  #: (1,) in K
+    time_ns: int  #: its stamp
+    requested: Array | None  #: (1,) set-point that was asked for just before, or None
 
 
 def lift(n_z: int) -> LiftedModel:

@@ -33,25 +33,15 @@ MEANING = {
 
 @dataclass(frozen=True)
 class Plan:
-    """
-    One extent of the measurements.
+    """One extent of the measurements."""
 
-    :param coordinates: the n_z of the lifts.
-    :param steps: timed control steps with each lift.
-    :param rounds: of latency, fifty measurements of each side in one.
-    :param rate_seconds: length of a run at one rate.
-    :param lowest_rate: of measurements, Hz.
-    :param starts: of the controller.
-    :param plant_seconds: length of the lock-step loop.
-    """
-
-    coordinates: tuple[int, ...]
-    steps: int
-    rounds: int
-    rate_seconds: float
-    lowest_rate: float
-    starts: int
-    plant_seconds: float
+    coordinates: tuple[int, ...]  #: the n_z of the lifts
+    steps: int  #: timed control steps with each lift
+    rounds: int  #: of latency, fifty measurements of each side in one
+    rate_seconds: float  #: length of a run at one rate
+    lowest_rate: float  #: of measurements, Hz
+    starts: int  #: of the controller
+    plant_seconds: float  #: length of the lock-step loop
 
 
 PLANS = {

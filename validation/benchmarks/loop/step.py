@@ -34,19 +34,12 @@ Taken = tuple[int, int]
 
 @dataclass(frozen=True)
 class Asked:
-    """
-    One call of the naive law.
+    """One call of the naive law."""
 
-    :param measurement: (1,) in K.
-    :param setpoint: (1,) that the controller tracked, in K.
-    :param seconds: since the call before.
-    :param command: (1,) that the controller gave, in K.
-    """
-
-    measurement: Array
-    setpoint: Array
-    seconds: float
-    command: Array
+    measurement: Array  #: (1,) in K
+    setpoint: Array  #: (1,) that the controller tracked, in K
+    seconds: float  #: since the call before
+    command: Array  #: (1,) that the controller gave, in K
 
 
 def measured(coordinates: tuple[int, ...], samples: int) -> dict[str, dict[str, Any]]:

@@ -21,21 +21,13 @@ _STEADY_RATE = 1000.0  # Hz
 
 @dataclass(frozen=True)
 class Plan:
-    """
-    One extent of the measurements.
+    """One extent of the measurements."""
 
-    :param seconds: length of the steady stream.
-    :param rates: of the ladder, Hz.
-    :param ladder_seconds: length of the stream on each step of the ladder.
-    :param messages: in each file written from memory.
-    :param runs: files by each writer.
-    """
-
-    seconds: float
-    rates: tuple[float, ...]
-    ladder_seconds: float
-    messages: int
-    runs: int
+    seconds: float  #: length of the steady stream
+    rates: tuple[float, ...]  #: of the ladder, Hz
+    ladder_seconds: float  #: length of the stream on each step of the ladder
+    messages: int  #: in each file written from memory
+    runs: int  #: files by each writer
 
 
 PLANS = {

@@ -31,18 +31,12 @@ Traces = dict[tuple[str, int, int], dict[str, list[tuple[float, float]]]]
 
 @dataclass
 class _Comparison:
-    """
-    The state of a run.
+    """The state of a run."""
 
-    :param plan: what is measured.
-    :param folder: for the cases' files.
-    :param traces: what each solver had reached when.
-    :param unbuilt: (samples, hidden, reason) of a solver whose graph could not be built.
-    """
-
-    plan: Plan
-    folder: Path
-    traces: Traces = field(default_factory=dict)
+    plan: Plan  #: what is measured
+    folder: Path  #: for the cases' files
+    traces: Traces = field(default_factory=dict)  #: what each solver had reached when
+    #: (samples, hidden, reason) of a solver whose graph could not be built
     unbuilt: dict[str, tuple[int, int, str]] = field(default_factory=dict)
 
     def case(self, system: str, samples: int, hidden: int, begin: Callable[[str], None]

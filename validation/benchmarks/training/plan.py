@@ -27,27 +27,20 @@ DRAWN = (2000, 16)
 
 @dataclass(frozen=True)
 class Plan:
-    """
-    One extent of the comparison.
+    """One extent of the comparison."""
 
-    :param cases: (samples, hidden units), each for both systems.
-    :param limit: of a solver in a case, s.
-    :param build_limit: of building what a solver solves, s.
-    :param megabytes: limit of the memory.
-    :param runs: of a solver that takes no longer than :data:`REPEATED`, of which the middle one
-        counts: a busy moment is long beside a short run.
-    :param samples: N of the growth of the cost, with n_x = 2, n_z = 3 and 16 hidden units.
-    :param n_z: n_z of the growth of the cost, with n_x = 1, 17 hidden units and N = 2000.
-    :param n_x: n_x of the growth of the cost, with n_z = n_x + 2, 16 hidden units and N = 2000.
-    """
-
-    cases: tuple[tuple[int, int], ...]
-    limit: float
-    build_limit: float
-    megabytes: float
+    cases: tuple[tuple[int, int], ...]  #: (samples, hidden units), each for both systems
+    limit: float  #: of a solver in a case, s
+    build_limit: float  #: of building what a solver solves, s
+    megabytes: float  #: limit of the memory
+    #: of a solver that takes no longer than :data:`REPEATED`, of which the middle one counts: a
+    #: busy moment is long beside a short run
     runs: int = 3
+    #: N of the growth of the cost, with n_x = 2, n_z = 3 and 16 hidden units
     samples: tuple[int, ...] = (1000, 10_000, 100_000, 1_000_000)
+    #: n_z of the growth of the cost, with n_x = 1, 17 hidden units and N = 2000
     n_z: tuple[int, ...] = (2, 3, 4, 5, 6, 7, 8)
+    #: n_x of the growth of the cost, with n_z = n_x + 2, 16 hidden units and N = 2000
     n_x: tuple[int, ...] = (1, 2, 3, 4)
 
 

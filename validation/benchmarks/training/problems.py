@@ -24,17 +24,11 @@ _SEED = 0
 
 @dataclass(frozen=True)
 class Case:
-    """
-    One problem with its start.
+    """One problem with its start."""
 
-    :param layout: sizes, identity coordinates and one tanh layer.
-    :param data: N samples.
-    :param theta: (p,) where every solver starts.
-    """
-
-    layout: Layout
-    data: ScaledSamples
-    theta: Tensor
+    layout: Layout  #: sizes, identity coordinates and one tanh layer
+    data: ScaledSamples  #: N samples
+    theta: Tensor  #: (p,) where every solver starts
 
     @property
     def problem(self) -> Problem:

@@ -36,15 +36,10 @@ _PRELOAD = ['validation.benchmarks.training.part', 'validation.benchmarks.traini
 
 @dataclass(frozen=True)
 class Outcome:
-    """
-    What a process has noted.
+    """What a process has noted."""
 
-    :param events: in their order.
-    :param failure: why it did not end by itself, or empty.
-    """
-
-    events: tuple[dict[str, Any], ...]
-    failure: str
+    events: tuple[dict[str, Any], ...]  #: in their order
+    failure: str  #: why it did not end by itself, or empty
 
     def find(self, key: str) -> Any:
         """Return the first value under a key, or None."""
