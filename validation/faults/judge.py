@@ -20,6 +20,8 @@ from validation.faults.trace import Trace
 
 RUNAWAY = 60.0  # degC; the reactor's operating points end below 54 degC
 _LAST = 30.0  # s at the end of a trace, in which an offset is looked for
+RATE = ControllerParameters.coolant_rate_limit / 60.0  # K/s
+LONGEST_GAP = 3.0  # s between two commands
 BAND = 0.3  # K around the set-point that counts as back
 
 
@@ -29,9 +31,9 @@ class Bounds:
 
     coolant_min: float = ControllerParameters.coolant_min  #: lowest command, degC
     coolant_max: float = ControllerParameters.coolant_max  #: highest command, degC
-    #: between two commands, K; by default what the rate limit allows between two samples. After a
-    #: gap it allows twice that
-    largest_step: float = 1.0
+    #: between two commands, K; never less than the rate limit allows for the time between them,
+    #: where a busy machine has missed measurements, of which :data:`LONGEST_GAP` counts
+    largest_step: float = RATE
     #: plant time from the end of the fault within which the reactor must be back, s
     recovery: float = 300.0
     bump: float = math.inf  #: largest step from the fault on, K, where nothing calls for any
@@ -121,11 +123,15 @@ def _commands(trace: Trace, bounds: Bounds) -> list[str]:
         return ['the controller never commanded']
     reasons = out_of_range(trace, bounds)
     times, steps = trace.steps()
+    gaps = np.diff(times, prepend=trace.commands[0].seconds)
+    allowed = np.maximum(bounds.largest_step, RATE * np.minimum(gaps, LONGEST_GAP))
     # written so that NaN counts
-    large = np.flatnonzero(~(steps <= bounds.largest_step + 1e-6))
+    large = np.flatnonzero(~(steps <= allowed + 1e-6))
     if len(large):
-        reasons.append(f'the coolant command stepped by {steps[large[0]]:.2f} K at '
-                       f'{times[large[0]]:.0f} s, {bounds.largest_step:g} K are allowed')
+        first = large[0]
+        reasons.append(f'the coolant command stepped by {steps[first]:.2f} K at '
+                       f'{times[first]:.0f} s, {allowed[first]:g} K are allowed after '
+                       f'{gaps[first]:g} s')
     return reasons
 
 

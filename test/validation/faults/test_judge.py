@@ -82,7 +82,7 @@ def test_command_out_of_range_is_not_survived(celsius):
 def test_bump_of_the_command_is_not_survived():
     found = trace(coolant=lambda t: 20.0 if t < 100 else 25.0)
     assert reasons(found) == (
-        'the coolant command stepped by 5.00 K at 100 s, 1 K are allowed')
+        'the coolant command stepped by 5.00 K at 100 s, 1 K are allowed after 1 s')
     assert judge(found, BOUNDS).worst_step == pytest.approx(5.0)
     # from what acts there is no bump
     found.coolants[100] = 24.8
@@ -90,6 +90,13 @@ def test_bump_of_the_command_is_not_survived():
     assert judge(found, BOUNDS).worst_step == pytest.approx(0.2)
     found.coolants[100] = 22.0
     assert 'the coolant command stepped by 3.00 K at 100 s' in reasons(found)
+    # after missed measurements, as the rate limit allows in the time that counts
+    for missed, step, words in ((1, 2.0, ''), (1, 2.1, '2 K are allowed after 2 s'),
+                                (2, 3.0, ''), (9, 3.1, '3 K are allowed after 10 s')):
+        found = trace(coolant=lambda t, step=step: 20.0 if t < 100 else 20.0 + step)
+        del found.commands[100 - missed:100]
+        assert words in reasons(found)
+        assert judge(found, BOUNDS).survived is not bool(words)
 
 
 @pytest.mark.parametrize(('temperature', 'bound', 'enough', 'words'), [
