@@ -14,6 +14,9 @@ from koopman_ros.units import NANOSECONDS
 from validation.faults.alterations import Alteration, Packet, unchanged
 from validation.faults.trace import Command, Sample, Status, Trace
 
+# that wait to be read: a storm makes thousands while the harness is busy sending it
+MOST_RECORDS = 100_000
+
 PLANT_TEMPERATURE = 'plant/temperature'
 PLANT_COOLANT = 'plant/coolant_setpoint'
 # What a plant is started with when messages are altered.
@@ -54,7 +57,8 @@ class Interceptor:
         node.create_subscription(
             DiagnosticArray, topics.DIAGNOSTICS, self._on_diagnostics, topics.LOOP_QOS)
         node.create_subscription(
-            String, topics.CONTROLLER_EVENTS, self._on_record, topics.LOOP_QOS)
+            String, topics.CONTROLLER_EVENTS, self._on_record,
+            topics.profile(MOST_RECORDS, reliable=True))
         node.create_subscription(
             Temperature, topics.COOLANT_TEMPERATURE, self._on_coolant, topics.LATCHED_QOS)
         node.create_subscription(
