@@ -3,6 +3,8 @@
 
 """Normal equations of a lift of any depth, from residual Jacobians sample by sample."""
 
+from __future__ import annotations
+
 import torch
 from torch import Tensor
 

@@ -3,6 +3,8 @@
 
 """Growth of a lift one coordinate at a time, which keeps coordinates from collapsing."""
 
+from __future__ import annotations
+
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import partial

@@ -3,6 +3,8 @@
 
 """Levenberg-Marquardt on normal equations that it accumulates from residuals, in torch."""
 
+from __future__ import annotations
+
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from enum import Enum

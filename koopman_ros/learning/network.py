@@ -3,6 +3,8 @@
 
 """The lift as a torch network: value, directional derivative, and their parameter derivatives."""
 
+from __future__ import annotations
+
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cached_property

@@ -10,6 +10,8 @@ sum_n J' J = sum_i T_i (sum_n phi phi') T_i', and what is summed over the sample
 length of the parameter vector nor a row for each coordinate.
 """
 
+from __future__ import annotations
+
 from dataclasses import dataclass
 from functools import cached_property
 import itertools
