@@ -20,7 +20,7 @@ from validation.benchmarks.training.problems import artificial, invariant_residu
 from validation.benchmarks.training.torch_solvers import differentiable
 
 # Few samples: casadi's graphs take most of the time, and grow with them.
-PLAN = Plan(((200, 8),), 0.5, 10.0, 4e3, 1, (500, 1000), (2, 3), (1, 2))
+PLAN = Plan(((200, 8),), 2.0, 10.0, 4e3, 1, (500, 1000), (2, 3), (1, 2))
 
 
 @pytest.fixture(scope='module')
