@@ -38,17 +38,17 @@ class Experiment:
     :raises ValueError: when the limits contradict each other.
     """
 
-    duration: float  # s
-    input_lower: float  # lowest level, in the input's unit; levels are uniform between the two
-    input_upper: float  # highest level
-    hold_shortest: float  # shortest time of a level, in s; times are uniform between the two
-    hold_longest: float  # longest time of a level, in s
-    rate: float  # largest change of the input, per s
-    state_lower: float  # smallest state that may be measured, in its unit
-    state_upper: float  # largest state
-    safe_input: float  # input that is safe whatever happened
-    seed: int  # of numpy's default generator; the same seed gives the same steps
-    state: str = 'state'  # name of the measured state
+    duration: float  #: s
+    input_lower: float  #: lowest level, in the input's unit; levels are uniform between the two
+    input_upper: float  #: highest level
+    hold_shortest: float  #: shortest time of a level, in s; times are uniform between the two
+    hold_longest: float  #: longest time of a level, in s
+    rate: float  #: largest change of the input, per s
+    state_lower: float  #: smallest state that may be measured, in its unit
+    state_upper: float  #: largest state
+    safe_input: float  #: input that is safe whatever happened
+    seed: int  #: of numpy's default generator; the same seed gives the same steps
+    state: str = 'state'  #: name of the measured state
 
     def __post_init__(self) -> None:
         for low, high in (('input_lower', 'input_upper'), ('state_lower', 'state_upper')):
@@ -86,12 +86,12 @@ class Experiment:
 class Progress:
     """How far an experiment is; it goes on commanding the safe input when it is over."""
 
-    start_ns: int  # stamp of the measurement it started with
-    time_ns: int  # stamp of the last measurement
-    command: float  # last input
-    interval: float = np.inf  # usual seconds between measurements; infinity before the second
+    start_ns: int  #: stamp of the measurement it started with
+    time_ns: int  #: stamp of the last measurement
+    command: float  #: last input
+    interval: float = np.inf  #: usual seconds between measurements; infinity before the second
     phase: Phase = Phase.RUNNING
-    reason: Reason | None = None  # why it was aborted
+    reason: Reason | None = None  #: why it was aborted
 
     @property
     def elapsed(self) -> float:
@@ -152,9 +152,9 @@ def level(experiment: Experiment, progress: Progress) -> float:
 class Following:
     """Whether a controller in manual mode passes the input on, within limits of its own."""
 
-    heard: float | None = None  # what it commanded last, or None at first
-    astray: int = 0  # how many times in a row that was not, nor came nearer to, what was asked
-    since: float = 0.0  # time of the first of these, in s
+    heard: float | None = None  #: what it commanded last, or None at first
+    astray: int = 0  #: how many times in a row that was not, nor came nearer to, what was asked
+    since: float = 0.0  #: time of the first of these, in s
 
     def after(self, heard: float, asked: float, now: float) -> Following:
         """Return the same after the controller commanded `heard` where `asked` was asked."""

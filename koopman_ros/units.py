@@ -6,7 +6,12 @@
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from functools import cache, cached_property
-from typing import Any
+from typing import Any, TypeVar
+
+import numpy as np
+from numpy.typing import NDArray
+
+Numbers = TypeVar('Numbers', float, NDArray[np.float64])
 
 NANOSECONDS = 1_000_000_000  # in a second
 SECONDS_PER_MINUTE = 60.0
@@ -25,8 +30,8 @@ class Conversion:
     factor: float = 1.0  #: of values and of differences
     offset: float = 0.0  #: of values alone
 
-    def __call__(self, value: float) -> float:
-        """Convert a value."""
+    def __call__(self, value: Numbers) -> Numbers:
+        """Convert a value, or an array of them."""
         if self.factor == 1.0 and self.offset == 0.0:
             # -0.0 stays what it is
             return value
@@ -71,6 +76,16 @@ def conversion(unit: str, wanted: str) -> Conversion:
 def display_unit(unit: str) -> str:
     """Return the unit in which people read values: degrees Celsius in place of kelvins."""
     return 'degC' if unit == 'K' else unit
+
+
+def unit_label(unit: str) -> str:
+    """Return the unit in which people read values, as it is printed."""
+    return display_unit(unit).replace('deg', '°')
+
+
+def shown(values: Numbers, unit: str) -> Numbers:
+    """Return values as people read them."""
+    return conversion(unit, display_unit(unit))(values)
 
 
 @cache

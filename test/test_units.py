@@ -6,6 +6,7 @@
 import math
 import string
 
+import numpy as np
 import pytest
 
 from koopman_ros.reasons import _TEMPLATES, Code, reason, Words
@@ -19,6 +20,7 @@ from koopman_ros.units import Conversion, conversion, Display, Displays
     ('anything', 'anything', 3.0, 3.0)])
 def test_values_are_converted(unit: str, wanted: str, value: float, converted: float) -> None:
     assert conversion(unit, wanted)(value) == pytest.approx(converted, rel=1e-12)
+    np.testing.assert_allclose(conversion(unit, wanted)(np.full(2, value)), converted, rtol=1e-12)
 
 
 def test_differences_have_no_offset() -> None:

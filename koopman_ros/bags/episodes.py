@@ -135,8 +135,7 @@ def _scale(bag: str | os.PathLike[str], topic: str, unit: str, wanted: str) -> C
 
 
 def _scaled(episode: Episode, x: Conversion, u: Conversion) -> Episode:
-    return Episode(episode.time, episode.x * x.factor + x.offset,
-                   episode.input_time, episode.u * u.factor + u.offset)
+    return Episode(episode.time, x(episode.x), episode.input_time, u(episode.u))
 
 
 def _runs(bag: str | os.PathLike[str], content: BagSummary, measured: str,

@@ -26,9 +26,9 @@ _PATIENCE = 5.0  # s from the request to end until the process is killed
 class JobState:
     """Where a retraining stands, with the figures of a lift that was judged."""
 
-    share: float = 0.0  # done, in [0, 1]
-    text: str = 'starting'  # what is done now, or how it ended
-    ended: bool = False  # whether it has ended
+    share: float = 0.0  #: done, in [0, 1]
+    text: str = 'starting'  #: what is done now, or how it ended
+    ended: bool = False  #: whether it has ended
     summary: Mapping[str, Any] | None = None
 
     @property

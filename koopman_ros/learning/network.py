@@ -149,12 +149,12 @@ class Layer:
     """Values of one layer kept for the backward pass; N samples, widths g -> h."""
 
     W: Tensor
-    value_in: Tensor      # (N, g)
-    rate_in: Tensor       # (N, g)
-    slope: Tensor         # (N, h) of the activation
-    slope_rate: Tensor    # (N, h) time derivative of the slope
-    zero_in: Tensor       # (g,) the layer's input at x = 0
-    zero_slope: Tensor    # (h,)
+    value_in: Tensor      #: (N, g)
+    rate_in: Tensor       #: (N, g)
+    slope: Tensor         #: (N, h) of the activation
+    slope_rate: Tensor    #: (N, h) time derivative of the slope
+    zero_in: Tensor       #: (g,) the layer's input at x = 0
+    zero_slope: Tensor    #: (h,)
 
 
 class Pass:

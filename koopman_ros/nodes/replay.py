@@ -48,8 +48,8 @@ class Result(enum.IntEnum):
 class Names:
     """The topics of a controller in a bag, as absolute names."""
 
-    records: str = f'/{topics.CONTROLLER_EVENTS}'  # where it wrote down what happened
-    commands: str = f'/{topics.COOLANT_SETPOINT}'  # where it commanded the coolant
+    records: str = f'/{topics.CONTROLLER_EVENTS}'  #: where it wrote down what happened
+    commands: str = f'/{topics.COOLANT_SETPOINT}'  #: where it commanded the coolant
 
 
 def replay_bags(parameters: ReplayParameters, names: Names, given: Collection[str] = ()) -> Result:

@@ -27,16 +27,16 @@ class ConfigurationError(ValueError):
 class Specification:
     """One row of a parameter table."""
 
-    name: str  # name of the ROS parameter
-    default: Any  # default, whose type is the parameter's type (a tuple is a string array)
-    unit: str  # unit, empty for none
-    description: str  # one sentence without the unit
-    minimum: float = -math.inf  # smallest value
-    maximum: float = math.inf  # largest value
-    open_minimum: bool = False  # whether the minimum itself is excluded
-    smallest: float = 0.0  # above a minimum of 0 that stands for something of its own
-    choices: tuple[str, ...] = ()  # allowed strings, empty for any
-    read_only: bool = False  # whether it can be changed while the node runs
+    name: str  #: name of the ROS parameter
+    default: Any  #: default, whose type is the parameter's type (a tuple is a string array)
+    unit: str  #: unit, empty for none
+    description: str  #: one sentence without the unit
+    minimum: float = -math.inf  #: smallest value
+    maximum: float = math.inf  #: largest value
+    open_minimum: bool = False  #: whether the minimum itself is excluded
+    smallest: float = 0.0  #: above a minimum of 0 that stands for something of its own
+    choices: tuple[str, ...] = ()  #: allowed strings, empty for any
+    read_only: bool = False  #: whether it can be changed while the node runs
 
     @property
     def range_text(self) -> str:

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from koopman_ros.lifting import Coordinates
 from koopman_ros.replay.bag import command_key
 from koopman_ros.replay.loop import Replay
-from koopman_ros.units import conversion, display_unit
+from koopman_ros.units import conversion
 
 Array = NDArray[np.float64]
 
@@ -130,13 +130,6 @@ class ReplayedBag:
         """Compare commands (n, n_u) with those recorded."""
         same = (commands.view(np.uint64) == self.recorded.view(np.uint64)).all(axis=1)
         return Comparison(commands - self.recorded, int(np.count_nonzero(same)), self.tolerance)
-
-
-def shown(values: Array, unit: str) -> tuple[Array, str]:
-    """Return values as people read them, with their unit."""
-    wanted = display_unit(unit)
-    to = conversion(unit, wanted)
-    return values * to.factor + to.offset, wanted.replace('deg', '°')
 
 
 def _rows(values: list[Array | None], like: Array | None = None) -> Array:

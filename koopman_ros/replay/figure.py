@@ -9,9 +9,10 @@ import textwrap
 import matplotlib.axes
 import numpy as np
 
-from koopman_ros.replay.comparison import ReplayedBag, shown
+from koopman_ros.replay.comparison import ReplayedBag
 from koopman_ros.replay.report import verdict
 from koopman_ros.reports import draw_limits, drawing, DRAWN_RANGE
+from koopman_ros.units import shown, unit_label
 
 _RECORDED, _CHECK, _NEW = '0.55', 'tab:blue', 'tab:orange'
 
@@ -63,10 +64,9 @@ def _draw_measured(axes: matplotlib.axes.Axes, time: np.ndarray, bag: ReplayedBa
     if controller is not None:
         states = controller.model.states
         name, unit = states.names[i], states.units[i]
-        (low, high), _ = shown(np.array([states.lower[i], states.upper[i]]), unit)
+        low, high = shown(np.array([states.lower[i], states.upper[i]]), unit)
         axes.axhspan(low, high, label='training range', **DRAWN_RANGE)
-    setpoint, _ = shown(bag.setpoint[:, i], unit)
-    measured, unit = shown(bag.measured[:, i], unit)
+    setpoint, measured = shown(bag.setpoint[:, i], unit), shown(bag.measured[:, i], unit)
     finite = measured[np.isfinite(measured)]
     typical = _typical(finite)
     hidden = len(finite) - len(typical)
@@ -77,7 +77,7 @@ def _draw_measured(axes: matplotlib.axes.Axes, time: np.ndarray, bag: ReplayedBa
     if both.size:
         margin = 0.5 + 0.05 * float(np.ptp(both))
         axes.set_ylim(float(both.min()) - margin, float(both.max()) + margin)
-    axes.set_ylabel(f'{name} [{unit}]')
+    axes.set_ylabel(f'{name} [{unit_label(unit)}]')
 
 
 def _typical(finite: np.ndarray) -> np.ndarray:
@@ -96,16 +96,16 @@ def _draw_commands(axes: matplotlib.axes.Axes, time: np.ndarray, bag: ReplayedBa
     if controller is not None:
         inputs, limits = controller.model.inputs, controller.settings.limits
         name, unit = inputs.names[i], inputs.units[i]
-        (low, high), _ = shown(np.array([limits.lower[i], limits.upper[i]]), unit)
+        low, high = shown(np.array([limits.lower[i], limits.upper[i]]), unit)
         draw_limits(axes, (high, low), 'limits')
-    axes.step(time, shown(bag.recorded[:, i], unit)[0], where='post', color=_RECORDED,
+    axes.step(time, shown(bag.recorded[:, i], unit), where='post', color=_RECORDED,
               linewidth=4.0, label='recorded')
-    axes.step(time, shown(bag.commands[:, i], unit)[0], where='post', color=_CHECK, linewidth=1.2,
+    axes.step(time, shown(bag.commands[:, i], unit), where='post', color=_CHECK, linewidth=1.2,
               label='replayed')
     if new_model:
-        axes.step(time, shown(bag.new_commands[:, i], unit)[0], where='post', color=_NEW,
+        axes.step(time, shown(bag.new_commands[:, i], unit), where='post', color=_NEW,
                   linewidth=1.5, label=f'{_short(new_model)} on the same measurements')
-    axes.set_ylabel(f'{name}, command [{shown(bag.recorded, unit)[1]}]')
+    axes.set_ylabel(f'{name}, command [{unit_label(unit)}]')
 
 
 def _draw_difference(axes: matplotlib.axes.Axes, time: np.ndarray, bag: ReplayedBag, i: int,

@@ -9,7 +9,6 @@ from typing import Any
 
 import numpy as np
 
-from koopman_ros.arrays import Array
 from koopman_ros.identification import Identified, longest_step, Segments
 from koopman_ros.identification.segments import fitted_starts, Rate
 from koopman_ros.lifting import Coordinates
@@ -17,7 +16,7 @@ from koopman_ros.reports import bullets, drawing, table, write_figures, write_pa
 from koopman_ros.retraining.coverage import CELLS, visited_cells
 from koopman_ros.retraining.gate import lifted_rate
 from koopman_ros.retraining.task import Retrained
-from koopman_ros.units import conversion, display_unit
+from koopman_ros.units import shown, unit_label
 
 
 def write_report(retrained: Retrained) -> list[Path]:
@@ -78,14 +77,8 @@ def _sections(retrained: Retrained) -> Iterator[str]:
            f'of {decision.loops} reach their set-point.')
 
 
-def _shown(signals: Coordinates, values: Array) -> Array:
-    to = conversion(signals.units[0], display_unit(signals.units[0]))
-    return values * to.factor + to.offset
-
-
 def _label(signals: Coordinates) -> str:
-    unit = display_unit(signals.units[0]).replace('deg', '°')
-    return f'{signals.names[0].replace("_", " ")} [{unit}]'
+    return f'{signals.names[0].replace("_", " ")} [{unit_label(signals.units[0])}]'
 
 
 def _draw(path: Path, retrained: Retrained) -> bool:
@@ -108,13 +101,13 @@ def _draw_coverage(axes: Any, found: Identified) -> None:
     visited = np.full((CELLS, CELLS), np.nan)
     for i, j in visited_cells(episodes, box):
         visited[j, i] = 1.0
-    edges = [_shown(a, np.linspace(a.lower[0], a.upper[0], CELLS + 1))
+    edges = [shown(np.linspace(a.lower[0], a.upper[0], CELLS + 1), a.units[0])
              for a in (box.states, box.inputs)]
     axes.pcolormesh(*edges, visited, cmap='Greens', vmin=0.0, vmax=3.0)
     for episode in episodes:
-        axes.plot(_shown(box.states, episode.x[:, 0]),
-                  _shown(box.inputs, episode.inputs_at(episode.time)[:, 0]), '.', markersize=1.0,
-                  color='tab:blue')
+        axes.plot(shown(episode.x[:, 0], box.states.units[0]),
+                  shown(episode.inputs_at(episode.time)[:, 0], box.inputs.units[0]), '.',
+                  markersize=1.0, color='tab:blue')
     axes.grid(False)  # the cells are one
     axes.set(xlabel=_label(box.states), ylabel=_label(box.inputs),
              title='where the measurements lie (visited cells in green)')
@@ -133,11 +126,11 @@ def _draw_drift(axes: Any, retrained: Retrained) -> None:
         rates.append(('new lift', lifted_rate(retrained.trained.model, unit), 'tab:green'))
     estimated = found.drift.rate(x, u)[:, 0]
     for name, rate, color in rates:
-        axes.plot(_shown(box.states, x[:, 0]), rate(x, u)[:, 0] - estimated, color=color,
-                  label=name)
+        axes.plot(shown(x[:, 0], box.states.units[0]), rate(x, u)[:, 0] - estimated,
+                  color=color, label=name)
     axes.axhline(0.0, color='k', linestyle='--', linewidth=1.0,
                  label='estimated from the data')
-    held = float(_shown(box.inputs, u[0])[0])
+    held = shown(float(u[0, 0]), box.inputs.units[0])
     axes.set(xlabel=_label(box.states),
              ylabel=f'difference of the rate [{box.states.units[0]}/{current.time_unit}]',
              title=f'rate at {held:.1f} {_label(box.inputs)}, less the estimate')
@@ -150,7 +143,7 @@ def _draw_prediction(axes: Any, retrained: Retrained) -> None:
     segments = Segments.of([episode], longest_step([episode]))
     minutes = np.concatenate(([0.0], np.cumsum(segments.steps[:, 0])))
     measured = segments.measured[:, 0]
-    axes.plot(minutes[measured], _shown(states, segments.x[measured, 0, 0]),
+    axes.plot(minutes[measured], shown(segments.x[measured, 0, 0], states.units[0]),
               '.', color='0.6', markersize=3.0, label='measured')
     unit = current.seconds_per_time_unit
     models = [('present lift', lifted_rate(current, unit), 'tab:red')]
@@ -159,7 +152,7 @@ def _draw_prediction(axes: Any, retrained: Retrained) -> None:
     for name, rate, color in models:
         x0, _ = fitted_starts(rate, segments, found.drift.box.states.scale)
         path = segments.path(rate, x0)[:, 0, 0]
-        axes.plot(minutes, _shown(states, path), color=color, label=name)
+        axes.plot(minutes, shown(path, states.units[0]), color=color, label=name)
     axes.set(xlabel=f'time [{current.time_unit}]', ylabel=_label(states),
              title='prediction of a held-out segment')
     axes.legend()

@@ -43,11 +43,11 @@ class Situation:
     report: Report
     counts: Counts
     timing: Timing
-    complaint: str  # what is wrong around the node, e.g. a second controller; or empty
-    request_refused: str  # why the operator's last request was refused, or empty
-    model_refused: str  # why the last model was refused, or empty
-    model: Mapping[str, object]  # figures of the model in force
-    temperature: float  # last measured, in degrees Celsius
+    complaint: str  #: what is wrong around the node, e.g. a second controller; or empty
+    request_refused: str  #: why the operator's last request was refused, or empty
+    model_refused: str  #: why the last model was refused, or empty
+    model: Mapping[str, object]  #: figures of the model in force
+    temperature: float  #: last measured, in degrees Celsius
 
     @property
     def reason(self) -> str:

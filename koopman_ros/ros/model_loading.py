@@ -34,10 +34,10 @@ _TRIALS = 3
 class LoadedModel:
     """A model with what tells its versions apart."""
 
-    name: str  # of a shipped model, or the path of a file
+    name: str  #: of a shipped model, or the path of a file
     model: LiftedModel
-    file_time: str  # when the file was written, in UTC
-    digest: str  # SHA-256 of the file
+    file_time: str  #: when the file was written, in UTC
+    digest: str  #: SHA-256 of the file
 
     @property
     def identity(self) -> dict[str, str]:
@@ -58,7 +58,7 @@ class Situation:
 
     settings: Settings
     state: State
-    measured: Array  # (1,) last temperature in K; NaN before the first
+    measured: Array  #: (1,) last temperature in K; NaN before the first
 
 
 def load_suitable(name: str) -> LoadedModel:

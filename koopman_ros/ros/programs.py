@@ -39,12 +39,12 @@ _LOOP = tuple(name for name in topics.TYPES if name != topics.CLOCK)
 class Program:
     """What a program does, and on the network by names as in the node."""
 
-    does: str = ''  # a sentence
+    does: str = ''  #: a sentence
     codes: str = '0 after a signal, 1 when it cannot start, 2 for an unknown argument'
-    publishes: tuple[str, ...] = ()  # topics
-    subscribes: tuple[str, ...] = ()  # topics; /clock where it follows simulated time
-    serves: tuple[str, ...] = ()  # services
-    calls: tuple[str, ...] = ()  # services of others
+    publishes: tuple[str, ...] = ()  #: topics
+    subscribes: tuple[str, ...] = ()  #: topics; /clock where it follows simulated time
+    serves: tuple[str, ...] = ()  #: services
+    calls: tuple[str, ...] = ()  #: services of others
 
 
 PROGRAMS = {
