@@ -20,9 +20,9 @@ from koopman_ros.experiment import (
     Progress,
 )
 from koopman_ros.ros.diagnostics import OPERATOR
+from koopman_ros.units import NANOSECONDS as SECOND
 from support.sampled_loops import say
 
-SECOND = 1_000_000_000
 START = 1_785_000_000 * SECOND
 PLAN = Experiment(
     duration=600.0, input_lower=282.0, input_upper=300.0, hold_shortest=20.0, hold_longest=50.0,

@@ -23,8 +23,8 @@ from koopman_ros.plant_data import Episode
 from koopman_ros.retraining.coverage import coverage
 from koopman_ros.retraining.gate import decide, Decision, Thresholds
 from koopman_ros.retraining.lift import learn_lift
+from koopman_ros.units import NANOSECONDS
 
-_NS = 1_000_000_000
 # Shares of the whole at which estimating, learning and judging begin.
 _STAGES = {'estimate': 0.05, 'learn': 0.35, 'decide': 0.9}
 
@@ -132,7 +132,7 @@ def retrain(task: Task, on_progress: OnProgress = lambda *_: False) -> Retrained
     recorded, account = loop_episodes(
         task.bags, task.temperature_topic, task.coolant_topic,
         (current.states.units[0], current.inputs.units[0]),
-        input_delay_ns=round(task.input_delay * _NS))
+        input_delay_ns=round(task.input_delay * NANOSECONDS))
     if not recorded:
         raise ValueError('the bags hold no usable segment of measurements: '
                          + '; '.join(account.lines()))

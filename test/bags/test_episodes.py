@@ -21,12 +21,12 @@ from koopman_ros.bags import (
     read_series,
 )
 from koopman_ros.plant_data import Episode
+from koopman_ros.units import NANOSECONDS as SECOND
 from support.bag_samples import PERIOD_NS, ROUNDS, Sample, START_NS
 
 MEASURED, COMMAND = '/level', '/valve'
 PRESSURE = 'sensor_msgs/msg/FluidPressure'
 UNITS = 'Pa', 'Pa'
-SECOND = 1_000_000_000
 # what the wall clock says where stamps are simulated
 WALL = 1_700_000_000 * SECOND
 

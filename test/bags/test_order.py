@@ -6,8 +6,7 @@
 import pytest
 
 from koopman_ros.bags import BagMessage, in_log_order
-
-S = 1_000_000_000
+from koopman_ros.units import NANOSECONDS as S
 
 
 def _order(*seconds: float) -> list[float]:

@@ -12,9 +12,9 @@ import pytest
 import yaml
 
 from koopman_ros.bags import BagReadError, BagWriter, read_messages, summary
+from koopman_ros.units import NANOSECONDS as SECOND
 from support.bag_samples import NUMBER, number, record, write_numbers
 
-SECOND = 1_000_000_000
 PERIOD = SECOND // 10
 
 

@@ -10,12 +10,12 @@ import numpy as np
 import pytest
 
 from koopman_ros.control import Arrival, Controller, Form, InputLimits, Mode, Settings, State
+from koopman_ros.units import NANOSECONDS as SECOND
 from support.closed_loops import COOLANT, SETPOINT, shipped, START
 from support.random_lifts import change_of_variable
 from support.sampled_loops import content, say
 from validation.paper.optimal_control import exact_two_state_model
 
-SECOND = 1_000_000_000
 NOW = 1_785_000_000 * SECOND
 LOWER, UPPER, RATE = 280.0, 304.0, 0.8
 LARGEST = float(np.finfo(np.float64).max)

@@ -8,11 +8,11 @@ import pytest
 
 from koopman_ros.control import Setpoint
 from koopman_ros.control.setpoint import advance, HORIZON_NANOSECONDS, refusal, request
+from koopman_ros.units import NANOSECONDS as SECOND
 from support.closed_loops import shipped
 from support.sampled_loops import say
 
 MODEL = shipped('reactor_nz4')
-SECOND = 1_000_000_000
 # a wall clock, far from where time starts
 NOW = 1_785_000_000 * SECOND
 

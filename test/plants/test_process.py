@@ -17,8 +17,8 @@ from koopman_ros.plants import (
     Process,
     scalar_example,
 )
+from koopman_ros.units import NANOSECONDS as SECOND
 
-SECOND = 1_000_000_000
 SLOPE, GAIN = -0.7, 0.4  # 1/s, of the linear plant
 
 

@@ -22,8 +22,8 @@ from koopman_ros.replay.records import (
     START,
 )
 from koopman_ros.resources import model_path
+from koopman_ros.units import NANOSECONDS as SECOND
 
-SECOND = 1_000_000_000
 STEADY, COOLANT = 324.9, 300.0  # K
 MODELS = {name: load_with_digest(model_path(name))
           for name in ('reactor_nz3', 'reactor_nz4', 'reactor_linear')}

@@ -19,10 +19,10 @@ from koopman_ros.plants import (
     RandomStepDesign,
     ReactorParameters,
 )
+from koopman_ros.units import NANOSECONDS as SECOND
 from support.disturbance import disturbed
 
 NOISE = 0.1  # K
-SECOND = 1_000_000_000
 _TYPE = 'sensor_msgs/msg/Temperature'
 
 

@@ -39,9 +39,9 @@ from koopman_ros.plants import (
 from koopman_ros.reasons import Words
 from koopman_ros.replay.values import encoded
 from koopman_ros.units import Displays
+from koopman_ros.units import NANOSECONDS as SECOND
 from support.closed_loops import REACTOR, shipped, START
 
-SECOND = 1_000_000_000
 EPOCH = 1_785_000_000 * SECOND
 LOWER, UPPER, RATE = 278.15, 305.15, 1.0  # K, K, K/s
 SAFE = LOWER

@@ -45,7 +45,7 @@ PERIOD = 1.0  # s
 COOLANT_RANGE = (278.15, 305.15)  # K
 BANDWIDTH = 6.0  # 1/min
 # Margins that are never exceeded: without fallback the learned law acts everywhere.
-NO_LADDER = (LevelSettings('sdre', 1e9), LevelSettings('linear', 1e9))
+NO_FALLBACK = (LevelSettings('sdre', 1e9), LevelSettings('linear', 1e9))
 
 
 @lru_cache
@@ -70,7 +70,7 @@ def reactor_controller(*, bandwidth: float = BANDWIDTH, coolant_weight: float = 
         observer_bandwidth=bandwidth, coolant_weight=coolant_weight, linear_margin=linear_margin
         ).settings()
     return Controller(model or shipped_model(), settings if fallback else replace(
-        settings, supervisor=replace(settings.supervisor, levels=NO_LADDER)))
+        settings, supervisor=replace(settings.supervisor, levels=NO_FALLBACK)))
 
 
 def changed_reactor(*, heat_transfer: float = 1.0, concentration: float = 1.0,

@@ -31,7 +31,7 @@ from validation.robustness.loop import (
     BANDWIDTH,
     changed_reactor,
     COOLANT,
-    NO_LADDER,
+    NO_FALLBACK,
     on_plant,
     REACTOR,
     reactor_controller,
@@ -153,7 +153,7 @@ def two_state_course(model: LiftedModel, *, fallback: bool) -> Simulation:
         limits=InputLimits(np.array([-_BOUND]), np.array([_BOUND]), np.array([np.inf])),
         safe_input=np.zeros(1), transfer_time=1.0,
         supervisor=SupervisorSettings(recovery_time=1.0) if fallback else (
-            SupervisorSettings(NO_LADDER))))
+            SupervisorSettings(NO_FALLBACK))))
 
     def to_origin(loop: Loop) -> Loop:
         origin = Setpoint(np.zeros(2), np.zeros(2))
