@@ -85,11 +85,12 @@ def end_in_time(name: str) -> Callable[[], None]:
             while (number := numbers.read(1)) and number[0] not in (
                     signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
                 pass
-        if number:
-            disarm = end_by_force(_PATIENCE, 1, (
-                f'{name}: busy for {_PATIENCE:g} s after a signal: ended by force'))
-            over.wait()
-            disarm()
+            # the pipe stays open, for the byte of a second signal
+            if number:
+                disarm = end_by_force(_PATIENCE, 1, (
+                    f'{name}: busy for {_PATIENCE:g} s after a signal: ended by force'))
+                over.wait()
+                disarm()
 
     thread = threading.Thread(target=listen, daemon=True)
     thread.start()

@@ -110,8 +110,8 @@ def test_trains_beside_the_running_loop(ros: Harness, tmp_path: Path) -> None:
         ros.wait_for_status('trainer: recording', lambda status: len(status.values) > 1 and int(
             value(status, 'messages on /temperature')) > count)
 
-    # the bag is still being recorded
-    wait_for_measurements(20)
+    # the bag is still being recorded; with fewer the training could fail before it is cancelled
+    wait_for_measurements(250)
     response = ros.trigger('trainer/train')
     assert (response.success, response.message) == (True, f'training from {tmp_path}/run.mcap')
     response = ros.trigger('trainer/train')
@@ -126,7 +126,6 @@ def test_trains_beside_the_running_loop(ros: Harness, tmp_path: Path) -> None:
     assert (response.success, response.message) == (False, 'not training')
     assert not list(tmp_path.glob('new*'))
 
-    wait_for_measurements(250)
     assert ros.trigger('trainer/train').success
     status = ros.wait_for_status(STATUS, lambda status: status.message.startswith('the new lift'))
     figures = json.loads((tmp_path / 'new.json').read_text())

@@ -107,6 +107,10 @@ def test_signal_before_the_interpreter_is_up_ends_a_node_cleanly(ros: Harness) -
 # What happens at the end of a plant that gets a signal as it starts, and its last words.
 ENDS = {
     'nothing': ('', r'.*'),
+    # each signal is heard, by a thread, before the next one
+    'signals one after the other': (
+        'kill = os.kill\n'
+        'os.kill = lambda *signal: (kill(*signal), time.sleep(0.2))\n', r'.*'),
     # what a module holds goes when the interpreter has given up its handlers
     'another signal, very late': (
         'class Late:\n'
