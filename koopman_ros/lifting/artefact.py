@@ -16,12 +16,16 @@ from typing import Any, NoReturn
 import numpy as np
 
 from koopman_ros.lifting.activations import activation_named
-from koopman_ros.lifting.bounds import check_sizes, check_texts, MAX_LAYERS
-from koopman_ros.lifting.coordinates import Coordinates
-from koopman_ros.lifting.files import NotRegularError, read_regular
+from koopman_ros.lifting.bounds import (
+    check_sizes,
+    check_texts,
+    MAX_LAYERS,
+    NotRegularError,
+    read_regular,
+)
+from koopman_ros.lifting.coordinates import Coordinates, TrainingStates
 from koopman_ros.lifting.model import LiftedModel, Provenance
 from koopman_ros.lifting.observables import NetworkObservables
-from koopman_ros.lifting.training_states import TrainingStates
 
 FORMAT = 'koopman_ros.lift'
 FORMAT_VERSION = 1

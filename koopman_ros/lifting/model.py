@@ -13,9 +13,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from koopman_ros.arrays import Array, frozen
-from koopman_ros.lifting.coordinates import Coordinates
+from koopman_ros.lifting.coordinates import Coordinates, TrainingStates
 from koopman_ros.lifting.observables import NetworkObservables, Observables
-from koopman_ros.lifting.training_states import TrainingStates
 from koopman_ros.plant_data import Plant
 from koopman_ros.units import SECONDS_PER_TIME_UNIT
 

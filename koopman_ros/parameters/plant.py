@@ -16,7 +16,7 @@ from koopman_ros.plants import (
     ReactorParameters,
     two_state_reactor,
 )
-from koopman_ros.plants.integration import resolved_limits
+from koopman_ros.plants.simulation import resolved_limits
 from koopman_ros.units import LAST_STAMP_SECONDS, to_kelvin
 
 REACTORS = {'one_state': one_state_reactor, 'two_state': two_state_reactor}

@@ -3,13 +3,7 @@
 
 """Control-affine systems, their steady states, actuators and simulation; imports plant data."""
 
-from koopman_ros.plants.equilibria import equilibrium_input, EquilibriumError
 from koopman_ros.plants.excitation import ExcitationError, random_steps, RandomStepDesign
-from koopman_ros.plants.integration import (
-    IntegrationError,
-    IntegrationFailure,
-    IntegratorSettings,
-)
 from koopman_ros.plants.library.reactor import (
     NOMINAL_COOLANT_TEMPERATURE,
     one_state_reactor,
@@ -18,32 +12,20 @@ from koopman_ros.plants.library.reactor import (
 )
 from koopman_ros.plants.library.scalar import scalar_example
 from koopman_ros.plants.library.two_state import two_state_example
-from koopman_ros.plants.process import Actuator, Process
-from koopman_ros.plants.sensor import in_steps, sensor_noise
-from koopman_ros.plants.simulation import advance, sample_derivatives, simulate
-from koopman_ros.plants.system import ControlAffineSystem
+from koopman_ros.plants.process import Actuator, in_steps, Process, sensor_noise
+from koopman_ros.plants.simulation import (
+    advance,
+    IntegrationError,
+    IntegrationFailure,
+    IntegratorSettings,
+    sample_derivatives,
+    simulate,
+)
+from koopman_ros.plants.system import ControlAffineSystem, equilibrium_input, EquilibriumError
 
-__all__ = [
-    'NOMINAL_COOLANT_TEMPERATURE',
-    'Actuator',
-    'ControlAffineSystem',
-    'EquilibriumError',
-    'ExcitationError',
-    'IntegrationError',
-    'IntegrationFailure',
-    'IntegratorSettings',
-    'Process',
-    'RandomStepDesign',
-    'ReactorParameters',
-    'advance',
-    'equilibrium_input',
-    'in_steps',
-    'one_state_reactor',
-    'random_steps',
-    'sample_derivatives',
-    'scalar_example',
-    'sensor_noise',
-    'simulate',
-    'two_state_example',
-    'two_state_reactor',
-]
+__all__ = ['NOMINAL_COOLANT_TEMPERATURE', 'Actuator', 'ControlAffineSystem', 'EquilibriumError',
+           'ExcitationError', 'IntegrationError', 'IntegrationFailure', 'IntegratorSettings',
+           'Process', 'RandomStepDesign', 'ReactorParameters', 'advance', 'equilibrium_input',
+           'in_steps', 'one_state_reactor', 'random_steps', 'sample_derivatives',
+           'scalar_example', 'sensor_noise', 'simulate', 'two_state_example',
+           'two_state_reactor']

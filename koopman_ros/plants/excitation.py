@@ -10,12 +10,12 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from koopman_ros.plant_data import Episode
-from koopman_ros.plants.integration import (
+from koopman_ros.plants.simulation import (
     IntegrationError,
     IntegrationFailure,
     IntegratorSettings,
+    simulate,
 )
-from koopman_ros.plants.simulation import simulate
 from koopman_ros.plants.system import checked_vector, ControlAffineSystem, FloatArray
 
 

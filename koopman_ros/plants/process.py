@@ -1,11 +1,12 @@
 # SPDX-FileCopyrightText: 2026 The koopman_ros Authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""A plant that runs in time, behind the actuators of its inputs: range, delay and lag."""
+"""A plant that runs in time, behind its actuators (range, delay, lag), and its sensor."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+import math
 
 import numpy as np
 
@@ -133,3 +134,25 @@ def _with_input_lag(system: ControlAffineSystem, time_constant: float) -> Contro
         state_lower=np.concatenate([system.state_lower, -unbounded]),
         state_upper=np.concatenate([system.state_upper, unbounded]),
     )
+
+
+def sensor_noise(deviation: float, seed: int, sample: int) -> float:
+    """
+    Return the noise of one sample, the same for the same seed and number.
+
+    :param deviation: standard deviation, in state units.
+    :param seed: seed of the run, not negative.
+    :param sample: number of the sample, not negative.
+    """
+    if deviation == 0.0:
+        return 0.0
+    return deviation * float(np.random.default_rng((seed, sample)).standard_normal())
+
+
+def in_steps(value: float, resolution: float) -> float:
+    """
+    Return the nearest value that a sensor of finite resolution can show.
+
+    :param resolution: distance between two such values, the multiples of it; 0 shows all.
+    """
+    return value if resolution == 0.0 else value - math.remainder(value, resolution)

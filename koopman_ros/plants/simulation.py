@@ -4,17 +4,173 @@
 """Simulation of a plant whose input is held constant over each sample period."""
 
 from collections.abc import Sequence
+from dataclasses import dataclass
+from enum import Enum
 import math
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike
+from scipy.integrate import DOP853
 
 from koopman_ros.arrays import frozen
 from koopman_ros.plant_data import Episode, Samples
-from koopman_ros.plants.integration import hold, IntegratorSettings, resolved_limits
 from koopman_ros.plants.system import ControlAffineSystem, FloatArray
 
+LOOSEST_RTOL = 1e-9
+# What scipy still keeps; it takes tighter tolerances for this one, with a warning.
+TIGHTEST_RTOL = 100.0 * float(np.finfo(np.float64).eps)
+# A stiff runaway would otherwise take tiny steps for ever; a reactor needs about ten a minute.
+_MAX_STEPS_PER_HOLD = 20_000
+
+
+class IntegrationFailure(Enum):
+    """Why a simulation ended early, and what to do about it."""
+
+    OUT_OF_BOUNDS = 'it left its bounds; choose an input that keeps it inside, or widen them'
+    NON_FINITE = 'its rate is not finite there; start where the model is defined'
+    STEP_TOO_SMALL = 'it changes too fast to follow; stop before it escapes, or set bounds'
+    TOO_MANY_STEPS = 'it needs too many integration steps; simulate shorter holds'
+
+
+class Limits(NamedTuple):
+    """Tolerances and state bounds (n_x,) of an integration, for one system."""
+
+    rtol: float
+    atol: FloatArray
+    lower: FloatArray
+    upper: FloatArray
+
+
+class IntegrationError(RuntimeError):
+    """
+    A simulation could not reach the end of its time.
+
+    :param sentence: the message: plant, state with units, time, cause and the next step.
+    :param failure: the cause.
+    :param time: when, in time units.
+    :param state: the offending state (n_x,).
+    """
+
+    def __init__(self, sentence: str, failure: IntegrationFailure, time: float, state: FloatArray
+                 ) -> None:
+        # All of them as args, so that the error survives pickling between processes.
+        super().__init__(sentence, failure, time, state)
+        self.sentence = sentence
+        self.failure = failure
+        self.time = time
+        self.state = state
+
+    def __str__(self) -> str:
+        return self.sentence
+
+
+@dataclass(frozen=True, eq=False)
+class IntegratorSettings:
+    """
+    Tolerances and state bounds of an integration.
+
+    :raises ValueError: when `rtol` is outside its range.
+    """
+
+    rtol: float = 1e-10  #: relative tolerance of each integration step, in [2.3e-14, 1e-9]
+    #: absolute tolerance of each, a scalar or (n_x,), in state units and above 0; `rtol` times the
+    #: magnitude of each nominal state when None
+    atol: ArrayLike | None = None
+    #: lowest states allowed, a scalar or (n_x,); the system's own when None
+    lower: ArrayLike | None = None
+    #: highest states allowed, a scalar or (n_x,); the system's own when None
+    upper: ArrayLike | None = None
+
+    def __post_init__(self) -> None:
+        if not TIGHTEST_RTOL <= self.rtol <= LOOSEST_RTOL:
+            raise ValueError(
+                f'rtol is {self.rtol:.3g}, must lie in [{TIGHTEST_RTOL:.3g}, {LOOSEST_RTOL:.3g}]')
+
+
 _DEFAULT_SETTINGS = IntegratorSettings()
+
+
+def resolved_limits(system: ControlAffineSystem, settings: IntegratorSettings) -> Limits:
+    """
+    Fill in what `settings` leaves to the system.
+
+    :raises ValueError: when a bound or a tolerance does not fit.
+    """
+    scale = settings.rtol * system.state_scale
+    atol = scale if settings.atol is None else system.checked_bound('atol', settings.atol)
+    # Zero would divide zero by zero in the error norm of a state that is exactly zero.
+    if not np.all((atol > 0.0) & (atol < np.inf)):
+        raise ValueError(f'atol is {atol}, must be finite and above 0')
+    lower, upper = (
+        own if bound is None else system.checked_bound(name, bound) for name, bound, own in (
+            ('lower', settings.lower, system.state_lower),
+            ('upper', settings.upper, system.state_upper)))
+    return Limits(settings.rtol, atol, lower, upper)
+
+
+def hold(system: ControlAffineSystem, start: FloatArray, u: FloatArray, duration: float,
+         limits: Limits, *, start_time: float = 0.0) -> FloatArray:
+    """
+    Integrate a state over one hold with the explicit Runge-Kutta pair DOP853.
+
+    Why not LSODA: every input step is a kink after which a multistep method has to build up its
+    history again, so that over one second it is no quicker, and its error at the same tolerance
+    is larger by orders of magnitude. The plants are not stiff within their bounds.
+
+    :param start: state at its start (n_x,).
+    :param u: the held input (n_u,).
+    :param duration: its length, in time units.
+    :param start_time: time of its start, for the message of an error.
+    :return: state at its end (n_x,).
+    :raises IntegrationError: when the end is not reached.
+    """
+    forcing = u @ system.B.T
+
+    def rate(_: float, x: FloatArray) -> FloatArray:
+        return system.drift(x) + forcing
+
+    def failed(failure: IntegrationFailure, elapsed: float, x: FloatArray) -> IntegrationError:
+        return _integration_error(system, limits, failure, start_time + elapsed, x)
+
+    # Stages of a step that is then rejected may overflow.
+    with np.errstate(all='ignore'):
+        if not _inside(start, limits):
+            raise failed(IntegrationFailure.OUT_OF_BOUNDS, 0.0, start)
+        # DOP853 would never return from a first step that begins with an infinite rate.
+        if not np.all(np.isfinite(rate(0.0, start))):
+            raise failed(IntegrationFailure.NON_FINITE, 0.0, start)
+        if duration == 0.0:
+            return start.copy()
+        solver = DOP853(rate, 0.0, start, duration, rtol=limits.rtol, atol=limits.atol)
+        for _ in range(_MAX_STEPS_PER_HOLD):
+            solver.step()
+            x: FloatArray = solver.y
+            if solver.status == 'failed':
+                raise failed(IntegrationFailure.STEP_TOO_SMALL, solver.t, x)
+            if not _inside(x, limits):
+                raise failed(IntegrationFailure.OUT_OF_BOUNDS, solver.t, x)
+            if solver.status == 'finished':
+                return x
+        raise failed(IntegrationFailure.TOO_MANY_STEPS, solver.t, x)
+
+
+def _inside(x: FloatArray, limits: Limits) -> bool:
+    return bool(np.all((x >= limits.lower) & (x <= limits.upper)))
+
+
+def _integration_error(system: ControlAffineSystem, limits: Limits, failure: IntegrationFailure,
+                       time: float, state: FloatArray) -> IntegrationError:
+    outside = ''.join(
+        f', {name} outside [{lower:.10g}, {upper:.10g}]{"" if unit == "1" else " " + unit}'
+        for name, unit, x, lower, upper in zip(
+            system.state_names, system.state_units, state, limits.lower, limits.upper,
+            strict=True)
+        if not lower <= x <= upper)
+    sentence = (
+        f'{system.name}: {system.describe_state(state)} at {time:.6g} {system.time_unit}'
+        f'{outside}: {failure.value}')
+    return IntegrationError(sentence, failure, time, state.copy())
 
 
 def advance(system: ControlAffineSystem, x: ArrayLike, u: ArrayLike, duration: float, *,

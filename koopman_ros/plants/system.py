@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 The koopman_ros Authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""The control-affine system dx/dt = f(x) + B u that every plant of this package is."""
+"""The control-affine system dx/dt = f(x) + B u that every plant is, and its holding inputs."""
 
 from collections.abc import Callable
 from dataclasses import dataclass, field
@@ -144,3 +144,33 @@ class ControlAffineSystem:
         return ', '.join(
             f'{name} = {value:.10g}' + ('' if unit == '1' else f' {unit}')
             for name, value, unit in zip(self.state_names, x, self.state_units, strict=True))
+
+
+class EquilibriumError(ValueError):
+    """There is no steady state or no holding input where one was asked for."""
+
+
+def equilibrium_input(system: ControlAffineSystem, state: ArrayLike, *, tolerance: float = 1e-9
+                      ) -> FloatArray:
+    """
+    Find the constant input that holds a state: B u = -f(x) by least squares.
+
+    :param state: the state to hold (n_x,).
+    :param tolerance: largest rate of each state that still counts as held, as a fraction of that
+        state per time unit.
+    :return: the input (n_u,).
+    :raises ValueError: when `state` does not fit the system.
+    :raises EquilibriumError: when no input holds that state.
+    """
+    held = system.checked_state('state', state)
+    u = np.asarray(np.linalg.lstsq(system.B, -system.drift(held), rcond=None)[0], np.float64)
+    rate = system.derivative(held, u)
+    magnitude = np.where(held != 0.0, np.abs(held), system.state_scale)
+    worst = int(np.argmax(np.abs(rate) / magnitude))
+    if not abs(rate[worst]) <= tolerance * magnitude[worst]:
+        raise EquilibriumError(
+            f'{system.name}: no input holds {system.describe_state(held)}: '
+            f'{system.state_names[worst]} still changes by {rate[worst]:.3g} '
+            f'{system.state_units[worst]}/{system.time_unit}; '
+            'choose a steady state')
+    return u

@@ -30,7 +30,7 @@ from koopman_ros.lifting import (
     save,
     TrainingStates,
 )
-from koopman_ros.lifting.files import read_regular
+from koopman_ros.lifting.bounds import read_regular
 from support.random_lifts import random_lift
 from support.sampled_loops import content
 

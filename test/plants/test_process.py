@@ -1,9 +1,10 @@
 # SPDX-FileCopyrightText: 2026 The koopman_ros Authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""A plant that runs in time, and what stands between a command and its input."""
+"""A plant that runs in time; what stands between a command and its input; the sensor."""
 
 from dataclasses import replace
+import math
 
 import numpy as np
 import pytest
@@ -12,10 +13,12 @@ from koopman_ros.plants import (
     Actuator,
     advance,
     ControlAffineSystem,
+    in_steps,
     IntegrationError,
     one_state_reactor,
     Process,
     scalar_example,
+    sensor_noise,
 )
 from koopman_ros.units import NANOSECONDS as SECOND
 
@@ -63,17 +66,13 @@ def test_an_instant_is_reached_in_the_units_of_the_plant() -> None:
     assert start.until(3 * SECOND // 2).x[0] == pytest.approx(0.5 / (1.0 - 0.75), rel=1e-9)
 
 
-def test_a_steady_state_stays_whatever_the_steps() -> None:
+def test_a_steady_state_stays_whatever_the_steps_and_a_runaway_is_an_error() -> None:
     process = actuated(Actuator(), one_state_reactor())
     for n in range(1, 11):
         process = process.until(n * SECOND)
     np.testing.assert_allclose(process.x, process.system.nominal_state, rtol=0.0, atol=1e-9)
-
-
-def test_a_runaway_is_an_error() -> None:
-    process = given(actuated(Actuator(), one_state_reactor()), 320.0)
     with pytest.raises(IntegrationError, match='temperature'):
-        process.until(3600 * SECOND)
+        given(process, 320.0).until(3600 * SECOND)
 
 
 # The lag.
@@ -96,16 +95,12 @@ def test_a_lag_is_in_the_seconds_of_a_plant_in_minutes() -> None:
     assert system.nominal_state[0] < late.x[0] < at_once.x[0] - 1.0
 
 
-def test_a_short_lag_in_a_long_hold_settles_to_the_bit() -> None:
+def test_a_lag_that_is_over_or_taken_away_leaves_the_command_itself() -> None:
     plant = given(actuated(Actuator(lag=1e-3)), 2.0).until(3600 * SECOND)
     assert plant.u[0] == 2.0
     assert plant.x[0] == pytest.approx(-2.0 * GAIN / SLOPE, rel=1e-9)
-
-
-def test_a_lag_that_is_taken_away_leaves_the_command() -> None:
     plant = given(actuated(Actuator(lag=10.0)), 2.0).until(1 * SECOND)
-    plant = replace(plant, actuator=Actuator()).until(2 * SECOND)
-    assert plant.u[0] == 2.0
+    assert replace(plant, actuator=Actuator()).until(2 * SECOND).u[0] == 2.0
 
 
 # The delay.
@@ -132,16 +127,12 @@ def test_a_delay_of_samples_shifts_the_commands(samples: int) -> None:
     assert acted == [0.0] * samples + values[:len(values) - samples]
 
 
-def test_a_delay_within_a_hold_takes_effect_in_the_middle_of_it() -> None:
-    plant = given(actuated(Actuator(delay=0.4)), 2.0).until(SECOND)
-    assert plant.x[0] == pytest.approx(
-        2.0 * GAIN / SLOPE * (np.exp(SLOPE * 0.6) - 1.0), abs=1e-10)
-
-
-def test_a_lag_follows_the_delay() -> None:
-    plant = given(actuated(Actuator(delay=0.5, lag=0.3)), 2.0).until(SECOND)
+@pytest.mark.parametrize(('delay', 'lag'), [(0.4, 0.0), (0.5, 0.3)])
+def test_a_delay_takes_effect_in_the_middle_of_a_hold_and_the_lag_follows(
+        delay: float, lag: float) -> None:
+    plant = given(actuated(Actuator(delay=delay, lag=lag)), 2.0).until(SECOND)
     assert (plant.x[0], plant.u[0]) == pytest.approx(
-        analytic(0.0, 0.0, 2.0, 0.3, 0.5), abs=1e-9)
+        analytic(0.0, 0.0, 2.0, max(lag, 1e-12), 1.0 - delay), abs=1e-9)
 
 
 def test_a_command_supersedes_those_that_would_act_later() -> None:
@@ -159,16 +150,30 @@ def test_an_earlier_instant_changes_nothing() -> None:
     assert plant.until(SECOND) is plant
 
 
-# The range.
-
-def test_an_input_reaches_no_further_than_its_range() -> None:
+def test_an_input_reaches_no_further_than_its_range_also_when_that_narrows() -> None:
     plant = given(actuated(Actuator(lower=-1.0, upper=1.5)), 2.0).until(SECOND)
     assert plant.u[0] == 1.5
     assert given(plant, -2.0).until(2 * SECOND).u[0] == -1.0
-
-
-def test_a_range_that_narrows_moves_the_held_input() -> None:
-    plant = given(actuated(Actuator()), 2.0).until(SECOND)
     plant = replace(plant, actuator=Actuator(upper=1.0)).until(2 * SECOND)
     assert plant.u[0] == 1.0
     assert replace(plant, actuator=Actuator()).until(3 * SECOND).u[0] == 2.0
+
+
+# The sensor.
+
+def test_noise_repeats_by_seed_and_sample() -> None:
+    values = [sensor_noise(0.1, 7, n) for n in range(4000)]
+    assert values == [sensor_noise(0.1, 7, n) for n in range(4000)]
+    assert values[:5] != [sensor_noise(0.1, 8, n) for n in range(5)]
+    # 4000 samples determine the standard deviation to about 1.1 % (one sigma)
+    assert math.isclose(np.std(values), 0.1, rel_tol=0.05)
+    assert abs(np.mean(values)) < 5 * 0.1 / math.sqrt(4000)
+    assert sensor_noise(0.0, 7, 3) == 0.0
+
+
+@pytest.mark.parametrize(('value', 'resolution', 'shown'), [
+    (25.34, 0.1, 25.3), (25.36, 0.1, 25.4), (-0.3, 0.25, -0.25), (7.0, 10.0, 10.0),
+    (3.0, 10.0, 0.0), (51.3, 5e-324, 51.3), (1.0 / 3.0, 0.0, 1.0 / 3.0)])
+def test_a_sensor_shows_multiples_of_its_resolution(
+        value: float, resolution: float, shown: float) -> None:
+    assert in_steps(value, resolution) == pytest.approx(shown, abs=1e-14)

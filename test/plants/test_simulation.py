@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 The koopman_ros Authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""Zero-order-hold simulation against closed forms, and its failures."""
+"""Simulation under held inputs against closed forms; random steps that stay inside a box."""
 
 from dataclasses import replace
 import pickle
@@ -11,20 +11,22 @@ import pytest
 
 from koopman_ros.plants import (
     advance,
-    integration,
+    ExcitationError,
     IntegrationError,
     IntegrationFailure,
     IntegratorSettings,
     one_state_reactor,
+    random_steps,
+    RandomStepDesign,
     sample_derivatives,
     scalar_example,
     simulate,
+    simulation,
     two_state_example,
     two_state_reactor,
 )
 
 STRICT = IntegratorSettings(rtol=1e-13)
-UNBOUNDED = IntegratorSettings(lower=-np.inf, upper=np.inf)
 
 
 def _two_state_closed_form(x, u, t, mu, lambda_):
@@ -56,10 +58,11 @@ def test_two_state_example_against_its_closed_form(mu, lambda_):
     np.testing.assert_allclose(episode.x, expected, rtol=1e-9)
 
 
-def test_reactor_settles_at_its_steady_state():
+def test_reactor_settles_at_its_steady_state_but_not_in_no_time():
     system = one_state_reactor()
     state = advance(system, [310.0], [300.0], 60.0)
     np.testing.assert_allclose(state, system.nominal_state, rtol=1e-9)
+    np.testing.assert_array_equal(advance(system, [310.0], [300.0], 0.0), [310.0])
 
 
 @pytest.mark.parametrize('rtol', [1e-9, 1e-10, 1e-11])
@@ -89,34 +92,16 @@ def test_advancing_hold_by_hold_is_simulating_to_the_bit():
         np.testing.assert_array_equal(state, episode.x[n + 1])
 
 
-def test_times_are_not_summed_up():
-    episode = simulate(scalar_example(), [0.0], np.zeros((200, 0)), 0.1, start_time=7.0)
-    np.testing.assert_array_equal(episode.time, 7.0 + 0.1 * np.arange(201))
-
-
 def test_substeps_record_more_of_the_same_trajectory():
     system, inputs = one_state_reactor(), _random_holds(6)
     coarse = simulate(system, [320.0], inputs, 0.7)
     fine = simulate(system, [320.0], inputs, 0.7, substeps=3)
     assert fine.x.shape == (19, 1)
+    # times are not summed up
+    np.testing.assert_array_equal(coarse.time, 0.7 * np.arange(7))
     np.testing.assert_array_equal(fine.time[::3], coarse.time)
     np.testing.assert_array_equal(fine.u, np.repeat(inputs, 3, axis=0))
     np.testing.assert_allclose(fine.x[::3], coarse.x, rtol=1e-9)
-
-
-def test_no_time_no_change():
-    np.testing.assert_array_equal(advance(one_state_reactor(), [310.0], [300.0], 0.0), [310.0])
-
-
-def counting(system):
-    """Return a system that counts how often its drift is evaluated, and the count."""
-    count = [0]
-
-    def drift(x):
-        count[0] += 1
-        return system.drift(x)
-
-    return replace(system, drift=drift), count
 
 
 REACTOR, TWO_STATES = one_state_reactor(), two_state_reactor()
@@ -142,11 +127,18 @@ OUT_OF_BOUNDS = IntegrationFailure.OUT_OF_BOUNDS
 ])
 def test_what_cannot_go_on_ends_in_an_error_that_names_state_and_time(
         system, x, u, duration, bounds, message, failure):
-    counted, evaluations = counting(system)
+    evaluations = []
+
+    def drift(x):
+        evaluations.append(x)
+        return system.drift(x)
+
+    counted = replace(system, drift=drift)
+    evaluations.clear()
     with pytest.raises(IntegrationError, match=message) as caught:
         advance(counted, x, u, duration, settings=IntegratorSettings(**bounds))
     # far from the limit of steps: it ends once the bound is passed
-    assert evaluations[0] < 20_000, evaluations
+    assert len(evaluations) < 20_000
     assert caught.value.failure is failure
     copy = pickle.loads(pickle.dumps(caught.value))
     assert str(copy) == str(caught.value)
@@ -160,13 +152,10 @@ def test_time_of_a_failure_counts_from_the_start_time():
     assert 11.0 < caught.value.time < 12.0
 
 
-def test_runaway_without_bounds_is_no_warning():
-    state = advance(one_state_reactor(), [324.0], [310.0], 5.0, settings=UNBOUNDED)
-    assert state.item() > 1e6
-
-
-def test_stiff_plant_is_given_up(monkeypatch):
-    monkeypatch.setattr(integration, '_MAX_STEPS_PER_HOLD', 50)
+def test_stiff_plant_is_given_up_and_a_runaway_without_bounds_is_no_warning(monkeypatch):
+    unbounded = IntegratorSettings(lower=-np.inf, upper=np.inf)
+    assert advance(one_state_reactor(), [324.0], [310.0], 5.0, settings=unbounded).item() > 1e6
+    monkeypatch.setattr(simulation, '_MAX_STEPS_PER_HOLD', 50)
     with pytest.raises(IntegrationError, match='too many integration steps') as caught:
         advance(two_state_example(-0.1, -1e6), [0.0, 1.0], [1.0], 1.0)
     assert caught.value.failure is IntegrationFailure.TOO_MANY_STEPS
@@ -224,3 +213,119 @@ def test_samples_without_input():
     np.testing.assert_array_equal(samples.dxdt, samples.x ** 2)
     with pytest.raises(ValueError, match=r'incompatible u: expected \(\.\.\., 1\), got \(3, 0\)'):
         sample_derivatives(one_state_reactor(), [episode])
+
+
+# Random steps.
+
+DESIGN = RandomStepDesign(
+    input_lower=281.3, input_upper=300.9, state_lower=305.0, state_upper=330.0,
+    hold_time=(1.0, 4.0), sample_period=0.25)
+
+
+def _inside(episode, design):
+    return np.all((episode.x >= design.state_lower) & (episode.x <= design.state_upper))
+
+
+def _changes(episode):
+    """Return the numbers of the samples at which the input steps."""
+    return np.flatnonzero(np.diff(episode.u[:, 0])) + 1
+
+
+def test_samples_stay_inside_box_and_bounds_and_repeat_by_seed():
+    system, levels = one_state_reactor(), set()
+    for seed in range(4):
+        episode, again = (random_steps(system, DESIGN, 30.0, seed) for _ in range(2))
+        assert episode.x.shape == (121, 1)
+        np.testing.assert_array_equal(episode.time, 0.25 * np.arange(121))
+        assert _inside(episode, DESIGN)
+        assert np.all((episode.u >= 281.3) & (episode.u <= 300.9))
+        assert np.ptp(episode.u) > 10.0
+        np.testing.assert_array_equal(again.x, episode.x)
+        np.testing.assert_array_equal(again.u, episode.u)
+        assert levels.isdisjoint(episode.u[:, 0])
+        levels |= set(episode.u[:, 0])
+    replayed = simulate(system, episode.x[0], episode.u, 0.25)
+    np.testing.assert_array_equal(replayed.x, episode.x)
+
+
+def test_hold_times_are_random_or_fixed_and_the_last_one_is_cut_short():
+    episode = random_steps(one_state_reactor(), DESIGN, 100.0, 0)
+    lengths = np.diff(_changes(episode))
+    assert set(lengths) <= set(range(4, 17))
+    assert len(set(lengths)) > 5
+    episode = random_steps(one_state_reactor(), replace(DESIGN, hold_time=1.5), 5.0, 0, x0=[306.0])
+    assert _changes(episode).tolist() == [6, 12, 18]
+    assert len(episode.u) == 20
+    assert episode.x[0] == [306.0]
+    # 0.3 / 0.1 is slightly below 3
+    assert replace(DESIGN, hold_time=0.3, sample_period=0.1).hold_samples == (3, 3)
+
+
+def test_levels_that_leave_the_box_are_drawn_again():
+    design = replace(DESIGN, input_upper=315.0)
+    episode = random_steps(one_state_reactor(), design, 40.0, 0)
+    assert _inside(episode, design)
+    # the same levels without a box would have left it
+    free = replace(design, state_lower=0.0, state_upper=999.0)
+    assert not _inside(random_steps(one_state_reactor(), free, 40.0, 0), design)
+
+
+def test_two_states_in_a_box():
+    design = RandomStepDesign(
+        input_lower=[285.0], input_upper=[306.0], state_lower=[0.6, 305.0],
+        state_upper=[1.0, 330.0], hold_time=(0.5, 3.0), sample_period=0.25)
+    episode = random_steps(two_state_reactor(), design, 40.0, 1)
+    assert _inside(episode, design)
+
+
+@pytest.mark.parametrize(('changes', 'x0', 'message'), [
+    ({'input_lower': 310.0, 'input_upper': 320.0, 'max_redraws': 7}, None,
+     r'one-state reactor: temperature reached 33\d\.\d+ K, outside the box \[305, 330\] K at '
+     r'0\.\d+ min, and so it went with each of 8 levels of coolant_temperature in '
+     r'\[310, 320\] K; narrow the input bounds, widen the box or shorten hold_time'),
+    ({}, [300.0], r'at the start temperature reached 300 K, outside the box \[305, 330\] K; '
+     'choose x0 inside the box'),
+])
+def test_no_level_saves_it(changes, x0, message):
+    with pytest.raises(ExcitationError, match=message):
+        random_steps(one_state_reactor(), replace(DESIGN, **changes), 40.0, 0, x0=x0)
+
+
+def test_failure_that_is_not_the_box_is_passed_on():
+    design = RandomStepDesign(
+        input_lower=-1.0, input_upper=1.0, state_lower=-np.inf, state_upper=np.inf,
+        hold_time=1.0, sample_period=1.0)
+    broken = replace(
+        two_state_example(), drift=lambda x: np.where(x > 0.5, np.inf, x))
+    with pytest.raises(IntegrationError, match='its rate is not finite there'):
+        random_steps(broken, design, 5.0, 0, x0=[1.0, 1.0])
+
+
+@pytest.mark.parametrize(('changes', 'message'), [
+    ({'sample_period': 0.0}, r'sample_period is 0\.0, must be finite and above 0'),
+    ({'max_redraws': -1}, 'max_redraws is -1, must not be negative'),
+    ({'hold_time': 0.3}, r'hold_time is 0\.3, must allow a whole number of sample periods of'),
+    ({'hold_time': (0.3, 0.4)}, r'hold_time is \(0\.3, 0\.4\), must allow a whole number'),
+    ({'hold_time': 0.0}, r'hold_time is 0\.0, must allow'),
+    ({'hold_time': (1.0, np.inf)}, r'hold_time must be finite: entry \[1\] is inf'),
+])
+def test_design_is_checked(changes, message):
+    with pytest.raises(ValueError, match=message):
+        replace(DESIGN, **changes)
+
+
+@pytest.mark.parametrize(('changes', 'duration', 'message'), [
+    ({}, 0.3, r'duration is 0\.3 min, must be a multiple of the sample period of 0\.25 min'),
+    ({}, 0.0, r'duration is 0\.0 min'),
+    ({}, np.inf, 'duration is inf min'),
+    ({'input_lower': [1.0, 2.0]}, 5.0, r'incompatible input_lower: expected \(1,\), got \(2,\)'),
+    ({'input_lower': 301.0}, 5.0, r'input_lower \[301\.\] must lie below input_upper'),
+    ({'state_upper': 300.0}, 5.0, r'state_lower \[305\.\] must lie below state_upper'),
+    ({'state_upper': [1.0, 2.0]}, 5.0, r'incompatible state_upper: expected \(1,\), got \(2,\)'),
+    ({'rtol': 1e-3}, 5.0, r'rtol is 0\.001'),
+])
+def test_design_must_fit_the_system(changes, duration, message):
+    with pytest.raises(ValueError, match=message):
+        random_steps(one_state_reactor(), replace(DESIGN, **changes), duration, 0)
+    with pytest.raises(ValueError, match='scalar example has no input to step'):
+        random_steps(scalar_example(), DESIGN, 5.0, 0)

@@ -1,37 +1,43 @@
 # SPDX-FileCopyrightText: 2026 The koopman_ros Authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""The control-affine system: shapes, names and derivatives."""
+"""Control-affine systems, their steady states and holding inputs; the plants of the library."""
 
-from dataclasses import FrozenInstanceError, replace
+from dataclasses import fields, FrozenInstanceError, replace
 import pickle
+import re
 
 import numpy as np
 import pytest
 
 from koopman_ros.plants import (
-    ControlAffineSystem,
+    equilibrium_input,
+    EquilibriumError,
+    NOMINAL_COOLANT_TEMPERATURE,
     one_state_reactor,
+    ReactorParameters,
     scalar_example,
     two_state_example,
     two_state_reactor,
 )
+from support.closed_loops import steady_state
 
+NOMINAL = 324.475443431599
+REACTORS = [one_state_reactor, two_state_reactor]
 PLANTS = {
-    'scalar example': (scalar_example, [0.3, 0.7, 2.0]),
-    'two-state example': (two_state_example, [0.5, 1.5, -2.0]),
-    'one-state reactor': (one_state_reactor, [310.0, 324.0, 360.0]),
-    'two-state reactor': (two_state_reactor, [310.0, 324.0, 360.0]),
+    scalar_example: [0.3, 0.7, 2.0],
+    two_state_example: [0.5, 1.5, -2.0],
+    one_state_reactor: [310.0, 324.0, 360.0],
+    two_state_reactor: [310.0, 324.0, 360.0],
 }
 
 
 @pytest.fixture(params=PLANTS)
-def plant_and_states(request: pytest.FixtureRequest) -> tuple[ControlAffineSystem, np.ndarray]:
-    build, values = PLANTS[request.param]
-    system = build()
+def plant_and_states(request):
+    system = request.param()
     rng = np.random.default_rng(0)
-    states = np.array(values)[:, None] + rng.uniform(0.0, 0.5, (3, system.n_x))
-    if system.name == 'two-state reactor':
+    states = np.array(PLANTS[request.param])[:, None] + rng.uniform(0.0, 0.5, (3, system.n_x))
+    if request.param is two_state_reactor:
         states[:, 0] = [0.9, 0.5, 0.1]
     return system, states
 
@@ -59,18 +65,14 @@ def test_derivative_is_drift_plus_forcing(plant_and_states):
     u = np.linspace(1.0, 2.0, 3 * system.n_u).reshape(3, system.n_u)
     expected = [system.drift(x) + system.B @ v for x, v in zip(states, u, strict=True)]
     np.testing.assert_allclose(system.derivative(states, u), expected, rtol=1e-15)
-    np.testing.assert_allclose(system.derivative(states, u)[1],
-                               system.derivative(states[1], u[1]), rtol=1e-15)
+    np.testing.assert_allclose(system.derivative(states[1], u[0]),
+                               system.drift(states[1]) + system.B @ u[0], rtol=1e-15)
 
 
-def test_nominal_point_is_a_steady_state(plant_and_states):
-    system, _ = plant_and_states
+def test_a_plant_rests_at_its_nominal_point_and_its_copy_is_the_same(plant_and_states):
+    system, states = plant_and_states
     rate = system.derivative(system.nominal_state, system.nominal_input)
     np.testing.assert_allclose(rate, 0.0, atol=1e-11)
-
-
-def test_system_survives_pickling(plant_and_states):
-    system, states = plant_and_states
     copy = pickle.loads(pickle.dumps(system))
     np.testing.assert_array_equal(copy.drift(states), system.drift(states))
 
@@ -87,27 +89,22 @@ def test_arrays_are_float64_and_read_only(plant_and_states):
 
 def test_no_input_works_throughout():
     system = scalar_example()
-    assert (system.n_x, system.n_u) == (1, 0)
-    assert system.B.shape == (1, 0)
+    assert (system.n_x, system.n_u, system.B.shape) == (1, 0, (1, 0))
     np.testing.assert_array_equal(system.derivative([3.0], []), [9.0])
     np.testing.assert_array_equal(system.derivative([[3.0], [2.0]], np.zeros((2, 0))),
                                   [[9.0], [4.0]])
+    assert equilibrium_input(system, [0.0]).shape == (0,)
 
 
-@pytest.mark.parametrize(('unit', 'seconds'), [('min', 60.0), ('s', 1.0)])
-def test_time_units(unit, seconds):
-    assert replace(two_state_example(), time_unit=unit).seconds_per_time_unit == seconds
-
-
-def test_state_scale_is_the_nominal_magnitude_and_one_at_zero():
+def test_units_scale_and_words():
     system = replace(two_state_example(), nominal_state=[-3.0, 0.0])
+    for unit, seconds in (('min', 60.0), ('s', 1.0)):
+        assert replace(system, time_unit=unit).seconds_per_time_unit == seconds
+    # the nominal magnitude, and one at zero
     np.testing.assert_array_equal(system.state_scale, [3.0, 1.0])
-
-
-def test_descriptions_carry_names_and_units():
+    assert system.describe_state(np.array([1.0, -2.0])) == 'x1 = 1, x2 = -2'
     assert two_state_reactor().describe_state(np.array([0.5, 350.0])) == (
         'concentration = 0.5 mol/L, temperature = 350 K')
-    assert two_state_example().describe_state(np.array([1.0, -2.0])) == 'x1 = 1, x2 = -2'
 
 
 @pytest.mark.parametrize(('changes', 'message'), [
@@ -142,10 +139,156 @@ def test_derivative_names_what_does_not_fit(x, u, message):
         two_state_example().derivative(x, u)
 
 
-@pytest.mark.parametrize(('rates', 'message'), [
-    ({'mu': np.nan}, 'mu is nan 1/s, must be finite'),
-    ({'lambda_': np.inf}, 'lambda_ is inf 1/s, must be finite'),
+# Steady states and holding inputs, against their analytic figures.
+
+@pytest.mark.parametrize(('system', 'u', 'guess', 'state', 'eigenvalues'), [
+    (one_state_reactor(), 300.0, [320.0], [NOMINAL], [-0.957887]),
+    (one_state_reactor(), 300.0, [336.0], [333.773476], [1.182959]),
+    (one_state_reactor(), 292.287569, [316.0], [314.475443], [-2.128208]),
+    # the fold
+    (one_state_reactor(), 301.183717, [329.0], [329.369601], [0.0]),
+    (two_state_reactor(), 300.0, [0.9, 320.0], [0.877253, 324.475443],
+     [-1.0489 - 0.5388j, -1.0489 + 0.5388j]),
+    (two_state_reactor(), 300.0, [0.5, 350.0], [0.499918, 350.005529], [-0.454227, 2.834443]),
+    (two_state_reactor(), 300.0, [0.2, 370.0], [0.208761, 369.704913],
+     [1.357 - 1.540j, 1.357 + 1.540j]),
+    (two_state_example(), 2.0, [3.0, 3.0], [0.0, -2.0], [-0.1, 1.0]),
 ])
-def test_rates_must_be_finite(rates, message):
-    with pytest.raises(ValueError, match=message):
-        two_state_example(**rates)
+def test_steady_states_and_their_eigenvalues(system, u, guess, state, eigenvalues):
+    # at the fold the root is a double one
+    fold = eigenvalues == [0.0]
+    found = np.array(state) if fold else steady_state(system, [u], guess)
+    np.testing.assert_allclose(found, state, rtol=0, atol=1e-6)
+    np.testing.assert_allclose(system.derivative(found, [u]), 0.0, atol=1e-5)
+    # figures given to four decimals carry half of the fifth
+    slopes = np.sort_complex(np.linalg.eigvals(system.drift_jacobian(found)))
+    np.testing.assert_allclose(slopes, eigenvalues, rtol=0, atol=5e-4)
+
+
+@pytest.mark.parametrize(('system', 'state', 'coolant', 'tolerance'), [
+    (one_state_reactor(), [NOMINAL], 300.0, 1e-9),
+    (one_state_reactor(), [NOMINAL - 10.0], 292.287569, 1e-6),
+    # the lowest and highest coolant that keep the reactor between 305 and 327 K
+    (one_state_reactor(), [305.0], 281.3, 0.05),
+    (one_state_reactor(), [327.0], 300.9, 0.05),
+])
+def test_input_that_holds_a_state(system, state, coolant, tolerance):
+    np.testing.assert_allclose(
+        equilibrium_input(system, state), [coolant], rtol=0, atol=tolerance)
+
+
+def test_linear_feed_forward_settles_off_its_setpoint():
+    system = one_state_reactor()
+    slope = system.drift_jacobian(system.nominal_state)
+    linear = system.nominal_input + np.linalg.solve(system.B, -slope @ [-10.0])
+    np.testing.assert_allclose(linear, [295.421299], rtol=0, atol=1e-6)
+    offset = steady_state(system, linear, [318.0]) - (system.nominal_state - 10.0)
+    np.testing.assert_allclose(offset, [3.3009], rtol=0, atol=5e-5)
+
+
+@pytest.mark.parametrize(('system', 'state', 'message'), [
+    (two_state_reactor(), [0.8, 324.0],
+     r'no input holds concentration = 0\.8 mol/L, temperature = 324 K: '
+     r'concentration still changes by 0\.0924 mol/L/min; choose a steady state'),
+    (scalar_example(), [1.0], 'no input holds x = 1: x still changes by 1 1/s'),
+    (one_state_reactor(), [1.0, 2.0], r'incompatible state: expected \(1,\), got \(2,\)'),
+    (one_state_reactor(), [np.nan], 'state must be finite'),
+])
+def test_state_that_no_input_holds(system, state, message):
+    with pytest.raises(ValueError, match=message) as caught:
+        equilibrium_input(system, state)
+    assert isinstance(caught.value, EquilibriumError) is ('no input' in message)
+
+
+def test_tolerance_of_the_holding_input():
+    rounded = [0.877253, 324.475443]
+    with pytest.raises(EquilibriumError, match='concentration still changes'):
+        equilibrium_input(two_state_reactor(), rounded)
+    u = equilibrium_input(two_state_reactor(), rounded, tolerance=1e-6)
+    np.testing.assert_allclose(u, [300.0], atol=1e-4)
+
+
+# The reactors and the examples of the paper.
+
+@pytest.mark.parametrize(('build', 'names', 'units', 'nominal', 'B'), [
+    (one_state_reactor, ('temperature',), ('K',), [NOMINAL], [[2.092050209]]),
+    (two_state_reactor, ('concentration', 'temperature'), ('mol/L', 'K'),
+     [0.87725294608097, NOMINAL], [[0.0], [2.092050209]]),
+])
+def test_signals_and_nominal_point_of_a_reactor(build, names, units, nominal, B):
+    system = build()
+    assert (system.state_names, system.state_units, system.time_unit) == (names, units, 'min')
+    assert (system.input_names, system.input_units) == (('coolant_temperature',), ('K',))
+    np.testing.assert_allclose(system.nominal_state, nominal, rtol=1e-13)
+    np.testing.assert_array_equal(system.nominal_input, [300.0])
+    np.testing.assert_allclose(system.B, B, rtol=0, atol=1e-9)
+
+
+@pytest.mark.parametrize('build', REACTORS)
+@pytest.mark.parametrize('changes', [
+    *({'heat_transfer_coefficient': 6e4, 'feed_temperature': kelvin}
+      for kelvin in (345.0, 350.0, 355.0)), {'feed_temperature': 345.0}])
+def test_nominal_point_follows_the_parameters(build, changes):
+    system = build(ReactorParameters(**changes))
+    assert system.nominal_input == [NOMINAL_COOLANT_TEMPERATURE]
+    rate = system.derivative(system.nominal_state, system.nominal_input)
+    np.testing.assert_allclose(rate, 0.0, atol=1e-10)
+    assert np.all(np.linalg.eigvals(system.drift_jacobian(system.nominal_state)).real < 0.0)
+    assert system.nominal_state[-1] < build().nominal_state[-1]
+
+
+@pytest.mark.parametrize(('build', 'changes'), [
+    *((build, {'heat_transfer_coefficient': 4e4}) for build in REACTORS),
+    (one_state_reactor, {'feed_temperature': 355.0}),
+    # this one has a single steady state, at 364 K, and a limit cycle around it
+    (two_state_reactor, {'heat_transfer_coefficient': 7e4, 'feed_temperature': 400.0}),
+])
+def test_missing_stable_steady_state_is_an_error_unless_a_nominal_state_is_given(build, changes):
+    message = r'no stable steady state .* coolant temperature of 300 K.*give nominal_state'
+    with pytest.raises(EquilibriumError, match=message):
+        build(ReactorParameters(**changes))
+    before = build()
+    system = build(ReactorParameters(**changes), nominal_state=before.nominal_state)
+    np.testing.assert_array_equal(system.nominal_state, before.nominal_state)
+    gain = changes.get('heat_transfer_coefficient', 5e4) / 5e4
+    assert system.B[-1, 0] == pytest.approx(gain * before.B[-1, 0])
+    with pytest.raises(ValueError, match=r'incompatible nominal_state: expected .* got \(3,\)'):
+        build(nominal_state=[1.0, 2.0, 3.0])
+
+
+def test_two_state_reactor_at_the_held_concentration_is_the_one_state_reactor():
+    parameters = ReactorParameters()
+    temperatures = np.linspace(300.0, 360.0, 7)
+    states = np.stack([np.full(7, parameters.concentration), temperatures], axis=-1)
+    np.testing.assert_array_equal(
+        two_state_reactor(parameters).drift(states)[:, 1],
+        one_state_reactor(parameters).drift(temperatures[:, None])[:, 0])
+
+
+@pytest.mark.parametrize(('changes', 'rate'), [
+    # at 350 K and 0.5 mol/L the Arrhenius factor is exp(-25), so the rates below need no solver
+    ({}, [0.5 - 0.5 * 7.2e10 * np.exp(-25.0),
+          0.5 * 7.2e10 * np.exp(-25.0) * 5e4 / 239.0 - 350.0 * 5e4 / 23900.0]),
+    ({'pre_exponential_factor': 0.0, 'flow_rate': 50.0, 'feed_temperature': 340.0},
+     [0.25, -5.0 - 350.0 * 5e4 / 23900.0]),
+    ({'pre_exponential_factor': 0.0, 'heat_transfer_coefficient': 0.0, 'feed_concentration': 0.7},
+     [0.2, 0.0]),
+    ({'pre_exponential_factor': 0.0, 'volume': 200.0, 'density': 500.0, 'heat_capacity': 0.478},
+     [0.25, -350.0 * 5e4 / 47800.0]),
+])
+def test_every_constant_enters_the_rates(changes, rate):
+    system = two_state_reactor(ReactorParameters(**changes), nominal_state=[0.5, 350.0])
+    np.testing.assert_allclose(system.drift(np.array([0.5, 350.0])), rate, rtol=1e-12, atol=1e-12)
+
+
+def test_each_constant_is_refused_outside_its_range_with_its_unit():
+    for constant in fields(ReactorParameters):
+        unit = re.escape(constant.metadata['unit'])
+        for value in (np.nextafter(constant.metadata['upper'], np.inf), np.nan, -np.inf):
+            message = rf'{constant.name} is .* {unit}, must lie in \[.*\] {unit}'
+            with pytest.raises(ValueError, match=message):
+                ReactorParameters(**{constant.name: value})
+    with pytest.raises(ValueError, match='mu is nan 1/s, must be finite'):
+        two_state_example(mu=np.nan)
+    with pytest.raises(ValueError, match='lambda_ is inf 1/s, must be finite'):
+        two_state_example(lambda_=np.inf)

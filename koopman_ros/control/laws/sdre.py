@@ -17,7 +17,7 @@ from koopman_ros.control.target import Target
 from koopman_ros.estimation import Estimate
 from koopman_ros.lifting import LiftedModel
 from koopman_ros.reasons import Code, reason
-from koopman_ros.solvers.riccati import RiccatiSolution, RiccatiStatus, solve_riccati
+from koopman_ros.solvers import RiccatiSolution, RiccatiStatus, solve_riccati
 
 
 class Form(Enum):

@@ -10,8 +10,12 @@ import numpy as np
 from numpy.typing import ArrayLike
 from scipy.optimize import brentq
 
-from koopman_ros.plants.equilibria import EquilibriumError
-from koopman_ros.plants.system import ArrayFunction, ControlAffineSystem, FloatArray
+from koopman_ros.plants.system import (
+    ArrayFunction,
+    ControlAffineSystem,
+    EquilibriumError,
+    FloatArray,
+)
 
 # The coolant temperature, in K, around which both reactors are run.
 NOMINAL_COOLANT_TEMPERATURE = 300.0

@@ -1,25 +1,28 @@
 # SPDX-FileCopyrightText: 2026 The koopman_ros Authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""The run-time model: sizes, scaling, modes and drift; the linearisation as one of its kind."""
+"""The run-time model: sizes, modes, drift, linearisation; boxes of signals, training states."""
 
 from dataclasses import replace
+import math
 
 import numpy as np
 import pytest
 
+from koopman_ros.learning import Growth, train
+from koopman_ros.learning.scaled import deviations
 from koopman_ros.lifting import (
+    Box,
     Coordinates,
     linearised_model,
     PolynomialObservables,
     Provenance,
+    TrainingStates,
 )
+from koopman_ros.plant_data import Plant
 from koopman_ros.plants import two_state_reactor
 from support.random_lifts import coordinates, random_lift, random_network
-
-SHAPES = [(n_x, widths, identity)
-          for n_x in (1, 2, 3) for widths in ((6,), (5, 4)) for identity in (True, False)]
-every_shape = pytest.mark.parametrize(('n_x', 'widths', 'identity'), SHAPES)
+from support.small_plants import BENT, bent_samples, TWO_STATE, two_state_samples
 
 
 def states(n_x, count=20, seed=1):
@@ -46,7 +49,9 @@ def test_a_model_lifts_as_its_observables_do(model):
             np.testing.assert_array_equal(a, b)
 
 
-@every_shape
+@pytest.mark.parametrize('identity', [True, False])
+@pytest.mark.parametrize(('n_x', 'widths'), [
+    (n_x, widths) for n_x in (1, 2, 3) for widths in ((6,), (5, 4))])
 def test_rates_of_z_are_brought_to_the_nearest_rate_of_the_state(n_x, widths, identity):
     """And the drift is that of A z, for a batch as for its members."""
     model = random_lift(n_x, widths, identity=identity)
@@ -68,8 +73,8 @@ def test_rates_of_z_are_brought_to_the_nearest_rate_of_the_state(n_x, widths, id
 
 def test_a_lift_that_stands_still_moves_no_state():
     model = random_lift(1, identity=False)
-    flat = np.zeros((model.n_z, 1))
-    np.testing.assert_array_equal(model.onto_states(flat, np.ones(model.n_z)), [0.0])
+    np.testing.assert_array_equal(
+        model.onto_states(np.zeros((model.n_z, 1)), np.ones(model.n_z)), [0.0])
 
 
 def test_drift_of_a_dictionary_by_hand():
@@ -119,8 +124,10 @@ def test_linearisation_is_a_lift_with_itself():
     np.testing.assert_array_equal(H, np.zeros((2, 2)))
 
 
-def test_linearisation_in_units():
+def test_linearisation_in_units_has_the_eigenvalues_of_the_plant():
     system, model = linear_reactor()
+    assert model.is_hurwitz
+    assert model.seconds_per_time_unit == 60.0
     x = system.nominal_state + np.array([0.02, -3.0])
     u = system.nominal_input + 4.0
     rate = model.states.scale * (
@@ -128,34 +135,21 @@ def test_linearisation_in_units():
     jacobian = system.drift_jacobian(system.nominal_state)
     expected = jacobian @ (x - system.nominal_state) + system.B @ (u - system.nominal_input)
     np.testing.assert_allclose(rate, expected, rtol=1e-13)
+    np.testing.assert_allclose(np.sort_complex(model.eigenvalues),
+                               np.sort_complex(np.linalg.eigvals(jacobian)), rtol=1e-12)
 
 
-def test_linearisation_has_the_eigenvalues_of_the_plant():
-    system, model = linear_reactor()
-    np.testing.assert_allclose(
-        np.sort_complex(model.eigenvalues), np.sort_complex(np.linalg.eigvals(
-            system.drift_jacobian(system.nominal_state))), rtol=1e-12)
-    assert model.is_hurwitz
-    assert model.seconds_per_time_unit == 60.0
-
-
-def with_drift_matrix(A):
-    return replace(random_lift(n_x=1, n_free=len(A) - 1), A=np.array(A))
-
-
-def test_eigenvalues_come_slowest_first():
-    model = with_drift_matrix([[-3.0, 1.0, 0.0], [0.0, -0.5, 0.0], [0.0, 0.0, -7.0]])
-    np.testing.assert_allclose(model.eigenvalues, [-0.5, -3.0, -7.0], rtol=1e-14)
-
-
-@pytest.mark.parametrize(('A', 'hurwitz'), [
-    ([[-1.0, 5.0], [0.0, -1e-9]], True),
-    ([[-1.0, 5.0], [0.0, 0.0]], False),
-    ([[0.0, 1.0], [-1.0, 0.0]], False),
-    ([[-1.0, 0.0], [0.0, 1e-9]], False),
+@pytest.mark.parametrize(('A', 'slowest_first', 'hurwitz'), [
+    ([[-3.0, 1.0, 0.0], [0.0, -0.5, 0.0], [0.0, 0.0, -7.0]], [-0.5, -3.0, -7.0], True),
+    ([[-1.0, 5.0], [0.0, -1e-9]], [-1e-9, -1.0], True),
+    ([[-1.0, 5.0], [0.0, 0.0]], [0.0, -1.0], False),
+    ([[0.0, 1.0], [-1.0, 0.0]], [1j, -1j], False),
+    ([[-1.0, 0.0], [0.0, 1e-9]], [1e-9, -1.0], False),
 ])
-def test_hurwitz_needs_every_mode_to_decay(A, hurwitz):
-    assert with_drift_matrix(A).is_hurwitz is hurwitz
+def test_eigenvalues_come_slowest_first_and_every_mode_has_to_decay(A, slowest_first, hurwitz):
+    model = replace(random_lift(n_x=1, n_free=len(A) - 1), A=np.array(A))
+    np.testing.assert_allclose(model.eigenvalues, slowest_first, rtol=1e-14, atol=1e-16)
+    assert model.is_hurwitz is hurwitz
 
 
 def test_a_model_cannot_be_changed():
@@ -183,6 +177,8 @@ def test_a_model_cannot_be_changed():
     ({'observables': PolynomialObservables.total_degree(2, 3)},
      r'incompatible A: expected \(9, 9\), got \(5, 5\)'),
     ({'time_unit': 'h'}, "time_unit must be 's' or 'min', got 'h'"),
+    ({'training_states': TrainingStates(np.zeros((1, 3)), 0.0)},
+     'incompatible training_states: expected 2 states, got 3'),
 ])
 def test_a_model_that_does_not_fit_is_refused(change, message):
     with pytest.raises(ValueError, match=message):
@@ -215,14 +211,8 @@ def test_coordinates_scale_both_ways():
 
 # The box is [2, 3.5] x [-2, 2.5], with half widths 0.75 and 2.25.
 @pytest.mark.parametrize(('value', 'violation'), [
-    ([3.0, 0.0], 0.0),
-    ([2.0, 2.5], 0.0),
-    ([3.5, -2.0], 0.0),
-    ([4.25, 0.0], 1.0),
-    ([1.25, 0.0], 1.0),
-    ([3.0, 7.0], 2.0),
-    ([5.0, -4.25], 2.0),
-    ([3.5, -8.75], 3.0),
+    ([3.0, 0.0], 0.0), ([2.0, 2.5], 0.0), ([3.5, -2.0], 0.0), ([4.25, 0.0], 1.0),
+    ([1.25, 0.0], 1.0), ([3.0, 7.0], 2.0), ([5.0, -4.25], 2.0), ([3.5, -8.75], 3.0),
     *((value, np.inf) for value in (
         [np.nan, 0.0], [3.0, np.nan], [np.inf, 0.0], [5.0, -np.inf], [np.nan, 70.0])),
 ])
@@ -234,3 +224,110 @@ def test_model_without_inputs():
     model = replace(random_lift(), inputs=coordinates('u', 0), B=np.zeros((2, 0)))
     assert model.n_u == 0
     assert model.inputs.violation(np.zeros(0)) == 0.0
+
+
+# Boxes, from the range of samples.
+
+def test_box_scales_by_half_the_range_from_the_nominal_point():
+    samples = bent_samples()
+    box = Box.of(BENT, samples.x, samples.u)
+    np.testing.assert_array_equal(box.states.center, [3.0])
+    np.testing.assert_array_equal(box.inputs.center, [0.5])
+    np.testing.assert_array_equal(box.states.lower, samples.x.min(axis=0))
+    np.testing.assert_array_equal(box.states.upper, samples.x.max(axis=0))
+    np.testing.assert_array_equal(box.states.scale, np.ptp(samples.x, axis=0) / 2.0)
+    assert (box.states.names, box.inputs.units, box.time_unit) == (
+        ('level',), ('m/s',), 's')
+    # the equation holds in deviations, too
+    x, rate, u = deviations(box, samples)
+    np.testing.assert_allclose(
+        rate, (-x - 0.3 * box.states.scale * x * x) + u @ box.input_matrix(BENT.B).T,
+        rtol=0, atol=1e-14)
+    # and without inputs
+    plant = Plant('free', ('x',), ('1',), (), (), 's', np.zeros(1), np.zeros(0), np.zeros((1, 0)))
+    samples = replace(samples, u=np.zeros((180, 0)))
+    box = Box.of(plant, samples.x, samples.u)
+    assert len(box.inputs) == 0
+    assert box.input_matrix(plant.B).shape == (1, 0)
+    assert deviations(box, samples)[2].shape == (180, 0)
+
+
+@pytest.mark.parametrize(('changes', 'message'), [
+    ({'u': np.full((180, 1), 0.5)}, r'flow never moves from 0\.5 m/s: excite the plant'),
+    ({'x': np.full((180, 1), 3.0)}, r'level never moves from 3\.0 m: excite the plant'),
+    ({'u': np.zeros((180, 2))}, 'there are values of 2 signals for 1 names: flow')])
+def test_what_never_moves_or_is_of_another_size_has_no_box(changes, message):
+    samples = bent_samples()
+    with pytest.raises(ValueError, match=message):
+        Box.of(BENT, changes.get('x', samples.x), changes.get('u', samples.u))
+    with pytest.raises(ValueError, match=r'incompatible B: expected \(1, 1\), got \(2, 1\)'):
+        Box.of(BENT, samples.x, samples.u).input_matrix(np.ones((2, 1)))
+
+
+# Representative states of the training data.
+
+# an L along two sides of the box [-1, 1] x [-1, 1]
+L_SHAPE = np.array([[-1.0, y] for y in np.linspace(-1.0, 1.0, 21)]
+                   + [[x, -1.0] for x in np.linspace(-0.9, 1.0, 20)])
+ONES = np.ones(2)
+
+
+def test_few_states_are_all_kept_once_and_fill_completely():
+    assert len(TrainingStates.of(np.zeros((9, 2)), ONES).states) == 1
+    found = TrainingStates.of(L_SHAPE, ONES)
+    assert found.fill_distance == 0.0
+    assert {tuple(x) for x in found.states} == {tuple(x) for x in L_SHAPE}
+    # the corner of the box that holds no data
+    assert found.distance(ONES, ONES) == pytest.approx(2.0)
+    assert found.distance(np.array([-1.0, -1.0]), ONES) == 0.0
+
+
+def test_many_states_are_thinned_and_none_is_outside():
+    states = np.random.default_rng(0).uniform(-1.0, 1.0, (3000, 2))
+    states = states[states.min(axis=1) < 0.0]
+    found = TrainingStates.of(states, ONES)
+    assert found.states.shape == (256, 2)
+    nearest = [np.min(np.max(np.abs(found.states - x), axis=1)) for x in states]
+    assert found.fill_distance == max(nearest)
+    # 256 squares of this half side would cover three quarters of the box
+    assert 0.5 * math.sqrt(3.0 / 256.0) <= found.fill_distance < 2.0 * math.sqrt(3.0 / 256.0)
+    assert max(found.distance(x, ONES) for x in states) == 0.0
+    assert found.distance(np.array([0.6, 0.6]), ONES) == pytest.approx(0.6, abs=0.15)
+
+
+def test_distance_of_a_model_is_the_larger_of_box_and_data():
+    model = random_lift()
+    model = replace(model, states=replace(
+        model.states, center=np.zeros(2), scale=np.array([1.0, 2.0]), lower=np.array([-1.0, -2.0]),
+        upper=np.array([1.0, 2.0])), training_states=TrainingStates.of(L_SHAPE, ONES))
+    # in state units, the second coordinate is scaled by 2
+    assert model.distance(np.array([1.0, 2.0])) == pytest.approx(2.0)
+    assert model.distance(np.array([-1.0, 1.5])) == pytest.approx(0.05)
+    assert model.distance(np.array([-1.0, 5.0])) == pytest.approx(1.5)
+    assert model.distance(np.array([np.nan, 0.0])) == math.inf
+    boxed = replace(model, training_states=None)
+    assert boxed.distance(np.array([1.0, 2.0])) == 0.0
+    assert boxed.distance(np.array([-1.0, 5.0])) == model.states.violation(np.array([-1.0, 5.0]))
+
+
+@pytest.mark.parametrize(('states', 'fill', 'words'), [
+    (np.zeros((0, 2)), 0.0, 'M from 1 to 256'), (np.zeros((257, 2)), 0.0, 'M from 1 to 256'),
+    (np.zeros(2), 0.0, 'M from 1 to 256'), (np.full((1, 2), np.nan), 0.0, 'must be finite'),
+    (np.zeros((1, 2)), -1.0, 'fill_distance must be'), (np.zeros((1, 2)), math.inf, 'fill_dis')])
+def test_what_does_not_fit_is_refused(states, fill, words):
+    with pytest.raises(ValueError, match=words):
+        TrainingStates(states, fill)
+
+
+def test_training_on_several_states_notes_them_and_on_one_does_not():
+    recipe = Growth(3, hidden_first=3, max_iterations=2)
+    samples = two_state_samples()
+    model = train(TWO_STATE, samples, recipe, starts=1, refuse=False).model
+    known = model.training_states
+    assert known is not None
+    assert known.states.shape == (256, 2)
+    # but for rounding on the way to scaled deviations and back
+    assert all(model.distance(x) < 1e-12 for x in samples.x)
+    assert model.distance(np.array([-6.0, 12.0])) > 0.5
+    assert train(BENT, bent_samples(), Growth(2, hidden_first=3, max_iterations=2), starts=1,
+                 refuse=False).model.training_states is None

@@ -1,8 +1,13 @@
 # SPDX-FileCopyrightText: 2026 The koopman_ros Authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""The continuous algebraic Riccati equation by an ordered Schur form, checked at every call."""
+"""
+Riccati equations and Runge-Kutta steps, in numpy and scipy; imports nothing of ours but arrays.
 
+The continuous algebraic Riccati equation is solved by an ordered Schur form, and checked.
+"""
+
+from collections.abc import Callable
 from dataclasses import dataclass
 from enum import Enum
 import math
@@ -11,6 +16,8 @@ import numpy as np
 from scipy.linalg import blas, lapack
 
 from koopman_ros.arrays import Array
+
+__all__ = ['RiccatiSolution', 'RiccatiStatus', 'runge_kutta_step', 'solve_riccati']
 
 # A double eigenvalue of the Hamiltonian on the imaginary axis comes out split by about the square
 # root of the rounding error: modes within that of the axis cannot be told from undamped ones.
@@ -120,3 +127,18 @@ def _size(matrix: Array) -> float:
 def _unsolved(B: Array, status: RiccatiStatus) -> RiccatiSolution:
     n, m = B.shape
     return RiccatiSolution(np.zeros((n, n)), np.zeros((m, n)), np.inf, np.inf, status)
+
+
+def runge_kutta_step(rate: Callable[[Array], Array], x: Array, h: Array | float) -> Array:
+    """
+    Take one step of dx/dt = rate(x) by the classical Runge-Kutta method of order four.
+
+    :param rate: of the states, in their shape.
+    :param x: (...) states.
+    :param h: length of the step, or one that broadcasts with the states.
+    """
+    k1 = rate(x)
+    k2 = rate(x + 0.5 * h * k1)
+    k3 = rate(x + 0.5 * h * k2)
+    k4 = rate(x + h * k3)
+    return x + h / 6.0 * (k1 + 2.0 * k2 + 2.0 * k3 + k4)
