@@ -26,20 +26,18 @@ ALLOWED = {
     'plants': set(),
     'lifting': set(),
     'bags': set(),
-    'reports': set(),
     'estimation': {'lifting'},
     'control': {'estimation', 'lifting'},
     'learning': {'control', 'lifting'},
     'identification': {'learning', 'lifting'},
-    'retraining': {'bags', 'control', 'identification', 'learning', 'lifting', 'reports'},
-    'replay': {'bags', 'control', 'lifting', 'reports'},
+    'retraining': {'bags', 'control', 'identification', 'learning', 'lifting'},
+    'replay': {'bags', 'control', 'lifting'},
     'parameters': {'control', 'estimation', 'plants'},
     'jobs': set(),
     'ros': {'bags', 'control', 'jobs', 'lifting', 'parameters', 'plants', 'replay'},
     'nodes': {'bags', 'control', 'jobs', 'lifting', 'parameters', 'plants', 'replay', 'ros'},
     'testing': {'ros'},
-    'demo': {'bags', 'control', 'learning', 'lifting', 'parameters', 'plants', 'reports', 'ros',
-             'testing'},
+    'demo': {'bags', 'control', 'learning', 'lifting', 'parameters', 'plants', 'ros', 'testing'},
 }
 
 

@@ -9,35 +9,15 @@ Python.
 """
 
 from koopman_ros.bags.episodes import Account, loop_episodes
-from koopman_ros.bags.errors import BagReadError
-from koopman_ros.bags.order import in_log_order
-from koopman_ros.bags.qos import INFINITE_NS, QosProfile
-from koopman_ros.bags.reader import BagMessage, BagSummary, read_messages, summary
-from koopman_ros.bags.schemas import (
-    message_definition,
-    MessageDefinition,
-    MessageDefinitionError,
-    search_prefixes,
-)
+from koopman_ros.bags.limits import BagReadError
+from koopman_ros.bags.metadata import INFINITE_NS, QosProfile
+from koopman_ros.bags.reader import BagMessage, BagSummary, in_log_order, read_messages, summary
+from koopman_ros.bags.schemas import message_definition, MessageDefinition, MessageDefinitionError
 from koopman_ros.bags.series import read_series, Series
 from koopman_ros.bags.writer import BagWriter
 
 __all__ = [
-    'INFINITE_NS',
-    'Account',
-    'BagMessage',
-    'BagReadError',
-    'BagSummary',
-    'BagWriter',
-    'MessageDefinition',
-    'MessageDefinitionError',
-    'QosProfile',
-    'Series',
-    'in_log_order',
-    'loop_episodes',
-    'message_definition',
-    'read_messages',
-    'read_series',
-    'search_prefixes',
-    'summary',
+    'INFINITE_NS', 'Account', 'BagMessage', 'BagReadError', 'BagSummary', 'BagWriter',
+    'MessageDefinition', 'MessageDefinitionError', 'QosProfile', 'Series', 'in_log_order',
+    'loop_episodes', 'message_definition', 'read_messages', 'read_series', 'summary',
 ]

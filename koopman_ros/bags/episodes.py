@@ -11,10 +11,9 @@ import os
 import numpy as np
 from numpy.typing import NDArray
 
-from koopman_ros.bags.errors import BagReadError
-from koopman_ros.bags.jumps import spikes_and_jumps
+from koopman_ros.bags.limits import BagReadError
 from koopman_ros.bags.reader import BagSummary, read_messages, summary
-from koopman_ros.bags.series import carriers, Scalar, stamped_number
+from koopman_ros.bags.series import carriers, Scalar, spikes_and_jumps, stamped_number
 from koopman_ros.plant_data import Episode
 from koopman_ros.units import Conversion, conversion, LATE_NANOSECONDS, NANOSECONDS
 

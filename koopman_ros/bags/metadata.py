@@ -1,26 +1,124 @@
 # SPDX-FileCopyrightText: 2026 The koopman_ros Authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""The bag metadata of rosbag2 (version 9, Jazzy): built as plain mappings, written as YAML."""
+"""The bag metadata of rosbag2 (version 9, Jazzy), and the offers that it stores with a topic."""
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import asdict, dataclass, field, replace
 import os
 from pathlib import Path
 from typing import Any
 
 import yaml
 
-from koopman_ros.bags.qos import qos_mappings, QosProfile
+from koopman_ros.bags.limits import load_plain
 from koopman_ros.bags.schemas import MessageDefinition
+from koopman_ros.units import NANOSECONDS
 
 METADATA_FILE = 'metadata.yaml'
 # The only top-level key of metadata.yaml; the record inside the MCAP file goes without it.
 METADATA_KEY = 'rosbag2_bagfile_information'
+# An unlimited duration [ns]: RMW_DURATION_INFINITE, 9223372036 s and 854775807 ns.
+INFINITE_NS = 2**63 - 1
 
 _VERSION = 9
 # What rosbag2 writes as the start of a bag without messages [ns].
 _NO_START_NS = 2**63 - 1
+# The spellings of rmw/qos_string_conversions.h; 'unknown' is what discovery reports when a
+# publisher's history is not on the wire.
+_POLICIES = {
+    'history': ('keep_last', 'keep_all', 'system_default', 'unknown'),
+    'reliability': ('reliable', 'best_effort', 'system_default', 'best_available', 'unknown'),
+    'durability': ('volatile', 'transient_local', 'system_default', 'best_available', 'unknown'),
+    'liveliness': ('automatic', 'manual_by_topic', 'system_default', 'best_available', 'unknown'),
+}
+# Before version 9 (Jazzy) rosbag2 wrote the numbers of rmw/types.h.
+_NUMBERED = {
+    'history': ('system_default', 'keep_last', 'keep_all', 'unknown'),
+    'reliability': ('system_default', 'reliable', 'best_effort', 'unknown', 'best_available'),
+    'durability': ('system_default', 'transient_local', 'volatile', 'unknown', 'best_available'),
+    'liveliness': ('system_default', 'automatic', 'manual_by_node', 'manual_by_topic', 'unknown',
+                   'best_available'),
+}
+_DURATIONS = ('deadline_ns', 'lifespan_ns', 'liveliness_lease_duration_ns')
+
+
+@dataclass(frozen=True)
+class QosProfile:
+    """
+    One publisher's offer, as plain values (durations in ns, `INFINITE_NS` for no limit).
+
+    The policies are rmw's own words, which rclpy gives as `policy.short_key`. Raises ValueError
+    for a word that rmw does not know, a negative depth and a duration outside
+    [0, INFINITE_NS] ns.
+    """
+
+    # in the order of rosbag2
+    history: str = 'keep_last'
+    depth: int = 10
+    reliability: str = 'reliable'
+    durability: str = 'volatile'
+    deadline_ns: int = INFINITE_NS
+    lifespan_ns: int = INFINITE_NS
+    liveliness: str = 'automatic'
+    liveliness_lease_duration_ns: int = INFINITE_NS
+    avoid_ros_namespace_conventions: bool = False
+
+    def __post_init__(self) -> None:
+        for policy, words in _POLICIES.items():
+            if getattr(self, policy) not in words:
+                raise ValueError(
+                    f'{policy} {getattr(self, policy)!r} is not one of {", ".join(words)}')
+        if self.depth < 0:
+            raise ValueError(f'depth {self.depth} is negative: give a queue length of 0 or more')
+        for name in _DURATIONS:
+            if not 0 <= getattr(self, name) <= INFINITE_NS:
+                raise ValueError(
+                    f'{name} {getattr(self, name)} is outside [0, {INFINITE_NS}] ns: '
+                    'use INFINITE_NS for no limit')
+
+
+def qos_mappings(profiles: Sequence[QosProfile]) -> list[dict[str, Any]]:
+    """Return the profiles as rosbag2's metadata.yaml (version 9) lists them."""
+    return [{name.removesuffix('_ns'): _seconds(value) if name in _DURATIONS else value
+             for name, value in asdict(profile).items()} for profile in profiles]
+
+
+def dump_offered_qos(profiles: Sequence[QosProfile]) -> str:
+    """Return the text of the channel metadata `offered_qos_profiles`: a YAML sequence."""
+    return yaml.safe_dump(qos_mappings(profiles), sort_keys=False).rstrip('\n')
+
+
+def parse_offered_qos(text: str) -> tuple[QosProfile, ...]:
+    """
+    Return the profiles of the channel metadata `offered_qos_profiles`, of any version of rosbag2.
+
+    What cannot be read gives no profile: a bag is of use without.
+    """
+    try:
+        return tuple(_profile(mapping) for mapping in load_plain(text) or ())
+    except (yaml.YAMLError, ValueError, KeyError, TypeError, IndexError, AttributeError,
+            RecursionError):
+        return ()
+
+
+def _profile(mapping: Mapping[str, Any]) -> QosProfile:
+    values: dict[str, Any] = {
+        policy: _NUMBERED[policy][word] if isinstance(word := mapping[policy], int) else word
+        for policy in _POLICIES}
+    values |= {name: _nanoseconds(mapping[name.removesuffix('_ns')]) for name in _DURATIONS}
+    return QosProfile(
+        **values, depth=int(mapping['depth']),
+        avoid_ros_namespace_conventions=bool(mapping['avoid_ros_namespace_conventions']))
+
+
+def _nanoseconds(duration: Mapping[str, int]) -> int:
+    return min(int(duration['sec']) * NANOSECONDS + int(duration['nsec']), INFINITE_NS)
+
+
+def _seconds(nanoseconds: int) -> dict[str, int]:
+    seconds, rest = divmod(nanoseconds, NANOSECONDS)
+    return {'sec': seconds, 'nsec': rest}
 
 
 @dataclass
@@ -35,14 +133,11 @@ class RecordedTopic:
 
 @dataclass
 class RecordedFile:
-    """
-    What a file of a bag holds so far.
-
-    `time_range_ns` is (first, last) log time [ns], or None for a file without messages.
-    """
+    """What a file of a bag holds so far."""
 
     name: str
     topics: dict[str, RecordedTopic] = field(default_factory=dict)
+    #: (first, last) log time [ns], or None without messages
     time_range_ns: tuple[int, int] | None = None
 
     @property
@@ -54,16 +149,10 @@ class RecordedFile:
         """Count one more message."""
         self.topics[topic].message_count += 1
         first, last = self.time_range_ns or (log_time_ns, log_time_ns)
-        if log_time_ns < first:
-            first = log_time_ns
-        elif log_time_ns > last:
-            last = log_time_ns
-        self.time_range_ns = first, last
+        self.time_range_ns = min(first, log_time_ns), max(last, log_time_ns)
 
 
-def bag_metadata(
-    files: Sequence[RecordedFile], custom_data: Mapping[str, str]
-) -> dict[str, Any]:
+def bag_metadata(files: Sequence[RecordedFile]) -> dict[str, Any]:
     """
     Return the metadata of a bag of these MCAP files, keys in the order of rosbag2.
 
@@ -88,7 +177,7 @@ def bag_metadata(
             'duration': _duration(file.time_range_ns),
             'message_count': file.message_count,
         } for file in files],
-        'custom_data': dict(custom_data) or None,
+        'custom_data': None,
         'ros_distro': os.environ.get('ROS_DISTRO') or 'jazzy',
     }
 

@@ -7,6 +7,7 @@ from collections import Counter
 from collections.abc import Callable, Collection, Iterable, Iterator
 import contextlib
 from dataclasses import dataclass, replace
+import heapq
 import io
 import os
 from pathlib import Path
@@ -17,16 +18,23 @@ from mcap.records import Channel
 from mcap.well_known import SchemaEncoding
 from mcap_ros2.decoder import DecoderFactory
 
-from koopman_ros.bags.compression import opened
-from koopman_ros.bags.errors import BagReadError, BagTooLargeError, reason
-from koopman_ros.bags.fields import fields_only
-from koopman_ros.bags.limits import Budget, enough_memory
-from koopman_ros.bags.qos import parse_offered_qos, QosProfile
+from koopman_ros.bags.limits import (
+    BagReadError,
+    BagTooLargeError,
+    Budget,
+    enough_memory,
+    fields_only,
+    opened,
+    reason,
+)
+from koopman_ros.bags.metadata import parse_offered_qos, QosProfile
 from koopman_ros.bags.records import stored_messages, StoredMessage, summary_section
 from koopman_ros.bags.storage import locate
 
 # Of the different offers in a file, which take seconds to read; seven hundred publishers' worth.
 _MAX_OFFERS_BYTES = 2**18
+# A recorder that falls behind writes what waits topic by topic; longer than this it never waits.
+_BEHIND_NS = 5_000_000_000
 
 
 @dataclass(frozen=True, slots=True)
@@ -68,12 +76,8 @@ class BagSummary:
         return sum(self.counts.values())
 
 
-def read_messages(
-    path: str | os.PathLike[str],
-    topics: Collection[str] | None = None,
-    *,
-    recover: bool = False,
-) -> Iterator[BagMessage]:
+def read_messages(path: str | os.PathLike[str], topics: Collection[str] | None = None, *,
+                  recover: bool = False) -> Iterator[BagMessage]:
     """
     Iterate over the messages of a bag in the order in which they were recorded.
 
@@ -92,6 +96,28 @@ def read_messages(
     return _decoded(bag.files, wanted, recover)
 
 
+def in_log_order(messages: Iterable[BagMessage]) -> Iterator[BagMessage]:
+    """
+    Yield messages by their log time, as `ros2 bag play` does, within runs of one clock.
+
+    A message goes ahead of those recorded before it when it was received earlier, by at most
+    5 s. One that is earlier by more tells of a clock that was set back: all that came before it
+    stays before it. Messages of one log time keep their order.
+    """
+    waiting: list[tuple[int, int, BagMessage]] = []
+    newest_ns = 0
+    for place, message in enumerate(messages):
+        time_ns = message.log_time_ns
+        if waiting and time_ns < newest_ns - _BEHIND_NS:
+            yield from (entry for _, _, entry in sorted(waiting))
+            waiting, newest_ns = [], time_ns
+        newest_ns = max(newest_ns, time_ns)
+        heapq.heappush(waiting, (time_ns, place, message))
+        while waiting[0][0] < newest_ns - _BEHIND_NS:
+            yield heapq.heappop(waiting)[2]
+    yield from (entry for _, _, entry in sorted(waiting))
+
+
 def summary(path: str | os.PathLike[str]) -> BagSummary:
     """
     Return what a bag holds, also for one that was not closed (`complete` is then False).
@@ -100,7 +126,7 @@ def summary(path: str | os.PathLike[str]) -> BagSummary:
     empty or not MCAP.
     """
     bag = locate(path, recover=True)
-    parts = [_file_summary(file) for file in bag.files]
+    parts = [_indexed_summary(file) or _scanned_summary(file) for file in bag.files]
     counts: Counter[str] = Counter()
     types: dict[str, str] = {}
     offered_qos: dict[str, tuple[QosProfile, ...]] = {}
@@ -110,48 +136,20 @@ def summary(path: str | os.PathLike[str]) -> BagSummary:
         offered_qos.update(part.offered_qos)
     starts = [part.start_ns for part in parts if part.start_ns is not None]
     ends = [part.end_ns for part in parts if part.end_ns is not None]
-    return BagSummary(
-        counts=dict(counts),
-        types=types,
-        offered_qos=offered_qos,
-        start_ns=min(starts, default=None),
-        end_ns=max(ends, default=None),
-        complete=bag.complete and all(part.complete for part in parts),
-    )
+    return BagSummary(dict(counts), types, offered_qos, min(starts, default=None),
+                      max(ends, default=None),
+                      complete=bag.complete and all(part.complete for part in parts))
 
 
-def _decoded(
-    files: tuple[Path, ...], topics: frozenset[str] | None, recover: bool
-) -> Iterator[BagMessage]:
+def _decoded(files: tuple[Path, ...], topics: frozenset[str] | None, recover: bool
+             ) -> Iterator[BagMessage]:
     for file in files:
         # One set of decoders for each file: they are kept by schema id, and ids are a file's own.
         decoders = _Decoders(file)
         for stored in stored_messages(file, recover=recover, topics=topics):
             with enough_memory(file):
-                message = _decode(stored, decoders, file)
+                message = decoders.decode(stored)
             yield message
-
-
-def _decode(stored: StoredMessage, decoders: '_Decoders', file: Path) -> BagMessage:
-    topic = stored.channel.topic
-    decoder = decoders.find(stored)
-    try:
-        message = decoder(_WholeSlices(stored.message.data))
-    except MemoryError:
-        raise
-    except Exception as error:
-        # The decoder walks over foreign bytes and fails in as many ways as they can be wrong.
-        raise BagReadError(
-            f'{str(file)!r}: the message on {topic!r} at {stored.message.log_time} ns does not '
-            f'decode ({reason(error)}): read the other topics by name') from error
-    return BagMessage(
-        topic=topic,
-        type_name=stored.schema.name if stored.schema else '',
-        log_time_ns=stored.message.log_time,
-        publish_time_ns=stored.message.publish_time,
-        message=message,
-        data=stored.message.data,
-    )
 
 
 class _WholeSlices(bytes):
@@ -176,12 +174,23 @@ class _Decoders:
         self._factory = DecoderFactory()
         self._known: dict[tuple[str, int], Callable[[bytes], Any]] = {}
 
-    def find(self, stored: StoredMessage) -> Callable[[bytes], Any]:
-        """Return the decoder of a message; raise BagReadError where there can be none."""
-        key = stored.channel.message_encoding, stored.channel.schema_id
+    def decode(self, stored: StoredMessage) -> BagMessage:
+        """Return a message with its fields; raise BagReadError where that cannot be."""
+        channel, message = stored.channel, stored.message
+        key = channel.message_encoding, channel.schema_id
         if key not in self._known:
             self._known[key] = self._decoder(stored)
-        return self._known[key]
+        try:
+            fields = self._known[key](_WholeSlices(message.data))
+        except MemoryError:
+            raise
+        except Exception as error:
+            # The decoder walks over foreign bytes and fails in as many ways as they can be wrong.
+            raise BagReadError(
+                f'{str(self._file)!r}: the message on {channel.topic!r} at {message.log_time} ns '
+                f'does not decode ({reason(error)}): read the other topics by name') from error
+        return BagMessage(channel.topic, stored.schema.name if stored.schema else '',
+                          message.log_time, message.publish_time, fields, message.data)
 
     def _decoder(self, stored: StoredMessage) -> Callable[[bytes], Any]:
         schema, encoding = stored.schema, stored.channel.message_encoding
@@ -207,11 +216,6 @@ class _Decoders:
         return decoder
 
 
-def _file_summary(file: Path) -> BagSummary:
-    indexed = _indexed_summary(file)
-    return _scanned_summary(file) if indexed is None else indexed
-
-
 def _indexed_summary(file: Path) -> BagSummary | None:
     """Return the summary from the statistics at the end of a closed file, None without them."""
     with enough_memory(file), opened(file) as stream:
@@ -227,13 +231,9 @@ def _indexed_summary(file: Path) -> BagSummary | None:
         types[channel.topic] = schema.name if schema else ''
     empty = statistics.message_count == 0
     return BagSummary(
-        counts=dict(counts),
-        types=types,
-        offered_qos=_offered_qos(content.channels.values()),
-        start_ns=None if empty else statistics.message_start_time,
-        end_ns=None if empty else statistics.message_end_time,
-        complete=True,
-    )
+        dict(counts), types, _offered_qos(content.channels.values()),
+        None if empty else statistics.message_start_time,
+        None if empty else statistics.message_end_time, complete=True)
 
 
 def _scanned_summary(file: Path) -> BagSummary:

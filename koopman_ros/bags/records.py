@@ -23,9 +23,17 @@ from mcap.records import Channel, Chunk, DataEnd, McapRecord, Message, Schema, S
 from mcap.summary import Summary
 import zstandard
 
-from koopman_ros.bags.compression import chunk_content, message_content, opened
-from koopman_ros.bags.errors import BagReadError, BagTooLargeError, DamageError, reason
-from koopman_ros.bags.limits import Budget, enough_memory
+from koopman_ros.bags.limits import (
+    BagReadError,
+    BagTooLargeError,
+    Budget,
+    chunk_content,
+    DamageError,
+    enough_memory,
+    message_content,
+    opened,
+    reason,
+)
 
 # The MCAP specification's magic, and the opcode and length that begin every record.
 MAGIC = b'\x89MCAP0\r\n'

@@ -8,7 +8,6 @@ The definition text is what rosbag2 stores with each topic, so that a recording 
 on a machine that has never heard of the message type.
 """
 
-from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 import json
 import os
@@ -40,21 +39,13 @@ class MessageDefinition:
     type_hash: str  #: of REP 2016, ``RIHS01_`` and 64 hexadecimal digits
 
 
-def search_prefixes() -> tuple[Path, ...]:
-    """Return the installation prefixes searched: `AMENT_PREFIX_PATH`, then `sys.prefix`."""
-    listed = os.environ.get('AMENT_PREFIX_PATH', '').split(os.pathsep)
-    return tuple(dict.fromkeys(Path(entry) for entry in (*listed, sys.prefix) if entry))
-
-
-def message_definition(
-    type_name: str, prefixes: Sequence[Path] | None = None
-) -> MessageDefinition:
+def message_definition(type_name: str) -> MessageDefinition:
     """
     Look up an installed message type such as 'sensor_msgs/msg/Temperature'.
 
-    `prefixes` are the installation prefixes to search, in order; by default those of
-    `search_prefixes`. The text has the layout of rosbag2's LocalMessageDefinitionSource:
-    dependencies depth first, each once, in alphabetical order per definition.
+    It is searched in the prefixes of `AMENT_PREFIX_PATH`, then in `sys.prefix`. The text has the
+    layout of rosbag2's LocalMessageDefinitionSource: dependencies depth first, each once, in
+    alphabetical order per definition.
 
     Raises MessageDefinitionError for a malformed name, and where a definition or its type
     description is not installed.
@@ -63,13 +54,12 @@ def message_definition(
     if type_name != f'{package}/msg/{name}':
         raise MessageDefinitionError(
             f'message type {type_name!r} is not a full name: write {package}/msg/{name}')
-    roots = search_prefixes() if prefixes is None else tuple(prefixes)
-    text = _read(package, f'{name}.msg', type_name, roots)
-    full_text = text + _dependencies(text, package, roots, seen=set())
-    return MessageDefinition(type_name, full_text, _type_hash(package, name, roots))
+    text = _read(package, f'{name}.msg', type_name)
+    full_text = text + _dependencies(text, package, seen=set())
+    return MessageDefinition(type_name, full_text, _type_hash(package, name))
 
 
-def _dependencies(text: str, package: str, roots: Iterable[Path], seen: set[str]) -> str:
+def _dependencies(text: str, package: str, seen: set[str]) -> str:
     """Return the delimited definitions of all field types of `text` that are not in `seen`."""
     parts = []
     for dependency in _field_types(text, package):
@@ -77,9 +67,9 @@ def _dependencies(text: str, package: str, roots: Iterable[Path], seen: set[str]
             continue
         seen.add(dependency)
         inner_package, name = _split(dependency)
-        inner = _read(inner_package, f'{name}.msg', dependency, roots)
+        inner = _read(inner_package, f'{name}.msg', dependency)
         parts.append(_DELIMITER.format(name=dependency) + inner)
-        parts.append(_dependencies(inner, inner_package, roots, seen))
+        parts.append(_dependencies(inner, inner_package, seen))
     return ''.join(parts)
 
 
@@ -89,9 +79,9 @@ def _field_types(text: str, package: str) -> list[str]:
     return sorted(name if '/' in name else f'{package}/{name}' for name in found)
 
 
-def _type_hash(package: str, name: str, roots: Iterable[Path]) -> str:
+def _type_hash(package: str, name: str) -> str:
     type_name = f'{package}/msg/{name}'
-    description = json.loads(_read(package, f'{name}.json', type_name, roots))
+    description = json.loads(_read(package, f'{name}.json', type_name))
     for entry in description.get('type_hashes', ()):
         if entry['type_name'] == type_name:
             return entry['hash_string']
@@ -109,15 +99,17 @@ def _split(type_name: str) -> tuple[str, str]:
     return match[1], match[2]
 
 
-def _read(package: str, file_name: str, type_name: str, roots: Iterable[Path]) -> str:
+def _read(package: str, file_name: str, type_name: str) -> str:
     """Return a file of a package's share/<package>/msg from the first prefix that has it."""
-    searched = [root / 'share' / package / 'msg' for root in roots]
+    listed = os.environ.get('AMENT_PREFIX_PATH', '').split(os.pathsep)
+    searched = [Path(prefix) / 'share' / package / 'msg'
+                for prefix in dict.fromkeys((*listed, sys.prefix)) if prefix]
     for folder in searched:
         file = folder / file_name
         if file.is_file():
             # Bytes, so that line ends stay what they are in the installed file.
             return file.read_bytes().decode('utf-8')
-    places = ', '.join(str(folder) for folder in searched) or 'nowhere (no prefix given)'
+    places = ', '.join(map(str, searched))
     raise MessageDefinitionError(
         f'message type {type_name!r}: no {file_name} in {places}; install '
         f'ros-jazzy-{_dashed(package)}, or source the workspace that provides {package}')

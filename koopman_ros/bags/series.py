@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 The koopman_ros Authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""Recorded signals: one number in each stamped message of a topic."""
+"""Recorded signals: one number in each stamped message of a topic, and where they jump."""
 
 from collections.abc import Collection
 from dataclasses import dataclass
@@ -10,7 +10,7 @@ import os
 import numpy as np
 from numpy.typing import NDArray
 
-from koopman_ros.bags.errors import BagReadError, reason
+from koopman_ros.bags.limits import BagReadError, reason
 from koopman_ros.bags.reader import BagMessage, BagSummary, read_messages, summary
 from koopman_ros.units import NANOSECONDS
 
@@ -32,30 +32,28 @@ SCALARS = {
     'sensor_msgs/msg/FluidPressure': Scalar('fluid_pressure', 'Pa', -1e12, 1e12, 1e3),
 }
 
+# Fewer samples do not tell what is usual.
+_ENOUGH = 50
+# A change is no motion when it is larger than so many times all but the largest changes, ...
+_TIMES_USUAL = 10.0
+_USUAL = 90.0  # percentile
+# ... and than this share of the range in which it mostly is.
+_SHARE_OF_RANGE = 0.2
+_MOSTLY = (1.0, 99.0)  # percentiles
+
 
 @dataclass(frozen=True)
 class Series:
+    """A signal as arrays of one length n, in the order of recording."""
+
+    stamp_ns: NDArray[np.int64]  #: (n,) the header's stamp [ns]
+    values: NDArray[np.float64]  #: (n,) the numbers
+    unit: str  #: of the numbers
+
+
+def read_series(path: str | os.PathLike[str], topic: str, *, recover: bool = False) -> Series:
     """
-    A signal as arrays of one length n, in the order of recording.
-
-    `stamp_ns` is the header's stamp [ns] (n, int64), `stamp_s` the same relative to the chosen
-    origin [s] (n, float64), `values` the numbers (n, float64) in `unit`.
-    """
-
-    stamp_ns: NDArray[np.int64]
-    stamp_s: NDArray[np.float64]
-    values: NDArray[np.float64]
-    unit: str
-
-
-def read_series(path: str | os.PathLike[str], topic: str, *, origin_ns: int = 0,
-                recover: bool = False) -> Series:
-    """
-    Return a signal of a bag as arrays.
-
-    `stamp_s` is (stamp - `origin_ns`) in seconds, subtracted as integers: seconds since the
-    epoch resolve no better than 0.24 us in float64, seconds since the start of the bag are
-    exact to the nanosecond for 100 days. `recover` is that of `read_messages`.
+    Return a signal of a bag as arrays; `recover` is that of `read_messages`.
 
     Raises BagReadError as `read_messages` does, and for a topic that the bag does not hold or
     that is of none of the types in `SCALARS`.
@@ -64,8 +62,7 @@ def read_series(path: str | os.PathLike[str], topic: str, *, origin_ns: int = 0,
     messages = read_messages(path, [topic], recover=recover)
     carrier = carriers(path, summary(path), [topic])[topic]
     numbers = [stamped_number(path, entry, carrier) for entry in messages]
-    stamp_ns = np.array([stamp for stamp, _ in numbers], dtype=np.int64)
-    return Series(stamp_ns, (stamp_ns - origin_ns) / NANOSECONDS,
+    return Series(np.array([stamp for stamp, _ in numbers], dtype=np.int64),
                   np.array([value for _, value in numbers], dtype=np.float64), carrier.unit)
 
 
@@ -104,3 +101,26 @@ def stamped_number(path: str | os.PathLike[str], entry: BagMessage, carrier: Sca
 def _other_type(path: str | os.PathLike[str], topic: str, found: str) -> BagReadError:
     return BagReadError(f'topic {topic!r} of bag {os.fspath(path)!r} is {found}, not '
                         f'{" or ".join(SCALARS)}: name another topic')
+
+
+def spikes_and_jumps(values: NDArray[np.float64], least: float
+                     ) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
+    """
+    Find changes that no plant makes: samples that leap away and back, and jumps to another level.
+
+    :param values: (n,) in the order of their times.
+    :param least: no smaller change is one of them.
+    :return: whether each sample is a spike (n,), and whether the signal jumps to it (n,).
+    """
+    spike, jump = np.zeros(len(values), dtype=bool), np.zeros(len(values), dtype=bool)
+    if len(values) < _ENOUGH:
+        return spike, jump
+    change = np.diff(values)
+    low, high = np.percentile(values, _MOSTLY)
+    limit = max(_TIMES_USUAL * float(np.percentile(np.abs(change), _USUAL)),
+                _SHARE_OF_RANGE * float(high - low), least)
+    large = np.abs(change) > limit
+    spike[1:-1] = large[:-1] & large[1:] & (change[:-1] * change[1:] < 0.0)
+    # two changes belong to each spike
+    jump[1:] = large & ~spike[1:] & ~spike[:-1]
+    return spike, jump

@@ -15,10 +15,8 @@ from typing import Any
 
 import yaml
 
-from koopman_ros.bags.errors import BagReadError, reason
-from koopman_ros.bags.limits import enough_memory
+from koopman_ros.bags.limits import BagReadError, enough_memory, load_plain, reason
 from koopman_ros.bags.metadata import METADATA_FILE, METADATA_KEY
-from koopman_ros.bags.plain_yaml import load_plain
 from koopman_ros.bags.records import is_closed, RECOVER
 
 # The files of a bag directory: run_0.mcap, run_1.mcap, ..., or the same compressed by rosbag2.

@@ -3,19 +3,16 @@
 
 """Recording: serialized messages into a bag that rosbag2 and every MCAP reader can open."""
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 import math
 import operator
 import os
 from pathlib import Path
 import time
-from types import TracebackType
 from typing import Self
 
-from koopman_ros.bags.file_sequence import FileSequence
-from koopman_ros.bags.mcap_file import COMPRESSIONS
-from koopman_ros.bags.metadata import RecordedTopic
-from koopman_ros.bags.qos import QosProfile
+from koopman_ros.bags.files import COMPRESSIONS, FileSequence
+from koopman_ros.bags.metadata import QosProfile, RecordedTopic
 from koopman_ros.bags.schemas import MessageDefinition
 from koopman_ros.units import NANOSECONDS
 
@@ -45,7 +42,6 @@ class BagWriter:
     silent calls `flush` from a timer. What it leaves is read by `read_messages` with `recover`,
     and by mcap in the order of the file (`iter_messages(log_time_order=False)` of its
     `NonSeekingReader`) until that raises `EndOfFile`.
-    `custom_data` is made of pairs of strings, kept in the bag's metadata.
 
     Not thread-safe: one thread at a time may use a writer. Raises FileExistsError if `path`
     exists, ValueError for an option out of range and for a single file that is to be split.
@@ -61,7 +57,6 @@ class BagWriter:
         max_file_duration_s: float = 0.0,
         max_chunk_bytes: int = 2**20,
         max_chunk_age_s: float = 1.0,
-        custom_data: Mapping[str, str] | None = None,
         clock: Callable[[], float] = time.monotonic,
     ) -> None:
         if compression not in COMPRESSIONS:
@@ -91,23 +86,13 @@ class BagWriter:
         self._chunk_opened_s: float | None = None
         self._closed = False
         self._files = FileSequence(
-            self.path, compression, _string_pairs(custom_data or {}),
-            max_file_bytes or math.inf, round(max_file_duration_s * NANOSECONDS) or math.inf)
+            self.path, compression, max_file_bytes or math.inf,
+            round(max_file_duration_s * NANOSECONDS) or math.inf)
 
     @property
     def mcap_path(self) -> Path:
         """The MCAP file that receives the messages."""
         return self._files.current.path
-
-    @property
-    def closed(self) -> bool:
-        """Whether `close` was called."""
-        return self._closed
-
-    @property
-    def message_count(self) -> int:
-        """The number of messages written so far, on all topics."""
-        return sum(topic.message_count for topic in self._topics.values())
 
     def add_topic(
         self, topic: str, definition: MessageDefinition, offered_qos: Sequence[QosProfile] = ()
@@ -131,13 +116,8 @@ class BagWriter:
         self._topics[topic] = RecordedTopic(topic, definition, tuple(offered_qos))
         self._files.current.add_topic(self._topics[topic])
 
-    def write(
-        self,
-        topic: str,
-        data: bytes | bytearray | memoryview,
-        log_time_ns: int,
-        publish_time_ns: int | None = None,
-    ) -> None:
+    def write(self, topic: str, data: bytes | bytearray | memoryview, log_time_ns: int,
+              publish_time_ns: int | None = None) -> None:
         """
         Append one serialized message, byte for byte.
 
@@ -165,7 +145,12 @@ class BagWriter:
         self._files.current.write(
             topic, bytes(data), log_time_ns, publish_time_ns, recorded.message_count)
         recorded.message_count += 1
-        self._flush_full_chunk()
+        now_s = self._clock()
+        if self._chunk_opened_s is None:
+            self._chunk_opened_s = now_s
+        if (self._files.current.open_chunk_bytes > self._max_chunk_bytes
+                or now_s - self._chunk_opened_s >= self._max_chunk_age_s):
+            self.flush()
 
     def flush(self) -> None:
         """
@@ -189,22 +174,9 @@ class BagWriter:
     def __enter__(self) -> Self:
         return self
 
-    def __exit__(
-        self,
-        exc_type: type[BaseException] | None,
-        exc_value: BaseException | None,
-        traceback: TracebackType | None,
-    ) -> None:
+    def __exit__(self, *exception: object) -> None:
         # Also after an exception: what was recorded up to it is what one wants to look at.
         self.close()
-
-    def _flush_full_chunk(self) -> None:
-        now_s = self._clock()
-        if self._chunk_opened_s is None:
-            self._chunk_opened_s = now_s
-        if (self._files.current.open_chunk_bytes > self._max_chunk_bytes
-                or now_s - self._chunk_opened_s >= self._max_chunk_age_s):
-            self.flush()
 
     def _check_consistent(self, topic: str, definition: MessageDefinition) -> None:
         """Refuse a second type of one topic, and a second definition of one type."""
@@ -228,12 +200,3 @@ def _checked_time(name: str, time_ns: int) -> int:
         raise ValueError(f'{name} {time_ns} is outside [0, {_MAX_TIME_NS}] ns: '
                          'give nanoseconds since the epoch of the clock in use')
     return time_ns
-
-
-def _string_pairs(pairs: Mapping[str, str]) -> dict[str, str]:
-    for key, value in pairs.items():
-        if not (isinstance(key, str) and isinstance(value, str)):
-            raise ValueError(
-                f'custom_data {key!r}: {value!r} is not a pair of strings: '
-                'convert both with str()')
-    return dict(pairs)

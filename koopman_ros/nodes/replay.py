@@ -23,12 +23,10 @@ from koopman_ros.parameters.controller import ControllerParameters
 from koopman_ros.parameters.controller import TABLE as CONTROLLER
 from koopman_ros.parameters.replay import ReplayParameters, TABLE
 from koopman_ros.parameters.table import ConfigurationError
-from koopman_ros.replay.bag import command_counts, read_records
-from koopman_ros.replay.comparison import ReplayedBag
 from koopman_ros.replay.loop import Alternative, Replay, replay
-from koopman_ros.replay.models import Models
 from koopman_ros.replay.records import Record, RecordError
-from koopman_ros.replay.report import reproduced, verdict, write_report
+from koopman_ros.replay.report import ReplayedBag, reproduced, verdict, write_report
+from koopman_ros.replay.sources import command_counts, Models, read_records
 from koopman_ros.resources import config_directory, model_path
 from koopman_ros.ros import topics
 from koopman_ros.ros.model_loading import load_suitable

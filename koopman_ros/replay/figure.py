@@ -9,8 +9,7 @@ import textwrap
 import matplotlib.axes
 import numpy as np
 
-from koopman_ros.replay.comparison import ReplayedBag
-from koopman_ros.replay.report import verdict
+from koopman_ros.replay.report import ReplayedBag, verdict
 from koopman_ros.reports import draw_limits, drawing, DRAWN_RANGE
 from koopman_ros.units import shown, unit_label
 

@@ -13,6 +13,7 @@ from koopman_ros.control.events import apply, Measurement, SetpointRequest
 from koopman_ros.lifting import LiftedModel
 from koopman_ros.replay.records import (
     event_of,
+    float_array,
     MODEL,
     PARAMETERS,
     Record,
@@ -21,7 +22,6 @@ from koopman_ros.replay.records import (
     START,
     state_of,
 )
-from koopman_ros.replay.values import float_array
 
 # The model of a name and a digest, read anew each time; raises RecordError where there is none.
 FindModel: TypeAlias = Callable[[str, str], LiftedModel]

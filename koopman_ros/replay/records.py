@@ -4,16 +4,21 @@
 """
 Records: numbered lines of JSON, one for each event that changed a controller; see docs/records.md.
 
-Numbers are in the model's units, times in nanoseconds.
+Numbers are in the model's units, times in nanoseconds. JSON has numbers, texts, lists and objects.
+What it lacks is an object with the key ``@``, which says what it is: ``float`` for one that is not
+finite, ``array``, or the class of a dataclass or an enum as ``module:name``. Lists become tuples.
 """
 
 from collections.abc import Mapping
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, is_dataclass
 from enum import Enum
 import json
+import math
+import sys
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from koopman_ros import __version__
 from koopman_ros.control import Mode, State
@@ -28,7 +33,6 @@ from koopman_ros.control.events import (
     Silence,
 )
 from koopman_ros.reasons import Reason
-from koopman_ros.replay.values import decoded, encoded, float_array, numbers
 
 VERSION = 1
 
@@ -43,6 +47,7 @@ _ENCODER = json.JSONEncoder(separators=(',', ':'), allow_nan=False)
 START, SNAPSHOT = 'start', 'snapshot'
 # Names of those by which it is exchanged for one with other parameters or another model.
 PARAMETERS, MODEL = 'parameters', 'model'
+_TAG = '@'
 
 
 class RecordError(ValueError):
@@ -163,3 +168,96 @@ def _read(value: Any) -> Any:
 def _codes(reason: Reason | None) -> list[str]:
     """Return the code of a reason, and those of the reasons behind it."""
     return [] if reason is None else [reason.code.value, *_codes(reason.cause)]
+
+
+def encoded(value: Any) -> Any:
+    """
+    Return a value as what :func:`json.dumps` writes without loss.
+
+    :raises TypeError: for what is none of those above.
+    """
+    if isinstance(value, Enum):
+        return {_TAG: _name(type(value)), 'name': value.name}
+    if isinstance(value, np.generic):
+        value = value.item()
+    if value is None or isinstance(value, (bool, int, str)):
+        return value
+    if isinstance(value, float):
+        return value if math.isfinite(value) else {_TAG: 'float', 'value': repr(value)}
+    if isinstance(value, np.ndarray):
+        return {_TAG: 'array', 'dtype': value.dtype.str, 'shape': list(value.shape),
+                'values': numbers(value.ravel())}
+    if isinstance(value, (tuple, list)):
+        return [encoded(item) for item in value]
+    if isinstance(value, Mapping):
+        return {str(key): encoded(item) for key, item in value.items()}
+    if is_dataclass(value) and not isinstance(value, type):
+        return {_TAG: _name(type(value)), **{
+            item.name: encoded(getattr(value, item.name)) for item in fields(value)}}
+    raise TypeError(f'a {type(value).__name__} cannot be written to a record')
+
+
+def decoded(value: Any) -> Any:
+    """
+    Return the value that :func:`encoded` was given.
+
+    A class is looked up among those that this program has loaded, and has to be a dataclass or an
+    enum: no text of a bag imports anything.
+
+    :raises ValueError: for a class that is not known here.
+    :raises TypeError: for one that has other fields here.
+    """
+    if isinstance(value, list):
+        return tuple(decoded(item) for item in value)
+    if not isinstance(value, dict):
+        return value
+    rest = {key: item for key, item in value.items() if key != _TAG}
+    match value.get(_TAG):
+        case None:
+            return {key: decoded(item) for key, item in rest.items()}
+        case 'float':
+            return float(rest['value'])
+        case 'array':
+            array = np.array([float(item) if isinstance(item, str) else item
+                              for item in rest['values']],
+                             dtype=np.dtype(rest['dtype'])).reshape(rest['shape'])
+            array.setflags(write=False)
+            return array
+        case name:
+            kind = _class(str(name))
+            if issubclass(kind, Enum):
+                return kind[rest['name']]
+            return kind(**{key: decoded(item) for key, item in rest.items()})
+
+
+def numbers(values: NDArray[Any]) -> list[Any]:
+    """Return the numbers (n,) of an array, as texts those that JSON has no number for."""
+    return [item if not isinstance(item, float) or math.isfinite(item) else repr(item)
+            for item in values.tolist()]
+
+
+def float_array(values: Any) -> NDArray[np.float64]:
+    """
+    Return what :func:`numbers` was given.
+
+    :raises TypeError, ValueError: for anything but a list of numbers.
+    """
+    if not isinstance(values, list):
+        raise TypeError(f'{values!r} is no list of numbers')
+    array = np.array([float(item) for item in values], dtype=np.float64)
+    array.setflags(write=False)
+    return array
+
+
+def _name(kind: type) -> str:
+    return f'{kind.__module__}:{kind.__qualname__}'
+
+
+def _class(name: str) -> type:
+    module, _, path = name.partition(':')
+    found: Any = sys.modules.get(module)
+    for part in path.split('.'):
+        found = getattr(found, part, None)
+    if not isinstance(found, type) or not (is_dataclass(found) or issubclass(found, Enum)):
+        raise ValueError(f'the class {name!r} is not known here')
+    return found

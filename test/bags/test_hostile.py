@@ -18,8 +18,8 @@ import yaml
 import zstandard
 
 from koopman_ros.bags import BagReadError, BagWriter, read_messages, summary
-from koopman_ros.bags.fields import fields_only
-from koopman_ros.bags.qos import parse_offered_qos
+from koopman_ros.bags.limits import fields_only
+from koopman_ros.bags.metadata import parse_offered_qos
 from support.bag_samples import HEAD, Sample, TEXT, text
 
 MIB = 2**20

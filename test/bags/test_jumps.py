@@ -6,7 +6,7 @@
 import numpy as np
 import pytest
 
-from koopman_ros.bags.jumps import spikes_and_jumps
+from koopman_ros.bags.series import spikes_and_jumps
 from koopman_ros.plants import one_state_reactor, random_steps, RandomStepDesign
 
 DESIGN = RandomStepDesign(281.33, 300.55, 305.0, 327.0, (0.5, 2.0), 1.0 / 60.0, rtol=1e-9)

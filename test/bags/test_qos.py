@@ -8,7 +8,7 @@ import pytest
 import yaml
 
 from koopman_ros.bags import INFINITE_NS, QosProfile
-from koopman_ros.bags.qos import dump_offered_qos, qos_mappings
+from koopman_ros.bags.metadata import dump_offered_qos, qos_mappings
 
 # As rosbag2 (Jazzy) writes a discovered publisher of the default profile.
 DISCOVERED = """\

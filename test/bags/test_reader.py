@@ -13,7 +13,7 @@ import pytest
 import yaml
 
 from koopman_ros.bags import BagReadError, QosProfile, read_messages, summary
-from koopman_ros.bags.qos import parse_offered_qos
+from koopman_ros.bags.metadata import parse_offered_qos
 from support.bag_mutants import compressed_files
 from support.bag_samples import (
     number,

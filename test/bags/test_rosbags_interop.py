@@ -52,7 +52,7 @@ def test_mcap_reader_decodes_everything(
 def test_rosbags_reads_messages_offers_and_metadata(
     tmp_path: Path, write_bag: WriteBag, samples: list[Sample], name: str, options: dict[str, Any]
 ) -> None:
-    path = write_bag(tmp_path / name, custom_data={'scenario': 'step'}, **options)
+    path = write_bag(tmp_path / name, **options)
     with rosbag2.Reader(path) as reader:
         found = [(c.topic, c.msgtype, time, bytes(data)) for c, time, data in reader.messages()]
         assert reader.message_count == len(samples)
@@ -72,7 +72,6 @@ def test_rosbags_reads_messages_offers_and_metadata(
                 assert deadline.sec * 10**9 + deadline.nsec == offered.deadline_ns
         if path.is_dir():
             assert reader.ros_distro
-            assert reader.storage.metadata.custom == {'scenario': 'step'}
             assert reader.storage.files[0]['path'] == 'run_0.mcap'
     assert found == [(s.topic, TOPICS[s.topic], s.log_time_ns, s.data) for s in samples]
 

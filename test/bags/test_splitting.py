@@ -29,8 +29,7 @@ def information(path: Path) -> dict[str, Any]:
 
 
 def test_splits_by_duration_into_files_complete_in_themselves(tmp_path: Path) -> None:
-    with BagWriter(tmp_path / 'run', max_file_duration_s=3.0, custom_data={'seed': '3'}
-                   ) as writer:
+    with BagWriter(tmp_path / 'run', max_file_duration_s=3.0) as writer:
         write_numbers(writer, range(40), PERIOD)
         # in the files from then on
         writer.add_topic('/z', NUMBER)
@@ -52,7 +51,6 @@ def test_splits_by_duration_into_files_complete_in_themselves(tmp_path: Path) ->
     assert found['starting_time'] == {'nanoseconds_since_epoch': 0}
     assert found['duration'] == {'nanoseconds': 74 * PERIOD}
     assert found['message_count'] == 76
-    assert found['custom_data'] == {'seed': '3'}
     assert [(entry['topic_metadata']['name'], entry['message_count'])
             for entry in found['topics_with_message_count']] == [('/x', 75), ('/z', 1)]
     sequence = []
@@ -71,7 +69,6 @@ def test_splits_by_duration_into_files_complete_in_themselves(tmp_path: Path) ->
         found = yaml.safe_load(own.metadata['serialized_metadata'])
         assert found['relative_file_paths'] == [name]
         assert found['topics_with_message_count'][0]['message_count'] == last - first
-        assert found['custom_data'] == {'seed': '3'}
     assert sequence == list(range(75))
 
 

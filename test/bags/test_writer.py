@@ -105,12 +105,11 @@ def test_statistics_indexes_and_compression(tmp_path: Path, compression: str) ->
 
 
 def test_metadata_begins_empty_and_ends_complete(tmp_path: Path) -> None:
-    path = record(tmp_path / 'deep' / 'er' / 'run', range(5, 8), 10, custom_data={'seed': '1e-3'})
+    path = record(tmp_path / 'deep' / 'er' / 'run', range(5, 8), 10)
     assert sorted(file.name for file in path.iterdir()) == ['metadata.yaml', 'run_0.mcap']
     first, last = serialized_metadata(path / 'run_0.mcap')
     assert first['message_count'] == 0
     assert first['starting_time'] == {'nanoseconds_since_epoch': 2**63 - 1}
-    assert first['custom_data'] == {'seed': '1e-3'}
     range_ns = {'starting_time': {'nanoseconds_since_epoch': 50},
                 'duration': {'nanoseconds': 20}, 'message_count': 3}
     topic = {'name': '/x', 'type': 'std_msgs/msg/Float64', 'serialization_format': 'cdr',
@@ -120,7 +119,7 @@ def test_metadata_begins_empty_and_ends_complete(tmp_path: Path) -> None:
         'starting_time': range_ns['starting_time'], 'message_count': 3,
         'topics_with_message_count': [{'topic_metadata': topic, 'message_count': 3}],
         'compression_format': '', 'compression_mode': '', 'relative_file_paths': ['run_0.mcap'],
-        'files': [{'path': 'run_0.mcap', **range_ns}], 'custom_data': {'seed': '1e-3'},
+        'files': [{'path': 'run_0.mcap', **range_ns}], 'custom_data': None,
         'ros_distro': last['ros_distro']}.items())
     assert yaml.safe_load((path / 'metadata.yaml').read_text('utf-8')) == {
         'rosbag2_bagfile_information': last}
@@ -135,14 +134,6 @@ def test_distribution_is_the_sourced_one(
         monkeypatch.setenv('ROS_DISTRO', environment)
     path = record(tmp_path / 'run.mcap')
     assert serialized_metadata(path)[1]['ros_distro'] == expected
-
-
-def test_unicode_and_long_custom_data_stay_on_one_line(tmp_path: Path) -> None:
-    note = 'Kühlmittel: ' + 'wort ' * 100
-    path = record(tmp_path / 'run', custom_data={'note': note})
-    text = (path / 'metadata.yaml').read_text('utf-8')
-    assert f"note: '{note}'" in text
-    assert yaml.safe_load(text)['rosbag2_bagfile_information']['custom_data'] == {'note': note}
 
 
 @pytest.mark.parametrize(('age_s', 'chunks'), [(0.0, 12), (1.0, 4), (math.inf, 1)])
@@ -222,7 +213,6 @@ def test_what_is_refused_leaves_no_trace(
         writer.add_topic('/x', NUMBER)
         with pytest.raises(kind, match=words):
             action(writer)
-        assert writer.message_count == 0
     assert list(read_messages(writer.path)) == []
     assert len(content(writer.path).channels) == 1
 
@@ -240,7 +230,6 @@ def test_closed_writer_refuses(
     # not before the bag is whole
     assert not (writer.path / 'metadata.yaml').exists()
     writer.close()
-    assert writer.closed
     before = writer.mcap_path.read_bytes()
     with pytest.raises(ValueError, match=rf"cannot {verb} the bag '.*run': it is closed"):
         action(writer)
@@ -264,7 +253,6 @@ def test_exception_inside_with_keeps_the_recording(tmp_path: Path) -> None:
     ('run.mcap', {'max_chunk_bytes': 0}, 'max_chunk_bytes 0 is below 1'),
     ('run.mcap', {'max_chunk_age_s': -1.0}, r'max_chunk_age_s -1\.0 is not a time of 0 s or more'),
     ('run.mcap', {'max_chunk_age_s': math.nan}, 'max_chunk_age_s nan is not a time'),
-    ('run.mcap', {'custom_data': {'seed': 7}}, "custom_data 'seed': 7 is not a pair of strings"),
     ('run.mcap', {'max_file_bytes': 1}, r"run\.mcap' is one file, which is not split: give the"),
     ('run.mcap', {'max_file_duration_s': 1.0}, 'is one file'),
     ('run', {'max_file_bytes': -1}, 'max_file_bytes -1 is negative: use 0 for no limit'),

@@ -17,7 +17,7 @@ from koopman_ros.control import Arrival, Controller, InputLimits, Mode, Settings
 from koopman_ros.estimation import SensorLimits
 from koopman_ros.lifting import LiftedModel, linearised_model, Provenance
 from koopman_ros.reasons import Code
-from koopman_ros.replay.values import decoded
+from koopman_ros.replay.records import decoded
 from koopman_ros.signals import Outputs
 from support.random_lifts import coordinates, random_lift
 from support.sampled_loops import content, controller, EPOCH, SECOND, supervisor_settings

@@ -24,10 +24,9 @@ from koopman_ros.bags import BagMessage, BagReadError, BagWriter, message_defini
 from koopman_ros.nodes import replay
 from koopman_ros.nodes.replay import Names
 from koopman_ros.parameters.replay import ReplayParameters
-from koopman_ros.replay.bag import read_records
-from koopman_ros.replay.comparison import ReplayedBag
 from koopman_ros.replay.records import parse, Record, SNAPSHOT, START
-from koopman_ros.replay.report import reproduced, verdict
+from koopman_ros.replay.report import ReplayedBag, reproduced, verdict
+from koopman_ros.replay.sources import read_records
 from koopman_ros.resources import config_directory, model_path
 from koopman_ros.ros import topics
 from koopman_ros.testing import Harness, isolated_domain

@@ -22,8 +22,8 @@ from koopman_ros.control.events import (
 from koopman_ros.lifting import load_with_digest, save
 from koopman_ros.nodes.replay import replay_records
 from koopman_ros.replay.loop import Alternative, Lost, Replay
-from koopman_ros.replay.models import Models
 from koopman_ros.replay.records import parse, RecordError, SNAPSHOT, START
+from koopman_ros.replay.sources import Models
 from koopman_ros.resources import config_directory
 from support.recorded_controller import COOLANT, MODELS, Recorded, SECOND, STEADY
 

@@ -15,7 +15,7 @@ import numpy as np
 import pytest
 
 from koopman_ros.control import Mode, State
-from koopman_ros.replay.values import decoded, encoded, float_array, numbers
+from koopman_ros.replay.records import decoded, encoded, float_array, numbers
 
 
 @dataclass(frozen=True)

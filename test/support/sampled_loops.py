@@ -37,7 +37,7 @@ from koopman_ros.plants import (
     Process,
 )
 from koopman_ros.reasons import Words
-from koopman_ros.replay.values import encoded
+from koopman_ros.replay.records import encoded
 from koopman_ros.units import Displays
 from koopman_ros.units import NANOSECONDS as SECOND
 from support.closed_loops import REACTOR, shipped, START

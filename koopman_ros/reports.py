@@ -1,0 +1,182 @@
+# SPDX-FileCopyrightText: 2026 The koopman_ros Authors
+# SPDX-License-Identifier: Apache-2.0
+
+"""
+Reports: pages in Markdown, figures in JSON, pictures in PNG, and what they were made on.
+
+Matplotlib is imported when a picture is drawn.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass
+from importlib.metadata import PackageNotFoundError, version
+import json
+import math
+import os
+from pathlib import Path
+import platform
+from typing import Any, TYPE_CHECKING
+
+from koopman_ros import __version__
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
+
+# A trained range is drawn as a grey band, a limit as a dotted line.
+DRAWN_RANGE: dict[str, Any] = {'color': '0.92', 'zorder': 0}
+LIMIT: dict[str, Any] = {'color': '0.4', 'linestyle': ':', 'linewidth': 1.0}
+
+
+@dataclass(frozen=True)
+class Picture:
+    """A picture of a page."""
+
+    file: str  #: its name, in the folder of the page
+    caption: str  #: what it shows, with its numbers
+
+    def __str__(self) -> str:
+        """Return the picture with its caption, in Markdown."""
+        return f'![{self.caption.partition(". ")[0]}]({self.file})\n\n*{self.caption}*'
+
+
+def table(head: Sequence[str], rows: Iterable[Sequence[object]], numbers: Collection[int] = ()
+          ) -> str:
+    """
+    Return a table in Markdown.
+
+    :param head: titles of the columns, units in brackets.
+    :param rows: a cell a column.
+    :param numbers: columns that are flush right.
+    """
+    rule = ['---:' if column in numbers else '---' for column in range(len(head))]
+    lines = [f'| {" | ".join(head)} |', f'|{"|".join(rule)}|']
+    for row in rows:
+        if len(row) != len(head):
+            raise ValueError(f'a row of {len(row)} cells in a table of {len(head)} columns: '
+                             f'{row}')
+        lines.append(f'| {" | ".join(str(cell).replace("|", chr(92) + "|") for cell in row)} |')
+    return '\n'.join(lines)
+
+
+def bullets(lines: Iterable[str]) -> str:
+    """Return a list in Markdown."""
+    return '\n'.join(f'- {line}' for line in lines)
+
+
+def write_page(path: Path, title: str, sections: Iterable[str], packages: Sequence[str] = ()
+               ) -> Path:
+    """
+    Write a page in Markdown; it names the versions and the machine below its title.
+
+    :param path: the file; its folder is made.
+    :param title: of the page.
+    :param sections: paragraphs, headings, tables, pictures; empty ones are left out.
+    :param packages: whose versions matter, beside this package's.
+    :return: the file.
+    """
+    parts = [f'# {title}', f'*{_headline(*packages)}*', *filter(None, map(str, sections))]
+    path.parent.mkdir(parents=True, exist_ok=True)
+    path.write_text('\n\n'.join(parts) + '\n', encoding='utf-8')
+    return path
+
+
+def write_figures(path: Path, figures: Mapping[str, Any]) -> Path:
+    """
+    Write figures as JSON; an interrupt leaves the old file or the new one, never a part.
+
+    :param path: the file; its folder is made.
+    :param figures: by name; infinity and NaN, which JSON does not know, become null.
+    :return: the file.
+    """
+    text = json.dumps(_finite(figures), indent=2, allow_nan=False) + '\n'
+    path.parent.mkdir(parents=True, exist_ok=True)
+    beside = path.with_name(path.name + '.part')
+    beside.write_text(text, encoding='utf-8')
+    os.replace(beside, path)
+    return path
+
+
+def _finite(value: Any) -> Any:
+    """Replace what JSON does not know by None, however deep it is nested."""
+    if isinstance(value, Mapping):
+        return {name: _finite(entry) for name, entry in value.items()}
+    if isinstance(value, list | tuple):
+        return [_finite(entry) for entry in value]
+    return None if isinstance(value, float) and not math.isfinite(value) else value
+
+
+@contextmanager
+def drawing(path: Path, rows: int = 1, columns: int = 1, *, size: tuple[float, float],
+            grid: bool = True, **options: Any) -> Iterator[tuple[Figure, list[Axes]]]:
+    """
+    Draw panels; they are written as PNG when the block ends, unless by an exception.
+
+    :param path: the file; its folder is made.
+    :param rows: of panels.
+    :param columns: of panels; they are counted row by row.
+    :param size: width and height in inches.
+    :param grid: whether the panels have one.
+    :param options: of matplotlib's ``Figure.subplots``.
+    :raises ImportError: without matplotlib.
+    """
+    from matplotlib.figure import Figure
+    # without pyplot: no window, no state that another picture could see
+    figure = Figure(figsize=size, layout='constrained')
+    panels = list(figure.subplots(rows, columns, squeeze=False, **options).flat)
+    for panel in panels:
+        if grid:
+            panel.grid(alpha=0.3)
+    yield figure, panels
+    path.parent.mkdir(parents=True, exist_ok=True)
+    figure.savefig(path, dpi=150)
+
+
+def draw_limits(axes: Axes, bounds: Iterable[float], label: str) -> None:
+    """Draw limits of what an axis shows as dotted lines with one label."""
+    for number, bound in enumerate(bounds):
+        axes.axhline(bound, label=label if number == 0 else None, **LIMIT)
+
+
+def legend(figure: Figure, panels: Iterable[Axes], columns: int) -> None:
+    """Put what some panels show, each thing once, below all of them."""
+    shown = {label: handle for panel in panels
+             for handle, label in zip(*panel.get_legend_handles_labels(), strict=True)}
+    figure.legend(shown.values(), shown.keys(), loc='outside lower center', ncols=columns,
+                  fontsize=8)
+
+
+def machine(*packages: str) -> dict[str, Any]:
+    """Return processor, system and load of this machine, and the versions of some packages."""
+    return {'processor': _processor(), 'cpu_count': os.cpu_count(),
+            'system': platform.platform(), 'python': platform.python_version(),
+            **{name: _version(name) for name in packages},
+            'load_at_start': os.getloadavg()[0]}
+
+
+def _headline(*packages: str) -> str:
+    """Return one line with the versions of this package and others, and the machine."""
+    found = machine(*packages)
+    versions = ''.join(f', {name} {found[name]}' for name in packages if found[name])
+    return (f'koopman_ros {__version__}, Python {found["python"]}{versions}; '
+            f'{found["processor"]}, {found["cpu_count"]} processors, load '
+            f'{found["load_at_start"]:.1f}')
+
+
+def _processor() -> str:
+    try:
+        lines = Path('/proc/cpuinfo').read_text().splitlines()
+    except OSError:
+        return platform.processor()
+    return next((line.partition(':')[2].strip() for line in lines
+                 if line.startswith('model name')), platform.processor())
+
+
+def _version(name: str) -> str | None:
+    try:
+        return version(name)
+    except PackageNotFoundError:
+        return None
