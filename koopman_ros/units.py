@@ -137,7 +137,7 @@ def to_celsius(kelvin: float) -> float:
     return kelvin - ZERO_CELSIUS
 
 
-def in_celsius(kelvin: float, unit: str = 'K') -> str:
+def in_celsius(kelvin: float) -> str:
     """Write a temperature given in K for the operator."""
     return f'{to_celsius(kelvin):.2f} degC'
 

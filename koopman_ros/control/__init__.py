@@ -3,7 +3,6 @@
 
 """Set-point control on lifted models: pure, no ROS; imports estimation, lifting and solvers."""
 
-from koopman_ros.control.closed_loop import ClosedLoop, run_closed_loop
 from koopman_ros.control.controller import Controller
 from koopman_ros.control.events import (
     Event,
@@ -23,24 +22,26 @@ from koopman_ros.control.laws import (
     recentred,
     Weights,
 )
+from koopman_ros.control.laws.base import steady_state_target, Target
 from koopman_ros.control.limits import InputLimits, limit
-from koopman_ros.control.report import Arrival, Report
 from koopman_ros.control.setpoint import Setpoint
 from koopman_ros.control.settings import Settings
 from koopman_ros.control.simulate import (
     at,
     Change,
+    ClosedLoop,
     exchange,
     Loop,
     perfect,
     Plant,
     restart,
+    run_closed_loop,
     Sensor,
     simulate,
     Simulation,
     Timed,
 )
-from koopman_ros.control.state import Mode, State
+from koopman_ros.control.state import Arrival, Mode, Report, State
 from koopman_ros.control.supervisor import (
     HOLD,
     LevelSettings,
@@ -49,51 +50,11 @@ from koopman_ros.control.supervisor import (
     Supervisor,
     SupervisorSettings,
 )
-from koopman_ros.control.target import steady_state_target, Target
 
-__all__ = [
-    'HOLD',
-    'LAWS',
-    'MANUAL',
-    'SAFE',
-    'Arrival',
-    'Change',
-    'ClosedLoop',
-    'Controller',
-    'Event',
-    'Feedback',
-    'Form',
-    'Initialisation',
-    'InputLimits',
-    'LevelSettings',
-    'Loop',
-    'ManualCommand',
-    'Measurement',
-    'Mode',
-    'ModeChange',
-    'Plant',
-    'Report',
-    'Sensor',
-    'Setpoint',
-    'SetpointRequest',
-    'Settings',
-    'Silence',
-    'Simulation',
-    'State',
-    'Supervisor',
-    'SupervisorSettings',
-    'Target',
-    'Timed',
-    'Weights',
-    'at',
-    'exchange',
-    'feedback',
-    'limit',
-    'perfect',
-    'projected',
-    'recentred',
-    'restart',
-    'run_closed_loop',
-    'simulate',
-    'steady_state_target',
-]
+__all__ = ['HOLD', 'LAWS', 'MANUAL', 'SAFE', 'Arrival', 'Change', 'ClosedLoop', 'Controller',
+           'Event', 'Feedback', 'Form', 'Initialisation', 'InputLimits', 'LevelSettings', 'Loop',
+           'ManualCommand', 'Measurement', 'Mode', 'ModeChange', 'Plant', 'Report', 'Sensor',
+           'Setpoint', 'SetpointRequest', 'Settings', 'Silence', 'Simulation', 'State',
+           'Supervisor', 'SupervisorSettings', 'Target', 'Timed', 'Weights', 'at', 'exchange',
+           'feedback', 'limit', 'perfect', 'projected', 'recentred', 'restart', 'run_closed_loop',
+           'simulate', 'steady_state_target']

@@ -13,24 +13,33 @@ import numpy as np
 
 from koopman_ros.arrays import Array
 from koopman_ros.control import setpoint as setpoints
-from koopman_ros.control.estimating import Estimating
 from koopman_ros.control.laws import LawResult
-from koopman_ros.control.levels import Level, levels_of
-from koopman_ros.control.limits import finite, limit
-from koopman_ros.control.report import (
+from koopman_ros.control.laws.base import Target
+from koopman_ros.control.levels import Estimating, Level, levels_of
+from koopman_ros.control.limits import finite, limit, Transfer
+from koopman_ros.control.settings import Settings
+from koopman_ros.control.state import (
+    amended,
     Arrival,
     CommandReport,
     EstimateReport,
     MeasurementReport,
+    Mode,
     Report,
+    State,
     TargetReport,
 )
-from koopman_ros.control.settings import Settings
-from koopman_ros.control.state import amended, Mode, State
-from koopman_ros.control.supervisor import HOLD, MANUAL, Requested, SAFE, Supervisor
-from koopman_ros.control.target import Target
-from koopman_ros.control.transfer import Transfer
-from koopman_ros.control.way_back import leads_home, Rest, rest_under, WayBack
+from koopman_ros.control.supervisor import (
+    HOLD,
+    leads_home,
+    MANUAL,
+    Requested,
+    Rest,
+    rest_under,
+    SAFE,
+    Supervisor,
+    WayBack,
+)
 from koopman_ros.estimation import equivalent_bias, Estimate, Verdict
 from koopman_ros.lifting import LiftedModel
 from koopman_ros.reasons import Code, Reason, reason
@@ -107,7 +116,6 @@ class Controller:
         """
         Ask for a set-point, at once or from a later time on.
 
-        :param state: the present state.
         :param value: (n_x,) in state units.
         :param effective_ns: stamp from which it holds; see :func:`setpoint.request`.
         :return: the new state and None, or the old one with the reason of refusal.
@@ -125,7 +133,6 @@ class Controller:
         """
         Set the input that manual mode commands; refused in automatic mode.
 
-        :param state: the present state.
         :param value: (n_u,) in input units; brought within the limits when commanded.
         :return: as :meth:`request_setpoint`.
         """
@@ -140,8 +147,7 @@ class Controller:
         """
         Hand over between operator and law, without a bump.
 
-        Manual mode starts from the last command, and so does automatic mode: what its law asks
-        for beside that fades in.
+        Both modes start from the last command; what a law asks for beside that fades in.
         """
         if mode is state.mode:
             return state
@@ -155,10 +161,9 @@ class Controller:
 
     def initialise(self, state: State, applied: Array) -> State:
         """
-        Start from the input that is applied already, as after a restart.
+        Start from the input (n_u,) that is applied already, as after a restart.
 
-        :param state: before its first command; afterwards nothing is changed.
-        :param applied: (n_u,) in input units; ignored when not finite.
+        Nothing is changed after the first command, nor by what is not finite.
         """
         if state.command is not None or not np.all(np.isfinite(applied)):
             return state
@@ -169,11 +174,7 @@ class Controller:
         Take the place of a controller with other settings or another model, without a bump.
 
         What the two laws ask for in the present state differs by an offset that fades; what is
-        estimated of the plant's rate stays.
-
-        :param predecessor: that acted so far.
-        :param state: the state it left.
-        :return: the state in this controller's units.
+        estimated of the plant's rate stays. The state comes back in this controller's units.
         """
         state = self._estimating.inherit(predecessor._estimating, state)
         if state.law is None or state.law_input is None or state.estimate is None:
@@ -189,11 +190,7 @@ class Controller:
             state.transfer, state.law_input - now.u))
 
     def try_law(self, x: Array, setpoint: Array) -> Reason | None:
-        """
-        Return why the best law cannot act at a state (n_x,) towards a set-point (n_x,), or None.
-
-        Both are in state units.
-        """
+        """Return why the best law fails at a state (n_x,) towards a set-point (n_x,), or None."""
         level = next(iter(self.levels.values()))
         estimate = Estimate(self.model.states.to_deviation(x), np.zeros(self.model.n_x))
         with np.errstate(all='ignore'):
@@ -210,9 +207,7 @@ class Controller:
         command again; a still earlier stamp starts time afresh. After a gap in the measurements
         ramp and rate limit count twice the interval before it, not the gap.
 
-        :param state: as returned by the step before.
         :param y: (n_y,) measured, in the signals' units.
-        :param time_ns: its stamp.
         :param applied: (n_u,) the input that was found to act then, where it is measured; see
             :meth:`Estimating.applied`.
         :return: the new state, the command (n_u,) in input units, always finite and within the
@@ -256,7 +251,6 @@ class Controller:
         """
         Hold the command as nothing has been measured, and later go to the safe input.
 
-        :param state: as returned by the step before.
         :param time_ns: up to which nothing came, in the time of the measurements' stamps.
         :return: as :meth:`step`; the command is None before the first.
         """
@@ -272,11 +266,7 @@ class Controller:
         return amended(state, commanded_ns=max(time_ns, since_ns)), command, report
 
     def equivalent_bias(self, state: State) -> Array:
-        """
-        Return the error (n_x,) of the sensor that would explain the disturbance, in state units.
-
-        NaN where nothing is known, or no error would.
-        """
+        """Return the sensor's error (n_x,) that would explain the disturbance; NaN for none."""
         if state.estimate is None:
             return np.full(self.model.n_x, np.nan)
         model = self._estimating.level(state).model

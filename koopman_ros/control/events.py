@@ -13,8 +13,7 @@ from typing import TypeAlias
 
 from koopman_ros.arrays import Array
 from koopman_ros.control.controller import Controller
-from koopman_ros.control.report import Report
-from koopman_ros.control.state import Mode, State
+from koopman_ros.control.state import Mode, Report, State
 from koopman_ros.reasons import Reason
 
 

@@ -1,7 +1,9 @@
 # SPDX-FileCopyrightText: 2026 The koopman_ros Authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""The control levels of a controller: a name, a model, a law and an estimator each."""
+"""The control levels, a law and an estimator each, and what is estimated whichever acts."""
+
+from __future__ import annotations
 
 from dataclasses import dataclass, field
 
@@ -9,12 +11,15 @@ import numpy as np
 
 from koopman_ros.arrays import Array
 from koopman_ros.control.laws import Law, LawResult, LAWS, Tuning, Weights
-from koopman_ros.control.limits import InputLimits
+from koopman_ros.control.laws.base import balance, Reference, reference, Target
+from koopman_ros.control.limits import finite, InputLimits
 from koopman_ros.control.settings import Settings
-from koopman_ros.control.target import balance, Reference, reference, Target
-from koopman_ros.estimation import Estimate, Estimator, ESTIMATORS
+from koopman_ros.control.state import amended, State
+from koopman_ros.estimation import check, Estimate, Estimator, ESTIMATORS, FrozenCheck, Verdict
 from koopman_ros.lifting import LiftedModel
 from koopman_ros.plugs import plug
+from koopman_ros.signals import Outputs
+from koopman_ros.units import NANOSECONDS
 
 
 @dataclass(frozen=True)
@@ -32,11 +37,7 @@ class Level:
         return self.law.model
 
     def target(self, setpoint: Array, estimate: Estimate) -> Target:
-        """
-        Return where to go under the estimated disturbance.
-
-        :param setpoint: (n_x,) in state units.
-        """
+        """Return where to go from a set-point (n_x,) in state units, under the disturbance."""
         x_ref = self.model.states.to_deviation(setpoint)
         # a memory of the last set-point only; what comes out does not depend on it
         known = self._references[0] if self._references else None
@@ -47,15 +48,7 @@ class Level:
 
     def compute(self, setpoint: Array, estimate: Estimate, limits: InputLimits, memory: object,
                 interval: float) -> tuple[Target, LawResult]:
-        """
-        Evaluate the law.
-
-        :param setpoint: (n_x,) in state units.
-        :param estimate: in terms of the level's model.
-        :param limits: of the inputs.
-        :param memory: of the law.
-        :param interval: seconds between samples; 0 when they are not known.
-        """
+        """Evaluate the law for a set-point (n_x,) in state units and an estimate of its model."""
         target = self.target(setpoint, estimate)
         return target, self.law.compute(estimate, target, limits, memory, interval)
 
@@ -82,3 +75,163 @@ def _estimator(model: LiftedModel, settings: Settings) -> Estimator:
         'disturbance_observer' if settings.observer_bandwidth > 0.0 else 'measured_state')
     return plug(name, 'estimator', ESTIMATORS)(
         model, settings.observer_bandwidth, settings.max_disturbance / model.inputs.scale)
+
+
+# After so many time constants without an accepted measurement the state is not known.
+_LOST = 2.0
+# So many intervals between measurements are a gap.
+_GAP = 1.5
+
+
+@dataclass(frozen=True)
+class Estimating:
+    """
+    The estimators of all levels behind the checks of the measurements.
+
+    While another level acts its model takes the better one's place, and the disturbance makes up
+    for the difference, so that the plant's estimated rate stays.
+    """
+
+    model: LiftedModel  #: the lift
+    outputs: Outputs  #: what is measured of its states
+    settings: Settings  #: the tuning
+    levels: dict[str, Level]  #: by name, best first
+
+    def level(self, state: State) -> Level:
+        """Return the level in terms of whose model the estimate is: without a law, the last."""
+        name = state.supervisor.settled
+        if name is None:
+            return next(iter(self.levels.values()))
+        return self.levels.get(name) or self.levels[next(reversed(self.levels))]
+
+    def applied(self, state: State, measured: Array | None = None) -> tuple[Array, bool]:
+        """
+        Return the input that has acted since the last command, as far as it is known.
+
+        That is the command, unless a measurement of the input says that it was not reached: at
+        a limit of the actuator, or behind its lag, nothing may wind up. Differences below
+        `input_tolerance` count for nothing, since a biased measurement of the input would bring
+        its bias into the loop.
+
+        :param measured: (n_u,) in input units, or None.
+        :return: (n_u,) in scaled deviations, and whether it follows the command.
+        """
+        if state.command is None:
+            return np.zeros(self.model.n_u), True
+        u, tolerance = state.command, self.settings.input_tolerance
+        if measured is not None and finite(measured):
+            u = np.minimum(np.maximum(u, measured - tolerance), measured + tolerance)
+        return self.model.inputs.to_deviation(u), bool((u == state.command).all())
+
+    def observe(self, state: State, y: Array, time_ns: int, elapsed: float, u: Array
+                ) -> tuple[State, Verdict, Array | None]:
+        """
+        Check a measurement (n_y,) and take it into account.
+
+        :param elapsed: seconds since the last command.
+        :param u: (n_u,) what has acted since then, in scaled deviations.
+        :return: the state with measurement, time and estimate, what became of the measurement,
+            and what (n_y,) was expected of it, None when nothing was.
+        """
+        before, last = state.estimate, state.accepted
+        x = self.outputs.state(y)
+        predicted = self.coast(state, elapsed, u).estimate
+        w = np.zeros(self.model.n_x) if before is None else before.w
+
+        def travel(then: FrozenCheck) -> Array:
+            if self._far_out(x) or state.way_back is not None:
+                # what the model says of its motion is worth nothing; under the safe input even a
+                # plant that it does not expect to may rest there
+                return np.zeros_like(y)
+            frozen = None if before is None else Estimate(before.x, then.w)
+            moved = self.coast(amended(state, estimate=frozen), elapsed, u).estimate
+            if before is None or moved is None:
+                return np.zeros_like(y)
+            return self.outputs.of((moved.x - before.x) * self.model.states.scale)
+
+        verdict = check(self.settings.sensor, self.outputs, last, y, time_ns, w, travel)
+        expected = None if predicted is None else self.outputs.of(
+            self.model.states.to_physical(predicted.x))
+        if verdict.fault is None:
+            predicted = self._corrected(state, predicted, verdict, x, time_ns, elapsed)
+        elif verdict.frozen and predicted is not None and last is not None:
+            # what the observer made of a sensor that does not move is no disturbance
+            predicted = Estimate(predicted.x, last.frozen.w)
+        return (amended(state, accepted=verdict.accepted, time_ns=time_ns, estimate=predicted),
+                verdict, expected)
+
+    def _corrected(self, state: State, predicted: Estimate | None, verdict: Verdict, x: Array,
+                   time_ns: int, elapsed: float) -> Estimate:
+        """Return the estimate with a measurement that is accepted."""
+        xi, estimator = self.model.states.to_deviation(x), self.level(state).estimator
+        if predicted is None:
+            # taken over from somebody who, it is supposed, held the plant where it is
+            return estimator.restart(None, xi, None if state.command is None else (
+                self.model.inputs.to_deviation(state.command)))
+        # far out the model's prediction is worth nothing
+        if (verdict.moved or not elapsed > 0.0 or self._lost(state, time_ns)
+                or self._far_out(x)):
+            return estimator.restart(predicted, xi, None)
+        return estimator.correct(predicted, xi, elapsed)
+
+    def _far_out(self, x: Array) -> bool:
+        """Tell whether no law is to act at a state (n_x,) in state units."""
+        return self.model.distance(x) > self.settings.supervisor.largest_margin
+
+    def _lost(self, state: State, time_ns: int) -> bool:
+        """Tell whether no measurement was accepted for so long that the state is not known."""
+        if state.accepted is None:
+            return False
+        seconds = (time_ns - state.accepted.time_ns) / NANOSECONDS
+        # where measurements are always that rare, they are all there is
+        return seconds * self.settings.observer_bandwidth > _LOST and (
+            seconds > _GAP * state.interval)
+
+    def coast(self, state: State, elapsed: float, u: Array) -> State:
+        """
+        Carry the estimate forward without a measurement.
+
+        Arguments as in :meth:`observe`.
+        """
+        if state.estimate is None or state.command is None or not elapsed > 0.0:
+            return state
+        predicted = self.level(state).estimator.predict(state.estimate, u, elapsed)
+        if predicted is None or not finite(predicted.x):
+            # after so long, or from so far out, nothing is known; the disturbance is kept
+            return state
+        return amended(state, estimate=predicted)
+
+    def rebase(self, estimate: Estimate | None, before: Level, now: Level) -> Estimate | None:
+        """Carry an estimate over from the model of one level to that of another."""
+        if estimate is None or before is now or not now.estimator.remembers:
+            return estimate
+        return now.estimator.rebased(estimate, before.model.drift(estimate.x))
+
+    def inherit(self, predecessor: Estimating, state: State) -> State:
+        """Carry an estimate over from other settings or another model."""
+        estimate, old, new = state.estimate, predecessor.model, self.model
+        if estimate is None:
+            return state
+        estimator = self.level(state).estimator
+        if not estimator.remembers:
+            estimate = Estimate(estimate.x, np.zeros_like(estimate.w))
+        if old is new:
+            return amended(state, estimate=estimate)
+        x = old.states.to_physical(estimate.x)
+        # the rates that the old model estimated, per second, which all models share
+        rate = estimate.w + predecessor.level(state).model.drift(estimate.x) + (
+            old.B @ _command(old, state))
+        factor = (old.states.scale / old.seconds_per_time_unit
+                  / (new.states.scale / new.seconds_per_time_unit))
+        moved = Estimate(new.states.to_deviation(x),
+                         factor * rate - new.B @ _command(new, state))
+        moved = estimator.rebased(moved, np.zeros_like(moved.w))
+        # what it holds of the disturbance is in the old model's units, and distances from its data
+        return amended(state, estimate=moved, accepted=None, way_back=None)
+
+
+def _command(model: LiftedModel, state: State) -> Array:
+    """Return the last command in a model's scaled deviations; the nominal one at first."""
+    if state.command is None:
+        return np.zeros(model.n_u)
+    return model.inputs.to_deviation(state.command)

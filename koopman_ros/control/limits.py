@@ -1,7 +1,9 @@
 # SPDX-FileCopyrightText: 2026 The koopman_ros Authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""Limits on the manipulated variables: range and rate."""
+"""Between a law and its command: range, rate, and what makes a change of law bumpless."""
+
+from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -29,12 +31,7 @@ class InputLimits:
             raise ValueError(f'input rate must be above 0, got {self.rate.tolist()}')
 
     def check(self, names: Sequence[str]) -> None:
-        """
-        Check that there is one number for each input.
-
-        :param names: (n_u,) of the inputs.
-        :raises ValueError: naming what does not fit.
-        """
+        """Check that there is one number for each input (n_u,); a ValueError names which not."""
         for name in ('lower', 'upper', 'rate'):
             per_signal(f'input {name}', getattr(self, name), names)
 
@@ -65,10 +62,8 @@ def limit(limits: InputLimits, wanted: Array, previous: Array | None, seconds: f
 
     A previous command from outside the range, which was tightened since, is left at the rate.
 
-    :param limits: the limits.
     :param wanted: (n_u,) the law's command.
     :param previous: (n_u,) command `seconds` ago, or None at the first.
-    :param seconds: time since the previous command, not negative.
     """
     within = limits.within(wanted)
     at_range = bool((within != wanted).any())
@@ -79,3 +74,33 @@ def limit(limits: InputLimits, wanted: Array, previous: Array | None, seconds: f
     reached = np.minimum(np.maximum(within, previous - reach), previous + reach)
     reached.setflags(write=False)
     return LimitedInput(reached, at_range, bool((reached != within).any()))
+
+
+# In input units; what is left then is below the resolution of any actuator.
+_NEGLIGIBLE = 1e-9
+
+
+@dataclass(frozen=True)
+class Transfer:
+    """
+    An offset to the command that fades with d (1 + t/T) exp(-t/T), flat at first.
+
+    Steps add up: after a second change the rest of the first fades on.
+    """
+
+    offset: Array  #: (n_u,) now, in input units
+    feed: Array  #: (n_u,) what it follows, which fades exponentially
+
+    def shifted(self, by: Array) -> Transfer:
+        """Return the transfer with a further step (n_u,)."""
+        return Transfer(self.offset + by, self.feed + by)
+
+    def after(self, seconds: float, time_constant: float) -> Transfer | None:
+        """Return what is left after seconds, None for nothing; T = 0 s ends it at once."""
+        if seconds > 100.0 * time_constant:
+            return None
+        share = seconds / time_constant if time_constant > 0.0 else 0.0
+        fading = math.exp(-share)
+        left = Transfer(fading * (self.offset + share * self.feed), fading * self.feed)
+        size = np.max(np.abs(left.offset)) + np.max(np.abs(left.feed))
+        return left if size > _NEGLIGIBLE else None

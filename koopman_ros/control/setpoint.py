@@ -33,12 +33,7 @@ class Setpoint:
 
 
 def refusal(model: LiftedModel, value: Array) -> Reason | None:
-    """
-    Return why a set-point cannot be tracked, or None.
-
-    :param model: whose training box is the range of set-points.
-    :param value: (n_x,) in state units.
-    """
+    """Return why a set-point (n_x,), in state units, is outside the training box, or None."""
     states = model.states
     for i, name in enumerate(states.names):
         if not np.isfinite(value[i]):
@@ -55,7 +50,6 @@ def request(setpoint: Setpoint, value: Array, effective_ns: int, now_ns: int | N
 
     A request that holds at once is the operator's last word: it ends every schedule.
 
-    :param setpoint: the present state.
     :param value: (n_x,) accepted value, in state units.
     :param effective_ns: time from which it holds; 0 or past means at once, and a time more than
         an hour ahead is taken for the stamp of another clock and means at once, too.
@@ -85,11 +79,9 @@ def advance(setpoint: Setpoint, measured: Array, model: LiftedModel, ramp: Array
     Before the first request the state that was first measured is held, so that a
     controller which starts on a running plant asks for no change.
 
-    :param setpoint: the present state.
     :param measured: (n_x,) measured state, in state units.
     :param model: whose training box bounds the first set-point.
     :param ramp: (n_x,) largest change per second, in state units; infinity for steps.
-    :param now_ns: time of the measurement.
     :param seconds: time since the last measurement; 0 at the first.
     :param lag: time constant in seconds of the filter behind the ramp; 0 for none.
     """

@@ -69,9 +69,6 @@ class Settings:
 
         Set-points step, every finite measurement is accepted, every command counts as reached,
         disturbances are not bounded, and the nominal input is the safe one.
-
-        :param model: whose signals the settings are for.
-        :param others: further fields.
         """
         n_x, n_u = model.n_x, model.n_u
         return cls(**{
@@ -81,13 +78,7 @@ class Settings:
             'sensor': SensorLimits.none(n_x), **others})
 
     def check(self, model: LiftedModel, outputs: Outputs) -> None:
-        """
-        Check that there is one number for each signal.
-
-        :param model: whose states and inputs they are for.
-        :param outputs: what is measured.
-        :raises ValueError: naming the setting, what is expected and what was given.
-        """
+        """Check that there is one number for each signal; a ValueError names which not."""
         states, inputs = model.states.names, model.inputs.names
         for names, signals in ((('state_weight', 'setpoint_ramp'), states), (
                 ('input_weight', 'max_disturbance', 'input_tolerance', 'safe_input'), inputs)):

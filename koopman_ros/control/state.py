@@ -1,20 +1,22 @@
 # SPDX-FileCopyrightText: 2026 The koopman_ros Authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""What a controller remembers between two measurements."""
+"""What a controller remembers between two measurements, and what it reports of a step."""
 
 from dataclasses import dataclass, field
 from enum import Enum
+import math
 from typing import TypeVar
 
 import numpy as np
 
 from koopman_ros.arrays import Array
+from koopman_ros.control.laws.base import Figures, NO_FIGURES
+from koopman_ros.control.limits import Transfer
 from koopman_ros.control.setpoint import Setpoint
-from koopman_ros.control.supervisor import Supervisor
-from koopman_ros.control.transfer import Transfer
-from koopman_ros.control.way_back import WayBack
+from koopman_ros.control.supervisor import Supervisor, WayBack
 from koopman_ros.estimation import Accepted, Estimate
+from koopman_ros.reasons import Reason
 
 Record = TypeVar('Record')
 
@@ -62,3 +64,75 @@ class State:
     law_input: Array | None = None  #: (n_u,) what that law asked for, within the range
     law_memory: object = None  #: what that law remembers
     transfer: Transfer | None = None  #: what is added to it for a while, or None
+
+
+class Arrival(Enum):
+    """What came of a measurement; after one late or repeated the last command is given again."""
+
+    ACCEPTED = 'accepted'
+    REJECTED = 'rejected'
+    LATE = 'late'
+    REPEATED = 'repeated'
+    MISSING = 'missing'
+
+
+@dataclass(frozen=True)
+class MeasurementReport:
+    """The measurement that was answered."""
+
+    arrival: Arrival = Arrival.MISSING  #: what came of it
+    #: its distance from the training data, in half widths; NaN when there is none
+    outside: float = math.nan
+    predicted: Array | None = None  #: (n_y,) what was expected of it, or None
+    missed: int = 0  #: measurements that should have come since the last one
+    #: whether its stamp was so much earlier than the one before that time starts afresh
+    clock_went_back: bool = False
+    follows: bool = True  #: whether the measured input, where there is one, is what was commanded
+
+
+@dataclass(frozen=True)
+class EstimateReport:
+    """The estimate."""
+
+    state: Array  #: (n_x,) in state units
+    disturbance: Array  #: (n_u,) as an input that would have the same effect, in input units
+    at_bound: bool  #: whether the disturbance is as large as is allowed
+
+
+@dataclass(frozen=True)
+class TargetReport:
+    """Where the law goes."""
+
+    setpoint: Array  #: (n_x,) what is tracked, in state units
+    outside: float  #: its distance from the training box, in half widths
+    #: rate of the state there that no input balances, scaled; NaN without a law
+    residual: float = math.nan
+
+
+@dataclass(frozen=True)
+class CommandReport:
+    """How the command came about."""
+
+    law: Figures = NO_FIGURES  #: what the law says of its solution
+    transfer: Array | None = None  #: (n_u,) what a change of law or mode still adds to it, or None
+    way_back: float = 0.0  #: share of the nominal input in it on the way back from the safe one
+    at_range: bool = False  #: whether the range of an input was active
+    at_rate: bool = False  #: whether the rate limit of an input was active
+    #: its distance from the training box, in half widths; NaN where not looked at
+    outside: float = math.nan
+
+
+@dataclass(frozen=True)
+class Report:
+    """What a step did."""
+
+    mode: Mode  #: who commanded
+    level: str  #: the control level that acted; 'manual' in manual mode
+    #: its place among the levels, 0 for the best; in manual mode, one after the last
+    depth: int = 0
+    #: why not a better one, or why a measurement is rejected; None without
+    reason: Reason | None = None
+    measurement: MeasurementReport = field(default_factory=MeasurementReport)  #: the measurement
+    estimate: EstimateReport | None = None  #: the estimate, or None
+    target: TargetReport | None = None  #: where the law goes, or None before the first measurement
+    command: CommandReport = field(default_factory=CommandReport)  #: the command

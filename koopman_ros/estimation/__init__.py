@@ -5,12 +5,12 @@
 
 from collections.abc import Callable
 
-from koopman_ros.estimation.base import Estimate, Estimator
-from koopman_ros.estimation.frozen import FrozenCheck
-from koopman_ros.estimation.measurement import Accepted, check, SensorLimits, Verdict
+from koopman_ros.estimation.measurement import Accepted, check, FrozenCheck, SensorLimits, Verdict
 from koopman_ros.estimation.observer import (
     DisturbanceObserver,
     equivalent_bias,
+    Estimate,
+    Estimator,
     MeasuredState,
 )
 
@@ -21,16 +21,5 @@ ESTIMATORS: dict[str, Callable[..., Estimator]] = {
     'measured_state': MeasuredState,
 }
 
-__all__ = [
-    'ESTIMATORS',
-    'Accepted',
-    'DisturbanceObserver',
-    'Estimate',
-    'Estimator',
-    'FrozenCheck',
-    'MeasuredState',
-    'SensorLimits',
-    'Verdict',
-    'check',
-    'equivalent_bias',
-]
+__all__ = ['ESTIMATORS', 'Accepted', 'DisturbanceObserver', 'Estimate', 'Estimator', 'FrozenCheck',
+           'MeasuredState', 'SensorLimits', 'Verdict', 'check', 'equivalent_bias']

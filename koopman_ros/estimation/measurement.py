@@ -10,12 +10,60 @@ from dataclasses import dataclass
 import math
 
 import numpy as np
+from numpy.typing import NDArray
 
 from koopman_ros.arrays import Array
-from koopman_ros.estimation.frozen import FrozenCheck
 from koopman_ros.reasons import Code, Reason, reason
 from koopman_ros.signals import Outputs, per_signal
 from koopman_ros.units import NANOSECONDS
+
+
+@dataclass(frozen=True)
+class FrozenCheck:
+    """Since when each signal has stood still, and how far the model says that it has moved."""
+
+    #: (n_y,) stamps of the first of the measurements that are bit-identical
+    since_ns: tuple[int, ...]
+    travel: Array  #: (n_y,) predicted since then, in the signals' units
+    #: (n_x,) disturbance that was estimated when all signals last changed: what an observer makes
+    #: of a sensor that does not move is no disturbance
+    w: Array
+
+    @classmethod
+    def started(cls, y: Array, time_ns: int, w: Array) -> FrozenCheck:
+        """Begin with a first measurement (n_y,)."""
+        return cls((time_ns,) * len(y), np.zeros_like(y), w)
+
+    def after(self, still: NDArray[np.bool_], time_ns: int, w: Array,
+              travel: Callable[[FrozenCheck], Array]) -> FrozenCheck:
+        """
+        Take a measurement into account.
+
+        :param still: (n_y,) which signals are bit-identical to the last ones.
+        :param w: (n_x,) disturbance that is estimated now.
+        :param travel: predicts how far (n_y,) the signals have moved since the last measurement.
+        """
+        if not still.any():
+            return FrozenCheck((time_ns,) * len(still), np.zeros_like(self.travel), w)
+        return FrozenCheck(
+            tuple(since if same else time_ns
+                  for since, same in zip(self.since_ns, still.tolist(), strict=True)),
+            np.where(still, self.travel + travel(self), 0.0), self.w)
+
+    def longest(self, time_ns: int, still: NDArray[np.bool_], significant: Array
+                ) -> tuple[int, float]:
+        """
+        Return which signal has stood still for longest although it should have moved.
+
+        :param significant: (n_y,) predicted travel above which it should have.
+        :return: its place, and for how many seconds; 0 when there is none.
+        """
+        place, stood = 0, 0.0
+        for i in np.flatnonzero(still & (np.abs(self.travel) > significant)).tolist():
+            seconds = (time_ns - self.since_ns[i]) / NANOSECONDS
+            if seconds > stood:
+                place, stood = i, seconds
+        return place, stood
 
 
 @dataclass(frozen=True)
@@ -50,12 +98,7 @@ class SensorLimits:
         return cls(-endless, endless, endless, endless)
 
     def check(self, names: Sequence[str]) -> None:
-        """
-        Check that there is one number for each signal.
-
-        :param names: (n_y,) of the measured signals.
-        :raises ValueError: naming what does not fit.
-        """
+        """Check that there is one number for each signal (n_y,); a ValueError names which not."""
         for name in ('lower', 'upper', 'rate', 'jump'):
             per_signal(f'sensor {name}', getattr(self, name), names)
 
@@ -87,12 +130,9 @@ class Verdict:
 def check(limits: SensorLimits, outputs: Outputs, last: Accepted | None, y: Array, time_ns: int,
           w: Array, travel: Callable[[FrozenCheck], Array]) -> Verdict:
     """
-    Accept or reject a measurement.
+    Accept or reject a measurement (n_y,), in the signals' units.
 
-    :param limits: of the sensors.
-    :param outputs: names of the measured signals.
     :param last: what is remembered, or None before the first.
-    :param y: (n_y,) measured, in the signals' units.
     :param time_ns: its stamp, later than those before.
     :param w: (n_x,) disturbance that is estimated now.
     :param travel: tells how far (n_y,) the model says that the signals have moved since the last

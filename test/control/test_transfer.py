@@ -6,7 +6,7 @@
 import numpy as np
 import pytest
 
-from koopman_ros.control.transfer import Transfer
+from koopman_ros.control.limits import Transfer
 
 
 def faded(seconds: float, constant: float) -> float:

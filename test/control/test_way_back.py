@@ -10,7 +10,7 @@ import pytest
 from scipy.optimize import brentq
 
 from koopman_ros.control import Controller, InputLimits, Settings, State
-from koopman_ros.control.way_back import leads_home, rest_under, WayBack
+from koopman_ros.control.supervisor import leads_home, rest_under, WayBack
 from koopman_ros.lifting import Coordinates, linearised_model, Provenance
 from koopman_ros.ros.model_loading import rests_outside
 from support.closed_loops import REACTOR, shipped, START

@@ -6,11 +6,11 @@
 from collections.abc import Callable
 
 from koopman_ros.control.laws.base import Figures, Law, LawResult, Tuning, Weights
-from koopman_ros.control.laws.linear import Linear
-from koopman_ros.control.laws.sdre import (
+from koopman_ros.control.laws.riccati import (
     Feedback,
     feedback,
     Form,
+    Linear,
     projected,
     recentred,
     StateDependentRiccati,
@@ -22,18 +22,5 @@ LAWS: dict[str, Callable[[LiftedModel, Tuning], Law]] = {
     'linear': Linear,
 }
 
-__all__ = [
-    'LAWS',
-    'Feedback',
-    'Figures',
-    'Form',
-    'Law',
-    'LawResult',
-    'Linear',
-    'StateDependentRiccati',
-    'Tuning',
-    'Weights',
-    'feedback',
-    'projected',
-    'recentred',
-]
+__all__ = ['LAWS', 'Feedback', 'Figures', 'Form', 'Law', 'LawResult', 'Linear',
+           'StateDependentRiccati', 'Tuning', 'Weights', 'feedback', 'projected', 'recentred']

@@ -7,12 +7,60 @@ from dataclasses import dataclass
 import math
 from typing import Protocol
 
+import numpy as np
+
 from koopman_ros.arrays import Array
 from koopman_ros.control.limits import InputLimits
-from koopman_ros.control.target import Target
 from koopman_ros.estimation import Estimate
 from koopman_ros.lifting import LiftedModel
 from koopman_ros.reasons import Reason
+
+
+@dataclass(frozen=True)
+class Target:
+    """A set-point with the input that holds it, in scaled deviations."""
+
+    x: Array  #: (n_x,) reference state
+    z: Array  #: (n_z,) z_ref = N(x_ref) (paper, section on the optimal control problem)
+    u: Array  #: (n_u,) input that balances the model's drift and the disturbance there
+    forcing: Array  #: (n_x,) B u_ref + w, what acts on the state beside the drift
+    residual: float  #: size of the rate that no input balances; 0 where x can be held
+
+
+def steady_state_target(model: LiftedModel, x_ref: Array, w: Array | None = None) -> Target:
+    """
+    Solve f(x_ref) + B u_ref + w = 0 for u_ref by least squares, f the model's drift.
+
+    The feed-forward comes from the lifted model: the linearisation's would leave a large
+    offset far from the nominal point.
+
+    :param x_ref: (n_x,) scaled deviation.
+    :param w: (n_x,) disturbance of the state's rate, none by default.
+    """
+    return balance(model, reference(model, x_ref), np.zeros(model.n_x) if w is None else w)
+
+
+@dataclass(frozen=True)
+class Reference:
+    """What a target has of its set-point alone, in scaled deviations."""
+
+    x: Array  #: (n_x,) reference state
+    z: Array  #: (n_z,) N(x_ref)
+    drift: Array  #: (n_x,) the model's drift there
+
+
+def reference(model: LiftedModel, x_ref: Array) -> Reference:
+    """Evaluate the model at a set-point (n_x,), in scaled deviations."""
+    return Reference(x_ref, model.lift(x_ref), model.drift(x_ref))
+
+
+def balance(model: LiftedModel, at: Reference, w: Array) -> Target:
+    """Complete a reference by the input that balances drift and disturbance w (n_x,)."""
+    load = at.drift + w
+    u = -model.input_inverse.dot(load)
+    forcing = model.B.dot(u)
+    rest = load + forcing
+    return Target(at.x, at.z, u, forcing + w, math.sqrt(rest.dot(rest)))
 
 
 @dataclass(frozen=True)
@@ -61,7 +109,7 @@ class Law(Protocol):
     """
     A control law on a model; pure, what it remembers goes out and comes in.
 
-    To add one: write a class like :class:`~koopman_ros.control.laws.linear.Linear` in any module,
+    To add one: write a class like :class:`~koopman_ros.control.laws.riccati.Linear` in any module,
     whose constructor takes the lift and a :class:`Tuning`, and name it in the levels of the
     settings as module:class.
     """

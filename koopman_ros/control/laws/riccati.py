@@ -1,19 +1,26 @@
 # SPDX-FileCopyrightText: 2026 The koopman_ros Authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""The state-dependent Riccati law on a lifted model, in its re-centred and projected forms."""
+"""Laws by Riccati equations: state-dependent, re-centred and projected, and the linear one."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from enum import Enum
+from functools import cached_property
 import math
 
 import numpy as np
 from scipy.linalg import expm
 
 from koopman_ros.arrays import Array
-from koopman_ros.control.laws.base import Figures, LawResult, Tuning, Weights
+from koopman_ros.control.laws.base import (
+    Figures,
+    LawResult,
+    steady_state_target,
+    Target,
+    Tuning,
+    Weights,
+)
 from koopman_ros.control.limits import finite, InputLimits
-from koopman_ros.control.target import Target
 from koopman_ros.estimation import Estimate
 from koopman_ros.lifting import LiftedModel
 from koopman_ros.reasons import Code, reason
@@ -82,10 +89,7 @@ def feedback(model: LiftedModel, x: Array, target: Target, weights: Weights, *,
     lift with more coordinates than states has directions of z that no state reaches, in which
     its weight C' Q C and so the gain are not determined near the target.
 
-    :param model: the lift.
     :param x: (n_x,) scaled deviation of the measured state.
-    :param target: where to go.
-    :param weights: the cost.
     :param max_gain: bound on the spectral norm of K.
     :param max_residual: bound on the relative Riccati residual.
     """
@@ -165,14 +169,7 @@ class StateDependentRiccati:
 
 def checked(model: LiftedModel, found: Feedback, limits: InputLimits, interval: float
             ) -> LawResult:
-    """
-    Return the command of a feedback, unless it must not be used.
-
-    :param model: in whose deviations it is.
-    :param found: the feedback.
-    :param limits: of the inputs.
-    :param interval: seconds between samples; 0 when they are not known.
-    """
+    """Return the command of a feedback, unless it must not be used; see :meth:`Law.compute`."""
     riccati = found.riccati
     growth = found.growth(interval / model.seconds_per_time_unit) if found.solved else math.nan
     figures = Figures(found.form.value, riccati.residual, riccati.gain, growth)
@@ -185,3 +182,33 @@ def checked(model: LiftedModel, found: Feedback, limits: InputLimits, interval: 
         return LawResult(None, reason(Code.COMMAND_NOT_FINITE), figures)
     within = limits.within(u)
     return LawResult(within, None, figures, clipped=bool((within != u).any()))
+
+
+@dataclass(frozen=True)
+class Linear:
+    """One gain for all states, of the Riccati equation of the linearised model."""
+
+    lift: LiftedModel  #: that is linearised
+    tuning: Tuning  #: weights and bounds
+
+    @property
+    def model(self) -> LiftedModel:
+        """The lift linearised at its nominal point."""
+        return self.lift.linearised
+
+    @cached_property
+    def _at_nominal(self) -> Feedback:
+        origin = np.zeros(self.model.n_x)
+        return feedback(self.model, origin, steady_state_target(self.model, origin),
+                        self.tuning.weights, max_gain=self.tuning.max_gain,
+                        max_residual=self.tuning.max_residual)
+
+    def compute(self, estimate: Estimate, target: Target, limits: InputLimits, memory: object,
+                interval: float, deadline: float = math.inf) -> LawResult:
+        """Apply the gain; see :class:`~koopman_ros.control.laws.base.Law`."""
+        try:
+            found = self._at_nominal
+            return checked(self.model, replace(
+                found, u=target.u - found.riccati.K.dot(estimate.x - target.x)), limits, interval)
+        except np.linalg.LinAlgError as error:
+            return LawResult(None, reason(Code.SINGULAR, matrix=str(error)))
