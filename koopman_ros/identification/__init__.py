@@ -8,35 +8,29 @@ Training needs states with their derivatives; sensors give states with noise. He
 dx/dt = f(x) + B u is found from the measurements first; the lift is then learned from that drift.
 """
 
-from koopman_ros.identification.drift import box_of, DriftModel
-from koopman_ros.identification.identify import Identified, identify, Score, Stopped
-from koopman_ros.identification.methods import Method, METHODS, weak_forms
-from koopman_ros.identification.output_error import output_error
-from koopman_ros.identification.segments import (
+from koopman_ros.identification.drift import (
+    box_of,
+    DriftModel,
     fitted_starts,
     longest_step,
     prediction_error,
     Segments,
 )
+from koopman_ros.identification.identify import (
+    Identified,
+    identify,
+    Method,
+    METHODS,
+    Score,
+    Stopped,
+    weak_forms,
+)
+from koopman_ros.identification.output_error import output_error
 from koopman_ros.identification.total_variation import noise_level, total_variation
 from koopman_ros.identification.weak_form import weak_form
 
 __all__ = [
-    'METHODS',
-    'DriftModel',
-    'Identified',
-    'Method',
-    'Score',
-    'Segments',
-    'Stopped',
-    'box_of',
-    'fitted_starts',
-    'identify',
-    'longest_step',
-    'noise_level',
-    'output_error',
-    'prediction_error',
-    'total_variation',
-    'weak_form',
-    'weak_forms',
+    'METHODS', 'DriftModel', 'Identified', 'Method', 'Score', 'Segments', 'Stopped', 'box_of',
+    'fitted_starts', 'identify', 'longest_step', 'noise_level', 'output_error',
+    'prediction_error', 'total_variation', 'weak_form', 'weak_forms',
 ]

@@ -1,24 +1,31 @@
 # SPDX-FileCopyrightText: 2026 The koopman_ros Authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""A polynomial model of a plant's drift, linear in what is estimated."""
+"""A polynomial model of a drift, and segments of episodes on which models are rolled out."""
 
-from collections.abc import Sequence
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cached_property, partial
+import itertools
+import math
 
 import numpy as np
 
 from koopman_ros.lifting import Box, PolynomialObservables
 from koopman_ros.plant_data import Array, Episode, Plant
+from koopman_ros.solvers import runge_kutta_step
+
+# dx/dt (M, n_x) of states (M, n_x) and inputs (M, n_u), all in units
+Rate = Callable[[Array, Array], Array]
+
+# Difference of two starts that tells the slope, in units of the states' scale.
+_STEP = 1e-4
 
 
 def box_of(plant: Plant, episodes: Sequence[Episode]) -> Box:
-    """
-    Return the range of some episodes, with deviations from its middle.
-
-    :raises ValueError: when a state or an input never moves.
-    """
+    """Return the episodes' range, its middle the origin; ValueError when a signal never moves."""
     return Box.of(plant, np.concatenate([episode.x for episode in episodes]),
                   np.concatenate([episode.u for episode in episodes]), nominal=False)
 
@@ -71,11 +78,8 @@ def regress(box: Box, degree: int, features: Array, inputs: Array, rates: Array,
     """
     Fit rates = features @ coefficients + inputs @ B' by linear least squares.
 
-    :param box: the deviations.
-    :param degree: of the monomials in `features`.
-    :param features: (K, 1 + m) features, or integrals of them.
-    :param inputs: (K, n_u) inputs, or integrals of them.
-    :param rates: (K, n_x) rates, or integrals of them.
+    Features (K, 1 + m), inputs (K, n_u) and rates (K, n_x), or integrals of them, in deviations.
+
     :param B: (n_x, n_u) scaled, where it is known; None to fit it.
     :raises ValueError: when the samples do not determine the coefficients.
     """
@@ -91,3 +95,112 @@ def regress(box: Box, degree: int, features: Array, inputs: Array, rates: Array,
     solution = np.linalg.lstsq(left / norms, right, rcond=1e-12)[0] / norms[:, None]
     m = features.shape[1]
     return DriftModel(box, degree, solution[:m], solution[m:].T if B is None else B)
+
+
+@dataclass(frozen=True)
+class Segments:
+    """M segments on grids of K steps, between which inputs are constant; short ones are padded."""
+
+    steps: Array  #: (K, M) lengths of the steps, 0 in the padding, in time units
+    u: Array  #: (K, M, n_u) inputs held over them
+    x: Array  #: (K + 1, M, n_x) measured states, 0 where none was measured
+    measured: np.ndarray  #: (K + 1, M) whether one was
+
+    @classmethod
+    def of(cls, episodes: Sequence[Episode], longest_step: float) -> Segments:
+        """Put episodes on grids of their own: samples, input changes and steps between."""
+        grids = [_grid(episode, longest_step) for episode in episodes]
+        K, M = max(len(grid) for grid in grids) - 1, len(episodes)
+        n_x, n_u = episodes[0].x.shape[1], episodes[0].u.shape[1]
+        steps, u = np.zeros((K, M)), np.zeros((K, M, n_u))
+        x, measured = np.zeros((K + 1, M, n_x)), np.zeros((K + 1, M), dtype=bool)
+        for j, (episode, grid) in enumerate(zip(episodes, grids, strict=True)):
+            k = len(grid) - 1
+            steps[:k, j] = np.diff(grid)
+            u[:k, j] = episode.inputs_at(grid[:-1])
+            u[k:, j] = episode.u[-1]
+            rows = np.searchsorted(grid, episode.time)
+            x[rows, j], measured[rows, j] = episode.x, True
+        return cls(steps, u, x, measured)
+
+    def path(self, rate: Rate, x0: Array) -> Array:
+        """Return the states (K + 1, M, n_x) from starts (M, n_x), not finite after divergence."""
+        path = np.empty(self.x.shape)
+        path[0] = x = x0
+        with np.errstate(all='ignore'):
+            for k, (h, u) in enumerate(zip(self.steps[..., None], self.u, strict=True)):
+                path[k + 1] = x = runge_kutta_step(partial(_held, rate, u), x, h)
+        return path
+
+    def errors(self, rate: Rate, x0: Array) -> Array:
+        """Return the prediction less the measurement (K + 1, M, n_x), 0 where there is none."""
+        return np.where(self.measured[..., None], self.path(rate, x0) - self.x, 0.0)
+
+
+def _held(rate: Rate, u: Array, x: Array) -> Array:
+    return rate(x, u)
+
+
+def longest_step(episodes: Sequence[Episode]) -> float:
+    """Return a step over which a Runge-Kutta method follows motion that the episodes resolve."""
+    # a motion is resolved where it takes several samples
+    return 2.0 * float(np.median(np.concatenate([np.diff(episode.time) for episode in episodes])))
+
+
+def fitted_starts(rate: Rate, segments: Segments, scale: Array) -> tuple[Array, Array]:
+    """
+    Predict every segment by a model, from the start that suits it best, and compare.
+
+    The start is fitted, for a measurement of it would bring its noise into the prediction.
+
+    :param scale: (n_x,) size of the states, in which their errors are weighed.
+    :return: the starts (M, n_x), and the mean squared errors from there (M, n_x), in state units
+        squared, infinite on divergence.
+    """
+    x0 = first_measured(segments)
+    n_x = x0.shape[1]
+    count = np.sum(segments.measured, axis=0)[:, None]
+    best, least = x0, np.full_like(x0, np.inf)
+    # errors in units of the scale: states of different units weigh alike
+    for last in (False, False, True):
+        errors = segments.errors(rate, x0) / scale
+        # a model may diverge from any of the starts
+        with np.errstate(all='ignore'):
+            squares = np.sum(errors ** 2, axis=0) / count
+            better = np.sum(squares, axis=1) < np.sum(least, axis=1)
+            best, least = (np.where(better[:, None], x0, best),
+                           np.where(better[:, None], squares, least))
+            if last or not np.all(np.isfinite(errors)):
+                break
+            # (K + 1, M, n_x, n_x): change of every state with each start
+            slopes = np.stack([
+                (segments.errors(rate, x0 + _STEP * scale * unit) / scale - errors) / _STEP
+                for unit in np.eye(n_x)], axis=-1)
+            normal = np.einsum('kmij,kmil->mjl', slopes, slopes)
+            right = np.einsum('kmij,kmi->mj', slopes, errors)
+            if not (np.all(np.isfinite(normal)) and np.all(np.isfinite(right))):
+                break
+            inverse = np.linalg.pinv(normal, rcond=1e-9, hermitian=True)
+            x0 = x0 - scale * (inverse @ right[..., None])[..., 0]
+    return best, least * scale ** 2
+
+
+def prediction_error(rate: Rate, segments: Segments, scale: Array) -> Array:
+    """Return the root mean square error (n_x,) of :func:`fitted_starts`, in state units."""
+    squares = fitted_starts(rate, segments, scale)[1]
+    weights = np.sum(segments.measured, axis=0)
+    return np.sqrt(np.average(squares, axis=0, weights=weights))
+
+
+def first_measured(segments: Segments) -> Array:
+    """Return the first measurement of each segment (M, n_x)."""
+    return segments.x[0].copy()
+
+
+def _grid(episode: Episode, longest: float) -> Array:
+    inside = (episode.input_time > episode.time[0]) & (episode.input_time < episode.time[-1])
+    knots = np.union1d(episode.time, episode.input_time[inside])
+    pieces = [np.linspace(a, b, math.ceil((b - a) / longest * (1.0 - 1e-9)) + 1)[:-1]
+              if b - a > longest else np.array([a])
+              for a, b in itertools.pairwise(knots)]
+    return np.concatenate([*pieces, knots[-1:]])

@@ -11,8 +11,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from koopman_ros.identification.drift import DriftModel
-from koopman_ros.identification.segments import first_measured, Segments
+from koopman_ros.identification.drift import DriftModel, first_measured, Segments
 from koopman_ros.learning.levenberg_marquardt import minimise, NormalEquations
 from koopman_ros.plant_data import Array
 from koopman_ros.solvers import runge_kutta_step
@@ -29,8 +28,6 @@ def output_error(model: DriftModel, segments: Segments, *, learn_input_matrix: b
     disturbs the plant (Ljung 1999, chapter 7). Levenberg-Marquardt with the exact derivatives of
     the Runge-Kutta steps; its normal equations are gathered step by step.
 
-    :param model: where to start from.
-    :param segments: measured segments.
     :param learn_input_matrix: whether B is refined, too.
     :param monitor: called with the step and the cost after each step; True ends it.
     """
@@ -80,10 +77,10 @@ class _Problem:
         count = int(np.sum(data.measured))
         M, n_x = x.shape
         p = model.coefficients.size + self._n_B
-        sums = _Sums(M, n_x, p) if equations.derivatives else None
-        # the state, and beside it its change with the model's parameters and with the start
-        y = x[..., None]
-        if sums is not None:
+        y, sums = x[..., None], None
+        if equations.derivatives:
+            sums = _Sums(M, n_x, p)
+            # beside the state its change with the model's parameters and with the start
             y = np.concatenate((y, np.zeros((M, n_x, p)),
                                 np.broadcast_to(np.eye(n_x), (M, n_x, n_x))), axis=-1)
         cost = 0.0
@@ -101,10 +98,8 @@ class _Problem:
                     y = runge_kutta_step(
                         partial(_rates, model, self._inputs[k], self.learn_input_matrix), y,
                         data.steps[k][:, None, None])
-        if sums is None:
-            equations.add_sums(cost)
-        else:
-            equations.add_sums(cost, *(torch.from_numpy(a / count) for a in sums.result()))
+        found = () if sums is None else sums.result()
+        equations.add_sums(cost, *(torch.from_numpy(a / count) for a in found))
 
 
 class _Sums:

@@ -27,9 +27,6 @@ def total_variation(episodes: Sequence[Episode], box: Box, degree: int, B: Array
     (Rudin, Osher, Fatemi 1992; Chartrand 2011. Here the variation of the second derivative is
     held down, so that the first one may bend and need not be made of stairs.)
 
-    :param episodes: what was recorded.
-    :param box: the deviations.
-    :param degree: of the drift.
     :param B: (n_x, n_u) scaled, or None to learn it.
     :param assumed: (n_x, n_u) scaled B that is taken off before smoothing; it need not be exact.
     :raises ValueError: when no episode is long enough, or without a B to take off.
@@ -61,9 +58,7 @@ def noise_level(episodes: Sequence[Episode], model: DriftModel) -> Array:
     Return the standard deviation (n_x,) of the measurement noise, in state units.
 
     From third differences of x - integral(B u), in which a motion that is well resolved leaves
-    nothing but noise.
-
-    :raises ValueError: when no episode is long enough.
+    nothing but noise. ValueError when no episode is long enough.
     """
     found = []
     for episode in episodes:
@@ -92,13 +87,10 @@ def _noise(D: Array, y: Array) -> float:
 
 def smoothed(time: Array, values: Array) -> Array:
     """
-    Smooth signals as far as their noise allows, with few bends of the derivative.
+    Smooth signals (N, n) as far as their noise allows, with few bends of the derivative.
 
     min 0.5 ||g - y||^2 + a ||D^3 g||_1 by iterated weights; `a` is such that what is taken away
     has the size of the noise, which third differences tell (discrepancy principle).
-
-    :param time: (N,) rising.
-    :param values: (N, n).
     """
     return np.column_stack([_smoothed(time, values[:, j]) for j in range(values.shape[1])])
 

@@ -25,9 +25,6 @@ def weak_form(episodes: Sequence[Episode], box: Box, degree: int, B: Array | Non
     phi = (1 - s^2)^3 on windows that overlap by three quarters; x enters as measured. (Weak SINDy:
     Messenger and Bortz 2021.)
 
-    :param episodes: what was recorded.
-    :param box: the deviations.
-    :param degree: of the drift.
     :param B: (n_x, n_u) scaled, or None to learn it.
     :param window: samples of a window, at least 4.
     :raises ValueError: when the window or the episodes are too short.

@@ -1,21 +1,11 @@
 # SPDX-FileCopyrightText: 2026 The koopman_ros Authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""
-Lifts learned from samples, their baselines and held-out figures; in torch.
+"""Lifts learned from samples, their baselines and held-out figures; in torch, never in a node."""
 
-No node imports this package where it controls or simulates.
-"""
-
-from koopman_ros.learning.algorithm1 import Algorithm1
-from koopman_ros.learning.baselines import Edmd, Linearisation
+from koopman_ros.learning.baselines import Algorithm1, Edmd, Linearisation
 from koopman_ros.learning.growth import Growth
-from koopman_ros.learning.training import (
-    NoUsefulLift,
-    Progress,
-    train,
-    Trained,
-)
+from koopman_ros.learning.training import NoUsefulLift, Progress, train, Trained
 from koopman_ros.learning.validation import (
     compare_closed_loops,
     evaluate,
@@ -27,19 +17,6 @@ from koopman_ros.learning.validation import (
 )
 
 __all__ = [
-    'Algorithm1',
-    'Edmd',
-    'Figures',
-    'Fit',
-    'Growth',
-    'Linearisation',
-    'NoUsefulLift',
-    'Progress',
-    'Trained',
-    'compare_closed_loops',
-    'evaluate',
-    'fit',
-    'roll_out',
-    'rollout_rmse',
-    'train',
+    'Algorithm1', 'Edmd', 'Figures', 'Fit', 'Growth', 'Linearisation', 'NoUsefulLift', 'Progress',
+    'Trained', 'compare_closed_loops', 'evaluate', 'fit', 'roll_out', 'rollout_rmse', 'train',
 ]

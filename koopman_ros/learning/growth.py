@@ -15,8 +15,7 @@ from torch import Tensor
 
 from koopman_ros.learning.levenberg_marquardt import minimise, Minimum, MinimumStatus
 from koopman_ros.learning.network import check_activation, Layout, Parameters, Pass
-from koopman_ros.learning.residuals import Problem, ResidualWeights
-from koopman_ros.learning.scaled import ScaledSamples
+from koopman_ros.learning.residuals import Problem, ResidualWeights, ScaledSamples
 
 # Called after every step with (iteration, cost); True ends the minimisation.
 Monitor = Callable[[int, float], bool]
@@ -68,16 +67,11 @@ class Growth:
         check_activation(self.activation)
 
     def rounds(self, n_x: int) -> tuple[int, ...]:
-        """
-        Return the n_z after each round of starts.
-
-        :raises ValueError: when `n_z` is too small for the states.
-        """
+        """Return the n_z after each round of starts; ValueError when the states need more."""
         if self.n_z < n_x + self.identity:
-            raise ValueError(
-                f'n_z = {self.n_z} is too small for {n_x} states'
-                + (' as its first coordinates: use Edmd(degree=1) for a linear model'
-                   if self.identity else ''))
+            hint = ' as its first coordinates: use Edmd(degree=1) for a linear model'
+            raise ValueError(f'n_z = {self.n_z} is too small for {n_x} states'
+                             + (hint if self.identity else ''))
         return tuple(range(n_x + self.identity, self.n_z + 1))
 
     def start(self, data: ScaledSamples, n_z: int, parent: Grown | None, seed: int,
@@ -109,9 +103,8 @@ class Growth:
         """Return the lift without a network that growth starts from."""
         n_x = data.x.shape[1]
         n_z = n_x if self.identity else 0
-        decoder = self.decoder
-        if decoder is None:
-            decoder = 8 if n_x > 1 and not self.identity else 0
+        default = 8 if n_x > 1 and not self.identity else 0
+        decoder = default if self.decoder is None else self.decoder
         layout = Layout(n_x, n_z, (), self.identity, self.activation,
                         0 if data.u is None else data.u.shape[1], decoder)
         drift, B = linear_drift(data)
@@ -129,34 +122,26 @@ class Growth:
         generator = torch.Generator().manual_seed(seed)
         given = old.split(parent.theta)
         drift = data.drift(given.B)
-        first = not old.hidden
-        count = self.hidden_first if first else self.hidden_more
+        count = self.hidden_more if old.hidden else self.hidden_first
         hidden = _widened(given, old.n_x, count, self.layers, generator)
         layout = replace(old, n_z=n_z, hidden=tuple(len(b) for _, b in hidden))
         zero = data.x.new_zeros
         blank = Parameters(hidden, zero((layout.n_free, layout.hidden[-1])), zero((n_z, n_z)))
         features = Pass(replace(layout, decoder=0, n_u=0), blank, data.x, drift).features
         V = torch.cat([given.V, zero((len(given.V), features.shape[1] - given.V.shape[1]))], 1)
-        if n_z == old.n_z + 1:
-            targets = _least_spanned_product(parent, data.x, drift)[:, None]
-        else:
-            targets = _whitened(data.x)
+        targets = (_least_spanned_product(parent, data.x, drift)[:, None]
+                   if n_z == old.n_z + 1 else _whitened(data.x))
         V = torch.cat([V, _ridge_fit(features, targets, self.ridge).T])
         begun = Parameters(hidden, V, zero((n_z, n_z)), given.B)
         lifted = Pass(layout, begun, data.x, drift)
         A = least_squares(lifted.z, lifted.z_rate).T
-        decoder = None
-        if layout.decoder:
-            decoder = _decoder_start(lifted.z, data.x, layout.decoder, generator)
+        decoder = (_decoder_start(lifted.z, data.x, layout.decoder, generator)
+                   if layout.decoder else None)
         return layout, layout.join(replace(begun, A=A, decoder=decoder))
 
 
 def linear_drift(data: ScaledSamples) -> tuple[Tensor, Tensor | None]:
-    """
-    Fit dx/dt = A x + B u by linear least squares.
-
-    :return: A (n_x, n_x), and B (n_x, n_u) where the inputs are among the data, else None.
-    """
+    """Fit dx/dt = A x + B u: A (n_x, n_x), and B (n_x, n_u) where inputs are given, else None."""
     n_x = data.x.shape[1]
     if data.u is None:
         return least_squares(data.x, data.f).T, None
@@ -182,8 +167,7 @@ def _widened(given: Parameters, n_x: int, count: int, layers: int, generator: to
              ) -> tuple[tuple[Tensor, Tensor], ...]:
     """Add `count` random units to each hidden layer; the old ones do not see the new ones."""
     hidden = []
-    width, added = n_x, 0
-    like = given.A
+    width, added, like = n_x, 0, given.A
     for i in range(layers):
         W, b = given.hidden[i] if given.hidden else (like.new_zeros((0, width)),
                                                      like.new_zeros(0))
@@ -220,9 +204,9 @@ def _decoder_start(z: Tensor, x: Tensor, units: int, generator: torch.Generator
 
 def _least_spanned_product(grown: Grown, x: Tensor, f: Tensor) -> Tensor:
     """
-    Return the product of slow eigenfunctions that the lift spans least, with unit variance.
+    Return the product of slow eigenfunctions that the lift spans least.
 
-    :return: (N,) its component orthogonal to the present coordinates.
+    Of which (N,) the component orthogonal to the present coordinates, with unit variance.
     """
     if grown.layout.n_z == 0:
         values, vectors = torch.linalg.eig(least_squares(x, f))

@@ -59,13 +59,7 @@ class NormalEquations:
         return float(self._cost)
 
     def add(self, r: Tensor, J: Tensor | None = None, count: int = 1) -> None:
-        """
-        Add residuals, their squares divided by a count.
-
-        :param r: (...) residuals.
-        :param J: (..., p) their derivatives, needed where derivatives are wanted.
-        :param count: divisor of the squares, the number of samples where their mean is meant.
-        """
+        """Add residuals (...) with their J (..., p) where wanted, squares divided by a count."""
         self._cost += 0.5 * torch.sum(r * r) / count
         if J is not None:
             J = J.reshape(-1, len(self.gradient))
@@ -147,9 +141,7 @@ class _State:
     now: NormalEquations
     scaling: Tensor
     damping: float = 1e-3
-    #: by what the damping rises when a step is refused; back at _FACTOR after a step that was
-    #: taken
-    factor: float = _FACTOR
+    factor: float = _FACTOR  # by which the damping rises when a step is refused; reset when taken
     iteration: int = 0
 
     def minimum(self, status: MinimumStatus) -> Minimum:

@@ -10,11 +10,38 @@ from dataclasses import dataclass, replace
 import torch
 from torch import Tensor
 
-from koopman_ros.learning.deep import ProductSums
 from koopman_ros.learning.levenberg_marquardt import NormalEquations
 from koopman_ros.learning.network import Layout, Parameters, Pass
-from koopman_ros.learning.scaled import ScaledSamples
-from koopman_ros.learning.shallow import FeatureMap, MomentSums
+from koopman_ros.learning.sums import FeatureMap, MomentSums, ProductSums
+from koopman_ros.lifting import Box
+from koopman_ros.plant_data import Array, Samples
+
+
+def deviations(box: Box, samples: Samples) -> tuple[Array, Array, Array]:
+    """Scale samples to deviations: x (N, n_x), dx/dt (N, n_x), u (N, n_u)."""
+    return (box.states.to_deviation(samples.x), samples.dxdt / box.states.scale,
+            box.inputs.to_deviation(samples.u))
+
+
+@dataclass(frozen=True)
+class ScaledSamples:
+    """Samples in the scaled deviations from the nominal point that a lift is learned from."""
+
+    x: Tensor  #: (N, n_x) states, float64
+    f: Tensor  #: (N, n_x) rates dx/dt, less B u where B is known
+    u: Tensor | None = None  #: (N, n_u) inputs whose B is to be learned, or None where it is known
+
+    def drift(self, B: Tensor | None) -> Tensor:
+        """Return the rates without what the inputs do, (N, n_x)."""
+        return self.f if B is None or self.u is None else self.f - self.u @ B.T
+
+    def part(self, start: int, length: int) -> ScaledSamples:
+        """Return some consecutive samples."""
+        rows = slice(start, start + length)
+        return ScaledSamples(self.x[rows], self.f[rows], None if self.u is None else self.u[rows])
+
+    def __len__(self) -> int:
+        return len(self.x)
 
 
 @dataclass(frozen=True)
@@ -54,9 +81,8 @@ class Problem:
             raise ValueError('a decoder weight needs a decoder network')
         if not self.chunk:
             shallow = len(self.layout.hidden) == 1
-            rows = self.layout.n_x if self.layout.decoder else 0
-            if not shallow:
-                rows = max(rows, self.layout.n_z)
+            rows = max(self.layout.n_x if self.layout.decoder else 0,
+                       0 if shallow else self.layout.n_z)
             floats = max(rows * self.layout.size,
                          FeatureMap.size(self.layout) if shallow else 0)
             object.__setattr__(self, 'chunk', max(64, (1 << 18) // floats))
@@ -124,11 +150,7 @@ def _decoder_block(layout: Layout, parameters: Parameters, x: Tensor, lifted: Pa
 
 def _whitening(layout: Layout, moment: Tensor, weight: float
                ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-    """
-    Evaluate the whitening residual from E[z z'].
-
-    :return: rows and columns of the entries that can change, their weights, the residual.
-    """
+    """Return rows, columns and weights of the entries of E[z z'] that can change, and residual."""
     i, j = torch.triu_indices(layout.n_z, layout.n_z, device=moment.device)
     varies = j >= layout.n_z - layout.n_free
     i, j = i[varies], j[varies]

@@ -19,11 +19,10 @@ import numpy as np
 import torch
 
 from koopman_ros import __version__
-from koopman_ros.learning.algorithm1 import Algorithm1
-from koopman_ros.learning.baselines import Edmd
+from koopman_ros.learning.baselines import Algorithm1, Edmd
 from koopman_ros.learning.growth import Grown, Growth, Monitor
 from koopman_ros.learning.levenberg_marquardt import MinimumStatus
-from koopman_ros.learning.scaled import deviations, ScaledSamples
+from koopman_ros.learning.residuals import deviations, ScaledSamples
 from koopman_ros.learning.validation import (
     ClosedLoopComparison,
     compare_closed_loops,
@@ -197,14 +196,11 @@ def _conclude(plant: Plant, parts: tuple[Samples, Samples, Samples], path: list[
 def _training_states(box: Box, samples: Samples) -> TrainingStates | None:
     """Return where the data are, held-out ones included; None for one state: its box says it."""
     states = box.states
-    if len(states) == 1:
-        return None
-    return TrainingStates.of(states.to_deviation(samples.x),
-                             0.5 * (states.upper - states.lower) / states.scale)
+    return None if len(states) == 1 else TrainingStates.of(
+        states.to_deviation(samples.x), 0.5 * (states.upper - states.lower) / states.scale)
 
 
-def _judged(assembly: _Assembly, grown: Grown | str, validation: Samples
-            ) -> _Candidate | str:
+def _judged(assembly: _Assembly, grown: Grown | str, validation: Samples) -> _Candidate | str:
     """Return the candidate of a start, or why it has none."""
     if isinstance(grown, str):
         return grown
@@ -232,8 +228,7 @@ class _Tracker:
         return self._report(iteration, math.sqrt(2.0 * cost))
 
     def finish(self, rw: float) -> None:
-        self.finished += 1
-        self._rw = rw
+        self.finished, self._rw = self.finished + 1, rw
         self._report(0, math.nan)
 
     def _report(self, iteration: int, residual: float) -> bool:
@@ -267,11 +262,9 @@ class _Assembly:
 
     def data(self, device: str) -> ScaledSamples:
         x, rate, u = deviations(self.box, self.samples)
-        if self.plant.B is None:
-            return ScaledSamples(*(
-                torch.from_numpy(a).to(device) for a in (x, rate / self.pace, u)))
-        f = rate - u @ self.box.input_matrix(self.plant.B).T
-        return ScaledSamples(*(torch.from_numpy(a).to(device) for a in (x, f / self.pace)))
+        arrays = (x, rate / self.pace, u) if self.plant.B is None else (
+            x, (rate - u @ self.box.input_matrix(self.plant.B).T) / self.pace)
+        return ScaledSamples(*(torch.from_numpy(a).to(device) for a in arrays))
 
     def model(self, grown: Grown) -> LiftedModel:
         parts = grown.layout.split(grown.theta.cpu())
@@ -292,8 +285,7 @@ class _Assembly:
 
 
 def _run_starts(recipe: Recipe, data: ScaledSamples, n_z: int, parent: Grown | None, seed: int,
-                starts: int, threads: int, tracker: _Tracker
-                ) -> Generator[Grown | str]:
+                starts: int, threads: int, tracker: _Tracker) -> Generator[Grown | str]:
     """Run one round; yield what each start has found, in their order."""
     seeds = [int(n) for n in np.random.SeedSequence([seed, n_z]).generate_state(starts)]
     monitor = tracker.step if _runs_here() else None

@@ -66,13 +66,7 @@ class Figures:
 
 
 def evaluate(model: LiftedModel, samples: Samples) -> Figures:
-    """
-    Evaluate all open-loop figures of a model.
-
-    :param model: the lift.
-    :param samples: held-out episodes.
-    :raises ValueError: when the samples do not distinguish the coordinates.
-    """
+    """Evaluate all open-loop figures on held-out episodes; raises as :func:`fit`."""
     return Figures(fit(model, samples.x, samples.dxdt, samples.u), model.eigenvalues,
                   rollout_rmse(model, samples))
 
@@ -81,7 +75,6 @@ def fit(model: LiftedModel, x: Array, dxdt: Array, u: Array) -> Fit:
     """
     Evaluate the residuals of a lift on samples of a plant.
 
-    :param model: the lift.
     :param x: (N, n_x) states, in state units.
     :param dxdt: (N, n_x) their derivatives, in state units per time unit.
     :param u: (N, n_u) inputs, in input units.
@@ -105,12 +98,10 @@ def fit(model: LiftedModel, x: Array, dxdt: Array, u: Array) -> Fit:
                cond=cond)
 
 
-def roll_out(model: LiftedModel, x0: Array, inputs: Array, sample_period: float | Array,
-             ) -> Array:
+def roll_out(model: LiftedModel, x0: Array, inputs: Array, sample_period: float | Array) -> Array:
     """
     Predict the states under inputs that are held, from the model's drift: dx/dt = f(x) + B u.
 
-    :param model: the lift.
     :param x0: (..., n_x) start, in state units; leading dimensions are predicted side by side.
     :param inputs: (..., K, n_u) inputs, each held for one sample period, in input units.
     :param sample_period: in the model's time unit, or (K,) periods.
@@ -174,10 +165,8 @@ def compare_closed_loops(model: LiftedModel, linear: LiftedModel, samples: Sampl
     The drift stands in for the plant, which training does not have; how close the two are is
     what the other figures say. Weights are 1 on scaled states and inputs.
 
-    :param model: the lift.
     :param linear: a linear model of the same plant in the same coordinates.
     :param samples: held-out samples; the starts are taken evenly in order of their distance.
-    :param starts: number of starts.
     :raises ValueError: for a plant without inputs.
     """
     if model.n_u == 0:
@@ -195,14 +184,12 @@ def compare_closed_loops(model: LiftedModel, linear: LiftedModel, samples: Sampl
     for x0 in chosen:
         for i, used in enumerate((model, linear)):
             loop = run_closed_loop(used, rate, x0, model.states.center, weights, duration,
-                                   samples=2, rtol=1e-6,
-                                   max_evaluations=_MAX_EVALUATIONS)
+                                   samples=2, rtol=1e-6, max_evaluations=_MAX_EVALUATIONS)
             end = np.linalg.norm(model.states.to_deviation(loop.states[-1]))
             costs[i] += loop.cost
             arrived[i] += int(not loop.failure and end < _ARRIVED)
-    if not np.isfinite(costs).any():
-        ratio = np.nan
-    else:
+    ratio = np.nan
+    if np.isfinite(costs).any():
         ratio = 0.0 if np.isinf(costs[1]) else costs[0] / costs[1]
     return ClosedLoopComparison(float(ratio), arrived[0], arrived[1], starts)
 

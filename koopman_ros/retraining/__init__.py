@@ -13,13 +13,5 @@ from koopman_ros.retraining.lift import learn_lift
 from koopman_ros.retraining.report import write_report
 from koopman_ros.retraining.task import retrain, Retrained, Task
 
-__all__ = [
-    'Decision',
-    'Retrained',
-    'Task',
-    'Thresholds',
-    'decide',
-    'learn_lift',
-    'retrain',
-    'write_report',
-]
+__all__ = ['Decision', 'Retrained', 'Task', 'Thresholds', 'decide', 'learn_lift', 'retrain',
+           'write_report']

@@ -10,14 +10,8 @@ import numpy as np
 
 from koopman_ros.arrays import Array
 from koopman_ros.control import run_closed_loop, Weights
-from koopman_ros.identification import (
-    DriftModel,
-    Identified,
-    longest_step,
-    prediction_error,
-    Segments,
-)
-from koopman_ros.identification.segments import Rate
+from koopman_ros.identification import DriftModel, Identified
+from koopman_ros.identification.drift import longest_step, prediction_error, Rate, Segments
 from koopman_ros.learning import Trained
 from koopman_ros.learning.validation import settling_time
 from koopman_ros.lifting import LiftedModel, linearised_model, Provenance
@@ -72,12 +66,9 @@ class Decision:
 
 def lifted_rate(model: LiftedModel, time_unit_seconds: float) -> Rate:
     """
-    Return dx/dt of a lift's projected drift, for states and inputs in units.
+    Return dx/dt of a lift's projected drift, in units and per a time unit of so many seconds.
 
     It is NaN for states that have diverged: their pseudo-inverse does not exist.
-
-    :param model: the lift.
-    :param time_unit_seconds: the time unit of the rates asked for.
     """
     factor = time_unit_seconds / model.seconds_per_time_unit
 
@@ -94,14 +85,7 @@ def lifted_rate(model: LiftedModel, time_unit_seconds: float) -> Rate:
 
 def decide(found: Identified, trained: Trained, current: LiftedModel, thresholds: Thresholds
           ) -> Decision:
-    """
-    Compare a new lift with the present one and with a linear model, and close the loop on it.
-
-    :param found: the drift, and the segments that were held out of its estimation.
-    :param trained: the new lift.
-    :param current: the present one.
-    :param thresholds: what it has to reach.
-    """
+    """Compare a new lift with the present and a linear one, held out, and close its loop."""
     model, scale = trained.model, found.drift.box.states.scale
     unit = model.seconds_per_time_unit
     held_out = Segments.of(found.held_out, longest_step(found.held_out))
@@ -111,8 +95,8 @@ def decide(found: Identified, trained: Trained, current: LiftedModel, thresholds
                      found.linear.rate))
     reasons = []
     own = _size(rmse, scale)
-    for name, other in (('the present lift', current_rmse), ('the best linear model',
-                                                            linear_rmse)):
+    for name, other in (('the present lift', current_rmse),
+                        ('the best linear model', linear_rmse)):
         if not np.isfinite(own) or own > (1.0 - thresholds.margin) * _size(other, scale):
             reasons.append(
                 f'its error on held-out records, {_text(rmse, model)}, is not '
@@ -157,7 +141,9 @@ def _closed_loops(model: LiftedModel, drift: DriftModel) -> tuple[int, int]:
     loops = arrived = 0
     for place in _PLACES:
         x_ref = lower + place * (upper - lower)
-        duration = settling_time(_linearised(drift, model, x_ref), weights)
+        duration = settling_time(
+            linearised_model(drift.slope(x_ref), drift.input_matrix, model.states, model.inputs,
+                             model.time_unit, Provenance(model.provenance.plant)), weights)
         for x0 in starts:
             loops += 1
             # a loop that runs away ends as a failure, whatever overflows meanwhile
@@ -167,12 +153,6 @@ def _closed_loops(model: LiftedModel, drift: DriftModel) -> tuple[int, int]:
             miss = np.abs(run.states[-1] - x_ref) / model.states.scale
             arrived += int(not run.failure and bool(np.all(miss < _ARRIVED)))
     return loops, arrived
-
-
-def _linearised(drift: DriftModel, like: LiftedModel, x: Array) -> LiftedModel:
-    """Linearise a drift at a state."""
-    return linearised_model(drift.slope(x), drift.input_matrix, like.states, like.inputs,
-                            like.time_unit, Provenance(like.provenance.plant))
 
 
 def _size(rmse: Array, scale: Array) -> float:

@@ -9,13 +9,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from koopman_ros.arrays import Array
-from koopman_ros.identification import (
-    DriftModel,
-    fitted_starts,
-    Identified,
-    longest_step,
-    Segments,
-)
+from koopman_ros.identification import DriftModel, Identified
+from koopman_ros.identification.drift import fitted_starts, longest_step, Segments
 from koopman_ros.learning import Growth, train, Trained
 from koopman_ros.learning.training import Watch
 from koopman_ros.plant_data import Episode, Plant, Samples
@@ -37,11 +32,8 @@ def drift_samples(drift: DriftModel, episodes: tuple[Episode, ...]) -> Samples:
     Sample a drift along the paths that it predicts for some episodes, free of their noise.
 
     They are values of one smooth function, free of noise, so that training, choice and figures
-    may share the range among them; the plant's own held-out segments judge the lift.
-
-    :param drift: the estimate.
-    :param episodes: segments; those that the drift does not follow are left out.
-    :raises ValueError: when it follows none.
+    may share the range among them; the plant's own held-out segments judge the lift. Episodes
+    that the drift does not follow are left out; ValueError when it follows none.
     """
     segments = Segments.of(episodes, longest_step(episodes))
     x0, squares = fitted_starts(drift.rate, segments, drift.box.states.scale)
@@ -60,13 +52,10 @@ def drift_samples(drift: DriftModel, episodes: tuple[Episode, ...]) -> Samples:
 
 def _spread(xi: Array) -> NDArray[np.int64]:
     """
-    Choose samples that fill the range as evenly as they can.
+    Choose samples (N, n_x) that fill the range as evenly as they can; return rising numbers.
 
     A plant dwells around some states; a lift learned from all samples would know those best and
     tell its coordinates apart by the few others.
-
-    :param xi: (N, n_x) in [-1, 1].
-    :return: rising numbers of the chosen ones.
     """
     low, high = xi.min(axis=0), xi.max(axis=0)
     cell = np.minimum((_CELLS * (xi - low) / (high - low)).astype(int), _CELLS - 1)
@@ -97,12 +86,10 @@ def steady_point(drift: DriftModel, x: Array, u: Array) -> tuple[Array, Array]:
     Find a state and an input near given ones under which the drift stands still.
 
     With as many inputs as states the state stays what it is; otherwise both move as little as
-    they can, in units of their range.
+    they can, in units of their range. ValueError when there is none nearby.
 
-    :param drift: the estimate.
     :param x: (n_x,) in state units.
     :param u: (n_u,) in input units.
-    :raises ValueError: when there is none nearby.
     """
     box = drift.box
     xi, v = box.states.to_deviation(x), box.inputs.to_deviation(u)
@@ -126,14 +113,9 @@ def steady_point(drift: DriftModel, x: Array, u: Array) -> tuple[Array, Array]:
 def learn_lift(found: Identified, plant: Plant, n_z: int, *, seed: int, starts: int,
                watch: Watch | None = None) -> Trained:
     """
-    Learn a lift of an estimated drift.
+    Learn a lift of an estimated drift; the arguments are those of :func:`learning.train`.
 
-    :param found: the estimate with the episodes that it was fitted to.
     :param plant: names, units and, where the episodes surround it, the nominal point.
-    :param n_z: number of coordinates.
-    :param seed: of the training.
-    :param starts: of each round.
-    :param watch: sees the progress and can end it.
     :raises NoUsefulLift: when no lift is better than a linear model.
     :raises ValueError: when the episodes hold no steady state.
     """

@@ -9,23 +9,17 @@ from typing import Any
 
 import numpy as np
 
-from koopman_ros.identification import Identified, longest_step, Segments
-from koopman_ros.identification.segments import fitted_starts, Rate
+from koopman_ros.identification import fitted_starts, Identified, longest_step, Segments
+from koopman_ros.identification.drift import Rate
 from koopman_ros.lifting import Coordinates
 from koopman_ros.reports import bullets, drawing, table, write_figures, write_page
-from koopman_ros.retraining.coverage import CELLS, visited_cells
 from koopman_ros.retraining.gate import lifted_rate
-from koopman_ros.retraining.task import Retrained
+from koopman_ros.retraining.task import CELLS, Retrained, visited_cells
 from koopman_ros.units import shown, unit_label
 
 
 def write_report(retrained: Retrained) -> list[Path]:
-    """
-    Write ``<output>.json``, ``<output>.md`` and, with matplotlib, ``<output>.png``.
-
-    :param retrained: what to report.
-    :return: what was written.
-    """
+    """Write ``<output>.json``, ``.md`` and, with matplotlib, ``.png``; return what was written."""
     base = Path(retrained.task.output)
     picture = base.with_suffix('.png')
     drawn = _draw(picture, retrained)
@@ -113,19 +107,21 @@ def _draw_coverage(axes: Any, found: Identified) -> None:
              title='where the measurements lie (visited cells in green)')
 
 
+def _lifts(retrained: Retrained) -> list[tuple[str, Rate, str]]:
+    """Return label, rate and colour of the present lift and of the new one, where there is one."""
+    unit = retrained.present.seconds_per_time_unit
+    new = [] if retrained.trained is None else [
+        ('new lift', lifted_rate(retrained.trained.model, unit), 'tab:green')]
+    return [('present lift', lifted_rate(retrained.present, unit), 'tab:red'), *new]
+
+
 def _draw_drift(axes: Any, retrained: Retrained) -> None:
     found, current = retrained.found, retrained.present
     box = found.drift.box
     x = np.linspace(box.states.lower, box.states.upper, 200)
     u = np.broadcast_to(box.inputs.center, (len(x), 1))
-    unit = current.seconds_per_time_unit
-    rates: list[tuple[str, Rate, str]] = [
-        ('present lift', lifted_rate(current, unit), 'tab:red'),
-        ('best linear model', found.linear.rate, '0.5')]
-    if retrained.trained is not None:
-        rates.append(('new lift', lifted_rate(retrained.trained.model, unit), 'tab:green'))
     estimated = found.drift.rate(x, u)[:, 0]
-    for name, rate, color in rates:
+    for name, rate, color in [*_lifts(retrained), ('best linear model', found.linear.rate, '0.5')]:
         axes.plot(shown(x[:, 0], box.states.units[0]), rate(x, u)[:, 0] - estimated,
                   color=color, label=name)
     axes.axhline(0.0, color='k', linestyle='--', linewidth=1.0,
@@ -145,11 +141,7 @@ def _draw_prediction(axes: Any, retrained: Retrained) -> None:
     measured = segments.measured[:, 0]
     axes.plot(minutes[measured], shown(segments.x[measured, 0, 0], states.units[0]),
               '.', color='0.6', markersize=3.0, label='measured')
-    unit = current.seconds_per_time_unit
-    models = [('present lift', lifted_rate(current, unit), 'tab:red')]
-    if retrained.trained is not None:
-        models.append(('new lift', lifted_rate(retrained.trained.model, unit), 'tab:green'))
-    for name, rate, color in models:
+    for name, rate, color in _lifts(retrained):
         x0, _ = fitted_starts(rate, segments, found.drift.box.states.scale)
         path = segments.path(rate, x0)[:, 0, 0]
         axes.plot(minutes, shown(path, states.units[0]), color=color, label=name)

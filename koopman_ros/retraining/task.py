@@ -5,8 +5,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from dataclasses import dataclass, field, replace
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
 import hashlib
 import json
 import os
@@ -14,16 +14,18 @@ from pathlib import Path
 import shutil
 
 import numpy as np
+from numpy.typing import NDArray
 
 from koopman_ros.bags import Account, loop_episodes
 from koopman_ros.identification import Identified, identify, Stopped
 from koopman_ros.learning import NoUsefulLift, Progress, Trained
-from koopman_ros.lifting import LiftedModel, load, save
+from koopman_ros.lifting import Box, LiftedModel, load, save
 from koopman_ros.plant_data import Episode
-from koopman_ros.retraining.coverage import coverage
 from koopman_ros.retraining.gate import decide, Decision, Thresholds
 from koopman_ros.retraining.lift import learn_lift
 from koopman_ros.units import NANOSECONDS
+
+CELLS = 10  # along each state and input, by which the visited share of their range is told
 
 # Shares of the whole at which estimating, learning and judging begin.
 _STAGES = {'estimate': 0.05, 'learn': 0.35, 'decide': 0.9}
@@ -68,7 +70,7 @@ class Retrained:
     reasons: tuple[str, ...]  #: why it was refused; empty when it was accepted
     coverage: float  #: share of the cells of the state-input box that the episodes visit
     present: LiftedModel  #: the lift that was in use; its time unit is that of the drift
-    model_file: str = field(default='')  #: where the lift was written, or an empty string
+    model_file: str = ''  #: where the lift was written, or an empty string
 
     @property
     def accepted(self) -> bool:
@@ -114,8 +116,6 @@ def retrain(task: Task, on_progress: OnProgress = lambda *_: False) -> Retrained
     An accepted lift goes to the output file, and what was there before is kept beside it as
     ``.previous.safetensors``; a refused one goes to ``.refused.safetensors``.
 
-    :param task: what to do.
-    :param on_progress: receives the progress and can stop it.
     :raises BagReadError: for bags that cannot be used.
     :raises ModelFileError: when the present lift cannot be read.
     :raises ValueError: for episodes that do not determine a model, or a task that does not fit.
@@ -139,36 +139,45 @@ def retrain(task: Task, on_progress: OnProgress = lambda *_: False) -> Retrained
     seconds = current.seconds_per_time_unit
     episodes = [replace(episode, time=episode.time / seconds,
                         input_time=episode.input_time / seconds) for episode in recorded]
-    B = None
-    if task.input_gain:
-        B = np.array([[task.input_gain * current.seconds_per_time_unit / 60.0]])
+    B = np.array([[task.input_gain * seconds / 60.0]]) if task.input_gain else None
     found = identify(
         replace(current.plant, B=B), episodes, seed=task.seed,
         watch=lambda done, total, text: on_progress(
             _at('estimate', done / total), f'estimating: {text}'))
-    covered = coverage(episodes, found.drift.box)
-    trained: Trained | None = None
-    decision: Decision | None = None
-    reasons: tuple[str, ...] = ()
+    bare = Retrained(task, account, found, None, None, (), coverage(episodes, found.drift.box),
+                     current)
     try:
         trained = learn_lift(found, current.plant, task.coordinates, seed=task.seed,
                              starts=task.starts, watch=lambda now: on_progress(
                                  _at('learn', now.finished / now.total), _learning(now)))
     except NoUsefulLift as error:
-        reasons = (str(error),)
+        _stop_if(on_progress(_at('decide', 0.0), 'judging'))
+        return replace(bare, reasons=(str(error),))
     # a training that was stopped ends with its best so far
     _stop_if(on_progress(_at('decide', 0.0), 'judging'))
-    if trained is not None:
-        decision = decide(found, trained, current, thresholds)
-        reasons = decision.reasons
-        _stop_if(on_progress(_at('decide', 0.9), 'writing'))
-    retrained = Retrained(task, account, found, trained, decision, reasons, covered, current)
-    if trained is None or decision is None:
-        return retrained
-    model = _with_provenance(trained.model, retrained, episodes)
-    path = _place(Path(task.output), retrained.accepted)
+    decision = decide(found, trained, current, thresholds)
+    _stop_if(on_progress(_at('decide', 0.9), 'writing'))
+    model = _with_provenance(trained.model, found, decision, bare.coverage, episodes)
+    path = _place(Path(task.output), decision.accepted)
     save(model, path)
-    return replace(retrained, trained=replace(trained, model=model), model_file=str(path))
+    return replace(bare, trained=replace(trained, model=model), decision=decision,
+                   reasons=decision.reasons, model_file=str(path))
+
+
+def visited_cells(episodes: Sequence[Episode], box: Box) -> NDArray[np.int64]:
+    """Return the cells (K, n_x + n_u) of the box that measurements and their inputs lie in."""
+    found = []
+    for episode in episodes:
+        u = box.inputs.to_deviation(episode.inputs_at(episode.time))
+        scaled = np.hstack([box.states.to_deviation(episode.x), u])
+        found.append(np.clip((0.5 * (scaled + 1.0) * CELLS).astype(np.int64), 0, CELLS - 1))
+    return np.unique(np.concatenate(found), axis=0)
+
+
+def coverage(episodes: Sequence[Episode], box: Box) -> float:
+    """Return the share of the cells of the box that are visited."""
+    cells = visited_cells(episodes, box)
+    return len(cells) / float(CELLS) ** cells.shape[1]
 
 
 def _check_signals(model: LiftedModel, path: str) -> None:
@@ -198,21 +207,19 @@ def _learning(now: Progress) -> str:
     return f'learning: n_z {now.n_z}, start {min(now.finished + 1, now.total)} of {now.total}{rw}'
 
 
-def _with_provenance(model: LiftedModel, retrained: Retrained, episodes: list[Episode]
-                     ) -> LiftedModel:
-    assert retrained.decision is not None
+def _with_provenance(model: LiftedModel, found: Identified, decision: Decision, covered: float,
+                     episodes: list[Episode]) -> LiftedModel:
     sha = hashlib.sha256()
     for episode in episodes:
         for array in (episode.time, episode.x, episode.input_time, episode.u):
             sha.update(np.ascontiguousarray(array).astype('<f8').tobytes())
-    metrics = {**model.provenance.metrics,
-               'rollout_rmse': float(retrained.decision.rmse[0]),
-               'noise': float(retrained.decision.noise[0]), 'coverage': retrained.coverage}
+    metrics = {**model.provenance.metrics, 'rollout_rmse': float(decision.rmse[0]),
+               'noise': float(decision.noise[0]), 'coverage': covered}
     # a refused lift may diverge
     metrics = {name: value for name, value in metrics.items() if np.isfinite(value)}
     return replace(model, provenance=replace(
         model.provenance, data_digest=sha.hexdigest(), metrics=metrics,
-        method=f'{retrained.found.method}, drift of degree {retrained.found.drift.degree}'))
+        method=f'{found.method}, drift of degree {found.drift.degree}'))
 
 
 def _place(output: Path, accepted: bool) -> Path:

@@ -11,8 +11,7 @@ import torch
 from koopman_ros.learning import Algorithm1
 from koopman_ros.learning.levenberg_marquardt import MinimumStatus, normal_equations
 from koopman_ros.learning.network import Layout
-from koopman_ros.learning.residuals import Problem, ResidualWeights
-from koopman_ros.learning.scaled import ScaledSamples
+from koopman_ros.learning.residuals import Problem, ResidualWeights, ScaledSamples
 from support.small_plants import bent_samples
 
 SMALL = {'n_z': 2, 'hidden': (3,), 'decoder': 3, 'max_iterations': 5}

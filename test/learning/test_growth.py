@@ -13,7 +13,7 @@ from koopman_ros.learning import Growth
 from koopman_ros.learning.growth import least_squares
 from koopman_ros.learning.levenberg_marquardt import MinimumStatus
 from koopman_ros.learning.network import Pass
-from koopman_ros.learning.scaled import ScaledSamples
+from koopman_ros.learning.residuals import ScaledSamples
 from support.disturbance import disturbed_data
 from support.small_plants import bent_samples, two_state_samples
 

@@ -15,8 +15,7 @@ import torch
 import koopman_ros
 from koopman_ros.learning.levenberg_marquardt import normal_equations
 from koopman_ros.learning.network import Layout
-from koopman_ros.learning.residuals import Problem, ResidualWeights
-from koopman_ros.learning.scaled import ScaledSamples
+from koopman_ros.learning.residuals import Problem, ResidualWeights, ScaledSamples
 
 FUNCTIONS = {'tanh': torch.tanh, 'sigmoid': torch.sigmoid, 'sine': torch.sin,
              'softplus': torch.nn.functional.softplus}
@@ -166,7 +165,7 @@ MEMORY = """
 import resource
 from koopman_ros.learning.network import Layout
 from koopman_ros.learning.residuals import Problem, ResidualWeights
-from koopman_ros.learning.scaled import ScaledSamples
+from koopman_ros.learning.residuals import ScaledSamples
 from koopman_ros.learning.levenberg_marquardt import normal_equations
 import torch
 torch.set_num_threads(1)

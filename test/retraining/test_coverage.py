@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from koopman_ros.plant_data import Episode
-from koopman_ros.retraining.coverage import CELLS, coverage, visited_cells
+from koopman_ros.retraining.task import CELLS, coverage, visited_cells
 from support.known_plants import box
 
 BOX = box([0.0], [10.0], [100.0], [200.0])

@@ -12,8 +12,7 @@ from torch import Tensor
 
 from koopman_ros.learning.growth import Growth
 from koopman_ros.learning.network import Layout, Pass
-from koopman_ros.learning.residuals import Problem, ResidualWeights
-from koopman_ros.learning.scaled import ScaledSamples
+from koopman_ros.learning.residuals import Problem, ResidualWeights, ScaledSamples
 from koopman_ros.plants import ControlAffineSystem, one_state_reactor, two_state_example
 
 WHITENING = 1.0
