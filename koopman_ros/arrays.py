@@ -14,8 +14,6 @@ def frozen(value: ArrayLike, name: str, shape: tuple[int | None, ...], *, finite
     """
     Return a read-only float64 copy of `value`, or say what is wrong with it.
 
-    :param value: what should have this shape.
-    :param name: what an error calls it.
     :param shape: expected; None where any length will do, -1 for a size that never fits.
     :param finite: whether infinity is refused as well as what is not a number.
     :raises ValueError: naming both shapes, or the first entry that is refused.

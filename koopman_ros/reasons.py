@@ -1,11 +1,7 @@
 # SPDX-FileCopyrightText: 2026 The koopman_ros Authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""
-Reasons as codes with values, and the one place where they become sentences.
-
-Programs compare codes; only people read what :class:`Words` makes of them.
-"""
+"""Reasons: codes with values, which programs compare, and the sentences that people read."""
 
 from __future__ import annotations
 
@@ -21,34 +17,78 @@ Value: TypeAlias = 'float | int | str | Reason | tuple[tuple[str, float, float],
 
 
 class Code(Enum):
-    """What is the matter; the value is the identifier in records."""
+    """
+    What is the matter: its identifier in records, and the sentence that people read.
 
-    NOT_FINITE = 'measurement_not_finite'
-    OUTSIDE_SENSOR = 'measurement_outside_sensor'
-    JUMPED = 'measurement_jumped'
-    FROZEN = 'sensor_frozen'
-    NO_MEASUREMENT = 'no_measurement'
-    OUTSIDE_TRAINING = 'outside_training'
-    LAW_FAILED = 'law_failed'
-    HELD_TOO_LONG = 'held_too_long'
-    RECOVERING = 'recovering'
-    NOT_STABILISABLE = 'riccati_not_stabilisable'
-    RICCATI_INACCURATE = 'riccati_inaccurate'
-    GAIN_TOO_LARGE = 'riccati_gain_too_large'
-    SINGULAR = 'singular'
-    PREDICTED_UNSTABLE = 'predicted_unstable'
-    COMMAND_NOT_FINITE = 'command_not_finite'
-    SETPOINT_NOT_FINITE = 'setpoint_not_finite'
-    SETPOINT_OUTSIDE = 'setpoint_outside'
-    SCHEDULE_FULL = 'schedule_full'
-    NOT_IN_MANUAL_MODE = 'not_in_manual_mode'
-    MANUAL_NOT_FINITE = 'manual_not_finite'
-    EXPERIMENT_BOUNDS = 'experiment_bounds'
-    CLOCK_WENT_BACK = 'clock_went_back'
-    SILENCE = 'silence'
-    OTHER_PUBLISHER = 'other_publisher'
-    CONTROLLER_GONE = 'controller_gone'
-    NOT_FOLLOWED = 'not_followed'
+    Of numbers in a sentence, 'value' is one of the signal, 'change' a difference of two, with its
+    unit; 'rate' is a change per second. 'ranges' are (name, lower, upper) of several signals,
+    'level' is the name of a control level. What has no such format is written as it is.
+    """
+
+    template: str
+
+    def __new__(cls, identifier: str, template: str = '') -> Code:
+        """Keep the identifier as the value, by which a code is found."""
+        code = object.__new__(cls)
+        code._value_ = identifier
+        code.template = template
+        return code
+
+    NOT_FINITE = 'measurement_not_finite', (
+        'the measured {signal} is {value}, not finite: check the sensor')
+    OUTSIDE_SENSOR = 'measurement_outside_sensor', (
+        'the measured {signal} {value:value} is outside the range of the sensor, {lower:value} '
+        'to {upper:value}: check it')
+    JUMPED = 'measurement_jumped', (
+        'the measured {signal} jumped from {before:value} to {value:value} in {seconds:.3g} s, '
+        'at most {jump:change} and {rate:rate} are possible: check the sensor')
+    FROZEN = 'sensor_frozen', (
+        'the measured {signal} has been exactly {value:value} for longer than {timeout:g} s '
+        'while the model moved by more than {change:change}: the sensor is frozen; check it')
+    NO_MEASUREMENT = 'no_measurement', 'no measurement arrives: check sensor and plant'
+    OUTSIDE_TRAINING = 'outside_training', (
+        'outside the trained range ({ranges:ranges}) by more than the {margin:g} half widths '
+        'that the {level:level} is allowed')
+    LAW_FAILED = 'law_failed', 'the {level:level} fails: {cause}'
+    HELD_TOO_LONG = 'held_too_long', '{cause}; held for longer than {timeout:g} s'
+    RECOVERING = 'recovering', '{cause} (over, waiting for it to stay so)'
+    NOT_STABILISABLE = 'riccati_not_stabilisable', (
+        'no feedback gain: the Hamiltonian has no stable subspace of full size: the pair (A, B) '
+        'is not stabilisable, or a mode on the imaginary axis is not weighted')
+    RICCATI_INACCURATE = 'riccati_inaccurate', (
+        'no feedback gain: the Riccati residual is too large to trust the gain: the pair (A, B) '
+        'is nearly not stabilisable')
+    GAIN_TOO_LARGE = 'riccati_gain_too_large', (
+        'no feedback gain: the gain exceeds its bound: the pair (A, B) is nearly not '
+        'stabilisable; raise the input weight or the gain bound')
+    SINGULAR = 'singular', '{matrix}'
+    PREDICTED_UNSTABLE = 'predicted_unstable', (
+        'the closed loop is predicted unstable at a sample every {interval:.3g} s: raise the '
+        'input weight, or measure more often')
+    COMMAND_NOT_FINITE = 'command_not_finite', 'its command is not finite'
+    SETPOINT_NOT_FINITE = 'setpoint_not_finite', (
+        '{signal} set-point {value:value} is not finite: the old one is kept')
+    SETPOINT_OUTSIDE = 'setpoint_outside', (
+        '{signal} set-point {value:value} is outside the trained range {lower:value} to '
+        '{upper:value}: the old one is kept; choose one inside, or load a model trained over a '
+        'wider range')
+    SCHEDULE_FULL = 'schedule_full', (
+        '{most} set-points are scheduled already: wait until some have taken effect, or send '
+        'this one with stamp 0')
+    NOT_IN_MANUAL_MODE = 'not_in_manual_mode', (
+        'manual command refused in automatic mode: switch to manual mode first')
+    MANUAL_NOT_FINITE = 'manual_not_finite', (
+        'manual {signal} {value:value} is not finite: the old one is kept')
+    EXPERIMENT_BOUNDS = 'experiment_bounds', (
+        'the {signal} {value:value} is outside the bounds of the experiment, {lower:value} to '
+        '{upper:value}')
+    CLOCK_WENT_BACK = 'clock_went_back', 'the stamps of the measurements went back'
+    SILENCE = 'silence', 'no newer measurement for more than {timeout:g} s: check sensor and plant'
+    OTHER_PUBLISHER = 'other_publisher', '{nodes} publishes on {topic}, too'
+    CONTROLLER_GONE = 'controller_gone', 'the controller is gone'
+    NOT_FOLLOWED = 'not_followed', (
+        'the controller commands {value:value} where {requested:value} is requested: switch it '
+        'to manual mode, and choose levels within its limits')
 
 
 @dataclass(frozen=True)
@@ -72,65 +112,6 @@ def reason(code: Code, **values: Value) -> Reason:
     return Reason(code, values)
 
 
-# Of numbers: 'value' is one of the signal, 'change' a difference of two, with its unit; 'rate' is
-# a change per second. 'ranges' are (name, lower, upper) of several signals, 'level' is the name of
-# a control level. What has no such format is written as it is.
-_TEMPLATES = {
-    Code.NOT_FINITE: 'the measured {signal} is {value}, not finite: check the sensor',
-    Code.OUTSIDE_SENSOR: (
-        'the measured {signal} {value:value} is outside the range of the sensor, {lower:value} '
-        'to {upper:value}: check it'),
-    Code.JUMPED: (
-        'the measured {signal} jumped from {before:value} to {value:value} in {seconds:.3g} s, '
-        'at most {jump:change} and {rate:rate} are possible: check the sensor'),
-    Code.FROZEN: (
-        'the measured {signal} has been exactly {value:value} for longer than {timeout:g} s '
-        'while the model moved by more than {change:change}: the sensor is frozen; check it'),
-    Code.NO_MEASUREMENT: 'no measurement arrives: check sensor and plant',
-    Code.OUTSIDE_TRAINING: (
-        'outside the trained range ({ranges:ranges}) by more than the {margin:g} half widths that '
-        'the {level:level} is allowed'),
-    Code.LAW_FAILED: 'the {level:level} fails: {cause}',
-    Code.HELD_TOO_LONG: '{cause}; held for longer than {timeout:g} s',
-    Code.RECOVERING: '{cause} (over, waiting for it to stay so)',
-    Code.NOT_STABILISABLE: (
-        'no feedback gain: the Hamiltonian has no stable subspace of full size: the pair (A, B) '
-        'is not stabilisable, or a mode on the imaginary axis is not weighted'),
-    Code.RICCATI_INACCURATE: (
-        'no feedback gain: the Riccati residual is too large to trust the gain: the pair (A, B) '
-        'is nearly not stabilisable'),
-    Code.GAIN_TOO_LARGE: (
-        'no feedback gain: the gain exceeds its bound: the pair (A, B) is nearly not '
-        'stabilisable; raise the input weight or the gain bound'),
-    Code.SINGULAR: '{matrix}',
-    Code.PREDICTED_UNSTABLE: (
-        'the closed loop is predicted unstable at a sample every {interval:.3g} s: raise the '
-        'input weight, or measure more often'),
-    Code.COMMAND_NOT_FINITE: 'its command is not finite',
-    Code.SETPOINT_NOT_FINITE: (
-        '{signal} set-point {value:value} is not finite: the old one is kept'),
-    Code.SETPOINT_OUTSIDE: (
-        '{signal} set-point {value:value} is outside the trained range {lower:value} to '
-        '{upper:value}: the old one is kept; choose one inside, or load a model trained over a '
-        'wider range'),
-    Code.SCHEDULE_FULL: (
-        '{most} set-points are scheduled already: wait until some have taken effect, or send '
-        'this one with stamp 0'),
-    Code.NOT_IN_MANUAL_MODE: (
-        'manual command refused in automatic mode: switch to manual mode first'),
-    Code.MANUAL_NOT_FINITE: 'manual {signal} {value:value} is not finite: the old one is kept',
-    Code.EXPERIMENT_BOUNDS: (
-        'the {signal} {value:value} is outside the bounds of the experiment, {lower:value} to '
-        '{upper:value}'),
-    Code.CLOCK_WENT_BACK: 'the stamps of the measurements went back',
-    Code.SILENCE: 'no newer measurement for more than {timeout:g} s: check sensor and plant',
-    Code.OTHER_PUBLISHER: '{nodes} publishes on {topic}, too',
-    Code.CONTROLLER_GONE: 'the controller is gone',
-    Code.NOT_FOLLOWED: (
-        'the controller commands {value:value} where {requested:value} is requested: switch it to '
-        'manual mode, and choose levels within its limits'),
-}
-
 LEVELS = {'sdre': 'learned law', 'linear': 'linear law', 'hold': 'hold', 'safe': 'safe input',
           'manual': 'manual'}
 
@@ -150,7 +131,7 @@ class Words:
         """Write a reason as a sentence; an empty string for none."""
         if about is None:
             return ''
-        return _Formatter(self, about).vformat(_TEMPLATES[about.code], (), about.values)
+        return _Formatter(self, about).vformat(about.code.template, (), about.values)
 
 
 class _Formatter(string.Formatter):

@@ -14,11 +14,8 @@ from koopman_ros.arrays import Array, frozen
 
 def per_signal(name: str, value: Array, signals: Sequence[str]) -> None:
     """
-    Check that an array holds one number for each signal; nothing broadcasts.
+    Check that an array (n,) holds one number for each of (n,) signals; nothing broadcasts.
 
-    :param name: of the quantity, for the error.
-    :param value: (n,) numbers, none of them NaN.
-    :param signals: (n,) names.
     :raises ValueError: when the sizes differ, or a number is NaN.
     """
     if not isinstance(value, np.ndarray) or value.shape != (len(signals),):
@@ -65,11 +62,7 @@ class Outputs:
         return found
 
     def state(self, y: Array) -> Array:
-        """
-        Return the state (n_x,) that the outputs (n_y,) determine.
-
-        :raises ValueError: when they do not.
-        """
+        """Return the state (n_x,) of outputs (n_y,); a ValueError where they leave it open."""
         if self.all_states:
             return y
         found: Array = self._inverse.dot(y)

@@ -46,10 +46,8 @@ _AT_HAND = {('K', 'degC'): Conversion(offset=-ZERO_CELSIUS),
 @cache
 def conversion(unit: str, wanted: str) -> Conversion:
     """
-    Return how values in one unit are converted to another.
+    Return how values in one unit, e.g. ``'K'``, are converted to another, e.g. ``'degC'``.
 
-    :param unit: e.g. ``'K'``.
-    :param wanted: e.g. ``'degC'``.
     :raises ValueError: for an unknown unit, or one of another dimension.
     """
     if unit == wanted:

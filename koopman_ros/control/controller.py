@@ -16,7 +16,7 @@ from koopman_ros.control import setpoint as setpoints
 from koopman_ros.control.laws import LawResult
 from koopman_ros.control.laws.base import Target
 from koopman_ros.control.levels import Estimating, Level, levels_of
-from koopman_ros.control.limits import finite, limit, Transfer
+from koopman_ros.control.limits import finite, limit, shifted, Transfer
 from koopman_ros.control.settings import Settings
 from koopman_ros.control.state import (
     amended,
@@ -186,7 +186,7 @@ class Controller:
                             0.0)[1]
         if now.u is None:
             return state
-        return amended(state, law_input=now.u, law_memory=now.memory, transfer=_shifted(
+        return amended(state, law_input=now.u, law_memory=now.memory, transfer=shifted(
             state.transfer, state.law_input - now.u))
 
     def try_law(self, x: Array, setpoint: Array) -> Reason | None:
@@ -278,9 +278,7 @@ class Controller:
         """
         Return the command within its limits, with what is known of it.
 
-        :param elapsed: seconds since the last command.
-        :param seconds: that count for the rate limit.
-        :param spacing: of the samples in seconds, 0 when it is not known.
+        Of the `elapsed` seconds since the last one, `seconds` count for the rate limit.
         """
         transfer = state.transfer and state.transfer.after(elapsed, self.settings.transfer_time)
         if state.mode is Mode.MANUAL:
@@ -361,7 +359,7 @@ class Controller:
                                                   law_memory=None), held, done)
         if state.law != level and state.command is not None:
             # somebody else has commanded so far
-            transfer = _shifted(None, held - result.u)
+            transfer = shifted(None, held - result.u)
         state = amended(state, law=level, law_input=result.u, law_memory=result.memory,
                         transfer=transfer)
         if transfer is None:
@@ -408,12 +406,7 @@ class Controller:
 
 
 def _passed(state: State, time_ns: int, elapsed: float) -> tuple[State, float, int]:
-    """
-    Count the time since the last command.
-
-    :return: the state with its usual interval, the seconds that count for ramp and rate limit,
-        and the measurements missed.
-    """
+    """Return the state with its usual interval, the seconds that count, and what was missed."""
     if state.time_ns is None or not elapsed > 0.0:
         return state, 0.0, 0
     since = (time_ns - state.time_ns) / NANOSECONDS
@@ -434,10 +427,6 @@ def _afresh(state: State) -> State:
 
 def _without_law(state: State) -> State:
     return amended(state, law=None, law_input=None, law_memory=None, transfer=None)
-
-
-def _shifted(transfer: Transfer | None, by: Array) -> Transfer:
-    return Transfer(by, by) if transfer is None else transfer.shifted(by)
 
 
 def _kept(value: Array) -> Array:

@@ -5,19 +5,21 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
+import importlib
+from typing import Any
 
 import numpy as np
 
 from koopman_ros.arrays import Array
 from koopman_ros.control.laws import Law, LawResult, LAWS, Tuning, Weights
-from koopman_ros.control.laws.base import balance, Reference, reference, Target
+from koopman_ros.control.laws.base import steady_state_target, Target
 from koopman_ros.control.limits import finite, InputLimits
 from koopman_ros.control.settings import Settings
 from koopman_ros.control.state import amended, State
 from koopman_ros.estimation import check, Estimate, Estimator, ESTIMATORS, FrozenCheck, Verdict
 from koopman_ros.lifting import LiftedModel
-from koopman_ros.plugs import plug
 from koopman_ros.signals import Outputs
 from koopman_ros.units import NANOSECONDS
 
@@ -29,7 +31,7 @@ class Level:
     name: str  #: of its law
     law: Law  #: with its model
     estimator: Estimator  #: on the same model
-    _references: list[Reference] = field(default_factory=list, init=False, compare=False)
+    _last: list[Target | None] = field(default_factory=lambda: [None], init=False, compare=False)
 
     @property
     def model(self) -> LiftedModel:
@@ -38,19 +40,40 @@ class Level:
 
     def target(self, setpoint: Array, estimate: Estimate) -> Target:
         """Return where to go from a set-point (n_x,) in state units, under the disturbance."""
-        x_ref = self.model.states.to_deviation(setpoint)
         # a memory of the last set-point only; what comes out does not depend on it
-        known = self._references[0] if self._references else None
-        if known is None or not (known.x == x_ref).all():
-            known = reference(self.model, x_ref)
-            self._references[:] = [known]
-        return balance(self.model, known, estimate.w)
+        target = steady_state_target(self.model, self.model.states.to_deviation(setpoint),
+                                     estimate.w, known=self._last[0])
+        self._last[0] = target
+        return target
 
     def compute(self, setpoint: Array, estimate: Estimate, limits: InputLimits, memory: object,
                 interval: float) -> tuple[Target, LawResult]:
         """Evaluate the law for a set-point (n_x,) in state units and an estimate of its model."""
         target = self.target(setpoint, estimate)
         return target, self.law.compute(estimate, target, limits, memory, interval)
+
+
+def plug(name: str, kind: str, known: Mapping[str, Callable[..., Any]]) -> Any:
+    """
+    Return the class that a name stands for: a known one, or ``module:class`` of any module.
+
+    :param kind: what it is, for the error, e.g. ``'law'``.
+    :raises ValueError: for a name that stands for nothing that can be called.
+    """
+    if name in known:
+        return known[name]
+    module, _, attribute = name.partition(':')
+    if not attribute:
+        raise ValueError(f'there is no {kind} {name!r}: choose one of {", ".join(known)}, or '
+                         'module:class of one of your own')
+    try:
+        found = getattr(importlib.import_module(module), attribute)
+    except (ImportError, AttributeError) as error:
+        raise ValueError(f'the {kind} {name!r} cannot be loaded ({error}): check module and '
+                         'class, and that Python finds the module') from error
+    if not callable(found):
+        raise ValueError(f'the {kind} {name!r} is no class: name one')
+    return found
 
 
 def levels_of(model: LiftedModel, settings: Settings) -> dict[str, Level]:
@@ -63,18 +86,16 @@ def levels_of(model: LiftedModel, settings: Settings) -> dict[str, Level]:
     weights = Weights(np.diag(settings.state_weight * model.states.scale ** 2),
                       np.diag(settings.input_weight * model.inputs.scale ** 2))
     tuning = Tuning(weights, settings.max_gain, settings.max_residual)
+    estimator = plug(settings.estimator or (
+        'disturbance_observer' if settings.observer_bandwidth > 0.0 else 'measured_state'),
+        'estimator', ESTIMATORS)
     levels = {}
     for level in settings.supervisor.levels:
         law = plug(level.law, 'law', LAWS)(model, tuning)
-        levels[level.law] = Level(level.law, law, _estimator(law.model, settings))
+        levels[level.law] = Level(level.law, law, estimator(
+            law.model, settings.observer_bandwidth,
+            settings.max_disturbance / model.inputs.scale))
     return levels
-
-
-def _estimator(model: LiftedModel, settings: Settings) -> Estimator:
-    name = settings.estimator or (
-        'disturbance_observer' if settings.observer_bandwidth > 0.0 else 'measured_state')
-    return plug(name, 'estimator', ESTIMATORS)(
-        model, settings.observer_bandwidth, settings.max_disturbance / model.inputs.scale)
 
 
 # After so many time constants without an accepted measurement the state is not known.
@@ -108,12 +129,10 @@ class Estimating:
         """
         Return the input that has acted since the last command, as far as it is known.
 
-        That is the command, unless a measurement of the input says that it was not reached: at
-        a limit of the actuator, or behind its lag, nothing may wind up. Differences below
-        `input_tolerance` count for nothing, since a biased measurement of the input would bring
-        its bias into the loop.
+        That is the command, unless a measurement (n_u,) of the input says that it was not
+        reached: at a limit of the actuator, or behind its lag, nothing may wind up. Differences
+        below `input_tolerance` count for nothing: a bias would come into the loop.
 
-        :param measured: (n_u,) in input units, or None.
         :return: (n_u,) in scaled deviations, and whether it follows the command.
         """
         if state.command is None:

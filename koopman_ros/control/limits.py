@@ -91,9 +91,6 @@ class Transfer:
     offset: Array  #: (n_u,) now, in input units
     feed: Array  #: (n_u,) what it follows, which fades exponentially
 
-    def shifted(self, by: Array) -> Transfer:
-        """Return the transfer with a further step (n_u,)."""
-        return Transfer(self.offset + by, self.feed + by)
 
     def after(self, seconds: float, time_constant: float) -> Transfer | None:
         """Return what is left after seconds, None for nothing; T = 0 s ends it at once."""
@@ -104,3 +101,9 @@ class Transfer:
         left = Transfer(fading * (self.offset + share * self.feed), fading * self.feed)
         size = np.max(np.abs(left.offset)) + np.max(np.abs(left.feed))
         return left if size > _NEGLIGIBLE else None
+
+
+def shifted(transfer: Transfer | None, by: Array) -> Transfer:
+    """Return a transfer, or none, with a further step (n_u,)."""
+    return Transfer(by, by) if transfer is None else Transfer(
+        transfer.offset + by, transfer.feed + by)

@@ -44,11 +44,7 @@ class Plant(Protocol):
         """Return the plant with a command (n_u,) given at its present time."""
 
     def until(self, time_ns: int) -> Self:
-        """
-        Return the plant at a later time.
-
-        :raises RuntimeError: when it cannot get there, e.g. because it ran away.
-        """
+        """Return the plant at a later time; RuntimeError when it cannot get there."""
 
 
 @dataclass(frozen=True)
@@ -136,8 +132,7 @@ def simulate(controller: Controller, plant: Plant, events: Iterable[Timed] = (),
 
     :param plant: at the start; its present time is that of the first sample.
     :param events: what happens when; of the same time, in the order given.
-    :param duration: in s.
-    :param period: between samples, in s.
+    :param duration: in s, as the period between samples.
     :param C: (n_y, n) what is measured of the plant's state, y = C x; by default that of the
         controller, whose model then has the plant's states.
     :param noise: (n_y,) standard deviations of what is added to y; none by default.
@@ -191,9 +186,6 @@ def simulate(controller: Controller, plant: Plant, events: Iterable[Timed] = (),
                       failure, loop)
 
 
-
-
-
 def _outputs(controller: Controller, plant: Plant, C: Array | None) -> Callable[[Array], Array]:
     n, outputs = len(plant.x), controller.measured
     if C is not None:
@@ -205,9 +197,6 @@ def _outputs(controller: Controller, plant: Plant, C: Array | None) -> Callable[
         raise ValueError(f'the plant has {n} states and the model {controller.model.n_x}: give C '
                          f'({len(outputs.names)}, {n}), what is measured of the plant')
     return outputs.of
-
-
-
 
 
 def _answered(loop: Loop, event: Event) -> tuple[Loop, Array | None, Report | None]:
@@ -225,9 +214,6 @@ def _answered(loop: Loop, event: Event) -> tuple[Loop, Array | None, Report | No
 
 def _or_nan(value: Array | None, size: int) -> Array:
     return np.full(size, np.nan) if value is None else value
-
-
-
 
 
 @dataclass(frozen=True)
@@ -316,6 +302,3 @@ def run_closed_loop(model: LiftedModel, rate: Callable[[Array, Array], Array], x
         failure = str(error)
         inputs = inputs or [np.full(model.n_u, np.nan)]
     return ClosedLoop(times[:len(states)], np.array(states), np.array(inputs), cost, failure)
-
-
-

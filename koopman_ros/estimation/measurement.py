@@ -37,9 +37,8 @@ class FrozenCheck:
     def after(self, still: NDArray[np.bool_], time_ns: int, w: Array,
               travel: Callable[[FrozenCheck], Array]) -> FrozenCheck:
         """
-        Take a measurement into account.
+        Take a measurement into account, of which the signals `still` (n_y,) have not changed.
 
-        :param still: (n_y,) which signals are bit-identical to the last ones.
         :param w: (n_x,) disturbance that is estimated now.
         :param travel: predicts how far (n_y,) the signals have moved since the last measurement.
         """

@@ -64,10 +64,9 @@ class Estimator(Protocol):
 
     def restart(self, predicted: Estimate | None, x: Array, u: Array | None) -> Estimate:
         """
-        Start from a measurement alone, as at first, and where the prediction is worth nothing.
+        Start from a measurement (n_x,) alone, as at first, and where no prediction is worth any.
 
         :param predicted: whose disturbance is kept, or None where nothing is known.
-        :param x: (n_x,) measured, in scaled deviations.
         :param u: (n_u,) input that is supposed to hold the plant there, or None.
         """
         ...
@@ -76,8 +75,7 @@ class Estimator(Protocol):
         """
         Take over an estimate from another model, so that the plant's estimated rate stays.
 
-        :param estimate: in this model's scaled deviations.
-        :param rate: (n_x,) the other model's drift there, in this model's units.
+        Estimate and rate, (n_x,) the other model's drift there, are in this model's terms.
         """
         ...
 

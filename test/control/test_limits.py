@@ -1,13 +1,29 @@
 # SPDX-FileCopyrightText: 2026 The koopman_ros Authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""Range and rate limits of the inputs, and the offset that makes a change of law bumpless."""
+"""Range and rate limits of the inputs, and hand-overs that the input does not feel."""
+
+from copy import copy
+from dataclasses import replace
+from functools import cache
 
 import numpy as np
 import pytest
 
-from koopman_ros.control import InputLimits, limit
-from koopman_ros.control.limits import Transfer
+from koopman_ros.control import (
+    Controller,
+    exchange,
+    InputLimits,
+    limit,
+    Mode,
+    ModeChange,
+    restart,
+    State,
+)
+from koopman_ros.control.limits import shifted, Transfer
+from support.closed_loops import SETPOINT, shipped, START
+from support.sampled_loops import controller, largest_step, Reactor, settled
+from validation.robustness.loop import changed_reactor
 
 
 @pytest.mark.parametrize(('previous', 'wanted', 'seconds', 'rate', 'u', 'at_range', 'at_rate'), [
@@ -57,7 +73,7 @@ def test_an_offset_fades_by_its_formula_however_it_is_sampled(steps):
 
 
 def test_offsets_add_up():
-    transfer = step(2.0).after(10.0, 30.0).shifted(np.array([-1.0])).after(20.0, 30.0)
+    transfer = shifted(step(2.0).after(10.0, 30.0), np.array([-1.0])).after(20.0, 30.0)
     expected = 2.0 * faded(30.0, 30.0) - faded(20.0, 30.0)
     np.testing.assert_allclose(transfer.offset, [expected], rtol=1e-12)
 
@@ -71,3 +87,127 @@ def test_an_offset_ends():
     # without a time constant, with the next sample
     assert step(5.0).after(0.0, 0.0).offset[0] == 5.0
     assert step(5.0).after(1e-9, 0.0) is None
+
+
+DRIFTED = 0.8
+
+
+@cache
+def at_rest(setpoint: float, heat_transfer: float) -> Reactor:
+    loop = Reactor(controller(), changed_reactor(heat_transfer=heat_transfer))
+    loop.run(10)
+    loop.ask(setpoint)
+    loop.run(480)
+    assert abs(loop.kelvin - setpoint) < 1e-6
+    return loop
+
+
+def loop_at(setpoint: float, heat_transfer: float = 1.0) -> Reactor:
+    """Return a loop at rest at a set-point; with another heat transfer than the model's."""
+    loop = copy(at_rest(setpoint, heat_transfer))
+    loop.samples = list(loop.samples)
+    return loop
+
+
+def test_automatic_to_manual_and_back_at_rest():
+    loop = loop_at(SETPOINT, DRIFTED)
+    loop.do(ModeChange(Mode.MANUAL))
+    loop.run(60)
+    loop.do(ModeChange(Mode.AUTOMATIC))
+    loop.run(300)
+    assert largest_step(loop.samples[480:]) < 1e-6
+
+
+@pytest.mark.parametrize('by', [-4.0, 0.5])
+def test_from_a_coolant_that_the_law_would_not_choose(by):
+    loop = loop_at(START)
+    loop.manual(loop.samples[-1].command + by)
+    before = loop.run(600)[-1]
+    loop.do(ModeChange(Mode.AUTOMATIC))
+    samples = loop.run(420)
+    assert abs(samples[0].command - before.command) < 0.01
+    assert abs(samples[1].command - samples[0].command) < 0.01
+    # and smoothly on its way from there
+    assert largest_step(samples) < 0.12
+    assert settled(samples, START, 1e-3) < 420
+
+
+@pytest.mark.parametrize('change', [
+    {'input_weight': np.array([0.05])}, {'state_weight': np.array([0.1])},
+    {'observer_bandwidth': 12.0 / 60.0}, {'transfer_time': 5.0},
+    {'limits': InputLimits(np.array([270.0]), np.array([320.0]), np.array([5.0]))},
+], ids=lambda change: next(iter(change)))
+def test_retuning(change):
+    # at rest nothing is felt
+    loop = loop_at(SETPOINT, DRIFTED)
+    loop.do(exchange(controller(**change)))
+    assert largest_step(loop.run(60)) < 1e-6
+    # and under way the command goes on where it was
+    loop.ask(START)
+    before = loop.run(25)
+    loop.do(exchange(controller()))
+    after = loop.run(2)
+    assert abs(after[0].command - before[-1].command) < 0.2 + largest_step(before[-2:])
+
+
+def test_a_storm_of_tunings_does_not_stop_the_feedback():
+    tunings = [controller(), controller(input_weight=np.array([0.05]))]
+    loop = Reactor(tunings[0])
+    loop.run(10)
+    loop.ask(SETPOINT)
+    for second in range(300):
+        loop.do(exchange(tunings[second % 2]))
+        loop.run(1)
+    assert settled(loop.samples[10:], SETPOINT, 0.05) < 290
+
+
+LINEAR = shipped('reactor_linear')
+SCALED = replace(LINEAR, B=LINEAR.B / 2.0, states=replace(
+    LINEAR.states, scale=LINEAR.states.scale * 2.0))
+
+
+@pytest.mark.parametrize(('other', 'more'), [('reactor_nz3', 0.0), (SCALED, 0.5)],
+                         ids=['reactor_nz3', 'in other units of scale'])
+def test_another_model_at_rest(other, more):
+    loop = loop_at(SETPOINT, DRIFTED)
+    before = loop.samples[-1].report.estimate.disturbance
+    for model in (other, 'reactor_nz4', other):
+        loop.do(exchange(controller(model)))
+        samples = loop.run(100)
+        assert largest_step(samples) < 1e-6
+        assert settled(samples, SETPOINT, 1e-3) == 0
+    # the linear model leaves more to the disturbance
+    assert abs(float(samples[0].report.estimate.disturbance[0] - before[0])) > more
+
+
+@pytest.mark.parametrize('at_rest', [True, False])
+def test_a_restart_takes_over_from_the_coolant_in_force(at_rest):
+    loop = loop_at(SETPOINT, DRIFTED)
+    if not at_rest:
+        loop.ask(START)
+        loop.run(25)
+    before = loop.samples[-1].command
+    loop.do(restart)
+    samples = loop.run(400)
+    assert samples[0].command == before
+    assert largest_step(samples) < (1e-6 if at_rest else 0.5)
+    # what it found is what it holds
+    assert settled(samples, float(samples[0].temperature), 1e-3) < 400
+
+
+def test_a_coolant_that_is_no_number_is_not_taken_over():
+    loop = controller()
+    assert loop.initialise(State(), np.array([np.nan])).command is None
+    state = loop.initialise(State(), np.array([1e300]))
+    np.testing.assert_array_equal(state.command, [305.15])
+    # later it is no news
+    assert loop.initialise(state, np.array([290.0])) is state
+
+
+def test_a_controller_succeeds_itself_without_a_trace():
+    loop = loop_at(START)
+    before, state, x = loop.loop.controller, loop.loop.state, np.array([loop.kelvin])
+    again = Controller(before.model, before.settings)
+    later = state.time_ns + 10 ** 9
+    np.testing.assert_array_equal(again.step(again.hand_over(before, state), x, later)[1],
+                                  before.step(state, x, later)[1])

@@ -1,17 +1,35 @@
 # SPDX-FileCopyrightText: 2026 The koopman_ros Authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""The disturbance observer against its own design, and against exact disturbances."""
+"""Which measurements are accepted, what is estimated from them, and zero offset with it."""
+
+from dataclasses import replace
+import itertools
+import math
 
 import numpy as np
 import pytest
 from scipy.integrate import solve_ivp
 
-from koopman_ros.control import Controller, InputLimits, Settings, State
-from koopman_ros.estimation import DisturbanceObserver, equivalent_bias, Estimate
+from koopman_ros.control import Controller, InputLimits, perfect, Settings, Silence, State
+from koopman_ros.estimation import DisturbanceObserver, equivalent_bias, Estimate, SensorLimits
+from koopman_ros.plants import Actuator, two_state_reactor
 from koopman_ros.solvers import runge_kutta_step
-from support.closed_loops import shipped, START
+from support.closed_loops import REACTOR, SETPOINT, shipped, START
+from support.sampled_loops import (
+    controller,
+    EPOCH,
+    largest_step,
+    levels,
+    Reactor,
+    say,
+    SECOND,
+    settled,
+    UPPER,
+)
 from validation.paper.optimal_control import exact_two_state_model
+from validation.robustness.disturbances import CHANGED
+from validation.robustness.loop import changed_reactor
 
 MODEL = shipped('reactor_nz4')
 NO_BOUND = np.array([np.inf])
@@ -48,11 +66,8 @@ def test_prediction_is_that_of_the_differential_equation():
     for _ in range(60):
         state = observer.predict(state, u, 1.0)
     np.testing.assert_allclose(state.x, exact, rtol=0, atol=2e-5)
-
-
-def test_after_very_long_nothing_is_predicted():
-    observer = DisturbanceObserver(MODEL, 0.1, NO_BOUND)
-    assert observer.predict(Estimate(np.zeros(1), np.zeros(1)), np.zeros(1), 3600.0) is None
+    # and nothing after very long
+    assert observer.predict(estimate, u, 3600.0) is None
 
 
 def test_the_disturbance_is_bounded():
@@ -72,9 +87,7 @@ def test_equivalent_bias_is_the_bias(kelvin, bias):
     estimate = Estimate(x, MODEL.drift(true) - MODEL.drift(x))
     found = equivalent_bias(MODEL, estimate) * MODEL.states.scale
     np.testing.assert_allclose(found, [bias], rtol=0, atol=1e-5)
-
-
-def test_no_bias_explains_a_disturbance_that_is_too_large():
+    # none explains a disturbance that is too large
     assert np.isnan(equivalent_bias(MODEL.linearised, Estimate(np.zeros(1), np.array([1e9]))))[0]
 
 
@@ -95,3 +108,220 @@ def test_several_states_have_a_disturbance_each():
     # the input cannot balance what acts on the first state, and the report says how much that is
     assert report.target.residual == pytest.approx(0.05, rel=1e-2)
     assert abs(float(x[1])) < 0.2
+
+
+# The nominal loop's step response of 10 K takes 192 s to stay within 1e-3 K.
+RESPONSE, MORE = 192, 120  # s
+
+
+def asked(*arguments, **others):
+    """Return a loop that is asked for a step of 10 K after ten seconds."""
+    loop = Reactor(*arguments or (controller(),), **others)
+    loop.run(10)
+    loop.ask(SETPOINT)
+    return loop
+
+
+def test_nominal_step_response():
+    loop = asked()
+    samples = loop.run(RESPONSE + MORE)
+    assert settled(samples, SETPOINT, 1e-3) <= RESPONSE
+    assert min(s.temperature for s in samples) > SETPOINT - 0.1
+    # the model is so good that there is next to nothing to estimate
+    assert max(abs(float(s.report.estimate.disturbance[0])) for s in samples) < 0.01
+
+
+@pytest.mark.parametrize(('plant', 'others'), [
+    *((plant, {}) for plant in CHANGED.values()),
+    *((REACTOR, {'actuator': Actuator(lag=lag, delay=delay)})
+      for lag, delay in ((10.0, 0.0), (0.0, 1.0), (10.0, 1.0))),
+    # a biased measurement of the coolant brings no offset
+    *((CHANGED['UA −20 %'], {'input_sensor': lambda u, _, error=error: u + error})
+      for error in (-1.5, 1.5))],
+    ids=[*CHANGED, 'lag 10 s', 'delay', 'lag and delay', 'told less', 'told more'])
+def test_what_is_not_the_model_is_brought_to_its_setpoint(plant, others):
+    loop = asked(controller(), plant, **others)
+    samples = loop.run(RESPONSE + MORE)
+    assert settled(samples, SETPOINT, 1e-3) <= RESPONSE + MORE - 10
+    assert plant is REACTOR or abs(float(samples[-1].report.estimate.disturbance[0])) > 0.4
+
+
+@pytest.mark.parametrize('step', [-3.0, 1.5])
+def test_two_state_reactor_under_the_lift_of_the_one_state_one(step):
+    plant = two_state_reactor()
+    loop = Reactor(controller(), plant, kelvin=float(plant.nominal_state[1]))
+    loop.run(10)
+    setpoint = float(plant.nominal_state[1]) + step
+    loop.ask(setpoint)
+    # its own slow mode, -1.05/min, takes 224 s to fade to a fiftieth
+    assert settled(loop.run(420), setpoint, 1e-3) <= 224 + 130
+
+
+def test_a_biased_sensor_is_shown_for_what_it_is():
+    loop = Reactor(controller(), sensor=lambda y, _: y + 2.0)
+    loop.run(1)
+    loop.ask(START)
+    last = loop.run(400)[-1]
+    # what is measured has no offset; the reactor has, and nobody in the loop can know
+    assert last.temperature + 2.0 == pytest.approx(START, abs=1e-3)
+    bias = loop.loop.controller.equivalent_bias(loop.loop.state)
+    np.testing.assert_allclose(bias, [2.0], rtol=0, atol=2e-3)
+    assert float(last.report.estimate.disturbance[0]) == pytest.approx(1.07, abs=0.02)
+
+
+def test_minutes_at_the_limit_leave_nothing_behind():
+    loop = Reactor(controller())
+    loop.run(10)
+    loop.change(system=changed_reactor(feed=-40.0))
+    saturated = loop.run(300)
+    assert all(s.command == UPPER for s in saturated[-200:])
+    assert START - saturated[-1].temperature > 10.0
+    loop.change(system=REACTOR)
+    samples = loop.run(RESPONSE + MORE)
+    assert max(s.temperature for s in samples) - START < 0.5
+    assert settled(samples, START, 1e-3) <= RESPONSE + MORE
+
+
+@pytest.mark.parametrize('tells', [True, False])
+def test_an_actuator_that_reaches_less_than_is_commanded(tells):
+    loop = asked(input_sensor=perfect if tells else None)
+    # 292.29 K would be needed
+    loop.act(Actuator(lower=298.15))
+    stuck = loop.run(300)
+    assert all(s.report.measurement.follows for s in stuck[20:]) is not tells
+    loop.act(Actuator())
+    samples = loop.run(RESPONSE + MORE)
+    below = SETPOINT - min(s.temperature for s in samples)
+    assert below < 0.5 if tells else below > 1.0
+    assert settled(samples, SETPOINT, 1e-3) <= RESPONSE + MORE or not tells
+
+
+def test_without_the_observer_the_offset_stays():
+    loop = asked(controller(observer_bandwidth=0.0), CHANGED['UA −20 %'])
+    assert abs(loop.run(300)[-1].temperature - SETPOINT) > 3.0
+
+
+@pytest.mark.parametrize(('bandwidth', 'low', 'high'), [(2.0, 0.0, 0.03), (6.0, 0.04, 0.09),
+                                                       (12.0, 0.09, 0.4)])
+def test_bandwidth_trades_noise_for_speed(bandwidth, low, high):
+    loop = Reactor(controller(observer_bandwidth=bandwidth / 60.0), noise=0.1)
+    commands = np.array([s.command for s in loop.run(800)[200:]])
+    assert low < np.std(commands) < high
+    # the filter adds no offset
+    assert abs(np.mean([s.temperature for s in loop.samples[200:]]) - START) < 0.02
+
+
+NAN = math.nan
+
+
+@pytest.mark.parametrize(('value', 'words'), [
+    (NAN, 'the measured temperature is nan, not finite: check the sensor'),
+    (math.inf, 'is inf, not finite'),
+    (1e300, 'outside the range of the sensor, 253.15 K to 423.15 K: check it'),
+    (-0.0, 'the measured temperature -0 K is outside the range of the sensor'),
+    (START + 30.0, 'to 354.475 K in 1 s, at most 2 K and 2 K/s are possible: check the sensor'),
+])
+def test_one_bad_measurement_holds_the_command(value, words):
+    loop = asked()
+    before = loop.run(20)[-1].command
+    bad = loop.run(1, lambda _: value)[0]
+    assert (bad.command, bad.report.level) == (before, 'hold')
+    assert words in say(bad.report.reason)
+    assert bad.report.command.law.form == ''
+    np.testing.assert_array_equal(bad.report.target.setpoint, [SETPOINT])
+    # and the next good one is used
+    after = loop.run(1)
+    assert (after[0].report.level, after[0].report.reason) == ('sdre', None)
+
+
+def test_every_other_measurement_is_enough():
+    loop, factors = asked(), itertools.cycle([1.0, NAN])
+    samples = loop.run(300, lambda kelvin: kelvin * next(factors))
+    assert settled(samples, SETPOINT, 1e-3) < 250
+    assert 'safe' not in levels(samples)
+
+
+@pytest.mark.parametrize(('by', 'seconds'), [(-3.0, 0), (-9.0, 3)])
+def test_a_jump_that_stays_is_accepted_when_the_plant_could_have_got_there(by, seconds):
+    loop = Reactor(controller())
+    loop.run(10)
+    loop.change(x=np.array([loop.kelvin + by]))
+    samples = loop.run(300)
+    assert [s.report.level for s in samples[:seconds + 1]] == (
+        ['hold'] * seconds + ['sdre'])
+    if seconds:
+        # it is no disturbance
+        assert abs(float(samples[seconds].report.estimate.disturbance[0])) < 0.01
+    assert settled(samples, START, 1e-3) < 280
+
+
+def test_a_sensor_that_freezes_under_way_is_found_out():
+    loop = asked()
+    loop.run(10)
+    value = loop.kelvin
+    frozen = loop.run(40, lambda _: value)
+    assert levels(frozen) == ['sdre', 'hold']
+    first = next(s for s in frozen if s.report.level == 'hold')
+    assert first.second - frozen[0].second == 21
+    assert 'for longer than 20 s while the model moved' in say(first.report.reason)
+    # what the observer made of it is forgotten
+    assert abs(float(first.report.estimate.disturbance[0])) < 0.05
+
+
+def test_a_plant_at_rest_is_not_frozen_and_nothing_is_when_that_is_switched_off():
+    assert levels(Reactor(controller()).run(100, lambda _: START)) == ['sdre']
+    loop = asked(controller(sensor={'frozen_timeout': math.inf}))
+    assert levels(loop.run(60, lambda _: START)) == ['sdre']
+
+
+def test_steps_of_the_sensor_are_no_fault():
+    loop = asked(noise=0.02)
+    samples = loop.run(400, lambda kelvin: 0.1 * round(kelvin / 0.1))
+    assert levels(samples) == ['sdre']
+    assert max(abs(s.temperature - SETPOINT) for s in samples[-60:]) < 0.1
+
+
+def test_rare_measurements_are_not_taken_for_a_gap():
+    loop = controller()
+    state = loop.initialise(State(), np.array([300.0]))
+    for k in range(30):
+        state, command, report = loop.step(
+            state, np.array([START + 1e-9 * k]), EPOCH + 60 * k * SECOND)
+        assert report.measurement.missed == 0
+        assert report.level == 'sdre'
+    assert command[0] == pytest.approx(300.0, abs=1e-3)
+
+
+def test_missed_measurements_are_counted():
+    loop = controller()
+    state, missed = State(), []
+    for second in (0, 1, 2, 3, 7, 8):
+        state, _, report = loop.step(state, np.array([START]), EPOCH + second * SECOND)
+        missed.append(report.measurement.missed)
+    assert missed == [0, 0, 0, 0, 3, 0]
+
+
+@pytest.mark.parametrize('ahead', [15, 3600])
+def test_stamps_that_stood_still_while_it_was_watched_do_not_stop_the_law(ahead):
+    """The plant was halted, or its clock was an hour ahead for a moment."""
+    loop = Reactor(controller())
+    loop.run(10)
+    loop.ask(START - 2.0)
+    loop.do(Silence(EPOCH + (9 + ahead) * SECOND))
+    samples = loop.run(300)
+    assert levels(samples) == ['sdre']
+    assert abs(samples[9].command - samples[0].command) > 0.5
+    assert largest_step(samples) <= 1.0 + 1e-9
+    assert abs(samples[-1].temperature - (START - 2.0)) < 0.01
+
+
+@pytest.mark.parametrize(('change', 'message'), [
+    ({'lower': np.array([400.0]), 'upper': np.array([300.0])},
+     r'sensor limits must be lower < upper, got \[400\.0\] and \[300'),
+    ({'rate': np.zeros(1)}, r'rate must be above 0, got \[0\.0\]'),
+    ({'jump': np.array([NAN])}, r'jump must be above 0, got \[nan\]'),
+    ({'frozen_timeout': -1.0}, r'frozen_timeout must be above 0, got -1\.0'),
+])
+def test_limits_that_make_no_sense_are_refused(change, message):
+    with pytest.raises(ValueError, match=message):
+        replace(SensorLimits.none(1), **change)

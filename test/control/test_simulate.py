@@ -1,33 +1,21 @@
 # SPDX-FileCopyrightText: 2026 The koopman_ros Authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""The sampled closed loop: laws on plants against references of their own, and what happens."""
+"""Closed loops, sampled and in continuous time, against references of their own."""
 
 from dataclasses import dataclass, replace
+import itertools
 import math
 
 import numpy as np
 import pytest
-from scipy.linalg import expm
+from scipy.linalg import solve_continuous_are
 
-from koopman_ros.control import (
-    at,
-    Controller,
-    exchange,
-    Initialisation,
-    InputLimits,
-    LAWS,
-    LevelSettings,
-    ManualCommand,
-    Mode,
-    ModeChange,
-    perfect,
-    restart,
-    SetpointRequest,
-    Settings,
-    simulate,
-    SupervisorSettings,
-)
+from koopman_ros.control import Controller, InputLimits, Mode, Settings
+from koopman_ros.control.events import Initialisation, ManualCommand, ModeChange, SetpointRequest
+from koopman_ros.control.laws import Feedback, feedback, Form, LAWS, Weights
+from koopman_ros.control.simulate import at, exchange, restart, run_closed_loop, simulate
+from koopman_ros.control.supervisor import LevelSettings, SupervisorSettings
 from koopman_ros.lifting import Coordinates, LiftedModel, linearised_model, Provenance
 from koopman_ros.plants import (
     Actuator,
@@ -37,35 +25,29 @@ from koopman_ros.plants import (
     two_state_reactor,
 )
 from koopman_ros.signals import Outputs
+from koopman_ros.solvers import solve_riccati
 from support.closed_loops import COOLANT, REACTOR, SETPOINT, shipped, START
+from support.random_lifts import coordinates
 from validation.paper.optimal_control import exact_two_state_model
 
 NAN = math.nan
 EVERYWHERE = 1e9  # half widths: the margin of a law that acts anywhere
 
 
-def random_pair() -> ControlAffineSystem:
-    """Return dx/dt = A x + B u with two states and two inputs, one of its modes unstable."""
+def random_pair() -> tuple[ControlAffineSystem, LiftedModel]:
+    """Return dx/dt = A x + B u, two of each and an unstable mode, and its model out to ten."""
     rng = np.random.default_rng(4)
     A, B = rng.normal(size=(2, 2)) + 0.3 * np.eye(2), rng.normal(size=(2, 2)) + 2.0 * np.eye(2)
-    return ControlAffineSystem(
+    system = ControlAffineSystem(
         'random pair', ('x1', 'x2'), ('1', '1'), ('u1', 'u2'), ('1/min', '1/min'), 'min',
         lambda x: x @ A.T, lambda x: np.broadcast_to(A, (*x.shape[:-1], 2, 2)), B, np.zeros(2),
         np.zeros(2))
-
-
-def exact(system: ControlAffineSystem) -> LiftedModel:
-    """Return the linear model of a plant about its nominal point, known out to ten."""
-    def coordinates(names: tuple[str, ...], units: tuple[str, ...]) -> Coordinates:
-        scale = 1.0 + np.arange(float(len(names)))
-        return Coordinates(names, units, np.zeros(len(names)), scale, -10.0 * scale,
-                           10.0 * scale)
-
-    states = coordinates(system.state_names, system.state_units)
-    inputs = coordinates(system.input_names, system.input_units)
-    return linearised_model(
-        system.drift_jacobian(system.nominal_state), system.B, states, inputs, system.time_unit,
-        Provenance(system.name))
+    scale = np.array([1.0, 2.0])
+    states, inputs = (
+        Coordinates(names, units, np.zeros(2), scale, -10.0 * scale, 10.0 * scale)
+        for names, units in ((system.state_names, system.state_units),
+                             (system.input_names, system.input_units)))
+    return system, linearised_model(A, B, states, inputs, 'min', Provenance(system.name))
 
 
 @dataclass(frozen=True)
@@ -81,7 +63,7 @@ class Case:
     bounds: tuple[float, float]  #: of each input
 
 
-PAIR = random_pair()
+PAIR, PAIR_MODEL = random_pair()
 GOAL = np.array([0.5, -1.0])
 CASES = {
     **{name: Case(shipped(name), REACTOR, np.array([START]), np.array([SETPOINT]),
@@ -90,20 +72,19 @@ CASES = {
     'two states': Case(exact_two_state_model(), two_state_example(), np.array([0.1, 1.0]),
                        np.zeros(2), np.zeros(1), 0.5, (-50.0, 50.0)),
     'random pair': Case(
-        exact(PAIR), PAIR, np.array([-2.0, 1.0]), GOAL,
+        PAIR_MODEL, PAIR, np.array([-2.0, 1.0]), GOAL,
         np.linalg.solve(PAIR.B, -PAIR.drift(GOAL)), 12.0, (-50.0, 50.0))}
 each_case = pytest.mark.parametrize('case', CASES.values(), ids=CASES)
 
 
-def controller(case: Case, law: str = 'sdre', bandwidth: float = 0.0, **settings: object
-               ) -> Controller:
+def controller(case: Case, law: str = 'sdre', bandwidth: float = 0.0) -> Controller:
     n_x, n_u = case.model.n_x, case.model.n_u
     low, high = case.bounds
     return Controller(case.model, Settings.for_model(
         case.model, state_weight=np.full(n_x, 3.0), input_weight=np.ones(n_u),
         limits=InputLimits(np.full(n_u, low), np.full(n_u, high), np.full(n_u, np.inf)),
-        **{'observer_bandwidth': bandwidth / case.seconds, 'supervisor': SupervisorSettings(
-            (LevelSettings(law, EVERYWHERE),)), **settings}))
+        observer_bandwidth=bandwidth / case.seconds,
+        supervisor=SupervisorSettings((LevelSettings(law, EVERYWHERE),))))
 
 
 def process(case: Case) -> Process:
@@ -147,14 +128,6 @@ def test_rows_are_what_the_plant_did(case):
     for number, command in enumerate(found.commands[:-1]):
         plant = replace(plant, u=command).until(round((number + 1) * case.seconds * 1e9))
         np.testing.assert_array_equal(plant.x, found.states[number + 1])
-
-
-def test_a_linear_plant_follows_its_matrix_exponential():
-    found = run(CASES['random pair'], samples=20)
-    A, B = PAIR.drift_jacobian(np.zeros(2)), PAIR.B
-    both = expm(np.block([[A, B], [np.zeros((2, 4))]]) * CASES['random pair'].seconds / 60.0)
-    expected = found.states[:-1] @ both[:2, :2].T + found.commands[:-1] @ both[:2, 2:].T
-    np.testing.assert_allclose(found.states[1:], expected, rtol=1e-8)
 
 
 @each_case
@@ -241,9 +214,6 @@ def test_stamps_are_those_of_the_clock(stamp, back):
 
 # What happens to the controller.
 
-def steps(found) -> float:
-    return float(np.max(np.abs(np.diff(found.commands, axis=0))))
-
 
 def at_rest(case, *events, **others):
     """Simulate a loop that starts at its goal."""
@@ -257,7 +227,8 @@ def test_a_hand_over_at_rest_is_not_felt(case):
     heavier = replace(controller(case).settings, input_weight=np.full(case.model.n_u, 9.0))
     for what in (exchange(Controller(case.model, heavier)), restart, ModeChange(Mode.MANUAL)):
         found = at_rest(case, at(later, what), samples=20)
-        assert steps(found) < 1e-3 * float(np.max(case.model.inputs.scale))
+        assert np.max(np.abs(np.diff(found.commands, axis=0))) < 1e-3 * np.max(
+            case.model.inputs.scale)
         assert (found.levels[-1] == 'manual') is isinstance(what, ModeChange)
 
 
@@ -288,17 +259,6 @@ def test_an_actuator_is_late_and_reaches_less(case):
         found.inputs[3:], np.clip(found.commands[:-3], reach.lower, reach.upper))
 
 
-@pytest.mark.parametrize(('sensor', 'follows'), [
-    (None, True), (perfect, False), (lambda u, seconds: u + 4.0 * (seconds > 30.0), True)])
-def test_a_measured_input_shows_whether_it_follows(sensor, follows):
-    case = CASES['reactor_nz4']
-    stuck = replace(process(case), actuator=Actuator(lower=298.15))
-    tolerance = np.array([2.0 if follows is False else 30.0])
-    found = simulate(controller(case, input_tolerance=tolerance), stuck,
-                     [at(0.0, SetpointRequest(0, case.goal))], duration=60.0, input_sensor=sensor)
-    assert found.reports[-1].measurement.follows is follows
-
-
 # The end.
 
 def test_it_ends_where_it_is_told_and_where_the_plant_cannot_go_on():
@@ -322,3 +282,130 @@ def test_arguments_that_make_no_sense_are_refused(change, message):
     case = CASES['reactor_nz4']
     with pytest.raises(ValueError, match=message):
         simulate(controller(case), process(case), **{'duration': 5.0, **change})
+
+
+# A law in continuous time, against the analytic cost of the linear regulator.
+
+JACOBIAN = np.array([[0.4, 1.0], [-0.3, -0.5]])
+B = np.array([[0.2], [1.5]])
+WEIGHTS = Weights(np.diag([2.0, 0.5]), np.array([[0.7]]))
+STATES, INPUTS = coordinates('x', 2), coordinates('u', 1)
+
+
+def linear_model(jacobian=JACOBIAN, B=B):
+    return linearised_model(jacobian, B, coordinates('x', len(jacobian)), INPUTS, 'min',
+                            Provenance('linear'))
+
+
+def rate(x, u):
+    return JACOBIAN @ (x - STATES.center) + B @ (u - INPUTS.center)
+
+
+def optimal_cost(model, deviation, weights=WEIGHTS):
+    P = solve_continuous_are(model.A, model.B, weights.Q, weights.R)
+    return deviation @ P @ deviation
+
+
+def test_the_cost_of_the_linear_regulator():
+    model, x0 = linear_model(), np.array([3.6, -0.4])
+    loop = run_closed_loop(model, rate, x0, STATES.center, WEIGHTS, 40.0)
+    assert loop.failure == ''
+    assert loop.cost == pytest.approx(optimal_cost(model, STATES.to_deviation(x0)), rel=1e-7)
+    assert (loop.times.shape, loop.states.shape, loop.inputs.shape) == ((301,), (301, 2), (301, 1))
+    np.testing.assert_array_equal(loop.times, np.linspace(0.0, 40.0, 301))
+    np.testing.assert_array_equal(loop.states[0], x0)
+    np.testing.assert_allclose(loop.states[-1], STATES.center, rtol=0, atol=1e-5)
+    np.testing.assert_allclose(loop.inputs[-1], INPUTS.center, rtol=0, atol=1e-5)
+    K = solve_riccati(model.A, model.B, WEIGHTS.Q, WEIGHTS.R).K
+    np.testing.assert_allclose(
+        loop.inputs[0], INPUTS.to_physical(-K @ STATES.to_deviation(x0)), rtol=1e-12)
+
+
+# A plant of one state, in deviations of its scale from its center.
+SCALAR = linear_model(np.array([[-0.8]]), np.array([[0.6]]))
+ONE = Weights(np.eye(1), np.eye(1))
+CENTER, SCALE = SCALAR.states.center, SCALAR.states.scale
+
+
+def scalar_rate(x, u):
+    return -0.8 * (x - CENTER) + 0.6 * (u - INPUTS.center)
+
+
+def drive(start=0.0, duration=10.0, *, goal=CENTER, model=SCALAR, rate=scalar_rate, weights=ONE,
+        **others):
+    return run_closed_loop(
+        model, rate, CENTER + start * SCALE, goal, weights, duration, **others)
+
+
+
+
+
+def test_distance_from_the_training_box():
+    """The box reaches two scales below and one above the center, three halves as its half."""
+    for start, expected in ((0.5, 0.0), (1.75, 0.5), (-2.5, 1.0 / 3.0)):
+        assert drive(start, 5.0).distance(SCALAR) == pytest.approx(expected, abs=1e-9)
+
+
+# Failures.
+
+def failing(law_input=None, solved=lambda x: True):
+    """Return a law that pushes with `law_input` and has an answer where `solved` says so."""
+    def law(model, x, target, weights):
+        found = feedback(model, x, target, weights)
+        u = found.u if law_input is None else law_input(x)
+        riccati = found.riccati
+        if not solved(x):
+            riccati = solve_riccati(np.eye(1), np.zeros((1, 1)), np.eye(1), np.eye(1))
+        return Feedback(u, Form.PROJECTED, riccati, found.drift, found.action)
+    return law
+
+
+UNSOLVED = 'no feedback gain: the Hamiltonian has no stable subspace'
+STUCK = linear_model(np.array([[0.5]]), np.zeros((1, 1)))
+# u = 3 x lets the state grow as exp(t), so that it is twice its scale away after log 5
+PUSHING = failing(lambda x: 1.8 * SCALE * x / (0.6 * INPUTS.scale))
+
+
+@pytest.mark.parametrize(('start', 'others', 'failure', 'earliest', 'latest'), [
+    # noticed at the end of a step
+    (0.4, {'law': PUSHING, 'escape': 2.0}, 'the state escaped', np.log(5.0) - 10.0 / 300, 4.0),
+    (3.0, {'escape': 2.0}, 'the state escaped', 0.0, 1.0),
+    # a law with a jump at the set-point keeps the steps tiny
+    (0.1, {'law': failing(lambda x: -5.0 * np.sign(x)), 'max_evaluations': 500},
+     'the law was evaluated 500 times before the end', 0.0, 10.0),
+    # once the state is half a scale away, the rate grows without bound in finite time
+    (0.0, {'rate': lambda x, u: 1e3 * (1.0 + (x - CENTER) ** 2), 'escape': 1e200},
+     'the integration failed', 0.0, 1.0),
+    (0.2, {'model': STUCK}, UNSOLVED, 0.0, 0.0),
+    (1.0, {'law': failing(solved=lambda x: x[0] > 0.5)}, UNSOLVED, 0.1, 2.0),
+], ids=['escapes', 'has escaped', 'chatters', 'explodes', 'not stabilisable', 'on the way'])
+def test_a_loop_that_fails_returns_the_path_up_to_there(start, others, failure, earliest, latest):
+    loop = drive(start, **others)
+    assert loop.failure.startswith(failure)
+    assert loop.cost == np.inf
+    np.testing.assert_array_equal(loop.states[0], CENTER + start * SCALE)
+    assert len(loop.times) == len(loop.states) == len(loop.inputs)
+    assert earliest <= loop.times[-1] <= latest
+    deviation = SCALAR.states.to_deviation(loop.states[:, 0])
+    if others.get('law') is PUSHING:
+        np.testing.assert_allclose(deviation, 0.4 * np.exp(loop.times), rtol=1e-6)
+    elif failure == UNSOLVED and 'law' in others:
+        # under the law of the regulator: e' = -1 e
+        assert np.min(deviation) > 0.5
+        np.testing.assert_allclose(
+            deviation, np.exp(-np.hypot(0.8, SCALAR.B[0, 0]) * loop.times), rtol=1e-6)
+    elif failure == UNSOLVED:
+        assert np.all(np.isnan(loop.inputs))
+
+
+def test_a_law_without_an_answer_at_a_time_of_the_report():
+    """The integration steps over the state; the inputs to return need the law there."""
+    def limited(calls):
+        return drive(1.0, 5.0, law=failing(solved=lambda _: next(calls) < limit), samples=3)
+
+    limit, calls = math.inf, itertools.count()
+    assert limited(calls).failure == ''
+    limit = next(calls) - 1
+    loop = limited(itertools.count())
+    assert loop.failure.startswith(UNSOLVED)
+    assert len(loop.times) == len(loop.states) == len(loop.inputs)

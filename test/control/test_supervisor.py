@@ -3,13 +3,18 @@
 
 """The supervisor: laws in their order, hold, safe input, and back with hysteresis."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
+from scipy.optimize import brentq
 
-from koopman_ros.control import exchange, Supervisor
-from koopman_ros.control.supervisor import Requested
+from koopman_ros.control import Controller, exchange, InputLimits, Settings, State, Supervisor
+from koopman_ros.control.supervisor import Requested, rest_under, WayBack
+from koopman_ros.lifting import Coordinates, linearised_model, Provenance
 from koopman_ros.reasons import Code, reason
-from support.closed_loops import START
+from koopman_ros.ros.model_loading import rests_outside
+from support.closed_loops import REACTOR, shipped, START
 from support.sampled_loops import (
     controller,
     largest_step,
@@ -21,67 +26,49 @@ from support.sampled_loops import (
     settled,
     supervisor_settings,
 )
+from validation.robustness.disturbances import CHANGED
 from validation.robustness.loop import changed_reactor
 
 SETTINGS = supervisor_settings(0.2, 1.0, hold_timeout=60.0, recovery_time=10.0)
 
 
-def walk(requests: list[Requested], supervisor: Supervisor | None = None) -> list[Supervisor]:
-    """Return where requests, one a second, lead."""
-    supervisor = supervisor or Supervisor()
-    result = []
-    for second, request in enumerate(requests):
-        supervisor = supervisor.at(SETTINGS, request, second * SECOND)
-        result.append(supervisor)
-    return result
-
-
 FAR = reason(Code.OUTSIDE_TRAINING, ranges=(('T', 1.0, 2.0),), margin=0.2, level='sdre')
 NO_LAW = reason(Code.LAW_FAILED, level='linear', cause=reason(Code.COMMAND_NOT_FINITE))
-BLINDED = reason(Code.NO_MEASUREMENT)
 BEST = Requested('sdre')
 LINEAR = Requested('linear', FAR)
 HOLD = Requested('hold', NO_LAW)
-BLIND = Requested('hold', BLINDED, passing=True)
+BLIND = Requested('hold', reason(Code.NO_MEASUREMENT), passing=True)
 
 
-def test_down_at_once_and_up_after_a_while():
-    supervisors = walk([BEST, LINEAR, *[BEST] * 12])
-    assert [s.level for s in supervisors[:2]] == ['sdre', 'linear']
-    assert [s.level for s in supervisors[2:]] == ['linear'] * 10 + ['sdre'] * 2
-    assert say(supervisors[5].reason) == f'{say(FAR)} (over, waiting for it to stay so)'
-    assert supervisors[-1].reason is None
+def walk(requests):
+    """Return where requests, one a second, lead."""
+    supervisors = [Supervisor()]
+    for second, request in enumerate(requests):
+        supervisors.append(supervisors[-1].at(SETTINGS, request, second * SECOND))
+    return supervisors[1:]
 
 
-def test_a_relapse_starts_the_wait_anew():
-    supervisors = walk([LINEAR, *[BEST] * 8, LINEAR, *[BEST] * 11])
-    assert [s.level for s in supervisors[:20]] == ['linear'] * 20
-    assert supervisors[20].level == 'sdre'
+@pytest.mark.parametrize(('requests', 'expected'), [
+    ([BEST, LINEAR, *[BEST] * 12], ['sdre', *['linear'] * 11, 'sdre', 'sdre']),
+    ([LINEAR, *[BEST] * 8, LINEAR, *[BEST] * 11], [*['linear'] * 20, 'sdre']),
+    ([*[HOLD] * 70, BEST, HOLD, *[BEST] * 11], [*['hold'] * 61, *['safe'] * 21, 'sdre']),
+    ([BEST, BLIND, BEST], ['sdre', 'hold', 'sdre']),
+    ([LINEAR, BLIND, LINEAR], ['linear', 'hold', 'linear']),
+    ([Requested('safe', FAR), BLIND, BLIND, *[BEST] * 11], [*['safe'] * 13, 'sdre']),
+    ([LINEAR, BLIND, *[BEST] * 12], ['linear', 'hold', *['linear'] * 10, 'sdre', 'sdre'])],
+    ids=['down at once and up after a while', 'a relapse starts the wait anew',
+         'a hold becomes the safe input and stays it', 'a passing hold resumes the best',
+         'a passing hold resumes the linear law', 'a passing hold stays safe',
+         'a passing hold does not shorten a recovery'])
+def test_the_way_through_the_levels(requests, expected):
+    assert [supervisor.level for supervisor in walk(requests)] == expected
 
 
-def test_a_hold_becomes_the_safe_input_and_stays_it():
-    supervisors = walk([*[HOLD] * 70, BEST, HOLD, *[BEST] * 11])
-    assert [s.level for s in supervisors[:61]] == ['hold'] * 61
-    assert {s.level for s in supervisors[61:82]} == {'safe'}
-    assert say(supervisors[61].reason) == f'{say(NO_LAW)}; held for longer than 60 s'
-    assert supervisors[82].level == 'sdre'
-
-
-@pytest.mark.parametrize('before', [BEST, LINEAR])
-def test_after_a_passing_hold_the_level_before_it_is_resumed(before):
-    supervisors = walk([before, BLIND, before, before])
-    assert [s.level for s in supervisors] == [before.level, 'hold', before.level, before.level]
-
-
-def test_a_passing_hold_does_not_stop_the_way_to_the_safe_input():
-    supervisors = walk([Requested('safe', FAR), BLIND, BLIND, *[BEST] * 11])
-    assert [s.level for s in supervisors[:13]] == ['safe'] * 13
-    assert supervisors[13].level == 'sdre'
-
-
-def test_a_passing_hold_does_not_shorten_a_recovery():
-    supervisors = walk([LINEAR, BLIND, *[BEST] * 12])
-    assert [s.level for s in supervisors[2:]] == ['linear'] * 10 + ['sdre'] * 2
+def test_reasons_tell_what_is_waited_for():
+    recovering = walk([BEST, LINEAR, *[BEST] * 12])
+    assert say(recovering[5].reason) == f'{say(FAR)} (over, waiting for it to stay so)'
+    assert recovering[-1].reason is None
+    assert say(walk([HOLD] * 62)[-1].reason) == f'{say(NO_LAW)}; held for longer than 60 s'
 
 
 @pytest.mark.parametrize(('level', 'outside', 'allowed'), [
@@ -112,6 +99,8 @@ def test_a_reactor_that_starts_far_above_is_caught_by_the_linear_law():
     loop.ask(320.0)
     samples = loop.run(460)
     assert levels(samples) == ['linear', 'sdre']
+    assert samples[0].report.measurement.outside == pytest.approx(4.0 / 11.0)
+    assert samples[0].report.target.outside == 0.0
     assert 'outside the trained range (temperature 305 K to 327 K)' in say(
         samples[0].report.reason)
     change = next(k for k, s in enumerate(samples) if s.report.level == 'sdre')
@@ -171,12 +160,165 @@ def test_without_a_law_the_command_is_held_then_safe_and_the_loop_comes_back(cha
     assert largest_step(back) <= 1.0 + 1e-9
 
 
-def test_far_out_the_supervisor_keeps_the_learned_law_from_acting():
-    loop = Reactor(controller(), kelvin=331.0)
-    first = loop.run(1)[0]
-    assert first.report.level == 'linear'
-    assert first.report.measurement.outside == pytest.approx(4.0 / 11.0)
-    assert first.report.target.outside == 0.0
-    loose = Reactor(controller(supervisor={'learned': 50.0, 'linear': 50.0}),
-                 kelvin=331.0)
-    assert loose.run(1)[0].report.level == 'sdre'
+# The way back from the safe input.
+
+LEAD = 0.25
+
+
+def rest_of(plant, coolant=SAFE):
+    """Return the cold temperature at which a reactor rests under a coolant, in K."""
+    return float(brentq(lambda T: plant.derivative(np.array([T]), np.array([coolant]))[0],
+                        coolant, 320.0))
+
+
+def narrow():
+    """Return a lift that knows the shipped one's middle only."""
+    model = shipped('reactor_nz4')
+    center = model.states.center
+    return replace(model, states=replace(model.states, lower=center - 1.5, upper=center + 1.5))
+
+
+def rested(plant, model=None, noise=0.0):
+    """Return a loop that finds its plant at rest under the safe coolant, far outside."""
+    loop = Reactor(controller(model or 'reactor_nz4'), plant, rest_of(plant), noise=noise)
+    loop.ask(START)
+    return loop
+
+
+def test_after_a_dead_sensor_the_loop_comes_back_by_itself():
+    loop = Reactor(controller())
+    loop.run(5)
+    silent = loop.run(260, lambda _: None)[-1]
+    assert (silent.report.level, silent.command) == ('safe', SAFE)
+    assert silent.temperature == pytest.approx(rest_of(REACTOR), abs=0.1)
+    assert settled(loop.run(320), START, 0.2) < 310
+
+
+@pytest.mark.parametrize(('plant', 'model', 'noise', 'tolerance'), [
+    *((plant, None, 0.0, 0.2) for plant in CHANGED.values()),
+    (CHANGED['UA +20 %'], None, 0.1, 0.3), (REACTOR, narrow(), 0.0, 0.2)],
+    ids=[*CHANGED, 'noisy sensor', 'lift of narrow data'])
+def test_a_loop_comes_back_from_where_the_safe_input_rests(plant, model, noise, tolerance):
+    loop = rested(plant, model, noise)
+    samples = loop.run(450 if model else 320)
+    assert samples[-1].report.level == 'sdre'
+    assert settled(samples, START, tolerance) < len(samples) - 1
+    assert max(s.temperature for s in samples) < START + 1.5
+    assert largest_step(samples) <= 1.0 + 1e-9
+
+
+@pytest.mark.parametrize('noise', [0.0, 0.1])
+def test_a_sensor_that_stands_still_brings_the_coolant_no_further_than_the_lead(noise):
+    plant = changed_reactor(heat_transfer=0.6)
+    loop = rested(plant)
+    rng = np.random.default_rng(1)
+    samples = loop.run(200, lambda _: 298.0 + noise * rng.standard_normal())
+    assert levels(samples) == ['safe']
+    assert samples[-1].report.command.way_back == pytest.approx(LEAD, abs=0.6 * noise)
+    # the plant that loses most of its cooling does not even then run away
+    assert max(s.temperature for s in samples) < 327.0
+
+
+def test_nothing_moves_before_the_plant_rests_and_the_safe_input_is_back_with_the_first_fault():
+    loop = rested(CHANGED['UA +20 %'])
+    assert {s.command for s in loop.run(30)} == {SAFE}
+    led = loop.run(4)
+    assert [s.report.command.way_back for s in led] == pytest.approx([LEAD] * 4, abs=0.1)
+    assert led[-1].command == SAFE + 4.0
+    blind = loop.run(5, lambda _: float('nan'))
+    assert {s.report.command.way_back for s in blind} == {0.0}
+    assert blind[-1].command == SAFE
+    assert loop.run(1)[0].command == SAFE
+
+
+def test_a_hot_reactor_that_stands_still_keeps_the_safe_coolant():
+    boundary = float(brentq(lambda T: REACTOR.derivative(np.array([T]), np.array([SAFE]))[0],
+                            335.0, 380.0))
+    loop = Reactor(controller(), kelvin=boundary - 1e-6, coolant=SAFE)
+    samples = loop.run(120)
+    assert samples[60].temperature > boundary - 0.2
+    assert {s.command for s in samples} == {SAFE}
+
+
+@pytest.mark.parametrize('side', [-1.0, 1.0])
+def test_it_leads_back_from_either_side(side):
+    """A plant dx/dt = u - x + 0.2 whose safe input takes it to 4 half widths from its nominal."""
+    box = Coordinates(('x',), ('1',), np.zeros(1), np.ones(1), -np.ones(1), np.ones(1))
+    model = linearised_model(-np.eye(1), np.eye(1), box, replace(box, names=('u',)), 's',
+                             Provenance('plant'))
+    step = Controller(model, Settings.for_model(
+        model, state_weight=np.ones(1), input_weight=np.ones(1),
+        limits=InputLimits(np.array([-9.0]), np.array([9.0]), np.ones(1)),
+        observer_bandwidth=0.5, transfer_time=5.0, safe_input=np.array([4.0 * side])))
+    state = step.initialise(State(), np.array([4.0 * side]))
+    state, refused = step.request_setpoint(state, np.array([-0.5 * side]))
+    assert refused is None
+    x, shares = 4.0 * side + 0.2, []
+    for second in range(1, 150):
+        state, u, report = step.step(state, np.array([x]), second * SECOND)
+        shares.append(report.command.way_back)
+        x += (u[0] + 0.2 - x) * -np.expm1(-1.0)
+    assert max(shares) > 0.5
+    assert report.level == 'sdre'
+    assert x == pytest.approx(-0.5 * side, abs=1e-3)
+
+
+def test_the_input_is_ahead_of_the_plant_by_the_lead():
+    way = WayBack(2.0, 2.0, 0)
+    assert way.share == 0.0
+    assert way.moved(2.0, 29 * SECOND, 10.0).share == 0.0
+    led = way.moved(2.0, 30 * SECOND, 10.0)
+    assert led.share == LEAD
+    half = led.moved(1.0, 31 * SECOND, 10.0)
+    assert half.share == pytest.approx(LEAD + 0.5)
+    # what has been reached is not given up for noise, but the way starts anew further out
+    assert half.moved(1.5, 32 * SECOND, 10.0) == half
+    assert half.moved(0.0, 33 * SECOND, 10.0).share == 1.0
+    assert half.moved(2.2, 34 * SECOND, 10.0) == WayBack(2.2, 2.2, 34 * SECOND)
+
+
+def test_what_comes_back_by_itself_is_waited_for():
+    way = WayBack(2.0, 2.0, 0)
+    for second in range(1, 60):
+        way = way.moved(2.0 - 0.02 * second, second * SECOND, 10.0)
+        assert way.share == 0.0
+
+
+
+
+
+# What a model tells of the safe input.
+
+@pytest.mark.parametrize('name', ['reactor_nz3', 'reactor_nz4'])
+@pytest.mark.parametrize('coolant', [SAFE, 282.0, 292.0])
+def test_a_model_tells_where_the_safe_input_rests(name, coolant):
+    rest = rest_under(shipped(name), np.array([coolant]), 0.25)
+    assert rest.x[0] == pytest.approx(rest_of(REACTOR, coolant), abs=0.05)
+    assert rest.outside == pytest.approx(max(0.0, (305.0 - rest.x[0]) / 11.0))
+    assert rest.holding is None
+
+
+@pytest.mark.parametrize('name', ['reactor_nz3', 'reactor_nz4', 'reactor_linear'])
+def test_shipped_models_are_not_complained_of(name):
+    assert rests_outside(Controller(shipped(name), controller().settings)) == ''
+
+
+def test_a_lift_of_narrow_data_says_that_the_safe_coolant_leads_out_of_its_range():
+    narrowed = controller(narrow())
+    # what holds the true reactor a quarter of half the width below the range
+    edge = float(narrowed.model.states.lower[0]) - 0.25 * 1.5
+    holding = float(brentq(lambda u: REACTOR.derivative(np.array([edge]), np.array([u]))[0],
+                           SAFE, 305.0))
+    assert narrowed.rest.holding[0] == pytest.approx(holding, abs=0.05)
+    words = rests_outside(Controller(narrowed.model, narrowed.settings))
+    assert 'under safe_coolant = 5' in words
+    assert 'leaves the trained range' in words
+    assert 'record data from there and train again, or set safe_coolant to 25.8' in words
+    warmer = replace(narrowed.settings, safe_input=np.array([holding + 0.1]))
+    assert rests_outside(Controller(narrowed.model, warmer)) == ''
+
+
+def test_a_safe_input_that_drives_the_reactor_up_is_told_as_well():
+    hot = controller(safe_input=np.array([305.15]))
+    assert hot.rest.holding[0] < 305.15
+    assert 'or less' in rests_outside(hot)

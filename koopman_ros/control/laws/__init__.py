@@ -18,9 +18,7 @@ from koopman_ros.control.laws.riccati import (
 from koopman_ros.lifting import LiftedModel
 
 LAWS: dict[str, Callable[[LiftedModel, Tuning], Law]] = {
-    'sdre': StateDependentRiccati,
-    'linear': Linear,
-}
+    'sdre': StateDependentRiccati, 'linear': Linear}
 
 __all__ = ['LAWS', 'Feedback', 'Figures', 'Form', 'Law', 'LawResult', 'Linear',
            'StateDependentRiccati', 'Tuning', 'Weights', 'feedback', 'projected', 'recentred']

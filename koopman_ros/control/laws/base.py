@@ -22,12 +22,14 @@ class Target:
 
     x: Array  #: (n_x,) reference state
     z: Array  #: (n_z,) z_ref = N(x_ref) (paper, section on the optimal control problem)
-    u: Array  #: (n_u,) input that balances the model's drift and the disturbance there
+    drift: Array  #: (n_x,) the model's drift there
+    u: Array  #: (n_u,) input that balances drift and disturbance
     forcing: Array  #: (n_x,) B u_ref + w, what acts on the state beside the drift
     residual: float  #: size of the rate that no input balances; 0 where x can be held
 
 
-def steady_state_target(model: LiftedModel, x_ref: Array, w: Array | None = None) -> Target:
+def steady_state_target(model: LiftedModel, x_ref: Array, w: Array | None = None, *,
+                        known: Target | None = None) -> Target:
     """
     Solve f(x_ref) + B u_ref + w = 0 for u_ref by least squares, f the model's drift.
 
@@ -36,31 +38,18 @@ def steady_state_target(model: LiftedModel, x_ref: Array, w: Array | None = None
 
     :param x_ref: (n_x,) scaled deviation.
     :param w: (n_x,) disturbance of the state's rate, none by default.
+    :param known: a target of the same model, which saves lift and drift where x_ref is the same.
     """
-    return balance(model, reference(model, x_ref), np.zeros(model.n_x) if w is None else w)
-
-
-@dataclass(frozen=True)
-class Reference:
-    """What a target has of its set-point alone, in scaled deviations."""
-
-    x: Array  #: (n_x,) reference state
-    z: Array  #: (n_z,) N(x_ref)
-    drift: Array  #: (n_x,) the model's drift there
-
-
-def reference(model: LiftedModel, x_ref: Array) -> Reference:
-    """Evaluate the model at a set-point (n_x,), in scaled deviations."""
-    return Reference(x_ref, model.lift(x_ref), model.drift(x_ref))
-
-
-def balance(model: LiftedModel, at: Reference, w: Array) -> Target:
-    """Complete a reference by the input that balances drift and disturbance w (n_x,)."""
-    load = at.drift + w
+    if known is not None and (known.x == x_ref).all():
+        x_ref, z, drift = known.x, known.z, known.drift
+    else:
+        z, drift = model.lift(x_ref), model.drift(x_ref)
+    w = np.zeros(model.n_x) if w is None else w
+    load = drift + w
     u = -model.input_inverse.dot(load)
     forcing = model.B.dot(u)
     rest = load + forcing
-    return Target(at.x, at.z, u, forcing + w, math.sqrt(rest.dot(rest)))
+    return Target(x_ref, z, drift, u, forcing + w, math.sqrt(rest.dot(rest)))
 
 
 @dataclass(frozen=True)
@@ -124,8 +113,7 @@ class Law(Protocol):
         """
         Find the input for an estimate.
 
-        :param estimate: in terms of :attr:`model`.
-        :param target: likewise.
+        :param estimate: in terms of :attr:`model`, as the target.
         :param limits: of the inputs; the command is brought within them afterwards anyhow.
         :param memory: of the result before, None at first and after another law.
         :param interval: seconds between samples; 0 when they are not known.
