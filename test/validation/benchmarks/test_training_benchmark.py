@@ -5,6 +5,7 @@
 
 import json
 
+import casadi
 import numpy as np
 import pytest
 import torch
@@ -12,57 +13,48 @@ import torch
 from koopman_ros.learning import fit
 from koopman_ros.learning.levenberg_marquardt import normal_equations
 from koopman_ros.lifting import Coordinates, LiftedModel, NetworkObservables, Provenance
+from validation.benchmarks import ipopt, process, solvers
 from validation.benchmarks.__main__ import main
-from validation.benchmarks.options import Extent
-from validation.benchmarks.training import process
-from validation.benchmarks.training.plan import Plan, PLANS, SOLVERS
-from validation.benchmarks.training.problems import artificial, invariant_residual, two_state
-from validation.benchmarks.training.torch_solvers import differentiable
+from validation.benchmarks.problems import artificial, two_state
+from validation.benchmarks.training import Plan, PLANS, SOLVERS
 
 # Few samples: casadi's graphs take most of the time, and grow with them.
-PLAN = Plan(((200, 8),), 2.0, 10.0, 4e3, 1, (500, 1000), (2, 3), (1, 2))
+PLAN = Plan(((200, 8),), 2.0, 10.0, 4e3, 1, (500, 1000), (2, 3), (1, 2), ('one-state reactor',))
 
 
 @pytest.fixture(scope='module')
-def summary(tmp_path_factory):
-    """Return what a short run leaves beside the figures of another part."""
+def training(tmp_path_factory):
+    """Return the figures of a short run."""
     folder = tmp_path_factory.mktemp('bench')
-    (folder / 'summary.json').write_text('{"loop": {"kept": true}}')
     with pytest.MonkeyPatch.context() as patch:
-        patch.setitem(PLANS, Extent.QUICK, PLAN)
+        patch.setitem(PLANS, 'quick', PLAN)
         assert main(['training', '--quick', '--output', str(folder)]) == 0
     assert (folder / 'training.png').stat().st_size > 10_000
-    return json.loads((folder / 'summary.json').read_text())
+    return json.loads((folder / 'summary.json').read_text())['training']
 
 
-def test_one_part_leaves_the_figures_of_the_others(summary):
-    assert summary['loop'] == {'kept': True}
+def test_every_solver_has_a_time_or_a_reason_and_ours_reaches_the_targets(training):
+    case, = training['cases']
+    assert case['system'] == 'one-state reactor'
+    assert 0.0 < case['seconds']['1e-4']['ours'] <= case['seconds']['1e-6']['ours']
+    assert case['best_rw']['ours'] <= 1e-6
+    assert (case['samples'], case['hidden'], case['parameters']) == (200, 8, 41)
+    for name, times in case['seconds'].items():
+        assert set(times) == set(SOLVERS)
+        for solver, seconds in times.items():
+            ratio = case['ratio_to_ours'][name].get(solver)
+            if seconds is None:
+                assert ratio is None
+                assert case['notes'].get(solver) or name in case['not_asked']
+            elif solver != 'ours' and times['ours']:
+                assert ratio == pytest.approx(seconds / times['ours'])
+    # IPOPT starts where we start
+    assert case['ipopt_build_seconds'] > 0.0
+    assert case['seconds_with_build']['1e-4']['ipopt'] == pytest.approx(
+        case['seconds']['1e-4']['ipopt'] + case['ipopt_build_seconds'])
 
 
-def test_every_solver_has_a_time_or_a_reason_and_ours_reaches_the_targets(summary):
-    cases = summary['training']['cases']
-    assert [case['system'] for case in cases] == ['two-state example', 'one-state reactor']
-    for case in cases:
-        assert 0.0 < case['seconds']['1e-4']['ours'] <= case['seconds']['1e-6']['ours']
-        assert case['best_rw']['ours'] <= 1e-6
-        assert (case['samples'], case['hidden'], case['parameters']) == (200, 8, 41)
-        for name, times in case['seconds'].items():
-            assert set(times) == set(SOLVERS)
-            for solver, seconds in times.items():
-                ratio = case['ratio_to_ours'][name].get(solver)
-                if seconds is None:
-                    assert ratio is None
-                    assert case['notes'].get(solver) or name in case['not_asked']
-                elif solver != 'ours' and times['ours']:
-                    assert ratio == pytest.approx(seconds / times['ours'])
-        # IPOPT starts where we start
-        assert case['ipopt_build_seconds'] > 0.0
-        assert case['seconds_with_build']['1e-4']['ipopt'] == pytest.approx(
-            case['seconds']['1e-4']['ipopt'] + case['ipopt_build_seconds'])
-
-
-def test_cost_of_an_iteration(summary):
-    training = summary['training']
+def test_cost_of_an_iteration(training):
     for name, sizes in (('samples', {'500', '1000'}), ('n_z', {'2', '3'}), ('n_x', {'1', '2'})):
         figures = training[f'seconds_per_iteration_by_{name}']
         assert set(figures) == sizes
@@ -73,7 +65,7 @@ def test_cost_of_an_iteration(summary):
 def test_objective_of_the_first_order_solvers_is_ours():
     case = artificial(samples=70, n_x=2, n_z=4, hidden=5)
     theta = case.theta.clone().requires_grad_(True)
-    cost = differentiable(case)(theta)
+    cost = solvers.differentiable(case)(theta)
     cost.backward()
     ours = normal_equations(case.problem.add_residuals, case.theta)
     assert cost.item() == pytest.approx(ours.cost, rel=1e-12)
@@ -82,14 +74,10 @@ def test_objective_of_the_first_order_solvers_is_ours():
 
 @pytest.mark.parametrize('graph', ['expanded', 'compiled'])
 def test_objective_of_ipopt_is_ours(graph, monkeypatch):
-    import casadi
-
-    from validation.benchmarks.training import ipopt
-
     monkeypatch.setattr(ipopt, '_COMPILER', {})
     case = artificial(samples=30, n_x=2, n_z=4, hidden=3)
     problem, derivatives = getattr(ipopt, f'_{graph}_graph')(case)
-    theta = case.theta.numpy()
+    theta = case.start
     cost = casadi.Function('cost', [problem['x']], [problem['f']])
     assert float(cost(theta)) == pytest.approx(
         normal_equations(case.problem.add_residuals, case.theta, derivatives=False).cost,
@@ -115,22 +103,14 @@ def test_invariant_residual_is_that_of_validation():
         parts.A.numpy(), np.zeros((2, 1)), plain,
         Coordinates(('u',), ('1',), np.zeros(1), np.ones(1), -np.ones(1), np.ones(1)), 's',
         Provenance('two-state example'))
-    x, f = case.data.x.numpy(), case.data.f.numpy()
-    assert invariant_residual(case.layout, case.data, case.theta) == (
-        pytest.approx(fit(model, x, f, np.zeros((200, 1))).rw, rel=1e-9))
+    assert case.rw(case.theta) == pytest.approx(
+        fit(model, case.x, case.f, np.zeros((200, 1))).rw, rel=1e-9)
 
 
-def test_a_process_that_takes_too_long_is_ended(tmp_path):
-    case = tmp_path / 'case.npz'
-    two_state(samples=300, hidden=4).save(case)
-    job = {'do': 'solve', 'solver': 'adam', 'path': str(case), 'targets': [1e-30], 'limit': 1e9}
-    outcome = process.run(job, build_limit=1.0, limit=-4.8, megabytes=4e3)
-    assert outcome.failure.startswith('stopped after')
-    assert outcome.find('rw') > 0.0
-
-
-def test_a_process_that_takes_too_much_memory_is_ended(tmp_path):
-    job = {'do': 'measure', 'sizes': [{'samples': 1000, 'n_x': 2, 'n_z': 3, 'hidden': 16,
-                                       'iterations': 10 ** 6}]}
-    outcome = process.run(job, build_limit=20.0, limit=1.0, megabytes=50.0)
-    assert outcome.failure == 'needs more than 50 MB of memory'
+@pytest.mark.parametrize(('samples', 'megabytes', 'failure'), [
+    (2_000_000, 8e3, 'stopped after 0.1 s'),
+    (100_000_000, 1500.0, 'needs more than 1500 MB of memory')])
+def test_a_process_that_takes_too_much_is_ended(samples, megabytes, failure, tmp_path):
+    outcome = process.run(solvers.measure_cost, [(samples, 2, 8, 64)], 0.1,
+                          folder=tmp_path, megabytes=megabytes)
+    assert outcome.failure == failure

@@ -19,8 +19,8 @@ import casadi
 import numpy as np
 import torch
 
-from validation.benchmarks.training.problems import Case, WHITENING
-from validation.benchmarks.training.trace import Trace
+from validation.benchmarks.problems import Case, WHITENING
+from validation.benchmarks.solvers import Trace
 
 # No stopping tests of its own: the trace ends it. All else are IPOPT's defaults, with MUMPS.
 _OPTIONS: dict[str, Any] = {
@@ -51,9 +51,8 @@ def _solve(case: Case, trace: Trace, build: Callable[[Case], Graph]) -> str:
     solver = casadi.nlpsol('solver', 'ipopt', problem,
                            {**_OPTIONS, **derivatives, 'iteration_callback': watch})
     # of this process and of the compiler
-    trace.built(sum(os.times()[:4]) - sum(start))
-    trace.start()
-    solver(x0=case.theta.numpy())
+    trace.start(sum(os.times()[:4]) - sum(start))
+    solver(x0=case.start)
     return str(solver.stats()['return_status'])
 
 
@@ -111,8 +110,8 @@ def _moments(case: Case) -> tuple[list[tuple[int, int]], casadi.DM, casadi.DM]:
 
 def _expanded_graph(case: Case) -> Graph:
     theta = casadi.SX.sym('theta', case.layout.size)
-    N = len(case.data)
-    x, f = (casadi.SX(casadi.DM(part.numpy().T)) for part in (case.data.x, case.data.f))
+    N = len(case.x)
+    x, f = (casadi.SX(casadi.DM(part.T)) for part in (case.x, case.f))
     z, residual = _lift(case, theta, x, f)
     entries, target, weight = _moments(case)
     moment = z @ z.T / N
@@ -123,7 +122,7 @@ def _expanded_graph(case: Case) -> Graph:
 
 
 def _compiled_graph(case: Case) -> Graph:
-    p, n_x, N = case.layout.size, case.layout.n_x, len(case.data)
+    p, n_x, N = case.layout.size, case.layout.n_x, len(case.x)
     theta = casadi.SX.sym('theta', p)
     x, f = casadi.SX.sym('x', n_x), casadi.SX.sym('f', n_x)
     entries, target, weight = _moments(case)
@@ -137,7 +136,7 @@ def _compiled_graph(case: Case) -> Graph:
     def mean(name: str, inputs: list[casadi.SX], outputs: list[casadi.SX]) -> Any:
         function = casadi.Function(name, [theta, x, f, *inputs],
                                    [casadi.vec(part) for part in outputs], _COMPILER).map(N)
-        data = [casadi.DM(part.numpy().T) for part in (case.data.x, case.data.f)]
+        data = [casadi.DM(part.T) for part in (case.x, case.f)]
 
         def call(at: casadi.MX, *more: casadi.MX) -> list[casadi.MX]:
             held = [casadi.repmat(part, 1, N) for part in more]

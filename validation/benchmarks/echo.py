@@ -7,19 +7,17 @@ import sys
 
 import rclpy
 from rclpy.executors import ExternalShutdownException
-from rclpy.node import Node
 from sensor_msgs.msg import Temperature
 
 from koopman_ros.ros import topics
 
 
-def main(args: list[str] | None = None) -> int:
+def main() -> int:
     """Answer until the process is told to end."""
-    rclpy.init(args=args)
-    node = Node('echo')
+    rclpy.init()
+    node = rclpy.create_node('echo')
     answers = node.create_publisher(Temperature, topics.COOLANT_SETPOINT, topics.LOOP_QOS)
-    node.create_subscription(
-        Temperature, topics.TEMPERATURE, answers.publish, topics.LOOP_QOS)
+    node.create_subscription(Temperature, topics.TEMPERATURE, answers.publish, topics.LOOP_QOS)
     try:
         rclpy.spin(node)
     except (KeyboardInterrupt, ExternalShutdownException):

@@ -1,0 +1,290 @@
+# SPDX-FileCopyrightText: 2026 The koopman_ros Authors
+# SPDX-License-Identifier: Apache-2.0
+
+"""The control step, and the loop across processes: latency, rate, start, memory, lock-step."""
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+import sys
+import tempfile
+import time
+from typing import Any
+
+import numpy as np
+import psutil
+from sensor_msgs.msg import Temperature
+from std_srvs.srv import Trigger
+
+from koopman_ros.reports import table
+from koopman_ros.ros import topics
+from koopman_ros.ros.codec import stamp_message, stamp_nanoseconds
+from koopman_ros.testing import Harness, NodeProcess
+from koopman_ros.units import NANOSECONDS
+from validation.benchmarks import process, step
+
+PACKAGES = ('numpy', 'scipy', 'torch', 'control')
+MEANING = {
+    'step_us': 'median time of a control step, by n_z; step has the 99th percentiles, too',
+    'step_ratio_to_naive': 'how many times as long the same law takes by torch jacrev and '
+                           'control.lqr, by n_z; medians of processor time, since a busy machine '
+                           'interrupts the longer one more often',
+    'latency_ratio_median': 'measurement published to command received, over that of a bare echo',
+    'latency_ratio_p99': 'the same for 99th percentiles',
+    'max_rate_hz': 'highest rate of measurements at which every one was answered and the median '
+                   'answer in the last tenth of the run took less than 20 ms',
+    'startup_seconds': "from the start of the controller's process to its first command, median",
+    'rss_megabytes': 'resident memory: plant and controller after the lock-step run, trainer and '
+                     'echo idle',
+    'speedup_over_real_time': 'seconds of the plant per second, in lock-step at one sample a '
+                              'second of the plant',
+}
+_ROUND = 50  # measurements of one side, then of the other
+_PACE = 0.005  # s between measurements whose latency is taken
+_BEHIND = 0.02  # s; a run whose answers come this late at its end has fallen behind
+_PATIENCE = 2.0  # s for the answers that are still missing at the end of a run
+_GROWTH, _TRIES = 1.2, 2
+_ON_SCHEDULE = 0.98
+_CELSIUS = 51.0  # about the nominal point of the shipped lifts
+_NOISE = 0.01  # K, standard deviation
+_RETRY = 0.01  # s between measurements that nobody may hear yet
+
+
+@dataclass(frozen=True)
+class Plan:
+    """One extent of the measurements."""
+
+    coordinates: tuple[int, ...]  #: the n_z of the lifts
+    steps: int  #: timed control steps with each lift
+    rounds: int  #: of latency, fifty measurements of each side in one
+    rate_seconds: float  #: length of a run at one rate
+    lowest_rate: float  #: of measurements, Hz
+    starts: int  #: of the controller
+    plant_seconds: float  #: length of the lock-step loop
+
+
+PLANS = {'quick': Plan((2, 3, 4, 5, 6), 200, 4, 0.4, 500.0, 2, 600.0),
+         'default': Plan((2, 3, 4, 5, 6), 1500, 30, 2.0, 500.0, 5, 3600.0)}
+
+
+def measure(plan: Plan, figures: dict[str, Any], folder: Path) -> Iterator[str]:
+    """Measure the control step and the loop, each beside its like."""
+    figures['meaning'] = MEANING
+    with tempfile.TemporaryDirectory() as name:
+        yield _steps(figures, plan, Path(name))
+        with Harness(Path(name), name='probe') as harness:
+            yield _latency(figures, harness, plan.rounds)
+            yield _highest_rate(figures, harness, plan.rate_seconds, plan.lowest_rate)
+            _start_up(figures, harness, plan.starts)
+            yield _lockstep(figures, harness, plan.plant_seconds)
+
+
+def _tell(label: str) -> None:
+    print(f'loop: {label}', file=sys.stderr, flush=True)
+
+
+def _steps(figures: dict[str, Any], plan: Plan, folder: Path) -> str:
+    _tell(f'{plan.steps} control steps with each lift')
+    outcome = process.run(step.compare_all, plan.coordinates, plan.steps, folder=folder,
+                          megabytes=8e3)
+    if outcome.failure:
+        raise RuntimeError(f'the control step could not be timed: {outcome.failure}')
+    found = {n_z: one for event in outcome.events for n_z, one in event.items()}
+    ratio = {n_z: one['naive_cpu_median_us'] / one['cpu_median_us'] for n_z, one in found.items()}
+    figures.update(step=found, step_ratio_to_naive=ratio,
+                   step_us={n_z: one['median_us'] for n_z, one in found.items()})
+    columns = ('median_us', 'p99_us', 'naive_median_us', 'naive_p99_us')
+    return table(('control step', 'ratio', *columns), [
+        (f'n_z = {n_z}', f'{ratio[n_z]:.1f}', *(f'{one[column]:.0f}' for column in columns))
+        for n_z, one in found.items()])
+
+
+class _Probe:
+    """
+    A sensor and an actuator in one, on the two topics of whoever answers.
+
+    :param harness: whose node measures.
+    :param namespace: of whoever answers, e.g. ``/ours``.
+    """
+
+    def __init__(self, harness: Harness, namespace: str) -> None:
+        self._harness = harness
+        self._rng = np.random.default_rng(0)
+        self._answers: dict[int, int] = {}  # stamp -> arrival
+        self._measurements = harness.node.create_publisher(
+            Temperature, f'{namespace}/{topics.TEMPERATURE}', topics.LOOP_QOS)
+        harness.node.create_subscription(
+            Temperature, f'{namespace}/{topics.COOLANT_SETPOINT}', self._on_command,
+            topics.LOOP_QOS)
+
+    def _on_command(self, message: Temperature) -> None:
+        self._answers[stamp_nanoseconds(message.header.stamp)] = time.time_ns()
+
+    def publish(self) -> int:
+        """Publish a measurement of now; return its stamp."""
+        message = Temperature(temperature=_CELSIUS + _NOISE * self._rng.normal())
+        stamp = time.time_ns()
+        message.header.stamp = stamp_message(stamp)
+        self._measurements.publish(message)
+        return stamp
+
+    def seconds(self, stamp: int) -> float:
+        """Return the time from a measurement to its command; infinity where none came."""
+        return (self._answers.get(stamp, np.inf) - stamp) / NANOSECONDS
+
+    def first_answer(self) -> int:
+        """Publish until somebody answers; return when the answer came [ns of time.time_ns]."""
+        begun = time.time_ns()
+
+        def answered() -> list[int]:
+            self.publish()
+            self._harness.spin_once(_RETRY)
+            # answers of somebody who has ended meanwhile may still come in
+            return [came for stamp, came in self._answers.items() if stamp >= begun]
+
+        return self._harness.wait_until(answered, 'an answer')[0]
+
+    def paced(self) -> list[float]:
+        """Measure, with time between that nothing left over from one meets the next; return s."""
+        taken = []
+        for _ in range(_ROUND):
+            due = time.monotonic() + _PACE
+            stamp = self.publish()
+            self._harness.wait_until(partial(self._answers.get, stamp), 'the answer')
+            taken.append(self.seconds(stamp))
+            time.sleep(max(0.0, due - time.monotonic()))
+        return taken
+
+    def run(self, rate: float, seconds: float) -> dict[str, Any]:
+        """Publish on schedule while the answers come in."""
+        stamps: list[int] = []
+        count = round(rate * seconds)
+        begun = time.monotonic()
+        for k in range(count):
+            due = begun + k / rate
+            while (left := due - time.monotonic()) > 0.0:
+                self._harness.spin_once(left)
+            stamps.append(self.publish())
+            self._harness.spin_once(0.0)
+        sent_hz = (count - 1) / (time.monotonic() - begun)
+        end = time.monotonic() + _PATIENCE
+        while np.isinf(self.seconds(stamps[-1])) and time.monotonic() < end:
+            self._harness.spin_once(0.05)
+        delays = np.array([self.seconds(stamp) for stamp in stamps])
+        at_end = float(np.median(delays[-max(1, count // 10):]))
+        unanswered = int(np.sum(np.isinf(delays)))
+        return {'rate_hz': rate, 'sent_hz': sent_hz, 'sent': count, 'unanswered': unanswered,
+                'delay_at_end_us': 1e6 * at_end, 'on_schedule': sent_hz > _ON_SCHEDULE * rate,
+                'kept_up': not unanswered and at_end < _BEHIND}
+
+
+def _start(harness: Harness, name: str, namespace: str, command: tuple[str, ...] | None = None,
+           **parameters: object) -> NodeProcess:
+    return harness.start(name, parameters, ('-r', f'__ns:={namespace}'), command)
+
+
+def _latency(figures: dict[str, Any], harness: Harness, rounds: int) -> str:
+    """Time measurement to command of the controller and of the echo, round by round in turns."""
+    _tell('latency beside an echo')
+    echo = (sys.executable, '-m', 'validation.benchmarks.echo')
+    taken: dict[str, list[float]] = {'controller': [], 'echo': []}
+    with _start(harness, 'controller', '/latency/controller'), \
+            _start(harness, 'echo', '/latency/echo', echo) as echoing:
+        probes = {name: _Probe(harness, f'/latency/{name}') for name in taken}
+        for probe in probes.values():
+            probe.first_answer()
+            probe.paced()
+        for _ in range(rounds):
+            for name, probe in probes.items():
+                taken[name] += probe.paced()
+        figures['latency'] = {'measurements': rounds * _ROUND, 'echo_rss_megabytes': _rss(echoing)}
+    rows = []
+    for quantile, percent in (('median', 50), ('p99', 99)):
+        ours, other = (1e6 * float(np.percentile(seconds, percent)) for seconds in taken.values())
+        for name, microseconds in zip(taken, (ours, other), strict=True):
+            figures['latency'].setdefault(name, {})[f'{quantile}_us'] = microseconds
+        figures[f'latency_ratio_{quantile}'] = ours / other
+        rows.append((quantile, f'{ours / other:.2f}', f'{ours:.0f}', f'{other:.0f}'))
+    return table(('latency', 'ratio', 'controller [us]', 'echo [us]'), rows)
+
+
+def _highest_rate(figures: dict[str, Any], harness: Harness, seconds: float, lowest: float) -> str:
+    """
+    Raise the rate of measurements until the controller does not keep up.
+
+    It keeps up with a rate when every measurement of a run is answered and the answers are not
+    late at the end; a rate is tried twice, since another program may have come in between.
+
+    :param seconds: length of a run.
+    :param lowest: rate to start from, Hz.
+    """
+    _tell('highest rate')
+    steps: list[dict[str, Any]] = []
+    highest, ended = None, ''
+    with _start(harness, 'controller', '/rate'):
+        probe = _Probe(harness, '/rate')
+        probe.first_answer()
+        probe.paced()
+        while not ended:
+            rate = lowest * _GROWTH ** sum(one['kept_up'] for one in steps)
+            for _ in range(_TRIES):
+                steps.append(one := probe.run(rate, seconds))
+                if one['kept_up']:
+                    highest = one['sent_hz']
+                    break
+            else:
+                ended = 'a measurement has no answer' if one['unanswered'] else (
+                    'the answers come late')
+            if not ended and not one['on_schedule']:
+                ended = 'the sender does not keep up'
+    figures.update(rate={'max_rate_hz': highest, 'ended_by': ended, 'steps': steps},
+                   max_rate_hz=highest)
+    reached = 'no rate' if highest is None else f'{highest:.0f} Hz'
+    return f'keeps up with {reached}; ended because {ended}'
+
+
+def _start_up(figures: dict[str, Any], harness: Harness, runs: int) -> None:
+    """Time the controller from the start of its process to its first command."""
+    _tell('start-up, memory and lock-step')
+    probe = _Probe(harness, '/start')
+    taken = []
+    for _ in range(runs):
+        begun = time.time_ns()
+        with _start(harness, 'controller', '/start'):
+            taken.append((probe.first_answer() - begun) / NANOSECONDS)
+    figures['startup'] = {'seconds': float(np.median(taken)), 'runs': taken}
+    figures['startup_seconds'] = figures['startup']['seconds']
+
+
+def _lockstep(figures: dict[str, Any], harness: Harness, seconds: float) -> str:
+    """
+    Let plant and controller run in lock-step as fast as they can, and weigh all nodes.
+
+    :param seconds: of the plant.
+    """
+    arrivals: list[float] = []
+    harness.node.create_subscription(
+        Temperature, f'/lockstep/{topics.TEMPERATURE}',
+        lambda _: arrivals.append(time.monotonic()), topics.LOOP_QOS, raw=True)
+    with _start(harness, 'trainer', '/idle', record_at_start=False) as trainer, \
+            _start(harness, 'plant', '/lockstep', speed=0.0, lockstep=True, duration=seconds,
+                   sample_period=1.0, lockstep_subscribers=2) as plant, \
+            _start(harness, 'controller', '/lockstep') as controller:
+        harness.wait_until(lambda: len(arrivals) > round(seconds), 'the end of the lock-step loop')
+        ready = harness.node.create_client(Trigger, '/idle/trainer/train').service_is_ready
+        harness.wait_until(ready, 'the trainer')
+        memory = {'plant': _rss(plant), 'controller': _rss(controller), 'trainer': _rss(trainer),
+                  'echo': figures['latency']['echo_rss_megabytes']}
+    took = arrivals[-1] - arrivals[0]
+    figures.update(rss_megabytes=memory, speedup_over_real_time=seconds / took, lockstep={
+        'plant_seconds': seconds, 'seconds': took, 'speed_over_real_time': seconds / took})
+    return '\n'.join((
+        f'first command {figures["startup_seconds"]:.2f} s after the start',
+        f'resident memory in MB: {", ".join(f"{k} {v:.0f}" for k, v in memory.items())}',
+        f'lock-step runs {seconds / took:.0f} times as fast as the plant'))
+
+
+def _rss(node: NodeProcess) -> float:
+    """Return the resident memory of a process in MB."""
+    return float(psutil.Process(node.process.pid).memory_info().rss) / 1e6

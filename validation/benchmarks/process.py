@@ -1,0 +1,91 @@
+# SPDX-FileCopyrightText: 2026 The koopman_ros Authors
+# SPDX-License-Identifier: Apache-2.0
+
+"""Measurements in processes of their own, with bounded processor time and memory."""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+import math
+import multiprocessing
+from multiprocessing.connection import Connection
+import os
+from pathlib import Path
+import resource
+import signal
+import time
+from typing import Any, TypeAlias
+
+Tell: TypeAlias = Callable[[dict[str, Any]], None]
+
+# Imported once; every process is forked from the one that has them.
+_PRELOAD = [f'validation.benchmarks.{name}' for name in ('training', 'ipopt', 'step')]
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """What a job has told."""
+
+    events: tuple[dict[str, Any], ...]  #: in their order
+    failure: str  #: why it did not end by itself, or empty
+
+    def find(self, key: str) -> Any:
+        """Return the last value under a key, or None."""
+        return next((event[key] for event in reversed(self.events) if key in event), None)
+
+
+def run(job: Callable[..., None], *arguments: Any, folder: Path, megabytes: float) -> Outcome:
+    """
+    Run a job in a process; what it had told stays when it is ended.
+
+    :param job: takes a function that is told what it finds, and the arguments.
+    :param folder: where it runs, as compilers leave files there.
+    :param megabytes: the memory that it may take.
+    """
+    context = multiprocessing.get_context('forkserver')
+    context.set_forkserver_preload(_PRELOAD)
+    receiving, sending = context.Pipe(duplex=False)
+    process = context.Process(target=_enter, args=(sending, folder, megabytes, job, arguments),
+                              daemon=True)
+    process.start()
+    sending.close()
+    events: list[dict[str, Any]] = []
+    try:
+        while True:
+            events.append(receiving.recv())
+    except (EOFError, OSError):  # it has ended, or was ended within an event
+        process.join()
+    finally:
+        process.kill()
+        process.join()
+    outcome = Outcome(tuple(events), '')
+    failure = outcome.find('error') or ''
+    if not failure and process.exitcode:
+        failure = (outcome.find('too_long') if process.exitcode == -signal.SIGXCPU
+                   else f'ended with status {process.exitcode}')
+    return Outcome(outcome.events, failure)
+
+
+def allow(tell: Tell, seconds: float, otherwise: str) -> None:
+    """
+    Let the system end this process when it takes more processor time from now on.
+
+    :param otherwise: why it has ended then.
+    """
+    tell({'too_long': otherwise})
+    resource.setrlimit(resource.RLIMIT_CPU, (
+        math.ceil(time.process_time() + seconds), resource.RLIM_INFINITY))
+
+
+def _enter(sending: Connection, folder: Path, megabytes: float, job: Callable[..., None],
+           arguments: tuple[Any, ...]) -> None:
+    # Ctrl-C is answered by the process that waits
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
+    resource.setrlimit(resource.RLIMIT_DATA, (round(1e6 * megabytes),) * 2)
+    os.chdir(folder)
+    try:
+        job(sending.send, *arguments)
+    except MemoryError:
+        sending.send({'error': f'needs more than {megabytes:.0f} MB of memory'})
+    except RuntimeError as error:
+        sending.send({'error': str(error)})

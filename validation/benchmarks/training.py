@@ -1,0 +1,274 @@
+# SPDX-FileCopyrightText: 2026 The koopman_ros Authors
+# SPDX-License-Identifier: Apache-2.0
+
+"""Training beside other solvers: seconds to a given accuracy, and how the cost grows."""
+
+from collections.abc import Iterator
+from dataclasses import dataclass, field
+import itertools
+import math
+from pathlib import Path
+import sys
+import tempfile
+from typing import Any
+
+from matplotlib.axes import Axes
+import numpy as np
+
+from koopman_ros.reports import drawing, legend, table
+from validation.benchmarks import process, solvers
+from validation.benchmarks.problems import SYSTEMS
+
+PACKAGES = ('torch', 'casadi', 'numpy')
+TARGETS = {'1e-4': 1e-4, '1e-6': 1e-6, '1e-8': 1e-8}
+# Three coordinates, the first of them the state, do not represent the reactor below 1e-8 or so.
+NOT_ASKED = {'two-state example': (), 'one-state reactor': ('1e-8',)}
+SOLVERS = {
+    'ours': 'ours',
+    'ipopt': 'IPOPT, expanded graph',
+    'ipopt_compiled': 'IPOPT, compiled graph',
+    'lbfgs': 'L-BFGS',
+    'adam': 'Adam',
+}
+_COLOURS = {'ours': '#0b6e4f', 'ipopt': '#c8553d', 'ipopt_compiled': '#e8a33d',
+            'lbfgs': '#3d5a98', 'adam': '#8d7aae'}
+_DRAWN = (2000, 16)  # the case that is drawn
+_FIRST = 1e-3  # s, the left end of the time axis
+_REPEATED = 4.0  # s
+_COST_LIMIT = 240.0  # s
+
+
+@dataclass(frozen=True)
+class Plan:
+    """One extent of the comparison."""
+
+    cases: tuple[tuple[int, int], ...]  #: (samples, hidden units), each for all systems
+    limit: float  #: of a solver in a case, s
+    build_limit: float  #: of building what a solver solves, beside imports, s
+    megabytes: float  #: limit of the memory
+    #: of a solver that takes no longer than four seconds, of which the middle one counts: a busy
+    #: moment is long beside a short run
+    runs: int
+    samples: tuple[int, ...]  #: N of the growth of the cost
+    n_z: tuple[int, ...]  #: likewise
+    n_x: tuple[int, ...]  #: likewise
+    systems: tuple[str, ...] = tuple(SYSTEMS)
+
+
+PLANS = {
+    'quick': Plan(((300, 8),), 1.0, 10.0, 4e3, 1, (1000, 10_000), (2, 3), (1, 2)),
+    'default': Plan(((300, 8), (2000, 8), (2000, 16), (2000, 32)), 20.0, 60.0, 8e3, 3,
+                    (1000, 10_000, 100_000, 1_000_000), (2, 3, 4, 5, 6, 7, 8), (1, 2, 3, 4)),
+}
+
+
+@dataclass
+class _Comparison:
+    """The solvers side by side."""
+
+    plan: Plan
+    folder: Path  #: where they run
+    #: what the solvers have told of each case (system, samples, hidden)
+    cases: dict[tuple[str, int, int], dict[str, process.Outcome]] = field(default_factory=dict)
+    #: (samples, hidden, reason) of a solver whose graph could not be built
+    unbuilt: dict[str, tuple[int, int, str]] = field(default_factory=dict)
+
+    def run(self, system: str, samples: int, hidden: int) -> dict[str, Any]:
+        """Run all solvers on one case; return its figures."""
+        case = SYSTEMS[system](samples, hidden)
+        outcomes = self.cases[system, samples, hidden] = {}
+        asked = [target for name, target in TARGETS.items() if name not in NOT_ASKED[system]]
+        for solver, label in SOLVERS.items():
+            _tell(f'{system}, N = {samples}, {hidden} hidden units: {label}')
+            fewer, narrower, reason = self.unbuilt.get(solver, (math.inf, math.inf, ''))
+            outcomes[solver] = process.Outcome(
+                (), f'left out, as N = {fewer}, {narrower} hidden units {reason}') if (
+                fewer <= samples and narrower <= hidden) else self._solve(solver, case, asked)
+            if not reason and outcomes[solver].find('built') is None:
+                self.unbuilt[solver] = samples, hidden, outcomes[solver].failure
+        return {'system': system, 'samples': samples, 'hidden': hidden,
+                'parameters': case.layout.size, **_figures(system, outcomes)}
+
+    def _solve(self, solver: str, case: Any, targets: list[float]) -> process.Outcome:
+        plan = self.plan
+        outcomes: list[process.Outcome] = []
+        while len(outcomes) < plan.runs:
+            outcomes.append(process.run(
+                solvers.solve, solver, case, targets, plan.limit, plan.build_limit,
+                folder=self.folder, megabytes=plan.megabytes))
+            if _ended(outcomes[0]) + (outcomes[0].find('built') or 0.0) > _REPEATED:
+                return outcomes[0]
+        return sorted(outcomes, key=_ended)[plan.runs // 2]
+
+
+def measure(plan: Plan, figures: dict[str, Any], folder: Path) -> Iterator[str]:
+    """Compare the solvers, measure how our cost grows, and draw both."""
+    figures['machine']['threads'] = 1
+    figures.update(limit_seconds=plan.limit, cases=[],
+                   clock='processor time of one thread; wall_seconds are those on the wall')
+    with tempfile.TemporaryDirectory() as name:
+        comparison = _Comparison(plan, Path(name))
+        try:
+            for system, size in itertools.product(plan.systems, plan.cases):
+                figures['cases'].append(comparison.run(system, *size))
+                yield _table_of(figures['cases'][-1])
+            # memory is measured in a fresh process each
+            for n in plan.samples:
+                _add_cost(figures, 'samples', {n: (n, 2, 3, 16)}, comparison)
+            _add_cost(figures, 'n_z', {n: (2000, 1, n, 17) for n in plan.n_z}, comparison)
+            _add_cost(figures, 'n_x', {n: (2000, n, n + 2, 16) for n in plan.n_x}, comparison)
+            yield '\n\n'.join(_tables_of_cost(figures))
+        finally:
+            _draw(folder / 'training.png', comparison.cases, figures)
+
+
+def _tell(label: str) -> None:
+    print(f'training: {label}', file=sys.stderr, flush=True)
+
+
+def _ended(outcome: process.Outcome) -> float:
+    ended = outcome.find('ended')
+    return math.inf if ended is None else float(ended)
+
+
+def _trace(outcome: process.Outcome) -> list[dict[str, float]]:
+    return [event for event in outcome.events if 'rw' in event]
+
+
+def _figures(system: str, outcomes: dict[str, process.Outcome]) -> dict[str, Any]:
+    """Turn what the solvers have told into times by target."""
+    def when(clock: str) -> dict[str, dict[str, float | None]]:
+        return {name: {solver: next((event[clock] for event in _trace(outcome)
+                                     if event['rw'] <= target), None)
+                       for solver, outcome in outcomes.items()}
+                for name, target in TARGETS.items()}
+
+    seconds = when('seconds')
+    built = {solver: outcome.find('built') for solver, outcome in outcomes.items()}
+    with_build = {name: {solver: None if t is None else t + built[solver]
+                         for solver, t in times.items()} for name, times in seconds.items()}
+    return {
+        'seconds': seconds,
+        'ratio_to_ours': _ratios(seconds),
+        'seconds_with_build': with_build,
+        'ratio_to_ours_with_build': _ratios(with_build),
+        'ipopt_build_seconds': built['ipopt'],
+        'ipopt_compiled_build_seconds': built['ipopt_compiled'],
+        'best_rw': {solver: min((event['rw'] for event in _trace(outcome)), default=None)
+                    for solver, outcome in outcomes.items()},
+        # where it is well above `seconds`, the machine was busy with something else
+        'wall_seconds': when('wall'),
+        'not_asked': list(NOT_ASKED[system]),
+        'notes': {solver: note for solver, outcome in outcomes.items()
+                  if (note := outcome.failure or outcome.find('end'))},
+    }
+
+
+def _ratios(seconds: dict[str, dict[str, float | None]]) -> dict[str, dict[str, float | None]]:
+    return {name: {solver: None if t is None or not times['ours'] else t / times['ours']
+                   for solver, t in times.items() if solver != 'ours'}
+            for name, times in seconds.items()}
+
+
+def _add_cost(figures: dict[str, Any], name: str, sizes: dict[int, tuple[int, int, int, int]],
+              comparison: _Comparison) -> None:
+    _tell(f'cost of an iteration by {name}')
+    outcome = process.run(solvers.measure_cost, list(sizes.values()), _COST_LIMIT,
+                          folder=comparison.folder, megabytes=comparison.plan.megabytes)
+    found = [event for event in outcome.events if 'size' in event]
+    if outcome.failure or len(found) < len(sizes):
+        raise RuntimeError(f'the cost by {name} could not be measured: {outcome.failure}')
+    for n, event in zip(sizes, found, strict=True):
+        figures.setdefault(f'seconds_per_iteration_by_{name}', {})[str(n)] = event['seconds']
+        if name == 'samples':
+            figures.setdefault('peak_memory_by_samples', {})[str(n)] = event['megabytes']
+
+
+def _table_of(case: dict[str, Any]) -> str:
+    """Write one case: seconds to each rw, and in brackets how many times ours that is."""
+    def cell(name: str, solver: str) -> str:
+        seconds, ratio = case['seconds'][name][solver], case['ratio_to_ours'][name].get(solver)
+        return '-' if seconds is None else f'{seconds:.3g}' + (f' ({ratio:.1f})' if ratio else '')
+
+    rows = [(label, *(cell(name, solver) for name in TARGETS),
+             f'{case.get(f"{solver}_build_seconds") or 0.0:.1f}', case['notes'].get(solver, ''))
+            for solver, label in SOLVERS.items()]
+    return (f'{case["system"]}, N = {case["samples"]}, {case["hidden"]} hidden units, '
+            f'{case["parameters"]} parameters: seconds to rw (times ours)\n\n'
+            + table(('', *TARGETS, 'build [s]', ''), rows))
+
+
+def _tables_of_cost(figures: dict[str, Any]) -> Iterator[str]:
+    memory = figures['peak_memory_by_samples']
+    for title, name in (('N (n_x = 2, n_z = 3, 16 hidden units)', 'samples'),
+                        ('n_z (n_x = 1, 17 hidden units, N = 2000)', 'n_z'),
+                        ('n_x (n_z = n_x + 2, 16 hidden units, N = 2000)', 'n_x')):
+        peaks = memory if name == 'samples' else {}
+        yield f'cost of an iteration by {title}\n\n' + table((name, 'ms', 'peak memory [MB]'), [
+            (size, f'{1e3 * seconds:.3f}', f'{peaks[size]:.1f}' if peaks.get(size) else '-')
+            for size, seconds in figures[f'seconds_per_iteration_by_{name}'].items()])
+
+
+def _draw(path: Path, cases: dict[tuple[str, int, int], dict[str, process.Outcome]],
+          figures: dict[str, Any]) -> None:
+    """Draw rw over time for all solvers and the cost of an iteration, as far as there is any."""
+    with drawing(path, 1, 3, size=(14.0, 5.0), width_ratios=(1.0, 1.0, 0.8)) as (figure, axes):
+        for ax, system in zip(axes, SYSTEMS, strict=False):
+            of_system = [case for case in figures['cases'] if case['system'] == system]
+            for case in sorted(of_system, key=lambda case: (
+                    case['samples'], case['hidden']) == _DRAWN)[-1:]:
+                _draw_traces(ax, cases[system, case['samples'], case['hidden']], case)
+        if 'seconds_per_iteration_by_samples' in figures:
+            _draw_cost(axes[2], figures)
+        for solver, label in SOLVERS.items():
+            axes[0].plot([], [], color=_COLOURS[solver], lw=_width(solver), label=label)
+        legend(figure, axes[:1], len(SOLVERS))
+        machine = figures['machine']
+        figure.suptitle(
+            f'Training: accuracy over time from the same start ({machine["processor"]}, one '
+            f'thread, torch {machine["torch"]}, casadi {machine["casadi"]})', fontsize=11)
+
+
+def _width(solver: str) -> float:
+    return 2.6 if solver == 'ours' else 1.6
+
+
+def _draw_traces(ax: Axes, outcomes: dict[str, process.Outcome], case: dict[str, Any]) -> None:
+    last = _FIRST
+    for solver, outcome in outcomes.items():
+        if not (trace := _trace(outcome)):
+            continue
+        # up to the end, where the solver may not have improved for a while
+        seconds = [event['seconds'] for event in trace] + [
+            outcome.find('ended') or trace[-1]['seconds']]
+        rw = [event['rw'] for event in trace] + [trace[-1]['rw']]
+        ax.plot(np.maximum(seconds, _FIRST), rw, color=_COLOURS[solver], lw=_width(solver),
+                drawstyle='steps-post')
+        last = max(last, seconds[-1])
+        if build := case.get(f'{solver}_build_seconds'):
+            ax.annotate(f'+{build:.0f} s to build', (seconds[-1], rw[-1]), xytext=(5, -3),
+                        textcoords='offset points', fontsize=8, color=_COLOURS[solver])
+    for name, target in TARGETS.items():
+        if name not in case['not_asked']:
+            ax.axhline(target, color='0.5', lw=0.9, ls=':', zorder=1)
+    ax.set(xscale='log', yscale='log', xlim=(_FIRST, 25.0 * last), xlabel='time of one thread [s]',
+           ylabel='relative residual rw on the training samples')
+    ax.set_title(f'{case["system"]}: N = {case["samples"]}, n$_z$ = 3, {case["hidden"]} hidden '
+                 'units', fontsize=10)
+
+
+def _draw_cost(ax: Axes, figures: dict[str, Any]) -> None:
+    by_samples = figures['seconds_per_iteration_by_samples']
+    samples, seconds = np.array([int(n) for n in by_samples]), np.array(list(by_samples.values()))
+    ax.plot(samples, seconds, 'o-', color=_COLOURS['ours'], lw=2.0,
+            label='ours, with its peak memory beyond the data')
+    ax.plot(samples, seconds[-1] * samples / samples[-1], color='0.5', lw=1.0, ls='--',
+            label='proportional to N')
+    for n, s in zip(samples, seconds, strict=True):
+        if peak := figures['peak_memory_by_samples'][str(n)]:
+            ax.annotate(f'{peak:.0f} MB', (n, s), xytext=(-8, 6), fontsize=8, ha='right',
+                        textcoords='offset points', color='0.3')
+    ax.legend(fontsize=8, loc='lower right')
+    ax.set(xscale='log', yscale='log', xlim=(samples[0] / 8, samples[-1] * 3),
+           xlabel='samples N', ylabel='time of an iteration [s]')
+    ax.set_title('a step of ours: n$_x$ = 2, n$_z$ = 3, 16 units', fontsize=10)
