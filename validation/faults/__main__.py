@@ -4,16 +4,16 @@
 """Run the campaign: ``python -m validation.faults [case | group | soak ...] [--quick]``."""
 
 import argparse
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 import sys
 
 from koopman_ros.testing import deferred_interrupt
 from validation.faults import report
-from validation.faults.case import Case, Outcome, run
+from validation.faults.case import Case
 from validation.faults.cases import CASES
-from validation.faults.endurance import Endurance, HOURS, run_endurance
-from validation.faults.figure import draw
+from validation.faults.endurance import HOURS, run_endurance
+from validation.faults.harness import Outcome, run
 
 SOAK = 'soak'
 # One of each group, quick ones that say much.
@@ -51,7 +51,7 @@ def main(args: list[str] | None = None) -> int:
 
 def _run(cases: Sequence[Case], hours: float, folder: Path) -> int:
     outcomes: list[Outcome] = []
-    endured: Endurance | None = None
+    endured = None
     try:
         with deferred_interrupt() as check:
             for number, case in enumerate(cases, 1):
@@ -60,22 +60,15 @@ def _run(cases: Sequence[Case], hours: float, folder: Path) -> int:
                 print(report.line(outcomes[-1]), flush=True)
                 report.write(folder, outcomes, None)
             if hours:
-                endured = run_endurance(folder / 'logs' / SOAK, check, hours, _progress(hours))
+                endured = run_endurance(folder / 'logs' / SOAK, check, hours)
                 print('\n'.join(endured.reasons) or 'survived')
     except KeyboardInterrupt:
         print(f'\ninterrupted; what was finished is in {folder}', file=sys.stderr)
         return 130
-    report.write(folder, outcomes, endured, draw(outcomes, folder / report.FIGURE))
+    report.write(folder, outcomes, endured, report.draw(outcomes, folder / report.FIGURE))
     print(f'\n{sum(outcome.survived for outcome in outcomes)} of {len(outcomes)} cases survived; '
           f'see {folder / "report.md"}')
     return 0 if report.survived(outcomes, endured) else 1
-
-
-def _progress(hours: float) -> Callable[[float], None]:
-    def show(share: float) -> None:
-        print(f'\r{SOAK}: {share * hours:5.1f} of {hours:g} h ', end='', flush=True)
-
-    return show
 
 
 if __name__ == '__main__':

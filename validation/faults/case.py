@@ -1,98 +1,136 @@
 # SPDX-FileCopyrightText: 2026 The koopman_ros Authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""A case of the campaign: what is done to a running loop, and what is expected of it."""
+"""A case of the campaign, and what was seen of it while it ran: plain figures, without ROS."""
+
+from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field, fields
-from pathlib import Path
-import time
-from typing import Any
+from dataclasses import dataclass, field
+import itertools
+import math
+from typing import NamedTuple, TYPE_CHECKING
 
-from koopman_ros.testing import HarnessError
-from validation.faults.harness import FaultHarness, LOCKSTEP
-from validation.faults.judge import Bounds, judge, Verdict
-from validation.faults.trace import Trace
+import numpy as np
+
+from koopman_ros.arrays import Array
+from koopman_ros.parameters.controller import ControllerParameters
+from koopman_ros.reasons import Code
+
+if TYPE_CHECKING:
+    from validation.faults.harness import FaultHarness
 
 SETPOINT = 46.0  # degC; 5 K below the steady state that the reactor starts from
-SETTLED = 240.0  # s of plant time from the start until the reactor stays there
-LIMIT = 300.0  # s of wall time for a case, on a machine that is busy otherwise
+LOCKSTEP = {'lockstep': True, 'speed': 0.0, 'lockstep_timeout': 0.5}
+RATE = ControllerParameters.coolant_rate_limit / 60.0  # K/s
+BAND = 0.3  # K around the set-point that counts as back
 
 
 @dataclass(frozen=True)
 class Case:
     """A fault, and what the loop is to make of it."""
 
-    name: str  #: by which it is called on the command line
     group: str  #: heading in the report
+    name: str  #: by which it is called on the command line
     does: str  #: what is done, for the report
-    #: does it: waits, begins, puts the fault in, ends it. The runner has let the loop settle
-    #: before, and lets it recover afterwards
+    #: does it; the runner has let the loop settle before, and lets it recover afterwards
     play: Callable[[FaultHarness], None]
-    bounds: Bounds = field(default_factory=Bounds)  #: what the loop must keep to
+
     between: bool = False  #: whether messages are altered
-    #: parameters on top of lock-step at full speed
-    plant: Mapping[str, object] = field(default_factory=lambda: LOCKSTEP)
+    plant: Mapping[str, object] = field(default_factory=lambda: LOCKSTEP)  #: parameters
     controller: Mapping[str, object] = field(default_factory=dict)  #: parameters
     setpoint: float = SETPOINT  #: degC, requested at the start
-    settle: float = SETTLED  #: plant time before the case is played, s
+    settle: float = 240.0  #: plant time from the start until it is played, s
     afterwards: float = 360.0  #: plant time that the loop runs on after the fault, s
 
-
-_OF_BOUNDS = frozenset(item.name for item in fields(Bounds))
-
-
-def case(group: str, name: str, does: str, play: Callable[[FaultHarness], None], **details: Any
-         ) -> Case:
-    """Build a case; the details are fields of it, or of its bounds."""
-    of_case = {key: value for key, value in details.items() if key not in _OF_BOUNDS}
-    bounds = Bounds(**{key: details[key] for key in details if key in _OF_BOUNDS})
-    return Case(name, group, does, play, bounds, **of_case)
-
-
-@dataclass(frozen=True)
-class Outcome:
-    """What became of a case."""
-
-    case: Case  #: the case
-    trace: Trace  #: what happened
-    #: what is held against it, and its figures; None where it could not be tried
-    verdict: Verdict | None
-    skipped: str  #: why it could not be tried here
-    wall: float  #: what it took, s
-
-    @property
-    def survived(self) -> bool:
-        """Whether it was tried and nothing is held against it."""
-        return self.verdict is not None and self.verdict.survived
+    #: largest step between two commands, K; never less than the rate limit allows for the time
+    #: between them, where a busy machine has missed measurements
+    largest_step: float = RATE
+    #: plant time from the end of the fault within which the reactor must be back, s
+    recovery: float = 300.0
+    bump: float = math.inf  #: largest step from the fault on, K, where nothing calls for any
+    #: distance from the set-point that counts as back, K; infinity where none is asked
+    band: float = BAND
+    offset: float = math.inf  #: largest distance from the set-point in the last seconds, K
+    worst: float = math.inf  #: largest distance from the set-point from the fault on, K
+    #: regular expressions that diagnostics (``<node>: <task>: <sentence>``) must have matched from
+    #: the beginning of the fault on
+    says: tuple[str, ...] = ()
+    code: Code | None = None  #: reason that the controller's records must have given since then
+    allowed_errors: tuple[str, ...] = ()  #: statuses (``<node>: <task>``) that may end in ERROR
 
 
-class SkipError(Exception):
-    """A case cannot be tried on this machine; the message says why."""
+class Sample(NamedTuple):
+    """A true temperature of the reactor, in degrees Celsius, at a plant time in seconds."""
+
+    seconds: float
+    celsius: float
 
 
-def run(case: Case, folder: Path, check: Callable[[], None] = lambda: None) -> Outcome:
-    """
-    Run a case in a domain of its own and judge it.
+class Command(NamedTuple):
+    """A coolant command in degrees Celsius, with the stamp that it carries."""
 
-    :param folder: for what the processes print.
-    :param check: called all the time; may raise to end the case, whose processes end then, too.
-    """
-    started = time.monotonic()
-    folder.mkdir(parents=True, exist_ok=True)
-    skipped = ''
-    loop = FaultHarness(folder, LIMIT, check, case.between)
-    with loop:
-        try:
-            loop.start_loop(case.setpoint, case.plant, case.controller)
-            loop.run_until(case.settle)
-            case.play(loop)
-            loop.run_for(case.afterwards)
-            loop.expect(any('"command"' in text for _, text in loop.trace.records),
-                        'the controller recorded no command')
-        except HarnessError as error:
-            loop.trace.complaints.append(str(error))
-        except SkipError as reason:
-            skipped = str(reason)
-    verdict = None if skipped else judge(loop.trace, case.bounds)
-    return Outcome(case, loop.trace, verdict, skipped, time.monotonic() - started)
+    seconds: float
+    celsius: float
+    stamp_ns: int
+
+
+class Status(NamedTuple):
+    """A status of diagnostics: whose, how bad (0 is OK, 1 WARN, 2 ERROR), and the sentence."""
+
+    seconds: float
+    name: str
+    level: int
+    message: str
+    values: dict[str, str]
+
+
+@dataclass
+class Trace:
+    """All that was seen of a case; times are plant time in seconds since the first measurement."""
+
+    samples: list[Sample] = field(default_factory=list)  #: before any fault of the sensor
+    #: what the operator wanted: (from when on, degrees Celsius)
+    setpoints: list[tuple[float, float]] = field(default_factory=list)
+    commands: list[Command] = field(default_factory=list)  #: as the controller published them
+    coolants: dict[int, float] = field(default_factory=dict)  #: measured input in degC by stamp
+    delivered: list[int] = field(default_factory=list)  #: stamps that reached the controller
+    statuses: list[Status] = field(default_factory=list)  #: of all nodes
+    #: what the controller recorded of itself: (plant time, text)
+    records: list[tuple[float, str]] = field(default_factory=list)
+    begin: float = math.inf  #: when the fault began
+    end: float = math.inf  #: when the fault was over, or had been put in where it stays
+    complaints: list[str] = field(default_factory=list)  #: what went wrong, in sentences
+    notes: list[str] = field(default_factory=list)  #: figures worth a line in the report
+
+    def reported(self) -> list[str]:
+        """Return what diagnostics reported from the fault on: ``<node>: <task>: <sentence>``."""
+        return [f'{status.name}: {status.message}' for status in self.statuses
+                if status.seconds >= self.begin]
+
+    def last(self, name: str) -> Status | None:
+        """Return the last status of a task."""
+        return next((s for s in reversed(self.statuses) if s.name == name), None)
+
+    def steps(self) -> tuple[Array, Array]:
+        """
+        Return the times (N - 1,) of the commands after the first and their steps in K.
+
+        A step is that from the command before, or from the measured input, whichever is
+        less: when messages are lost it is not the one, and when the controller is a new one
+        it need not be the other.
+        """
+        times = np.array([command.seconds for command in self.commands[1:]])
+        steps = [min(abs(after.celsius - before.celsius),
+                     abs(after.celsius - self.coolants.get(after.stamp_ns, math.inf)))
+                 for before, after in itertools.pairwise(self.commands)]
+        return times, np.array(steps, dtype=np.float64)
+
+    def errors(self) -> tuple[Array, Array]:
+        """Return the times (N,) of the samples and |T - set-point| (N,) in K."""
+        samples = np.array(self.samples, dtype=np.float64).reshape(-1, 2)
+        since, wanted = np.array(self.setpoints, dtype=np.float64).reshape(-1, 2).T
+        latest = np.searchsorted(since, samples[:, 0], side='right') - 1
+        asked = latest >= 0
+        times, temperatures = samples[asked].T
+        return times, np.abs(temperatures - wanted[latest[asked]])

@@ -5,7 +5,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
+import contextlib
+from dataclasses import dataclass
 from pathlib import Path
 import re
 import signal
@@ -18,15 +20,62 @@ from sensor_msgs.msg import Temperature
 
 from koopman_ros.ros import topics
 from koopman_ros.testing import Harness, HarnessError, NodeProcess
-from validation.faults.alterations import Alteration, unchanged
-from validation.faults.interceptor import Interceptor, REMAPPED
+from validation.faults.case import Case, Trace
+from validation.faults.interceptor import Alteration, Interceptor, REMAPPED, unchanged
+from validation.faults.judge import judge, Verdict
 
 T = TypeVar('T')
-LOCKSTEP = {'lockstep': True, 'speed': 0.0, 'lockstep_timeout': 0.5}
 _STEADY = 0.3  # s of wall time that a set-point must stay the one tracked
 _ASK_AGAIN = 0.2  # s of wall time
 # s of wall time for anything that is waited for, also on a machine that is busy otherwise
 PATIENCE = 120.0
+LIMIT = 300.0  # s of wall time for a case, on a machine that is busy otherwise
+
+
+class SkipError(Exception):
+    """A case cannot be tried on this machine; the message says why."""
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """What became of a case."""
+
+    case: Case  #: the case
+    trace: Trace  #: what happened
+    verdict: Verdict | None  #: what is held against it; None where it could not be tried
+    skipped: str  #: why it could not be tried here
+    wall: float  #: what it took, s
+
+    @property
+    def survived(self) -> bool:
+        """Whether it was tried and nothing is held against it."""
+        return self.verdict is not None and not self.verdict.reasons
+
+
+def run(case: Case, folder: Path, check: Callable[[], None] = lambda: None) -> Outcome:
+    """
+    Run a case in a domain of its own and judge it.
+
+    :param folder: for what the processes print.
+    :param check: called all the time; may raise to end the case, whose processes end then, too.
+    """
+    started = time.monotonic()
+    folder.mkdir(parents=True, exist_ok=True)
+    skipped = ''
+    with FaultHarness(folder, LIMIT, check, case.between) as loop:
+        try:
+            loop.start_loop(case.setpoint, case.plant, case.controller)
+            loop.run_until(case.settle)
+            case.play(loop)
+            loop.run_for(case.afterwards)
+            loop.expect(any('"command"' in text for _, text in loop.trace.records),
+                        'the controller recorded no command')
+        except HarnessError as error:
+            loop.trace.complaints.append(str(error))
+        except SkipError as reason:
+            skipped = str(reason)
+    verdict = None if skipped else judge(loop.trace, case)
+    return Outcome(case, loop.trace, verdict, skipped, time.monotonic() - started)
 
 
 class FaultHarness:
@@ -63,12 +112,9 @@ class FaultHarness:
     def __exit__(self, kind: type[BaseException] | None, error: BaseException | None,
                  traceback: TracebackType | None) -> None:
         for name, code in self.ros.close().items():
-            if code:
-                self.trace.complaints.append(
-                    f'{name} ended with code {code}, see {self.folder / name}.log')
+            self.expect(not code, f'{name} ended with code {code}, see {self.folder / name}.log')
         for process in self.ros.processes:
-            if 'Traceback' in process.output():
-                self.trace.complaints.append(f'{process.log} holds a traceback')
+            self.expect('Traceback' not in process.output(), f'{process.log} holds a traceback')
 
     def _each_turn(self) -> None:
         self._check()
@@ -80,11 +126,7 @@ class FaultHarness:
     def start(self, name: str, parameters: Mapping[str, object] | None = None,
               arguments: tuple[str, ...] = (), command: tuple[str, ...] | None = None,
               called: str = '') -> NodeProcess:
-        """
-        Start a process as :class:`Harness` does.
-
-        :param called: its name here, that of the node by default.
-        """
+        """Start a process as :class:`Harness` does; it is `called` as the node by default."""
         called = called or name
         if self._between and called == 'plant':
             arguments += REMAPPED
@@ -196,12 +238,11 @@ class FaultHarness:
 
     # The fault.
 
-    def begin(self) -> None:
-        """Mark that the fault begins."""
+    @contextlib.contextmanager
+    def fault(self) -> Iterator[None]:
+        """Mark when the fault begins, and when it is over or stays from then on."""
         self.trace.begin = self.now
-
-    def end(self) -> None:
-        """Mark that the fault is over, or stays from now on."""
+        yield
         self.trace.end = self.now
 
     def alter(self, seconds: float, measurements: Alteration = unchanged,

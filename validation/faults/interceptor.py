@@ -1,9 +1,18 @@
 # SPDX-FileCopyrightText: 2026 The koopman_ros Authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""What lies between plant and controller: traces messages, and alters them where asked to."""
+"""
+What lies between plant and controller: traces messages, and alters them where asked to.
+
+An alteration turns one message into none or more; one with a memory is made anew for each case.
+"""
+
+from collections import deque
+from collections.abc import Callable
+from typing import NamedTuple
 
 from diagnostic_msgs.msg import DiagnosticArray
+import numpy as np
 from rclpy.node import Node
 from sensor_msgs.msg import Temperature
 from std_msgs.msg import String
@@ -11,8 +20,7 @@ from std_msgs.msg import String
 from koopman_ros.ros import topics
 from koopman_ros.ros.codec import stamp_message, stamp_nanoseconds
 from koopman_ros.units import NANOSECONDS
-from validation.faults.alterations import Alteration, Packet, unchanged
-from validation.faults.trace import Command, Sample, Status, Trace
+from validation.faults.case import Command, Sample, Status, Trace
 
 # that wait to be read: a storm makes thousands while the harness is busy sending it
 MOST_RECORDS = 100_000
@@ -22,6 +30,95 @@ PLANT_COOLANT = 'plant/coolant_setpoint'
 # What a plant is started with when messages are altered.
 REMAPPED = ('-r', f'{topics.TEMPERATURE}:={PLANT_TEMPERATURE}',
             '-r', f'{topics.COOLANT_SETPOINT}:={PLANT_COOLANT}')
+
+
+class Packet(NamedTuple):
+    """A stamped temperature on its way, in degrees Celsius."""
+
+    stamp_ns: int
+    celsius: float
+
+
+Alteration = Callable[[Packet], list[Packet]]
+
+
+def unchanged(packet: Packet) -> list[Packet]:
+    """Pass a message on."""
+    return [packet]
+
+
+def changed(change: Callable[[Packet, Packet], Packet]) -> Alteration:
+    """Replace each message; `change` takes the first message and this one."""
+    first: list[Packet] = []
+
+    def alter(packet: Packet) -> list[Packet]:
+        first.append(packet)
+        del first[1:]
+        return [change(first[0], packet)]
+
+    return alter
+
+
+def value(change: Callable[[float, float], float]) -> Alteration:
+    """Replace the value; `change` takes the seconds since the first message and the value."""
+    return changed(lambda first, packet: packet._replace(celsius=change(
+        (packet.stamp_ns - first.stamp_ns) / NANOSECONDS, packet.celsius)))
+
+
+def frozen() -> Alteration:
+    """Repeat the first value for ever."""
+    return changed(lambda first, packet: packet._replace(celsius=first.celsius))
+
+
+def stamps_frozen() -> Alteration:
+    """Give every message the stamp of the first."""
+    return changed(lambda first, packet: packet._replace(stamp_ns=first.stamp_ns))
+
+
+def stamped(change: Callable[[int], int]) -> Alteration:
+    """Replace the stamp in nanoseconds."""
+    return lambda packet: [packet._replace(stamp_ns=change(packet.stamp_ns))]
+
+
+def noise(deviation: float, seed: int = 0) -> Alteration:
+    """Add normal noise of a standard deviation in K."""
+    random = np.random.default_rng(seed)
+    return value(lambda _, celsius: celsius + float(random.normal(0.0, deviation)))
+
+
+def lost(share: float = 1.0, seed: int = 0) -> Alteration:
+    """Lose a share of the messages, 1 for all."""
+    random = np.random.default_rng(seed)
+    return lambda packet: [] if random.random() < share else [packet]
+
+
+def twice(packet: Packet) -> list[Packet]:
+    """Deliver a message twice."""
+    return [packet, packet]
+
+
+def swapped() -> Alteration:
+    """Deliver each two messages in the wrong order."""
+    held: list[Packet] = []
+
+    def alter(packet: Packet) -> list[Packet]:
+        if not held:
+            held.append(packet)
+            return []
+        return [packet, held.pop()]
+
+    return alter
+
+
+def delayed(messages: int) -> Alteration:
+    """Deliver each message when so many later ones were sent."""
+    waiting: deque[Packet] = deque()
+
+    def alter(packet: Packet) -> list[Packet]:
+        waiting.append(packet)
+        return [waiting.popleft()] if len(waiting) > messages else []
+
+    return alter
 
 
 class Interceptor:
@@ -54,15 +151,13 @@ class Interceptor:
             self._to_controller = node.create_publisher(
                 Temperature, topics.TEMPERATURE, topics.LOOP_QOS)
             self._to_plant = node.create_publisher(Temperature, PLANT_COOLANT, topics.LOOP_QOS)
-        node.create_subscription(
-            DiagnosticArray, topics.DIAGNOSTICS, self._on_diagnostics, topics.LOOP_QOS)
-        node.create_subscription(
-            String, topics.CONTROLLER_EVENTS, self._on_record,
-            topics.profile(MOST_RECORDS, reliable=True))
-        node.create_subscription(
-            Temperature, topics.COOLANT_TEMPERATURE, self._on_coolant, topics.LATCHED_QOS)
-        node.create_subscription(
-            Temperature, topics.COOLANT_SETPOINT, self._on_command, topics.LOOP_QOS)
+        for kind, topic, callback, qos in (
+                (DiagnosticArray, topics.DIAGNOSTICS, self._on_diagnostics, topics.LOOP_QOS),
+                (String, topics.CONTROLLER_EVENTS, self._on_record,
+                 topics.profile(MOST_RECORDS, reliable=True)),
+                (Temperature, topics.COOLANT_TEMPERATURE, self._on_coolant, topics.LATCHED_QOS),
+                (Temperature, topics.COOLANT_SETPOINT, self._on_command, topics.LOOP_QOS)):
+            node.create_subscription(kind, topic, callback, qos)
 
     def open(self) -> None:
         """Trace the plant from now on."""
@@ -110,8 +205,7 @@ class Interceptor:
         """Give the plant the last command that arrived, under the open stamp."""
         if self._held is None or self._stamp_ns is None:
             return
-        self._to_plant.publish(_message(Packet(self._stamp_ns, self._held)))
-        for packet in arriving[:-1]:
+        for packet in (Packet(self._stamp_ns, self._held), *arriving[:-1]):
             self._to_plant.publish(_message(packet))
 
     def _on_record(self, message: String) -> None:

@@ -1,43 +1,46 @@
 # SPDX-FileCopyrightText: 2026 The koopman_ros Authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""The judge of the fault campaign: whatever is wrong with a trace is found."""
+"""What is wrong with a trace is found; what happens to messages on their way is what was asked."""
 
 from dataclasses import replace
 import math
 
+import numpy as np
 import pytest
 
 from koopman_ros.reasons import Code
 from koopman_ros.replay.records import parse
 from support.recorded_controller import Recorded, STEADY
-from validation.faults.judge import Bounds, judge, Responses, responses
-from validation.faults.trace import Command, Sample, Status, Trace
+from validation.faults import interceptor
+from validation.faults.case import Case, Command, Sample, Status, Trace
+from validation.faults.interceptor import Packet
+from validation.faults.judge import judge, Responses, responses
 
-BOUNDS = Bounds(recovery=50.0, says=('^controller: control: .*frozen',))
+CASE = Case('test', 'test', '', lambda _: None, recovery=50.0,
+            says=('^controller: control: .*frozen',))
 SECONDS = 200
 BEGIN, END = 50, 60
-RECORDING = 'trainer: recording'
+CONTROL, RECORDING = 'controller: control', 'trainer: recording'
 
 
 def trace(temperature=lambda t: 46.0 + (1.0 if BEGIN <= t < END + 20 else 0.0),
           coolant=lambda t: 20.0 + 0.01 * t):
     """Return a trace that keeps to the bounds: 1 K off until 20 s after the fault."""
-    statuses = [Status(55.0, 'controller: control', 2, 'hold: the sensor is frozen', {}),
-                Status(70.0, 'controller: control', 0, 'automatic', {})]
     return Trace(
         samples=[Sample(float(t), temperature(t)) for t in range(SECONDS)],
-        setpoints=[(0.0, 46.0)], begin=float(BEGIN), end=float(END), statuses=statuses,
+        setpoints=[(0.0, 46.0)], begin=float(BEGIN), end=float(END),
+        statuses=[Status(55.0, CONTROL, 2, 'hold: the sensor is frozen', {}),
+                  Status(70.0, CONTROL, 0, 'automatic', {})],
         commands=[Command(float(t), coolant(t), t) for t in range(SECONDS)])
 
 
-def reasons(found):
-    return '; '.join(judge(found, BOUNDS).reasons)
+def reasons(found, **bounds):
+    return '; '.join(judge(found, replace(CASE, **bounds)).reasons)
 
 
 def test_figures_of_a_case_that_is_survived():
-    verdict = judge(trace(), BOUNDS)
-    assert verdict.survived
+    verdict = judge(trace(), CASE)
     assert verdict.reasons == ()
     assert verdict.worst_error == pytest.approx(1.0)
     assert verdict.worst_step == pytest.approx(0.01)
@@ -50,7 +53,7 @@ def test_commands_that_do_not_follow_from_the_records_are_not_survived():
         controller.measure(STEADY + 0.1 * k)
     found = trace()
     found.records = [(60.0, text) for text in controller.texts]
-    assert judge(found, BOUNDS).survived
+    assert not reasons(found)
     altered = parse(controller.texts[3])
     altered.fields['command'][0] += 1e-12
     found.records[3] = 60.0, altered.text()
@@ -65,12 +68,11 @@ def test_reason_is_looked_for_in_the_records_from_the_fault_on():
     controller = Recorded()
     controller.measure(STEADY)
     controller.measure(math.nan)
-    bounds = replace(BOUNDS, codes=(Code.NOT_FINITE,))
     found = trace()
     for seconds, words in ((BEGIN, ''), (BEGIN - 1.0, 'no record gives the reason')):
         found.records = [(seconds, text) for text in controller.texts]
-        assert words in '; '.join(judge(found, bounds).reasons)
-        assert judge(found, bounds).survived is not bool(words)
+        assert reasons(found, code=Code.NOT_FINITE).startswith(words)
+        assert bool(reasons(found, code=Code.NOT_FINITE)) is bool(words)
 
 
 @pytest.mark.parametrize('celsius', [4.9, 32.1, math.nan, math.inf, -math.inf])
@@ -83,11 +85,11 @@ def test_bump_of_the_command_is_not_survived():
     found = trace(coolant=lambda t: 20.0 if t < 100 else 25.0)
     assert reasons(found) == (
         'the coolant command stepped by 5.00 K at 100 s, 1 K are allowed after 1 s')
-    assert judge(found, BOUNDS).worst_step == pytest.approx(5.0)
+    assert judge(found, CASE).worst_step == pytest.approx(5.0)
     # from what acts there is no bump
     found.coolants[100] = 24.8
-    assert judge(found, BOUNDS).survived
-    assert judge(found, BOUNDS).worst_step == pytest.approx(0.2)
+    assert not reasons(found)
+    assert judge(found, CASE).worst_step == pytest.approx(0.2)
     found.coolants[100] = 22.0
     assert 'the coolant command stepped by 3.00 K at 100 s' in reasons(found)
     # after missed measurements, as the rate limit allows in the time that counts
@@ -96,7 +98,7 @@ def test_bump_of_the_command_is_not_survived():
         found = trace(coolant=lambda t, step=step: 20.0 if t < 100 else 20.0 + step)
         del found.commands[100 - missed:100]
         assert words in reasons(found)
-        assert judge(found, BOUNDS).survived is not bool(words)
+        assert bool(reasons(found)) is bool(words)
 
 
 @pytest.mark.parametrize(('temperature', 'bound', 'enough', 'words'), [
@@ -112,19 +114,17 @@ def test_bump_of_the_command_is_not_survived():
      'not back within 0.3 K of the set-point; 50 s are allowed, and 0.40 K are left')])
 def test_bounds_are_kept_to(temperature, bound, enough, words):
     found = trace() if temperature is None else trace(temperature)
-    assert judge(found, replace(BOUNDS, **bound)).reasons == (words,)
-    assert judge(found, replace(BOUNDS, **enough)).survived
+    assert reasons(found, **bound) == words
+    assert not reasons(found, **enough)
 
 
-def test_coming_back_is_not_being_back():
-    found = trace(temperature=lambda t: 46.5 if BEGIN <= t < END or t == 150 else 46.0)
-    assert judge(found, BOUNDS).recovery == 91.0
-
-
-def test_error_is_that_from_the_set_point_of_its_time():
+def test_error_and_recovery_are_those_of_the_set_point_of_their_time():
     found = trace(temperature=lambda t: 46.0 if t < 100 else 44.0)
     found.setpoints.append((100.0, 44.0))
-    assert judge(found, BOUNDS).worst_error == 0.0
+    assert judge(found, CASE).worst_error == 0.0
+    # coming back is not being back
+    found = trace(temperature=lambda t: 46.5 if BEGIN <= t < END or t == 150 else 46.0)
+    assert judge(found, CASE).recovery == 91.0
 
 
 @pytest.mark.parametrize(('change', 'words'), [
@@ -135,7 +135,7 @@ def test_error_is_that_from_the_set_point_of_its_time():
      'the reactor reached 61.0 degC, 60 degC is a runaway'),
     ({'complaints': ['controller ended with code -6']}, 'controller ended with code -6'),
     # before the fault, or by another node
-    ({'statuses': [Status(10.0, 'controller: control', 2, 'hold: the sensor is frozen', {}),
+    ({'statuses': [Status(10.0, CONTROL, 2, 'hold: the sensor is frozen', {}),
                    Status(56.0, 'plant: simulation', 0, 'frozen', {})]},
      'diagnostics never said "^controller: control: .*frozen"'),
     ({'statuses': [*trace().statuses, Status(150.0, RECORDING, 2, 'the disk is full', {})]},
@@ -143,8 +143,7 @@ def test_error_is_that_from_the_set_point_of_its_time():
 def test_what_else_is_not_survived(change, words):
     found = replace(trace(), **change)
     assert words in reasons(found)
-    assert judge(found, replace(BOUNDS, allowed_errors=(RECORDING,))).survived == (
-        RECORDING in words)
+    assert bool(reasons(found, allowed_errors=(RECORDING,))) is (RECORDING not in words)
 
 
 @pytest.mark.parametrize(('delivered', 'answers', 'expected'), [
@@ -158,3 +157,42 @@ def test_what_else_is_not_survived(change, words):
 def test_responses_are_counted(delivered, answers, expected):
     assert responses(delivered, answers) == expected
     assert responses(delivered, answers).complete == (delivered == answers)
+
+
+VALUES = [5, 6, 7, 8, 9, 10]
+STAMPS = [k * 1_000_000_000 for k in VALUES]
+SENT = [Packet(stamp, float(k)) for stamp, k in zip(STAMPS, VALUES, strict=True)]
+
+
+def arriving(alter, sent=SENT):
+    return [packet for message in sent for packet in alter(message)]
+
+
+@pytest.mark.parametrize(('alter', 'values', 'stamps'), [
+    (interceptor.unchanged, VALUES, STAMPS),
+    (interceptor.frozen(), [5] * 6, STAMPS),
+    (interceptor.value(lambda seconds, shown: shown + 10.0 * seconds),
+     [5, 16, 27, 38, 49, 60], STAMPS),
+    (interceptor.lost(), [], []),
+    (interceptor.lost(0.0), VALUES, STAMPS),
+    (interceptor.twice, [5, 5, 6, 6, 7, 7, 8, 8, 9, 9, 10, 10], None),
+    (interceptor.swapped(), [6, 5, 8, 7, 10, 9], None),
+    (interceptor.delayed(2), [5, 6, 7, 8], STAMPS[:4]),
+    (interceptor.stamped(lambda stamp_ns: stamp_ns + 7), VALUES, [k + 7 for k in STAMPS]),
+    (interceptor.stamps_frozen(), VALUES, STAMPS[:1] * 6)])
+def test_what_arrives(alter, values, stamps):
+    packets = arriving(alter)
+    assert [packet.celsius for packet in packets] == values
+    assert stamps in (None, [packet.stamp_ns for packet in packets])
+
+
+def test_a_share_is_lost_the_same_every_time_and_noise_has_its_deviation():
+    many = [Packet(k, 40.0) for k in range(4000)]
+    lossy = arriving(interceptor.lost(0.3), many)
+    assert len(lossy) == pytest.approx(2800, abs=150)
+    assert arriving(interceptor.lost(0.3), many) == lossy
+    noisy = arriving(interceptor.noise(2.0), many)
+    assert [packet.stamp_ns for packet in noisy] == list(range(4000))
+    shown = [packet.celsius for packet in noisy]
+    assert np.mean(shown) == pytest.approx(40.0, abs=0.15)
+    assert np.std(shown) == pytest.approx(2.0, rel=0.05)

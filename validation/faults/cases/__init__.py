@@ -3,20 +3,9 @@
 
 """The cases of the campaign, by group."""
 
-from validation.faults.case import Case
-from validation.faults.cases import (
-    clocks,
-    disturbances,
-    messages,
-    neighbours,
-    operators,
-    processes,
-    sensor,
-)
+from validation.faults.cases import messages, operators, processes
 
-CASES: dict[str, Case] = {
-    case.name: case
-    for group in (sensor, messages, clocks, processes, operators, neighbours, disturbances)
-    for case in group.CASES}
+CASES = {case.name: case for case in (
+    *messages.CASES, *processes.CASES, *operators.CASES)}
 
 __all__ = ['CASES']

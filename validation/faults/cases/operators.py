@@ -1,11 +1,11 @@
 # SPDX-FileCopyrightText: 2026 The koopman_ros Authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""Storms of requests: parameters, set-points and modes, good and bad, as fast as they go."""
+"""Storms of requests, as fast as they go, and plants that the model does not know."""
 
 from collections import deque
-from collections.abc import Callable, Iterator, Mapping
-import functools
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from functools import partial
 import itertools
 import math
 import time
@@ -18,19 +18,22 @@ from rclpy.task import Future
 from sensor_msgs.msg import Temperature
 from std_srvs.srv import SetBool
 
+from koopman_ros.parameters.controller import ControllerParameters
 from koopman_ros.reasons import Code
 from koopman_ros.ros import topics
-from validation.faults.case import case, SETPOINT
+from validation.faults.case import Case, LOCKSTEP, SETPOINT
 from validation.faults.harness import FaultHarness
 
-GROUP = 'operators'
 _AT_ONCE = 10  # requests on their way
 _REQUESTS = 400
 _STORM = 2.0  # s of wall time
 _WORKED_OFF = 30.0  # s of wall time, within which a storm is worked off on a busy machine
+STUCK_AT = 25.0  # degC; the set-point needs 23.4 degC, and the reactor gets 2.1 K too warm
+WINDUP = 3.0  # K; who has wound up meanwhile goes further to the other side
+CONCENTRATION = 0.87725294608097  # mol/L, that of the plant
 
 
-def _send(loop: FaultHarness, kind: Any, service: str, requests: Iterator[Any]) -> list[Any]:
+def _send(loop: FaultHarness, kind: Any, service: str, requests: Iterable[Any]) -> list[Any]:
     """Send requests as fast as they are answered, and return the answers."""
     client = loop.ros.node.create_client(kind, service)
     loop.wait(client.service_is_ready, f'there is no service {service}')
@@ -46,54 +49,35 @@ def _send(loop: FaultHarness, kind: Any, service: str, requests: Iterator[Any]) 
     return answers
 
 
-def _changes(values: Iterator[Mapping[str, Any]]) -> Iterator[SetParameters.Request]:
-    for change in values:
-        yield SetParameters.Request(parameters=[
-            Parameter(name, value=value).to_parameter_msg() for name, value in change.items()])
+def _change(change: Mapping[str, Any]) -> SetParameters.Request:
+    return SetParameters.Request(parameters=[
+        Parameter(name, value=value).to_parameter_msg() for name, value in change.items()])
 
 
-def _weights() -> Iterator[dict[str, Any]]:
-    random = np.random.default_rng(0)
+def _drawn(seed: int, ranges: Mapping[str, tuple[float, float]], exponents: bool = False
+           ) -> Iterator[dict[str, float]]:
+    """Draw parameters, or their decimal exponents, from ranges."""
+    random = np.random.default_rng(seed)
     for _ in range(_REQUESTS):
-        yield {'temperature_weight': float(10.0 ** random.uniform(-2.0, 2.0)),
-               'coolant_weight': float(10.0 ** random.uniform(-2.0, 2.0))}
+        drawn = {name: float(random.uniform(*range_)) for name, range_ in ranges.items()}
+        yield {name: 10.0 ** value for name, value in drawn.items()} if exponents else drawn
 
 
-def _limits() -> Iterator[dict[str, Any]]:
-    random = np.random.default_rng(1)
-    for _ in range(_REQUESTS):
-        yield {'coolant_min': float(random.uniform(5.0, 22.0)),
-               'coolant_max': float(random.uniform(24.0, 32.0)),
-               'coolant_rate_limit': float(random.uniform(1.0, 60.0))}
+_BAD: tuple[dict[str, Any], ...] = (
+    {'temperature_weight': math.nan}, {'temperature_weight': -1.0}, {'temperature_weight': 1},
+    {'coolant_weight': 0.0}, {'coolant_weight': math.inf}, {'coolant_weight': 'much'},
+    {'coolant_min': 60.0}, {'coolant_max': -10.0}, {'coolant_max': math.nan},
+    {'coolant_rate_limit': 0.0}, {'setpoint_ramp': -math.inf}, {'max_gain': 0.0},
+    {'max_riccati_residual': 2.0}, {'measurement_timeout': math.nan},
+    {'model': ''}, {'model': '/nowhere/lift.safetensors'}, {'model': 3.0})
 
 
-def _ramps() -> Iterator[dict[str, Any]]:
-    random = np.random.default_rng(2)
-    for _ in range(_REQUESTS):
-        yield {'setpoint_ramp': float(10.0 ** random.uniform(-3.0, 3.0))}
-
-
-_BAD: tuple[tuple[str, Any], ...] = (
-    ('temperature_weight', math.nan), ('temperature_weight', -1.0), ('temperature_weight', 1),
-    ('coolant_weight', 0.0), ('coolant_weight', math.inf), ('coolant_weight', 'much'),
-    ('coolant_min', 60.0), ('coolant_max', -10.0), ('coolant_max', math.nan),
-    ('coolant_rate_limit', 0.0), ('setpoint_ramp', -math.inf), ('max_gain', 0.0),
-    ('max_riccati_residual', 2.0), ('measurement_timeout', math.nan),
-    ('model', ''), ('model', '/nowhere/lift.safetensors'), ('model', 3.0))
-
-
-def _bad() -> Iterator[dict[str, Any]]:
-    for name, value in itertools.islice(itertools.cycle(_BAD), _REQUESTS):
-        yield {name: value}
-
-
-def _storm_of_parameters(values: Callable[[], Iterator[Mapping[str, Any]]], refused: bool = False
-                         ) -> Callable[[FaultHarness], None]:
-    def play(loop: FaultHarness) -> None:
-        loop.begin()
+def _storm_of_parameters(loop: FaultHarness, make: Callable[[], Iterable[Mapping[str, Any]]],
+                         refused: bool = False) -> None:
+    with loop.fault():
         loop.request(44.0)
         started = time.monotonic()
-        answers = _send(loop, SetParameters, 'controller/set_parameters', _changes(values()))
+        answers = _send(loop, SetParameters, 'controller/set_parameters', map(_change, make()))
         seconds = time.monotonic() - started
         loop.trace.notes.append(f'{len(answers)} changes at {len(answers) / seconds:.0f} 1/s')
         results = [result for answer in answers for result in answer.results]
@@ -108,20 +92,16 @@ def _storm_of_parameters(values: Callable[[], Iterator[Mapping[str, Any]]], refu
                 'controller', temperature_weight=1.0, coolant_weight=1.0, coolant_min=5.0,
                 coolant_max=32.0, coolant_rate_limit=60.0, setpoint_ramp=1000.0)
             loop.expect(not last, f'the defaults were refused: {last}')
-        loop.end()
-
-    return play
 
 
-def _storm_of_setpoints(values: Callable[[int], float]) -> Callable[[FaultHarness], None]:
-    """Return the play that asks for a set-point a thousand times a second."""
-    def play(loop: FaultHarness) -> None:
-        loop.begin()
+def _storm_of_setpoints(loop: FaultHarness, values: tuple[float, ...]) -> None:
+    """Ask for set-points in turn, a thousand times a second."""
+    with loop.fault():
         started = time.monotonic()
         sent = 0
         while (passed := time.monotonic() - started) < _STORM:
             while sent < 1000.0 * passed:
-                loop.setpoint.publish(Temperature(temperature=values(sent)))
+                loop.setpoint.publish(Temperature(temperature=values[sent % len(values)]))
                 sent += 1
             loop.linger(0.001)
         loop.trace.notes.append(f'{sent} set-points at {sent / passed:.0f} 1/s')
@@ -130,56 +110,103 @@ def _storm_of_setpoints(values: Callable[[int], float]) -> Callable[[FaultHarnes
         waited = time.monotonic() - over
         loop.trace.notes.append(f'the next one was tracked {waited:.1f} s of wall time later')
         loop.expect(waited < _WORKED_OFF, f'the next one was tracked {waited:.1f} s later only')
-        loop.end()
-
-    return play
 
 
 def _storm_of_modes(loop: FaultHarness) -> None:
     """Between operator and law, while a manual command is always on its way."""
     manual = loop.publisher(topics.MANUAL_COOLANT_SETPOINT)
-    loop.begin()
 
     def requests() -> Iterator[SetBool.Request]:
         for number in range(_REQUESTS):
             manual.publish(Temperature(temperature=20.0 + number % 7))
             yield SetBool.Request(data=bool(number % 2))
 
-    _send(loop, SetBool, 'controller/set_automatic', requests())
-    loop.ros.set_bool('controller/set_automatic', True)
-    loop.end()
+    with loop.fault():
+        _send(loop, SetBool, 'controller/set_automatic', requests())
+        loop.ros.set_bool('controller/set_automatic', True)
 
 
 def _mode_once(loop: FaultHarness) -> None:
-    loop.begin()
-    loop.ros.set_bool('controller/set_automatic', False)
-    loop.run_for(60.0)
-    loop.ros.set_bool('controller/set_automatic', True)
-    loop.end()
+    with loop.fault():
+        loop.ros.set_bool('controller/set_automatic', False)
+        loop.run_for(60.0)
+        loop.ros.set_bool('controller/set_automatic', True)
 
 
-_case = functools.partial(case, GROUP)
+def _changed(loop: FaultHarness, parameters: Mapping[str, float], setpoint: float | None = None
+             ) -> None:
+    """Change the plant for good, after a step of the set-point if asked to."""
+    if setpoint is not None:
+        loop.request(setpoint)
+    with loop.fault():
+        reasons = loop.set_parameters('plant', **parameters)
+        loop.expect(not reasons, f'the plant was not changed: {reasons}')
+
+
+def _without_the_cold(loop: FaultHarness, node: str, usual: float) -> None:
+    """Take the lower part of a node's range of the coolant for 15 min."""
+    with loop.fault():
+        loop.set_parameters(node, coolant_min=STUCK_AT)
+        loop.run_for(900.0)
+        loop.set_parameters(node, coolant_min=usual)
+
+
+def _parameters(name: str, does: str, make: Callable[[], Iterable[Mapping[str, Any]]],
+                refused: bool = False) -> Case:
+    return Case('operators', name, f'{_REQUESTS} {does}',
+                partial(_storm_of_parameters, make=make, refused=refused))
+
+
+def _setpoints(name: str, does: str, *values: float, code: Code | None = None) -> Case:
+    return Case('operators', name, f'set-points at 1 kHz{does}',
+                partial(_storm_of_setpoints, values=values), code=code)
+
+
+def _constant(name: str, does: str, play: Callable[[FaultHarness], None], **details: Any) -> Case:
+    return Case('disturbances', name, does, play,
+                **{'recovery': 360.0, 'afterwards': 600.0, 'offset': 0.01, **details})
+
 
 CASES = (
-    _case('weights-storm', f'{_REQUESTS} changes of both weights by factors of up to 10,000',
-          _storm_of_parameters(_weights)),
-    _case('limits-storm', f'{_REQUESTS} changes of range and rate of the coolant',
-          _storm_of_parameters(_limits)),
-    _case('ramps-storm', f'{_REQUESTS} changes of the ramp of the set-point',
-          _storm_of_parameters(_ramps)),
-    _case('bad-values-storm', f'{_REQUESTS} parameters that cannot be', _storm_of_parameters(
-        _bad, refused=True)),
-    _case('setpoint-storm', 'set-points at 1 kHz, all the same',
-          _storm_of_setpoints(lambda _: SETPOINT)),
-    _case('setpoint-storm-nan', 'set-points at 1 kHz: NaN',
-          _storm_of_setpoints(lambda _: math.nan), codes=(Code.SETPOINT_NOT_FINITE,)),
-    _case('setpoint-storm-outside', 'set-points at 1 kHz: 500 and -1e308 degC',
-          _storm_of_setpoints(lambda number: (500.0, -1e308)[number % 2]),
-          codes=(Code.SETPOINT_OUTSIDE,)),
-    _case('setpoint-storm-alternating', 'set-points at 1 kHz: 41 and 51 degC in turn',
-          _storm_of_setpoints(lambda number: (41.0, 51.0)[number % 2])),
-    _case('mode-once', 'manual mode for a minute, and back, without a bump', _mode_once,
-          bump=0.01),
-    _case('mode-storm', f'{_REQUESTS} changes between automatic and manual mode',
-          _storm_of_modes),
-)
+    _parameters('weights-storm', 'changes of both weights by factors of up to 10,000', partial(
+        _drawn, 0, {'temperature_weight': (-2.0, 2.0), 'coolant_weight': (-2.0, 2.0)}, True)),
+    _parameters('limits-storm', 'changes of range and rate of the coolant', partial(
+        _drawn, 1, {'coolant_min': (5.0, 22.0), 'coolant_max': (24.0, 32.0),
+                    'coolant_rate_limit': (1.0, 60.0)})),
+    _parameters('ramps-storm', 'changes of the ramp of the set-point', partial(
+        _drawn, 2, {'setpoint_ramp': (-3.0, 3.0)}, True)),
+    _parameters('bad-values-storm', 'parameters that cannot be',
+                lambda: itertools.islice(itertools.cycle(_BAD), _REQUESTS), refused=True),
+    _setpoints('setpoint-storm', ', all the same', SETPOINT),
+    _setpoints('setpoint-storm-nan', ': NaN', math.nan, code=Code.SETPOINT_NOT_FINITE),
+    _setpoints('setpoint-storm-outside', ': 500 and -1e308 degC', 500.0, -1e308,
+               code=Code.SETPOINT_OUTSIDE),
+    _setpoints('setpoint-storm-alternating', ': 41 and 51 degC in turn', 41.0, 51.0),
+    Case('operators', 'mode-once', 'manual mode for a minute, and back, without a bump',
+         _mode_once, bump=0.01),
+    Case('operators', 'mode-storm', f'{_REQUESTS} changes between automatic and manual mode',
+         _storm_of_modes),
+    *(_constant(name, f'{does}, for good', partial(_changed, parameters=changes))
+      for name, does, changes in (
+          ('heat-transfer-low', 'UA -20 %', {'heat_transfer_coefficient': 40000.0}),
+          ('heat-transfer-high', 'UA +20 %', {'heat_transfer_coefficient': 60000.0}),
+          ('feed-warm', 'T_i +5 K', {'feed_temperature': 81.85}),
+          ('feed-cold', 'T_i -5 K', {'feed_temperature': 71.85}),
+          ('concentration-high', 'C_A +10 %', {'concentration': 1.1 * CONCENTRATION}),
+          ('concentration-low', 'C_A -10 %', {'concentration': 0.9 * CONCENTRATION}))),
+    _constant('actuator-lag', 'the coolant follows its command with 5 s, for good, and the '
+              'set-point steps',
+              partial(_changed, parameters={'coolant_lag': 5.0}, setpoint=42.0)),
+    _constant('actuator-late', 'commands act one sample late, for good, and the set-point steps',
+              partial(_changed, parameters={'command_delay': 1.0}, setpoint=42.0)),
+    _constant('actuator-saturated', f'the coolant does not get below {STUCK_AT:g} degC, 15 min',
+              partial(_without_the_cold, node='plant', usual=-20.0), worst=WINDUP),
+    _constant('coolant-limited', f'the controller may not command less than {STUCK_AT:g} degC, '
+              '15 min', partial(_without_the_cold, node='controller',
+                                usual=ControllerParameters.coolant_min), worst=WINDUP),
+    _constant('noise', 'noise of 0.1 K, for good', partial(_changed, parameters={'noise': 0.1}),
+              band=0.5, offset=0.5),
+    _constant('two-state', 'the concentration moves, which the model does not know, and the feed '
+              'gets 1 K warmer; near the stable point',
+              partial(_changed, parameters={'feed_temperature': 77.85}), setpoint=50.5,
+              plant={**LOCKSTEP, 'reactor': 'two_state'}))

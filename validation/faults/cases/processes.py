@@ -1,55 +1,63 @@
 # SPDX-FileCopyrightText: 2026 The koopman_ros Authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""Processes that end, hang and come back, and the files that they live on."""
+"""Processes that end, hang and come back, their files, and their neighbours on the machine."""
 
-import functools
+from functools import partial
+import os
 from pathlib import Path
 import re
 import shutil
 import signal
 import subprocess
 import sys
+import time
 
+import rclpy
+from rclpy.context import Context
+from rclpy.node import Node
 from sensor_msgs.msg import Temperature
 
 from koopman_ros.bags import read_messages
 from koopman_ros.resources import model_path
 from koopman_ros.ros import topics
-from validation.faults.case import case, SETPOINT, SkipError
-from validation.faults.harness import FaultHarness, LOCKSTEP
+from validation.faults.case import Case, LOCKSTEP, SETPOINT
+from validation.faults.harness import FaultHarness, SkipError
 
-GROUP = 'processes'
 # While a controller is dead, the plant goes on at twenty times real time.
 PATIENT = {**LOCKSTEP, 'lockstep_timeout': 0.05}
 RUNNING = {'speed': 20.0}  # without lock-step
 RUNNING_STEP = 5.0  # K; what is late by a few samples may step as far as in these
 _DISK = '1m'  # size of a small disk
+_BUSY = (sys.executable, '-c', 'while True: pass')
+_PARTICIPANTS = 12  # at once; those of one machine find each other up to 32
+_FLOOD = (sys.executable, '-c', f'from {__name__} import flood; flood(5.0, {_PARTICIPANTS})')
+_KEPT = ('^controller: control: .*the old model is kept',)
+_TWO_CONTROLLERS = ('^controller: control: 2 nodes command the coolant',
+                    '^plant: simulation: 2 nodes command the coolant')
+_TWO_PLANTS = ('^controller: control: .*2 nodes publish the temperature',)
 
 
-def _plant_again(number: int, loop: FaultHarness) -> None:
-    loop.begin()
-    loop.kill('plant', number)
-    before = loop.now
-    loop.start('plant', {**LOCKSTEP, 'lockstep_subscribers': 2})
-    loop.wait(lambda: loop.now > before, 'the new plant does not measure')
-    loop.end()
+def _plant_again(loop: FaultHarness, number: int) -> None:
+    with loop.fault():
+        loop.kill('plant', number)
+        before = loop.now
+        loop.start('plant', {**LOCKSTEP, 'lockstep_subscribers': 2})
+        loop.wait(lambda: loop.now > before, 'the new plant does not measure')
 
 
 def _plant_reset(loop: FaultHarness) -> None:
-    loop.begin()
-    answer = loop.ros.trigger('plant/reset')
-    loop.expect(answer.success, f'the reset was refused: {answer.message}')
-    loop.end()
+    with loop.fault():
+        answer = loop.ros.trigger('plant/reset')
+        loop.expect(answer.success, f'the reset was refused: {answer.message}')
 
 
 def _controller_again(loop: FaultHarness, setpoint: float = SETPOINT, dead: float = 0.0) -> None:
-    loop.begin()
-    loop.kill('controller')
-    loop.run_for(dead)
-    loop.start('controller')
-    loop.request_until_tracked(setpoint)
-    loop.end()
+    with loop.fault():
+        loop.kill('controller')
+        loop.run_for(dead)
+        loop.start('controller')
+        loop.request_until_tracked(setpoint)
 
 
 def _controller_in_a_step(loop: FaultHarness) -> None:
@@ -74,20 +82,15 @@ def _controller_in_manual_mode(loop: FaultHarness) -> None:
 def _controller_stopped(loop: FaultHarness) -> None:
     loop.request(44.0)
     loop.run_for(20.0)
-    loop.begin()
-    loop.pause('controller', 4.0)
-    loop.linger(0.2)
-    loop.end()
+    with loop.fault():
+        loop.pause('controller', 4.0)
+        loop.linger(0.2)
 
 
 def _plant_stopped(loop: FaultHarness) -> None:
-    loop.begin()
-    loop.pause('plant', 3.0)
-    loop.run_for(1.0)
-    loop.end()
-
-
-# The trainer, and the disk.
+    with loop.fault():
+        loop.pause('plant', 3.0)
+        loop.run_for(1.0)
 
 
 def _recording(loop: FaultHarness, bag: Path, command: tuple[str, ...] | None = None) -> None:
@@ -100,9 +103,8 @@ def _trainer_killed(loop: FaultHarness) -> None:
     bag = loop.folder / 'killed.mcap'
     bag.unlink(missing_ok=True)
     _recording(loop, bag)
-    loop.begin()
-    loop.kill('trainer')
-    loop.end()
+    with loop.fault():
+        loop.kill('trainer')
     count = sum(1 for _ in read_messages(bag, recover=True))
     loop.trace.notes.append(f'{count} messages were read from the bag that it left')
     loop.expect(count > 100, f'the bag that it left holds {count} messages only')
@@ -114,14 +116,10 @@ def _disk_full(loop: FaultHarness) -> None:
                f'mount -t tmpfs -o size={_DISK} tmpfs {disk} && exec "$@"', 'sh')
     if subprocess.run([*private, 'true'], capture_output=True, check=False).returncode:
         raise SkipError('this machine lends no disk of its own to a process')
-    loop.begin()
-    _recording(loop, disk / 'full.mcap',
-               (*private, sys.executable, '-m', 'koopman_ros.nodes.trainer'))
-    loop.wait_for_report(f'recording to {re.escape(str(disk))}/full.mcap stopped')
-    loop.end()
-
-
-# The model file.
+    with loop.fault():
+        _recording(loop, disk / 'full.mcap',
+                   (*private, sys.executable, '-m', 'koopman_ros.nodes.trainer'))
+        loop.wait_for_report(f'recording to {re.escape(str(disk))}/full.mcap stopped')
 
 
 def _reload(loop: FaultHarness, spoil: str) -> None:
@@ -132,56 +130,125 @@ def _reload(loop: FaultHarness, spoil: str) -> None:
             'controller', model=str(file)))):
         pass
     loop.expect(refused == '[]', f'the model was refused: {refused}')
-    loop.begin()
-    if spoil == 'deleted':
-        file.unlink()
-    elif spoil == 'garbage':
-        file.write_bytes(b'\x07' * file.stat().st_size)
-    elif spoil == 'cut':
-        file.write_bytes(file.read_bytes()[:-100])
-    else:
-        shutil.copy(model_path(spoil), file)
-    answer = loop.ros.trigger('controller/reload_model')
-    if spoil.startswith('reactor'):
-        loop.expect(answer.success, f'the reload was refused: {answer.message}')
-    else:
-        loop.expect(not answer.success, 'a spoilt model was accepted')
-        loop.expect('the old model is kept' in answer.message, f'the reason: {answer.message}')
-    loop.end()
+    with loop.fault():
+        if spoil == 'deleted':
+            file.unlink()
+        elif spoil == 'garbage':
+            file.write_bytes(b'\x07' * file.stat().st_size)
+        elif spoil == 'cut':
+            file.write_bytes(file.read_bytes()[:-100])
+        else:
+            shutil.copy(model_path('reactor_nz3'), file)
+        answer = loop.ros.trigger('controller/reload_model')
+        if spoil == 'changed':
+            loop.expect(answer.success, f'the reload was refused: {answer.message}')
+        else:
+            loop.expect(not answer.success, 'a spoilt model was accepted')
+            loop.expect('the old model is kept' in answer.message, f'the reason: {answer.message}')
 
 
-KEPT = ('^controller: control: .*the old model is kept',)
+def _second_controller(loop: FaultHarness) -> None:
+    with loop.fault():
+        loop.start('controller', {'coolant_weight': 0.1}, ('-r', '__node:=controller_2'),
+                   called='controller_2')
+        loop.request(45.0)
+        loop.wait_for_report(*_TWO_CONTROLLERS)
+        loop.linger(1.0)
+        loop.kill('controller_2', signal.SIGINT)
+
+
+def _second_plant(loop: FaultHarness) -> None:
+    with loop.fault():
+        loop.start('plant', {'speed': 20.0, 'start_time': 5000.0}, (
+            '-r', '__node:=plant_2', '-r', 'coolant_temperature:=plant_2/coolant_temperature'),
+                   called='plant_2')
+        loop.wait_for_report(*_TWO_PLANTS)
+        loop.linger(1.0)
+        loop.kill('plant_2', signal.SIGINT)
+
+
+def flood(seconds: float, count: int) -> None:
+    """Come and go with so many participants at once, and print how many there were."""
+    end, come = time.monotonic() + seconds, 0
+    while time.monotonic() < end:
+        present = []
+        for number in range(count):
+            context = Context()
+            rclpy.init(context=context)
+            node = Node(f'flood_{number}', context=context)
+            node.create_publisher(Temperature, f'flood_{number}', 10)
+            present.append((context, node))
+        come += count
+        for context, node in present:
+            node.destroy_node()
+            rclpy.shutdown(context=context)
+    print(come)
+
+
+def _flooded(loop: FaultHarness) -> None:
+    with loop.fault():
+        process = loop.start('flood', command=_FLOOD)
+        # it ends by itself
+        loop.processes.pop('flood').told_to_end = True
+        loop.request(44.0)
+        try:
+            loop.wait(lambda: not process.running, 'the flood does not end')
+        finally:
+            code = process.stop(signal.SIGKILL)
+        come = process.output().strip()
+        loop.expect(code == 0 and come.isdigit(), f'the flood failed: {come}')
+        loop.trace.notes.append(f'{come} participants came and went')
+
+
+def _starved(loop: FaultHarness) -> None:
+    with loop.fault():
+        busy = [loop.start('busy', command=_BUSY, called=f'busy_{number}')
+                for number in range(2 * (os.cpu_count() or 1))]
+        loop.request(44.0)
+        loop.linger(8.0)
+        loop.trace.notes.append(f'{len(busy)} busy neighbours')
+        for number in range(len(busy)):
+            loop.kill(f'busy_{number}')
+
+
+_process, _neighbour = partial(Case, 'processes'), partial(Case, 'neighbours')
 CASES = (
-    case(GROUP, 'plant-restart', 'the plant is ended and started again, 5 K too warm and at time '
-         '1 s', functools.partial(_plant_again, signal.SIGINT)),
-    case(GROUP, 'plant-killed', 'the plant is killed and started again',
-         functools.partial(_plant_again, signal.SIGKILL)),
-    case(GROUP, 'plant-reset', 'the plant is reset, which makes it 5 K warmer at once',
-         _plant_reset),
-    case(GROUP, 'plant-stopped', 'the plant is stopped (SIGSTOP) for 3 s of wall time',
-         _plant_stopped),
-    case(GROUP, 'controller-killed', 'the controller is killed at rest and started again',
-         _controller_again, plant=PATIENT, bump=0.01),
-    case(GROUP, 'controller-killed-in-a-step', 'killed 15 s after a step of the set-point, and '
-         'started again', _controller_in_a_step, plant=PATIENT),
-    case(GROUP, 'controller-killed-while-disturbed', 'killed while the feed is 2 K too warm, and '
-         'started again after a minute', _controller_while_disturbed, plant=PATIENT,
-         afterwards=420.0, recovery=360.0),
-    case(GROUP, 'controller-killed-in-manual-mode', 'killed in manual mode, and started again',
-         _controller_in_manual_mode, plant=PATIENT),
-    case(GROUP, 'controller-stopped', 'stopped (SIGSTOP) for 4 s of wall time, 80 s of plant '
-         'time, while the set-point steps', _controller_stopped, plant=RUNNING, settle=100.0,
-         largest_step=RUNNING_STEP, afterwards=120.0, recovery=120.0),
-    case(GROUP, 'trainer-killed', 'the trainer is killed while it records', _trainer_killed),
-    case(GROUP, 'disk-full', f'the trainer records to a disk of {_DISK}B until it is full',
-         _disk_full, allowed_errors=('trainer: recording',),
-         says=('^trainer: recording: recording to .* stopped',)),
-    *(case(GROUP, f'model-{name}', does, functools.partial(_reload, spoil=spoil), bump=0.01,
-           says=KEPT if spoil == name else ())
-      for name, spoil, does in (
-          ('garbage', 'garbage', 'the model file is overwritten by garbage and read again'),
-          ('cut', 'cut', 'the model file is cut short and read again'),
-          ('deleted', 'deleted', 'the model file is deleted and read again'),
-          ('changed', 'reactor_nz3', 'another lift takes the place of the model file and is '
-           'read'))),
-)
+    _process('plant-restart', 'the plant is ended and started again, 5 K too warm and at time 1 s',
+             partial(_plant_again, number=signal.SIGINT)),
+    _process('plant-killed', 'the plant is killed and started again',
+             partial(_plant_again, number=signal.SIGKILL)),
+    _process('plant-reset', 'the plant is reset, which makes it 5 K warmer at once', _plant_reset),
+    _process('plant-stopped', 'the plant is stopped (SIGSTOP) for 3 s of wall time',
+             _plant_stopped),
+    _process('controller-killed', 'the controller is killed at rest and started again',
+             _controller_again, plant=PATIENT, bump=0.01),
+    _process('controller-killed-in-a-step', 'killed 15 s after a step of the set-point, and '
+             'started again', _controller_in_a_step, plant=PATIENT),
+    _process('controller-killed-while-disturbed', 'killed while the feed is 2 K too warm, and '
+             'started again after a minute', _controller_while_disturbed, plant=PATIENT,
+             afterwards=420.0, recovery=360.0),
+    _process('controller-killed-in-manual-mode', 'killed in manual mode, and started again',
+             _controller_in_manual_mode, plant=PATIENT),
+    _process('controller-stopped', 'stopped (SIGSTOP) for 4 s of wall time, 80 s of plant '
+             'time, while the set-point steps', _controller_stopped, plant=RUNNING, settle=100.0,
+             largest_step=RUNNING_STEP, afterwards=120.0, recovery=120.0),
+    _process('trainer-killed', 'the trainer is killed while it records', _trainer_killed),
+    _process('disk-full', f'the trainer records to a disk of {_DISK}B until it is full',
+             _disk_full, allowed_errors=('trainer: recording',),
+             says=('^trainer: recording: recording to .* stopped',)),
+    *(_process(f'model-{spoil}', does, partial(_reload, spoil=spoil), bump=0.01,
+               says=() if spoil == 'changed' else _KEPT)
+      for spoil, does in (
+          ('garbage', 'the model file is overwritten by garbage and read again'),
+          ('cut', 'the model file is cut short and read again'),
+          ('deleted', 'the model file is deleted and read again'),
+          ('changed', 'another lift takes the place of the model file and is read'))),
+    _neighbour('two-controllers', 'a second controller, tuned otherwise, commands the same plant, '
+               'in turn', _second_controller, largest_step=27.0, says=_TWO_CONTROLLERS),
+    _neighbour('two-plants', 'a second plant, 5 K warmer and at another time, measures, too',
+               _second_plant, True, largest_step=2.0, says=_TWO_PLANTS),
+    _neighbour('participants', f'{_PARTICIPANTS} participants at a time come and go for 5 s',
+               _flooded),
+    _neighbour('starved', 'two busy processes on each core, while the set-point steps', _starved,
+               plant=RUNNING, largest_step=RUNNING_STEP, settle=100.0, afterwards=100.0,
+               recovery=100.0))
