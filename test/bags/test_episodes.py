@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 The koopman_ros Authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""Signals as arrays, and what acted on which measurement, as read from bags."""
+"""Signals as arrays, their jumps, and what acted on which measurement, as read from bags."""
 
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass, replace
@@ -20,7 +20,9 @@ from koopman_ros.bags import (
     message_definition,
     read_series,
 )
+from koopman_ros.bags.series import spikes_and_jumps
 from koopman_ros.plant_data import Episode
+from koopman_ros.plants import one_state_reactor, random_steps, RandomStepDesign
 from koopman_ros.units import NANOSECONDS as SECOND
 from support.bag_samples import PERIOD_NS, ROUNDS, Sample, START_NS
 
@@ -85,31 +87,101 @@ def write(samples: list[Sample], tmp_path: Path) -> Callable[..., Path]:
 def read(*bags: Path) -> tuple[list[Episode], Account]:
     episodes, account = loop_episodes(bags, MEASURED, COMMAND, UNITS)
     assert account.used == sum(map(len, episodes))
-    assert account.lines()[0] == f'{account.used} of {account.measurements} measurements used'
     return episodes, account
 
 
-def stamps(episode: Episode) -> list[float]:
-    """Return the seconds of the measurements, of which the value of the first one tells."""
-    return (episode.time + episode.x[0, 0]).tolist()
+def inputs(episode: Episode) -> list[tuple[float, float]]:
+    """Return from when on which input acts, on the scale of the first measurement's value."""
+    return list(zip((episode.input_time + episode.x[0, 0]).tolist(), episode.u[:, 0].tolist(),
+                    strict=True))
 
 
-def acts(episode: Episode) -> list[float]:
-    """Return the seconds from which the inputs act."""
-    return (episode.input_time + episode.x[0, 0]).tolist()
+def answers(first: int, last: int, later: float = 0.0) -> list[tuple[float, float]]:
+    """Return the inputs of :func:`loop`; the last command acts after the last measurement."""
+    return [(later + k, 100.0 + k) for k in range(first, last)]
 
 
-# What acts when.
+SPIKE_AND_JUMP = {k: 5000.0 if k == 40 else 3000.0 * (k > 70) for k in range(1, 121)}
+NO_INPUT = 'too short, or without any input'
+NEW = 'a new episode begins'
 
 
-def test_lock_step_answers_act_from_their_stamp_on(write: Callable[..., Path]) -> None:
-    (episode,), account = read(write(loop(20)))
-    assert stamps(episode) == list(range(1, 21))
-    assert episode.x[:, 0].tolist() == list(range(1, 21))
-    # the last command acts after the last measurement, and does not count
-    assert acts(episode) == list(range(1, 20))
-    assert episode.u[:, 0].tolist() == [100.0 + k for k in range(1, 20)]
-    assert account.lines() == ['20 of 20 measurements used']
+@pytest.mark.parametrize(('messages', 'values', 'acting', 'lines'), [
+    pytest.param(loop(20), [range(1, 21)], [answers(1, 20)], ['20 of 20 measurements used'],
+                 id='answers act from their stamp on'),
+    pytest.param([s for k in range(1, 21)
+                  for s in (*measured(k), Sent(COMMAND, k, 25.0 if 8 <= k < 15 else 20.0))],
+                 [range(1, 21)], [[(1.0, 20.0), (8.0, 25.0), (15.0, 20.0)]],
+                 ['20 of 20 measurements used'], id='an input that stays is one'),
+    pytest.param([Sent(COMMAND, 0.5, 20.0), *measured(*range(1, 12)), Sent(COMMAND, 5.25, 30.0),
+                  Sent(COMMAND, 5.75, 10.0)],
+                 [range(1, 12)], [[(0.5, 20.0), (5.25, 30.0), (5.75, 10.0)]],
+                 ['11 of 11 measurements used'], id='commands between measurements'),
+    pytest.param([*loop(5), Sent(COMMAND, 5.0, 77.0, 5.2), *loop(7, 6)], [range(1, 13)],
+                 [[*answers(1, 5), (5.0, 77.0), *answers(6, 12)]],
+                 ['12 of 12 measurements used'], id='the last word for a measurement counts'),
+    pytest.param([*loop(15), *loop(12, 40)], [range(1, 16), range(40, 52)],
+                 [answers(1, 15), answers(40, 51)],
+                 ['27 of 27 measurements used', f'{{bag}}: gap of 25.000 s at 15.000 s, {NEW}'],
+                 id='gap'),
+    pytest.param([*loop(15), *loop(9, 40)], [range(1, 16)], [answers(1, 15)],
+                 ['15 of 24 measurements used', '9 dropped: in a segment of fewer than 10',
+                  f'{{bag}}: gap of 25.000 s at 15.000 s, {NEW}'], id='short segment'),
+    pytest.param([s for s in loop(20) if (s.topic, s.stamp) not in [(MEASURED, 7), (MEASURED, 8)]],
+                 [[*range(1, 7), *range(9, 21)]], [answers(1, 20)],
+                 ['18 of 18 measurements used'], id='a few lost samples are no gap'),
+    pytest.param([Sent(COMMAND, 0.5, 20.0), *measured(*range(1, 13)), *measured(*range(60, 72))],
+                 [range(1, 13), range(60, 72)], [[(0.5, 20.0)]] * 2,
+                 ['24 of 24 measurements used', f'{{bag}}: gap of 48.000 s at 12.000 s, {NEW}'],
+                 id='a command is held over a gap'),
+    pytest.param([replace(s, value=s.value + SPIKE_AND_JUMP[s.stamp]) if s.topic == MEASURED else s
+                  for s in loop(120)],
+                 [[*range(1, 40), *range(41, 71)], range(3071, 3121)],
+                 [answers(1, 70), answers(71, 120, 3000.0)],
+                 ['119 of 120 measurements used', '1 dropped: spike of a single sample',
+                  f'{{bag}}: jump to 3071.00 Pa at 70.000 s, {NEW}'], id='spike and jump'),
+    pytest.param([*loop(30), *(Sent(s.topic, s.stamp, s.value + 500.0, s.received + 100.0)
+                               for s in loop(12))],
+                 # what acted before is not what acts now
+                 [range(1, 31), range(501, 513)],
+                 [answers(1, 30), [(500.0 + k, 600.0 + k) for k in range(1, 12)]],
+                 ['42 of 42 measurements used',
+                  f'{{bag}}: time was set back by 29.000 s, {NEW}'], id='time set back'),
+    # 5.5 s arrives after 6 s; 9 s comes twice, with another value
+    pytest.param([*loop(6), Sent(MEASURED, 5.5, 5.5, 6.2), *loop(3, 7),
+                  Sent(MEASURED, 9.0, 999.0, 9.9), *loop(11, 10)],
+                 [[*range(1, 6), 5.5, *range(6, 21)]], [answers(1, 20)],
+                 ['21 of 22 measurements used', '1 dropped: measurement with a repeated stamp'],
+                 id='late and repeated stamps'),
+    pytest.param([*measured(*range(1, 16)), *loop(14, 16)], [range(16, 30)], [answers(16, 29)],
+                 ['14 of 29 measurements used', '15 dropped: before the first input'],
+                 id='measurements before the first command'),
+    pytest.param([], [], [], ['0 of 0 measurements used'], id='nothing'),
+    pytest.param(measured(*range(1, 21)), [], [],
+                 ['0 of 20 measurements used', f'20 dropped: {NO_INPUT}'], id='no command'),
+    pytest.param(loop(9), [], [], ['0 of 9 measurements used', f'9 dropped: {NO_INPUT}'],
+                 id='too short'),
+    pytest.param([s for s in loop(20) if s.topic == COMMAND], [], [],
+                 ['0 of 0 measurements used'], id='no measurement'),
+    pytest.param([Sent(s.topic, 0.0, s.value, s.stamp) for s in loop(20)], [], [],
+                 ['0 of 20 measurements used', f'1 dropped: {NO_INPUT}',
+                  '19 dropped: measurement with a repeated stamp'],
+                 id='a sensor that does not stamp'),
+])
+def test_episodes_of_a_bag(
+    write: Callable[..., Path], messages: list[Sent], values: list[Iterable[float]],
+    acting: list[list[tuple[float, float]]], lines: list[str]
+) -> None:
+    bag = write(messages)
+    episodes, account = read(bag)
+    # values tell the stamps
+    assert [episode.x[:, 0].tolist() for episode in episodes] == [list(one) for one in values]
+    for episode in episodes:
+        np.testing.assert_allclose(episode.time, episode.x[:, 0] - episode.x[0, 0], atol=1e-12)
+    assert [inputs(episode) for episode in episodes] == acting
+    first, *others = [line.replace('{bag}', str(bag)) for line in lines]
+    assert account.lines()[0] == first
+    assert sorted(account.lines()[1:]) == sorted(others)
 
 
 def test_wall_clock_answers_act_when_they_arrive(write: Callable[..., Path]) -> None:
@@ -117,31 +189,15 @@ def test_wall_clock_answers_act_when_they_arrive(write: Callable[..., Path]) -> 
     messages = loop(20, late=0.02, answer=0.14)
     (episode,), _ = read(write(messages, wall=True))
     # the first measurement was taken before any command
-    assert stamps(episode) == list(range(2, 21))
-    assert acts(episode)[:3] == pytest.approx([1.12, 2.12, 3.12])
+    assert episode.x[:, 0].tolist() == list(range(2, 21))
+    assert [t for t, _ in inputs(episode)[:3]] == pytest.approx([1.12, 2.12, 3.12])
     # one stray receipt does not hide the wall clock
     messages[-2] = replace(messages[-2], received=29.0)
     (episode,), _ = read(write(sorted(messages, key=lambda s: s.received), 'stray', wall=True))
-    assert acts(episode)[0] == pytest.approx(1.12)
+    assert inputs(episode)[0][0] == pytest.approx(1.12)
     # a short delay counts as none
     (episode,), _ = read(write(loop(20, late=0.02, answer=0.025), 'short', wall=True))
-    assert acts(episode) == list(range(1, 20))
-
-
-def test_input_that_stays_is_one_input(write: Callable[..., Path]) -> None:
-    levels = [20.0] * 7 + [25.0] * 7 + [20.0] * 6
-    messages = [s for k, level in enumerate(levels, 1)
-            for s in (*measured(k), Sent(COMMAND, k, level))]
-    (episode,), _ = read(write(messages))
-    assert acts(episode) == [1.0, 8.0, 15.0]
-    assert episode.u[:, 0].tolist() == [20.0, 25.0, 20.0]
-
-
-def test_commands_between_measurements_keep_their_time(write: Callable[..., Path]) -> None:
-    messages = [Sent(COMMAND, 0.5, 20.0), *measured(*range(1, 12)), Sent(COMMAND, 5.25, 30.0),
-            Sent(COMMAND, 5.75, 10.0)]
-    (episode,), _ = read(write(messages))
-    assert acts(episode) == [0.5, 5.25, 5.75]
+    assert [t for t, _ in inputs(episode)] == list(range(1, 20))
 
 
 def test_dead_time_of_the_actuator(write: Callable[..., Path]) -> None:
@@ -151,16 +207,8 @@ def test_dead_time_of_the_actuator(write: Callable[..., Path]) -> None:
     assert episode.input_time[:3].tolist() == [1e-9 - 1.0, 1e-9, 1e-9 + 1.0]
     assert episode.u[:3, 0].tolist() == [101.0, 102.0, 103.0]
     # nobody knows what acted before
-    assert stamps(episode)[0] == 4.0
+    assert episode.x[0, 0] == 4.0
     assert account.dropped == {'before the first input': 3}
-
-
-def test_last_word_for_a_measurement_counts(write: Callable[..., Path]) -> None:
-    messages = [*loop(12), Sent(COMMAND, 5.0, 77.0, 5.2)]
-    messages.sort(key=lambda s: s.stamp if s.received is None else s.received)
-    (episode,), _ = read(write(messages))
-    assert episode.u[4, 0] == 77.0
-    assert len(episode.u) == 11
 
 
 @pytest.mark.parametrize('wall', [True, False])
@@ -173,62 +221,8 @@ def test_commands_without_a_stamp_act_when_received(write: Callable[..., Path], 
     messages.sort(key=lambda s: s.received or 0.0)
     (episode,), account = read(write(messages, wall=wall))
     # the clocks' nanoseconds since 1970 are told apart to some hundred
-    assert acts(episode) == pytest.approx([1.5, 12.25], abs=1e-5)
+    assert [t for t, _ in inputs(episode)] == pytest.approx([1.5, 12.25], abs=1e-5)
     assert account.lines() == ['29 of 30 measurements used', '1 dropped: before the first input']
-
-
-# What ends an episode, and what is left out.
-
-
-def test_gap_ends_an_episode(write: Callable[..., Path]) -> None:
-    bag = write([*loop(15), *loop(12, 40)])
-    (first, second), account = read(bag)
-    assert stamps(first)[-1] == 15.0
-    assert stamps(second)[0] == 40.0
-    # the input of the second one begins with the last command before it
-    assert acts(second)[0] == 40.0
-    assert account.notes == [
-        f'{bag}: gap of 25.000 s at 15.000 s, a new episode begins']
-
-
-def test_a_few_lost_samples_are_no_gap(write: Callable[..., Path]) -> None:
-    messages = [s for s in loop(20) if not (s.topic == MEASURED and s.stamp in (7.0, 8.0))]
-    (episode,), account = read(write(messages))
-    assert len(episode) == 18
-    assert account.lines() == ['18 of 18 measurements used']
-
-
-def test_spike_is_dropped_and_jump_ends_an_episode(write: Callable[..., Path]) -> None:
-    added = {k: 5000.0 if k == 40 else 3000.0 * (k > 70) for k in range(1, 121)}
-    messages = [replace(one, value=one.value + added[round(one.stamp)])
-            if one.topic == MEASURED else one for one in loop(120)]
-    bag = write(messages)
-    (first, second), account = read(bag)
-    assert stamps(first) == [*range(1, 40), *range(41, 71)]
-    assert (second.time + 71.0).tolist() == list(range(71, 121))
-    assert second.x[0, 0] == 3071.0
-    assert account.dropped == {'spike of a single sample': 1}
-    assert account.notes == [
-        f'{bag}: jump to 3071.00 Pa at 70.000 s, a new episode begins']
-
-
-def test_command_before_a_gap_is_held_over_it(write: Callable[..., Path]) -> None:
-    messages = [Sent(COMMAND, 0.5, 20.0), *measured(*range(1, 13)), *measured(*range(60, 72))]
-    (first, second), _ = read(write(messages))
-    assert [acts(e) for e in (first, second)] == [[0.5], [0.5]]
-
-
-def test_time_set_back_begins_anew(write: Callable[..., Path]) -> None:
-    restarted = [Sent(s.topic, s.stamp, s.value + 500.0, (s.received or s.stamp) + 100.0)
-                 for s in loop(12)]
-    bag = write([*loop(30), *restarted])
-    (first, second), account = read(bag)
-    assert (len(first), len(second)) == (30, 12)
-    assert second.x[0, 0] == 501.0
-    # what acted before is not what acts now
-    assert second.u[0, 0] == 601.0
-    assert account.notes == [
-        f'{bag}: time was set back by 29.000 s, a new episode begins']
 
 
 def test_what_happens_often_is_told_once(write: Callable[..., Path]) -> None:
@@ -247,19 +241,6 @@ def test_what_happens_often_is_told_once(write: Callable[..., Path]) -> None:
         'a new episode begins at each']
 
 
-def test_late_and_repeated_stamps_are_put_in_order(write: Callable[..., Path]) -> None:
-    messages = loop(20)
-    # 5.5 s arrives after 6 s; 9 s comes twice, with another value
-    messages.insert(12, Sent(MEASURED, 5.5, 5.5, 6.2))
-    messages.insert(20, Sent(MEASURED, 9.0, 999.0, 9.9))
-    (episode,), account = read(write(messages))
-    assert 5.5 in episode.x
-    assert 999.0 not in episode.x
-    assert np.all(np.diff(episode.time) > 0)
-    assert account.lines() == [
-        '21 of 22 measurements used', '1 dropped: measurement with a repeated stamp']
-
-
 @pytest.mark.parametrize('value', [math.nan, math.inf, -math.inf, -1e13])
 @pytest.mark.parametrize('topic', [MEASURED, COMMAND])
 def test_values_that_are_no_measurement(write: Callable[..., Path], topic: str, value: float
@@ -274,41 +255,6 @@ def test_values_that_are_no_measurement(write: Callable[..., Path], topic: str, 
         # the plant holds the last good one, too
         assert 107.0 not in episode.u
         assert len(episode.u) == 18
-
-
-def test_measurements_before_the_first_command_are_dropped(write: Callable[..., Path]) -> None:
-    (episode,), account = read(write([*measured(*range(1, 16)), *loop(14, 16)]))
-    assert stamps(episode)[0] == 16.0
-    assert account.lines() == [
-        '14 of 29 measurements used', '15 dropped: before the first input']
-
-
-def test_short_segments_are_dropped(write: Callable[..., Path]) -> None:
-    (episode,), account = read(write([*loop(15), *loop(9, 40)]))
-    assert len(episode) == 15
-    assert account.dropped == {'in a segment of fewer than 10': 9}
-
-
-@pytest.mark.parametrize(('messages', 'lines'), [
-    ([], ['0 of 0 measurements used']),
-    (measured(*range(1, 21)), [
-        '0 of 20 measurements used', '20 dropped: too short, or without any input']),
-    (loop(9), ['0 of 9 measurements used', '9 dropped: too short, or without any input']),
-    ([s for s in loop(20) if s.topic == COMMAND], ['0 of 0 measurements used']),
-    # a sensor that does not stamp
-    ([Sent(s.topic, 0.0, s.value, s.stamp) for s in loop(20)], [
-        '0 of 20 measurements used', '19 dropped: measurement with a repeated stamp',
-        '1 dropped: too short, or without any input']),
-])
-def test_nothing_to_use(
-    write: Callable[..., Path], messages: list[Sent], lines: list[str]
-) -> None:
-    episodes, account = read(write(messages))
-    assert episodes == []
-    assert sorted(account.lines()) == sorted(lines)
-
-
-# Bags.
 
 
 def test_several_bags(write: Callable[..., Path]) -> None:
@@ -417,3 +363,47 @@ def test_type_that_only_bears_the_name(
                  lambda: loop_episodes([writer.path], '/t', '/t', ('K', 'K'))):
         with pytest.raises(BagReadError, match=r'laid out differently|does not decode'):
             read()
+
+
+# Spikes and jumps.
+
+DESIGN = RandomStepDesign(281.33, 300.55, 305.0, 327.0, (0.5, 2.0), 1.0 / 60.0, rtol=1e-9)
+
+
+@pytest.fixture(scope='module')
+def motion() -> np.ndarray:
+    """Return twenty minutes of the reactor under random steps, a sample a second [degC]."""
+    return random_steps(one_state_reactor(), DESIGN, 20.0, 5).x[:, 0] - 273.15
+
+
+def found(values: np.ndarray) -> list[list[int]]:
+    """Return where there are spikes, and where jumps."""
+    return [np.flatnonzero(kind).tolist() for kind in spikes_and_jumps(values, 1.0)]
+
+
+@pytest.mark.parametrize('noise', [0.0, 0.1, 1.0])
+def test_motion_under_steps_is_neither(motion: np.ndarray, noise: float) -> None:
+    for stride in (1, 10, 30):
+        values = motion[::stride]
+        values = values + noise * np.random.default_rng(1).standard_normal(len(values))
+        assert found(values) == [[], []]
+
+
+@pytest.mark.parametrize('noise', [0.0, 0.1])
+def test_spikes_and_jumps_are_found(motion: np.ndarray, noise: float) -> None:
+    values = motion + noise * np.random.default_rng(2).standard_normal(len(motion))
+    values[[100, 700]] += [40.0, -35.0]
+    values[900:] += 30.0
+    assert found(values) == [[100, 700], [900]]
+
+
+@pytest.mark.parametrize(('values', 'jumps'), [
+    # a step of the input after a long rest
+    (51.0 - 10.0 * (1.0 - np.exp(-np.maximum(np.arange(3000.0) - 2950.0, 0.0) / 25.0)), []),
+    # a reset while all rests, and one that is too small
+    (np.r_[np.full(200, 40.0), np.full(200, 51.0)], [200]),
+    (np.r_[np.full(200, 40.0), np.full(200, 40.9)], []),
+    # few samples tell nothing
+    (np.r_[np.zeros(20), 100.0, np.zeros(20)], [])])
+def test_jumps_after_a_rest(values: np.ndarray, jumps: list[int]) -> None:
+    assert found(values) == [[], jumps]
