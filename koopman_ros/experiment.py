@@ -10,12 +10,10 @@ from enum import Enum
 from functools import cached_property
 
 import numpy as np
-from numpy.typing import NDArray
 
+from koopman_ros.arrays import Array
 from koopman_ros.reasons import Code, Reason, reason
 from koopman_ros.units import LATE_NANOSECONDS, NANOSECONDS
-
-Array = NDArray[np.float64]
 
 _FOLLOWS_WITHIN = 0.01  # in the input's unit
 _COMES_NEARER = 1e-4  # likewise, less than any rate limit allows
@@ -76,10 +74,9 @@ class Experiment:
         """Return why the experiment must not go on with a measurement, or None."""
         if not np.isfinite(measured):
             return reason(Code.NOT_FINITE, signal=self.state, value=measured)
-        if not self.state_lower <= measured <= self.state_upper:
-            return reason(Code.EXPERIMENT_BOUNDS, signal=self.state, value=measured,
-                          lower=self.state_lower, upper=self.state_upper)
-        return None
+        return None if self.state_lower <= measured <= self.state_upper else reason(
+            Code.EXPERIMENT_BOUNDS, signal=self.state, value=measured,
+            lower=self.state_lower, upper=self.state_upper)
 
 
 @dataclass(frozen=True)
@@ -114,13 +111,10 @@ def end(progress: Progress, phase: Phase, why: Reason | None = None) -> Progress
 def advance(experiment: Experiment, progress: Progress, measured: float | None, time_ns: int
             ) -> Progress:
     """
-    Answer a measurement, or the passing of time without one.
+    Answer a measurement of the state, or the passing of time without one.
 
     As in the control step, a stamp that is not later moves nothing, and the rate limit counts a
     gap in the measurements as twice the interval before it.
-
-    :param measured: of the state, in its unit, or None.
-    :param time_ns: its stamp, or the present time.
     """
     ahead = time_ns - progress.time_ns
     if measured is not None and (why := experiment.refusal(measured)):

@@ -13,11 +13,7 @@ _PACKAGE = 'koopman_ros'
 
 
 def config_directory() -> Path:
-    """
-    Return the folder of the shipped parameter files and models.
-
-    :raises FileNotFoundError: when the package was installed without them.
-    """
+    """Return the folder of the shipped files; FileNotFoundError when it is not installed."""
     prefixes = [Path(p) for p in os.environ.get('AMENT_PREFIX_PATH', '').split(os.pathsep) if p]
     here = Path(__file__).resolve()
     # an install tree without its environment: <prefix>/lib/python3.x/site-packages/koopman_ros
@@ -32,11 +28,7 @@ def config_directory() -> Path:
 
 
 def model_path(model: str) -> Path:
-    """
-    Return the file of a model given by name or by path.
-
-    :param model: name of a shipped model, e.g. ``reactor_nz4``, or a path to a model file.
-    """
+    """Return the file of a model given by name, e.g. ``reactor_nz4``, or by path."""
     if model.endswith('.safetensors') or os.sep in model:
         return Path(model).expanduser()
     return config_directory() / 'models' / f'{model}.safetensors'

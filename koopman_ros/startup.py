@@ -4,11 +4,8 @@
 """
 First steps of a program, before anything large is loaded, and its end by force.
 
-What is imported here is imported before signals are handled, so it is little.
-
-Until a program runs this, a signal does what Python does with it: in the interpreter's own first
-tens of milliseconds an interrupt ends it with SIGINT or a traceback. A child that is started by
-:func:`command` and :func:`blocked_signals` has no such time.
+What is imported here is imported before signals are handled, so it is little. Only a child that
+is started by :func:`command` and :func:`blocked_signals` handles them from its very start.
 """
 
 from collections.abc import Callable, Iterator
@@ -34,7 +31,6 @@ _IN_THE_LOOP = ('koopman_ros.nodes.plant', 'koopman_ros.nodes.controller',
 _PR_SET_PDEATHSIG = 1  # of prctl(2)
 _END = 8.0  # s from the end of a program to that by force
 _QUIET = 1.0  # s after an interrupt in which another one is the same
-
 _SIGEV_THREAD = 2  # of sigevent(3type): the function is called in a thread of its own
 _LATER = 3.0  # s from the sentence, which some thread can say, to the stack
 _AFTER = 0.5  # s from the stack that is printed to the end
@@ -42,11 +38,9 @@ _AFTER = 0.5  # s from the stack that is printed to the end
 
 def run_program(module: str, interrupted: int) -> int:
     """
-    Load a module and run its `main`, whatever signals come meanwhile.
+    Load a module, run its `main`, whatever signals come meanwhile, and return its exit code.
 
-    :param module: name of the module, whose `main` takes no argument and returns the exit code.
     :param interrupted: exit code when a signal ends it that `main` does not handle itself.
-    :return: the exit code.
     """
     open_standard_streams()
     # numpy, scipy and rclpy take half a second, in which there is nothing to complete
@@ -69,11 +63,8 @@ def run_program(module: str, interrupted: int) -> int:
 
 
 def open_standard_streams() -> None:
-    """
-    Open what is closed of the three standard streams, to nowhere.
-
-    The next file or socket would take its number, and what a library prints would go there.
-    """
+    """Open what is closed of the three standard streams, to nowhere."""
+    # the next file or socket would take its number, and what a library prints would go there
     for number, name in enumerate(('stdin', 'stdout', 'stderr')):
         try:
             os.fstat(number)
@@ -117,11 +108,9 @@ def end_by_force(seconds: float, code: int = 0, sentence: str = '') -> Callable[
     """
     End the process then, with a sentence; where no Python runs, print where it hangs and end it.
 
-    The latter comes some seconds later, and takes no lock of the interpreter's: Python prints
-    from a thread of its own, and the C library ends the process.
+    The latter comes some seconds later, or at once without a sentence, and takes no lock of the
+    interpreter's: Python prints from a thread of its own, and the C library ends the process.
 
-    :param code: its exit code.
-    :param sentence: without one the latter comes at once.
     :return: takes that back.
     """
     def give_up() -> None:
@@ -166,11 +155,9 @@ def _exit_later(seconds: float, code: int) -> Callable[[], object] | None:
 
 def command(module: str, number: int, interrupted: int) -> tuple[str, ...]:
     """
-    Return the command line of a child that does not outlive this process.
+    Return the command line of a child that does not outlive this process; its arguments follow.
 
-    :param module: as for :func:`run_program`; its arguments follow.
     :param number: signal that the child gets when this process ends, however it ends.
-    :param interrupted: as for :func:`run_program`.
     """
     # the signal comes when the thread ends that started the child
     parent = os.getpid() if threading.current_thread() is threading.main_thread() else 0

@@ -12,7 +12,7 @@ import queue
 import signal
 import subprocess
 import threading
-from typing import Any
+from typing import Any, IO
 
 from koopman_ros.startup import command
 
@@ -20,6 +20,7 @@ _MODULE = 'koopman_ros.retraining.__main__'
 # The problems are small, and the nodes of the loop need the cores; sums keep their order, too.
 _ONE_THREAD = {'OMP_NUM_THREADS': '1', 'OPENBLAS_NUM_THREADS': '1'}
 _PATIENCE = 5.0  # s from the request to end until the process is killed
+_CANCELLED = 'cancelled, nothing was written'
 
 
 @dataclass(frozen=True)
@@ -59,11 +60,13 @@ class RetrainingJob:
             env={**_ONE_THREAD, **os.environ})
         self._lines: queue.SimpleQueue[str | None] = queue.SimpleQueue()
         self._complaints: list[str] = []
-        assert self._process.stdin is not None
-        self._process.stdin.write(json.dumps(dict(task)) + '\n')
-        self._process.stdin.flush()
-        self._threads = [threading.Thread(target=read, daemon=True)
-                         for read in (self._read_lines, self._read_complaints)]
+        stdin, *outputs = self._process.stdin, self._process.stdout, self._process.stderr
+        assert stdin is not None
+        stdin.write(json.dumps(dict(task)) + '\n')
+        stdin.flush()
+        self._threads = [
+            threading.Thread(target=read, args=(stream,), daemon=True) for read, stream in zip(
+                (self._read_lines, self._read_complaints), outputs, strict=True)]
         for thread in self._threads:
             thread.start()
 
@@ -77,7 +80,10 @@ class RetrainingJob:
     def cancel(self) -> None:
         """Ask the process to end; nothing is written then."""
         self._cancelled = True
-        self._close_input()
+        assert self._process.stdin is not None
+        # it may have ended
+        with contextlib.suppress(BrokenPipeError):
+            self._process.stdin.close()
 
     def close(self) -> None:
         """End the process, by force when it does not end in time."""
@@ -104,41 +110,33 @@ class RetrainingJob:
         if 'summary' in said:
             return JobState(1.0, _in_words(said['summary']), True, said['summary'])
         if 'stopped' in said:
-            return JobState(self.state.share, 'cancelled, nothing was written', True)
+            return JobState(self.state.share, _CANCELLED, True)
         return JobState(self.state.share, f'training failed: {said["error"]}', True)
 
     def _ended(self) -> JobState:
         """Say what is known of a process that ended without a word."""
         code = self._process.wait()
         if self._cancelled:
-            return JobState(self.state.share, 'cancelled, nothing was written', True)
-        if code < 0:
-            return JobState(
-                self.state.share, f'the training process was killed by {_signal_name(-code)}: see '
-                'whether the memory suffices, and train again', True)
-        self._threads[1].join()
-        last = self._complaints[-1] if self._complaints else 'it said nothing'
-        if last.startswith(('ModuleNotFoundError', 'ImportError')):
-            return JobState(self.state.share, 'training needs a package that is not installed '
-                            f"({last}): pip install 'koopman_ros[train]'", True)
-        return JobState(self.state.share, f'the training process ended with code {code}: {last}',
-                        True)
+            text = _CANCELLED
+        elif code < 0:
+            text = (f'the training process was killed by {_signal_name(-code)}: see whether the '
+                    'memory suffices, and train again')
+        else:
+            self._threads[1].join()
+            last = self._complaints[-1] if self._complaints else 'it said nothing'
+            text = f'the training process ended with code {code}: {last}'
+            if last.startswith(('ModuleNotFoundError', 'ImportError')):
+                text = (f'training needs a package that is not installed ({last}): pip install '
+                        "'koopman_ros[train]'")
+        return JobState(self.state.share, text, True)
 
-    def _close_input(self) -> None:
-        assert self._process.stdin is not None
-        # it may have ended
-        with contextlib.suppress(BrokenPipeError):
-            self._process.stdin.close()
-
-    def _read_lines(self) -> None:
-        assert self._process.stdout is not None
-        for line in self._process.stdout:
+    def _read_lines(self, stream: IO[str]) -> None:
+        for line in stream:
             self._lines.put(line)
         self._lines.put(None)
 
-    def _read_complaints(self) -> None:
-        assert self._process.stderr is not None
-        for line in self._process.stderr:
+    def _read_complaints(self, stream: IO[str]) -> None:
+        for line in stream:
             self._complaints = [*self._complaints[-20:], line.strip()]
 
 

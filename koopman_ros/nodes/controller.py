@@ -22,20 +22,15 @@ from koopman_ros.parameters.controller import ControllerParameters, TABLE
 from koopman_ros.parameters.wire import LONGEST_FRAME_ID
 from koopman_ros.reasons import level_words
 from koopman_ros.replay import records
-from koopman_ros.ros import events as messages
+from koopman_ros.ros import controller_messages as messages
 from koopman_ros.ros import topics
 from koopman_ros.ros.codec import stamp_message, stamp_nanoseconds, temperature_message
-from koopman_ros.ros.controller_status import Counts, internals, Situation, status
 from koopman_ros.ros.diagnostics import DiagnosticsPublisher, Status, words_of
 from koopman_ros.ros.matching import Matching, SINGLE
-from koopman_ros.ros.model_loading import load_suitable, rests_outside
-from koopman_ros.ros.model_loading import Situation as ModelSituation
-from koopman_ros.ros.model_reload import ModelReload
-from koopman_ros.ros.owned import wall_timer
-from koopman_ros.ros.process import LoopNode, run
-from koopman_ros.ros.record_publisher import RecordPublisher
-from koopman_ros.ros.timing import Timing
-from koopman_ros.ros.watchdog import PERIOD, Watchdog
+from koopman_ros.ros.model_reload import load_suitable, ModelReload, rests_outside, Situation
+from koopman_ros.ros.node import LoopNode, wall_timer
+from koopman_ros.ros.process import run
+from koopman_ros.ros.watchdog import PERIOD, Timing, Watchdog
 from koopman_ros.units import NANOSECONDS, to_kelvin
 
 _WATCH_STEP = NANOSECONDS // 2  # of plant time between two commands without a measurement
@@ -48,9 +43,9 @@ class ControllerNode(LoopNode):
     """
     Carry messages to and from the control step; docs/interfaces.md has its topics and services.
 
-    All runs in the executor's thread, but for the watch over silence: while that thread is busy,
-    the watchdog's does it. The lock is held where the state changes and its command goes out, not
-    while a measurement is answered, so that the watchdog goes by the last state that commanded.
+    All runs in the executor's thread, but for the watch over silence while that thread is busy.
+    The lock is held where the state changes and its command goes out, not while a measurement is
+    answered, so that the watchdog goes by the last state that commanded.
     """
 
     def __init__(self) -> None:
@@ -58,17 +53,16 @@ class ControllerNode(LoopNode):
         parameters = self.declare_table(TABLE)
         self._settings = parameters
         self._models = ModelReload(
-            self, load_suitable(parameters.model), self._model_situation, self._on_model,
+            self, load_suitable(parameters.model), self._model_situation,
+            lambda: self._exchange(records.MODEL, {'model': self._models.in_force.identity}),
             lambda: self._diagnostics.publish_if_changed())
         self._controller = self._built()
         self._state = State()
-        self._lock = threading.Lock()
-        self._telling = threading.Lock()
-        self._report = Report(Mode.AUTOMATIC, next(iter(self._controller.levels)))
-        self._logged = self._report
-        self._refused = ''
-        self._rests_outside = ''
-        self._counts = Counts()
+        self._lock, self._telling = threading.Lock(), threading.Lock()
+        self._report = self._logged = Report(
+            Mode.AUTOMATIC, next(iter(self._controller.levels)))
+        self._refused = self._rests_outside = ''
+        self._counts = messages.Counts()
         self._temperature = np.nan
         self._timing = Timing(self)
         self._coolant: Temperature | None = None
@@ -98,7 +92,10 @@ class ControllerNode(LoopNode):
         self.create_service(Trigger, '~/reload_model', self._models.on_reload,
                             callback_group=MutuallyExclusiveCallbackGroup())
         wall_timer(self, PERIOD, self._on_watch)
-        self._records = RecordPublisher(self._matching, self._snapshot, self._on_record_subscriber)
+        self._records = messages.RecordPublisher(
+            self._matching, lambda: records.snapshot(
+                self._state, asdict(self._settings), self._models.in_force.identity),
+            self._on_record_subscriber)
         self.follow_table(TABLE, parameters, self._on_parameters, self._models.accept)
         self.get_logger().info(self._models.in_force.about)
         self._warn_of_rest()
@@ -108,8 +105,6 @@ class ControllerNode(LoopNode):
     def complete(self) -> None:
         """Let nobody command while the middleware is taken down."""
         self._watchdog.end()
-
-    # Measurements and their absence.
 
     def _on_temperature(self, message: Temperature) -> None:
         if self._waiting or self._lacks_coolant():
@@ -211,11 +206,7 @@ class ControllerNode(LoopNode):
                 self._telling.release()
 
     def _watch(self, silence: float) -> tuple[Report, Time] | None:
-        """
-        Hold the command, and go to the safe coolant, when measurements stay away.
-
-        :return: report and stamp of what was commanded, or None.
-        """
+        """Hold the command, or go to the safe coolant, in a silence; return what was commanded."""
         with self._lock:
             timeout, state = self._settings.measurement_timeout, self._state
             if not timeout or not silence > timeout or state.time_ns is None:
@@ -255,7 +246,7 @@ class ControllerNode(LoopNode):
         if predicted is not None:
             self._predicted.publish(temperature_message(
                 float(predicted[0]), stamp, self._frame_id))
-        self._internals.publish(internals(report, stamp, self._frame_id))
+        self._internals.publish(messages.internals(report, stamp, self._frame_id))
 
     def _log_transition(self, before: Report, report: Report) -> None:
         change = f'{level_words(before.level)} -> {level_words(report.level)}'
@@ -265,8 +256,6 @@ class ControllerNode(LoopNode):
                 throttle_duration_sec=1.0)
         else:
             self.get_logger().info(change, throttle_duration_sec=1.0)
-
-    # The operator.
 
     def _on_setpoint(self, message: Temperature) -> None:
         stamp_ns = stamp_nanoseconds(message.header.stamp)
@@ -302,13 +291,11 @@ class ControllerNode(LoopNode):
             self.get_logger().warning(self._refused, throttle_duration_sec=1.0)
         return not self._refused
 
-    # Settings and models.
-
     def _built(self) -> Controller:
         return Controller(self._models.in_force.model, self._settings.settings())
 
-    def _model_situation(self) -> ModelSituation:
-        return ModelSituation(self._settings.settings(), self._state,
+    def _model_situation(self) -> Situation:
+        return Situation(self._settings.settings(), self._state,
                               np.array([to_kelvin(self._temperature)]))
 
     def _on_parameters(self, parameters: ControllerParameters) -> None:
@@ -320,9 +307,6 @@ class ControllerNode(LoopNode):
             fields['model'] = self._models.in_force.identity
         self._exchange(records.PARAMETERS, fields)
 
-    def _on_model(self) -> None:
-        self._exchange(records.MODEL, {'model': self._models.in_force.identity})
-
     def _exchange(self, event: str, fields: Mapping[str, object]) -> None:
         """Put the parameters and the model of now in force."""
         with self._lock:
@@ -331,10 +315,6 @@ class ControllerNode(LoopNode):
             self._records.publish(event, fields)
         self._warn_of_rest()
         self._diagnostics.publish_if_changed()
-
-    def _snapshot(self) -> Mapping[str, object]:
-        return records.snapshot(
-            self._state, asdict(self._settings), self._models.in_force.identity)
 
     def _on_record_subscriber(self) -> None:
         with self._lock:
@@ -346,19 +326,14 @@ class ControllerNode(LoopNode):
         if self._rests_outside not in ('', before):
             self.get_logger().warning(self._rests_outside)
 
-    # Diagnostics.
-
-    def _complaint(self) -> str:
-        """Return what is wrong around the node, or an empty string."""
+    def _status(self) -> Status:
         frame = (f'the frame_id of the measurement has {self._frame_length} characters, of which '
                  f'{LONGEST_FRAME_ID} are passed on: shorten it at the sensor'
                  ) if self._frame_length else ''
-        return self._matching.complaint or frame
-
-    def _status(self) -> Status:
-        return status(Situation(
+        return messages.status(messages.Situation(
             self._controller, self._settings, self._state, self._report, self._counts,
-            self._timing, self._complaint(), self._refused, self._models.refused,
+            self._timing, self._matching.complaint or frame, self._refused,
+            self._models.refused,
             {**self._models.figures(), 'safe coolant': self._rests_outside or 'within reach'},
             self._temperature))
 

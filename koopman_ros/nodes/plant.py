@@ -14,18 +14,13 @@ from sensor_msgs.msg import Temperature
 from std_srvs.srv import Trigger
 
 from koopman_ros.parameters.plant import PlantParameters, REACTORS, TABLE
-from koopman_ros.plants import (
-    ControlAffineSystem,
-    EquilibriumError,
-    IntegrationError,
-    Process,
-)
+from koopman_ros.plants import ControlAffineSystem, EquilibriumError, IntegrationError, Process
 from koopman_ros.ros import topics
 from koopman_ros.ros.codec import stamp_nanoseconds
 from koopman_ros.ros.diagnostics import DiagnosticsPublisher, Level, Status
 from koopman_ros.ros.matching import Matching, SINGLE
-from koopman_ros.ros.owned import wall_timer
-from koopman_ros.ros.process import LoopNode, run
+from koopman_ros.ros.node import LoopNode, wall_timer
+from koopman_ros.ros.process import run
 from koopman_ros.ros.sensors import Instruments
 from koopman_ros.units import LAST_STAMP_SECONDS, NANOSECONDS, seconds_text, to_celsius, to_kelvin
 
@@ -43,11 +38,6 @@ class Phase(Enum):
     OUT_OF_STAMPS = (f'finished: the stamps of messages end at {LAST_STAMP_SECONDS} s; start the '
                      'plant again with a smaller start_time')
     TRIPPED = 'stopped'
-
-    @property
-    def is_over(self) -> bool:
-        """Whether the plant stands still for good."""
-        return self in (Phase.FINISHED, Phase.OUT_OF_STAMPS)
 
 
 class PlantNode(LoopNode):
@@ -82,7 +72,7 @@ class PlantNode(LoopNode):
         self._diagnostics = DiagnosticsPublisher(
             self, 'simulation', parameters.reactor, self._status)
         self.create_service(Trigger, '~/reset', self._on_reset)
-        wall_period = parameters.sample_period / parameters.speed if parameters.speed else 0.0
+        wall_period = parameters.sample_period / (parameters.speed or math.inf)
         if parameters.lockstep:
             wall_timer(self, _POLL_PERIOD, self._on_poll)
             if parameters.speed:
@@ -115,12 +105,9 @@ class PlantNode(LoopNode):
             return build(parameters.constants(), nominal_state=nominal)
 
     def _initial(self, system: ControlAffineSystem, time_ns: int) -> Process:
-        x = system.nominal_state.copy()
+        x, u = system.nominal_state.copy(), system.nominal_input
         x[-1] += self._settings.initial_temperature_offset
-        u = system.nominal_input
         return Process(system, time_ns, x, u, self._settings.actuator(), u)
-
-    # Time: in lock-step by commands, otherwise by the wall clock.
 
     def _now_ns(self) -> int:
         """Return the plant time that the wall clock stands for."""
@@ -151,10 +138,8 @@ class PlantNode(LoopNode):
     def _on_poll(self) -> None:
         """Start lock-step when the loop is complete, and watch for a command that is missing."""
         if self._phase is Phase.WAITING:
-            complete = (
-                self._instruments.subscribers >= self._settings.lockstep_subscribers
-                and self._command_subscription.get_publisher_count() > 0)
-            if complete:
+            if (self._instruments.subscribers >= self._settings.lockstep_subscribers
+                    and self._command_subscription.get_publisher_count() > 0):
                 self._phase = Phase.RUNNING
                 self._measure()
             return
@@ -179,8 +164,6 @@ class PlantNode(LoopNode):
         if not self._settings.speed:
             self._step_in_lockstep()
 
-    # The plant: measurements out, commands in.
-
     def _measure(self) -> None:
         """Advance to the next sample and publish it."""
         instant = self._start_ns + self._sample * self._period_ns
@@ -196,11 +179,10 @@ class PlantNode(LoopNode):
             return
         if not self._advance(instant):
             return
-        sample = self._sample
         self._sample += 1
         self._answered = False
         self._wall_published = time.monotonic()
-        self._instruments.publish(self._plant, sample, self._settings)
+        self._instruments.publish(self._plant, self._sample - 1, self._settings)
         self._diagnostics.publish_if_changed()
 
     def _advance(self, time_ns: int) -> bool:
@@ -250,13 +232,12 @@ class PlantNode(LoopNode):
 
     def _on_reset(self, _: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
         """Put the reactor back to its initial state; time goes on."""
-        response.success = not self._phase.is_over
-        if not response.success:
+        if self._phase in (Phase.FINISHED, Phase.OUT_OF_STAMPS):
             response.message = ('the duration is over: start the plant again'
                                 if self._phase is Phase.FINISHED else self._phase.value)
             return response
-        self._plant = self._initial(self._plant.system, self._plant.time_ns)
-        fresh = self._plant
+        response.success = True
+        self._plant = fresh = self._initial(self._plant.system, self._plant.time_ns)
         if self._phase is Phase.TRIPPED:
             self._phase, self._trip = Phase.RUNNING, ''
             self._resynchronise()
@@ -280,11 +261,10 @@ class PlantNode(LoopNode):
         if not self._settings.lockstep:
             self._advance_to_now()
         self._settings = parameters
-        build = REACTORS[parameters.reactor]
         # the changed plant may have no steady state near; the nominal point stays what it was
-        self._plant = replace(self._plant, system=build(
-            parameters.constants(), nominal_state=self._plant.system.nominal_state))
-        self._plant = replace(self._plant, actuator=parameters.actuator())
+        self._plant = replace(self._plant, actuator=parameters.actuator(), system=REACTORS[
+            parameters.reactor](parameters.constants(),
+                                nominal_state=self._plant.system.nominal_state))
 
     def _status(self) -> Status:
         level, message = Level.OK, self._phase.value
@@ -317,10 +297,9 @@ class PlantNode(LoopNode):
         """Tell whether a controller that commanded before has fallen silent."""
         if self._phase is not Phase.RUNNING or self._settings.lockstep:
             return self._waiting_in_vain
-        periods = self._settings.sample_period / self._settings.speed if (
-            self._settings.speed) else 0.0
-        limit = max(_SILENCE, 5.0 * periods)
-        return bool(self._commands) and time.monotonic() - self._last_command > limit
+        period = self._settings.sample_period / (self._settings.speed or math.inf)
+        silence = time.monotonic() - self._last_command
+        return bool(self._commands) and silence > max(_SILENCE, 5.0 * period)
 
 
 def main(args: list[str] | None = None) -> int:

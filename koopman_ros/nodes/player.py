@@ -12,27 +12,19 @@ from rclpy.qos import QoSProfile
 from rosgraph_msgs.msg import Clock as ClockMessage
 from sensor_msgs.msg import Temperature
 
-from koopman_ros.bags import (
-    BagMessage,
-    BagReadError,
-    in_log_order,
-    QosProfile,
-    read_messages,
-    summary,
-)
+from koopman_ros import bags
 from koopman_ros.parameters.player import TABLE
 from koopman_ros.parameters.table import ConfigurationError
 from koopman_ros.ros import topics
 from koopman_ros.ros.codec import stamp_message, stamp_nanoseconds
-from koopman_ros.ros.owned import wall_timer
-from koopman_ros.ros.process import LoopNode, run
+from koopman_ros.ros.node import LoopNode, wall_timer
+from koopman_ros.ros.process import run
 from koopman_ros.units import NANOSECONDS
 
 _POLL_PERIOD_NS = 10_000_000  # for what no message announces
 _PROGRESS_PERIOD = 3.0  # s
 _LAST_PATIENCE = Duration(seconds=5.0)  # for what was sent last to be received
-# Messages without an answer that are sent in one go, before signals are heard again.
-_BURST = 100
+_BURST = 100  # messages without an answer that are sent in one go, before signals are heard again
 
 
 class PlayerNode(LoopNode):
@@ -40,10 +32,9 @@ class PlayerNode(LoopNode):
     Publish recorded messages byte for byte, in the order and at the pace of the recording.
 
     As fast as possible means in lock-step: a measurement is followed by the next message when its
-    command has arrived, and any other message when all subscribers have received it. A controller
-    then meets the inputs in the recorded order whatever the machine does. What carries the stamp
-    of the message after it was published with that, such as the coolant with the temperature, and
-    is so again: to hear that a message was received takes some middlewares 0.1 s.
+    command has arrived, and any other message when all subscribers have received it. What carries
+    the stamp of the message after it, such as the coolant with the temperature, is published with
+    that: to hear that a message was received takes some middlewares 0.1 s.
     """
 
     def __init__(self) -> None:
@@ -52,12 +43,12 @@ class PlayerNode(LoopNode):
         if reason := topics.unusable(
                 self, (*settings.topics, settings.measurement, settings.answer)):
             raise ConfigurationError(reason)
-        # what stands for a name in the bag
-        names = {_in_bag(name): name for name in settings.topics}
-        content = summary(settings.bag)
+        # by topic of the bag
+        names = {'/' + name.lstrip('/'): name for name in settings.topics}
+        content = bags.summary(settings.bag)
         begin_ns = (content.start_ns or 0) + round(settings.start_offset * NANOSECONDS)
-        self._messages = (message for message in in_log_order(
-            read_messages(settings.bag, names, recover=settings.recover))
+        self._messages = (message for message in bags.in_log_order(
+            bags.read_messages(settings.bag, names, recover=settings.recover))
             if message.log_time_ns >= begin_ns)
         played = {topic: name for topic, name in names.items() if content.counts.get(topic)}
         if not played:
@@ -65,7 +56,7 @@ class PlayerNode(LoopNode):
             raise ConfigurationError(f'bag {settings.bag!r} has no message on {", ".join(names)}: '
                                      f'choose topics among {known or "none"}')
         self._total = sum(content.counts[topic] for topic in played)
-        self._measured = _in_bag(settings.measurement)
+        self._measured = '/' + settings.measurement.lstrip('/')
         self._lockstep = settings.rate == 0.0
 
         # the subscription first: a controller that hears the measurement has then seen it, too
@@ -74,12 +65,16 @@ class PlayerNode(LoopNode):
         ) if self._lockstep and self._measured in played else None
         self._clock_publisher = self.create_publisher(
             *topics.of(topics.CLOCK)) if settings.clock else None
-        self._outlets: dict[str, Publisher] = {
-            topic: self.create_publisher(_message_class(content.types[topic]), name,
-                                         recorded_offer(content.offered_qos.get(topic, ())))
-            for topic, name in played.items()}
+        try:
+            self._outlets: dict[str, Publisher] = {
+                topic: self.create_publisher(
+                    topics.message_class(content.types[topic]), name,
+                    recorded_offer(content.offered_qos.get(topic, ())))
+                for topic, name in played.items()}
+        except LookupError as error:
+            raise ConfigurationError(str(error)) from error
 
-        self._next: BagMessage | None = None
+        self._next: bags.BagMessage | None = None
         self._began = False
         self._open: int | None = None  # stamp of the measurement that has no answer yet
         self._sent = 0
@@ -97,7 +92,7 @@ class PlayerNode(LoopNode):
                 self._play_in_lockstep()
             else:
                 self._play_in_time()
-        except BagReadError as error:
+        except bags.BagReadError as error:
             self._give_up(str(error))
         except MemoryError:
             self._give_up('memory does not suffice for what is recorded within five seconds: play '
@@ -121,8 +116,6 @@ class PlayerNode(LoopNode):
                 f'{self._settings.wait_timeout:g} s: start the controller first, or set '
                 'wait_for_subscribers to 0')
 
-    # By the clock.
-
     def _play_in_time(self) -> None:
         """Publish what is due, and sleep until the next message is."""
         while self._next is not None and self._due <= time.monotonic():
@@ -140,8 +133,6 @@ class PlayerNode(LoopNode):
         self._timer.timer_period_ns = min(max(left_ns, 1), 100 * _POLL_PERIOD_NS)
         self._timer.reset()
         self._say_progress()
-
-    # In lock-step.
 
     def _play_in_lockstep(self) -> None:
         """Publish up to the next measurement, whose answer continues it."""
@@ -166,13 +157,12 @@ class PlayerNode(LoopNode):
             self._received.add(message.topic)
         self._say_progress()
 
-    def _goes_with_next(self, message: BagMessage) -> bool:
+    def _goes_with_next(self, message: bags.BagMessage) -> bool:
         """Tell whether the next message was published at the same instant on another topic."""
         following = self._next
         if following is None or following.topic == message.topic:
             return False
-        stamp_ns = _stamp_ns(message)
-        return stamp_ns is not None and stamp_ns == _stamp_ns(following)
+        return _stamp_ns(message) is not None and _stamp_ns(message) == _stamp_ns(following)
 
     def _on_answer(self, message: Temperature) -> None:
         if self._open is None or stamp_nanoseconds(message.header.stamp) != self._open:
@@ -188,9 +178,7 @@ class PlayerNode(LoopNode):
                 f'{self._settings.answer_timeout:g} s: is the controller alive? A rate above 0 '
                 'plays without waiting for answers')
 
-    # Either way.
-
-    def _publish(self, message: BagMessage) -> None:
+    def _publish(self, message: bags.BagMessage) -> None:
         if self._clock_publisher is not None and message.topic == self._measured:
             self._clock_publisher.publish(ClockMessage(clock=stamp_message(
                 stamp_nanoseconds(message.message.header.stamp))))
@@ -198,9 +186,8 @@ class PlayerNode(LoopNode):
         self._sent += 1
 
     def _say_progress(self) -> None:
-        now = time.monotonic()
-        if now - self._said >= _PROGRESS_PERIOD:
-            self._said = now
+        if time.monotonic() - self._said >= _PROGRESS_PERIOD:
+            self._said = time.monotonic()
             self.get_logger().info(f'{self._sent} of {self._total} messages')
 
     def _finish(self) -> None:
@@ -219,12 +206,7 @@ class PlayerNode(LoopNode):
         self.exit_code = 1
 
 
-def _in_bag(name: str) -> str:
-    """Return the topic of the bag that a name stands for."""
-    return '/' + name.lstrip('/')
-
-
-def _stamp_ns(message: BagMessage) -> int | None:
+def _stamp_ns(message: bags.BagMessage) -> int | None:
     """Return the stamp of a message, None for one that has none or an unset one."""
     try:
         return stamp_nanoseconds(message.message.header.stamp) or None
@@ -232,14 +214,7 @@ def _stamp_ns(message: BagMessage) -> int | None:
         return None
 
 
-def _message_class(type_name: str) -> type:
-    try:
-        return topics.message_class(type_name)
-    except LookupError as error:
-        raise ConfigurationError(str(error)) from error
-
-
-def recorded_offer(offered: tuple[QosProfile, ...]) -> QoSProfile:
+def recorded_offer(offered: tuple[bags.QosProfile, ...]) -> QoSProfile:
     """Offer what all publishers of the recording offered."""
     best_effort = bool(offered) and all(o.reliability == 'best_effort' for o in offered)
     latched = bool(offered) and all(o.durability == 'transient_local' for o in offered)

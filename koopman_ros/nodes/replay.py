@@ -1,12 +1,7 @@
 # SPDX-FileCopyrightText: 2026 The koopman_ros Authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""
-The replay: the records in bags through the control step again, and beside a new model.
-
-Its exit code is 0 when the recorded commands are reproduced, 1 when some are not and for every
-error, and 3 when there was nothing to compare, as in a short bag from the middle of a run.
-"""
+"""The replay: the records in bags through the control step again, and beside a new model."""
 
 from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass, fields
@@ -19,8 +14,8 @@ import numpy as np
 
 from koopman_ros.bags import BagReadError, summary
 from koopman_ros.control import Settings
+from koopman_ros.parameters import controller
 from koopman_ros.parameters.controller import ControllerParameters
-from koopman_ros.parameters.controller import TABLE as CONTROLLER
 from koopman_ros.parameters.replay import ReplayParameters, TABLE
 from koopman_ros.parameters.table import ConfigurationError
 from koopman_ros.replay.loop import Alternative, Replay, replay
@@ -29,13 +24,13 @@ from koopman_ros.replay.report import ReplayedBag, reproduced, verdict, write_re
 from koopman_ros.replay.sources import command_counts, Models, read_records
 from koopman_ros.resources import config_directory, model_path
 from koopman_ros.ros import topics
-from koopman_ros.ros.model_loading import load_suitable
-from koopman_ros.ros.parameters import ParameterNode
+from koopman_ros.ros.model_reload import load_suitable
+from koopman_ros.ros.node import LoopNode
 from koopman_ros.ros.process import run_task
 
 
 class Result(enum.IntEnum):
-    """What a replay found, as exit code."""
+    """What a replay found, as exit code; 1 is that of every error, too."""
 
     REPRODUCED = 0
     DIFFERENT = 1
@@ -118,13 +113,12 @@ def replay_records(records: Iterable[Record], models: Sequence[Path] = (),
 
 def _settings(values: Mapping[str, Any]) -> Settings:
     """Return the tuning that a controller's parameters stand for, if this version has them."""
-    unknown = ', '.join(sorted(set(values) - set(CONTROLLER.rows)))
+    unknown = ', '.join(sorted(set(values) - set(controller.TABLE.rows)))
     if unknown:
         raise RecordError(f'its controller had the parameters {unknown}, which this version has '
                           'not: take the package that recorded it')
     snapshot = ControllerParameters(**values)
-    reason = CONTROLLER.check(snapshot)
-    if reason:
+    if reason := controller.TABLE.check(snapshot):
         raise RecordError(f'its controller had parameters that this version refuses ({reason}): '
                           'take the package that recorded it')
     return snapshot.settings()
@@ -132,7 +126,7 @@ def _settings(values: Mapping[str, Any]) -> Settings:
 
 def _prepare() -> Callable[[], int]:
     """Read parameters and names, which remaps and the namespace change as for the controller."""
-    node = ParameterNode('replay', start_parameter_services=False, enable_rosout=False)
+    node = LoopNode('replay', start_parameter_services=False, enable_rosout=False)
     try:
         given = set(node.get_parameters_by_prefix(''))
         parameters = node.declare_table(TABLE)

@@ -10,7 +10,8 @@ from koopman_ros.parameters.table import ConfigurationError
 from koopman_ros.parameters.trainer import TABLE, TrainerParameters
 from koopman_ros.ros import topics
 from koopman_ros.ros.experiment import CoolantExperiment
-from koopman_ros.ros.process import LoopNode, run
+from koopman_ros.ros.node import LoopNode
+from koopman_ros.ros.process import run
 from koopman_ros.ros.recording import Recording
 from koopman_ros.ros.training import Training
 

@@ -26,14 +26,7 @@ def stamp_message(nanoseconds: int) -> Time:
 
 def temperature_message(kelvin: float, stamp: Time, frame_id: str, variance: float = 0.0
                         ) -> Temperature:
-    """
-    Build a temperature message.
-
-    :param kelvin: temperature in K.
-    :param stamp: time of the sample, or of the measurement that is answered.
-    :param frame_id: where the temperature is taken.
-    :param variance: in K^2; 0 means unknown.
-    """
+    """Build a message from a temperature in K and its variance in K^2, where 0 means unknown."""
     message = Temperature(temperature=to_celsius(kelvin), variance=variance)
     message.header.stamp = stamp
     message.header.frame_id = frame_id

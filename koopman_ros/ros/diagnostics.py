@@ -14,7 +14,7 @@ from rclpy.node import Node
 from koopman_ros.lifting import LiftedModel
 from koopman_ros.reasons import Words
 from koopman_ros.ros.codec import stamp_message
-from koopman_ros.ros.owned import Owned
+from koopman_ros.ros.node import Owned
 from koopman_ros.ros.topics import DIAGNOSTICS
 from koopman_ros.units import Display, Displays
 
@@ -32,14 +32,11 @@ class Level(Enum):
 
 @dataclass(frozen=True)
 class Status:
-    """
-    What a node says of itself: a sentence, and figures with their units in the key.
-
-    The figures may be a function, which is called only when they are published.
-    """
+    """What a node says of itself: a sentence, and figures with their units in the key."""
 
     level: Level
     message: str
+    #: or a function, which is called only when they are published
     values: Mapping[str, object] | Callable[[], Mapping[str, object]] = field(
         default_factory=dict)
 
@@ -72,8 +69,9 @@ class DiagnosticsPublisher:
         message.status.append(DiagnosticStatus(
             level=status.level.value, name=self._name, message=status.message,
             hardware_id=self._hardware_id,
-            values=[KeyValue(key=key, value=as_text(value))
-                    for key, value in values.items()]))
+            values=[KeyValue(key=key, value=(
+                f'{value:.9g}' if isinstance(value, float) else str(value)))
+                for key, value in values.items()]))
         self._publisher.publish(message)
 
     def publish_if_changed(self) -> None:
@@ -81,11 +79,6 @@ class DiagnosticsPublisher:
         status = self._collect()
         if (status.level, status.message) != self._last:
             self.publish()
-
-
-def as_text(value: object) -> str:
-    """Write a figure as it stands in a status."""
-    return f'{value:.9g}' if isinstance(value, float) else str(value)
 
 
 def words_of(model: LiftedModel) -> Words:

@@ -11,7 +11,7 @@ import time
 from rclpy.callback_groups import MutuallyExclusiveCallbackGroup
 from rclpy.duration import Duration
 from rclpy.node import Node
-from rclpy.qos import QoSProfile, ReliabilityPolicy
+from rclpy.qos import ReliabilityPolicy
 from rclpy.task import Future
 from sensor_msgs.msg import Temperature
 from std_srvs.srv import SetBool
@@ -23,7 +23,7 @@ from koopman_ros.ros import topics
 from koopman_ros.ros.codec import stamp_message, stamp_nanoseconds, temperature_message
 from koopman_ros.ros.diagnostics import DiagnosticsPublisher, Level, OPERATOR, Status
 from koopman_ros.ros.matching import node_name
-from koopman_ros.ros.owned import Owned
+from koopman_ros.ros.node import Owned
 from koopman_ros.units import in_celsius, NANOSECONDS, to_celsius, to_kelvin
 
 _TICK = 0.1  # s
@@ -36,11 +36,9 @@ class CoolantExperiment:
     """
     Drive the coolant with random steps on the service ``~/experiment``; reports by diagnostics.
 
-    Every temperature is answered with a command of the same stamp. When the steps are over, for
-    whatever reason, the coolant returns to the safe temperature along the rate limit and is held
-    there until the service is called with false once more, or another node commands it. Two
-    commanders are worse than none: beside another publisher no experiment starts, and when one
-    comes the experiment stops at once and leaves the coolant to it.
+    When the steps are over, for whatever reason, the coolant returns to the safe temperature along
+    the rate limit and is held there until the service is called with false once more. Beside
+    another publisher no experiment starts, and when one comes it leaves the coolant to that.
 
     :param settings: what the next experiment starts with; the node replaces it when they change.
     """
@@ -88,8 +86,7 @@ class CoolantExperiment:
 
     def _start(self) -> str:
         """Take the coolant in hand, or return why not."""
-        if self._run is not None:
-            self._let_go(self._outcome)
+        self._let_go(self._outcome)
         topic = self._node.resolve_topic_name(self.settings.experiment_topic)
         if others := other_publishers(self._node, topic):
             return f'{others} publishes on {topic}: end it, or choose another experiment_topic'
@@ -127,9 +124,9 @@ class CoolantExperiment:
 
     def _let_go(self, outcome: Status) -> None:
         self._outcome = outcome
-        run, self._run = self._run, None
-        if run is not None:
-            run.destroy()
+        if self._run is not None:
+            self._run.destroy()
+        self._run = None
 
     def _say(self, sentence: str) -> None:
         # two lines, because rclpy allows one severity a line
@@ -148,9 +145,11 @@ class CoolantExperiment:
 
     def _status(self) -> Status:
         run = self._run
-        if run is None or run.progress is None:
-            return self._outcome if run is None else self._verdict(run)
+        if run is None:
+            return self._outcome
         verdict = self._verdict(run)
+        if run.progress is None:
+            return verdict
         held = '' if run.running else (
             f'; the coolant returns to {in_celsius(run.plan.safe_input)} and is held there')
         left = max(0.0, run.plan.duration - run.progress.elapsed) if run.running else 0.0
@@ -167,8 +166,7 @@ class ExperimentRun:
     """
     Command the coolant from the first measurement on until :meth:`destroy`.
 
-    Publisher, subscriptions and timer exist as long as the run: nobody takes an idle trainer for
-    a commander, and a plant in lock-step that waits for one starts.
+    Its publisher exists as long as the run: nobody takes an idle trainer for a commander.
 
     :param on_end: called when the steps are over, and with the reason when it must not command
         any more.
@@ -182,15 +180,17 @@ class ExperimentRun:
         # why it cannot start, or None with the first measurement
         self.started = Future()
         self._node = node
-        self._patience = settings.experiment_timeout
-        self._on_end = on_end
-        self._frame_id = ''
-        self._stamp_ns = 0
-        self._heard_at = time.monotonic()
+        self._patience, self._on_end = settings.experiment_timeout, on_end
+        self._frame_id, self._stamp_ns, self._heard_at = '', 0, time.monotonic()
         self._following = Following()
         self._owned = owned = Owned(node)
+        # a sensor driver may publish best effort
+        offers = node.get_publishers_info_by_topic(node.resolve_topic_name(topics.TEMPERATURE))
+        reliable = all(info.qos_profile.reliability is not ReliabilityPolicy.BEST_EFFORT
+                       for info in offers)
         self._temperatures = owned.keep(node.create_subscription(
-            Temperature, topics.TEMPERATURE, self._on_temperature, _sensor_qos(node)))
+            Temperature, topics.TEMPERATURE, self._on_temperature,
+            topics.profile(topics.LOOP_QOS.depth, reliable=reliable)))
         self._coolants = owned.keep(node.create_subscription(
             Temperature, topics.COOLANT_SETPOINT, self._on_coolant, topics.LOOP_QOS)) if (
                 settings.experiment_topic == topics.MANUAL_COOLANT_SETPOINT) else None
@@ -233,8 +233,7 @@ class ExperimentRun:
         if self.progress is None:
             if self.started.done():
                 return
-            refusal = self.plan.refusal(measured)
-            self.started.set_result(refusal)
+            self.started.set_result(refusal := self.plan.refusal(measured))
             if refusal is not None:
                 return
             self.progress = begin(self.plan, stamp_ns)
@@ -300,10 +299,3 @@ def other_publishers(node: Node, topic: str, own: int = 0) -> str:
     # another node may have the same name
     others = {name for name in names if name != me}
     return ' and '.join(sorted(others | ({me} if names.count(me) > own else set())))
-
-
-def _sensor_qos(node: Node) -> QoSProfile:
-    """Hear a sensor driver that publishes best effort."""
-    offers = node.get_publishers_info_by_topic(node.resolve_topic_name(topics.TEMPERATURE))
-    return topics.profile(topics.LOOP_QOS.depth, reliable=all(
-        info.qos_profile.reliability is not ReliabilityPolicy.BEST_EFFORT for info in offers))

@@ -7,24 +7,16 @@ from collections.abc import Callable, Mapping
 import copy
 from typing import Any, TypeAlias
 
+from rclpy import qos
 from rclpy.duration import Infinite
 from rclpy.event_handler import PublisherEventCallbacks, SubscriptionEventCallbacks
 from rclpy.node import Node
 from rclpy.publisher import Publisher
-from rclpy.qos import (
-    DurabilityPolicy,
-    LivelinessPolicy,
-    qos_check_compatible,
-    qos_policy_name_from_kind,
-    QoSCompatibility,
-    QoSProfile,
-    ReliabilityPolicy,
-)
 from rclpy.subscription import Subscription
 from rclpy.topic_endpoint_info import TopicEndpointInfo
 
 from koopman_ros.ros import topics
-from koopman_ros.ros.owned import Owned
+from koopman_ros.ros.node import Owned
 
 _Own: TypeAlias = Publisher | Subscription
 
@@ -34,15 +26,14 @@ SINGLE = {topics.COOLANT_SETPOINT: 'command the coolant',
 
 _LOOK_PERIOD = 0.5  # s
 # What does not pass: policy, offered, asked for.
-_CONFLICTS = (('reliability', ReliabilityPolicy.BEST_EFFORT, ReliabilityPolicy.RELIABLE),
-              ('durability', DurabilityPolicy.VOLATILE, DurabilityPolicy.TRANSIENT_LOCAL))
+_CONFLICTS = (
+    ('reliability', qos.ReliabilityPolicy.BEST_EFFORT, qos.ReliabilityPolicy.RELIABLE),
+    ('durability', qos.DurabilityPolicy.VOLATILE, qos.DurabilityPolicy.TRANSIENT_LOCAL))
 
 
 class Matching:
     """
     Make a node's publishers and subscriptions, and say which others conflict or do not match.
-
-    The middleware tells when one is found; whether it is still there is looked up.
 
     :param on_change: called when the complaint is another.
     :param single: topics that only one node may publish, as in `SINGLE`.
@@ -50,9 +41,7 @@ class Matching:
 
     def __init__(self, node: Node, on_change: Callable[[], None],
                  single: Mapping[str, str] | None = None) -> None:
-        self._node = node
-        self._on_change = on_change
-        self._single = single or {}
+        self._node, self._on_change, self._single = node, on_change, single or {}
         self._owned = Owned(node)
         self._own: list[_Own] = []
         self._overridable: set[str] = set()  # subscribed, with quality of service by parameter
@@ -98,7 +87,7 @@ class Matching:
         name = self._node.resolve_topic_name(topic)
 
         def note(event: Any) -> None:
-            self._policies[name] = qos_policy_name_from_kind(event.last_policy_kind).lower()
+            self._policies[name] = qos.qos_policy_name_from_kind(event.last_policy_kind).lower()
             self._look()
 
         return note
@@ -154,23 +143,23 @@ class Matching:
 
 
 def _passes(own: _Own, other: TopicEndpointInfo) -> bool:
-    compatible, _ = qos_check_compatible(*_in_order(own, other))
-    return bool(compatible != QoSCompatibility.ERROR)
+    compatible, _ = qos.qos_check_compatible(*_in_order(own, other))
+    return bool(compatible != qos.QoSCompatibility.ERROR)
 
 
-def _in_order(own: _Own, other: TopicEndpointInfo) -> tuple[QoSProfile, QoSProfile]:
+def _in_order(own: _Own, other: TopicEndpointInfo) -> tuple[qos.QoSProfile, qos.QoSProfile]:
     ours, theirs = _explicit(own.qos_profile), _explicit(other.qos_profile)
     return (theirs, ours) if isinstance(own, Subscription) else (ours, theirs)
 
 
-def _explicit(profile: QoSProfile) -> QoSProfile:
-    """Write out what a profile leaves to the default, which else passes for a difference."""
+def _explicit(profile: qos.QoSProfile) -> qos.QoSProfile:
+    # what a profile leaves to the default else passes for a difference
     filled = copy.copy(profile)
     for name in ('deadline', 'liveliness_lease_duration'):
         if not getattr(filled, name).nanoseconds:
             setattr(filled, name, Infinite)
-    if filled.liveliness == LivelinessPolicy.SYSTEM_DEFAULT:
-        filled.liveliness = LivelinessPolicy.AUTOMATIC
+    if filled.liveliness == qos.LivelinessPolicy.SYSTEM_DEFAULT:
+        filled.liveliness = qos.LivelinessPolicy.AUTOMATIC
     return filled
 
 

@@ -8,22 +8,18 @@ import os
 from pathlib import Path
 import signal
 import sys
-from typing import Any
 
 import rclpy
 from rclpy.exceptions import ParameterException
 from rclpy.executors import SingleThreadedExecutor
 from rclpy.logging import LoggingSeverity, set_logger_level
 from rclpy.signals import SignalHandlerOptions
-from rclpy.subscription import Subscription
 from rclpy.utilities import remove_ros_args
-from rosgraph_msgs.msg import Clock
 
 from koopman_ros.resources import LOOPBACK_PROFILE
-from koopman_ros.ros.parameters import ParameterNode
+from koopman_ros.ros.node import LoopNode
 from koopman_ros.ros.watchdog import end_in_time
 from koopman_ros.startup import end_by_force, ignore_signals, SIGNALS
-from koopman_ros.units import NANOSECONDS
 
 # A parameter or a model that does not fit is a ValueError; rclpy raises RCLError for an unreadable
 # parameter file, a RuntimeError whose class is private to the extension.
@@ -36,46 +32,9 @@ _LONGEST_WAIT = 0.1  # s from a signal to the end
 _TAKE_DOWN_PATIENCE = 5.0  # s; taking down a participant needs some ten milliseconds
 
 
-class LoopNode(ParameterNode):
-    """
-    A node with work of its own to complete before the middleware is taken down.
-
-    :ivar exit_code: ends the process when a node whose work is done sets it.
-    """
-
-    exit_code: int | None = None
-    _clocks_refused = 0
-
-    def create_subscription(self, msg_type: Any, topic: str, callback: Callable[[Any], None],
-                            *args: Any, **options: Any) -> Subscription:
-        """Subscribe as any node does; a time that cannot be does not reach its clock."""
-        # rclpy subscribes through here for `use_sim_time`, and a negative time ends it in spin
-        heard = self._possible(callback) if msg_type is Clock else callback
-        return super().create_subscription(msg_type, topic, heard, *args, **options)
-
-    def _possible(self, callback: Callable[[Clock], None]) -> Callable[[Clock], None]:
-        def hear(message: Clock) -> None:
-            time = message.clock
-            if time.sec >= 0 and time.nanosec < NANOSECONDS:
-                callback(message)
-                return
-            self._clocks_refused += 1
-            self.get_logger().warning(
-                f'/clock told sec {time.sec}, nanosec {time.nanosec}, which is no time: ignored '
-                f'({self._clocks_refused} so far); check who publishes /clock',
-                throttle_duration_sec=10.0)
-
-        return hear
-
-    def complete(self) -> None:
-        """Complete that work; by default there is none. What is published here goes out last."""
-
-
 def run(name: str, create: Callable[[], LoopNode], args: list[str] | None = None) -> int:
     """
-    Run a node until SIGINT, SIGTERM or SIGHUP, which end it between two callbacks.
-
-    One that is still in a callback after five seconds is ended by force.
+    Run a node until SIGINT, SIGTERM or SIGHUP, which end it between two callbacks, or by force.
 
     :param name: word that starts an error line.
     :return: exit code, 0 after a signal and for `--help`, 1 when the node could not start, 2 for
@@ -119,9 +78,8 @@ def run_task(name: str, prepare: Callable[[], Callable[[], int]],
     """
     Run what needs ROS for its parameters and names alone; an interrupt ends it.
 
-    :param prepare: reads them with a node of its own, and returns the task, which runs without
-        the middleware and returns the exit code.
-    :return: exit code; 1 when it could not start or complete, 2 for an unknown argument.
+    :param prepare: reads them, and returns a task without ROS that returns the exit code, which
+        is 1 when it could not start or complete, 2 for an unknown argument.
     """
     if (said := answer(name, args)) is not None:
         return said
@@ -165,7 +123,7 @@ def _init(args: list[str] | None) -> None:
 
 
 def _one_line(error: Exception) -> str:
-    """Return an error's text on one line; rcl repeats itself over several."""
+    # rcl repeats itself over several
     text = str(error).split(', at ./')[0].split(', at /')[0]
     return ' '.join(text.split()) or type(error).__name__
 
@@ -183,20 +141,15 @@ def answer(name: str, args: list[str] | None) -> int | None:
         # it imports the tables of all nodes
         from koopman_ros.ros.programs import help_text
 
-        _show(help_text(name))
+        try:
+            print(help_text(name), flush=True)
+        except BrokenPipeError:
+            # `--help | head` stops half-way; the interpreter flushes once more when it ends
+            os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return 0
     print(f'{name}: unknown argument {rest[0][:100]!r}: parameters are given as --ros-args -p '
           'name:=value; --help says more', file=sys.stderr)
     return 2
-
-
-def _show(text: str) -> None:
-    """Print a text to whoever reads it; `--help | head` stops half-way."""
-    try:
-        print(text, flush=True)
-    except BrokenPipeError:
-        # the interpreter flushes once more when it ends
-        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
 
 
 def open_to_the_network(environment: Mapping[str, str]) -> str:

@@ -3,7 +3,7 @@
 
 """Recording of topics as they come: raw subscriptions into a bag."""
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Mapping
 import heapq
 import time
 from typing import Any, NamedTuple
@@ -20,10 +20,8 @@ from koopman_ros.ros.matching import type_name
 
 # Five seconds at 1 kHz wait here while the disk is slow; Fast DDS keeps no more than this.
 _QUEUE_DEPTH = 5000
-
 _LINGER = 0.1  # s
-# From sending to receipt, on a machine that is busy.
-_LONGEST_WAY_NS = 1_000_000_000
+_LONGEST_WAY_NS = 1_000_000_000  # from sending to receipt, on a machine that is busy
 
 
 class _Taken(NamedTuple):
@@ -34,12 +32,8 @@ class _Taken(NamedTuple):
 
 
 class _OutsideTheExecutor(CallbackGroup):
-    """
-    Keeps subscriptions out of the executor, for us to take from.
-
-    The executor builds its wait set anew for each message, which costs many times what it costs
-    to record one.
-    """
+    # the executor builds its wait set anew for each message, which costs many times what it
+    # costs to record one
 
     def can_execute(self, entity: object) -> bool:
         return False
@@ -63,8 +57,7 @@ class Recorder:
     """
 
     def __init__(self, node: Node, writer: BagWriter, names: tuple[str, ...]) -> None:
-        self._node = node
-        self._writer = writer
+        self._node, self._writer = node, writer
         self._names = {node.resolve_topic_name(name): name for name in names}
         self._types = {topic: topics.TYPES.get(name) for topic, name in self._names.items()}
         self._group = _OutsideTheExecutor()
@@ -89,8 +82,7 @@ class Recorder:
                     self._node.get_logger().error(f'{topic} is not recorded: {error}')
                     del self._types[topic]
                     continue
-            message_type = self._types[topic]
-            if message_type is None:
+            if (message_type := self._types[topic]) is None:
                 continue
             wanted = _matching_qos(self._names[topic], publishers)
             existing = self._subscriptions.get(topic)
@@ -108,8 +100,7 @@ class Recorder:
 
     def take(self) -> None:
         """Record what has arrived."""
-        self._record_in_order(self._waiting(topic, subscription)
-                              for topic, subscription in self._subscriptions.items())
+        self._record_in_order(self._subscriptions)
 
     def flush(self) -> None:
         """Hand what is recorded to the operating system."""
@@ -127,14 +118,12 @@ class Recorder:
     def _end(self, ended: list[str]) -> None:
         subscriptions = {topic: self._subscriptions.pop(topic) for topic in ended}
         try:
-            self._record_in_order(self._waiting(topic, subscription)
-                                  for topic, subscription in subscriptions.items())
+            self._record_in_order(subscriptions)
         finally:
             for subscription in subscriptions.values():
                 self._node.destroy_subscription(subscription)
 
     def _waiting(self, topic: str, subscription: Subscription) -> list[_Taken]:
-        """Take what waits in the middleware."""
         waiting: list[_Taken] = []
         with (handle := subscription.handle):
             # no more than can wait, lest a fast publisher keeps us here
@@ -150,20 +139,19 @@ class Recorder:
                     topic, data, received_ns, info['source_timestamp'] or received_ns))
         return waiting
 
-    def _record_in_order(self, waiting: Iterable[list[_Taken]]) -> None:
+    def _record_in_order(self, subscriptions: Mapping[str, Subscription]) -> None:
         """Record in the order of receipt; the order within a topic stays whatever the clock."""
+        waiting = [self._waiting(topic, each) for topic, each in subscriptions.items()]
         for taken in heapq.merge(*waiting, key=lambda taken: taken.received_ns):
             if not self.counts[taken.topic]:
-                self._announce(taken.topic)
+                # with what its publishers offer now
+                self._writer.add_topic(
+                    taken.topic, message_definition(type_name(self._types[taken.topic])),
+                    [_offered(info.qos_profile) for info in
+                     self._node.get_publishers_info_by_topic(taken.topic)])
             # rosbag2, too, logs the time of receipt
             self._writer.write(taken.topic, taken.data, taken.received_ns, taken.sent_ns)
             self.counts[taken.topic] += 1
-
-    def _announce(self, topic: str) -> None:
-        """Add a topic to the bag with what its publishers offer now."""
-        publishers = self._node.get_publishers_info_by_topic(topic)
-        self._writer.add_topic(topic, message_definition(type_name(self._types[topic])),
-                               [_offered(info.qos_profile) for info in publishers])
 
 
 def take_raw(handle: Any, message_type: Any) -> tuple[bytes, Mapping[str, int]] | None:
@@ -175,12 +163,11 @@ def receipt_ns(info: Mapping[str, int], take_ns: int, empty_ns: int) -> int:
     """
     Return when a message was received, for its place in the recording.
 
-    rmw_fastrtps tells when it arrived; rmw_cyclonedds when it was taken, which puts all that
-    waited on one topic before all that waited on the next. The sender's time is what is left
-    then. Where its clock is another, the nearest time at which the message can have arrived is.
+    rmw_fastrtps tells when it arrived; rmw_cyclonedds when it was taken, just after `take_ns`,
+    which puts all that waited on one topic before the next. The sender's time is what is left
+    then, or the nearest time at which the message can have arrived.
 
     :param info: received and source timestamp in ns, 0 where unknown.
-    :param take_ns: a time just before it was taken.
     :param empty_ns: when nothing waited on its topic for the last time.
     """
     received_ns, source_ns = info['received_timestamp'], info['source_timestamp']
@@ -205,12 +192,7 @@ def _offered(profile: QoSProfile) -> QosProfile:
     return QosProfile(
         history=profile.history.short_key, depth=profile.depth,
         reliability=profile.reliability.short_key, durability=profile.durability.short_key,
-        deadline_ns=_nanoseconds(profile.deadline.nanoseconds),
-        lifespan_ns=_nanoseconds(profile.lifespan.nanoseconds),
-        liveliness=profile.liveliness.short_key,
-        liveliness_lease_duration_ns=_nanoseconds(
-            profile.liveliness_lease_duration.nanoseconds))
-
-
-def _nanoseconds(value: int) -> int:
-    return value if 0 <= value <= INFINITE_NS else INFINITE_NS
+        liveliness=profile.liveliness.short_key, **{
+            f'{name}_ns': ns if 0 <= (ns := getattr(profile, name).nanoseconds) <= INFINITE_NS
+            else INFINITE_NS
+            for name in ('deadline', 'lifespan', 'liveliness_lease_duration')})

@@ -4,6 +4,7 @@
 """Recording as the trainer does it: starts and stops, names, room on the disk, what went wrong."""
 
 from collections.abc import Callable
+import contextlib
 import datetime
 from functools import partial
 import os
@@ -16,7 +17,7 @@ from std_srvs.srv import SetBool
 from koopman_ros.bags import BagWriter
 from koopman_ros.parameters.trainer import TrainerParameters
 from koopman_ros.ros.diagnostics import DiagnosticsPublisher, Level, Status
-from koopman_ros.ros.owned import Owned
+from koopman_ros.ros.node import Owned
 from koopman_ros.ros.recorder import Recorder
 
 _TAKE_PERIOD = 0.05  # s, for new messages
@@ -36,8 +37,7 @@ class Recording:
         self.settings = settings
         self._node = node
         self._recorder: Recorder | None = None
-        self._problem = ''
-        self._path = ''
+        self._problem = self._path = ''
         self._diagnostics = DiagnosticsPublisher(node, 'recording', 'trainer', self._status)
         self._owned = Owned(node)
         self._owned.keep(node.create_service(SetBool, '~/record', self._on_record))
@@ -47,11 +47,7 @@ class Recording:
                                  (_LOOK_PERIOD, Recorder.look_for_publishers))]
 
     def start(self) -> str:
-        """
-        Start a bag and return a sentence that names it.
-
-        :raises OSError: when the bag cannot be made, or the disk has too little room for it.
-        """
+        """Start a bag and return a sentence that names it; OSError without room, e.g."""
         # to the millisecond: recordings may follow each other quickly
         wanted = Path(self.settings.output or datetime.datetime.now().strftime(
             'koopman_ros_%Y_%m_%d-%H_%M_%S_%f')[:-3])
@@ -76,15 +72,13 @@ class Recording:
         return said
 
     def stop(self) -> str:
-        """
-        Complete the bag with all that has arrived and return a sentence that counts it.
-
-        :raises OSError: when the bag could not be completed.
-        """
+        """Complete the bag and return a sentence that counts it; OSError when that fails."""
         recorder = self._end()
         if self._problem:
             raise OSError(self._problem)
-        return self._counted(recorder)
+        said = f'recorded {sum(recorder.counts.values())} messages to {recorder.path}'
+        self._node.get_logger().info(said)
+        return said
 
     def flushed(self) -> str:
         """Return the path of the present or the last bag with all of it on disk, or ''."""
@@ -95,20 +89,14 @@ class Recording:
     def complete(self) -> None:
         """Complete the bag, if there is one, with all that has arrived, and say what it holds."""
         if self._recorder is not None:
-            recorder = self._end()
-            if not self._problem:
-                self._counted(recorder)
+            with contextlib.suppress(OSError):
+                self.stop()
 
     def destroy(self) -> None:
         """Complete the bag, if there is one, and take the service down."""
         self.complete()
         self._owned.destroy()
         self._diagnostics.destroy()
-
-    def _counted(self, recorder: Recorder) -> str:
-        said = f'recorded {sum(recorder.counts.values())} messages to {recorder.path}'
-        self._node.get_logger().info(said)
-        return said
 
     def _end(self) -> Recorder:
         assert self._recorder is not None

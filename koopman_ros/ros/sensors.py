@@ -12,9 +12,7 @@ from koopman_ros.plants import in_steps, Process, sensor_noise
 from koopman_ros.ros import topics
 from koopman_ros.ros.codec import stamp_message, temperature_message
 from koopman_ros.ros.matching import Matching
-from koopman_ros.ros.owned import Owned
-
-_CONCENTRATION_NAME = 'reactant_concentration [mol/L]'
+from koopman_ros.ros.node import Owned
 
 
 class Instruments:
@@ -45,7 +43,8 @@ class Instruments:
         if self._clock is not None:
             self._clock.publish(Clock(clock=stamp))
         if self._concentration is not None:
-            message = JointState(name=[_CONCENTRATION_NAME], position=[float(process.x[0])])
+            message = JointState(
+                name=['reactant_concentration [mol/L]'], position=[float(process.x[0])])
             message.header.stamp = stamp
             message.header.frame_id = frame_id
             self._concentration.publish(message)

@@ -32,10 +32,8 @@ from koopman_ros.parameters.wire import (
     TEMPERATURE,
 )
 
-# JointState is the one stamped type of common_interfaces that carries named float64 values, so
-# that a concentration goes on the wire with its name and unit instead of under a false meaning,
-# and so do the internals of the controller. Its records are lines of JSON, which keep a float64
-# and a nested state bit-identical at a third of the time that named values would take.
+# JointState is the one stamped type of common_interfaces that carries named float64 values.
+# Records are lines of JSON, which keep a float64 bit-identical at a third of the time.
 TYPES = {
     TEMPERATURE: Temperature,
     CONCENTRATION: JointState,
@@ -51,11 +49,9 @@ TYPES = {
     CLOCK: Clock,
 }
 
-# Every message of the loop counts: reliable, with room for a receiver that falls behind while
-# the plant runs hundreds of times faster than real time, or is not found by all yet.
+# Every message counts: reliable, with room for a receiver that falls behind a fast plant.
 LOOP_QOS = QoSProfile(depth=1000)
-# A late joiner learns what is tracked, and which coolant is applied (REP 2003 leaves latching to
-# the publisher).
+# A late joiner learns what is tracked, and which coolant is applied.
 LATCHED_QOS = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
 CLOCK_QOS = QoSProfile(depth=1, reliability=ReliabilityPolicy.BEST_EFFORT)
 

@@ -16,7 +16,7 @@ from koopman_ros.parameters.trainer import TrainerParameters
 from koopman_ros.resources import model_path
 from koopman_ros.ros import topics
 from koopman_ros.ros.diagnostics import DiagnosticsPublisher, Level, Status
-from koopman_ros.ros.owned import Owned
+from koopman_ros.ros.node import Owned
 
 _POLL_PERIOD = 0.1  # s
 _LINE_PERIOD = 5.0  # s between plain lines of progress
@@ -29,15 +29,12 @@ class Training:
 
     :param settings: what the next training starts with; the node replaces it when they change.
     :param recorded: returns the bag that is being recorded or was last, flushed, or ''.
-    :param on_end: called when a training has ended.
     """
 
     def __init__(self, node: Node, settings: TrainerParameters, recorded: Callable[[], str],
                  on_end: Callable[[JobState], None] = lambda _: None) -> None:
         self.settings = settings
-        self._node = node
-        self._recorded = recorded
-        self._on_end = on_end
+        self._node, self._recorded, self._on_end = node, recorded, on_end
         self._job: RetrainingJob | None = None
         self._state: JobState | None = None
         self._last_line = 0.0
@@ -48,12 +45,7 @@ class Training:
         self._timer = owned.timer(_POLL_PERIOD, self._on_poll, autostart=False)
 
     def start(self) -> str:
-        """
-        Start a training and return a sentence that says from what.
-
-        :raises ValueError: when there is nothing to train from.
-        :raises OSError: when the process cannot be started.
-        """
+        """Start a training and say from what; ValueError without a bag, OSError of the system."""
         settings = self.settings
         bags = [bag for bag in (settings.bags if any(settings.bags) else (self._recorded(),))
                 if bag]
@@ -146,14 +138,11 @@ class Training:
         state = self._state
         if state is None:
             return Status(Level.OK, 'not training')
-        values = {'done [%]': 100.0 * state.share, **_figures(state)}
+        values = {'done [%]': 100.0 * state.share, **{
+            key: value for key, value in (state.summary or {}).items()
+            if isinstance(value, (bool, int, float, str))}}
         if not state.ended or state.accepted:
             # the sentence stays while the figures move, or there would be a status a step
             text = state.text if state.ended else state.text.split(',')[0]
             return Status(Level.OK, text, {**values, 'step': state.text})
         return Status(Level.WARN if state.refused else Level.ERROR, state.text, values)
-
-
-def _figures(state: JobState) -> dict[str, object]:
-    return {key: value for key, value in (state.summary or {}).items()
-            if isinstance(value, (bool, int, float, str))}

@@ -1,19 +1,98 @@
 # SPDX-FileCopyrightText: 2026 The koopman_ros Authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""What goes on when the executor's thread does not: the watch over silence, and the end."""
+"""Times of measurements, and what goes on when the executor is busy: watch and end."""
 
 from collections.abc import Callable
+import math
 import os
 import signal
 import threading
+import time
+from typing import NamedTuple
+
+from rclpy.node import Node
 
 from koopman_ros.startup import end_by_force
+from koopman_ros.units import NANOSECONDS
 
 PERIOD = 0.1  # s by the wall, of the executor's own watch and of the one over it
 # Looks in a row at which the executor has not come by: on a loaded machine it may be late by some.
 _MISSED = 10
 _PATIENCE = 5.0  # s from a signal to the end of a callback, or of the start
+# Stamps further from the node's clock than this come from another clock.
+_SAME_CLOCK = 3600.0  # s
+_CLOCK_PATIENCE = 1.0  # s from the start until somebody should publish the time
+
+
+class Moment(NamedTuple):
+    """A time by the steady clock, in s, on /clock (0 where it does not count) and the node's."""
+
+    wall: float
+    sim_ns: int
+    node_ns: int
+
+
+class Timing:
+    """
+    The time of the last measurement that brought news, by the plant's time where it is known.
+
+    With `use_sim_time` that is the time on /clock, as long as there is one; otherwise the steady
+    clock, which no correction of the system's time upsets.
+    """
+
+    def __init__(self, node: Node) -> None:
+        self._node = node
+        self._simulated = bool(node.get_parameter('use_sim_time').value)
+        self._wall = self._begun = time.monotonic()
+        self._sim = self._sim_now()
+        self.age = math.nan  # s, of the last measurement at its arrival
+        self.answer_seconds = math.nan  # from its arrival to its command
+        self.busy = False  # whether what has arrived since then waits for the node itself
+
+    def now(self) -> Moment:
+        """Return the present time."""
+        return Moment(time.monotonic(), self._sim_now(),
+                      self._node.get_clock().now().nanoseconds)
+
+    def note(self, stamp_ns: int, at: Moment) -> None:
+        """Take down that a measurement with a new stamp has arrived at a time."""
+        self._wall, self._sim = at.wall, at.sim_ns
+        age = (at.node_ns - stamp_ns) / NANOSECONDS
+        # at time zero the clock has not begun
+        self.age = age if at.node_ns and abs(age) < _SAME_CLOCK else math.nan
+
+    def answered(self) -> None:
+        """Take down that its command is out."""
+        self.answer_seconds = time.monotonic() - self._wall
+
+    @property
+    def without_clock(self) -> bool:
+        """Whether `use_sim_time` is set and nobody publishes the time."""
+        waited = time.monotonic() - self._begun
+        return self._simulated and self._sim_now() == 0 and waited > _CLOCK_PATIENCE
+
+    def busy_silence(self, seconds: float) -> float:
+        """Return the silence of a node that was busy so long, in which nobody read /clock."""
+        return max(self.silence, seconds if self._simulated else 0.0)
+
+    @property
+    def wall_silence(self) -> float:
+        """Seconds since the last measurement by the steady clock."""
+        return time.monotonic() - self._wall
+
+    @property
+    def silence(self) -> float:
+        """Seconds since the last measurement, in the plant's time where it is known."""
+        now = self._sim_now()
+        if now:
+            # a clock that was set back says nothing yet
+            self._sim = min(self._sim or now, now)
+            return (now - self._sim) / NANOSECONDS
+        return self.wall_silence
+
+    def _sim_now(self) -> int:
+        return self._node.get_clock().now().nanoseconds if self._simulated else 0
 
 
 class Watchdog:
@@ -21,8 +100,7 @@ class Watchdog:
     A thread that does what the executor's timer would, whenever the executor does not come to it.
 
     It counts its own looks, so that time in which the whole process stood still is not held
-    against the executor. What it can do while others compute depends on Python's interpreter lock:
-    it waits for library calls that keep it.
+    against the executor. It waits for library calls that keep Python's interpreter lock.
 
     :param act: called from that thread with the seconds for which the executor has been busy;
         what it raises is raised again in the executor, by :meth:`beat`.
@@ -69,12 +147,11 @@ def end_in_time(name: str) -> Callable[[], None]:
     """
     End the process by force when it is still in a callback, or starting, 5 s after a signal.
 
-    Python's handlers run in the main thread alone, between two instructions of its own. A byte
-    comes through the pipe whatever that thread is doing.
-
     :param name: word that starts the line which says so.
     :return: to be called when callbacks are over; what comes then is bounded elsewhere.
     """
+    # Python's handlers run in the main thread alone, between two instructions of its own; a byte
+    # comes through the pipe whatever that thread is doing
     reader, writer = os.pipe()
     os.set_blocking(writer, False)
     signal.set_wakeup_fd(writer, warn_on_full_buffer=False)

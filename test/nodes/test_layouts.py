@@ -16,7 +16,7 @@ from sensor_msgs.msg import JointState
 from koopman_ros.control import Mode, Report
 from koopman_ros.resources import config_directory
 from koopman_ros.ros import topics
-from koopman_ros.ros.controller_status import internals
+from koopman_ros.ros.controller_messages import internals
 
 # What a layout shows: topics with one value by themselves, and internals by their names.
 TEMPERATURES = {topics.TEMPERATURE, topics.ACTIVE_SETPOINT, topics.PREDICTED_TEMPERATURE,

@@ -38,7 +38,7 @@ from koopman_ros.parameters.trainer import TrainerParameters
 from koopman_ros.resources import model_path
 from koopman_ros.retraining import retrain, Task
 from koopman_ros.ros import topics
-from koopman_ros.ros.process import LoopNode
+from koopman_ros.ros.node import LoopNode
 from koopman_ros.ros.programs import TABLES
 from koopman_ros.testing import isolated_domain
 from koopman_ros.units import NANOSECONDS, to_kelvin

@@ -23,7 +23,7 @@ from koopman_ros.parameters.table import (
     Specification,
 )
 from koopman_ros.resources import config_directory
-from koopman_ros.ros.parameters import ParameterNode, range_of
+from koopman_ros.ros.node import LoopNode, range_of
 from koopman_ros.ros.programs import main, POLICY_FILE, TABLES
 from koopman_ros.testing import Harness
 
@@ -145,7 +145,7 @@ def test_what_is_dumped_can_be_loaded_again(ros: Harness, tmp_path: Path, node: 
                               default_flow_style=False))
     loaded = {name: parameter_value_to_python(message.value)
               for name, message in parameter_dict_from_yaml_file(str(file)).items()}
-    reader = ParameterNode(node, context=ros.node.context,
+    reader = LoopNode(node, context=ros.node.context,
                            cli_args=['--ros-args', '--params-file', str(file)])
     started = {name: reader.get_parameter(name).value for name in defaults}
     reader.destroy_node()
@@ -158,7 +158,7 @@ def test_what_is_dumped_can_be_loaded_again(ros: Harness, tmp_path: Path, node: 
 def declared(ros: Harness, *arguments: str, name: str = 'odd',
              table: ParameterTable[Any] = ODD) -> Any:
     """Return the snapshot of a node started with arguments, and if it has what is not its own."""
-    node = ParameterNode(name, context=ros.node.context, cli_args=['--ros-args', *arguments])
+    node = LoopNode(name, context=ros.node.context, cli_args=['--ros-args', *arguments])
     try:
         return node.declare_table(table), node.has_parameter('foreign')
     finally:

@@ -19,7 +19,7 @@ from koopman_ros.bags import BagWriter, message_definition
 from koopman_ros.nodes import replay
 from koopman_ros.parameters.player import PlayerParameters
 from koopman_ros.ros import topics
-from koopman_ros.ros.parameters import ParameterNode
+from koopman_ros.ros.node import LoopNode
 from koopman_ros.ros.programs import OPERATOR, policy, Program, PROGRAMS
 from koopman_ros.testing import Harness
 from support.messages import temperature
@@ -122,12 +122,12 @@ def test_the_replay_does_what_it_is_granted(context: None, monkeypatch: pytest.M
     """It is gone before others have found it, so that it is asked itself, at its end."""
     seen: list[dict[str, set[str]]] = []
 
-    class Asked(ParameterNode):
+    class Asked(LoopNode):
         def destroy_node(self) -> None:
             seen.append(done(self, 'replay'))
             super().destroy_node()
 
-    monkeypatch.setattr(replay, 'ParameterNode', Asked)
+    monkeypatch.setattr(replay, 'LoopNode', Asked)
     replay._prepare()
     assert seen == [resolved(PROGRAMS['replay'], 'replay')]
 

@@ -12,8 +12,8 @@ import pytest
 from koopman_ros.control import Controller
 from koopman_ros.lifting import load, ModelFileError, save
 from koopman_ros.resources import model_path
-from koopman_ros.ros import model_loading
-from koopman_ros.ros.model_loading import load_suitable
+from koopman_ros.ros import model_reload
+from koopman_ros.ros.model_reload import load_suitable
 
 SHIPPED = load(model_path('reactor_nz4'))
 
@@ -45,7 +45,7 @@ def test_model_that_takes_the_coolant_for_what_is_controlled_is_refused(
 def test_model_whose_step_takes_too_long_is_refused_with_its_time(
         monkeypatch: pytest.MonkeyPatch) -> None:
     """No model within the bounds takes that long, so the limit is moved."""
-    monkeypatch.setattr(model_loading, '_LONGEST_STEP', 1e-7)
+    monkeypatch.setattr(model_reload, '_LONGEST_STEP', 1e-7)
     with pytest.raises(ModelFileError, match=(
             r'a control step with the model takes [0-9.e-]+ s of a processor, at most 1e-07 s are '
             r'allowed: train one with fewer coordinates \(n_z = 4\)$')):

@@ -10,7 +10,7 @@ import pytest
 from rcl_interfaces.srv import DescribeParameters
 
 from koopman_ros.parameters.controller import TABLE
-from koopman_ros.ros.parameters import range_of
+from koopman_ros.ros.node import range_of
 from koopman_ros.testing import Harness
 
 CONTROLLER = '/controller'

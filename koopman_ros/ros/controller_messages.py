@@ -1,25 +1,62 @@
 # SPDX-FileCopyrightText: 2026 The koopman_ros Authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""What the controller says of itself: its status for /diagnostics, and its internals to plot."""
+"""The controller's messages: into events of its step, and its status, internals and records."""
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
+import math
+import secrets
+import time
+from typing import Any
 
 from builtin_interfaces.msg import Time
 import numpy as np
-from numpy.typing import NDArray
 from sensor_msgs.msg import JointState
+from std_msgs.msg import String
 
-from koopman_ros.control import Arrival, Controller, HOLD, Mode, Report, SAFE, State
+from koopman_ros.arrays import Array
+from koopman_ros.control import Arrival, Controller, events, HOLD, Mode, Report, SAFE, State
 from koopman_ros.parameters.controller import ControllerParameters
 from koopman_ros.reasons import level_words
+from koopman_ros.replay.records import fields_of, Record, SNAPSHOT, START
+from koopman_ros.ros import topics
+from koopman_ros.ros.codec import stamp_nanoseconds
 from koopman_ros.ros.diagnostics import Level, Status, words_of
-from koopman_ros.ros.timing import Timing
-from koopman_ros.units import in_celsius, to_celsius
+from koopman_ros.ros.matching import Matching
+from koopman_ros.ros.watchdog import Timing
+from koopman_ros.units import in_celsius, NANOSECONDS, to_celsius, to_kelvin
 
+# The temperatures of reactor and coolant at an instant are stamped no further apart.
+SAME_TIME_NS = 2 * NANOSECONDS
+_SNAPSHOT_PERIOD = 10.0  # s by the wall
 _ACTIONS = {HOLD: 'the last command is held', SAFE: 'the safe coolant temperature is commanded'}
 _WAY_BACK = 'the coolant leads the reactor back from where the safe coolant keeps it'
+
+
+def measurement(message: Any, coolant: float | None = None) -> events.Measurement:
+    """Return the event of a measurement, with the applied coolant in degrees Celsius if known."""
+    kelvin = to_kelvin(message.temperature)
+    # below absolute zero there is nothing to measure
+    return events.Measurement(stamp_nanoseconds(message.header.stamp),
+                              np.array([kelvin if kelvin >= 0.0 else math.nan]),
+                              None if coolant is None else np.array([to_kelvin(coolant)]))
+
+
+def initialisation(message: Any) -> events.Initialisation:
+    """Return the event of a start from the coolant temperature that is applied already."""
+    return events.Initialisation(np.array([to_kelvin(message.temperature)]))
+
+
+def setpoint_request(message: Any) -> events.SetpointRequest:
+    """Return the event of a set-point, whose stamp says from when it holds."""
+    return events.SetpointRequest(stamp_nanoseconds(message.header.stamp),
+                                  np.array([to_kelvin(message.temperature)]))
+
+
+def manual_command(message: Any) -> events.ManualCommand:
+    """Return the event of a coolant temperature commanded in manual mode."""
+    return events.ManualCommand(np.array([to_kelvin(message.temperature)]))
 
 
 @dataclass
@@ -135,6 +172,7 @@ def _warning(now: Situation) -> str:
 def _figures(now: Situation) -> dict[str, object]:
     report, state, timing = now.report, now.state, now.timing
     target, law = report.target, report.command.law
+    setpoint, disturbance, transfer = _setpoint_disturbance_transfer(report)
     bias = None if report.estimate is None else now.controller.equivalent_bias(state)
     return {
         'mode': state.mode.value,
@@ -143,9 +181,9 @@ def _figures(now: Situation) -> dict[str, object]:
         'reason': now.reason or 'none',
         **now.model,
         'temperature [degC]': float(now.temperature),
-        'set-point [degC]': _setpoint(report),
+        'set-point [degC]': setpoint,
         'coolant [degC]': to_celsius(_first(state.command)),
-        'disturbance [K of coolant]': _disturbance(report),
+        'disturbance [K of coolant]': disturbance,
         'equivalent sensor bias [K]': _first(bias),
         'distance outside training box [half widths]': float(report.measurement.outside),
         'set-point outside training box [half widths]': (
@@ -154,7 +192,7 @@ def _figures(now: Situation) -> dict[str, object]:
         'Riccati residual': float(law.residual),
         'gain norm': float(law.gain),
         'predicted growth per sample': float(law.growth),
-        'transfer [K]': _transfer(report),
+        'transfer [K]': transfer,
         'scheduled set-points': len(state.setpoint.scheduled),
         'measurements': now.counts.measurements,
         'late measurements': now.counts.late,
@@ -167,27 +205,23 @@ def _figures(now: Situation) -> dict[str, object]:
     }
 
 
-def _first(values: NDArray[np.float64] | None) -> float:
+def _first(values: Array | None) -> float:
     return np.nan if values is None else float(values[0])
 
 
-def _setpoint(report: Report) -> float:
-    return to_celsius(_first(report.target.setpoint if report.target else None))
-
-
-def _disturbance(report: Report) -> float:
-    return _first(report.estimate.disturbance if report.estimate else None)
-
-
-def _transfer(report: Report) -> float:
-    return 0.0 if report.command.transfer is None else _first(report.command.transfer)
+def _setpoint_disturbance_transfer(report: Report) -> tuple[float, float, float]:
+    transfer = report.command.transfer
+    return (to_celsius(_first(report.target.setpoint if report.target else None)),
+            _first(report.estimate.disturbance if report.estimate else None),
+            0.0 if transfer is None else _first(transfer))
 
 
 def internals(report: Report, stamp: Time, frame_id: str) -> JointState:
     """Return what a person would plot beside the temperatures, under names with units."""
     law = report.command.law
+    setpoint, disturbance, transfer = _setpoint_disturbance_transfer(report)
     values = {
-        'disturbance [K]': _disturbance(report),
+        'disturbance [K]': disturbance,
         'estimated_temperature [degC]': to_celsius(
             _first(report.estimate.state if report.estimate else None)),
         'distance_outside [half widths]': float(report.measurement.outside),
@@ -195,10 +229,48 @@ def internals(report: Report, stamp: Time, frame_id: str) -> JointState:
         'gain': float(law.gain),
         'riccati_residual': float(law.residual),
         'growth_per_sample': float(law.growth),
-        'transfer [K]': _transfer(report),
-        'setpoint [degC]': _setpoint(report),
+        'transfer [K]': transfer,
+        'setpoint [degC]': setpoint,
     }
     message = JointState(name=list(values), position=list(values.values()))
     message.header.stamp = stamp
     message.header.frame_id = frame_id
     return message
+
+
+class RecordPublisher:
+    """
+    Publish numbered records; the caller holds the lock of the controller's state meanwhile.
+
+    A replay begins at a snapshot of that state: there is one at the start, one for each new
+    subscriber, by `joined`, which is called in the executor, and one every ten seconds.
+    """
+
+    def __init__(self, matching: Matching, snapshot: Callable[[], Mapping[str, Any]],
+                 joined: Callable[[], None]) -> None:
+        self._snapshot = snapshot
+        self._run, self._number, self._due = secrets.token_hex(8), 0, 0.0
+        self._publisher = matching.publish(
+            topics.CONTROLLER_EVENTS,
+            matched=lambda info: joined() if info.current_count_change > 0 else None)
+        self.publish_snapshot(START)
+
+    def publish_snapshot(self, event: str = SNAPSHOT) -> None:
+        """Publish the state."""
+        self._publish(event, self._snapshot())
+        self._due = time.monotonic() + _SNAPSHOT_PERIOD
+
+    def publish_event(self, event: events.Event, outcome: events.Outcome) -> None:
+        """Publish an event and what it led to."""
+        self.publish(*fields_of(event, outcome))
+
+    def publish(self, event: str, fields: Mapping[str, Any]) -> None:
+        """Publish an event by its name."""
+        self._publish(event, fields)
+        if time.monotonic() > self._due:
+            self.publish_snapshot()
+
+    def _publish(self, event: str, fields: Mapping[str, Any]) -> None:
+        record = Record(self._run, self._number, event, fields)
+        self._number += 1
+        self._publisher.publish(String(data=record.text()))

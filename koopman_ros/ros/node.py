@@ -1,45 +1,110 @@
 # SPDX-FileCopyrightText: 2026 The koopman_ros Authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""A node whose parameters are those of a table: declared, checked, and followed from then on."""
+"""A node with the parameters of a table, and what its parts create, to be taken down with them."""
 
 from collections.abc import Callable
 import copy
 from dataclasses import replace
 import difflib
-from functools import partial
 import math
 from typing import Any, TypeVar
 
-from rcl_interfaces.msg import (
-    FloatingPointRange,
-    IntegerRange,
-    ParameterDescriptor,
-    SetParametersResult,
-)
+from rcl_interfaces import msg
+from rclpy.clock import Clock, ClockType
 from rclpy.exceptions import InvalidParameterTypeException
 from rclpy.node import Node
 from rclpy.parameter import Parameter
+from rclpy.publisher import Publisher
+from rclpy.service import Service
+from rclpy.subscription import Subscription
+from rclpy.timer import Timer
+from rosgraph_msgs.msg import Clock as ClockMessage
 
 from koopman_ros.parameters.table import ConfigurationError, ParameterTable, Specification
+from koopman_ros.units import NANOSECONDS
 
 T = TypeVar('T')
+Entity = TypeVar('Entity', Publisher, Service, Subscription, Timer)
 
 # Parameters that rclpy itself declares or reads.
 _RCLPY_PARAMETERS = ('use_sim_time', 'start_type_description_service')
 
+_DESTROY: dict[type, Callable[[Node, Any], object]] = {
+    Publisher: Node.destroy_publisher, Subscription: Node.destroy_subscription,
+    Service: Node.destroy_service, Timer: Node.destroy_timer}
 
-class ParameterNode(Node):
+
+def wall_timer(node: Node, seconds: float, callback: Callable[[], Any], **options: Any) -> Timer:
+    """Create a timer by the steady clock, which runs while simulated time stands still."""
+    return node.create_timer(
+        seconds, callback, clock=Clock(clock_type=ClockType.STEADY_TIME), **options)
+
+
+class Owned:
+    """Publishers, subscriptions, services and timers of one part of a node."""
+
+    def __init__(self, node: Node) -> None:
+        self._node = node
+        self._entities: list[Any] = []
+
+    def keep(self, entity: Entity) -> Entity:
+        """Note an entity, and return it."""
+        self._entities.append(entity)
+        return entity
+
+    def timer(self, seconds: float, callback: Callable[[], Any], **options: Any) -> Timer:
+        """Create a :func:`wall_timer`."""
+        return self.keep(wall_timer(self._node, seconds, callback, **options))
+
+    def destroy(self) -> None:
+        """Take all of them down, the last one first."""
+        while self._entities:
+            entity = self._entities.pop()
+            _DESTROY[type(entity)](self._node, entity)
+
+
+class LoopNode(Node):
     """
-    A node whose parameters are those of a :class:`ParameterTable`.
+    A node whose parameters are those of a table, and which may complete work before its end.
 
     Every value that it was given is declared, so that the table finds names it does not know, and
     the table answers what rclpy would answer less clearly itself.
+
+    :ivar exit_code: ends the process when a node whose work is done sets it.
     """
 
+    exit_code: int | None = None
+    _clocks_refused = 0
+
     def __init__(self, name: str, **options: Any) -> None:
-        self._ranges: dict[str, FloatingPointRange | IntegerRange] = {}
+        self._ranges: dict[str, msg.FloatingPointRange | msg.IntegerRange] = {}
         super().__init__(name, automatically_declare_parameters_from_overrides=True, **options)
+
+    def complete(self) -> None:
+        """Complete that work, if there is any; what is published here goes out last."""
+
+    def create_subscription(self, msg_type: Any, topic: str, callback: Callable[[Any], None],
+                            *args: Any, **options: Any) -> Subscription:
+        """Subscribe as any node does; a time that cannot be does not reach its clock."""
+        # rclpy subscribes through here for `use_sim_time`, and a negative time ends it in spin
+        heard = self._possible(callback) if msg_type is ClockMessage else callback
+        return super().create_subscription(msg_type, topic, heard, *args, **options)
+
+    def _possible(self, callback: Callable[[ClockMessage], None]
+                  ) -> Callable[[ClockMessage], None]:
+        def hear(message: ClockMessage) -> None:
+            time = message.clock
+            if time.sec >= 0 and time.nanosec < NANOSECONDS:
+                callback(message)
+                return
+            self._clocks_refused += 1
+            self.get_logger().warning(
+                f'/clock told sec {time.sec}, nanosec {time.nanosec}, which is no time: ignored '
+                f'({self._clocks_refused} so far); check who publishes /clock',
+                throttle_duration_sec=10.0)
+
+        return hear
 
     def declare_parameters(self, namespace: str, parameters: list[Any],
                            ignore_override: bool = False) -> list[Parameter]:
@@ -52,7 +117,7 @@ class ParameterNode(Node):
         declared: list[Parameter] = super().declare_parameters(namespace, typed, ignore_override)
         return declared
 
-    def describe_parameter(self, name: str) -> ParameterDescriptor:
+    def describe_parameter(self, name: str) -> msg.ParameterDescriptor:
         """
         Return the descriptor of a parameter with its range.
 
@@ -61,7 +126,7 @@ class ParameterNode(Node):
         """
         descriptor = copy.copy(super().describe_parameter(name))
         limits = self._ranges.get(name)
-        if isinstance(limits, IntegerRange):
+        if isinstance(limits, msg.IntegerRange):
             descriptor.integer_range = [limits]
         elif limits is not None:
             descriptor.floating_point_range = [limits]
@@ -71,8 +136,7 @@ class ParameterNode(Node):
         """
         Declare every parameter of a table, and validate the whole.
 
-        Names that no table knows are ignored with a warning: a parameter file may serve several
-        nodes.
+        Names that no table knows are ignored with a warning: a file may serve several nodes.
 
         :raises ConfigurationError: naming the parameter, its value and the allowed range.
         """
@@ -84,7 +148,7 @@ class ParameterNode(Node):
             self.undeclare_parameter(name)
         if unknown:
             self.get_logger().warning('parameters that this node does not have are ignored: '
-                                      + ', '.join(map(partial(_with_hint, table), unknown)))
+                                      + ', '.join(_with_hint(table, name) for name in unknown))
         snapshot = table.kind(**{
             name: self._declare_row(row, given[name].value if name in given else row.default)
             for name, row in table.rows.items()})
@@ -96,7 +160,7 @@ class ParameterNode(Node):
         unit = f' [{row.unit}]' if row.unit else ''
         default = list(row.default) if isinstance(row.default, tuple) else row.default
         try:
-            declared = self.declare_parameter(row.name, default, ParameterDescriptor(
+            declared = self.declare_parameter(row.name, default, msg.ParameterDescriptor(
                 description=row.description + unit, additional_constraints=row.range_text,
                 read_only=row.read_only))
         except InvalidParameterTypeException:
@@ -111,10 +175,8 @@ class ParameterNode(Node):
     def follow_table(self, table: ParameterTable[T], snapshot: T, apply: Callable[[T], None],
                      accept: Callable[[T, set[str]], str] = lambda *_: '') -> None:
         """
-        Keep a snapshot in step with the parameters from now on.
+        Keep a snapshot of a table, all of which is declared, in step with the parameters.
 
-        :param table: all of whose parameters are declared.
-        :param snapshot: the present values.
         :param apply: called with each new snapshot, after the change took effect.
         :param accept: called before with a snapshot that fits and the names of what was set;
             returns why it cannot be, or an empty string.
@@ -125,14 +187,14 @@ class ParameterNode(Node):
             return {change.name: _as_python(change.value) for change in changes
                     if change.name in table.rows}
 
-        def validate(changes: list[Parameter]) -> SetParametersResult:
+        def validate(changes: list[Parameter]) -> msg.SetParametersResult:
             # rclpy has refused values of another type
             values = changed(changes)
             merged = replace(current, **values)  # type: ignore[type-var]
             reason = table.check(merged, current) or accept(merged, set(values))
             if reason:
                 self.get_logger().warning(f'parameter change refused: {reason}')
-            return SetParametersResult(successful=not reason, reason=reason)
+            return msg.SetParametersResult(successful=not reason, reason=reason)
 
         def take_over(changes: list[Parameter]) -> None:
             nonlocal current
@@ -144,13 +206,13 @@ class ParameterNode(Node):
         self.add_post_set_parameters_callback(take_over)
 
 
-def range_of(row: Specification) -> FloatingPointRange | IntegerRange | None:
+def range_of(row: Specification) -> msg.FloatingPointRange | msg.IntegerRange | None:
     """Return the range for a slider, which holds an open minimum, too; None without an end."""
     if math.isinf(row.minimum) or math.isinf(row.maximum):
         return None
     if isinstance(row.default, int):
-        return IntegerRange(from_value=int(row.minimum), to_value=int(row.maximum))
-    return FloatingPointRange(from_value=float(row.minimum), to_value=float(row.maximum))
+        return msg.IntegerRange(from_value=int(row.minimum), to_value=int(row.maximum))
+    return msg.FloatingPointRange(from_value=float(row.minimum), to_value=float(row.maximum))
 
 
 def _with_hint(table: ParameterTable[Any], name: str) -> str:
