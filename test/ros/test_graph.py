@@ -1,0 +1,250 @@
+# SPDX-FileCopyrightText: 2026 The koopman_ros Authors
+# SPDX-License-Identifier: Apache-2.0
+
+"""
+Nodes among others: the SROS2 policy grants what each does on the network, and no more.
+
+And complaints about others whose messages cannot pass, between two nodes of one process.
+"""
+
+from collections.abc import Callable, Iterator
+from pathlib import Path
+import re
+import time
+from typing import Any
+from xml.etree import ElementTree
+
+import pytest
+import rclpy
+from rclpy import qos
+from rclpy.context import Context
+from rclpy.duration import Duration
+from rclpy.executors import SingleThreadedExecutor
+from rclpy.node import Node, NodeNameNonExistentError
+from rclpy.qos import QoSProfile
+from rclpy.qos_overriding_options import QoSOverridingOptions
+from rclpy.serialization import serialize_message
+from sensor_msgs.msg import JointState, Temperature
+from std_srvs.srv import SetBool
+
+from koopman_ros.bags import BagWriter, message_definition
+from koopman_ros.nodes import replay
+from koopman_ros.parameters.player import PlayerParameters
+from koopman_ros.ros import topics
+from koopman_ros.ros.matching import Matching
+from koopman_ros.ros.node import LoopNode
+from koopman_ros.ros.programs import OPERATOR, policy, Program, PROGRAMS
+from koopman_ros.testing import Harness, isolated_domain
+from support.messages import temperature, TIMEOUT
+
+Seen = dict[str, set[str]]
+BEST_EFFORT = QoSProfile(depth=1, reliability=qos.ReliabilityPolicy.BEST_EFFORT)
+
+
+def resolved(access: Program, node: str) -> Seen:
+    """Return the names of a node in the root namespace in full, by what it does with them."""
+    return {verb: {name if name.startswith('/') else f'/{name.replace("~", node, 1)}'
+                   for name in getattr(access, verb)}
+            for verb in ('publishes', 'subscribes', 'serves', 'calls')}
+
+
+def done(observer: Node, node: str) -> Seen:
+    """Return what a node does at this moment, by the graph."""
+    questions = {
+        'publishes': observer.get_publisher_names_and_types_by_node,
+        'subscribes': observer.get_subscriber_names_and_types_by_node,
+        'serves': observer.get_service_names_and_types_by_node,
+        'calls': observer.get_client_names_and_types_by_node}
+    try:
+        return {verb: {name for name, _ in ask(node, '/')} for verb, ask in questions.items()}
+    except NodeNameNonExistentError:
+        return {verb: set() for verb in questions}
+
+
+def watch(ros: Harness, node: str, seen: Seen, **wanted: set[str]) -> None:
+    """Add to what was seen of a node, until all that is wanted was."""
+    def found() -> bool:
+        for verb, names in done(ros.node, node).items():
+            seen.setdefault(verb, set()).update(names)
+        return all(names <= seen[verb] for verb, names in wanted.items())
+
+    ros.wait_until(found)
+
+
+def check(ros: Harness, node: str, seen: Seen) -> None:
+    """Compare what a node does, and did, with what is granted."""
+    granted = resolved(PROGRAMS[node], node)
+    watch(ros, node, seen, **granted)
+    assert seen == granted
+
+
+@pytest.mark.parametrize(('node', 'parameters'), [
+    ('plant', {'reactor': 'two_state', 'speed': 2.0}),
+    ('controller', {'use_sim_time': True}),
+    ('player', {'bag': 'all.mcap', 'rate': 0.0, 'clock': True}),
+])
+def test_a_node_does_what_it_is_granted(
+        ros: Harness, tmp_path: Path, node: str, parameters: dict[str, Any]) -> None:
+    if 'bag' in parameters:
+        parameters = {**parameters, 'bag': tmp_path / parameters['bag']}
+        with BagWriter(parameters['bag']) as writer:
+            for number, name in enumerate(PlayerParameters().topics):
+                writer.add_topic(f'/{name}', message_definition('sensor_msgs/msg/Temperature'), ())
+                writer.write(f'/{name}', serialize_message(temperature(40.0, 1.0)), number)
+    ros.start(node, parameters)
+    check(ros, node, {})
+
+
+def test_the_trainer_does_what_it_is_granted(ros: Harness, tmp_path: Path) -> None:
+    seen: Seen = {}
+    ros.start('trainer', {'use_sim_time': True, 'output': tmp_path / 'run.mcap',
+                          'experiment_timeout': 0.5})
+    client = ros.node.create_client(SetBool, '/trainer/experiment')
+    ros.wait_until(client.service_is_ready)
+    for topic in (topics.COOLANT_SETPOINT, topics.MANUAL_COOLANT_SETPOINT):
+        assert ros.set_parameters('/trainer', experiment_topic=topic)[0].successful
+        # it publishes while it waits for the measurement that does not come
+        waiting = client.call_async(SetBool.Request(data=True))
+        watch(ros, 'trainer', seen, publishes={f'/{topic}'})
+        ros.wait_until(waiting.done)
+        # without a controller nobody drives it by hand
+        ros.node.create_publisher(Temperature, topics.COOLANT_SETPOINT, topics.LOOP_QOS)
+    check(ros, 'trainer', seen)
+
+
+def test_the_replay_does_what_it_is_granted(ros: Harness, monkeypatch: pytest.MonkeyPatch
+                                            ) -> None:
+    """It is gone before others have found it, so that it is asked itself, at its end."""
+    seen: list[Seen] = []
+
+    class Asked(LoopNode):
+        def destroy_node(self) -> None:
+            seen.append(done(self, 'replay'))
+            super().destroy_node()
+
+    monkeypatch.setattr(replay, 'LoopNode', Asked)
+    rclpy.init(args=['--ros-args', '-p', 'bags:=[run_1]'])
+    try:
+        replay._prepare()
+    finally:
+        rclpy.try_shutdown()
+    assert seen == [resolved(PROGRAMS['replay'], 'replay')]
+
+
+def test_an_operator_asks_and_watches_all_and_commands_by_the_set_points_alone() -> None:
+    operator = resolved(OPERATOR, 'operator')
+    loop = {node: resolved(access, node) for node, access in PROGRAMS.items() if node != 'replay'}
+    assert operator['subscribes'] >= set().union(*(do['publishes'] for do in loop.values()))
+    assert operator['calls'] == set().union(*(do['serves'] for do in loop.values()))
+    assert operator['publishes'] == {
+        '/setpoint', '/manual_coolant_setpoint', '/rosout', '/parameter_events'}
+
+
+def test_policy_has_the_form_that_sros2_reads() -> None:
+    """Policy version 0.2.0: enclaves, profiles, and lists that are not empty and allow."""
+    root = ElementTree.fromstring(policy())
+    assert (root.tag, root.attrib) == ('policy', {'version': '0.2.0'})
+    (enclaves,) = root
+    found = {}
+    for enclave in enclaves:
+        ((profile,),) = enclave
+        assert (enclaves.tag, enclave.tag, enclave[0].tag, profile.tag) == (
+            'enclaves', 'enclave', 'profiles', 'profile')
+        found[enclave.get('path')] = (profile.attrib, {
+            (rules.tag, *rules.attrib.items()): {(rule.tag, rule.text) for rule in rules}
+            for rules in profile})
+    assert found == {f'/koopman_ros/{name}': ({'ns': '/', 'node': name}, {
+        (f'{kind}s', (verb, 'ALLOW')): {(kind, each) for each in names} for kind, verb, names in (
+            ('topic', 'publish', access.publishes), ('topic', 'subscribe', access.subscribes),
+            ('service', 'reply', access.serves), ('service', 'request', access.calls)) if names})
+        for name, access in {**PROGRAMS, 'operator': OPERATOR}.items()}
+
+
+class Pair:
+    """A node that watches what matches it, and another one."""
+
+    def __init__(self) -> None:
+        # no participant may use a topic for two types
+        self.own, self.other = (self._node(name) for name in ('own', 'other'))
+        self.executor = SingleThreadedExecutor(context=self.own.context)
+        self.executor.add_node(self.own)
+        self.matching = Matching(self.own, lambda: None)
+        self.speaker = self.matching.publish('command', Temperature)
+        self.matching.subscribe(
+            'temperature', lambda _: None,
+            qos_overriding_options=QoSOverridingOptions((qos.QoSPolicyKind.RELIABILITY,)))
+
+    def _node(self, name: str) -> Node:
+        context = Context()
+        rclpy.init(context=context)
+        return Node(name, context=context)
+
+    def wait(self, condition: Callable[[], bool]) -> None:
+        deadline = time.monotonic() + TIMEOUT
+        while not condition():
+            assert time.monotonic() < deadline, self.matching.complaint
+            self.executor.spin_once(timeout_sec=0.05)
+
+    def close(self) -> None:
+        self.executor.shutdown()
+        for node in (self.own, self.other):
+            node.destroy_node()
+            rclpy.shutdown(context=node.context)
+
+
+@pytest.fixture(scope='module')
+def pair() -> Iterator[Pair]:
+    with isolated_domain():
+        pair = Pair()
+        yield pair
+        pair.close()
+
+
+@pytest.mark.parametrize(('profile', 'complaint'), [
+    (QoSProfile(depth=1, durability=qos.DurabilityPolicy.TRANSIENT_LOCAL),
+     '/command: /other subscribes with transient_local, which is incompatible in durability, so '
+     'that no message passes: use volatile there'),
+    (QoSProfile(depth=1, deadline=Duration(seconds=1)),
+     '/command: /other subscribes, which is incompatible in deadline, so that no message passes: '
+     'use the default there'),
+    (QoSProfile(depth=1, liveliness=qos.LivelinessPolicy.MANUAL_BY_TOPIC),
+     '/command: /other subscribes, which is incompatible in liveliness, so that no message '
+     'passes: use the default there'),
+])
+def test_subscription_that_asks_for_more_than_is_offered(
+        pair: Pair, profile: QoSProfile, complaint: str) -> None:
+    asking = pair.other.create_subscription(Temperature, 'command', lambda _: None, profile)
+    pair.wait(lambda: pair.matching.complaint == complaint)
+    pair.other.destroy_subscription(asking)
+    pair.wait(lambda: not pair.matching.complaint)
+
+
+@pytest.mark.parametrize(('kind', 'profile', 'complaint'), [
+    (Temperature, BEST_EFFORT,
+     '/temperature: /other publishes with best_effort, which is incompatible in reliability, '
+     'so that no message passes: use reliable there, or start this node with -p '
+     'qos_overrides./temperature.subscription.reliability:=best_effort'),
+    (JointState, topics.LOOP_QOS,
+     '/temperature: /other uses it for sensor_msgs/msg/JointState, here it is '
+     'sensor_msgs/msg/Temperature: end that node, or remap its topic'),
+])
+def test_publisher_whose_messages_cannot_be_heard(
+        pair: Pair, capfd: pytest.CaptureFixture[str], kind: type, profile: QoSProfile,
+        complaint: str) -> None:
+    offering = pair.other.create_publisher(kind, 'temperature', profile)
+    # found, perhaps, before its name is
+    pair.wait(lambda: pair.matching.complaint == complaint)
+    pair.other.destroy_publisher(offering)
+    pair.wait(lambda: not pair.matching.complaint)
+    assert f'[WARN] [own]: {complaint}\n' in re.sub(r' \[[0-9.]+\]', '', capfd.readouterr().err)
+
+
+@pytest.mark.parametrize('profile', [topics.LOOP_QOS, QoSProfile(depth=1), BEST_EFFORT])
+def test_subscription_that_matches_is_no_complaint(pair: Pair, profile: QoSProfile) -> None:
+    hearing = pair.other.create_subscription(Temperature, 'command', lambda _: None, profile)
+    pair.wait(lambda: pair.speaker.get_subscription_count() == 1)
+    pair.wait(lambda: len(pair.own.get_subscriptions_info_by_topic('command')) == 1)
+    pair.matching._look()
+    assert not pair.matching.complaint
+    pair.other.destroy_subscription(hearing)
+    pair.wait(lambda: not pair.own.get_subscriptions_info_by_topic('command'))

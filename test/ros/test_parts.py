@@ -1,0 +1,210 @@
+# SPDX-FileCopyrightText: 2026 The koopman_ros Authors
+# SPDX-License-Identifier: Apache-2.0
+
+"""Parts of nodes: what they create goes with them; what a recorder writes; models refused."""
+
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+import threading
+import time
+from typing import Any
+
+import numpy as np
+import pytest
+from rclpy.duration import Duration
+from rclpy.node import Node
+from sensor_msgs.msg import Temperature
+
+from koopman_ros.bags import BagWriter, read_messages
+from koopman_ros.control import Controller
+from koopman_ros.lifting import load, ModelFileError, save
+from koopman_ros.parameters.trainer import TrainerParameters
+from koopman_ros.resources import model_path
+from koopman_ros.ros import model_reload, recorder, topics
+from koopman_ros.ros.diagnostics import DiagnosticsPublisher, Level, Status
+from koopman_ros.ros.experiment import CoolantExperiment
+from koopman_ros.ros.matching import Matching
+from koopman_ros.ros.model_reload import load_suitable
+from koopman_ros.ros.recorder import receipt_ns, Recorder
+from koopman_ros.ros.recording import Recording
+from koopman_ros.ros.sensors import Instruments
+from koopman_ros.ros.training import Training
+from koopman_ros.ros.watchdog import Watchdog
+from koopman_ros.testing import Harness
+from koopman_ros.units import NANOSECONDS
+from support.messages import temperature, TIMEOUT
+
+NAMES = (topics.TEMPERATURE, topics.SETPOINT, topics.COOLANT_SETPOINT)
+
+
+# Each makes a part, and returns what takes it down.
+
+
+def diagnostics(node: Node, _: Path) -> Callable[[], object]:
+    return DiagnosticsPublisher(
+        node, 'task', 'hardware', lambda: Status(Level.OK, 'well')).destroy
+
+
+def matching(node: Node, _: Path) -> Callable[[], object]:
+    part = Matching(node, lambda: None, {topics.TEMPERATURE: 'publish the temperature'})
+    part.publish('mine', Temperature)
+    part.subscribe('other', lambda _: None, Temperature)
+    return part.destroy
+
+
+def instruments(node: Node, _: Path) -> Callable[[], object]:
+    loop = Matching(node, lambda: None)
+    part = Instruments(node, loop, clock=True, concentration=True)
+    return lambda: (part.destroy(), loop.destroy())
+
+
+def recording_of_topics(node: Node, folder: Path) -> Callable[[], object]:
+    return Recorder(node, BagWriter(folder / 'bag'), (topics.TEMPERATURE, topics.SETPOINT)).close
+
+
+def recording(node: Node, folder: Path) -> Callable[[], object]:
+    part = Recording(node, TrainerParameters(output=str(folder / 'bag')))
+    part.start()
+    return part.destroy
+
+
+def experiment(node: Node, _: Path) -> Callable[[], object]:
+    part = CoolantExperiment(node, TrainerParameters(experiment_topic=topics.COOLANT_SETPOINT))
+    assert part._start() == ''
+    return part.destroy
+
+
+def training(node: Node, folder: Path) -> Callable[[], object]:
+    part = Training(node, TrainerParameters(), lambda: str(folder / 'missing'))
+    part.start()
+    return part.destroy
+
+
+def watchdog(_: Node, __: Path) -> Callable[[], object]:
+    part = Watchdog(lambda _: None)
+    part.start()
+    return part.end
+
+
+@pytest.mark.parametrize('make', [diagnostics, matching, instruments, recording_of_topics,
+                                  recording, experiment, training, watchdog])
+def test_what_a_part_has_created_goes_with_it(
+        shared_ros: Harness, tmp_path: Path, monkeypatch: pytest.MonkeyPatch,
+        make: Callable[[Node, Path], Callable[[], object]]) -> None:
+    # a training that loads no library, and ends when it is asked to
+    monkeypatch.setattr('koopman_ros.jobs.training._command', lambda: (
+        'sh', '-c', 'cat > /dev/null'))
+    node = shared_ros.node
+
+    def created() -> tuple[object, ...]:
+        return (*map(set, (node.publishers, node.subscriptions, node.services, node.timers)),
+                set(threading.enumerate()))
+
+    before = created()
+    destroy = make(node, tmp_path)
+    assert created() != before
+    destroy()
+    assert created() == before
+
+
+# Recording.
+
+
+def stamped_at_the_take(handle: Any, message_type: type) -> Any:
+    """Take a message as rmw_cyclonedds does, which says that it was received just now."""
+    taken = handle.take_message(message_type, True)
+    return taken and (taken[0], {**taken[1], 'received_timestamp': time.time_ns()})
+
+
+@pytest.mark.parametrize('at_the_take', [False, True])
+def test_batch_is_recorded_in_the_order_of_sending(
+        ros: Harness, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, at_the_take: bool
+        ) -> None:
+    if at_the_take:
+        monkeypatch.setattr(recorder, 'take_raw', stamped_at_the_take)
+    publishers = [ros.node.create_publisher(Temperature, name, topics.LOOP_QOS) for name in NAMES]
+    recording = Recorder(ros.node, BagWriter(tmp_path / 'run.mcap'), NAMES)
+    ros.wait_until(lambda: all(p.get_subscription_count() for p in publishers))
+    recording.take()
+    sent = []
+    for k in range(90):
+        publisher = publishers[(k * k) % 7 % 3]
+        publisher.publish(temperature(float(k)))
+        # one after the other, for a middleware that tells when they arrived
+        assert publisher.wait_for_all_acked(Duration(seconds=TIMEOUT))
+        sent.append((publisher.topic_name, float(k)))
+    before = time.time_ns()
+    recording.take()
+    recording.close()
+    messages = list(read_messages(tmp_path / 'run.mcap'))
+    assert [(m.topic, m.message.temperature) for m in messages] == sent
+    logged = [m.log_time_ns for m in messages]
+    assert logged == sorted(logged)
+    # the times are not those at which the batch was taken
+    assert logged[-1] < before
+    assert all(m.publish_time_ns <= m.log_time_ns for m in messages)
+
+
+@pytest.mark.parametrize(('received', 'source', 'found'), [
+    (70, 60, 70),  # stamped on arrival
+    (100, 60, 60),  # at the take
+    (101, 60, 60),
+    (0, 60, 60),  # not at all
+    (101, 0, 101),
+    (0, 0, 100),
+    (101, 49.5, 49.5),  # on its way when nothing had come yet
+    (101, 20, 50),  # by a sender whose clock is late
+    (101, 900, 101),  # or early
+    (40, 30, 40),
+])
+def test_time_of_receipt(received: float, source: float, found: float) -> None:
+    info = {'received_timestamp': round(received * NANOSECONDS),
+            'source_timestamp': round(source * NANOSECONDS)}
+    assert receipt_ns(info, take_ns=100 * NANOSECONDS, empty_ns=50 * NANOSECONDS) == round(
+        found * NANOSECONDS)
+
+
+# Models.
+
+
+@pytest.mark.parametrize(('state', 'coolant', 'fits'), [
+    ('temperature', 'coolant_temperature', True), ('T', 'T_c', True), ('reactor', 'jacket', True),
+    ('temperature', 'coolant', True), ('coolant_temperature', 'temperature', False),
+    ('coolant_temperature', 'heater', False), ('x', 'temperature', False), ('x', 'x', False)])
+def test_model_that_takes_the_coolant_for_what_is_controlled_is_refused(
+        tmp_path: Path, state: str, coolant: str, fits: bool) -> None:
+    path, shipped = tmp_path / 'x.safetensors', load(model_path('reactor_nz4'))
+    save(replace(shipped, states=replace(shipped.states, names=(state,)),
+                 inputs=replace(shipped.inputs, names=(coolant,))), path)
+    if fits:
+        assert load_suitable(str(path)).model.states.names[0] == state
+        return
+    with pytest.raises(ModelFileError, match='needs the temperature as state and that of the coo'):
+        load_suitable(str(path))
+
+
+def test_model_whose_step_takes_too_long_is_refused_with_its_time(
+        monkeypatch: pytest.MonkeyPatch) -> None:
+    """No model within the bounds takes that long, so the limit is moved."""
+    monkeypatch.setattr(model_reload, '_LONGEST_STEP', 1e-7)
+    with pytest.raises(ModelFileError, match=(
+            r'a control step with the model takes [0-9.e-]+ s of a processor, at most 1e-07 s are '
+            r'allowed: train one with fewer coordinates \(n_z = 4\)$')):
+        load_suitable('reactor_nz4')
+
+
+def test_model_whose_step_fails_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
+    def fail(*_: object) -> None:
+        raise np.linalg.LinAlgError('Eigenvalues did not converge')
+
+    monkeypatch.setattr(Controller, 'step', fail)
+    with pytest.raises(ModelFileError, match=r'model fails .Eigenvalues did not converge'):
+        load_suitable('reactor_nz4')
+
+
+@pytest.mark.parametrize('name', ['x' * 5000 + '.safetensors', '/tmp/\0.safetensors'])
+def test_name_that_is_no_path_is_not_repeated_at_length(name: str) -> None:
+    with pytest.raises(ModelFileError, match='is no path of a file, which has at most 4096') as e:
+        load_suitable(name)
+    assert len(str(e.value)) < 200
