@@ -157,11 +157,8 @@ def _in_words(summary: Mapping[str, Any]) -> str:
         reasons = '; '.join(summary['reasons'])
         kept = f'; it is kept as {summary["model_file"]}' if summary['model_file'] else ''
         return f'the new lift is refused: {reasons}{kept}'
+    present = summary['heldout_error_of_present_lift_kelvin']
     return (f'the new lift is accepted: error on held-out records '
             f'{summary["heldout_error_kelvin"]:.4g} K, that of the present one '
-            f'{_kelvin(summary["heldout_error_of_present_lift_kelvin"])}; written to '
-            f'{summary["model_file"]}')
-
-
-def _kelvin(error: float | None) -> str:
-    return 'infinite, as it diverges' if error is None else f'{error:.4g} K'
+            + ('infinite, as it diverges' if present is None else f'{present:.4g} K')
+            + f'; written to {summary["model_file"]}')

@@ -53,7 +53,9 @@ class ControllerNode(LoopNode):
         parameters = self.declare_table(TABLE)
         self._settings = parameters
         self._models = ModelReload(
-            self, load_suitable(parameters.model), self._model_situation,
+            self, load_suitable(parameters.model), lambda: Situation(
+                self._settings.settings(), self._state,
+                np.array([to_kelvin(self._temperature)])),
             lambda: self._exchange(records.MODEL, {'model': self._models.in_force.identity}),
             lambda: self._diagnostics.publish_if_changed())
         self._controller = self._built()
@@ -94,8 +96,7 @@ class ControllerNode(LoopNode):
         wall_timer(self, PERIOD, self._on_watch)
         self._records = messages.RecordPublisher(
             self._matching, lambda: records.snapshot(
-                self._state, asdict(self._settings), self._models.in_force.identity),
-            self._on_record_subscriber)
+                self._state, asdict(self._settings), self._models.in_force.identity), self._lock)
         self.follow_table(TABLE, parameters, self._on_parameters, self._models.accept)
         self.get_logger().info(self._models.in_force.about)
         self._warn_of_rest()
@@ -107,18 +108,15 @@ class ControllerNode(LoopNode):
         self._watchdog.end()
 
     def _on_temperature(self, message: Temperature) -> None:
-        if self._waiting or self._lacks_coolant():
+        # whether the applied coolant temperature will be known in a moment
+        if self._waiting or (
+                self._state.command is None and self._coolant is None and self._patience is None
+                and self.count_publishers(self._coolants.topic_name) > 0):
             self._waiting.append(message)
             if self._patience is None:
                 self._patience = wall_timer(self, _COOLANT_PATIENCE, self._answer_waiting)
             return
         self._answer(message)
-
-    def _lacks_coolant(self) -> bool:
-        """Tell whether the applied coolant temperature will be known in a moment."""
-        return (self._state.command is None and self._coolant is None
-                and self._patience is None
-                and self.count_publishers(self._coolants.topic_name) > 0)
 
     def _on_coolant(self, message: Temperature) -> None:
         # only value and stamp are kept
@@ -146,7 +144,7 @@ class ControllerNode(LoopNode):
                 initial = messages.initialisation(self._coolant)
                 done.append((initial, events.apply(self._controller, state, initial)))
                 state = done[0][1].state
-            asked = messages.measurement(message, self._coolant_at(stamp_ns))
+            asked = messages.measurement(message, self._coolant)
             outcome = events.apply(self._controller, state, asked)
             assert outcome.command is not None
             assert outcome.report is not None
@@ -175,14 +173,6 @@ class ControllerNode(LoopNode):
         self._counts.missed += report.measurement.missed
         self._counts.refused += report.measurement.arrival is Arrival.REJECTED
         self._tell(report, message.header.stamp)
-
-    def _coolant_at(self, stamp_ns: int) -> float | None:
-        """Return the applied coolant temperature at a time, if it is known."""
-        heard = self._coolant
-        if heard is None or (abs(stamp_nanoseconds(heard.header.stamp) - stamp_ns)
-                             > messages.SAME_TIME_NS):
-            return None
-        return float(heard.temperature)
 
     def _on_watch(self) -> None:
         self._timing.busy = False
@@ -294,10 +284,6 @@ class ControllerNode(LoopNode):
     def _built(self) -> Controller:
         return Controller(self._models.in_force.model, self._settings.settings())
 
-    def _model_situation(self) -> Situation:
-        return Situation(self._settings.settings(), self._state,
-                              np.array([to_kelvin(self._temperature)]))
-
     def _on_parameters(self, parameters: ControllerParameters) -> None:
         before, self._settings = self._settings, parameters
         fields: dict[str, object] = {'parameters': {
@@ -315,10 +301,6 @@ class ControllerNode(LoopNode):
             self._records.publish(event, fields)
         self._warn_of_rest()
         self._diagnostics.publish_if_changed()
-
-    def _on_record_subscriber(self) -> None:
-        with self._lock:
-            self._records.publish_snapshot()
 
     def _warn_of_rest(self) -> None:
         """Say that the safe coolant leads out of the model's range, once for each reason."""

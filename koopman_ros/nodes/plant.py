@@ -80,18 +80,13 @@ class PlantNode(LoopNode):
         else:
             self._tick = wall_timer(self, wall_period, self._step_in_time)
         self.follow_table(TABLE, parameters, self._on_parameters)
-        self.get_logger().info(self._started())
-
-    def _started(self) -> str:
-        """Say what starts, for the log."""
-        settings = self._settings
-        pace = ('as fast as it can' if not settings.speed else 'in real time' if self._real_time
-                else f'{settings.speed:g} times as fast as the clock')
+        pace = ('as fast as it can' if not parameters.speed else 'in real time'
+                if self._real_time else f'{parameters.speed:g} times as fast as the clock')
         start = '' if self._real_time else f' from {seconds_text(self._start_ns)} s on'
-        lockstep = (f', in lock-step: it begins with {settings.lockstep_subscribers} subscribers '
-                    'and a controller') if settings.lockstep else ''
-        return (f'{settings.reactor} reactor started: a measurement every '
-                f'{settings.sample_period:g} s{start}, {pace}{lockstep}')
+        lockstep = (f', in lock-step: it begins with {parameters.lockstep_subscribers} '
+                    'subscribers and a controller') if parameters.lockstep else ''
+        self.get_logger().info(f'{parameters.reactor} reactor started: a measurement every '
+                               f'{parameters.sample_period:g} s{start}, {pace}{lockstep}')
 
     def _build(self, parameters: PlantParameters) -> ControlAffineSystem:
         """Build the reactor, which starts from its steady state if it has one."""
@@ -116,7 +111,13 @@ class PlantNode(LoopNode):
 
     def _step_in_time(self) -> None:
         if self._sample == 0:
-            self._start_clock()
+            # time begins now, and the next tick is in a period from now: after a first one that
+            # was late, all stamps would be ahead of the clock
+            self._tick.reset()
+            self._wall_start = time.monotonic()
+            if self._real_time:
+                self._start_ns = time.time_ns()
+                self._plant = replace(self._plant, time_ns=self._start_ns)
         if self._phase is not Phase.RUNNING:
             return
         if self._settings.speed:
@@ -124,16 +125,6 @@ class PlantNode(LoopNode):
             due = round((self._now_ns() - self._start_ns) / self._period_ns)
             self._sample = max(self._sample, due)
         self._measure()
-
-    def _start_clock(self) -> None:
-        """Let time begin now, with the first measurement."""
-        # the next tick in a period from now: after a first one that was late, all stamps would be
-        # ahead of the clock
-        self._tick.reset()
-        self._wall_start = time.monotonic()
-        if self._real_time:
-            self._start_ns = time.time_ns()
-            self._plant = replace(self._plant, time_ns=self._start_ns)
 
     def _on_poll(self) -> None:
         """Start lock-step when the loop is complete, and watch for a command that is missing."""
@@ -160,7 +151,7 @@ class PlantNode(LoopNode):
             self._measure()
 
     def _continue_lockstep(self) -> None:
-        """Go on after an answer: at once, or with the next tick of the pacing timer."""
+        # with a speed the next tick of the pacing timer does it
         if not self._settings.speed:
             self._step_in_lockstep()
 
@@ -170,19 +161,14 @@ class PlantNode(LoopNode):
         duration_ns = round(self._settings.duration * NANOSECONDS)
         if duration_ns and instant > self._start_ns + duration_ns:
             self._phase = Phase.FINISHED
-            self._diagnostics.publish_if_changed()
-            return
-        if instant > _LAST_STAMP_NS:
+        elif instant > _LAST_STAMP_NS:
             self._phase = Phase.OUT_OF_STAMPS
             self.get_logger().error(self._phase.value)
-            self._diagnostics.publish_if_changed()
-            return
-        if not self._advance(instant):
-            return
-        self._sample += 1
-        self._answered = False
-        self._wall_published = time.monotonic()
-        self._instruments.publish(self._plant, self._sample - 1, self._settings)
+        elif self._advance(instant):
+            self._sample += 1
+            self._answered = False
+            self._wall_published = time.monotonic()
+            self._instruments.publish(self._plant, self._sample - 1, self._settings)
         self._diagnostics.publish_if_changed()
 
     def _advance(self, time_ns: int) -> bool:

@@ -49,8 +49,7 @@ def replay_bags(parameters: ReplayParameters, names: Names, given: Collection[st
     """
     Replay bags and write the report; `given` are the parameters that replace recorded ones.
 
-    :raises BagReadError, ModelFileError: for a bag or a new model that cannot be used.
-    :raises ConfigurationError: without the package that draws.
+    :raises BagReadError, ModelFileError, ConfigurationError: also without the package that draws.
     """
     try:
         # a controller's machine may lack it
@@ -112,7 +111,6 @@ def replay_records(records: Iterable[Record], models: Sequence[Path] = (),
 
 
 def _settings(values: Mapping[str, Any]) -> Settings:
-    """Return the tuning that a controller's parameters stand for, if this version has them."""
     unknown = ', '.join(sorted(set(values) - set(controller.TABLE.rows)))
     if unknown:
         raise RecordError(f'its controller had the parameters {unknown}, which this version has '

@@ -7,6 +7,7 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 import math
 import secrets
+import threading
 import time
 from typing import Any
 
@@ -28,19 +29,22 @@ from koopman_ros.ros.watchdog import Timing
 from koopman_ros.units import in_celsius, NANOSECONDS, to_celsius, to_kelvin
 
 # The temperatures of reactor and coolant at an instant are stamped no further apart.
-SAME_TIME_NS = 2 * NANOSECONDS
+_SAME_TIME_NS = 2 * NANOSECONDS
 _SNAPSHOT_PERIOD = 10.0  # s by the wall
 _ACTIONS = {HOLD: 'the last command is held', SAFE: 'the safe coolant temperature is commanded'}
 _WAY_BACK = 'the coolant leads the reactor back from where the safe coolant keeps it'
 
 
-def measurement(message: Any, coolant: float | None = None) -> events.Measurement:
-    """Return the event of a measurement, with the applied coolant in degrees Celsius if known."""
-    kelvin = to_kelvin(message.temperature)
+def measurement(message: Any, coolant: Any) -> events.Measurement:
+    """Return the event of a measurement, with the coolant measured last where it goes with it."""
+    kelvin, stamp_ns = to_kelvin(message.temperature), stamp_nanoseconds(message.header.stamp)
+    applied = None
+    if coolant is not None and (
+            abs(stamp_nanoseconds(coolant.header.stamp) - stamp_ns) <= _SAME_TIME_NS):
+        applied = np.array([to_kelvin(coolant.temperature)])
     # below absolute zero there is nothing to measure
-    return events.Measurement(stamp_nanoseconds(message.header.stamp),
-                              np.array([kelvin if kelvin >= 0.0 else math.nan]),
-                              None if coolant is None else np.array([to_kelvin(coolant)]))
+    return events.Measurement(
+        stamp_ns, np.array([kelvin if kelvin >= 0.0 else math.nan]), applied)
 
 
 def initialisation(message: Any) -> events.Initialisation:
@@ -243,17 +247,20 @@ class RecordPublisher:
     Publish numbered records; the caller holds the lock of the controller's state meanwhile.
 
     A replay begins at a snapshot of that state: there is one at the start, one for each new
-    subscriber, by `joined`, which is called in the executor, and one every ten seconds.
+    subscriber, and one every ten seconds.
     """
 
     def __init__(self, matching: Matching, snapshot: Callable[[], Mapping[str, Any]],
-                 joined: Callable[[], None]) -> None:
-        self._snapshot = snapshot
+                 lock: threading.Lock) -> None:
+        self._snapshot, self._lock = snapshot, lock
         self._run, self._number, self._due = secrets.token_hex(8), 0, 0.0
-        self._publisher = matching.publish(
-            topics.CONTROLLER_EVENTS,
-            matched=lambda info: joined() if info.current_count_change > 0 else None)
+        self._publisher = matching.publish(topics.CONTROLLER_EVENTS, matched=self._on_matched)
         self.publish_snapshot(START)
+
+    def _on_matched(self, info: Any) -> None:
+        if info.current_count_change > 0:
+            with self._lock:
+                self.publish_snapshot()
 
     def publish_snapshot(self, event: str = SNAPSHOT) -> None:
         """Publish the state."""

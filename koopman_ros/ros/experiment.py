@@ -39,12 +39,10 @@ class CoolantExperiment:
     When the steps are over, for whatever reason, the coolant returns to the safe temperature along
     the rate limit and is held there until the service is called with false once more. Beside
     another publisher no experiment starts, and when one comes it leaves the coolant to that.
-
-    :param settings: what the next experiment starts with; the node replaces it when they change.
     """
 
     def __init__(self, node: Node, settings: TrainerParameters) -> None:
-        self.settings = settings
+        self.settings = settings  # of the next experiment
         self._node = node
         self._run: ExperimentRun | None = None
         self._outcome = Status(Level.OK, 'no experiment')
@@ -262,32 +260,28 @@ class ExperimentRun:
 
     def _on_tick(self) -> None:
         """Look for other commanders, and for measurements that stay away."""
+        why = None
         if others := other_publishers(self._node, self.topic, own=1):
-            self._lose(reason(Code.OTHER_PUBLISHER, nodes=others, topic=self.topic))
+            why = reason(Code.OTHER_PUBLISHER, nodes=others, topic=self.topic)
         elif self._coolants is not None and not self._node.count_publishers(
                 self._coolants.topic_name):
-            self._lose(reason(Code.CONTROLLER_GONE))
+            why = reason(Code.CONTROLLER_GONE)
         elif time.monotonic() - self._heard_at > self._patience:
-            self._on_silence(reason(Code.SILENCE, timeout=self._patience))
-
-    def _lose(self, why: Reason) -> None:
-        if self.progress is not None:
-            self._on_end(why)
-        elif not self.started.done():
-            self.started.set_result(why)
-
-    def _on_silence(self, why: Reason) -> None:
+            why = reason(Code.SILENCE, timeout=self._patience)
         if self.progress is None:
-            self._lose(why)
-            return
-        was_running = self.running
-        self.stop(Phase.ABORTED, why)
-        # the way back goes by the wall clock
-        self.progress = advance(self.plan, self.progress, None,
-                                self.progress.time_ns + round(_TICK * NANOSECONDS))
-        self._command(self.progress.command, self.progress.time_ns)
-        if was_running:
-            self._on_end(None)
+            if why is not None and not self.started.done():
+                self.started.set_result(why)
+        elif why is not None and why.code is Code.SILENCE:
+            was_running = self.running
+            # the way back goes by the wall clock
+            self.progress = advance(
+                self.plan, end(self.progress, Phase.ABORTED, why), None,
+                self.progress.time_ns + round(_TICK * NANOSECONDS))
+            self._command(self.progress.command, self.progress.time_ns)
+            if was_running:
+                self._on_end(None)
+        elif why is not None:
+            self._on_end(why)
 
 
 def other_publishers(node: Node, topic: str, own: int = 0) -> str:

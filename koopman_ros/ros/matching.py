@@ -5,7 +5,7 @@
 
 from collections.abc import Callable, Mapping
 import copy
-from typing import Any, TypeAlias
+from typing import Any
 
 from rclpy import qos
 from rclpy.duration import Infinite
@@ -17,8 +17,6 @@ from rclpy.topic_endpoint_info import TopicEndpointInfo
 
 from koopman_ros.ros import topics
 from koopman_ros.ros.node import Owned
-
-_Own: TypeAlias = Publisher | Subscription
 
 # Topics of the loop on which only one node may publish, and what it does.
 SINGLE = {topics.COOLANT_SETPOINT: 'command the coolant',
@@ -43,7 +41,7 @@ class Matching:
                  single: Mapping[str, str] | None = None) -> None:
         self._node, self._on_change, self._single = node, on_change, single or {}
         self._owned = Owned(node)
-        self._own: list[_Own] = []
+        self._own: list[Publisher | Subscription] = []
         self._overridable: set[str] = set()  # subscribed, with quality of service by parameter
         self._policies: dict[str, str] = {}  # last reported by the middleware, by topic
         self._said: tuple[str, ...] = ('', '')
@@ -104,15 +102,13 @@ class Matching:
             self._on_change()
 
     def _conflict(self, topic: str) -> str:
-        # who publishes something else there is not in conflict
-        publishers = [info for info in self._node.get_publishers_info_by_topic(topic)
-                      if info.topic_type == type_name(topics.TYPES[topic])]
-        names = sorted(map(node_name, publishers))
-        # publishers, not names: a node may have been started twice under the same
+        # who publishes something else is not in conflict; a node may be there twice
+        names = sorted(node_name(info) for info in self._node.get_publishers_info_by_topic(topic)
+                       if info.topic_type == type_name(topics.TYPES[topic]))
         return '' if len(names) < 2 else (
             f'{len(names)} nodes {self._single[topic]}: {", ".join(names)}; end all but one')
 
-    def _complaints(self, own: _Own) -> list[str]:
+    def _complaints(self, own: Publisher | Subscription) -> list[str]:
         topic, kind = own.topic_name, type_name(own.msg_type)
         subscribes = isinstance(own, Subscription)
         publishers = self._node.get_publishers_info_by_topic(topic)
@@ -120,11 +116,13 @@ class Matching:
         said = [f'{topic}: {node_name(other)} uses it for {other.topic_type[:100]}, here it is '
                 f'{kind}: end that node, or remap its topic'
                 for other in (*publishers, *subscriptions) if other.topic_type != kind]
-        others = publishers if subscribes else subscriptions
-        return said + [self._qos_complaint(own, other) for other in others
-                       if other.topic_type == kind and not _passes(own, other)]
+        return said + [
+            self._qos_complaint(own, other) for other in (publishers if subscribes else
+                                                          subscriptions)
+            if other.topic_type == kind and (
+                qos.qos_check_compatible(*_in_order(own, other))[0] == qos.QoSCompatibility.ERROR)]
 
-    def _qos_complaint(self, own: _Own, other: TopicEndpointInfo) -> str:
+    def _qos_complaint(self, own: Publisher | Subscription, other: TopicEndpointInfo) -> str:
         topic, subscribes = own.topic_name, isinstance(own, Subscription)
         offered, asked = _in_order(own, other)
         policy, wanted = self._policies.get(topic, 'quality of service'), 'the default'
@@ -142,12 +140,8 @@ class Matching:
                 f'that no message passes: {remedy}')
 
 
-def _passes(own: _Own, other: TopicEndpointInfo) -> bool:
-    compatible, _ = qos.qos_check_compatible(*_in_order(own, other))
-    return bool(compatible != qos.QoSCompatibility.ERROR)
-
-
-def _in_order(own: _Own, other: TopicEndpointInfo) -> tuple[qos.QoSProfile, qos.QoSProfile]:
+def _in_order(own: Publisher | Subscription, other: TopicEndpointInfo
+              ) -> tuple[qos.QoSProfile, qos.QoSProfile]:
     ours, theirs = _explicit(own.qos_profile), _explicit(other.qos_profile)
     return (theirs, ours) if isinstance(own, Subscription) else (ours, theirs)
 

@@ -87,12 +87,6 @@ class LoopNode(Node):
     def create_subscription(self, msg_type: Any, topic: str, callback: Callable[[Any], None],
                             *args: Any, **options: Any) -> Subscription:
         """Subscribe as any node does; a time that cannot be does not reach its clock."""
-        # rclpy subscribes through here for `use_sim_time`, and a negative time ends it in spin
-        heard = self._possible(callback) if msg_type is ClockMessage else callback
-        return super().create_subscription(msg_type, topic, heard, *args, **options)
-
-    def _possible(self, callback: Callable[[ClockMessage], None]
-                  ) -> Callable[[ClockMessage], None]:
         def hear(message: ClockMessage) -> None:
             time = message.clock
             if time.sec >= 0 and time.nanosec < NANOSECONDS:
@@ -104,26 +98,22 @@ class LoopNode(Node):
                 f'({self._clocks_refused} so far); check who publishes /clock',
                 throttle_duration_sec=10.0)
 
-        return hear
+        # rclpy subscribes through here for `use_sim_time`, and a negative time ends it in spin
+        return super().create_subscription(
+            msg_type, topic, hear if msg_type is ClockMessage else callback, *args, **options)
 
     def declare_parameters(self, namespace: str, parameters: list[Any],
                            ignore_override: bool = False) -> list[Parameter]:
-        """
-        Declare parameters, but for those given as ``[]``, at which rclpy gives up.
-
-        An empty list has no type: the table asks for one that has, or it belongs to another node.
-        """
+        """Declare parameters, but for those given as ``[]``, at which rclpy gives up."""
+        # an empty list has no type: the table asks for one that has, or it is another node's
         typed = [entry for entry in parameters if not (len(entry) > 1 and entry[1] is None)]
         declared: list[Parameter] = super().declare_parameters(namespace, typed, ignore_override)
         return declared
 
     def describe_parameter(self, name: str) -> msg.ParameterDescriptor:
-        """
-        Return the descriptor of a parameter with its range.
-
-        The one that rclpy keeps has none: rclpy would refuse a value by it before the table does,
-        in words without the unit, and let pass what exceeds it by a rounding.
-        """
+        """Return the descriptor of a parameter with its range."""
+        # the one that rclpy keeps has none: rclpy would refuse by it before the table does, in
+        # words without the unit, and let pass what exceeds it by a rounding
         descriptor = copy.copy(super().describe_parameter(name))
         limits = self._ranges.get(name)
         if isinstance(limits, msg.IntegerRange):
@@ -147,8 +137,11 @@ class LoopNode(Node):
         for name in [*unknown, *set(given).intersection(table.rows)]:
             self.undeclare_parameter(name)
         if unknown:
-            self.get_logger().warning('parameters that this node does not have are ignored: '
-                                      + ', '.join(_with_hint(table, name) for name in unknown))
+            near = {name: difflib.get_close_matches(name, table.rows, n=1) for name in unknown}
+            self.get_logger().warning(
+                'parameters that this node does not have are ignored: ' + ', '.join(
+                    f'{name!r}' + ''.join(f' (did you mean {other}?)' for other in near[name])
+                    for name in unknown))
         snapshot = table.kind(**{
             name: self._declare_row(row, given[name].value if name in given else row.default)
             for name, row in table.rows.items()})
@@ -213,11 +206,6 @@ def range_of(row: Specification) -> msg.FloatingPointRange | msg.IntegerRange | 
     if isinstance(row.default, int):
         return msg.IntegerRange(from_value=int(row.minimum), to_value=int(row.maximum))
     return msg.FloatingPointRange(from_value=float(row.minimum), to_value=float(row.maximum))
-
-
-def _with_hint(table: ParameterTable[Any], name: str) -> str:
-    near = difflib.get_close_matches(name, table.rows, n=1)
-    return f'{name!r}' + (f' (did you mean {near[0]}?)' if near else '')
 
 
 def _as_python(value: Any) -> Any:

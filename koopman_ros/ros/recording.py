@@ -27,14 +27,10 @@ _MEGABYTE = 1_000_000
 
 
 class Recording:
-    """
-    Record the loop to one bag after another, on the service ``~/record``; reports by diagnostics.
-
-    :param settings: what the next recording starts with; the node replaces it when they change.
-    """
+    """Record the loop to one bag after another, on ``~/record``; reports by diagnostics."""
 
     def __init__(self, node: Node, settings: TrainerParameters) -> None:
-        self.settings = settings
+        self.settings = settings  # of the next recording
         self._node = node
         self._recorder: Recorder | None = None
         self._problem = self._path = ''

@@ -35,26 +35,16 @@ from koopman_ros.parameters.wire import (
 # JointState is the one stamped type of common_interfaces that carries named float64 values.
 # Records are lines of JSON, which keep a float64 bit-identical at a third of the time.
 TYPES = {
-    TEMPERATURE: Temperature,
-    CONCENTRATION: JointState,
-    SETPOINT: Temperature,
-    ACTIVE_SETPOINT: Temperature,
-    COOLANT_SETPOINT: Temperature,
-    COOLANT_TEMPERATURE: Temperature,
-    MANUAL_COOLANT_SETPOINT: Temperature,
-    PREDICTED_TEMPERATURE: Temperature,
-    CONTROLLER_STATE: JointState,
-    CONTROLLER_EVENTS: String,
-    DIAGNOSTICS: DiagnosticArray,
-    CLOCK: Clock,
-}
+    **dict.fromkeys((TEMPERATURE, SETPOINT, ACTIVE_SETPOINT, COOLANT_SETPOINT, COOLANT_TEMPERATURE,
+                     MANUAL_COOLANT_SETPOINT, PREDICTED_TEMPERATURE), Temperature),
+    CONCENTRATION: JointState, CONTROLLER_STATE: JointState, CONTROLLER_EVENTS: String,
+    DIAGNOSTICS: DiagnosticArray, CLOCK: Clock}
 
 # Every message counts: reliable, with room for a receiver that falls behind a fast plant.
 LOOP_QOS = QoSProfile(depth=1000)
 # A late joiner learns what is tracked, and which coolant is applied.
 LATCHED_QOS = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
 CLOCK_QOS = QoSProfile(depth=1, reliability=ReliabilityPolicy.BEST_EFFORT)
-
 _QOS = {ACTIVE_SETPOINT: LATCHED_QOS, COOLANT_TEMPERATURE: LATCHED_QOS, CLOCK: CLOCK_QOS}
 
 
@@ -92,11 +82,7 @@ def profile(depth: int, *, reliable: bool, latched: bool = False) -> QoSProfile:
 
 
 def message_class(type_name: str) -> Any:
-    """
-    Return the class of a message type given as ``package/msg/Name``.
-
-    :raises LookupError: when it is not installed, or no such name.
-    """
+    """Return the class of a ``package/msg/Name``; LookupError where it is not installed."""
     try:
         package, kind, name = type_name.split('/')
         return getattr(importlib.import_module(f'{package}.{kind}'), name)

@@ -24,16 +24,11 @@ _BAR_WIDTH = 30
 
 
 class Training:
-    """
-    Retrain in a process of its own, on ``~/train``; ``~/cancel_training`` ends it.
-
-    :param settings: what the next training starts with; the node replaces it when they change.
-    :param recorded: returns the bag that is being recorded or was last, flushed, or ''.
-    """
+    """Retrain in a process of its own, on ``~/train``; ``~/cancel_training`` ends it."""
 
     def __init__(self, node: Node, settings: TrainerParameters, recorded: Callable[[], str],
                  on_end: Callable[[JobState], None] = lambda _: None) -> None:
-        self.settings = settings
+        self.settings = settings  # of the next training
         self._node, self._recorded, self._on_end = node, recorded, on_end
         self._job: RetrainingJob | None = None
         self._state: JobState | None = None
@@ -83,12 +78,12 @@ class Training:
 
     def _on_train(self, _: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
         if self._job is not None:
-            response.success, response.message = False, 'already training'
+            response.message = 'already training'
             return response
         try:
-            response.success, response.message = True, self.start()
+            response.message, response.success = self.start(), True
         except (OSError, ValueError) as error:
-            response.success, response.message = False, f'cannot train: {error}'
+            response.message = f'cannot train: {error}'
             self._node.get_logger().error(response.message)
         self._diagnostics.publish_if_changed()
         return response
