@@ -107,9 +107,8 @@ def test_process_ends_with_its_parent_that_is_killed(
 
 
 def test_process_that_does_not_end_is_killed(monkeypatch: pytest.MonkeyPatch) -> None:
-    program = 'import signal, time; print(\'{"progress": 0.5, "text": "x"}\', flush=True); ' \
-        'time.sleep(3600)'
-    monkeypatch.setattr(training, '_command', lambda: (sys.executable, '-c', program))
+    monkeypatch.setattr(training, '_command', lambda: (
+        'sh', '-c', 'echo \'{"progress": 0.5, "text": "x"}\'; exec sleep 3600'))
     monkeypatch.setattr(training, '_PATIENCE', 0.2)
     job = RetrainingJob({})
     next(follow(job))

@@ -20,17 +20,14 @@ from rosgraph_msgs.msg import Clock
 from koopman_ros.bags import summary
 from koopman_ros.nodes import controller, plant, player, trainer
 from koopman_ros.resources import model_path
-from koopman_ros.ros import process as node_process
 from koopman_ros.ros import topics
 from koopman_ros.ros.codec import stamp_message
-from koopman_ros.ros.process import open_to_the_network
+from koopman_ros.ros.process import answer, open_to_the_network
 from koopman_ros.ros.programs import TABLES
 from koopman_ros.testing import Harness
 from koopman_ros.units import NANOSECONDS
 from support.messages import TIMEOUT
 from support.processes import run_here
-
-# Ends.
 
 
 @pytest.mark.parametrize(('name', 'number', 'unneeded'), [
@@ -98,10 +95,15 @@ def test_signal_while_a_program_loads_ends_it_without_a_word(
     assert process.output() == ''
 
 
-def test_signal_before_the_interpreter_is_up_ends_a_node_cleanly(ros: Harness) -> None:
+def test_signal_before_the_interpreter_is_up_and_arguments_are_answered_before_the_start(
+        ros: Harness) -> None:
     process = ros.start('plant')
     assert process.stop(signal.SIGTERM) == 0
     assert process.output() == ''
+    program = 'import sys; from koopman_ros.startup import plant; sys.exit(plant())'
+    process = ros.start('plant', command=(sys.executable, '-c', program, '--speed=2.0'))
+    assert process.wait() == 2
+    assert 'started' not in process.output()
 
 
 # What happens at the end of a plant that gets a signal as it starts, and its last words.
@@ -174,9 +176,6 @@ def test_a_process_that_runs_a_node_among_other_things_is_not_ended_by_force() -
     assert (done.returncode, done.stderr) == (7, b'')
 
 
-# The time that they are told.
-
-
 def test_impossible_time_does_not_end_a_node(ros: Harness) -> None:
     process = ros.start('controller', {'use_sim_time': True})
     clock = ros.speak(Clock, '/clock', topics.CLOCK_QOS, to='controller')
@@ -192,22 +191,18 @@ def test_impossible_time_does_not_end_a_node(ros: Harness) -> None:
     ros.meet('controller')
 
 
-# Arguments.
-
-
-@pytest.mark.parametrize('name', ['plant', 'controller', 'trainer', 'player', 'replay'])
-def test_help_and_unknown_arguments(
-        name: str, capsys: pytest.CaptureFixture[str]) -> None:
-    assert node_process.answer(name, [name, '--ros-args', '-p', 'a:=1.0']) is None
-    assert node_process.answer(name, [name, '--help']) == 0
+@pytest.mark.parametrize('name', TABLES)
+def test_help_and_unknown_arguments(name: str, capsys: pytest.CaptureFixture[str]) -> None:
+    assert answer(name, [name, '--ros-args', '-p', 'a:=1.0']) is None
+    assert answer(name, [name, '--help']) == 0
     said = capsys.readouterr().out
     assert said.startswith(f'usage: ros2 run koopman_ros {name} ')
     assert 'exit codes: 0 ' in said
     assert f'config/{name}.yaml' in said
     assert all(f'\n  {row} ' in said for row in TABLES[name].rows)
     # rules as in ROS 1, which rcl still takes
-    assert node_process.answer(name, [name, '__ns:=/unit']) is None
-    assert node_process.answer(name, [name, 'speed:=2.0', 'more']) == 2
+    assert answer(name, [name, '__ns:=/unit']) is None
+    assert answer(name, [name, 'speed:=2.0', 'more']) == 2
     assert capsys.readouterr().err == (
         f"{name}: unknown argument 'speed:=2.0': parameters are given as --ros-args -p "
         'name:=value; --help says more\n')
@@ -220,16 +215,6 @@ def test_help_is_read_as_far_as_somebody_wants_to() -> None:
         done = subprocess.run([sys.executable, '-m', 'koopman_ros.nodes.plant', '--help'],
                               stdout=closed, stderr=subprocess.PIPE, check=False, timeout=TIMEOUT)
     assert (done.returncode, done.stderr) == (0, b'')
-
-
-def test_program_answers_arguments_before_it_starts(ros: Harness) -> None:
-    program = 'import sys; from koopman_ros.startup import plant; sys.exit(plant())'
-    process = ros.start('plant', command=(sys.executable, '-c', program, '--speed=2.0'))
-    assert process.wait() == 2
-    assert 'started' not in process.output()
-
-
-# Who can reach them.
 
 
 @pytest.mark.parametrize(('environment', 'is_open'), [
@@ -251,8 +236,7 @@ def test_who_can_reach_a_node(environment: dict[str, str], is_open: bool) -> Non
         assert 'ROS_AUTOMATIC_DISCOVERY_RANGE=LOCALHOST' in note
 
 
-def test_node_that_is_open_to_the_network_says_so_once(
-        ros: Harness) -> None:
+def test_node_that_is_open_to_the_network_says_so_once(ros: Harness) -> None:
     # a node that believes itself open, on loopback
     program = (
         'import os, sys\n'
@@ -267,11 +251,7 @@ def test_node_that_is_open_to_the_network_says_so_once(
     assert process.output().count('can command this node') == 1
 
 
-# Bad starts.
-
-
-def _parameters(text: str) -> str:
-    return f'/**:\n  ros__parameters:\n    {text}\n'
+PARAMETERS = '/**:\n  ros__parameters:\n    '
 
 
 # The text of a parameter file, and words that name what is wrong.
@@ -279,13 +259,13 @@ def _parameters(text: str) -> str:
     (plant, None, 'Error opening YAML file'),
     (plant, 'plant: [1, 2\n foo: : bar\n', "Couldn't parse params file"),
     (trainer, '/**:\n  speed: 1.0\n', 'Cannot have a value before ros__parameters'),
-    (player, _parameters('topics: []'),
+    (player, f'{PARAMETERS}topics: []\n',
      'topics = [] must be a list of at least one string, e.g. [a, b]'),
-    (plant, _parameters('speed: 1'), 'speed = 1 must be a double, e.g. 1.0'),
-    (controller, _parameters('coolant_max: 500.0'),
+    (plant, f'{PARAMETERS}speed: 1\n', 'speed = 1 must be a double, e.g. 1.0'),
+    (controller, f'{PARAMETERS}coolant_max: 500.0\n',
      'coolant_max = 500.0 degC must be in [-50, 150] degC'),
-    (controller, _parameters('model: /nowhere/lift.safetensors'), '/nowhere/lift.safetensors'),
-    (controller, _parameters('model: {folder}/cut.safetensors'), 'cut.safetensors'),
+    (controller, f'{PARAMETERS}model: /nowhere/lift.safetensors\n', '/nowhere/lift.safetensors'),
+    (controller, f'{PARAMETERS}model: {{folder}}/cut.safetensors\n', 'cut.safetensors'),
 ])
 def test_bad_start_says_why_in_one_line(
         tmp_path: Path, capfd: pytest.CaptureFixture[str], node: ModuleType, text: str | None,
