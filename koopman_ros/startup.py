@@ -20,13 +20,13 @@ import sys
 import threading
 import time
 from types import FrameType
+from typing import Any
 
 SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
 
 # Their steps take a fraction of a millisecond; where threads are to share it, and others use the
 # cores, one takes twenty.
-_IN_THE_LOOP = ('koopman_ros.nodes.plant', 'koopman_ros.nodes.controller',
-                'koopman_ros.nodes.player')
+_IN_THE_LOOP = tuple(f'koopman_ros.nodes.{name}' for name in ('plant', 'controller', 'player'))
 
 _PR_SET_PDEATHSIG = 1  # of prctl(2)
 _END = 8.0  # s from the end of a program to that by force
@@ -44,8 +44,7 @@ def run_program(module: str, interrupted: int) -> int:
     """
     open_standard_streams()
     # numpy, scipy and rclpy take half a second, in which there is nothing to complete
-    for number in SIGNALS:
-        signal.signal(number, lambda *_: os._exit(interrupted))
+    handle_signals(lambda *_: os._exit(interrupted))
     if module in _IN_THE_LOOP:
         os.environ.setdefault('OPENBLAS_NUM_THREADS', '1')
     main = importlib.import_module(module).main
@@ -56,7 +55,7 @@ def run_program(module: str, interrupted: int) -> int:
     except KeyboardInterrupt:
         code = interrupted
     finally:
-        ignore_signals()
+        handle_signals(signal.SIG_IGN)
         # what libraries do at the interpreter's own end may hang, too
         end_by_force(_END, code)
     return code
@@ -77,10 +76,10 @@ def open_standard_streams() -> None:
             setattr(sys, f'__{name}__', stream)
 
 
-def ignore_signals() -> None:
-    """Ignore further signals: the interpreter gives up its handlers before it has ended."""
+def handle_signals(handler: Any) -> None:
+    """Handle signals so; at the end they are ignored, for Python gives up its handlers early."""
     for number in SIGNALS:
-        signal.signal(number, signal.SIG_IGN)
+        signal.signal(number, handler)
 
 
 def _raise_interrupts() -> None:
@@ -93,8 +92,7 @@ def _raise_interrupts() -> None:
             last = time.monotonic()
             raise KeyboardInterrupt
 
-    for number in SIGNALS:
-        signal.signal(number, interrupt)
+    handle_signals(interrupt)
 
 
 class _Event(ctypes.Structure):
@@ -175,23 +173,17 @@ def blocked_signals() -> Iterator[None]:
         signal.pthread_sigmask(signal.SIG_SETMASK, before)
 
 
-def _end_with_parent(parent: int, number: int) -> None:
-    libc = ctypes.CDLL(None)
-    if not parent or not hasattr(libc, 'prctl'):
-        return
-    libc.prctl(_PR_SET_PDEATHSIG, number, 0, 0, 0)
-    if os.getppid() != parent:
-        # it has ended before
-        os._exit(0)
-
-
 def main() -> int:
     """Run a child; see :func:`command`."""
     parent, number, interrupted, module, *arguments = sys.argv[1:]
-    _end_with_parent(int(parent), int(number))
+    libc = ctypes.CDLL(None)
+    if int(parent) and hasattr(libc, 'prctl'):
+        libc.prctl(_PR_SET_PDEATHSIG, int(number), 0, 0, 0)
+        if os.getppid() != int(parent):
+            # it has ended before
+            os._exit(0)
     sys.argv = [module, *arguments]
-    for blocked in SIGNALS:
-        signal.signal(blocked, lambda *_: os._exit(int(interrupted)))
+    handle_signals(lambda *_: os._exit(int(interrupted)))
     signal.pthread_sigmask(signal.SIG_UNBLOCK, SIGNALS)
     return run_program(module, int(interrupted))
 

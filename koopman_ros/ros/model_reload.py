@@ -75,8 +75,7 @@ def load_suitable(name: str) -> LoadedModel:
     """
     Load a model by name or path, if it is for one temperature and one coolant temperature.
 
-    :raises ModelFileError: naming the file, what is wrong and what to do; also for a model that
-        a control step fails with, or takes too long for.
+    :raises ModelFileError: also for a model that a control step fails with or is slow with.
     """
     if len(name.encode()) > _LONGEST_PATH or '\0' in name:
         raise ModelFileError(f'model = {name[:50]!r}... is no path of a file, which has at most '
@@ -215,12 +214,9 @@ class ModelReload:
 
     Files are read and tried in a thread, so that no measurement waits for a disk. The service
     answers when that is done, up to ten seconds later. A parameter must be answered at once, for
-    only then `ros2 param set` can say why it was refused: the loop waits for the thread a fifth
-    of a second, where a local file takes milliseconds. Whatever is not read by then is refused,
-    and the service is there for it.
-
-    A read from a disk that does not answer cannot be ended. No file is read twice at once, and no
-    more than eight from one file system, so that little piles up and a model elsewhere is read.
+    only then `ros2 param set` can say why it was refused: what is not read in a fifth of a second
+    is refused. A read from a disk that does not answer cannot be ended: no file is read twice at
+    once, and no more than eight from one file system, so that a model elsewhere is read.
 
     :param reloaded: called in the executor when the service has put another model in force.
     :param refused: called there when a model was refused.
@@ -267,8 +263,8 @@ class ModelReload:
         self._accepted = None
         if 'model' not in changes:
             return ''
-        situation = replace(self._situation(), settings=parameters.settings())
-        trial = self._start(parameters.model, situation)
+        trial = self._start(parameters.model, replace(
+            self._situation(), settings=parameters.settings()))
         if not trial.outcome.done():
             trial.thread.join(_SHORT_WAIT)
         outcome = trial.outcome.result() if trial.outcome.done() else (
@@ -322,7 +318,6 @@ class ModelReload:
 
 
 def _absolute(name: str) -> str:
-    """Return what tells one file from another, also where there is none."""
     with contextlib.suppress(OSError):
         return os.path.abspath(os.path.expanduser(name))
     # the folder in which the process was started is gone

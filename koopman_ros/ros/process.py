@@ -19,15 +19,12 @@ from rclpy.utilities import remove_ros_args
 from koopman_ros.resources import LOOPBACK_PROFILE
 from koopman_ros.ros.node import LoopNode
 from koopman_ros.ros.watchdog import end_in_time
-from koopman_ros.startup import end_by_force, ignore_signals, SIGNALS
+from koopman_ros.startup import end_by_force, handle_signals
 
 # A parameter or a model that does not fit is a ValueError; rclpy raises RCLError for an unreadable
 # parameter file, a RuntimeError whose class is private to the extension.
 _START_ERRORS = (OSError, ParameterException, RuntimeError, ValueError)
-
 _PROFILES = ('FASTDDS_DEFAULT_PROFILES_FILE', 'FASTRTPS_DEFAULT_PROFILES_FILE')
-_CLOSED_RANGES = ('LOCALHOST', 'OFF')
-
 _LONGEST_WAIT = 0.1  # s from a signal to the end
 _TAKE_DOWN_PATIENCE = 5.0  # s; taking down a participant needs some ten milliseconds
 
@@ -42,8 +39,7 @@ def run(name: str, create: Callable[[], LoopNode], args: list[str] | None = None
     """
     # a list, because a second signal may come while the first is handled, where a lock would hang
     arrived: list[int] = []
-    for number in SIGNALS:
-        signal.signal(number, lambda number, _: arrived.append(number))
+    handle_signals(lambda number, _: arrived.append(number))
     if (said := answer(name, args)) is not None:
         return said
     leave = end_in_time(name)
@@ -69,7 +65,7 @@ def run(name: str, create: Callable[[], LoopNode], args: list[str] | None = None
                 node.complete()
         finally:
             _take_down(name, node)
-            ignore_signals()
+            handle_signals(signal.SIG_IGN)
     return node.exit_code or 0
 
 
@@ -98,12 +94,7 @@ def run_task(name: str, prepare: Callable[[], Callable[[], int]],
 
 
 def _take_down(name: str, node: LoopNode | None) -> None:
-    """
-    Take the middleware down, or leave it to the operating system when it hangs in that.
-
-    Fast DDS can: two of its threads wait for each other, and whoever takes an entity down waits
-    for them, in rclpy with the interpreter's lock held. See docs/middleware.md.
-    """
+    # Fast DDS can hang in that, in rclpy with the interpreter's lock held: see docs/middleware.md
     disarm = end_by_force(_TAKE_DOWN_PATIENCE, 0, (
         f'{name}: the middleware does not shut down: left to the operating system'))
     if node is not None:
@@ -155,7 +146,7 @@ def answer(name: str, args: list[str] | None) -> int | None:
 def open_to_the_network(environment: Mapping[str, str]) -> str:
     """Return a warning for a node that others on the network can command, or ''."""
     closed = (
-        environment.get('ROS_AUTOMATIC_DISCOVERY_RANGE', '').upper() in _CLOSED_RANGES
+        environment.get('ROS_AUTOMATIC_DISCOVERY_RANGE', '').upper() in ('LOCALHOST', 'OFF')
         or environment.get('ROS_LOCALHOST_ONLY') == '1'
         or any(Path(environment.get(name, '')).name == LOOPBACK_PROFILE for name in _PROFILES)
         # with keys, or not at all

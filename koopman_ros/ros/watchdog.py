@@ -9,11 +9,10 @@ import os
 import signal
 import threading
 import time
-from typing import NamedTuple
 
 from rclpy.node import Node
 
-from koopman_ros.startup import end_by_force
+from koopman_ros.startup import end_by_force, SIGNALS
 from koopman_ros.units import NANOSECONDS
 
 PERIOD = 0.1  # s by the wall, of the executor's own watch and of the one over it
@@ -23,14 +22,6 @@ _PATIENCE = 5.0  # s from a signal to the end of a callback, or of the start
 # Stamps further from the node's clock than this come from another clock.
 _SAME_CLOCK = 3600.0  # s
 _CLOCK_PATIENCE = 1.0  # s from the start until somebody should publish the time
-
-
-class Moment(NamedTuple):
-    """A time by the steady clock, in s, on /clock (0 where it does not count) and the node's."""
-
-    wall: float
-    sim_ns: int
-    node_ns: int
 
 
 class Timing:
@@ -50,17 +41,16 @@ class Timing:
         self.answer_seconds = math.nan  # from its arrival to its command
         self.busy = False  # whether what has arrived since then waits for the node itself
 
-    def now(self) -> Moment:
-        """Return the present time."""
-        return Moment(time.monotonic(), self._sim_now(),
-                      self._node.get_clock().now().nanoseconds)
+    def now(self) -> tuple[float, int, int]:
+        """Return the time by the steady clock in s, on /clock, or 0, and the node's, in ns."""
+        return time.monotonic(), self._sim_now(), self._node.get_clock().now().nanoseconds
 
-    def note(self, stamp_ns: int, at: Moment) -> None:
+    def note(self, stamp_ns: int, at: tuple[float, int, int]) -> None:
         """Take down that a measurement with a new stamp has arrived at a time."""
-        self._wall, self._sim = at.wall, at.sim_ns
-        age = (at.node_ns - stamp_ns) / NANOSECONDS
+        self._wall, self._sim, node_ns = at
+        age = (node_ns - stamp_ns) / NANOSECONDS
         # at time zero the clock has not begun
-        self.age = age if at.node_ns and abs(age) < _SAME_CLOCK else math.nan
+        self.age = age if node_ns and abs(age) < _SAME_CLOCK else math.nan
 
     def answered(self) -> None:
         """Take down that its command is out."""
@@ -147,7 +137,6 @@ def end_in_time(name: str) -> Callable[[], None]:
     """
     End the process by force when it is still in a callback, or starting, 5 s after a signal.
 
-    :param name: word that starts the line which says so.
     :return: to be called when callbacks are over; what comes then is bounded elsewhere.
     """
     # Python's handlers run in the main thread alone, between two instructions of its own; a byte
@@ -159,8 +148,7 @@ def end_in_time(name: str) -> Callable[[], None]:
 
     def listen() -> None:
         with open(reader, 'rb', buffering=0) as numbers:
-            while (number := numbers.read(1)) and number[0] not in (
-                    signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
+            while (number := numbers.read(1)) and number[0] not in SIGNALS:
                 pass
             # the pipe stays open, for the byte of a second signal
             if number:

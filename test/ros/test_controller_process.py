@@ -273,7 +273,7 @@ def test_silence_by_the_wall_clock_ends_at_the_safe_coolant_or_with_the_operator
     # in manual mode the coolant is left to the operator
     ros.set_parameters('controller', hold_timeout=0.0)
     ros.set_bool('controller/set_automatic', False)
-    last = seconds(bench.commands[-1]) + 60.0
+    last = math.floor(seconds(bench.commands[-1])) + 60.0
     held = bench.measure(STEADY, last).temperature
     manual = ros.speak(Temperature, topics.MANUAL_COOLANT_SETPOINT, to='controller')
     manual.publish(temperature(held - 0.5))
