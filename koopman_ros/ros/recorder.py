@@ -192,7 +192,10 @@ def _offered(profile: QoSProfile) -> QosProfile:
     return QosProfile(
         history=profile.history.short_key, depth=profile.depth,
         reliability=profile.reliability.short_key, durability=profile.durability.short_key,
-        liveliness=profile.liveliness.short_key, **{
-            f'{name}_ns': ns if 0 <= (ns := getattr(profile, name).nanoseconds) <= INFINITE_NS
-            else INFINITE_NS
-            for name in ('deadline', 'lifespan', 'liveliness_lease_duration')})
+        liveliness=profile.liveliness.short_key, deadline_ns=_nanoseconds(profile.deadline),
+        lifespan_ns=_nanoseconds(profile.lifespan),
+        liveliness_lease_duration_ns=_nanoseconds(profile.liveliness_lease_duration))
+
+
+def _nanoseconds(duration: Any) -> int:
+    return ns if 0 <= (ns := duration.nanoseconds) <= INFINITE_NS else INFINITE_NS
