@@ -35,10 +35,11 @@ from koopman_ros.parameters.wire import (
 # JointState is the one stamped type of common_interfaces that carries named float64 values.
 # Records are lines of JSON, which keep a float64 bit-identical at a third of the time.
 TYPES = {
-    **dict.fromkeys((TEMPERATURE, SETPOINT, ACTIVE_SETPOINT, COOLANT_SETPOINT, COOLANT_TEMPERATURE,
-                     MANUAL_COOLANT_SETPOINT, PREDICTED_TEMPERATURE), Temperature),
-    CONCENTRATION: JointState, CONTROLLER_STATE: JointState, CONTROLLER_EVENTS: String,
-    DIAGNOSTICS: DiagnosticArray, CLOCK: Clock}
+    TEMPERATURE: Temperature, CONCENTRATION: JointState, SETPOINT: Temperature,
+    ACTIVE_SETPOINT: Temperature, COOLANT_SETPOINT: Temperature, COOLANT_TEMPERATURE: Temperature,
+    MANUAL_COOLANT_SETPOINT: Temperature, PREDICTED_TEMPERATURE: Temperature,
+    CONTROLLER_STATE: JointState, CONTROLLER_EVENTS: String, DIAGNOSTICS: DiagnosticArray,
+    CLOCK: Clock}
 
 # Every message counts: reliable, with room for a receiver that falls behind a fast plant.
 LOOP_QOS = QoSProfile(depth=1000)
