@@ -13,7 +13,7 @@ from koopman_ros.control import Controller, exchange, InputLimits, Settings, Sta
 from koopman_ros.control.supervisor import Requested, rest_under, WayBack
 from koopman_ros.lifting import Coordinates, linearised_model, Provenance
 from koopman_ros.reasons import Code, reason
-from koopman_ros.ros.model_loading import rests_outside
+from koopman_ros.ros.model_reload import rests_outside
 from support.closed_loops import REACTOR, shipped, START
 from support.sampled_loops import (
     controller,
