@@ -11,11 +11,13 @@ import threading
 from builtin_interfaces.msg import Time
 import numpy as np
 from rclpy.callback_groups import MutuallyExclusiveCallbackGroup
+from rclpy.publisher import Publisher
 from rclpy.qos_overriding_options import QoSOverridingOptions
 from rclpy.timer import Timer
 from sensor_msgs.msg import Temperature
 from std_srvs.srv import SetBool, Trigger
 
+from koopman_ros.arrays import Array
 from koopman_ros.control import Arrival, Controller, events, MANUAL, Mode, Report, State
 from koopman_ros.control.events import Event, ModeChange, Silence
 from koopman_ros.parameters.controller import ControllerParameters, TABLE
@@ -50,8 +52,7 @@ class ControllerNode(LoopNode):
 
     def __init__(self) -> None:
         super().__init__('controller')
-        parameters = self.declare_table(TABLE)
-        self._settings = parameters
+        self._settings = parameters = self.declare_table(TABLE)
         self._models = ModelReload(
             self, load_suitable(parameters.model), lambda: Situation(
                 self._settings.settings(), self._state,
@@ -61,20 +62,16 @@ class ControllerNode(LoopNode):
         self._controller = self._built()
         self._state = State()
         self._lock, self._telling = threading.Lock(), threading.Lock()
-        self._report = self._logged = Report(
-            Mode.AUTOMATIC, next(iter(self._controller.levels)))
+        self._report = self._logged = Report(Mode.AUTOMATIC, next(iter(self._controller.levels)))
         self._refused = self._rests_outside = ''
         self._counts = messages.Counts()
-        self._temperature = np.nan
-        self._timing = Timing(self)
+        self._temperature, self._timing = np.nan, Timing(self)
         self._coolant: Temperature | None = None
         self._waiting: list[Temperature] = []  # measurements that came before the coolant
         self._patience: Timer | None = None
-        self._frame_id = ''
-        self._frame_length = 0  # of the last measurement's, where it is too long
+        self._frame_id, self._frame_length = '', 0  # the length where it is too long
 
-        self._matching = Matching(
-            self, lambda: self._diagnostics.publish_if_changed(), SINGLE)
+        self._matching = Matching(self, lambda: self._diagnostics.publish_if_changed(), SINGLE)
         self._commands = self._matching.publish(topics.COOLANT_SETPOINT)
         self._active = self.create_publisher(*topics.of(topics.ACTIVE_SETPOINT))
         self._predicted = self.create_publisher(*topics.of(topics.PREDICTED_TEMPERATURE))
@@ -86,7 +83,7 @@ class ControllerNode(LoopNode):
         self._matching.subscribe(topics.MANUAL_COOLANT_SETPOINT, self._on_manual_coolant_setpoint)
         self._coolants = self._matching.subscribe(topics.COOLANT_TEMPERATURE, self._on_coolant)
         # a sensor driver that publishes best effort needs this overridden to match
-        self._measurements = self._matching.subscribe(
+        self._matching.subscribe(
             topics.TEMPERATURE, self._on_temperature,
             qos_overriding_options=QoSOverridingOptions.with_default_policies())
         self.create_service(SetBool, '~/set_automatic', self._on_set_automatic)
@@ -146,15 +143,13 @@ class ControllerNode(LoopNode):
                 state = done[0][1].state
             asked = messages.measurement(message, self._coolant)
             outcome = events.apply(self._controller, state, asked)
-            assert outcome.command is not None
-            assert outcome.report is not None
+            assert outcome.command is not None and outcome.report is not None
             with self._lock:
                 if self._state is not before:
                     # the watchdog has commanded meanwhile: the answer must go on from there
                     continue
                 self._state = outcome.state
-                self._commands.publish(temperature_message(
-                    float(outcome.command[0]), message.header.stamp, self._frame_id))
+                self._publish(self._commands, outcome.command, message.header.stamp)
                 for event, led_to in (*done, (asked, outcome)):
                     self._records.publish_event(event, led_to)
                 if stamp_ns != before.time_ns:
@@ -209,8 +204,7 @@ class ControllerNode(LoopNode):
             if outcome.command is None or outcome.report is None:
                 return None
             self._state, stamp = outcome.state, stamp_message(now_ns)
-            self._commands.publish(temperature_message(
-                float(outcome.command[0]), stamp, self._frame_id))
+            self._publish(self._commands, outcome.command, stamp)
             self._records.publish_event(silence_ends, outcome)
             return outcome.report, stamp
 
@@ -219,7 +213,12 @@ class ControllerNode(LoopNode):
         with self._telling:
             self._publish_beside(report, stamp)
         if report.level not in (self._logged.level, MANUAL):
-            self._log_transition(self._logged, report)
+            change = f'{level_words(self._logged.level)} -> {level_words(report.level)}'
+            if report.depth > self._logged.depth:
+                why = words_of(self._controller.model)(report.reason)
+                self.get_logger().warning(f'{change}: {why}', throttle_duration_sec=1.0)
+            else:
+                self.get_logger().info(change, throttle_duration_sec=1.0)
             self._logged = report
         if report.measurement.clock_went_back:
             self.get_logger().warning('the measurement is older than the last one: time starts '
@@ -231,21 +230,13 @@ class ControllerNode(LoopNode):
         target, predicted = report.target, report.measurement.predicted
         if target is not None and target.setpoint[0] != self._published_setpoint:
             self._published_setpoint = float(target.setpoint[0])
-            self._active.publish(temperature_message(
-                self._published_setpoint, stamp, self._frame_id))
+            self._publish(self._active, target.setpoint, stamp)
         if predicted is not None:
-            self._predicted.publish(temperature_message(
-                float(predicted[0]), stamp, self._frame_id))
+            self._publish(self._predicted, predicted, stamp)
         self._internals.publish(messages.internals(report, stamp, self._frame_id))
 
-    def _log_transition(self, before: Report, report: Report) -> None:
-        change = f'{level_words(before.level)} -> {level_words(report.level)}'
-        if report.depth > before.depth:
-            self.get_logger().warning(
-                f'{change}: {words_of(self._controller.model)(report.reason)}',
-                throttle_duration_sec=1.0)
-        else:
-            self.get_logger().info(change, throttle_duration_sec=1.0)
+    def _publish(self, publisher: Publisher, kelvin: Array, stamp: Time) -> None:
+        publisher.publish(temperature_message(float(kelvin[0]), stamp, self._frame_id))
 
     def _on_setpoint(self, message: Temperature) -> None:
         stamp_ns = stamp_nanoseconds(message.header.stamp)
@@ -314,8 +305,7 @@ class ControllerNode(LoopNode):
                  ) if self._frame_length else ''
         return messages.status(messages.Situation(
             self._controller, self._settings, self._state, self._report, self._counts,
-            self._timing, self._matching.complaint or frame, self._refused,
-            self._models.refused,
+            self._timing, self._matching.complaint or frame, self._refused, self._models.refused,
             {**self._models.figures(), 'safe coolant': self._rests_outside or 'within reach'},
             self._temperature))
 

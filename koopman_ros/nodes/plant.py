@@ -10,18 +10,18 @@ import sys
 import time
 
 import numpy as np
-from sensor_msgs.msg import Temperature
+from rosgraph_msgs.msg import Clock
+from sensor_msgs.msg import JointState, Temperature
 from std_srvs.srv import Trigger
 
+from koopman_ros import plants
 from koopman_ros.parameters.plant import PlantParameters, REACTORS, TABLE
-from koopman_ros.plants import ControlAffineSystem, EquilibriumError, IntegrationError, Process
 from koopman_ros.ros import topics
-from koopman_ros.ros.codec import stamp_nanoseconds
+from koopman_ros.ros.codec import stamp_message, stamp_nanoseconds, temperature_message
 from koopman_ros.ros.diagnostics import DiagnosticsPublisher, Level, Status
 from koopman_ros.ros.matching import Matching, SINGLE
 from koopman_ros.ros.node import LoopNode, wall_timer
 from koopman_ros.ros.process import run
-from koopman_ros.ros.sensors import Instruments
 from koopman_ros.units import LAST_STAMP_SECONDS, NANOSECONDS, seconds_text, to_celsius, to_kelvin
 
 _POLL_PERIOD = 0.01  # s; for what no message announces
@@ -57,18 +57,20 @@ class PlantNode(LoopNode):
         self._answered = True  # whether the last measurement has its command
         self._commands = self._rejected = self._missed = self._foreign = 0
         self._waiting_in_vain = False
-        self._last_command = time.monotonic()
         self._rejection = ''
-        self._wall_start = self._wall_published = time.monotonic()
+        self._wall_start = self._wall_published = self._last_command = time.monotonic()
 
         # the subscription first: a controller that hears the measurement has then seen it, too
-        self._matching = Matching(
-            self, lambda: self._diagnostics.publish_if_changed(), SINGLE)
+        self._matching = Matching(self, lambda: self._diagnostics.publish_if_changed(), SINGLE)
         self._command_subscription = self._matching.subscribe(
             topics.COOLANT_SETPOINT, self._on_command)
-        self._instruments = Instruments(
-            self, self._matching, clock=parameters.publish_clock and not self._real_time,
-            concentration=system.n_x == 2)
+        self._clock_publisher = self.create_publisher(*topics.of(topics.CLOCK)) if (
+            parameters.publish_clock and not self._real_time) else None
+        self._concentration = self.create_publisher(*topics.of(topics.CONCENTRATION)) if (
+            system.n_x == 2) else None
+        # the temperature last: who has found it has found the coolant, too
+        self._coolant = self._matching.publish(topics.COOLANT_TEMPERATURE)
+        self._temperature = self._matching.publish(topics.TEMPERATURE)
         self._diagnostics = DiagnosticsPublisher(
             self, 'simulation', parameters.reactor, self._status)
         self.create_service(Trigger, '~/reset', self._on_reset)
@@ -88,21 +90,21 @@ class PlantNode(LoopNode):
         self.get_logger().info(f'{parameters.reactor} reactor started: a measurement every '
                                f'{parameters.sample_period:g} s{start}, {pace}{lockstep}')
 
-    def _build(self, parameters: PlantParameters) -> ControlAffineSystem:
+    def _build(self, parameters: PlantParameters) -> plants.ControlAffineSystem:
         """Build the reactor, which starts from its steady state if it has one."""
         build = REACTORS[parameters.reactor]
         try:
             return build(parameters.constants())
-        except EquilibriumError as error:
+        except plants.EquilibriumError as error:
             nominal = build().nominal_state
             self.get_logger().warning(
                 f'{error}; the plant starts at {to_celsius(float(nominal[-1])):.3f} degC instead')
             return build(parameters.constants(), nominal_state=nominal)
 
-    def _initial(self, system: ControlAffineSystem, time_ns: int) -> Process:
+    def _initial(self, system: plants.ControlAffineSystem, time_ns: int) -> plants.Process:
         x, u = system.nominal_state.copy(), system.nominal_input
         x[-1] += self._settings.initial_temperature_offset
-        return Process(system, time_ns, x, u, self._settings.actuator(), u)
+        return plants.Process(system, time_ns, x, u, self._settings.actuator(), u)
 
     def _now_ns(self) -> int:
         """Return the plant time that the wall clock stands for."""
@@ -129,7 +131,8 @@ class PlantNode(LoopNode):
     def _on_poll(self) -> None:
         """Start lock-step when the loop is complete, and watch for a command that is missing."""
         if self._phase is Phase.WAITING:
-            if (self._instruments.subscribers >= self._settings.lockstep_subscribers
+            listeners = self._temperature.get_subscription_count()
+            if (listeners >= self._settings.lockstep_subscribers
                     and self._command_subscription.get_publisher_count() > 0):
                 self._phase = Phase.RUNNING
                 self._measure()
@@ -165,17 +168,37 @@ class PlantNode(LoopNode):
             self._phase = Phase.OUT_OF_STAMPS
             self.get_logger().error(self._phase.value)
         elif self._advance(instant):
-            self._sample += 1
+            sample, self._sample = self._sample, self._sample + 1
             self._answered = False
             self._wall_published = time.monotonic()
-            self._instruments.publish(self._plant, self._sample - 1, self._settings)
+            self._publish(sample)
         self._diagnostics.publish_if_changed()
+
+    def _publish(self, sample: int) -> None:
+        """Publish the plant as it stands, the temperature, which is answered, last."""
+        plant, settings = self._plant, self._settings
+        stamp, frame_id = stamp_message(plant.time_ns), settings.frame_id
+        if self._clock_publisher is not None:
+            self._clock_publisher.publish(Clock(clock=stamp))
+        if self._concentration is not None:
+            message = JointState(
+                name=['reactant_concentration [mol/L]'], position=[float(plant.x[0])])
+            message.header.stamp, message.header.frame_id = stamp, frame_id
+            self._concentration.publish(message)
+        self._coolant.publish(temperature_message(float(plant.u[0]), stamp, frame_id))
+        noise = plants.sensor_noise(settings.noise, settings.seed, sample)
+        # the steps of the scale have the variance of a uniform error
+        variance = settings.noise ** 2 + settings.sensor_resolution ** 2 / 12.0
+        measured = temperature_message(
+            float(plant.x[-1]) + noise + settings.sensor_bias, stamp, frame_id, variance)
+        measured.temperature = plants.in_steps(measured.temperature, settings.sensor_resolution)
+        self._temperature.publish(measured)
 
     def _advance(self, time_ns: int) -> bool:
         """Bring the process to an instant; a reactor that ran away stops the plant."""
         try:
             self._plant = self._plant.until(time_ns)
-        except IntegrationError as error:
+        except plants.IntegrationError as error:
             self._phase, self._trip = Phase.TRIPPED, str(error)
             self.get_logger().error(f'{error}; call ~/reset to start again')
             self._diagnostics.publish_if_changed()

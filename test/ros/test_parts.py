@@ -28,7 +28,6 @@ from koopman_ros.ros.matching import Matching
 from koopman_ros.ros.model_reload import load_suitable
 from koopman_ros.ros.recorder import receipt_ns, Recorder
 from koopman_ros.ros.recording import Recording
-from koopman_ros.ros.sensors import Instruments
 from koopman_ros.ros.training import Training
 from koopman_ros.ros.watchdog import Watchdog
 from koopman_ros.testing import Harness
@@ -38,60 +37,38 @@ from support.messages import temperature, TIMEOUT
 NAMES = (topics.TEMPERATURE, topics.SETPOINT, topics.COOLANT_SETPOINT)
 
 
-# Each makes a part, and returns what takes it down.
+def made(part: str, node: Node, folder: Path) -> Callable[[], object]:
+    """Make a part of a node, and return what takes it down."""
+    match part:
+        case 'diagnostics':
+            made = DiagnosticsPublisher(node, 'task', 'x', lambda: Status(Level.OK, 'well'))
+        case 'matching':
+            made = Matching(node, lambda: None, {topics.TEMPERATURE: 'publish the temperature'})
+            made.publish('mine', Temperature)
+            made.subscribe('other', lambda _: None, Temperature)
+        case 'recorder':
+            return Recorder(node, BagWriter(folder / 'bag'), NAMES).close
+        case 'recording':
+            made = Recording(node, TrainerParameters(output=str(folder / 'bag')))
+            made.start()
+        case 'experiment':
+            made = CoolantExperiment(
+                node, TrainerParameters(experiment_topic=topics.COOLANT_SETPOINT))
+            assert made._start() == ''
+        case 'training':
+            made = Training(node, TrainerParameters(), lambda: str(folder / 'missing'))
+            made.start()
+        case 'watchdog':
+            made = Watchdog(lambda _: None)
+            made.start()
+            return made.end
+    return made.destroy
 
 
-def diagnostics(node: Node, _: Path) -> Callable[[], object]:
-    return DiagnosticsPublisher(
-        node, 'task', 'hardware', lambda: Status(Level.OK, 'well')).destroy
-
-
-def matching(node: Node, _: Path) -> Callable[[], object]:
-    part = Matching(node, lambda: None, {topics.TEMPERATURE: 'publish the temperature'})
-    part.publish('mine', Temperature)
-    part.subscribe('other', lambda _: None, Temperature)
-    return part.destroy
-
-
-def instruments(node: Node, _: Path) -> Callable[[], object]:
-    loop = Matching(node, lambda: None)
-    part = Instruments(node, loop, clock=True, concentration=True)
-    return lambda: (part.destroy(), loop.destroy())
-
-
-def recording_of_topics(node: Node, folder: Path) -> Callable[[], object]:
-    return Recorder(node, BagWriter(folder / 'bag'), (topics.TEMPERATURE, topics.SETPOINT)).close
-
-
-def recording(node: Node, folder: Path) -> Callable[[], object]:
-    part = Recording(node, TrainerParameters(output=str(folder / 'bag')))
-    part.start()
-    return part.destroy
-
-
-def experiment(node: Node, _: Path) -> Callable[[], object]:
-    part = CoolantExperiment(node, TrainerParameters(experiment_topic=topics.COOLANT_SETPOINT))
-    assert part._start() == ''
-    return part.destroy
-
-
-def training(node: Node, folder: Path) -> Callable[[], object]:
-    part = Training(node, TrainerParameters(), lambda: str(folder / 'missing'))
-    part.start()
-    return part.destroy
-
-
-def watchdog(_: Node, __: Path) -> Callable[[], object]:
-    part = Watchdog(lambda _: None)
-    part.start()
-    return part.end
-
-
-@pytest.mark.parametrize('make', [diagnostics, matching, instruments, recording_of_topics,
-                                  recording, experiment, training, watchdog])
+@pytest.mark.parametrize('part', ['diagnostics', 'matching', 'recorder', 'recording',
+                                  'experiment', 'training', 'watchdog'])
 def test_what_a_part_has_created_goes_with_it(
-        shared_ros: Harness, tmp_path: Path, monkeypatch: pytest.MonkeyPatch,
-        make: Callable[[Node, Path], Callable[[], object]]) -> None:
+        shared_ros: Harness, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, part: str) -> None:
     # a training that loads no library, and ends when it is asked to
     monkeypatch.setattr('koopman_ros.jobs.training._command', lambda: (
         'sh', '-c', 'cat > /dev/null'))
@@ -102,13 +79,10 @@ def test_what_a_part_has_created_goes_with_it(
                 set(threading.enumerate()))
 
     before = created()
-    destroy = make(node, tmp_path)
+    destroy = made(part, node, tmp_path)
     assert created() != before
     destroy()
     assert created() == before
-
-
-# Recording.
 
 
 def stamped_at_the_take(handle: Any, message_type: type) -> Any:
@@ -163,9 +137,6 @@ def test_time_of_receipt(received: float, source: float, found: float) -> None:
             'source_timestamp': round(source * NANOSECONDS)}
     assert receipt_ns(info, take_ns=100 * NANOSECONDS, empty_ns=50 * NANOSECONDS) == round(
         found * NANOSECONDS)
-
-
-# Models.
 
 
 @pytest.mark.parametrize(('state', 'coolant', 'fits'), [
