@@ -30,11 +30,7 @@ class Phase(Enum):
 
 @dataclass(frozen=True)
 class Experiment:
-    """
-    Steps of random height and length (paper, section on the reactor), and what ends them.
-
-    :raises ValueError: when the limits contradict each other.
-    """
+    """Steps of random height and length (paper, section on the reactor), and what ends them."""
 
     duration: float  #: s
     input_lower: float  #: lowest level, in the input's unit; levels are uniform between the two

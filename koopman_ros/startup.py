@@ -37,11 +37,7 @@ _AFTER = 0.5  # s from the stack that is printed to the end
 
 
 def run_program(module: str, interrupted: int) -> int:
-    """
-    Load a module, run its `main`, whatever signals come meanwhile, and return its exit code.
-
-    :param interrupted: exit code when a signal ends it that `main` does not handle itself.
-    """
+    """Run a module's `main`, whatever signals come; return its exit code, or `interrupted`."""
     open_standard_streams()
     # numpy, scipy and rclpy take half a second, in which there is nothing to complete
     handle_signals(lambda *_: os._exit(interrupted))
@@ -152,11 +148,7 @@ def _exit_later(seconds: float, code: int) -> Callable[[], object] | None:
 
 
 def command(module: str, number: int, interrupted: int) -> tuple[str, ...]:
-    """
-    Return the command line of a child that does not outlive this process; its arguments follow.
-
-    :param number: signal that the child gets when this process ends, however it ends.
-    """
+    """Return the command line of a child that gets a signal when this process ends, however."""
     # the signal comes when the thread ends that started the child
     parent = os.getpid() if threading.current_thread() is threading.main_thread() else 0
     return (sys.executable, '-m', 'koopman_ros.startup', str(parent), str(int(number)),

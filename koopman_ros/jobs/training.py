@@ -44,11 +44,7 @@ class JobState:
 
 
 class RetrainingJob:
-    """
-    A retraining in a process of its own, which does not outlive this one.
-
-    :param task: fields of :class:`koopman_ros.retraining.Task`.
-    """
+    """A retraining in a process of its own, of fields of :class:`koopman_ros.retraining.Task`."""
 
     def __init__(self, task: Mapping[str, object]) -> None:
         self.state = JobState()

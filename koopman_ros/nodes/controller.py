@@ -28,7 +28,6 @@ from koopman_ros.ros import controller_messages as messages
 from koopman_ros.ros import topics
 from koopman_ros.ros.codec import stamp_message, stamp_nanoseconds, temperature_message
 from koopman_ros.ros.diagnostics import DiagnosticsPublisher, Status, words_of
-from koopman_ros.ros.matching import Matching, SINGLE
 from koopman_ros.ros.model_reload import load_suitable, ModelReload, rests_outside, Situation
 from koopman_ros.ros.node import LoopNode, wall_timer
 from koopman_ros.ros.process import run
@@ -71,7 +70,8 @@ class ControllerNode(LoopNode):
         self._patience: Timer | None = None
         self._frame_id, self._frame_length = '', 0  # the length where it is too long
 
-        self._matching = Matching(self, lambda: self._diagnostics.publish_if_changed(), SINGLE)
+        self._matching = topics.Matching(
+            self, lambda: self._diagnostics.publish_if_changed(), topics.SINGLE)
         self._commands = self._matching.publish(topics.COOLANT_SETPOINT)
         self._active = self.create_publisher(*topics.of(topics.ACTIVE_SETPOINT))
         self._predicted = self.create_publisher(*topics.of(topics.PREDICTED_TEMPERATURE))

@@ -19,7 +19,6 @@ from koopman_ros.parameters.plant import PlantParameters, REACTORS, TABLE
 from koopman_ros.ros import topics
 from koopman_ros.ros.codec import stamp_message, stamp_nanoseconds, temperature_message
 from koopman_ros.ros.diagnostics import DiagnosticsPublisher, Level, Status
-from koopman_ros.ros.matching import Matching, SINGLE
 from koopman_ros.ros.node import LoopNode, wall_timer
 from koopman_ros.ros.process import run
 from koopman_ros.units import LAST_STAMP_SECONDS, NANOSECONDS, seconds_text, to_celsius, to_kelvin
@@ -51,17 +50,16 @@ class PlantNode(LoopNode):
         self._period_ns = round(parameters.sample_period * NANOSECONDS)
         self._start_ns = round(parameters.start_time * NANOSECONDS)
         self._plant = self._initial(system, self._start_ns)
-        self._phase = Phase.WAITING if parameters.lockstep else Phase.RUNNING
-        self._trip = ''
+        self._phase, self._trip = Phase.WAITING if parameters.lockstep else Phase.RUNNING, ''
         self._sample = 0  # number of the next measurement
         self._answered = True  # whether the last measurement has its command
         self._commands = self._rejected = self._missed = self._foreign = 0
-        self._waiting_in_vain = False
-        self._rejection = ''
+        self._waiting_in_vain, self._rejection = False, ''
         self._wall_start = self._wall_published = self._last_command = time.monotonic()
 
         # the subscription first: a controller that hears the measurement has then seen it, too
-        self._matching = Matching(self, lambda: self._diagnostics.publish_if_changed(), SINGLE)
+        self._matching = topics.Matching(
+            self, lambda: self._diagnostics.publish_if_changed(), topics.SINGLE)
         self._command_subscription = self._matching.subscribe(
             topics.COOLANT_SETPOINT, self._on_command)
         self._clock_publisher = self.create_publisher(*topics.of(topics.CLOCK)) if (
@@ -141,12 +139,11 @@ class PlantNode(LoopNode):
         if (self._phase is Phase.RUNNING and not self._answered
                 and waited > self._settings.lockstep_timeout):
             self._missed += 1
-            self._waiting_in_vain = True
+            self._answered = self._waiting_in_vain = True
             self.get_logger().warning(
                 f'no command for the measurement at {seconds_text(self._plant.time_ns)} s '
                 f'within {self._settings.lockstep_timeout} s: the last one is held',
                 throttle_duration_sec=10.0)
-            self._answered = True
             self._continue_lockstep()
 
     def _step_in_lockstep(self) -> None:
@@ -214,8 +211,7 @@ class PlantNode(LoopNode):
             return
         if math.isfinite(message.temperature):
             self._commands += 1
-            self._last_command = time.monotonic()
-            self._rejection = ''
+            self._last_command, self._rejection = time.monotonic(), ''
             # in lock-step it was given at its measurement, otherwise now
             if lockstep or self._advance_to_now():
                 command = np.array([to_kelvin(message.temperature)])
@@ -227,8 +223,7 @@ class PlantNode(LoopNode):
             self.get_logger().warning(self._rejection, throttle_duration_sec=1.0)
             self._diagnostics.publish_if_changed()
         if lockstep and self._phase is Phase.RUNNING and not self._answered:
-            self._answered = True
-            self._waiting_in_vain = False
+            self._answered, self._waiting_in_vain = True, False
             self._continue_lockstep()
 
     def _advance_to_now(self) -> bool:

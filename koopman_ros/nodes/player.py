@@ -75,9 +75,8 @@ class PlayerNode(LoopNode):
             raise ConfigurationError(str(error)) from error
 
         self._next: bags.BagMessage | None = None
-        self._began = False
         self._open: int | None = None  # stamp of the measurement that has no answer yet
-        self._sent = 0
+        self._began, self._sent = False, 0
         self._received: set[str] = set()  # topics of which subscribers have received a message
         self._due = self._wall_start = self._said = self._asked = time.monotonic()
         self._timer = wall_timer(self, _POLL_PERIOD_NS / NANOSECONDS, self._on_timer)
@@ -87,7 +86,11 @@ class PlayerNode(LoopNode):
             if not self._began:
                 self._begin()
             elif self._open is not None:
-                self._check_patience()
+                if time.monotonic() - self._asked > self._settings.answer_timeout:
+                    self._give_up(
+                        f'no command for the measurement at {self._open / NANOSECONDS:.3f} s '
+                        f'within {self._settings.answer_timeout:g} s: is the controller alive? A '
+                        'rate above 0 plays without waiting for answers')
             elif self._lockstep:
                 self._play_in_lockstep()
             else:
@@ -146,8 +149,12 @@ class PlayerNode(LoopNode):
                 self._open = stamp_nanoseconds(message.message.header.stamp)
                 self._asked = time.monotonic()
                 break
-            # the first one of a topic tells that the subscribers have found it
-            if message.topic in self._received and self._goes_with_next(message):
+            following = self._next
+            # the first one of a topic tells that the subscribers have found it; later ones go
+            # with the next message where it was published at the same instant on another topic
+            if message.topic in self._received and following and (
+                    following.topic != message.topic
+                    and _stamp_ns(message) == _stamp_ns(following) is not None):
                 continue
             patience = Duration(seconds=self._settings.answer_timeout)
             if not self._outlets[message.topic].wait_for_all_acked(patience):
@@ -157,26 +164,10 @@ class PlayerNode(LoopNode):
             self._received.add(message.topic)
         self._say_progress()
 
-    def _goes_with_next(self, message: bags.BagMessage) -> bool:
-        """Tell whether the next message was published at the same instant on another topic."""
-        following = self._next
-        if following is None or following.topic == message.topic:
-            return False
-        return _stamp_ns(message) is not None and _stamp_ns(message) == _stamp_ns(following)
-
     def _on_answer(self, message: Temperature) -> None:
-        if self._open is None or stamp_nanoseconds(message.header.stamp) != self._open:
-            return
-        self._open = None
-        self._on_timer()
-
-    def _check_patience(self) -> None:
-        assert self._open is not None
-        if time.monotonic() - self._asked > self._settings.answer_timeout:
-            self._give_up(
-                f'no command for the measurement at {self._open / NANOSECONDS:.3f} s within '
-                f'{self._settings.answer_timeout:g} s: is the controller alive? A rate above 0 '
-                'plays without waiting for answers')
+        if stamp_nanoseconds(message.header.stamp) == self._open:
+            self._open = None
+            self._on_timer()
 
     def _publish(self, message: bags.BagMessage) -> None:
         if self._clock_publisher is not None and message.topic == self._measured:
@@ -195,10 +186,9 @@ class PlayerNode(LoopNode):
                        for publisher in self._outlets.values())
         seconds = time.monotonic() - self._wall_start
         self.get_logger().info(f'played {self._sent} messages in {seconds:.3f} s')
+        self.exit_code = 0
         if not received:
             self._give_up('not all of the last messages were received: are the subscribers alive?')
-            return
-        self.exit_code = 0
 
     def _give_up(self, reason: str) -> None:
         self._timer.cancel()

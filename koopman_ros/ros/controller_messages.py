@@ -24,7 +24,6 @@ from koopman_ros.replay.records import fields_of, Record, SNAPSHOT, START
 from koopman_ros.ros import topics
 from koopman_ros.ros.codec import stamp_nanoseconds
 from koopman_ros.ros.diagnostics import Level, Status, words_of
-from koopman_ros.ros.matching import Matching
 from koopman_ros.ros.watchdog import Timing
 from koopman_ros.units import in_celsius, NANOSECONDS, to_celsius, to_kelvin
 
@@ -250,7 +249,7 @@ class RecordPublisher:
     subscriber, and one every ten seconds.
     """
 
-    def __init__(self, matching: Matching, snapshot: Callable[[], Mapping[str, Any]],
+    def __init__(self, matching: topics.Matching, snapshot: Callable[[], Mapping[str, Any]],
                  lock: threading.Lock) -> None:
         self._snapshot, self._lock = snapshot, lock
         self._run, self._number, self._due = secrets.token_hex(8), 0, 0.0

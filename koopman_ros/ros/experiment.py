@@ -22,7 +22,6 @@ from koopman_ros.reasons import Code, Reason, reason
 from koopman_ros.ros import topics
 from koopman_ros.ros.codec import stamp_message, stamp_nanoseconds, temperature_message
 from koopman_ros.ros.diagnostics import DiagnosticsPublisher, Level, OPERATOR, Status
-from koopman_ros.ros.matching import node_name
 from koopman_ros.ros.node import Owned
 from koopman_ros.units import in_celsius, NANOSECONDS, to_celsius, to_kelvin
 
@@ -164,10 +163,7 @@ class ExperimentRun:
     """
     Command the coolant from the first measurement on until :meth:`destroy`.
 
-    Its publisher exists as long as the run: nobody takes an idle trainer for a commander.
-
-    :param on_end: called when the steps are over, and with the reason when it must not command
-        any more.
+    :param on_end: called when the steps are over, with the reason when it must command no more.
     """
 
     def __init__(self, node: Node, settings: TrainerParameters,
@@ -287,7 +283,7 @@ class ExperimentRun:
 def other_publishers(node: Node, topic: str, own: int = 0) -> str:
     """Name the nodes that publish on a topic, but for so many publishers of a node's own."""
     # a publisher may be known before its node is
-    names = ['another node' if 'UNKNOWN' in info.node_name else node_name(info)
+    names = ['another node' if 'UNKNOWN' in info.node_name else topics.node_name(info)
              for info in node.get_publishers_info_by_topic(topic)]
     me = node.get_fully_qualified_name()
     # another node may have the same name

@@ -72,11 +72,7 @@ class Situation:
 
 
 def load_suitable(name: str) -> LoadedModel:
-    """
-    Load a model by name or path, if it is for one temperature and one coolant temperature.
-
-    :raises ModelFileError: also for a model that a control step fails with or is slow with.
-    """
+    """Load a model of one temperature and one coolant, or raise ModelFileError with the reason."""
     if len(name.encode()) > _LONGEST_PATH or '\0' in name:
         raise ModelFileError(f'model = {name[:50]!r}... is no path of a file, which has at most '
                              f'{_LONGEST_PATH} bytes: check it')

@@ -33,7 +33,6 @@ def run(name: str, create: Callable[[], LoopNode], args: list[str] | None = None
     """
     Run a node until SIGINT, SIGTERM or SIGHUP, which end it between two callbacks, or by force.
 
-    :param name: word that starts an error line.
     :return: exit code, 0 after a signal and for `--help`, 1 when the node could not start, 2 for
         an unknown argument, or the node's own.
     """

@@ -16,7 +16,6 @@ from rclpy.topic_endpoint_info import TopicEndpointInfo
 
 from koopman_ros.bags import BagWriter, INFINITE_NS, message_definition, QosProfile
 from koopman_ros.ros import topics
-from koopman_ros.ros.matching import type_name
 
 # Five seconds at 1 kHz wait here while the disk is slow; Fast DDS keeps no more than this.
 _QUEUE_DEPTH = 5000
@@ -52,8 +51,6 @@ class Recorder:
     Messages wait in the middleware until :meth:`take`, which a timer should call often. Any
     method raises OSError where the bag cannot be written, and LookupError where the definition of
     a type is not installed; then :meth:`close` is all that is left to do.
-
-    :param names: topics, relative or absolute; types are looked up for those outside the loop.
     """
 
     def __init__(self, node: Node, writer: BagWriter, names: tuple[str, ...]) -> None:
@@ -146,7 +143,7 @@ class Recorder:
             if not self.counts[taken.topic]:
                 # with what its publishers offer now
                 self._writer.add_topic(
-                    taken.topic, message_definition(type_name(self._types[taken.topic])),
+                    taken.topic, message_definition(topics.type_name(self._types[taken.topic])),
                     [_offered(info.qos_profile) for info in
                      self._node.get_publishers_info_by_topic(taken.topic)])
             # rosbag2, too, logs the time of receipt

@@ -1,17 +1,24 @@
 # SPDX-FileCopyrightText: 2026 The koopman_ros Authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""The topics of the loop: names, types and quality of service, the same for every node."""
+"""The topics of the loop: names, types, quality of service, and others who do not match."""
 
-from collections.abc import Collection
+from collections.abc import Callable, Collection, Mapping
+import copy
 import importlib
 import reprlib
 from typing import Any
 
 from diagnostic_msgs.msg import DiagnosticArray
+from rclpy import qos as rclpy_qos
+from rclpy.duration import Infinite
+from rclpy.event_handler import PublisherEventCallbacks, SubscriptionEventCallbacks
 from rclpy.exceptions import InvalidTopicNameException
 from rclpy.node import Node
+from rclpy.publisher import Publisher
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
+from rclpy.subscription import Subscription
+from rclpy.topic_endpoint_info import TopicEndpointInfo
 from rclpy.validate_topic_name import validate_topic_name
 from rosgraph_msgs.msg import Clock
 from sensor_msgs.msg import JointState, Temperature
@@ -31,6 +38,7 @@ from koopman_ros.parameters.wire import (
     SETPOINT,
     TEMPERATURE,
 )
+from koopman_ros.ros.node import Owned
 
 # JointState is the one stamped type of common_interfaces that carries named float64 values.
 # Records are lines of JSON, which keep a float64 bit-identical at a third of the time.
@@ -47,6 +55,14 @@ LOOP_QOS = QoSProfile(depth=1000)
 LATCHED_QOS = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
 CLOCK_QOS = QoSProfile(depth=1, reliability=ReliabilityPolicy.BEST_EFFORT)
 _QOS = {ACTIVE_SETPOINT: LATCHED_QOS, COOLANT_TEMPERATURE: LATCHED_QOS, CLOCK: CLOCK_QOS}
+
+# Topics of the loop on which only one node may publish, and what it does.
+SINGLE = {COOLANT_SETPOINT: 'command the coolant', TEMPERATURE: 'publish the temperature'}
+
+_LOOK_PERIOD = 0.5  # s
+# What does not pass: policy, offered, asked for.
+_CONFLICTS = (('reliability', ReliabilityPolicy.BEST_EFFORT, ReliabilityPolicy.RELIABLE),
+              ('durability', DurabilityPolicy.VOLATILE, DurabilityPolicy.TRANSIENT_LOCAL))
 
 
 def qos(topic: str) -> QoSProfile:
@@ -90,3 +106,142 @@ def message_class(type_name: str) -> Any:
     except (ImportError, AttributeError, ValueError) as error:
         raise LookupError(
             f'message type {type_name!r} is not installed here: source its workspace') from error
+
+
+class Matching:
+    """
+    Make a node's publishers and subscriptions, and say which others conflict or do not match.
+
+    :param on_change: called when the complaint is another.
+    :param single: topics that only one node may publish, as in `SINGLE`.
+    """
+
+    def __init__(self, node: Node, on_change: Callable[[], None],
+                 single: Mapping[str, str] | None = None) -> None:
+        self._node, self._on_change, self._single = node, on_change, single or {}
+        self._owned = Owned(node)
+        self._own: list[Publisher | Subscription] = []
+        self._overridable: set[str] = set()  # subscribed, with quality of service by parameter
+        self._policies: dict[str, str] = {}  # last reported by the middleware, by topic
+        self._said: tuple[str, ...] = ('', '')
+        self._owned.timer(_LOOK_PERIOD, self._look)
+
+    @property
+    def complaint(self) -> str:
+        """Names topic, nodes, what is wrong and what to do; conflicts first; or is empty."""
+        return next(filter(None, self._said), '')
+
+    def destroy(self) -> None:
+        """Take down the publishers and subscriptions that were made here, and look no more."""
+        self._owned.destroy()
+
+    def subscribe(self, topic: str, callback: Callable[[Any], None], kind: Any = None,
+                  **options: Any) -> Subscription:
+        """Subscribe to a topic of the loop, or to another one of a type; options as in rclpy."""
+        # overriding parameters change the profile itself
+        made = self._owned.keep(self._node.create_subscription(
+            kind or TYPES[topic], topic, callback, copy.copy(qos(topic)),
+            event_callbacks=SubscriptionEventCallbacks(
+                incompatible_qos=self._found(topic), incompatible_type=lambda _: self._look()),
+            **options))
+        self._own.append(made)
+        if 'qos_overriding_options' in options:
+            self._overridable.add(made.topic_name)
+        return made
+
+    def publish(self, topic: str, kind: Any = None, matched: Callable[[Any], None] | None = None
+                ) -> Publisher:
+        """Publish a topic of the loop, or another one of a type; matched is an event of rclpy."""
+        made = self._owned.keep(self._node.create_publisher(
+            kind or TYPES[topic], topic, copy.copy(qos(topic)),
+            event_callbacks=PublisherEventCallbacks(
+                incompatible_qos=self._found(topic), incompatible_type=lambda _: self._look(),
+                matched=matched)))
+        self._own.append(made)
+        return made
+
+    def _found(self, topic: str) -> Callable[[Any], None]:
+        name = self._node.resolve_topic_name(topic)
+
+        def note(event: Any) -> None:
+            policy = rclpy_qos.qos_policy_name_from_kind(event.last_policy_kind)
+            self._policies[name] = policy.lower()
+            self._look()
+
+        return note
+
+    def _look(self) -> None:
+        said = ('; '.join(filter(None, map(self._conflict, self._single))),
+                '; '.join(dict.fromkeys(
+                    complaint for own in self._own for complaint in self._complaints(own))))
+        before, self._said = self._said, said
+        for complaint in said:
+            if complaint and complaint not in before:
+                self._node.get_logger().warning(complaint)
+        if said != before:
+            self._on_change()
+
+    def _conflict(self, topic: str) -> str:
+        # who publishes something else is not in conflict; a node may be there twice
+        names = sorted(node_name(info) for info in self._node.get_publishers_info_by_topic(topic)
+                       if info.topic_type == type_name(TYPES[topic]))
+        return '' if len(names) < 2 else (
+            f'{len(names)} nodes {self._single[topic]}: {", ".join(names)}; end all but one')
+
+    def _complaints(self, own: Publisher | Subscription) -> list[str]:
+        topic, kind = own.topic_name, type_name(own.msg_type)
+        subscribes = isinstance(own, Subscription)
+        publishers = self._node.get_publishers_info_by_topic(topic)
+        subscriptions = self._node.get_subscriptions_info_by_topic(topic)
+        said = [f'{topic}: {node_name(other)} uses it for {other.topic_type[:100]}, here it is '
+                f'{kind}: end that node, or remap its topic'
+                for other in (*publishers, *subscriptions) if other.topic_type != kind]
+        for other in publishers if subscribes else subscriptions:
+            compatible, _ = rclpy_qos.qos_check_compatible(*_in_order(own, other))
+            if other.topic_type == kind and compatible == rclpy_qos.QoSCompatibility.ERROR:
+                said.append(self._qos_complaint(own, other))
+        return said
+
+    def _qos_complaint(self, own: Publisher | Subscription, other: TopicEndpointInfo) -> str:
+        topic, subscribes = own.topic_name, isinstance(own, Subscription)
+        offered, asked = _in_order(own, other)
+        policy, wanted = self._policies.get(topic, 'quality of service'), 'the default'
+        does = 'publishes' if subscribes else 'subscribes'
+        for name, too_little, too_much in _CONFLICTS:
+            if (getattr(offered, name), getattr(asked, name)) == (too_little, too_much):
+                policy, wanted = name, (too_much if subscribes else too_little).short_key
+                does += f' with {(too_little if subscribes else too_much).short_key}'
+                break
+        remedy = f'use {wanted} there'
+        if subscribes and topic in self._overridable and policy == 'reliability':
+            remedy += (f', or start this node with -p qos_overrides.{topic}.subscription.'
+                       'reliability:=best_effort')
+        return (f'{topic}: {node_name(other)} {does}, which is incompatible in {policy}, so '
+                f'that no message passes: {remedy}')
+
+
+def _in_order(own: Publisher | Subscription, other: TopicEndpointInfo
+              ) -> tuple[QoSProfile, QoSProfile]:
+    ours, theirs = _explicit(own.qos_profile), _explicit(other.qos_profile)
+    return (theirs, ours) if isinstance(own, Subscription) else (ours, theirs)
+
+
+def _explicit(profile: QoSProfile) -> QoSProfile:
+    # what a profile leaves to the default else passes for a difference
+    filled = copy.copy(profile)
+    for name in ('deadline', 'liveliness_lease_duration'):
+        if not getattr(filled, name).nanoseconds:
+            setattr(filled, name, Infinite)
+    if filled.liveliness == rclpy_qos.LivelinessPolicy.SYSTEM_DEFAULT:
+        filled.liveliness = rclpy_qos.LivelinessPolicy.AUTOMATIC
+    return filled
+
+
+def node_name(info: TopicEndpointInfo) -> str:
+    """Return the name of the node that has an endpoint, with its namespace."""
+    return f'{info.node_namespace.rstrip("/")}/{info.node_name}'
+
+
+def type_name(kind: Any) -> str:
+    """Return the name of a message type, ``package/msg/Name``."""
+    return f'{kind.__module__.split(".")[0]}/msg/{kind.__name__}'

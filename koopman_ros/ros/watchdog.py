@@ -25,12 +25,7 @@ _CLOCK_PATIENCE = 1.0  # s from the start until somebody should publish the time
 
 
 class Timing:
-    """
-    The time of the last measurement that brought news, by the plant's time where it is known.
-
-    With `use_sim_time` that is the time on /clock, as long as there is one; otherwise the steady
-    clock, which no correction of the system's time upsets.
-    """
+    """When the last measurement with news came, on /clock where it counts, or the steady clock."""
 
     def __init__(self, node: Node) -> None:
         self._node = node
@@ -134,11 +129,7 @@ class Watchdog:
 
 
 def end_in_time(name: str) -> Callable[[], None]:
-    """
-    End the process by force when it is still in a callback, or starting, 5 s after a signal.
-
-    :return: to be called when callbacks are over; what comes then is bounded elsewhere.
-    """
+    """End the process by force when it is busy 5 s after a signal; return what takes it back."""
     # Python's handlers run in the main thread alone, between two instructions of its own; a byte
     # comes through the pipe whatever that thread is doing
     reader, writer = os.pipe()

@@ -31,7 +31,6 @@ from koopman_ros.bags import BagWriter, message_definition
 from koopman_ros.nodes import replay
 from koopman_ros.parameters.player import PlayerParameters
 from koopman_ros.ros import topics
-from koopman_ros.ros.matching import Matching
 from koopman_ros.ros.node import LoopNode
 from koopman_ros.ros.programs import OPERATOR, policy, Program, PROGRAMS
 from koopman_ros.testing import Harness, isolated_domain
@@ -168,7 +167,7 @@ class Pair:
         self.own, self.other = (self._node(name) for name in ('own', 'other'))
         self.executor = SingleThreadedExecutor(context=self.own.context)
         self.executor.add_node(self.own)
-        self.matching = Matching(self.own, lambda: None)
+        self.matching = topics.Matching(self.own, lambda: None)
         self.speaker = self.matching.publish('command', Temperature)
         self.matching.subscribe(
             'temperature', lambda _: None,

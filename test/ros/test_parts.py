@@ -24,7 +24,6 @@ from koopman_ros.resources import model_path
 from koopman_ros.ros import model_reload, recorder, topics
 from koopman_ros.ros.diagnostics import DiagnosticsPublisher, Level, Status
 from koopman_ros.ros.experiment import CoolantExperiment
-from koopman_ros.ros.matching import Matching
 from koopman_ros.ros.model_reload import load_suitable
 from koopman_ros.ros.recorder import receipt_ns, Recorder
 from koopman_ros.ros.recording import Recording
@@ -43,7 +42,7 @@ def made(part: str, node: Node, folder: Path) -> Callable[[], object]:
         case 'diagnostics':
             made = DiagnosticsPublisher(node, 'task', 'x', lambda: Status(Level.OK, 'well'))
         case 'matching':
-            made = Matching(node, lambda: None, {topics.TEMPERATURE: 'publish the temperature'})
+            made = topics.Matching(node, lambda: None, topics.SINGLE)
             made.publish('mine', Temperature)
             made.subscribe('other', lambda _: None, Temperature)
         case 'recorder':
