@@ -51,19 +51,12 @@ class Outputs:
             raise ValueError(
                 f'the measured signals {", ".join(self.names)} do not determine all '
                 f'{self.C.shape[1]} states: measure as many, or choose an estimator')
-        inverse: Array = np.asarray(np.linalg.inv(self.C), dtype=np.float64)
-        return inverse
+        return np.asarray(np.linalg.inv(self.C), dtype=np.float64)
 
     def of(self, x: Array) -> Array:
         """Return the outputs (n_y,) of a state (n_x,) or of a difference of states."""
-        if self.all_states:
-            return x
-        found: Array = self.C.dot(x)
-        return found
+        return x if self.all_states else self.C.dot(x)
 
     def state(self, y: Array) -> Array:
         """Return the state (n_x,) of outputs (n_y,); a ValueError where they leave it open."""
-        if self.all_states:
-            return y
-        found: Array = self._inverse.dot(y)
-        return found
+        return y if self.all_states else self._inverse.dot(y)

@@ -13,15 +13,7 @@ from koopman_ros.control.events import (
     SetpointRequest,
     Silence,
 )
-from koopman_ros.control.laws import (
-    Feedback,
-    feedback,
-    Form,
-    LAWS,
-    projected,
-    recentred,
-    Weights,
-)
+from koopman_ros.control.laws import Feedback, feedback, Form, LAWS, projected, recentred, Weights
 from koopman_ros.control.laws.base import steady_state_target, Target
 from koopman_ros.control.limits import InputLimits, limit
 from koopman_ros.control.setpoint import Setpoint

@@ -48,15 +48,6 @@ from koopman_ros.units import LATE_NANOSECONDS, NANOSECONDS
 
 
 @dataclass(frozen=True)
-class _Choice:
-    """The level that acts, and what the last law that was tried gives."""
-
-    supervisor: Supervisor  #: its new state
-    target: Target | None = None  #: of that law, or None when none was tried
-    result: LawResult | None = None  #: of that law, or None
-
-
-@dataclass(frozen=True)
 class Controller:
     """
     A lifted model with its tuning; every method is pure and returns a new state.
@@ -287,13 +278,12 @@ class Controller:
             state = _without_law(state)
             report, done = self._report(state, verdict.fault), CommandReport()
         else:
-            choice = self._choose(state, verdict, outside, time_ns, spacing)
-            state = self._supervised(state, choice.supervisor, verdict, outside, time_ns)
-            state, wanted, done = self._act(state, choice, transfer)
+            supervisor, target, result = self._choose(state, verdict, outside, time_ns, spacing)
+            state = self._supervised(state, supervisor, verdict, outside, time_ns)
+            state, wanted, done = self._act(state, result, transfer)
             report = self._report(state, state.supervisor.reason)
-            if choice.target is not None and report.target is not None:
-                report = amended(report, target=amended(
-                    report.target, residual=choice.target.residual))
+            if target is not None and report.target is not None:
+                report = amended(report, target=amended(report.target, residual=target.residual))
         limited = limit(self.settings.limits, wanted, state.command, seconds)
         return amended(state, command=limited.u), limited.u, amended(
             report, command=amended(
@@ -301,8 +291,8 @@ class Controller:
                 outside=self.model.inputs.violation(limited.u)))
 
     def _choose(self, state: State, verdict: Verdict, outside: float, time_ns: int,
-                spacing: float) -> _Choice:
-        """Find the best level that may act, and what its law gives."""
+                spacing: float) -> tuple[Supervisor, Target | None, LawResult | None]:
+        """Find the level that acts; also give target and result of the last law tried, if any."""
         settings, estimating = self.settings.supervisor, self._estimating
         if verdict.fault is not None:
             requested = Requested(HOLD, verdict.fault, passing=True)
@@ -313,14 +303,14 @@ class Controller:
             supervisor = state.supervisor.at(settings, requested, time_ns)
             level = self.levels.get(supervisor.level or '')
             if level is None or state.estimate is None or state.setpoint.active is None:
-                return _Choice(supervisor, target, result)
+                return supervisor, target, result
             estimate = estimating.rebase(state.estimate, estimating.level(state), level)
             assert estimate is not None
             memory = state.law_memory if state.law == level.name else None
             target, result = level.compute(
                 state.setpoint.active, estimate, self.settings.limits, memory, spacing)
             if result.failure is None:
-                return _Choice(supervisor, target, result)
+                return supervisor, target, result
             below = settings.order[settings.depth(level.name) + 1]
             requested = Requested(below, reason(
                 Code.LAW_FAILED, level=level.name, cause=result.failure))
@@ -336,12 +326,11 @@ class Controller:
             state = amended(state, estimate=estimating.rebase(state.estimate, before, now))
         return state
 
-    def _act(self, state: State, choice: _Choice, transfer: Transfer | None
+    def _act(self, state: State, result: LawResult | None, transfer: Transfer | None
              ) -> tuple[State, Array, CommandReport]:
         """Return the command before limits of the level that acts."""
         held = self.model.inputs.center if state.command is None else state.command
-        level, result = state.supervisor.level, choice.result
-        done = CommandReport()
+        level, done = state.supervisor.level, CommandReport()
         if result is not None:
             done = CommandReport(result.figures, at_range=result.clipped)
         if result is None or result.u is None:
@@ -388,13 +377,10 @@ class Controller:
     def _report(self, state: State, why: Reason | None) -> Report:
         """Return what is known without a law."""
         estimate, active = state.estimate, state.setpoint.active
-        order = self.settings.supervisor.order
-        if state.mode is Mode.MANUAL:
-            level, depth = MANUAL, len(order)
-        else:
-            depth = self.settings.supervisor.depth(state.supervisor.level)
-            level = order[depth]
-        report = Report(state.mode, level, depth, why, target=None if active is None else (
+        order = (*self.settings.supervisor.order, MANUAL)
+        depth = len(order) - 1 if state.mode is Mode.MANUAL else (
+            self.settings.supervisor.depth(state.supervisor.level))
+        report = Report(state.mode, order[depth], depth, why, target=None if active is None else (
             TargetReport(active, self.model.states.violation(active))))
         if estimate is None:
             return report

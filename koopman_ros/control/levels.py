@@ -38,18 +38,13 @@ class Level:
         """The model of law and estimator."""
         return self.law.model
 
-    def target(self, setpoint: Array, estimate: Estimate) -> Target:
-        """Return where to go from a set-point (n_x,) in state units, under the disturbance."""
+    def compute(self, setpoint: Array, estimate: Estimate, limits: InputLimits, memory: object,
+                interval: float) -> tuple[Target, LawResult]:
+        """Evaluate the law for a set-point (n_x,) in state units and an estimate of its model."""
         # a memory of the last set-point only; what comes out does not depend on it
         target = steady_state_target(self.model, self.model.states.to_deviation(setpoint),
                                      estimate.w, known=self._last[0])
         self._last[0] = target
-        return target
-
-    def compute(self, setpoint: Array, estimate: Estimate, limits: InputLimits, memory: object,
-                interval: float) -> tuple[Target, LawResult]:
-        """Evaluate the law for a set-point (n_x,) in state units and an estimate of its model."""
-        target = self.target(setpoint, estimate)
         return target, self.law.compute(estimate, target, limits, memory, interval)
 
 

@@ -17,7 +17,7 @@ from koopman_ros.control.laws import Feedback, feedback, Weights
 from koopman_ros.control.laws.base import steady_state_target
 from koopman_ros.control.state import Report, State
 from koopman_ros.lifting import LiftedModel
-from koopman_ros.reasons import Code, Reason, reason, Words
+from koopman_ros.reasons import Code, reason, Words
 from koopman_ros.signals import per_signal
 from koopman_ros.units import Displays, NANOSECONDS
 
@@ -111,11 +111,6 @@ class Simulation:
     def levels(self) -> tuple[str, ...]:
         """The control levels that acted."""
         return tuple(report.level for report in self.reports)
-
-    @property
-    def reasons(self) -> tuple[Reason | None, ...]:
-        """Why not better ones."""
-        return tuple(report.reason for report in self.reports)
 
 
 def simulate(controller: Controller, plant: Plant, events: Iterable[Timed] = (), *,

@@ -42,12 +42,10 @@ class Estimator(Protocol):
     @property
     def model(self) -> LiftedModel:
         """The model whose drift predicts."""
-        ...
 
     @property
     def remembers(self) -> bool:
         """Whether an estimate depends on more than the last measurement."""
-        ...
 
     def predict(self, estimate: Estimate, u: Array, seconds: float) -> Estimate | None:
         """
@@ -56,11 +54,9 @@ class Estimator(Protocol):
         :param u: (n_u,) the input that was applied, in scaled deviations.
         :return: the estimate then, or None after so long that nothing is known any more.
         """
-        ...
 
     def correct(self, predicted: Estimate, x: Array, seconds: float) -> Estimate:
         """Take a measurement (n_x,), in scaled deviations, so long after the last into account."""
-        ...
 
     def restart(self, predicted: Estimate | None, x: Array, u: Array | None) -> Estimate:
         """
@@ -69,7 +65,6 @@ class Estimator(Protocol):
         :param predicted: whose disturbance is kept, or None where nothing is known.
         :param u: (n_u,) input that is supposed to hold the plant there, or None.
         """
-        ...
 
     def rebased(self, estimate: Estimate, rate: Array) -> Estimate:
         """
@@ -77,15 +72,12 @@ class Estimator(Protocol):
 
         Estimate and rate, (n_x,) the other model's drift there, are in this model's terms.
         """
-        ...
 
     def as_input(self, w: Array) -> Array:
         """Return the (n_u,) input that would act like a disturbance, in scaled deviations."""
-        ...
 
     def at_bound(self, w: Array) -> bool:
         """Tell whether a disturbance is as large as is allowed."""
-        ...
 
 
 def simulated(model: LiftedModel, estimate: Estimate, u: Array, seconds: float
@@ -159,8 +151,7 @@ class DisturbanceObserver:
 
     def as_input(self, w: Array) -> Array:
         """Return the (n_u,) input that would act like a disturbance, in scaled deviations."""
-        found: Array = self.model.input_inverse.dot(w)
-        return found
+        return self.model.input_inverse.dot(w)
 
     def at_bound(self, w: Array) -> bool:
         """Tell whether a disturbance is as large as is allowed, but for rounding."""

@@ -106,7 +106,6 @@ class Law(Protocol):
     @property
     def model(self) -> LiftedModel:
         """The model in whose terms estimate and target are, in the units of the lift."""
-        ...
 
     def compute(self, estimate: Estimate, target: Target, limits: InputLimits, memory: object,
                 interval: float, deadline: float = math.inf) -> LawResult:
@@ -119,4 +118,3 @@ class Law(Protocol):
         :param interval: seconds between samples; 0 when they are not known.
         :param deadline: seconds that it may take; a law that iterates returns its best by then.
         """
-        ...
