@@ -11,7 +11,7 @@ import pytest
 
 from koopman_ros import experiment
 from koopman_ros.experiment import advance, begin, end, Experiment, Following, level, Phase
-from koopman_ros.ros.diagnostics import OPERATOR
+from koopman_ros.ros.node import OPERATOR
 from koopman_ros.units import NANOSECONDS as SECOND
 from support.sampled_loops import say
 

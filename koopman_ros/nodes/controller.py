@@ -27,9 +27,8 @@ from koopman_ros.replay import records
 from koopman_ros.ros import controller_messages as messages
 from koopman_ros.ros import topics
 from koopman_ros.ros.codec import stamp_message, stamp_nanoseconds, temperature_message
-from koopman_ros.ros.diagnostics import DiagnosticsPublisher, Status, words_of
 from koopman_ros.ros.model_reload import load_suitable, ModelReload, rests_outside, Situation
-from koopman_ros.ros.node import LoopNode, wall_timer
+from koopman_ros.ros.node import DiagnosticsPublisher, LoopNode, Status, wall_timer, words_of
 from koopman_ros.ros.process import run
 from koopman_ros.ros.watchdog import PERIOD, Timing, Watchdog
 from koopman_ros.units import NANOSECONDS, to_kelvin

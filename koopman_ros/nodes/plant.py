@@ -18,8 +18,7 @@ from koopman_ros import plants
 from koopman_ros.parameters.plant import PlantParameters, REACTORS, TABLE
 from koopman_ros.ros import topics
 from koopman_ros.ros.codec import stamp_message, stamp_nanoseconds, temperature_message
-from koopman_ros.ros.diagnostics import DiagnosticsPublisher, Level, Status
-from koopman_ros.ros.node import LoopNode, wall_timer
+from koopman_ros.ros.node import DiagnosticsPublisher, Level, LoopNode, Status, wall_timer
 from koopman_ros.ros.process import run
 from koopman_ros.units import LAST_STAMP_SECONDS, NANOSECONDS, seconds_text, to_celsius, to_kelvin
 

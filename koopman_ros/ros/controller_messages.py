@@ -23,7 +23,7 @@ from koopman_ros.reasons import level_words
 from koopman_ros.replay.records import fields_of, Record, SNAPSHOT, START
 from koopman_ros.ros import topics
 from koopman_ros.ros.codec import stamp_nanoseconds
-from koopman_ros.ros.diagnostics import Level, Status, words_of
+from koopman_ros.ros.node import Level, Status, words_of
 from koopman_ros.ros.watchdog import Timing
 from koopman_ros.units import in_celsius, NANOSECONDS, to_celsius, to_kelvin
 

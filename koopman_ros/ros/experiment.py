@@ -21,8 +21,7 @@ from koopman_ros.parameters.trainer import TrainerParameters
 from koopman_ros.reasons import Code, Reason, reason
 from koopman_ros.ros import topics
 from koopman_ros.ros.codec import stamp_message, stamp_nanoseconds, temperature_message
-from koopman_ros.ros.diagnostics import DiagnosticsPublisher, Level, OPERATOR, Status
-from koopman_ros.ros.node import Owned
+from koopman_ros.ros.node import DiagnosticsPublisher, Level, OPERATOR, Owned, Status
 from koopman_ros.units import in_celsius, NANOSECONDS, to_celsius, to_kelvin
 
 _TICK = 0.1  # s

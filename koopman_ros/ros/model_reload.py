@@ -23,7 +23,7 @@ from koopman_ros.control import Controller, Settings, State
 from koopman_ros.lifting import LiftedModel, load_with_digest, ModelFileError
 from koopman_ros.parameters.controller import ControllerParameters
 from koopman_ros.resources import model_path
-from koopman_ros.ros.diagnostics import words_of
+from koopman_ros.ros.node import words_of
 from koopman_ros.units import in_celsius, NANOSECONDS
 
 _SHORT_WAIT = 0.2  # s that the loop may stand still for a parameter

@@ -1,15 +1,18 @@
 # SPDX-FileCopyrightText: 2026 The koopman_ros Authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""A node with the parameters of a table, and what its parts create, to be taken down with them."""
+"""Nodes with the parameters of a table, what their parts create and take down, diagnostics."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 import copy
-from dataclasses import replace
+from dataclasses import dataclass, field, replace
 import difflib
+from enum import Enum
 import math
+import time
 from typing import Any, TypeVar
 
+from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
 from rcl_interfaces import msg
 from rclpy.clock import Clock, ClockType
 from rclpy.exceptions import InvalidParameterTypeException
@@ -21,8 +24,12 @@ from rclpy.subscription import Subscription
 from rclpy.timer import Timer
 from rosgraph_msgs.msg import Clock as ClockMessage
 
+from koopman_ros.lifting import LiftedModel
 from koopman_ros.parameters.table import ConfigurationError, ParameterTable, Specification
-from koopman_ros.units import NANOSECONDS
+from koopman_ros.parameters.wire import DIAGNOSTICS
+from koopman_ros.reasons import Words
+from koopman_ros.ros.codec import stamp_message
+from koopman_ros.units import Display, Displays, NANOSECONDS
 
 T = TypeVar('T')
 Entity = TypeVar('Entity', Publisher, Service, Subscription, Timer)
@@ -33,6 +40,9 @@ _RCLPY_PARAMETERS = ('use_sim_time', 'start_type_description_service')
 _DESTROY: dict[type, Callable[[Node, Any], object]] = {
     Publisher: Node.destroy_publisher, Subscription: Node.destroy_subscription,
     Service: Node.destroy_service, Timer: Node.destroy_timer}
+
+_SHOWN = {'K': Display('K', 'degC', '.2f')}
+OPERATOR = Words(Displays({'temperature': 'K', 'coolant_temperature': 'K'}, _SHOWN))
 
 
 def wall_timer(node: Node, seconds: float, callback: Callable[[], Any], **options: Any) -> Timer:
@@ -64,6 +74,65 @@ class Owned:
             _DESTROY[type(entity)](self._node, entity)
 
 
+class Level(Enum):
+    """Severity of a status, as one byte."""
+
+    OK = DiagnosticStatus.OK
+    WARN = DiagnosticStatus.WARN
+    ERROR = DiagnosticStatus.ERROR
+
+
+@dataclass(frozen=True)
+class Status:
+    """What a node says of itself: a sentence, and figures with their units in the key."""
+
+    level: Level
+    message: str
+    #: or a function, which is called only when they are published
+    values: Mapping[str, object] | Callable[[], Mapping[str, object]] = field(
+        default_factory=dict)
+
+
+class DiagnosticsPublisher:
+    """Publish the status ``<node>: <task>`` of a node, as diagnostic_updater would."""
+
+    def __init__(self, node: Node, task: str, hardware_id: str,
+                 collect: Callable[[], Status]) -> None:
+        self._name = f'{node.get_fully_qualified_name().lstrip("/")}: {task}'
+        self._hardware_id = hardware_id
+        self._collect = collect
+        self._last: tuple[Level, str] | None = None
+        self._owned = Owned(node)
+        self._publisher = self._owned.keep(
+            node.create_publisher(DiagnosticArray, DIAGNOSTICS, 10))
+        self._owned.timer(1.0, self.publish)
+
+    def destroy(self) -> None:
+        """Report no more."""
+        self._owned.destroy()
+
+    def publish(self) -> None:
+        """Publish the present status."""
+        status = self._collect()
+        self._last = (status.level, status.message)
+        values = status.values() if callable(status.values) else status.values
+        message = DiagnosticArray()
+        message.header.stamp = stamp_message(time.time_ns())
+        message.status.append(DiagnosticStatus(
+            level=status.level.value, name=self._name, message=status.message,
+            hardware_id=self._hardware_id,
+            values=[KeyValue(key=key, value=(
+                f'{value:.9g}' if isinstance(value, float) else str(value)))
+                for key, value in values.items()]))
+        self._publisher.publish(message)
+
+    def publish_if_changed(self) -> None:
+        """Publish at once when the level or the sentence differ from the last ones."""
+        status = self._collect()
+        if (status.level, status.message) != self._last:
+            self.publish()
+
+
 class LoopNode(Node):
     """
     A node whose parameters are those of a table, and which may complete work before its end.
@@ -88,13 +157,13 @@ class LoopNode(Node):
                             *args: Any, **options: Any) -> Subscription:
         """Subscribe as any node does; a time that cannot be does not reach its clock."""
         def hear(message: ClockMessage) -> None:
-            time = message.clock
-            if time.sec >= 0 and time.nanosec < NANOSECONDS:
+            told = message.clock
+            if told.sec >= 0 and told.nanosec < NANOSECONDS:
                 callback(message)
                 return
             self._clocks_refused += 1
             self.get_logger().warning(
-                f'/clock told sec {time.sec}, nanosec {time.nanosec}, which is no time: ignored '
+                f'/clock told sec {told.sec}, nanosec {told.nanosec}, which is no time: ignored '
                 f'({self._clocks_refused} so far); check who publishes /clock',
                 throttle_duration_sec=10.0)
 
@@ -213,3 +282,10 @@ def _as_python(value: Any) -> Any:
     if isinstance(value, (str, bytes, bool, int, float)) or value is None:
         return value
     return tuple(value)
+
+
+def words_of(model: LiftedModel) -> Words:
+    """Return the words for the signals of a model."""
+    return Words(Displays({name: unit for signals in (model.states, model.inputs)
+                           for name, unit in zip(signals.names, signals.units, strict=True)},
+                          _SHOWN))

@@ -16,8 +16,7 @@ from std_srvs.srv import SetBool
 
 from koopman_ros.bags import BagWriter
 from koopman_ros.parameters.trainer import TrainerParameters
-from koopman_ros.ros.diagnostics import DiagnosticsPublisher, Level, Status
-from koopman_ros.ros.node import Owned
+from koopman_ros.ros.node import DiagnosticsPublisher, Level, Owned, Status
 from koopman_ros.ros.recorder import Recorder
 
 _TAKE_PERIOD = 0.05  # s, for new messages

@@ -15,8 +15,7 @@ from koopman_ros.jobs.training import JobState, RetrainingJob
 from koopman_ros.parameters.trainer import TrainerParameters
 from koopman_ros.resources import model_path
 from koopman_ros.ros import topics
-from koopman_ros.ros.diagnostics import DiagnosticsPublisher, Level, Status
-from koopman_ros.ros.node import Owned
+from koopman_ros.ros.node import DiagnosticsPublisher, Level, Owned, Status
 
 _POLL_PERIOD = 0.1  # s
 _LINE_PERIOD = 5.0  # s between plain lines of progress

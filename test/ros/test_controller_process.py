@@ -75,24 +75,21 @@ def test_two_limits_that_cross_on_the_way_change_together(running: Harness) -> N
         assert running.get_parameters(CONTROLLER, *limits) == list(limits.values())
 
 
-@pytest.mark.parametrize(('low', 'high', 'kind'), [
-    ('coolant_min', 'coolant_max', 'input'), ('sensor_min', 'sensor_max', 'sensor')])
-def test_limits_that_are_equal_in_kelvin_are_refused(
-        running: Harness, low: str, high: str, kind: str) -> None:
-    above = 20.00000000000001
-    result = running.set_parameters_atomically(CONTROLLER, **{low: 20.0, high: above})
+@pytest.mark.parametrize(('changes', 'words'), [
+    ({'max_gain': 7.0, 'coolant_max': 500.0}, 'coolant_max = 500.0 degC must be in '),
+    # equal in K
+    *(({f'{name}_min': 20.0, f'{name}_max': 20.00000000000001},
+       f'{name}_min = 20.0 degC and {name}_max = 20.00000000000001 degC cannot be used: {kind} '
+       'limits must be lower < upper, got ') for name, kind in (
+           ('coolant', 'input'), ('sensor', 'sensor')))])
+def test_atomic_change_is_refused_as_a_whole(
+        running: Harness, changes: dict[str, float], words: str) -> None:
+    result = running.set_parameters_atomically(CONTROLLER, **changes)
     assert not result.successful
-    assert result.reason.startswith(f'{low} = 20.0 degC and {high} = {above} degC cannot be used: '
-                                    f'{kind} limits must be lower < upper, got ')
-    assert running.get_parameters(CONTROLLER, low) == [TABLE.rows[low].default]
-
-
-def test_atomic_change_is_refused_as_a_whole(running: Harness) -> None:
-    result = running.set_parameters_atomically(CONTROLLER, max_gain=7.0, coolant_max=500.0)
-    assert not result.successful
-    assert 'coolant_max = 500.0 degC' in result.reason
-    assert running.get_parameters(CONTROLLER, 'max_gain') == [TABLE.rows['max_gain'].default]
-    running.wait_until(lambda: 'parameter change refused: coolant_max = 500' in running.printed())
+    assert result.reason.startswith(words)
+    assert running.get_parameters(CONTROLLER, *changes) == [
+        TABLE.rows[name].default for name in changes]
+    running.wait_until(lambda: f'parameter change refused: {words}' in running.printed())
 
 
 def test_every_parameter_is_described_with_unit_and_range(running: Harness) -> None:

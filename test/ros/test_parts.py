@@ -22,9 +22,9 @@ from koopman_ros.lifting import load, ModelFileError, save
 from koopman_ros.parameters.trainer import TrainerParameters
 from koopman_ros.resources import model_path
 from koopman_ros.ros import model_reload, recorder, topics
-from koopman_ros.ros.diagnostics import DiagnosticsPublisher, Level, Status
 from koopman_ros.ros.experiment import CoolantExperiment
 from koopman_ros.ros.model_reload import load_suitable
+from koopman_ros.ros.node import DiagnosticsPublisher, Level, Status
 from koopman_ros.ros.recorder import receipt_ns, Recorder
 from koopman_ros.ros.recording import Recording
 from koopman_ros.ros.training import Training

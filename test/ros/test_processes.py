@@ -30,24 +30,29 @@ from support.messages import TIMEOUT
 from support.processes import run_here
 
 
+def importing(names: tuple[str, ...], act: str, main: str) -> tuple[str, ...]:
+    """Return a command that runs what it imports as main, and acts when packages are imported."""
+    return (sys.executable, '-c', (
+        'import os, sys\n'
+        'class Finder:\n'
+        '    def find_spec(self, name, path=None, target=None):\n'
+        f'        if name.split(".")[0] in {names}:\n'
+        f'            {act}\n'
+        'sys.meta_path.insert(0, Finder())\n'
+        f'from koopman_ros.{main}\n'
+        'sys.exit(main())\n'))
+
+
 @pytest.mark.parametrize(('name', 'number', 'unneeded'), [
     ('plant', signal.SIGINT, ('torch',)), ('controller', signal.SIGTERM, ('torch',)),
     ('trainer', signal.SIGINT, ('torch', 'scipy'))])
 def test_signal_ends_a_node_on_loopback_cleanly_that_loads_only_what_it_needs(
         ros: Harness, tmp_path: Path, name: str, number: int, unneeded: tuple[str, ...]) -> None:
-    program = (
-        'import sys\n'
-        'class Missing:\n'
-        '    def find_spec(self, name, path=None, target=None):\n'
-        f'        if name.split(".")[0] in {unneeded}:\n'
-        '            raise AssertionError(f"{name} is imported")\n'
-        'sys.meta_path.insert(0, Missing())\n'
-        f'from koopman_ros.nodes.{name} import main\n'
-        'sys.exit(main())\n')
     # the plant is in the middle of a callback whenever the signal comes
     parameters = {'plant': {'speed': 0.0}, 'controller': {},
                   'trainer': {'output': tmp_path / 'bag'}}[name]
-    process = ros.start(name, parameters, command=(sys.executable, '-c', program))
+    process = ros.start(name, parameters, command=importing(
+        unneeded, 'raise AssertionError(f"{name} is imported")', f'nodes.{name} import main'))
     ros.meet(name)
     # the profile is one for Fast DDS
     if 'fastrtps' in get_rmw_implementation_identifier():
@@ -81,16 +86,8 @@ def _udp_sockets(pid: int) -> list[str]:
     ('plant', signal.SIGTERM, 0), ('replay', signal.SIGINT, 130)])
 def test_signal_while_a_program_loads_ends_it_without_a_word(
         ros: Harness, name: str, number: int, code: int) -> None:
-    program = (
-        'import os, signal, sys\n'
-        'class Interrupted:\n'
-        '    def find_spec(self, name, path=None, target=None):\n'
-        '        if name == "scipy":\n'
-        f'            os.kill(os.getpid(), {int(number)})\n'
-        'sys.meta_path.insert(0, Interrupted())\n'
-        f'from koopman_ros.startup import {name} as program\n'
-        'sys.exit(program())\n')
-    process = ros.start(name, command=(sys.executable, '-c', program))
+    process = ros.start(name, command=importing(
+        ('scipy',), f'os.kill(os.getpid(), {int(number)})', f'startup import {name} as main'))
     assert ros.wait_for_end(process) == code
     assert process.output() == ''
 
@@ -100,8 +97,8 @@ def test_signal_before_the_interpreter_is_up_and_arguments_are_answered_before_t
     process = ros.start('plant')
     assert process.stop(signal.SIGTERM) == 0
     assert process.output() == ''
-    program = 'import sys; from koopman_ros.startup import plant; sys.exit(plant())'
-    process = ros.start('plant', command=(sys.executable, '-c', program, '--speed=2.0'))
+    process = ros.start('plant', command=(
+        *importing((), 'pass', 'startup import plant as main'), '--speed=2.0'))
     assert process.wait() == 2
     assert 'started' not in process.output()
 
@@ -152,9 +149,9 @@ def test_signals_during_the_start_end_a_node_cleanly(shared_ros: Harness, name: 
 
 
 def test_node_without_standard_streams_ends_cleanly(ros: Harness, tmp_path: Path) -> None:
-    program = 'import sys; from koopman_ros.startup import trainer; sys.exit(trainer())'
     process = ros.start('trainer', {'output': tmp_path / 'bag.mcap'}, command=(
-        'sh', '-c', 'exec "$@" <&- >&- 2>&-', 'sh', sys.executable, '-c', program))
+        'sh', '-c', 'exec "$@" <&- >&- 2>&-', 'sh',
+        *importing((), 'pass', 'startup import trainer as main')))
     ros.meet('trainer')
     assert process.stop() == 0
     assert summary(tmp_path / 'bag.mcap').complete
