@@ -26,8 +26,7 @@ os.environ['ROS_PYTHON_CHECK_FIELDS'] = '1'
 LONGEST = ('test_training_node', 'test_training_benchmark', 'test_examples', 'test_plant_node',
            'test_experiment_node', 'test_demo', 'test_retrain', 'test_replay', 'test_recording',
            'test_processes', 'test_identify', 'test_experiments', 'test_campaign', 'test_gate',
-           'test_closed_loop', 'test_fault_campaign', 'test_player', 'test_install_tree',
-           'test_trainer_node')
+           'test_closed_loop', 'test_fault_campaign', 'test_player', 'test_install_tree')
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:

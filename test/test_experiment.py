@@ -13,7 +13,7 @@ from koopman_ros import experiment
 from koopman_ros.experiment import advance, begin, end, Experiment, Following, level, Phase
 from koopman_ros.ros.node import OPERATOR
 from koopman_ros.units import NANOSECONDS as SECOND
-from support.sampled_loops import say
+from support.closed_loops import say
 
 START = 1_785_000_000 * SECOND
 PLAN = Experiment(

@@ -24,8 +24,7 @@ from koopman_ros.bags import (
     read_series,
     summary,
 )
-from support.bag_mutants import mutate, Specimen, specimens
-from support.bag_samples import Sample, TOPICS
+from support.bag_samples import mutate, Sample, Specimen, specimens, TOPICS
 
 MUTANTS = int(os.environ.get('BAG_MUTANTS', '40'))
 ROUNDS = 8

@@ -14,8 +14,8 @@ import yaml
 
 from koopman_ros.bags import BagReadError, QosProfile, read_messages, summary
 from koopman_ros.bags.metadata import parse_offered_qos
-from support.bag_mutants import compressed_files
 from support.bag_samples import (
+    compressed_files,
     number,
     OFFERED_QOS,
     PERIOD_NS,

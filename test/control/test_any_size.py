@@ -19,8 +19,8 @@ from koopman_ros.lifting import LiftedModel, linearised_model, Provenance
 from koopman_ros.reasons import Code
 from koopman_ros.replay.records import decoded
 from koopman_ros.signals import Outputs
+from support.closed_loops import content, controller, EPOCH, SECOND, supervisor_settings
 from support.random_lifts import coordinates, random_lift
-from support.sampled_loops import content, controller, EPOCH, SECOND, supervisor_settings
 
 
 def tuned(model: LiftedModel, outputs: Outputs | None = None, **changes: object) -> Controller:

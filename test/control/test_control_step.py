@@ -12,9 +12,8 @@ import pytest
 from koopman_ros.control import Arrival, Controller, Form, InputLimits, Mode, Settings, State
 from koopman_ros.control.setpoint import advance, HORIZON_NANOSECONDS, refusal, request, Setpoint
 from koopman_ros.units import NANOSECONDS as SECOND
-from support.closed_loops import COOLANT, SETPOINT, shipped, START
+from support.closed_loops import content, COOLANT, say, SETPOINT, shipped, START
 from support.random_lifts import change_of_variable
-from support.sampled_loops import content, say
 from validation.paper.optimal_control import exact_two_state_model
 
 NOW = 1_785_000_000 * SECOND

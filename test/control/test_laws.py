@@ -16,7 +16,9 @@ from koopman_ros.control.laws.base import steady_state_target
 from koopman_ros.lifting import Coordinates, linearised_model, Provenance
 from koopman_ros.plants import two_state_example, two_state_reactor
 from support.closed_loops import (
+    controller,
     REACTOR,
+    Reactor,
     reactor_weights,
     run_reactor,
     SETPOINT,
@@ -26,7 +28,6 @@ from support.closed_loops import (
     UNIT,
 )
 from support.random_lifts import change_of_variable, random_lift
-from support.sampled_loops import controller, Reactor
 from validation.paper.optimal_control import exact_two_state_model, scalar_optimal_cost
 
 

@@ -21,8 +21,15 @@ from koopman_ros.control import (
     State,
 )
 from koopman_ros.control.limits import shifted, Transfer
-from support.closed_loops import SETPOINT, shipped, START
-from support.sampled_loops import controller, largest_step, Reactor, settled
+from support.closed_loops import (
+    controller,
+    largest_step,
+    Reactor,
+    SETPOINT,
+    settled,
+    shipped,
+    START,
+)
 from validation.robustness.loop import changed_reactor
 
 

@@ -14,16 +14,19 @@ from koopman_ros.control import Controller, InputLimits, perfect, Settings, Sile
 from koopman_ros.estimation import DisturbanceObserver, equivalent_bias, Estimate
 from koopman_ros.plants import Actuator, two_state_reactor
 from koopman_ros.solvers import runge_kutta_step
-from support.closed_loops import REACTOR, SETPOINT, shipped, START
-from support.sampled_loops import (
+from support.closed_loops import (
     controller,
     EPOCH,
     largest_step,
     levels,
+    REACTOR,
     Reactor,
     say,
     SECOND,
+    SETPOINT,
     settled,
+    shipped,
+    START,
     UPPER,
 )
 from validation.paper.optimal_control import exact_two_state_model

@@ -14,16 +14,18 @@ from koopman_ros.control.supervisor import Requested, rest_under, WayBack
 from koopman_ros.lifting import Coordinates, linearised_model, Provenance
 from koopman_ros.reasons import Code, reason
 from koopman_ros.ros.model_reload import rests_outside
-from support.closed_loops import REACTOR, shipped, START
-from support.sampled_loops import (
+from support.closed_loops import (
     controller,
     largest_step,
     levels,
+    REACTOR,
     Reactor,
     SAFE,
     say,
     SECOND,
     settled,
+    shipped,
+    START,
     supervisor_settings,
 )
 from validation.robustness.disturbances import CHANGED

@@ -17,8 +17,7 @@ import pytest
 from koopman_ros.jobs import training
 from koopman_ros.jobs.training import JobState, RetrainingJob
 from koopman_ros.resources import model_path
-from support.messages import TIMEOUT
-from support.processes import wait_until_ended
+from support.nodes import TIMEOUT, wait_until_ended
 from support.recorded_runs import driven, reactor, write_bag
 
 

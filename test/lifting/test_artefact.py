@@ -31,8 +31,8 @@ from koopman_ros.lifting import (
     TrainingStates,
 )
 from koopman_ros.lifting.bounds import read_regular
+from support.closed_loops import content
 from support.random_lifts import random_lift
-from support.sampled_loops import content
 
 Change: TypeAlias = tuple[Callable[[bytes], bytes], str]
 SHIPPED = Path(__file__).parents[2] / 'config' / 'models'

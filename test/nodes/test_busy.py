@@ -3,11 +3,12 @@
 
 """The controller whose executor does not come to its timers: who commands, and who ends it."""
 
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Sequence
 import os
 from pathlib import Path
 import sys
 import time as clock
+from types import SimpleNamespace
 from typing import BinaryIO
 
 from diagnostic_msgs.msg import DiagnosticStatus
@@ -17,15 +18,11 @@ from rosgraph_msgs.msg import Clock
 from sensor_msgs.msg import Temperature
 from std_msgs.msg import String
 
-from koopman_ros.nodes.replay import replay_records
-from koopman_ros.replay.records import parse
 from koopman_ros.ros import topics
 from koopman_ros.ros.watchdog import Watchdog
 from koopman_ros.testing import Harness
-from koopman_ros.units import to_celsius
-from support.controller_bench import STATUS, STEADY
-from support.messages import seconds, temperature
-from support.processes import opened
+from support.controller_bench import reproduced, STATUS, STEADY
+from support.nodes import opened, seconds, temperature
 
 SAFE = 10.0  # degC
 SETTINGS = {'measurement_timeout': 0.3, 'hold_timeout': 0.2, 'coolant_rate_limit': 1200.0,
@@ -52,13 +49,7 @@ sys.exit(controller.main())
 
 
 class BusyBench:
-    """
-    A controller whose control step can be kept from ending, with a thermometer.
-
-    :param ros: where it runs.
-    :param pipe: that keeps it.
-    :param simulated: whether time comes from /clock, where it stands still.
-    """
+    """A controller whose control step a pipe can keep from ending, with a thermometer."""
 
     def __init__(self, ros: Harness, pipe: Path, simulated: bool = False) -> None:
         self.ros, self.pipe = ros, pipe
@@ -90,23 +81,14 @@ class BusyBench:
         self.ros.wait_until(lambda: seconds(self.commands[-1]) > now)
 
     def answered(self, time: float) -> bool:
-        """Tell whether a measurement was answered."""
         return any(seconds(message) == time for message in self.commands)
 
 
 def wait_for_replay(bench: BusyBench, stamps: Sequence[float]) -> None:
-    """
-    Wait until the commands are those that follow from the controller's records.
-
-    :param stamps: of the measurements that they hold, in s; all else is silence.
-    """
+    """Wait until the commands are those that follow from the records, of these measurements."""
     def agrees() -> bool:
-        records = [parse(message.data) for message in bench.records]
-        found = replay_records(records)
-        assert [sample.recorded for sample in found.samples] == [
-            sample.replayed for sample in found.samples]
-        return [to_celsius(float(sample.recorded[0])) for sample in found.samples] == [
-            message.temperature for message in bench.commands] and [
+        records, recorded = reproduced(bench.records)
+        return recorded == [message.temperature for message in bench.commands] and [
             record.stamp_ns / 1e9 for record in records if record.event == 'measurement'
             ] == list(stamps)
 
@@ -168,24 +150,6 @@ def test_step_that_is_always_too_slow_is_given_up_and_the_process_ends_in_it(
     assert 'controller: busy for 0.2 s after a signal: ended by force' in bench.process.output()
 
 
-class Looks:
-    """
-    Stands for the time between a watchdog's looks.
-
-    :param between: what happens before each.
-    """
-
-    def __init__(self, between: Iterable[Callable[[], None]]) -> None:
-        self._between = iter(between)
-
-    def wait(self, _: float) -> bool:
-        """Let happen what does; tell whether there is no further look."""
-        happens = next(self._between, None)
-        if happens is not None:
-            happens()
-        return happens is None
-
-
 def test_watchdog_acts_only_without_a_beat_and_tells_its_errors(
         monkeypatch: pytest.MonkeyPatch) -> None:
     acted: list[float] = []
@@ -195,13 +159,17 @@ def test_watchdog_acts_only_without_a_beat_and_tells_its_errors(
         if len(acted) == 2:
             raise RuntimeError('the second time')
 
-    def nothing() -> None:
-        pass
-
     watchdog = Watchdog(act)
-    # the executor comes by in time, then a little late, then not any more
-    monkeypatch.setattr(watchdog, '_over', Looks(
-        [watchdog.beat] * 20 + ([nothing] * 9 + [watchdog.beat]) * 2 + [nothing] * 12))
+    # the executor comes by in time, then a little late, then not any more, and then it is over
+    looks = iter([True] * 20 + ([False] * 9 + [True]) * 2 + [False] * 12)
+
+    def wait(_: float) -> bool:
+        comes = next(looks, None)
+        if comes:
+            watchdog.beat()
+        return comes is None
+
+    monkeypatch.setattr(watchdog, '_over', SimpleNamespace(wait=wait))
     watchdog._run()
     assert acted == pytest.approx([1.0, 1.1, 1.2])
     with pytest.raises(RuntimeError, match='the second time'):

@@ -1,20 +1,26 @@
 # SPDX-FileCopyrightText: 2026 The koopman_ros Authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""The controller as a process: what it answers to measurements, set-points and operators."""
+"""The controller as a process: what it answers, and what it tells of itself."""
 
+from dataclasses import replace
 import itertools
 import math
+from pathlib import Path
+import sys
+import time
 
 from diagnostic_msgs.msg import DiagnosticStatus
 import pytest
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
-from sensor_msgs.msg import Temperature
+from sensor_msgs.msg import JointState, Temperature
 
+from koopman_ros.lifting import load, save
+from koopman_ros.resources import model_path
 from koopman_ros.ros import topics
 from koopman_ros.testing import Harness
 from support.controller_bench import Bench, STATUS, STEADY
-from support.messages import seconds, temperature, value
+from support.nodes import seconds, temperature, value
 
 
 @pytest.fixture(scope='module')
@@ -31,11 +37,63 @@ def bench(shared_bench: Bench) -> Bench:
 
 def test_each_command_carries_the_stamp_of_its_measurement(bench: Bench) -> None:
     times = [2.0 + 0.125 * k for k in range(50)]
-    for k, time in enumerate(times):
-        bench.send(STEADY - 0.01 * k, time)
+    for k, at in enumerate(times):
+        bench.send(STEADY - 0.01 * k, at)
     # whatever else is still on its way would come before the answer to this
     bench.measure(STEADY, 60.0)
     assert [seconds(message) for message in bench.commands] == [1.0, *times, 60.0]
+    last = bench.measure(STEADY - 1.0, 61.0).temperature
+    assert bench.measure(STEADY, 60.5).temperature == last
+    status = bench.status(lambda s: int(value(s, 'late measurements')) >= 1)
+    assert status.level == DiagnosticStatus.OK
+
+
+def test_odd_stamps_are_answered_with_themselves(bench: Bench) -> None:
+    message = temperature(STEADY)
+    message.header.stamp.sec, message.header.stamp.nanosec = 2, 1_500_000_000
+    bench.sent += 1
+    bench.thermometer.publish(message)
+    command = bench.ros.wait_until(
+        lambda: next((m for m in bench.commands if seconds(m) == 3.5), None))
+    assert command.header.stamp == message.header.stamp
+    for at in (-2.0 ** 31, -5.25, -4.25):
+        assert math.isfinite(bench.measure(STEADY, at).temperature)
+
+
+def test_long_frame_id_is_cut_and_reported(bench: Bench) -> None:
+    message = temperature(STEADY, 2.0)
+    message.header.frame_id = 'x' * 100_000
+    bench.sent += 1
+    bench.thermometer.publish(message)
+    command = bench.ros.wait_until(
+        lambda: next((m for m in bench.commands if seconds(m) == 2.0), None))
+    assert command.header.frame_id == 'x' * 256
+    status = bench.ros.wait_for_status(STATUS, lambda s: 'frame_id' in s.message)
+    assert status.level == DiagnosticStatus.WARN
+    assert 'has 100000 characters, of which 256 are passed on' in status.message
+    assert bench.measure(STEADY, 3.0).header.frame_id == ''
+    bench.ros.wait_for_status(STATUS, lambda s: s.level == DiagnosticStatus.OK)
+
+
+def test_first_command_waits_for_the_coolant_in_force(ros: Harness) -> None:
+    """Which has another name here."""
+    commands = ros.listen(Temperature, topics.COOLANT_SETPOINT)
+    # patient, or a busy machine could be too slow for it
+    program = ('import sys\n'
+               'from koopman_ros.nodes import controller\n'
+               'controller._COOLANT_PATIENCE = 100.0\n'
+               'sys.exit(controller.main())\n')
+    ros.start('controller', arguments=('-r', f'{topics.COOLANT_TEMPERATURE}:=jacket'),
+              command=(sys.executable, '-c', program))
+    coolant = ros.speak(Temperature, 'jacket', topics.LATCHED_QOS, to='controller')
+    thermometer = ros.speak(Temperature, topics.TEMPERATURE, to='controller')
+    thermometer.publish(temperature(STEADY, 1.0))
+    ros.meet('controller')
+    assert not commands
+    coolant.publish(temperature(22.0, 1.0))
+    ros.wait_until(lambda: commands)
+    assert commands[0].temperature == pytest.approx(22.0, abs=1e-9)
+    assert seconds(commands[0]) == 1.0
 
 
 def test_setpoint_of_a_volatile_publisher_is_heard_and_the_active_one_latched(
@@ -51,165 +109,194 @@ def test_setpoint_of_a_volatile_publisher_is_heard_and_the_active_one_latched(
     bench.measure_until_active(45.0, 2.0)
     assert bench.active_since(45.0) >= 2.0
 
-
-@pytest.mark.parametrize(('asked', 'words'), [
-    (80.0, 'set-point 80.00 degC is outside the trained range'),
-    (math.nan, 'set-point nan degC is not finite'),
-])
-def test_bad_setpoint_is_refused_and_the_old_one_kept(bench: Bench, asked: float, words: str
-                                                      ) -> None:
-    bench.ask(45.0)
-    bench.measure_until_active(45.0, 2.0)
-    bench.ask(asked)
-    status = bench.refusal()
+    bench.ask(80.0)
+    status = bench.status(lambda s: 'set-point' in s.message)
     assert status.level == DiagnosticStatus.WARN
-    assert words in status.message
+    assert 'set-point 80.00 degC is outside the trained range' in status.message
     assert 'the old one is kept' in status.message
     # a change would be tracked and said with the first of these, before the next is answered
     bench.settle(STEADY, 100.0)
     assert bench.active == pytest.approx(45.0)
 
 
-def test_scheduled_setpoint_takes_effect_at_its_stamp_until_one_for_now_ends_the_schedule(
+def test_manual_mode_commands_what_the_operator_asks(bench: Bench) -> None:
+    manual = bench.ros.speak(Temperature, topics.MANUAL_COOLANT_SETPOINT, to='controller')
+    at, held = bench.settle(STEADY, 2.0)
+    manual.publish(temperature(20.0))
+    status = bench.status(lambda s: 'switch to manual mode' in s.message)
+    assert status.level == DiagnosticStatus.WARN
+    assert bench.measure(STEADY, at + 1.0).temperature == pytest.approx(held, abs=1e-6)
+
+    response = bench.ros.set_bool('controller/set_automatic', False)
+    assert (response.success, response.message) == (True, 'manual mode')
+    held = bench.measure(STEADY, at + 2.0).temperature
+    assert bench.measure(STEADY + 1.0, at + 3.0).temperature == held
+    manual.publish(temperature(20.0))
+    at = bench.measure_until(lambda m: m.temperature == pytest.approx(20.0), at + 4.0)
+    status = bench.status(lambda s: s.message.startswith('manual'))
+    assert value(status, 'law') == 'none'
+    for wild in (90.0, math.nan):
+        manual.publish(temperature(wild))
+    bench.status(lambda s: 'manual coolant_temperature nan degC is not finite' in s.message)
+    at = bench.measure_until(lambda m: m.temperature == pytest.approx(32.0), at + 1.0)
+
+    assert bench.ros.set_bool('controller/set_automatic', True).message == 'automatic mode'
+    at, command = bench.settle(STEADY, at + 1.0)
+    assert command == pytest.approx(held, abs=1e-6)
+    assert bench.settle(STEADY + 1.0, at + 1.0)[1] < held - 0.3
+
+
+def test_limits_ramp_and_weights_change_while_the_loop_runs(bench: Bench) -> None:
+    held = bench.measure(STEADY, 2.0).temperature
+    assert held > 25.0
+    bench.ros.set_parameters('controller', coolant_rate_limit=6.0)
+    assert bench.measure(STEADY + 3.0, 3.0).temperature == pytest.approx(held - 0.1)
+    bench.ros.set_parameters('controller', coolant_rate_limit=60.0, coolant_max=24.0)
+    commands = [bench.measure(STEADY, float(at)).temperature for at in range(4, 10)]
+    # at the rate limit of 1 K/s
+    assert max(a - b for a, b in itertools.pairwise(commands)) == pytest.approx(1.0)
+    assert commands[-1] == pytest.approx(24.0)
+
+    bench.ros.set_parameters('controller', coolant_max=32.0)
+    at, held = bench.settle(STEADY, 10.0)
+    at, before = bench.settle(STEADY + 1.0, at + 1.0)
+    bench.ros.set_parameters('controller', coolant_weight=100.0)
+    at, dear = bench.settle(STEADY + 1.0, at + 1.0)
+    bench.ros.set_parameters('controller', temperature_weight=10000.0)
+    at, eager = bench.settle(STEADY + 1.0, at + 1.0)
+    assert eager < before < dear < held
+
+    bench.ros.set_parameters('controller', setpoint_ramp=6.0)
+    bench.ask(STEADY - 10.0)
+    for k in range(1, 12):
+        bench.measure(STEADY, at + k)
+    # 0.1 K/s since the last measurement before
+    assert bench.active_since(STEADY - 1.1) == at + 11.0
+
+
+def measure_on(bench: Bench, count: int, first: float) -> float:
+    """Measure a falling temperature once a second; return the time of the last."""
+    for k in range(count):
+        bench.measure(STEADY - 0.02 * k, first + k)
+    return first + count - 1
+
+
+def test_status_tells_mode_law_reason_and_figures(bench: Bench) -> None:
+    bench.ros.set_parameters('controller', observer_bandwidth=6.0)
+    # whole seconds of the clock of the node, so that ages are known
+    last = measure_on(bench, 20, float(int(time.time()) - 40))
+    status = bench.status()
+    figures = {item.key: item.value for item in status.values}
+    assert {key: figures[key] for key in (
+        'measurements', 'mode', 'active law', 'law', 'reason')} == {
+        'measurements': str(bench.sent), 'mode': 'automatic', 'active law': 'learned law',
+        'law': 're-centred', 'reason': 'none'}
+    assert float(figures['coolant [degC]']) == pytest.approx(
+        bench.commands[-1].temperature, abs=1e-6)
+    assert float(figures['disturbance [K of coolant]']) < -0.1
+    assert 0.0 < abs(float(figures['equivalent sensor bias [K]'])) < math.inf
+    assert 0.0 < float(figures['gain norm']) < 1000.0
+    assert 0.0 <= float(figures['Riccati residual']) < 1e-8
+    assert 0.0 < float(figures['predicted growth per sample']) < 1.0
+    assert float(figures['transfer [K]']) == 0.0
+    age, answer, latency = (float(figures[key]) for key in (
+        'age of measurement [s]', 'latency from arrival to command [s]',
+        'latency from stamp to command [s]'))
+    assert 0.0 < time.time() - last - age < 10.0
+    assert 0.0 < answer < 1.0
+    assert latency == pytest.approx(age + answer, abs=1e-6)
+
+    missed = int(value(status, 'missed measurements'))
+    bench.measure(STEADY, last + 4.0)
+    assert value(bench.status(), 'missed measurements') == str(missed + 3)
+    bench.ros.set_parameters('controller', max_measurement_age=1.0)
+    status = bench.status(lambda s: 'old when they arrive' in s.message)
+    assert status.level == DiagnosticStatus.WARN
+    assert 'at most 1 s are expected' in status.message
+
+
+def test_stamps_that_stand_still_and_a_temperature_outside_the_trained_range_are_reported(
         bench: Bench) -> None:
-    bench.ask(46.0, time=8.0)
-    bench.ask(47.0, time=4.0)
-    bench.ask(49.0, time=11.0)
-    for k in range(2, 10):
-        bench.measure(STEADY, float(k))
-    assert bench.active_since(47.0) == 4.0
-    assert bench.active_since(46.0) == 8.0
-    bench.ask(48.0)
-    for k in range(10, 13):
-        bench.measure(STEADY, float(k))
-    assert bench.active_since(48.0) == 10.0
-    assert bench.active == pytest.approx(48.0)
-
-
-def test_measurement_out_of_order_repeats_the_command(bench: Bench) -> None:
-    last = bench.measure(STEADY - 1.0, 3.0).temperature
-    assert bench.measure(STEADY, 2.5).temperature == last
-    status = bench.status(lambda s: int(value(s, 'late measurements')) >= 1)
-    assert status.level == DiagnosticStatus.OK
-
-
-def test_stamp_that_does_not_advance_is_reported(bench: Bench) -> None:
     for _ in range(2):
         bench.measure(STEADY, 2.0)
     status = bench.status(lambda s: 'does not advance' in s.message)
     assert status.level == DiagnosticStatus.WARN
     bench.measure(STEADY, 3.0)
     bench.status(lambda s: s.level == DiagnosticStatus.OK)
-
-
-def test_temperature_outside_the_trained_range_is_reported(bench: Bench) -> None:
-    assert math.isfinite(bench.measure(54.5, 2.0).temperature)
-    status = bench.status(lambda s: s.level == DiagnosticStatus.WARN)
-    assert 'outside the trained range' in status.message
+    assert math.isfinite(bench.measure(54.5, 6.0).temperature)
+    status = bench.status(lambda s: 'outside the trained range' in s.message)
+    assert status.level == DiagnosticStatus.WARN
     assert value(status, 'active law') == 'learned law'
 
 
-def test_before_the_first_setpoint_the_temperature_is_held(ros: Harness) -> None:
-    """That of a best-effort thermometer, here, which is heard by an override."""
-    best_effort = QoSProfile(depth=10, reliability=ReliabilityPolicy.BEST_EFFORT)
-    override = 'qos_overrides./temperature.subscription.reliability:=best_effort'
-    bench = Bench(ros, arguments=('-p', override), qos=best_effort)
-    assert bench.active == pytest.approx(STEADY)
-    bench.measure(STEADY - 1.0, 2.0)
+def test_internals_carry_the_stamp_of_the_measurement(bench: Bench) -> None:
+    bench.ros.set_parameters('controller', observer_bandwidth=6.0)
+    internals = bench.ros.listen(JointState, topics.CONTROLLER_STATE)
+    predicted = bench.ros.listen(Temperature, topics.PREDICTED_TEMPERATURE)
+    bench.ros.meet('controller')
+    last = measure_on(bench, 10, 2.0)
+    bench.ros.wait_until(lambda: all(
+        heard and seconds(heard[-1]) == last for heard in (internals, predicted)))
+    # those of the measurement before may have been on their way
+    for heard in (internals, predicted):
+        assert [seconds(message) for message in heard[-10:]] == [2.0 + k for k in range(10)]
+    # what the model expected of a temperature that falls
+    assert predicted[-1].temperature == pytest.approx(STEADY - 0.18, abs=0.5)
+    assert predicted[-1].temperature != STEADY - 0.02 * 9
+    found = {name.split(' [')[0]: position for name, position in zip(
+        internals[-1].name, internals[-1].position, strict=True)}
+    assert found['estimated_temperature'] == pytest.approx(STEADY - 0.18, abs=0.5)
+    assert found['level'] == 0.0
+    assert 0.0 < found['gain'] < 1000.0
+
+
+def test_a_model_that_does_not_reach_to_the_safe_coolant_says_so(
+        bench: Bench, tmp_path: Path) -> None:
+    bench.ros.wait_for_status(STATUS, lambda s: value(s, 'safe coolant') == 'within reach')
+    model = load(model_path('reactor_nz4'))
+    lower, upper = model.states.center - 1.5, model.states.center + 1.5
+    narrow = tmp_path / 'narrow.safetensors'
+    save(replace(model, states=replace(model.states, lower=lower, upper=upper)), narrow)
+    # accepted nevertheless
+    (result,) = bench.ros.set_parameters('controller', model=str(narrow))
+    assert result.successful, result.reason
+    words = 'under safe_coolant = 5'
+    status = bench.ros.wait_for_status(STATUS, lambda s: words in value(s, 'safe coolant'))
+    assert 'leaves the trained range' in value(status, 'safe coolant')
+    bench.ros.wait_until(lambda: words in bench.process.output())
+    bench.ros.set_parameters('controller', safe_coolant=27.0)
+    bench.ros.wait_for_status(STATUS, lambda s: value(s, 'safe coolant') == 'within reach')
+    bench.ros.set_parameters('controller', model='reactor_nz4')
+
+
+def test_second_controller_is_told_by_both_while_it_lasts(ros: Harness) -> None:
+    """Beside a best-effort thermometer, and a coolant that is promised and never told."""
+    ros.node.create_publisher(Temperature, topics.COOLANT_TEMPERATURE, topics.LATCHED_QOS)
+    override = ('-p', 'qos_overrides./temperature.subscription.reliability:=best_effort')
+    bench = Bench(ros, arguments=override, qos=QoSProfile(
+        depth=10, reliability=ReliabilityPolicy.BEST_EFFORT))
+    assert bench.commands[0].temperature > 25.0
+    waited = []
+    for k in range(2, 12):
+        before = time.monotonic()
+        bench.measure(STEADY - 1.0, float(k))
+        waited.append(time.monotonic() - before)
+    # on a busy machine some may be slow, but if they waited for the coolant all would be
+    assert min(waited) < 0.4
+    # the temperature first measured is held
     assert bench.active == pytest.approx(STEADY)
     bench.status(lambda s: s.message.startswith('automatic, no set-point yet'))
 
-
-def test_long_frame_id_is_cut_and_reported(bench: Bench) -> None:
-    message = temperature(STEADY, 2.0)
-    message.header.frame_id = 'x' * 100_000
-    bench.thermometer.publish(message)
-    command = bench.ros.wait_until(
-        lambda: next((m for m in bench.commands if seconds(m) == 2.0), None))
-    assert command.header.frame_id == 'x' * 256
-    status = bench.ros.wait_for_status(STATUS, lambda s: 'frame_id' in s.message)
-    assert status.level == DiagnosticStatus.WARN
-    assert 'has 100000 characters, of which 256 are passed on' in status.message
-    assert bench.measure(STEADY, 3.0).header.frame_id == ''
-    bench.ros.wait_for_status(STATUS, lambda s: s.level == DiagnosticStatus.OK)
-
-
-def test_odd_stamps_are_answered_with_themselves(bench: Bench) -> None:
-    message = temperature(STEADY)
-    message.header.stamp.sec, message.header.stamp.nanosec = 2, 1_500_000_000
-    bench.thermometer.publish(message)
-    command = bench.ros.wait_until(
-        lambda: next((m for m in bench.commands if seconds(m) == 3.5), None))
-    assert command.header.stamp == message.header.stamp
-    for time in (-2.0 ** 31, -5.25, -4.25):
-        assert math.isfinite(bench.measure(STEADY, time).temperature)
-
-
-def test_manual_mode_commands_what_the_operator_asks(bench: Bench) -> None:
-    held = bench.measure(STEADY, 2.0).temperature
-    response = bench.ros.set_bool('controller/set_automatic', False)
-    assert (response.success, response.message) == (True, 'manual mode')
-    assert bench.measure(STEADY + 1.0, 3.0).temperature == held
-
-    manual = bench.ros.speak(Temperature, topics.MANUAL_COOLANT_SETPOINT, to='controller')
-    manual.publish(temperature(20.0))
-    time = bench.measure_until(lambda command: command.temperature == pytest.approx(20.0), 4.0)
-    status = bench.status(lambda s: s.message.startswith('manual'))
-    assert value(status, 'law') == 'none'
-
-    assert bench.ros.set_bool('controller/set_automatic', True).message == 'automatic mode'
-    time, command = bench.settle(STEADY, time + 1.0)
-    assert command == pytest.approx(held, abs=1e-6)
-    assert bench.settle(STEADY + 1.0, time + 1.0)[1] < held - 0.3
-
-
-def test_manual_command_is_refused_in_automatic_mode(bench: Bench) -> None:
-    manual = bench.ros.speak(Temperature, topics.MANUAL_COOLANT_SETPOINT, to='controller')
-    held = bench.settle(STEADY, 2.0)[1]
-    manual.publish(temperature(20.0))
-    status = bench.status(lambda s: 'switch to manual mode' in s.message)
-    assert status.level == DiagnosticStatus.WARN
-    assert bench.measure(STEADY, 1000.0).temperature == pytest.approx(held, abs=1e-6)
-
-
-def test_manual_command_stays_within_the_limits(bench: Bench) -> None:
-    bench.ros.set_parameters('controller', coolant_max=28.0)
-    bench.ros.set_bool('controller/set_automatic', False)
-    manual = bench.ros.speak(Temperature, topics.MANUAL_COOLANT_SETPOINT, to='controller')
-    for wild in (90.0, math.nan):
-        manual.publish(temperature(wild))
-    bench.status(lambda s: 'manual coolant_temperature nan degC is not finite' in s.message)
-    assert bench.measure(STEADY, 1000.0).temperature == pytest.approx(28.0)
-
-
-def test_limits_change_while_the_loop_runs(bench: Bench) -> None:
-    held = bench.measure(STEADY, 2.0).temperature
-    assert held > 25.0
-    bench.ros.set_parameters('controller', coolant_rate_limit=6.0)
-    assert bench.measure(STEADY + 3.0, 3.0).temperature == pytest.approx(held - 0.1)
-    bench.ros.set_parameters('controller', coolant_rate_limit=60.0, coolant_max=24.0)
-    commands = [bench.measure(STEADY, float(time)).temperature for time in range(4, 10)]
-    # at the rate limit of 1 K/s
-    assert max(before - now for before, now in itertools.pairwise(commands)) == pytest.approx(1.0)
-    assert commands[-1] == pytest.approx(24.0)
-
-
-def test_setpoint_ramp_changes_while_the_loop_runs(bench: Bench) -> None:
-    bench.ros.set_parameters('controller', setpoint_ramp=6.0)
-    bench.ask(STEADY - 10.0)
-    for k in range(2, 13):
-        bench.measure(STEADY, float(k))
-    # 0.1 K/s since the measurement at 1 s
-    assert bench.active_since(STEADY - 1.1) == 12.0
-
-
-def test_weights_change_while_the_loop_runs(bench: Bench) -> None:
-    """A dear coolant moves less."""
-    hot = STEADY + 1.0
-    time, held = bench.settle(STEADY, 2.0)
-    time, before = bench.settle(hot, time + 1.0)
-    bench.ros.set_parameters('controller', coolant_weight=100.0)
-    time, dear = bench.settle(hot, time + 1.0)
-    bench.ros.set_parameters('controller', temperature_weight=10000.0)
-    time, eager = bench.settle(hot, time + 1.0)
-    assert eager < before < dear < held
+    second = ros.start('controller', arguments=('-r', '__node:=controller_2', *override))
+    ros.meet('controller_2')
+    bench.measure(STEADY, 12.0)
+    for name in ('controller', 'controller_2'):
+        # names come a moment after their topics
+        status = ros.wait_for_status(f'{name}: control', lambda s: (
+            'end all but one' in s.message and 'UNKNOWN' not in s.message))
+        assert status.level == DiagnosticStatus.WARN
+        assert status.message == (
+            '2 nodes command the coolant: /controller, /controller_2; end all but one')
+    assert '2 nodes command the coolant' in second.output()
+    assert second.stop() == 0
+    ros.wait_for_status(STATUS, lambda s: s.level == DiagnosticStatus.OK)

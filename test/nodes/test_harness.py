@@ -20,28 +20,22 @@ from koopman_ros.testing import (
     process,
     reservations,
 )
-from support.messages import TIMEOUT
-from support.processes import wait_until_ended
+from support.nodes import TIMEOUT, wait_until_ended
 
 SLEEPER = (sys.executable, '-c', 'import time; time.sleep(600)')
 
 
-def test_end_that_nobody_asked_for_is_told(tmp_path: Path) -> None:
-    ros = Harness(tmp_path)
-    ros.start('failing', command=('sh', '-c', 'echo a reason; exit 3'))
-    with pytest.raises(HarnessError, match='failing ended early, with code 3: a reason'), ros:
-        ros.wait_until(bool)
-
-
-@pytest.mark.parametrize('lasting', [False, True])
-def test_end_without_an_error_counts_where_processes_are_to_last(
-        tmp_path: Path, lasting: bool) -> None:
-    with Harness(tmp_path, lasting=lasting, timeout=1.0) as ros:
-        ended = ros.start('brief', command=(sys.executable, '-c', ''))
-        ended.process.wait()
-        with pytest.raises(HarnessError, match=(
-                'brief ended early' if lasting else 'not within 1 s: the impossible; see ')):
-            ros.wait_until(bool, 'the impossible')
+@pytest.mark.parametrize(('program', 'lasting', 'words'), [
+    ('echo a reason; exit 3', False, 'failing ended early, with code 3: a reason'),
+    ('exit 0', True, 'failing ended early'),
+    ('exit 0', False, 'not within 1 s: the impossible; see ')])
+def test_end_that_nobody_asked_for_is_told(
+        tmp_path: Path, program: str, lasting: bool, words: str) -> None:
+    """One without an error counts where processes are to last."""
+    ros = Harness(tmp_path, lasting=lasting, timeout=1.0)
+    ros.start('failing', command=('sh', '-c', program)).process.wait()
+    with pytest.raises(HarnessError, match=words), ros:
+        ros.wait_until(bool, 'the impossible')
 
 
 def test_code_at_the_end_counts_unless_the_process_was_stopped_before(tmp_path: Path) -> None:
@@ -151,14 +145,6 @@ def test_no_process_outlives_one_that_is_killed(
     wait_until_ended(child)
 
 
-# Reservations.
-
-
-def test_two_reservations_are_two_domains() -> None:
-    with isolated_domain() as first, isolated_domain() as second:
-        assert first['ROS_DOMAIN_ID'] != second['ROS_DOMAIN_ID']
-
-
 def test_reservation_ends_with_its_context(monkeypatch: pytest.MonkeyPatch) -> None:
     # one that no other test reserves meanwhile
     monkeypatch.setattr(reservations, '_DOMAINS', [1000 + os.getpid()])
@@ -169,25 +155,18 @@ def test_reservation_ends_with_its_context(monkeypatch: pytest.MonkeyPatch) -> N
                 pass
 
 
-def test_environment_of_the_reservation_holds_here_too(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setenv('ROS_DOMAIN_ID', '7')
-    monkeypatch.delenv('RMW_IMPLEMENTATION', raising=False)
-    with isolated_domain() as environment:
-        assert environment.items() <= os.environ.items()
-    assert os.environ['ROS_DOMAIN_ID'] == '7'
-    assert 'RMW_IMPLEMENTATION' not in os.environ
-
-
 @pytest.mark.parametrize(('given', 'found', 'reach'), [
     ('', 'rmw_fastrtps_cpp', 'SYSTEM_DEFAULT'),
     ('rmw_fastrtps_dynamic_cpp', 'rmw_fastrtps_dynamic_cpp', 'SYSTEM_DEFAULT'),
     # whose default is the whole network, as it knows nothing of the profile
     ('rmw_cyclonedds_cpp', 'rmw_cyclonedds_cpp', 'LOCALHOST'),
 ])
-def test_middleware_that_is_named_stays(
+def test_environment_of_the_reservation_holds_here_with_the_middleware_that_is_named(
         monkeypatch: pytest.MonkeyPatch, given: str, found: str, reach: str) -> None:
+    monkeypatch.setenv('ROS_DOMAIN_ID', '7')
     monkeypatch.setenv('RMW_IMPLEMENTATION', given)
     with isolated_domain() as environment:
-        assert environment['RMW_IMPLEMENTATION'] == os.environ['RMW_IMPLEMENTATION'] == found
+        assert environment.items() <= os.environ.items()
+        assert environment['RMW_IMPLEMENTATION'] == found
         assert environment['ROS_AUTOMATIC_DISCOVERY_RANGE'] == reach
-    assert os.environ['RMW_IMPLEMENTATION'] == given
+    assert (os.environ['ROS_DOMAIN_ID'], os.environ['RMW_IMPLEMENTATION']) == ('7', given)

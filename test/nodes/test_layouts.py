@@ -3,7 +3,6 @@
 
 """The shipped plot layouts name what the nodes publish."""
 
-from collections.abc import Iterator
 import json
 import re
 from typing import Any
@@ -33,21 +32,10 @@ def published(topic: str, field: str, name: str = '') -> str:
     return name.split(' [')[0] or topic
 
 
-@pytest.fixture(scope='module')
-def plotjuggler() -> ElementTree.Element:
-    return ElementTree.parse(config_directory() / 'plotjuggler.xml').getroot()
-
-
-@pytest.fixture(scope='module')
-def foxglove() -> dict[str, Any]:
-    layout: dict[str, Any] = json.loads(
-        (config_directory() / 'foxglove_layout.json').read_text())
-    return layout
-
-
-def test_every_curve_of_plotjuggler_is_published(plotjuggler: ElementTree.Element) -> None:
+def test_plotjuggler_shows_what_is_published_and_subscribes_to_it() -> None:
+    layout = ElementTree.parse(config_directory() / 'plotjuggler.xml').getroot()
     shown = []
-    for curve in plotjuggler.iter('curve'):
+    for curve in layout.iter('curve'):
         # PlotJuggler unrolls a JointState as /topic/name/position
         _, topic, *name, field = curve.attrib['name'].split('/')
         assert all(part in NAMES for part in name)
@@ -55,21 +43,17 @@ def test_every_curve_of_plotjuggler_is_published(plotjuggler: ElementTree.Elemen
     assert len(shown) == len(set(shown))
     assert set(shown) == TEMPERATURES | INTERNALS
 
-
-def test_plotjuggler_subscribes_to_what_it_shows(plotjuggler: ElementTree.Element) -> None:
-    streamer = plotjuggler.find('previouslyLoaded_Streamer')
-    plugin = plotjuggler.find('Plugins/plugin')
+    streamer = layout.find('previouslyLoaded_Streamer')
+    plugin = layout.find('Plugins/plugin')
     assert streamer is not None
     assert plugin is not None
     assert streamer.attrib['name'] == plugin.attrib['ID'] == 'ROS2 Topic Subscriber'
     selected = plugin.find('selected_topics')
     assert selected is not None
     assert sorted(selected.attrib['value'].split(';')) == sorted(
-        {'/' + curve.attrib['name'].split('/')[1] for curve in plotjuggler.iter('curve')})
+        {'/' + curve.attrib['name'].split('/')[1] for curve in layout.iter('curve')})
 
-
-def test_splitters_of_plotjuggler_count_their_children(plotjuggler: ElementTree.Element) -> None:
-    splitters = list(plotjuggler.iter('DockSplitter'))
+    splitters = list(layout.iter('DockSplitter'))
     assert splitters
     for splitter in splitters:
         sizes = [float(size) for size in splitter.attrib['sizes'].split(';')]
@@ -78,9 +62,10 @@ def test_splitters_of_plotjuggler_count_their_children(plotjuggler: ElementTree.
         assert splitter.attrib['orientation'] in '|-'
 
 
-def test_every_series_of_foxglove_is_published(foxglove: dict[str, Any]) -> None:
+def test_foxglove_shows_what_is_published() -> None:
+    layout = json.loads((config_directory() / 'foxglove_layout.json').read_text())
     shown = []
-    for panel in foxglove['configById'].values():
+    for panel in layout['configById'].values():
         for series in panel.get('paths', ()):
             parts = re.fullmatch(r'/(\w+)\.(\w+)(?:\[(\d+)\])?', series['value'])
             assert parts is not None
@@ -91,18 +76,12 @@ def test_every_series_of_foxglove_is_published(foxglove: dict[str, Any]) -> None
             shown.append(published(topic, field, *name))
     assert len(shown) == len(set(shown))
     assert set(shown) == TEMPERATURES | INTERNALS
+    assert sorted(_panels(layout['layout'])) == sorted(layout['configById'])
+    assert layout['configById']['DiagnosticSummary!all']['topicToRender'] == topics.DIAGNOSTICS
 
 
-def test_panels_of_foxglove_have_their_places(foxglove: dict[str, Any]) -> None:
-    assert sorted(_panels(foxglove['layout'])) == sorted(foxglove['configById'])
-    assert foxglove['configById']['DiagnosticSummary!all']['topicToRender'] == topics.DIAGNOSTICS
-
-
-def _panels(node: str | dict[str, Any]) -> Iterator[str]:
-    """Yield the panels of a layout, which is a tree of splits."""
+def _panels(node: str | dict[str, Any]) -> list[str]:
     if isinstance(node, str):
-        yield node
-    else:
-        assert node['direction'] in ('row', 'column')
-        yield from _panels(node['first'])
-        yield from _panels(node['second'])
+        return [node]
+    assert node['direction'] in ('row', 'column')
+    return _panels(node['first']) + _panels(node['second'])

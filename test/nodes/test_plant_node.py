@@ -19,7 +19,7 @@ from koopman_ros.ros import topics
 from koopman_ros.ros.codec import stamp_nanoseconds
 from koopman_ros.testing import Harness
 from koopman_ros.units import LAST_STAMP_SECONDS, seconds_text
-from support.messages import seconds, temperature, value
+from support.nodes import seconds, temperature, value
 
 STATUS = 'plant: simulation'
 NOMINAL_COOLANT = 26.85  # degC
@@ -27,13 +27,7 @@ SEED = 3
 
 
 class Bench:
-    """
-    A lock-step plant whose every measurement the test answers with a coolant temperature.
-
-    :param ros: where the plant runs.
-    :param before: called when the plant has started and nobody commands it yet.
-    :param parameters: of the plant.
-    """
+    """A lock-step plant whose every measurement the test answers with a coolant."""
 
     def __init__(self, ros: Harness, before: Callable[[], object] = lambda: None,
                  **parameters: object) -> None:
@@ -45,7 +39,7 @@ class Bench:
         self.sent_ns: list[int] = []  # when each was measured
         ros.node.create_subscription(
             Temperature, topics.TEMPERATURE, self._on_measurement, topics.LOOP_QOS)
-        self.process = ros.start(
+        ros.start(
             'plant', {'lockstep': True, 'speed': 0.0, 'lockstep_timeout': 3600.0, **parameters})
         before()
         self._commands = ros.node.create_publisher(
@@ -63,7 +57,6 @@ class Bench:
                 Temperature(header=message.header, temperature=self.coolant))
 
     def pause(self) -> float:
-        """Leave a measurement unanswered; return its stamp."""
         self.answering = False
         self.ros.wait_until(lambda: seconds(self.measured[-1]) not in self.commanded)
         return seconds(self.measured[-1])
@@ -74,12 +67,10 @@ class Bench:
         self._answer(self.measured.pop())
 
     def set(self, **parameters: float) -> None:
-        """Set parameters of the plant, which takes them."""
         for result in self.ros.set_parameters('plant', **parameters):
             assert result.successful, result.reason
 
     def status(self, condition: Callable[[DiagnosticStatus], bool]) -> DiagnosticStatus:
-        """Wait for a status of the plant."""
         return self.ros.wait_for_status(STATUS, condition)
 
     def start_afresh(self) -> None:
@@ -92,17 +83,10 @@ class Bench:
         del self.measured[:], self.ros.statuses[:]
         self.commanded.clear()
 
-    @property
-    def celsius(self) -> float:
-        """The last measurement."""
-        return float(self.measured[-1].temperature)
-
     def wait_for(self, condition: Callable[[float], bool]) -> None:
-        """Wait for a temperature."""
-        self.ros.wait_until(lambda: self.measured and condition(self.celsius))
+        self.ros.wait_until(lambda: self.measured and condition(self.measured[-1].temperature))
 
     def wait_for_more(self, count: int) -> list[Temperature]:
-        """Wait for so many further measurements and return them."""
         present = len(self.measured)
         self.ros.wait_until(lambda: len(self.measured) >= present + count)
         return self.measured[present:present + count]
@@ -115,15 +99,11 @@ def shared_bench(shared_ros: Harness) -> Bench:
 
 @pytest.fixture
 def bench(shared_bench: Bench) -> Bench:
-    """Return a plant at its steady state."""
     shared_bench.start_afresh()
     return shared_bench
 
 
-# Measurements.
-
-
-def test_noise_is_that_of_seed_and_sample_and_changes_while_it_runs(bench: Bench) -> None:
+def test_sensor_is_noisy_biased_and_coarse_as_it_is_set_while_it_runs(bench: Bench) -> None:
     (steady,) = bench.wait_for_more(1)
     assert steady.variance == 0.0
     bench.set(noise=0.5)
@@ -135,28 +115,20 @@ def test_noise_is_that_of_seed_and_sample_and_changes_while_it_runs(bench: Bench
         [steady.temperature + sensor_noise(0.5, SEED, round(seconds(message)) - 1)
          for message in measured], abs=1e-6)
 
-
-def test_biased_sensor_leaves_the_truth_to_the_diagnostics(bench: Bench) -> None:
-    steady = bench.wait_for_more(1)[0].temperature
-    bench.set(sensor_bias=2.0)
-    bench.wait_for(lambda celsius: celsius > steady + 1.0)
-    assert bench.celsius == pytest.approx(steady + 2.0, abs=1e-6)
+    bench.set(noise=0.0, sensor_bias=2.0)
+    bench.wait_for(lambda celsius: celsius == pytest.approx(steady.temperature + 2.0, abs=1e-6))
     biased = seconds(bench.measured[-1])
     status = bench.status(lambda s: float(value(s, 'time [s]')) >= biased)
-    assert float(value(status, 'temperature [degC]')) == pytest.approx(steady, abs=1e-6)
+    assert float(value(status, 'temperature [degC]')) == pytest.approx(
+        steady.temperature, abs=1e-6)
 
-
-def test_coarse_sensor_shows_steps_and_says_how_coarse_it_is(bench: Bench) -> None:
-    bench.set(sensor_resolution=0.25)
-    bench.coolant = 25.0
+    bench.set(sensor_bias=0.0, sensor_resolution=0.25)
     bench.ros.wait_until(lambda: bench.measured[-1].variance > 0.0)
+    bench.coolant = 25.0
     measured = bench.wait_for_more(50)
     assert {message.temperature % 0.25 for message in measured} == {0.0}
     assert {message.variance for message in measured} == {0.25 ** 2 / 12.0}
     assert len({message.temperature for message in measured}) > 3
-
-
-# Time.
 
 
 def test_real_time_stamps_are_the_wall_clock_and_silence_is_reported_while_it_lasts(
@@ -208,27 +180,12 @@ def test_lockstep_waits_for_a_controller_and_is_paced(ros: Harness) -> None:
     ros.wait_until(lambda: stamps <= {seconds(message) for message in bench.measured})
 
 
-def test_lockstep_goes_on_without_an_answer_after_its_timeout(ros: Harness) -> None:
-    bench = Bench(ros, lockstep_timeout=0.05)
-    bench.coolant = 25.0
-    bench.wait_for_more(5)
-    bench.answering = False
-    # a busy machine may have missed some before
-    status = bench.status(lambda s: s.level == DiagnosticStatus.WARN and int(
-        value(s, 'missed commands')) >= 3)
-    assert float(value(status, 'coolant [degC]')) == pytest.approx(25.0)
-    assert 'no command arrives' in status.message
-    assert 'no command for the measurement at' in bench.process.output()
-    bench.answering = True
-    bench.wait_for_more(20)
-
-
 def test_reset_returns_to_the_initial_temperature_until_the_duration_is_over(ros: Harness
                                                                               ) -> None:
     bench = Bench(ros, initial_temperature_offset=-5.0, start_time=10.0, duration=210.0,
                   sample_period=0.7)
     initial = bench.wait_for_more(1)[0].temperature
-    bench.wait_for(lambda celsius: celsius > initial + 4.0)
+    bench.wait_for(lambda celsius: celsius > initial + 1.0)
     bench.pause()
     response = ros.trigger('plant/reset')
     assert (response.success, response.message) == (
@@ -252,15 +209,9 @@ def test_stands_still_where_the_stamps_end(ros: Harness) -> None:
         'smaller start_time')
     # all digits
     assert value(status, 'time [s]') == '2147483647'
-    ros.wait_until(lambda: len(bench.measured) >= 8)
-    assert [message.header.stamp.sec for message in bench.measured] == [
-        LAST_STAMP_SECONDS - 7 + k for k in range(8)]
+    ros.wait_until(lambda: bench.measured[-1].header.stamp.sec == LAST_STAMP_SECONDS)
     response = ros.trigger('plant/reset')
     assert (response.success, response.message) == (False, status.message)
-    assert (
-        'one_state reactor started: a measurement every 1 s from 2147483640 s on, as fast as it '
-        'can, in lock-step: it begins with 1 subscribers and a controller'
-    ) in bench.process.output()
 
 
 @pytest.mark.parametrize(('parameters', 'words'), [
@@ -286,10 +237,7 @@ def test_time_is_written_with_all_digits(nanoseconds: int, text: str) -> None:
     assert seconds_text(nanoseconds) == text
 
 
-# The coolant that is in force.
-
-
-def test_coolant_in_force_is_told_before_each_measurement(bench: Bench) -> None:
+def test_coolant_in_force_is_told_before_each_measurement_and_latched(bench: Bench) -> None:
     sent: dict[str, list[tuple[float, int, float]]] = {'coolant': [], 'measured': []}
     for name, topic in (('coolant', topics.COOLANT_TEMPERATURE), ('measured', topics.TEMPERATURE)):
         bench.ros.node.create_subscription(
@@ -305,11 +253,6 @@ def test_coolant_in_force_is_told_before_each_measurement(bench: Bench) -> None:
     # what acted until then is the answer to the measurement before
     for stamp, *_ in told[1:]:
         assert coolants[stamp][1] == pytest.approx(bench.commanded[stamp - 1.0], abs=1e-9)
-
-
-def test_coolant_in_force_is_latched_for_a_late_joiner(bench: Bench) -> None:
-    bench.coolant = 25.0
-    bench.wait_for_more(3)
     bench.pause()
     late = bench.ros.listen(Temperature, topics.COOLANT_TEMPERATURE, topics.LATCHED_QOS)
     bench.ros.wait_until(lambda: late and late[-1].header == bench.measured[-1].header)
@@ -340,11 +283,9 @@ def test_coolant_follows_its_command_as_the_actuator_lets_it(
         [expected(n) for n in range(20)], abs=1e-6)
 
 
-# Commands.
-
-
-def test_command_that_is_not_a_number_is_rejected_and_the_last_one_held(bench: Bench) -> None:
-    bench.coolant = 25.0
+def test_command_beyond_the_range_is_limited_and_one_that_is_no_number_rejected(
+        bench: Bench) -> None:
+    bench.coolant = -200.0
     bench.wait_for_more(5)
     bench.coolant = math.nan
     status = bench.status(lambda s: s.message.startswith('coolant command nan degC'))
@@ -352,8 +293,8 @@ def test_command_that_is_not_a_number_is_rejected_and_the_last_one_held(bench: B
     assert status.message == ('coolant command nan degC is not finite and was rejected: the last '
                               'good one is held')
     assert int(value(status, 'rejected commands')) >= 1
-    assert float(value(status, 'coolant [degC]')) == pytest.approx(25.0)
-    bench.coolant = 25.0
+    assert float(value(status, 'coolant [degC]')) == pytest.approx(-20.0)
+    bench.coolant = NOMINAL_COOLANT
     bench.status(lambda s: s.level == DiagnosticStatus.OK)
 
 
@@ -371,13 +312,6 @@ def test_command_that_answers_no_open_measurement_is_not_taken(bench: Bench) -> 
     bench.resume()
 
 
-def test_actuator_reaches_no_further_than_its_range(bench: Bench) -> None:
-    bench.coolant = -200.0
-    bench.wait_for_more(10)
-    status = bench.status(lambda s: float(value(s, 'coolant [degC]')) < 26.0)
-    assert float(value(status, 'coolant [degC]')) == pytest.approx(-20.0)
-
-
 def test_runaway_stops_the_plant_and_reset_recovers_it(bench: Bench) -> None:
     bench.coolant = 40.0
     status = bench.status(lambda s: s.level == DiagnosticStatus.ERROR)
@@ -391,31 +325,14 @@ def test_runaway_stops_the_plant_and_reset_recovers_it(bench: Bench) -> None:
     bench.status(lambda s: s.level == DiagnosticStatus.OK)
 
 
-# Parameters.
-
-
-@pytest.mark.parametrize(('name', 'given', 'sign'), [
-    ('heat_transfer_coefficient', 48000.0, 1), ('concentration', 0.85, -1),
-    ('feed_temperature', 75.0, -1)])
-def test_reactor_changes_while_it_runs(bench: Bench, name: str, given: float, sign: int) -> None:
+def test_reactor_changes_while_it_runs_but_for_what_is_fixed_at_start(bench: Bench) -> None:
     steady = bench.wait_for_more(1)[0].temperature
-    bench.set(**{name: given})
-    bench.wait_for(lambda celsius: sign * (celsius - steady) > 0.5)
-    assert bench.ros.get_parameters('plant', name) == [given]
-
-
-def test_what_is_fixed_at_start_is_refused(bench: Bench) -> None:
+    bench.set(concentration=0.85)
+    bench.wait_for(lambda celsius: celsius < steady - 0.5)
     (result,) = bench.ros.set_parameters('plant', speed=2.0)
     assert not result.successful
     assert 'read-only parameter: speed' in result.reason
-
-
-# Others where only one may be.
-
-
-def told(status: DiagnosticStatus) -> bool:
-    """Tell whether others are known by their names, which come a moment after their topics."""
-    return status.message.count('end all but one') == 2 and 'UNKNOWN' not in status.message
+    assert bench.ros.get_parameters('plant', 'concentration', 'speed') == [0.85, 0.0]
 
 
 def test_others_are_told_by_their_names_while_they_last(bench: Bench) -> None:
@@ -423,7 +340,9 @@ def test_others_are_told_by_their_names_while_they_last(bench: Bench) -> None:
     intruder = Node('intruder', context=bench.ros.node.context, namespace='/elsewhere')
     for topic in (topics.COOLANT_SETPOINT, topics.TEMPERATURE):
         intruder.create_publisher(Temperature, f'/{topic}', topics.LOOP_QOS)
-    status = bench.ros.wait_for_status(STATUS, told)
+    # names come a moment after their topics
+    status = bench.ros.wait_for_status(STATUS, lambda s: (
+        s.message.count('end all but one') == 2 and 'UNKNOWN' not in s.message))
     assert status.level == DiagnosticStatus.WARN
     assert status.message == (
         '2 nodes command the coolant: /bench, /elsewhere/intruder; end all but one; '

@@ -3,6 +3,6 @@
 
 """What ROS needs to read what tables write, in a domain of its own."""
 
-from support.ros_fixtures import ros, shared_ros, type_support
+from support.nodes import ros, shared_ros, type_support
 
 __all__ = ['ros', 'shared_ros', 'type_support']

@@ -25,7 +25,7 @@ from koopman_ros.replay.loop import Alternative, Lost, Replay
 from koopman_ros.replay.records import parse, RecordError, SNAPSHOT, START
 from koopman_ros.replay.sources import Models
 from koopman_ros.resources import config_directory
-from support.recorded_controller import COOLANT, MODELS, Recorded, SECOND, STEADY
+from support.recorded_runs import COOLANT, MODELS, Recorded, SECOND, STEADY
 
 
 def replayed(texts: list[str], alternative: Alternative | None = None) -> Replay:

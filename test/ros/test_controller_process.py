@@ -24,7 +24,7 @@ from koopman_ros.ros.node import range_of
 from koopman_ros.testing import Harness
 from koopman_ros.units import LAST_STAMP_SECONDS
 from support.controller_bench import Bench, STEADY
-from support.messages import seconds, temperature, value
+from support.nodes import seconds, temperature, value
 
 CONTROLLER = '/controller'
 SAFE = 5.0  # degC

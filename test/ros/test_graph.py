@@ -34,7 +34,7 @@ from koopman_ros.ros import topics
 from koopman_ros.ros.node import LoopNode
 from koopman_ros.ros.programs import OPERATOR, policy, Program, PROGRAMS
 from koopman_ros.testing import Harness, isolated_domain
-from support.messages import temperature, TIMEOUT
+from support.nodes import temperature, TIMEOUT
 
 Seen = dict[str, set[str]]
 BEST_EFFORT = QoSProfile(depth=1, reliability=qos.ReliabilityPolicy.BEST_EFFORT)

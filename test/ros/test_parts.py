@@ -31,7 +31,7 @@ from koopman_ros.ros.training import Training
 from koopman_ros.ros.watchdog import Watchdog
 from koopman_ros.testing import Harness
 from koopman_ros.units import NANOSECONDS
-from support.messages import temperature, TIMEOUT
+from support.nodes import temperature, TIMEOUT
 
 NAMES = (topics.TEMPERATURE, topics.SETPOINT, topics.COOLANT_SETPOINT)
 

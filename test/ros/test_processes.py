@@ -26,8 +26,7 @@ from koopman_ros.ros.process import answer, open_to_the_network
 from koopman_ros.ros.programs import TABLES
 from koopman_ros.testing import Harness
 from koopman_ros.units import NANOSECONDS
-from support.messages import TIMEOUT
-from support.processes import run_here
+from support.nodes import run_here, TIMEOUT
 
 
 def importing(names: tuple[str, ...], act: str, main: str) -> tuple[str, ...]:

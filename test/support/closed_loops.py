@@ -1,24 +1,32 @@
 # SPDX-FileCopyrightText: 2026 The koopman_ros Authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""Models, closed loops and exact solutions that the tests of the control laws share."""
+"""Models, laws and closed loops on the true reactor, in which anything may go wrong."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, replace
+import json
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from scipy.optimize import root
 
-from koopman_ros.control import Feedback, run_closed_loop, Weights
+from koopman_ros import control, plants
+from koopman_ros.arrays import Array
 from koopman_ros.lifting import LiftedModel, load
-from koopman_ros.plants import ControlAffineSystem, equilibrium_input, one_state_reactor
+from koopman_ros.parameters.controller import ControllerParameters
+from koopman_ros.reasons import Words
+from koopman_ros.replay.records import encoded
+from koopman_ros.units import Displays
+from koopman_ros.units import NANOSECONDS as SECOND
 
-Law = Callable[..., Feedback]
+Law = Callable[..., control.Feedback]
 
-REACTOR = one_state_reactor()
+REACTOR = plants.one_state_reactor()
 START = float(REACTOR.nominal_state[0])
 SETPOINT = START - 10.0
-COOLANT = float(equilibrium_input(REACTOR, [SETPOINT])[0])
+COOLANT = float(plants.equilibrium_input(REACTOR, [SETPOINT])[0])
 # K, of temperature and of coolant: what the costs are measured in
 UNIT = 10.0
 
@@ -27,24 +35,139 @@ def shipped(name: str) -> LiftedModel:
     return load(Path(__file__).parents[2] / 'config' / 'models' / f'{name}.safetensors')
 
 
-def steady_state(system: ControlAffineSystem, u: list[float], guess: list[float]) -> np.ndarray:
-    """Return the steady state that a constant input has near a guess."""
+def steady_state(system: plants.ControlAffineSystem, u: list[float], guess: list[float]
+                 ) -> np.ndarray:
     found = root(lambda x: system.derivative(x, u), guess, jac=system.drift_jacobian, tol=1e-13)
     assert found.success
     return found.x
 
 
-def reactor_weights(model: LiftedModel, R: float) -> Weights:
+def reactor_weights(model: LiftedModel, R: float) -> control.Weights:
     """Weigh squared deviations in units of 10 K by 1 and by R."""
-    return Weights(np.diag(np.square(model.states.scale / UNIT)),
+    return control.Weights(np.diag(np.square(model.states.scale / UNIT)),
                    R * np.diag(np.square(model.inputs.scale / UNIT)))
 
 
 def run_reactor(model: LiftedModel, law: Law, R: float, minutes: float) -> tuple[float, float]:
     """Drive the true reactor to the set-point; return its cost and its last temperature."""
-    run = run_closed_loop(
+    run = control.run_closed_loop(
         model, REACTOR.derivative, np.array([START]), np.array([SETPOINT]),
         reactor_weights(model, R), minutes, law=law, samples=2, rtol=1e-10,
         u_ref=np.array([COOLANT]))
     assert not run.failure
     return run.cost, float(run.states[-1, 0])
+
+
+EPOCH = 1_785_000_000 * SECOND
+LOWER, UPPER, RATE = 278.15, 305.15, 1.0  # K, K, K/s
+SAFE = LOWER
+
+
+def controller(model: Any = 'reactor_nz4', *, supervisor: Mapping[str, float] | None = None,
+               sensor: Mapping[str, Any] | None = None, **changes: Any) -> control.Controller:
+    """Return a controller with the default parameters of its node."""
+    model = shipped(model) if isinstance(model, str) else model
+    usual = ControllerParameters().settings()
+    return control.Controller(model, replace(
+        usual, sensor=replace(usual.sensor, **(sensor or {})),
+        supervisor=supervisor_settings(**(supervisor or {})), **changes))
+
+
+def supervisor_settings(learned: float = 0.1, linear: float = 0.5, **times: float
+                        ) -> control.SupervisorSettings:
+    return control.SupervisorSettings(
+        (control.LevelSettings('sdre', learned), control.LevelSettings('linear', linear)), **times)
+
+
+say = Words(Displays({'temperature': 'K', 'coolant_temperature': 'K'}))
+
+
+def content(value: Any) -> str:
+    """Write states, commands and reports so that they compare bit for bit."""
+    return json.dumps(encoded(value), sort_keys=True)
+
+
+@dataclass
+class Sample:
+    second: int
+    temperature: float
+    command: float
+    report: control.Report
+
+
+class Reactor:
+    """A loop on the true reactor that a test leads from one simulation to the next."""
+
+    def __init__(self, controller: control.Controller,
+                 plant: plants.ControlAffineSystem = REACTOR, kelvin: float = START, *,
+                 actuator: plants.Actuator | None = None, noise: float = 0.0,
+                 sensor: control.Sensor = control.perfect,
+                 input_sensor: control.Sensor | None = None, coolant: float | None = None
+                 ) -> None:
+        x = np.append(plant.nominal_state[:-1], kelvin)
+        u = plants.equilibrium_input(plant, x) if coolant is None else np.array([coolant])
+        self.loop = control.Loop(controller, controller.initialise(control.State(), u),
+                         plants.Process(plant, 0, x, u, actuator or plants.Actuator(), u))
+        self.noise, self.sensor, self.input_sensor = noise, sensor, input_sensor
+        self.waiting: list[control.Event | control.Change] = []
+        self.samples: list[Sample] = []
+
+    @property
+    def kelvin(self) -> float:
+        second = len(self.samples)
+        return float(self.loop.plant.until(second * SECOND).x[-1])
+
+    def do(self, *what: control.Event | control.Change) -> None:
+        self.waiting += what
+
+    def ask(self, kelvin: float) -> None:
+        self.do(control.SetpointRequest(0, np.array([kelvin])))
+
+    def manual(self, kelvin: float) -> None:
+        self.do(control.ModeChange(control.Mode.MANUAL), control.ManualCommand(np.array([kelvin])))
+
+    def act(self, actuator: plants.Actuator) -> None:
+        self.change(actuator=actuator)
+
+    def change(self, **changes: Any) -> None:
+        """Go on with another state, system or actuator."""
+        self.do(lambda loop: replace(loop, plant=replace(loop.plant, **changes)))
+
+    def run(self, seconds: int, sensor: Callable[[float], float | None] | None = None
+            ) -> list[Sample]:
+        """Let the loop run, under a sensor of its own meanwhile; return its samples."""
+        first = len(self.samples)
+
+        def measure(y: Array, second: float) -> Array | None:
+            found = sensor(float(y[0])) if sensor else self.sensor(y, second)
+            return None if found is None else np.reshape(found, 1)
+
+        run = control.simulate(
+            self.loop.controller, self.loop.plant.until(first * SECOND),
+            [control.at(0.0, what) for what in self.waiting], duration=seconds - 1.0,
+            C=np.eye(len(self.loop.plant.x))[-1:], seed=first, sensor=measure,
+            noise=np.array([self.noise]) if self.noise else None, state=self.loop.state,
+            input_sensor=self.input_sensor, stamp=lambda time_ns: EPOCH + time_ns)
+        assert not run.failure
+        self.loop, self.waiting = run.loop, []
+        self.samples += [Sample(first + n, *row) for n, row in enumerate(zip(
+            run.states[:, -1].tolist(), run.commands[:, 0].tolist(), run.reports, strict=True))]
+        return self.samples[first:]
+
+
+def largest_step(samples: list[Sample]) -> float:
+    return float(np.max(np.abs(np.diff([sample.command for sample in samples]))))
+
+
+def settled(samples: list[Sample], kelvin: float, tolerance: float) -> int:
+    """Return how many seconds it takes until the temperature stays within a tolerance."""
+    off = [k for k, s in enumerate(samples) if abs(s.temperature - kelvin) > tolerance]
+    return off[-1] + 1 if off else 0
+
+
+def levels(samples: list[Sample]) -> list[str]:
+    found: list[str] = []
+    for sample in samples:
+        if not found or found[-1] != sample.report.level:
+            found.append(sample.report.level)
+    return found

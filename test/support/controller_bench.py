@@ -3,7 +3,7 @@
 
 """A controller as a process, with a thermometer and an operator in the test."""
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 import math
 import time as clock
 
@@ -11,11 +11,15 @@ from diagnostic_msgs.msg import DiagnosticStatus
 import pytest
 from rclpy.qos import QoSProfile
 from sensor_msgs.msg import Temperature
+from std_msgs.msg import String
 
+from koopman_ros.nodes.replay import replay_records
 from koopman_ros.parameters.controller import TABLE
+from koopman_ros.replay.records import parse, Record
 from koopman_ros.ros import topics
 from koopman_ros.testing import Harness
-from support.messages import seconds, temperature, TIMEOUT, value
+from koopman_ros.units import to_celsius
+from support.nodes import seconds, temperature, TIMEOUT, value
 
 STATUS = 'controller: control'
 STEADY = 51.8  # degC, near the plant's steady state
@@ -29,16 +33,16 @@ RESET = {name: PURE.get(name, row.default)
          for name, row in TABLE.rows.items() if not row.read_only and name != 'model'}
 
 
-class Bench:
-    """
-    A controller with a thermometer and an operator in the test.
+def reproduced(messages: Sequence[String]) -> tuple[list[Record], list[float]]:
+    """Return records, and the commands in them in degC, which a replay finds bit for bit."""
+    records = [parse(message.data) for message in messages]
+    samples = replay_records(records).samples
+    assert [sample.recorded for sample in samples] == [sample.replayed for sample in samples]
+    return records, [to_celsius(float(sample.recorded[0])) for sample in samples]
 
-    :param ros: where the controller runs.
-    :param parameters: of the controller; without another one, silence has no time-out.
-    :param arguments: further ROS arguments of the controller.
-    :param qos: what the thermometer offers.
-    :param first: stamp of the first measurement in s.
-    """
+
+class Bench:
+    """A controller with a thermometer, which measures once at a first time, and an operator."""
 
     def __init__(self, ros: Harness, parameters: Mapping[str, object] | None = None,
                  arguments: tuple[str, ...] = (), qos: QoSProfile = topics.LOOP_QOS,
@@ -67,12 +71,10 @@ class Bench:
         self.measure(STEADY, 1.0)
 
     def send(self, celsius: float, time: float) -> None:
-        """Send a measurement."""
         self.sent += 1
         self.thermometer.publish(temperature(celsius, time))
 
     def measure(self, celsius: float, time: float) -> Temperature:
-        """Send a measurement and return its command."""
         first = len(self.commands)
         self.send(celsius, time)
         return self.ros.wait_until(
@@ -89,10 +91,6 @@ class Bench:
         self._setpoint.publish(temperature(celsius, time))
         self.ros.meet('controller')
 
-    def refusal(self) -> DiagnosticStatus:
-        """Wait until a set-point was refused."""
-        return self.status(lambda s: 'set-point' in s.message)
-
     def active_since(self, celsius: float) -> float:
         """Wait until a set-point is tracked; return since when."""
         return seconds(self.ros.wait_until(lambda: next(
@@ -100,7 +98,6 @@ class Bench:
 
     @property
     def active(self) -> float:
-        """The set-point that is tracked."""
         return float(self.tracked[-1].temperature)
 
     def measure_until(self, condition: Callable[[Temperature], bool], time: float) -> float:

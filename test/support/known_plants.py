@@ -15,7 +15,6 @@ from support.disturbance import disturbed
 
 
 def names(letter: str, count: int) -> tuple[str, ...]:
-    """Return numbered names."""
     return tuple(f'{letter}{i + 1}' for i in range(count))
 
 

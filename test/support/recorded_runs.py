@@ -1,29 +1,31 @@
 # SPDX-FileCopyrightText: 2026 The koopman_ros Authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""Runs of a reactor as a trainer would have recorded them."""
+"""Runs of a reactor as a trainer would have recorded them, and a controller with its records."""
 
-from dataclasses import dataclass, replace
+from collections.abc import Callable, Iterable, Mapping
+from dataclasses import asdict, dataclass, replace
 import importlib
 from pathlib import Path
+from typing import Any
 import warnings
 
 import numpy as np
 
+from koopman_ros import plants
 from koopman_ros.bags import BagWriter, message_definition
+from koopman_ros.control import Controller, State
+from koopman_ros.control.events import apply, Event, Measurement, Outcome, Silence
+from koopman_ros.lifting import load_with_digest
+from koopman_ros.parameters.controller import ControllerParameters
 from koopman_ros.plant_data import Episode
-from koopman_ros.plants import (
-    ControlAffineSystem,
-    one_state_reactor,
-    random_steps,
-    RandomStepDesign,
-    ReactorParameters,
-)
+from koopman_ros.replay import records
+from koopman_ros.resources import model_path
 from koopman_ros.units import NANOSECONDS as SECOND
+from koopman_ros.units import to_celsius
 from support.disturbance import disturbed
 
 NOISE = 0.1  # K
-_TYPE = 'sensor_msgs/msg/Temperature'
 
 
 @dataclass(frozen=True)
@@ -34,26 +36,25 @@ class Run:
     coolant: np.ndarray
 
     def episode(self) -> Episode:
-        """Return the run with times in minutes."""
         minutes = np.arange(len(self.kelvin)) / 60.0
         return Episode(minutes, self.kelvin[:, None], minutes, self.coolant[:, None])
 
 
-def reactor(heat_transfer: float = 1.0) -> ControlAffineSystem:
+def reactor(heat_transfer: float = 1.0) -> plants.ControlAffineSystem:
     """Return the reactor with a jacket that has lost some of its heat transfer."""
-    clean = ReactorParameters()
-    return one_state_reactor(replace(
+    clean = plants.ReactorParameters()
+    return plants.one_state_reactor(replace(
         clean, heat_transfer_coefficient=heat_transfer * clean.heat_transfer_coefficient),
         nominal_state=[314.475])
 
 
-def driven(system: ControlAffineSystem, minutes: float, *, seed: int = 0, noise: float = NOISE,
-           coolant: tuple[float, float] = (276.0, 300.0)) -> Run:
+def driven(system: plants.ControlAffineSystem, minutes: float, *, seed: int = 0,
+           noise: float = NOISE, coolant: tuple[float, float] = (276.0, 300.0)) -> Run:
     """Drive a reactor by random steps that hold it between 305 and 327 K."""
     others = [0.0] * (system.n_x - 1), [1.0] * (system.n_x - 1)
-    design = RandomStepDesign(
+    design = plants.RandomStepDesign(
         *coolant, [*others[0], 305.0], [*others[1], 327.0], (0.5, 2.0), 1.0 / 60.0, rtol=1e-9)
-    path = random_steps(system, design, minutes, seed)
+    path = plants.random_steps(system, design, minutes, seed)
     true = path.x[:, -1]
     noisy = true + noise * np.random.default_rng(seed).standard_normal(len(true))
     return Run(disturbed(noisy), np.append(path.u[:, 0], path.u[-1, 0]))
@@ -74,19 +75,95 @@ def linear_run(count: int) -> Run:
 
 def write_bag(path: Path, run: Run) -> Path:
     """Write a run of the lock-step loop, stamped from 1 s on."""
+    return write_messages(path, [
+        (second * SECOND, *row) for second, row in enumerate(
+            zip(run.kelvin.tolist(), run.coolant.tolist(), strict=True), 1)])
+
+
+def write_messages(path: Path, rows: Iterable[tuple[int, float, float]],
+                   texts: Iterable[str] = (), prefix: str = '') -> Path:
+    """Write measurements and commands, stamped in ns and in K, and a controller's records."""
     with warnings.catch_warnings():
         # The type support imports its generator, whose parser imports a deprecated module.
         warnings.simplefilter('ignore', DeprecationWarning)
         serialize = importlib.import_module('rclpy.serialization').serialize_message
         message = importlib.import_module('sensor_msgs.msg').Temperature()
+        text = importlib.import_module('std_msgs.msg').String()
         with BagWriter(path) as writer:
             for topic in ('/temperature', '/coolant_setpoint'):
-                writer.add_topic(topic, message_definition(_TYPE))
-            for k, (temperature, coolant) in enumerate(
-                    zip(run.kelvin, run.coolant, strict=True), 1):
-                message.header.stamp.sec = k
+                writer.add_topic(topic, message_definition('sensor_msgs/msg/Temperature'))
+            for stamp_ns, temperature, coolant in rows:
+                message.header.stamp.sec = stamp_ns // SECOND
                 for offset, (topic, kelvin) in enumerate((
                         ('/temperature', temperature), ('/coolant_setpoint', coolant))):
-                    message.temperature = float(kelvin) - 273.15
-                    writer.write(topic, serialize(message), k * SECOND + offset)
+                    message.temperature = to_celsius(kelvin)
+                    writer.write(topic, serialize(message), stamp_ns + offset)
+            for number, record in enumerate(texts):
+                text.data = record
+                topic = f'{prefix}/controller_events'
+                writer.add_topic(topic, message_definition('std_msgs/msg/String'))
+                writer.write(topic, serialize(text), number)
     return path
+
+
+STEADY, COOLANT = 324.9, 300.0  # K
+MODELS = {name: load_with_digest(model_path(name))
+          for name in ('reactor_nz3', 'reactor_nz4', 'reactor_linear')}
+
+
+class Recorded:
+    """A controller with a model and a tuning that writes down what happens to it."""
+
+    def __init__(self, name: str = 'reactor_nz4', run: str = 'a', **parameters: float) -> None:
+        self.run, self.now = run, 0
+        self.parameters = ControllerParameters(model=name, **parameters)
+        self.controller = Controller(MODELS[name][0], self.parameters.settings())
+        self.state = State()
+        self.texts: list[str] = []
+        self.answers: list[tuple[int, float, float]] = []  # stamp in ns, measured and command in K
+        self.commands: list[np.ndarray] = []
+        self.snapshot(records.START)
+
+    def write(self, event: str, fields: Mapping[str, object]) -> None:
+        self.texts.append(records.Record(self.run, len(self.texts), event, fields).text())
+
+    def snapshot(self, event: str = records.SNAPSHOT) -> None:
+        name = self.parameters.model
+        self.write(event, records.snapshot(self.state, asdict(self.parameters),
+                                   {'name': name, 'digest': MODELS[name][1]}))
+
+    def do(self, event: Event) -> Outcome:
+        outcome = apply(self.controller, self.state, event)
+        self.state = outcome.state
+        if outcome.command is not None:
+            self.commands.append(outcome.command)
+        if not isinstance(event, Silence) or outcome.command is not None:
+            self.write(*records.fields_of(event, outcome))
+        return outcome
+
+    def measure(self, kelvin: float, after: float = 1.0, applied: float | None = None) -> None:
+        self.now += round(after * SECOND)
+        self.do(Measurement(self.now, np.array([kelvin]),
+                            None if applied is None else np.array([applied])))
+        self.answers.append((self.now, kelvin, float(self.commands[-1][0])))
+
+    def exchange(self, **parameters: object) -> None:
+        """Set parameters; the same model once more is read again."""
+        self.parameters = replace(self.parameters, **parameters)
+        model = self.controller.model
+        fields: dict[str, object] = {'parameters': parameters}
+        if 'model' in parameters:
+            name = self.parameters.model
+            model = load_with_digest(model_path(name))[0]
+            fields['model'] = {'name': name, 'digest': MODELS[name][1]}
+        predecessor = self.controller
+        self.controller = Controller(model, self.parameters.settings())
+        self.state = self.controller.hand_over(predecessor, self.state)
+        event = records.PARAMETERS if len(parameters) > ('model' in parameters) else records.MODEL
+        self.write(event, fields)
+
+    def save(self, path: Path, change: Callable[[list[Any]], Iterable[Any]] = list,
+             prefix: str = '') -> Path:
+        """Write a bag of measurements, commands and records, which may be changed."""
+        return write_messages(path, self.answers, [
+            record.text() for record in change(list(map(records.parse, self.texts)))], prefix)

@@ -49,7 +49,6 @@ def two_state_samples(count=600, seed=0):
 
 
 def bits(model):
-    """Return the bytes of all that was learned."""
     network = model.observables
     arrays = (model.A, model.B, network.output, model.states.scale,
               *(array for layer in network.hidden for array in layer))

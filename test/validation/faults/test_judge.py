@@ -11,7 +11,7 @@ import pytest
 
 from koopman_ros.reasons import Code
 from koopman_ros.replay.records import parse
-from support.recorded_controller import Recorded, STEADY
+from support.recorded_runs import Recorded, STEADY
 from validation.faults import interceptor
 from validation.faults.case import Case, Command, Sample, Status, Trace
 from validation.faults.interceptor import Packet

@@ -1,19 +1,64 @@
 # SPDX-FileCopyrightText: 2026 The koopman_ros Authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""Programs in the test's own process, processes that others started, and pipes that they read."""
+"""Of tests with nodes: fixtures, messages and statuses, programs and processes, pipes."""
 
+from collections.abc import Iterator
 import errno
 import os
 from pathlib import Path
 import time
 from types import ModuleType
-from typing import BinaryIO
+from typing import Any, BinaryIO
+import warnings
 
+from diagnostic_msgs.msg import DiagnosticStatus
 import pytest
+from rclpy.serialization import serialize_message
+from sensor_msgs.msg import Temperature
 
+from koopman_ros.ros.codec import stamp_message, stamp_nanoseconds
 from koopman_ros.testing import Harness, isolated_domain
-from support.messages import TIMEOUT
+from koopman_ros.units import NANOSECONDS
+
+TIMEOUT = 120.0  # s; a test that waits this long has failed, on a busy machine, too
+
+
+def temperature(celsius: float, seconds: float = 0.0) -> Temperature:
+    message = Temperature(temperature=celsius)
+    message.header.stamp = stamp_message(round(seconds * NANOSECONDS))
+    return message
+
+
+def seconds(message: Any) -> float:
+    return stamp_nanoseconds(message.header.stamp) / NANOSECONDS
+
+
+def value(status: DiagnosticStatus, key: str) -> str:
+    return next(item.value for item in status.values if item.key == key)
+
+
+@pytest.fixture(scope='session', autouse=True)
+def type_support() -> None:
+    """Load the type support once; its parser imports a module that Python deprecated."""
+    with warnings.catch_warnings():
+        warnings.simplefilter('ignore', DeprecationWarning)
+        serialize_message(Temperature())
+
+
+@pytest.fixture
+def ros(tmp_path: Path) -> Iterator[Harness]:
+    """Yield a node in a domain of its own, which starts processes and talks to them."""
+    with Harness(tmp_path) as bench:
+        yield bench
+
+
+@pytest.fixture(scope='module')
+def shared_ros(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Harness]:
+    """Yield the same for tests that use one process after each other."""
+    folder = tmp_path_factory.mktemp('shared')
+    with Harness(folder) as bench:
+        yield bench
 
 
 def run_here(program: ModuleType, *arguments: str, **parameters: object) -> int:
@@ -38,7 +83,6 @@ def _stat(pid: int) -> list[str]:
 
 
 def children(pid: int) -> list[int]:
-    """Return the processes that a process has started."""
     return [int(path.name) for path in Path('/proc').glob('[0-9]*')
             if _stat(int(path.name))[1:2] == [str(pid)]]
 
@@ -49,7 +93,6 @@ def ended(pid: int) -> bool:
 
 
 def wait_until_ended(pid: int) -> None:
-    """Wait for that."""
     deadline = time.monotonic() + TIMEOUT
     while not ended(pid):
         assert time.monotonic() < deadline
