@@ -97,11 +97,9 @@ def identify(plant: Plant, episodes: Sequence[Episode], *, degrees: Sequence[int
     held out for good.
 
     :param plant: names, units, and B where it is known.
-    :param episodes: what was recorded.
     :param degrees: of f that are tried, rising, the first one 1.
     :param methods: by name; those that go by a rough B come after one that learns it.
     :param seed: of the split.
-    :param watch: sees the progress and can end it.
     :raises ValueError: when the episodes are too short, or nothing fits.
     :raises Stopped: when `watch` asked for it.
     """
@@ -125,8 +123,8 @@ def identify(plant: Plant, episodes: Sequence[Episode], *, degrees: Sequence[int
     for number, degree in enumerate(degrees):
         monitor = progress(number, f'drift of degree {degree}')
         monitor()
-        found = _estimates(fit, box, degree, known, methods)
-        rated = [(model, _score(model, chooser, method)) for method, model in found]
+        rated = [(model, _score(model, chooser, method))
+                 for method, model in _estimates(fit, box, degree, known, methods)]
         model, score = min(rated, key=lambda pair: pair[1].cost, default=(None, None))
         if model is None or score is None:
             continue

@@ -76,18 +76,8 @@ class Growth:
 
     def start(self, data: ScaledSamples, n_z: int, parent: Grown | None, seed: int,
               monitor: Monitor | None = None) -> Grown:
-        """
-        Extend a lift to `n_z` coordinates and minimise.
-
-        :param data: the samples.
-        :param n_z: as given by :meth:`rounds`.
-        :param parent: the lift of the round before, None in the first round.
-        :param seed: seed of the random hidden units.
-        :param monitor: progress, and the way to end early.
-        """
-        if parent is None:
-            parent = self._root(data)
-        layout, theta = self._extended(data, n_z, parent, seed)
+        """Extend the lift of the round before, None in the first one, to `n_z` coordinates."""
+        layout, theta = self._extended(data, n_z, parent or self._root(data), seed)
         run = partial(minimise, max_iterations=self.max_iterations, tolerance=self.tolerance,
                       monitor=monitor)
         problem = Problem(layout, data, ResidualWeights(self.whitening,
@@ -203,11 +193,7 @@ def _decoder_start(z: Tensor, x: Tensor, units: int, generator: torch.Generator
 
 
 def _least_spanned_product(grown: Grown, x: Tensor, f: Tensor) -> Tensor:
-    """
-    Return the product of slow eigenfunctions that the lift spans least.
-
-    Of which (N,) the component orthogonal to the present coordinates, with unit variance.
-    """
+    """Return what the lift spans least of products of slow eigenfunctions (N,), of variance 1."""
     if grown.layout.n_z == 0:
         values, vectors = torch.linalg.eig(least_squares(x, f))
         z = x

@@ -101,7 +101,6 @@ def minimise(residuals: Residuals, theta: Tensor, *, max_iterations: int,
     method does not depend on the units of single parameters (More, 1978). An interrupt from the
     keyboard ends it like the monitor does.
 
-    :param residuals: adds the residuals at given parameters to normal equations.
     :param theta: (p,) start, float64.
     :param max_iterations: limit on steps tried.
     :param tolerance: relative decrease over `patience` accepted steps taken as convergence.

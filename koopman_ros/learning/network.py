@@ -164,8 +164,6 @@ class Pass:
     With a = W h + b, s = sigma'(a), the rate of a layer's output is s (W h'), and everything
     below follows by the chain rule; verified against automatic differentiation.
 
-    :param layout: sizes.
-    :param parameters: the lift's parameters.
     :param x: (N, n_x) scaled states.
     :param f: (N, n_x) rate of change of the states.
     """
@@ -179,8 +177,7 @@ class Pass:
             through = rate @ W.T
             next_value, slope, curvature = activation(torch.addmm(b, value, W.T))
             next_zero, zero_slope, _ = activation(b + W @ zero)
-            self.layers.append(Layer(W, value, rate, slope, curvature * through, zero,
-                                       zero_slope))
+            self.layers.append(Layer(W, value, rate, slope, curvature * through, zero, zero_slope))
             value, rate, zero = next_value, slope * through, next_zero
         # (N, h): the last layer above its value at 0, and its rate
         self.features = value - zero if parameters.hidden else x[:, :0]

@@ -18,11 +18,7 @@ _LINE_PERIOD = 5.0  # s between plain lines
 
 
 class TrainingProgress:
-    """
-    Show the starts of a training; give it to :func:`koopman_ros.learning.train`.
-
-    :param label: what is trained.
-    """
+    """Show the starts of a training; give it to :func:`koopman_ros.learning.train`."""
 
     def __init__(self, label: str) -> None:
         self._label = label

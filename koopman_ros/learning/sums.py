@@ -25,11 +25,8 @@ from koopman_ros.learning.network import Layout, Parameters, Pass
 
 class ProductSums:
     """
-    The sums of a lift of any depth.
+    The sums of a lift of any depth over N samples in all.
 
-    :param layout: sizes.
-    :param parameters: the lift's parameters.
-    :param N: number of samples in all.
     :param whitening: whether the derivatives of E[z z'] are wanted; otherwise they stay 0.
     """
 

@@ -100,15 +100,11 @@ def train(plant: Plant, samples: Samples, recipe: Recipe, *, seed: int = 0, star
 
     :param plant: names, units, nominal point, and B where it is known.
     :param samples: at least three episodes.
-    :param recipe: what to learn and how.
-    :param seed: the starts' seeds are drawn from it.
-    :param starts: number of starts in each round.
+    :param starts: number of starts in each round; their seeds are drawn from `seed`.
     :param split_seed: seed of the split into training, validation and test episodes.
-    :param watch: sees the progress and can end the training.
     :param refuse: whether a lift that is no better than the linear model is refused.
     :param device: where the residuals are evaluated, as torch names it.
-    :param threads: torch's threads for each start; the sums keep their order, and so the model
-        its bits, for a given number.
+    :param threads: torch's threads for each start, for a number of which the bits are the same.
     :raises NoUsefulLift: when no start gives a lift that can be judged, or none that beats the
         linear model on validation episodes.
     :raises ValueError: on too few episodes, held-out episodes that hardly move, or a recipe that
@@ -240,12 +236,7 @@ class _Tracker:
 
 @dataclass(frozen=True)
 class _Assembly:
-    """
-    Conversion of samples to the scaled problem, and of its solution to a model.
-
-    Time is scaled, too: rates of order one put the residuals of the dynamics beside the others
-    whatever the plant's time unit.
-    """
+    """Conversion of samples to the scaled problem, and of its solution to a model."""
 
     plant: Plant
     box: Box
@@ -256,7 +247,8 @@ class _Assembly:
 
     @cached_property
     def pace(self) -> float:
-        """Root mean square of the scaled rates, in 1/time unit."""
+        """Root mean square of the scaled rates, by which time is scaled, in 1/time unit."""
+        # rates of order one put the residuals of the dynamics beside the others
         _, rate, _ = deviations(self.box, self.samples)
         return float(np.sqrt(np.mean(rate ** 2))) or 1.0
 
@@ -268,20 +260,15 @@ class _Assembly:
 
     def model(self, grown: Grown) -> LiftedModel:
         parts = grown.layout.split(grown.theta.cpu())
+        B = np.zeros((grown.layout.n_x, 0)) if parts.B is None else self.pace * parts.B.numpy()
         if self.plant.B is not None:
             B = self.box.input_matrix(self.plant.B)
-        elif parts.B is not None:
-            B = self.pace * parts.B.numpy()
-        else:
-            B = np.zeros((grown.layout.n_x, 0))
         observables = NetworkObservables(
             tuple((W.numpy(), b.numpy()) for W, b in parts.hidden), parts.V.numpy(),
             grown.layout.identity, grown.layout.activation)
-        return LiftedModel(
-            observables, self.pace * parts.A.numpy(), B, self.box.states,
-            self.box.inputs, self.box.time_unit,
-            Provenance(self.plant.name, self.seed, self.digest, {}, __version__),
-            self.training_states)
+        origin = Provenance(self.plant.name, self.seed, self.digest, {}, __version__)
+        return LiftedModel(observables, self.pace * parts.A.numpy(), B, self.box.states,
+                           self.box.inputs, self.box.time_unit, origin, self.training_states)
 
 
 def _run_starts(recipe: Recipe, data: ScaledSamples, n_z: int, parent: Grown | None, seed: int,

@@ -131,10 +131,9 @@ def roll_out(model: LiftedModel, x0: Array, inputs: Array, sample_period: float 
 
 def rollout_rmse(model: LiftedModel, samples: Samples) -> Array | None:
     """
-    Predict every episode from its first state and compare.
+    Predict every episode from its first state; return the root mean square error (n_x,), in units.
 
-    :return: (n_x,) root mean square error in state units, infinite when a prediction diverges,
-        None when the samples have no times.
+    It is infinite when a prediction diverges, None when the samples have no times.
     """
     if samples.time is None:
         return None

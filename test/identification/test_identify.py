@@ -11,14 +11,7 @@ import tracemalloc
 import numpy as np
 import pytest
 
-from koopman_ros.identification import (
-    box_of,
-    identify,
-    longest_step,
-    Segments,
-    Stopped,
-    weak_form,
-)
+from koopman_ros.identification import box_of, identify, longest_step, Segments, Stopped, weak_form
 from koopman_ros.identification.output_error import _Problem
 from koopman_ros.learning.levenberg_marquardt import normal_equations
 from koopman_ros.plant_data import cut, Episode
@@ -29,7 +22,7 @@ NOISE = 0.02
 
 @pytest.fixture(scope='module')
 def noisy():
-    return CUBIC.excited(900, 0.1, noise=NOISE)
+    return CUBIC.excited(600, 0.1, noise=NOISE)
 
 
 @pytest.fixture(scope='module')
@@ -41,8 +34,8 @@ def test_takes_output_error_and_the_right_degree(found):
     assert found.method.startswith('output error from ')
     assert found.drift.degree == 3
     assert found.linear.degree == 1
-    # 720 samples with noise of 2 % of the range: see the bound in test_regressed_estimates
-    assert CUBIC.misfit(found.drift) < 5.0 * np.sqrt(5.0) * NOISE / np.sqrt(720.0)
+    # 480 samples with noise of 2 % of the range: see the bound in test_estimates
+    assert CUBIC.misfit(found.drift) < 5.0 * np.sqrt(5.0) * NOISE / np.sqrt(480.0)
     assert found.drift.input_matrix == pytest.approx(CUBIC.B, rel=5e-3)
     assert found.noise == pytest.approx([NOISE], rel=0.1)
 
@@ -57,10 +50,10 @@ def test_scores_say_what_was_tried(found):
     cubic = [score.rmse[0] for score in found.scores if score.degree == 3]
     linear = [score.rmse[0] for score in found.scores if score.degree == 1]
     # the noise is in each, and in the cubic ones nothing else
-    assert max(cubic) < 1.2 * NOISE < 2.0 * NOISE < min(linear)
+    assert max(cubic) < 1.2 * NOISE < 1.5 * NOISE < min(linear)
 
 
-def test_stretches_are_fitted_to_or_held_out(noisy, found):
+def test_segments_are_fitted_to_or_held_out(noisy, found):
     assert len(found.held_out) == 3
     pieces = sorted([*found.fitted, *found.held_out], key=lambda part: part.time[0])
     assert [p.time[0] for p in pieces] == [noisy.time[0], *(p.time[-1] for p in pieces[:-1])]
@@ -70,12 +63,7 @@ def test_stretches_are_fitted_to_or_held_out(noisy, found):
     assert np.concatenate([p.x for p in found.fitted]).max() == found.drift.box.states.upper
 
 
-def test_split_follows_the_seed(noisy, found):
-    other = identify(CUBIC.plant, [noisy], degrees=(1,), methods=methods(20), seed=1)
-    assert [p.time[0] for p in other.held_out] != [p.time[0] for p in found.held_out]
-
-
-def test_held_out_stretches_change_nothing(noisy, found):
+def test_held_out_segments_change_nothing(noisy, found):
     """An estimate that had seen them would move with them; all else is bit-identical."""
     start, end = found.held_out[0].time[[5, -5]]
     inside = ((noisy.time > start) & (noisy.time < end))[:, None]
@@ -88,11 +76,12 @@ def test_held_out_stretches_change_nothing(noisy, found):
     assert [score.cost for score in again.scores] == [score.cost for score in found.scores]
 
 
-def test_known_input_matrix_is_kept(noisy):
-    known = identify(replace(CUBIC.plant, B=CUBIC.B), [noisy.part(0, 300)], degrees=(1, 3),
-                     methods=methods(20))
+def test_known_input_matrix_is_kept_and_the_split_follows_the_seed(noisy, found):
+    known = identify(replace(CUBIC.plant, B=CUBIC.B), [noisy], degrees=(1, 2), methods=methods(20),
+                     seed=2)
     assert known.drift.input_matrix == pytest.approx(CUBIC.B, rel=1e-12)
     assert known.linear.input_matrix == pytest.approx(CUBIC.B, rel=1e-12)
+    assert [p.time[0] for p in known.held_out] != [p.time[0] for p in found.held_out]
 
 
 def test_two_states_two_inputs_and_records_of_different_length():
@@ -143,18 +132,11 @@ def test_method_of_another_module_is_a_candidate(noisy, tmp_path, monkeypatch):
         'weak form, 10 samples', 'total variation', 'another'}
 
 
-# Watching.
-
-
 def test_progress_and_stop(noisy):
     seen = []
-
-    def watch(done, total, text):
-        seen.append((done, total, text))
-        return False
-
     record = noisy.part(0, 160)
-    identify(CUBIC.plant, [record], degrees=(1, 3), methods=methods(10), watch=watch)
+    identify(CUBIC.plant, [record], degrees=(1, 3), methods=methods(10),
+             watch=lambda *step: bool(seen.append(step)))
     assert list(dict.fromkeys(seen)) == [
         (0, 3, 'drift of degree 1'), (1, 3, 'drift of degree 3'),
         (2, 3, 'drift of degree 3 on all episodes')]
@@ -163,19 +145,12 @@ def test_progress_and_stop(noisy):
 
     # at the beginning of any step, and in the midst of one
     for stop in (1, 2, len(seen)):
-        calls = 0
-
-        def end(*_, stop=stop):
-            nonlocal calls
-            calls += 1
-            return calls == stop
-
+        again = []
         with pytest.raises(Stopped):
-            identify(CUBIC.plant, [record], degrees=(1, 3), methods=methods(10), watch=end)
-        assert calls == stop
-
-
-# What cannot be learned from.
+            identify(CUBIC.plant, [record], degrees=(1, 3), methods=methods(10),
+                     watch=lambda *step, again=again, stop=stop: (
+                         again.append(step) or len(again) == stop))
+        assert again == seen[:stop]
 
 
 def changed(record, **values):
@@ -195,7 +170,7 @@ def test_degenerate_records(records, words):
         identify(CUBIC.plant, records)
 
 
-def test_extremes_in_every_stretch():
+def test_extremes_in_every_segment():
     parts = cut([PAIR.excited(160, 0.1)], 20)[:8]
     for i, part in enumerate(parts):
         x, u = np.zeros_like(part.x), np.zeros_like(part.u)
@@ -204,15 +179,6 @@ def test_extremes_in_every_stretch():
         parts[i] = replace(part, x=x, u=u)
     with pytest.raises(ValueError, match=r'all but 0 of 8 segments hold .* record longer'):
         identify(PAIR.plant, [*parts, parts[0].part(0, 5)] + [parts[0].part(0, 9)] * 2)
-
-
-def test_state_that_is_noise_alone_is_told_apart_from_nothing():
-    rng = np.random.default_rng(0)
-    record = CUBIC.excited(200, 0.1)
-    noise = Episode(record.time, rng.standard_normal((200, 1)), record.input_time, record.u)
-    found = identify(CUBIC.plant, [noise], degrees=(1, 3), methods=methods(10))
-    # no drift predicts it better than its own mean
-    assert min(score.rmse[0] for score in found.scores) > 0.8
 
 
 def test_linear_model_that_diverges_does_not_stand_in_the_way(noisy, monkeypatch):

@@ -1,16 +1,21 @@
 # SPDX-FileCopyrightText: 2026 The koopman_ros Authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""The baselines against exact models, numpy's least squares and the linearisation."""
+"""EDMD and linearisation against exact models; Algorithm 1's start, schedule and two criteria."""
 
 from dataclasses import replace
 
 import numpy as np
 import pytest
+from scipy.stats import kstest
+import torch
 
 from koopman_ros.control import projected, run_closed_loop, steady_state_target, Weights
-from koopman_ros.learning import Edmd, evaluate, fit, Linearisation
-from koopman_ros.lifting import Box, linearised_model
+from koopman_ros.learning import Algorithm1, Edmd, evaluate, fit, Linearisation
+from koopman_ros.learning.levenberg_marquardt import MinimumStatus, normal_equations
+from koopman_ros.learning.network import Layout
+from koopman_ros.learning.residuals import Problem, ResidualWeights, ScaledSamples
+from koopman_ros.lifting import Box
 from koopman_ros.plant_data import Plant, Samples
 from support.small_plants import BENT, bent_samples, TWO_STATE, two_state_samples
 
@@ -79,67 +84,37 @@ def test_a_drift_of_monomials_is_found_exactly(degree, B):
                                rtol=0, atol=1e-10)
 
 
-def test_a_linear_plant_is_fitted_exactly():
-    samples = bent_samples()
-    linear = replace(samples, dxdt=-(samples.x - 3.0) + 2.0 * (samples.u - 0.5))
-    for degree in (1, 3):
-        assert fit(Edmd(degree).learn(BENT, linear), linear.x, linear.dxdt, linear.u).rw < 1e-20
-
-
-@pytest.mark.parametrize('learned', [True, False])
-def test_degree_one_is_linear_regression(learned):
+def test_degree_one_is_linear_regression():
     samples = two_state_samples()
-    model = Edmd(1).learn(replace(TWO_STATE, B=None) if learned else TWO_STATE, samples)
-    if learned:
-        both = np.linalg.lstsq(np.hstack([samples.x, samples.u]), samples.dxdt)[0].T
-        A, B = both[:, :2], both[:, 2:]
-    else:
-        B = TWO_STATE.B
-        A = np.linalg.lstsq(samples.x, samples.dxdt - samples.u @ B.T)[0].T
-    scale = model.states.scale
-    np.testing.assert_allclose(model.A * scale[:, None] / scale, A, rtol=0, atol=1e-13)
-    np.testing.assert_allclose(model.B * scale[:, None] / model.inputs.scale, B,
-                               rtol=0, atol=1e-13)
-
-
-def test_scaling_may_be_given():
-    samples = bent_samples()
-    scaling = Box.of(BENT, bent_samples(seed=1).x, bent_samples(seed=1).u)
-    for baseline in (Edmd(2), Linearisation(np.array([[-1.0]]))):
-        model = baseline.learn(BENT, samples, scaling)
-        assert model.states is scaling.states
-        assert model.inputs is scaling.inputs
-
-
-def test_where_a_baseline_comes_from():
-    samples = bent_samples()
-    for baseline in (Edmd(2), Linearisation(np.array([[-1.0]]))):
-        origin = baseline.learn(BENT, samples).provenance
-        assert (origin.plant, origin.seed, origin.data_digest) == (
-            'bent', None, samples.digest())
+    model = Edmd(1).learn(replace(TWO_STATE, B=None), samples)
+    both = np.linalg.lstsq(np.hstack([samples.x, samples.u]), samples.dxdt)[0].T
+    units = np.concatenate([model.states.scale, model.inputs.scale])
+    np.testing.assert_allclose(np.hstack([model.A, model.B]) * model.states.scale[:, None] / units,
+                               both, rtol=0, atol=1e-13)
 
 
 def test_linearisation():
     samples, jacobian = two_state_samples(), np.array([[-0.1, 0.0], [0.0, 1.0]])
     model = Linearisation(jacobian).learn(TWO_STATE, samples)
-    expected = linearised_model(jacobian, TWO_STATE.B, model.states, model.inputs, 's',
-                                model.provenance)
-    np.testing.assert_array_equal(model.A, expected.A)
-    np.testing.assert_array_equal(model.B, expected.B)
-    scaling = Box.of(TWO_STATE, samples.x, samples.u)
-    np.testing.assert_array_equal(model.states.scale, scaling.states.scale)
-
-
-def test_linearisation_needs_b():
+    scale = model.states.scale
+    np.testing.assert_allclose(model.A * scale[:, None] / scale, jacobian, rtol=0, atol=1e-15)
+    np.testing.assert_allclose(model.B * scale[:, None] / model.inputs.scale, TWO_STATE.B,
+                               rtol=0, atol=1e-15)
+    np.testing.assert_array_equal(scale, Box.of(TWO_STATE, samples.x, samples.u).states.scale)
     with pytest.raises(ValueError, match='a linearisation needs the B of the plant'):
-        Linearisation(np.array([[-1.0]])).learn(replace(BENT, B=None), bent_samples())
+        Linearisation(jacobian).learn(replace(TWO_STATE, B=None), samples)
 
 
 @pytest.mark.parametrize('baseline', [Edmd(1), Edmd(3), Linearisation(np.array([[-1.0]]))],
                          ids=str)
 def test_a_baseline_controls_and_is_judged_like_a_lift(baseline):
     samples = bent_samples()
-    model = baseline.learn(BENT, samples)
+    model, box = baseline.learn(BENT, samples), Box.of(BENT, 2.0 * samples.x, samples.u)
+    origin = model.provenance
+    assert (origin.plant, origin.seed, origin.data_digest) == ('bent', None, samples.digest())
+    given = baseline.learn(BENT, samples, box)
+    assert given.states is box.states
+    assert given.inputs is box.inputs
     figures = evaluate(model, bent_samples(seed=1))
     assert figures.fit.rx < 0.1
     assert figures.eigenvalues.shape == (model.n_z,)
@@ -152,3 +127,102 @@ def test_a_baseline_controls_and_is_judged_like_a_lift(baseline):
     assert loop.failure == ''
     assert np.isfinite(loop.cost)
     assert abs(loop.states[-1, 0] - 3.0) < 1e-3
+
+
+# Algorithm 1.
+
+SMALL = {'n_z': 2, 'hidden': (3,), 'decoder': 3, 'max_iterations': 5}
+
+
+@pytest.fixture(scope='module')
+def data():
+    samples = bent_samples(2)
+    x, u = samples.x - 3.0, samples.u - 0.5
+    return ScaledSamples(torch.from_numpy(x), torch.from_numpy(samples.dxdt - 2.0 * u))
+
+
+@pytest.mark.parametrize(('change', 'message'), [
+    ({'gamma': 1.0}, 'gamma must be above 1, got 1.0'),
+    ({'lambda_initial': 0.0}, 'lambda_initial must be above 0, got 0.0'),
+    *(({name: 0}, 'sizes and limits must be at least 1')
+      for name in ('n_z', 'decoder', 'max_rounds', 'max_iterations')),
+    ({'hidden': (4, 0)}, 'sizes and limits must be at least 1'),
+    ({'hidden': ()}, 'hidden must name the units of at least one layer'),
+    ({'activation': 'relu'}, "must be one of tanh, sigmoid, sine, softplus, got 'relu'"),
+])
+def test_a_recipe_without_sense(change, message):
+    with pytest.raises(ValueError, match=message):
+        Algorithm1(**{**SMALL, **change})
+
+
+def test_there_is_one_round_of_starts():
+    assert Algorithm1(5).rounds(3) == (5,)
+    assert Algorithm1(3).rounds(3) == (3,)
+    assert Algorithm1(4, identity=True).rounds(3) == (4,)
+    for n_z, identity in ((2, False), (3, True)):
+        with pytest.raises(ValueError, match=f'n_z = {n_z} is too small for 3 states'):
+            Algorithm1(n_z, identity=identity).rounds(3)
+
+
+def unmoved(seed):
+    """Return a start as it was drawn: where the cost is not a number, no step is taken."""
+    nothing = ScaledSamples(*(torch.full((2, 1), torch.nan).double() for _ in range(3)))
+    grown = Algorithm1(4, hidden=(40, 40), decoder=30).start(nothing, 4, None, seed)
+    assert grown.status is MinimumStatus.STALLED
+    return grown
+
+
+def test_all_parameters_start_from_the_standard_normal_distribution():
+    grown = unmoved(0)
+    assert grown.layout == Layout(1, 4, (40, 40), False, n_u=1, decoder=30)
+    parts = grown.layout.split(grown.theta)
+    for part in (grown.theta, parts.hidden[1][0], parts.V, parts.decoder[0]):
+        assert kstest(part.flatten().numpy(), 'norm').pvalue > 0.01
+    assert torch.equal(unmoved(1).theta, unmoved(1).theta)
+    assert not torch.equal(unmoved(1).theta, unmoved(2).theta)
+
+
+@pytest.mark.parametrize(('initial', 'gamma'), [(10.0, 10.0), (3.0, 2.0)])
+def test_lambda_falls_by_gamma_from_one_minimisation_to_the_next(data, initial, gamma):
+    recipe = Algorithm1(**SMALL, lambda_initial=initial, gamma=gamma, tolerance=0.0)
+    for number in range(4):
+        seen = []
+
+        def monitor(iteration, cost, number=number, seen=seen):
+            seen.append((iteration, cost))
+            return [i for i, _ in seen].count(1) == number + 1
+
+        grown = recipe.start(data, 2, None, 0, monitor)
+        assert grown.status is MinimumStatus.INTERRUPTED
+        weights = ResidualWeights(decoder=initial / gamma ** number)
+        there = normal_equations(Problem(grown.layout, data, weights).add_residuals, grown.theta,
+                                 derivatives=False)
+        assert there.cost == pytest.approx(seen[-1][1], rel=1e-13)
+
+
+@pytest.mark.parametrize(('limits', 'status', 'minimisations'), [
+    ({'tolerance': 1e9}, MinimumStatus.CONVERGED, 1),
+    ({'tolerance': 0.0, 'max_rounds': 4}, MinimumStatus.MAX_ITERATIONS, 4)])
+def test_it_ends_when_parameters_hardly_move_or_after_max_rounds(
+        data, limits, status, minimisations):
+    steps = []
+    grown = Algorithm1(**SMALL, **limits).start(
+        data, 2, None, 0, lambda iteration, cost: steps.append(iteration))
+    assert (grown.status, steps.count(1)) == (status, minimisations)
+
+
+def test_inputs_and_identity_go_into_the_layout(data):
+    with_inputs = ScaledSamples(data.x, data.f, torch.ones((len(data), 2), dtype=torch.float64))
+    recipe = Algorithm1(3, identity=True, hidden=(4, 2), activation='sine', decoder=5,
+                        max_rounds=1, max_iterations=1)
+    grown = recipe.start(with_inputs, 3, None, 0)
+    assert grown.layout == Layout(1, 3, (4, 2), True, 'sine', 2, 5)
+    assert len(grown.theta) == grown.layout.size
+
+
+def test_it_lowers_the_residual_of_the_dynamics(data):
+    recipe = Algorithm1(2, identity=True, hidden=(4,), decoder=4, max_iterations=60)
+    grown = recipe.start(data, 2, None, 0)
+    problem = Problem(grown.layout, data, ResidualWeights())
+    found = normal_equations(problem.add_residuals, grown.theta, derivatives=False)
+    assert found.cost < 0.02 * 0.5 * float(np.mean(data.f.numpy() ** 2))

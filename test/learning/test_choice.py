@@ -1,9 +1,12 @@
 # SPDX-FileCopyrightText: 2026 The koopman_ros Authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""Which start and which lift a training takes, and what it refuses."""
+"""Which start and lift a training takes and refuses, what its watch sees, what interrupts keep."""
 
 from dataclasses import replace
+import itertools
+import math
+import signal
 
 import numpy as np
 import pytest
@@ -12,15 +15,10 @@ import torch
 from koopman_ros.learning import fit, Growth, NoUsefulLift, train
 from koopman_ros.learning.levenberg_marquardt import MinimumStatus
 from koopman_ros.plant_data import split_by_episode
-from support.small_plants import (
-    BENT,
-    bent_samples,
-    SMALL,
-    TWO_STATE,
-    two_state_samples,
-    UNFORCED,
-    unforced_samples,
-)
+from support import small_plants
+from support.small_plants import BENT, bent_samples, bits, SMALL, UNFORCED, unforced_samples
+
+RECIPE = replace(SMALL, n_z=3)
 
 
 class Recorded:
@@ -28,9 +26,7 @@ class Recorded:
 
     def __init__(self, recipe):
         self.recipe, self.found = recipe, {}
-
-    def rounds(self, n_x):
-        return self.recipe.rounds(n_x)
+        self.rounds = recipe.rounds
 
     def start(self, data, n_z, parent, seed, monitor=None):
         grown = self.recipe.start(data, n_z, parent, seed, monitor)
@@ -38,8 +34,25 @@ class Recorded:
         return grown
 
 
+class Given:
+    """A recipe that has the results of its rounds already: lifts, errors, or other recipes."""
+
+    def __init__(self, *results):
+        self.results = results
+
+    def rounds(self, n_x):
+        return tuple(range(2, 2 + len(self.results)))
+
+    def start(self, data, n_z, parent, seed, monitor=None):
+        result = self.results[n_z - 2]
+        if isinstance(result, BaseException):
+            raise result
+        start = getattr(result, 'start', None)
+        return start(data, n_z, parent, seed, monitor) if start else result
+
+
 def test_the_best_start_wins_and_is_what_the_next_round_extends():
-    recorded, everything = Recorded(replace(SMALL, n_z=3)), unforced_samples()
+    recorded, everything = Recorded(RECIPE), unforced_samples()
     trained = train(UNFORCED, everything, recorded, starts=4, seed=3)
     seeds = [seed for n_z in (2, 3) for seed, _, _ in recorded.found[n_z]]
     assert len(set(seeds)) == 8
@@ -59,40 +72,20 @@ def test_the_best_start_wins_and_is_what_the_next_round_extends():
     assert score(trained.path[0]) == min(scores)
 
 
-class Given:
-    """A recipe that has its result already, or an error."""
-
-    def __init__(self, *results):
-        self.results = list(results)
-
-    def rounds(self, n_x):
-        return tuple(range(2, 2 + len(self.results)))
-
-    def start(self, data, n_z, parent, seed, monitor=None):
-        result = self.results[n_z - 2]
-        if isinstance(result, BaseException):
-            raise result
-        return result
-
-
-def test_a_degenerate_start_is_no_candidate():
-    error = torch.linalg.LinAlgError('singular')
+@pytest.mark.parametrize(('change', 'words'), [
+    (None, r'a start is degenerate \(singular\): check that all states'),
+    ({'status': MinimumStatus.STALLED}, 'no damped step lowers the cost'),
+    ({'theta': torch.full((15,), torch.nan, dtype=torch.float64)}, '')])
+def test_a_start_without_a_result_is_no_candidate(change, words):
+    given = torch.linalg.LinAlgError('singular')
+    if change:
+        recorded = Recorded(replace(SMALL, max_iterations=5))
+        train(UNFORCED, unforced_samples(), recorded, starts=1)
+        given = replace(recorded.found[2][0][2], **change)
     # a ValueError to whoever does not know it
     assert issubclass(NoUsefulLift, ValueError)
-    with pytest.raises(NoUsefulLift, match=r'no start gave a usable lift with n_z = 2: a start is '
-                                           r'degenerate \(singular\): check that all states'):
-        train(UNFORCED, unforced_samples(), Given(error), starts=2)
-
-
-@pytest.mark.parametrize('change', [
-    {'status': MinimumStatus.STALLED},
-    {'theta': torch.full((15,), torch.nan, dtype=torch.float64)}])
-def test_a_start_without_a_result_is_no_candidate(change):
-    recorded = Recorded(SMALL)
-    train(UNFORCED, unforced_samples(), recorded, starts=1)
-    grown = replace(recorded.found[2][0][2], **change)
-    with pytest.raises(NoUsefulLift, match='no start gave a usable lift with n_z = 2: '):
-        train(UNFORCED, unforced_samples(), Given(grown), starts=2)
+    with pytest.raises(NoUsefulLift, match=f'no start gave a usable lift with n_z = 2: {words}'):
+        train(UNFORCED, unforced_samples(), Given(given), starts=2)
 
 
 def test_a_linear_plant_needs_no_lift_and_gets_one_where_it_is_asked_for():
@@ -125,10 +118,105 @@ def test_what_cannot_be_trained(recipe, starts, words):
 
 def test_a_lift_that_loses_a_state_is_refused_whatever_its_rw():
     """Two free coordinates can be x1 and x1^2, whose rw is 0 and which do not hold x2."""
-    samples = two_state_samples(400)
+    plant, samples = small_plants.TWO_STATE, small_plants.two_state_samples(400)
     exact = Growth(3, identity=False, decoder=0, max_iterations=150)
     with pytest.raises(NoUsefulLift, match='does not predict the motion better than a linear'):
-        train(TWO_STATE, samples, replace(exact, n_z=2), starts=1)
+        train(plant, samples, replace(exact, n_z=2), starts=1)
     # with the states as its first coordinates the same data are enough
-    kept = train(TWO_STATE, samples, replace(exact, identity=True), starts=1)
+    kept = train(plant, samples, replace(exact, identity=True), starts=1)
     assert kept.figures.fit.rx < 1e-6
+
+
+# Watching, and interrupting.
+
+
+def watched(stop=lambda now: False, recipe=RECIPE, starts=2):
+    """Train; return the result and what the watch saw."""
+    seen = []
+
+    def watch(now):
+        seen.append(now)
+        return stop(now)
+
+    return train(UNFORCED, unforced_samples(), recipe, starts=starts, watch=watch), seen
+
+
+def test_the_watch_sees_rounds_starts_steps_and_the_best_so_far():
+    trained, seen = watched()
+    assert {now.total for now in seen} == {4}
+    steps = [now for now in seen if now.iteration]
+    for finished, here in itertools.groupby(steps, lambda now: now.finished):
+        iterations = [now.iteration for now in here]
+        assert iterations == list(range(1, len(iterations) + 1)), finished
+    assert all(now.residual > 0.0 for now in steps)
+    ends = [now for now in seen if not now.iteration]
+    assert [(now.n_z, now.finished) for now in ends] == [(2, 1), (2, 2), (3, 3), (3, 4)]
+    assert all(math.isnan(now.residual) for now in ends)
+    assert ends[1].rw <= ends[0].rw
+    assert ends[3].rw <= ends[2].rw
+    assert trained.starts == 4
+    # before the first start has finished there is none
+    assert all(math.isnan(now.rw) for now in seen[:seen.index(ends[0])])
+    between = seen[seen.index(ends[0]) + 1:seen.index(ends[1])]
+    assert {(now.n_z, now.rw) for now in between} == {(2, ends[0].rw)}
+
+
+def press_interrupt(now):
+    before = signal.signal(signal.SIGINT, signal.default_int_handler)
+    try:
+        signal.raise_signal(signal.SIGINT)
+    finally:
+        signal.signal(signal.SIGINT, before)
+
+
+@pytest.mark.parametrize('act', [lambda now: True, press_interrupt],
+                         ids=['the watch', 'the keyboard'])
+@pytest.mark.parametrize(('place', 'n_z', 'starts'), [
+    ((2, 0, 30), 2, 1), ((2, 1, 0), 2, 1), ((2, 1, 5), 2, 2), ((2, 2, 0), 2, 2),
+    ((3, 2, 39), 3, 3), ((3, 3, 0), 3, 3)], ids=str)
+def test_an_interrupt_keeps_the_best_so_far(act, place, n_z, starts):
+    def stop(now):
+        return (now.n_z, now.finished, now.iteration) == place and act(now)
+
+    trained, seen = watched(stop)
+    assert trained.model.n_z == n_z
+    assert trained.starts == starts
+    assert trained.status == MinimumStatus.INTERRUPTED.value
+    assert trained.model.provenance.metrics['rw'] < 3e-3
+    # the watch is not asked again after it has ended the training
+    last = (seen[-1].n_z, seen[-1].finished, seen[-1].iteration)
+    assert last == place or (act is press_interrupt and last[:2] <= (place[0], place[1] + 1))
+
+
+def test_an_interrupt_keeps_the_bits_of_the_starts_that_finished():
+    one = train(UNFORCED, unforced_samples(), SMALL, starts=1)
+    kept, _ = watched(lambda now: now.finished == 1, SMALL, starts=3)
+    assert bits(kept.model) == bits(one.model)
+    assert kept.model.provenance == one.model.provenance
+
+
+class Useless:
+    """A start that is cut short with a lift of no use."""
+
+    def start(self, data, n_z, parent, seed, monitor=None):
+        grown = replace(RECIPE, max_iterations=0).start(data, n_z, parent, seed)
+        spoiled = grown.theta.clone()
+        spoiled[-3:] = 5.0
+        return replace(grown, theta=spoiled, status=MinimumStatus.INTERRUPTED)
+
+
+@pytest.mark.parametrize('cut_short', [Useless(), KeyboardInterrupt()], ids=['useless', 'none'])
+def test_a_start_cut_short_does_not_displace_the_round_before(cut_short):
+    trained = train(UNFORCED, unforced_samples(), Given(SMALL, cut_short), starts=2)
+    assert [model.n_z for model in trained.path] == [trained.model.n_z] == [2]
+    assert trained.status == MinimumStatus.INTERRUPTED.value
+    assert bits(trained.model) == bits(train(UNFORCED, unforced_samples(), SMALL, starts=2).model)
+
+
+def test_an_interrupt_before_there_is_anything_of_use():
+    threads = torch.get_num_threads()
+    with pytest.raises(KeyboardInterrupt):
+        train(UNFORCED, unforced_samples(), Given(KeyboardInterrupt()), starts=3)
+    assert torch.get_num_threads() == threads
+    with pytest.raises(NoUsefulLift):
+        watched(lambda now: True, replace(SMALL, hidden_first=1, ridge=1e6))

@@ -14,10 +14,11 @@ import pytest
 from koopman_ros.bags import BagReadError
 from koopman_ros.identification import Stopped
 from koopman_ros.lifting import load, ModelFileError, save
+from koopman_ros.plant_data import Episode
 from koopman_ros.resources import model_path
 from koopman_ros.retraining import retrain, Task, write_report
 from koopman_ros.retraining import task as task_module
-from support.known_plants import methods
+from support.known_plants import box, methods
 from support.random_lifts import random_lift
 from support.recorded_runs import driven, linear_run, NOISE, reactor, write_bag
 
@@ -39,38 +40,47 @@ def few_methods():
         yield
 
 
-@pytest.fixture(scope='module')
-def short_bag(tmp_path_factory):
-    return write_bag(tmp_path_factory.mktemp('short') / 'run.mcap', driven(reactor(0.8), 5.0))
+def small(bag, output, present=SHIPPED, **others):
+    return Task((str(bag),), str(output), str(present), coordinates=2, starts=1, **others)
 
 
 @pytest.fixture(scope='module')
 def accepted(bag, tmp_path_factory):
-    """Return the retrained of a training that replaces a model, its progress, and its folder."""
+    """Return the result of a training that replaces a model, its progress, and its folder."""
     folder = tmp_path_factory.mktemp('accepted')
     (folder / 'new.safetensors').write_bytes(Path(SHIPPED).read_bytes())
     told = []
-    retrained = retrain(Task((str(bag),), str(folder / 'new.safetensors'), SHIPPED, coordinates=2,
-                           starts=1), lambda share, text: told.append((share, text)) or False)
+    retrained = retrain(small(bag, folder / 'new.safetensors'),
+                        lambda share, text: told.append((share, text)) or False)
     return retrained, told, folder
+
+
+@pytest.fixture
+def estimated(accepted, monkeypatch):
+    """Let a retraining go on from what the accepted one has estimated."""
+    monkeypatch.setattr(task_module, 'identify', lambda *_, **__: accepted[0].found)
+
+
+@pytest.fixture
+def learned(accepted, estimated, monkeypatch):
+    """Let it go on from what the accepted one has learned, too."""
+    monkeypatch.setattr(task_module, 'learn_lift', lambda *_, **__: accepted[0].trained)
 
 
 def test_accepted_lift_is_written_and_the_one_before_is_kept(accepted):
     retrained, _, folder = accepted
     assert retrained.accepted
     assert retrained.model_file == str(folder / 'new.safetensors')
-    assert sorted(path.name for path in folder.glob('*.safetensors')) == [
+    # no temporary file is left
+    assert sorted(path.name for path in folder.iterdir()) == [
         'new.previous.safetensors', 'new.safetensors']
     assert (folder / 'new.previous.safetensors').read_bytes() == Path(SHIPPED).read_bytes()
-    # no temporary file is left
-    assert not list(folder.glob('*.tmp'))
 
 
 def test_file_says_where_it_comes_from(accepted):
     retrained, _, folder = accepted
-    origin = load(folder / 'new.safetensors').provenance
-    found = retrained.found
-    assert origin.plant == load(SHIPPED).provenance.plant
+    origin, found = load(folder / 'new.safetensors').provenance, retrained.found
+    assert (origin.plant, origin.seed) == (load(SHIPPED).provenance.plant, 0)
     assert len(origin.data_digest) == 64
     assert origin.method == f'{found.method}, drift of degree {found.drift.degree}'
     assert origin.metrics['noise'] == float(found.noise[0]) == pytest.approx(NOISE, rel=0.1)
@@ -78,40 +88,31 @@ def test_file_says_where_it_comes_from(accepted):
     assert origin.metrics['coverage'] == retrained.coverage
     assert 0.2 < retrained.coverage < 1.0
     assert {'rw', 'rx', 'cond'} < set(origin.metrics)
-    assert origin.seed == 0
 
 
 def test_learned_lift_predicts_the_plant(accepted):
-    _, _, folder = accepted
-    model = load(folder / 'new.safetensors')
-    system = reactor(0.8)
+    model = load(accepted[2] / 'new.safetensors')
     # over the middle of the box, where twenty minutes tell enough
-    x = np.linspace(310.0, 322.0, 25)[:, None]
-    xi = model.states.to_deviation(x)
-    u = np.full((25, 1), 288.0)
-    rate = model.states.scale * (model.drift(xi) + model.inputs.to_deviation(u) @ model.B.T)
-    true = system.derivative(x, u)
+    x, u = np.linspace(310.0, 322.0, 25)[:, None], np.full((25, 1), 288.0)
+    rate = model.states.scale * (model.drift(model.states.to_deviation(x))
+                                 + model.inputs.to_deviation(u) @ model.B.T)
     # K/min, of rates up to 15
-    assert np.max(np.abs(rate - true)) < 0.6
+    assert np.max(np.abs(rate - reactor(0.8).derivative(x, u))) < 0.6
 
 
 def test_progress_rises_to_the_end(accepted):
-    _, told, _ = accepted
-    shares = [share for share, _ in told]
-    assert shares == sorted(shares)
+    shares, words = zip(*accepted[1], strict=True)
+    assert list(shares) == sorted(shares)
     assert (shares[0], shares[-1]) == (0.0, pytest.approx(0.99))
-    words = [text for _, text in told]
     assert words[0] == 'reading bags'
-    assert 'estimating: drift of degree 3' in words
-    assert 'learning: n_z 2, start 1 of 1' in words
-    assert words[-2:] == ['judging', 'writing']
+    assert {'estimating: drift of degree 3', 'learning: n_z 2, start 1 of 1'} < set(words)
+    assert words[-2:] == ('judging', 'writing')
 
 
 def test_refused_lift_is_kept_aside_and_has_the_same_bits(bag, accepted, tmp_path):
-    _, _, folder = accepted
-    present = folder / 'new.safetensors'
+    present = accepted[2] / 'new.safetensors'
     output = tmp_path / 'deep' / 'er' / 'new.safetensors'
-    retrained = retrain(Task((str(bag),), str(output), str(present), coordinates=2, starts=1))
+    retrained = retrain(small(bag, output, present))
     assert not retrained.accepted
     assert 'is not 10 % below that of the present lift' in retrained.reasons[0]
     # nothing replaces the output, and the same data and seed give the same file
@@ -130,30 +131,23 @@ def test_report(accepted):
     # UA is 0.8 of 2.092 1/min
     assert figures['input_gain_per_minute'] == pytest.approx(0.8 * 2.0921, rel=0.02)
     page = files[1].read_text()
-    assert '**The new lift is accepted.**' in page
-    assert '1201 of 1201 measurements used' in page
-    assert f'| the present lift | {retrained.decision.current_rmse[0]:.5f} |' in page
-    assert '![Data, drift and prediction](new.png)' in page
+    for words in ('**The new lift is accepted.**', '1201 of 1201 measurements used',
+                  f'| the present lift | {retrained.decision.current_rmse[0]:.5f} |',
+                  '![Data, drift and prediction](new.png)'):
+        assert words in page
     assert files[2].read_bytes().startswith(b'\x89PNG')
-
-
-def test_figures_that_are_infinite_stay_valid_json(accepted):
-    retrained, _, _ = accepted
     diverging = replace(retrained, decision=replace(
         retrained.decision, current_rmse=np.array([np.inf])))
     figures = json.loads(json.dumps(diverging.summary(), allow_nan=False))
     assert figures['heldout_error_of_present_lift_kelvin'] is None
 
 
-def test_refused_lift_that_diverges_is_kept_all_the_same(short_bag, tmp_path, monkeypatch):
+@pytest.mark.usefixtures('learned')
+def test_refused_lift_that_diverges_is_kept_all_the_same(bag, tmp_path, monkeypatch):
     original = task_module.decide
-
-    def decide(*arguments):
-        return replace(original(*arguments), rmse=np.array([np.inf]), reasons=('it diverges',))
-
-    monkeypatch.setattr(task_module, 'decide', decide)
-    retrained = retrain(Task((str(short_bag),), str(tmp_path / 'new.safetensors'), SHIPPED,
-                           coordinates=2, starts=1))
+    monkeypatch.setattr(task_module, 'decide', lambda *arguments: replace(
+        original(*arguments), rmse=np.array([np.inf]), reasons=('it diverges',)))
+    retrained = retrain(small(bag, tmp_path / 'new.safetensors'))
     metrics = load(retrained.model_file).provenance.metrics
     assert 'rollout_rmse' not in metrics
     assert 'noise' in metrics
@@ -172,54 +166,41 @@ def test_previous_model_is_copied_where_there_are_no_hard_links(tmp_path, monkey
         assert output.read_bytes() == content
 
 
-def test_a_linear_plant_needs_no_lift(tmp_path):
+def test_a_linear_plant_of_known_gain_needs_no_lift(tmp_path):
+    """The gain is given in 1/min whatever the time unit of the present lift, here seconds."""
     bag = write_bag(tmp_path / 'linear.mcap', linear_run(200))
-    retrained = retrain(Task((str(bag),), str(tmp_path / 'new.safetensors'), SHIPPED,
-                           coordinates=2, starts=1))
+    present, seconds = load(SHIPPED), tmp_path / 'seconds.safetensors'
+    save(replace(present, A=present.A / 60.0, B=present.B / 60.0, time_unit='s'), seconds)
+    retrained = retrain(small(bag, tmp_path / 'new.safetensors', seconds, input_gain=1.0))
     (reason,) = retrained.reasons
     assert 'does not predict the motion better than a linear model' in reason
     assert (retrained.trained, retrained.decision, retrained.model_file) == (None, None, '')
-    assert not list(tmp_path.glob('*.safetensors'))
+    assert list(tmp_path.glob('*.safetensors')) == [seconds]
+    # dT/dt = -(T - 315) / 2 + (Tc - 288), in minutes
     assert retrained.found.drift.degree == 1
-    # dT/dt = -(T - 315) / 2 + (Tc - 288)
-    assert retrained.found.drift.input_matrix == pytest.approx(np.array([[1.0]]), rel=0.02)
+    assert retrained.found.drift.input_matrix == pytest.approx(np.array([[1.0 / 60.0]]), rel=1e-12)
+    assert retrained.summary()['input_gain_per_minute'] == pytest.approx(1.0, rel=1e-12)
     files = write_report(retrained)
     assert '**The new lift is refused.**' in files[1].read_text()
     assert json.loads(files[0].read_text())['accepted'] is False
 
 
-def test_known_gain_and_a_model_in_seconds(tmp_path):
-    """The gain is given in 1/min whatever the time unit of the present lift."""
-    bag = write_bag(tmp_path / 'linear.mcap', linear_run(200))
-    present = load(SHIPPED)
-    save(replace(present, A=present.A / 60.0, B=present.B / 60.0, time_unit='s'),
-         tmp_path / 'seconds.safetensors')
-    retrained = retrain(Task((str(bag),), str(tmp_path / 'new.safetensors'),
-                           str(tmp_path / 'seconds.safetensors'), coordinates=2, starts=1,
-                           input_gain=1.0))
-    assert retrained.found.drift.input_matrix == pytest.approx(np.array([[1.0 / 60.0]]), rel=1e-12)
-    assert retrained.summary()['input_gain_per_minute'] == pytest.approx(1.0, rel=1e-12)
-
-
-@pytest.mark.parametrize('text', ['reading bags', 'estimating: drift of degree 3',
-                                  'learning: n_z 2', 'judging', 'writing'])
-def test_stops_at_any_stage_and_writes_nothing(short_bag, tmp_path, text):
-    task = Task((str(short_bag),), str(tmp_path / 'new.safetensors'), SHIPPED, coordinates=2,
-                starts=1)
+@pytest.mark.parametrize(('stage', 'done_before'), [
+    ('reading bags', 'bag'), ('estimating: drift of degree 3', 'bag'),
+    ('learning: n_z 2', 'estimated'), ('judging', 'learned'), ('writing', 'learned')])
+def test_stops_at_any_stage_and_writes_nothing(bag, tmp_path, request, stage, done_before):
+    request.getfixturevalue(done_before)
     stopped = False
 
-    def tell(_, said):
+    def tell(_, text):
         nonlocal stopped
         # whoever asked goes on asking
-        stopped = stopped or said.startswith(text)
+        stopped = stopped or text.startswith(stage)
         return stopped
 
     with pytest.raises(Stopped):
-        retrain(task, tell)
+        retrain(small(bag, tmp_path / 'new.safetensors'), tell)
     assert list(tmp_path.iterdir()) == []
-
-
-# Tasks that do not fit.
 
 
 def test_a_task_survives_json():
@@ -232,35 +213,48 @@ def test_a_task_survives_json():
 @pytest.mark.parametrize(('values', 'error', 'words'), [
     ({'model': '/nowhere/x.safetensors'}, ModelFileError, 'no model file at /nowhere/x.safetens'),
     ({'model': '/dev/zero'}, ModelFileError, '/dev/zero: it is a device, not a regular file'),
+    ({'model': 'two.safetensors'}, ValueError, r'x0 \[K\], x1 \[K\] as states and u0 \[K\] as '
+     'inputs, bags of the loop hold one of each: name a lift'),
     ({'output': 'new.bin'}, ValueError, "output = 'new.bin' must end in .safetensors"),
+    ({'output': 'file/new.safetensors'}, OSError, 'file'),
     ({'bags': ('/nowhere/run.mcap',)}, BagReadError, '/nowhere/run.mcap'),
+    ({'bags': ('short.mcap',)}, ValueError, 'no usable segment of measurements: 0 of 9 '
+     'measurements used; 9 dropped: too short'),
     ({'temperature_topic': '/other'}, BagReadError, "has no topic '/other', it has /coolant_se"),
     ({'margin': 2.0}, ValueError, 'margin = 2.0'),
 ])
-def test_what_does_not_fit_is_said_at_once(bag, tmp_path, values, error, words):
-    good = Task((str(bag),), str(tmp_path / 'new.safetensors'), SHIPPED)
-    with pytest.raises(error, match=words):
-        retrain(replace(good, **values))
-
-
-def test_folder_that_cannot_be_made_is_said_at_once(bag, tmp_path):
+def test_what_does_not_fit_is_said_at_once(bag, tmp_path, monkeypatch, values, error, words):
+    monkeypatch.chdir(tmp_path)
     (tmp_path / 'file').touch()
-    task = Task((str(bag),), str(tmp_path / 'file' / 'new.safetensors'), SHIPPED)
-    with pytest.raises(OSError, match='file'):
-        retrain(task)
-
-
-def test_present_lift_of_another_plant(bag, tmp_path):
     save(random_lift(), tmp_path / 'two.safetensors')
-    task = Task((str(bag),), str(tmp_path / 'new.safetensors'), str(tmp_path / 'two.safetensors'))
-    with pytest.raises(ValueError, match=r'x0 \[K\], x1 \[K\] as states and u0 \[K\] as inputs'
-                                         ', bags of the loop hold one of each: name a lift'):
-        retrain(task)
+    write_bag(tmp_path / 'short.mcap', linear_run(9))
+    with pytest.raises(error, match=words):
+        retrain(replace(Task((str(bag),), 'new.safetensors', SHIPPED), **values))
 
 
-def test_bag_without_a_usable_stretch(tmp_path):
-    bag = write_bag(tmp_path / 'short.mcap', linear_run(9))
-    task = Task((str(bag),), str(tmp_path / 'new.safetensors'), SHIPPED)
-    with pytest.raises(ValueError, match='no usable segment of measurements: 0 of 9 measurements '
-                                         'used; 9 dropped: too short'):
-        retrain(task)
+BOX = box([0.0], [10.0], [100.0], [200.0])
+
+
+def record(x, u):
+    times = np.arange(float(len(x)))
+    return Episode(times, np.array(x)[:, None], times, np.array(u)[:, None])
+
+
+# inputs are those that held at the samples
+HELD = Episode(np.arange(3.0), np.full((3, 1), 0.5), np.array([-1.0, 0.5]),
+               np.array([[105.0], [195.0]]))
+TWO_STATES = Episode(np.arange(2.0), np.array([[0.05, 0.95], [0.55, 0.45]]), np.zeros(1),
+                     np.array([[0.35]]))
+
+
+@pytest.mark.parametrize(('episodes', 'within', 'cells'), [
+    ([record([0.0, 0.5, 9.9, 10.0], [100.0, 105.0, 199.0, 200.0]),
+      record([0.2, 5.0], [101.0, 150.0])], BOX, [[0, 0], [5, 5], [9, 9]]),
+    # outside counts for the border
+    ([record([-3.0, 40.0], [90.0, 150.0])], BOX, [[0, 0], [9, 5]]),
+    ([HELD], BOX, [[0, 0], [0, 9]]),
+    ([TWO_STATES], box([0.0, 0.0], [1.0, 1.0], [0.0], [1.0]), [[0, 9, 3], [5, 4, 3]])])
+def test_visited_cells_and_their_share_of_all(episodes, within, cells):
+    assert task_module.visited_cells(episodes, within).tolist() == cells
+    share = len(cells) / 10.0 ** len(cells[0])
+    assert task_module.coverage(episodes, within) == pytest.approx(share)

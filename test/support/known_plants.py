@@ -89,6 +89,13 @@ class KnownPlant:
         return self.record(period * np.arange(count), period * steps, u, noise=noise,
                            seed=seed + 1000)
 
+    def irregular(self, count, changes, periods, *, seed):
+        """Return a clean record at irregular times, of inputs that change between them."""
+        rng = np.random.default_rng(seed)
+        times = np.cumsum(rng.uniform(*periods, count))
+        edges = np.concatenate(([0.0], np.sort(rng.uniform(0.0, times[-1], changes))))
+        return self.record(times, edges, rng.uniform(-1.0, 1.0, (changes + 1, self.B.shape[1])))
+
     def misfit(self, model: DriftModel, box: Box | None = None) -> float:
         """Return the largest error of a model's rates over a box, relative to their size."""
         box = box or model.box
