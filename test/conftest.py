@@ -25,7 +25,7 @@ os.environ['ROS_PYTHON_CHECK_FIELDS'] = '1'
 # What takes longest, first: where each core takes the next file, none is then idle at the end.
 LONGEST = ('test_training_node', 'test_training_benchmark', 'test_examples', 'test_plant_node',
            'test_experiment_node', 'test_demo', 'test_retrain', 'test_replay', 'test_recording',
-           'test_processes', 'test_identify', 'test_experiments', 'test_campaign', 'test_gate',
+           'test_processes', 'test_identify', 'test_experiments', 'test_campaign', 'test_training',
            'test_closed_loop', 'test_fault_campaign', 'test_player', 'test_install_tree')
 
 

@@ -26,8 +26,7 @@ from koopman_ros.identification.identify import (
     weak_forms,
 )
 from koopman_ros.identification.output_error import output_error
-from koopman_ros.identification.total_variation import noise_level, total_variation
-from koopman_ros.identification.weak_form import weak_form
+from koopman_ros.identification.regression import noise_level, total_variation, weak_form
 
 __all__ = [
     'METHODS', 'DriftModel', 'Identified', 'Method', 'Score', 'Segments', 'Stopped', 'box_of',

@@ -73,30 +73,6 @@ class DriftModel:
         return self.box.states.scale[:, None] * self.B / self.box.inputs.scale
 
 
-def regress(box: Box, degree: int, features: Array, inputs: Array, rates: Array,
-            B: Array | None) -> DriftModel:
-    """
-    Fit rates = features @ coefficients + inputs @ B' by linear least squares.
-
-    Features (K, 1 + m), inputs (K, n_u) and rates (K, n_x), or integrals of them, in deviations.
-
-    :param B: (n_x, n_u) scaled, where it is known; None to fit it.
-    :raises ValueError: when the samples do not determine the coefficients.
-    """
-    if B is not None:
-        left, right = features, rates - inputs @ B.T
-    else:
-        left, right = np.hstack([features, inputs]), rates
-    # columns of integrals differ in size with their monomial's degree
-    norms = np.linalg.norm(left, axis=0)
-    if len(left) < left.shape[1] or np.any(norms == 0.0):
-        raise ValueError(f'{len(left)} equations do not determine {left.shape[1]} coefficients: '
-                         'record more, or choose a lower degree')
-    solution = np.linalg.lstsq(left / norms, right, rcond=1e-12)[0] / norms[:, None]
-    m = features.shape[1]
-    return DriftModel(box, degree, solution[:m], solution[m:].T if B is None else B)
-
-
 @dataclass(frozen=True)
 class Segments:
     """M segments on grids of K steps, between which inputs are constant; short ones are padded."""

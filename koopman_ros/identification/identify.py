@@ -18,8 +18,7 @@ from koopman_ros.identification.drift import (
     Segments,
 )
 from koopman_ros.identification.output_error import output_error
-from koopman_ros.identification.total_variation import noise_level, total_variation
-from koopman_ros.identification.weak_form import weak_form
+from koopman_ros.identification.regression import noise_level, total_variation, weak_form
 from koopman_ros.lifting import Box
 from koopman_ros.plant_data import Array, cut, Episode, Plant
 

@@ -8,8 +8,7 @@ Imports bags, identification, learning, lifting and control; needs the `train` r
 do not import it, they start ``python -m koopman_ros.retraining``.
 """
 
-from koopman_ros.retraining.gate import decide, Decision, Thresholds
-from koopman_ros.retraining.lift import learn_lift
+from koopman_ros.retraining.lift import decide, Decision, learn_lift, Thresholds
 from koopman_ros.retraining.report import write_report
 from koopman_ros.retraining.task import retrain, Retrained, Task
 

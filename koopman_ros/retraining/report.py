@@ -13,7 +13,7 @@ from koopman_ros.identification import fitted_starts, Identified, longest_step, 
 from koopman_ros.identification.drift import Rate
 from koopman_ros.lifting import Coordinates
 from koopman_ros.reports import bullets, drawing, table, write_figures, write_page
-from koopman_ros.retraining.gate import lifted_rate
+from koopman_ros.retraining.lift import lifted_rate
 from koopman_ros.retraining.task import CELLS, Retrained, visited_cells
 from koopman_ros.units import shown, unit_label
 

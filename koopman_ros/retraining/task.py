@@ -21,14 +21,13 @@ from koopman_ros.identification import Identified, identify, Stopped
 from koopman_ros.learning import NoUsefulLift, Progress, Trained
 from koopman_ros.lifting import Box, LiftedModel, load, save
 from koopman_ros.plant_data import Episode
-from koopman_ros.retraining.gate import decide, Decision, Thresholds
-from koopman_ros.retraining.lift import learn_lift
+from koopman_ros.retraining.lift import decide, Decision, learn_lift, Thresholds
 from koopman_ros.units import NANOSECONDS
 
 CELLS = 10  # along each state and input, by which the visited share of their range is told
 
-# Shares of the whole at which estimating, learning and judging begin.
-_STAGES = {'estimate': 0.05, 'learn': 0.35, 'decide': 0.9}
+# Shares of the whole at which estimating, learning and judging begin and end.
+_STAGES = {'estimate': (0.05, 0.35), 'learn': (0.35, 0.9), 'decide': (0.9, 1.0)}
 
 # Called with the share done in [0, 1] and what is done now; True asks to stop.
 OnProgress = Callable[[float, str], bool]
@@ -192,8 +191,7 @@ def _check_signals(model: LiftedModel, path: str) -> None:
 
 
 def _at(stage: str, share: float) -> float:
-    begin = _STAGES[stage]
-    end = min((value for value in _STAGES.values() if value > begin), default=1.0)
+    begin, end = _STAGES[stage]
     return begin + share * (end - begin)
 
 

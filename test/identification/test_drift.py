@@ -14,7 +14,7 @@ from koopman_ros.identification import (
     prediction_error,
     Segments,
 )
-from koopman_ros.identification.drift import regress
+from koopman_ros.identification.regression import regress
 from koopman_ros.plant_data import cut, Episode
 from koopman_ros.plants import one_state_reactor, simulate, two_state_example
 from support.known_plants import box, CUBIC, PAIR
@@ -29,13 +29,9 @@ def model(degree=3, seed=0):
 
 
 def test_box_is_the_range_of_all_episodes():
-    episodes = [Episode(np.arange(3.0), np.array([[1.0], [5.0], [2.0]]), np.array([0.0, 1.0]),
-                        np.array([[7.0], [9.0]])),
-                Episode(np.arange(2.0), np.array([[-3.0], [0.0]]), np.array([-1.0, 0.5]),
-                        np.array([[8.0], [20.0]]))]
-    found = box_of(CUBIC.plant, episodes)
-    assert (found.states.lower, found.states.upper) == ([-3.0], [5.0])
-    assert (found.inputs.lower, found.inputs.upper) == ([7.0], [20.0])
+    found = box_of(CUBIC.plant, [
+        Episode(np.arange(2.0), np.array([x]).T, np.array([0.0, 1.0]), np.array([u]).T)
+        for x, u in (([1.0, 5.0], [7.0, 9.0]), ([-3.0, 0.0], [8.0, 20.0]))])
     assert found.states.to_deviation(np.array([-3.0, 1.0, 5.0])).tolist() == [-1.0, 0.0, 1.0]
     assert found.inputs.to_deviation(np.array([7.0, 20.0])).tolist() == [-1.0, 1.0]
 

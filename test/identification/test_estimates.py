@@ -23,7 +23,7 @@ from koopman_ros.identification import (
     weak_form,
 )
 from koopman_ros.identification.output_error import _Problem
-from koopman_ros.identification.total_variation import smoothed
+from koopman_ros.identification.regression import smoothed
 from koopman_ros.learning.levenberg_marquardt import normal_equations
 from koopman_ros.plant_data import cut, Episode
 from support.known_plants import CUBIC, PAIR
@@ -152,9 +152,6 @@ def test_start_that_diverges_and_one_segment_of_few_samples():
     assert np.max(np.abs(found.coefficients - model.coefficients)) < 1.0
 
 
-# Total variation and the weak form.
-
-
 def estimate(method, plant, records, degree, B=None, window=20):
     box = box_of(plant.plant, records)
     known = None if B is None else box.input_matrix(B)
@@ -163,12 +160,12 @@ def estimate(method, plant, records, degree, B=None, window=20):
     return total_variation(records, box, degree, known, box.input_matrix(plant.B))
 
 
-METHODS = ['weak form', 'total variation']
+either = pytest.mark.parametrize('method', ['weak form', 'total variation'])
 
 
 @pytest.mark.parametrize('known', [True, False])
 @pytest.mark.parametrize(('plant', 'degree'), [(CUBIC, 3), (PAIR, 2)])
-@pytest.mark.parametrize('method', METHODS)
+@either
 def test_recovers_the_drift(method, plant, degree, known):
     records = [plant.excited(400, 0.05), plant.excited(250, 0.05, seed=1)]
     B = plant.B if known else None
@@ -178,7 +175,7 @@ def test_recovers_the_drift(method, plant, degree, known):
     assert found.input_matrix == pytest.approx(plant.B, abs=1e-12 if known else 2e-2)
 
 
-@pytest.mark.parametrize('method', METHODS)
+@either
 def test_error_falls_with_the_square_of_the_period(method):
     misfits = [CUBIC.misfit(estimate(
         method, CUBIC, [CUBIC.excited(300 * n, 0.1 / n, hold=20 * n)], 3, window=10 * n))
@@ -199,7 +196,7 @@ def test_weak_form_integrates_the_input_exactly():
     assert found.input_matrix == pytest.approx(np.array([[1.7]]), rel=2e-3)
 
 
-@pytest.mark.parametrize('method', METHODS)
+@either
 def test_irregular_samples_with_inputs_between_them(method):
     record = PAIR.irregular(800, 100, (0.01, 0.09), seed=5)
     assert PAIR.misfit(estimate(method, PAIR, [record], 2)) < 3e-2
@@ -240,10 +237,7 @@ def test_noise_level():
                    clean.input_time, clean.u)
     # of 1500 deviations the median strays by 3 %, twice that as third differences overlap
     assert noise_level([noisy], model) == pytest.approx(sigma, rel=0.12)
-
-
-def test_noise_level_on_irregular_times():
-    rng = np.random.default_rng(1)
+    # on irregular times
     times = np.cumsum(rng.uniform(0.01, 0.03, 1500))
     record = Episode(times, np.cos(times)[:, None] + 0.02 * rng.standard_normal((1500, 1)),
                     np.array([0.0, 5.0]), np.array([[0.0], [1.0]]))

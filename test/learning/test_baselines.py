@@ -167,14 +167,15 @@ def test_there_is_one_round_of_starts():
 def unmoved(seed):
     """Return a start as it was drawn: where the cost is not a number, no step is taken."""
     nothing = ScaledSamples(*(torch.full((2, 1), torch.nan).double() for _ in range(3)))
-    grown = Algorithm1(4, hidden=(40, 40), decoder=30).start(nothing, 4, None, seed)
+    recipe = Algorithm1(4, identity=True, hidden=(40, 40), activation='sine', decoder=30)
+    grown = recipe.start(nothing, 4, None, seed)
     assert grown.status is MinimumStatus.STALLED
     return grown
 
 
 def test_all_parameters_start_from_the_standard_normal_distribution():
-    grown = unmoved(0)
-    assert grown.layout == Layout(1, 4, (40, 40), False, n_u=1, decoder=30)
+    grown = unmoved(4)
+    assert grown.layout == Layout(1, 4, (40, 40), True, 'sine', n_u=1, decoder=30)
     parts = grown.layout.split(grown.theta)
     for part in (grown.theta, parts.hidden[1][0], parts.V, parts.decoder[0]):
         assert kstest(part.flatten().numpy(), 'norm').pvalue > 0.01
@@ -209,15 +210,6 @@ def test_it_ends_when_parameters_hardly_move_or_after_max_rounds(
     grown = Algorithm1(**SMALL, **limits).start(
         data, 2, None, 0, lambda iteration, cost: steps.append(iteration))
     assert (grown.status, steps.count(1)) == (status, minimisations)
-
-
-def test_inputs_and_identity_go_into_the_layout(data):
-    with_inputs = ScaledSamples(data.x, data.f, torch.ones((len(data), 2), dtype=torch.float64))
-    recipe = Algorithm1(3, identity=True, hidden=(4, 2), activation='sine', decoder=5,
-                        max_rounds=1, max_iterations=1)
-    grown = recipe.start(with_inputs, 3, None, 0)
-    assert grown.layout == Layout(1, 3, (4, 2), True, 'sine', 2, 5)
-    assert len(grown.theta) == grown.layout.size
 
 
 def test_it_lowers_the_residual_of_the_dynamics(data):

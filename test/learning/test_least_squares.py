@@ -61,20 +61,6 @@ def test_sizes_that_do_not_fit(sizes):
         Layout(*sizes)
 
 
-@pytest.mark.parametrize('name', ACTIVATIONS)
-def test_derivatives_of_activations(name):
-    a = torch.linspace(-3.0, 3.0, 13, dtype=torch.float64)
-
-    def value(t):
-        return ACTIVATIONS[name](t)[0]
-
-    slope = torch.func.vmap(torch.func.grad(value))
-    _, first, second = ACTIVATIONS[name](a)
-    torch.testing.assert_close(first, slope(a), rtol=0, atol=1e-15)
-    torch.testing.assert_close(
-        second, torch.func.vmap(torch.func.grad(torch.func.grad(value)))(a), rtol=0, atol=1e-14)
-
-
 @every_depth
 @pytest.mark.parametrize('name', ACTIVATIONS)
 @identity_or_free
@@ -177,17 +163,13 @@ ALL_TERMS = ResidualWeights(whitening=0.5, decoder=0.2)
 def test_chunks_add_up(chunk):
     of, theta = random_problem(LAYOUT, ALL_TERMS, chunk=4096)
     whole = normal_equations(of.add_residuals, theta)
+    alone = normal_equations(of.add_residuals, theta, derivatives=False)
+    assert alone.cost == whole.cost
+    assert not alone.gradient.any()
     parts = normal_equations(replace(of, chunk=chunk).add_residuals, theta)
     assert parts.cost == pytest.approx(whole.cost, rel=1e-13)
     assert_close(parts.gradient, whole.gradient, 1e-13)
     assert_close(parts.matrix, whole.matrix, 1e-13)
-
-
-def test_cost_alone_is_the_same_cost():
-    of, theta = random_problem(LAYOUT, ALL_TERMS)
-    alone = normal_equations(of.add_residuals, theta, derivatives=False)
-    assert not alone.gradient.any()
-    assert alone.cost == normal_equations(of.add_residuals, theta).cost
 
 
 @pytest.mark.parametrize(('layout', 'weights', 'words'), [
@@ -226,9 +208,6 @@ def test_memory_does_not_grow_with_the_samples():
     assert int(result.stdout) < 32 * 1024  # KiB
 
 
-# Levenberg-Marquardt.
-
-
 def least_squares(residual):
     """Turn a residual function into what `minimise` takes."""
     def residuals(theta, equations):
@@ -245,19 +224,14 @@ def vector(*values):
     return torch.tensor(values, dtype=torch.float64)
 
 
-def linear_problem(rows=30, columns=6, seed=0):
-    generator = torch.Generator().manual_seed(seed)
-    J = torch.randn(rows, columns, generator=generator, dtype=torch.float64)
-    y = torch.randn(rows, generator=generator, dtype=torch.float64)
-    return J, y
-
-
 def rosenbrock(theta):
     return torch.stack([10.0 * (theta[1] - theta[0] ** 2), 1.0 - theta[0]])
 
 
 def test_linear_least_squares():
-    J, y = linear_problem()
+    generator = torch.Generator().manual_seed(0)
+    J, y = (torch.randn(*shape, generator=generator, dtype=torch.float64)
+            for shape in ((30, 6), (30,)))
     expected, squares = np.linalg.lstsq(J.numpy(), y.numpy(), rcond=None)[:2]
     for limit in (5, 100):
         found = minimise(least_squares(lambda theta: J @ theta - y), vector(*[3.0] * 6),
@@ -351,18 +325,3 @@ def test_an_interrupt_from_the_keyboard_keeps_the_best_so_far(derivatives_too):
     if derivatives_too:
         with pytest.raises(KeyboardInterrupt):
             minimise(residuals, start, max_iterations=10)
-
-
-@pytest.mark.parametrize('count', [1, 7])
-def test_blocks_of_residuals_add_up(count):
-    J, y = linear_problem()
-    theta = vector(*range(6))
-
-    def residuals(theta, equations):
-        for rows in (slice(0, 11), slice(11, 30)):
-            equations.add(J[rows] @ theta - y[rows], J[rows], count)
-
-    found, r = normal_equations(residuals, theta), J @ theta - y
-    assert found.cost == pytest.approx(0.5 * float(r @ r) / count, rel=1e-14)
-    torch.testing.assert_close(found.gradient, J.T @ r / count, rtol=1e-13, atol=1e-13)
-    torch.testing.assert_close(found.matrix, J.T @ J / count, rtol=1e-13, atol=1e-13)

@@ -153,9 +153,6 @@ def test_least_squares_of_full_and_of_short_rank():
         np.testing.assert_allclose(found, np.linalg.lstsq(matrix, b)[0], rtol=0, atol=1e-13)
 
 
-# Training.
-
-
 @pytest.fixture(scope='module')
 def small():
     """Train the bent plant's small lift once."""

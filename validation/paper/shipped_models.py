@@ -16,7 +16,8 @@ import sys
 import numpy as np
 
 from koopman_ros.learning import Growth, roll_out, train
-from koopman_ros.learning.progress import TrainingProgress
+from koopman_ros.learning.progress import training_progress
+from koopman_ros.learning.training import Watch
 from koopman_ros.lifting import LiftedModel, linearised_model, Provenance, save
 from koopman_ros.plants import ControlAffineSystem, one_state_reactor, random_steps
 from validation.paper.datasets import describe
@@ -27,8 +28,7 @@ STARTS = 3
 LIFTED_SIZES = (3, 4)
 
 
-def train_lifts(progress: TrainingProgress | None = None, starts: int = STARTS
-                ) -> dict[int, LiftedModel]:
+def train_lifts(progress: Watch | None = None, starts: int = STARTS) -> dict[int, LiftedModel]:
     """
     Train the shipped lifts of the one-state reactor; the larger one is grown from the smaller.
 
@@ -70,7 +70,7 @@ def main(args: list[str] | None = None) -> int:
                         help='folder for the model files (default: %(default)s)')
     output = parser.parse_args(args).output
     output.mkdir(parents=True, exist_ok=True)
-    with TrainingProgress('reactor') as progress:
+    with training_progress('reactor') as progress:
         models = train_lifts(progress)
     for n_z, model in models.items():
         save(model, output / f'reactor_nz{n_z}.safetensors')

@@ -1,21 +1,105 @@
 # SPDX-FileCopyrightText: 2026 The koopman_ros Authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""Drift from derivatives by total variation of x - integral(B u)."""
+"""Estimates of a drift by linear least squares: the weak form and total variation."""
 
 from collections.abc import Sequence
 
 import numpy as np
 from scipy.linalg import solveh_banded
 
-from koopman_ros.identification.drift import DriftModel, regress
+from koopman_ros.identification.drift import DriftModel
 from koopman_ros.lifting import Box
 from koopman_ros.plant_data import Array, Episode
 
+# Exponent of the test functions (1 - s^2)^p, which are zero at the first and at the last sample.
+_POWER = 3
+_NARROWEST = 4
+
+# Of total variation: steps towards the weight, and samples that an episode needs.
 _SWEEPS = 30
 _BISECTIONS = 14
-# Samples that an episode needs.
 _SHORTEST = 8
+
+
+def regress(box: Box, degree: int, features: Array, inputs: Array, rates: Array,
+            B: Array | None) -> DriftModel:
+    """
+    Fit rates = features @ coefficients + inputs @ B' by linear least squares.
+
+    Features (K, 1 + m), inputs (K, n_u) and rates (K, n_x), or integrals of them, in deviations.
+
+    :param B: (n_x, n_u) scaled, where it is known; None to fit it.
+    :raises ValueError: when the samples do not determine the coefficients.
+    """
+    if B is not None:
+        left, right = features, rates - inputs @ B.T
+    else:
+        left, right = np.hstack([features, inputs]), rates
+    # columns of integrals differ in size with their monomial's degree
+    norms = np.linalg.norm(left, axis=0)
+    if len(left) < left.shape[1] or np.any(norms == 0.0):
+        raise ValueError(f'{len(left)} equations do not determine {left.shape[1]} coefficients: '
+                         'record more, or choose a lower degree')
+    solution = np.linalg.lstsq(left / norms, right, rcond=1e-12)[0] / norms[:, None]
+    m = features.shape[1]
+    return DriftModel(box, degree, solution[:m], solution[m:].T if B is None else B)
+
+
+def weak_form(episodes: Sequence[Episode], box: Box, degree: int, B: Array | None,
+              window: int) -> DriftModel:
+    """
+    Fit the drift to -integral(phi' x) = integral(phi f(x)) + B integral(phi u).
+
+    phi = (1 - s^2)^3 on windows that overlap by three quarters; x enters as measured. (Weak SINDy:
+    Messenger and Bortz 2021.)
+
+    :param B: (n_x, n_u) scaled, or None to learn it.
+    :param window: samples of a window, at least 4.
+    :raises ValueError: when the window or the episodes are too short.
+    """
+    if window < _NARROWEST:
+        raise ValueError(f'a window of {window} samples is too short, at least {_NARROWEST} are '
+                         'needed')
+    n_x, n_u = episodes[0].x.shape[1], episodes[0].u.shape[1]
+    shape = DriftModel(box, degree, np.empty(0), np.empty((n_x, n_u)))
+    features, inputs, rates = [], [], []
+    for episode in episodes:
+        xi = box.states.to_deviation(episode.x)
+        P = shape.features(xi)
+        for start in range(0, len(episode) - window + 1, max(1, window // 4)):
+            rows = slice(start, start + window)
+            t = episode.time[rows]
+            middle, half = 0.5 * (t[0] + t[-1]), 0.5 * (t[-1] - t[0])
+            s = (t - middle) / half
+            phi = (1.0 - s * s) ** _POWER
+            slope = -2.0 * _POWER * s * (1.0 - s * s) ** (_POWER - 1) / half
+            weights = _trapezoid(t)
+            features.append((weights * phi) @ P[rows])
+            rates.append(-(weights * slope) @ xi[rows])
+            inputs.append(_input_integral(episode, box, middle, half))
+    if not features:
+        raise ValueError(f'no episode has {window} samples: record longer')
+    return regress(box, degree, np.array(features), np.array(inputs), np.array(rates), B)
+
+
+def _trapezoid(t: Array) -> Array:
+    """Return the weights of the trapezoidal rule."""
+    steps = np.diff(t)
+    return 0.5 * (np.append(steps, 0.0) + np.insert(steps, 0, 0.0))
+
+
+def _input_integral(episode: Episode, box: Box, middle: float, half: float) -> Array:
+    """Integrate phi times the scaled input exactly: it is constant between its changes."""
+    inside = episode.input_time[np.abs(episode.input_time - middle) < half]
+    edges = np.concatenate(([middle - half], inside, [middle + half]))
+    held = box.inputs.to_deviation(episode.inputs_at(edges[:-1]))
+    return half * np.diff(_antiderivative((edges - middle) / half)) @ held
+
+
+def _antiderivative(s: Array) -> Array:
+    """Integrate (1 - s^2)^3 from 0."""
+    return s - s ** 3 + 0.6 * s ** 5 - s ** 7 / 7.0
 
 
 def total_variation(episodes: Sequence[Episode], box: Box, degree: int, B: Array | None,

@@ -23,11 +23,10 @@ from koopman_ros.plant_data import Episode
 from koopman_ros.plants import two_state_reactor
 from koopman_ros.resources import model_path
 from koopman_ros.retraining import decide, learn_lift, Thresholds
-from koopman_ros.retraining.gate import lifted_rate
-from koopman_ros.retraining.lift import _spread, drift_samples, steady_point
+from koopman_ros.retraining.lift import _spread, drift_samples, lifted_rate, steady_point
 from support.known_plants import box, methods
 from support.random_lifts import random_lift
-from support.recorded_runs import driven, linear_run, NOISE, reactor
+from support.recorded_runs import driven, NOISE, reactor
 
 
 @pytest.fixture(scope='module')
@@ -57,12 +56,6 @@ def linear_lift(model, slope, input_matrix):
     """Return the lift N(x) = x with the names and boxes of a model."""
     return linearised_model(np.array([[slope]]), np.array([[input_matrix]]), model.states,
                             model.inputs, model.time_unit, Provenance(model.provenance.plant))
-
-
-def linear_of(drift, model):
-    """Return the linear lift of a drift at the center of a model's box."""
-    return linear_lift(model, float(drift.slope(model.states.center)[0, 0]),
-                       float(drift.input_matrix[0, 0]))
 
 
 @pytest.mark.parametrize(('unit', 'seconds'), [('s', 1.0), ('min', 60.0)])
@@ -137,13 +130,6 @@ def test_coordinates_that_have_collapsed(found, trained, shipped):
                       f'{0.99 * cond:.3g}: use fewer coordinates')
 
 
-@pytest.mark.usefixtures('no_loops')
-def test_a_linear_model_is_no_better_than_the_best_one(found, trained, shipped):
-    other = replace(trained, model=linear_of(found.linear, trained.model))
-    reasons = decide(found, other, shipped, Thresholds()).reasons
-    assert [reason for reason in reasons if 'the best linear model' in reason]
-
-
 def test_a_controller_that_destabilises_is_refused(found, trained, shipped):
     wrong = replace(trained, model=replace(trained.model, B=-trained.model.B))
     decision = decide(found, wrong, shipped, Thresholds())
@@ -180,8 +166,7 @@ def test_warns_of_a_state_that_is_not_measured(trained, shipped):
     """The reactor's concentration moves, too; its temperature alone does not tell where it is."""
     run = driven(two_state_reactor(), 20.0, coolant=(294.0, 302.0), seed=2, noise=0.03)
     found = identify(shipped.plant, [run.episode()], degrees=(1, 2), methods=methods(20))
-    lift = replace(trained, model=linear_of(found.drift, shipped))
-    decision = decide(found, lift, shipped, Thresholds())
+    decision = decide(found, trained, shipped, Thresholds())
     (warning,) = decision.warnings
     assert warning.startswith(
         f'the best drift errs by {decision.drift_rmse[0]:.3g} K in temperature, of which ')
@@ -191,14 +176,6 @@ def test_warns_of_a_state_that_is_not_measured(trained, shipped):
     assert decision.drift_rmse > 1.5 * decision.noise
     # it is judged by what it does, not by the warning
     assert warning not in decision.reasons
-
-
-@pytest.mark.usefixtures('no_loops')
-def test_does_not_warn_where_all_is_measured(trained):
-    model = load(model_path('reactor_nz3'))
-    found = identify(model.plant, [linear_run(400).episode()], degrees=(1,), methods=methods(20))
-    lift = replace(trained, model=linear_of(found.drift, model))
-    assert decide(found, lift, model, Thresholds()).warnings == ()
 
 
 # The steady point and the samples of a drift.
