@@ -10,7 +10,7 @@ Matplotlib is imported when a picture is drawn.
 from __future__ import annotations
 
 from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from importlib.metadata import PackageNotFoundError, version
 import json
@@ -45,13 +45,7 @@ class Picture:
 
 def table(head: Sequence[str], rows: Iterable[Sequence[object]], numbers: Collection[int] = ()
           ) -> str:
-    """
-    Return a table in Markdown.
-
-    :param head: titles of the columns, units in brackets.
-    :param rows: a cell a column.
-    :param numbers: columns that are flush right.
-    """
+    """Return a table in Markdown; `head` has units in brackets, `numbers` are flush right."""
     rule = ['---:' if column in numbers else '---' for column in range(len(head))]
     lines = [f'| {" | ".join(head)} |', f'|{"|".join(rule)}|']
     for row in rows:
@@ -70,13 +64,9 @@ def bullets(lines: Iterable[str]) -> str:
 def write_page(path: Path, title: str, sections: Iterable[str], packages: Sequence[str] = ()
                ) -> Path:
     """
-    Write a page in Markdown; it names the versions and the machine below its title.
+    Write a page in Markdown; its folder is made, and empty sections are left out.
 
-    :param path: the file; its folder is made.
-    :param title: of the page.
-    :param sections: paragraphs, headings, tables, pictures; empty ones are left out.
-    :param packages: whose versions matter, beside this package's.
-    :return: the file.
+    Below its title it names the machine and the versions of this package and `packages`.
     """
     parts = [f'# {title}', f'*{_headline(*packages)}*', *filter(None, map(str, sections))]
     path.parent.mkdir(parents=True, exist_ok=True)
@@ -86,11 +76,9 @@ def write_page(path: Path, title: str, sections: Iterable[str], packages: Sequen
 
 def write_figures(path: Path, figures: Mapping[str, Any]) -> Path:
     """
-    Write figures as JSON; an interrupt leaves the old file or the new one, never a part.
+    Write figures as JSON, with null for infinity and NaN; the folder is made.
 
-    :param path: the file; its folder is made.
-    :param figures: by name; infinity and NaN, which JSON does not know, become null.
-    :return: the file.
+    An interrupt leaves the old file or the new one, never a part.
     """
     text = json.dumps(_finite(figures), indent=2, allow_nan=False) + '\n'
     path.parent.mkdir(parents=True, exist_ok=True)
@@ -113,15 +101,10 @@ def _finite(value: Any) -> Any:
 def drawing(path: Path, rows: int = 1, columns: int = 1, *, size: tuple[float, float],
             grid: bool = True, **options: Any) -> Iterator[tuple[Figure, list[Axes]]]:
     """
-    Draw panels; they are written as PNG when the block ends, unless by an exception.
+    Draw panels, counted row by row; they are written as PNG when the block ends without exception.
 
-    :param path: the file; its folder is made.
-    :param rows: of panels.
-    :param columns: of panels; they are counted row by row.
-    :param size: width and height in inches.
-    :param grid: whether the panels have one.
-    :param options: of matplotlib's ``Figure.subplots``.
-    :raises ImportError: without matplotlib.
+    The folder is made. `size` is width and height in inches, `options` are those of matplotlib's
+    ``Figure.subplots``. Raises ImportError without matplotlib.
     """
     from matplotlib.figure import Figure
     # without pyplot: no window, no state that another picture could see
@@ -151,10 +134,17 @@ def legend(figure: Figure, panels: Iterable[Axes], columns: int) -> None:
 
 def machine(*packages: str) -> dict[str, Any]:
     """Return processor, system and load of this machine, and the versions of some packages."""
-    return {'processor': _processor(), 'cpu_count': os.cpu_count(),
-            'system': platform.platform(), 'python': platform.python_version(),
-            **{name: _version(name) for name in packages},
-            'load_at_start': os.getloadavg()[0]}
+    processor = platform.processor()
+    with suppress(OSError):
+        lines = Path('/proc/cpuinfo').read_text().splitlines()
+        processor = next((line.partition(':')[2].strip() for line in lines
+                          if line.startswith('model name')), processor)
+    versions: dict[str, str | None] = dict.fromkeys(packages)
+    for name in packages:
+        with suppress(PackageNotFoundError):
+            versions[name] = version(name)
+    return {'processor': processor, 'cpu_count': os.cpu_count(), 'system': platform.platform(),
+            'python': platform.python_version(), **versions, 'load_at_start': os.getloadavg()[0]}
 
 
 def _headline(*packages: str) -> str:
@@ -164,19 +154,3 @@ def _headline(*packages: str) -> str:
     return (f'koopman_ros {__version__}, Python {found["python"]}{versions}; '
             f'{found["processor"]}, {found["cpu_count"]} processors, load '
             f'{found["load_at_start"]:.1f}')
-
-
-def _processor() -> str:
-    try:
-        lines = Path('/proc/cpuinfo').read_text().splitlines()
-    except OSError:
-        return platform.processor()
-    return next((line.partition(':')[2].strip() for line in lines
-                 if line.startswith('model name')), platform.processor())
-
-
-def _version(name: str) -> str | None:
-    try:
-        return version(name)
-    except PackageNotFoundError:
-        return None

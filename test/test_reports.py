@@ -10,74 +10,51 @@ import numpy as np
 import pytest
 
 import koopman_ros
-from koopman_ros.reports import (
-    bullets,
-    draw_limits,
-    drawing,
-    legend,
-    machine,
-    Picture,
-    table,
-    write_figures,
-    write_page,
-)
-
-PNG = b'\x89PNG\r\n'
+from koopman_ros import reports
 
 
 def test_a_table_in_markdown():
-    assert table(('case', 'error [K]'), [('bias', 0.5), ('a|b', '1')], numbers=(1,)) == (
+    head = 'case', 'error [K]'
+    assert reports.table(head, [('bias', 0.5), ('a|b', '1')], numbers=(1,)) == (
         '| case | error [K] |\n|---|---:|\n| bias | 0.5 |\n| a\\|b | 1 |')
-
-
-def test_a_row_of_another_length_is_refused():
     with pytest.raises(ValueError, match='a row of 1 cells in a table of 2 columns'):
-        table(('case', 'error [K]'), [('bias',)])
+        reports.table(head, [('bias',)])
 
 
 def test_a_page_names_versions_and_machine_and_leaves_out_what_is_empty(tmp_path):
-    path = write_page(tmp_path / 'new' / 'report.md', 'Title', [
-        'First.', '', bullets([]), bullets(['one', 'two']),
-        Picture('a.png', 'Seen. In detail.')], ('numpy', 'not-installed'))
+    path = reports.write_page(tmp_path / 'new' / 'report.md', 'Title', [
+        'First.', '', reports.bullets([]), reports.bullets(['one', 'two']),
+        reports.Picture('a.png', 'Seen. In detail.')], ('numpy', 'not-installed'))
     title, about, *sections = path.read_text().split('\n\n')
     assert title == '# Title'
     assert about.startswith(f'*koopman_ros {koopman_ros.__version__}, Python ')
     assert f', numpy {np.__version__}; ' in about
     assert 'not-installed' not in about
-    assert f'{machine()["cpu_count"]} processors' in about
+    assert f'{reports.machine()["cpu_count"]} processors' in about
     assert sections == ['First.', '- one\n- two', '![Seen](a.png)', '*Seen. In detail.*\n']
 
 
 def test_figures_hold_null_for_what_json_does_not_know(tmp_path):
-    path = write_figures(tmp_path / 'new' / 'summary.json', {
+    path = reports.write_figures(tmp_path / 'new' / 'summary.json', {
         'a': math.inf, 'b': [1, math.nan, {'c': (np.float64(-math.inf), True, None)}], 'd': 'NaN'})
+    # what cannot be written leaves the old ones
+    with pytest.raises(TypeError):
+        reports.write_figures(path, {'what': object()})
     assert json.loads(path.read_text()) == {
         'a': None, 'b': [1, None, {'c': [None, True, None]}], 'd': 'NaN'}
     assert [file.name for file in path.parent.iterdir()] == ['summary.json']
 
 
-def test_figures_that_cannot_be_written_leave_the_old_ones(tmp_path):
-    path = write_figures(tmp_path / 'summary.json', {'kept': 1})
-    with pytest.raises(TypeError):
-        write_figures(path, {'what': object()})
-    assert json.loads(path.read_text()) == {'kept': 1}
-
-
-def test_a_drawing_is_written_when_its_block_ends(tmp_path):
+def test_a_drawing_is_written_when_its_block_ends_without_an_error(tmp_path):
     path = tmp_path / 'new' / 'picture.png'
-    with drawing(path, 2, 1, size=(3.0, 3.0), sharex=True) as (figure, (upper, lower)):
+    with pytest.raises(ZeroDivisionError), reports.drawing(path, size=(2.0, 2.0)):
+        raise ZeroDivisionError
+    with reports.drawing(path, 2, 1, size=(3.0, 3.0), sharex=True) as (figure, (upper, lower)):
         upper.plot([0.0, 1.0], label='seen')
         lower.plot([0.0, 1.0], label='seen')
-        draw_limits(lower, (0.2, 0.8), 'limits')
-        legend(figure, (upper, lower), 2)
+        reports.draw_limits(lower, (0.2, 0.8), 'limits')
+        reports.legend(figure, (upper, lower), 2)
         assert not path.exists()
-    assert path.read_bytes().startswith(PNG)
+    assert path.read_bytes().startswith(b'\x89PNG\r\n')
     (shown,) = figure.legends
     assert [text.get_text() for text in shown.get_texts()] == ['seen', 'limits']
-
-
-def test_a_drawing_that_fails_writes_nothing(tmp_path):
-    path = tmp_path / 'picture.png'
-    with pytest.raises(ZeroDivisionError), drawing(path, size=(2.0, 2.0)):
-        raise ZeroDivisionError
-    assert not path.exists()

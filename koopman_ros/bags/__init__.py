@@ -1,12 +1,7 @@
 # SPDX-FileCopyrightText: 2026 The koopman_ros Authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""
-Bags in the layout of rosbag2 (MCAP), written and read without ROS.
-
-Imports nothing of ROS and nothing that learns: a recording can be opened on any machine with
-Python.
-"""
+"""Bags in the layout of rosbag2 (MCAP), written and read on any machine with Python, no ROS."""
 
 from koopman_ros.bags.episodes import Account, loop_episodes
 from koopman_ros.bags.limits import BagReadError

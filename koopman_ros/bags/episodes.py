@@ -39,8 +39,7 @@ class Account:
 
     measurements: int = 0  #: number of measurements read
     used: int = 0  #: number of those in an episode
-    #: number of messages left out, by reason
-    dropped: Counter[str] = field(default_factory=Counter)
+    dropped: Counter[str] = field(default_factory=Counter)  #: messages left out, by reason
     notes: list[str] = field(default_factory=list)  #: what else is worth knowing, in words
 
     def lines(self) -> list[str]:
@@ -66,7 +65,6 @@ def loop_episodes(bags: Sequence[str | os.PathLike[str]], measured: str, applied
     the first command, since nobody knows what acted on them. A bag that was not closed or is
     damaged is read as far as it goes. The account tells all that.
 
-    :param bags: files or folders.
     :param measured: topic of the measured signal, of a type in :data:`SCALARS`.
     :param applied: topic of the input that acts, likewise.
     :param units: of both in the episodes.
@@ -87,8 +85,9 @@ def loop_episodes(bags: Sequence[str | os.PathLike[str]], measured: str, applied
         scales = [_scale(bag, topic, by_topic[topic].unit, unit)
                   for topic, unit in zip((measured, applied), units, strict=True)]
         for run in _runs(bag, content, measured, by_topic, account, cuts):
-            episodes += [_scaled(episode, *scales)
-                         for episode in _episodes(run, account, cuts, input_delay_ns)]
+            episodes += [
+                Episode(found.time, scales[0](found.x), found.input_time, scales[1](found.u))
+                for found in _episodes(run, account, cuts, input_delay_ns)]
         account.notes += cuts.notes(os.fspath(bag))
     account.used = sum(map(len, episodes))
     account.dropped = +account.dropped
@@ -131,10 +130,6 @@ def _scale(bag: str | os.PathLike[str], topic: str, unit: str, wanted: str) -> C
     except ValueError as error:
         raise BagReadError(f'topic {topic!r} of bag {os.fspath(bag)!r}: {error}; name another '
                            'topic') from error
-
-
-def _scaled(episode: Episode, x: Conversion, u: Conversion) -> Episode:
-    return Episode(episode.time, x(episode.x), episode.input_time, u(episode.u))
 
 
 def _runs(bag: str | os.PathLike[str], content: BagSummary, measured: str,

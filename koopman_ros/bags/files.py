@@ -13,15 +13,7 @@ from mcap.well_known import MessageEncoding, Profile, SchemaEncoding
 from mcap.writer import CompressionType, Writer
 
 from koopman_ros import __version__
-from koopman_ros.bags.metadata import (
-    bag_metadata,
-    dump_metadata,
-    dump_offered_qos,
-    RecordedFile,
-    RecordedTopic,
-    sync_folder,
-    write_metadata_file,
-)
+from koopman_ros.bags import metadata
 from koopman_ros.bags.schemas import MessageDefinition
 
 COMPRESSIONS = {
@@ -52,7 +44,7 @@ class FileSequence:
         self._compression = compression
         self._max_bytes = max_bytes
         self._max_ns = max_ns
-        self._completed: list[RecordedFile] = []
+        self._completed: list[metadata.RecordedFile] = []
         # A thread of its own: to write a large file through to the disk takes longer than
         # messages can wait.
         self._background = ThreadPoolExecutor(max_workers=1, thread_name_prefix='bag')
@@ -67,7 +59,7 @@ class FileSequence:
             self.current.size_bytes >= self._max_bytes
             or log_time_ns - range_ns[0] >= self._max_ns)
 
-    def split(self, topics: Iterable[RecordedTopic]) -> None:
+    def split(self, topics: Iterable[metadata.RecordedTopic]) -> None:
         """Go on in the next file, and complete the present one meanwhile."""
         if self._completion is not None:
             # long done, unless files fill up faster than the disk takes them
@@ -114,9 +106,9 @@ class FileSequence:
         file.close()
         self._completed.append(file.content)
         if self._is_directory:
-            write_metadata_file(self._path, bag_metadata(self._completed))
+            metadata.write_metadata_file(self._path, metadata.bag_metadata(self._completed))
         else:
-            sync_folder(self._path.parent)
+            metadata.sync_folder(self._path.parent)
 
 
 class McapFile:
@@ -129,7 +121,7 @@ class McapFile:
 
     def __init__(self, path: Path, compression: str) -> None:
         self.path = path
-        self.content = RecordedFile(path.name)
+        self.content = metadata.RecordedFile(path.name)
         self.open_chunk_bytes = 0
         self._whole_chunk_bytes = 0
         # After a failed write, mcap's writer and the file no longer agree.
@@ -158,15 +150,15 @@ class McapFile:
         """The size so far, with the open chunk as if it was not compressed."""
         return self._whole_chunk_bytes + self.open_chunk_bytes
 
-    def add_topic(self, topic: RecordedTopic) -> None:
+    def add_topic(self, topic: metadata.RecordedTopic) -> None:
         """Announce a topic, once; its own count of messages begins at 0."""
         definition = topic.definition
         self._channels[topic.name] = self._mcap.register_channel(
             topic=topic.name, message_encoding=MessageEncoding.CDR,
             schema_id=self._schema_id(definition),
-            metadata={'offered_qos_profiles': dump_offered_qos(topic.offered_qos),
+            metadata={'offered_qos_profiles': metadata.dump_offered_qos(topic.offered_qos),
                       'topic_type_hash': definition.type_hash})
-        self.content.topics[topic.name] = RecordedTopic(
+        self.content.topics[topic.name] = metadata.RecordedTopic(
             topic.name, definition, topic.offered_qos)
 
     def write(self, topic: str, data: bytes, log_time_ns: int, publish_time_ns: int, sequence: int
@@ -191,12 +183,7 @@ class McapFile:
         self.open_chunk_bytes = 0
 
     def close(self) -> None:
-        """
-        Complete the file and wait until it is on the disk.
-
-        Raises OSError where that fails; the file then ends with its last whole chunk, as that of
-        a recorder that was killed.
-        """
+        """Complete the file on the disk; after an OSError it ends with its last whole chunk."""
         try:
             self.flush()
             self._add_metadata_record()
@@ -219,5 +206,5 @@ class McapFile:
         return self._schemas[name]
 
     def _add_metadata_record(self) -> None:
-        text = dump_metadata(bag_metadata([self.content]))
+        text = metadata.dump_metadata(metadata.bag_metadata([self.content]))
         self._mcap.add_metadata('rosbag2', {'serialized_metadata': text})

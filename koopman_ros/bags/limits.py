@@ -74,11 +74,9 @@ def reason(error: BaseException) -> str:
 
 class Budget:
     """
-    What one reading of a file may still come to.
+    What one reading of a file of this size on the disk may still come to.
 
     Every method raises BagTooLargeError beyond it, which `recover` does not pass over.
-
-    :param file: that is read; its size on the disk counts.
     """
 
     def __init__(self, file: Path) -> None:

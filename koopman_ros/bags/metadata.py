@@ -4,7 +4,7 @@
 """The bag metadata of rosbag2 (version 9, Jazzy), and the offers that it stores with a topic."""
 
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass, field, replace
+from dataclasses import asdict, dataclass, field
 import os
 from pathlib import Path
 from typing import Any
@@ -24,20 +24,14 @@ INFINITE_NS = 2**63 - 1
 _VERSION = 9
 # What rosbag2 writes as the start of a bag without messages [ns].
 _NO_START_NS = 2**63 - 1
-# The spellings of rmw/qos_string_conversions.h; 'unknown' is what discovery reports when a
-# publisher's history is not on the wire.
+# The spellings of rmw/qos_string_conversions.h in the order of rmw/types.h, by whose numbers
+# rosbag2 wrote them before version 9 (Jazzy); 'unknown' is what discovery reports when a
+# publisher's history is not on the wire. None is a word that is no longer in use.
 _POLICIES = {
-    'history': ('keep_last', 'keep_all', 'system_default', 'unknown'),
-    'reliability': ('reliable', 'best_effort', 'system_default', 'best_available', 'unknown'),
-    'durability': ('volatile', 'transient_local', 'system_default', 'best_available', 'unknown'),
-    'liveliness': ('automatic', 'manual_by_topic', 'system_default', 'best_available', 'unknown'),
-}
-# Before version 9 (Jazzy) rosbag2 wrote the numbers of rmw/types.h.
-_NUMBERED = {
     'history': ('system_default', 'keep_last', 'keep_all', 'unknown'),
     'reliability': ('system_default', 'reliable', 'best_effort', 'unknown', 'best_available'),
     'durability': ('system_default', 'transient_local', 'volatile', 'unknown', 'best_available'),
-    'liveliness': ('system_default', 'automatic', 'manual_by_node', 'manual_by_topic', 'unknown',
+    'liveliness': ('system_default', 'automatic', None, 'manual_by_topic', 'unknown',
                    'best_available'),
 }
 _DURATIONS = ('deadline_ns', 'lifespan_ns', 'liveliness_lease_duration_ns')
@@ -65,7 +59,8 @@ class QosProfile:
     avoid_ros_namespace_conventions: bool = False
 
     def __post_init__(self) -> None:
-        for policy, words in _POLICIES.items():
+        for policy, numbered in _POLICIES.items():
+            words = [word for word in numbered if word is not None]
             if getattr(self, policy) not in words:
                 raise ValueError(
                     f'{policy} {getattr(self, policy)!r} is not one of {", ".join(words)}')
@@ -90,11 +85,7 @@ def dump_offered_qos(profiles: Sequence[QosProfile]) -> str:
 
 
 def parse_offered_qos(text: str) -> tuple[QosProfile, ...]:
-    """
-    Return the profiles of the channel metadata `offered_qos_profiles`, of any version of rosbag2.
-
-    What cannot be read gives no profile: a bag is of use without.
-    """
+    """Return the profiles of a channel, of any version of rosbag2, or none if unreadable."""
     try:
         return tuple(_profile(mapping) for mapping in load_plain(text) or ())
     except (yaml.YAMLError, ValueError, KeyError, TypeError, IndexError, AttributeError,
@@ -104,7 +95,7 @@ def parse_offered_qos(text: str) -> tuple[QosProfile, ...]:
 
 def _profile(mapping: Mapping[str, Any]) -> QosProfile:
     values: dict[str, Any] = {
-        policy: _NUMBERED[policy][word] if isinstance(word := mapping[policy], int) else word
+        policy: _POLICIES[policy][word] if isinstance(word := mapping[policy], int) else word
         for policy in _POLICIES}
     values |= {name: _nanoseconds(mapping[name.removesuffix('_ns')]) for name in _DURATIONS}
     return QosProfile(
@@ -153,21 +144,29 @@ class RecordedFile:
 
 
 def bag_metadata(files: Sequence[RecordedFile]) -> dict[str, Any]:
-    """
-    Return the metadata of a bag of these MCAP files, keys in the order of rosbag2.
-
-    Chunk compression is MCAP's own affair: rosbag2's compression fields stay empty.
-    """
+    """Return the metadata of a bag of these MCAP files, keys in the order of rosbag2."""
     ranges = [file.time_range_ns for file in files if file.time_range_ns is not None]
     whole = (min(first for first, _ in ranges), max(last for _, last in ranges)
              ) if ranges else None
+    topics = {name: topic for file in files for name, topic in file.topics.items()}
     return {
         'version': _VERSION,
         'storage_identifier': 'mcap',
         'duration': _duration(whole),
         'starting_time': _starting_time(whole),
         'message_count': sum(file.message_count for file in files),
-        'topics_with_message_count': [_topic_mapping(topic) for topic in _all_topics(files)],
+        'topics_with_message_count': [{
+            'topic_metadata': {
+                'name': name,
+                'type': topic.definition.type_name,
+                'serialization_format': 'cdr',
+                'offered_qos_profiles': qos_mappings(topic.offered_qos),
+                'type_description_hash': topic.definition.type_hash,
+            },
+            'message_count': sum(
+                file.topics[name].message_count for file in files if name in file.topics),
+        } for name, topic in topics.items()],
+        # that of chunks is MCAP's own affair
         'compression_format': '',
         'compression_mode': '',
         'relative_file_paths': [file.name for file in files],
@@ -208,32 +207,9 @@ def sync_folder(folder: Path) -> None:
         os.close(descriptor)
 
 
-def _all_topics(files: Sequence[RecordedFile]) -> list[RecordedTopic]:
-    """Return the topics of all files in the order they appeared, with their messages summed."""
-    topics: dict[str, RecordedTopic] = {}
-    for file in files:
-        for name, topic in file.topics.items():
-            before = topics[name].message_count if name in topics else 0
-            topics[name] = replace(topic, message_count=before + topic.message_count)
-    return list(topics.values())
-
-
 def _starting_time(range_ns: tuple[int, int] | None) -> dict[str, int]:
     return {'nanoseconds_since_epoch': _NO_START_NS if range_ns is None else range_ns[0]}
 
 
 def _duration(range_ns: tuple[int, int] | None) -> dict[str, int]:
     return {'nanoseconds': 0 if range_ns is None else range_ns[1] - range_ns[0]}
-
-
-def _topic_mapping(topic: RecordedTopic) -> dict[str, Any]:
-    return {
-        'topic_metadata': {
-            'name': topic.name,
-            'type': topic.definition.type_name,
-            'serialization_format': 'cdr',
-            'offered_qos_profiles': qos_mappings(topic.offered_qos),
-            'type_description_hash': topic.definition.type_hash,
-        },
-        'message_count': topic.message_count,
-    }

@@ -18,15 +18,7 @@ from mcap.records import Channel
 from mcap.well_known import SchemaEncoding
 from mcap_ros2.decoder import DecoderFactory
 
-from koopman_ros.bags.limits import (
-    BagReadError,
-    BagTooLargeError,
-    Budget,
-    enough_memory,
-    fields_only,
-    opened,
-    reason,
-)
+from koopman_ros.bags import limits
 from koopman_ros.bags.metadata import parse_offered_qos, QosProfile
 from koopman_ros.bags.records import stored_messages, StoredMessage, summary_section
 from koopman_ros.bags.storage import locate
@@ -91,9 +83,8 @@ def read_messages(path: str | os.PathLike[str], topics: Collection[str] | None =
     """
     if isinstance(topics, str):
         raise TypeError(f'topics must be a collection of names: pass [{topics!r}]')
-    bag = locate(path, recover=recover)
-    wanted = None if topics is None else frozenset(topics)
-    return _decoded(bag.files, wanted, recover)
+    files, _ = locate(path, recover=recover)
+    return _decoded(files, None if topics is None else frozenset(topics), recover)
 
 
 def in_log_order(messages: Iterable[BagMessage]) -> Iterator[BagMessage]:
@@ -125,8 +116,8 @@ def summary(path: str | os.PathLike[str]) -> BagSummary:
     `path` is a .mcap file or a bag directory. Raises BagReadError for a bag that is missing,
     empty or not MCAP.
     """
-    bag = locate(path, recover=True)
-    parts = [_indexed_summary(file) or _scanned_summary(file) for file in bag.files]
+    files, complete = locate(path, recover=True)
+    parts = [_indexed_summary(file) or _scanned_summary(file) for file in files]
     counts: Counter[str] = Counter()
     types: dict[str, str] = {}
     offered_qos: dict[str, tuple[QosProfile, ...]] = {}
@@ -138,7 +129,7 @@ def summary(path: str | os.PathLike[str]) -> BagSummary:
     ends = [part.end_ns for part in parts if part.end_ns is not None]
     return BagSummary(dict(counts), types, offered_qos, min(starts, default=None),
                       max(ends, default=None),
-                      complete=bag.complete and all(part.complete for part in parts))
+                      complete=complete and all(part.complete for part in parts))
 
 
 def _decoded(files: tuple[Path, ...], topics: frozenset[str] | None, recover: bool
@@ -147,7 +138,7 @@ def _decoded(files: tuple[Path, ...], topics: frozenset[str] | None, recover: bo
         # One set of decoders for each file: they are kept by schema id, and ids are a file's own.
         decoders = _Decoders(file)
         for stored in stored_messages(file, recover=recover, topics=topics):
-            with enough_memory(file):
+            with limits.enough_memory(file):
                 message = decoders.decode(stored)
             yield message
 
@@ -186,9 +177,10 @@ class _Decoders:
             raise
         except Exception as error:
             # The decoder walks over foreign bytes and fails in as many ways as they can be wrong.
-            raise BagReadError(
+            raise limits.BagReadError(
                 f'{str(self._file)!r}: the message on {channel.topic!r} at {message.log_time} ns '
-                f'does not decode ({reason(error)}): read the other topics by name') from error
+                f'does not decode ({limits.reason(error)}): read the other topics by name'
+            ) from error
         return BagMessage(channel.topic, stored.schema.name if stored.schema else '',
                           message.log_time, message.publish_time, fields, message.data)
 
@@ -196,7 +188,7 @@ class _Decoders:
         schema, encoding = stored.schema, stored.channel.message_encoding
         try:
             if schema is not None and schema.encoding == SchemaEncoding.ROS2:
-                schema = replace(schema, data=fields_only(schema.data))
+                schema = replace(schema, data=limits.fields_only(schema.data))
             # the definition parser prints what it also raises
             with contextlib.redirect_stderr(io.StringIO()):
                 decoder = self._factory.decoder_for(encoding, schema)
@@ -204,12 +196,12 @@ class _Decoders:
             raise
         except Exception as error:
             # Another recorder's schema text meets the definition parser here.
-            raise BagReadError(
+            raise limits.BagReadError(
                 f'{str(self._file)!r}: the definition stored for {stored.channel.topic!r} does '
-                f'not parse ({reason(error)}): read the other topics by name') from error
+                f'not parse ({limits.reason(error)}): read the other topics by name') from error
         if decoder is None:
             schema_encoding = schema.encoding if schema else 'no schema'
-            raise BagReadError(
+            raise limits.BagReadError(
                 f'{str(self._file)!r}: topic {stored.channel.topic!r} is encoded as {encoding!r} '
                 f'with {schema_encoding!r}, only cdr with ros2msg is decoded here: read the other '
                 'topics by name')
@@ -218,8 +210,8 @@ class _Decoders:
 
 def _indexed_summary(file: Path) -> BagSummary | None:
     """Return the summary from the statistics at the end of a closed file, None without them."""
-    with enough_memory(file), opened(file) as stream:
-        content = summary_section(stream, Budget(file))
+    with limits.enough_memory(file), limits.opened(file) as stream:
+        content = summary_section(stream, limits.Budget(file))
     if content is None or content.statistics is None:
         return None
     statistics = content.statistics
@@ -251,9 +243,9 @@ def _scanned_summary(file: Path) -> BagSummary:
             channels[topic] = stored.channel
             start_ns = time_ns if start_ns is None else min(start_ns, time_ns)
             end_ns = time_ns if end_ns is None else max(end_ns, time_ns)
-    except BagTooLargeError:
+    except limits.BagTooLargeError:
         raise
-    except BagReadError:
+    except limits.BagReadError:
         complete = False
     return BagSummary(
         dict(counts), types, _offered_qos(channels.values()), start_ns, end_ns, complete)

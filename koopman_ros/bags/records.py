@@ -1,11 +1,7 @@
 # SPDX-FileCopyrightText: 2026 The koopman_ros Authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""
-The records of one MCAP file, whole or left behind by a recorder that was killed.
-
-Records are read in file order, which is the order in which the recorder received them.
-"""
+"""The records of one MCAP file, whole or of a killed recorder, in the order of the file."""
 
 from collections.abc import Callable, Collection, Iterator
 from dataclasses import dataclass, replace
@@ -23,17 +19,7 @@ from mcap.records import Channel, Chunk, DataEnd, McapRecord, Message, Schema, S
 from mcap.summary import Summary
 import zstandard
 
-from koopman_ros.bags.limits import (
-    BagReadError,
-    BagTooLargeError,
-    Budget,
-    chunk_content,
-    DamageError,
-    enough_memory,
-    message_content,
-    opened,
-    reason,
-)
+from koopman_ros.bags import limits
 
 # The MCAP specification's magic, and the opcode and length that begin every record.
 MAGIC = b'\x89MCAP0\r\n'
@@ -74,8 +60,8 @@ def stored_messages(file: Path, *, recover: bool, topics: Collection[str] | None
     messages than the file says it holds. Raises BagTooLargeError for what grows beyond reason.
     """
     count = 0
-    budget = Budget(file)
-    with enough_memory(file), opened(file) as stream:
+    budget = limits.Budget(file)
+    with limits.enough_memory(file), limits.opened(file) as stream:
         try:
             for stored in _messages(stream, budget):
                 count += 1
@@ -84,17 +70,18 @@ def stored_messages(file: Path, *, recover: bool, topics: Collection[str] | None
                 yield _as_sent(stored, budget) if with_data else stored
             if not recover:
                 _check_count(count, summary_section(stream, budget))
-        except DamageError as damage:
+        except limits.DamageError as damage:
             if not recover:
-                raise BagReadError(f'{str(file)!r} is damaged ({damage}): {RECOVER}') from damage
+                raise limits.BagReadError(
+                    f'{str(file)!r} is damaged ({damage}): {RECOVER}') from damage
 
 
-def summary_section(stream: BinaryIO, budget: Budget) -> Summary | None:
+def summary_section(stream: BinaryIO, budget: limits.Budget) -> Summary | None:
     """Return the index at the end of a file, None where it is missing or damaged."""
     try:
         start = _start_of_summary(stream)
         return None if start is None else _summary(stream, start, budget)
-    except (MemoryError, BagTooLargeError):
+    except (MemoryError, limits.BagTooLargeError):
         raise
     except Exception:
         # A cut or damaged end fails in any way, a seek out of range among them.
@@ -104,11 +91,12 @@ def summary_section(stream: BinaryIO, budget: Budget) -> Summary | None:
 def is_closed(file: Path) -> bool:
     """Tell a closed file from a cut one; raise BagReadError for one that is not MCAP at all."""
     if file.stat().st_size == 0:
-        raise BagReadError(f'{str(file)!r} is empty: its recorder wrote nothing, record again')
-    with opened(file) as stream:
+        raise limits.BagReadError(
+            f'{str(file)!r} is empty: its recorder wrote nothing, record again')
+    with limits.opened(file) as stream:
         head = stream.read(len(MAGIC))
         if not MAGIC.startswith(head):
-            raise BagReadError(
+            raise limits.BagReadError(
                 f'{str(file)!r} is not an MCAP file (it starts with {head!r}): '
                 'pass a .mcap file or a bag directory')
         size = stream.seek(0, os.SEEK_END)
@@ -145,7 +133,7 @@ class _WholeReads:
         return self._stream.seek(offset)
 
 
-def _messages(stream: BinaryIO, budget: Budget) -> Iterator[StoredMessage]:
+def _messages(stream: BinaryIO, budget: limits.Budget) -> Iterator[StoredMessage]:
     schemas: dict[int, Schema] = {}
     channels: dict[int, Channel] = {}
     for record in _records(stream, budget):
@@ -156,11 +144,11 @@ def _messages(stream: BinaryIO, budget: Budget) -> Iterator[StoredMessage]:
         elif isinstance(record, Message):
             channel = channels.get(record.channel_id)
             if channel is None:
-                raise DamageError(f'no channel {record.channel_id} for a message')
+                raise limits.DamageError(f'no channel {record.channel_id} for a message')
             yield StoredMessage(schemas.get(channel.schema_id), channel, record)
 
 
-def _records(stream: BinaryIO, budget: Budget) -> Iterator[McapRecord]:
+def _records(stream: BinaryIO, budget: limits.Budget) -> Iterator[McapRecord]:
     """Yield the records of the data section; raise DamageError where they stop making sense."""
     try:
         for record in _data_section(stream, budget):
@@ -168,28 +156,28 @@ def _records(stream: BinaryIO, budget: Budget) -> Iterator[McapRecord]:
                 yield from _chunk_records(record, budget)
             else:
                 yield record
-    except (OSError, MemoryError, DamageError, BagTooLargeError):
+    except (OSError, MemoryError, limits.DamageError, limits.BagTooLargeError):
         raise
     except Exception as error:
         # Arbitrary bytes meet the parser here, and the decompressor behind it: the kinds of
         # exception are theirs, the meaning is the same.
-        raise DamageError(reason(error)) from error
+        raise limits.DamageError(limits.reason(error)) from error
 
 
-def _data_section(stream: BinaryIO, budget: Budget) -> Iterator[McapRecord]:
+def _data_section(stream: BinaryIO, budget: limits.Budget) -> Iterator[McapRecord]:
     """Yield the records between the two ends of a file, chunks whole."""
     data = ReadDataStream(cast('BinaryIO', _WholeReads(stream)), calculate_crc=True)
     if data.read(len(MAGIC)) != MAGIC:
-        raise DamageError('no MCAP file')
+        raise limits.DamageError('no MCAP file')
     while True:
         checksum = data.checksum()
         opcode, length = _HEAD.unpack(data.read(_HEAD.size))
         if opcode == Opcode.FOOTER:
-            raise DamageError('the end of the data is missing')
+            raise limits.DamageError('the end of the data is missing')
         if opcode == Opcode.DATA_END:
             expected = DataEnd.read(data).data_section_crc
             if expected and expected != checksum:
-                raise DamageError('wrong checksum of the data')
+                raise limits.DamageError('wrong checksum of the data')
             return
         _count(opcode, length, budget)
         if opcode in _READ or opcode == Opcode.CHUNK:
@@ -199,9 +187,9 @@ def _data_section(stream: BinaryIO, budget: Budget) -> Iterator[McapRecord]:
                 length -= len(data.read(min(length, _PIECE_BYTES)))
 
 
-def _chunk_records(chunk: Chunk, budget: Budget) -> Iterator[McapRecord]:
+def _chunk_records(chunk: Chunk, budget: limits.Budget) -> Iterator[McapRecord]:
     """Yield the schemas, channels and messages of a chunk, once it is whole."""
-    content = chunk_content(chunk, budget)
+    content = limits.chunk_content(chunk, budget)
     for opcode, start, end in _spans(content):
         _count(opcode, end - start, budget)
     for opcode, start, end in _spans(content):
@@ -220,10 +208,10 @@ def _spans(content: bytes) -> Iterator[tuple[int, int, int]]:
         yield opcode, start, end
 
 
-def _count(opcode: int, length: int, budget: Budget) -> None:
+def _count(opcode: int, length: int, budget: limits.Budget) -> None:
     if opcode == 0:
         # what a disk that was full leaves, and reserved for nothing
-        raise DamageError('zeros in place of a record')
+        raise limits.DamageError('zeros in place of a record')
     budget.take_record(length if opcode in (Opcode.SCHEMA, Opcode.CHANNEL) else 0)
 
 
@@ -236,12 +224,12 @@ def _parsed(opcode: int, body: bytes) -> McapRecord:
     return _READ_BY[opcode](ReadDataStream(cast('BinaryIO', _WholeReads(io.BytesIO(body)))))
 
 
-def _as_sent(stored: StoredMessage, budget: Budget) -> StoredMessage:
+def _as_sent(stored: StoredMessage, budget: limits.Budget) -> StoredMessage:
     """Return a message as it was sent, also where rosbag2 compressed it by itself."""
     try:
-        data = message_content(stored.message.data)
+        data = limits.message_content(stored.message.data)
     except zstandard.ZstdError as error:
-        raise DamageError(reason(error)) from error
+        raise limits.DamageError(limits.reason(error)) from error
     budget.take_message(len(data))
     if data is stored.message.data:
         return stored
@@ -251,7 +239,8 @@ def _as_sent(stored: StoredMessage, budget: Budget) -> StoredMessage:
 def _check_count(count: int, summary: Summary | None) -> None:
     statistics = None if summary is None else summary.statistics
     if statistics is not None and statistics.message_count != count:
-        raise DamageError(f'{count} of the {statistics.message_count} messages it should hold')
+        raise limits.DamageError(
+            f'{count} of the {statistics.message_count} messages it should hold')
 
 
 def _start_of_summary(stream: BinaryIO) -> int | None:
@@ -266,7 +255,7 @@ def _start_of_summary(stream: BinaryIO) -> int | None:
     return start or None
 
 
-def _summary(stream: BinaryIO, start: int, budget: Budget) -> Summary | None:
+def _summary(stream: BinaryIO, start: int, budget: limits.Budget) -> Summary | None:
     """Return the schemas, channels and statistics between a place and the footer."""
     found = Summary()
     whole = _WholeReads(stream)

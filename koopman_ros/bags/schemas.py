@@ -1,12 +1,7 @@
 # SPDX-FileCopyrightText: 2026 The koopman_ros Authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""
-Message definitions of the installed ROS 2 packages, as text and as type hash.
-
-The definition text is what rosbag2 stores with each topic, so that a recording can be decoded
-on a machine that has never heard of the message type.
-"""
+"""Message definitions of the installed ROS 2 packages, which rosbag2 stores with each topic."""
 
 from dataclasses import dataclass
 import json
@@ -87,7 +82,7 @@ def _type_hash(package: str, name: str) -> str:
             return entry['hash_string']
     raise MessageDefinitionError(
         f'the type description {name}.json of {package} carries no hash of {type_name}: '
-        f'reinstall the package ros-jazzy-{_dashed(package)}')
+        f'reinstall the package {_debian(package)}')
 
 
 def _split(type_name: str) -> tuple[str, str]:
@@ -111,9 +106,9 @@ def _read(package: str, file_name: str, type_name: str) -> str:
             return file.read_bytes().decode('utf-8')
     places = ', '.join(map(str, searched))
     raise MessageDefinitionError(
-        f'message type {type_name!r}: no {file_name} in {places}; install '
-        f'ros-jazzy-{_dashed(package)}, or source the workspace that provides {package}')
+        f'message type {type_name!r}: no {file_name} in {places}; install {_debian(package)}, or '
+        f'source the workspace that provides {package}')
 
 
-def _dashed(package: str) -> str:
-    return package.replace('_', '-')
+def _debian(package: str) -> str:
+    return f'ros-jazzy-{package.replace("_", "-")}'

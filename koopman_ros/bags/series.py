@@ -68,11 +68,7 @@ def read_series(path: str | os.PathLike[str], topic: str, *, recover: bool = Fal
 
 def carriers(path: str | os.PathLike[str], content: BagSummary, topics: Collection[str]
              ) -> dict[str, Scalar]:
-    """
-    Return how the messages of some topics carry their numbers.
-
-    Raises BagReadError for a topic that the bag lacks, or of a type that carries no number.
-    """
+    """Return how topics carry their numbers; raise BagReadError for one that has none."""
     for topic in topics:
         if topic not in content.types:
             known = ', '.join(sorted(content.types)) or 'no topic at all'

@@ -1,13 +1,8 @@
 # SPDX-FileCopyrightText: 2026 The koopman_ros Authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""
-The files of a bag, in reading order, of a recorder that ended well or was killed.
+"""The files of a bag, in reading order, of a recorder that ended well or was killed."""
 
-A file counts as closed when it ends with MCAP's footer and magic.
-"""
-
-from dataclasses import dataclass
 import os
 from pathlib import Path
 import re
@@ -26,17 +21,9 @@ _NUMBERED = re.compile(r'(.*)_\d+\.mcap(?:\.zstd)?')
 _MAX_METADATA_BYTES = 2**24
 
 
-@dataclass(frozen=True)
-class BagFiles:
-    """The MCAP files of a bag in reading order, and whether every one of them was closed."""
-
-    files: tuple[Path, ...]
-    complete: bool
-
-
-def locate(path: str | os.PathLike[str], *, recover: bool) -> BagFiles:
+def locate(path: str | os.PathLike[str], *, recover: bool) -> tuple[tuple[Path, ...], bool]:
     """
-    Return the files of a bag: a bare MCAP file, or a directory in the order of its metadata.
+    Return the files of a bag in the order of its metadata, and whether its recorder closed them.
 
     With `recover`, files without a footer pass, and a directory without metadata.yaml, or with
     numbered files that it does not list, is read in the order of the file numbers. Raises
@@ -56,14 +43,20 @@ def locate(path: str | os.PathLike[str], *, recover: bool) -> BagFiles:
                     f'{str(left_behind[0])!r} is not listed in {METADATA_FILE}, its recorder did '
                     f'not close it: {RECOVER}')
             files, listed = tuple(sorted({*files, *left_behind}, key=_natural_order)), False
+    elif recover:
+        files, listed = tuple(_files_with_content(path)), False
+        if not files:
+            raise BagReadError(f'{str(path)!r} has neither {METADATA_FILE} nor MCAP files with '
+                               'content: check the path')
     else:
-        files, listed = _numbered_files(path, recover), False
+        raise BagReadError(f'{str(path)!r} has no {METADATA_FILE}, its recorder did not close it '
+                           f'or it is no bag: {RECOVER}')
     closed = [is_closed(file) for file in files]
     if not all(closed) and not recover:
         unclosed = files[closed.index(False)]
         raise BagReadError(
             f'{str(unclosed)!r} is cut short, its recorder did not close it: {RECOVER}')
-    return BagFiles(files, complete=listed and all(closed))
+    return files, listed and all(closed)
 
 
 def _listed_files(folder: Path) -> tuple[Path, ...]:
@@ -114,30 +107,12 @@ def _file_names(listed: Any) -> list[str]:
 
 
 def _left_behind(folder: Path, listed: tuple[Path, ...]) -> list[Path]:
-    """
-    Return the numbered files of a bag that metadata.yaml does not list, those with content.
-
-    A recorder that splits its bag lists each file once it is complete.
-    """
+    """Return the numbered files with content that metadata.yaml does not list, or not yet."""
     names = {match[1] for file in listed if (match := _NUMBERED.fullmatch(file.name))}
     known = {_plain_name(file) for file in listed}
     return [file for file in _files_with_content(folder)
             if (match := _NUMBERED.fullmatch(file.name)) and match[1] in names
             and _plain_name(file) not in known]
-
-
-def _numbered_files(folder: Path, recover: bool) -> tuple[Path, ...]:
-    """Return the MCAP files of a directory without metadata.yaml, by their numbers."""
-    if not recover:
-        raise BagReadError(
-            f'{str(folder)!r} has no {METADATA_FILE}, its recorder did not close it or it is no '
-            f'bag: {RECOVER}')
-    files = _files_with_content(folder)
-    if not files:
-        raise BagReadError(
-            f'{str(folder)!r} has neither {METADATA_FILE} nor MCAP files with content: '
-            'check the path')
-    return tuple(files)
 
 
 def _files_with_content(folder: Path) -> list[Path]:
@@ -154,7 +129,5 @@ def _plain_name(file: Path) -> str:
 
 def _natural_order(file: Path) -> list[tuple[int, str]]:
     """Return a key that sorts 'run_2' before 'run_10'."""
-    return [
-        (int(part), '') if part.isdigit() else (-1, part)
-        for part in re.split(r'(\d+)', file.name)
-    ]
+    return [(int(part), '') if part.isdigit() else (-1, part)
+            for part in re.split(r'(\d+)', file.name)]

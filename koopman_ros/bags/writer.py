@@ -24,24 +24,22 @@ class BagWriter:
     """
     Write serialized (CDR) messages to an MCAP bag in the layout of rosbag2, Jazzy.
 
-    `path` ending in '.mcap' makes one self-describing file; any other path makes a bag
-    directory with `<name>_0.mcap` and, at `close`, `metadata.yaml`. Missing parent folders are
-    made. An existing path is never overwritten.
+    `path` ending in '.mcap' makes one self-describing file; any other path makes a bag directory
+    with `<name>_0.mcap` and, at `close`, `metadata.yaml`. An existing path is never overwritten.
 
     A bag directory is split where asked for: a message that finds `max_file_bytes` written, or
     `max_file_duration_s` [s] passed since the first log time of the file, begins the next file
     (`<name>_1.mcap`, ...; 0: never). The file before it is completed in the background, written
     through to the disk and only then listed in `metadata.yaml`.
 
-    `compression` of the chunks is 'none', 'zstd' or 'lz4'. The default is 'none', as in
-    rosbag2: every reader can open it, and there is no codec between a damaged file and its
-    messages. With 'zstd' the bag of a control loop has about a third of the size.
-    A chunk ends when it exceeds `max_chunk_bytes`, or with the first `write` after it has been
-    open for `max_chunk_age_s` [s of `clock`] (0: after each message, infinity: never). A
-    process that is killed loses no more than the open chunk; a recorder whose topics may fall
-    silent calls `flush` from a timer. What it leaves is read by `read_messages` with `recover`,
-    and by mcap in the order of the file (`iter_messages(log_time_order=False)` of its
-    `NonSeekingReader`) until that raises `EndOfFile`.
+    `compression` of the chunks is 'none', 'zstd' or 'lz4'. The default is that of rosbag2: every
+    reader can open it, and there is no codec between a damaged file and its messages. With 'zstd'
+    the bag of a control loop has about a third of the size. A chunk ends when it exceeds
+    `max_chunk_bytes`, or with the first `write` after it has been open for `max_chunk_age_s` [s of
+    `clock`] (0: after each message, infinity: never). A process that is killed loses no more than
+    the open chunk; a recorder whose topics may fall silent calls `flush` from a timer. What it
+    leaves is read by `read_messages` with `recover`, and by mcap's `NonSeekingReader` with
+    `log_time_order=False` until that raises `EndOfFile`.
 
     Not thread-safe: one thread at a time may use a writer. Raises FileExistsError if `path`
     exists, ValueError for an option out of range and for a single file that is to be split.
@@ -98,12 +96,11 @@ class BagWriter:
         self, topic: str, definition: MessageDefinition, offered_qos: Sequence[QosProfile] = ()
     ) -> None:
         """
-        Announce a topic; announcing it again with the same definition does nothing.
+        Announce a topic by its absolute name; again with the same definition does nothing.
 
-        `topic` is the resolved name ('/temperature'), `definition` that of its type (see
-        `message_definition`), `offered_qos` one profile for each publisher known when the
-        recording starts. Raises ValueError for a relative name, for another definition of the
-        topic or of the type than before, and on a closed writer.
+        `offered_qos` has one profile for each publisher known when the recording starts. Raises
+        ValueError for a relative name, for another definition of the topic or of the type than
+        before, and on a closed writer.
         """
         self._check_open('add a topic to')
         if not topic.startswith('/'):
@@ -119,13 +116,11 @@ class BagWriter:
     def write(self, topic: str, data: bytes | bytearray | memoryview, log_time_ns: int,
               publish_time_ns: int | None = None) -> None:
         """
-        Append one serialized message, byte for byte.
+        Append one message, byte for byte, in CDR with its encapsulation header.
 
-        `data` is CDR with its encapsulation header, as a subscription with `raw=True` or
-        `rclpy.serialization.serialize_message` gives it. `log_time_ns` is the time of receipt
-        [ns], `publish_time_ns` that of sending [ns], the same by default. Raises ValueError for
-        an unknown topic, for a time outside [0, 2**63) ns and on a closed writer, TypeError for
-        data that is not bytes.
+        `log_time_ns` is the time of receipt [ns], `publish_time_ns` that of sending [ns], the same
+        by default. Raises ValueError for an unknown topic, for a time outside [0, 2**63) ns and on
+        a closed writer, TypeError for data that is not bytes.
         """
         self._check_open('write to')
         recorded = self._topics.get(topic)
@@ -154,10 +149,9 @@ class BagWriter:
 
     def flush(self) -> None:
         """
-        End the open chunk and hand everything to the operating system.
+        End the open chunk; what was flushed survives the end of the process, not a loss of power.
 
-        What was flushed survives the end of the process, not the loss of power. Raises
-        ValueError on a closed writer.
+        Raises ValueError on a closed writer.
         """
         self._check_open('flush')
         self._files.current.flush()

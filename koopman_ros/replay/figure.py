@@ -17,13 +17,7 @@ _RECORDED, _CHECK, _NEW = '0.55', 'tab:blue', 'tab:orange'
 
 
 def draw(path: Path, bag: ReplayedBag, new_model: str) -> None:
-    """
-    Draw a replayed bag.
-
-    :param path: PNG file to write.
-    :param bag: what to draw.
-    :param new_model: name of the new model, or empty.
-    """
+    """Draw a replayed bag to a PNG file; `new_model` is the new model's name, or empty."""
     inputs = bag.recorded.shape[1]
     states = bag.measured.shape[1]
     time, label = _time(bag)

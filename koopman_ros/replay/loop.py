@@ -11,17 +11,7 @@ from koopman_ros.arrays import Array
 from koopman_ros.control import Controller, Setpoint, Settings, State
 from koopman_ros.control.events import apply, Measurement, SetpointRequest
 from koopman_ros.lifting import LiftedModel
-from koopman_ros.replay.records import (
-    event_of,
-    float_array,
-    MODEL,
-    PARAMETERS,
-    Record,
-    RecordError,
-    SNAPSHOT,
-    START,
-    state_of,
-)
+from koopman_ros.replay import records
 
 # The model of a name and a digest, read anew each time; raises RecordError where there is none.
 FindModel: TypeAlias = Callable[[str, str], LiftedModel]
@@ -33,7 +23,7 @@ MakeSettings: TypeAlias = Callable[[Mapping[str, Any]], Settings]
 class Alternative:
     """Another model, whose commands are compared with the recorded ones."""
 
-    model: LiftedModel  #: the model
+    model: LiftedModel
     digest: str  #: SHA-256 of its file
     #: that replace recorded ones, by name
     parameters: Mapping[str, Any] = field(default_factory=dict)
@@ -78,33 +68,31 @@ class Replay:
     controller: Controller | None = None
 
 
-def replay(records: Iterable[Record], find_model: FindModel, make_settings: MakeSettings,
+def replay(recorded: Iterable[records.Record], find_model: FindModel, make_settings: MakeSettings,
            alternative: Alternative | None = None) -> Replay:
     """
     Apply what is recorded again.
 
-    :param records: of a bag, in the order of receipt; those of several runs may alternate.
-    :param find_model: gives the models that the records name.
-    :param make_settings: gives the tuning that their parameters stand for.
-    :param alternative: another model that answers the same measurements under the set-points that
-        were tracked, or None.
-    :raises RecordError: for records that cannot be replayed.
+    Records come in the order of receipt; those of several runs may alternate. The alternative
+    answers the same measurements under the set-points that were tracked. Raises RecordError for
+    records that cannot be replayed.
     """
     found = Replay()
     runs: dict[str, _Run] = {}
-    for record in records:
+    for record in recorded:
         if record.run not in runs:
             runs[record.run] = _Run(found, find_model, make_settings, alternative)
             found.runs += 1
-            found.begins_late += record.event != START
+            found.begins_late += record.event != records.START
         try:
             runs[record.run].take(record)
         except (ArithmeticError, AttributeError, IndexError, KeyError, TypeError, ValueError
                 ) as error:
-            if isinstance(error, RecordError):
+            if isinstance(error, records.RecordError):
                 raise
-            raise RecordError(f'record {record.number} of run {record.run} cannot be replayed '
-                              f'({type(error).__name__}: {error})') from error
+            raise records.RecordError(
+                f'record {record.number} of run {record.run} cannot be replayed '
+                f'({type(error).__name__}: {error})') from error
     return found
 
 
@@ -124,39 +112,40 @@ class _Run:
         self._controller: Controller
         self._other_controller: Controller
 
-    def take(self, record: Record) -> None:
+    def take(self, record: records.Record) -> None:
         """Replay the next record."""
         if self._next is not None:
             if record.number < self._next:
-                raise RecordError(f'record {record.number} of run {record.run} comes again, or '
-                                  f'after record {self._next - 1}: the bag is not in order')
+                raise records.RecordError(
+                    f'record {record.number} of run {record.run} comes again, or after record '
+                    f'{self._next - 1}: the bag is not in order')
             if record.number > self._next:
                 self._found.lost.append(Lost(record.run, self._next, record.number - 1))
                 self._state = None
         self._next = record.number + 1
-        if record.event in (START, SNAPSHOT):
+        if record.event in (records.START, records.SNAPSHOT):
             if self._state is None:
                 self._begin(record)
         elif self._state is None:
             self._keep(record, None, None, None)
-        elif record.event in (PARAMETERS, MODEL):
+        elif record.event in (records.PARAMETERS, records.MODEL):
             self._exchange(record, self._state)
         else:
             self._apply(record, self._state)
 
-    def _begin(self, record: Record) -> None:
+    def _begin(self, record: records.Record) -> None:
         self._parameters = dict(record.fields['parameters'])
         self._controller = Controller(
             self._model(record), self._make_settings(self._parameters))
         self._found.controller = self._controller
-        self._state = state_of(record)
+        self._state = records.state_of(record)
         if self._other is not None:
             same = self._other.digest == record.fields['model']['digest']
             self._other_controller = self._tuned(
                 self._controller.model if same else self._other.model)
             self._other_state = self._other_controller.hand_over(self._controller, self._state)
 
-    def _exchange(self, record: Record, state: State) -> None:
+    def _exchange(self, record: records.Record, state: State) -> None:
         """Put other parameters or another model in force."""
         self._parameters.update(record.fields.get('parameters', {}))
         predecessor = self._controller
@@ -170,8 +159,8 @@ class _Run:
             self._other_controller = self._tuned(predecessor.model)
             self._other_state = self._other_controller.hand_over(predecessor, self._other_state)
 
-    def _apply(self, record: Record, state: State) -> None:
-        event = event_of(record)
+    def _apply(self, record: records.Record, state: State) -> None:
+        event = records.event_of(record)
         outcome = apply(self._controller, state, event)
         self._state = outcome.state
         self._found.refused += outcome.refused is not None
@@ -187,17 +176,17 @@ class _Run:
             self._other_state, other = answered.state, answered.command
         self._keep(record, active, outcome.command, other)
 
-    def _keep(self, record: Record, setpoint: Array | None, replayed: Array | None,
+    def _keep(self, record: records.Record, setpoint: Array | None, replayed: Array | None,
               other: Array | None) -> None:
         """Keep the command of a record, where it has one."""
         fields = record.fields
         if fields.get('command') is not None:
             measured = fields.get('measured')
             self._found.samples.append(Sample(
-                record.stamp_ns, None if measured is None else float_array(measured), setpoint,
-                float_array(fields['command']), replayed, other))
+                record.stamp_ns, None if measured is None else records.float_array(measured),
+                setpoint, records.float_array(fields['command']), replayed, other))
 
-    def _model(self, record: Record) -> LiftedModel:
+    def _model(self, record: records.Record) -> LiftedModel:
         name, digest = record.fields['model']['name'], record.fields['model']['digest']
         if name not in self._found.models:
             self._found.models.append(name)

@@ -21,25 +21,16 @@ import numpy as np
 from numpy.typing import NDArray
 
 from koopman_ros import __version__
-from koopman_ros.control import Mode, State
-from koopman_ros.control.events import (
-    Event,
-    Initialisation,
-    ManualCommand,
-    Measurement,
-    ModeChange,
-    Outcome,
-    SetpointRequest,
-    Silence,
-)
+from koopman_ros.control import events, Mode, State
 from koopman_ros.reasons import Reason
 
 VERSION = 1
 
 # Events by the names that they have in records.
-EVENTS: dict[str, type[Event]] = {
-    'measurement': Measurement, 'silence': Silence, 'setpoint': SetpointRequest,
-    'manual_command': ManualCommand, 'mode': ModeChange, 'initialisation': Initialisation}
+EVENTS: dict[str, type[events.Event]] = {
+    'measurement': events.Measurement, 'silence': events.Silence,
+    'setpoint': events.SetpointRequest, 'manual_command': events.ManualCommand,
+    'mode': events.ModeChange, 'initialisation': events.Initialisation}
 _NAMES = {kind: name for name, kind in EVENTS.items()}
 _FIELDS = {kind: tuple(item.name for item in fields(kind)) for kind in _NAMES}
 _ENCODER = json.JSONEncoder(separators=(',', ':'), allow_nan=False)
@@ -75,11 +66,7 @@ class Record:
 
 
 def parse(text: str) -> Record:
-    """
-    Read a record.
-
-    :raises RecordError: for another text, or another version of the schema.
-    """
+    """Read a record; raise RecordError for another text, or another version of the schema."""
     try:
         fields = json.loads(text)
         version = fields.pop('version')
@@ -97,16 +84,16 @@ def parse(text: str) -> Record:
     return record
 
 
-def fields_of(event: Event, outcome: Outcome) -> tuple[str, dict[str, Any]]:
+def fields_of(event: events.Event, outcome: events.Outcome) -> tuple[str, dict[str, Any]]:
     """Return the name of an event, and what is written of it and of what it led to."""
     written = {name: _written(getattr(event, name)) for name in _FIELDS[type(event)]}
     report = outcome.report
     if report is None:
-        if not isinstance(event, (ModeChange, Initialisation)):
+        if not isinstance(event, (events.ModeChange, events.Initialisation)):
             written['accepted'] = outcome.refused is None
             written['reason'] = _codes(outcome.refused)
         return _NAMES[type(event)], written
-    if isinstance(event, Measurement):
+    if isinstance(event, events.Measurement):
         written['result'] = report.measurement.arrival.value
     return _NAMES[type(event)], {
         **written, 'command': _written(outcome.command),
@@ -114,12 +101,8 @@ def fields_of(event: Event, outcome: Outcome) -> tuple[str, dict[str, Any]]:
         'mode': _written(report.mode), 'level': report.level, 'reason': _codes(report.reason)}
 
 
-def event_of(record: Record) -> Event:
-    """
-    Return the event of a record.
-
-    :raises KeyError, TypeError, ValueError: for a record that is none of an event.
-    """
+def event_of(record: Record) -> events.Event:
+    """Return the event of a record; raise KeyError, TypeError or ValueError where it has none."""
     if record.event not in EVENTS:
         raise ValueError(f'the event {record.event!r} is not known')
     kind = EVENTS[record.event]
@@ -128,23 +111,13 @@ def event_of(record: Record) -> Event:
 
 def snapshot(state: State, parameters: Mapping[str, Any], model: Mapping[str, str]
              ) -> dict[str, Any]:
-    """
-    Return the fields of a record from which a replay can begin.
-
-    :param state: of the controller.
-    :param parameters: all of them, by name.
-    :param model: its name and the SHA-256 digest of its file.
-    """
+    """Return the fields of a snapshot; a model is its `name` and the SHA-256 of its file."""
     return {'package': __version__, 'model': dict(model), 'parameters': dict(parameters),
             'state': encoded(state)}
 
 
 def state_of(record: Record) -> State:
-    """
-    Return the state in a snapshot.
-
-    :raises KeyError, TypeError, ValueError: where it does not fit this package.
-    """
+    """Return the state in a snapshot; raise KeyError, TypeError or ValueError for another."""
     state = decoded(record.fields['state'])
     if not isinstance(state, State):
         raise TypeError(f'a {type(state).__name__} is no state of a controller')
@@ -171,11 +144,7 @@ def _codes(reason: Reason | None) -> list[str]:
 
 
 def encoded(value: Any) -> Any:
-    """
-    Return a value as what :func:`json.dumps` writes without loss.
-
-    :raises TypeError: for what is none of those above.
-    """
+    """Return a value as what :func:`json.dumps` writes without loss, or raise TypeError."""
     if isinstance(value, Enum):
         return {_TAG: _name(type(value)), 'name': value.name}
     if isinstance(value, np.generic):
@@ -202,10 +171,8 @@ def decoded(value: Any) -> Any:
     Return the value that :func:`encoded` was given.
 
     A class is looked up among those that this program has loaded, and has to be a dataclass or an
-    enum: no text of a bag imports anything.
-
-    :raises ValueError: for a class that is not known here.
-    :raises TypeError: for one that has other fields here.
+    enum: no text of a bag imports anything. Raises ValueError for a class that is not known here,
+    TypeError for one that has other fields here.
     """
     if isinstance(value, list):
         return tuple(decoded(item) for item in value)
@@ -237,11 +204,7 @@ def numbers(values: NDArray[Any]) -> list[Any]:
 
 
 def float_array(values: Any) -> NDArray[np.float64]:
-    """
-    Return what :func:`numbers` was given.
-
-    :raises TypeError, ValueError: for anything but a list of numbers.
-    """
+    """Return what :func:`numbers` was given; raise TypeError or ValueError for no numbers."""
     if not isinstance(values, list):
         raise TypeError(f'{values!r} is no list of numbers')
     array = np.array([float(item) for item in values], dtype=np.float64)

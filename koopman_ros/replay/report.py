@@ -126,21 +126,11 @@ def _rows(values: list[Array | None], like: Array | None = None) -> Array:
 
 def write_report(folder: Path, bags: list[ReplayedBag], pictures: list[str], new_model: str
                  ) -> None:
-    """
-    Write report.md and summary.json.
-
-    :param folder: where to.
-    :param bags: what was replayed.
-    :param pictures: file name of each bag's picture.
-    :param new_model: name of the new model, or empty.
-    """
-    summary = {
-        'new_model': new_model or None,
-        'tolerance_K': bags[0].tolerance,
+    """Write report.md and summary.json; `new_model` is the new model's name, or empty."""
+    write_figures(folder / 'summary.json', {
+        'new_model': new_model or None, 'tolerance_K': bags[0].tolerance,
         'reproduced': all(reproduced(bag) for bag in bags),
-        'bags': [_figures(bag) for bag in bags],
-    }
-    write_figures(folder / 'summary.json', summary)
+        'bags': [_figures(bag) for bag in bags]})
     sections = [_about(new_model)]
     for bag, picture in zip(bags, pictures, strict=True):
         sections += [f'## {bag.path}', '\n'.join(_section(bag)), f'![commands]({picture})']
@@ -149,7 +139,7 @@ def write_report(folder: Path, bags: list[ReplayedBag], pictures: list[str], new
 
 def reproduced(bag: ReplayedBag) -> bool:
     """Tell whether the recorded commands are those of the replay, within the tolerance."""
-    return bag.check.compared > 0 and not np.any(bag.check.beyond)
+    return bag.check.compared > 0 and not bag.check.beyond.any()
 
 
 def verdict(bag: ReplayedBag) -> str:
@@ -221,9 +211,7 @@ def _section(bag: ReplayedBag) -> list[str]:
 def _figures(bag: ReplayedBag) -> dict[str, Any]:
     found = bag.found
     figures: dict[str, Any] = {
-        'bag': bag.path,
-        'measurements': bag.measurements,
-        'reproduced': reproduced(bag),
+        'bag': bag.path, 'measurements': bag.measurements, 'reproduced': reproduced(bag),
         'recorded_model': _comparison(bag, bag.check),
         'not_compared': len(found.samples) - bag.check.compared,
         'commands_without_record': bag.unexplained,
@@ -231,9 +219,7 @@ def _figures(bag: ReplayedBag) -> dict[str, Any]:
         'refused_requests': found.refused,
         'began_before_bag': found.begins_late > 0,
         'lost_records': [[lost.run, lost.first, lost.last] for lost in found.lost],
-        'runs': found.runs,
-        'models': found.models,
-        'complete': bag.complete,
+        'runs': found.runs, 'models': found.models, 'complete': bag.complete,
     }
     if bag.new is not None:
         figures['new_model'] = _comparison(bag, bag.new)
@@ -243,8 +229,7 @@ def _figures(bag: ReplayedBag) -> dict[str, Any]:
 def _comparison(bag: ReplayedBag, comparison: Comparison) -> dict[str, Any]:
     worst = comparison.worst
     return {
-        'compared': comparison.compared,
-        'identical': comparison.identical,
+        'compared': comparison.compared, 'identical': comparison.identical,
         'beyond_tolerance': int(np.count_nonzero(comparison.beyond)),
         'largest_difference_K': 0.0 if worst is None else _largest(comparison.difference[worst]),
         'largest_at_s': None if worst is None else float(bag.seconds[worst]),

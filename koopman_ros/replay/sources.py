@@ -21,12 +21,10 @@ RECORD_TYPE, COMMAND_TYPE = 'std_msgs/msg/String', 'sensor_msgs/msg/Temperature'
 def read_records(path: str | os.PathLike[str], topic: str, *, recover: bool = False
                  ) -> Iterator[Record]:
     """
-    Iterate over the records in a bag, in the order of receipt.
+    Iterate over the records on a topic of a bag, in the order of receipt.
 
-    :param path: a .mcap file or a bag directory.
-    :param topic: absolute name of the controller's records.
-    :param recover: read a bag that was not closed or is damaged as far as it is whole.
-    :raises BagReadError: for a bag that cannot be read, or holds none.
+    `recover` is that of :func:`read_messages`. Raises BagReadError for a bag that cannot be read,
+    or holds none.
     """
     # first, for what it says of a bag that is none
     messages = read_messages(path, (topic,), recover=recover)
@@ -55,12 +53,7 @@ def _parsed(path: str | os.PathLike[str], messages: Iterator[BagMessage]) -> Ite
 
 def command_counts(path: str | os.PathLike[str], topic: str, *, recover: bool = False
                    ) -> Counter[tuple[int, bytes]]:
-    """
-    Count the commands on a topic by stamp and value.
-
-    :return: of (stamp in ns, bytes of the float64 as it was sent); empty where the bag has none.
-    :raises BagReadError: for a bag that cannot be read.
-    """
+    """Count the commands on a topic of a bag by :func:`command_key`; none where it has none."""
     if summary(path).types.get(topic) != COMMAND_TYPE:
         return Counter()
     found: Counter[tuple[int, bytes]] = Counter()
@@ -72,28 +65,18 @@ def command_counts(path: str | os.PathLike[str], topic: str, *, recover: bool = 
 
 
 def command_key(stamp_ns: int, value: float) -> tuple[int, bytes]:
-    """Return what is equal for commands that are bit-identical."""
+    """Return stamp [ns] and bytes of the float64, equal for commands that are bit-identical."""
     return stamp_ns, struct.pack('<d', value)
 
 
 class Models:
-    """
-    Models by the digest of their file.
-
-    :param places: files, and folders of which all model files count.
-    """
+    """Models by the digest of their file, from files and from folders."""
 
     def __init__(self, places: Sequence[Path]) -> None:
         self._places = places
 
     def find(self, name: str, digest: str) -> LiftedModel:
-        """
-        Return a model, read anew.
-
-        :param name: by which the controller knew it; looked up first where it is a path.
-        :param digest: SHA-256 of its file.
-        :raises RecordError: where there is none with this digest.
-        """
+        """Return the model of this SHA-256 digest, read anew; raise RecordError for none."""
         for path in self._files(name):
             with contextlib.suppress(ModelFileError, OSError):
                 model, found = load_with_digest(path)

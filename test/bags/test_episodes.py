@@ -12,14 +12,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from koopman_ros.bags import (
-    Account,
-    BagReadError,
-    BagWriter,
-    loop_episodes,
-    message_definition,
-    read_series,
-)
+from koopman_ros import bags
 from koopman_ros.bags.series import spikes_and_jumps
 from koopman_ros.plant_data import Episode
 from koopman_ros.plants import one_state_reactor, random_steps, RandomStepDesign
@@ -63,8 +56,8 @@ def write(samples: list[Sample], tmp_path: Path) -> Callable[..., Path]:
 
     def write(messages: Iterable[Sent], name: str = 'run.mcap', *, wall: bool = False,
               closed: bool = True) -> Path:
-        writer = BagWriter(tmp_path / name)
-        definition = message_definition(PRESSURE)
+        writer = bags.BagWriter(tmp_path / name)
+        definition = bags.message_definition(PRESSURE)
         writer.add_topic(MEASURED, definition)
         writer.add_topic(COMMAND, definition)
         for number, one in enumerate(messages):
@@ -84,8 +77,8 @@ def write(samples: list[Sample], tmp_path: Path) -> Callable[..., Path]:
     return write
 
 
-def read(*bags: Path) -> tuple[list[Episode], Account]:
-    episodes, account = loop_episodes(bags, MEASURED, COMMAND, UNITS)
+def read(*paths: Path) -> tuple[list[Episode], bags.Account]:
+    episodes, account = bags.loop_episodes(paths, MEASURED, COMMAND, UNITS)
     assert account.used == sum(map(len, episodes))
     return episodes, account
 
@@ -201,8 +194,8 @@ def test_wall_clock_answers_act_when_they_arrive(write: Callable[..., Path]) -> 
 
 
 def test_dead_time_of_the_actuator(write: Callable[..., Path]) -> None:
-    (episode,), account = loop_episodes([write(loop(20))], MEASURED, COMMAND, UNITS,
-                                        input_delay_ns=2 * SECOND + 1)
+    (episode,), account = bags.loop_episodes([write(loop(20))], MEASURED, COMMAND, UNITS,
+                                             input_delay_ns=2 * SECOND + 1)
     # to the nanosecond, from the first measurement on, at 4 s
     assert episode.input_time[:3].tolist() == [1e-9 - 1.0, 1e-9, 1e-9 + 1.0]
     assert episode.u[:3, 0].tolist() == [101.0, 102.0, 103.0]
@@ -258,8 +251,7 @@ def test_values_that_are_no_measurement(write: Callable[..., Path], topic: str, 
 
 
 def test_several_bags(write: Callable[..., Path]) -> None:
-    bags = [write(loop(15), 'a.mcap'), write(loop(12, 3), 'b')]
-    (first, second), account = read(*bags)
+    (first, second), account = read(write(loop(15), 'a.mcap'), write(loop(12, 3), 'b'))
     assert (len(first), len(second)) == (15, 12)
     assert account.lines() == ['27 of 27 measurements used']
 
@@ -306,14 +298,14 @@ def test_topics_that_are_not_there(write: Callable[..., Path], tmp_path: Path) -
              '; name another topic'),
             (tmp_path / 'none.mcap', COMMAND, UNITS, r'none\.mcap'),
             (tmp_path / 'empty.mcap', COMMAND, UNITS, r'empty\.mcap')):
-        with pytest.raises(BagReadError, match=words):
-            loop_episodes([path], MEASURED, topic, units)
-    with pytest.raises(BagReadError, match="has no topic '/valve_2', it has /level, /valve"):
-        read_series(bag, '/valve_2')
+        with pytest.raises(bags.BagReadError, match=words):
+            bags.loop_episodes([path], MEASURED, topic, units)
+    with pytest.raises(bags.BagReadError, match="has no topic '/valve_2', it has /level, /valve"):
+        bags.read_series(bag, '/valve_2')
 
 
 def test_episodes_come_in_the_units_asked_for(write: Callable[..., Path]) -> None:
-    (episode,), _ = loop_episodes([write(loop(15))], MEASURED, COMMAND, ('kPa', 'mbar'))
+    (episode,), _ = bags.loop_episodes([write(loop(15))], MEASURED, COMMAND, ('kPa', 'mbar'))
     assert episode.x[0, 0] == pytest.approx(0.001)
     assert episode.u[0, 0] == pytest.approx(1.01)
 
@@ -324,22 +316,22 @@ def test_episodes_come_in_the_units_asked_for(write: Callable[..., Path]) -> Non
 def test_signal_as_arrays(tmp_path: Path, write_bag: Callable[..., Path]) -> None:
     bag = write_bag(tmp_path / 'run')
     index = np.arange(ROUNDS)
-    series = read_series(bag, '/temperature')
+    series = bags.read_series(bag, '/temperature')
     np.testing.assert_array_equal(series.stamp_ns, START_NS + PERIOD_NS * index)
     np.testing.assert_array_equal(series.values, 51.95 + 0.1 * index)
     assert series.unit == 'degC'
-    with pytest.raises(BagReadError, match=(
+    with pytest.raises(bags.BagReadError, match=(
             r"'/joint_states' .* is sensor_msgs/msg/JointState, not sensor_msgs/msg/Temperature")):
-        read_series(bag, '/joint_states')
+        bags.read_series(bag, '/joint_states')
     file = bag / 'run_0.mcap'
     file.write_bytes(file.read_bytes()[:-1])
-    with pytest.raises(BagReadError, match='is cut short'):
-        read_series(file, '/temperature')
-    assert len(read_series(file, '/temperature', recover=True).values) == ROUNDS
+    with pytest.raises(bags.BagReadError, match='is cut short'):
+        bags.read_series(file, '/temperature')
+    assert len(bags.read_series(file, '/temperature', recover=True).values) == ROUNDS
 
 
 def test_topic_without_messages_gives_empty_arrays(write: Callable[..., Path]) -> None:
-    series = read_series(write([]), MEASURED)
+    series = bags.read_series(write([]), MEASURED)
     assert series.stamp_ns.shape == series.values.shape == (0,)
     assert series.stamp_ns.dtype == np.int64
 
@@ -352,16 +344,16 @@ def test_topic_without_messages_gives_empty_arrays(write: Callable[..., Path]) -
 def test_type_that_only_bears_the_name(
     tmp_path: Path, samples: list[Sample], field: str, other: str
 ) -> None:
-    known = message_definition('sensor_msgs/msg/Temperature')
+    known = bags.message_definition('sensor_msgs/msg/Temperature')
     sample = next(s for s in samples if s.topic == '/temperature')
     text = known.text.replace(field, other)
     assert text != known.text
-    with BagWriter(tmp_path / 'run.mcap') as writer:
+    with bags.BagWriter(tmp_path / 'run.mcap') as writer:
         writer.add_topic('/t', replace(known, text=text))
         writer.write('/t', sample.data, 1)
-    for read in (lambda: read_series(writer.path, '/t'),
-                 lambda: loop_episodes([writer.path], '/t', '/t', ('K', 'K'))):
-        with pytest.raises(BagReadError, match=r'laid out differently|does not decode'):
+    for read in (lambda: bags.read_series(writer.path, '/t'),
+                 lambda: bags.loop_episodes([writer.path], '/t', '/t', ('K', 'K'))):
+        with pytest.raises(bags.BagReadError, match=r'laid out differently|does not decode'):
             read()
 
 

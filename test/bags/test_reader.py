@@ -4,6 +4,7 @@
 """Bags of ours and of rosbag2 through the years, and what is no bag or none that is read."""
 
 from collections.abc import Callable
+import importlib
 from pathlib import Path
 import shutil
 from typing import Any
@@ -12,8 +13,9 @@ from mcap.writer import Writer
 import pytest
 import yaml
 
-from koopman_ros.bags import BagReadError, QosProfile, read_messages, summary
-from koopman_ros.bags.metadata import parse_offered_qos
+from koopman_ros import bags
+from koopman_ros.bags.metadata import dump_offered_qos, parse_offered_qos, qos_mappings
+from koopman_ros.units import NANOSECONDS as SECOND
 from support.bag_samples import (
     compressed_files,
     number,
@@ -69,25 +71,21 @@ def test_messages_and_summary_come_back_as_they_were(
 ) -> None:
     path = write_bag(tmp_path / name)
     assert [(m.topic, m.type_name, m.log_time_ns, m.publish_time_ns, m.data)
-            for m in read_messages(path)] == [
+            for m in bags.read_messages(path)] == [
         (s.topic, TOPICS[s.topic], s.log_time_ns, s.publish_time_ns, s.data) for s in samples]
-    assert {m.topic for m in read_messages(path, ['/clock', '/nowhere'])} == {'/clock'}
-    assert list(read_messages(path, [])) == []
+    assert {m.topic for m in bags.read_messages(path, ['/clock', '/nowhere'])} == {'/clock'}
+    assert list(bags.read_messages(path, [])) == []
     with pytest.raises(TypeError, match=r"must be a collection of names: pass \['/x'\]"):
-        read_messages(path, '/x')
-    content = summary(path)
-    assert content.counts == dict.fromkeys(TOPICS, ROUNDS)
-    assert content.types == TOPICS
-    assert content.offered_qos == OFFERED_QOS
-    assert content.start_ns == START_NS + 1_000_000
-    assert content.end_ns == START_NS + (ROUNDS - 1) * PERIOD_NS + 1_000_003
-    assert content.message_count == 4 * ROUNDS
-    assert content.complete
+        bags.read_messages(path, '/x')
+    assert bags.summary(path) == bags.BagSummary(
+        dict.fromkeys(TOPICS, ROUNDS), TOPICS, OFFERED_QOS, START_NS + 1_000_000,
+        START_NS + (ROUNDS - 1) * PERIOD_NS + 1_000_003, complete=True)
+    assert bags.summary(path).message_count == 4 * ROUNDS
 
 
 def test_fields_are_decoded(tmp_path: Path, write_bag: WriteBag, samples: list[Sample]) -> None:
     for entry, sample in zip(
-            read_messages(write_bag(tmp_path / 'run.mcap')), samples, strict=True):
+            bags.read_messages(write_bag(tmp_path / 'run.mcap')), samples, strict=True):
         found, sent = entry.message, sample.message
         stamps = [getattr(m, 'clock', None) or m.header.stamp for m in (found, sent)]
         assert (stamps[0].sec, stamps[0].nanosec) == (stamps[1].sec, stamps[1].nanosec)
@@ -100,44 +98,41 @@ def test_fields_are_decoded(tmp_path: Path, write_bag: WriteBag, samples: list[S
             assert list(found.velocity) == [-1e-300]
             assert str(list(found.effort)) == '[nan]'
         elif entry.topic == '/diagnostics':
-            assert len(found.status) == len(sent.status)
-            for one, other in zip(found.status, sent.status, strict=True):
-                assert bytes([one.level]) == other.level
-                assert (one.name, one.message) == (other.name, other.message)
-                assert [(v.key, v.value) for v in one.values] == [
-                    (v.key, v.value) for v in other.values]
+            assert [(bytes([one.level]), one.name, one.message,
+                     [(v.key, v.value) for v in one.values]) for one in found.status] == [
+                (other.level, other.name, other.message,
+                 [(v.key, v.value) for v in other.values]) for other in sent.status]
 
 
 def test_order_is_that_of_recording_across_a_clock_reset(tmp_path: Path) -> None:
     path = record(tmp_path / 'run.mcap', [5, 6, 7, 1, 2, 6])
-    assert [m.message.data for m in read_messages(path)] == [5, 6, 7, 1, 2, 6]
-    content = summary(path)
+    assert [m.message.data for m in bags.read_messages(path)] == [5, 6, 7, 1, 2, 6]
+    content = bags.summary(path)
     assert (content.start_ns, content.end_ns) == (1, 7)
 
 
 @FORMS
 def test_bag_without_messages(tmp_path: Path, name: str) -> None:
     path = record(tmp_path / name)
-    assert list(read_messages(path)) == []
-    content = summary(path)
-    assert (content.counts, content.types) == ({'/x': 0}, {'/x': 'std_msgs/msg/Float64'})
-    assert (content.start_ns, content.end_ns, content.complete) == (None, None, True)
+    assert list(bags.read_messages(path)) == []
+    assert bags.summary(path) == bags.BagSummary(
+        {'/x': 0}, {'/x': 'std_msgs/msg/Float64'}, {}, None, None, complete=True)
 
 
 def test_split_bag_is_read_in_the_order_of_its_metadata(tmp_path: Path) -> None:
     path = record(tmp_path / 'run', (1, 2))
     shutil.move(record(tmp_path / 'more.mcap', (3, 4)), path / 'run_1.mcap')
     change(path, lambda found: found.update(relative_file_paths=['run_1.mcap', 'run_0.mcap']))
-    assert [m.message.data for m in read_messages(path)] == [3, 4, 1, 2]
-    assert summary(path).counts == {'/x': 4}
-    assert (summary(path).start_ns, summary(path).end_ns) == (1, 4)
+    assert [m.message.data for m in bags.read_messages(path)] == [3, 4, 1, 2]
+    content = bags.summary(path)
+    assert (content.counts, content.start_ns, content.end_ns) == ({'/x': 4}, 1, 4)
 
 
 def test_types_of_the_same_number_in_two_files_do_not_mix(tmp_path: Path) -> None:
     path = record(tmp_path / 'run', [7])
     foreign(path / 'run_1.mcap', schema=b'float64 other\n', data=number(9.0))
     (path / 'metadata.yaml').unlink()
-    first, second = read_messages(path, recover=True)
+    first, second = bags.read_messages(path, recover=True)
     assert (first.message.data, second.message.other) == (7, 9)
 
 
@@ -153,19 +148,17 @@ def test_file_that_is_no_bag(tmp_path: Path, content: bytes | None, words: str) 
     path = tmp_path / 'run.mcap'
     if content is not None:
         path.write_bytes(content)
-    for read in (read_messages, summary, lambda path: read_messages(path, recover=True)):
-        with pytest.raises(BagReadError, match=words):
+    for read in (bags.read_messages, bags.summary,
+                 lambda path: bags.read_messages(path, recover=True)):
+        with pytest.raises(bags.BagReadError, match=words):
             read(path)
 
 
-def test_directory_that_is_no_bag(tmp_path: Path) -> None:
-    with pytest.raises(BagReadError, match=r'has no metadata\.yaml.*: pass recover=True'):
-        read_messages(tmp_path)
-    with pytest.raises(BagReadError, match=r'has neither metadata\.yaml nor MCAP files'):
-        read_messages(tmp_path, recover=True)
-
-
-def test_broken_metadata(tmp_path: Path) -> None:
+def test_directory_that_is_no_bag_and_broken_metadata(tmp_path: Path) -> None:
+    with pytest.raises(bags.BagReadError, match=r'has no metadata\.yaml.*: pass recover=True'):
+        bags.read_messages(tmp_path)
+    with pytest.raises(bags.BagReadError, match=r'has neither metadata\.yaml nor MCAP files'):
+        bags.read_messages(tmp_path, recover=True)
     path = record(tmp_path / 'run')
     source = path / 'metadata.yaml'
     whole = source.read_text('utf-8')
@@ -174,23 +167,18 @@ def test_broken_metadata(tmp_path: Path) -> None:
                      '[]', '3', 'run_0.mcap', '[run_0.mcap, run_0.mcap]', '[[a]]'))):
         source.write_text(text, encoding='utf-8')
         assert text != whole
-        with pytest.raises(BagReadError, match=r'metadata\.yaml.*is not the metadata of a bag'):
-            read_messages(path)
+        with pytest.raises(bags.BagReadError, match=r'metadata\.yaml.*is not the metadata of a'):
+            bags.read_messages(path)
+    for written, other, kind in (
+            ('storage_identifier: mcap', 'storage_identifier: sqlite3', 'sqlite3 files'),
+            ("compression_format: ''", 'compression_format: lz4', 'mcap files .* with lz4')):
+        source.write_text(whole.replace(written, other), encoding='utf-8')
+        with pytest.raises(bags.BagReadError, match=f"holds {kind}.* with 'ros2 bag convert'"):
+            bags.read_messages(path)
     source.write_text(whole, encoding='utf-8')
     (path / 'run_0.mcap').unlink()
-    with pytest.raises(BagReadError, match=r"lists 'run_0\.mcap', which is not there"):
-        read_messages(path)
-
-
-@pytest.mark.parametrize(('key', 'value', 'kind'), [
-    ('storage_identifier', 'sqlite3', 'sqlite3 files'),
-    ('compression_format', 'lz4', 'mcap files compressed with lz4'),
-])
-def test_storage_that_is_not_read_here(tmp_path: Path, key: str, value: str, kind: str) -> None:
-    path = record(tmp_path / 'run')
-    change(path, lambda found: found.update({key: value}))
-    with pytest.raises(BagReadError, match=f"holds {kind}, .* convert it with 'ros2 bag convert'"):
-        read_messages(path)
+    with pytest.raises(bags.BagReadError, match=r"lists 'run_0\.mcap', which is not there"):
+        bags.read_messages(path)
 
 
 @pytest.mark.parametrize(('options', 'words'), [
@@ -209,9 +197,9 @@ def test_storage_that_is_not_read_here(tmp_path: Path, key: str, value: str, kin
 ])
 def test_message_that_is_not_decoded(tmp_path: Path, options: dict[str, Any], words: str) -> None:
     path = foreign(tmp_path / 'run.mcap', **options)
-    with pytest.raises(BagReadError, match=words):
-        list(read_messages(path))
-    assert list(read_messages(path, ['/y'])) == []
+    with pytest.raises(bags.BagReadError, match=words):
+        list(bags.read_messages(path))
+    assert list(bags.read_messages(path, ['/y'])) == []
 
 
 # Bags as rosbag2 itself has written them.
@@ -233,8 +221,8 @@ def test_metadata_of_every_version(tmp_path: Path, version: int) -> None:
 
     path = record(tmp_path / 'run', (3, 4))
     change(path, downgrade)
-    assert [m.message.data for m in read_messages(path)] == [3, 4]
-    assert summary(path).complete
+    assert [m.message.data for m in bags.read_messages(path)] == [3, 4]
+    assert bags.summary(path).complete
 
 
 def test_compressed_files_of_a_killed_recorder(
@@ -247,7 +235,7 @@ def test_compressed_files_of_a_killed_recorder(
     # a file by itself
     bare = tmp_path / 'run_0.mcap.zstd'
     bare.write_bytes(compressed['run_0.mcap.zstd'])
-    begin = [m.data for m in read_messages(bare)]
+    begin = [m.data for m in bags.read_messages(bare)]
     assert begin == [s.data for s in samples[:len(begin)]] != []
     del compressed['metadata.yaml']
     assert len(compressed) >= 3
@@ -258,19 +246,91 @@ def test_compressed_files_of_a_killed_recorder(
         (path / name).write_bytes(content)
         if name != f'{last}.zstd':
             (path / name.removesuffix('.zstd')).unlink()
-    assert [m.data for m in read_messages(path, recover=True)] == [s.data for s in samples]
+    assert [m.data for m in bags.read_messages(path, recover=True)] == [s.data for s in samples]
 
 
-def test_offer_in_numbers() -> None:
-    assert parse_offered_qos(HUMBLE_OFFER) == (QosProfile(
+# The order of receipt, restored from the order in the file.
+
+
+@pytest.mark.parametrize(('recorded', 'order'), [
+    ((), []),
+    ((1, 2, 3), [1, 2, 3]),
+    # a recorder that fell behind wrote what waited topic by topic
+    ((1, 4, 2, 3, 5), [1, 2, 3, 4, 5]),
+    ((10, 5.5, 11, 6, 20), [5.5, 6, 10, 11, 20]),
+    # the clock was set back: nothing of the later run goes ahead
+    ((100, 101, 3, 4, 101, 102), [100, 101, 3, 4, 101, 102]),
+    ((100, 99, 98, 1, 0.5, 2), [98, 99, 100, 0.5, 1, 2]),
+    # and set forward
+    ((1, 2, 1000, 1001), [1, 2, 1000, 1001]),
+    # one time
+    ((7, 7, 7), [7, 7, 7]),
+])
+def test_order_of_receipt(recorded: tuple[float, ...], order: list[float]) -> None:
+    messages = [bags.BagMessage('/x', '', round(time * SECOND), place, None, b'')
+                for place, time in enumerate(recorded)]
+    found = list(bags.in_log_order(messages))
+    assert [m.log_time_ns / SECOND for m in found] == order
+    places = [m.publish_time_ns for m in found]
+    assert sorted(places) == list(range(len(recorded)))
+    assert len(set(recorded)) > 1 or places == sorted(places)
+
+
+def test_messages_are_handed_on_before_the_last_is_read() -> None:
+    recorded = (bags.BagMessage('/x', '', k * SECOND, k, None, b'') for k in range(100))
+    assert next(bags.in_log_order(recorded)).log_time_ns == 0
+    assert next(recorded).publish_time_ns < 10
+
+
+# Offers.
+
+# As rosbag2 (Jazzy) writes a discovered publisher of the default profile.
+NEVER = '\n    sec: 9223372036\n    nsec: 854775807\n'
+DISCOVERED = (
+    '- history: unknown\n  depth: 0\n  reliability: reliable\n  durability: volatile\n'
+    f'  deadline:{NEVER}  lifespan:{NEVER}  liveliness: automatic\n'
+    f'  liveliness_lease_duration:{NEVER}  avoid_ros_namespace_conventions: false')
+
+
+def test_text_of_profiles() -> None:
+    assert dump_offered_qos([]) == '[]'
+    assert dump_offered_qos([bags.QosProfile(history='unknown', depth=0)]) == DISCOVERED
+    # those that are equal are written out each
+    profile = bags.QosProfile(deadline_ns=2_500_000_001)
+    text = dump_offered_qos([profile, profile])
+    assert not {'&', '*'}.intersection(text)
+    assert yaml.safe_load(text) == qos_mappings([profile, profile])
+    assert yaml.safe_load(text)[0]['deadline'] == {'sec': 2, 'nsec': 500_000_001}
+
+
+@pytest.mark.parametrize(('field', 'value', 'sentence'), [
+    ('history', 'last', "history 'last' is not one of system_default, keep_last, keep_all"),
+    ('reliability', 1, 'reliability 1 is not one of system_default, reliable, best_effort'),
+    ('durability', 'latched', "durability 'latched' is not one of system_default, transient_loc"),
+    ('liveliness', '', "liveliness '' is not one of system_default, automatic, manual_by_topic"),
+    ('depth', -1, 'depth -1 is negative'),
+    ('deadline_ns', -1, r'deadline_ns -1 is outside \[0, 9223372036854775807\] ns'),
+    ('lifespan_ns', bags.INFINITE_NS + 1, 'use INFINITE_NS for no limit'),
+    ('liveliness_lease_duration_ns', -5, 'liveliness_lease_duration_ns -5 is outside'),
+])
+def test_bad_values(field: str, value: Any, sentence: str) -> None:
+    with pytest.raises(ValueError, match=sentence):
+        bags.QosProfile(**{field: value})
+
+
+def test_words_are_those_of_rclpy() -> None:
+    qos = importlib.import_module('rclpy.qos')
+    for field in ('history', 'reliability', 'durability', 'liveliness'):
+        for word in getattr(qos, f'{field.capitalize()}Policy').short_keys():
+            assert getattr(bags.QosProfile(**{field: word}), field) == word
+
+
+def test_offers_of_older_versions_and_such_that_cannot_be_read() -> None:
+    assert parse_offered_qos(HUMBLE_OFFER) == (bags.QosProfile(
         history='unknown', depth=0, reliability='best_effort', durability='transient_local',
         liveliness_lease_duration_ns=1_500_000_000),)
-
-
-@pytest.mark.parametrize('text', [
-    '', 'x', '- 3', '- history: 1', '[', HUMBLE_OFFER.replace('reliability: 2', 'reliability: 9'),
-    HUMBLE_OFFER.replace('depth: 0', 'depth: -1'),
-    HUMBLE_OFFER.replace('sec: 1', 'sec: 2001-99-01'),
-])
-def test_offer_that_cannot_be_read_is_left_out(text: str) -> None:
-    assert parse_offered_qos(text) == ()
+    for text in ('', 'x', '- 3', '- history: 1', '[', *(
+            HUMBLE_OFFER.replace(*other) for other in (
+                ('reliability: 2', 'reliability: 9'), ('depth: 0', 'depth: -1'),
+                ('liveliness: 1', 'liveliness: 2'), ('sec: 1', 'sec: 2001-99-01')))):
+        assert parse_offered_qos(text) == ()

@@ -1,35 +1,35 @@
 # SPDX-FileCopyrightText: 2026 The koopman_ros Authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""Records of any sequence of events give the same commands again, from any snapshot on."""
+"""
+Records of any sequence of events give the same commands again, from any snapshot on.
 
-from dataclasses import replace
+Values go through JSON bit-identical, and nothing but data comes back.
+"""
+
+from dataclasses import dataclass, replace
+import json
 from pathlib import Path
+import re
+from typing import Any
 
 from hypothesis import given, settings
 from hypothesis import strategies as st
 import numpy as np
 import pytest
 
-from koopman_ros.control import Mode
-from koopman_ros.control.events import (
-    Initialisation,
-    ManualCommand,
-    ModeChange,
-    SetpointRequest,
-    Silence,
-)
+from koopman_ros.control import events, Mode, State
 from koopman_ros.lifting import load_with_digest, save
 from koopman_ros.nodes.replay import replay_records
+from koopman_ros.replay import records
 from koopman_ros.replay.loop import Alternative, Lost, Replay
-from koopman_ros.replay.records import parse, RecordError, SNAPSHOT, START
 from koopman_ros.replay.sources import Models
 from koopman_ros.resources import config_directory
 from support.recorded_runs import COOLANT, MODELS, Recorded, SECOND, STEADY
 
 
 def replayed(texts: list[str], alternative: Alternative | None = None) -> Replay:
-    return replay_records(map(parse, texts), (), alternative)
+    return replay_records(map(records.parse, texts), (), alternative)
 
 
 def identical(found: Replay, part: str = 'replayed') -> list[bool]:
@@ -65,16 +65,16 @@ def happen(controller: Recorded, event: tuple) -> None:
         case ('measure', kelvin, after, applied):
             controller.measure(kelvin, after, applied)
         case ('silence', seconds):
-            controller.do(Silence(controller.now + round(seconds * SECOND)))
+            controller.do(events.Silence(controller.now + round(seconds * SECOND)))
         case ('setpoint', kelvin, ahead):
             stamp_ns = controller.now + round(ahead * SECOND) if ahead else 0
-            controller.do(SetpointRequest(stamp_ns, np.array([kelvin])))
+            controller.do(events.SetpointRequest(stamp_ns, np.array([kelvin])))
         case ('manual', kelvin):
-            controller.do(ManualCommand(np.array([kelvin])))
+            controller.do(events.ManualCommand(np.array([kelvin])))
         case ('mode', mode):
-            controller.do(ModeChange(mode))
+            controller.do(events.ModeChange(mode))
         case ('applied', kelvin):
-            controller.do(Initialisation(np.array([kelvin])))
+            controller.do(events.Initialisation(np.array([kelvin])))
         case ('exchange', parameters):
             controller.exchange(**parameters)
         case ('snapshot',):
@@ -95,8 +95,10 @@ def test_any_run_is_reproduced_from_its_start_and_from_any_place(
     assert len(found.samples) == len(controller.commands)
     assert not found.lost
     late = controller.texts[place:]
-    snapshots = [k for k, text in enumerate(late) if parse(text).event in (START, SNAPSHOT)]
-    before = sum('command' in parse(text).fields for text in late[:min(snapshots, default=None)])
+    parsed = [records.parse(text) for text in late]
+    snapshots = [k for k, record in enumerate(parsed)
+                 if record.event in (records.START, records.SNAPSHOT)]
+    before = sum('command' in record.fields for record in parsed[:min(snapshots, default=None)])
     found = replayed(late)
     assert [sample.replayed is None for sample in found.samples] == [
         k < before for k in range(len(found.samples))]
@@ -108,7 +110,7 @@ def day(**options: object) -> Recorded:
     controller = Recorded(**options)
     for k in range(60):
         if k % 20 == 10:
-            controller.do(SetpointRequest(0, np.array([STEADY - 0.1 * k])))
+            controller.do(events.SetpointRequest(0, np.array([STEADY - 0.1 * k])))
             controller.snapshot()
         controller.measure(STEADY - 0.05 * k)
     return controller
@@ -139,16 +141,16 @@ def test_same_model_under_the_same_parameters_commands_the_same() -> None:
     controller = Recorded(setpoint_ramp=6.0)
     for k in range(40):
         if k == 10:
-            controller.do(SetpointRequest(0, np.array([STEADY - 6.0])))
+            controller.do(events.SetpointRequest(0, np.array([STEADY - 6.0])))
         if k == 20:
             controller.exchange(coolant_weight=0.5)
         if k in (25, 30):
-            controller.do(ModeChange(Mode.MANUAL if k == 25 else Mode.AUTOMATIC))
+            controller.do(events.ModeChange(Mode.MANUAL if k == 25 else Mode.AUTOMATIC))
         controller.measure(STEADY - 0.1 * k)
     model, digest = MODELS['reactor_nz4']
     for texts in (controller.texts, day().texts[12:]):
         found = replayed(texts, Alternative(model, digest))
-        assert parse(texts[0]).event in (START, SNAPSHOT)
+        assert records.parse(texts[0]).event in (records.START, records.SNAPSHOT)
         assert all(identical(found, 'alternative'))
     found = replayed(controller.texts, Alternative(model, digest, {'coolant_weight': 0.1}))
     assert not all(identical(found, 'alternative'))
@@ -171,55 +173,120 @@ def test_own_model_is_found_where_it_lies_now(tmp_path: Path) -> None:
     moved = Models([tmp_path]).find(name, digest)
     assert moved.provenance == model.provenance
     assert Models([path]).find(name, digest).provenance == model.provenance
-    with pytest.raises(RecordError, match=r'own.safetensors \(SHA-256 .* neither shipped nor'):
+    with pytest.raises(records.RecordError, match=r'own.safetensors \(SHA-256 .* neither shipped'):
         Models([config_directory() / 'models']).find(name, digest)
 
 
 @pytest.mark.parametrize(('text', 'words'), [
-    ('', 'is no record of a controller'), ('[]', 'is no record of a controller'),
-    ('{}', 'is no record of a controller'), ('{"version":2}', 'are of version 2, this package'),
-    ('{"version":1,"run":"a","number":"x","event":"start"}', 'is no record'),
-    ('[' * 100_000, 'is no record'),
-])
+    *((text, 'is no record of a controller') for text in (
+        '', '[]', '{}', '{"version":1,"run":"a","number":"x","event":"start"}', '[' * 100_000)),
+    ('{"version":2}', 'are of version 2, this package')])
 def test_text_that_is_no_record(text: str, words: str) -> None:
-    with pytest.raises(RecordError, match=words):
-        parse(text)
+    with pytest.raises(records.RecordError, match=words):
+        records.parse(text)
 
 
-@pytest.mark.parametrize(('change', 'words'), [
-    (lambda fields: fields.pop('state'), 'record 0 of run a cannot be replayed'),
-    (lambda fields: fields['state'].pop('mode'), None),
-    (lambda fields: fields['state'].update({'@': 'os:system'}), "class 'os:system' is not known"),
-    (lambda fields: fields['state'].update(extra=1), 'unexpected keyword'),
-    (lambda fields: fields['state'].update(command={'@': 'array', 'dtype': '<f8', 'shape': [3],
-                                                    'values': [1.0, 2.0, 3.0]}), 'record 1'),
-    (lambda fields: fields['model'].update(digest='0' * 64), 'neither shipped nor found'),
-    (lambda fields: fields['parameters'].update(coolant_weight=-1.0), 'refuses .coolant_weight'),
-    (lambda fields: fields['parameters'].update(other=1.0), 'parameters other, which this'),
+def event(measured: object) -> dict[str, object]:
+    return {'stamp_ns': 1, 'measured': measured, 'applied': None}
+
+
+@pytest.mark.parametrize(('place', 'change', 'words'), [
+    (0, lambda fields: fields.pop('state'), 'record 0 of run a cannot be replayed'),
+    (0, lambda fields: fields['state'].update({'@': 'os:system'}), "'os:system' is not known"),
+    (0, lambda fields: fields['state'].update(extra=1), 'unexpected keyword'),
+    (0, lambda fields: fields['state'].update(command={
+        '@': 'array', 'dtype': '<f8', 'shape': [3], 'values': [1.0, 2.0, 3.0]}), 'record 1'),
+    (0, lambda fields: fields['model'].update(digest='0' * 64), 'neither shipped nor found'),
+    (0, lambda fields: fields['parameters'].update(coolant_weight=-1.0), 'refuses .coolant_weig'),
+    (0, lambda fields: fields['parameters'].update(other=1.0), 'parameters other, which this'),
+    # what has a default may be missing, as in a later version
+    (0, lambda fields: fields['state'].pop('mode'), ''),
+    (1, {'event': 'unheard'}, "the event 'unheard' is not known"),
+    (1, {'fields': event({})}, 'is no list of numbers'),
+    (1, {'fields': event([])}, 'record 1 of run a cannot be replayed'),
+    (1, {'fields': {}}, 'record 1 of run a cannot be replayed'),
+    (1, {'number': 0}, 'record 0 of run a comes again, or after record 0'),
 ])
-def test_snapshot_that_does_not_fit(change: object, words: str | None) -> None:
+def test_record_that_does_not_fit(place: int, change: Any, words: str) -> None:
     controller = Recorded()
     controller.measure(STEADY)
-    record = parse(controller.texts[0])
-    change(record.fields)
-    if words is None:
-        # what has a default may be missing, as in a later version
-        assert all(identical(replayed([record.text(), *controller.texts[1:]])))
+    texts = controller.texts
+    record = records.parse(texts[place])
+    if place:
+        record = replace(record, **change)
+    else:
+        change(record.fields)
+    texts[place] = record.text()
+    if not words:
+        assert all(identical(replayed(texts)))
         return
-    with pytest.raises(RecordError, match=words):
-        replayed([record.text(), *controller.texts[1:]])
+    with pytest.raises(records.RecordError, match=words):
+        replayed(texts)
 
 
-@pytest.mark.parametrize(('change', 'words'), [
-    ({'event': 'unheard'}, "the event 'unheard' is not known"),
-    ({'fields': {'stamp_ns': 1, 'measured': {}, 'applied': None}}, 'is no list of numbers'),
-    ({'fields': {'stamp_ns': 1, 'measured': [], 'applied': None}}, 'record 1 of run a cannot'),
-    ({'fields': {}}, 'record 1 of run a cannot be replayed'),
-    ({'number': 0}, 'record 0 of run a comes again, or after record 0'),
+# Values.
+
+
+@dataclass(frozen=True)
+class Leaf:
+    mode: Mode
+    weights: np.ndarray
+    note: object = None
+
+
+class Plain:
+    pass
+
+
+FLOATS = st.floats() | st.sampled_from([-0.0, 5e-324, 1.7976931348623157e308, 0.1])
+ARRAYS = st.lists(FLOATS, max_size=4).map(np.array) | st.lists(
+    FLOATS, min_size=6, max_size=6).map(lambda values: np.array(values).reshape(2, 3)) | (
+    st.lists(st.integers(-9, 9), max_size=3).map(lambda values: np.array(values, dtype=int))) | (
+    st.just(np.zeros((0, 3))))
+VALUES = st.recursive(
+    st.none() | st.booleans() | st.integers() | FLOATS | st.text(max_size=5) | ARRAYS
+    | st.sampled_from(Mode) | FLOATS.map(np.float64),
+    lambda inner: st.lists(inner, max_size=3).map(tuple) | st.dictionaries(
+        st.text(max_size=3).filter(lambda key: key != '@'), inner, max_size=3) | st.builds(
+        Leaf, st.sampled_from(Mode), ARRAYS, inner), max_leaves=12)
+
+
+def exact(value: object) -> str:
+    """Return a text that tells all values apart: of types, of bits, but not of several NaN."""
+    with np.printoptions(floatmode='unique'):
+        return re.sub(r'np\.float64\(([^)]*)\)', r'\1', repr(value))
+
+
+@given(VALUES)
+def test_values_survive_bit_identical(value: object) -> None:
+    text = json.dumps(records.encoded(value), allow_nan=False)
+    assert exact(records.decoded(json.loads(text))) == exact(value)
+
+
+@given(st.lists(FLOATS, max_size=5))
+def test_numbers_survive_bit_identical(values: list[float]) -> None:
+    array = np.array(values, dtype=np.float64)
+    back = records.float_array(json.loads(json.dumps(records.numbers(array), allow_nan=False)))
+    assert exact(back) == exact(array)
+    assert not back.flags.writeable
+
+
+@pytest.mark.parametrize(('text', 'error'), [
+    ({'@': 'os:system'}, ValueError), ({'@': 'subprocess:Popen', 'args': ['true']}, ValueError),
+    ({'@': f'{__name__}:Plain'}, ValueError), ({'@': 'no_such_module:State'}, ValueError),
+    ({'@': 'koopman_ros.control.state:State', 'other': 1}, TypeError),
+    ({'@': f'{Mode.__module__}:Mode', 'name': 'ASLEEP'}, KeyError),
 ])
-def test_event_that_does_not_fit(change: dict, words: str) -> None:
-    controller = Recorded()
-    controller.measure(STEADY)
-    record = replace(parse(controller.texts[1]), **change)
-    with pytest.raises(RecordError, match=words):
-        replayed([controller.texts[0], record.text()])
+def test_only_known_data_is_made(text: dict, error: type[Exception]) -> None:
+    with pytest.raises(error):
+        records.decoded(text)
+
+
+@pytest.mark.parametrize('value', [Plain(), {1, 2}, b'bytes', lambda: None])
+def test_what_is_no_data_is_refused(value: object) -> None:
+    with pytest.raises(TypeError, match='cannot be written to a record'):
+        records.encoded(value)
+
+
+def test_first_state_of_a_controller() -> None:
+    assert exact(records.decoded(records.encoded(State()))) == exact(State())
