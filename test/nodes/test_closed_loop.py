@@ -45,12 +45,6 @@ class Loop:
     def start_plant(self, **parameters: object) -> None:
         self.ros.start('plant', parameters, self._remaps)
 
-    def settled(self, celsius: float) -> bool:
-        """Tell whether the last twenty temperatures are near a value."""
-        last = self.measured[-20:]
-        return len(last) == 20 and all(
-            abs(message.temperature - celsius) <= 0.01 for message in last)
-
     def rest(self) -> None:
         """Wait until the plant has come to rest at the set-point for another half a minute."""
         seen = len(self.commands)
@@ -90,7 +84,8 @@ def test_two_loops_side_by_side_in_their_namespaces_and_with_another_topic(ros: 
         loop.start_controller(celsius)
         loop.start_plant(**LOCKSTEP, speed=0.0)
     for celsius, loop in loops.items():
-        ros.wait_until(lambda celsius=celsius, loop=loop: loop.settled(celsius))
+        ros.wait_until(lambda celsius=celsius, loop=loop: len(loop.measured) > 20 and all(
+            abs(message.temperature - celsius) <= 0.01 for message in loop.measured[-20:]))
     ros.wait_until(lambda: {status.name for status in ros.statuses} >= {
         'unit_1/plant: simulation', 'unit_2/controller: control'})
     assert ros.node.count_publishers('/unit_2/temperature') == 0

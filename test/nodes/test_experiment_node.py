@@ -26,6 +26,7 @@ from support.nodes import seconds, temperature, value
 
 STATUS = 'trainer: experiment'
 SERVICE = 'trainer/experiment'
+TRAINER, JACKET = 'unit_1/trainer', '/unit_1/jacket'
 SAFE = TrainerParameters().safe_coolant
 LOCKSTEP = {'lockstep': True, 'speed': 0.0, 'lockstep_subscribers': 2}
 IDLE = {'record_at_start': False}
@@ -33,27 +34,32 @@ LOST = 'the trainer does not command the coolant any more'
 
 
 class Bench:
-    """A trainer with a thermometer and a coolant in the test."""
+    """A trainer in a namespace with a best-effort thermometer and a coolant of another name."""
 
-    def __init__(self, ros: Harness, arguments: tuple[str, ...] = (), prefix: str = '',
-                 coolant: str = topics.COOLANT_SETPOINT,
-                 qos: QoSProfile = topics.LOOP_QOS) -> None:
+    def __init__(self, ros: Harness) -> None:
         self.ros = ros
-        self._service = f'{prefix}{SERVICE}'
-        self.coolant = f'{prefix}{coolant}'
-        self.commands = ros.listen(Temperature, self.coolant)
-        ros.start('trainer', IDLE, arguments)
+        self.commands = ros.listen(Temperature, JACKET)
+        ros.start('trainer', IDLE, ('-r', '__ns:=/unit_1', '-r', 'coolant_setpoint:=jacket'))
         self.thermometer = ros.node.create_publisher(
-            Temperature, f'{prefix}{topics.TEMPERATURE}', qos)
+            Temperature, '/unit_1/temperature',
+            QoSProfile(depth=10, reliability=ReliabilityPolicy.BEST_EFFORT))
         self._time = 0.0
-        ros.meet(f'{prefix}trainer')
+        ros.meet(TRAINER)
+
+    def ask(self, begin: bool) -> tuple[bool, str]:
+        response = self.ros.set_bool(f'unit_1/{SERVICE}', begin)
+        return response.success, response.message
+
+    def set(self, **parameters: object) -> None:
+        for result in self.ros.set_parameters(TRAINER, **parameters):
+            assert result.successful, result.reason
 
     def start(self, celsius: float = 45.0) -> tuple[bool, str]:
         """Start an experiment, measuring all the while; return what the service answers."""
         timer = self.ros.node.create_timer(0.02, lambda: self.measure(celsius))
-        response = self.ros.set_bool(self._service, True)
+        answer = self.ask(True)
         self.ros.node.destroy_timer(timer)
-        return response.success, response.message
+        return answer
 
     def measure(self, celsius: float = 45.0) -> None:
         self._time += 1.0
@@ -65,7 +71,7 @@ class Bench:
         return float(self.commands[-1].temperature)
 
     def status(self, words: str) -> DiagnosticStatus:
-        return self.ros.wait_for_status(STATUS, lambda s: words in s.message)
+        return self.ros.wait_for_status(f'unit_1/{STATUS}', lambda s: words in s.message)
 
 
 def start_with_plant(ros: Harness, trainer: Mapping[str, object],
@@ -109,14 +115,6 @@ def test_steps_drive_the_plant_as_planned(ros: Harness) -> None:
     assert progress.phase is Phase.FINISHED
 
 
-def test_names_follow_namespace_and_remaps(ros: Harness) -> None:
-    bench = Bench(ros, ('-r', '__ns:=/unit_1', '-r', 'coolant_setpoint:=jacket'),
-                  prefix='/unit_1/', coolant='jacket',
-                  qos=QoSProfile(depth=10, reliability=ReliabilityPolicy.BEST_EFFORT))
-    assert bench.start() == (True, 'running on /unit_1/jacket')
-    ros.wait_until(lambda: bench.commands)
-
-
 @pytest.fixture(scope='module')
 def shared_bench(shared_ros: Harness) -> Bench:
     return Bench(shared_ros)
@@ -133,17 +131,17 @@ def test_what_is_in_the_way_refuses_the_start(shared_bench: Bench) -> None:
         assert words in said
         assert bench.status(words).level == DiagnosticStatus.WARN
         assert bench.commands == []
-        ros.wait_until(lambda: ros.node.count_publishers(bench.coolant) == 0)
+        ros.wait_until(lambda: ros.node.count_publishers(JACKET) == 0)
 
-    ros.set_parameters('trainer', experiment_timeout=0.3)
-    assert ros.set_bool(SERVICE, True).message == (
+    bench.set(experiment_timeout=0.3)
+    assert bench.ask(True)[1] == (
         'refused: no newer measurement for more than 0.3 s: check sensor and plant')
     # a busy machine may be as slow
-    ros.set_parameters('trainer', experiment_timeout=10.0)
+    bench.set(experiment_timeout=10.0)
 
-    ros.set_parameters('trainer', experiment_topic='manual_coolant_setpoint')
+    bench.set(experiment_topic='manual_coolant_setpoint')
     assert 'start the controller and switch it to manual mode' in bench.start()[1]
-    ros.set_parameters('trainer', experiment_topic='coolant_setpoint')
+    bench.set(experiment_topic='coolant_setpoint')
 
 
 @pytest.mark.parametrize(('given', 'words'), [
@@ -161,28 +159,27 @@ def test_contradicting_limits_are_refused(given: dict[str, object], words: str) 
 
 def test_service_ends_the_steps_and_then_lets_go(shared_bench: Bench) -> None:
     bench, ros = shared_bench, shared_bench.ros
-    assert ros.set_bool(SERVICE, False).message == 'no experiment is running'
-    assert bench.start() == (True, 'running on /coolant_setpoint')
-    assert not ros.set_bool(SERVICE, True).success
+    assert bench.ask(False)[1] == 'no experiment is running'
+    assert bench.start() == (True, 'running on /unit_1/jacket')
+    assert not bench.ask(True)[0]
     for _ in range(20):
         bench.answer()
     assert bench.answer() != pytest.approx(SAFE, abs=0.5)
-    assert value(bench.status('running'), 'topic') == '/coolant_setpoint'
+    assert value(bench.status('running'), 'topic') == JACKET
 
-    assert 'the coolant returns to 18.85 degC' in ros.set_bool(SERVICE, False).message
+    assert 'the coolant returns to 18.85 degC' in bench.ask(False)[1]
     bench.status('ended; the coolant returns')
     for _ in range(20):
         bench.answer()
     assert bench.answer() == pytest.approx(SAFE)
-    assert ros.set_bool(SERVICE, False).message == LOST
-    ros.wait_until(lambda: ros.node.count_publishers(topics.COOLANT_SETPOINT) == 0)
-    ros.wait_for_status(STATUS, lambda s: s.message == 'ended')
+    assert bench.ask(False)[1] == LOST
+    ros.wait_until(lambda: ros.node.count_publishers(JACKET) == 0)
+    ros.wait_for_status(f'unit_1/{STATUS}', lambda s: s.message == 'ended')
 
 
 def test_silent_sensor_brings_the_safe_coolant(shared_bench: Bench) -> None:
     bench, ros = shared_bench, shared_bench.ros
-    results = ros.set_parameters('trainer', experiment_timeout=0.5, experiment_rate_limit=600.0)
-    assert all(result.successful for result in results)
+    bench.set(experiment_timeout=0.5, experiment_rate_limit=600.0)
     # which a busy machine may miss
     ros.wait_until(lambda: bench.start()[0])
     for _ in range(5):
@@ -194,25 +191,25 @@ def test_silent_sensor_brings_the_safe_coolant(shared_bench: Bench) -> None:
     ros.wait_until(lambda: len(bench.commands) > heard + 2)
     # a sensor that comes back is answered, with the same
     assert bench.answer() == pytest.approx(SAFE, abs=1e-9)
-    assert ros.set_bool(SERVICE, False).message == LOST
-    ros.set_parameters('trainer', experiment_timeout=10.0, experiment_rate_limit=60.0)
+    assert bench.ask(False)[1] == LOST
+    bench.set(experiment_timeout=10.0, experiment_rate_limit=60.0)
 
 
 def test_another_commander_ends_it_at_once_and_refuses_the_next(shared_bench: Bench) -> None:
     bench, ros = shared_bench, shared_bench.ros
     assert bench.start()[0]
     bench.answer()
-    other = ros.node.create_publisher(Temperature, bench.coolant, topics.LOOP_QOS)
+    other = ros.node.create_publisher(Temperature, JACKET, topics.LOOP_QOS)
     status = bench.status('aborted')
     assert status.level == DiagnosticStatus.ERROR
     # found, perhaps, before its name is
     assert status.message.removeprefix('aborted: ') in (
-        '/bench publishes on /coolant_setpoint, too',
-        'another node publishes on /coolant_setpoint, too')
-    ros.wait_until(lambda: ros.node.count_publishers(bench.coolant) == 1)
+        '/bench publishes on /unit_1/jacket, too',
+        'another node publishes on /unit_1/jacket, too')
+    ros.wait_until(lambda: ros.node.count_publishers(JACKET) == 1)
     assert ros.wait_until(lambda: '/bench publishes' in (answer := bench.start())[1]
                           and answer) == (
-        False, 'refused: /bench publishes on /coolant_setpoint: end it, or choose another '
+        False, 'refused: /bench publishes on /unit_1/jacket: end it, or choose another '
         'experiment_topic')
     ros.node.destroy_publisher(other)
 

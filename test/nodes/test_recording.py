@@ -85,18 +85,30 @@ def test_kill_loses_no_more_than_the_last_second(
 
 
 def test_signal_completes_the_bag_with_all_that_arrived(ros: Harness, tmp_path: Path) -> None:
-    process = ros.start('trainer', {'output': tmp_path / 'run'})
-    received = ros.listen(Temperature, topics.TEMPERATURE, QoSProfile(depth=1000), raw=True)
-    publisher = ros.speak(Temperature, topics.TEMPERATURE, to='trainer', subscribers=2)
+    """In a namespace, with a topic outside the loop that is recorded by its name."""
+    bag = tmp_path / 'run'
+    process = ros.start('trainer', {'output': bag, 'topics': ['temperature', 'notes']},
+                        ('-r', '__ns:=/unit_1'))
+    received = ros.listen(Temperature, '/unit_1/temperature', QoSProfile(depth=1000), raw=True)
+    publisher = ros.speak(
+        Temperature, '/unit_1/temperature', to='/unit_1/trainer', subscribers=2)
+    notes = ros.speak(String, '/unit_1/notes', to='/unit_1/trainer')
+    said = [f'note {k}: 51.8 °C' for k in range(10)]
+    for note in said:
+        notes.publish(String(data=note))
+    assert notes.wait_for_all_acked(Duration(seconds=TIMEOUT))
     say(publisher, 900)
     ros.wait_until(lambda: len(received) == 900)
     assert process.stop(signal.SIGTERM) == 0
-    messages = recorded(tmp_path / 'run')
+    messages = recorded(bag, '/unit_1/temperature')
     assert values(messages) == list(range(900))
     assert [entry.data for entry in messages] == received
     logged = [entry.log_time_ns for entry in messages]
     assert logged == sorted(logged)
     assert all(entry.publish_time_ns <= entry.log_time_ns for entry in messages)
+    messages = recorded(bag, '/unit_1/notes')
+    assert [entry.message.data for entry in messages] == said
+    assert {entry.type_name for entry in messages} == {'std_msgs/msg/String'}
 
 
 @pytest.fixture(scope='module')
@@ -206,24 +218,6 @@ def test_bag_that_vanished_is_no_success(shared: Harness, tmp_path: Path) -> Non
     assert response.message.startswith(f'{bag} is not complete: ')
     status = shared.wait_for_status(STATUS, lambda s: s.level == DiagnosticStatus.ERROR)
     assert status.message == response.message
-
-
-def test_topic_outside_the_loop_is_recorded_by_name_in_a_namespace(
-        ros: Harness, tmp_path: Path) -> None:
-    bag = tmp_path / 'run.mcap'
-    process = ros.start('trainer', {'output': bag, 'topics': ['temperature', 'notes']},
-                        ('-r', '__ns:=/unit_1'))
-    say(ros.speak(Temperature, '/unit_1/temperature', to='/unit_1/trainer'), 5)
-    notes = ros.speak(String, '/unit_1/notes', to='/unit_1/trainer')
-    said = [f'note {k}: 51.8 °C' for k in range(10)]
-    for note in said:
-        notes.publish(String(data=note))
-    assert notes.wait_for_all_acked(Duration(seconds=TIMEOUT))
-    assert process.stop() == 0
-    assert values(recorded(bag, '/unit_1/temperature')) == list(range(5))
-    messages = recorded(bag, '/unit_1/notes')
-    assert [entry.message.data for entry in messages] == said
-    assert {entry.type_name for entry in messages} == {'std_msgs/msg/String'}
 
 
 def test_full_disk_stops_the_recording_but_not_the_node(ros: Harness, tmp_path: Path) -> None:

@@ -10,7 +10,7 @@ import math
 import os
 from pathlib import Path
 import sys
-from typing import Any, BinaryIO
+from typing import Any
 
 from diagnostic_msgs.msg import DiagnosticStatus
 import numpy as np
@@ -143,9 +143,6 @@ def test_forty_reloads_under_load_leave_no_trace(ros: Harness, tmp_path: Path) -
     assert np.ptp(commands) > 0.2
 
 
-# Models that are refused.
-
-
 SHIPPED = load(model_path('reactor_nz4'))
 
 
@@ -248,50 +245,42 @@ def start_controller(ros: Harness, folder: Path, changes: str = '') -> tuple[Ben
     return Bench(ros), file
 
 
-def hang(*files: Path) -> None:
-    for file in files:
-        os.mkfifo(f'{file}.disk')
-
-
-def wait_for_reader(ros: Harness, file: Path) -> BinaryIO:
-    """Wait until a file is read; closing what is returned lets the reader go on."""
-    return opened(ros, Path(f'{file}.disk'))
+def disk(file: Path) -> Path:
+    return Path(f'{file}.disk')
 
 
 def test_loop_goes_on_while_a_slow_disk_is_read(ros: Harness, tmp_path: Path) -> None:
     bench, file = start_controller(ros, tmp_path)
     dead = file.with_name('dead.safetensors')
-    hang(file, dead)
+    for path in (file, dead):
+        os.mkfifo(disk(path))
     put(model_path('reactor_nz3').read_bytes(), file)
     reloaded = bench.ask_to_reload()
-    slow = wait_for_reader(ros, file)
+    # closing it lets the reader go on
+    slow = opened(ros, disk(file))
     (result,) = ros.set_parameters('controller', model=str(dead))
     assert result.reason.startswith(f'the old model is kept: {dead} is still being read')
     for _ in range(50):
         bench.measure()
     ros.wait_until(lambda: len(bench.commands) == 50)
     assert not reloaded.done()
-
     slow.close()
     ros.wait_until(reloaded.done)
     assert reloaded.result().success
     assert 'n_z = 3' in reloaded.result().message
-    # the other is still being read when the process is told to end
-    assert ros.processes[0].stop() == 0
-    assert 'Traceback' not in ros.printed()
 
-
-def test_model_changed_during_a_slow_reload_stays(ros: Harness, tmp_path: Path) -> None:
-    bench, file = start_controller(ros, tmp_path)
-    hang(file)
+    # one that is changed during a slow reload stays
     reloaded = bench.ask_to_reload()
-    slow = wait_for_reader(ros, file)
+    slow = opened(ros, disk(file))
     assert bench.set('reactor_linear')[0]
     slow.close()
     ros.wait_until(reloaded.done)
     assert not reloaded.result().success
     assert 'the model was changed to reactor_linear' in reloaded.result().message
     ros.wait_for_status(STATUS, lambda s: value(s, 'model') == 'reactor_linear')
+    # the other is still being read when the process is told to end
+    assert ros.processes[0].stop() == 0
+    assert 'Traceback' not in ros.printed()
 
 
 def test_dead_disk_does_not_pile_up_readers_and_a_healthy_one_is_read(
@@ -302,7 +291,8 @@ model_reload._LONG_WAIT = 0.02
 model_reload._mount_of = lambda path: '/dead' if path.startswith('{tmp_path}/') else '/'
 """)
     others = [file.with_name(f'{k}.safetensors') for k in range(8)]
-    hang(file, *others)
+    for path in (file, *others):
+        os.mkfifo(disk(path))
     assert bench.reload() == (
         False, f'the old model is kept: {file} was not read within 0.02 s: check its disk')
     assert bench.reload() == (
