@@ -24,8 +24,8 @@ from koopman_ros.testing import Harness, isolated_domain
 ROOT = Path(__file__).parents[2]
 NODES = {'plant': 'simulation', 'controller': 'control', 'trainer': 'recording'}
 # what ends by itself, and what it says of a bag that is not there
-TOOLS = {'player': "cannot start: bag 'none' does not exist",
-         'replay': "bag 'none' does not exist"}
+TOOLS = {'player': ('bag:=none', "cannot start: bag 'none' does not exist"),
+         'replay': ('bags:=[none]', "bag 'none' does not exist")}
 # Notes what is opened below the repository, but for the environment that the tests run in. `open`
 # is an audit event of imports and of files alike.
 NOTING = f"""
@@ -80,7 +80,9 @@ def run(command: tuple[str, ...], **options: object) -> subprocess.CompletedProc
                           **options)  # type: ignore[call-overload]
 
 
-def by_colcon(folder: Path) -> Installation:
+@pytest.fixture(scope='module')
+def colcon(tmp_path_factory: pytest.TempPathFactory) -> Installation:
+    folder = tmp_path_factory.mktemp('workspace')
     sources(folder / 'src' / 'koopman_ros')
     built = run((sys.executable, '-m', 'colcon', 'build', '--event-handlers', 'console_direct+'),
                 cwd=folder)
@@ -92,8 +94,10 @@ def by_colcon(folder: Path) -> Installation:
         f'. {folder}/install/setup.bash', Path(sys.executable), folder / 'notes')
 
 
-def by_pip(folder: Path) -> Installation:
+@pytest.fixture(scope='module')
+def wheel(tmp_path_factory: pytest.TempPathFactory) -> Installation:
     """Build a wheel and install it into an empty environment; requirements are those of here."""
+    folder = tmp_path_factory.mktemp('wheel')
     wheels = folder / 'wheels'
     wheels.mkdir()
     built = run((sys.executable, '-c', 'import sys; from setuptools import build_meta; '
@@ -114,16 +118,6 @@ def by_pip(folder: Path) -> Installation:
     return Installation(
         environment / 'bin', environment / 'share' / 'koopman_ros', site / 'koopman_ros',
         'unset PYTHONPATH AMENT_PREFIX_PATH', environment / 'bin' / 'python', notes)
-
-
-@pytest.fixture(scope='module')
-def colcon(tmp_path_factory: pytest.TempPathFactory) -> Installation:
-    return by_colcon(tmp_path_factory.mktemp('workspace'))
-
-
-@pytest.fixture(scope='module')
-def wheel(tmp_path_factory: pytest.TempPathFactory) -> Installation:
-    return by_pip(tmp_path_factory.mktemp('wheel'))
 
 
 @pytest.fixture(params=['colcon', 'wheel'])
@@ -171,12 +165,12 @@ def test_nodes_of_the_wheel_start_with_their_parameter_files_and_end(
 @pytest.mark.parametrize(('installation', 'name'), [('colcon', 'player'), ('wheel', 'replay')],
                          indirect=['installation'])
 def test_a_tool_reads_its_parameters(installation: Installation, name: str) -> None:
-    parameter = {'player': 'bag:=none', 'replay': 'bags:=[none]'}[name]
+    parameter, words = TOOLS[name]
     with isolated_domain():
         ended = run(installation.command(str(installation.executables / name), '--ros-args', '-p',
                                          parameter))
     assert ended.returncode == 1
-    assert ended.stderr.strip() == f'{name}: {TOOLS[name]}: check the path'
+    assert ended.stderr.strip() == f'{name}: {words}: check the path'
 
 
 def test_no_module_of_the_wheel_needs_the_repository(wheel: Installation) -> None:

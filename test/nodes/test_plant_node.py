@@ -180,8 +180,7 @@ def test_lockstep_waits_for_a_controller_and_is_paced(ros: Harness) -> None:
     ros.wait_until(lambda: stamps <= {seconds(message) for message in bench.measured})
 
 
-def test_reset_returns_to_the_initial_temperature_until_the_duration_is_over(ros: Harness
-                                                                              ) -> None:
+def test_reset_returns_to_the_start_until_the_duration_is_over(ros: Harness) -> None:
     bench = Bench(ros, initial_temperature_offset=-5.0, start_time=10.0, duration=210.0,
                   sample_period=0.7)
     initial = bench.wait_for_more(1)[0].temperature

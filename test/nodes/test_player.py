@@ -199,8 +199,7 @@ def test_measurements_come_at_their_times(ros: Harness, tmp_path: Path) -> None:
     assert arrived[-1] - arrived[0] > 0.75 * 8.0 / 4.0
 
 
-def test_clock_shows_the_stamp_of_each_measurement_before_it(ros: Harness, tmp_path: Path
-                                                             ) -> None:
+def test_clock_shows_the_stamp_of_each_measurement(ros: Harness, tmp_path: Path) -> None:
     bag = write_bag(tmp_path / 'bag.mcap', [
         ('/temperature', temperature(50.0, 100.0), 1.0),
         # a request for later does not move the time

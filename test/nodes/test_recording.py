@@ -147,8 +147,7 @@ def test_recording_stops_and_starts_by_service(shared: Harness, tmp_path: Path) 
         assert values(recorded(tmp_path / name)) == [1000 * number + k for k in range(900)]
 
 
-def test_takes_the_next_name_beside_an_existing_recording(shared: Harness, tmp_path: Path
-                                                          ) -> None:
+def test_takes_the_next_name_beside_a_recording(shared: Harness, tmp_path: Path) -> None:
     bag, second = tmp_path / 'run', tmp_path / 'run_2'
     bag.mkdir()
     (bag / 'run_0.mcap').write_text('precious')
@@ -185,8 +184,7 @@ def test_split_bag_reads_as_one(shared: Harness, tmp_path: Path) -> None:
     shared.node.destroy_publisher(publisher)
 
 
-def test_too_little_room_stops_the_recording_but_not_the_node(shared: Harness, tmp_path: Path
-                                                              ) -> None:
+def test_too_little_room_stops_the_recording_alone(shared: Harness, tmp_path: Path) -> None:
     ros, bag = shared, tmp_path / 'run'
     publisher = record(ros, bag)
     say(publisher, 900)
