@@ -7,13 +7,14 @@ import argparse
 from collections.abc import Sequence
 from pathlib import Path
 import sys
+from typing import Any
 
 from koopman_ros.testing import deferred_interrupt
 from validation.faults import report
-from validation.faults.case import Case
+from validation.faults.case import Case, Trace
 from validation.faults.cases import CASES
 from validation.faults.endurance import HOURS, run_endurance
-from validation.faults.harness import Outcome, run
+from validation.faults.harness import run
 
 SOAK = 'soak'
 # One of each group, quick ones that say much.
@@ -43,32 +44,33 @@ def main(args: list[str] | None = None) -> int:
     names = given.names or (QUICK if given.quick else [*CASES, SOAK])
     cases = [case for case in CASES.values() if case.name in names or case.group in names]
     if given.list:
-        for case in cases:
-            print(f'{case.name:34s}{case.group:14s}{case.does}')
+        print(*(f'{case.name:34s}{case.group:14s}{case.does}' for case in cases), sep='\n')
         return 0
     return _run(cases, given.hours if SOAK in names else 0.0, given.output)
 
 
 def _run(cases: Sequence[Case], hours: float, folder: Path) -> int:
-    outcomes: list[Outcome] = []
+    results: dict[str, dict[str, Any]] = {}
+    traces: dict[str, Trace] = {}
     endured = None
     try:
         with deferred_interrupt() as check:
             for number, case in enumerate(cases, 1):
                 print(f'[{number:2d}/{len(cases)}] {case.name:34s}', end='', flush=True)
-                outcomes.append(run(case, folder / 'logs' / case.name, check))
-                print(report.line(outcomes[-1]), flush=True)
-                report.write(folder, outcomes, None)
+                results[case.name], traces[case.name] = run(
+                    case, folder / 'logs' / case.name, check)
+                print(report.line(results[case.name]), flush=True)
+                report.write(folder, results)
             if hours:
                 endured = run_endurance(folder / 'logs' / SOAK, check, hours)
-                print('\n'.join(endured.reasons) or 'survived')
+                print('\n'.join(endured['reasons']) or 'survived')
     except KeyboardInterrupt:
         print(f'\ninterrupted; what was finished is in {folder}', file=sys.stderr)
         return 130
-    report.write(folder, outcomes, endured, report.draw(outcomes, folder / report.FIGURE))
-    print(f'\n{sum(outcome.survived for outcome in outcomes)} of {len(outcomes)} cases survived; '
-          f'see {folder / "report.md"}')
-    return 0 if report.survived(outcomes, endured) else 1
+    survived = report.write(folder, results, endured, traces)
+    print(f'\n{sum(result["survived"] for result in results.values())} of {len(results)} cases '
+          f'survived; see {folder / "report.md"}')
+    return 0 if survived else 1
 
 
 if __name__ == '__main__':

@@ -60,15 +60,8 @@ class Case:
     allowed_errors: tuple[str, ...] = ()  #: statuses (``<node>: <task>``) that may end in ERROR
 
 
-class Sample(NamedTuple):
-    """A true temperature of the reactor, in degrees Celsius, at a plant time in seconds."""
-
-    seconds: float
-    celsius: float
-
-
 class Command(NamedTuple):
-    """A coolant command in degrees Celsius, with the stamp that it carries."""
+    """A coolant command, with the stamp that it carries."""
 
     seconds: float
     celsius: float
@@ -89,7 +82,8 @@ class Status(NamedTuple):
 class Trace:
     """All that was seen of a case; times are plant time in seconds since the first measurement."""
 
-    samples: list[Sample] = field(default_factory=list)  #: before any fault of the sensor
+    #: (when, true temperature before any fault of the sensor in degrees Celsius)
+    samples: list[tuple[float, float]] = field(default_factory=list)
     #: what the operator wanted: (from when on, degrees Celsius)
     setpoints: list[tuple[float, float]] = field(default_factory=list)
     commands: list[Command] = field(default_factory=list)  #: as the controller published them

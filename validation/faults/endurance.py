@@ -5,13 +5,12 @@
 
 from collections import Counter
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass
-from functools import partial
 import math
 from pathlib import Path
 import shutil
 import signal
 import time
+from typing import Any
 
 import numpy as np
 from numpy.random import default_rng, Generator
@@ -24,121 +23,71 @@ from validation.faults import interceptor
 from validation.faults.case import LOCKSTEP, SETPOINT, Trace
 from validation.faults.harness import FaultHarness
 from validation.faults.interceptor import Alteration, value
-from validation.faults.judge import out_of_range, Responses, responses
+from validation.faults.judge import out_of_range, responses
 
 HOURS = 24.0
-_SEED = 0
 _EVENT_PERIOD = 300.0  # s, mean time between two events
 _WALL_PER_HOUR = 240.0  # s, at most
 _LOOKS = 200  # at the memory
 _WARM = 0.25  # share of the run after which memory is to be flat
 _GROWTH = 4.0  # MB that a process may grow from then on
 _RECORDED = ('temperature', 'coolant_setpoint')
-_MEGABYTE = 1e6
 
 
-@dataclass(frozen=True)
-class Memory:
-    """The resident memory of a process over the run."""
-
-    seconds: Array  #: (N,) plant time
-    megabytes: Array  #: (N,) resident
-
-    @property
-    def growth(self) -> float:
-        """By how much it grows by a straight line from when the process is warm, MB."""
-        warm = self.seconds >= _WARM * self.seconds[-1]
-        if np.count_nonzero(warm) < 3:
-            return 0.0
-        # from the first on, so that what does not grow is exactly 0
-        since = self.megabytes[warm] - self.megabytes[warm][0]
-        slope = np.polyfit(self.seconds[warm], since, 1)[0]
-        return float(slope * np.ptp(self.seconds[warm])) + 0.0
-
-
-@dataclass(frozen=True)
-class Endurance:
-    """What an endurance run found."""
-
-    reasons: tuple[str, ...]  #: what is held against it, in sentences
-    hours: float  #: of plant time
-    wall: float  #: what it took, s
-    answers: Responses  #: how measurements were answered
-    events: dict[str, int]  #: how often each happened
-    memory: dict[str, Memory]  #: by process
-    recorded: dict[str, int]  #: messages in the bag by topic
-    hottest: float  #: the highest true temperature, degC
-    mean_error: float  #: mean |T - set-point| in K
-
-
-# What may happen in a day: faults of messages, requests, disturbances; each ends by itself.
+def _happen(event: str, loop: FaultHarness, random: Generator) -> None:
+    """Do what may happen in a day: each ends by itself."""
+    what, _, alteration = event.partition(': ')
+    match event:
+        case 'set-point':
+            loop.request(float(random.uniform(42.0, 50.0)))
+        case 'disturbance':
+            loop.set_parameters(
+                'plant', feed_temperature=float(random.uniform(74.0, 80.0)),
+                heat_transfer_coefficient=float(random.uniform(45000.0, 55000.0)),
+                noise=float(random.uniform(0.0, 0.05)))
+        case 'impossible set-point':
+            celsius = float(random.choice([math.nan, 90.0, -1e9]))
+            loop.setpoint.publish(Temperature(temperature=celsius))
+        case 'weights':
+            loop.set_parameters(
+                'controller', coolant_weight=float(10.0 ** random.uniform(-1.0, 1.0)),
+                temperature_weight=float(random.choice([1.0, math.nan])))
+        case 'manual mode':
+            loop.ros.set_bool('controller/set_automatic', False)
+            loop.run_for(float(random.uniform(5.0, 60.0)))
+            loop.ros.set_bool('controller/set_automatic', True)
+        case 'model':
+            loop.set_parameters('controller', model=str(random.choice(
+                ['reactor_nz3', 'reactor_nz4', '/nowhere.safetensors'])))
+            loop.ros.trigger('controller/reload_model')
+        case 'plant reset':
+            loop.ros.trigger('plant/reset')
+        case _:
+            seconds = float(random.uniform(2.0, 60.0))
+            loop.alter(seconds, **{what: ALTERATIONS[alteration]()})
 
 
-def _alter(loop: FaultHarness, random: Generator, what: str, make: Callable[[], Alteration]
-           ) -> None:
-    loop.alter(float(random.uniform(2.0, 60.0)), **{what: make()})
-
-
-def _ask(loop: FaultHarness, random: Generator) -> None:
-    loop.request(float(random.uniform(42.0, 50.0)))
-
-
-def _ask_for_too_much(loop: FaultHarness, random: Generator) -> None:
-    celsius = float(random.choice([math.nan, 90.0, -1e9]))
-    loop.setpoint.publish(Temperature(temperature=celsius))
-
-
-def _disturb(loop: FaultHarness, random: Generator) -> None:
-    loop.set_parameters(
-        'plant', feed_temperature=float(random.uniform(74.0, 80.0)),
-        heat_transfer_coefficient=float(random.uniform(45000.0, 55000.0)),
-        noise=float(random.uniform(0.0, 0.05)))
-
-
-def _retune(loop: FaultHarness, random: Generator) -> None:
-    loop.set_parameters(
-        'controller', coolant_weight=float(10.0 ** random.uniform(-1.0, 1.0)),
-        temperature_weight=float(random.choice([1.0, math.nan])))
-
-
-def _by_hand(loop: FaultHarness, random: Generator) -> None:
-    loop.ros.set_bool('controller/set_automatic', False)
-    loop.run_for(float(random.uniform(5.0, 60.0)))
-    loop.ros.set_bool('controller/set_automatic', True)
-
-
-def _other_model(loop: FaultHarness, random: Generator) -> None:
-    loop.set_parameters('controller', model=str(random.choice(
-        ['reactor_nz3', 'reactor_nz4', '/nowhere.safetensors'])))
-    loop.ros.trigger('controller/reload_model')
-
-
-def _reset(loop: FaultHarness, _: Generator) -> None:
-    loop.ros.trigger('plant/reset')
-
-
-_ON_THE_WAY: dict[str, Callable[[], Alteration]] = {
-    'lost': lambda: interceptor.lost(0.5), 'late': lambda: interceptor.delayed(3),
-    'doubled': lambda: interceptor.twice}
-_MEASURED: dict[str, Callable[[], Alteration]] = {
+ALTERATIONS: dict[str, Callable[[], Alteration]] = {
     'NaN': lambda: value(lambda *_: math.nan), '200 degC': lambda: value(lambda *_: 200.0),
     'spike': lambda: value(lambda _, shown: shown + 15.0), 'frozen': interceptor.frozen,
-    'noise of 1 K': lambda: interceptor.noise(1.0), **_ON_THE_WAY}
-EVENTS: list[tuple[str, Callable[[FaultHarness, Generator], None]]] = [
-    *((f'{what}: {name}', partial(_alter, what=what, make=make)) for what, makers in (
-        ('measurements', _MEASURED), ('commands', _ON_THE_WAY)) for name, make in makers.items()),
+    'noise of 1 K': lambda: interceptor.noise(1.0), 'lost': lambda: interceptor.lost(0.5),
+    'late': lambda: interceptor.delayed(3), 'doubled': lambda: interceptor.twice}
+EVENTS = (
+    *(f'measurements: {name}' for name in ALTERATIONS),
+    *(f'commands: {name}' for name in ('lost', 'late', 'doubled')),
     # what an operator does, and the weather, come more often
-    *4 * [('set-point', _ask), ('disturbance', _disturb)],
-    ('impossible set-point', _ask_for_too_much), ('weights', _retune), ('manual mode', _by_hand),
-    ('model', _other_model), ('plant reset', _reset)]
+    *4 * ('set-point', 'disturbance'),
+    'impossible set-point', 'weights', 'manual mode', 'model', 'plant reset')
 
 
-def run_endurance(folder: Path, check: Callable[[], None], hours: float = HOURS) -> Endurance:
+def run_endurance(folder: Path, check: Callable[[], None], hours: float = HOURS
+                  ) -> dict[str, Any]:
     """
     Run plant, controller and trainer for some hours of plant time, and account for everything.
 
     :param folder: for the bag, which is deleted afterwards, and for what the processes print.
     :param check: called all the time; may raise to end it.
+    :return: figures by name, among them the `reasons` held against it, in sentences.
     """
     started = time.monotonic()
     shutil.rmtree(folder, ignore_errors=True)
@@ -165,28 +114,32 @@ def run_endurance(folder: Path, check: Callable[[], None], hours: float = HOURS)
     if bag.exists():
         recorded = dict(summary(bag).counts)
         shutil.rmtree(bag)
-    memory = {name: Memory(*np.array(seen).T) for name, seen in looks.items()}
     trace = loop.trace
     answers = responses(trace.delivered, [command.stamp_ns for command in trace.commands])
-    return Endurance(
-        tuple(_held_against(trace, answers, memory, recorded)), hours,
-        time.monotonic() - started, answers, dict(happened), memory, recorded,
-        max((sample.celsius for sample in trace.samples), default=math.nan),
-        float(np.mean(trace.errors()[1])) if trace.samples else math.nan)
+    memory = {name: {'first': round(seen[0][1], 2), 'last': round(seen[-1][1], 2),
+                     'growth_when_warm': round(growth(*np.array(seen).T), 3)}
+              for name, seen in looks.items()}
+    reasons = list(_held_against(trace, answers, memory, recorded))
+    hottest = max((celsius for _, celsius in trace.samples), default=math.nan)
+    mean_error = float(np.mean(trace.errors()[1])) if trace.samples else math.nan
+    return {'survived': not reasons, 'reasons': reasons, 'hours': hours,
+            'wall_seconds': round(time.monotonic() - started, 1), 'answers': answers,
+            'events': dict(happened), 'recorded': recorded, 'hottest_degC': round(hottest, 6),
+            'mean_error_K': round(mean_error, 6), 'memory_MB': memory}
 
 
 def _let_happen(loop: FaultHarness, hours: float, happened: Counter[str],
                 looks: dict[str, list[tuple[float, float]]]) -> None:
     """Run for so long; count the events, and note each process's memory by plant time."""
-    random = default_rng(_SEED)
+    random = default_rng(0)
     look = 3600.0 * hours / _LOOKS
     due = loop.now + random.exponential(_EVENT_PERIOD)
     for number in range(1, _LOOKS + 1):
         while due < number * look:
             loop.run_until(due)
-            name, play = EVENTS[random.integers(len(EVENTS))]
-            happened[name] += 1
-            play(loop, random)
+            event = EVENTS[random.integers(len(EVENTS))]
+            happened[event] += 1
+            _happen(event, loop, random)
             due = loop.now + random.exponential(_EVENT_PERIOD)
         loop.run_until(number * look)
         for name, process in loop.processes.items():
@@ -195,24 +148,34 @@ def _let_happen(loop: FaultHarness, hours: float, happened: Counter[str],
 
 
 def _resident(pid: int) -> float:
-    """Return the resident memory of a process in MB."""
+    """Return the resident memory of a process in megabytes of 1e6 bytes."""
     lines = Path(f'/proc/{pid}/status').read_text().splitlines()
     kilobytes = next(line.split()[1] for line in lines if line.startswith('VmRSS'))
-    return int(kilobytes) * 1024 / _MEGABYTE
+    return int(kilobytes) * 1024 / 1e6
 
 
-def _held_against(trace: Trace, answers: Responses, memory: dict[str, Memory],
+def growth(seconds: Array, megabytes: Array) -> float:
+    """Return by how much a process grows by a straight line from when it is warm, in MB."""
+    warm = seconds >= _WARM * seconds[-1]
+    if np.count_nonzero(warm) < 3:
+        return 0.0
+    # from the first on, so that what does not grow is exactly 0
+    slope = np.polyfit(seconds[warm], megabytes[warm] - megabytes[warm][0], 1)[0]
+    return float(slope * np.ptp(seconds[warm])) + 0.0
+
+
+def _held_against(trace: Trace, answers: dict[str, int], memory: dict[str, dict[str, float]],
                   recorded: dict[str, int]) -> Iterator[str]:
     yield from trace.complaints
-    if not answers.complete:
-        yield (f'of {answers.measurements} measurements {answers.unanswered} were not answered; '
-               f'{answers.repeated} answers were repeated, {answers.unasked} unasked, '
-               f'{answers.out_of_order} out of order')
+    wrong = ('unanswered', 'repeated', 'unasked', 'out_of_order')
+    if any(answers[name] for name in wrong):
+        yield f'of {answers["measurements"]} measurements or their answers were ' + ', '.join(
+            f'{answers[name]} {name.replace("_", " ")}' for name in wrong)
     yield from out_of_range(trace)
     for name, seen in memory.items():
-        if not seen.growth <= _GROWTH:
-            yield (f'{name} grew by {seen.growth:.1f} MB after it was warm, {_GROWTH:g} MB are '
-                   'allowed')
+        if not seen['growth_when_warm'] <= _GROWTH:
+            yield (f'{name} grew by {seen["growth_when_warm"]:.1f} MB after it was warm, '
+                   f'{_GROWTH:g} MB are allowed')
     for topic, sent in (('/temperature', len(trace.delivered)),
                         ('/coolant_setpoint', len(trace.commands))):
         if recorded.get(topic) != sent:

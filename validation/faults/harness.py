@@ -7,7 +7,6 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping
 import contextlib
-from dataclasses import dataclass
 from pathlib import Path
 import re
 import signal
@@ -22,7 +21,7 @@ from koopman_ros.ros import topics
 from koopman_ros.testing import Harness, HarnessError, NodeProcess
 from validation.faults.case import Case, Trace
 from validation.faults.interceptor import Alteration, Interceptor, REMAPPED, unchanged
-from validation.faults.judge import judge, Verdict
+from validation.faults.judge import judge
 
 T = TypeVar('T')
 _STEADY = 0.3  # s of wall time that a set-point must stay the one tracked
@@ -36,28 +35,14 @@ class SkipError(Exception):
     """A case cannot be tried on this machine; the message says why."""
 
 
-@dataclass(frozen=True)
-class Outcome:
-    """What became of a case."""
-
-    case: Case  #: the case
-    trace: Trace  #: what happened
-    verdict: Verdict | None  #: what is held against it; None where it could not be tried
-    skipped: str  #: why it could not be tried here
-    wall: float  #: what it took, s
-
-    @property
-    def survived(self) -> bool:
-        """Whether it was tried and nothing is held against it."""
-        return self.verdict is not None and not self.verdict.reasons
-
-
-def run(case: Case, folder: Path, check: Callable[[], None] = lambda: None) -> Outcome:
+def run(case: Case, folder: Path, check: Callable[[], None] = lambda: None
+        ) -> tuple[dict[str, Any], Trace]:
     """
     Run a case in a domain of its own and judge it.
 
     :param folder: for what the processes print.
     :param check: called all the time; may raise to end the case, whose processes end then, too.
+    :return: figures by name, as of :func:`judge`, or why it was `skipped`; and what happened.
     """
     started = time.monotonic()
     folder.mkdir(parents=True, exist_ok=True)
@@ -74,15 +59,15 @@ def run(case: Case, folder: Path, check: Callable[[], None] = lambda: None) -> O
             loop.trace.complaints.append(str(error))
         except SkipError as reason:
             skipped = str(reason)
-    verdict = None if skipped else judge(loop.trace, case)
-    return Outcome(case, loop.trace, verdict, skipped, time.monotonic() - started)
+    figures = {'survived': False, 'skipped': skipped} if skipped else judge(loop.trace, case)
+    return {'group': case.group, 'does': case.does, 'notes': loop.trace.notes, **figures,
+            'wall_seconds': round(time.monotonic() - started, 2)}, loop.trace
 
 
 class FaultHarness:
     """
     A loop to put faults into; leaving the context ends its processes.
 
-    :param folder: for what the processes print.
     :param limit: wall time of the case, s.
     :param check: called at every turn; may raise to end the case.
     :param between: whether the interceptor stands between plant and controller.
@@ -205,8 +190,6 @@ class FaultHarness:
         return [result.reason for result in self.ros.set_parameters(node, **values)
                 if not result.successful]
 
-    # Time.
-
     @property
     def now(self) -> float:
         """Plant time in s since the first measurement."""
@@ -235,8 +218,6 @@ class FaultHarness:
         """Let the loop run for a wall time."""
         end = time.monotonic() + seconds
         self.wait(lambda: time.monotonic() > end, 'no time to linger')
-
-    # The fault.
 
     @contextlib.contextmanager
     def fault(self) -> Iterator[None]:

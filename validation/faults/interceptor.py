@@ -20,7 +20,7 @@ from std_msgs.msg import String
 from koopman_ros.ros import topics
 from koopman_ros.ros.codec import stamp_message, stamp_nanoseconds
 from koopman_ros.units import NANOSECONDS
-from validation.faults.case import Command, Sample, Status, Trace
+from validation.faults.case import Command, Status, Trace
 
 # that wait to be read: a storm makes thousands while the harness is busy sending it
 MOST_RECORDS = 100_000
@@ -65,14 +65,9 @@ def value(change: Callable[[float, float], float]) -> Alteration:
         (packet.stamp_ns - first.stamp_ns) / NANOSECONDS, packet.celsius)))
 
 
-def frozen() -> Alteration:
-    """Repeat the first value for ever."""
-    return changed(lambda first, packet: packet._replace(celsius=first.celsius))
-
-
-def stamps_frozen() -> Alteration:
-    """Give every message the stamp of the first."""
-    return changed(lambda first, packet: packet._replace(stamp_ns=first.stamp_ns))
+def frozen(what: str = 'celsius') -> Alteration:
+    """Repeat the first value, or the first `stamp_ns`, for ever."""
+    return changed(lambda first, packet: packet._replace(**{what: getattr(first, what)}))
 
 
 def stamped(change: Callable[[int], int]) -> Alteration:
@@ -128,19 +123,17 @@ class Interceptor:
     Where it stands between them it is the actuator, too, which holds its last command when none
     arrives: so lock-step goes on whatever is lost.
 
-    :param node: whose executor does the work.
     :param between: whether all messages between plant and controller pass through it.
 
     :ivar measurements: what is done to measurements on their way to the controller.
     :ivar commands: what is done to commands on their way to the plant.
-    :ivar now: plant time in s since the first measurement.
     """
 
     def __init__(self, node: Node, between: bool) -> None:
         self.trace = Trace()
         self.measurements: Alteration = unchanged
         self.commands: Alteration = unchanged
-        self.now = 0.0
+        self.now = 0.0  # plant time in s since the first measurement
         self._node = node
         self._between = between
         self._stamp_ns: int | None = None  # of the last true temperature
@@ -174,7 +167,7 @@ class Interceptor:
             self._origin_ns += stamp_ns - self._stamp_ns - NANOSECONDS
         self._stamp_ns = stamp_ns
         self.now = (stamp_ns - self._origin_ns) / NANOSECONDS
-        self.trace.samples.append(Sample(self.now, message.temperature))
+        self.trace.samples.append((self.now, message.temperature))
         if not self._between:
             self.trace.delivered.append(stamp_ns)
             return

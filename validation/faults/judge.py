@@ -5,10 +5,10 @@
 
 from collections import Counter
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
 import itertools
 import math
 import re
+from typing import Any
 
 import numpy as np
 
@@ -23,21 +23,14 @@ _LAST = 30.0  # s at the end of a trace, in which an offset is looked for
 _LOWEST, _HIGHEST = ControllerParameters.coolant_min, ControllerParameters.coolant_max  # degC
 
 
-@dataclass(frozen=True)
-class Verdict:
-    """What became of a case."""
+def judge(trace: Trace, case: Case) -> dict[str, Any]:
+    """
+    Judge the trace of a case.
 
-    reasons: tuple[str, ...]  #: why it was not survived, in sentences; empty when it was
-    worst_error: float  #: largest |T - set-point| from the fault on, K; NaN when nothing was seen
-    worst_step: float  #: largest step between two commands from the fault on, K
-    #: plant time from the end of the fault until the temperature stays within the band, s;
-    #: infinity when it never does
-    recovery: float
-    offset: float  #: largest |T - set-point| in the last seconds, K
-
-
-def judge(trace: Trace, case: Case) -> Verdict:
-    """Judge the trace of a case."""
+    :return: `reasons` why it was not survived, in sentences; largest |T - set-point| and step
+        between two commands from the fault on; plant time from its end until the temperature
+        stays within the band (infinity for never); largest |T - set-point| in the last seconds.
+    """
     times, errors = trace.errors()
     stepped, steps = trace.steps()
     offset = float(np.max(errors[times >= times[-1] - _LAST])) if len(times) else math.nan
@@ -62,7 +55,9 @@ def judge(trace: Trace, case: Case) -> Verdict:
         reasons.append(f'the coolant command stepped by {step:.3f} K after the fault, '
                        f'{case.bump:g} K are allowed')
     reasons += [*_reports(trace, case), *_records(trace, case)]
-    return Verdict(tuple(reasons), worst, step, recovery, offset)
+    return {'survived': not reasons, 'reasons': reasons,
+            'worst_temperature_error_K': round(worst, 6), 'worst_coolant_step_K': round(step, 6),
+            'time_to_recover_s': round(recovery, 6), 'offset_at_the_end_K': round(offset, 6)}
 
 
 def _recovery(trace: Trace, band: float) -> float:
@@ -77,7 +72,7 @@ def _recovery(trace: Trace, band: float) -> float:
 
 def out_of_range(trace: Trace) -> Iterator[str]:
     """Say whether the reactor ran away, and which command is the first outside its range."""
-    hottest = max((sample.celsius for sample in trace.samples), default=-math.inf)
+    hottest = max((celsius for _, celsius in trace.samples), default=-math.inf)
     if not hottest < RUNAWAY:
         yield f'the reactor reached {hottest:.1f} degC, {RUNAWAY:g} degC is a runaway'
     for command in trace.commands:
@@ -131,39 +126,24 @@ def _records(trace: Trace, case: Case) -> Iterator[str]:
         yield f'records {lost.first} to {lost.last} are missing'
 
 
-@dataclass(frozen=True)
-class Responses:
-    """How the commands answer the measurements that reached the controller, by their stamps."""
-
-    measurements: int  #: that reached it
-    answered: int  #: of these, exactly once
-    unanswered: int  #: of these, not at all
-    repeated: int  #: answers beyond the first
-    unasked: int  #: commands with a stamp that no measurement had
-    out_of_order: int  #: answers that came before the answer to an earlier measurement
-
-    @property
-    def complete(self) -> bool:
-        """Whether each measurement was answered once, in order."""
-        return self.answered == self.measurements and not (
-            self.repeated or self.unasked or self.out_of_order)
-
-
-def responses(delivered: Sequence[int], answers: Sequence[int]) -> Responses:
+def responses(delivered: Sequence[int], answers: Sequence[int]) -> dict[str, int]:
     """
-    Count commands by their stamps.
+    Count how commands answer the measurements that reached the controller.
 
     :param delivered: stamps of the measurements as they reached the controller; one that came
         twice is to be answered twice.
     :param answers: stamps of the commands as they were published.
+    :return: `measurements` that reached it; `answered`, of these, as often as they came;
+        `unanswered`; `repeated` answers beyond those; `unasked`, whose stamp no measurement had;
+        `out_of_order`, before the answer to an earlier measurement.
     """
     asked, given = Counter(delivered), Counter(answers)
     place = {stamp: number for number, stamp in reversed([*enumerate(delivered)])}
     order = [place[stamp] for stamp in answers if stamp in place]
-    return Responses(
-        measurements=len(delivered),
-        answered=sum(count for stamp, count in asked.items() if given[stamp] == count),
-        unanswered=(asked - given).total(),
-        repeated=sum(count for stamp, count in (given - asked).items() if stamp in asked),
-        unasked=sum(count for stamp, count in given.items() if stamp not in asked),
-        out_of_order=sum(after < before for before, after in itertools.pairwise(order)))
+    return {
+        'measurements': len(delivered),
+        'answered': sum(count for stamp, count in asked.items() if given[stamp] == count),
+        'unanswered': (asked - given).total(),
+        'repeated': sum(count for stamp, count in (given - asked).items() if stamp in asked),
+        'unasked': sum(count for stamp, count in given.items() if stamp not in asked),
+        'out_of_order': sum(after < before for before, after in itertools.pairwise(order))}

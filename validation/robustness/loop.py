@@ -6,65 +6,43 @@
 from collections.abc import Iterable
 from dataclasses import replace
 from functools import lru_cache
-import math
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+from koopman_ros import control, plants
 from koopman_ros.arrays import Array
-from koopman_ros.control import (
-    at,
-    Change,
-    Controller,
-    Event,
-    Initialisation,
-    LevelSettings,
-    Loop,
-    perfect,
-    Sensor,
-    SetpointRequest,
-    simulate,
-    Simulation,
-    Timed,
-)
+from koopman_ros.control import Controller, Simulation
 from koopman_ros.lifting import LiftedModel, load
 from koopman_ros.parameters.controller import ControllerParameters
-from koopman_ros.plants import (
-    Actuator,
-    ControlAffineSystem,
-    one_state_reactor,
-    Process,
-    ReactorParameters,
-)
+from koopman_ros.resources import model_path
 
-REACTOR = one_state_reactor()
+REACTOR = plants.one_state_reactor()
 START = float(REACTOR.nominal_state[0])
 COOLANT = float(REACTOR.nominal_input[0])
 PERIOD = 1.0  # s
 COOLANT_RANGE = (278.15, 305.15)  # K
 BANDWIDTH = 6.0  # 1/min
 # Margins that are never exceeded: without fallback the learned law acts everywhere.
-NO_FALLBACK = (LevelSettings('sdre', 1e9), LevelSettings('linear', 1e9))
+NO_FALLBACK = (control.LevelSettings('sdre', 1e9), control.LevelSettings('linear', 1e9))
 
 
 @lru_cache
 def shipped_model() -> LiftedModel:
     """Return the lift that the controller loads by default."""
-    return load(Path(__file__).parents[2] / 'config' / 'models' / 'reactor_nz4.safetensors')
+    return load(model_path('reactor_nz4'))
 
 
 def reactor_controller(*, bandwidth: float = BANDWIDTH, coolant_weight: float = 1.0,
                        fallback: bool = True, linear_margin: float = 0.5,
                        model: LiftedModel | None = None) -> Controller:
     """
-    Return the controller with the default parameters of its node.
+    Return the controller with the default parameters of its node and the shipped model.
 
     :param bandwidth: of the observer, in 1/min.
     :param coolant_weight: in 1/K^2.
     :param fallback: whether the distance from the training data decides which law acts.
     :param linear_margin: up to which the linear law does, in half widths.
-    :param model: the shipped one by default.
     """
     settings = ControllerParameters(
         observer_bandwidth=bandwidth, coolant_weight=coolant_weight, linear_margin=linear_margin
@@ -74,44 +52,32 @@ def reactor_controller(*, bandwidth: float = BANDWIDTH, coolant_weight: float = 
 
 
 def changed_reactor(*, heat_transfer: float = 1.0, concentration: float = 1.0,
-                    feed: float = 0.0) -> ControlAffineSystem:
-    """
-    Return the reactor with other constants.
-
-    :param heat_transfer: factor of UA.
-    :param concentration: factor of C_A.
-    :param feed: added to T_i, in K.
-    """
-    usual = ReactorParameters()
-    return one_state_reactor(replace(
+                    feed: float = 0.0) -> plants.ControlAffineSystem:
+    """Return the reactor with UA and C_A multiplied by factors and T_i shifted by `feed` K."""
+    usual = plants.ReactorParameters()
+    return plants.one_state_reactor(replace(
         usual, heat_transfer_coefficient=heat_transfer * usual.heat_transfer_coefficient,
         concentration=concentration * usual.concentration,
         feed_temperature=feed + usual.feed_temperature), nominal_state=REACTOR.nominal_state)
 
 
-def at_setpoint(value: float) -> Event:
+def at_setpoint(value: float) -> control.Event:
     """Ask for a set-point in K."""
-    return SetpointRequest(0, np.array([value]))
+    return control.SetpointRequest(0, np.array([value]))
 
 
-def on_plant(system: ControlAffineSystem) -> Change:
-    """Go on with another plant from the same state."""
-    return lambda loop: replace(loop, plant=replace(_process(loop), system=system))
+def on_plant(**changes: Any) -> control.Change:
+    """Go on with another `system` or behind another `actuator` from the same state."""
+    def change(loop: control.Loop) -> control.Loop:
+        assert isinstance(loop.plant, plants.Process)
+        return replace(loop, plant=replace(loop.plant, **changes))
+
+    return change
 
 
-def behind(actuator: Actuator) -> Change:
-    """Put another actuator before the plant."""
-    return lambda loop: replace(loop, plant=replace(_process(loop), actuator=actuator))
-
-
-def biased(bias: float, since: float = 0.0) -> Sensor:
+def biased(bias: float, since: float = 0.0) -> control.Sensor:
     """Let the sensor err by so much from a time in s on, in state units."""
     return lambda y, seconds: y + (bias if seconds >= since else 0.0)
-
-
-def _process(loop: Loop) -> Process:
-    assert isinstance(loop.plant, Process)
-    return loop.plant
 
 
 def errors(run: Simulation, reference: float, since: float = 0.0) -> Array:
@@ -120,14 +86,15 @@ def errors(run: Simulation, reference: float, since: float = 0.0) -> Array:
     return found
 
 
-def settling(run: Simulation, reference: float, tolerance: float, since: float = 0.0) -> float:
-    """Return the seconds from `since` until it stays that close; infinity for never."""
+def settling(run: Simulation, reference: float, tolerance: float, since: float = 0.0
+             ) -> float | None:
+    """Return the seconds from `since` until it stays that close; None for never."""
     outside = np.flatnonzero(np.abs(errors(run, reference, since)) > tolerance)
     if not outside.size:
         return 0.0
     start = run.times[run.times >= since]
     if outside[-1] + 1 >= len(start) or run.failure:
-        return math.inf
+        return None
     return float(start[outside[-1] + 1] - since)
 
 
@@ -136,28 +103,24 @@ def worst(run: Simulation) -> str:
     return max(run.levels, key=run.loop.controller.settings.supervisor.order.index)
 
 
-def run_loop(controller: Controller, system: ControlAffineSystem, x0: Array, coolant: float,
-             seconds: float, events: Iterable[Timed] = (), *, actuator: Actuator | None = None,
-             tells: bool = False, noise: float = 0.0, **others: Any) -> Simulation:
+def run_loop(controller: Controller, system: plants.ControlAffineSystem, x0: Array,
+             coolant: float, seconds: float, events: Iterable[control.Timed] = (), *,
+             actuator: plants.Actuator | None = None, tells: bool = False, noise: float = 0.0,
+             **others: Any) -> Simulation:
     """
-    Simulate a loop whose controller takes over from an applied input.
+    Simulate a loop whose controller takes over from an applied input at the state x0 (n,).
 
     :param controller: it measures the plant's last n_x states.
-    :param system: the plant.
-    :param x0: (n,) state at time 0.
-    :param coolant: applied input at time 0.
-    :param seconds: how long.
-    :param events: what happens when.
-    :param actuator: between command and plant; perfect by default.
     :param tells: whether the applied input is measured.
     :param noise: standard deviation of the measurement, in state units.
     :param others: of :func:`simulate`.
     """
     held = np.array([coolant])
-    plant = Process(system, 0, np.asarray(x0, dtype=np.float64), held, actuator or Actuator(),
-                    held)
+    plant = plants.Process(system, 0, np.asarray(x0, dtype=np.float64), held,
+                           actuator or plants.Actuator(), held)
     n_x = controller.model.n_x
-    return simulate(
-        controller, plant, [at(0.0, Initialisation(held)), *events], duration=seconds,
-        C=np.eye(system.n_x)[-n_x:], noise=np.full(n_x, noise) if noise else None,
-        input_sensor=perfect if tells else None, **others)
+    return control.simulate(
+        controller, plant, [control.at(0.0, control.Initialisation(held)), *events],
+        duration=seconds, C=np.eye(system.n_x)[-n_x:],
+        noise=np.full(n_x, noise) if noise else None,
+        input_sensor=control.perfect if tells else None, **others)

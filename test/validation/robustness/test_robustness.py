@@ -11,25 +11,9 @@ import pytest
 from scipy.integrate import solve_ivp
 
 from koopman_ros.control import at
-from validation.robustness import attraction, disturbances
-from validation.robustness.attraction import End
+from validation.robustness import disturbances, loop, stability
 from validation.robustness.disturbances import Case
-from validation.robustness.loop import (
-    at_setpoint,
-    biased,
-    REACTOR,
-    reactor_controller,
-    run_loop,
-    settling,
-    shipped_model,
-    START,
-)
-from validation.robustness.margins import (
-    grows,
-    linearised_controller,
-    linearised_reactor,
-    margins_at,
-)
+from validation.robustness.loop import REACTOR, START
 
 PERIOD = 1.0 / 60.0  # min
 
@@ -42,19 +26,15 @@ def _first_order(temperature, coolant_weight=1.0):
     return a, b, K
 
 
-def _pole(a, b):
-    """Return pole and gain of the plant between samples."""
-    pole = math.exp(a * PERIOD)
-    return pole, b * (pole - 1.0) / a
-
-
 @pytest.mark.parametrize(('temperature', 'weight'), [(310.0, 1.0), (START, 0.1)])
 def test_margins_without_observer_are_those_of_a_first_order_loop(temperature, weight):
     a, b, K = _first_order(temperature, weight)
-    pole, gain = _pole(a, b)
-    controller = reactor_controller(bandwidth=0.0, coolant_weight=weight)
-    found = margins_at(controller, temperature)
-    learned = -linearised_controller(controller, temperature).D[0, 0]
+    # of the plant between samples
+    pole = math.exp(a * PERIOD)
+    gain = b * (pole - 1.0) / a
+    controller = loop.reactor_controller(bandwidth=0.0, coolant_weight=weight)
+    found = stability.margins_at(controller, temperature)
+    learned = -stability.linearised_controller(controller, temperature).D[0, 0]
     # as far as the lift's slope is that of the reactor
     assert learned == pytest.approx(K, rel=2e-3)
     K = learned
@@ -72,10 +52,9 @@ def test_margins_without_observer_are_those_of_a_first_order_loop(temperature, w
 
 
 def test_differences_of_the_step_agree_with_the_observer_by_hand():
-    temperature, bandwidth = 316.0, 6.0
-    found = linearised_controller(reactor_controller(bandwidth=bandwidth), temperature)
-    a, b, K = _first_order(temperature)
-    p = math.exp(-bandwidth * PERIOD)
+    found = stability.linearised_controller(loop.reactor_controller(bandwidth=6.0), 316.0)
+    a, b, K = _first_order(316.0)
+    p = math.exp(-6.0 * PERIOD)
     # the observer predicts by Heun's method; disturbance in K/min, measured in K
     h = PERIOD
     drift, push = 1.0 + a * h + 0.5 * (a * h) ** 2, h * (1.0 + 0.5 * a * h)
@@ -84,7 +63,7 @@ def test_differences_of_the_step_agree_with_the_observer_by_hand():
                   [-learn * drift, 1.0 - learn * push, -learn * b * push]])
     G = np.array([[take], [learn]])
     law = np.array([[-K, -1.0 / b]])
-    scale = np.diag([1.0 / shipped_model().states.scale[0]] * 2 + [1.0])
+    scale = np.diag([1.0 / loop.shipped_model().states.scale[0]] * 2 + [1.0])
     A = np.vstack([F, law @ F])
     B = np.vstack([G, law @ G])
     # in the lift's scaled deviations; the lift is not the reactor to the last digit
@@ -94,39 +73,36 @@ def test_differences_of_the_step_agree_with_the_observer_by_hand():
 
 
 def test_the_delay_margin_is_where_the_simulated_loop_begins_to_oscillate():
-    controller = reactor_controller(bandwidth=10.0, coolant_weight=0.1)
-    at = margins_at(controller, 316.0)
+    controller = loop.reactor_controller(bandwidth=10.0, coolant_weight=0.1)
+    at = stability.margins_at(controller, 316.0)
     assert at.delay == pytest.approx(8.73, abs=0.05)
-    assert not grows(controller, 316.0, delay=0.95 * at.delay, seconds=450.0)
-    assert grows(controller, 316.0, delay=1.05 * at.delay, seconds=450.0)
-    assert linearised_reactor(316.0).A[0, 0] == pytest.approx(
+    assert not stability.grows(controller, 316.0, delay=0.95 * at.delay, seconds=450.0)
+    assert stability.grows(controller, 316.0, delay=1.05 * at.delay, seconds=450.0)
+    assert stability.linearised_reactor(316.0).A[0, 0] == pytest.approx(
         math.exp(REACTOR.drift_jacobian(np.array([316.0]))[0, 0] * PERIOD), rel=1e-12)
 
 
 def test_no_coolant_saves_what_is_hotter_than_the_boundary():
     """With the coolant on its way to the coldest as fast as it may, from scipy's integration."""
-    boundary = attraction.hottest_saved(300.0)
+    boundary = stability.hottest_saved(300.0)
 
     def rate(t, x):
         return REACTOR.derivative(x, np.array([max(278.15, 300.0 - 60.0 * t)]))
 
+    def gone(t, x):
+        return x[0] - 400.0
+
+    gone.terminal = True
     ends = [solve_ivp(rate, (0.0, 5.0), [boundary + d], rtol=1e-9, max_step=0.05,
-                      events=_runaway).y[0, -1] for d in (-0.01, 0.01)]
+                      events=gone).y[0, -1] for d in (-0.01, 0.01)]
     assert ends[0] < 330.0
     assert ends[1] > 399.0
 
 
-def _runaway(t, x):
-    return x[0] - 400.0
-
-
-_runaway.terminal = True
-
-
 @pytest.mark.parametrize(('temperature', 'fallback', 'end'), [
-    (340.0, True, End.SAFE), (340.0, False, End.RAN_AWAY), (343.0, True, End.RAN_AWAY)])
+    (340.0, True, 'SAFE'), (340.0, False, 'RAN_AWAY'), (343.0, True, 'RAN_AWAY')])
 def test_fallback_widens_the_region_of_attraction(temperature, fallback, end):
-    assert attraction.end_of(temperature, 316.0, fallback=fallback) is end
+    assert stability.end_of(temperature, 316.0, fallback=fallback).name == end
 
 
 def test_a_disturbance_leaves_no_offset_and_a_biased_sensor_its_bias():
@@ -136,29 +112,29 @@ def test_a_disturbance_leaves_no_offset_and_a_biased_sensor_its_bias():
     assert found['seconds_to_0.2_kelvin'] < 180.0
     # the coolant that makes up for it: UA (T_c - T) as before, from the heat balance
     assert found['disturbance_kelvin'] == pytest.approx(0.25 * (START - 300.0), abs=0.01)
-    found = disturbances.judge(Case('', REACTOR, [START - 5.0], [
-        at(0.0, at_setpoint(START - 5.0))], START - 5.0, seconds=600.0,
-        sensor=biased(1.0, 10.0)))
+    found = disturbances.judge(Case('', [at(0.0, loop.at_setpoint(START - 5.0))], START - 5.0,
+                                    x0=[START - 5.0], seconds=600.0,
+                                    sensor=loop.biased(1.0, 10.0)))
     assert found['final_kelvin'] == pytest.approx(-1.0, abs=1e-3)
     assert found['equivalent_bias_kelvin'] == pytest.approx(1.0, abs=1e-2)
 
 
 def test_settling_counts_from_the_change():
-    course = run_loop(reactor_controller(), REACTOR, np.array([START]), 300.0, 60.0,
-                      [at(20.0, at_setpoint(START - 1.0))])
-    assert settling(course, START, 0.01, 0.0) == math.inf
-    assert settling(course, START - 1.0, 2.0, 20.0) == 0.0
+    course = loop.run_loop(loop.reactor_controller(), REACTOR, np.array([START]), 300.0, 60.0,
+                      [at(20.0, loop.at_setpoint(START - 1.0))])
+    assert loop.settling(course, START, 0.01, 0.0) is None
+    assert loop.settling(course, START - 1.0, 2.0, 20.0) == 0.0
     errors = course.states[:, 0] - (START - 1.0)
     first = course.times[np.flatnonzero(np.abs(errors) > 0.9)[-1] + 1]
-    assert settling(course, START - 1.0, 0.9, 20.0) == first - 20.0
+    assert loop.settling(course, START - 1.0, 0.9, 20.0) == first - 20.0
 
 
 def test_what_rests_outside_the_data_comes_back_from_the_safe_coolant():
-    usual = attraction.back_from_safe(REACTOR, 0.5)
+    usual = stability.back_from_safe(REACTOR, 0.5)
     # by the heat balance; the trained range starts at 305 K, half its width is 11
     assert usual['rest_kelvin'] == pytest.approx(302.565, abs=1e-2)
     assert usual['outside'] == pytest.approx((305.0 - usual['rest_kelvin']) / 11.0, abs=1e-6)
     assert usual['seconds_to_0.2_kelvin'] < 300.0
-    better_cooled = attraction.back_from_safe(disturbances.CHANGED['UA +20 %'], 0.5)
+    better_cooled = stability.back_from_safe(disturbances.CHANGED['UA +20 %'], 0.5)
     assert better_cooled['outside'] > 0.5
     assert better_cooled['seconds_to_0.2_kelvin'] < 300.0

@@ -144,7 +144,7 @@ CASES = (
            plant={**LOCKSTEP, 'start_time': 10_000.0}),
     _clock('clock-far', 'stamps jump 60 years ahead, and then back', _moved(1_900_000_000), 60.0),
     _clock('clock-zero', 'stamps are zero', lambda: stamped(lambda _: 0), 30.0),
-    _clock('clock-stopped', 'stamps stand still', interceptor.stamps_frozen, 30.0,
+    _clock('clock-stopped', 'stamps stand still', partial(interceptor.frozen, 'stamp_ns'), 30.0,
            says=('^controller: control: .*does not advance',)),
     _clock('clock-jitter', 'stamps are up to 0.4 s wrong', lambda: stamped(_jittered), 120.0),
     _clock('clock-twins', 'two measurements with each stamp', lambda: _twin, 60.0),
