@@ -87,11 +87,6 @@ class BagWriter:
             self.path, compression, max_file_bytes or math.inf,
             round(max_file_duration_s * NANOSECONDS) or math.inf)
 
-    @property
-    def mcap_path(self) -> Path:
-        """The MCAP file that receives the messages."""
-        return self._files.current.path
-
     def add_topic(
         self, topic: str, definition: MessageDefinition, offered_qos: Sequence[QosProfile] = ()
     ) -> None:

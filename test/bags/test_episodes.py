@@ -68,11 +68,11 @@ def write(samples: list[Sample], tmp_path: Path) -> Callable[..., Path]:
             writer.write(one.topic, serialize(written), WALL + round(received * SECOND))
             if number % 20 == 19:
                 writer.flush()
-        before = writer.mcap_path.read_bytes()
+        before = None if closed else writer.path.read_bytes()
         writer.close()
-        if not closed:
-            writer.mcap_path.write_bytes(before)
-        return tmp_path / name
+        if before is not None:
+            writer.path.write_bytes(before)
+        return writer.path
 
     return write
 

@@ -52,10 +52,10 @@ def test_header_schemas_and_channels_are_those_of_rosbag2(tmp_path: Path) -> Non
         writer.add_topic('/y', NUMBER)
         # again, which does nothing
         writer.add_topic('/x', NUMBER, [bags.QosProfile()])
-    with writer.mcap_path.open('rb') as stream:
+    with writer.path.open('rb') as stream:
         header = make_reader(stream).get_header()
     assert (header.profile, header.library) == ('ros2', f'koopman_ros {__version__}')
-    found = content(writer.mcap_path)
+    found = content(writer.path)
     (schema,) = found.schemas.values()
     assert (schema.name, schema.encoding, schema.data) == (
         'std_msgs/msg/Float64', 'ros2msg', b'float64 data\n')
@@ -79,7 +79,7 @@ def test_messages_carry_times_and_a_counter_by_topic(tmp_path: Path) -> None:
             writer.write(topic, buffer, np.int64(100 + sent_ns), np.uint64(sent_ns))
         # the time of sending is that of receipt by default
         writer.write('/y', data, 104)
-    with writer.mcap_path.open('rb') as stream:
+    with writer.path.open('rb') as stream:
         found = [(channel.topic, message.sequence, message.log_time, message.publish_time)
                  for _, channel, message in make_reader(stream).iter_messages()]
     assert found == [('/x', 0, 100, 0), ('/y', 0, 101, 1), ('/x', 1, 102, 2), ('/y', 1, 104, 104)]
@@ -199,14 +199,14 @@ def test_closed_writer_refuses(tmp_path: Path) -> None:
     # not before the bag is whole
     assert not (writer.path / 'metadata.yaml').exists()
     writer.close()
-    before = writer.mcap_path.read_bytes()
+    before = (writer.path / 'run_0.mcap').read_bytes()
     for verb, method, arguments in (('write to', writer.write, ('/x', number(1.5), 3)),
                                     ('add a topic to', writer.add_topic, ('/y', NUMBER)),
                                     ('flush', writer.flush, ())):
         with pytest.raises(ValueError, match=rf"cannot {verb} the bag '.*run': it is closed"):
             method(*arguments)
     writer.close()
-    assert writer.mcap_path.read_bytes() == before
+    assert (writer.path / 'run_0.mcap').read_bytes() == before
 
 
 def test_exception_inside_with_keeps_the_recording(tmp_path: Path) -> None:
