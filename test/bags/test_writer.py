@@ -4,6 +4,7 @@
 """What is written, when, and what is refused; the readers of mcap and rosbags; definitions."""
 
 from collections.abc import Callable
+from dataclasses import replace
 import importlib
 import math
 from pathlib import Path
@@ -18,17 +19,7 @@ import pytest
 import yaml
 
 from koopman_ros import __version__, bags
-from support.bag_samples import (
-    HASH,
-    NUMBER,
-    number,
-    OFFERED_QOS,
-    record,
-    ROUNDS,
-    Sample,
-    TOPICS,
-    write_numbers,
-)
+from support.bag_samples import NUMBER, number, OFFERED_QOS, record, Sample, TOPICS, write_numbers
 
 
 def content(path: Path) -> Summary:
@@ -64,7 +55,7 @@ def test_header_schemas_and_channels_are_those_of_rosbag2(tmp_path: Path) -> Non
         assert (channel.topic, channel.schema_id, channel.message_encoding) == (
             topic, schema.id, 'cdr')
         assert channel.metadata.keys() == {'offered_qos_profiles', 'topic_type_hash'}
-        assert channel.metadata['topic_type_hash'] == HASH
+        assert channel.metadata['topic_type_hash'] == NUMBER.type_hash
         offers = yaml.safe_load(channel.metadata['offered_qos_profiles'])
         assert [offer['depth'] for offer in offers] == depths
 
@@ -120,7 +111,7 @@ def test_metadata_begins_empty_and_ends_complete(
     range_ns = {'starting_time': {'nanoseconds_since_epoch': 50},
                 'duration': {'nanoseconds': 20}, 'message_count': 3}
     topic = {'name': '/x', 'type': 'std_msgs/msg/Float64', 'serialization_format': 'cdr',
-             'offered_qos_profiles': [], 'type_description_hash': HASH}
+             'offered_qos_profiles': [], 'type_description_hash': NUMBER.type_hash}
     assert list(last.items()) == list({
         'version': 9, 'storage_identifier': 'mcap', 'duration': range_ns['duration'],
         'starting_time': range_ns['starting_time'], 'message_count': 3,
@@ -163,8 +154,8 @@ def test_existing_path_is_never_overwritten(tmp_path: Path, name: str) -> None:
     assert {f: f.read_bytes() for f in tmp_path.rglob('*') if f.is_file()} == before
 
 
-INTEGER = bags.MessageDefinition('std_msgs/msg/Int64', 'int64 data\n', HASH)
-CHANGED = bags.MessageDefinition('std_msgs/msg/Float64', 'float32 data\n', HASH)
+INTEGER = replace(NUMBER, type_name='std_msgs/msg/Int64', text='int64 data\n')
+CHANGED = replace(NUMBER, text='float32 data\n')
 
 
 @pytest.mark.parametrize(('method', 'arguments', 'kind', 'words'), [
@@ -258,7 +249,7 @@ def test_rosbags_reads_messages_offers_and_metadata(
         assert reader.start_time == samples[0].log_time_ns
         assert reader.end_time == samples[-1].log_time_ns + 1  # rosbags counts past the last
         assert {t: info.msgcount for t, info in reader.topics.items()} == dict.fromkeys(
-            TOPICS, ROUNDS)
+            TOPICS, len(samples) // 4)
         for connection in reader.connections:
             hash_ = bags.message_definition(connection.msgtype).type_hash
             assert connection.digest == (hash_ if path.is_dir() else '')

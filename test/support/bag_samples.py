@@ -5,7 +5,6 @@
 
 from collections.abc import Iterable
 from dataclasses import dataclass
-import importlib
 from pathlib import Path
 import struct
 from typing import Any
@@ -14,10 +13,6 @@ import yaml
 import zstandard
 
 from koopman_ros.bags import BagWriter, MessageDefinition, QosProfile
-
-START_NS = 1_700_000_000_123_456_789
-PERIOD_NS = 100_000_000
-ROUNDS = 25
 
 TOPICS = {
     '/temperature': 'sensor_msgs/msg/Temperature',
@@ -34,8 +29,8 @@ OFFERED_QOS = {
     ),
     '/clock': (QosProfile(reliability='best_effort', depth=1),),
 }
-HASH = 'RIHS01_705ba9c3d1a09df43737eb67095534de36fd426c0587779bda2bc51fe790182a'
-NUMBER = MessageDefinition('std_msgs/msg/Float64', 'float64 data\n', HASH)
+_HASH = 'RIHS01_705ba9c3d1a09df43737eb67095534de36fd426c0587779bda2bc51fe790182a'
+NUMBER = MessageDefinition('std_msgs/msg/Float64', 'float64 data\n', _HASH)
 TEXT = MessageDefinition('std_msgs/msg/String', 'string data', 'RIHS01_' + 'a' * 64)
 HEAD = b'\x00\x01\x00\x00'  # of each message in CDR
 
@@ -73,31 +68,6 @@ class Sample:
     data: bytes
     log_time_ns: int
     publish_time_ns: int
-
-
-def messages(index: int, stamp_ns: int) -> dict[str, Any]:
-    """Return one message a topic; all fields differ from their defaults."""
-    diagnostic = importlib.import_module('diagnostic_msgs.msg')
-    sensor = importlib.import_module('sensor_msgs.msg')
-    rosgraph = importlib.import_module('rosgraph_msgs.msg')
-    std = importlib.import_module('std_msgs.msg')
-    time = importlib.import_module('builtin_interfaces.msg').Time
-    stamp = time(sec=stamp_ns // 10**9, nanosec=stamp_ns % 10**9)
-    header = std.Header(stamp=stamp, frame_id='reactor')
-    status = diagnostic.DiagnosticStatus(
-        level=b'\x01', name='controller: loop', message='Überlauf', hardware_id='cstr',
-        values=[diagnostic.KeyValue(key='round', value=str(index))])
-    return {
-        '/temperature': sensor.Temperature(
-            header=header, temperature=51.95 + 0.1 * index, variance=0.04),
-        '/diagnostics': diagnostic.DiagnosticArray(header=header, status=[status] * (index % 3)),
-        # No empty sequence of doubles: rmw reserves room to align it and leaves the rest as
-        # trailing bytes, which ROS and mcap ignore and rosbags refuses.
-        '/joint_states': sensor.JointState(
-            header=header, name=['valve', 'pump'], position=[0.5, float(index)],
-            velocity=[-1e-300], effort=[float('nan')]),
-        '/clock': rosgraph.Clock(clock=stamp),
-    }
 
 
 def compressed_files(files: dict[str, bytes]) -> dict[str, bytes]:
