@@ -3,7 +3,6 @@
 
 """The identification experiment across processes: steps on a plant, refusals, ways back."""
 
-from collections.abc import Mapping
 from itertools import pairwise
 import math
 from pathlib import Path
@@ -28,7 +27,6 @@ STATUS = 'trainer: experiment'
 SERVICE = 'trainer/experiment'
 TRAINER, JACKET = 'unit_1/trainer', '/unit_1/jacket'
 SAFE = TrainerParameters().safe_coolant
-LOCKSTEP = {'lockstep': True, 'speed': 0.0, 'lockstep_subscribers': 2}
 IDLE = {'record_at_start': False}
 LOST = 'the trainer does not command the coolant any more'
 
@@ -74,12 +72,11 @@ class Bench:
         return self.ros.wait_for_status(f'unit_1/{STATUS}', lambda s: words in s.message)
 
 
-def start_with_plant(ros: Harness, trainer: Mapping[str, object],
-                     plant: Mapping[str, object] | None = None) -> list[Temperature]:
+def start_with_plant(ros: Harness, subscribers: int = 2, **trainer: object) -> list[Temperature]:
     """Start both, and an experiment that both know of; return the measurements to come."""
     measured = ros.listen(Temperature, topics.TEMPERATURE)
     ros.start('trainer', {**IDLE, **trainer})
-    ros.start('plant', {**LOCKSTEP, **(plant or {})})
+    ros.start('plant', {'lockstep': True, 'speed': 0.0, 'lockstep_subscribers': subscribers})
     ros.meet('plant')
     response = ros.set_bool(SERVICE, True)
     assert response.success, response.message
@@ -91,7 +88,7 @@ def test_steps_drive_the_plant_as_planned(ros: Harness) -> None:
     commands = ros.listen(Temperature, topics.COOLANT_SETPOINT)
     given = {'experiment_duration': 5.0, 'experiment_seed': 5, 'experiment_hold_min': 0.25,
              'experiment_hold_max': 1.0}
-    measured = start_with_plant(ros, given)
+    measured = start_with_plant(ros, **given)
     status = ros.wait_for_status(STATUS, lambda s: s.message.startswith('finished'))
     assert status.level == DiagnosticStatus.OK
     assert status.message == 'finished; the coolant returns to 18.85 degC and is held there'
@@ -144,17 +141,14 @@ def test_what_is_in_the_way_refuses_the_start(shared_bench: Bench) -> None:
     bench.set(experiment_topic='coolant_setpoint')
 
 
-@pytest.mark.parametrize(('given', 'words'), [
-    ({'experiment_coolant_min': 30.0},
-     'experiment_coolant_min = 30.0 degC must be below experiment_coolant_max = 27.5 degC'),
-    ({'experiment_temperature_max': 20.0},
-     'must be below experiment_temperature_max = 20.0 degC'),
-    ({'experiment_hold_max': 0.4}, 'experiment_hold_min = 0.5 min must be below'),
-    ({'experiment_topic': 'setpoint'},
-     'must be one of coolant_setpoint, manual_coolant_setpoint'),
-])
-def test_contradicting_limits_are_refused(given: dict[str, object], words: str) -> None:
-    assert words in TABLE.check(TrainerParameters(**given))
+def test_contradicting_limits_are_refused() -> None:
+    for name, given, words in (
+            ('coolant_min', 30.0, 'experiment_coolant_min = 30.0 degC must be below '
+             'experiment_coolant_max = 27.5 degC'),
+            ('temperature_max', 20.0, 'must be below experiment_temperature_max = 20.0 degC'),
+            ('hold_max', 0.4, 'experiment_hold_min = 0.5 min must be below'),
+            ('topic', 'setpoint', 'must be one of coolant_setpoint, manual_coolant_setpoint')):
+        assert words in TABLE.check(TrainerParameters(**{f'experiment_{name}': given}))
 
 
 def test_service_ends_the_steps_and_then_lets_go(shared_bench: Bench) -> None:
@@ -219,8 +213,7 @@ def test_reactor_that_leaves_its_bounds_and_trainer_that_ends_leave_the_safe_coo
     bag = tmp_path / 'run.mcap'
     commands = ros.listen(Temperature, topics.COOLANT_SETPOINT)
     measured = start_with_plant(
-        ros, {'experiment_duration': 1000.0, 'record_at_start': True, 'output': bag},
-        {'lockstep_subscribers': 3})
+        ros, 3, experiment_duration=1000.0, record_at_start=True, output=bag)
     ros.wait_until(lambda: len(commands) > 50)
     ros.set_parameters('plant', feed_temperature=-20.0)
     status = ros.wait_for_status(STATUS, lambda s: s.level == DiagnosticStatus.ERROR)

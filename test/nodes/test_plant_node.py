@@ -213,27 +213,23 @@ def test_stands_still_where_the_stamps_end(ros: Harness) -> None:
     assert (response.success, response.message) == (False, status.message)
 
 
-@pytest.mark.parametrize(('parameters', 'words'), [
-    ({'start_time': 2147483647.0}, ''),
-    ({'start_time': 2147483648.0}, 'must be in [0.001, 2147483647] s'),
-    ({'start_time': 2e9, 'duration': 1e9}, 'start_time + duration = 3000000000 s must be at most'),
-    ({'frame_id': 'x' * 256}, ''),
-    ({'frame_id': 'x' * 50_000}, 'frame_id has 50000 characters, must have at most 256'),
-])
-def test_stamps_and_frames_that_a_message_can_hold(
-        parameters: dict[str, object], words: str) -> None:
-    reason = TABLE.check(PlantParameters(**parameters))
-    assert words in reason
-    assert bool(words) == bool(reason)
-    assert len(reason) < 200
+def test_stamps_and_frames_that_a_message_can_hold() -> None:
+    for parameters in ({'start_time': 2147483647.0}, {'frame_id': 'x' * 256}):
+        assert TABLE.check(PlantParameters(**parameters)) == ''
+    for parameters, words in (
+            ({'start_time': 2147483648.0}, 'must be in [0.001, 2147483647] s'),
+            ({'start_time': 2e9, 'duration': 1e9},
+             'start_time + duration = 3000000000 s must be at most'),
+            ({'frame_id': 'x' * 50_000}, 'frame_id has 50000 characters, must have at most 256')):
+        reason = TABLE.check(PlantParameters(**parameters))
+        assert words in reason
+        assert len(reason) < 200
 
 
-@pytest.mark.parametrize(('nanoseconds', 'text'), [
-    (0, '0'), (1_000_000_000, '1'), (1_700_000_000_250_000_001, '1700000000.250000001'),
-    (-500_000_000, '-0.5'), (600_000_000_000, '600'),
-])
-def test_time_is_written_with_all_digits(nanoseconds: int, text: str) -> None:
-    assert seconds_text(nanoseconds) == text
+def test_time_is_written_with_all_digits() -> None:
+    times = {0: '0', 1_000_000_000: '1', 1_700_000_000_250_000_001: '1700000000.250000001',
+             -500_000_000: '-0.5', 600_000_000_000: '600'}
+    assert {nanoseconds: seconds_text(nanoseconds) for nanoseconds in times} == times
 
 
 def test_coolant_in_force_is_told_before_each_measurement_and_latched(bench: Bench) -> None:

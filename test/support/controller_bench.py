@@ -75,8 +75,12 @@ class Bench:
         self.thermometer.publish(temperature(celsius, time))
 
     def measure(self, celsius: float, time: float) -> Temperature:
-        first = len(self.commands)
-        self.send(celsius, time)
+        return self.answer_to(temperature(celsius, time))
+
+    def answer_to(self, measurement: Temperature) -> Temperature:
+        first, time = len(self.commands), seconds(measurement)
+        self.sent += 1
+        self.thermometer.publish(measurement)
         return self.ros.wait_until(
             lambda: next((m for m in self.commands[first:] if seconds(m) == time), None))
 

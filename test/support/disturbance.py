@@ -4,10 +4,9 @@
 """
 A disturbance of the data that trainings see, in place of a processor that rounds differently.
 
-``DISTURB_TRAINING=1e-13`` in the environment switches it on, for pytest through test/conftest.py
-and for a script as ``python test/support/disturbance.py SCRIPT ARGUMENTS``. Rounding of one part
-in 2^53 is carried that far by the simulations from which samples come; what a test asks of a
-training has to hold with it.
+``DISTURB_TRAINING=1e-13`` in the environment switches it on, for pytest and for a script as
+``python test/support/disturbance.py SCRIPT ARGUMENTS``. Rounding of one part in 2^53 is carried
+that far by the simulations of samples; what a test asks of a training has to hold with it.
 """
 
 import os

@@ -19,7 +19,6 @@ def names(letter: str, count: int) -> tuple[str, ...]:
 
 
 def box(state_lower, state_upper, input_lower, input_upper) -> Box:
-    """Return a box with deviations from its middle."""
     return Box(*(Coordinates.spanning(names(letter, len(lower)), ('1',) * len(lower),
                                       np.array(lower), np.array(upper))
                  for letter, lower, upper in (('x', state_lower, state_upper),
@@ -81,7 +80,6 @@ class KnownPlant:
         return Episode(times, disturbed(noisy), input_time, u)
 
     def excited(self, count, period, *, noise=0.0, seed=0, level=1.0, hold=20):
-        """Return a record of random steps, each held for about `hold` samples."""
         rng = np.random.default_rng(seed)
         steps = np.arange(0, count, hold) + rng.integers(0, hold // 2, -(-count // hold))
         steps[0] = 0

@@ -26,7 +26,6 @@ TWO_STATE = Plant(
 
 
 def bent_samples(episodes=6, length=30, seed=0):
-    """Return samples of the bent plant, scattered over its box."""
     rng = np.random.default_rng(seed)
     x = rng.uniform(-1.0, 1.5, (episodes * length, 1))
     u = rng.uniform(-1.0, 1.0, (episodes * length, 1))
@@ -41,7 +40,6 @@ def unforced_samples():
 
 
 def two_state_samples(count=600, seed=0):
-    """Return samples of the paper's two-state example, scattered over its box."""
     rng = np.random.default_rng(seed)
     x = np.stack([rng.uniform(-6.0, 6.0, count), rng.uniform(-6.0, 8.0, count)], 1)
     u = rng.uniform(-5.0, 5.0, (count, 1))
