@@ -11,7 +11,6 @@ import pytest
 
 from koopman_ros import experiment
 from koopman_ros.experiment import advance, begin, end, Experiment, Following, level, Phase
-from koopman_ros.ros.node import OPERATOR
 from koopman_ros.units import NANOSECONDS as SECOND
 from support.closed_loops import say
 
@@ -86,11 +85,6 @@ def test_a_bad_measurement_aborts_and_refuses_a_start(measured: float, words: st
     if words is not None:
         assert words in say(PLAN.refusal(measured))
         assert words in say(after.reason)
-
-
-def test_words_are_those_of_the_reader() -> None:
-    reason = advance(PLAN, begin(PLAN, START), 330.0, START + SECOND).reason
-    assert 'the temperature 56.85 degC is outside' in OPERATOR(reason)
 
 
 def test_aborted_input_returns_along_the_rate_limit_and_stays() -> None:

@@ -115,8 +115,9 @@ class RetrainingJob:
         if self._cancelled:
             text = _CANCELLED
         elif code < 0:
-            text = (f'the training process was killed by {_signal_name(-code)}: see whether the '
-                    'memory suffices, and train again')
+            name = next((s.name for s in signal.Signals if s == -code), f'signal {-code}')
+            text = (f'the training process was killed by {name}: see whether the memory '
+                    'suffices, and train again')
         else:
             self._threads[1].join()
             last = self._complaints[-1] if self._complaints else 'it said nothing'
@@ -139,13 +140,6 @@ class RetrainingJob:
 def _command() -> tuple[str, ...]:
     # killed with us: nobody would hear what it says
     return command(_MODULE, signal.SIGKILL, interrupted=1)
-
-
-def _signal_name(number: int) -> str:
-    try:
-        return signal.Signals(number).name
-    except ValueError:
-        return f'signal {number}'
 
 
 def _in_words(summary: Mapping[str, Any]) -> str:

@@ -176,7 +176,8 @@ class ExperimentRun:
         self._patience, self._on_end = settings.experiment_timeout, on_end
         self._frame_id, self._stamp_ns, self._heard_at = '', 0, time.monotonic()
         self._following = Following()
-        self._owned = owned = Owned(node)
+        owned = Owned(node)
+        self.destroy = owned.destroy  #: commands no more
         # a sensor driver may publish best effort
         offers = node.get_publishers_info_by_topic(node.resolve_topic_name(topics.TEMPERATURE))
         reliable = all(info.qos_profile.reliability is not ReliabilityPolicy.BEST_EFFORT
@@ -215,10 +216,6 @@ class ExperimentRun:
                 else:
                     time.sleep(0.001)
         self._publisher.wait_for_all_acked(Duration(seconds=_FAREWELL))
-
-    def destroy(self) -> None:
-        """Command no more."""
-        self._owned.destroy()
 
     def _on_temperature(self, message: Temperature) -> None:
         measured = to_kelvin(message.temperature)

@@ -102,14 +102,10 @@ class DiagnosticsPublisher:
         self._hardware_id = hardware_id
         self._collect = collect
         self._last: tuple[Level, str] | None = None
-        self._owned = Owned(node)
-        self._publisher = self._owned.keep(
-            node.create_publisher(DiagnosticArray, DIAGNOSTICS, 10))
-        self._owned.timer(1.0, self.publish)
-
-    def destroy(self) -> None:
-        """Report no more."""
-        self._owned.destroy()
+        owned = Owned(node)
+        self._publisher = owned.keep(node.create_publisher(DiagnosticArray, DIAGNOSTICS, 10))
+        owned.timer(1.0, self.publish)
+        self.destroy = owned.destroy  #: reports no more
 
     def publish(self) -> None:
         """Publish the present status."""

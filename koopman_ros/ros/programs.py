@@ -22,13 +22,10 @@ from koopman_ros.ros import topics
 POLICY_FILE = 'sros2_policy.xml'
 
 # what rclpy gives every node
-_ROSOUT, _PARAMETER_EVENTS = '/rosout', '/parameter_events'
-_PARAMETER_SERVICES = (
+STANDARD_TOPICS = ('/rosout', '/parameter_events')
+STANDARD_SERVICES = (
     '~/describe_parameters', '~/get_parameter_types', '~/get_parameters', '~/list_parameters',
-    '~/set_parameters', '~/set_parameters_atomically')
-_TYPE_SERVICE = '~/get_type_description'
-STANDARD_TOPICS = (_ROSOUT, _PARAMETER_EVENTS)
-STANDARD_SERVICES = (*_PARAMETER_SERVICES, _TYPE_SERVICE)
+    '~/set_parameters', '~/set_parameters_atomically', '~/get_type_description')
 # `ros2 topic pub` and its like start a node with this service, named after their process
 _COMMAND_LINE_SERVICE = '/_ros2cli_*/get_type_description'
 
@@ -81,7 +78,7 @@ PROGRAMS = {
         'Takes the records in bags through the control step again, also with a new model.',
         '0 when the recorded commands are reproduced, 1 when not or when it cannot run, 2 for an '
         'unknown argument, 3 when there is nothing to compare in a bag, 130 when interrupted',
-        publishes=(_PARAMETER_EVENTS,), serves=(_TYPE_SERVICE,)),
+        publishes=('/parameter_events',), serves=('~/get_type_description',)),
 }
 
 TABLES: dict[str, ParameterTable[Any]] = {

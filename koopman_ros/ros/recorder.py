@@ -63,11 +63,6 @@ class Recorder:
         self.counts: dict[str, int] = dict.fromkeys(self._types, 0)
         self.look_for_publishers()
 
-    @property
-    def path(self) -> str:
-        """The file or folder that is written."""
-        return str(self._writer.path)
-
     def look_for_publishers(self) -> None:
         """Subscribe to what has become known, matching what its publishers offer."""
         for topic in list(self._types):

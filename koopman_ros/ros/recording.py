@@ -71,14 +71,13 @@ class Recording:
         recorder = self._end()
         if self._problem:
             raise OSError(self._problem)
-        said = f'recorded {sum(recorder.counts.values())} messages to {recorder.path}'
+        said = f'recorded {sum(recorder.counts.values())} messages to {self._path}'
         self._node.get_logger().info(said)
         return said
 
     def flushed(self) -> str:
         """Return the path of the present or the last bag with all of it on disk, or ''."""
-        if self._recorder is not None:
-            self._attempt(Recorder.flush)
+        self._attempt(Recorder.flush)
         return self._path
 
     def complete(self) -> None:
@@ -101,7 +100,7 @@ class Recording:
         try:
             recorder.close()
         except (OSError, LookupError) as error:
-            said = f'{recorder.path} is not complete: {error}'
+            said = f'{self._path} is not complete: {error}'
             self._node.get_logger().error(said)
             # what went wrong first tells more
             self._problem = self._problem or said
@@ -115,7 +114,7 @@ class Recording:
             work(self._recorder)
         except (OSError, LookupError) as error:
             remedy = 'free some space and ' if isinstance(error, OSError) else ''
-            self._problem = (f'recording to {self._recorder.path} stopped: {error}; {remedy}call '
+            self._problem = (f'recording to {self._path} stopped: {error}; {remedy}call '
                              '~/record again')
             self._node.get_logger().error(self._problem)
             self._end()
@@ -123,7 +122,7 @@ class Recording:
 
     def _flush(self, recorder: Recorder) -> None:
         recorder.flush()
-        if reason := self._too_little_room(Path(recorder.path)):
+        if reason := self._too_little_room(Path(self._path)):
             raise OSError(reason)
 
     def _on_record(self, request: SetBool.Request, response: SetBool.Response
@@ -157,7 +156,7 @@ class Recording:
             return Status(Level.ERROR, self._problem) if self._problem else Status(
                 Level.OK, 'not recording')
         counts = self._recorder.counts
-        return Status(Level.OK, f'recording to {self._recorder.path}', {
+        return Status(Level.OK, f'recording to {self._path}', {
             'messages': sum(counts.values()),
             **{f'messages on {topic}': count for topic, count in counts.items()}})
 

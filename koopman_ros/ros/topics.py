@@ -125,15 +125,12 @@ class Matching:
         self._policies: dict[str, str] = {}  # last reported by the middleware, by topic
         self._said: tuple[str, ...] = ('', '')
         self._owned.timer(_LOOK_PERIOD, self._look)
+        self.destroy = self._owned.destroy  #: with what was made here
 
     @property
     def complaint(self) -> str:
         """Names topic, nodes, what is wrong and what to do; conflicts first; or is empty."""
         return next(filter(None, self._said), '')
-
-    def destroy(self) -> None:
-        """Take down the publishers and subscriptions that were made here, and look no more."""
-        self._owned.destroy()
 
     def subscribe(self, topic: str, callback: Callable[[Any], None], kind: Any = None,
                   **options: Any) -> Subscription:

@@ -156,22 +156,6 @@ def test_node_without_standard_streams_ends_cleanly(ros: Harness, tmp_path: Path
     assert summary(tmp_path / 'bag.mcap').complete
 
 
-def test_a_process_that_runs_a_node_among_other_things_is_not_ended_by_force() -> None:
-    program = (
-        'import sys, time\n'
-        'from koopman_ros import startup\n'
-        'from koopman_ros.ros import process\n'
-        'process._TAKE_DOWN_PATIENCE = 0.2\n'
-        'startup._LATER = startup._AFTER = 0.0\n'
-        'process._take_down("plant", None)\n'
-        '# longer than it takes until a process is ended by force\n'
-        'time.sleep(0.5)\n'
-        'sys.exit(7)\n')
-    done = subprocess.run([sys.executable, '-c', program], capture_output=True, check=False,
-                          timeout=TIMEOUT)
-    assert (done.returncode, done.stderr) == (7, b'')
-
-
 def test_impossible_time_does_not_end_a_node(ros: Harness) -> None:
     process = ros.start('controller', {'use_sim_time': True})
     clock = ros.speak(Clock, '/clock', topics.CLOCK_QOS, to='controller')
