@@ -79,7 +79,8 @@ class ControllerNode(LoopNode):
         self._diagnostics = DiagnosticsPublisher(self, 'control', 'controller', self._status)
         # volatile, so that `ros2 topic pub` matches
         self._matching.subscribe(topics.SETPOINT, self._on_setpoint)
-        self._matching.subscribe(topics.MANUAL_COOLANT_SETPOINT, self._on_manual_coolant_setpoint)
+        self._matching.subscribe(topics.MANUAL_COOLANT_SETPOINT, lambda message: self._change(
+            messages.manual_command(message)))
         self._coolants = self._matching.subscribe(topics.COOLANT_TEMPERATURE, self._on_coolant)
         # a sensor driver that publishes best effort needs this overridden to match
         self._matching.subscribe(
@@ -240,16 +241,10 @@ class ControllerNode(LoopNode):
     def _on_setpoint(self, message: Temperature) -> None:
         stamp_ns = stamp_nanoseconds(message.header.stamp)
         if self._change(messages.setpoint_request(message)):
-            self._counts.setpoint_received = True
             scheduled = any(entry[0] == stamp_ns for entry in self._state.setpoint.scheduled)
             when = f', holds from {stamp_ns / NANOSECONDS:.3f} s on' if scheduled else ''
             self.get_logger().info(f'set-point {message.temperature:.6g} degC accepted{when}',
                                    throttle_duration_sec=1.0)
-        self._diagnostics.publish_if_changed()
-
-    def _on_manual_coolant_setpoint(self, message: Temperature) -> None:
-        self._change(messages.manual_command(message))
-        self._diagnostics.publish_if_changed()
 
     def _on_set_automatic(self, request: SetBool.Request, response: SetBool.Response
                           ) -> SetBool.Response:
@@ -257,7 +252,6 @@ class ControllerNode(LoopNode):
         self._change(ModeChange(mode))
         response.success, response.message = True, f'{mode.value} mode'
         self.get_logger().info(response.message)
-        self._diagnostics.publish_if_changed()
         return response
 
     def _change(self, event: Event) -> bool:
@@ -269,6 +263,9 @@ class ControllerNode(LoopNode):
         self._refused = words_of(self._controller.model)(outcome.refused)
         if self._refused:
             self.get_logger().warning(self._refused, throttle_duration_sec=1.0)
+        elif isinstance(event, events.SetpointRequest):
+            self._counts.setpoint_received = True
+        self._diagnostics.publish_if_changed()
         return not self._refused
 
     def _built(self) -> Controller:

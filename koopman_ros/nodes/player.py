@@ -32,9 +32,8 @@ class PlayerNode(LoopNode):
     Publish recorded messages byte for byte, in the order and at the pace of the recording.
 
     As fast as possible means in lock-step: a measurement is followed by the next message when its
-    command has arrived, and any other message when all subscribers have received it. What carries
-    the stamp of the message after it, such as the coolant with the temperature, is published with
-    that: to hear that a message was received takes some middlewares 0.1 s.
+    command has arrived, and any other message when all subscribers have received it, which takes
+    some middlewares 0.1 s, so that messages of one stamp go together.
     """
 
     def __init__(self) -> None:

@@ -97,8 +97,7 @@ class Situation:
 
 def status(now: Situation) -> Status:
     """Return the status of the control task."""
-    level, message = _verdict(now)
-    return Status(level, message, lambda: _figures(now))
+    return Status(*_verdict(now), lambda: _figures(now))
 
 
 def _verdict(now: Situation) -> tuple[Level, str]:
@@ -122,8 +121,7 @@ def _verdict(now: Situation) -> tuple[Level, str]:
         level = Level.ERROR if report.level in _ACTIONS else Level.WARN
         action = _WAY_BACK if report.command.way_back else _action(report)
         return level, f'{action}: {now.reason}'
-    warning = _warning(now)
-    if warning:
+    if warning := _warning(now):
         return Level.WARN, warning
     message = mode.value
     if mode is Mode.AUTOMATIC and not now.counts.setpoint_received:

@@ -34,9 +34,8 @@ class CoolantExperiment:
     """
     Drive the coolant with random steps on the service ``~/experiment``; reports by diagnostics.
 
-    When the steps are over, for whatever reason, the coolant returns to the safe temperature along
-    the rate limit and is held there until the service is called with false once more. Beside
-    another publisher no experiment starts, and when one comes it leaves the coolant to that.
+    When the steps are over, the coolant returns to the safe temperature along the rate limit and
+    is held there until the service is called with false once more, or another publisher comes.
     """
 
     def __init__(self, node: Node, settings: TrainerParameters) -> None:

@@ -172,7 +172,10 @@ class _Trial:
 
     def __init__(self, node: Node, name: str, situation: Situation) -> None:
         self.outcome = Future()
-        self.path = _absolute(name)
+        self.path = name
+        # the folder in which the process was started may be gone
+        with contextlib.suppress(OSError):
+            self.path = os.path.abspath(os.path.expanduser(name))
         self.mount = _mount_of(self.path)
         self.reading = True
         self.thread = threading.Thread(target=self._run, args=(name, situation), daemon=True)
@@ -209,10 +212,9 @@ class ModelReload:
     Swap the model of a running controller, or keep the old one and say why.
 
     Files are read and tried in a thread, so that no measurement waits for a disk. The service
-    answers when that is done, up to ten seconds later. A parameter must be answered at once, for
-    only then `ros2 param set` can say why it was refused: what is not read in a fifth of a second
-    is refused. A read from a disk that does not answer cannot be ended: no file is read twice at
-    once, and no more than eight from one file system, so that a model elsewhere is read.
+    answers when that is done; a parameter must be answered at once, for only then `ros2 param set`
+    can say why it was refused. A read from a disk that does not answer cannot be ended: no file is
+    read twice at once, and few from one file system, so that a model elsewhere is read.
 
     :param reloaded: called in the executor when the service has put another model in force.
     :param refused: called there when a model was refused.
@@ -311,13 +313,6 @@ class ModelReload:
         self.refused = f'the old model is kept: {reason}'
         self._on_refused()
         return self.refused
-
-
-def _absolute(name: str) -> str:
-    with contextlib.suppress(OSError):
-        return os.path.abspath(os.path.expanduser(name))
-    # the folder in which the process was started is gone
-    return name
 
 
 def _mount_of(path: str) -> str:

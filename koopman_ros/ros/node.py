@@ -172,8 +172,7 @@ class LoopNode(Node):
         """Declare parameters, but for those given as ``[]``, at which rclpy gives up."""
         # an empty list has no type: the table asks for one that has, or it is another node's
         typed = [entry for entry in parameters if not (len(entry) > 1 and entry[1] is None)]
-        declared: list[Parameter] = super().declare_parameters(namespace, typed, ignore_override)
-        return declared
+        return list(super().declare_parameters(namespace, typed, ignore_override))
 
     def describe_parameter(self, name: str) -> msg.ParameterDescriptor:
         """Return the descriptor of a parameter with its range."""

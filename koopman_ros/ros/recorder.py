@@ -48,9 +48,8 @@ class Recorder:
     """
     Write every message of some topics to a bag, byte for byte, from now until :meth:`close`.
 
-    Messages wait in the middleware until :meth:`take`, which a timer should call often. Any
-    method raises OSError where the bag cannot be written, and LookupError where the definition of
-    a type is not installed; then :meth:`close` is all that is left to do.
+    Messages wait in the middleware until :meth:`take`. Any method raises OSError where the bag
+    cannot be written, and LookupError where the definition of a type is not installed.
     """
 
     def __init__(self, node: Node, writer: BagWriter, names: tuple[str, ...]) -> None:

@@ -84,8 +84,7 @@ class Watchdog:
     """
     A thread that does what the executor's timer would, whenever the executor does not come to it.
 
-    It counts its own looks, so that time in which the whole process stood still is not held
-    against the executor. It waits for library calls that keep Python's interpreter lock.
+    It counts its own looks: time in which the whole process stood still does not count.
 
     :param act: called from that thread with the seconds for which the executor has been busy;
         what it raises is raised again in the executor, by :meth:`beat`.

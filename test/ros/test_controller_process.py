@@ -1,11 +1,7 @@
 # SPDX-FileCopyrightText: 2026 The koopman_ros Authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""
-A controller as a process: its parameters, changed and read as `ros2 param` does.
-
-And what it does when measurements are nonsense, stay away, or come with stamps that jump.
-"""
+"""A controller's parameters as `ros2 param` changes them, and bad, missing or odd measurements."""
 
 import itertools
 import math
@@ -109,14 +105,10 @@ def test_every_parameter_is_described_with_unit_and_range(running: Harness) -> N
     assert described['coolant_min'].additional_constraints == '[-50, 150] degC'
 
 
-def around(k: float) -> float:
-    """Return what a reactor near its steady state may show."""
-    return STEADY + 0.05 * math.sin(0.3 * k)
-
-
 def measured(bench: Bench, first: int, count: int) -> list[float]:
-    """Measure once a second; return the commands."""
-    return [bench.measure(around(k), float(k)).temperature for k in range(first, first + count)]
+    """Measure once a second near the steady state; return the commands."""
+    return [bench.measure(STEADY + 0.05 * math.sin(0.3 * k), float(k)).temperature
+            for k in range(first, first + count)]
 
 
 def own_commands(bench: Bench, after: float) -> list[Temperature]:

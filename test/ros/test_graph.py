@@ -1,11 +1,7 @@
 # SPDX-FileCopyrightText: 2026 The koopman_ros Authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""
-Nodes among others: the SROS2 policy grants what each does on the network, and no more.
-
-And complaints about others whose messages cannot pass, between two nodes of one process.
-"""
+"""Nodes among others: the policy grants what each does, and no more; messages that do not pass."""
 
 from collections.abc import Callable, Iterator
 from pathlib import Path
