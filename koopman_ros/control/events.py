@@ -81,8 +81,7 @@ def apply(controller: Controller, state: State, event: Event) -> Outcome:
     """Apply an event to a controller's state; pure, as the controller is."""
     match event:
         case Measurement():
-            return Outcome(*controller.step(
-                state, event.measured, event.stamp_ns, event.applied))
+            return Outcome(*controller.step(state, event.measured, event.stamp_ns, event.applied))
         case Silence():
             return Outcome(*controller.hold(state, event.stamp_ns))
         case SetpointRequest():

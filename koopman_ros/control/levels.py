@@ -20,6 +20,7 @@ from koopman_ros.control.settings import Settings
 from koopman_ros.control.state import amended, State
 from koopman_ros.estimation import check, Estimate, Estimator, ESTIMATORS, FrozenCheck, Verdict
 from koopman_ros.lifting import LiftedModel
+from koopman_ros.reasons import Code
 from koopman_ros.signals import Outputs
 from koopman_ros.units import NANOSECONDS
 
@@ -168,7 +169,7 @@ class Estimating:
             self.model.states.to_physical(predicted.x))
         if verdict.fault is None:
             predicted = self._corrected(state, predicted, verdict, x, time_ns, elapsed)
-        elif verdict.frozen and predicted is not None and last is not None:
+        elif verdict.fault.code is Code.FROZEN and predicted is not None and last is not None:
             # what the observer made of a sensor that does not move is no disturbance
             predicted = Estimate(predicted.x, last.frozen.w)
         return (amended(state, accepted=verdict.accepted, time_ns=time_ns, estimate=predicted),
@@ -183,8 +184,7 @@ class Estimating:
             return estimator.restart(None, xi, None if state.command is None else (
                 self.model.inputs.to_deviation(state.command)))
         # far out the model's prediction is worth nothing
-        if (verdict.moved or not elapsed > 0.0 or self._lost(state, time_ns)
-                or self._far_out(x)):
+        if verdict.moved or not elapsed > 0.0 or self._lost(state, time_ns) or self._far_out(x):
             return estimator.restart(predicted, xi, None)
         return estimator.correct(predicted, xi, elapsed)
 
@@ -237,8 +237,7 @@ class Estimating:
             old.B @ _command(old, state))
         factor = (old.states.scale / old.seconds_per_time_unit
                   / (new.states.scale / new.seconds_per_time_unit))
-        moved = Estimate(new.states.to_deviation(x),
-                         factor * rate - new.B @ _command(new, state))
+        moved = Estimate(new.states.to_deviation(x), factor * rate - new.B @ _command(new, state))
         moved = estimator.rebased(moved, np.zeros_like(moved.w))
         # what it holds of the disturbance is in the old model's units, and distances from its data
         return amended(state, estimate=moved, accepted=None, way_back=None)

@@ -91,7 +91,6 @@ class Transfer:
     offset: Array  #: (n_u,) now, in input units
     feed: Array  #: (n_u,) what it follows, which fades exponentially
 
-
     def after(self, seconds: float, time_constant: float) -> Transfer | None:
         """Return what is left after seconds, None for nothing; T = 0 s ends it at once."""
         if seconds > 100.0 * time_constant:

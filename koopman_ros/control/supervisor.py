@@ -272,5 +272,4 @@ def _beyond(model: LiftedModel, x: Array, rate: Array) -> Rest:
     if np.all(np.isfinite(slope)) and np.all(np.linalg.eigvals(slope).real < 0.0):
         place = model.states.to_physical(x - np.linalg.solve(slope, rate))
         outside = model.distance(place)
-    return Rest(place, outside, model.inputs.to_physical(
-        -model.input_inverse @ model.drift(x)))
+    return Rest(place, outside, model.inputs.to_physical(-model.input_inverse @ model.drift(x)))

@@ -29,11 +29,6 @@ class FrozenCheck:
     #: of a sensor that does not move is no disturbance
     w: Array
 
-    @classmethod
-    def started(cls, y: Array, time_ns: int, w: Array) -> FrozenCheck:
-        """Begin with a first measurement (n_y,)."""
-        return cls((time_ns,) * len(y), np.zeros_like(y), w)
-
     def after(self, still: NDArray[np.bool_], time_ns: int, w: Array,
               travel: Callable[[FrozenCheck], Array]) -> FrozenCheck:
         """
@@ -120,11 +115,6 @@ class Verdict:
     fault: Reason | None = None  #: why it is rejected; None when it is accepted
     moved: bool = False  #: whether it is accepted although the plant has jumped there
 
-    @property
-    def frozen(self) -> bool:
-        """Whether a sensor stands still."""
-        return self.fault is not None and self.fault.code is Code.FROZEN
-
 
 def check(limits: SensorLimits, outputs: Outputs, last: Accepted | None, y: Array, time_ns: int,
           w: Array, travel: Callable[[FrozenCheck], Array]) -> Verdict:
@@ -141,7 +131,7 @@ def check(limits: SensorLimits, outputs: Outputs, last: Accepted | None, y: Arra
     if fault is not None:
         return Verdict(last, fault)
     if last is None:
-        return Verdict(Accepted(y, time_ns, FrozenCheck.started(y, time_ns, w)))
+        return Verdict(Accepted(y, time_ns, FrozenCheck((time_ns,) * len(y), np.zeros_like(y), w)))
     seconds = (time_ns - last.time_ns) / NANOSECONDS
     unreachable = _unreachable(limits, last.value, y, seconds)
     if unreachable is not None:

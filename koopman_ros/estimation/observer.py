@@ -80,8 +80,7 @@ class Estimator(Protocol):
         """Tell whether a disturbance is as large as is allowed."""
 
 
-def simulated(model: LiftedModel, estimate: Estimate, u: Array, seconds: float
-              ) -> Estimate | None:
+def simulated(model: LiftedModel, estimate: Estimate, u: Array, seconds: float) -> Estimate | None:
     """Integrate the model from an estimate; see :meth:`Estimator.predict`."""
     duration = seconds / model.seconds_per_time_unit
     fastest = model.linearised.fastest_rate

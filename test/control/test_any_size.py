@@ -41,8 +41,7 @@ def tuned(model: LiftedModel, outputs: Outputs | None = None, **changes: object)
 def mixed(model: LiftedModel) -> Outputs:
     """Return measurements that each see two states."""
     n = model.n_x
-    return Outputs(tuple(f'y{i}' for i in range(n)), ('1',) * n,
-                   np.eye(n) + 0.5 * np.eye(n, k=1))
+    return Outputs(tuple(f'y{i}' for i in range(n)), ('1',) * n, np.eye(n) + 0.5 * np.eye(n, k=1))
 
 
 WILD = [math.nan, math.inf, -math.inf, 1e300, -1e300, 1.7e308, 0.0, -0.0, 5e-324, -40.0]
@@ -193,9 +192,7 @@ def test_a_frozen_sensor_is_found_beside_another_that_moves():
     for k in range(12):
         # both relax towards the nominal point, but for what the first sensor says
         x = np.exp(-np.array([0.0, k / 60.0])) * 0.8
-        state, _, report = loop.step(
-            state, model.states.to_physical(x), (k + 10) * SECOND)
+        state, _, report = loop.step(state, model.states.to_physical(x), (k + 10) * SECOND)
         reasons.append(report.reason)
     assert reasons[:6] == [None] * 6
-    assert {(found.code, found.values['signal']) for found in reasons[6:]} == {
-        (Code.FROZEN, 'x0')}
+    assert {(found.code, found.values['signal']) for found in reasons[6:]} == {(Code.FROZEN, 'x0')}

@@ -238,8 +238,7 @@ def test_the_mode_changes_between_operator_and_law():
     assert loop.set_mode(state, Mode.MANUAL) is state
     # a manual command is forgotten with the mode
     again = manual(loop, state=loop.set_mode(state, Mode.AUTOMATIC))
-    np.testing.assert_array_equal(
-        measured(loop, again, START, 3600)[1], started(loop).command)
+    np.testing.assert_array_equal(measured(loop, again, START, 3600)[1], started(loop).command)
     # back in automatic mode the law acts as if nothing had been
     state = started(loop, (316.0,))
     detour = loop.set_mode(manual(loop, state=state), Mode.AUTOMATIC)
@@ -374,6 +373,9 @@ def test_the_filter_follows_a_step_with_its_time_constant():
     for second in range(1, 20):
         setpoint = moved(setpoint, NOW + second * SECOND, lag=10.0)
         assert setpoint.active[0] == pytest.approx(310.0 + 10.0 * math.exp(-0.1 * second))
+    loop = controller(setpoint_filter=10.0)
+    report = measured(loop, started(loop, (310.0,)), START, 1)[2]
+    assert report.target.setpoint[0] == pytest.approx(310.0 + (START - 310.0) * math.exp(-0.1))
 
 
 @pytest.mark.parametrize('before', [moved(Setpoint(), seconds=0.0), Setpoint()])

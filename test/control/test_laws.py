@@ -96,8 +96,7 @@ def test_the_linear_regulator_ends_off_target(law, R, offset):
     cost, end = run_reactor(shipped('reactor_linear'), law, R, minutes=30.0)
     assert end - SETPOINT == pytest.approx(offset, abs=1e-4)
     # its cost grows for as long as it is off target: count the first five minutes alone
-    assert run_reactor(shipped('reactor_linear'), law, R, minutes=5.0)[0] > (
-        1.3 * optimal_cost(R))
+    assert run_reactor(shipped('reactor_linear'), law, R, minutes=5.0)[0] > 1.3 * optimal_cost(R)
     assert cost > 2.9 * optimal_cost(R)
 
     # the same by hand: scalar regulator and feed-forward from the slope at the nominal point
@@ -157,8 +156,7 @@ def test_laws_of_the_two_state_example(R, cost, K, linear_ratio):
                               rtol=1e-8 if act is recentred else 1e-6)
         assert run.cost / cost == pytest.approx(ratio, rel=rel)
         # x1 decays as exp(-0.1 t) whatever the input does
-        np.testing.assert_allclose(
-            run.states[-1], [5.0 * np.exp(-10.0), 0.0], rtol=0, atol=1e-6)
+        np.testing.assert_allclose(run.states[-1], [5.0 * np.exp(-10.0), 0.0], rtol=0, atol=1e-6)
 
 
 # Choice of the law.

@@ -248,8 +248,7 @@ def test_a_jump_that_stays_is_accepted_when_the_plant_could_have_got_there(by, s
     loop.run(10)
     loop.change(x=np.array([loop.kelvin + by]))
     samples = loop.run(300)
-    assert [s.report.level for s in samples[:seconds + 1]] == (
-        ['hold'] * seconds + ['sdre'])
+    assert [s.report.level for s in samples[:seconds + 1]] == ['hold'] * seconds + ['sdre']
     if seconds:
         # it is no disturbance
         assert abs(float(samples[seconds].report.estimate.disturbance[0])) < 0.01

@@ -75,8 +75,7 @@ class Feedback:
         block[:n, :n], block[:n, n:] = self.drift, self.action
         # Van Loan, 1978: the exponential of the block matrix holds that of A and its integral
         exponential = expm(interval * block)
-        return float(np.max(np.abs(np.linalg.eigvals(
-            exponential[:n, :n] + exponential[:n, n:]))))
+        return float(np.max(np.abs(np.linalg.eigvals(exponential[:n, :n] + exponential[:n, n:]))))
 
 
 def feedback(model: LiftedModel, x: Array, target: Target, weights: Weights, *,
