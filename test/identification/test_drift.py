@@ -128,13 +128,6 @@ def test_path_against_the_plants_integrator(system):
     assert 10.0 < errors[0] / errors[1] < 25.0
 
 
-def test_path_follows_inputs_that_change_between_samples():
-    record = PAIR.irregular(60, 40, (0.05, 0.15), seed=0)
-    errors = Segments.of([record], 0.05).errors(PAIR.rate, record.x[:1])
-    # the classical Runge-Kutta method at rates up to 2: 0.05^4 2^5 / 120
-    assert np.max(np.abs(errors)) < 2e-6
-
-
 def test_model_that_diverges_has_infinite_error():
     record = CUBIC.excited(200, 0.1, noise=0.01)
     segments = Segments.of(cut([record], 50), 0.2)

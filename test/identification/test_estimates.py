@@ -126,20 +126,6 @@ def test_errors_are_those_of_the_best_estimate_possible():
     assert chi2.ppf(1e-3, 5) < distance < chi2.ppf(0.999, 5)
 
 
-def test_monitor_sees_the_cost_fall_and_ends_it():
-    records = cut([CUBIC.excited(200, 0.1, noise=NOISE)], 60)
-    model, segments = start_of(CUBIC, records, 3)
-    costs = []
-
-    def monitor(_, cost):
-        costs.append(cost)
-        return len(costs) == 2
-
-    output_error(model, segments, learn_input_matrix=True, monitor=monitor)
-    assert len(costs) == 2
-    assert costs[1] <= costs[0]
-
-
 def test_start_that_diverges_and_one_segment_of_few_samples():
     record = CUBIC.excited(300, 0.1)
     model, segments = start_of(CUBIC, [record], 3)

@@ -95,11 +95,6 @@ def test_two_states_two_inputs_and_records_of_different_length():
     assert min(len(part) for part in (*found.fitted, *found.held_out)) >= 10
 
 
-def test_without_noise_it_is_exact():
-    found = identify(CUBIC.plant, [CUBIC.excited(300, 0.1)], degrees=(1, 3), methods=methods(20))
-    assert CUBIC.misfit(found.drift) < 3e-5
-
-
 def test_output_error_is_taken_although_chance_is_against_it():
     """On a short record the few segments to choose by rate luck above skill."""
     for seed in range(2):

@@ -3,7 +3,6 @@
 
 """Levenberg-Marquardt, and what it minimises: parameters, a pass, residuals, their derivatives."""
 
-from dataclasses import replace
 from functools import partial
 import itertools
 import math
@@ -36,22 +35,6 @@ identity_or_free = pytest.mark.parametrize('identity', [True, False], ids=['iden
 def normals(seed):
     """Return a source of normally distributed tensors."""
     return partial(torch.randn, generator=torch.Generator().manual_seed(seed), dtype=torch.float64)
-
-
-@pytest.mark.parametrize('hidden', [(), (7,), (2, 5, 3)], ids=str)
-@identity_or_free
-@pytest.mark.parametrize(('n_u', 'decoder'), [(0, 0), (2, 0), (1, 4)])
-def test_split_and_join_are_inverse(hidden, identity, n_u, decoder):
-    layout = Layout(2, 2 if identity and not hidden else 5, hidden, identity, 'sine', n_u, decoder)
-    theta = torch.arange(layout.size, dtype=torch.float64)
-    parts = layout.split(theta)
-    assert [b.shape for _, b in parts.hidden] == [(h,) for h in hidden]
-    assert [W.shape for W, _ in parts.hidden] == list(zip(hidden, (2, *hidden), strict=False))
-    assert parts.V.shape == (layout.n_free, hidden[-1] if hidden else 0)
-    assert parts.A.shape == (layout.n_z, layout.n_z)
-    assert (None if parts.B is None else parts.B.shape) == ((2, n_u) if n_u else None)
-    assert (parts.decoder is None) == (decoder == 0)
-    assert torch.equal(layout.join(parts), theta)
 
 
 @pytest.mark.parametrize('sizes', [(3, 2, (4,), True), (0, 1, (4,), False), (1, 2, (0,), True),
@@ -121,14 +104,10 @@ def assert_normal_equations(of, theta):
     r, J = residuals(theta, of), torch.func.jacrev(residuals)(theta, of)
     normal = normal_equations(of.add_residuals, theta)
     assert normal.cost == pytest.approx(0.5 * float(r @ r), rel=1e-12), of.layout
-    assert_close(normal.gradient, J.T @ r, of=of)
-    assert_close(normal.matrix, J.T @ J, of=of)
-
-
-def assert_close(actual, expected, tolerance=1e-12, of=None):
-    torch.testing.assert_close(
-        actual, expected, rtol=0, atol=tolerance * float(expected.abs().max()),
-        msg=lambda text: f'{of.layout if of else ""}\n{text}')
+    for actual, expected in ((normal.gradient, J.T @ r), (normal.matrix, J.T @ J)):
+        torch.testing.assert_close(
+            actual, expected, rtol=0, atol=1e-12 * float(expected.abs().max()),
+            msg=lambda text: f'{of.layout}\n{text}')
 
 
 @every_depth
@@ -159,17 +138,13 @@ LAYOUT = Layout(2, 4, (5,), True, n_u=1, decoder=3)
 ALL_TERMS = ResidualWeights(whitening=0.5, decoder=0.2)
 
 
-@pytest.mark.parametrize('chunk', [1, 3, 10, 11, 12])
-def test_chunks_add_up(chunk):
-    of, theta = random_problem(LAYOUT, ALL_TERMS, chunk=4096)
-    whole = normal_equations(of.add_residuals, theta)
+@pytest.mark.parametrize('chunk', [1, 10, 11, 12])
+def test_any_chunks_and_the_cost_alone(chunk):
+    of, theta = random_problem(LAYOUT, ALL_TERMS, chunk)
+    assert_normal_equations(of, theta)
     alone = normal_equations(of.add_residuals, theta, derivatives=False)
-    assert alone.cost == whole.cost
+    assert alone.cost == normal_equations(of.add_residuals, theta).cost
     assert not alone.gradient.any()
-    parts = normal_equations(replace(of, chunk=chunk).add_residuals, theta)
-    assert parts.cost == pytest.approx(whole.cost, rel=1e-13)
-    assert_close(parts.gradient, whole.gradient, 1e-13)
-    assert_close(parts.matrix, whole.matrix, 1e-13)
 
 
 @pytest.mark.parametrize(('layout', 'weights', 'words'), [
