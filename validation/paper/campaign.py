@@ -11,9 +11,7 @@ import sys
 from typing import Any
 
 import joblib
-from tqdm import tqdm
 
-from koopman_ros.control import ClosedLoop
 from koopman_ros.lifting import LiftedModel
 from validation.paper import reactor, scalar, sensors, two_state
 from validation.paper.datasets import Metrics, Models
@@ -46,8 +44,6 @@ class Campaign:
     models: dict[str, dict[int, Mapping[str, LiftedModel]]] = field(default_factory=dict)
     errors: list[str] = field(default_factory=list)  #: one line for each run that failed
     complete: bool = False  #: whether every run was made
-    #: closed loops of models, by the identity of the model
-    loops: dict[int, ClosedLoop] = field(default_factory=dict)
 
     def summary(self) -> dict[str, Any]:
         """Nest the figures: experiment, its parts, then one list over the seeds."""
@@ -72,7 +68,6 @@ def run_campaign(seeds: int, *, of_sensors: bool = False) -> Campaign:
     joblib spreads the runs over the cores; within ``joblib.parallel_config(...)`` they go where
     that says.
 
-    :param seeds: number of seeds.
     :param of_sensors: whether to run the experiments on data from a sensor instead of the
         paper's.
     """
@@ -84,12 +79,17 @@ def run_campaign(seeds: int, *, of_sensors: bool = False) -> Campaign:
     finished = joblib.Parallel(n_jobs=jobs, return_as='generator_unordered')(
         joblib.delayed(_run)(name, seed, experiments[name]) for name, seed in runs)
     try:
-        for name, seed, outcome in _shown(finished, len(runs)):
+        for number, (name, seed, outcome) in enumerate(finished, 1):
             if isinstance(outcome, str):
                 campaign.errors.append(f'{name}, seed {seed}: {outcome}')
-                continue
-            campaign.metrics.setdefault(name, {})[seed] = outcome[0]
-            campaign.models.setdefault(name, {})[seed] = outcome[1]
+                text = ' failed'
+            else:
+                campaign.metrics.setdefault(name, {})[seed], campaign.models.setdefault(
+                    name, {})[seed] = outcome
+                rw = [value for figure, value in outcome[0].items()
+                      if figure.split('/')[-1] in ('rw', 'rw_in') and isinstance(value, float)]
+                text = f', rw {min(rw):.1e}' if rw else ''
+            print(f'{number}/{len(runs)}: {name}, seed {seed}{text}', file=sys.stderr, flush=True)
         campaign.complete = True
     except KeyboardInterrupt:
         print('interrupted: reporting on what is done', file=sys.stderr)
@@ -108,37 +108,9 @@ def _run(name: str, seed: int, experiment: Callable[[int], tuple[Metrics, Models
         return name, seed, f'{type(error).__name__}: {error}'
 
 
-def _shown(results: Iterator[Any], total: int) -> Iterator[Any]:
-    """Pass results on and show how many there are."""
-    terminal = sys.stderr.isatty()
-    with tqdm(total=total, unit='run', disable=not terminal) as bar:
-        for number, (name, seed, outcome) in enumerate(results, 1):
-            text = f'{name}, seed {seed}{_best_rw(outcome)}'
-            if terminal:
-                bar.set_postfix_str(text, refresh=False)
-                bar.update()
-            else:
-                print(f'{number}/{total}: {text}', file=sys.stderr, flush=True)
-            yield name, seed, outcome
-
-
-def _best_rw(outcome: tuple[Metrics, Models] | str) -> str:
-    if isinstance(outcome, str):
-        return ' failed'
-    found = [value for name, value in outcome[0].items()
-             if name.split('/')[-1] in ('rw', 'rw_in') and isinstance(value, float)]
-    return f', rw {min(found):.1e}' if found else ''
-
-
 def _flattened(metrics: Metrics) -> Iterator[tuple[str, float | bool | None]]:
+    """Yield the figures with their paths; None for what JSON cannot hold."""
     for name, value in metrics.items():
-        if isinstance(value, dict):
-            for key, entry in value.items():
-                yield f'{name}/{key}', _finite(entry)
-        else:
-            yield name, _finite(value)
-
-
-def _finite(value: float | bool | None) -> float | bool | None:
-    """Return None for what JSON cannot hold."""
-    return value if value is None or math.isfinite(value) else None
+        for key, entry in (value.items() if isinstance(value, dict) else (('', value),)):
+            yield (f'{name}/{key}' if key else name,
+                   entry if entry is None or math.isfinite(entry) else None)

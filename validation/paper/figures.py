@@ -3,6 +3,8 @@
 
 """The figures of the paper's results, one file each."""
 
+from collections.abc import Sequence
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -11,11 +13,9 @@ import numpy as np
 from koopman_ros.control import ClosedLoop
 from koopman_ros.learning import roll_out
 from koopman_ros.lifting import LiftedModel
-from koopman_ros.plant_data import Samples
 from koopman_ros.plants import RandomStepDesign
-from koopman_ros.reports import drawing, DRAWN_RANGE, LIMIT, Picture
+from koopman_ros.reports import drawing, DRAWN_RANGE, legend, LIMIT, Picture
 from validation.paper import reactor, scalar, two_state
-from validation.paper.boxes import draw_box
 from validation.paper.campaign import Campaign
 from validation.paper.datasets import random_step_episodes
 
@@ -23,6 +23,7 @@ from validation.paper.datasets import random_step_episodes
 EXACT: dict[str, Any] = {'color': 'black', 'linewidth': 1.8}
 LEARNED: dict[str, Any] = {'color': 'tab:green', 'linestyle': '--', 'linewidth': 1.8}
 LINEAR: dict[str, Any] = {'color': 'tab:red', 'linewidth': 1.2}
+_LIFTED: dict[str, Any] = {'color': 'tab:red', 'linestyle': '--', 'linewidth': 1.8}
 FIGURE_SEED = 0
 FIGURE_NARROW_BOX = '[4,5.5]x[4,5.5]'
 
@@ -34,8 +35,9 @@ def draw_figures(campaign: Campaign, folder: Path) -> list[Picture]:
             ('01_scalar_example', ('scalar',), _scalar),
             ('02_two_state_derivatives', ('two_state',), _wide_derivatives),
             ('03_two_state_control', ('two_state',), _wide_control),
-            ('04_reactor_in_range', ('reactor',), _in_range),
-            ('05_reactor_out_of_range', ('reactor',), _out_of_range),
+            ('04_reactor_in_range', ('reactor',), partial(_roll_outs, reactor.IN_RANGE, 'within')),
+            ('05_reactor_out_of_range', ('reactor',), partial(
+                _roll_outs, reactor.OUT_OF_RANGE, 'that leave')),
             ('06_reactor_set_point', ('reactor',), _set_point),
             ('07_wide_box', ('two_state',), _wide_box),
             ('08_narrow_derivatives', ('narrow',), _narrow_derivatives),
@@ -50,124 +52,10 @@ def draw_figures(campaign: Campaign, folder: Path) -> list[Picture]:
     return drawn
 
 
-def _models(campaign: Campaign, experiment: str) -> dict[str, LiftedModel]:
-    """Return the models of the first seed that was finished."""
+def _model(campaign: Campaign, experiment: str, name: str) -> LiftedModel:
+    """Return a model of the first seed that was finished."""
     by_seed = campaign.models[experiment]
-    return dict(by_seed[min(by_seed)])
-
-
-def _loop(campaign: Campaign, model: LiftedModel) -> ClosedLoop:
-    """Regulate the two-state example with R = 1 by one of the models, once for all figures."""
-    if id(model) not in campaign.loops:
-        campaign.loops[id(model)] = two_state.close_loop(model, 1.0)
-    return campaign.loops[id(model)]
-
-
-def _scalar(campaign: Campaign, path: Path) -> str:
-    model = _models(campaign, 'scalar')['scalar']
-    x = np.linspace(0.0, 8.0, 801)
-    at = 2.5
-    # within these bounds the tangent is within 10 % of x^2
-    reach = np.array([1.0 / (1.0 + np.sqrt(0.1)), 1.0 / (1.0 - np.sqrt(0.1))]) * at
-    xi = model.states.to_deviation(x[:, None])
-    z, J = model.lift_and_jacobian(xi)
-    exact = (J[:, :, 0] * (x * x)[:, None] / model.states.scale)[:, 0]
-    linear = (z @ model.A.T)[:, 0]
-    scale = 1.0 / np.max(np.abs(exact[x <= 5.0]))
-    with drawing(path, 1, 2, size=(10.0, 4.3)) as (_, (left, right)):
-        left.axvspan(*scalar.RANGE, label='training range', **DRAWN_RANGE)
-        left.plot(x, x * x, color='tab:blue', label='$\\dot x = x^2$')
-        left.plot(x, at * at + 2.0 * at * (x - at), label='linearisation', **LINEAR)
-        left.plot([at], [at * at], 'o', color='tab:red', label='operating point')
-        for bound in reach:
-            left.axvline(bound, color='tab:red', linestyle='--', linewidth=1.0)
-        left.plot([], [], color='tab:red', linestyle='--', label='linearisation within 10 %')
-        left.set(xlabel='x', ylabel='dx/dt  [1/s]', ylim=(-6.0, 66.0), xlim=(0.0, 8.0))
-        left.legend(loc='upper left')
-        right.axvspan(*scalar.RANGE, label='training range', **DRAWN_RANGE)
-        right.plot(x, scale * exact, label='chain rule  $J_N(x)\\,\\dot x$', **EXACT)
-        right.plot(x, scale * linear, color='tab:red', linestyle='--', linewidth=1.8,
-                   label='learned  $A\\,N(x)$')
-        right.set(xlabel='x', ylabel='dz/dt  (largest in range = 1)', xlim=(0.0, 8.0))
-        right.legend(loc='lower right')
-    off = abs(exact[-1] - linear[-1]) / abs(exact[-1])
-    return ('The motivating example. The learned lift holds on the whole training range, the '
-            f'linearisation from x = {reach[0]:.2g} to {reach[1]:.2g}. At x = 8, outside the '
-            f'range, A z is {100 * off:.2g} % off.')
-
-
-def _episode(box: two_state.Box) -> Samples:
-    """Simulate one training trajectory that is long enough to look at."""
-    return two_state.samples(box, FIGURE_SEED, episodes=1, duration=3.0)
-
-
-def _derivatives(model: LiftedModel, box: two_state.Box, path: Path) -> float:
-    """Draw both sides of the lifted dynamics; return the largest relative difference."""
-    episode = _episode(box)
-    assert episode.time is not None
-    xi = model.states.to_deviation(episode.x)
-    push = model.inputs.to_deviation(episode.u) @ model.B.T
-    z, J = model.lift_and_jacobian(xi)
-    exact = (J @ (episode.dxdt / model.states.scale)[..., None])[..., 0]
-    linear = z @ model.A.T + (J @ push[..., None])[..., 0]
-    with drawing(path, 3, 1, size=(7.0, 6.5), sharex=True) as (_, axes):
-        for i, axis in enumerate(axes):
-            axis.step(episode.time, exact[:, i], where='post',
-                      label='chain rule  $J_N(x)\\,\\dot x$', **EXACT)
-            axis.step(episode.time, linear[:, i], where='post', color='tab:red',
-                      linestyle='--', linewidth=1.8, label='learned  $A z + J_N(x) B u$')
-            axis.set(ylabel=f'dz$_{i + 1}$/dt  [1/s]')
-        axes[0].legend(loc='best')
-        axes[-1].set(xlabel='time  [s]')
-    return float(np.max(np.abs(exact - linear)) / np.max(np.abs(exact)))
-
-
-def _wide_derivatives(campaign: Campaign, path: Path) -> str:
-    off = _derivatives(_models(campaign, 'two_state')['wide'], two_state.WIDE, path)
-    return ('Time derivatives of the lifted coordinates (scaled) along a training trajectory; '
-            f'the two sides differ by at most {off:.1e} of the largest.')
-
-
-def _control(path: Path, loops: list[tuple[str, dict[str, Any], ClosedLoop]], until: float
-             ) -> None:
-    with drawing(path, 1, 2, size=(10.0, 4.0)) as (_, (state, action)):
-        for label, style, loop in loops:
-            state.plot(loop.times, loop.states[:, 1], label=label, **style)
-            action.plot(loop.times, loop.inputs[:, 0], label=label, **style)
-        state.axhline(0.0, label='reference', **LIMIT)
-        state.set(xlabel='time  [s]', ylabel='unstable state x$_2$', xlim=(-0.02 * until, until))
-        action.set(xlabel='time  [s]', ylabel='control action u  [1/s]',
-                   xlim=(-0.02 * until, until))
-        state.legend()
-
-
-def _wide_control(campaign: Campaign, path: Path) -> str:
-    models = _models(campaign, 'two_state')
-    exact = two_state.exact_loop(1.0)
-    loops = {name: _loop(campaign, models[name]) for name in ('linear', 'wide')}
-    _control(path, [('linearisation', LINEAR, loops['linear']), ('exact lift', EXACT, exact),
-                    ('learned lift', LEARNED, loops['wide'])], 30.0)
-    return ('Control of the two-state example from (5, 5), R = 1. Costs: exact '
-            f'{exact.cost:.2f}, learned {loops["wide"].cost:.2f}, linearised '
-            f'{loops["linear"].cost:.2f}.')
-
-
-def _narrow_control(campaign: Campaign, path: Path) -> str:
-    seed, model = worst_narrow(campaign)
-    linear = _models(campaign, 'two_state')['linear']
-    loop = _loop(campaign, model)
-    _control(path, [('linearisation', LINEAR, _loop(campaign, linear)),
-                    ('exact lift', EXACT, two_state.exact_loop(1.0)),
-                    (f'learned on {FIGURE_NARROW_BOX}', LEARNED, loop)], 30.0)
-    end = loop.failure or f'x2 ends at {loop.states[-1, 1]:.3g}'
-    return (f'The same control with a lift learned on the narrow box, seed {seed}: {end}.')
-
-
-def _narrow_derivatives(campaign: Campaign, path: Path) -> str:
-    seed, model = worst_narrow(campaign)
-    off = _derivatives(model, two_state.NARROW[FIGURE_NARROW_BOX], path)
-    return (f'As figure 2, for the narrow box, seed {seed}: within the box the two sides differ '
-            f'by at most {off:.1e} of the largest, and nothing warns.')
+    return by_seed[min(by_seed)][name]
 
 
 def worst_narrow(campaign: Campaign) -> tuple[int, LiftedModel]:
@@ -180,15 +68,112 @@ def worst_narrow(campaign: Campaign) -> tuple[int, LiftedModel]:
     return seed, campaign.models['narrow'][seed][FIGURE_NARROW_BOX]
 
 
-def _reactor_roll_out(campaign: Campaign, path: Path, design: RandomStepDesign) -> str:
-    models = _models(campaign, 'reactor')
+def _scalar(campaign: Campaign, path: Path) -> str:
+    model = _model(campaign, 'scalar', 'scalar')
+    x = np.linspace(0.0, 8.0, 801)
+    at = 2.5
+    # within these bounds the tangent is within 10 % of x^2
+    reach = np.array([1.0 / (1.0 + np.sqrt(0.1)), 1.0 / (1.0 - np.sqrt(0.1))]) * at
+    z, J = model.lift_and_jacobian(model.states.to_deviation(x[:, None]))
+    exact = (J[:, :, 0] * (x * x)[:, None] / model.states.scale)[:, 0]
+    linear = (z @ model.A.T)[:, 0]
+    scale = 1.0 / np.max(np.abs(exact[x <= 5.0]))
+    with drawing(path, 1, 2, size=(10.0, 4.3)) as (_, (left, right)):
+        for axes in (left, right):
+            axes.axvspan(*scalar.RANGE, label='training range', **DRAWN_RANGE)
+            axes.set(xlabel='x', xlim=(0.0, 8.0))
+        left.plot(x, x * x, color='tab:blue', label='$\\dot x = x^2$')
+        left.plot(x, at * at + 2.0 * at * (x - at), label='linearisation', **LINEAR)
+        left.plot([at], [at * at], 'o', color='tab:red', label='operating point')
+        for bound, label in zip(reach, ('linearisation within 10 %', None), strict=True):
+            left.axvline(bound, color='tab:red', linestyle='--', linewidth=1.0, label=label)
+        left.set(ylabel='dx/dt  [1/s]', ylim=(-6.0, 66.0))
+        left.legend(loc='upper left')
+        right.plot(x, scale * exact, label='chain rule  $J_N(x)\\,\\dot x$', **EXACT)
+        right.plot(x, scale * linear, label='learned  $A\\,N(x)$', **_LIFTED)
+        right.set(ylabel='dz/dt  (largest in range = 1)')
+        right.legend(loc='lower right')
+    off = abs(exact[-1] - linear[-1]) / abs(exact[-1])
+    return ('The motivating example. The learned lift holds on the whole training range, the '
+            f'linearisation from x = {reach[0]:.2g} to {reach[1]:.2g}. At x = 8, outside the '
+            f'range, A z is {100 * off:.2g} % off.')
+
+
+def _derivatives(model: LiftedModel, box: two_state.Box, path: Path) -> float:
+    """Draw both sides of the lifted dynamics; return the largest relative difference."""
+    # one training trajectory that is long enough to look at
+    episode = two_state.samples(box, FIGURE_SEED, episodes=1, duration=3.0)
+    assert episode.time is not None
+    push = model.inputs.to_deviation(episode.u) @ model.B.T
+    z, J = model.lift_and_jacobian(model.states.to_deviation(episode.x))
+    exact = (J @ (episode.dxdt / model.states.scale)[..., None])[..., 0]
+    linear = z @ model.A.T + (J @ push[..., None])[..., 0]
+    with drawing(path, 3, 1, size=(7.0, 6.5), sharex=True) as (_, axes):
+        for i, axis in enumerate(axes):
+            axis.step(episode.time, exact[:, i], where='post',
+                      label='chain rule  $J_N(x)\\,\\dot x$', **EXACT)
+            axis.step(episode.time, linear[:, i], where='post',
+                      label='learned  $A z + J_N(x) B u$', **_LIFTED)
+            axis.set(ylabel=f'dz$_{i + 1}$/dt  [1/s]')
+        axes[0].legend(loc='best')
+        axes[-1].set(xlabel='time  [s]')
+    return float(np.max(np.abs(exact - linear)) / np.max(np.abs(exact)))
+
+
+def _wide_derivatives(campaign: Campaign, path: Path) -> str:
+    off = _derivatives(_model(campaign, 'two_state', 'wide'), two_state.WIDE, path)
+    return ('Time derivatives of the lifted coordinates (scaled) along a training trajectory; '
+            f'the two sides differ by at most {off:.1e} of the largest.')
+
+
+def _narrow_derivatives(campaign: Campaign, path: Path) -> str:
+    seed, model = worst_narrow(campaign)
+    off = _derivatives(model, two_state.NARROW[FIGURE_NARROW_BOX], path)
+    return (f'As figure 2, for the narrow box, seed {seed}: within the box the two sides differ '
+            f'by at most {off:.1e} of the largest, and nothing warns.')
+
+
+def _control(campaign: Campaign, path: Path, label: str, learned: LiftedModel
+             ) -> tuple[ClosedLoop, ...]:
+    """Draw the control by a learned lift beside those by linearisation and exact lift."""
+    linear = _model(campaign, 'two_state', 'linear')
+    loops = (two_state.close_loop(linear, 1.0), two_state.exact_loop(1.0),
+             two_state.close_loop(learned, 1.0))
+    with drawing(path, 1, 2, size=(10.0, 4.0)) as (_, (state, action)):
+        for name, style, loop in zip(('linearisation', 'exact lift', label),
+                                     (LINEAR, EXACT, LEARNED), loops, strict=True):
+            state.plot(loop.times, loop.states[:, 1], label=name, **style)
+            action.plot(loop.times, loop.inputs[:, 0], label=name, **style)
+        state.axhline(0.0, label='reference', **LIMIT)
+        for axes, ylabel in ((state, 'unstable state x$_2$'), (action, 'control action u  [1/s]')):
+            axes.set(xlabel='time  [s]', ylabel=ylabel, xlim=(-0.6, 30.0))
+        state.legend()
+    return loops
+
+
+def _wide_control(campaign: Campaign, path: Path) -> str:
+    linear, exact, learned = _control(
+        campaign, path, 'learned lift', _model(campaign, 'two_state', 'wide'))
+    return ('Control of the two-state example from (5, 5), R = 1. Costs: exact '
+            f'{exact.cost:.2f}, learned {learned.cost:.2f}, linearised {linear.cost:.2f}.')
+
+
+def _narrow_control(campaign: Campaign, path: Path) -> str:
+    seed, model = worst_narrow(campaign)
+    *_, loop = _control(campaign, path, f'learned on {FIGURE_NARROW_BOX}', model)
+    end = loop.failure or f'x2 ends at {loop.states[-1, 1]:.3g}'
+    return f'The same control with a lift learned on the narrow box, seed {seed}: {end}.'
+
+
+def _roll_outs(design: RandomStepDesign, where: str, campaign: Campaign, path: Path) -> str:
+    models = {name: _model(campaign, 'reactor', name) for name in ('nz=3', 'linear')}
+    states, inputs = models['nz=3'].states, models['nz=3'].inputs
     truth = random_step_episodes(reactor.SYSTEM, design, 1, 60.0, 77)
     assert truth.time is not None
     errors = {}
     with drawing(path, 2, 1, size=(8.0, 5.5), sharex=True, height_ratios=(3, 1)
                  ) as (_, (top, low)):
-        box = models['nz=3'].states
-        top.axhspan(box.lower[0], box.upper[0], label='training range', **DRAWN_RANGE)
+        top.axhspan(states.lower[0], states.upper[0], label='training range', **DRAWN_RANGE)
         top.plot(truth.time, truth.x[:, 0], label='reactor', **EXACT)
         for name, label, style in (('nz=3', 'learned lift, n$_z$ = 3', LEARNED),
                                    ('linear', 'linearisation', LINEAR)):
@@ -197,33 +182,21 @@ def _reactor_roll_out(campaign: Campaign, path: Path, design: RandomStepDesign) 
             top.plot(truth.time, predicted[:, 0], label=label, **style)
         top.set(ylabel='temperature  [K]')
         top.legend(loc='best', ncols=2)
-        inputs = models['nz=3'].inputs
         low.axhspan(inputs.lower[0], inputs.upper[0], **DRAWN_RANGE)
         low.step(truth.time, truth.u[:, 0], where='post', color='tab:blue')
         low.set(ylabel='coolant  [K]', xlabel='time  [min]')
-    return (f'root mean square error: learned {errors["nz=3"]:.2g} K, linearised '
-            f'{errors["linear"]:.2g} K.')
-
-
-def _in_range(campaign: Campaign, path: Path) -> str:
-    return 'Fresh random coolant steps within the training range; ' + _reactor_roll_out(
-        campaign, path, reactor.IN_RANGE)
-
-
-def _out_of_range(campaign: Campaign, path: Path) -> str:
-    return 'Fresh random coolant steps that leave the training range; ' + _reactor_roll_out(
-        campaign, path, reactor.OUT_OF_RANGE)
+    return (f'Fresh random coolant steps {where} the training range; root mean square error: '
+            f'learned {errors["nz=3"]:.2g} K, linearised {errors["linear"]:.2g} K.')
 
 
 def _set_point(campaign: Campaign, path: Path) -> str:
-    models = _models(campaign, 'reactor')
     offsets = {}
     with drawing(path, 2, 1, size=(7.0, 5.5), sharex=True) as (_, (top, low)):
         top.axhline(reactor.SETPOINT, label='set-point T$_{ss}$ − 10 K', **LIMIT)
         for name, label, style in (
                 ('linear', 'linearisation', LINEAR),
                 ('nz=3', 'learned lift, n$_z$ = 3', {**LEARNED, 'linestyle': '-'})):
-            loop = reactor.close_loop(models[name])
+            loop = reactor.close_loop(_model(campaign, 'reactor', name))
             offsets[name] = abs(loop.states[-1, 0] - reactor.SETPOINT)
             top.plot(loop.times, loop.states[:, 0], label=label, **style)
             low.plot(loop.times, loop.inputs[:, 0], label=label, **style)
@@ -234,28 +207,54 @@ def _set_point(campaign: Campaign, path: Path) -> str:
             f'{offsets["nz=3"]:.1e} K off, the linearised controller {offsets["linear"]:.3f} K.')
 
 
+def _boxes(path: Path, parts: Sequence[tuple[str, str, two_state.Box, LiftedModel, str]]) -> float:
+    """
+    Draw boxes over (x1, x2, u) with the closed-loop paths that their lifts give.
+
+    :param parts: label, face colour, box, lift, colour of the path.
+    :return: how far the last path leaves its box, in halves of its width.
+    """
+    with drawing(path, size=(7.5, 6.0), grid=False,
+                 subplot_kw={'projection': '3d'}) as (figure, panels):
+        axes: Any = panels[0]
+        for label, face, box, model, color in parts:
+            loop = two_state.close_loop(model, 1.0)
+            lower = np.array([*box.lower, box.inputs[0]])
+            axes.bar3d(*lower, *(np.array([*box.upper, box.inputs[1]]) - lower), shade=False,
+                       color=(face, 0.0 if face == 'white' else 0.2), edgecolor='black',
+                       linewidth=0.8, linestyle='--' if face == 'white' else '-', label=label)
+            points = np.column_stack([loop.states, loop.inputs])
+            # what escapes would shrink the boxes to a point
+            points = points[np.all(np.abs(points) < 80.0, axis=1)]
+            axes.plot(*points.T, color=color, linewidth=2.0, label=f'path with the {label}')
+            axes.scatter(*points[0], color=color, s=30)
+        axes.scatter(0.0, 0.0, 0.0, color='black', marker='x', s=40, label='origin')
+        axes.set(xlabel='x$_1$', ylabel='x$_2$', zlabel='u  [1/s]')
+        axes.view_init(elev=22.0, azim=-60.0)
+        legend(figure, [axes], 3)
+    return loop.distance(model)
+
+
 def _wide_box(campaign: Campaign, path: Path) -> str:
-    loop = _loop(campaign, _models(campaign, 'two_state')['wide'])
-    draw_box(path, [('wide box', 'gold', two_state.WIDE, loop, 'tab:red')])
+    model = _model(campaign, 'two_state', 'wide')
+    _boxes(path, [('wide box', 'gold', two_state.WIDE, model, 'tab:red')])
     return 'The wide training box holds the whole path of the controlled system.'
 
 
 def _narrow_box(campaign: Campaign, path: Path) -> str:
     seed, model = worst_narrow(campaign)
     box = two_state.NARROW[FIGURE_NARROW_BOX]
-    loop = _loop(campaign, model)
-    draw_box(path, [('narrow box', 'gold', box, loop, 'tab:red')])
+    left = _boxes(path, [('narrow box', 'gold', box, model, 'tab:red')])
     return (f'The narrow training box, seed {seed}: the path starts in it and leaves it, by up '
-            f'to {loop.distance(model):.2g} times half its width.')
+            f'to {left:.2g} times half its width.')
 
 
 def _both_boxes(campaign: Campaign, path: Path) -> str:
     _, narrow = worst_narrow(campaign)
-    wide = _models(campaign, 'two_state')['wide']
-    draw_box(path, [
-        ('wide box', 'none', two_state.WIDE, _loop(campaign, wide), 'tab:green'),
-        ('narrow box', 'grey', two_state.NARROW[FIGURE_NARROW_BOX],
-         _loop(campaign, narrow), 'tab:red')])
+    wide = _model(campaign, 'two_state', 'wide')
+    _boxes(path, [
+        ('wide box', 'white', two_state.WIDE, wide, 'tab:green'),
+        ('narrow box', 'grey', two_state.NARROW[FIGURE_NARROW_BOX], narrow, 'tab:red')])
     return 'Both boxes and paths in one picture: the same start, another training range.'
 
 

@@ -3,24 +3,13 @@
 
 """The one-state reactor: lifts of 2 to 5 coordinates, baselines, and Algorithm 1."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np
 from scipy.integrate import solve_ivp
 
+from koopman_ros import learning
 from koopman_ros.control import ClosedLoop, run_closed_loop, steady_state_target, Weights
-from koopman_ros.learning import (
-    Algorithm1,
-    Edmd,
-    fit,
-    Growth,
-    Linearisation,
-    NoUsefulLift,
-    rollout_rmse,
-    train,
-)
 from koopman_ros.lifting import LiftedModel
 from koopman_ros.plant_data import Samples
 from koopman_ros.plants import equilibrium_input, one_state_reactor, RandomStepDesign
@@ -46,18 +35,13 @@ IN_RANGE = RandomStepDesign(
 OUT_OF_RANGE = RandomStepDesign(
     input_lower=270.0, input_upper=301.1, state_lower=293.0, state_upper=329.3,
     hold_time=(2.0, 10.0), sample_period=0.25)
-RECIPE = Growth(max(LIFTED_SIZES), max_iterations=600)
+RECIPE = learning.Growth(max(LIFTED_SIZES), max_iterations=600)
 EDMD_DEGREE = 5
 
 
 def training_samples(seed: int) -> Samples:
     """Simulate 240 episodes of 1 min under random coolant steps from anywhere in the box."""
     return box_episodes(SYSTEM, TRAINING, 240, 1.0, seed)
-
-
-def test_samples(design: RandomStepDesign, seed: int) -> Samples:
-    """Simulate 10 fresh episodes of 30 min."""
-    return random_step_episodes(SYSTEM, design, 10, 30.0, 10_000 * seed + 5_000)
 
 
 def close_loop(model: LiftedModel) -> ClosedLoop:
@@ -91,12 +75,6 @@ class Judge:
     inside: Samples  #: longer ones within the range
     outside: Samples  #: longer ones that leave it
 
-    @staticmethod
-    def of(seed: int) -> Judge:
-        """Simulate the episodes of a seed."""
-        return Judge(training_samples(1000 + seed), test_samples(IN_RANGE, seed),
-                     test_samples(OUT_OF_RANGE, seed))
-
     def figures(self, model: LiftedModel) -> Metrics:
         """
         Judge a model on the episodes and on the task of the paper.
@@ -105,24 +83,20 @@ class Judge:
             it diverges); `tracking_offset_kelvin`, `cost_ratio_to_optimum` (over 30 min, R = 1)
             and `feed_forward_offset_kelvin`.
         """
-        found = fit(model, self.held_out.x, self.held_out.dxdt, self.held_out.u)
+        found = learning.fit(model, self.held_out.x, self.held_out.dxdt, self.held_out.u)
         loop = close_loop(model)
         failed = bool(loop.failure)
         optimum = scalar_optimal_cost(SYSTEM, START, SETPOINT, INPUT_WEIGHT, UNIT)
+        rmse = [learning.rollout_rmse(model, samples) for samples in (self.inside, self.outside)]
+        inside, outside = (float(error[0]) if error is not None and np.isfinite(error[0]) else None
+                           for error in rmse)
         return {
             'rw': found.rw, 'cond': found.cond,
-            'rollout_rmse_in_kelvin': _kelvin(model, self.inside),
-            'rollout_rmse_out_kelvin': _kelvin(model, self.outside),
+            'rollout_rmse_in_kelvin': inside, 'rollout_rmse_out_kelvin': outside,
             'tracking_offset_kelvin': (
                 None if failed else abs(float(loop.states[-1, 0]) - SETPOINT)),
             'cost_ratio_to_optimum': None if failed else loop.cost / optimum,
             'feed_forward_offset_kelvin': feed_forward_offset(model)}
-
-
-def _kelvin(model: LiftedModel, samples: Samples) -> float | None:
-    error = rollout_rmse(model, samples)
-    assert error is not None
-    return float(error[0]) if np.isfinite(error[0]) else None
 
 
 def run(seed: int) -> tuple[Metrics, Models]:
@@ -132,12 +106,12 @@ def run(seed: int) -> tuple[Metrics, Models]:
     :return: figures named ``nz=<n>/<figure>``, ``linear/<figure>`` and ``edmd/<figure>``.
     """
     samples, plant = training_samples(seed), describe(SYSTEM)
-    models = {f'nz={model.n_z}': model for model in train(
+    models = {f'nz={model.n_z}': model for model in learning.train(
         plant, samples, RECIPE, seed=seed, starts=STARTS, refuse=False).path}
-    models['linear'] = Linearisation(SYSTEM.drift_jacobian(SYSTEM.nominal_state)).learn(
+    models['linear'] = learning.Linearisation(SYSTEM.drift_jacobian(SYSTEM.nominal_state)).learn(
         plant, samples)
-    models['edmd'] = Edmd(EDMD_DEGREE).learn(plant, samples)
-    return _named(models, seed), models
+    models['edmd'] = learning.Edmd(EDMD_DEGREE).learn(plant, samples)
+    return _judged(models, seed), models
 
 
 def run_paper(seed: int) -> tuple[Metrics, Models]:
@@ -149,15 +123,17 @@ def run_paper(seed: int) -> tuple[Metrics, Models]:
     samples, models = training_samples(seed), {}
     for n_z in LIFTED_SIZES:
         try:
-            recipe = Algorithm1(n_z, max_iterations=100)
-            models[f'nz={n_z}'] = train(describe(SYSTEM), samples, recipe, seed=seed, starts=1,
-                                        refuse=False).model
-        except NoUsefulLift:
+            models[f'nz={n_z}'] = learning.train(
+                describe(SYSTEM), samples, learning.Algorithm1(n_z, max_iterations=100), seed=seed,
+                starts=1, refuse=False).model
+        except learning.NoUsefulLift:
             continue
-    return _named(models, seed), {f'paper_{name}': model for name, model in models.items()}
+    return _judged(models, seed), {f'paper_{name}': model for name, model in models.items()}
 
 
-def _named(models: dict[str, LiftedModel], seed: int) -> Metrics:
-    judge = Judge.of(seed)
+def _judged(models: dict[str, LiftedModel], seed: int) -> Metrics:
+    judge = Judge(training_samples(1000 + seed), *(
+        random_step_episodes(SYSTEM, design, 10, 30.0, 10_000 * seed + 5_000)
+        for design in (IN_RANGE, OUT_OF_RANGE)))
     return {f'{name}/{figure}': value for name, model in models.items()
             for figure, value in judge.figures(model).items()}

@@ -6,16 +6,14 @@
 import numpy as np
 
 from koopman_ros.learning import fit, Growth, train
-from koopman_ros.lifting import LiftedModel
 from koopman_ros.plant_data import Samples
 from koopman_ros.plants import scalar_example
 from validation.paper.datasets import describe, Metrics, Models
 
 RANGE = (0.0, 5.0)
-BEYOND = {'rw_5_6': (5.0, 6.0), 'rw_6_8': (6.0, 8.0)}
+PARTS = {'rw_in': RANGE, 'rw_5_6': (5.0, 6.0), 'rw_6_8': (6.0, 8.0)}
 SAMPLES = 500
 STARTS = 4
-RECIPE = Growth(1, identity=False, hidden_first=10)
 
 
 def points(lower: float, upper: float, count: int = 400) -> Samples:
@@ -33,13 +31,10 @@ def run(seed: int) -> tuple[Metrics, Models]:
     """
     x = np.random.default_rng(seed).uniform(*RANGE, (SAMPLES, 1))
     samples = Samples(x, x * x, np.zeros((SAMPLES, 0)), np.arange(SAMPLES) % 10)
-    model = train(describe(scalar_example()), samples, RECIPE, seed=seed, starts=STARTS).model
-    metrics: Metrics = {'rw_in': _rw(model, *RANGE), 'eigenvalue': float(model.A[0, 0])}
-    for name, (lower, upper) in BEYOND.items():
-        metrics[name] = _rw(model, lower, upper)
+    recipe = Growth(1, identity=False, hidden_first=10)
+    model = train(describe(scalar_example()), samples, recipe, seed=seed, starts=STARTS).model
+    metrics: Metrics = {'eigenvalue': float(model.A[0, 0])}
+    for name, bounds in PARTS.items():
+        part = points(*bounds)
+        metrics[name] = fit(model, part.x, part.dxdt, part.u).rw
     return metrics, {'scalar': model}
-
-
-def _rw(model: LiftedModel, lower: float, upper: float) -> float:
-    part = points(lower, upper)
-    return fit(model, part.x, part.dxdt, part.u).rw

@@ -3,7 +3,7 @@
 
 """Lifts from what a sensor sees: sampled, noisy, of a plant that drifted, of half the state."""
 
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 
@@ -46,13 +46,7 @@ _TEST_MINUTES = 15.0
 _NS = 1_000_000_000
 
 
-@dataclass(frozen=True)
-class _Learned:
-    found: Identified
-    trained: Trained
-
-
-def run_noisy(seed: int) -> tuple[Metrics, Models]:
+def run_noisy(seed: int, noise: float = NOISE) -> tuple[Metrics, Models]:
     """
     Learn from an hour of a noisy sensor, B unknown.
 
@@ -60,12 +54,19 @@ def run_noisy(seed: int) -> tuple[Metrics, Models]:
         noise), `input_gain_error` (relative), `rw`, `cond`, `degree`,
         `noise_kelvin` as estimated.
     """
-    return _judged_on_truth(seed, NOISE)
+    found, learned = _learn(_measured(_drive(SYSTEM, DESIGN, seed), noise, seed), _like(), seed)
+    fitted = learned.figures.fit
+    return {
+        'rollout_kelvin': _roll_out_error(learned.model, SYSTEM, DESIGN, seed),
+        'input_gain_error': _gain_error(found, SYSTEM),
+        'rw': fitted.rw, 'cond': fitted.cond, 'degree': float(found.drift.degree),
+        'noise_kelvin': float(found.noise[0]),
+    }, {'new': learned.model}
 
 
 def run_noise_free(seed: int) -> tuple[Metrics, Models]:
     """Learn from the same hour without noise; figures as in :func:`run_noisy`."""
-    return _judged_on_truth(seed, 0.0)
+    return run_noisy(seed, 0.0)
 
 
 def run_drifted(seed: int) -> tuple[Metrics, Models]:
@@ -79,8 +80,11 @@ def run_drifted(seed: int) -> tuple[Metrics, Models]:
         set-point, mean over the last five minutes), `offset_ratio`, `accepted`,
         `rollout_kelvin`, `input_gain_error`.
     """
-    present = _learn(_measured(_drive(SYSTEM, DESIGN, seed), NOISE, seed), _like(), seed).trained
-    fouled = _fouled()
+    _, present = _learn(_measured(_drive(SYSTEM, DESIGN, seed), NOISE, seed), _like(), seed)
+    clean = ReactorParameters()
+    fouled = one_state_reactor(replace(
+        clean, heat_transfer_coefficient=HEAT_TRANSFER_LEFT * clean.heat_transfer_coefficient),
+        nominal_state=[314.0])
     before, _ = _controlled(fouled, present.model, SYSTEM.nominal_state, 15.0, seed)
     loop, record = _controlled(fouled, present.model, SYSTEM.nominal_state, 10.0, seed + 1)
     plan = experiments.Experiment(
@@ -88,16 +92,16 @@ def run_drifted(seed: int) -> tuple[Metrics, Models]:
         hold_longest=150.0, rate=1.0, state_lower=300.0, state_upper=328.0, safe_input=286.0,
         seed=seed)
     driven = _experiment(fouled, plan, loop[-1], seed + 2)
-    learned = _learn([record, driven], present.model, seed)
-    decision = decide(learned.found, learned.trained, present.model, Thresholds())
-    after, _ = _controlled(fouled, learned.trained.model, before[-1], 15.0, seed)
+    found, learned = _learn([record, driven], present.model, seed)
+    decision = decide(found, learned, present.model, Thresholds())
+    after, _ = _controlled(fouled, learned.model, before[-1], 15.0, seed)
     offsets = [abs(float(np.mean(x[-300:, 0])) - SETPOINT) for x in (before, after)]
     return {
         'offset_before_kelvin': offsets[0], 'offset_after_kelvin': offsets[1],
         'offset_ratio': offsets[1] / offsets[0], 'accepted': decision.accepted,
-        'rollout_kelvin': _roll_out_error(learned.trained.model, fouled, FOULED_DESIGN, seed),
-        'input_gain_error': _gain_error(learned.found, fouled),
-    }, {'present': present.model, 'new': learned.trained.model}
+        'rollout_kelvin': _roll_out_error(learned.model, fouled, FOULED_DESIGN, seed),
+        'input_gain_error': _gain_error(found, fouled),
+    }, {'present': present.model, 'new': learned.model}
 
 
 def run_two_state(seed: int) -> tuple[Metrics, Models]:
@@ -125,30 +129,12 @@ def run_two_state(seed: int) -> tuple[Metrics, Models]:
     }, {'new': trained.model}
 
 
-def _judged_on_truth(seed: int, noise: float) -> tuple[Metrics, Models]:
-    learned = _learn(_measured(_drive(SYSTEM, DESIGN, seed), noise, seed), _like(), seed)
-    model, fitted = learned.trained.model, learned.trained.figures.fit
-    return {
-        'rollout_kelvin': _roll_out_error(model, SYSTEM, DESIGN, seed),
-        'input_gain_error': _gain_error(learned.found, SYSTEM),
-        'rw': fitted.rw, 'cond': fitted.cond, 'degree': float(learned.found.drift.degree),
-        'noise_kelvin': float(learned.found.noise[0]),
-    }, {'new': model}
-
-
 def _like() -> LiftedModel:
     """Return a model with the names, units and nominal point of the reactor."""
     plant = describe(SYSTEM)
     box = Box.of(plant, np.array([[305.0], [327.0]]), np.array([[281.3], [301.1]]))
     return linearised_model(SYSTEM.drift_jacobian(SYSTEM.nominal_state), SYSTEM.B, box.states,
                             box.inputs, SYSTEM.time_unit, Provenance(SYSTEM.name))
-
-
-def _fouled() -> ControlAffineSystem:
-    clean = ReactorParameters()
-    return one_state_reactor(replace(
-        clean, heat_transfer_coefficient=HEAT_TRANSFER_LEFT * clean.heat_transfer_coefficient),
-        nominal_state=[314.0])
 
 
 def _drive(system: ControlAffineSystem, design: RandomStepDesign, seed: int,
@@ -163,9 +149,9 @@ def _measured(path: Episode, noise: float, seed: int, state: int = 0) -> list[Ep
     return [replace(path, x=x)]
 
 
-def _learn(episodes: list[Episode], like: LiftedModel, seed: int) -> _Learned:
+def _learn(episodes: list[Episode], like: LiftedModel, seed: int) -> tuple[Identified, Trained]:
     found = identify(like.plant, episodes, seed=seed)
-    return _Learned(found, learn_lift(found, like.plant, N_Z, seed=seed, starts=STARTS))
+    return found, learn_lift(found, like.plant, N_Z, seed=seed, starts=STARTS)
 
 
 def _gain_error(found: Identified, system: ControlAffineSystem) -> float:

@@ -19,9 +19,9 @@ from koopman_ros.learning import Growth, roll_out, train
 from koopman_ros.learning.progress import training_progress
 from koopman_ros.learning.training import Watch
 from koopman_ros.lifting import LiftedModel, linearised_model, Provenance, save
-from koopman_ros.plants import ControlAffineSystem, one_state_reactor, random_steps
+from koopman_ros.plants import random_steps
 from validation.paper.datasets import describe
-from validation.paper.reactor import TRAINING, training_samples
+from validation.paper.reactor import SYSTEM, TRAINING, training_samples
 
 SEED = 2026
 STARTS = 3
@@ -32,31 +32,28 @@ def train_lifts(progress: Watch | None = None, starts: int = STARTS) -> dict[int
     """
     Train the shipped lifts of the one-state reactor; the larger one is grown from the smaller.
 
-    :param progress: what shows the progress.
     :param starts: of each round.
     :return: models by n_z.
     """
-    system = one_state_reactor()
     # a fixed number of steps: where they end depends least on how a processor rounds
-    recipe = Growth(max(LIFTED_SIZES), tolerance=0.0)
-    trained = train(describe(system), training_samples(SEED), recipe, seed=SEED, starts=starts,
+    trained = train(describe(SYSTEM), training_samples(SEED),
+                    Growth(max(LIFTED_SIZES), tolerance=0.0), seed=SEED, starts=starts,
                     watch=progress)
-    return {model.n_z: _with_roll_out(model, system) for model in trained.path
+    return {model.n_z: _with_roll_out(model) for model in trained.path
             if model.n_z in LIFTED_SIZES}
 
 
 def linear_model(like: LiftedModel) -> LiftedModel:
     """Return the linearisation at the nominal point, with the box of a lift."""
-    system = one_state_reactor()
-    model = linearised_model(
-        system.drift_jacobian(system.nominal_state), system.B, like.states, like.inputs,
-        system.time_unit, Provenance(system.name, package_version=like.provenance.package_version))
-    return _with_roll_out(model, system)
+    provenance = Provenance(SYSTEM.name, package_version=like.provenance.package_version)
+    return _with_roll_out(linearised_model(
+        SYSTEM.drift_jacobian(SYSTEM.nominal_state), SYSTEM.B, like.states, like.inputs,
+        SYSTEM.time_unit, provenance))
 
 
-def _with_roll_out(model: LiftedModel, system: ControlAffineSystem) -> LiftedModel:
+def _with_roll_out(model: LiftedModel) -> LiftedModel:
     """Add the roll-out error, in K, over a fresh episode of random steps to the metrics."""
-    truth = random_steps(system, TRAINING, 15.0, SEED - 1)
+    truth = random_steps(SYSTEM, TRAINING, 15.0, SEED - 1)
     predicted = roll_out(model, truth.x[0], truth.u, TRAINING.sample_period)
     error = float(np.sqrt(np.mean((predicted - truth.x) ** 2)))
     metrics = {**model.provenance.metrics, 'rollout_rmse': error}
@@ -71,19 +68,15 @@ def main(args: list[str] | None = None) -> int:
     output = parser.parse_args(args).output
     output.mkdir(parents=True, exist_ok=True)
     with training_progress('reactor') as progress:
-        models = train_lifts(progress)
-    for n_z, model in models.items():
-        save(model, output / f'reactor_nz{n_z}.safetensors')
-        _report(f'reactor_nz{n_z}', model)
-    linear = linear_model(model)
-    save(linear, output / 'reactor_linear.safetensors')
-    _report('reactor_linear', linear)
+        lifts = train_lifts(progress)
+    models = {f'reactor_nz{n_z}': model for n_z, model in lifts.items()}
+    models['reactor_linear'] = linear_model(lifts[max(lifts)])
+    for name, model in models.items():
+        save(model, output / f'{name}.safetensors')
+        metrics = ', '.join(f'{key} {value:.2g}'
+                            for key, value in model.provenance.metrics.items())
+        print(f'{name}: seed {model.provenance.seed}, {metrics} (roll-out in K)', flush=True)
     return 0
-
-
-def _report(name: str, model: LiftedModel) -> None:
-    metrics = ', '.join(f'{key} {value:.2g}' for key, value in model.provenance.metrics.items())
-    print(f'{name}: seed {model.provenance.seed}, {metrics} (roll-out in K)', flush=True)
 
 
 if __name__ == '__main__':

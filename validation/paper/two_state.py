@@ -10,6 +10,7 @@ from functools import cache
 import numpy as np
 from scipy.integrate import solve_ivp
 
+from koopman_ros import learning
 from koopman_ros.arrays import Array
 from koopman_ros.control import (
     ClosedLoop,
@@ -19,15 +20,6 @@ from koopman_ros.control import (
     run_closed_loop,
     Target,
     Weights,
-)
-from koopman_ros.learning import (
-    Algorithm1,
-    Edmd,
-    fit,
-    Growth,
-    Linearisation,
-    NoUsefulLift,
-    train,
 )
 from koopman_ros.lifting import LiftedModel
 from koopman_ros.plant_data import Samples
@@ -63,9 +55,9 @@ NARROW = {
     '[3,6]x[3,8]': Box((3.0, 3.0), (6.0, 8.0), (0.0, 40.0)),
     '[4,5.5]x[4,5.5]': Box((4.0, 4.0), (5.5, 5.5), (5.0, 35.0)),
 }
-WIDE_RECIPE = Growth(3, hidden_first=16, max_iterations=600)
-NARROW_RECIPE = Growth(3)
-PAPER_RECIPE = Algorithm1(3, identity=True, hidden=(16,), max_iterations=100)
+WIDE_RECIPE = learning.Growth(3, hidden_first=16, max_iterations=600)
+NARROW_RECIPE = learning.Growth(3)
+PAPER_RECIPE = learning.Algorithm1(3, identity=True, hidden=(16,), max_iterations=100)
 STARTS = 2
 SYSTEM = two_state_example()
 
@@ -128,15 +120,14 @@ def run(seed: int) -> tuple[Metrics, Models]:
         weight `cost_ratio_to_exact` of the learned law and
         `linear_cost_ratio`, and `edmd_cost_ratio` of the projected law for R = 1; `left_box`.
     """
-    data, test = samples(WIDE, seed), samples(WIDE, 1000 + seed)
-    plant = describe(SYSTEM)
-    model = train(plant, data, WIDE_RECIPE, seed=seed, starts=STARTS, refuse=False).model
-    linear = Linearisation(SYSTEM.drift_jacobian(np.zeros(2))).learn(plant, data)
-    edmd = Edmd(degree=2).learn(plant, data)
-    metrics = _judged(model, test)
-    metrics['linear_cost_ratio'] = _cost_ratios(linear)
-    metrics['edmd_cost_ratio'] = {'R=1': _ratio(close_loop(edmd, 1.0, projected), 1.0)}
-    return metrics, {'wide': model, 'linear': linear}
+    data, plant = samples(WIDE, seed), describe(SYSTEM)
+    model = _learned(data, WIDE_RECIPE, seed, STARTS)
+    linear = learning.Linearisation(SYSTEM.drift_jacobian(np.zeros(2))).learn(plant, data)
+    edmd = learning.Edmd(degree=2).learn(plant, data)
+    return {**judged(model, seed), 'linear_cost_ratio': {
+        f'R={R:g}': _ratio(close_loop(linear, R), R) for R in INPUT_WEIGHTS},
+        'edmd_cost_ratio': {'R=1': _ratio(close_loop(edmd, 1.0, projected), 1.0)},
+    }, {'wide': model, 'linear': linear}
 
 
 def run_narrow(seed: int) -> tuple[Metrics, Models]:
@@ -150,16 +141,14 @@ def run_narrow(seed: int) -> tuple[Metrics, Models]:
     metrics: Metrics = {}
     models = {}
     for name, box in NARROW.items():
-        data, test = samples(box, seed), samples(box, 1000 + seed)
-        model = train(describe(SYSTEM), data, NARROW_RECIPE, seed=seed, starts=1,
-                      refuse=False).model
+        test = samples(box, 1000 + seed)
+        model = models[name] = _learned(samples(box, seed), NARROW_RECIPE, seed)
         loop = close_loop(model, 1.0)
-        metrics[f'{name}/rw_in'] = fit(model, test.x, test.dxdt, test.u).rw
-        metrics[f'{name}/cost_ratio_to_exact'] = _ratio(loop, 1.0)
-        metrics[f'{name}/left_box'] = loop.distance(model) > 0.0
-        metrics[f'{name}/final_distance'] = (
-            None if loop.failure else float(np.linalg.norm(loop.states[-1])))
-        models[name] = model
+        end = None if loop.failure else float(np.linalg.norm(loop.states[-1]))
+        metrics.update({
+            f'{name}/rw_in': learning.fit(model, test.x, test.dxdt, test.u).rw,
+            f'{name}/cost_ratio_to_exact': _ratio(loop, 1.0),
+            f'{name}/left_box': loop.distance(model) > 0.0, f'{name}/final_distance': end})
     return metrics, models
 
 
@@ -170,17 +159,24 @@ def run_paper(seed: int) -> tuple[Metrics, Models]:
     :return: as :func:`run`; all figures None when the lift is degenerate.
     """
     try:
-        model = train(describe(SYSTEM), samples(WIDE, seed), PAPER_RECIPE, seed=seed, starts=1,
-                      refuse=False).model
-    except NoUsefulLift:
+        model = _learned(samples(WIDE, seed), PAPER_RECIPE, seed)
+    except learning.NoUsefulLift:
         return {'rw': None, 'rx': None, 'cond': None, 'eigenvalue_error': None,
                 'cost_ratio_to_exact': {f'R={R:g}': None for R in INPUT_WEIGHTS},
                 'left_box': None}, {}
-    return _judged(model, samples(WIDE, 1000 + seed)), {'paper_two_state': model}
+    return judged(model, seed), {'paper_two_state': model}
 
 
-def _judged(model: LiftedModel, test: Samples) -> Metrics:
-    found = fit(model, test.x, test.dxdt, test.u)
+def _learned(data: Samples, recipe: learning.Growth | learning.Algorithm1, seed: int,
+             starts: int = 1) -> LiftedModel:
+    return learning.train(describe(SYSTEM), data, recipe, seed=seed, starts=starts,
+                          refuse=False).model
+
+
+def judged(model: LiftedModel, seed: int) -> Metrics:
+    """Judge a lift of the wide box on fresh samples and by its closed loops."""
+    test = samples(WIDE, 1000 + seed)
+    found = learning.fit(model, test.x, test.dxdt, test.u)
     exact = np.sort(np.linalg.eigvals(exact_two_state_model().A).real)
     error = np.abs(np.sort_complex(model.eigenvalues) - exact)
     loops = {R: close_loop(model, R) for R in INPUT_WEIGHTS}
@@ -188,10 +184,6 @@ def _judged(model: LiftedModel, test: Samples) -> Metrics:
             'eigenvalue_error': float(np.max(error)),
             'cost_ratio_to_exact': {f'R={R:g}': _ratio(loop, R) for R, loop in loops.items()},
             'left_box': any(loop.distance(model) > 0.0 for loop in loops.values())}
-
-
-def _cost_ratios(model: LiftedModel) -> dict[str, float | bool | None]:
-    return {f'R={R:g}': _ratio(close_loop(model, R), R) for R in INPUT_WEIGHTS}
 
 
 def _ratio(loop: ClosedLoop, R: float) -> float | None:

@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 The koopman_ros Authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""The experiments: their data, what they measure, and their known answers."""
+"""The experiments: their data, and what learned controllers are measured by, in closed form."""
 
 import numpy as np
 import pytest
@@ -9,16 +9,19 @@ from scipy.linalg import solve_continuous_are
 
 from koopman_ros.control import projected, steady_state_target, Weights
 from koopman_ros.learning import Edmd, fit, Linearisation
-from koopman_ros.plants import scalar_example
+from koopman_ros.plants import ControlAffineSystem, one_state_reactor, scalar_example
 from validation.paper import reactor, two_state
-from validation.paper.datasets import describe
+from validation.paper.datasets import box_episodes, describe
+from validation.paper.optimal_control import (
+    exact_two_state_cost,
+    exact_two_state_gain,
+    scalar_optimal_cost,
+)
 
-BOXES = [two_state.WIDE, *two_state.NARROW.values()]
 
-
-@pytest.mark.parametrize('box', BOXES, ids=str)
+@pytest.mark.parametrize('box', [two_state.WIDE, *two_state.NARROW.values()], ids=str)
 def test_samples_stay_within_their_box_and_fill_it(box):
-    samples = two_state.samples(box, 1)
+    samples = two_state.samples(box, 1, episodes=20)
     assert np.all(samples.x >= box.lower)
     assert np.all(samples.x <= box.upper)
     assert samples.u.min() >= box.inputs[0]
@@ -31,8 +34,13 @@ def test_samples_stay_within_their_box_and_fill_it(box):
 
 
 def test_the_same_seed_gives_the_same_samples():
-    first, again, other = (reactor.training_samples(seed).digest() for seed in (3, 3, 4))
+    first, again, other = (box_episodes(reactor.SYSTEM, reactor.TRAINING, 12, 1.0, seed).digest()
+                           for seed in (3, 3, 4))
     assert first == again != other
+
+
+def test_the_scalar_plant_has_no_input():
+    assert describe(scalar_example()).B.shape == (1, 0)
 
 
 def test_linearised_control_of_the_two_state_example():
@@ -42,7 +50,7 @@ def test_linearised_control_of_the_two_state_example():
         describe(two_state.SYSTEM), samples)
     for R, ratio in ((1.0, 4.5297), (0.1, 1.9296)):
         loop = two_state.close_loop(linear, R)
-        assert loop.cost / two_state.exact_two_state_cost(two_state.START, R) == pytest.approx(
+        assert loop.cost / exact_two_state_cost(two_state.START, R) == pytest.approx(
             ratio, abs=1e-3)
 
 
@@ -62,5 +70,52 @@ def test_monomials_control_the_two_state_example_by_its_exact_drift():
         np.testing.assert_allclose(model.inputs.to_physical(found.u), expected, rtol=0, atol=1e-8)
 
 
-def test_the_scalar_plant_has_no_input():
-    assert describe(scalar_example()).B.shape == (1, 0)
+# K on (x1, x2, x1^2) and cost from (5, 5), from an independent Riccati solver
+@pytest.mark.parametrize(('R', 'gain', 'cost'), [
+    (1.0, [0.0, 2.41421356, -1.49559737], 990.1798),
+    (0.1, [0.0, 4.31662479, -1.22749086], 253.2680),
+    (0.001, [0.0, 32.6385840, -1.02512675], 127.1212)])
+def test_two_state_optimum(R, gain, cost):
+    np.testing.assert_allclose(exact_two_state_gain(R)[0], gain, rtol=1e-8, atol=1e-8)
+    assert exact_two_state_cost(np.array([5.0, 5.0]), R) == pytest.approx(cost, abs=5e-5)
+
+
+def test_the_exact_path_costs_what_the_riccati_equation_says():
+    loop = two_state.exact_loop(1.0)
+    rate = np.sum(loop.states ** 2, axis=1) + loop.inputs[:, 0] ** 2
+    assert np.trapezoid(rate, loop.times) == pytest.approx(loop.cost, rel=1e-3)
+    assert np.linalg.norm(loop.states[-1]) < 0.002
+
+
+@pytest.mark.parametrize('a', [-1.5, 0.5])
+@pytest.mark.parametrize('R', [1.0, 0.1])
+def test_scalar_optimum_of_a_linear_plant(a, R):
+    """P of the scalar Riccati equation 2 a P - P^2 b^2 / R + 1 = 0, for deviations from x_ref."""
+    b, unit = 2.0, 10.0
+    plant = ControlAffineSystem(
+        name='linear', state_names=('x',), state_units=('K',), input_names=('u',),
+        input_units=('K',), time_unit='min', drift=lambda x: a * x,
+        drift_jacobian=lambda x: np.full((*x.shape, 1), a), B=np.array([[b]]),
+        nominal_state=np.zeros(1), nominal_input=np.zeros(1))
+    P = R / b ** 2 * (a + np.sqrt(a * a + b * b / R))
+    assert scalar_optimal_cost(plant, 7.0, 2.0, R, unit) == pytest.approx(
+        P * (5.0 / unit) ** 2, rel=1e-9)
+
+
+def test_no_gain_does_better_than_the_optimum_on_the_reactor():
+    """Constant gains with the true feed-forward come near the optimum and never below it."""
+    system = one_state_reactor()
+    optimum = scalar_optimal_cost(system, reactor.START, reactor.SETPOINT, 1.0, reactor.UNIT)
+    held = reactor.equilibrium_input(system, [reactor.SETPOINT])[0]
+
+    def cost(gain):
+        def rate(_, y):
+            e = (y[0] - reactor.SETPOINT) / reactor.UNIT
+            u = held - gain * e * reactor.UNIT
+            return [system.derivative(y[:1], [u])[0], e * e + (gain * e) ** 2]
+
+        return reactor.solve_ivp(rate, (0.0, 30.0), [reactor.START, 0.0], rtol=1e-9,
+                                 atol=1e-9).y[1, -1]
+
+    costs = [cost(gain) for gain in (0.2, 0.4, 0.6, 0.8)]
+    assert optimum < min(costs) < 1.1 * optimum
