@@ -17,7 +17,7 @@ import numpy as np
 
 from koopman_ros.reports import drawing, legend, table
 from validation.benchmarks import process, solvers
-from validation.benchmarks.problems import SYSTEMS
+from validation.benchmarks.problems import build, Case, SYSTEMS
 
 PACKAGES = ('torch', 'casadi', 'numpy')
 TARGETS = {'1e-4': 1e-4, '1e-6': 1e-6, '1e-8': 1e-8}
@@ -75,7 +75,7 @@ class _Comparison:
 
     def run(self, system: str, samples: int, hidden: int) -> dict[str, Any]:
         """Run all solvers on one case; return its figures."""
-        case = SYSTEMS[system](samples, hidden)
+        case = build(system, samples, hidden)
         outcomes = self.cases[system, samples, hidden] = {}
         asked = [target for name, target in TARGETS.items() if name not in NOT_ASKED[system]]
         for solver, label in SOLVERS.items():
@@ -89,7 +89,7 @@ class _Comparison:
         return {'system': system, 'samples': samples, 'hidden': hidden,
                 'parameters': case.layout.size, **_figures(system, outcomes)}
 
-    def _solve(self, solver: str, case: Any, targets: list[float]) -> process.Outcome:
+    def _solve(self, solver: str, case: Case, targets: list[float]) -> process.Outcome:
         plan = self.plan
         outcomes: list[process.Outcome] = []
         while len(outcomes) < plan.runs:

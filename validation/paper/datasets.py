@@ -39,11 +39,8 @@ def random_step_episodes(system: ControlAffineSystem, design: RandomStepDesign, 
     """
     Simulate episodes of random input steps from the nominal state, with exact derivatives.
 
-    :param system: the plant.
-    :param design: the steps and the box.
-    :param episodes: number of episodes; episode n uses `seed` + n.
     :param duration: of each, in the plant's time unit.
-    :param seed: seed of the first.
+    :param seed: of the first; episode n uses `seed` + n.
     """
     return sample_derivatives(system, [
         random_steps(system, design, duration, seed + number)
@@ -57,9 +54,6 @@ def box_episodes(system: ControlAffineSystem, design: RandomStepDesign, episodes
 
     A fifth of them starts in corners of the box, so that no part of it is left to extrapolation.
 
-    :param system: the plant.
-    :param design: the steps and the box.
-    :param episodes: number of episodes.
     :param duration: of each, in the plant's time unit.
     :param seed: of the initial states and of the steps.
     """

@@ -3,8 +3,10 @@
 
 """The report on the experiments: tables, what was held to, and how it compares with the paper."""
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import reduce
+from operator import getitem
 from pathlib import Path
 import statistics
 from typing import Any
@@ -33,11 +35,9 @@ TARGETS = (
     Target('two_state/rw', 1e-8),
     Target('two_state/eigenvalue_error', 1e-4),
     *(Target(f'two_state/cost_ratio_to_exact/R={R}', 1e-6, 1.0) for R in ('1', '0.1', '0.001')),
-    *(Target(f'reactor/nz={n}/rw', rw) for n, rw in zip(
-        (2, 3, 4, 5), (1e-4, 1e-6, 1e-7, 1e-7), strict=True)),
-    *(Target(f'reactor/nz={n}/cond', 10.0) for n in (2, 3, 4, 5)),
-    *(Target(f'reactor/nz={n}/rollout_rmse_in_kelvin', kelvin) for n, kelvin in zip(
-        (2, 3, 4, 5), (0.1, 0.005, 0.002, 0.002), strict=True)),
+    *(Target(f'reactor/nz={n}/{name}', bounds[n - 2]) for name, bounds in (
+        ('rw', (1e-4, 1e-6, 1e-7, 1e-7)), ('cond', (10.0, 10.0, 10.0, 10.0)),
+        ('rollout_rmse_in_kelvin', (0.1, 0.005, 0.002, 0.002))) for n in (2, 3, 4, 5)),
     *(Target(f'reactor/nz={n}/tracking_offset_kelvin', 1e-3) for n in (3, 4, 5)),
     Target('sensors/noisy/rollout_kelvin', 0.05),
     Target('sensors/noisy/input_gain_error', 0.01),
@@ -51,20 +51,13 @@ _REACTOR_COLUMNS = ('rw', 'cond', 'rollout_rmse_in_kelvin', 'rollout_rmse_out_ke
 
 
 def write_report(summary: dict[str, Any], figures: Sequence[Picture], path: Path) -> None:
-    """
-    Write the report in Markdown.
-
-    :param summary: as in ``summary.json``; experiments that are missing are left out.
-    :param figures: what was drawn, in the paper's order.
-    :param path: the file.
-    """
-    sections = [_opening(summary)]
-    for name, write in (('scalar', _scalar), ('two_state', _two_state), ('reactor', _reactor),
-                        ('narrow', _narrow), ('paper_algorithm', _paper), ('sensors', _sensors)):
-        if name in summary:
-            sections.append(write(summary[name]))
+    """Write the report, in Markdown, on what ``summary.json`` holds, with what was drawn."""
+    sections = {'scalar': _scalar, 'two_state': _two_state, 'reactor': _reactor,
+                'narrow': _narrow, 'paper_algorithm': _paper, 'sensors': _sensors}
     title = 'Learning from a sensor' if 'sensors' in summary else 'The experiments of the paper'
-    write_page(path, title, [*sections, '## Figures', *(
+    write_page(path, title, [_opening(summary), *(
+        write(summary[name]) for name, write in sections.items() if name in summary),
+        '## Figures', *(
         str(replace(figure, caption=f'Figure {number}. {figure.caption}'))
         for number, figure in enumerate(figures, 1))], ('torch', 'numpy', 'scipy'))
 
@@ -91,11 +84,11 @@ def _opening(summary: dict[str, Any]) -> str:
 
 
 def _scalar(part: dict[str, Any]) -> str:
-    rows = _rows({'rw in [0, 5]': 'rw_in', 'rw in [5, 6]': 'rw_5_6', 'rw in [6, 8]': 'rw_6_8',
-                  'eigenvalue': 'eigenvalue'}, part)
     growth = _median(part['rw_6_8']) / _median(part['rw_in'])
     return (
-        '## Motivating example, dx/dt = x^2\n\n' + table(('', ''), rows) + '\n\n'
+        '## Motivating example, dx/dt = x^2\n\n' + _table(('', ''), {
+            'rw in [0, 5]': 'rw_in', 'rw in [5, 6]': 'rw_5_6', 'rw in [6, 8]': 'rw_6_8',
+            'eigenvalue': 'eigenvalue'}, part) + '\n\n'
         'As in the paper, a lift of one coordinate is exact to plotting accuracy within the '
         f'training range and fails outside it: from [0, 5] to [6, 8] rw grows {growth:.1g} '
         'times. The paper gives no numbers. It calls exp(-1/x) the exact lift; in fact '
@@ -108,7 +101,6 @@ def _two_state(part: dict[str, Any]) -> str:
         (f'cost ratio of the linearised law, {R}', _spread(part['linear_cost_ratio'][R]))
         for R in weights), ('cost ratio of EDMD (degree 2), projected law, R=1',
                             _spread(part['edmd_cost_ratio']['R=1']))]
-    left = sum(bool(value) for value in part['left_box'])
     ratios = ', '.join(f'{_median(part["linear_cost_ratio"][R]):.3f} ({R})' for R in weights)
     return (
         '## Two-state example\n\n' + table(('', ''), rows) + '\n\n'
@@ -117,19 +109,16 @@ def _two_state(part: dict[str, Any]) -> str:
         'the simulation, too. How much worse the linearised one is depends on the weight of '
         f'the input, which the paper does not state: {ratios}. The paper notes that its learned '
         'A differs from the exact one; that is a matter of coordinates, and the eigenvalues '
-        f'agree. The path left the training box in {left} of {len(part["left_box"])} seeds. '
+        f'agree. The path left the training box in {_count(part["left_box"])} seeds. '
         'Polynomial EDMD of degree 2 holds the exact drift and the exact lift, yet its other '
         'monomials do not close and bring unstable products that no input reaches: the law of '
         'the lift cannot be used with it, the projected one can.')
 
 
 def _reactor(part: dict[str, Any]) -> str:
-    linear = part['linear']
-    inside = [_median(part[name]['rollout_rmse_in_kelvin']) for name in part
-              if name.startswith('nz=')]
-    outside = [_median(part[name]['rollout_rmse_out_kelvin']) for name in part
-               if name.startswith('nz=')]
-    edmd = part['edmd']
+    linear, edmd = part['linear'], part['edmd']
+    inside, outside = ([_median(part[name][f'rollout_rmse_{where}_kelvin']) for name in part
+                        if name.startswith('nz=')] for where in ('in', 'out'))
     return (
         '## One-state reactor\n\n' + _reactor_table('', part) + '\n\n'
         "In range the paper's picture holds: the learned lifts lie on the reactor "
@@ -152,12 +141,11 @@ def _reactor(part: dict[str, Any]) -> str:
 def _narrow(part: dict[str, Any]) -> str:
     columns = ('rw_in', 'cost_ratio_to_exact', 'left_box', 'final_distance')
     rows = [(name, _spread(box['rw_in']), _spread(box['cost_ratio_to_exact']),
-             f'{sum(map(bool, box["left_box"]))} of {len(box["left_box"])}',
-             _spread(box['final_distance'])) for name, box in part.items()]
-    bad = {name: sum(value is None or value > 1.01 for value in box['cost_ratio_to_exact'])
-           for name, box in part.items()}
-    counts = ', '.join(f'{count} of {len(part[name]["rw_in"])} on {name}'
-                       for name, count in bad.items())
+             _count(box['left_box']), _spread(box['final_distance']))
+            for name, box in part.items()]
+    counts = ', '.join(f'{_count([value is None or value > 1.01 for value in ratios])} on {name}'
+                       for name, ratios in (
+                           (name, box['cost_ratio_to_exact']) for name, box in part.items()))
     return (
         '## Narrow data\n\n' + table(('box', *columns), rows) + '\n\n'
         'The failure that the paper shows comes back: within their narrow boxes these lifts '
@@ -188,33 +176,29 @@ def _paper(part: dict[str, Any]) -> str:
 def _sensors(part: dict[str, Any]) -> str:
     noisy, free, drifted, two = (
         part[name] for name in ('noisy', 'noise_free', 'drifted', 'two_state'))
-    hour = _rows({
-        'roll-out over fresh random steps [K]': 'rollout_kelvin',
-        'relative error of B': 'input_gain_error', 'rw': 'rw', 'cond': 'cond',
-        'degree of the drift': 'degree', 'noise as estimated [K]': 'noise_kelvin'}, noisy, free)
-    fouled = _rows({
-        'offset with the present lift [K]': 'offset_before_kelvin',
-        'offset with the new lift [K]': 'offset_after_kelvin',
-        'new over present': 'offset_ratio', 'roll-out [K]': 'rollout_kelvin',
-        'relative error of B': 'input_gain_error'}, drifted)
-    half = _rows({
-        'error on held-out measurements [K]': 'heldout_kelvin',
-        'noise as estimated [K]': 'noise_kelvin',
-        'error of the best linear model [K]': 'linear_kelvin',
-        'roll-out over fresh random steps [K]': 'rollout_kelvin'}, two)
-    accepted = sum(map(bool, drifted['accepted']))
-    warned = sum(map(bool, two['warned']))
     return (
-        '## An hour at 1 s, B unknown\n\n' + table(('', 'noise of 0.1 K', 'no noise'), hour)
+        '## An hour at 1 s, B unknown\n\n' + _table(('', 'noise of 0.1 K', 'no noise'), {
+            'roll-out over fresh random steps [K]': 'rollout_kelvin',
+            'relative error of B': 'input_gain_error', 'rw': 'rw', 'cond': 'cond',
+            'degree of the drift': 'degree', 'noise as estimated [K]': 'noise_kelvin'},
+            noisy, free)
         + '\n\nThe lift is learned from the drift that output error finds, not from derivatives '
         'of noisy data; what is left is the statistical error of the drift.\n\n'
-        '## A fouled cooling jacket\n\n' + table(('', ''), fouled) + '\n\n'
+        '## A fouled cooling jacket\n\n' + _table(('', ''), {
+            'offset with the present lift [K]': 'offset_before_kelvin',
+            'offset with the new lift [K]': 'offset_after_kelvin',
+            'new over present': 'offset_ratio', 'roll-out [K]': 'rollout_kelvin',
+            'relative error of B': 'input_gain_error'}, drifted) + '\n\n'
         'A fifth of the heat transfer is lost. The record is ten minutes of the loop under the '
         'present lift and fifty of random steps, with noise of 0.1 K; no disturbance observer '
-        f'helps. The gate accepted {accepted} of {len(drifted["accepted"])} new lifts.\n\n'
-        '## One temperature of a reactor with two states\n\n' + table(('', ''), half) + '\n\n'
+        f'helps. The gate accepted {_count(drifted["accepted"])} new lifts.\n\n'
+        '## One temperature of a reactor with two states\n\n' + _table(('', ''), {
+            'error on held-out measurements [K]': 'heldout_kelvin',
+            'noise as estimated [K]': 'noise_kelvin',
+            'error of the best linear model [K]': 'linear_kelvin',
+            'roll-out over fresh random steps [K]': 'rollout_kelvin'}, two) + '\n\n'
         'The concentration moves, too, and is not measured: the temperature alone has no drift of '
-        f'its own. The report said so in {warned} of {len(two["warned"])} seeds. The lift still '
+        f'its own. The report said so in {_count(two["warned"])} seeds. The lift still '
         'predicts better than a linear model, yet no better than the two-state motion lets it.')
 
 
@@ -236,25 +220,25 @@ def _reactor_table(title: str, part: dict[str, Any]) -> str:
         for name, figures in part.items()))
 
 
-def _at(summary: dict[str, Any], path: str) -> Values:
-    place: Any = summary
-    for part in path.split('/'):
-        place = place[part]
-    return place
+def _table(head: Sequence[str], names: dict[str, str], *parts: dict[str, Any]) -> str:
+    return table(head, _rows(names, *parts))
 
 
-def _numbers(values: Iterable[float | bool | None]) -> list[float]:
-    return [float(value) for value in values if value is not None]
+def _at(summary: Any, path: str) -> Values:
+    return reduce(getitem, path.split('/'), summary)
+
+
+def _count(values: Values) -> str:
+    return f'{sum(map(bool, values))} of {len(values)}'
 
 
 def _median(values: Values) -> float:
-    numbers = _numbers(values)
-    return statistics.median(numbers) if numbers else float('nan')
+    return statistics.median([float(v) for v in values if v is not None] or [float('nan')])
 
 
 def _spread(values: Values, offset: float = 0.0) -> str:
     """Return the median with the range, and how many have no value."""
-    numbers = [value - offset for value in _numbers(values)]
+    numbers = [float(value) - offset for value in values if value is not None]
     missing = len(values) - len(numbers)
     if not numbers:
         return f'failed in all {missing}'

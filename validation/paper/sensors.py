@@ -8,21 +8,14 @@ from dataclasses import replace
 import numpy as np
 
 from koopman_ros import experiment as experiments
+from koopman_ros import plants
 from koopman_ros.arrays import Array
 from koopman_ros.control import at, Controller, InputLimits, SetpointRequest, Settings, simulate
 from koopman_ros.identification import Identified, identify
 from koopman_ros.learning import NoUsefulLift, roll_out, Trained
 from koopman_ros.lifting import Box, LiftedModel, linearised_model, Provenance
 from koopman_ros.plant_data import Episode
-from koopman_ros.plants import (
-    ControlAffineSystem,
-    one_state_reactor,
-    Process,
-    random_steps,
-    RandomStepDesign,
-    ReactorParameters,
-    two_state_reactor,
-)
+from koopman_ros.plants import ControlAffineSystem, RandomStepDesign
 from koopman_ros.retraining import decide, Decision, learn_lift, Thresholds
 from validation.paper.datasets import describe, Metrics, Models
 from validation.paper.reactor import SETPOINT, SYSTEM
@@ -81,8 +74,8 @@ def run_drifted(seed: int) -> tuple[Metrics, Models]:
         `rollout_kelvin`, `input_gain_error`.
     """
     _, present = _learn(_measured(_drive(SYSTEM, DESIGN, seed), NOISE, seed), _like(), seed)
-    clean = ReactorParameters()
-    fouled = one_state_reactor(replace(
+    clean = plants.ReactorParameters()
+    fouled = plants.one_state_reactor(replace(
         clean, heat_transfer_coefficient=HEAT_TRANSFER_LEFT * clean.heat_transfer_coefficient),
         nominal_state=[314.0])
     before, _ = _controlled(fouled, present.model, SYSTEM.nominal_state, 15.0, seed)
@@ -112,7 +105,7 @@ def run_two_state(seed: int) -> tuple[Metrics, Models]:
         `linear_kelvin` (of the best linear model), `rollout_kelvin`, `warned` (whether the report
         says that something is not measured), `accepted`.
     """
-    system = two_state_reactor()
+    system = plants.two_state_reactor()
     path = _drive(system, TWO_STATE_DESIGN, seed)
     like = _like()
     found = identify(like.plant, _measured(path, NOISE, seed, state=1), seed=seed)
@@ -139,7 +132,7 @@ def _like() -> LiftedModel:
 
 def _drive(system: ControlAffineSystem, design: RandomStepDesign, seed: int,
            minutes: float = MINUTES) -> Episode:
-    episode = random_steps(system, design, minutes, seed)
+    episode = plants.random_steps(system, design, minutes, seed)
     return _recorded(episode.x, np.vstack([episode.u, episode.u[-1:]]))
 
 
@@ -177,7 +170,7 @@ def _controlled(system: ControlAffineSystem, model: LiftedModel, x0: Array, minu
         limits=InputLimits(np.array([278.15]), np.array([305.15]), np.ones(1))))
     rng = np.random.default_rng([seed, 2])
     run = simulate(
-        controller, Process(system, 0, np.asarray(x0), system.nominal_input),
+        controller, plants.Process(system, 0, np.asarray(x0), system.nominal_input),
         [at(0.0, SetpointRequest(0, np.array([SETPOINT])))], duration=60.0 * minutes - 1.0,
         sensor=lambda x, _: x + NOISE * rng.standard_normal(len(x)))
     return run.states, _recorded(run.measured, run.commands)
@@ -187,7 +180,7 @@ def _experiment(system: ControlAffineSystem, plan: experiments.Experiment, x0: A
                 ) -> Episode:
     """Run an experiment as the trainer does; return its noisy record."""
     progress, rng = experiments.begin(plan, _NS), np.random.default_rng([seed, 2])
-    process = Process(system, _NS, np.asarray(x0), system.nominal_input)
+    process = plants.Process(system, _NS, np.asarray(x0), system.nominal_input)
     measured, inputs = [], []
     for number in range(round(plan.duration)):
         process = process.until((number + 1) * _NS)

@@ -63,14 +63,7 @@ SYSTEM = two_state_example()
 
 
 def samples(box: Box, seed: int, episodes: int = 40, duration: float = 1.0) -> Samples:
-    """
-    Simulate random steps of the input from states in a box.
-
-    :param box: which the states do not leave.
-    :param seed: of the initial states and the steps.
-    :param episodes: number of episodes.
-    :param duration: of each, in s.
-    """
+    """Simulate random steps of the input from states in a box, which they do not leave; in s."""
     design = RandomStepDesign(
         input_lower=box.inputs[0], input_upper=box.inputs[1], state_lower=box.lower,
         state_upper=box.upper, hold_time=(0.05, 0.1), sample_period=0.05,

@@ -15,7 +15,7 @@ from koopman_ros.learning.levenberg_marquardt import normal_equations
 from koopman_ros.lifting import Coordinates, LiftedModel, NetworkObservables, Provenance
 from validation.benchmarks import ipopt, process, solvers
 from validation.benchmarks.__main__ import main
-from validation.benchmarks.problems import artificial, two_state
+from validation.benchmarks.problems import artificial, build
 from validation.benchmarks.training import Plan, PLANS, SOLVERS
 
 # Few samples: casadi's graphs take most of the time, and grow with them.
@@ -93,7 +93,7 @@ def test_objective_of_ipopt_is_ours(graph, monkeypatch):
 
 
 def test_invariant_residual_is_that_of_validation():
-    case = two_state(samples=200, hidden=4)
+    case = build('two-state example', samples=200, hidden=4)
     parts = case.layout.split(case.theta)
     plain = Coordinates(('x1', 'x2'), ('1', '1'), np.zeros(2), np.ones(2), -np.ones(2),
                         np.ones(2))
