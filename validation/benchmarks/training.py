@@ -3,8 +3,9 @@
 
 """Training beside other solvers: seconds to a given accuracy, and how the cost grows."""
 
-from collections.abc import Iterator
-from dataclasses import dataclass, field
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from functools import partial
 import itertools
 import math
 from pathlib import Path
@@ -62,64 +63,54 @@ PLANS = {
 }
 
 
-@dataclass
-class _Comparison:
-    """The solvers side by side."""
-
-    plan: Plan
-    folder: Path  #: where they run
-    #: what the solvers have told of each case (system, samples, hidden)
-    cases: dict[tuple[str, int, int], dict[str, process.Outcome]] = field(default_factory=dict)
-    #: (samples, hidden, reason) of a solver whose graph could not be built
-    unbuilt: dict[str, tuple[int, int, str]] = field(default_factory=dict)
-
-    def run(self, system: str, samples: int, hidden: int) -> dict[str, Any]:
-        """Run all solvers on one case; return its figures."""
-        case = build(system, samples, hidden)
-        outcomes = self.cases[system, samples, hidden] = {}
-        asked = [target for name, target in TARGETS.items() if name not in NOT_ASKED[system]]
-        for solver, label in SOLVERS.items():
-            _tell(f'{system}, N = {samples}, {hidden} hidden units: {label}')
-            fewer, narrower, reason = self.unbuilt.get(solver, (math.inf, math.inf, ''))
-            outcomes[solver] = process.Outcome(
-                (), f'left out, as N = {fewer}, {narrower} hidden units {reason}') if (
-                fewer <= samples and narrower <= hidden) else self._solve(solver, case, asked)
-            if not reason and outcomes[solver].find('built') is None:
-                self.unbuilt[solver] = samples, hidden, outcomes[solver].failure
-        return {'system': system, 'samples': samples, 'hidden': hidden,
-                'parameters': case.layout.size, **_figures(system, outcomes)}
-
-    def _solve(self, solver: str, case: Case, targets: list[float]) -> process.Outcome:
-        plan = self.plan
-        outcomes: list[process.Outcome] = []
-        while len(outcomes) < plan.runs:
-            outcomes.append(process.run(
-                solvers.solve, solver, case, targets, plan.limit, plan.build_limit,
-                folder=self.folder, megabytes=plan.megabytes))
-            if _ended(outcomes[0]) + (outcomes[0].find('built') or 0.0) > _REPEATED:
-                return outcomes[0]
-        return sorted(outcomes, key=_ended)[plan.runs // 2]
-
-
 def measure(plan: Plan, figures: dict[str, Any], folder: Path) -> Iterator[str]:
     """Compare the solvers, measure how our cost grows, and draw both."""
     figures['machine']['threads'] = 1
     figures.update(limit_seconds=plan.limit, cases=[],
                    clock='processor time of one thread; wall_seconds are those on the wall')
+    outcomes: list[dict[str, process.Outcome]] = []  # by solver, for each case
+    unbuilt: dict[str, tuple[int, int, str]] = {}  # samples, hidden units, reason, by solver
     with tempfile.TemporaryDirectory() as name:
-        comparison = _Comparison(plan, Path(name))
+        within = partial(process.run, folder=Path(name), megabytes=plan.megabytes)
         try:
-            for system, size in itertools.product(plan.systems, plan.cases):
-                figures['cases'].append(comparison.run(system, *size))
+            for system, (samples, hidden) in itertools.product(plan.systems, plan.cases):
+                case = build(system, samples, hidden)
+                outcomes.append({})
+                for solver, label in SOLVERS.items():
+                    _tell(f'{system}, N = {samples}, {hidden} hidden units: {label}')
+                    fewer, narrower, reason = unbuilt.get(solver, (math.inf, math.inf, ''))
+                    if fewer <= samples and narrower <= hidden:
+                        found = process.Outcome((), f'left out, as N = {fewer}, {narrower} hidden '
+                                                    f'units {reason}')
+                    else:
+                        found = _solve(within, plan, solver, case, [
+                            TARGETS[name] for name in TARGETS if name not in NOT_ASKED[system]])
+                        if found.find('built') is None:
+                            unbuilt[solver] = samples, hidden, found.failure
+                    outcomes[-1][solver] = found
+                figures['cases'].append({
+                    'system': system, 'samples': samples, 'hidden': hidden,
+                    'parameters': case.layout.size, **_figures(system, outcomes[-1])})
                 yield _table_of(figures['cases'][-1])
             # memory is measured in a fresh process each
             for n in plan.samples:
-                _add_cost(figures, 'samples', {n: (n, 2, 3, 16)}, comparison)
-            _add_cost(figures, 'n_z', {n: (2000, 1, n, 17) for n in plan.n_z}, comparison)
-            _add_cost(figures, 'n_x', {n: (2000, n, n + 2, 16) for n in plan.n_x}, comparison)
+                _add_cost(figures, 'samples', {n: (n, 2, 3, 16)}, within)
+            _add_cost(figures, 'n_z', {n: (2000, 1, n, 17) for n in plan.n_z}, within)
+            _add_cost(figures, 'n_x', {n: (2000, n, n + 2, 16) for n in plan.n_x}, within)
             yield '\n\n'.join(_tables_of_cost(figures))
         finally:
-            _draw(folder / 'training.png', comparison.cases, figures)
+            _draw(folder / 'training.png', outcomes, figures)
+
+
+def _solve(within: Callable[..., process.Outcome], plan: Plan, solver: str, case: Case,
+           targets: list[float]) -> process.Outcome:
+    """Run a solver on a case; where it is quick, as often as planned, and take the middle run."""
+    outcomes: list[process.Outcome] = []
+    while len(outcomes) < plan.runs:
+        outcomes.append(within(solvers.solve, solver, case, targets, plan.limit, plan.build_limit))
+        if _ended(outcomes[0]) + (outcomes[0].find('built') or 0.0) > _REPEATED:
+            return outcomes[0]
+    return sorted(outcomes, key=_ended)[plan.runs // 2]
 
 
 def _tell(label: str) -> None:
@@ -171,10 +162,9 @@ def _ratios(seconds: dict[str, dict[str, float | None]]) -> dict[str, dict[str, 
 
 
 def _add_cost(figures: dict[str, Any], name: str, sizes: dict[int, tuple[int, int, int, int]],
-              comparison: _Comparison) -> None:
+              within: Callable[..., process.Outcome]) -> None:
     _tell(f'cost of an iteration by {name}')
-    outcome = process.run(solvers.measure_cost, list(sizes.values()), _COST_LIMIT,
-                          folder=comparison.folder, megabytes=comparison.plan.megabytes)
+    outcome = within(solvers.measure_cost, list(sizes.values()), _COST_LIMIT)
     found = [event for event in outcome.events if 'size' in event]
     if outcome.failure or len(found) < len(sizes):
         raise RuntimeError(f'the cost by {name} could not be measured: {outcome.failure}')
@@ -209,15 +199,16 @@ def _tables_of_cost(figures: dict[str, Any]) -> Iterator[str]:
             for size, seconds in figures[f'seconds_per_iteration_by_{name}'].items()])
 
 
-def _draw(path: Path, cases: dict[tuple[str, int, int], dict[str, process.Outcome]],
-          figures: dict[str, Any]) -> None:
+def _draw(path: Path, outcomes: list[dict[str, process.Outcome]], figures: dict[str, Any]
+          ) -> None:
     """Draw rw over time for all solvers and the cost of an iteration, as far as there is any."""
     with drawing(path, 1, 3, size=(14.0, 5.0), width_ratios=(1.0, 1.0, 0.8)) as (figure, axes):
         for ax, system in zip(axes, SYSTEMS, strict=False):
-            of_system = [case for case in figures['cases'] if case['system'] == system]
-            for case in sorted(of_system, key=lambda case: (
-                    case['samples'], case['hidden']) == _DRAWN)[-1:]:
-                _draw_traces(ax, cases[system, case['samples'], case['hidden']], case)
+            of_system = [pair for pair in zip(figures['cases'], outcomes, strict=False)
+                         if pair[0]['system'] == system]
+            for case, found in sorted(of_system, key=lambda pair: (
+                    pair[0]['samples'], pair[0]['hidden']) == _DRAWN)[-1:]:
+                _draw_traces(ax, found, case)
         if 'seconds_per_iteration_by_samples' in figures:
             _draw_cost(axes[2], figures)
         for solver, label in SOLVERS.items():
