@@ -4,10 +4,9 @@
 """
 The solver of the paper: casadi with IPOPT and an exact Hessian, from two kinds of graph.
 
-`expanded` writes the objective as one graph of scalars over all samples, as the paper does, and
-leaves the derivatives to casadi. `compiled` is what a patient user can get out of casadi: a graph
-of one sample, its derivatives compiled by the C compiler and summed over the samples, the
-Hessian of the whitening term put together by hand. Both take the same steps.
+`expanded` is one graph of scalars over all samples, as in the paper; `compiled`, what a patient
+user can get out of casadi: compiled derivatives of one sample, summed over the samples, and the
+Hessian of the whitening term by hand. Both take the same steps.
 """
 
 from collections.abc import Callable, Sequence

@@ -44,7 +44,7 @@ _ROUND = 50  # measurements of one side, then of the other
 _PACE = 0.005  # s between measurements whose latency is taken
 _BEHIND = 0.02  # s; a run whose answers come this late at its end has fallen behind
 _PATIENCE = 2.0  # s for the answers that are still missing at the end of a run
-_GROWTH, _TRIES = 1.2, 2
+_GROWTH, _TRIES = 1.2, 2  # twice, since another program may have come in between
 _ON_SCHEDULE = 0.98
 _CELSIUS = 51.0  # about the nominal point of the shipped lifts
 _NOISE = 0.01  # K, standard deviation
@@ -101,12 +101,7 @@ def _steps(figures: dict[str, Any], plan: Plan, folder: Path) -> str:
 
 
 class _Probe:
-    """
-    A sensor and an actuator in one, on the two topics of whoever answers.
-
-    :param harness: whose node measures.
-    :param namespace: of whoever answers, e.g. ``/ours``.
-    """
+    """A sensor and an actuator in one, on the topics of whoever answers under a namespace."""
 
     def __init__(self, harness: Harness, namespace: str) -> None:
         self._harness = harness
@@ -210,15 +205,7 @@ def _latency(figures: dict[str, Any], harness: Harness, rounds: int) -> str:
 
 
 def _highest_rate(figures: dict[str, Any], harness: Harness, seconds: float, lowest: float) -> str:
-    """
-    Raise the rate of measurements until the controller does not keep up.
-
-    It keeps up with a rate when every measurement of a run is answered and the answers are not
-    late at the end; a rate is tried twice, since another program may have come in between.
-
-    :param seconds: length of a run.
-    :param lowest: rate to start from, Hz.
-    """
+    """Raise the rate of measurements, in Hz, until the controller does not keep up for a run."""
     _tell('highest rate')
     steps: list[dict[str, Any]] = []
     highest, ended = None, ''
@@ -258,11 +245,7 @@ def _start_up(figures: dict[str, Any], harness: Harness, runs: int) -> None:
 
 
 def _lockstep(figures: dict[str, Any], harness: Harness, seconds: float) -> str:
-    """
-    Let plant and controller run in lock-step as fast as they can, and weigh all nodes.
-
-    :param seconds: of the plant.
-    """
+    """Let plant and controller run in lock-step as fast as they can, and weigh all nodes."""
     arrivals: list[float] = []
     harness.node.create_subscription(
         Temperature, f'/lockstep/{topics.TEMPERATURE}',

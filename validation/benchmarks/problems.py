@@ -52,12 +52,7 @@ class Case:
         return Problem(self.layout, self.data, ResidualWeights(WHITENING))
 
     def rw(self, theta: Tensor) -> float:
-        """
-        Return rw = ||(J_N f - A N) S^(-1/2)||^2 / ||J_N f S^(-1/2)||^2 with S = E[z z'].
-
-        :param theta: (p,).
-        :return: rw, infinite where coordinates have collapsed.
-        """
+        """Return rw, the residual relative to the motion in the metric of E[z z'], or infinity."""
         parameters, data = self.layout.split(theta), self.data
         lifted = Pass(self.layout, parameters, data.x, data.f)
         factor, info = torch.linalg.cholesky_ex(lifted.z.T @ lifted.z / len(data))

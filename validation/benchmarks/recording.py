@@ -1,12 +1,7 @@
 # SPDX-FileCopyrightText: 2026 The koopman_ros Authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""
-What recording costs: a trainer fed by a publisher, our writer and mcap's fed from memory.
-
-The trainer is a process of its own on loopback; the messages are numbered temperatures, and what
-was lost is counted by these numbers.
-"""
+"""What recording costs: a trainer sent numbered messages, our writer and mcap's from memory."""
 
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass

@@ -41,13 +41,8 @@ class Trace:
     """
     What a solver has reached when, by a clock that stands still while its iterates are judged.
 
-    It counts the processor time of the one thread, which on an idle machine is the time on the
-    wall, and which other programs disturb less; the time on the wall is noted beside it.
-
-    :param tell: takes what is noted.
-    :param case: the problem.
-    :param targets: values of rw at which the time is wanted.
-    :param limit: processor time after which to stop, s.
+    It counts the processor time of the one thread, which other programs disturb less; the time on
+    the wall is noted beside it. It ends at the last target for rw or at a limit in s.
     """
 
     def __init__(self, tell: Tell, case: Case, targets: list[float], limit: float) -> None:
@@ -131,11 +126,7 @@ def ours(case: Case, trace: Trace) -> str:
 
 
 def lbfgs(case: Case, trace: Trace) -> str:
-    """
-    Run torch's L-BFGS with strong Wolfe line search.
-
-    Every point of a line search counts as reached, and the search is started again where it ends.
-    """
+    """Run torch's L-BFGS with strong Wolfe line search, each point of which counts as reached."""
     theta, objective = _warm(case)
     solver = torch.optim.LBFGS(
         [theta], max_iter=10 ** 9, max_eval=10 ** 9, history_size=_LBFGS_HISTORY,
@@ -215,10 +206,8 @@ def measure_cost(tell: Tell, sizes: list[tuple[int, int, int, int]], limit: floa
     """
     Measure what an iteration of our learner takes whose step is accepted.
 
-    :param tell: takes for each size the median of processor time in s, and the peak memory in MB
-        beyond that of the process with the data (None where the system does not tell it).
-    :param sizes: N, n_x, n_z, hidden units.
-    :param limit: processor time of all, s.
+    Tells for each size (N, n_x, n_z, hidden units) the median of processor time in s and the peak
+    memory in MB beyond that of the process with the data, None where the system does not tell it.
     """
     allow(tell, limit, f'stopped after {limit:g} s')
     for size in sizes:

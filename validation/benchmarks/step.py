@@ -87,11 +87,7 @@ def compare_all(tell: Tell, sizes: tuple[int, ...], samples: int) -> None:
 
 
 def _lift(n_z: int) -> LiftedModel:
-    """
-    Return the shipped lift with so many coordinates, or a random one of the same kind.
-
-    How long a step takes depends on the sizes, not on how good the lift is.
-    """
+    """Return the shipped lift of so many coordinates, or a random one, which takes as long."""
     if n_z in _SHIPPED:
         return load(model_path(f'reactor_nz{n_z}'))
     rng = np.random.default_rng(n_z)
@@ -135,12 +131,7 @@ def _course(ours: Controller, samples: int) -> tuple[Simulation, dict[int, Array
 
 
 class NaiveLaw:
-    """
-    The re-centred law with the disturbance observer, for one state and one input, in float64.
-
-    :param model: a lift that starts with the state and whose modes decay; slow beside a sample.
-    :param settings: weights, limits and the observer's bandwidth.
-    """
+    """The re-centred law with the disturbance observer, for one state and one input."""
 
     def __init__(self, model: LiftedModel, settings: Settings) -> None:
         network = model.observables
@@ -160,14 +151,7 @@ class NaiveLaw:
         self._command: Array | None = None
 
     def step(self, measurement: Array, setpoint: Array, seconds: float) -> Array:
-        """
-        Answer one measurement.
-
-        :param measurement: (1,) in K.
-        :param setpoint: (1,) that is tracked, in K.
-        :param seconds: since the measurement before.
-        :return: (1,) the command in K.
-        """
+        """Answer a measurement (1,), so many seconds after the one before, by a command (1,)."""
         model = self._model
         x = self._observed(model.states.to_deviation(measurement), seconds)
         x_ref = model.states.to_deviation(setpoint)

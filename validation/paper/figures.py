@@ -263,28 +263,29 @@ def _sensors(campaign: Campaign, path: Path) -> str:
         found = campaign.metrics[f'sensors/{experiment}']
         return [float(found[seed][name]) for seed in sorted(found)]  # type: ignore[arg-type]
 
+    before = np.array(values('drifted', 'offset_before_kelvin'))
     with drawing(path, 1, 3, size=(12.0, 4.2)) as (_, (left, middle, right)):
-        for experiment, label, color in (('noisy', 'noise of 0.1 K', 'tab:blue'),
-                                         ('noise_free', 'no noise', 'tab:green')):
-            left.semilogy(values(experiment, 'rollout_kelvin'), 'o', color=color, label=label)
-        for bound, label in ((0.05, 'held to, noisy'), (0.01, 'held to, no noise')):
-            left.axhline(bound, label=label, **{
-                **LIMIT, 'linestyle': ':' if bound > 0.02 else '--'})
-        left.set(ylabel='roll-out error [K]', title='an hour of data')
-        for name, label, color in (('offset_before_kelvin', 'present lift', 'tab:red'),
-                                   ('offset_after_kelvin', 'new lift', 'tab:green')):
-            middle.semilogy(values('drifted', name), 'o', color=color, label=label)
-        before = np.array(values('drifted', 'offset_before_kelvin'))
+        for axes, title, ylabel, shown in (
+                (left, 'an hour of data', 'roll-out error [K]', (
+                    ('noisy', 'rollout_kelvin', 'noise of 0.1 K', 'tab:blue'),
+                    ('noise_free', 'rollout_kelvin', 'no noise', 'tab:green'))),
+                (middle, 'cooling jacket fouled', 'offset from the set-point [K]', (
+                    ('drifted', 'offset_before_kelvin', 'present lift', 'tab:red'),
+                    ('drifted', 'offset_after_kelvin', 'new lift', 'tab:green'))),
+                (right, 'one temperature of two states', 'error on held-out measurements [K]', (
+                    ('two_state', 'linear_kelvin', 'best linear model', 'tab:red'),
+                    ('two_state', 'heldout_kelvin', 'lift', 'tab:blue'),
+                    ('two_state', 'noise_kelvin', 'noise', '0.5')))):
+            for experiment, name, label, color in shown:
+                axes.plot(values(experiment, name), 'o', color=color, label=label)
+            axes.set(title=title, xlabel='seed', ylabel=ylabel)
+        for bound, label, style in ((0.05, 'noisy', ':'), (0.01, 'no noise', '--')):
+            left.axhline(bound, label=f'held to, {label}', **{**LIMIT, 'linestyle': style})
         middle.plot(before / 20.0, '_', color='0.4', markersize=12, label='held to: a 20th')
-        middle.set(ylabel='offset from the set-point [K]', title='cooling jacket fouled')
-        for name, label, color in (('linear_kelvin', 'best linear model', 'tab:red'),
-                                   ('heldout_kelvin', 'lift', 'tab:blue'),
-                                   ('noise_kelvin', 'noise', '0.5')):
-            right.plot(values('two_state', name), 'o', color=color, label=label)
-        right.set(ylabel='error on held-out measurements [K]', ylim=(0.0, None),
-                  title='one temperature of two states')
+        left.set_yscale('log')
+        middle.set_yscale('log')
+        right.set_ylim(0.0, None)
         for axes in (left, middle, right):
-            axes.set_xlabel('seed')
             axes.legend(fontsize=8)
     worst = max(values('noisy', 'rollout_kelvin'))
     return (f'Lifts learned from a sensor: with noise of 0.1 K the worst of {len(before)} seeds '

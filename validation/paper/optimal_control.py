@@ -56,15 +56,10 @@ def scalar_optimal_cost(system: ControlAffineSystem, start: float, setpoint: flo
     """
     Return the optimal cost of moving a plant of one state and one input to a set-point.
 
-    With e and v the deviations from the set-point and from the input that holds it, in `unit`s,
-    and e' = F(e) + b v, the Hamilton-Jacobi equation e^2 + V' F - (b V')^2 / (4 R) = 0 is
-    quadratic in V'; the root with the sign of e is the one whose closed loop decays.
-
-    :param system: the plant.
-    :param start: initial state.
-    :param setpoint: final state.
-    :param R: weight of v^2 against e^2.
-    :param unit: what deviations are measured in, in units of state and input.
+    With e and v the deviations from the set-point and from the input that holds it, in `unit`s
+    of state and input, R the weight of v^2 against e^2 and e' = F(e) + b v, the Hamilton-Jacobi
+    equation e^2 + V' F - (b V')^2 / (4 R) = 0 is quadratic in V'; the root with the sign of e is
+    the one whose closed loop decays.
     """
     b = float(system.B[0, 0])
     held = equilibrium_input(system, [setpoint])

@@ -3,8 +3,6 @@
 
 """The one-state reactor: lifts of 2 to 5 coordinates, baselines, and Algorithm 1."""
 
-from dataclasses import dataclass
-
 import numpy as np
 from scipy.integrate import solve_ivp
 
@@ -67,36 +65,30 @@ def feed_forward_offset(model: LiftedModel) -> float:
     return abs(float(end) - SETPOINT)
 
 
-@dataclass(frozen=True)
-class Judge:
-    """Fresh episodes to judge models on."""
+def judged(model: LiftedModel, held_out: Samples, inside: Samples, outside: Samples) -> Metrics:
+    """
+    Judge a model on fresh episodes and on the task of the paper.
 
-    held_out: Samples  #: made like the training episodes
-    inside: Samples  #: longer ones within the range
-    outside: Samples  #: longer ones that leave it
-
-    def figures(self, model: LiftedModel) -> Metrics:
-        """
-        Judge a model on the episodes and on the task of the paper.
-
-        :return: `rw`, `cond`; `rollout_rmse_in_kelvin` and `rollout_rmse_out_kelvin` (None when
-            it diverges); `tracking_offset_kelvin`, `cost_ratio_to_optimum` (over 30 min, R = 1)
-            and `feed_forward_offset_kelvin`.
-        """
-        found = learning.fit(model, self.held_out.x, self.held_out.dxdt, self.held_out.u)
-        loop = close_loop(model)
-        failed = bool(loop.failure)
-        optimum = scalar_optimal_cost(SYSTEM, START, SETPOINT, INPUT_WEIGHT, UNIT)
-        rmse = [learning.rollout_rmse(model, samples) for samples in (self.inside, self.outside)]
-        inside, outside = (float(error[0]) if error is not None and np.isfinite(error[0]) else None
-                           for error in rmse)
-        return {
-            'rw': found.rw, 'cond': found.cond,
-            'rollout_rmse_in_kelvin': inside, 'rollout_rmse_out_kelvin': outside,
-            'tracking_offset_kelvin': (
-                None if failed else abs(float(loop.states[-1, 0]) - SETPOINT)),
-            'cost_ratio_to_optimum': None if failed else loop.cost / optimum,
-            'feed_forward_offset_kelvin': feed_forward_offset(model)}
+    :param held_out: episodes made like those of the training.
+    :param inside: longer ones within the range.
+    :param outside: longer ones that leave it.
+    :return: `rw`, `cond`; `rollout_rmse_in_kelvin` and `rollout_rmse_out_kelvin` (None when
+        it diverges); `tracking_offset_kelvin`, `cost_ratio_to_optimum` (over 30 min, R = 1)
+        and `feed_forward_offset_kelvin`.
+    """
+    found = learning.fit(model, held_out.x, held_out.dxdt, held_out.u)
+    loop = close_loop(model)
+    optimum = scalar_optimal_cost(SYSTEM, START, SETPOINT, INPUT_WEIGHT, UNIT)
+    errors = (learning.rollout_rmse(model, samples) for samples in (inside, outside))
+    inner, outer = (None if error is None or not np.isfinite(error[0]) else float(error[0])
+                    for error in errors)
+    return {
+        'rw': found.rw, 'cond': found.cond, 'rollout_rmse_in_kelvin': inner,
+        'rollout_rmse_out_kelvin': outer,
+        'tracking_offset_kelvin': (
+            None if loop.failure else abs(float(loop.states[-1, 0]) - SETPOINT)),
+        'cost_ratio_to_optimum': None if loop.failure else loop.cost / optimum,
+        'feed_forward_offset_kelvin': feed_forward_offset(model)}
 
 
 def run(seed: int) -> tuple[Metrics, Models]:
@@ -111,7 +103,7 @@ def run(seed: int) -> tuple[Metrics, Models]:
     models['linear'] = learning.Linearisation(SYSTEM.drift_jacobian(SYSTEM.nominal_state)).learn(
         plant, samples)
     models['edmd'] = learning.Edmd(EDMD_DEGREE).learn(plant, samples)
-    return _judged(models, seed), models
+    return _all_judged(models, seed), models
 
 
 def run_paper(seed: int) -> tuple[Metrics, Models]:
@@ -128,12 +120,12 @@ def run_paper(seed: int) -> tuple[Metrics, Models]:
                 starts=1, refuse=False).model
         except learning.NoUsefulLift:
             continue
-    return _judged(models, seed), {f'paper_{name}': model for name, model in models.items()}
+    return _all_judged(models, seed), {f'paper_{name}': model for name, model in models.items()}
 
 
-def _judged(models: dict[str, LiftedModel], seed: int) -> Metrics:
-    judge = Judge(training_samples(1000 + seed), *(
+def _all_judged(models: dict[str, LiftedModel], seed: int) -> Metrics:
+    fresh = (training_samples(1000 + seed), *(
         random_step_episodes(SYSTEM, design, 10, 30.0, 10_000 * seed + 5_000)
         for design in (IN_RANGE, OUT_OF_RANGE)))
     return {f'{name}/{figure}': value for name, model in models.items()
-            for figure, value in judge.figures(model).items()}
+            for figure, value in judged(model, *fresh).items()}

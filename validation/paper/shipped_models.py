@@ -29,12 +29,7 @@ LIFTED_SIZES = (3, 4)
 
 
 def train_lifts(progress: Watch | None = None, starts: int = STARTS) -> dict[int, LiftedModel]:
-    """
-    Train the shipped lifts of the one-state reactor; the larger one is grown from the smaller.
-
-    :param starts: of each round.
-    :return: models by n_z.
-    """
+    """Train the shipped lifts, by n_z; the larger is grown from the smaller."""
     # a fixed number of steps: where they end depends least on how a processor rounds
     trained = train(describe(SYSTEM), training_samples(SEED),
                     Growth(max(LIFTED_SIZES), tolerance=0.0), seed=SEED, starts=starts,

@@ -109,9 +109,8 @@ def run(seed: int) -> tuple[Metrics, Models]:
     """
     Learn on the wide box.
 
-    :return: held-out `rw`, `rx`, `cond`; `eigenvalue_error`, the largest of the three; for each
-        weight `cost_ratio_to_exact` of the learned law and
-        `linear_cost_ratio`, and `edmd_cost_ratio` of the projected law for R = 1; `left_box`.
+    :return: as :func:`judged`, and for each weight `linear_cost_ratio`; for R = 1
+        `edmd_cost_ratio` of the projected law.
     """
     data, plant = samples(WIDE, seed), describe(SYSTEM)
     model = _learned(data, WIDE_RECIPE, seed, STARTS)
@@ -146,11 +145,7 @@ def run_narrow(seed: int) -> tuple[Metrics, Models]:
 
 
 def run_paper(seed: int) -> tuple[Metrics, Models]:
-    """
-    Run Algorithm 1 once on the wide box.
-
-    :return: as :func:`run`; all figures None when the lift is degenerate.
-    """
+    """Run Algorithm 1 once on the wide box; all figures are None when the lift is degenerate."""
     try:
         model = _learned(samples(WIDE, seed), PAPER_RECIPE, seed)
     except learning.NoUsefulLift:
@@ -167,7 +162,12 @@ def _learned(data: Samples, recipe: learning.Growth | learning.Algorithm1, seed:
 
 
 def judged(model: LiftedModel, seed: int) -> Metrics:
-    """Judge a lift of the wide box on fresh samples and by its closed loops."""
+    """
+    Judge a lift of the wide box on fresh samples and by its closed loops.
+
+    :return: `rw`, `rx`, `cond`; `eigenvalue_error`, the largest of the three; for each weight
+        `cost_ratio_to_exact`; `left_box`.
+    """
     test = samples(WIDE, 1000 + seed)
     found = learning.fit(model, test.x, test.dxdt, test.u)
     exact = np.sort(np.linalg.eigvals(exact_two_state_model().A).real)

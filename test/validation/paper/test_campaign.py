@@ -91,10 +91,10 @@ def campaign():
     models['linear'] = load(model_path('reactor_linear'))
     few = box_episodes(reactor.SYSTEM, reactor.TRAINING, 30, 1.0, 0)
     models['edmd'] = Edmd(reactor.EDMD_DEGREE).learn(describe(reactor.SYSTEM), few)
-    judge = reactor.Judge(few, *(random_step_episodes(reactor.SYSTEM, design, 2, 30.0, 5_000)
-                                 for design in (reactor.IN_RANGE, reactor.OUT_OF_RANGE)))
+    fresh = [random_step_episodes(reactor.SYSTEM, design, 2, 30.0, 5_000)
+             for design in (reactor.IN_RANGE, reactor.OUT_OF_RANGE)]
     add('reactor', ({f'{name}/{figure}': value for name, model in models.items()
-                     for figure, value in judge.figures(model).items()}, models))
+                     for figure, value in reactor.judged(model, few, *fresh).items()}, models))
     return found
 
 
