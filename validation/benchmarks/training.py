@@ -261,5 +261,6 @@ def _draw_cost(ax: Axes, figures: dict[str, Any]) -> None:
                         textcoords='offset points', color='0.3')
     ax.legend(fontsize=8, loc='lower right')
     ax.set(xscale='log', yscale='log', xlim=(samples[0] / 8, samples[-1] * 3),
+           ylim=(seconds[-1] * samples[0] / samples[-1] / 5, 3 * seconds[-1]),
            xlabel='samples N', ylabel='time of an iteration [s]')
     ax.set_title('a step of ours: n$_x$ = 2, n$_z$ = 3, 16 units', fontsize=10)

@@ -12,6 +12,7 @@ from typing import Any
 
 import joblib
 
+from koopman_ros.control import ClosedLoop
 from koopman_ros.lifting import LiftedModel
 from validation.paper import reactor, scalar, sensors, two_state
 from validation.paper.datasets import Metrics, Models
@@ -44,6 +45,8 @@ class Campaign:
     models: dict[str, dict[int, Mapping[str, LiftedModel]]] = field(default_factory=dict)
     errors: list[str] = field(default_factory=list)  #: one line for each run that failed
     complete: bool = False  #: whether every run was made
+    #: closed loops of models, by the identity of the model
+    loops: dict[int, ClosedLoop] = field(default_factory=dict)
 
     def summary(self) -> dict[str, Any]:
         """Nest the figures: experiment, its parts, then one list over the seeds."""

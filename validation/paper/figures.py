@@ -68,6 +68,13 @@ def worst_narrow(campaign: Campaign) -> tuple[int, LiftedModel]:
     return seed, campaign.models['narrow'][seed][FIGURE_NARROW_BOX]
 
 
+def _loop(campaign: Campaign, model: LiftedModel) -> ClosedLoop:
+    """Regulate the two-state example with R = 1 by one of the models, once for all figures."""
+    if id(model) not in campaign.loops:
+        campaign.loops[id(model)] = two_state.close_loop(model, 1.0)
+    return campaign.loops[id(model)]
+
+
 def _scalar(campaign: Campaign, path: Path) -> str:
     model = _model(campaign, 'scalar', 'scalar')
     x = np.linspace(0.0, 8.0, 801)
@@ -137,8 +144,7 @@ def _control(campaign: Campaign, path: Path, label: str, learned: LiftedModel
              ) -> tuple[ClosedLoop, ...]:
     """Draw the control by a learned lift beside those by linearisation and exact lift."""
     linear = _model(campaign, 'two_state', 'linear')
-    loops = (two_state.close_loop(linear, 1.0), two_state.exact_loop(1.0),
-             two_state.close_loop(learned, 1.0))
+    loops = _loop(campaign, linear), two_state.exact_loop(1.0), _loop(campaign, learned)
     with drawing(path, 1, 2, size=(10.0, 4.0)) as (_, (state, action)):
         for name, style, loop in zip(('linearisation', 'exact lift', label),
                                      (LINEAR, EXACT, LEARNED), loops, strict=True):
@@ -207,18 +213,16 @@ def _set_point(campaign: Campaign, path: Path) -> str:
             f'{offsets["nz=3"]:.1e} K off, the linearised controller {offsets["linear"]:.3f} K.')
 
 
-def _boxes(path: Path, parts: Sequence[tuple[str, str, two_state.Box, LiftedModel, str]]) -> float:
+def _boxes(path: Path, parts: Sequence[tuple[str, str, two_state.Box, ClosedLoop, str]]) -> None:
     """
     Draw boxes over (x1, x2, u) with the closed-loop paths that their lifts give.
 
-    :param parts: label, face colour, box, lift, colour of the path.
-    :return: how far the last path leaves its box, in halves of its width.
+    :param parts: label, face colour, box, path, colour of the path.
     """
     with drawing(path, size=(7.5, 6.0), grid=False,
                  subplot_kw={'projection': '3d'}) as (figure, panels):
         axes: Any = panels[0]
-        for label, face, box, model, color in parts:
-            loop = two_state.close_loop(model, 1.0)
+        for label, face, box, loop, color in parts:
             lower = np.array([*box.lower, box.inputs[0]])
             axes.bar3d(*lower, *(np.array([*box.upper, box.inputs[1]]) - lower), shade=False,
                        color=(face, 0.0 if face == 'white' else 0.2), edgecolor='black',
@@ -232,29 +236,29 @@ def _boxes(path: Path, parts: Sequence[tuple[str, str, two_state.Box, LiftedMode
         axes.set(xlabel='x$_1$', ylabel='x$_2$', zlabel='u  [1/s]')
         axes.view_init(elev=22.0, azim=-60.0)
         legend(figure, [axes], 3)
-    return loop.distance(model)
 
 
 def _wide_box(campaign: Campaign, path: Path) -> str:
-    model = _model(campaign, 'two_state', 'wide')
-    _boxes(path, [('wide box', 'gold', two_state.WIDE, model, 'tab:red')])
+    loop = _loop(campaign, _model(campaign, 'two_state', 'wide'))
+    _boxes(path, [('wide box', 'gold', two_state.WIDE, loop, 'tab:red')])
     return 'The wide training box holds the whole path of the controlled system.'
 
 
 def _narrow_box(campaign: Campaign, path: Path) -> str:
     seed, model = worst_narrow(campaign)
-    box = two_state.NARROW[FIGURE_NARROW_BOX]
-    left = _boxes(path, [('narrow box', 'gold', box, model, 'tab:red')])
+    box, loop = two_state.NARROW[FIGURE_NARROW_BOX], _loop(campaign, model)
+    _boxes(path, [('narrow box', 'gold', box, loop, 'tab:red')])
     return (f'The narrow training box, seed {seed}: the path starts in it and leaves it, by up '
-            f'to {left:.2g} times half its width.')
+            f'to {loop.distance(model):.2g} times half its width.')
 
 
 def _both_boxes(campaign: Campaign, path: Path) -> str:
     _, narrow = worst_narrow(campaign)
     wide = _model(campaign, 'two_state', 'wide')
     _boxes(path, [
-        ('wide box', 'white', two_state.WIDE, wide, 'tab:green'),
-        ('narrow box', 'grey', two_state.NARROW[FIGURE_NARROW_BOX], narrow, 'tab:red')])
+        ('wide box', 'white', two_state.WIDE, _loop(campaign, wide), 'tab:green'),
+        ('narrow box', 'grey', two_state.NARROW[FIGURE_NARROW_BOX], _loop(campaign, narrow),
+         'tab:red')])
     return 'Both boxes and paths in one picture: the same start, another training range.'
 
 

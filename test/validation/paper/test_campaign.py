@@ -74,9 +74,7 @@ def campaign():
     def add(name, outcome):
         found.metrics[name], found.models[name] = {0: outcome[0]}, {0: outcome[1]}
 
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(scalar, 'STARTS', 1)
-        add('scalar', scalar.run(0))
+    add('scalar', scalar.run(0))
     plant, exact, narrow = (
         describe(two_state.SYSTEM), exact_two_state_model(), figures.FIGURE_NARROW_BOX)
     lifts = {'wide': exact, narrow: exact, 'linear': Linearisation(
