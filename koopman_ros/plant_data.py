@@ -89,12 +89,7 @@ class Episode:
 
 
 def cut(episodes: Sequence[Episode], samples: int) -> list[Episode]:
-    """
-    Cut episodes into segments of nearly equal length, each beginning where the last one ends.
-
-    :param episodes: what was recorded.
-    :param samples: most measurements of a segment, at least 2.
-    """
+    """Cut into nearly equal segments of at most `samples`, each beginning where the last ends."""
     if samples < 2:
         raise ValueError(f'a segment needs at least 2 samples, got {samples}')
     parts = []
@@ -125,21 +120,19 @@ class Samples:
     def __post_init__(self) -> None:
         for name in ('x', 'dxdt', 'u'):
             array = np.ascontiguousarray(getattr(self, name), dtype=np.float64)
-            if array.ndim != 2 or len(array) != len(self.episode):
-                raise ValueError(f'incompatible {name}: expected ({len(self.episode)}, n), '
-                                 f'got {array.shape}')
-            if not np.all(np.isfinite(array)):
-                raise ValueError(f'{name} holds {np.count_nonzero(~np.isfinite(array))} values '
-                                 'that are not finite: drop those samples')
+            if array.ndim != 2 or len(array) != len(self):
+                raise ValueError(
+                    f'incompatible {name}: expected ({len(self)}, n), got {array.shape}')
+            if count := np.count_nonzero(~np.isfinite(array)):
+                raise ValueError(
+                    f'{name} holds {count} values that are not finite: drop those samples')
             object.__setattr__(self, name, array)
         if self.x.shape != self.dxdt.shape:
-            raise ValueError(f'incompatible dxdt: expected {self.x.shape}, '
-                             f'got {self.dxdt.shape}')
+            raise ValueError(f'incompatible dxdt: expected {self.x.shape}, got {self.dxdt.shape}')
         if self.time is not None:
             time = np.ascontiguousarray(self.time, dtype=np.float64)
-            if time.shape != (len(self.episode),):
-                raise ValueError(f'incompatible time: expected ({len(self.episode)},), '
-                                 f'got {time.shape}')
+            if time.shape != (len(self),):
+                raise ValueError(f'incompatible time: expected ({len(self)},), got {time.shape}')
             # an episode's samples need not lie side by side
             order = np.argsort(self.episode, kind='stable')
             within = np.diff(np.asarray(self.episode)[order]) == 0

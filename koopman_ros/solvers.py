@@ -63,8 +63,7 @@ def solve_riccati(A: Array, B: Array, Q: Array, R: Array, *, max_residual: float
     stabilisability the Schur method yields a P with enormous gains and eigenvalues that look
     fine, which only the residual and the size of the gain reveal.
 
-    :param A: (n, n).
-    :param B: (n, m).
+    :param A: (n, n), and B (n, m).
     :param Q: (n, n) symmetric, positive semidefinite, not zero.
     :param R: (m, m) symmetric, positive definite.
     :param max_residual: largest relative residual taken as solved.
@@ -130,13 +129,7 @@ def _unsolved(B: Array, status: RiccatiStatus) -> RiccatiSolution:
 
 
 def runge_kutta_step(rate: Callable[[Array], Array], x: Array, h: Array | float) -> Array:
-    """
-    Take one step of dx/dt = rate(x) by the classical Runge-Kutta method of order four.
-
-    :param rate: of the states, in their shape.
-    :param x: (...) states.
-    :param h: length of the step, or one that broadcasts with the states.
-    """
+    """Step dx/dt = rate(x) by h, which broadcasts with x, by the Runge-Kutta method of order 4."""
     k1 = rate(x)
     k2 = rate(x + 0.5 * h * k1)
     k3 = rate(x + 0.5 * h * k2)

@@ -30,32 +30,24 @@ TRAINING = ('test/validation/paper/test_shipped_models.py', 'test/learning/test_
 QUICK = ('oldest', 'disturbed')
 
 
-def found_by_numpy(*parts: str) -> list[str]:
-    """Return the features that numpy finds and can do without, all or by parts of their names."""
-    found = np.show_config(mode='dicts')['SIMD Extensions'].get('found', [])
-    return [name for name in found if not parts or any(part in name for part in parts)]
-
-
-def threads(count: int) -> dict[str, str]:
-    """Return what sets the threads of torch, MKL and OpenBLAS."""
-    return {f'{library}_NUM_THREADS': str(count) for library in ('OMP', 'MKL', 'OPENBLAS')}
-
-
 def imitations() -> dict[str, dict[str, str]]:
     """Return what the environment of each imitated machine says besides."""
-    machines = {'oldest': {'ATEN_CPU_CAPABILITY': 'default', **without(found_by_numpy()),
-                           **threads(1)}}
+    one, two = ({f'{library}_NUM_THREADS': count for library in ('OMP', 'MKL', 'OPENBLAS')}
+                for count in '12')
+    machines = {'oldest': {'ATEN_CPU_CAPABILITY': 'default', **without(), **one}}
     if torch.backends.cpu.get_cpu_capability() in ('AVX2', 'AVX512'):
         # X86_V4 is what numpy calls AVX-512 since its release 2.4
-        machines['avx2'] = {'ATEN_CPU_CAPABILITY': 'avx2',
-                            **without(found_by_numpy('AVX512', 'X86_V4')), **threads(1)}
-    machines['two-threads'] = threads(2)
-    machines['disturbed'] = {'DISTURB_TRAINING': '1e-13', **threads(1)}
+        machines['avx2'] = {
+            'ATEN_CPU_CAPABILITY': 'avx2', **without('AVX512', 'X86_V4'), **one}
+    machines['two-threads'] = two
+    machines['disturbed'] = {'DISTURB_TRAINING': '1e-13', **one}
     return machines
 
 
-def without(features: list[str]) -> dict[str, str]:
-    """Return what takes features away from numpy; nothing where there is none to take."""
+def without(*parts: str) -> dict[str, str]:
+    """Return what takes features that numpy finds away from it, all or by parts of their names."""
+    found = np.show_config(mode='dicts')['SIMD Extensions'].get('found', [])
+    features = [name for name in found if not parts or any(part in name for part in parts)]
     return {'NPY_DISABLE_CPU_FEATURES': ' '.join(features)} if features else {}
 
 

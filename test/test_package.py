@@ -54,24 +54,16 @@ def _imports(path: Path) -> set[str]:
     return names
 
 
-def test_versions_agree() -> None:
+def test_versions_agree_and_the_manifest_is_of_format_3_and_names_real_people() -> None:
     manifest = ElementTree.parse(ROOT / 'package.xml').getroot()
     setup = re.search(r"version='([^']+)'", (ROOT / 'setup.py').read_text())
     assert setup is not None
     assert manifest.findtext('version') == koopman_ros.__version__ == setup.group(1)
     assert f'\n{koopman_ros.__version__} ' in (ROOT / 'CHANGELOG.rst').read_text()
-
-
-def test_manifest_is_of_format_3_and_ament_python() -> None:
-    manifest = ElementTree.parse(ROOT / 'package.xml').getroot()
     assert manifest.get('format') == '3'
     assert manifest.findtext('name') == 'koopman_ros'
     assert manifest.findtext('export/build_type') == 'ament_python'
     assert (ROOT / 'resource' / 'koopman_ros').is_file()
-
-
-def test_manifest_names_people_and_a_place_that_are_no_placeholders() -> None:
-    manifest = ElementTree.parse(ROOT / 'package.xml').getroot()
     people = [*manifest.findall('maintainer'), *manifest.findall('author')]
     assert people
     for person in people:
@@ -137,18 +129,12 @@ def test_imports_run_one_way(package: str) -> None:
                 r'(rclpy|rcl_|\w+_(msgs|interfaces)(\.|$))', name)], path
 
 
-def test_nothing_that_is_installed_imports_what_is_not() -> None:
+def test_nothing_installed_imports_what_is_not_and_few_packages_torch() -> None:
+    users = set()
     for path in ROOT.glob('koopman_ros/**/*.py'):
         roots = {name.split('.')[0] for name in _imports(path)}
         assert not roots & {'validation', 'examples', 'support', 'test'}, path
-
-
-def test_every_package_has_its_rule() -> None:
-    packages = {path.parent.name for path in ROOT.glob('koopman_ros/*/__init__.py')}
-    assert packages == set(ALLOWED)
-
-
-def test_learning_and_identification_alone_import_torch() -> None:
-    users = {path.parent.name for path in ROOT.glob('koopman_ros/**/*.py')
-             if 'torch' in {name.split('.')[0] for name in _imports(path)}}
+        users |= {path.parent.name} if 'torch' in roots else set()
     assert users == {'identification', 'learning'}
+    # and every package has its rule
+    assert {path.parent.name for path in ROOT.glob('koopman_ros/*/__init__.py')} == set(ALLOWED)

@@ -12,10 +12,9 @@ from pathlib import Path
 import time
 
 from koopman_ros.bags import summary
-from koopman_ros.demo.command import read_options, run_act
+from koopman_ros.demo.console import LiveTable, read_options, run_act
 from koopman_ros.demo.loop import run_loop, Scenario
 from koopman_ros.demo.results import plot, read_run
-from koopman_ros.demo.table import LiveTable
 from koopman_ros.lifting import load
 from koopman_ros.parameters.controller import ControllerParameters
 from koopman_ros.reports import write_figures
@@ -28,13 +27,7 @@ LINEAR_MODEL = 'reactor_linear'
 
 
 def run_demo(output: Path, speed: float) -> dict[str, object]:
-    """
-    Run both loops and write bags, picture and summary.
-
-    :param output: folder for the results; what an earlier demo left there is replaced.
-    :param speed: simulated seconds per second of the learned loop, 0 for as fast as it can.
-    :return: the summary.
-    """
+    """Run both loops, the linearised one as fast as it can; write and return what came of them."""
     begin = time.monotonic()
     parameters = ControllerParameters()
     model = load(model_path(parameters.model))

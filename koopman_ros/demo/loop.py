@@ -10,7 +10,6 @@ from pathlib import Path
 
 from diagnostic_msgs.msg import DiagnosticStatus
 import rclpy
-from rclpy.node import Node
 from sensor_msgs.msg import Temperature
 
 from koopman_ros.ros import topics
@@ -52,16 +51,19 @@ class Row:
 
 
 class Operator:
-    """Set the set-point through its topic and watch the loop."""
+    """Set the set-point through its topic and watch the loop, whose processes `harness` runs."""
 
-    def __init__(self, scenario: Scenario, node: Node, on_row: Callable[[Row], None]) -> None:
+    def __init__(self, scenario: Scenario, harness: Harness, on_row: Callable[[Row], None]
+                 ) -> None:
         self.scenario = scenario
+        self.harness = harness
         self._on_row = on_row
         # two topics: either message of a pair may come first
         self._measured: dict[int, float] = {}
         self._commanded: dict[int, float] = {}
         self._active: float | None = None
         self.last_stamp_ns = 0
+        node = harness.node
         self.setpoint = node.create_publisher(Temperature, topics.SETPOINT, topics.LOOP_QOS)
         node.create_subscription(
             Temperature, topics.TEMPERATURE, self._on_temperature, topics.LOOP_QOS)
@@ -76,9 +78,17 @@ class Operator:
         return (self.setpoint.get_subscription_count() >= 2
                 and self._commands.get_publisher_count() >= 1)
 
-    def hears_more_than(self, stamp_ns: int) -> Callable[[], bool]:
-        """Return the condition that the answer to a later measurement than this was heard."""
-        return lambda: self.last_stamp_ns > stamp_ns
+    @property
+    def seconds(self) -> float:
+        """Plant time of the last command since the first measurement, in s; 0 before it."""
+        return max(0.0, (self.last_stamp_ns - self.scenario.first_stamp_ns) / NANOSECONDS)
+
+    def run_until(self, seconds: float) -> None:
+        """Let the loop go on until so many seconds of plant time after its first measurement."""
+        end = self.scenario.first_stamp_ns + round(seconds * NANOSECONDS)
+        while (last := self.last_stamp_ns) < end:
+            self.harness.wait_until(lambda last=last: self.last_stamp_ns > last,
+                                    'the loop stands still: no command')
 
     def request_setpoint(self) -> None:
         """Publish the set-point, stamped with the plant time from which it holds."""
@@ -108,30 +118,14 @@ class Operator:
                              self._commanded.pop(stamp)))
 
 
-@dataclass(frozen=True)
-class Loop:
-    """Plant, controller and trainer as three processes, with an operator beside them."""
-
-    harness: Harness  #: which runs them
-    operator: Operator  #: sets the set-point and watches
-
-    def run_until(self, seconds: float) -> None:
-        """Let the loop go on until so many seconds of plant time after its first measurement."""
-        end = self.operator.scenario.first_stamp_ns + round(seconds * NANOSECONDS)
-        while self.operator.last_stamp_ns < end:
-            self.harness.wait_until(self.operator.hears_more_than(self.operator.last_stamp_ns),
-                                    'the loop stands still: no command')
-
-
 @contextlib.contextmanager
 def running_loop(scenario: Scenario, logs: Path, trainer: Mapping[str, object],
-                 on_row: Callable[[Row], None] = lambda _: None) -> Iterator[Loop]:
+                 on_row: Callable[[Row], None] = lambda _: None) -> Iterator[Operator]:
     """
     Run plant, controller and trainer in lock-step, the set-point requested, until it is left.
 
     To be called from the main thread: it takes over Ctrl-C, so that the processes end.
 
-    :param scenario: what to do.
     :param logs: folder for what the processes print.
     :param trainer: parameters of the trainer, which records from its start.
     :param on_row: called with what the operator sees, at every command.
@@ -140,7 +134,7 @@ def running_loop(scenario: Scenario, logs: Path, trainer: Mapping[str, object],
     with (deferred_interrupt() as check_interrupt,
           Harness(logs, name='operator', timeout=_TIMEOUT, lasting=True,
                   each_turn=check_interrupt) as harness):
-        operator = Operator(scenario, harness.node, on_row)
+        operator = Operator(scenario, harness, on_row)
         # the observer would make up for what a model does not know, which is what is to be seen
         harness.start('controller', {'model': scenario.model, 'observer_bandwidth': 0.0})
         harness.start('trainer', trainer)
@@ -156,19 +150,14 @@ def running_loop(scenario: Scenario, logs: Path, trainer: Mapping[str, object],
         })
         # the others hear its last measurement
         with plant:
-            yield Loop(harness, operator)
+            yield operator
         if (code := plant.stop()) != 0:
             raise HarnessError(f'plant ended with code {code}: {plant.output()[-1000:]}')
 
 
 def run_loop(scenario: Scenario, bag: Path, logs: Path,
              on_row: Callable[[Row], None] = lambda _: None) -> None:
-    """
-    Run a loop until the scenario's end; see :func:`running_loop`.
-
-    :param bag: where the trainer records, the last measurement and its command among the rest;
-        must not exist.
-    """
+    """Run a loop until the scenario's end, recorded whole by the trainer in a new bag."""
     samples = round(scenario.duration / scenario.sample_period) + 1
 
     def recorded(status: DiagnosticStatus) -> bool:
@@ -176,8 +165,8 @@ def run_loop(scenario: Scenario, bag: Path, logs: Path,
         return all(int(counts.get(f'messages on /{topic}', 0)) >= samples
                    for topic in (topics.TEMPERATURE, topics.COOLANT_SETPOINT))
 
-    with running_loop(scenario, logs, {'output': bag}, on_row) as loop:
-        loop.run_until(scenario.duration)
+    with running_loop(scenario, logs, {'output': bag}, on_row) as operator:
+        operator.run_until(scenario.duration)
         # what the operator has heard may still be on its way to the trainer, where it is lost
         # with its sender
-        loop.harness.wait_for_status('trainer: recording', recorded)
+        operator.harness.wait_for_status('trainer: recording', recorded)

@@ -73,17 +73,10 @@ def plot(path: Path, learned: Run, linear: Run, setpoint: float, step_time: floa
     """
     Draw both runs: temperature with set-point and training range, coolant with limits.
 
-    :param path: PNG file to write.
-    :param learned: the run with the learned lift.
-    :param linear: the same with the linearised model.
-    :param setpoint: in K.
-    :param step_time: in s after the first measurement.
-    :param model: whose training range is drawn.
-    :param limits: whose coolant limits are drawn.
+    :param setpoint: in K, from `step_time` on, in s after the first measurement.
     """
     start, end = float(learned.temperature[0]), float(learned.seconds[-1])
-    low, high = (to_celsius(float(bound[0])) for bound in (model.states.lower,
-                                                           model.states.upper))
+    low, high = (to_celsius(float(b[0])) for b in (model.states.lower, model.states.upper))
     with drawing(path, 2, 1, size=(9.0, 7.0), sharex=True) as (_, (upper, lower)):
         upper.axhspan(low, high, label='training range', **DRAWN_RANGE)
         upper.step(np.array([0.0, step_time, end]) / 60.0,
@@ -113,13 +106,9 @@ def plot_retraining(path: Path, history: Run, phases: Sequence[tuple[str, float]
     """
     Draw the story: temperature, coolant and error over plant time, phase by phase.
 
-    :param path: PNG file to write.
-    :param history: what was recorded.
     :param phases: name and start of each, in s.
     :param setpoint: in K, from the step on.
-    :param present: the lift at the start, whose training range is drawn.
-    :param learned: the lift at the end, likewise.
-    :param limits: whose coolant limits are drawn.
+    :param present: the lift at the start; training ranges of both are drawn.
     """
     minutes = history.seconds / 60.0
     end = float(minutes[-1])

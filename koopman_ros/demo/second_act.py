@@ -18,10 +18,9 @@ from diagnostic_msgs.msg import DiagnosticStatus
 import numpy as np
 from std_srvs.srv import SetBool, Trigger
 
-from koopman_ros.demo.command import read_options, run_act
-from koopman_ros.demo.loop import Loop, running_loop, Scenario
+from koopman_ros.demo.console import LiveTable, read_options, run_act
+from koopman_ros.demo.loop import Operator, running_loop, Scenario
 from koopman_ros.demo.results import plot_retraining, read_run
-from koopman_ros.demo.table import LiveTable
 from koopman_ros.learning import roll_out
 from koopman_ros.lifting import LiftedModel, load
 from koopman_ros.parameters.controller import ControllerParameters
@@ -31,7 +30,6 @@ from koopman_ros.reports import write_figures
 from koopman_ros.resources import model_path
 from koopman_ros.ros import topics
 from koopman_ros.testing import HarnessError
-from koopman_ros.units import NANOSECONDS
 
 STEP = -10.0  # K
 FOULING = 0.8  # share of the heat transfer that is left
@@ -54,25 +52,8 @@ _EXPERIMENT = {
 }
 
 
-@dataclass
-class Story:
-    """What happens when, in seconds of plant time since the first measurement."""
-
-    phases: list[tuple[str, float]] = field(default_factory=list)  #: name and start of each phase
-
-    def start_of(self, name: str) -> float:
-        """Return when a phase began."""
-        return dict(self.phases)[name]
-
-
 def run_retraining(output: Path, speed: float) -> dict[str, object]:
-    """
-    Run the loop through drift, experiment, training and reload; write picture and summary.
-
-    :param output: folder for the results; what an earlier run left there is replaced.
-    :param speed: simulated seconds per second.
-    :return: the summary.
-    """
+    """Run the loop through drift, experiment, training and reload; write and return figures."""
     begin = time.monotonic()
     if output.exists():
         shutil.rmtree(output)
@@ -85,19 +66,18 @@ def run_retraining(output: Path, speed: float) -> dict[str, object]:
                         speed=speed, plant={'noise': NOISE})
     bags = [output / 'before.mcap', output / 'after.mcap']
     new_model = output / 'retrained.safetensors'
-    story = Story()
     table = LiveTable('a controller without observer learns its plant anew', row_period=300.0)
     trainer = {'output': bags[0], 'model_output': new_model, **_EXPERIMENT}
-    with table, running_loop(scenario, logs, trainer, table.show) as loop:
-        _Actor(loop, table, story).act(bags[1], new_model)
+    with table, running_loop(scenario, logs, trainer, table.show) as operator:
+        phases = _Actor(operator, table).act(bags[1], new_model)
     drifted = PlantParameters(heat_transfer_coefficient=FOULING * PlantParameters(
         ).heat_transfer_coefficient)
     history = read_run(*bags)
     learned = load(new_model)
     trained = json.loads(new_model.with_suffix('.json').read_text())
-    plot_retraining(output / 'retraining.png', history, story.phases, setpoint, present, learned,
+    plot_retraining(output / 'retraining.png', history, phases, setpoint, present, learned,
                     parameters)
-    reload = story.start_of('new lift')
+    reload = phases[-1][1]
     result: dict[str, object] = {
         'setpoint_kelvin': setpoint,
         'heat_transfer_left': FOULING,
@@ -117,13 +97,7 @@ def run_retraining(output: Path, speed: float) -> dict[str, object]:
 
 
 def rollout_rmse(model: LiftedModel, plant: PlantParameters) -> float:
-    """
-    Predict the reactor over 15 min of fresh random steps without noise, from the projected drift.
-
-    :param model: the lift.
-    :param plant: the reactor as it is now.
-    :return: root mean square error in K.
-    """
+    """Predict the reactor over 15 min of fresh steps without noise; return the RMS error in K."""
     reactor = one_state_reactor(plant.constants(), nominal_state=model.states.center)
     design = RandomStepDesign(model.inputs.lower, model.inputs.upper, model.states.lower,
                               model.states.upper, (0.5, 2.0), 1.0 / 60.0, rtol=1e-9)
@@ -140,14 +114,15 @@ class ActError(RuntimeError):
 class _Actor:
     """The operator's hands."""
 
-    loop: Loop
+    operator: Operator
     table: LiveTable
-    story: Story
+    phases: list[tuple[str, float]] = field(default_factory=list)  #: name and start in s
 
-    def act(self, second_bag: Path, new_model: Path) -> None:
-        loop = self.loop
+    def act(self, second_bag: Path, new_model: Path) -> list[tuple[str, float]]:
+        """Do it all; return name and start, in s of plant time, of each phase."""
+        operator = self.operator
         self._begin('shipped lift', 'set-point step of -10 K with the shipped lift')
-        loop.run_until(_DRIFT_TIME)
+        operator.run_until(_DRIFT_TIME)
         heat_transfer = FOULING * PlantParameters().heat_transfer_coefficient
         self._set('plant', heat_transfer_coefficient=heat_transfer)
         self._begin('fouling', 'the cooling jacket fouls: a fifth of its heat transfer is lost')
@@ -155,7 +130,7 @@ class _Actor:
         self._switch('trainer/record', False)
         self._set('trainer', output=str(second_bag))
         self._switch('trainer/record', True)
-        loop.run_until(_EXPERIMENT_TIME)
+        operator.run_until(_EXPERIMENT_TIME)
         self._switch('controller/set_automatic', False)
         self._switch('trainer/experiment', True)
         self._begin('experiment', f'manual mode: random steps for {_EXPERIMENT_MINUTES:.0f} min')
@@ -163,38 +138,37 @@ class _Actor:
         self._switch('trainer/experiment', False)
         self._switch('controller/set_automatic', True)
         self._begin('training', 'automatic mode again; a lift is learned from the recording')
-        _checked('trainer/train', loop.harness.trigger('trainer/train'))
+        _checked('trainer/train', operator.harness.trigger('trainer/train'))
         status = self._wait_for('training', 'the new lift is', _TRAINING_TIMEOUT)
         self.table.announce(status.message)
         if not new_model.exists():
             raise ActError(status.message)
         self._set('controller', model=str(new_model.resolve()))
         self._begin('new lift', 'the controller has taken the new lift over')
-        loop.run_until(self.story.start_of('new lift') + _AFTER)
+        operator.run_until(self.phases[-1][1] + _AFTER)
+        return self.phases
 
     def _begin(self, name: str, text: str) -> None:
-        operator = self.loop.operator
-        now = (operator.last_stamp_ns - operator.scenario.first_stamp_ns) / NANOSECONDS
-        self.story.phases.append((name, max(0.0, now)))
+        self.phases.append((name, self.operator.seconds))
         self.table.announce(text)
 
     def _wait_for(self, task: str, words: str, timeout: float) -> DiagnosticStatus:
         """Wait until a task of the trainer says so."""
         def said() -> DiagnosticStatus | None:
-            status = self.loop.harness.last_status(_TASKS[task])
+            status = self.operator.harness.last_status(_TASKS[task])
             if status is not None and status.level == DiagnosticStatus.ERROR:
                 raise ActError(f'{task}: {status.message}')
             return status if status is not None and status.message.startswith(words) else None
 
-        status = self.loop.harness.wait_until(said, f'the {task} did not end', timeout)
+        status = self.operator.harness.wait_until(said, f'the {task} did not end', timeout)
         assert status is not None
         return status
 
     def _switch(self, service: str, on: bool) -> None:
-        _checked(service, self.loop.harness.set_bool(service, on))
+        _checked(service, self.operator.harness.set_bool(service, on))
 
     def _set(self, node: str, **values: object) -> None:
-        for result in self.loop.harness.set_parameters(node, **values):
+        for result in self.operator.harness.set_parameters(node, **values):
             if not result.successful:
                 raise ActError(f'{node}: {result.reason}')
 

@@ -29,11 +29,7 @@ class Activation:
 
 
 def activation_named(name: str) -> Activation:
-    """
-    Return the activation of this name.
-
-    :raises ValueError: listing the names, when there is none.
-    """
+    """Return the activation of this name; raise ValueError with the known names where none is."""
     # not by hash: what a file holds in the place of a name may have none
     if name not in tuple(ACTIVATIONS):
         known = ', '.join(map(repr, ACTIVATIONS))

@@ -15,14 +15,8 @@ from typing import Any, NoReturn
 
 import numpy as np
 
+from koopman_ros.lifting import bounds
 from koopman_ros.lifting.activations import activation_named
-from koopman_ros.lifting.bounds import (
-    check_sizes,
-    check_texts,
-    MAX_LAYERS,
-    NotRegularError,
-    read_regular,
-)
 from koopman_ros.lifting.coordinates import Coordinates, TrainingStates
 from koopman_ros.lifting.model import LiftedModel, Provenance
 from koopman_ros.lifting.observables import NetworkObservables
@@ -45,8 +39,6 @@ def save(model: LiftedModel, path: str | os.PathLike[str]) -> None:
     """
     Write a model as safetensors; a reader sees the old file or the new one, never a part.
 
-    :param model: what to write, with the lift of a network.
-    :param path: a file name ending in ``.safetensors``.
     :raises OSError: when the folder cannot be written.
     :raises TypeError: when the lift is not a network's.
     :raises ValueError: when :func:`load` would refuse it, e.g. for a metric that is not finite.
@@ -55,8 +47,7 @@ def save(model: LiftedModel, path: str | os.PathLike[str]) -> None:
     if not isinstance(network, NetworkObservables):
         raise TypeError(f'only network lifts can be saved, got {type(network).__name__}: keep the '
                         'program that makes the model instead')
-    check_sizes(model)
-    check_texts(model)
+    bounds.check(model)
     tensors = {'A': model.A, 'B': model.B, 'output': network.output}
     for i, (weight, bias) in enumerate(network.hidden):
         tensors[f'hidden.{i}.weight'] = weight
@@ -101,29 +92,19 @@ def save(model: LiftedModel, path: str | os.PathLike[str]) -> None:
 
 
 def load(path: str | os.PathLike[str]) -> LiftedModel:
-    """
-    Read a model and check every field of it.
-
-    :param path: a regular file, or a link to one.
-    :raises ModelFileError: naming the file, what is wrong and what to do.
-    """
+    """Read a model and check every field; raise ModelFileError with what is wrong and to do."""
     return load_with_digest(path)[0]
 
 
 def load_with_digest(path: str | os.PathLike[str]) -> tuple[LiftedModel, str]:
-    """
-    Read a model as :func:`load` does, with the SHA-256 digest of the file that it was read from.
-
-    :param path: a regular file, or a link to one.
-    :raises ModelFileError: as :func:`load`.
-    """
+    """Read a model as :func:`load` does, with the SHA-256 digest of the file it was read from."""
     path = Path(path)
     try:
-        content = read_regular(path, _MAX_FILE_BYTES)
+        content = bounds.read_regular(path, _MAX_FILE_BYTES)
     except FileNotFoundError:
         raise ModelFileError(
             f'no model file at {path}: check the path, or train a model') from None
-    except NotRegularError as error:
+    except bounds.NotRegularError as error:
         raise ModelFileError(f'cannot read the model file {path}: {error}') from None
     except OSError as error:
         raise ModelFileError(f'cannot read the model file {path}: {error.strerror}') from error
@@ -138,14 +119,13 @@ def load_with_digest(path: str | os.PathLike[str]) -> tuple[LiftedModel, str]:
         raise ModelFileError(
             f'the model file {path} has format version {version!r}, this package reads '
             f'{FORMAT_VERSION}: retrain the model, or install the matching package')
-    if len(header) > 2 * MAX_LAYERS + 4:
+    if len(header) > 2 * bounds.MAX_LAYERS + 4:
         _refuse(path, f'it holds {len(header)} arrays, more than any lift')
     tensors = {name: _tensor(path, name, entry, data) for name, entry in header.items()}
     try:
         about = _parsed(metadata['description'])
         model = _build(about, tensors)
-        check_sizes(model)
-        check_texts(model)
+        bounds.check(model)
         # last, so that whatever has a reason of its own is refused with that reason
         if metadata['sha256'] != _checksum(metadata['description'], header, data):
             raise ValueError('its checksum is wrong, so it was damaged or edited')
@@ -172,6 +152,10 @@ def _build(about: dict[str, Any], tensors: dict[str, np.ndarray]) -> LiftedModel
         raise TypeError('identity must be true or false')
     origin = about['provenance']
     metrics = {name: float(value) for name, value in origin['metrics'].items()}
+    filled = about.get('fill_distance')
+    if 'fill_distance' in about and (
+            not isinstance(filled, int | float) or isinstance(filled, bool)):
+        raise TypeError(f'fill_distance must be a number, got {filled!r}')
     model = LiftedModel(
         observables=NetworkObservables(
             hidden=tuple((tensors[f'hidden.{i}.weight'], tensors[f'hidden.{i}.bias'])
@@ -188,7 +172,7 @@ def _build(about: dict[str, Any], tensors: dict[str, np.ndarray]) -> LiftedModel
             package_version=origin['package_version'],
             method=origin.get('method', '')),
         training_states=None if 'fill_distance' not in about else TrainingStates(
-            tensors['training_states'], _number(about, 'fill_distance')))
+            tensors['training_states'], float(filled)))
     for name, actual in (('n_x', model.n_x), ('n_u', model.n_u), ('n_z', model.n_z)):
         if _integer(about, name) != actual:
             raise ValueError(f'{name} is given as {about[name]}, the arrays say {actual}')
@@ -206,13 +190,6 @@ def _integer(about: dict[str, Any], name: str) -> int:
     if not isinstance(value, int) or isinstance(value, bool) or value < 0:
         raise TypeError(f'{name} must be an integer of at least 0, got {value!r}')
     return value
-
-
-def _number(about: dict[str, Any], name: str) -> float:
-    value = about[name]
-    if not isinstance(value, int | float) or isinstance(value, bool):
-        raise TypeError(f'{name} must be a number, got {value!r}')
-    return float(value)
 
 
 def _describe(coordinates: Coordinates) -> dict[str, Any]:

@@ -3,7 +3,6 @@
 
 """Limits of a model file: a regular one, sizes that a step has time for, printable texts."""
 
-from collections.abc import Iterable
 import math
 import os
 import stat
@@ -28,11 +27,12 @@ _KINDS = ((stat.S_ISDIR, 'a folder'), (stat.S_ISFIFO, 'a named pipe'), (stat.S_I
           (stat.S_ISCHR, 'a device'), (stat.S_ISBLK, 'a device'))
 
 
-def check_sizes(model: LiftedModel) -> None:
+def check(model: LiftedModel) -> None:
     """
-    Refuse a model that is too large to control with.
+    Refuse a model too large to control with, or with texts that no log or message could carry.
 
-    :raises ValueError: naming the size and its limit.
+    :raises TypeError: when a name, a unit or a note on its origin is no text.
+    :raises ValueError: naming the size and its limit, or the text and what is wrong with it.
     """
     sizes = [('n_z', model.n_z, MAX_COORDINATES), ('n_x', model.n_x, MAX_STATES),
              ('n_u', model.n_u, MAX_STATES)]
@@ -44,38 +44,26 @@ def check_sizes(model: LiftedModel) -> None:
     for name, size, limit in sizes:
         if size > limit:
             raise ValueError(f'{name} is {size}, at most {limit} can be controlled with')
-
-
-def check_texts(model: LiftedModel) -> None:
-    """
-    Refuse names, units and notes on its origin that no log and no message could carry.
-
-    :raises ValueError: naming the text and what is wrong with it.
-    """
     origin = model.provenance
     for what, box in (('state', model.states), ('input', model.inputs)):
-        _check_all(f'the name of a {what}', box.names)
-        _check_all(f'the unit of a {what}', box.units)
-    _check('plant', origin.plant, MAX_LONG_TEXT)
-    _check('method', origin.method, MAX_LONG_TEXT)
-    _check('data_digest', origin.data_digest)
-    _check('package_version', origin.package_version)
+        for name, unit in zip(box.names, box.units, strict=True):
+            _check_text(f'the name of a {what}', name)
+            _check_text(f'the unit of a {what}', unit)
+    _check_text('plant', origin.plant, MAX_LONG_TEXT)
+    _check_text('method', origin.method, MAX_LONG_TEXT)
+    _check_text('data_digest', origin.data_digest)
+    _check_text('package_version', origin.package_version)
     if len(origin.metrics) > MAX_METRICS:
         raise ValueError(f'there are {len(origin.metrics)} metrics, at most {MAX_METRICS} may be')
-    _check_all('the name of a metric', origin.metrics)
     for name, value in origin.metrics.items():
+        _check_text('the name of a metric', name)
         if not math.isfinite(value):
             raise ValueError(f'the metric {name} is {value}, not finite')
     if origin.seed is not None and not 0 <= origin.seed < MAX_SEED:
         raise ValueError('the seed must be an integer of at least 0 and below 2^128')
 
 
-def _check_all(what: str, texts: Iterable[str]) -> None:
-    for text in texts:
-        _check(what, text)
-
-
-def _check(what: str, text: str, longest: int = MAX_TEXT) -> None:
+def _check_text(what: str, text: str, longest: int = MAX_TEXT) -> None:
     if not isinstance(text, str):
         raise TypeError(f'{what} must be a text, got {text!r}')
     if len(text) > longest:
@@ -93,8 +81,6 @@ def read_regular(path: str | os.PathLike[str], limit: int) -> bytes:
     """
     Return what a regular file holds, or its first `limit` + 1 bytes.
 
-    :param path: the file, or a link to it.
-    :param limit: how many bytes are wanted at most.
     :raises NotRegularError: for a device, a pipe, a socket or a folder.
     :raises OSError: when it cannot be opened or read.
     """

@@ -43,8 +43,8 @@ class Coordinates:
         if np.any(self.scale <= 0.0):
             raise ValueError(f'scale must be positive, got {self.scale.tolist()}')
         if np.any(self.lower >= self.upper):
-            raise ValueError(f'the box is empty: lower {self.lower.tolist()}, '
-                             f'upper {self.upper.tolist()}')
+            raise ValueError(
+                f'the box is empty: lower {self.lower.tolist()}, upper {self.upper.tolist()}')
 
     @classmethod
     def spanning(cls, names: tuple[str, ...], units: tuple[str, ...], lower: Array, upper: Array,
@@ -52,11 +52,6 @@ class Coordinates:
         """
         Scale by half the width of a range, from its middle or from a given center.
 
-        :param names: one name a coordinate.
-        :param units: one unit a coordinate.
-        :param lower: (n,) lower end of the range, in units.
-        :param upper: (n,) upper end of the range, in units.
-        :param center: (n,) nominal point, in units.
         :raises ValueError: when a range is empty, naming the coordinate, or the sizes do not fit.
         """
         if not len(names) == len(lower) == len(upper):
@@ -113,9 +108,7 @@ class Box:
         """
         Return the range of some values.
 
-        :param plant: names, units and the nominal point.
-        :param x: (N, n_x) states, in state units.
-        :param u: (N, n_u) inputs, in input units.
+        :param x: (N, n_x) states, and u (N, n_u) inputs, in their units.
         :param nominal: whether deviations are from the nominal point or from the middle.
         :raises ValueError: when a state or an input never moves, or the sizes do not fit.
         """
@@ -128,11 +121,7 @@ class Box:
         return Box(states, inputs, plant.time_unit)
 
     def input_matrix(self, B: Array) -> Array:
-        """
-        Scale B (n_x, n_u) from units to deviations.
-
-        :raises ValueError: when its shape does not fit.
-        """
+        """Scale B (n_x, n_u) from units to deviations; raise ValueError for another shape."""
         n_x, n_u = len(self.states), len(self.inputs)
         if np.shape(B) != (n_x, n_u):
             raise ValueError(f'incompatible B: expected {(n_x, n_u)}, got {np.shape(B)}')
@@ -169,8 +158,8 @@ class TrainingStates:
         """
         Choose by farthest points: each next one is the farthest from those chosen so far.
 
-        :param states: (N, n_x) all of the training data, in scaled deviations.
-        :param half_widths: (n_x,) of the training box, in scaled deviations.
+        :param states: (N, n_x) all of the training data, in scaled deviations, as the half widths
+            (n_x,) of the training box.
         """
         middle = 0.5 * (states.min(axis=0) + states.max(axis=0))
         chosen = [int(np.argmin(_distances(states, middle, half_widths)))]
@@ -182,10 +171,8 @@ class TrainingStates:
 
     def distance(self, x: Array, half_widths: Array) -> float:
         """
-        Return how far a state (n_x,) is from the nearest one beyond the fill distance.
+        Return how far a state (n_x,), scaled, is from the nearest one beyond the fill distance.
 
-        :param x: in scaled deviations.
-        :param half_widths: (n_x,) of the training box, in scaled deviations.
         :return: in half widths, so 0 at every training state; infinity where x is not finite.
         """
         if not np.all(np.isfinite(x)):

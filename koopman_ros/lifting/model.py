@@ -40,9 +40,7 @@ class LiftedModel:
     A lift z = N(x) with dz/dt = A z + J_N(x) B u (paper, equation for control-affine systems).
 
     All methods work in scaled deviations from the nominal point (see :class:`Coordinates`),
-    with time in `time_unit`. Which functions of the state z consists of is the matter of
-    `observables`; with those of :class:`NetworkObservables` without hidden layers the model is a
-    linearisation.
+    with time in `time_unit`. With a network without hidden layers it is a linearisation.
 
     :raises ValueError: naming the array that does not fit and both shapes.
     """
@@ -154,7 +152,7 @@ class LiftedModel:
         return self.observables.lift_and_jacobian(x)[1]
 
     def lift_and_jacobian(self, x: Array) -> tuple[Array, Array]:
-        """Evaluate N(x) and J_N(x) at once; shapes as in the single methods."""
+        """Evaluate N(x) and J_N(x) at once."""
         return self.observables.lift_and_jacobian(x)
 
     def lift_and_secants(self, x: Array, x_ref: Array, w: Array
@@ -163,14 +161,7 @@ class LiftedModel:
         return self.observables.lift_and_secants(x, x_ref, w)
 
     def onto_states(self, J: Array, rate: Array) -> Array:
-        """
-        Read the rate of the state off a rate of z: (..., n_z, k) -> (..., n_x, k).
-
-        A network's lift is read by J_N(x)^+, monomials by the rows of the states.
-
-        :param J: (..., n_z, n_x) from the state x in question.
-        :param rate: what the rate of the state is wanted of; (n_z,) gives (n_x,).
-        """
+        """Read the rate of the state off a rate of z; see :meth:`Observables.onto_states`."""
         return self.observables.onto_states(J, rate)
 
     def drift(self, x: Array) -> Array:
@@ -186,14 +177,8 @@ def linearised_model(jacobian: Array, B: Array, states: Coordinates, inputs: Coo
     """
     Build the linear model dx/dt = (df/dx)(x - x_0) + B (u - u_0) as a lift with N(x) = x.
 
-    Every controller and every study can then treat it as just another model.
-
-    :param jacobian: (n_x, n_x) df/dx at the nominal point, in units.
+    :param jacobian: (n_x, n_x) df/dx at the nominal point, the centers, in units.
     :param B: (n_x, n_u) input matrix, in units.
-    :param states: whose center is the nominal state.
-    :param inputs: whose center is the nominal input.
-    :param time_unit: ``'s'`` or ``'min'``.
-    :param provenance: the plant it belongs to.
     """
     n_x = len(states)
     A = np.asarray(jacobian) * states.scale / states.scale[:, None]

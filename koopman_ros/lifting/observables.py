@@ -64,6 +64,8 @@ class Observables(ABC):
         """
         Read the rate of the state off a rate of z: (..., n_z, k) -> (..., n_x, k).
 
+        A network's lift is read by J_N(x)^+, monomials by the rows of the states.
+
         :param J: (..., n_z, n_x) from the state x in question.
         :param rate: what the rate of the state is wanted of; (n_z,) gives (n_x,).
         """
@@ -166,11 +168,7 @@ class NetworkObservables(Observables):
 
     def lift_and_secants(self, x: Array, x_ref: Array, w: Array
                          ) -> tuple[Array, Array, Array, Array]:
-        """
-        Evaluate the lift and, by the chain rule of divided differences, the secants.
-
-        With one hidden layer M is the mean of J_N along the segment.
-        """
+        """Evaluate the lift and, by the chain rule of divided differences, the secants."""
         eye, zero, f = self._identity_rows, self._zero_rows, self._activation
         if not self.hidden:
             return x, eye, eye, zero
@@ -193,15 +191,11 @@ class NetworkObservables(Observables):
                 G.dot(rows).T)
 
     def onto_states(self, J: Array, rate: Array) -> Array:
-        """
-        Evaluate J_N(x)^+ times a rate of z; shapes as in the interface.
-
-        All coordinates share in what training left over, so that all of them are asked.
-        """
+        """Evaluate J_N(x)^+ times a rate of z; shapes as in the interface."""
+        # all coordinates share in what training left over, so that all of them are asked
         if self.identity and J.shape[1:] == (1,):
             # one state: the same without a singular value decomposition; J holds a 1
-            column = J[:, 0]
-            found: Array = J.T.dot(rate) / column.dot(column)
+            found: Array = J.T.dot(rate) / J[:, 0].dot(J[:, 0])
             return found
         return np.linalg.pinv(J) @ rate
 
@@ -251,11 +245,7 @@ class PolynomialObservables(Observables):
 
     @classmethod
     def total_degree(cls, n_x: int, degree: int) -> Self:
-        """
-        Return all monomials of n_x states from degree 1 to `degree`, by rising degree.
-
-        :raises ValueError: when either is less than 1.
-        """
+        """Return the monomials of n_x states from degree 1 on; raise ValueError below 1."""
         if n_x < 1 or degree < 1:
             raise ValueError(f'n_x and degree must be at least 1, got {n_x} and {degree}')
         return cls(np.array([np.bincount(factors, minlength=n_x)
@@ -298,12 +288,7 @@ class PolynomialObservables(Observables):
 
     def lift_and_secants(self, x: Array, x_ref: Array, w: Array
                          ) -> tuple[Array, Array, Array, Array]:
-        """
-        Evaluate the lift, and the secants as means along the segment.
-
-        M is the mean of J_N and H that of d(J_N w)/dx, by Gauss-Legendre quadrature, which is
-        exact for polynomials.
-        """
+        """Evaluate the lift, and the secants as means along the segment, by exact quadrature."""
         nodes, weights = self._quadrature
         points = x_ref + nodes[:, None] * (x - x_ref)
         first, exponents = self._first
@@ -337,13 +322,7 @@ def _columns(array: Array) -> int:
 
 def _differentiated(factors: Array, exponents: NDArray[np.int64]
                     ) -> tuple[Array, NDArray[np.int64]]:
-    """
-    Differentiate monomials by each state.
-
-    :param factors: (...) that multiply the monomials.
-    :param exponents: (..., n_x).
-    :return: factors (..., n_x) and exponents (..., n_x, n_x), by each state in the axis added.
-    """
+    """Differentiate factors (...) times monomials (..., n_x) by each state, in an axis added."""
     n_x = exponents.shape[-1]
     # the factor is 0 where an exponent would turn negative, and x^-1 must not be evaluated at 0
     lowered = np.maximum(exponents[..., None, :] - np.eye(n_x, dtype=np.int64), 0)

@@ -13,8 +13,8 @@ from rosgraph_msgs.msg import Clock as ClockMessage
 from sensor_msgs.msg import Temperature
 
 from koopman_ros import bags
-from koopman_ros.parameters.player import TABLE
 from koopman_ros.parameters.table import ConfigurationError
+from koopman_ros.parameters.trainer import PLAYER_TABLE
 from koopman_ros.ros import topics
 from koopman_ros.ros.codec import stamp_message, stamp_nanoseconds
 from koopman_ros.ros.node import LoopNode, wall_timer
@@ -38,7 +38,7 @@ class PlayerNode(LoopNode):
 
     def __init__(self) -> None:
         super().__init__('player')
-        self._settings = settings = self.declare_table(TABLE)
+        self._settings = settings = self.declare_table(PLAYER_TABLE)
         if reason := topics.unusable(
                 self, (*settings.topics, settings.measurement, settings.answer)):
             raise ConfigurationError(reason)

@@ -15,8 +15,7 @@ import numpy as np
 from koopman_ros.bags import BagReadError, summary
 from koopman_ros.control import Settings
 from koopman_ros.parameters import controller
-from koopman_ros.parameters.controller import ControllerParameters
-from koopman_ros.parameters.replay import ReplayParameters, TABLE
+from koopman_ros.parameters.controller import ControllerParameters, ReplayParameters
 from koopman_ros.parameters.table import ConfigurationError
 from koopman_ros.replay.loop import Alternative, Replay, replay
 from koopman_ros.replay.records import Record, RecordError
@@ -127,7 +126,7 @@ def _prepare() -> Callable[[], int]:
     node = LoopNode('replay', start_parameter_services=False, enable_rosout=False)
     try:
         given = set(node.get_parameters_by_prefix(''))
-        parameters = node.declare_table(TABLE)
+        parameters = node.declare_table(controller.REPLAY_TABLE)
         names = Names(node.resolve_topic_name(topics.CONTROLLER_EVENTS),
                       node.resolve_topic_name(topics.COOLANT_SETPOINT))
     finally:

@@ -11,12 +11,11 @@ from koopman_ros.parameters.wire import LONGEST_FRAME_ID
 from koopman_ros.plants import (
     Actuator,
     EquilibriumError,
-    IntegratorSettings,
     one_state_reactor,
     ReactorParameters,
     two_state_reactor,
 )
-from koopman_ros.plants.simulation import resolved_limits
+from koopman_ros.plants.simulation import integration_limits
 from koopman_ros.units import LAST_STAMP_SECONDS, to_kelvin
 
 REACTORS = {'one_state': one_state_reactor, 'two_state': two_state_reactor}
@@ -130,7 +129,7 @@ def _build(values: PlantParameters) -> None:
     except EquilibriumError:
         # it then starts from the nominal state
         system = build(constants, nominal_state=build().nominal_state)
-    resolved_limits(system, IntegratorSettings())
+    integration_limits(system)
 
 
 TABLE = ParameterTable(PlantParameters, _cross_check, _build, (('coolant_min', 'coolant_max'),))

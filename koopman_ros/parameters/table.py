@@ -91,7 +91,6 @@ class ParameterTable(Generic[T]):
     """
     The parameters of a node, from the dataclass that is also their typed, frozen snapshot.
 
-    :param kind: a frozen dataclass whose fields come from :func:`parameter`.
     :param ordered: names of which the first must be below the second.
     :param cross_check: returns what is wrong with a whole snapshot, or an empty string.
     :param build: builds from a snapshot what the node will use, of which a ValueError or an
@@ -114,12 +113,10 @@ class ParameterTable(Generic[T]):
         """
         Return the first thing wrong with a snapshot, or an empty string.
 
-        :param snapshot: the values.
-        :param before: those in force, which are known to be right; None for the defaults.
+        :param before: the one in force, which is known to be right; None for the defaults.
         """
         for name, row in self.rows.items():
-            reason = row.check(getattr(snapshot, name))
-            if reason:
+            if reason := row.check(getattr(snapshot, name)):
                 return reason
         for low, high in self.ordered:
             if not getattr(snapshot, low) < getattr(snapshot, high):
@@ -130,8 +127,7 @@ class ParameterTable(Generic[T]):
 
     def _unusable(self, snapshot: T, before: T) -> str:
         """Return why nothing can be built from values that fit each for itself, or ''."""
-        error = self._build_error(snapshot)
-        if not error:
+        if not (error := self._build_error(snapshot)):
             return ''
         changed = [row for name, row in self.rows.items()
                    if getattr(snapshot, name) != getattr(before, name)]

@@ -5,7 +5,6 @@
 
 from koopman_ros.plants.excitation import ExcitationError, random_steps, RandomStepDesign
 from koopman_ros.plants.library.reactor import (
-    NOMINAL_COOLANT_TEMPERATURE,
     one_state_reactor,
     ReactorParameters,
     two_state_reactor,
@@ -17,15 +16,14 @@ from koopman_ros.plants.simulation import (
     advance,
     IntegrationError,
     IntegrationFailure,
-    IntegratorSettings,
     sample_derivatives,
     simulate,
 )
 from koopman_ros.plants.system import ControlAffineSystem, equilibrium_input, EquilibriumError
 
-__all__ = ['NOMINAL_COOLANT_TEMPERATURE', 'Actuator', 'ControlAffineSystem', 'EquilibriumError',
-           'ExcitationError', 'IntegrationError', 'IntegrationFailure', 'IntegratorSettings',
-           'Process', 'RandomStepDesign', 'ReactorParameters', 'advance', 'equilibrium_input',
-           'in_steps', 'one_state_reactor', 'random_steps', 'sample_derivatives',
+__all__ = ['Actuator', 'ControlAffineSystem', 'EquilibriumError',
+           'ExcitationError', 'IntegrationError', 'IntegrationFailure', 'Process',
+           'RandomStepDesign', 'ReactorParameters', 'advance', 'equilibrium_input', 'in_steps',
+           'one_state_reactor', 'random_steps', 'sample_derivatives',
            'scalar_example', 'sensor_noise', 'simulate', 'two_state_example',
            'two_state_reactor']

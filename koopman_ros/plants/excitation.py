@@ -9,14 +9,15 @@ import math
 import numpy as np
 from numpy.typing import ArrayLike
 
+from koopman_ros.arrays import Array
 from koopman_ros.plant_data import Episode
 from koopman_ros.plants.simulation import (
+    integration_limits,
     IntegrationError,
     IntegrationFailure,
-    IntegratorSettings,
     simulate,
 )
-from koopman_ros.plants.system import checked_vector, ControlAffineSystem, FloatArray
+from koopman_ros.plants.system import checked_vector, ControlAffineSystem
 
 
 class ExcitationError(ValueError):
@@ -41,7 +42,7 @@ class RandomStepDesign:
     hold_time: float | tuple[float, float]
     sample_period: float  #: time between samples, in time units
     max_redraws: int = 100  #: how many other levels are tried for a step that would leave the box
-    rtol: float = 1e-10  #: relative tolerance of the simulation, as in `IntegratorSettings`
+    rtol: float = 1e-10  #: relative tolerance of the simulation, as in `integration_limits`
 
     def __post_init__(self) -> None:
         if not 0.0 < self.sample_period < math.inf:
@@ -70,11 +71,9 @@ def random_steps(system: ControlAffineSystem, design: RandomStepDesign, duration
     Drive a plant through random steps of its inputs (paper, section on the reactor).
 
     Each step is simulated before it is taken. If the state would leave the box its level is drawn
-    again, its length kept. The last step is cut short at `duration`. The same seed gives the same
-    bits.
+    again, its length kept. The last step is cut short. The same seed gives the same bits.
 
     :param duration: length of the trajectory, in time units: a multiple of the sample period.
-    :param seed: seed of numpy's default generator.
     :param x0: initial state (n_x,); the nominal one when None.
     :raises ValueError: when the system has no input or an argument does not fit it.
     :raises ExcitationError: when the trajectory begins outside the box, or no level that was
@@ -84,7 +83,7 @@ def random_steps(system: ControlAffineSystem, design: RandomStepDesign, duration
         raise ValueError(f'{system.name} has no input to step; choose initial states instead')
     holds = _whole_samples(duration, design.sample_period, system.time_unit)
     levels, box = _bounds(system, design)
-    settings = IntegratorSettings(rtol=design.rtol, lower=box[0], upper=box[1])
+    limits = integration_limits(system, design.rtol, *box)
     state = system.nominal_state if x0 is None else system.checked_state('x0', x0)
     if not np.all((state >= box[0]) & (state <= box[1])):
         raise ExcitationError(
@@ -98,7 +97,7 @@ def random_steps(system: ControlAffineSystem, design: RandomStepDesign, duration
             try:
                 return simulate(
                     system, state, np.tile(level, (length, 1)), design.sample_period,
-                    start_time=sample * design.sample_period, settings=settings)
+                    start_time=sample * design.sample_period, limits=limits)
             except IntegrationError as error:
                 if error.failure is not IntegrationFailure.OUT_OF_BOUNDS:
                     raise
@@ -125,7 +124,7 @@ def random_steps(system: ControlAffineSystem, design: RandomStepDesign, duration
 
 
 def _bounds(system: ControlAffineSystem, design: RandomStepDesign
-            ) -> tuple[tuple[FloatArray, FloatArray], tuple[FloatArray, FloatArray]]:
+            ) -> tuple[tuple[Array, Array], tuple[Array, Array]]:
     """Return ranges of the levels and of the states, as far as the model holds there."""
     lower = np.maximum(
         system.checked_bound('state_lower', design.state_lower), system.state_lower)
@@ -149,12 +148,11 @@ def _whole_samples(duration: float, sample_period: float, time_unit: str) -> int
     return round(count)
 
 
-def _violation(system: ControlAffineSystem, box: tuple[FloatArray, FloatArray], state: FloatArray
+def _violation(system: ControlAffineSystem, box: tuple[Array, Array], state: Array
                ) -> str:
     """Name the first state variable that is outside the box, its value and its range."""
     lower, upper = box
     i = int(np.argmax((state < lower) | (state > upper)))
     unit = '' if system.state_units[i] == '1' else f' {system.state_units[i]}'
-    return (
-        f'{system.state_names[i]} reached {state[i]:.6g}{unit}, outside the box '
-        f'[{lower[i]:.10g}, {upper[i]:.10g}]{unit}')
+    return (f'{system.state_names[i]} reached {state[i]:.6g}{unit}, outside the box '
+            f'[{lower[i]:.10g}, {upper[i]:.10g}]{unit}')

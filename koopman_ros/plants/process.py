@@ -10,8 +10,9 @@ import math
 
 import numpy as np
 
+from koopman_ros.arrays import Array
 from koopman_ros.plants.simulation import advance
-from koopman_ros.plants.system import ControlAffineSystem, FloatArray
+from koopman_ros.plants.system import ControlAffineSystem
 from koopman_ros.units import NANOSECONDS
 
 # After so many time constants exp(-40) of a step is left, less than a double can tell.
@@ -34,38 +35,26 @@ class Process:
 
     system: ControlAffineSystem  #: the plant
     time_ns: int  #: present time, in integer nanoseconds so that instants repeat exactly
-    x: FloatArray  #: present state (n_x,)
-    u: FloatArray  #: input (n_u,) that acts, up to the present time
+    x: Array  #: present state (n_x,)
+    u: Array  #: input (n_u,) that acts, up to the present time
     actuator: Actuator = Actuator()  #: between commands and input
-    command: FloatArray | None = None  #: what the input follows (n_u,); None for what it is
+    command: Array | None = None  #: what the input follows (n_u,); None for what it is
     #: commands that take effect later, by rising time: (time in ns, command (n_u,))
-    pending: tuple[tuple[int, FloatArray], ...] = ()
+    pending: tuple[tuple[int, Array], ...] = ()
 
     @property
-    def followed(self) -> FloatArray:
+    def followed(self) -> Array:
         """What the input follows (n_u,)."""
         return self.u if self.command is None else self.command
 
-    def commanded(self, command: FloatArray, time_ns: int) -> Process:
-        """
-        Return the process with a command given at a time.
-
-        It supersedes commands that would take effect at the same time or later, such as those
-        given before the delay was shortened.
-        """
+    def commanded(self, command: Array, time_ns: int) -> Process:
+        """Return the process with a command given, in place of any that would act later."""
         effect_ns = time_ns + round(self.actuator.delay * NANOSECONDS)
         earlier = tuple(entry for entry in self.pending if entry[0] < effect_ns)
         return replace(self, pending=(*earlier, (effect_ns, command)))
 
     def until(self, time_ns: int) -> Process:
-        """
-        Return the process at a later time, under the commands that took effect before it.
-
-        An earlier time returns it unchanged.
-
-        :raises IntegrationError: when the state leaves the bounds of the system, e.g. because
-            the reactor ran away.
-        """
+        """Return the process at a later time, else itself; raise IntegrationError past bounds."""
         now = self
         while now.pending and now.pending[0][0] < time_ns:
             (effect_ns, command), *later = now.pending
@@ -91,7 +80,7 @@ class Process:
             self.system, now.x, goal, time_ns - now.time_ns))
 
 
-def _moved(system: ControlAffineSystem, x: FloatArray, u: FloatArray, time_ns: int) -> FloatArray:
+def _moved(system: ControlAffineSystem, x: Array, u: Array, time_ns: int) -> Array:
     """Return a state (n_x,) so many nanoseconds later."""
     if time_ns == 0:
         return x
@@ -102,19 +91,16 @@ def _with_input_lag(system: ControlAffineSystem, time_constant: float) -> Contro
     """
     Put a first-order lag before each input: d[x; v]/dt = [f(x) + B v; -v / tau] + [0; u / tau].
 
-    The system that results is control-affine again; its last n_u states are the inputs v that
-    act, its input u is what they follow.
-
-    :param time_constant: tau, in time units, above 0.
+    The inputs v that act become states; the time constant tau is in time units, above 0.
     """
     n_x, n_u = system.n_x, system.n_u
     rate = 1.0 / time_constant
 
-    def drift(state: FloatArray) -> FloatArray:
+    def drift(state: Array) -> Array:
         x, v = state[..., :n_x], state[..., n_x:]
         return np.concatenate([system.derivative(x, v), -rate * v], axis=-1)
 
-    def drift_jacobian(state: FloatArray) -> FloatArray:
+    def drift_jacobian(state: Array) -> Array:
         jacobian = np.zeros((*state.shape, n_x + n_u))
         jacobian[..., :n_x, :n_x] = system.drift_jacobian(state[..., :n_x])
         jacobian[..., :n_x, n_x:] = system.B
@@ -137,22 +123,12 @@ def _with_input_lag(system: ControlAffineSystem, time_constant: float) -> Contro
 
 
 def sensor_noise(deviation: float, seed: int, sample: int) -> float:
-    """
-    Return the noise of one sample, the same for the same seed and number.
-
-    :param deviation: standard deviation, in state units.
-    :param seed: seed of the run, not negative.
-    :param sample: number of the sample, not negative.
-    """
+    """Return the noise of one sample of a standard deviation, the same for seed and number."""
     if deviation == 0.0:
         return 0.0
     return deviation * float(np.random.default_rng((seed, sample)).standard_normal())
 
 
 def in_steps(value: float, resolution: float) -> float:
-    """
-    Return the nearest value that a sensor of finite resolution can show.
-
-    :param resolution: distance between two such values, the multiples of it; 0 shows all.
-    """
+    """Return the nearest multiple of a sensor's resolution; 0 shows every value."""
     return value if resolution == 0.0 else value - math.remainder(value, resolution)

@@ -4,7 +4,6 @@
 """Simulation of a plant whose input is held constant over each sample period."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 from enum import Enum
 import math
 from typing import NamedTuple
@@ -13,9 +12,9 @@ import numpy as np
 from numpy.typing import ArrayLike
 from scipy.integrate import DOP853
 
-from koopman_ros.arrays import frozen
+from koopman_ros.arrays import Array, frozen
 from koopman_ros.plant_data import Episode, Samples
-from koopman_ros.plants.system import ControlAffineSystem, FloatArray
+from koopman_ros.plants.system import ControlAffineSystem
 
 LOOSEST_RTOL = 1e-9
 # What scipy still keeps; it takes tighter tolerances for this one, with a warning.
@@ -37,80 +36,55 @@ class Limits(NamedTuple):
     """Tolerances and state bounds (n_x,) of an integration, for one system."""
 
     rtol: float
-    atol: FloatArray
-    lower: FloatArray
-    upper: FloatArray
+    atol: Array
+    lower: Array
+    upper: Array
 
 
 class IntegrationError(RuntimeError):
     """
-    A simulation could not reach the end of its time.
+    A simulation could not reach the end of its time, with plant, state, cause and next step.
 
-    :param sentence: the message: plant, state with units, time, cause and the next step.
-    :param failure: the cause.
-    :param time: when, in time units.
-    :param state: the offending state (n_x,).
+    :ivar failure: the cause.
+    :ivar time: when, in time units.
+    :ivar state: the offending state (n_x,).
     """
 
-    def __init__(self, sentence: str, failure: IntegrationFailure, time: float, state: FloatArray
+    def __init__(self, sentence: str, failure: IntegrationFailure, time: float, state: Array
                  ) -> None:
         # All of them as args, so that the error survives pickling between processes.
         super().__init__(sentence, failure, time, state)
-        self.sentence = sentence
         self.failure = failure
         self.time = time
         self.state = state
 
     def __str__(self) -> str:
-        return self.sentence
+        return str(self.args[0])
 
 
-@dataclass(frozen=True, eq=False)
-class IntegratorSettings:
+def integration_limits(system: ControlAffineSystem, rtol: float = 1e-10,
+                       lower: Array | None = None, upper: Array | None = None) -> Limits:
     """
-    Tolerances and state bounds of an integration.
+    Return the precision of an integration, and its bounds, by default the system's own.
 
-    :raises ValueError: when `rtol` is outside its range.
+    The absolute tolerance is `rtol` times the magnitude of each nominal state.
+
+    :param rtol: relative tolerance of each integration step, in [2.3e-14, 1e-9].
+    :raises ValueError: when a tolerance cannot be used.
     """
-
-    rtol: float = 1e-10  #: relative tolerance of each integration step, in [2.3e-14, 1e-9]
-    #: absolute tolerance of each, a scalar or (n_x,), in state units and above 0; `rtol` times the
-    #: magnitude of each nominal state when None
-    atol: ArrayLike | None = None
-    #: lowest states allowed, a scalar or (n_x,); the system's own when None
-    lower: ArrayLike | None = None
-    #: highest states allowed, a scalar or (n_x,); the system's own when None
-    upper: ArrayLike | None = None
-
-    def __post_init__(self) -> None:
-        if not TIGHTEST_RTOL <= self.rtol <= LOOSEST_RTOL:
-            raise ValueError(
-                f'rtol is {self.rtol:.3g}, must lie in [{TIGHTEST_RTOL:.3g}, {LOOSEST_RTOL:.3g}]')
-
-
-_DEFAULT_SETTINGS = IntegratorSettings()
-
-
-def resolved_limits(system: ControlAffineSystem, settings: IntegratorSettings) -> Limits:
-    """
-    Fill in what `settings` leaves to the system.
-
-    :raises ValueError: when a bound or a tolerance does not fit.
-    """
-    scale = settings.rtol * system.state_scale
-    atol = scale if settings.atol is None else system.checked_bound('atol', settings.atol)
-    # Zero would divide zero by zero in the error norm of a state that is exactly zero.
+    if not TIGHTEST_RTOL <= rtol <= LOOSEST_RTOL:
+        raise ValueError(
+            f'rtol is {rtol:.3g}, must lie in [{TIGHTEST_RTOL:.3g}, {LOOSEST_RTOL:.3g}]')
+    atol = rtol * system.state_scale
+    # zero would divide zero by zero in the error norm of a state that is exactly zero
     if not np.all((atol > 0.0) & (atol < np.inf)):
         raise ValueError(f'atol is {atol}, must be finite and above 0')
-    lower, upper = (
-        own if bound is None else system.checked_bound(name, bound) for name, bound, own in (
-            ('lower', settings.lower, system.state_lower),
-            ('upper', settings.upper, system.state_upper)))
-    return Limits(settings.rtol, atol, lower, upper)
+    return Limits(rtol, atol, system.state_lower if lower is None else lower,
+                  system.state_upper if upper is None else upper)
 
 
-def hold(system: ControlAffineSystem, start: FloatArray, u: FloatArray, duration: float,
-         limits: Limits, *, start_time: float = 0.0) -> FloatArray:
+def hold(system: ControlAffineSystem, start: Array, u: Array, duration: float,
+         limits: Limits, *, start_time: float = 0.0) -> Array:
     """
     Integrate a state over one hold with the explicit Runge-Kutta pair DOP853.
 
@@ -118,26 +92,23 @@ def hold(system: ControlAffineSystem, start: FloatArray, u: FloatArray, duration
     history again, so that over one second it is no quicker, and its error at the same tolerance
     is larger by orders of magnitude. The plants are not stiff within their bounds.
 
-    :param start: state at its start (n_x,).
-    :param u: the held input (n_u,).
-    :param duration: its length, in time units.
     :param start_time: time of its start, for the message of an error.
-    :return: state at its end (n_x,).
+    :return: the state at its end (n_x,).
     :raises IntegrationError: when the end is not reached.
     """
     forcing = u @ system.B.T
 
-    def rate(_: float, x: FloatArray) -> FloatArray:
+    def rate(_: float, x: Array) -> Array:
         return system.drift(x) + forcing
 
-    def failed(failure: IntegrationFailure, elapsed: float, x: FloatArray) -> IntegrationError:
+    def failed(failure: IntegrationFailure, elapsed: float, x: Array) -> IntegrationError:
         return _integration_error(system, limits, failure, start_time + elapsed, x)
 
     # Stages of a step that is then rejected may overflow.
     with np.errstate(all='ignore'):
         if not _inside(start, limits):
             raise failed(IntegrationFailure.OUT_OF_BOUNDS, 0.0, start)
-        # DOP853 would never return from a first step that begins with an infinite rate.
+        # DOP853 would never return from a first step that begins with an infinite rate
         if not np.all(np.isfinite(rate(0.0, start))):
             raise failed(IntegrationFailure.NON_FINITE, 0.0, start)
         if duration == 0.0:
@@ -145,7 +116,7 @@ def hold(system: ControlAffineSystem, start: FloatArray, u: FloatArray, duration
         solver = DOP853(rate, 0.0, start, duration, rtol=limits.rtol, atol=limits.atol)
         for _ in range(_MAX_STEPS_PER_HOLD):
             solver.step()
-            x: FloatArray = solver.y
+            x: Array = solver.y
             if solver.status == 'failed':
                 raise failed(IntegrationFailure.STEP_TOO_SMALL, solver.t, x)
             if not _inside(x, limits):
@@ -155,86 +126,68 @@ def hold(system: ControlAffineSystem, start: FloatArray, u: FloatArray, duration
         raise failed(IntegrationFailure.TOO_MANY_STEPS, solver.t, x)
 
 
-def _inside(x: FloatArray, limits: Limits) -> bool:
+def _inside(x: Array, limits: Limits) -> bool:
     return bool(np.all((x >= limits.lower) & (x <= limits.upper)))
 
 
 def _integration_error(system: ControlAffineSystem, limits: Limits, failure: IntegrationFailure,
-                       time: float, state: FloatArray) -> IntegrationError:
+                       time: float, state: Array) -> IntegrationError:
     outside = ''.join(
         f', {name} outside [{lower:.10g}, {upper:.10g}]{"" if unit == "1" else " " + unit}'
         for name, unit, x, lower, upper in zip(
             system.state_names, system.state_units, state, limits.lower, limits.upper,
             strict=True)
         if not lower <= x <= upper)
-    sentence = (
+    return IntegrationError(
         f'{system.name}: {system.describe_state(state)} at {time:.6g} {system.time_unit}'
-        f'{outside}: {failure.value}')
-    return IntegrationError(sentence, failure, time, state.copy())
+        f'{outside}: {failure.value}', failure, time, state.copy())
 
 
-def advance(system: ControlAffineSystem, x: ArrayLike, u: ArrayLike, duration: float, *,
-            settings: IntegratorSettings = _DEFAULT_SETTINGS) -> FloatArray:
+def advance(system: ControlAffineSystem, x: ArrayLike, u: ArrayLike, duration: float) -> Array:
     """
-    Integrate a plant over one interval with its input held constant.
+    Integrate a state (n_x,) over one interval with the input (n_u,) held constant.
 
-    :param x: the state at its start (n_x,).
-    :param u: the held input (n_u,).
     :param duration: its length, in time units, >= 0.
-    :return: the state at its end (n_x,).
     :raises ValueError: when an argument does not fit.
     :raises IntegrationError: when the end is not reached; its time counts from the start.
     """
     if not 0.0 <= duration < math.inf:
         raise ValueError(
             f'duration is {duration} {system.time_unit}, must be finite and not negative')
-    start, held = system.checked_state('x', x), system.checked_input('u', u)
-    return hold(system, start, held, duration, resolved_limits(system, settings))
+    return hold(system, system.checked_state('x', x), system.checked_input('u', u), duration,
+                integration_limits(system))
 
 
 def simulate(system: ControlAffineSystem, x0: ArrayLike, inputs: ArrayLike, sample_period: float,
-             *, substeps: int = 1, start_time: float = 0.0,
-             settings: IntegratorSettings = _DEFAULT_SETTINGS) -> Episode:
+             *, start_time: float = 0.0, limits: Limits | None = None) -> Episode:
     """
     Simulate a plant under zero-order-hold inputs.
 
-    :param x0: initial state (n_x,).
-    :param inputs: inputs (K, n_u), each held for one sample period; (K, 0) without inputs.
-    :param sample_period: length of each hold, in time units, > 0.
-    :param substeps: samples recorded in each hold; the episode then has K * substeps + 1.
-    :param start_time: time of `x0`, in time units.
-    :return: the states at all samples, and an input for each but the last.
+    :param x0: initial state (n_x,), at `start_time`.
+    :param inputs: inputs (K, n_u), each held for one sample period, in time units.
+    :param limits: precision and bounds, by default those of :func:`integration_limits`.
+    :return: the states at K + 1 samples, and an input for each but the last.
     :raises ValueError: when an argument does not fit.
     :raises IntegrationError: when the end is not reached.
     """
     x = system.checked_state('x0', x0)
-    held = frozen(inputs, 'inputs', (None, system.n_u))
+    held = np.array(frozen(inputs, 'inputs', (None, system.n_u)))
     if not 0.0 < sample_period < math.inf:
         raise ValueError(
             f'sample_period is {sample_period} {system.time_unit}, must be finite and above 0')
-    if substeps < 1:
-        raise ValueError(f'substeps is {substeps}, must be at least 1')
-    # each by itself, so that no round-off adds up, and the same at the ends of the holds
-    # whatever `substeps` is
-    times = start_time + sample_period * (np.arange(len(held) * substeps + 1) / substeps)
-    held = np.repeat(held, substeps, axis=0)
-    limits = resolved_limits(system, settings)
+    # each by itself, so that no round-off adds up
+    times = start_time + sample_period * np.arange(float(len(held) + 1))
+    limits = limits or integration_limits(system)
     states = np.empty((len(times), system.n_x))
     states[0] = x
     for n, u in enumerate(held):
-        states[n + 1] = hold(system, states[n], u, sample_period / substeps, limits,
+        states[n + 1] = hold(system, states[n], u, sample_period, limits,
                              start_time=float(times[n]))
     return Episode(times, states, times[:-1], held)
 
 
 def sample_derivatives(system: ControlAffineSystem, episodes: Sequence[Episode]) -> Samples:
-    """
-    Evaluate dx/dt exactly at the samples of simulated episodes, but for the last of each.
-
-    :param system: the plant.
-    :param episodes: as :func:`simulate` returns them, with an input for each sample but the last.
-    :raises ValueError: when the episodes are not of this system.
-    """
+    """Evaluate dx/dt exactly at the samples of episodes by :func:`simulate`, but the last."""
     return Samples(
         np.concatenate([episode.x[:-1] for episode in episodes]),
         np.concatenate([system.derivative(episode.x[:-1], episode.u) for episode in episodes]),

@@ -9,18 +9,17 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import ArrayLike
 
-from koopman_ros.arrays import Array as FloatArray
-from koopman_ros.arrays import frozen
+from koopman_ros.arrays import Array, frozen
 from koopman_ros.units import SECONDS_PER_TIME_UNIT
 
-ArrayFunction = Callable[[FloatArray], FloatArray]
+ArrayFunction = Callable[[Array], Array]
 
 
-def checked_vector(name: str, value: ArrayLike, length: int, *, finite: bool = True) -> FloatArray:
+def checked_vector(name: str, value: ArrayLike, length: int, *, finite: bool = True) -> Array:
     """Return :func:`frozen` of a vector, which may be given by one number for all of it."""
     array = np.asarray(value, dtype=np.float64)
-    return frozen(np.broadcast_to(array, (length,)) if array.ndim == 0 else array, name, (length,),
-                  finite=finite)
+    whole = np.broadcast_to(array, (length,)) if array.ndim == 0 else array
+    return frozen(whole, name, (length,), finite=finite)
 
 
 @dataclass(frozen=True, eq=False)
@@ -41,43 +40,37 @@ class ControlAffineSystem:
     drift: ArrayFunction = field(repr=False)  #: f, states (..., n_x) to rates (..., n_x)
     #: df/dx, states (..., n_x) to (..., n_x, n_x)
     drift_jacobian: ArrayFunction = field(repr=False)
-    B: FloatArray  #: input matrix (n_x, n_u)
-    nominal_state: FloatArray  #: the point (n_x,) that deviations are measured from
-    nominal_input: FloatArray  #: the input (n_u,) that goes with it
+    B: Array  #: input matrix (n_x, n_u)
+    nominal_state: Array  #: the point (n_x,) that deviations are measured from
+    nominal_input: Array  #: the input (n_u,) that goes with it
     #: lowest states (n_x,) at which the model means anything; none by default
-    state_lower: FloatArray = field(default_factory=lambda: np.array(-np.inf))
+    state_lower: Array = field(default_factory=lambda: np.array(-np.inf))
     #: highest such states (n_x,); none by default
-    state_upper: FloatArray = field(default_factory=lambda: np.array(np.inf))
+    state_upper: Array = field(default_factory=lambda: np.array(np.inf))
 
     def __post_init__(self) -> None:
         if self.time_unit not in SECONDS_PER_TIME_UNIT:
             raise ValueError(
                 f"time_unit is {self.time_unit!r}, must be one of "
                 f"{', '.join(map(repr, SECONDS_PER_TIME_UNIT))}")
-        for names, units in (('state_names', 'state_units'), ('input_names', 'input_units')):
-            self._set(names, tuple(getattr(self, names)))
-            self._set(units, tuple(getattr(self, units)))
-            if len(getattr(self, names)) != len(getattr(self, units)):
-                raise ValueError(
-                    f'incompatible {units}: expected ({len(getattr(self, names))},), '
-                    f'got ({len(getattr(self, units))},)')
+        for kind in ('state', 'input'):
+            names, units = (tuple(getattr(self, f'{kind}_{what}')) for what in ('names', 'units'))
+            object.__setattr__(self, f'{kind}_names', names)
+            object.__setattr__(self, f'{kind}_units', units)
+            if len(names) != len(units):
+                raise ValueError(f'incompatible {kind}_units: expected ({len(names)},), '
+                                 f'got ({len(units)},)')
         if not self.state_names:
             raise ValueError('state_names is empty, a system has at least one state')
-        self._set('B', frozen(self.B, 'B', (self.n_x, self.n_u)))
-        self._set('nominal_state', self.checked_state('nominal_state', self.nominal_state))
-        self._set('nominal_input', self.checked_input('nominal_input', self.nominal_input))
-        self._set('state_lower', self.checked_bound('state_lower', self.state_lower))
-        self._set('state_upper', self.checked_bound('state_upper', self.state_upper))
+        object.__setattr__(self, 'B', frozen(self.B, 'B', (self.n_x, self.n_u)))
+        for name, checked in (
+                ('nominal_state', self.checked_state), ('nominal_input', self.checked_input),
+                ('state_lower', self.checked_bound), ('state_upper', self.checked_bound)):
+            object.__setattr__(self, name, checked(name, getattr(self, name)))
         if not np.all(self.state_lower < self.state_upper):
             raise ValueError(
                 f'state_lower {self.state_lower} must lie below state_upper {self.state_upper}')
-        self._check_functions()
-
-    def _set(self, name: str, value: object) -> None:
-        object.__setattr__(self, name, value)
-
-    def _check_functions(self) -> None:
-        """Refuse a drift or a Jacobian that does not keep its leading axes."""
+        # a drift or a Jacobian that does not keep its leading axes
         single = self.nominal_state
         for state in (single, np.stack([single, single])):
             for name, function, expected in (
@@ -106,20 +99,13 @@ class ControlAffineSystem:
         return SECONDS_PER_TIME_UNIT[self.time_unit]
 
     @property
-    def state_scale(self) -> FloatArray:
+    def state_scale(self) -> Array:
         """The magnitude (n_x,) of each state: the nominal one, and 1 where that is zero."""
         magnitude = np.abs(self.nominal_state)
         return np.where(magnitude > 0.0, magnitude, 1.0)
 
-    def derivative(self, x: ArrayLike, u: ArrayLike) -> FloatArray:
-        """
-        Evaluate dx/dt = f(x) + B u.
-
-        :param x: states (..., n_x).
-        :param u: inputs (..., n_u), with leading axes that broadcast with those of `x`.
-        :return: rates (..., n_x), in state units per time unit.
-        :raises ValueError: when a last axis has the wrong length.
-        """
+    def derivative(self, x: ArrayLike, u: ArrayLike) -> Array:
+        """Evaluate dx/dt = f(x) + B u: (..., n_x), (..., n_u) that broadcast -> (..., n_x)."""
         x, u = np.asarray(x, dtype=np.float64), np.asarray(u, dtype=np.float64)
         for name, value, length in (('x', x, self.n_x), ('u', u, self.n_u)):
             if value.ndim == 0 or value.shape[-1] != length:
@@ -127,19 +113,19 @@ class ControlAffineSystem:
                     f'incompatible {name}: expected (..., {length}), got {value.shape}')
         return self.drift(x) + u @ self.B.T
 
-    def checked_state(self, name: str, value: ArrayLike) -> FloatArray:
+    def checked_state(self, name: str, value: ArrayLike) -> Array:
         """Return `value` as a read-only state (n_x,); raise ValueError naming it if it is none."""
         return frozen(value, name, (self.n_x,))
 
-    def checked_input(self, name: str, value: ArrayLike) -> FloatArray:
+    def checked_input(self, name: str, value: ArrayLike) -> Array:
         """Return `value` as a read-only input (n_u,); raise ValueError naming it if it is none."""
         return frozen(value, name, (self.n_u,))
 
-    def checked_bound(self, name: str, value: ArrayLike) -> FloatArray:
+    def checked_bound(self, name: str, value: ArrayLike) -> Array:
         """Return `value`, a scalar or (n_x,) and possibly infinite, as a bound on the states."""
         return checked_vector(name, value, self.n_x, finite=False)
 
-    def describe_state(self, x: FloatArray) -> str:
+    def describe_state(self, x: Array) -> str:
         """Write a state (n_x,) with names and units, for a message."""
         return ', '.join(
             f'{name} = {value:.10g}' + ('' if unit == '1' else f' {unit}')
@@ -150,15 +136,12 @@ class EquilibriumError(ValueError):
     """There is no steady state or no holding input where one was asked for."""
 
 
-def equilibrium_input(system: ControlAffineSystem, state: ArrayLike, *, tolerance: float = 1e-9
-                      ) -> FloatArray:
+def equilibrium_input(system: ControlAffineSystem, state: ArrayLike) -> Array:
     """
-    Find the constant input that holds a state: B u = -f(x) by least squares.
+    Find the constant input (n_u,) that holds a state (n_x,): B u = -f(x) by least squares.
 
-    :param state: the state to hold (n_x,).
-    :param tolerance: largest rate of each state that still counts as held, as a fraction of that
-        state per time unit.
-    :return: the input (n_u,).
+    A state is held when no state variable changes by more than 1e-9 of itself a time unit.
+
     :raises ValueError: when `state` does not fit the system.
     :raises EquilibriumError: when no input holds that state.
     """
@@ -167,7 +150,7 @@ def equilibrium_input(system: ControlAffineSystem, state: ArrayLike, *, toleranc
     rate = system.derivative(held, u)
     magnitude = np.where(held != 0.0, np.abs(held), system.state_scale)
     worst = int(np.argmax(np.abs(rate) / magnitude))
-    if not abs(rate[worst]) <= tolerance * magnitude[worst]:
+    if not abs(rate[worst]) <= 1e-9 * magnitude[worst]:
         raise EquilibriumError(
             f'{system.name}: no input holds {system.describe_state(held)}: '
             f'{system.state_names[worst]} still changes by {rate[worst]:.3g} '

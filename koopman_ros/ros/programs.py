@@ -14,7 +14,7 @@ import sys
 from typing import Any
 from xml.etree import ElementTree
 
-from koopman_ros.parameters import controller, plant, player, replay, trainer
+from koopman_ros.parameters import controller, plant, trainer
 from koopman_ros.parameters.table import ParameterTable
 from koopman_ros.resources import config_directory
 from koopman_ros.ros import topics
@@ -71,7 +71,7 @@ PROGRAMS = {
         'Publishes the measurements and set-points of a bag again, by the clock or in lock-step.',
         '0 when all was played or after a signal, 1 when it cannot start or go on, 2 for an '
         'unknown argument',
-        publishes=(*player.PlayerParameters().topics, topics.CLOCK, *STANDARD_TOPICS),
+        publishes=(*trainer.PlayerParameters().topics, topics.CLOCK, *STANDARD_TOPICS),
         subscribes=(topics.COOLANT_SETPOINT,),
         serves=STANDARD_SERVICES),
     'replay': Program(
@@ -83,7 +83,7 @@ PROGRAMS = {
 
 TABLES: dict[str, ParameterTable[Any]] = {
     'plant': plant.TABLE, 'controller': controller.TABLE, 'trainer': trainer.TABLE,
-    'player': player.TABLE, 'replay': replay.TABLE}
+    'player': trainer.PLAYER_TABLE, 'replay': controller.REPLAY_TABLE}
 
 # whoever moves the set-point, calls the services, tunes and watches: a person or a panel
 OPERATOR = Program(

@@ -9,8 +9,12 @@ middleware hangs. See :class:`Harness`, which needs no launch file.
 """
 
 from koopman_ros.testing.harness import Harness, HarnessError
-from koopman_ros.testing.process import deferred_interrupt, NodeProcess
-from koopman_ros.testing.reservations import isolated_domain, reserved_output
+from koopman_ros.testing.process import (
+           deferred_interrupt,
+           isolated_domain,
+           NodeProcess,
+           reserved_output,
+)
 
 __all__ = ['Harness', 'HarnessError', 'NodeProcess', 'deferred_interrupt', 'isolated_domain',
            'reserved_output']

@@ -25,11 +25,7 @@ _lock = threading.Lock()
 
 
 def guard(pid: int) -> None:
-    """
-    End a process with this one, by an interrupt first.
-
-    :param pid: of a child that leads a session of its own, and was not waited for yet.
-    """
+    """End a child, which leads a session and was not waited for yet, with this process."""
     own = os.getpid()
     with _lock:
         if own not in _pipes:

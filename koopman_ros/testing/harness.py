@@ -27,8 +27,7 @@ from rclpy.task import Future
 from std_srvs.srv import SetBool, Trigger
 
 from koopman_ros.ros.topics import DIAGNOSTICS, LOOP_QOS
-from koopman_ros.testing.process import NodeProcess
-from koopman_ros.testing.reservations import isolated_domain
+from koopman_ros.testing.process import isolated_domain, NodeProcess
 
 _TURN = 0.05  # s; how long the node listens before a condition is looked at again
 _ASK_AGAIN = 0.5  # s
@@ -51,9 +50,8 @@ class Harness:
             commands = ros.listen(Temperature, 'coolant_setpoint')
             ros.wait_until(lambda: len(commands) > 10, 'ten commands')
 
-    Leaving the context ends all processes, in order first and by force in the end, and raises
-    HarnessError when one of them ends with another code than 0. They end, too, when this process
-    is killed.
+    Leaving the context ends all processes, by force in the end, and raises HarnessError when one
+    of them ends with another code than 0. They end, too, when this process is killed.
 
     :param folder: for what the processes print, a file each; must exist.
     :param environment: variables for the processes, on top of the present ones.
@@ -101,11 +99,7 @@ class Harness:
                                         for name, code in ended.items() if code))
 
     def close(self) -> dict[str, int]:
-        """
-        End all processes, then the node.
-
-        :return: exit codes by name of the log, of those that were not told to end before.
-        """
+        """End all processes, then the node; return the codes, by log, of those ended by this."""
         try:
             # all at once, as some take their time
             left = [process for process in self.processes if not process.told_to_end]
@@ -123,11 +117,7 @@ class Harness:
     def start(self, name: str, parameters: Mapping[str, object] | None = None,
               arguments: tuple[str, ...] = (), command: tuple[str, ...] | None = None,
               called: str = '') -> NodeProcess:
-        """
-        Start a process; the arguments are those of :class:`NodeProcess`.
-
-        :param called: starts the name of its log, which is that of the node by default.
-        """
+        """Start a process as :class:`NodeProcess`, its log `called` as the node by default."""
         log = self.folder / f'{called or name}_{len(self.processes)}.log'
         process = NodeProcess(name, parameters or {}, log, self.environment, arguments, command)
         self.processes.append(process)
@@ -154,8 +144,7 @@ class Harness:
         Let the node work until a condition holds, and return what it returned.
 
         :param what: what is waited for, or what there is instead, for the error.
-        :param timeout: in s, that of the harness by default.
-        :raises HarnessError: after that time, or when a process ends that was not told to.
+        :raises HarnessError: after the timeout, or when a process ends that was not told to.
         """
         patience = self._timeout if timeout is None else timeout
         deadline = time.monotonic() + patience
@@ -185,8 +174,7 @@ class Harness:
         """
         Wait until the last status of a task meets a condition.
 
-        It may have been collected before the event that it is to show: a status comes on a topic
-        of its own, later or sooner than what else a node answers with, and again each second.
+        A status comes on a topic of its own, later or sooner than what else a node answers with.
         The condition has to hold for no status from before, e.g. by a count that it carries; what
         a test asserts of one status belongs into one condition.
         """
@@ -213,24 +201,15 @@ class Harness:
 
     def speak(self, kind: Any, topic: str, qos: QoSProfile = LOOP_QOS, *,
               to: str, subscribers: int = 1) -> Publisher:
-        """
-        Return a publisher that a node hears from the first message on.
-
-        :param to: name of the node.
-        :param subscribers: how many there are, with those of the bench.
-        """
+        """Return a publisher that a node and, with it, so many subscribers hear from the start."""
         publisher = self.node.create_publisher(kind, topic, qos)
         self.wait_until(lambda: publisher.get_subscription_count() >= subscribers)
         self.meet(to)
         return publisher
 
     def meet(self, node: str) -> None:
-        """
-        Wait until a node knows the topics and services that the bench has made so far.
-
-        It learns of the bench's readers, and of its writers, in the order in which they were
-        made: those of the service call in here come last.
-        """
+        """Wait until a node knows the topics and services that the bench has made so far."""
+        # it learns of them in the order in which they were made: this call's come last
         client = self.node.create_client(GetParameters, f'{node}/get_parameters')
         self.wait_until(client.service_is_ready)
         asked: list[Future] = []

@@ -1,24 +1,27 @@
 # SPDX-FileCopyrightText: 2026 The koopman_ros Authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""A node, or another program, as a process that is ended whatever happens."""
+"""A process that is ended whatever happens; the domain and folder that a run has reserved."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping
 import contextlib
+import hashlib
 import os
 from pathlib import Path
 import signal
+import socket
 import subprocess
 from types import TracebackType
 
-from koopman_ros.startup import blocked_signals, SIGNALS
-from koopman_ros.startup import command as child_command
+from koopman_ros import startup
+from koopman_ros.resources import config_directory, LOOPBACK_PROFILE
 from koopman_ros.testing.guard import guard
 
 STOP_TIMEOUT = 10.0  # s from a signal to the end of a process
 _ABORT_TIMEOUT = 1.0  # s from SIGABRT, at which Python prints where it is, to SIGKILL
+_DOMAINS = range(1, 102)
 
 
 class NodeProcess:
@@ -31,7 +34,6 @@ class NodeProcess:
     :param environment: variables on top of the present ones.
     :param arguments: further ROS arguments, e.g. ``('-r', '__ns:=/unit_1')``.
     :param command: what to run instead of a node of this package.
-
     :ivar told_to_end: whether its end is expected, e.g. after :meth:`stop`.
     """
 
@@ -43,9 +45,9 @@ class NodeProcess:
         self.told_to_end = False
         given = [part for key, value in parameters.items()
                  for part in ('-p', f'{key}:={_as_argument(value)}')]
-        program = command or child_command(
+        program = command or startup.command(
             f'koopman_ros.nodes.{name}', signal.SIGINT, interrupted=0)
-        waiting = contextlib.nullcontext() if command else blocked_signals()
+        waiting = contextlib.nullcontext() if command else startup.blocked_signals()
         ros_arguments = ['--ros-args', *given, *arguments] if given or arguments else []
         with open(log, 'wb') as output, waiting:
             # a session of its own: an interrupt of the terminal is passed on by us, in order
@@ -73,12 +75,10 @@ class NodeProcess:
 
     def wait(self, timeout: float | None = None) -> int:
         """
-        Wait until the process ends, by itself or after a signal; abort it when that takes long.
+        Wait until the process ends and return its exit code; abort it when that takes long.
 
-        A Python process that is aborted prints where it was.
-
-        :param timeout: in s, `STOP_TIMEOUT` by default.
-        :return: its exit code; negative after a signal that it did not handle.
+        A Python process that is aborted prints where it was. The code is negative after a signal
+        that it did not handle; the timeout is `STOP_TIMEOUT` seconds by default.
         """
         self.told_to_end = True
         patience = STOP_TIMEOUT if timeout is None else timeout
@@ -105,10 +105,8 @@ class NodeProcess:
 def _as_argument(value: object) -> str:
     """Write a parameter value for the command line, keeping its type."""
     if isinstance(value, bool):
-        return 'true' if value else 'false'
-    if isinstance(value, (tuple, list)):
-        return '[' + ','.join(str(item) for item in value) + ']'
-    return str(value)
+        return str(value).lower()
+    return f'[{",".join(map(str, value))}]' if isinstance(value, tuple | list) else str(value)
 
 
 @contextlib.contextmanager
@@ -117,8 +115,7 @@ def deferred_interrupt() -> Iterator[Callable[[], None]]:
     Let a signal raise KeyboardInterrupt where the yielded function is called, and at the end.
 
     One that comes while Python looks after a child leaves the child's lock taken for ever, and
-    one inside the middleware's extension comes out as another error. The processes live in
-    sessions of their own: without us nobody would end them.
+    one inside the middleware's extension comes out as another error.
     """
     pending: list[bool] = []
 
@@ -127,10 +124,87 @@ def deferred_interrupt() -> Iterator[Callable[[], None]]:
             raise KeyboardInterrupt
 
     before = {number: signal.signal(number, lambda *_: pending.append(True))
-              for number in SIGNALS}
+              for number in startup.SIGNALS}
     try:
         yield check
     finally:
         for number, handler in before.items():
             signal.signal(number, handler)
     check()
+
+
+@contextlib.contextmanager
+def isolated_domain() -> Iterator[dict[str, str]]:
+    """
+    Reserve a ROS domain on loopback that no other run on this machine uses.
+
+    Yields the environment variables of the run, which hold for this process, too, until the end.
+    A middleware that RMW_IMPLEMENTATION names stays, else it is Fast DDS, whose profile keeps
+    everything on 127.0.0.1 and says what else it is for.
+
+    :raises RuntimeError: when all domains are taken.
+    """
+    middleware = os.environ.get('RMW_IMPLEMENTATION') or 'rmw_fastrtps_cpp'
+    with _reserved_domain() as domain:
+        environment = {
+            'ROS_DOMAIN_ID': str(domain),
+            'RMW_IMPLEMENTATION': middleware,
+            # the profile alone says where to look; others do not read it
+            'ROS_AUTOMATIC_DISCOVERY_RANGE': (
+                'SYSTEM_DEFAULT' if 'fastrtps' in middleware else 'LOCALHOST'),
+            'FASTRTPS_DEFAULT_PROFILES_FILE': str(config_directory() / LOOPBACK_PROFILE),
+        }
+        before = {name: os.environ.get(name) for name in environment}
+        os.environ.update(environment)
+        try:
+            yield environment
+        finally:
+            for name, value in before.items():
+                os.environ.pop(name)
+                if value is not None:
+                    os.environ[name] = value
+
+
+@contextlib.contextmanager
+def _reserved_domain() -> Iterator[int]:
+    # runs side by side start looking at different places
+    offset = os.getpid() % len(_DOMAINS)
+    for domain in (*_DOMAINS[offset:], *_DOMAINS[:offset]):
+        with _reservation(f'domain_{domain}') as mine:
+            if mine:
+                yield domain
+                return
+    raise RuntimeError('all ROS domains are taken by other runs: wait until one ends')
+
+
+@contextlib.contextmanager
+def reserved_output(wanted: Path) -> Iterator[Path]:
+    """
+    Reserve a folder for the results of a run.
+
+    It is the one wanted or, while another run on this machine writes there, the first of demo-2,
+    demo-3, ... that is free.
+    """
+    folder, number = wanted, 1
+    while True:
+        # a name of a socket has little room
+        digest = hashlib.sha256(os.fsencode(folder.resolve())).hexdigest()[:32]
+        with _reservation(f'output_{digest}') as mine:
+            if mine:
+                yield folder
+                return
+        number += 1
+        folder = wanted.with_name(f'{wanted.name}-{number}')
+
+
+@contextlib.contextmanager
+def _reservation(name: str) -> Iterator[bool]:
+    """Hold a name on this machine; yields whether nobody else holds it."""
+    with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as held:
+        mine = True
+        try:
+            # an abstract name: whoever's process holds it, it goes when the process ends
+            held.bind(f'\0koopman_ros_{name}')
+        except OSError:
+            mine = False
+        yield mine

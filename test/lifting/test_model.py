@@ -29,26 +29,6 @@ def states(n_x, count=20, seed=1):
     return np.random.default_rng(seed).uniform(-1.5, 1.5, (count, n_x))
 
 
-def dictionary_model():
-    observables = PolynomialObservables.total_degree(2, 3)
-    return replace(random_lift(), observables=observables, A=-np.eye(observables.n_z))
-
-
-@pytest.mark.parametrize('model', [
-    random_lift(), random_lift(3, (5, 4), identity=False, activation='sine'), dictionary_model()])
-def test_a_model_lifts_as_its_observables_do(model):
-    observables, x = model.observables, states(model.n_x)
-    assert (model.n_x, model.n_z, model.identity) == (
-        observables.n_x, observables.n_z, observables.identity)
-    np.testing.assert_array_equal(model.lift(x), observables.lift(x))
-    np.testing.assert_array_equal(model.jacobian(x), observables.lift_and_jacobian(x)[1])
-    for ours, theirs in (
-            (model.lift_and_jacobian(x), observables.lift_and_jacobian(x)),
-            (model.lift_and_secants(*x[:3]), observables.lift_and_secants(*x[:3]))):
-        for a, b in zip(ours, theirs, strict=True):
-            np.testing.assert_array_equal(a, b)
-
-
 @pytest.mark.parametrize('identity', [True, False])
 @pytest.mark.parametrize(('n_x', 'widths'), [
     (n_x, widths) for n_x in (1, 2, 3) for widths in ((6,), (5, 4))])
@@ -88,18 +68,6 @@ def test_drift_of_a_dictionary_by_hand():
     np.testing.assert_array_equal(model.linearised.A, [[-1.0]])
 
 
-@pytest.mark.parametrize('columns', [(), (1,), (3,)])
-def test_rates_of_monomials_are_read_by_the_rows_of_the_states(columns):
-    model = dictionary_model()
-    rate = np.random.default_rng(3).normal(size=(model.n_z, *columns))
-    for J in (model.jacobian(x) for x in states(2)):
-        np.testing.assert_array_equal(model.onto_states(J, rate), rate[:2])
-    if columns:
-        both = np.stack([rate, -rate])
-        np.testing.assert_array_equal(
-            model.onto_states(model.jacobian(states(2, 2)), both), both[:, :2])
-
-
 def linear_reactor():
     system = two_state_reactor()
     below, above = np.array([0.1, 9.0]), np.array([0.1, 5.0])
@@ -111,17 +79,6 @@ def linear_reactor():
         Coordinates(system.input_names, system.input_units, system.nominal_input,
                     np.array([7.0]), np.array([290.0]), np.array([310.0])),
         system.time_unit, Provenance(system.name))
-
-
-def test_linearisation_is_a_lift_with_itself():
-    _, model = linear_reactor()
-    x = states(2)
-    np.testing.assert_array_equal(model.lift(x), x)
-    np.testing.assert_array_equal(model.jacobian(x), np.broadcast_to(np.eye(2), (20, 2, 2)))
-    np.testing.assert_allclose(model.drift(x), x @ model.A.T, rtol=1e-14, atol=1e-15)
-    M, H = model.lift_and_secants(x[0], x[1], x[2])[2:]
-    np.testing.assert_array_equal(M, np.eye(2))
-    np.testing.assert_array_equal(H, np.zeros((2, 2)))
 
 
 def test_linearisation_in_units_has_the_eigenvalues_of_the_plant():

@@ -30,7 +30,7 @@ from koopman_ros.nodes.plant import PlantNode
 from koopman_ros.nodes.player import PlayerNode
 from koopman_ros.nodes.replay import Names, replayed_bag
 from koopman_ros.nodes.trainer import TrainerNode
-from koopman_ros.parameters.replay import ReplayParameters
+from koopman_ros.parameters.controller import ReplayParameters
 from koopman_ros.parameters.table import ConfigurationError, Specification
 from koopman_ros.parameters.trainer import TrainerParameters
 from koopman_ros.resources import model_path

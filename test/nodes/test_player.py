@@ -25,8 +25,8 @@ from koopman_ros import bags
 from koopman_ros.demo.loop import run_loop, Scenario
 from koopman_ros.nodes import player
 from koopman_ros.nodes.replay import Names, replayed_bag
-from koopman_ros.parameters.player import PlayerParameters
-from koopman_ros.parameters.replay import ReplayParameters
+from koopman_ros.parameters.controller import ReplayParameters
+from koopman_ros.parameters.trainer import PlayerParameters
 from koopman_ros.resources import config_directory
 from koopman_ros.ros import topics
 from koopman_ros.ros.codec import stamp_nanoseconds

@@ -21,7 +21,7 @@ from std_msgs.msg import String
 from koopman_ros.bags import BagReadError
 from koopman_ros.nodes import replay
 from koopman_ros.nodes.replay import Names
-from koopman_ros.parameters.replay import ReplayParameters
+from koopman_ros.parameters.controller import ReplayParameters
 from koopman_ros.replay.records import parse, Record, SNAPSHOT
 from koopman_ros.replay.report import ReplayedBag, reproduced, verdict
 from koopman_ros.replay.sources import read_records

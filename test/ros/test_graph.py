@@ -25,7 +25,7 @@ from std_srvs.srv import SetBool
 
 from koopman_ros.bags import BagWriter, message_definition
 from koopman_ros.nodes import replay
-from koopman_ros.parameters.player import PlayerParameters
+from koopman_ros.parameters.trainer import PlayerParameters
 from koopman_ros.ros import topics
 from koopman_ros.ros.node import LoopNode
 from koopman_ros.ros.programs import OPERATOR, policy, Program, PROGRAMS

@@ -10,12 +10,8 @@ import numpy as np
 from numpy.typing import ArrayLike
 from scipy.optimize import brentq
 
-from koopman_ros.plants.system import (
-    ArrayFunction,
-    ControlAffineSystem,
-    EquilibriumError,
-    FloatArray,
-)
+from koopman_ros.arrays import Array
+from koopman_ros.plants.system import ArrayFunction, ControlAffineSystem, EquilibriumError
 
 # The coolant temperature, in K, around which both reactors are run.
 NOMINAL_COOLANT_TEMPERATURE = 300.0
@@ -94,16 +90,16 @@ def one_state_reactor(parameters: ReactorParameters | None = None, *,
 
     Its nominal input is a coolant at 300 K.
 
-    :param parameters: the physical constants; the benchmark's when None.
-    :param nominal_state: the state (n_x,) to measure deviations from; when None, the stable
-        steady state on the cold branch at the nominal input. Give it where that may not exist, as
-        when a running plant changes.
+    :param parameters: the benchmark's when None.
+    :param nominal_state: (n_x,); the stable steady state on the cold branch at the nominal input
+        when None. Give it where that may not exist, as when a running plant changes.
     :raises ValueError: when `nominal_state` is none of this reactor.
     :raises EquilibriumError: when `nominal_state` is None and there is no stable steady state.
     """
     constants = parameters or ReactorParameters()
     return _reactor('one-state reactor', constants, partial(_one_state_drift, constants),
-                    partial(_one_state_jacobian, constants), _temperature_alone, nominal_state)
+                    partial(_one_state_jacobian, constants), partial(np.expand_dims, axis=-1),
+                    nominal_state)
 
 
 def two_state_reactor(parameters: ReactorParameters | None = None, *,
@@ -145,18 +141,19 @@ def _reactor(name: str, constants: ReactorParameters, drift: ArrayFunction,
     )
 
 
-def _one_state_drift(constants: ReactorParameters, x: FloatArray) -> FloatArray:
+def _one_state_drift(constants: ReactorParameters, x: Array) -> Array:
     reaction = constants.concentration * _rate_constant(constants, x)
     return _heat_flow(constants, x) + constants.heating_per_conversion * reaction
 
 
-def _one_state_jacobian(constants: ReactorParameters, x: FloatArray) -> FloatArray:
+def _one_state_jacobian(constants: ReactorParameters, x: Array) -> Array:
     steepening = constants.concentration * _rate_constant_slope(constants, x)
-    slope = _heat_flow_slope(constants) + constants.heating_per_conversion * steepening
+    heating = constants.heating_per_conversion * steepening
+    slope: Array = -constants.dilution_rate - constants.cooling_rate + heating
     return slope[..., None]
 
 
-def _two_state_drift(constants: ReactorParameters, x: FloatArray) -> FloatArray:
+def _two_state_drift(constants: ReactorParameters, x: Array) -> Array:
     concentration, temperature = x[..., 0], x[..., 1]
     reaction = concentration * _rate_constant(constants, temperature)
     supply = constants.dilution_rate * (constants.feed_concentration - concentration)
@@ -164,57 +161,43 @@ def _two_state_drift(constants: ReactorParameters, x: FloatArray) -> FloatArray:
     return np.stack([supply - reaction, _heat_flow(constants, temperature) + heating], axis=-1)
 
 
-def _two_state_jacobian(constants: ReactorParameters, x: FloatArray) -> FloatArray:
+def _two_state_jacobian(constants: ReactorParameters, x: Array) -> Array:
     rate = _rate_constant(constants, x[..., 1])
     steepening = x[..., 0] * _rate_constant_slope(constants, x[..., 1])
     jacobian = np.empty((*x.shape, 2))
     jacobian[..., 0, 0] = -constants.dilution_rate - rate
     jacobian[..., 0, 1] = -steepening
     jacobian[..., 1, 0] = constants.heating_per_conversion * rate
-    jacobian[..., 1, 1] = (
-        _heat_flow_slope(constants) + constants.heating_per_conversion * steepening)
+    heating = constants.heating_per_conversion * steepening
+    jacobian[..., 1, 1] = -constants.dilution_rate - constants.cooling_rate + heating
     return jacobian
 
 
-def _rate_constant(constants: ReactorParameters, temperature: FloatArray) -> FloatArray:
+def _rate_constant(constants: ReactorParameters, temperature: Array) -> Array:
     """Evaluate the Arrhenius law k exp(-E_A/(R T)), in 1/min."""
     return constants.pre_exponential_factor * np.exp(
         -constants.activation_temperature / temperature)
 
 
-def _rate_constant_slope(constants: ReactorParameters, temperature: FloatArray) -> FloatArray:
+def _rate_constant_slope(constants: ReactorParameters, temperature: Array) -> Array:
     steepness = constants.activation_temperature / (temperature * temperature)
     return _rate_constant(constants, temperature) * steepness
 
 
-def _heat_flow(constants: ReactorParameters, temperature: FloatArray) -> FloatArray:
+def _heat_flow(constants: ReactorParameters, temperature: Array) -> Array:
     """Evaluate the heating by the feed and by a jacket at 0 K, in K/min; B u adds the coolant."""
     feed = constants.dilution_rate * (constants.feed_temperature - temperature)
     return feed - constants.cooling_rate * temperature
 
 
-def _heat_flow_slope(constants: ReactorParameters) -> float:
-    return -constants.dilution_rate - constants.cooling_rate
-
-
-def _temperature_alone(temperature: FloatArray) -> FloatArray:
-    return temperature[..., None]
-
-
-def _with_steady_concentration(
-    constants: ReactorParameters, temperature: FloatArray,
-) -> FloatArray:
+def _with_steady_concentration(constants: ReactorParameters, temperature: Array) -> Array:
     supply = constants.dilution_rate * constants.feed_concentration
     consumption = constants.dilution_rate + _rate_constant(constants, temperature)
     return np.stack([supply / consumption, temperature], axis=-1)
 
 
-def _cold_stable_state(
-    constants: ReactorParameters,
-    drift: ArrayFunction,
-    jacobian: ArrayFunction,
-    state_at: ArrayFunction,
-) -> FloatArray:
+def _cold_stable_state(constants: ReactorParameters, drift: ArrayFunction,
+                       jacobian: ArrayFunction, state_at: ArrayFunction) -> Array:
     """
     Find the stable steady state at the nominal input on the cold branch of the heat balance.
 
@@ -224,9 +207,9 @@ def _cold_stable_state(
     :param state_at: temperatures (...) to the states (..., n_x) at which all but the last of the
         rates, that of the temperature, vanish.
     """
-    def heat_balance(temperature: FloatArray) -> FloatArray:
+    def heat_balance(temperature: Array) -> Array:
         coolant = constants.cooling_rate * NOMINAL_COOLANT_TEMPERATURE
-        balance: FloatArray = drift(state_at(temperature))[..., -1] + coolant
+        balance: Array = drift(state_at(temperature))[..., -1] + coolant
         return balance
 
     grid = np.linspace(*TEMPERATURE_RANGE, _SCAN_POINTS)

@@ -5,7 +5,8 @@
 
 import numpy as np
 
-from koopman_ros.plants.system import ControlAffineSystem, FloatArray
+from koopman_ros.arrays import Array
+from koopman_ros.plants.system import ControlAffineSystem
 
 
 def scalar_example() -> ControlAffineSystem:
@@ -29,5 +30,5 @@ def scalar_example() -> ControlAffineSystem:
     )
 
 
-def _drift_jacobian(x: FloatArray) -> FloatArray:
+def _drift_jacobian(x: Array) -> Array:
     return 2.0 * x[..., None]

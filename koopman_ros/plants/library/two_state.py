@@ -8,19 +8,16 @@ import math
 
 import numpy as np
 
-from koopman_ros.plants.system import ControlAffineSystem, FloatArray
-
-# The paper's choice: a stable first state and an unstable second one.
-PAPER_MU = -0.1
-PAPER_LAMBDA = 1.0
+from koopman_ros.arrays import Array
+from koopman_ros.plants.system import ControlAffineSystem
 
 
-def two_state_example(mu: float = PAPER_MU, lambda_: float = PAPER_LAMBDA) -> ControlAffineSystem:
+def two_state_example(mu: float = -0.1, lambda_: float = 1.0) -> ControlAffineSystem:
     """
     Build dx1/dt = mu x1, dx2/dt = lambda (x2 - x1^2) + u (paper, eq. 32), nominal at the origin.
 
-    :param mu: growth rate of the first state, in 1/s.
-    :param lambda_: growth rate of the second state, in 1/s.
+    :param mu: growth rate of the first state, in 1/s; by default the paper's, stable.
+    :param lambda_: that of the second state, in 1/s; by default the paper's, unstable.
     :raises ValueError: when a rate is not finite.
     """
     for name, rate in (('mu', mu), ('lambda_', lambda_)):
@@ -41,12 +38,12 @@ def two_state_example(mu: float = PAPER_MU, lambda_: float = PAPER_LAMBDA) -> Co
     )
 
 
-def _drift(mu: float, lambda_: float, x: FloatArray) -> FloatArray:
+def _drift(mu: float, lambda_: float, x: Array) -> Array:
     x1, x2 = x[..., 0], x[..., 1]
     return np.stack([mu * x1, lambda_ * (x2 - x1 * x1)], axis=-1)
 
 
-def _drift_jacobian(mu: float, lambda_: float, x: FloatArray) -> FloatArray:
+def _drift_jacobian(mu: float, lambda_: float, x: Array) -> Array:
     jacobian = np.zeros((*x.shape, 2))
     jacobian[..., 0, 0] = mu
     jacobian[..., 1, 0] = -2.0 * lambda_ * x[..., 0]

@@ -1,10 +1,14 @@
 # SPDX-FileCopyrightText: 2026 The koopman_ros Authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""What the demo shows while it runs: a live table on a terminal, plain lines elsewhere."""
+"""What both acts do on the terminal: options, a live table, and what came of them."""
 
 from __future__ import annotations
 
+import argparse
+from collections.abc import Callable, Mapping
+from pathlib import Path
+import sys
 from types import TracebackType
 
 from rich.console import Console
@@ -13,17 +17,46 @@ from rich.markup import escape
 from rich.table import Table
 
 from koopman_ros.demo.loop import Row
+from koopman_ros.testing import reserved_output
 
 _COLUMNS = ('time [min]', 'temperature [°C]', 'set-point [°C]', 'error [K]', 'coolant [°C]')
 
 
-class LiveTable:
-    """
-    Show a run as it happens.
+def read_options(args: list[str] | None, description: str | None, output: str, speed: float
+                 ) -> argparse.Namespace:
+    """Read `output` and `speed` from a command line, with these defaults."""
+    parser = argparse.ArgumentParser(description=description)
+    parser.add_argument('--output', type=Path, default=Path(output),
+                        help='folder for the results (default: %(default)s)')
+    parser.add_argument('--speed', type=float, default=speed,
+                        help='simulated seconds per second, 0 for as fast as the machine can '
+                        '(default: %(default)s)')
+    return parser.parse_args(args)
 
-    :param title: what runs.
-    :param row_period: s of plant time between rows.
-    """
+
+def run_act(act: Callable[[Path, float], Mapping[str, object]], options: argparse.Namespace,
+            errors: tuple[type[Exception], ...], files: str) -> int:
+    """Run a demo, say what came of it or which of `errors`, and return the exit code."""
+    try:
+        with reserved_output(options.output) as output:
+            if output != options.output:
+                print(f'another run writes to {options.output}: this one writes to {output}',
+                      flush=True)
+            result = act(output, options.speed)
+    except errors as error:
+        print(f'demo: {error}', file=sys.stderr)
+        return 1
+    except KeyboardInterrupt:
+        print('demo: interrupted; what was recorded is kept', file=sys.stderr)
+        return 130
+    for key, value in result.items():
+        print(f'{key}: {value:.6g}' if isinstance(value, float) else f'{key}: {value}')
+    print(f'wrote {output}/{files}')
+    return 0
+
+
+class LiveTable:
+    """Show a run as it happens, with a row each `row_period` seconds of plant time."""
 
     def __init__(self, title: str, row_period: float = 30.0) -> None:
         self._title = title
@@ -79,9 +112,7 @@ class LiveTable:
 
 
 def _cells(row: Row) -> tuple[str, ...]:
-    setpoint, error = '', ''
-    if row.setpoint is not None:
-        setpoint = f'{row.setpoint:.3f}'
-        error = f'{row.temperature - row.setpoint:+.4f}'
+    setpoint, error = ('', '') if row.setpoint is None else (
+        f'{row.setpoint:.3f}', f'{row.temperature - row.setpoint:+.4f}')
     return (f'{row.seconds / 60.0:.1f}', f'{row.temperature:.4f}', setpoint, error,
             f'{row.coolant:.3f}')

@@ -1,8 +1,0 @@
-# SPDX-FileCopyrightText: 2026 The koopman_ros Authors
-# SPDX-License-Identifier: Apache-2.0
-
-"""What ROS needs to read what tables write, in a domain of its own."""
-
-from support.nodes import ros, shared_ros, type_support
-
-__all__ = ['ros', 'shared_ros', 'type_support']
