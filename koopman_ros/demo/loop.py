@@ -18,6 +18,7 @@ from koopman_ros.testing import deferred_interrupt, Harness, HarnessError
 from koopman_ros.units import NANOSECONDS
 
 _START_TIME = 1.0  # s of plant time at the first measurement
+_FIRST_STAMP_NS = round(_START_TIME * NANOSECONDS)
 _TIMEOUT = 30.0  # s for the processes to find each other, and from one command to the next
 
 
@@ -33,11 +34,6 @@ class Scenario:
     speed: float = 0.0  #: simulated seconds per second, 0 for as fast as the machine can
     #: further parameters of the plant node
     plant: Mapping[str, object] = field(default_factory=dict)
-
-    @property
-    def first_stamp_ns(self) -> int:
-        """Stamp of the first measurement."""
-        return round(_START_TIME * NANOSECONDS)
 
 
 @dataclass(frozen=True)
@@ -81,18 +77,18 @@ class Operator:
     @property
     def seconds(self) -> float:
         """Plant time of the last command since the first measurement, in s; 0 before it."""
-        return max(0.0, (self.last_stamp_ns - self.scenario.first_stamp_ns) / NANOSECONDS)
+        return max(0.0, (self.last_stamp_ns - _FIRST_STAMP_NS) / NANOSECONDS)
 
     def run_until(self, seconds: float) -> None:
         """Let the loop go on until so many seconds of plant time after its first measurement."""
-        end = self.scenario.first_stamp_ns + round(seconds * NANOSECONDS)
+        end = _FIRST_STAMP_NS + round(seconds * NANOSECONDS)
         while (last := self.last_stamp_ns) < end:
             self.harness.wait_until(lambda last=last: self.last_stamp_ns > last,
                                     'the loop stands still: no command')
 
     def request_setpoint(self) -> None:
         """Publish the set-point, stamped with the plant time from which it holds."""
-        stamp = self.scenario.first_stamp_ns + round(self.scenario.step_time * NANOSECONDS)
+        stamp = _FIRST_STAMP_NS + round(self.scenario.step_time * NANOSECONDS)
         message = temperature_message(
             self.scenario.setpoint, rclpy.time.Time(nanoseconds=stamp).to_msg(), 'operator')
         self.setpoint.publish(message)
@@ -113,7 +109,7 @@ class Operator:
     def _show_pair(self, stamp: int) -> None:
         if stamp in self._measured and stamp in self._commanded:
             self.last_stamp_ns = stamp
-            self._on_row(Row((stamp - self.scenario.first_stamp_ns) / NANOSECONDS,
+            self._on_row(Row((stamp - _FIRST_STAMP_NS) / NANOSECONDS,
                              self._measured.pop(stamp), self._active,
                              self._commanded.pop(stamp)))
 

@@ -42,7 +42,6 @@ _AFTER = 960.0  # s of plant time from the reload to the end
 _TEST_SEED = 7
 _TRAINING_TIMEOUT = 300.0  # s
 _EXPERIMENT_TIMEOUT = 600.0  # s
-_TASKS = {task: f'trainer: {task}' for task in ('experiment', 'training')}
 # What the fouled reactor bears; see the bounds of the experiment.
 _EXPERIMENT = {
     'experiment_topic': topics.MANUAL_COOLANT_SETPOINT,
@@ -155,7 +154,7 @@ class _Actor:
     def _wait_for(self, task: str, words: str, timeout: float) -> DiagnosticStatus:
         """Wait until a task of the trainer says so."""
         def said() -> DiagnosticStatus | None:
-            status = self.operator.harness.last_status(_TASKS[task])
+            status = self.operator.harness.last_status(f'trainer: {task}')
             if status is not None and status.level == DiagnosticStatus.ERROR:
                 raise ActError(f'{task}: {status.message}')
             return status if status is not None and status.message.startswith(words) else None
