@@ -6,6 +6,7 @@
 from collections.abc import Callable, Iterator, Mapping
 import contextlib
 from dataclasses import dataclass, field
+from functools import partial
 from pathlib import Path
 
 from diagnostic_msgs.msg import DiagnosticStatus
@@ -82,9 +83,12 @@ class Operator:
     def run_until(self, seconds: float) -> None:
         """Let the loop go on until so many seconds of plant time after its first measurement."""
         end = _FIRST_STAMP_NS + round(seconds * NANOSECONDS)
-        while (last := self.last_stamp_ns) < end:
-            self.harness.wait_until(lambda last=last: self.last_stamp_ns > last,
+        while self.last_stamp_ns < end:
+            self.harness.wait_until(partial(self._answered_after, self.last_stamp_ns),
                                     'the loop stands still: no command')
+
+    def _answered_after(self, stamp_ns: int) -> bool:
+        return self.last_stamp_ns > stamp_ns
 
     def request_setpoint(self) -> None:
         """Publish the set-point, stamped with the plant time from which it holds."""

@@ -152,7 +152,7 @@ def _build(about: dict[str, Any], tensors: dict[str, np.ndarray]) -> LiftedModel
         raise TypeError('identity must be true or false')
     origin = about['provenance']
     metrics = {name: float(value) for name, value in origin['metrics'].items()}
-    filled = about.get('fill_distance')
+    filled: Any = about.get('fill_distance')
     if 'fill_distance' in about and (
             not isinstance(filled, int | float) or isinstance(filled, bool)):
         raise TypeError(f'fill_distance must be a number, got {filled!r}')
