@@ -12,14 +12,7 @@ import sys
 import pytest
 
 from koopman_ros.bags import summary
-from koopman_ros.testing import (
-    Harness,
-    HarnessError,
-    isolated_domain,
-    NodeProcess,
-    process,
-    reservations,
-)
+from koopman_ros.testing import Harness, HarnessError, isolated_domain, NodeProcess, process
 from support.nodes import TIMEOUT, wait_until_ended
 
 SLEEPER = (sys.executable, '-c', 'import time; time.sleep(600)')
@@ -147,7 +140,7 @@ def test_no_process_outlives_one_that_is_killed(
 
 def test_reservation_ends_with_its_context(monkeypatch: pytest.MonkeyPatch) -> None:
     # one that no other test reserves meanwhile
-    monkeypatch.setattr(reservations, '_DOMAINS', [1000 + os.getpid()])
+    monkeypatch.setattr(process, '_DOMAINS', [1000 + os.getpid()])
     for _ in range(2):
         with isolated_domain() as environment:
             assert environment['ROS_DOMAIN_ID'] == str(1000 + os.getpid())
