@@ -82,8 +82,7 @@ def biased(bias: float, since: float = 0.0) -> control.Sensor:
 
 def errors(run: Simulation, reference: float, since: float = 0.0) -> Array:
     """Return the last state's distance from a reference from a time on."""
-    found: Array = run.states[run.times >= since, -1] - reference
-    return found
+    return np.asarray(run.states[run.times >= since, -1] - reference)
 
 
 def settling(run: Simulation, reference: float, tolerance: float, since: float = 0.0

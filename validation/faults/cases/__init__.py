@@ -5,7 +5,4 @@
 
 from validation.faults.cases import messages, operators, processes
 
-CASES = {case.name: case for case in (
-    *messages.CASES, *processes.CASES, *operators.CASES)}
-
-__all__ = ['CASES']
+CASES = {case.name: case for case in (*messages.CASES, *processes.CASES, *operators.CASES)}
