@@ -3,6 +3,8 @@
 
 """Nodes with the parameters of a table, what their parts create and take down, diagnostics."""
 
+from __future__ import annotations
+
 from collections.abc import Callable, Mapping
 import copy
 from dataclasses import dataclass, field, replace

@@ -3,6 +3,8 @@
 
 """The topics of the loop: names, types, quality of service, and others who do not match."""
 
+from __future__ import annotations
+
 from collections.abc import Callable, Collection, Mapping
 import copy
 import importlib
