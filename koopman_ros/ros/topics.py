@@ -134,7 +134,7 @@ class Matching:
         """Names topic, nodes, what is wrong and what to do; conflicts first; or is empty."""
         return next(filter(None, self._said), '')
 
-    def subscribe(self, topic: str, callback: Callable[[Any], object], kind: Any = None,
+    def subscribe(self, topic: str, callback: Callable[[Any], Any], kind: Any = None,
                   **options: Any) -> Subscription:
         """Subscribe to a topic of the loop, or to another one of a type; options as in rclpy."""
         # overriding parameters change the profile itself
