@@ -11,6 +11,7 @@ import sys
 from typing import Any
 
 import joblib
+from tqdm import tqdm
 
 from koopman_ros.control import ClosedLoop
 from koopman_ros.lifting import LiftedModel
@@ -81,6 +82,7 @@ def run_campaign(seeds: int, *, of_sensors: bool = False) -> Campaign:
     jobs = joblib.parallel.get_active_backend()[1] or len(os.sched_getaffinity(0))
     finished = joblib.Parallel(n_jobs=jobs, return_as='generator_unordered')(
         joblib.delayed(_run)(name, seed, experiments[name]) for name, seed in runs)
+    bar = tqdm(total=len(runs), unit='run', disable=not sys.stderr.isatty())
     try:
         for number, (name, seed, outcome) in enumerate(finished, 1):
             if isinstance(outcome, str):
@@ -92,12 +94,17 @@ def run_campaign(seeds: int, *, of_sensors: bool = False) -> Campaign:
                 rw = [value for figure, value in outcome[0].items()
                       if figure.split('/')[-1] in ('rw', 'rw_in') and isinstance(value, float)]
                 text = f', rw {min(rw):.1e}' if rw else ''
-            print(f'{number}/{len(runs)}: {name}, seed {seed}{text}', file=sys.stderr, flush=True)
+            bar.set_postfix_str(f'{name}, seed {seed}{text}', refresh=False)
+            bar.update()
+            if bar.disable:
+                print(f'{number}/{len(runs)}: {name}, seed {seed}{text}', file=sys.stderr,
+                      flush=True)
         campaign.complete = True
     except KeyboardInterrupt:
         print('interrupted: reporting on what is done', file=sys.stderr)
     finally:
         finished.close()
+        bar.close()
     campaign.errors.sort()
     return campaign
 
