@@ -68,9 +68,18 @@ def write_report(found: Found, folder: Path) -> None:
 
 def _table(rows: Mapping[str, Mapping[str, Any]]) -> str:
     """Return a table of figures, under their names."""
-    names = next(iter(rows.values()))
-    return table(('', *(name.replace('_', ' ').replace('ladder', 'fallback') for name in names)),
+    return table(('', *map(_heading, next(iter(rows.values())))),
                  [(row, *map(_cell, figures.values())) for row, figures in rows.items()])
+
+
+def _heading(name: str) -> str:
+    """Return the name of a figure with its unit in brackets."""
+    words, unit = name.replace('ladder', 'fallback').split('_'), ''
+    if 'to' in words:  # the time until a deviation is no larger
+        words, unit = [word for word in words if word != 'seconds'], ' [s]'
+    elif words[-1] == 'kelvin':
+        words, unit = words[:-1], ' [K]'
+    return ' '.join(words).replace('kelvin', 'K') + unit
 
 
 def _cell(value: float | bool | None) -> str:
