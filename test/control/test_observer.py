@@ -11,8 +11,15 @@ import pytest
 from scipy.integrate import solve_ivp
 
 from koopman_ros.control import Controller, InputLimits, perfect, Settings, Silence, State
-from koopman_ros.estimation import DisturbanceObserver, equivalent_bias, Estimate
+from koopman_ros.estimation import (
+    check,
+    DisturbanceObserver,
+    equivalent_bias,
+    Estimate,
+    SensorLimits,
+)
 from koopman_ros.plants import Actuator, two_state_reactor
+from koopman_ros.signals import Outputs
 from koopman_ros.solvers import runge_kutta_step
 from support.closed_loops import (
     controller,
@@ -253,6 +260,17 @@ def test_a_jump_that_stays_is_accepted_when_the_plant_could_have_got_there(by, s
         # it is no disturbance
         assert abs(float(samples[seconds].report.estimate.disturbance[0])) < 0.01
     assert settled(samples, START, 1e-3) < 280
+
+
+def test_only_what_was_taken_for_a_jump_before_has_moved():
+    limits = SensorLimits(*(np.array([x]) for x in (-100.0, 100.0, 1.0, 1.0)))
+    outputs, last, seen = Outputs(('level',), ('m',), np.eye(1)), None, []
+    for second, y in ((0, 0.0), (5, 4.0), (6, 14.0), (17, 14.1)):
+        verdict = check(limits, outputs, last, np.array([y]), second * SECOND, np.zeros(1),
+                        lambda _: np.ones(1))
+        last = verdict.accepted
+        seen.append((verdict.fault is None, verdict.moved))
+    assert seen == [(True, False), (True, False), (False, False), (True, True)]
 
 
 def test_a_sensor_that_freezes_under_way_is_found_out():
