@@ -116,6 +116,17 @@ def day(**options: object) -> Recorded:
     return controller
 
 
+def test_a_reason_is_written_with_those_behind_it() -> None:
+    controller = Recorded()
+    controller.measure(STEADY, 1.0)
+    for _ in range(2):
+        controller.measure(np.nan, 100.0)
+    written = [records.parse(text).fields for text in controller.texts[1:]]
+    assert [(fields['level'], fields['reason']) for fields in written] == [
+        ('sdre', []), ('hold', ['measurement_not_finite']),
+        ('safe', ['held_too_long', 'measurement_not_finite'])]
+
+
 def test_lost_records_are_named_and_the_next_snapshot_goes_on() -> None:
     texts = day().texts
     # the first snapshot behind it is that of the 30th measurement
