@@ -160,10 +160,11 @@ def bag(tmp_path_factory: pytest.TempPathFactory) -> Path:
         run_a_day(operator)
         tune_and_swap(operator)
         fall_silent(operator)
-        # what is on its way to the trainer is lost with its sender: one record to spare, which
-        # stands for the first, where that came before the trainer had found the controller
+        # what is on its way to the trainer is lost with its sender, or at the end: records to
+        # spare, for the first one that comes before the trainer has found the controller, too
         operator.join()
-        operator.wait_for_records(operator.join())
+        count = operator.join()
+        operator.wait_for_records(count)
         operator.controller.send(signal.SIGINT)
         assert ros.wait_for_end(operator.controller) == 0
         ros.start('controller', SETTINGS | {'model': 'reactor_nz3'})
@@ -172,6 +173,8 @@ def bag(tmp_path_factory: pytest.TempPathFactory) -> Path:
         runs = ros.listen(String, topics.CONTROLLER_EVENTS)
         ros.wait_until(lambda: len({parse(message.data).run for message in runs}) == 1)
         operator.measure_on(20, 46.0, -0.05)
+        operator.join()
+        operator.wait_for_records(count + operator.join())
         assert ros.set_bool('trainer/record', False).success
     operator.model.unlink()
     return folder / 'day'
