@@ -160,8 +160,8 @@ def bag(tmp_path_factory: pytest.TempPathFactory) -> Path:
         run_a_day(operator)
         tune_and_swap(operator)
         fall_silent(operator)
-        # what is on its way to the trainer is lost with its sender, or at the end: records to
-        # spare, for the first one that comes before the trainer has found the controller, too
+        # what is on its way to the trainer is lost with its sender: one record to spare, which
+        # stands for the first, where that came before the trainer had found the controller
         operator.join()
         count = operator.join()
         operator.wait_for_records(count)
@@ -173,8 +173,9 @@ def bag(tmp_path_factory: pytest.TempPathFactory) -> Path:
         runs = ros.listen(String, topics.CONTROLLER_EVENTS)
         ros.wait_until(lambda: len({parse(message.data).run for message in runs}) == 1)
         operator.measure_on(20, 46.0, -0.05)
-        operator.join()
-        operator.wait_for_records(count + operator.join())
+        ros.wait_until(lambda: sum(
+            parse(message.data).event == 'measurement' for message in runs) == 20)
+        operator.wait_for_records(count)
         assert ros.set_bool('trainer/record', False).success
     operator.model.unlink()
     return folder / 'day'
