@@ -172,6 +172,9 @@ def bag(tmp_path_factory: pytest.TempPathFactory) -> Path:
         ros.meet('controller')
         runs = ros.listen(String, topics.CONTROLLER_EVENTS)
         ros.wait_until(lambda: len({parse(message.data).run for message in runs}) == 1)
+        # each who joins is sent a record, which the trainer has once it has found the controller
+        ros.wait_until(lambda: operator.join() and int(value(
+            ros.last_status('trainer: recording'), f'messages on {RECORDS}')) > count + 1)
         operator.measure_on(20, 46.0, -0.05)
         ros.wait_until(lambda: sum(
             parse(message.data).event == 'measurement' for message in runs) == 20)
