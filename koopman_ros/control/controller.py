@@ -377,11 +377,12 @@ class Controller:
     def _report(self, state: State, why: Reason | None) -> Report:
         """Return what is known without a law."""
         estimate, active = state.estimate, state.setpoint.active
-        order = (*self.settings.supervisor.order, MANUAL)
-        depth = len(order) - 1 if state.mode is Mode.MANUAL else (
-            self.settings.supervisor.depth(state.supervisor.level))
-        report = Report(state.mode, order[depth], depth, why, target=None if active is None else (
-            TargetReport(active, self.model.states.violation(active))))
+        levels, manual = self.settings.supervisor, state.mode is Mode.MANUAL
+        depth = len(levels.order) if manual else levels.depth(state.supervisor.level)
+        report = Report(
+            state.mode, MANUAL if manual else levels.order[depth], depth, why,
+            target=None if active is None else (
+                TargetReport(active, self.model.states.violation(active))))
         if estimate is None:
             return report
         estimator = self._estimating.level(state).estimator
