@@ -23,10 +23,12 @@ from support.disturbance import disturb_training
 os.environ['ROS_PYTHON_CHECK_FIELDS'] = '1'
 
 # What takes longest, first: where each core takes the next file, none is then idle at the end.
-LONGEST = ('test_training_node', 'test_training_benchmark', 'test_examples', 'test_plant_node',
-           'test_experiment_node', 'test_demo', 'test_retrain', 'test_replay', 'test_recording',
-           'test_processes', 'test_identify', 'test_experiments', 'test_campaign', 'test_training',
-           'test_closed_loop', 'test_fault_campaign', 'test_player', 'test_install_tree')
+LONGEST = ('test_training_benchmark', 'test_examples', 'test_campaign', 'test_identify',
+           'test_training', 'test_observer', 'test_shipped_models', 'test_install_tree',
+           'test_retrain', 'test_training_node', 'test_estimates', 'test_demo', 'test_replay',
+           'test_parallel', 'test_parameter_ends', 'test_player', 'test_node_benchmarks',
+           'test_controller_process', 'test_experiment_node', 'test_fault_campaign',
+           'test_plant_node', 'test_processes')
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:

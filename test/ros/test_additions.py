@@ -3,7 +3,6 @@
 
 """What CONTRIBUTING says can be added in one file or row, from a folder outside the package."""
 
-from collections.abc import Iterator
 import importlib
 from pathlib import Path
 import textwrap
@@ -14,8 +13,7 @@ import pytest
 from rclpy.serialization import serialize_message
 from sensor_msgs.msg import RelativeHumidity
 
-from koopman_ros.bags import BagWriter, loop_episodes, message_definition
-from koopman_ros.bags.series import SCALARS
+from koopman_ros.bags import BagWriter, loop_episodes, message_definition, series
 from koopman_ros.parameters.table import ConfigurationError
 from koopman_ros.plants import Process
 from koopman_ros.ros.node import LoopNode
@@ -53,15 +51,14 @@ TYPE = """
 
 @pytest.fixture
 def added(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, request: pytest.FixtureRequest
-          ) -> Iterator[ModuleType]:
-    """Yield the module made of a text, in a folder that Python searches."""
-    name = f'added_{len(request.param)}'
+          ) -> ModuleType:
+    """Return the module made of a text, in a folder that Python searches."""
+    name = f'added_{request.node.callspec.id}'
     (tmp_path / f'{name}.py').write_text(textwrap.dedent(request.param))
     monkeypatch.syspath_prepend(tmp_path)
-    before = dict(SCALARS)
-    yield importlib.import_module(name)
-    SCALARS.clear()
-    SCALARS.update(before)
+    # what it adds is gone with it
+    monkeypatch.setattr(series, 'SCALARS', dict(series.SCALARS))
+    return importlib.import_module(name)
 
 
 @pytest.mark.parametrize('added', [PLANT], indirect=True, ids=['plant'])
