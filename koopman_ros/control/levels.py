@@ -5,10 +5,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
-import importlib
-from typing import Any
 
 import numpy as np
 
@@ -20,6 +17,7 @@ from koopman_ros.control.settings import Settings
 from koopman_ros.control.state import amended, State
 from koopman_ros.estimation import check, Estimate, Estimator, ESTIMATORS, FrozenCheck, Verdict
 from koopman_ros.lifting import LiftedModel
+from koopman_ros.plugs import plug
 from koopman_ros.reasons import Code
 from koopman_ros.signals import Outputs
 from koopman_ros.units import NANOSECONDS
@@ -47,29 +45,6 @@ class Level:
                                      estimate.w, known=self._last[0])
         self._last[0] = target
         return target, self.law.compute(estimate, target, limits, memory, interval)
-
-
-def plug(name: str, kind: str, known: Mapping[str, Callable[..., Any]]) -> Any:
-    """
-    Return the class that a name stands for: a known one, or ``module:class`` of any module.
-
-    :param kind: what it is, for the error, e.g. ``'law'``.
-    :raises ValueError: for a name that stands for nothing that can be called.
-    """
-    if name in known:
-        return known[name]
-    module, _, attribute = name.partition(':')
-    if not attribute:
-        raise ValueError(f'there is no {kind} {name!r}: choose one of {", ".join(known)}, or '
-                         'module:class of one of your own')
-    try:
-        found = getattr(importlib.import_module(module), attribute)
-    except (ImportError, AttributeError) as error:
-        raise ValueError(f'the {kind} {name!r} cannot be loaded ({error}): check module and '
-                         'class, and that Python finds the module') from error
-    if not callable(found):
-        raise ValueError(f'the {kind} {name!r} is no class: name one')
-    return found
 
 
 def levels_of(model: LiftedModel, settings: Settings) -> dict[str, Level]:

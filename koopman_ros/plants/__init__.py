@@ -3,6 +3,8 @@
 
 """Control-affine systems, their steady states, actuators and simulation; imports plant data."""
 
+from koopman_ros.plants.catalogue import build, plant_class, PLANTS
+from koopman_ros.plants.constants import Constant, constant, Constants, constants_of
 from koopman_ros.plants.excitation import ExcitationError, random_steps, RandomStepDesign
 from koopman_ros.plants.library.reactor import (
     one_state_reactor,
@@ -21,9 +23,9 @@ from koopman_ros.plants.simulation import (
 )
 from koopman_ros.plants.system import ControlAffineSystem, equilibrium_input, EquilibriumError
 
-__all__ = ['Actuator', 'ControlAffineSystem', 'EquilibriumError',
-           'ExcitationError', 'IntegrationError', 'IntegrationFailure', 'Process',
-           'RandomStepDesign', 'ReactorParameters', 'advance', 'equilibrium_input', 'in_steps',
-           'one_state_reactor', 'random_steps', 'sample_derivatives',
-           'scalar_example', 'sensor_noise', 'simulate', 'two_state_example',
-           'two_state_reactor']
+__all__ = ['PLANTS', 'Actuator', 'Constant', 'Constants', 'ControlAffineSystem',
+           'EquilibriumError', 'ExcitationError', 'IntegrationError', 'IntegrationFailure',
+           'Process', 'RandomStepDesign', 'ReactorParameters', 'advance', 'build', 'constant',
+           'constants_of', 'equilibrium_input', 'in_steps', 'one_state_reactor', 'plant_class',
+           'random_steps', 'sample_derivatives', 'scalar_example', 'sensor_noise', 'simulate',
+           'two_state_example', 'two_state_reactor']

@@ -291,7 +291,7 @@ def test_estimator_of_another_module_estimates(tmp_path, monkeypatch):
     ('nonsense', "there is no estimator 'nonsense': choose one of disturbance_observer"),
     ('no_such_module:Estimator', "'no_such_module:Estimator' cannot be loaded"),
     ('math:nothing', "'math:nothing' cannot be loaded"),
-    ('math:pi', "'math:pi' is no class"),
+    ('math:pi', "'math:pi' is a float, which cannot be called"),
 ])
 def test_names_that_stand_for_nothing_are_refused(name: str, words: str) -> None:
     with pytest.raises(ValueError, match=words):

@@ -3,7 +3,7 @@
 
 """The continuous stirred tank reactor (CSTR) with a cooling jacket, as one state and as two."""
 
-from dataclasses import dataclass, field, fields
+from dataclasses import dataclass
 from functools import partial
 
 import numpy as np
@@ -11,6 +11,7 @@ from numpy.typing import ArrayLike
 from scipy.optimize import brentq
 
 from koopman_ros.arrays import Array
+from koopman_ros.plants.constants import constant, Constants
 from koopman_ros.plants.system import ArrayFunction, ControlAffineSystem, EquilibriumError
 
 # The coolant temperature, in K, around which both reactors are run.
@@ -23,14 +24,8 @@ TEMPERATURE_RANGE = (200.0, 1000.0)
 _SCAN_POINTS = 20001
 
 
-def _constant(default: float, unit: str, lower: float, upper: float) -> float:
-    value: float = field(
-        default=default, metadata={'unit': unit, 'lower': lower, 'upper': upper})
-    return value
-
-
 @dataclass(frozen=True)
-class ReactorParameters:
+class ReactorParameters(Constants):
     """
     The physical constants of the reactor; the defaults are the benchmark's.
 
@@ -40,32 +35,34 @@ class ReactorParameters:
     :raises ValueError: when a value is no number or outside its range.
     """
 
-    flow_rate: float = _constant(100.0, 'L/min', 1.0, 1e4)  #: q, feed and product flow, in L/min
-    volume: float = _constant(100.0, 'L', 1.0, 1e5)  #: V, of the liquid, in L
-    density: float = _constant(1000.0, 'g/L', 100.0, 1e4)  #: rho, in g/L
-    heat_capacity: float = _constant(0.239, 'J/(g K)', 0.01, 100.0)  #: C_p, in J/(g K)
-    #: Delta H_R, in J/mol, negative for this exothermic reaction
-    reaction_enthalpy: float = _constant(-5e4, 'J/mol', -1e6, -1.0)
-    activation_temperature: float = _constant(8750.0, 'K', 2e3, 1e5)  #: E_A/R, in K
-    pre_exponential_factor: float = _constant(7.2e10, '1/min', 0.0, 1e30)  #: k, in 1/min
-    #: UA, coefficient times area of the jacket, in J/(min K)
-    heat_transfer_coefficient: float = _constant(5e4, 'J/(min K)', 0.0, 1e7)
-    feed_temperature: float = _constant(350.0, 'K', 250.0, 500.0)  #: T_i, in K
-    #: C_Af, in mol/L; the two-state reactor's alone
-    feed_concentration: float = _constant(1.0, 'mol/L', 0.0, 100.0)
-    #: C_A as the one-state reactor holds it, in mol/L: by default that of the two-state reactor's
-    #: stable steady state at a coolant of 300 K
-    concentration: float = _constant(0.87725294608097, 'mol/L', 0.0, 100.0)
-
-    def __post_init__(self) -> None:
-        for constant in fields(self):
-            value = getattr(self, constant.name)
-            lower, upper = constant.metadata['lower'], constant.metadata['upper']
-            # Written so that NaN, which compares false with everything, is refused too.
-            if not lower <= value <= upper:
-                raise ValueError(
-                    f'{constant.name} is {value:.10g} {constant.metadata["unit"]}, must lie in '
-                    f'[{lower:.10g}, {upper:.10g}] {constant.metadata["unit"]}')
+    flow_rate: float = constant(
+        100.0, 'L/min', 1.0, 1e4, 'feed and product flow q', si='m^3/s', factor=6e4)
+    volume: float = constant(
+        100.0, 'L', 1.0, 1e5, 'volume V of the liquid', si='m^3', factor=1e3)
+    density: float = constant(
+        1000.0, 'g/L', 100.0, 1e4, 'density rho of the liquid', si='kg/m^3')
+    heat_capacity: float = constant(
+        0.239, 'J/(g K)', 0.01, 100.0, 'heat capacity C_p of the liquid', si='J/(kg K)',
+        factor=1e-3)
+    reaction_enthalpy: float = constant(
+        -5e4, 'J/mol', -1e6, -1.0, 'enthalpy of reaction Delta H_R, negative as heat is released')
+    activation_temperature: float = constant(
+        8750.0, 'K', 2e3, 1e5, 'activation energy over the gas constant, E_A/R')
+    pre_exponential_factor: float = constant(
+        7.2e10, '1/min', 0.0, 1e30, 'rate constant k at infinite temperature', si='1/s',
+        factor=60.0)
+    heat_transfer_coefficient: float = constant(
+        5e4, 'J/(min K)', 0.0, 1e7, 'coefficient times area of the cooling jacket, UA', si='W/K',
+        factor=60.0)
+    feed_temperature: float = constant(
+        350.0, 'K', 250.0, 500.0, 'temperature T_i of the feed', si='degC')
+    feed_concentration: float = constant(
+        1.0, 'mol/L', 0.0, 100.0, 'reactant C_Af in the feed, of the two-state reactor alone',
+        si='mol/m^3', factor=1e-3)
+    #: by default that of the two-state reactor's stable steady state at a coolant of 300 K
+    concentration: float = constant(
+        0.87725294608097, 'mol/L', 0.0, 100.0,
+        'reactant C_A that the one-state reactor holds, its alone', si='mol/m^3', factor=1e-3)
 
     @property
     def dilution_rate(self) -> float:
@@ -115,6 +112,24 @@ def two_state_reactor(parameters: ReactorParameters | None = None, *,
                     partial(_two_state_jacobian, constants),
                     partial(_with_steady_concentration, constants), nominal_state,
                     ('concentration',), ('mol/L',))
+
+
+@dataclass(frozen=True)
+class OneStateReactor(ReactorParameters):
+    """The reactor of the paper as a plant of the catalogue."""
+
+    def system(self, nominal_state: ArrayLike | None = None) -> ControlAffineSystem:
+        """Build it as :func:`one_state_reactor` does."""
+        return one_state_reactor(self, nominal_state=nominal_state)
+
+
+@dataclass(frozen=True)
+class TwoStateReactor(ReactorParameters):
+    """The benchmark reactor as a plant of the catalogue."""
+
+    def system(self, nominal_state: ArrayLike | None = None) -> ControlAffineSystem:
+        """Build it as :func:`two_state_reactor` does."""
+        return two_state_reactor(self, nominal_state=nominal_state)
 
 
 def _reactor(name: str, constants: ReactorParameters, drift: ArrayFunction,

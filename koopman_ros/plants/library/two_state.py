@@ -3,39 +3,47 @@
 
 """The paper's two-state example, linear in (x1, x2, x1^2)."""
 
+from dataclasses import dataclass
 from functools import partial
-import math
 
 import numpy as np
 
 from koopman_ros.arrays import Array
+from koopman_ros.plants.constants import constant, Constants
 from koopman_ros.plants.system import ControlAffineSystem
 
 
-def two_state_example(mu: float = -0.1, lambda_: float = 1.0) -> ControlAffineSystem:
+@dataclass(frozen=True)
+class TwoStateExample(Constants):
     """
-    Build dx1/dt = mu x1, dx2/dt = lambda (x2 - x1^2) + u (paper, eq. 32), nominal at the origin.
+    Two states of which the square of one drives the other (paper, eq. 32).
 
-    :param mu: growth rate of the first state, in 1/s; by default the paper's, stable.
-    :param lambda_: that of the second state, in 1/s; by default the paper's, unstable.
-    :raises ValueError: when a rate is not finite.
+    :raises ValueError: when a rate is no number or outside its range.
     """
-    for name, rate in (('mu', mu), ('lambda_', lambda_)):
-        if not math.isfinite(rate):
-            raise ValueError(f'{name} is {rate} 1/s, must be finite')
-    return ControlAffineSystem(
-        name='two-state example',
-        state_names=('x1', 'x2'),
-        state_units=('1', '1'),
-        input_names=('u',),
-        input_units=('1/s',),
-        time_unit='s',
-        drift=partial(_drift, mu, lambda_),
-        drift_jacobian=partial(_drift_jacobian, mu, lambda_),
-        B=np.array([[0.0], [1.0]]),
-        nominal_state=np.zeros(2),
-        nominal_input=np.zeros(1),
-    )
+
+    mu: float = constant(-0.1, '1/s', -100.0, 100.0, 'growth rate of the first state')
+    lambda_: float = constant(1.0, '1/s', -100.0, 100.0, 'growth rate of the second state')
+
+    def system(self) -> ControlAffineSystem:
+        """Build dx1/dt = mu x1, dx2/dt = lambda (x2 - x1^2) + u, nominal at the origin."""
+        return ControlAffineSystem(
+            name='two-state example',
+            state_names=('x1', 'x2'),
+            state_units=('1', '1'),
+            input_names=('u',),
+            input_units=('1/s',),
+            time_unit='s',
+            drift=partial(_drift, self.mu, self.lambda_),
+            drift_jacobian=partial(_drift_jacobian, self.mu, self.lambda_),
+            B=np.array([[0.0], [1.0]]),
+            nominal_state=np.zeros(2),
+            nominal_input=np.zeros(1),
+        )
+
+
+def two_state_example(mu: float = -0.1, lambda_: float = 1.0) -> ControlAffineSystem:
+    """Build :class:`TwoStateExample` with other rates than the paper's, in 1/s."""
+    return TwoStateExample(mu, lambda_).system()
 
 
 def _drift(mu: float, lambda_: float, x: Array) -> Array:

@@ -1,0 +1,63 @@
+# SPDX-FileCopyrightText: 2026 The koopman_ros Authors
+# SPDX-License-Identifier: Apache-2.0
+
+"""Plants by name: those of the library, those that installed packages offer, and one's own."""
+
+from collections.abc import Mapping
+from typing import Any
+
+from numpy.typing import ArrayLike
+
+from koopman_ros.plants.constants import in_plant_units
+from koopman_ros.plants.system import ControlAffineSystem
+from koopman_ros.plugs import plug
+
+_LIBRARY = 'koopman_ros.plants.library'
+#: the classes of the library by name, each imported when it is asked for
+PLANTS = {
+    'reactor': f'{_LIBRARY}.reactor:OneStateReactor',
+    'two_state': f'{_LIBRARY}.reactor:TwoStateReactor',
+    'two_state_example': f'{_LIBRARY}.two_state:TwoStateExample',
+}
+#: of packages that offer plants
+ENTRY_POINTS = 'koopman_ros.plants'
+
+
+def plant_class(name: str) -> Any:
+    """
+    Return the class of a plant, a frozen dataclass of constants with a method `system`.
+
+    :param name: of the library, of an entry point of the group `koopman_ros.plants`, or
+        ``package.module:factory``; the latter two may be of any callable that returns a
+        ControlAffineSystem, too, which has no constants then.
+    :raises ValueError: for a name that stands for no plant; it lists those that there are.
+    """
+    if name in PLANTS or ':' in name:
+        return plug(name, 'plant', PLANTS)
+    # in here: no other name needs it
+    from importlib.metadata import entry_points
+
+    return plug(name, 'plant', {
+        **PLANTS, **{entry.name: entry.value for entry in entry_points(group=ENTRY_POINTS)
+                     if entry.name not in PLANTS}})
+
+
+def build(plant: Any, values: Mapping[str, float], nominal_state: ArrayLike | None = None
+          ) -> ControlAffineSystem:
+    """
+    Build a plant of :func:`plant_class`.
+
+    :param values: constants in SI, by name, as :func:`constants_of` has them; the default of each
+        that is missing.
+    :param nominal_state: (n_x,) for a plant that raised EquilibriumError without, only then.
+    :raises ValueError: for a constant that there is not or that is outside its range, or for a
+        factory that returns no ControlAffineSystem.
+    :raises EquilibriumError: where the plant says so.
+    """
+    made = plant(**in_plant_units(plant, values))
+    if not isinstance(made, ControlAffineSystem) and hasattr(made, 'system'):
+        made = made.system() if nominal_state is None else made.system(nominal_state)
+    if not isinstance(made, ControlAffineSystem):
+        raise ValueError(f'the plant {plant.__name__} returned a {type(made).__name__}, must be a '
+                         'ControlAffineSystem: return one from its method system')
+    return made

@@ -1,0 +1,95 @@
+# SPDX-FileCopyrightText: 2026 The koopman_ros Authors
+# SPDX-License-Identifier: Apache-2.0
+
+"""Physical constants of a plant: fields of a dataclass with unit, range and how SI has them."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field, fields, is_dataclass
+from typing import Any
+
+from koopman_ros.units import to_celsius, to_kelvin
+
+
+def constant(default: float, unit: str, lower: float, upper: float, description: str, *,
+             si: str | None = None, factor: float = 1.0) -> Any:
+    """
+    Declare a physical constant of a plant.
+
+    :param default: in the plant's unit, as `lower` and `upper`, the ends of its range.
+    :param si: the unit in which a parameter shows it; the plant's by default. A temperature in K
+        with ``'degC'`` is shown as REP 103 has it.
+    :param factor: the value in the plant's unit is that in `si` times this factor.
+    """
+    return field(default=default, metadata={
+        'unit': unit, 'lower': lower, 'upper': upper, 'description': description,
+        'si': unit if si is None else si, 'factor': factor})
+
+
+@dataclass(frozen=True)
+class Constants:
+    """
+    The base of a plant's class, whose constants are checked.
+
+    :raises ValueError: for a constant that is no number or outside its range.
+    """
+
+    def __post_init__(self) -> None:
+        for row in _rows(self):
+            value, unit = getattr(self, row.name), row.metadata['unit']
+            lower, upper = row.metadata['lower'], row.metadata['upper']
+            # Written so that NaN, which compares false with everything, is refused too.
+            if not lower <= value <= upper:
+                raise ValueError(f'{row.name} is {value:.10g} {unit}, must lie in '
+                                 f'[{lower:.10g}, {upper:.10g}] {unit}')
+
+
+@dataclass(frozen=True)
+class Constant:
+    """A constant as a parameter shows it."""
+
+    name: str  #: of the field
+    default: float  #: in `unit`, as `lower` and `upper`
+    unit: str  #: of SI; degC for a temperature
+    lower: float  #: lowest value
+    upper: float  #: highest value
+    description: str  #: what it is
+
+
+def constants_of(plant: Any) -> tuple[Constant, ...]:
+    """Return the constants of a plant's class in SI; none where it declares none."""
+    return tuple(Constant(row.name, _shown(row, row.default), row.metadata['si'],
+                          _shown(row, row.metadata['lower']), _shown(row, row.metadata['upper']),
+                          row.metadata['description']) for row in _rows(plant))
+
+
+def in_plant_units(plant: Any, values: Mapping[str, float]) -> dict[str, float]:
+    """
+    Return constants given in SI in the units of the plant's class.
+
+    A default or an end of a range that was not changed comes back to the bit.
+
+    :raises ValueError: for a name that is no constant of the plant.
+    """
+    rows = {row.name: row for row in _rows(plant)}
+    if unknown := values.keys() - rows.keys():
+        raise ValueError(f'{min(unknown)} is no constant of {plant.__name__}: it has '
+                         f'{", ".join(rows) or "none"}')
+    return {name: _given(rows[name], value) for name, value in values.items()}
+
+
+def _rows(plant: Any) -> list[Any]:
+    return [row for row in fields(plant) if 'si' in row.metadata] if is_dataclass(plant) else []
+
+
+def _shown(row: Any, value: float) -> float:
+    shown = (to_celsius(value) if row.metadata['si'] == 'degC'
+             else value / row.metadata['factor'])
+    # 76.85, and not 76.85000000000002
+    return float(f'{shown:.15g}')
+
+
+def _given(row: Any, value: float) -> float:
+    for exact in (row.default, row.metadata['lower'], row.metadata['upper']):
+        if value == _shown(row, exact):
+            return float(exact)
+    return to_kelvin(value) if row.metadata['si'] == 'degC' else value * row.metadata['factor']

@@ -1,0 +1,36 @@
+# SPDX-FileCopyrightText: 2026 The koopman_ros Authors
+# SPDX-License-Identifier: Apache-2.0
+
+"""What a name in a parameter stands for: something of the package, or ``module:name`` of any."""
+
+from collections.abc import Callable, Mapping
+import importlib
+from typing import Any
+
+
+def plug(name: str, kind: str, known: Mapping[str, Callable[..., Any] | str]) -> Any:
+    """
+    Return what a name stands for: something known, or ``module:name`` of any module.
+
+    :param kind: what it is, for the error, e.g. ``'law'``.
+    :param known: by name, itself or as ``module:name``, which is imported only when it is asked
+        for.
+    :raises ValueError: for a name that stands for nothing that can be called.
+    """
+    found = known.get(name, name)
+    if not isinstance(found, str):
+        return found
+    module, _, attribute = found.partition(':')
+    if not attribute:
+        raise ValueError(f'there is no {kind} {name!r}: choose one of {", ".join(known)}, or '
+                         'module:name of one of your own')
+    try:
+        found = getattr(importlib.import_module(module), attribute)
+    except Exception as error:  # a module may fail in every way
+        cause = ' '.join(f'{type(error).__name__}: {error}'.split())
+        raise ValueError(f'the {kind} {name!r} cannot be loaded ({cause}): check module and '
+                         'name, and that Python finds the module') from error
+    if not callable(found):
+        raise ValueError(f'the {kind} {name!r} is a {type(found).__name__}, which cannot be '
+                         'called: name a class or a function')
+    return found
