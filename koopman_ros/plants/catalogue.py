@@ -18,6 +18,9 @@ PLANTS = {
     'reactor': f'{_LIBRARY}.reactor:OneStateReactor',
     'two_state': f'{_LIBRARY}.reactor:TwoStateReactor',
     'two_state_example': f'{_LIBRARY}.two_state:TwoStateExample',
+    'two_tanks': f'{_LIBRARY}.two_tanks:TwoTanks',
+    'quadruple_tank': f'{_LIBRARY}.quadruple_tank:QuadrupleTank',
+    'pendulum': f'{_LIBRARY}.pendulum:Pendulum',
 }
 #: of packages that offer plants
 ENTRY_POINTS = 'koopman_ros.plants'

@@ -14,6 +14,7 @@ from koopman_ros.plants import (
     equilibrium_input,
     EquilibriumError,
     one_state_reactor,
+    plant_class,
     ReactorParameters,
     scalar_example,
     two_state_example,
@@ -23,11 +24,27 @@ from support.closed_loops import steady_state
 
 NOMINAL = 324.475443431599
 REACTORS = [one_state_reactor, two_state_reactor]
+
+def two_tanks():
+    return plant_class('two_tanks')().system()
+
+
+def quadruple_tank():
+    return plant_class('quadruple_tank')().system()
+
+
+def pendulum():
+    return plant_class('pendulum')().system()
+
+
 PLANTS = {
     scalar_example: [0.3, 0.7, 2.0],
     two_state_example: [0.5, 1.5, -2.0],
     one_state_reactor: [310.0, 324.0, 360.0],
     two_state_reactor: [310.0, 324.0, 360.0],
+    two_tanks: [0.02, 0.1, 0.4],
+    quadruple_tank: [0.02, 0.1, 0.4],
+    pendulum: [-2.0, 0.1, 3.0],
 }
 
 
