@@ -1,0 +1,175 @@
+# SPDX-FileCopyrightText: 2026 The koopman_ros Authors
+# SPDX-License-Identifier: Apache-2.0
+
+"""The least cost of moving a plant, on its true equations, to measure controllers by."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+import math
+
+import numpy as np
+
+from koopman_ros.arrays import Array
+from koopman_ros.plants.system import ControlAffineSystem
+from koopman_ros.solvers import RiccatiStatus, runge_kutta_step, solve_riccati
+
+_MAX_ITERATIONS = 200
+_SHORTEST_STEP = 2.0 ** -20
+
+
+@dataclass(frozen=True, eq=False)
+class Task:
+    """Moving a plant to a set-point, its input held between samples."""
+
+    system: ControlAffineSystem  #: the plant
+    x0: Array  #: (n_x,) start
+    x_ref: Array  #: (n_x,) set-point; only its weighted states count
+    u_ref: Array  #: (n_u,) input that holds it, from which the cost counts
+    Q: Array  #: (n_x,) weights of squared state errors
+    R: Array  #: (n_u,) weights of squared input deviations, above 0
+    period: float  #: of the samples, in time units
+    samples: int  #: how many there are
+    substeps: int = 4  #: Runge-Kutta steps in a period
+
+
+@dataclass(frozen=True, eq=False)
+class Course:
+    """What a plant did in a task."""
+
+    states: Array  #: (samples + 1, n_x)
+    inputs: Array  #: (samples, n_u), each held for a period
+    cost: float  #: integral of e' Q e + v' R v; infinite where the plant escaped
+
+
+def held(task: Task, inputs: Array) -> Course:
+    """Apply inputs (samples, n_u), e.g. those that a controller is recorded to have given."""
+    return _roll_out(task, inputs, np.zeros((*inputs.shape, task.system.n_x)),
+                     np.zeros((len(inputs), task.system.n_x)))
+
+
+def linear_law(task: Task) -> Course:
+    """
+    Apply the linear-quadratic law of the plant linearised at its nominal point.
+
+    Its feed-forward is its own: the input that, to the linearised plant, holds the weighted
+    states at the set-point.
+    """
+    system = task.system
+    A, weighted = system.drift_jacobian(system.nominal_state), task.Q > 0.0
+    C = np.eye(system.n_x)[weighted]
+    # in units of the states, which matter where no input holds them all
+    unit = np.concatenate([system.state_scale, system.state_scale[weighted]])
+    held_so = np.block([[A, system.B], [C, np.zeros((len(C), system.n_u))]]) / unit[:, None]
+    offset = np.concatenate([np.zeros(system.n_x), C @ (task.x_ref - system.nominal_state)])
+    x, u = np.split(np.linalg.lstsq(held_so, offset / unit, rcond=None)[0], [system.n_x])
+    K = solve_riccati(A, system.B, np.diag(task.Q), np.diag(task.R)).K
+    return _constant_law(task, system.nominal_input + u, K, system.nominal_state + x)
+
+
+def optimum(task: Task) -> Course:
+    """
+    Find the inputs of least cost by the iterated linear-quadratic regulator (Gauss-Newton).
+
+    It begins with the linear-quadratic law at the set-point, so that an unstable plant stays with
+    it from the first step on.
+
+    :raises ValueError: when that law loses the plant, or the iteration does not end.
+    """
+    system = task.system
+    riccati = solve_riccati(system.drift_jacobian(task.x_ref), system.B, np.diag(task.Q),
+                            np.diag(task.R))
+    K = riccati.K if riccati.status is RiccatiStatus.SOLVED else np.zeros_like(system.B.T)
+    course = _constant_law(task, task.u_ref, K, task.x_ref)
+    if not math.isfinite(course.cost):
+        raise ValueError(f'{system.name}: the linear law does not hold the plant from '
+                         f'{system.describe_state(task.x0)}: start nearer to the set-point')
+    for _ in range(_MAX_ITERATIONS):
+        change, gains, gain = _improvement(task, course)
+        if gain <= 1e-10 * course.cost:
+            return course
+        length, better = 1.0, course
+        while better.cost >= course.cost and length >= _SHORTEST_STEP:
+            better = _roll_out(task, course.inputs + length * change, gains, course.states)
+            length *= 0.5
+        if better.cost >= course.cost:
+            break
+        course = better
+    raise ValueError(f'{system.name}: no optimum found, the cost is still {course.cost:.6g} and '
+                     f'would fall by {gain:.3g}: shorten the horizon or the period')
+
+
+def _constant_law(task: Task, u: Array, K: Array, x: Array) -> Course:
+    return _roll_out(task, np.tile(u, (task.samples, 1)), np.tile(K, (task.samples, 1, 1)),
+                     np.tile(x, (task.samples, 1)))
+
+
+def _roll_out(task: Task, inputs: Array, K: Array, about: Array) -> Course:
+    """Apply inputs[k] - K[k] (x - about[k]): (N, n_u), (N, n_u, n_x) and (N or more, n_x)."""
+    system, h = task.system, task.period / task.substeps
+    states, applied = np.empty((len(inputs) + 1, system.n_x)), np.empty_like(inputs)
+    y = np.append(task.x0, 0.0)
+    with np.errstate(all='ignore'):
+        for k, u in enumerate(inputs):
+            states[k] = y[:-1]
+            applied[k] = u - K[k].dot(states[k] - about[k])
+            forcing, effort = system.B.dot(applied[k]), task.R.dot((applied[k] - task.u_ref) ** 2)
+
+            def rate(y: Array, forcing: Array = forcing, effort: float = effort) -> Array:
+                x = y[:-1]
+                return np.append(system.drift(x) + forcing,
+                                 task.Q.dot((x - task.x_ref) ** 2) + effort)
+
+            for _ in range(task.substeps):
+                y = runge_kutta_step(rate, y, h)
+    states[-1] = y[:-1]
+    return Course(states, applied, float(y[-1]) if np.all(np.isfinite(y)) else math.inf)
+
+
+def _improvement(task: Task, course: Course) -> tuple[Array, Array, float]:
+    """Return a change of the inputs, its gains (N, n_u, n_x), and how far the cost would fall."""
+    n = task.system.n_x
+    F, g, H = _expansion(task, course)
+    change, gains = np.empty_like(course.inputs), np.empty((len(F), task.system.n_u, n))
+    slope, curvature, gain = np.zeros(n), np.zeros((n, n)), 0.0
+    for k in reversed(range(len(F))):
+        h = g[k] + F[k].T @ slope
+        W = H[k] + F[k].T @ curvature @ F[k]
+        solved = np.linalg.solve(W[n:, n:], np.column_stack([h[n:], W[n:, :n]]))
+        change[k], gains[k] = -solved[:, 0], solved[:, 1:]
+        gain += 0.5 * float(h[n:] @ solved[:, 0])
+        slope = h[:n] - W[:n, n:] @ solved[:, 0]
+        curvature = W[:n, :n] - W[:n, n:] @ gains[k]
+    return change, gains, gain
+
+
+def _expansion(task: Task, course: Course) -> tuple[Array, Array, Array]:
+    """
+    Expand all samples at once by state and input at their beginning, p = n_x + n_u in number.
+
+    :return: of the state at the end its slope (N, n_x, p), of the cost on the way its slope
+        (N, p) and the curvature (N, p, p) that the plant's own curvature has no part in.
+    """
+    system = task.system
+    n, N = system.n_x, task.samples
+    p = n + system.n_u
+    effort = np.concatenate([np.zeros((N, n)), 2.0 * task.R * (course.inputs - task.u_ref)], 1)
+    weight = np.diag(np.concatenate([np.zeros(n), 2.0 * task.R]))
+    into = np.concatenate([np.zeros((n, n)), system.B], 1)
+    ends = np.cumsum([n, n * p, p, p * p])
+
+    def rate(y: Array) -> Array:
+        x, F = y[:, :n], y[:, ends[0]:ends[1]].reshape(N, n, p)
+        QF = 2.0 * task.Q[:, None] * F
+        return np.concatenate([part.reshape(N, -1) for part in (
+            system.derivative(x, course.inputs), system.drift_jacobian(x) @ F + into,
+            np.einsum('kip,ki->kp', QF, x - task.x_ref) + effort,
+            F.transpose(0, 2, 1) @ QF + weight)], axis=1)
+
+    y = np.zeros((N, ends[-1]))
+    y[:, :n] = course.states[:-1]
+    y[:, n:ends[1]] = np.eye(n, p).ravel()
+    for _ in range(task.substeps):
+        y = runge_kutta_step(rate, y, task.period / task.substeps)
+    return (y[:, ends[0]:ends[1]].reshape(N, n, p), y[:, ends[1]:ends[2]],
+            y[:, ends[2]:].reshape(N, p, p))
