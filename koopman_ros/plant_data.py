@@ -33,7 +33,10 @@ class Plant:
 @dataclass(frozen=True)
 class Episode:
     """
-    Uninterrupted measurements of a plant, with inputs that are held between their changes.
+    Uninterrupted measurements of a plant, with the inputs that acted.
+
+    A command is held until the next one; an input that was measured behind a slow actuator is
+    linear from sample to sample.
 
     :raises ValueError: on unequal lengths, times that do not rise, values that are not finite,
         or an input that is not known at the first measurement.
@@ -41,10 +44,12 @@ class Episode:
 
     time: Array  #: (N,) times of the measurements, rising, in time units
     x: Array  #: (N, n_x) measured states, in state units, with their noise
-    #: (M,) times from which each input was held, rising, the first not later than the first
-    #: measurement
+    #: (M,) times from which each input was held, or at which it was measured, rising, the first
+    #: not later than the first measurement
     input_time: Array
     u: Array  #: (M, n_u) those inputs, in input units
+    #: (n_u,) whether each is linear between those times; empty where all are held
+    linear: tuple[bool, ...] = ()
 
     def __post_init__(self) -> None:
         for times, values in (('time', 'x'), ('input_time', 'u')):
@@ -62,30 +67,47 @@ class Episode:
         if self.input_time[0] > self.time[0]:
             raise ValueError('the input at the first measurement is not known: begin the episode '
                              'with the first measurement after an input')
+        if self.linear and len(self.linear) != self.u.shape[1]:
+            raise ValueError(f'linear = {self.linear} must have one entry for each of '
+                             f'{self.u.shape[1]} inputs')
 
     def __len__(self) -> int:
         return len(self.time)
 
     def inputs_at(self, times: Array) -> Array:
-        """Return the inputs (n, n_u) that hold from `times` (n,) on."""
-        return self.u[np.searchsorted(self.input_time, times, side='right') - 1]
+        """Return the inputs (n, n_u) that act from `times` (n,) on."""
+        u: Array = self.u[np.searchsorted(self.input_time, times, side='right') - 1]
+        for j in np.flatnonzero(self.linear):
+            u[:, j] = np.interp(times, self.input_time, self.u[:, j])
+        return u
+
+    def inputs_between(self, edges: Array) -> tuple[Array, Array]:
+        """Return the inputs (n - 1, n_u) at begin and end of intervals that no change divides."""
+        begin = self.inputs_at(edges[:-1])
+        return begin, self._later(begin, edges[1:])
 
     def input_integral(self, times: Array) -> Array:
         """Return the integral of u (n, n_u) from the first measurement to `times` (n,)."""
         knots = np.concatenate((self.time[:1], self.input_time[self.input_time > self.time[0]]))
-        held = self.inputs_at(knots)
-        areas = np.vstack((np.zeros((1, held.shape[1])),
-                           np.cumsum(np.diff(knots)[:, None] * held[:-1], axis=0)))
+        begin, end = self.inputs_between(np.append(knots, knots[-1]))
+        areas = np.vstack((np.zeros((1, begin.shape[1])), np.cumsum(
+            np.diff(knots)[:, None] * (0.5 * (begin + end))[:-1], axis=0)))
         last = np.maximum(np.searchsorted(knots, times, side='right') - 1, 0)
-        return areas[last] + (times - knots[last])[:, None] * held[last]
+        mean = 0.5 * (begin[last] + self._later(begin[last], times))
+        return areas[last] + (times - knots[last])[:, None] * mean
+
+    def _later(self, u: Array, times: Array) -> Array:
+        """Return what inputs (n, n_u) have become at `times` (n,), before any other change."""
+        return np.where(self.linear, self.inputs_at(times), u) if any(self.linear) else u
 
     def part(self, start: int, stop: int) -> Episode:
         """Return the measurements `start` to `stop` with the inputs that acted on them."""
         time = self.time[start:stop]
         first = np.searchsorted(self.input_time, time[0], side='right') - 1
-        last = np.searchsorted(self.input_time, time[-1], side='left')
+        # a line needs its end, too
+        last = np.searchsorted(self.input_time, time[-1], side='left') + any(self.linear)
         keep = slice(first, max(first + 1, last))
-        return Episode(time, self.x[start:stop], self.input_time[keep], self.u[keep])
+        return Episode(time, self.x[start:stop], self.input_time[keep], self.u[keep], self.linear)
 
 
 def cut(episodes: Sequence[Episode], samples: int) -> list[Episode]:

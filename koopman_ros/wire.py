@@ -7,12 +7,12 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from functools import cache
+from functools import cache, cached_property
 import math
 import re
 from typing import Any
 
-from koopman_ros.units import display_unit
+from koopman_ros.units import conversion, display_unit
 
 
 @dataclass(frozen=True)
@@ -65,10 +65,14 @@ class Place:
     def __post_init__(self) -> None:
         _steps(self.field)
 
-    @property
-    def carrier(self) -> Carrier:
-        """What is known of the type."""
-        return CARRIERS.get(self.type, _ANY)
+    @cached_property
+    def range(self) -> tuple[float, float]:
+        """Lowest and highest number that can be there; ValueError for a unit that is none here."""
+        usual = CARRIERS.get(self.type, _ANY)
+        if self.field != usual.field:
+            return -math.inf, math.inf
+        here = conversion(usual.unit or self.unit, self.unit)
+        return here(usual.lowest), here(usual.highest)
 
     def get(self, message: Any) -> float:
         """Return the number in a message; LookupError where it has none there."""

@@ -30,8 +30,25 @@ def test_inputs_hold_from_their_own_time_on_and_add_up_by_hand():
     assert episode.input_integral(times)[:, 0].tolist() == [0.0, 0.5, 1.0, -1.0, 7.0]
 
 
-def test_part_keeps_what_acted():
-    episode = irregular()
+def test_inputs_that_were_measured_are_linear_between():
+    # the first is 1 + t, then falls; the second is held
+    episode = Episode(np.array([1.0, 3.0, 4.0]), np.zeros((3, 1)), np.array([0.0, 2.0, 4.0]),
+                      np.array([[1.0, 5.0], [3.0, 7.0], [1.0, 9.0]]), (True, False))
+    times = np.array([1.0, 1.5, 2.0, 3.0, 4.0])
+    assert episode.inputs_at(times).tolist() == [
+        [2.0, 5.0], [2.5, 5.0], [3.0, 7.0], [2.0, 7.0], [1.0, 9.0]]
+    assert episode.input_integral(times).tolist() == [
+        [0.0, 0.0], [1.125, 2.5], [2.5, 5.0], [5.0, 12.0], [6.5, 19.0]]
+    begin, end = episode.inputs_between(np.array([1.0, 2.0, 3.0]))
+    assert (begin.tolist(), end.tolist()) == (
+        [[2.0, 5.0], [3.0, 7.0]], [[3.0, 5.0], [2.0, 7.0]])
+    with pytest.raises(ValueError, match='one entry for each of 2 inputs'):
+        replace(episode, linear=(True,))
+
+
+@pytest.mark.parametrize('linear', [(), (True, False)])
+def test_part_keeps_what_acted(linear):
+    episode = replace(irregular(), linear=linear)
     part = episode.part(7, 21)
     assert np.array_equal(part.time, episode.time[7:21])
     assert np.array_equal(part.x, episode.x[7:21])

@@ -3,7 +3,7 @@
 
 """Bags in the layout of rosbag2 (MCAP), written and read on any machine with Python, no ROS."""
 
-from koopman_ros.bags.episodes import Account, loop_episodes
+from koopman_ros.bags.episodes import Account, loop_episodes, RecordedInput, RecordedState
 from koopman_ros.bags.limits import BagReadError
 from koopman_ros.bags.metadata import INFINITE_NS, QosProfile
 from koopman_ros.bags.reader import BagMessage, BagSummary, in_log_order, read_messages, summary
@@ -13,6 +13,7 @@ from koopman_ros.bags.writer import BagWriter
 
 __all__ = [
     'INFINITE_NS', 'Account', 'BagMessage', 'BagReadError', 'BagSummary', 'BagWriter',
-    'MessageDefinition', 'MessageDefinitionError', 'QosProfile', 'Series', 'in_log_order',
-    'loop_episodes', 'message_definition', 'read_messages', 'read_series', 'summary',
+    'MessageDefinition', 'MessageDefinitionError', 'QosProfile', 'RecordedInput',
+    'RecordedState', 'Series', 'in_log_order', 'loop_episodes', 'message_definition',
+    'read_messages', 'read_series', 'summary',
 ]

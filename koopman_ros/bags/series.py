@@ -1,9 +1,9 @@
 # SPDX-FileCopyrightText: 2026 The koopman_ros Authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""Recorded signals: one number in each stamped message of a topic, and where they jump."""
+"""Recorded signals: a number in each message of a topic, and where they jump."""
 
-from collections.abc import Collection
+from collections.abc import Iterable
 from dataclasses import dataclass
 import os
 
@@ -13,24 +13,7 @@ from numpy.typing import NDArray
 from koopman_ros.bags.limits import BagReadError, reason
 from koopman_ros.bags.reader import BagMessage, BagSummary, read_messages, summary
 from koopman_ros.units import NANOSECONDS
-
-
-@dataclass(frozen=True)
-class Scalar:
-    """How messages of a type carry a number."""
-
-    field: str  #: its name in the message
-    unit: str  #: of the number
-    lowest: float  #: that it can be, in this unit; what is below is no measurement
-    highest: float  #: likewise
-    least_jump: float  #: smallest change that may be one to another level, as after a reset
-
-
-# The types that can be read as signals, in the units of REP 103.
-SCALARS = {
-    'sensor_msgs/msg/Temperature': Scalar('temperature', 'degC', -273.15, 1e4, 1.0),
-    'sensor_msgs/msg/FluidPressure': Scalar('fluid_pressure', 'Pa', -1e12, 1e12, 1e3),
-}
+from koopman_ros.wire import CARRIERS, Place
 
 # Fewer samples do not tell what is usual.
 _ENOUGH = 50
@@ -46,60 +29,88 @@ _MOSTLY = (1.0, 99.0)  # percentiles
 class Series:
     """A signal as arrays of one length n, in the order of recording."""
 
-    stamp_ns: NDArray[np.int64]  #: (n,) the header's stamp [ns]
+    stamp_ns: NDArray[np.int64]  #: (n,) the header's stamp [ns], of receipt where there is none
     values: NDArray[np.float64]  #: (n,) the numbers
     unit: str  #: of the numbers
 
 
-def read_series(path: str | os.PathLike[str], topic: str, *, recover: bool = False) -> Series:
+def read_series(path: str | os.PathLike[str], place: Place | str, *, recover: bool = False
+                ) -> Series:
     """
     Return a signal of a bag as arrays; `recover` is that of `read_messages`.
 
-    Raises BagReadError as `read_messages` does, and for a topic that the bag does not hold or
-    that is of none of the types in `SCALARS`.
+    :param place: of the number, or the name of its topic where the type alone tells field and
+        unit, as a temperature does. Messages without the number are left out.
+    :raises BagReadError: as `read_messages` does, and for a topic that the bag does not hold or
+        that is of another type.
     """
+    topic = place if isinstance(place, str) else place.topic
     # first, for what it says of a bag that is none
     messages = read_messages(path, [topic], recover=recover)
-    carrier = carriers(path, summary(path), [topic])[topic]
-    numbers = [stamped_number(path, entry, carrier) for entry in messages]
+    content = summary(path)
+    if isinstance(place, str):
+        place = _usual(path, content, place)
+    check_places(path, content, [place])
+    found = [(entry, stamped_number(path, entry, place)) for entry in messages]
+    numbers = [(entry.log_time_ns if stamp is None else stamp, value)
+               for entry, (stamp, value) in found if value is not None]
     return Series(np.array([stamp for stamp, _ in numbers], dtype=np.int64),
-                  np.array([value for _, value in numbers], dtype=np.float64), carrier.unit)
+                  np.array([value for _, value in numbers], dtype=np.float64), place.unit)
 
 
-def carriers(path: str | os.PathLike[str], content: BagSummary, topics: Collection[str]
-             ) -> dict[str, Scalar]:
-    """Return how topics carry their numbers; raise BagReadError for one that has none."""
-    for topic in topics:
-        if topic not in content.types:
+def _usual(path: str | os.PathLike[str], content: BagSummary, topic: str) -> Place:
+    """Return where the number is in messages of a topic whose type tells it."""
+    known = {name: row for name, row in CARRIERS.items() if row.unit}
+    kind = content.types.get(topic, next(iter(known)))
+    if kind not in known:
+        raise _other_type(path, topic, kind, ' or '.join(known))
+    return Place(topic, kind, known[kind].field, known[kind].unit)
+
+
+def check_places(path: str | os.PathLike[str], content: BagSummary, places: Iterable[Place]
+                 ) -> None:
+    """Raise BagReadError for a topic that a bag does not hold, or that is of another type."""
+    for place in places:
+        if place.topic not in content.types:
             known = ', '.join(sorted(content.types)) or 'no topic at all'
-            raise BagReadError(f'bag {os.fspath(path)!r} has no topic {topic!r}, it has {known}: '
-                               'name the right topics, or record them')
-        if content.types[topic] not in SCALARS:
-            raise _other_type(path, topic, content.types[topic])
-    return {topic: SCALARS[content.types[topic]] for topic in topics}
+            raise BagReadError(f'bag {os.fspath(path)!r} has no topic {place.topic!r}, it has '
+                               f'{known}: name the right topics, or record them')
+        if content.types[place.topic] != place.type:
+            raise _other_type(path, place.topic, content.types[place.topic], place.type)
 
 
-def stamped_number(path: str | os.PathLike[str], entry: BagMessage, carrier: Scalar
-                   ) -> tuple[int, float]:
-    """Return stamp [ns] and number of a message; raise BagReadError where it has none."""
-    if SCALARS.get(entry.type_name) is not carrier:
-        raise _other_type(path, entry.topic, entry.type_name)
+def stamped_number(path: str | os.PathLike[str], entry: BagMessage, place: Place
+                   ) -> tuple[int | None, float | None]:
+    """
+    Return stamp [ns] and number of a message: None where its type has none, or an array lacks it.
+
+    :raises BagReadError: for a message of another type, or one that is laid out differently.
+    """
+    if entry.type_name != place.type:
+        raise _other_type(path, entry.topic, entry.type_name, place.type)
     try:
-        stamp = entry.message.header.stamp
-        return (int(np.int64(NANOSECONDS * stamp.sec + stamp.nanosec)),
-                float(getattr(entry.message, carrier.field)))
-    except (AttributeError, TypeError, ValueError, OverflowError) as error:
+        header = getattr(entry.message, 'header', None)
+        stamp_ns = None if header is None else int(np.int64(
+            NANOSECONDS * header.stamp.sec + header.stamp.nanosec))
+        try:
+            return stamp_ns, place.get(entry.message)
+        except LookupError:
+            # an array may be shorter at times, or name other elements
+            if '[' not in place.field:
+                raise
+            return stamp_ns, None
+    except (AttributeError, LookupError, TypeError, ValueError, OverflowError) as error:
         raise BagReadError(
             f'topic {entry.topic!r} of bag {os.fspath(path)!r} calls itself {entry.type_name} and '
             f'is laid out differently ({reason(error)}): read it with read_messages') from error
 
 
-def _other_type(path: str | os.PathLike[str], topic: str, found: str) -> BagReadError:
-    return BagReadError(f'topic {topic!r} of bag {os.fspath(path)!r} is {found}, not '
-                        f'{" or ".join(SCALARS)}: name another topic')
+def _other_type(path: str | os.PathLike[str], topic: str, found: str, wanted: str) -> BagReadError:
+    return BagReadError(f'topic {topic!r} of bag {os.fspath(path)!r} is {found}, not {wanted}: '
+                        'name another topic')
 
 
-def spikes_and_jumps(values: NDArray[np.float64], least: float
+def spikes_and_jumps(values: NDArray[np.float64], least: float = 0.0
                      ) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
     """
     Find changes that no plant makes: samples that leap away and back, and jumps to another level.

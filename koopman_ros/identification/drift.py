@@ -75,10 +75,10 @@ class DriftModel:
 
 @dataclass(frozen=True)
 class Segments:
-    """M segments on grids of K steps, between which inputs are constant; short ones are padded."""
+    """M segments on grids of K steps, each with one input; short ones are padded."""
 
     steps: Array  #: (K, M) lengths of the steps, 0 in the padding, in time units
-    u: Array  #: (K, M, n_u) inputs held over them
+    u: Array  #: (K, M, n_u) inputs held over them, or their means where they were linear
     x: Array  #: (K + 1, M, n_x) measured states, 0 where none was measured
     measured: np.ndarray  #: (K + 1, M) whether one was
 
@@ -93,7 +93,7 @@ class Segments:
         for j, (episode, grid) in enumerate(zip(episodes, grids, strict=True)):
             k = len(grid) - 1
             steps[:k, j] = np.diff(grid)
-            u[:k, j] = episode.inputs_at(grid[:-1])
+            u[:k, j] = 0.5 * np.add(*episode.inputs_between(grid))
             u[k:, j] = episode.u[-1]
             rows = np.searchsorted(grid, episode.time)
             x[rows, j], measured[rows, j] = episode.x, True

@@ -16,13 +16,13 @@ import shutil
 import numpy as np
 from numpy.typing import NDArray
 
-from koopman_ros.bags import Account, loop_episodes
+from koopman_ros.bags import Account, loop_episodes, RecordedInput, RecordedState
 from koopman_ros.identification import Identified, identify, Stopped
 from koopman_ros.learning import NoUsefulLift, Progress, Trained
 from koopman_ros.lifting import Box, LiftedModel, load, save
 from koopman_ros.plant_data import Episode
 from koopman_ros.retraining.lift import decide, Decision, learn_lift, Thresholds
-from koopman_ros.units import NANOSECONDS
+from koopman_ros.wire import place
 
 CELLS = 10  # along each state and input, by which the visited share of their range is told
 
@@ -128,10 +128,11 @@ def retrain(task: Task, on_progress: OnProgress = lambda *_: False) -> Retrained
     # a folder that cannot be written should fail now, not after the training
     Path(task.output).parent.mkdir(parents=True, exist_ok=True)
     _stop_if(on_progress(0.0, 'reading bags'))
+    (x,), (x_unit,) = current.states.names, current.states.units
+    (u,), (u_unit,) = current.inputs.names, current.inputs.units
     recorded, account = loop_episodes(
-        task.bags, task.temperature_topic, task.coolant_topic,
-        (current.states.units[0], current.inputs.units[0]),
-        input_delay_ns=round(task.input_delay * NANOSECONDS))
+        task.bags, [RecordedState(x, x_unit, place(task.temperature_topic, x, x_unit))],
+        [RecordedInput(u, u_unit, place(task.coolant_topic, u, u_unit), delay=task.input_delay)])
     if not recorded:
         raise ValueError('the bags hold no usable segment of measurements: '
                          + '; '.join(account.lines()))

@@ -17,11 +17,13 @@ from koopman_ros.bags.series import spikes_and_jumps
 from koopman_ros.plant_data import Episode
 from koopman_ros.plants import one_state_reactor, random_steps, RandomStepDesign
 from koopman_ros.units import NANOSECONDS as SECOND
+from koopman_ros.wire import Place
 from support.bag_samples import Sample
 
 MEASURED, COMMAND = '/level', '/valve'
 PRESSURE = 'sensor_msgs/msg/FluidPressure'
-UNITS = 'Pa', 'Pa'
+STATE = bags.RecordedState('level', 'Pa', Place(MEASURED, PRESSURE, 'fluid_pressure', 'Pa'))
+INPUT = bags.RecordedInput('valve', 'Pa', Place(COMMAND, PRESSURE, 'fluid_pressure', 'Pa'))
 # what the wall clock says where stamps are simulated
 WALL = 1_700_000_000 * SECOND
 
@@ -78,7 +80,7 @@ def write(samples: list[Sample], tmp_path: Path) -> Callable[..., Path]:
 
 
 def read(*paths: Path) -> tuple[list[Episode], bags.Account]:
-    episodes, account = bags.loop_episodes(paths, MEASURED, COMMAND, UNITS)
+    episodes, account = bags.loop_episodes(paths, [STATE], [INPUT])
     assert account.used == sum(map(len, episodes))
     return episodes, account
 
@@ -132,7 +134,7 @@ NEW = 'a new episode begins'
                  [[*range(1, 40), *range(41, 71)], range(3071, 3121)],
                  [answers(1, 70), answers(71, 120, 3000.0)],
                  ['119 of 120 measurements used', '1 dropped: spike of a single sample',
-                  f'{{bag}}: jump to 3071.00 Pa at 70.000 s, {NEW}'], id='spike and jump'),
+                  f'{{bag}}: jump to 3071 Pa at 70.000 s, {NEW}'], id='spike and jump'),
     pytest.param([*loop(30), *(Sent(s.topic, s.stamp, s.value + 500.0, s.received + 100.0)
                                for s in loop(12))],
                  # what acted before is not what acts now
@@ -194,8 +196,8 @@ def test_wall_clock_answers_act_when_they_arrive(write: Callable[..., Path]) -> 
 
 
 def test_dead_time_of_the_actuator(write: Callable[..., Path]) -> None:
-    (episode,), account = bags.loop_episodes([write(loop(20))], MEASURED, COMMAND, UNITS,
-                                             input_delay_ns=2 * SECOND + 1)
+    (episode,), account = bags.loop_episodes(
+        [write(loop(20))], [STATE], [replace(INPUT, delay=2.000000001)])
     # to the nanosecond, from the first measurement on, at 4 s
     assert episode.input_time[:3].tolist() == [1e-9 - 1.0, 1e-9, 1e-9 + 1.0]
     assert episode.u[:3, 0].tolist() == [101.0, 102.0, 103.0]
@@ -291,21 +293,25 @@ def test_damage_in_a_closed_bag_is_told(write: Callable[..., Path]) -> None:
 def test_topics_that_are_not_there(write: Callable[..., Path], tmp_path: Path) -> None:
     bag = write(loop(15))
     (tmp_path / 'empty.mcap').touch()
-    for path, topic, units, words in (
-            (bag, '/unit/level', UNITS, r"run\.mcap' has no topic '/unit/level', it has /level, "
-             '/valve: name the right topics, or record them'),
-            (bag, COMMAND, ('Pa', 'K'), r"'/valve' of bag .*: 'Pa' cannot be converted to 'K'.*"
-             '; name another topic'),
-            (tmp_path / 'none.mcap', COMMAND, UNITS, r'none\.mcap'),
-            (tmp_path / 'empty.mcap', COMMAND, UNITS, r'empty\.mcap')):
+    other = replace(INPUT, command=replace(INPUT.command, topic='/unit/level'))
+    for path, signal, words in (
+            (bag, other, r"run\.mcap' has no topic '/unit/level', it has /level, /valve: name the "
+             'right topics, or record them'),
+            (bag, replace(INPUT, command=replace(INPUT.command, type='std_msgs/msg/Float64')),
+             r"'/valve' of bag .* is sensor_msgs/msg/FluidPressure, not std_msgs/msg/Float64"),
+            (bag, replace(INPUT, unit='K'), r"'/valve' of bag .*: 'Pa' cannot be converted to 'K'"
+             '.*; name another topic'),
+            (tmp_path / 'none.mcap', INPUT, r'none\.mcap'),
+            (tmp_path / 'empty.mcap', INPUT, r'empty\.mcap')):
         with pytest.raises(bags.BagReadError, match=words):
-            bags.loop_episodes([path], MEASURED, topic, units)
+            bags.loop_episodes([path], [STATE], [signal])
     with pytest.raises(bags.BagReadError, match="has no topic '/valve_2', it has /level, /valve"):
         bags.read_series(bag, '/valve_2')
 
 
 def test_episodes_come_in_the_units_asked_for(write: Callable[..., Path]) -> None:
-    (episode,), _ = bags.loop_episodes([write(loop(15))], MEASURED, COMMAND, ('kPa', 'mbar'))
+    (episode,), _ = bags.loop_episodes(
+        [write(loop(15))], [replace(STATE, unit='kPa')], [replace(INPUT, unit='mbar')])
     assert episode.x[0, 0] == pytest.approx(0.001)
     assert episode.u[0, 0] == pytest.approx(1.01)
 
@@ -353,8 +359,11 @@ def test_type_that_only_bears_the_name(
     with bags.BagWriter(tmp_path / 'run.mcap') as writer:
         writer.add_topic('/t', replace(known, text=text))
         writer.write('/t', sample.data, 1)
+    place = Place('/t', 'sensor_msgs/msg/Temperature', 'temperature', 'degC')
     for read in (lambda: bags.read_series(writer.path, '/t'),
-                 lambda: bags.loop_episodes([writer.path], '/t', '/t', ('K', 'K'))):
+                 lambda: bags.read_series(writer.path, place),
+                 lambda: bags.loop_episodes([writer.path], [bags.RecordedState('x', 'K', place)],
+                                            [bags.RecordedInput('u', 'K', place)])):
         with pytest.raises(bags.BagReadError, match=r'laid out differently|does not decode'):
             read()
 

@@ -3,17 +3,20 @@
 
 """What CONTRIBUTING says can be added in one file or row, from a folder outside the package."""
 
+from collections.abc import Iterator
 import importlib
 from pathlib import Path
 import textwrap
 from types import ModuleType
+from unittest import mock
 
 import numpy as np
 import pytest
 from rclpy.serialization import serialize_message
-from sensor_msgs.msg import RelativeHumidity
+from sensor_msgs.msg import BatteryState
 
-from koopman_ros.bags import BagWriter, loop_episodes, message_definition, series
+from koopman_ros import wire
+from koopman_ros.bags import BagWriter, message_definition, read_series
 from koopman_ros.parameters.table import ConfigurationError
 from koopman_ros.plants import Process
 from koopman_ros.ros.node import LoopNode
@@ -43,22 +46,22 @@ ROW = """
     TABLE = ParameterTable(Wider)
     """
 TYPE = """
-    from koopman_ros.bags.series import Scalar, SCALARS
+    from koopman_ros.wire import Carrier, CARRIERS
 
-    SCALARS['sensor_msgs/msg/RelativeHumidity'] = Scalar('relative_humidity', '1', 0.0, 1.0, 0.5)
+    CARRIERS['sensor_msgs/msg/BatteryState'] = Carrier('voltage', 'V', 0.0, 1e3)
     """
 
 
 @pytest.fixture
 def added(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, request: pytest.FixtureRequest
-          ) -> ModuleType:
+          ) -> Iterator[ModuleType]:
     """Return the module made of a text, in a folder that Python searches."""
     name = f'added_{request.node.callspec.id}'
     (tmp_path / f'{name}.py').write_text(textwrap.dedent(request.param))
     monkeypatch.syspath_prepend(tmp_path)
     # what it adds is gone with it
-    monkeypatch.setattr(series, 'SCALARS', dict(series.SCALARS))
-    return importlib.import_module(name)
+    with mock.patch.dict(wire.CARRIERS):
+        yield importlib.import_module(name)
 
 
 @pytest.mark.parametrize('added', [PLANT], indirect=True, ids=['plant'])
@@ -89,15 +92,13 @@ def test_a_parameter_is_declared_checked_and_written(added: ModuleType, ros: Har
 @pytest.mark.usefixtures('added', 'type_support')
 def test_a_message_type_is_learned_from(tmp_path: Path) -> None:
     with BagWriter(tmp_path / 'run') as writer:
-        definition = message_definition('sensor_msgs/msg/RelativeHumidity')
-        for topic in ('/moisture', '/spray'):
-            writer.add_topic(topic, definition)
-        for second in range(1, 31):
-            for topic, value in (('/moisture', 0.01 * second), ('/spray', 0.5)):
-                message = RelativeHumidity(relative_humidity=value)
-                message.header.stamp.sec = second
-                writer.write(topic, serialize_message(message), second * NANOSECONDS)
-    (episode,), account = loop_episodes(
-        [tmp_path / 'run'], '/moisture', '/spray', ('percent', '1'))
-    assert episode.x[:, 0] == pytest.approx(np.arange(1.0, 31.0), rel=1e-12)
-    assert account.used == 30
+        writer.add_topic('/cell', message_definition('sensor_msgs/msg/BatteryState'))
+        for second, voltage in enumerate((3.5, -1.0, 3.75), 1):
+            message = BatteryState(voltage=voltage)
+            message.header.stamp.sec = second
+            writer.write('/cell', serialize_message(message), second * NANOSECONDS)
+    series = read_series(tmp_path / 'run', '/cell')
+    assert (series.values.tolist(), series.unit) == ([3.5, -1.0, 3.75], 'V')
+    where = wire.place('/cell', 'cell', 'mV', {'type': 'sensor_msgs/msg/BatteryState'})
+    assert where == wire.Place('/cell', 'sensor_msgs/msg/BatteryState', 'voltage', 'V')
+    assert where.range == (0.0, 1e3)
