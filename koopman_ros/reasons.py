@@ -13,7 +13,9 @@ from typing import TypeAlias
 
 from koopman_ros.units import Displays
 
-Value: TypeAlias = 'float | int | str | Reason | tuple[tuple[str, float, float], ...]'
+Value: TypeAlias = (
+    'float | int | str | Reason | tuple[tuple[str, float], ...] '
+    '| tuple[tuple[str, float, float], ...]')
 
 
 class Code(Enum):
@@ -22,7 +24,8 @@ class Code(Enum):
 
     Of numbers in a sentence, 'value' is one of the signal, 'change' a difference of two, with its
     unit; 'rate' is a change per second. 'ranges' are (name, lower, upper) of several signals,
-    'level' is the name of a control level. What has no such format is written as it is.
+    'values' (name, value); 'level' is the name of a control level. What has no such format is
+    written as it is.
     """
 
     template: str
@@ -72,6 +75,18 @@ class Code(Enum):
         '{signal} set-point {value:value} is outside the trained range {lower:value} to '
         '{upper:value}: the old one is kept; choose one inside, or load a model trained over a '
         'wider range')
+    SETPOINT_NOT_HELD = 'setpoint_not_held', (
+        '{signal} set-point {value:value} cannot be held, since {cause}: the old one is kept; '
+        'the nearest that can be held is {held:values}')
+    NO_SETPOINT_HELD = 'no_setpoint_held', (
+        '{signal} set-point {value:value} cannot be held, since {cause}, and no other one is '
+        'found that can: the old one is kept; check the range of the inputs')
+    INPUT_NEEDED = 'input_needed', (
+        '{signal} would have to be {value:value}, its range is {lower:value} to {upper:value}')
+    STATE_LEAVES = 'state_leaves', (
+        '{signal} would go to {value:value}, outside the trained range {lower:value} to '
+        '{upper:value}')
+    NO_STEADY_STATE = 'no_steady_state', 'the model has no steady state there'
     SCHEDULE_FULL = 'schedule_full', (
         '{most} set-points are scheduled already: wait until some have taken effect, or send '
         'this one with stamp 0')
@@ -148,6 +163,9 @@ class _Formatter(string.Formatter):
                     f'{name} {self._words.displays[name].text(lower)} to '
                     f'{self._words.displays[name].text(upper)}'
                     for name, lower, upper in value)  # type: ignore[attr-defined]
+            case 'values':
+                return ', '.join(f'{name} {self._words.displays[name].text(number)}'
+                                 for name, number in value)  # type: ignore[attr-defined]
             case 'level':
                 return level_words(str(value))
             case 'value':

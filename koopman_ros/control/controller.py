@@ -13,6 +13,7 @@ import numpy as np
 
 from koopman_ros.arrays import Array
 from koopman_ros.control import setpoint as setpoints
+from koopman_ros.control.holding import Holding
 from koopman_ros.control.laws import LawResult
 from koopman_ros.control.laws.base import Target
 from koopman_ros.control.levels import Estimating, Level, levels_of
@@ -41,7 +42,7 @@ from koopman_ros.control.supervisor import (
     WayBack,
 )
 from koopman_ros.estimation import equivalent_bias, Estimate, Verdict
-from koopman_ros.lifting import LiftedModel
+from koopman_ros.lifting import Coordinates, LiftedModel
 from koopman_ros.reasons import Code, Reason, reason
 from koopman_ros.signals import Outputs
 from koopman_ros.units import LATE_NANOSECONDS, NANOSECONDS
@@ -78,6 +79,15 @@ class Controller:
         return levels_of(self.model, self.settings)
 
     @cached_property
+    def _best(self) -> Level:
+        return next(iter(self.levels.values()))
+
+    @property
+    def controlled(self) -> Coordinates:
+        """The states with a set-point."""
+        return self._best.controlled_states
+
+    @cached_property
     def _estimating(self) -> Estimating:
         return Estimating(self.model, self.measured, self.settings, self.levels)
 
@@ -102,23 +112,68 @@ class Controller:
 
     # What the operator asks for.
 
-    def request_setpoint(self, state: State, value: Array, effective_ns: int = 0
-                         ) -> tuple[State, Reason | None]:
+    def request_setpoint(self, state: State, value: Array, effective_ns: int = 0,
+                         signals: tuple[str, ...] | None = None) -> tuple[State, Reason | None]:
         """
         Ask for a set-point, at once or from a later time on.
 
-        :param value: (n_x,) in state units.
+        It has to lie in the trained range, and an input within its range has to hold it under the
+        disturbance that is estimated now.
+
+        :param value: (n,) of the signals, in state units.
         :param effective_ns: stamp from which it holds; see :func:`setpoint.request`.
+        :param signals: (n,) which of the controlled ones are asked for, the others stay as they
+            are; None for all.
         :return: the new state and None, or the old one with the reason of refusal.
+        :raises ValueError: for signals that are not controlled, or that do not fit the value.
         """
-        refusal = setpoints.refusal(self.model, value)
+        asked, every = self.controlled.names if signals is None else signals, self.controlled
+        if not asked or len(set(asked)) != len(asked) or not set(asked) <= set(every.names):
+            raise ValueError(f'signals must be some of {", ".join(every.names)}, each once, got '
+                             f'{list(asked)}')
+        if np.shape(value) != (len(asked),):
+            raise ValueError(f'incompatible set-point: expected one number for each of '
+                             f'{", ".join(asked)}, got {np.asarray(value).tolist()}')
+        refusal = setpoints.refusal(every.only(asked), value)
         if refusal is not None:
             return state, refusal
+        whole = np.full(len(every), np.nan)
+        whole[[every.names.index(name) for name in asked]] = value
         if (len(state.setpoint.scheduled) >= setpoints.MAX_SCHEDULED
                 and setpoints.lies_ahead(effective_ns, state.time_ns)):
             return state, reason(Code.SCHEDULE_FULL, most=setpoints.MAX_SCHEDULED)
-        return amended(state, setpoint=setpoints.request(
-            state.setpoint, _kept(value), effective_ns, state.time_ns)), None
+        requested = setpoints.request(
+            state.setpoint, _kept(whole), effective_ns, state.time_ns)
+        refusal = self._unheld(state, setpoints.at_its_time(
+            requested, effective_ns, state.time_ns), len(asked) == len(every))
+        return (amended(state, setpoint=requested), None) if refusal is None else (state, refusal)
+
+    def _unheld(self, state: State, goal: Array, whole: bool) -> Reason | None:
+        """Return why a set-point (n_c,) cannot be held as things are, or None."""
+        level, estimating = self._best, self._estimating
+        try:
+            with np.errstate(all='ignore'):
+                estimate = estimating.rebase(state.estimate, estimating.level(state), level)
+                holding = Holding(
+                    level, self.settings.limits, self.settings.supervisor.levels[0].margin,
+                    np.zeros(self.model.n_x) if estimate is None else estimate.w, state.target)
+                return holding.refusal(
+                    goal, (state.setpoint.requested, state.setpoint.active), state.command, whole)
+        except np.linalg.LinAlgError as error:
+            return reason(Code.SINGULAR, matrix=str(error))
+
+    def untrained(self, setpoint: setpoints.Setpoint) -> Reason | None:
+        """Return what of a set-point, asked for already, is outside the trained range, or None."""
+        for value in (*(value for _, value in setpoint.scheduled), setpoint.requested,
+                      setpoint.active):
+            if value is not None:
+                known = [name for name, number in zip(
+                    self.controlled.names, value.tolist(), strict=True) if number == number]
+                refusal = setpoints.refusal(
+                    self.controlled.only(known), value[np.isfinite(value)])
+                if refusal is not None:
+                    return refusal
+        return None
 
     def request_manual_input(self, state: State, value: Array) -> tuple[State, Reason | None]:
         """
@@ -168,24 +223,39 @@ class Controller:
         estimated of the plant's rate stays. The state comes back in this controller's units.
         """
         state = self._estimating.inherit(predecessor._estimating, state)
+        every = self._best.controls_all and predecessor._best.controls_all
+        if not every and self.controlled.names != predecessor.controlled.names:
+            # what is measured next is held until there is another request
+            state = amended(state, setpoint=setpoints.Setpoint())
         if state.law is None or state.law_input is None or state.estimate is None:
             return state
         level = self.levels.get(state.law)
         if level is None or state.setpoint.active is None:
             return state
         now = level.compute(state.setpoint.active, state.estimate, self.settings.limits, None,
-                            0.0)[1]
+                            0.0, state.target)[1]
         if now.u is None:
             return state
         return amended(state, law_input=now.u, law_memory=now.memory, transfer=shifted(
             state.transfer, state.law_input - now.u))
 
+    def steady_state(self, setpoint: Array) -> Array:
+        """Return where (n_x,) the model has a set-point (n_c,) undisturbed; NaN for nowhere."""
+        if self._best.controls_all:
+            return setpoint
+        with np.errstate(all='ignore'):
+            target = self._best.target(
+                setpoint, np.zeros(self.model.n_x), self.settings.limits, None)
+        return np.full(self.model.n_x, np.nan) if target is None else (
+            self.model.states.to_physical(target.x))
+
     def try_law(self, x: Array, setpoint: Array) -> Reason | None:
-        """Return why the best law fails at a state (n_x,) towards a set-point (n_x,), or None."""
-        level = next(iter(self.levels.values()))
+        """Return why the best law fails at a state (n_x,) towards a set-point (n_c,), or None."""
+        level = self._best
         estimate = Estimate(self.model.states.to_deviation(x), np.zeros(self.model.n_x))
         with np.errstate(all='ignore'):
-            return level.compute(setpoint, estimate, self.settings.limits, None, 0.0)[1].failure
+            return level.compute(
+                setpoint, estimate, self.settings.limits, None, 0.0, None)[1].failure
 
     # Steps.
 
@@ -227,7 +297,8 @@ class Controller:
             state, verdict, predicted = self._estimating.observe(state, y, time_ns, elapsed, u)
             if verdict.fault is None:
                 state = amended(state, setpoint=setpoints.advance(
-                    state.setpoint, self.measured.state(y), self.model,
+                    state.setpoint, self._best.controlled_of(self.measured.state(y)),
+                    self.controlled,
                     self.settings.setpoint_ramp, time_ns, seconds,
                     self.settings.setpoint_filter))
             # without elapsed time the rate limit holds the last command
@@ -283,7 +354,12 @@ class Controller:
             state, wanted, done = self._act(state, result, transfer)
             report = self._report(state, state.supervisor.reason)
             if target is not None and report.target is not None:
-                report = amended(report, target=amended(report.target, residual=target.residual))
+                u, every = self.model.inputs.to_physical(target.u), self._best.controls_all
+                x = report.target.setpoint if every else self.model.states.to_physical(target.x)
+                report = amended(report, target=amended(
+                    report.target, residual=target.residual, state=x, input=u))
+                if not every:
+                    state = amended(state, target=_kept(np.concatenate((x, u))))
         limited = limit(self.settings.limits, wanted, state.command, seconds)
         return amended(state, command=limited.u), limited.u, amended(
             report, command=amended(
@@ -308,7 +384,8 @@ class Controller:
             assert estimate is not None
             memory = state.law_memory if state.law == level.name else None
             target, result = level.compute(
-                state.setpoint.active, estimate, self.settings.limits, memory, spacing)
+                state.setpoint.active, estimate, self.settings.limits, memory, spacing,
+                state.target)
             if result.failure is None:
                 return supervisor, target, result
             below = settings.order[settings.depth(level.name) + 1]
@@ -382,7 +459,7 @@ class Controller:
         report = Report(
             state.mode, MANUAL if manual else levels.order[depth], depth, why,
             target=None if active is None else (
-                TargetReport(active, self.model.states.violation(active))))
+                TargetReport(active, self.controlled.violation(active))))
         if estimate is None:
             return report
         estimator = self._estimating.level(state).estimator

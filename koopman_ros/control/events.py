@@ -38,7 +38,9 @@ class SetpointRequest:
     """The operator asks for a set-point."""
 
     stamp_ns: int  #: from when it is to hold; 0 for now
-    value: Array  #: in the model's units
+    value: Array  #: of the signals, in the model's units
+    #: which of the controlled ones are asked for, the others stay as they are; None for all
+    signals: tuple[str, ...] | None = None
 
 
 @dataclass(frozen=True)
@@ -85,7 +87,8 @@ def apply(controller: Controller, state: State, event: Event) -> Outcome:
         case Silence():
             return Outcome(*controller.hold(state, event.stamp_ns))
         case SetpointRequest():
-            state, refused = controller.request_setpoint(state, event.value, event.stamp_ns)
+            state, refused = controller.request_setpoint(
+                state, event.value, event.stamp_ns, event.signals)
             return Outcome(state, refused=refused)
         case ManualCommand():
             state, refused = controller.request_manual_input(state, event.value)

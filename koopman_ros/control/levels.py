@@ -6,8 +6,10 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
+from functools import cached_property
 
 import numpy as np
+from numpy.typing import NDArray
 
 from koopman_ros.arrays import Array
 from koopman_ros.control.laws import Law, LawResult, LAWS, Tuning, Weights
@@ -15,10 +17,11 @@ from koopman_ros.control.laws.base import steady_state_target, Target
 from koopman_ros.control.limits import finite, InputLimits
 from koopman_ros.control.settings import Settings
 from koopman_ros.control.state import amended, State
+from koopman_ros.control.target import partial_target
 from koopman_ros.estimation import check, Estimate, Estimator, ESTIMATORS, FrozenCheck, Verdict
-from koopman_ros.lifting import LiftedModel
+from koopman_ros.lifting import Coordinates, LiftedModel
 from koopman_ros.plugs import plug
-from koopman_ros.reasons import Code
+from koopman_ros.reasons import Code, reason
 from koopman_ros.signals import Outputs
 from koopman_ros.units import NANOSECONDS
 
@@ -30,6 +33,7 @@ class Level:
     name: str  #: of its law
     law: Law  #: with its model
     estimator: Estimator  #: on the same model
+    controlled: tuple[str, ...]  #: (n_c,) names of the states with a set-point
     _last: list[Target | None] = field(default_factory=lambda: [None], init=False, compare=False)
 
     @property
@@ -37,13 +41,58 @@ class Level:
         """The model of law and estimator."""
         return self.law.model
 
+    @cached_property
+    def controls_all(self) -> bool:
+        """Whether every state has a set-point."""
+        return len(self.controlled) == self.model.n_x
+
+    @cached_property
+    def controlled_states(self) -> Coordinates:
+        """The states with a set-point."""
+        return self.model.states.only(self.controlled)
+
+    @cached_property
+    def _indices(self) -> NDArray[np.intp]:
+        return np.array([self.model.states.names.index(name) for name in self.controlled],
+                        dtype=np.intp)
+
+    def controlled_of(self, x: Array) -> Array:
+        """Return the part (n_c,) of a state (n_x,) that has a set-point."""
+        return x if self.controls_all else x[self._indices]
+
+    def controlling(self, names: tuple[str, ...]) -> Level:
+        """Return the level with set-points for these states alone."""
+        return Level(self.name, self.law, self.estimator, names)
+
+    def target(self, setpoint: Array, w: Array, limits: InputLimits, start: Array | None
+               ) -> Target | None:
+        """
+        Find where a set-point (n_c,), in state units, leads under a disturbance (n_x,).
+
+        :param start: (n_x + n_u,) where a steady state is looked for, in units; the nominal point
+            by default.
+        :return: None where there is no steady state.
+        """
+        model = self.model
+        if self.controls_all:
+            # a memory of the last set-point only; what comes out does not depend on it
+            target = steady_state_target(model, model.states.to_deviation(setpoint), w,
+                                         known=self._last[0])
+            self._last[0] = target
+            return target
+        n, inputs = model.n_x, model.inputs
+        y = np.zeros(n + model.n_u) if start is None else np.concatenate(
+            (model.states.to_deviation(start[:n]), inputs.to_deviation(start[n:])))
+        return partial_target(
+            model, self._indices, self.controlled_states.to_deviation(setpoint), w,
+            inputs.to_deviation(limits.lower), inputs.to_deviation(limits.upper), y)
+
     def compute(self, setpoint: Array, estimate: Estimate, limits: InputLimits, memory: object,
-                interval: float) -> tuple[Target, LawResult]:
-        """Evaluate the law for a set-point (n_x,) in state units and an estimate of its model."""
-        # a memory of the last set-point only; what comes out does not depend on it
-        target = steady_state_target(self.model, self.model.states.to_deviation(setpoint),
-                                     estimate.w, known=self._last[0])
-        self._last[0] = target
+                interval: float, start: Array | None) -> tuple[Target | None, LawResult]:
+        """Evaluate the law towards a target, see :meth:`target`, for an estimate of its model."""
+        target = self.target(setpoint, estimate.w, limits, start)
+        if target is None:
+            return None, LawResult(None, reason(Code.NO_STEADY_STATE))
         return target, self.law.compute(estimate, target, limits, memory, interval)
 
 
@@ -65,7 +114,8 @@ def levels_of(model: LiftedModel, settings: Settings) -> dict[str, Level]:
         law = plug(level.law, 'law', LAWS)(model, tuning)
         levels[level.law] = Level(level.law, law, estimator(
             law.model, settings.observer_bandwidth,
-            settings.max_disturbance / model.inputs.scale))
+            settings.max_disturbance / model.inputs.scale),
+            settings.controlled or model.states.names)
     return levels
 
 

@@ -9,7 +9,7 @@ import math
 import numpy as np
 
 from koopman_ros.arrays import Array
-from koopman_ros.lifting import LiftedModel
+from koopman_ros.lifting import Coordinates
 from koopman_ros.reasons import Code, Reason, reason
 from koopman_ros.units import NANOSECONDS
 
@@ -22,25 +22,26 @@ MAX_SCHEDULED = 1000
 class Setpoint:
     """The state of the set-point."""
 
-    #: (n_x,) where the operator wants to be, or None before the first request
+    #: (n_c,) where the operator wants to be, or None before the first request; NaN, before the
+    #: first measurement, for what was not asked for
     requested: Array | None = None
-    #: (n_x,) what is tracked now, on its ramp to the requested value; None at first
+    #: (n_c,) what is tracked now, on its ramp to the requested value; None at first
     active: Array | None = None
-    #: (time in ns, value) of requests that take effect later, in time order
+    #: (time in ns, (n_c,) value) of requests that take effect later, in time order; NaN for what
+    #: they do not ask for
     scheduled: tuple[tuple[int, Array], ...] = ()
-    #: (n_x,) where the ramp is, which the filter follows; None for where it is
+    #: (n_c,) where the ramp is, which the filter follows; None for where it is
     ramped: Array | None = None
 
 
-def refusal(model: LiftedModel, value: Array) -> Reason | None:
-    """Return why a set-point (n_x,), in state units, is outside the training box, or None."""
-    states = model.states
-    for i, name in enumerate(states.names):
+def refusal(box: Coordinates, value: Array) -> Reason | None:
+    """Return why a set-point (n,), in the units of the box, is outside of it, or None."""
+    for i, name in enumerate(box.names):
         if not np.isfinite(value[i]):
             return reason(Code.SETPOINT_NOT_FINITE, signal=name, value=float(value[i]))
-        if not states.lower[i] <= value[i] <= states.upper[i]:
+        if not box.lower[i] <= value[i] <= box.upper[i]:
             return reason(Code.SETPOINT_OUTSIDE, signal=name, value=float(value[i]),
-                          lower=float(states.lower[i]), upper=float(states.upper[i]))
+                          lower=float(box.lower[i]), upper=float(box.upper[i]))
     return None
 
 
@@ -48,19 +49,43 @@ def request(setpoint: Setpoint, value: Array, effective_ns: int, now_ns: int | N
     """
     Take over an accepted request, at once or when its time has come.
 
-    A request that holds at once is the operator's last word: it ends every schedule.
+    A request that holds at once is the operator's last word: it ends every schedule of what it
+    asks for.
 
-    :param value: (n_x,) accepted value, in state units.
+    :param value: (n_c,) accepted value, in state units; NaN for what is not asked for.
     :param effective_ns: time from which it holds; 0 or past means at once, and a time more than
         an hour ahead is taken for the stamp of another clock and means at once, too.
     :param now_ns: time of the last measurement, or None before the first.
     """
     if not lies_ahead(effective_ns, now_ns):
-        return replace(setpoint, requested=value, scheduled=())
+        left = ((time_ns, np.where(np.isnan(value), later, np.nan))
+                for time_ns, later in setpoint.scheduled)
+        return replace(
+            setpoint, requested=overlaid(setpoint.requested, value),
+            scheduled=tuple(entry for entry in left if not np.isnan(entry[1]).all()))
     # the later request for the same time replaces the earlier one
-    kept = [entry for entry in setpoint.scheduled if entry[0] != effective_ns]
-    entries = sorted([*kept, (effective_ns, value)], key=lambda entry: entry[0])
-    return replace(setpoint, scheduled=tuple(entries))
+    entries = dict(setpoint.scheduled)
+    entries[effective_ns] = overlaid(entries.get(effective_ns), value)
+    return replace(setpoint, scheduled=tuple(sorted(entries.items(), key=lambda item: item[0])))
+
+
+def overlaid(earlier: Array | None, later: Array) -> Array:
+    """Return a request (n_c,) with what a later one (n_c,) asks for."""
+    left_open = np.isnan(later)
+    if earlier is None or not left_open.any():
+        return later
+    return np.where(left_open, earlier, later)
+
+
+def at_its_time(setpoint: Setpoint, effective_ns: int, now_ns: int | None) -> Array:
+    """Return what (n_c,) is requested when a request takes effect; NaN for what nobody knows."""
+    goal = setpoint.requested
+    if lies_ahead(effective_ns, now_ns):
+        for time_ns, value in setpoint.scheduled:
+            if time_ns <= effective_ns:
+                goal = overlaid(goal, value)
+    assert goal is not None  # of a request that was taken over
+    return goal
 
 
 def lies_ahead(effective_ns: int, now_ns: int | None) -> bool:
@@ -71,7 +96,7 @@ def lies_ahead(effective_ns: int, now_ns: int | None) -> bool:
     return now_ns < effective_ns <= now_ns + HORIZON_NANOSECONDS
 
 
-def advance(setpoint: Setpoint, measured: Array, model: LiftedModel, ramp: Array, now_ns: int,
+def advance(setpoint: Setpoint, measured: Array, box: Coordinates, ramp: Array, now_ns: int,
             seconds: float, lag: float = 0.0) -> Setpoint:
     """
     Bring the set-point to the present time.
@@ -79,9 +104,9 @@ def advance(setpoint: Setpoint, measured: Array, model: LiftedModel, ramp: Array
     Before the first request the state that was first measured is held, so that a
     controller which starts on a running plant asks for no change.
 
-    :param measured: (n_x,) measured state, in state units.
-    :param model: whose training box bounds the first set-point.
-    :param ramp: (n_x,) largest change per second, in state units; infinity for steps.
+    :param measured: (n_c,) measured of the controlled states, in their units.
+    :param box: of the controlled states, which bounds the first set-point.
+    :param ramp: (n_c,) largest change per second, in state units; infinity for steps.
     :param seconds: time since the last measurement; 0 at the first.
     :param lag: time constant in seconds of the filter behind the ramp; 0 for none.
     """
@@ -92,11 +117,14 @@ def advance(setpoint: Setpoint, measured: Array, model: LiftedModel, ramp: Array
     due = [entry for entry in setpoint.scheduled if not lies_ahead(entry[0], now_ns)]
     if due:
         kept = tuple(entry for entry in setpoint.scheduled if lies_ahead(entry[0], now_ns))
-        setpoint = replace(setpoint, requested=due[-1][1], scheduled=kept)
+        requested = setpoint.requested
+        for _, value in due:
+            requested = overlaid(requested, value)
+        setpoint = replace(setpoint, requested=requested, scheduled=kept)
     active = setpoint.active
     if active is None:
-        active = np.clip(measured, model.states.lower, model.states.upper)
-    requested = active if setpoint.requested is None else setpoint.requested
+        active = np.clip(measured, box.lower, box.upper)
+    requested = active if setpoint.requested is None else overlaid(active, setpoint.requested)
     ramped = active if setpoint.ramped is None or lag <= 0.0 else setpoint.ramped
     # infinity for a step, also where no time has passed
     reach = np.full(len(ramp), np.inf)

@@ -23,13 +23,16 @@ class Settings:
     state_weight: Array  #: (n_x,) weights of squared state errors, per state unit squared
     input_weight: Array  #: (n_u,) weights of squared input deviations, per input unit squared
     limits: InputLimits  #: range and rate of the inputs
-    setpoint_ramp: Array  #: (n_x,) largest change of the set-point per second; infinity for steps
+    setpoint_ramp: Array  #: (n_c,) largest change of the set-point per second; infinity for steps
     max_disturbance: Array  #: (n_u,) largest disturbance that is allowed for, in input units
     #: (n_u,) how far, in input units, a measured input may be from its command before the command
     #: counts as not reached
     input_tolerance: Array
     safe_input: Array  #: (n_u,) commanded when nothing else can be, in input units
     sensor: SensorLimits  #: which measurements are accepted
+    #: (n_c,) names of the states that are given set-points, in the model's order; empty for all.
+    #: The others go where the model's steady state has them
+    controlled: tuple[str, ...] = ()
     setpoint_filter: float = 0.0  #: time constant in s with which the set-point follows its ramp
     #: of the disturbance observer in 1/s; 0 for none, as in the paper
     observer_bandwidth: float = 0.0
@@ -71,17 +74,27 @@ class Settings:
         disturbances are not bounded, and the nominal input is the safe one.
         """
         n_x, n_u = model.n_x, model.n_u
+        n_c = len(others.get('controlled') or model.states)
         return cls(**{
             'state_weight': state_weight, 'input_weight': input_weight, 'limits': limits,
-            'setpoint_ramp': np.full(n_x, np.inf), 'max_disturbance': np.full(n_u, np.inf),
+            'setpoint_ramp': np.full(n_c, np.inf), 'max_disturbance': np.full(n_u, np.inf),
             'input_tolerance': np.full(n_u, np.inf), 'safe_input': model.inputs.center,
             'sensor': SensorLimits.none(n_x), **others})
 
     def check(self, model: LiftedModel, outputs: Outputs) -> None:
         """Check that there is one number for each signal; a ValueError names which not."""
         states, inputs = model.states.names, model.inputs.names
-        for names, signals in ((('state_weight', 'setpoint_ramp'), states), (
-                ('input_weight', 'max_disturbance', 'input_tolerance', 'safe_input'), inputs)):
+        controlled = self.controlled or states
+        if list(controlled) != [name for name in states if name in controlled]:
+            raise ValueError(f'controlled must be some of the states {", ".join(states)}, each '
+                             f'once and in this order, got {", ".join(controlled)}')
+        if len(inputs) < len(controlled) < len(states):
+            raise ValueError(f'{len(inputs)} inputs cannot hold {len(controlled)} signals '
+                             f'({", ".join(controlled)}): name at most {len(inputs)} in '
+                             'controlled, or leave it empty for a compromise between all states')
+        for names, signals in (
+                (('state_weight',), states), (('setpoint_ramp',), controlled),
+                (('input_weight', 'max_disturbance', 'input_tolerance', 'safe_input'), inputs)):
             for name in names:
                 per_signal(name, getattr(self, name), signals)
         self.limits.check(inputs)

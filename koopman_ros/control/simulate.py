@@ -14,8 +14,9 @@ from koopman_ros.arrays import Array
 from koopman_ros.control.controller import Controller
 from koopman_ros.control.events import apply, Event, Measurement, Silence
 from koopman_ros.control.laws import Feedback, feedback, Weights
-from koopman_ros.control.laws.base import steady_state_target
+from koopman_ros.control.laws.base import steady_state_target, Target
 from koopman_ros.control.state import Report, State
+from koopman_ros.control.target import partial_target
 from koopman_ros.lifting import LiftedModel
 from koopman_ros.reasons import Code, reason, Words
 from koopman_ros.signals import per_signal
@@ -102,7 +103,7 @@ class Simulation:
     measured: Array  #: (N, n_y) what the controller received; NaN where nothing
     inputs: Array  #: (N, n_u) that acted when it was measured
     commands: Array  #: (N, n_u) answered; NaN before the first
-    setpoints: Array  #: (N, n_x) active; NaN before the first
+    setpoints: Array  #: (N, n_c) active; NaN before the first
     reports: tuple[Report, ...]  #: (N) of the controller
     failure: str  #: why the plant could not go on to the end; empty when it could
     loop: Loop  #: after the last sample, to go on from
@@ -173,7 +174,7 @@ def simulate(controller: Controller, plant: Plant, events: Iterable[Timed] = (),
         reports.append(report)
         active = loop.state.setpoint.active
         rows.append((seconds, x, _or_nan(received, len(y)), u, _or_nan(command, len(u)),
-                     _or_nan(active, controller.model.n_x)))
+                     _or_nan(active, len(controller.controlled))))
         if stop is not None and stop(x, rows[-1][4], report):
             break
     times, states, measured, inputs, commands, setpoints = map(np.array, zip(*rows, strict=True))
@@ -230,32 +231,48 @@ class _Failed(Exception):  # noqa: N818
     """The loop cannot go on; the message says why."""
 
 
+def _target(model: LiftedModel, setpoint: Array, controlled: tuple[str, ...]) -> Target:
+    if not controlled:
+        return steady_state_target(model, model.states.to_deviation(setpoint))
+    endless = np.full(model.n_u, np.inf)
+    found = partial_target(
+        model, np.array([model.states.names.index(name) for name in controlled], dtype=np.intp),
+        model.states.only(controlled).to_deviation(setpoint), np.zeros(model.n_x), -endless,
+        endless, np.zeros(model.n_x + model.n_u))
+    if found is None:
+        raise ValueError(f'the model has no steady state with {", ".join(controlled)} at '
+                         f'{setpoint.tolist()}: choose another set-point')
+    return found
+
+
 def run_closed_loop(model: LiftedModel, rate: Callable[[Array, Array], Array], x0: Array,
                     x_ref: Array, weights: Weights, duration: float, *,
-                    law: Callable[..., Feedback] = feedback, samples: int = 301,
-                    rtol: float = 1e-8, u_ref: Array | None = None, escape: float = 10.0,
-                    max_evaluations: int = 20_000) -> ClosedLoop:
+                    law: Callable[..., Feedback] = feedback, controlled: tuple[str, ...] = (),
+                    samples: int = 301, rtol: float = 1e-8, u_ref: Array | None = None,
+                    escape: float = 10.0, max_evaluations: int = 20_000) -> ClosedLoop:
     """
     Integrate a plant under a continuous law and the law's cost with it.
 
     :param rate: the plant's dx/dt (n_x,) of state and input, e.g.
         ``ControlAffineSystem.derivative``.
     :param x0: (n_x,) start, in state units.
-    :param x_ref: (n_x,) set-point, in state units.
+    :param x_ref: (n_c,) set-point, in state units.
     :param weights: weights of the law and of the cost, on the model's scaled deviations.
     :param duration: in the model's time unit.
     :param law: feedback(model, x, target, weights).
+    :param controlled: (n_c,) names of the states with a set-point, empty for all.
     :param samples: number of times to return.
     :param u_ref: (n_u,) input from which the cost counts, in input units; by default the one
         that the model takes to hold the set-point.
     :param escape: the loop has failed when a state is further than this from the nominal point,
         in units of its scale.
     :param max_evaluations: of the law, after which the loop has failed: it chatters or is stiff.
+    :raises ValueError: where the model has no steady state with the set-point.
     """
     # in here: no node needs it, and it would make a fourth of their start
     from scipy.integrate import DOP853
 
-    target = steady_state_target(model, model.states.to_deviation(np.asarray(x_ref)))
+    target = _target(model, np.asarray(x_ref), controlled)
     v_ref = target.u if u_ref is None else model.inputs.to_deviation(np.asarray(u_ref))
 
     def act(x: Array) -> tuple[Array, Array]:

@@ -64,6 +64,9 @@ class State:
     law_input: Array | None = None  #: (n_u,) what that law asked for, within the range
     law_memory: object = None  #: what that law remembers
     transfer: Transfer | None = None  #: what is added to it for a while, or None
+    #: (n_x + n_u,) steady state that was last aimed at and its input, in their units, where the
+    #: next one is looked for; None at first, and where every state has a set-point
+    target: Array | None = None
 
 
 class Arrival(Enum):
@@ -103,10 +106,13 @@ class EstimateReport:
 class TargetReport:
     """Where the law goes."""
 
-    setpoint: Array  #: (n_x,) what is tracked, in state units
+    setpoint: Array  #: (n_c,) what is tracked, in state units
     outside: float  #: its distance from the training box, in half widths
     #: rate of the state there that no input balances, scaled; NaN without a law
     residual: float = math.nan
+    #: (n_x,) steady state that goes with it, in state units; None without a law
+    state: Array | None = None
+    input: Array | None = None  #: (n_u,) that holds it, in input units; None likewise
 
 
 @dataclass(frozen=True)

@@ -266,8 +266,7 @@ def _followed(model: LiftedModel, u: Array, known: float) -> Rest:
 
 def _beyond(model: LiftedModel, x: Array, rate: Array) -> Rest:
     """Extrapolate from a state (n_x,) that moves at a rate (n_x,), in scaled deviations."""
-    half = 1e-4 * np.eye(model.n_x)
-    slope = np.stack([(model.drift(x + d) - model.drift(x - d)) / 2e-4 for d in half], axis=-1)
+    slope = model.drift_jacobian(x)
     place, outside = np.full(model.n_x, np.nan), np.nan
     if np.all(np.isfinite(slope)) and np.all(np.linalg.eigvals(slope).real < 0.0):
         place = model.states.to_physical(x - np.linalg.solve(slope, rate))

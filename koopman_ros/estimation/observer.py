@@ -221,14 +221,12 @@ def equivalent_bias(model: LiftedModel, estimate: Estimate) -> Array:
     :return: (n_x,) in scaled deviations.
     """
     wanted = model.drift(estimate.x) + estimate.w
-    bias, step = np.zeros_like(estimate.x), 1e-6
+    bias = np.zeros_like(estimate.x)
     with np.errstate(all='ignore'):
         for _ in range(20):
             x = estimate.x - bias
-            slope = np.stack([(model.drift(x + d) - model.drift(x - d)) / (2.0 * step)
-                              for d in step * np.eye(len(x))], axis=-1)
             try:
-                bias = bias + np.linalg.solve(slope, model.drift(x) - wanted)
+                bias = bias + np.linalg.solve(model.drift_jacobian(x), model.drift(x) - wanted)
             except np.linalg.LinAlgError:
                 break
             if not np.all(np.abs(bias) < 1e3):

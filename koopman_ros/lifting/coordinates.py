@@ -5,6 +5,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
 import math
@@ -66,6 +67,14 @@ class Coordinates:
 
     def __len__(self) -> int:
         return len(self.names)
+
+    def only(self, names: Sequence[str]) -> Coordinates:
+        """Return these coordinates alone; raise ValueError for one that there is not."""
+        if tuple(names) == self.names:
+            return self
+        chosen = [self.names.index(name) for name in names]
+        return Coordinates(tuple(names), tuple(self.units[i] for i in chosen), *(
+            value[chosen] for value in (self.center, self.scale, self.lower, self.upper)))
 
     def to_deviation(self, value: Array) -> Array:
         """Map physical values (..., n) to scaled deviations (..., n)."""

@@ -18,6 +18,9 @@ from koopman_ros.lifting.observables import NetworkObservables, Observables
 from koopman_ros.plant_data import Plant
 from koopman_ros.units import SECONDS_PER_TIME_UNIT
 
+# Of scaled deviations: rounding and the third derivative both leave about ten digits.
+_DIFFERENCE = 1e-5
+
 
 @dataclass(frozen=True)
 class Provenance:
@@ -170,6 +173,13 @@ class LiftedModel:
         if x.ndim == 1:
             return self.onto_states(J, self.A.dot(z))
         return self.onto_states(J, (z @ self.A.T)[..., None])[..., 0]
+
+    def drift_jacobian(self, x: Array) -> Array:
+        """Evaluate df/dx (n_x, n_x) of the drift at (n_x,), by central differences."""
+        # J_N^+ changes with x as well, so that the exact one would need second derivatives
+        steps = _DIFFERENCE * np.eye(self.n_x)
+        ahead, behind = self.drift(np.array((x + steps, x - steps)))
+        return np.asarray(ahead - behind).T / (2.0 * _DIFFERENCE)
 
 
 def linearised_model(jacobian: Array, B: Array, states: Coordinates, inputs: Coordinates,

@@ -53,17 +53,20 @@ def _time(bag: ReplayedBag) -> tuple[np.ndarray, str]:
 
 def _draw_measured(axes: matplotlib.axes.Axes, time: np.ndarray, bag: ReplayedBag, i: int) -> None:
     controller = bag.found.controller
-    name, unit = 'measured', ''
+    name, unit, tracked = 'measured', '', bag.setpoint[:, i:i + 1]
     if controller is not None:
         states = controller.model.states
         name, unit = states.names[i], states.units[i]
+        tracked = bag.setpoint[:, [k for k, other in enumerate(controller.controlled.names)
+                                   if other == name]]
         low, high = shown(np.array([states.lower[i], states.upper[i]]), unit)
         axes.axhspan(low, high, label='training range', **DRAWN_RANGE)
-    setpoint, measured = shown(bag.setpoint[:, i], unit), shown(bag.measured[:, i], unit)
+    setpoint, measured = shown(tracked, unit), shown(bag.measured[:, i], unit)
     finite = measured[np.isfinite(measured)]
     typical = _typical(finite)
     hidden = len(finite) - len(typical)
-    axes.step(time, setpoint, 'k--', where='post', linewidth=1.2, label='set-point tracked')
+    if setpoint.size:
+        axes.step(time, setpoint, 'k--', where='post', linewidth=1.2, label='set-point tracked')
     axes.plot(time, measured, color='tab:green', label='measured' + (
         f' ({hidden} of {len(finite)} outside the picture)' if hidden else ''))
     both = np.concatenate([typical, setpoint[np.isfinite(setpoint)]])

@@ -35,7 +35,7 @@ class Sample:
 
     stamp_ns: int  #: of the measurement that it answers, or of the silence
     measured: Array | None  #: (n_y,) or None in silence
-    setpoint: Array | None  #: (n_x,) that was tracked according to the replay, or None
+    setpoint: Array | None  #: (n_c,) that was tracked according to the replay, or None
     recorded: Array  #: (n_u,) what was commanded
     #: (n_u,) the same by the replay; None where it knows no state, before the first snapshot and
     #: behind a lost record

@@ -87,6 +87,10 @@ def parse(text: str) -> Record:
 def fields_of(event: events.Event, outcome: events.Outcome) -> tuple[str, dict[str, Any]]:
     """Return the name of an event, and what is written of it and of what it led to."""
     written = {name: _written(getattr(event, name)) for name in _FIELDS[type(event)]}
+    if isinstance(event, events.SetpointRequest):
+        names = written.pop('signals')
+        if names is not None:
+            written['signals'] = list(names)
     report = outcome.report
     if report is None:
         if not isinstance(event, (events.ModeChange, events.Initialisation)):
@@ -106,7 +110,10 @@ def event_of(record: Record) -> events.Event:
     if record.event not in EVENTS:
         raise ValueError(f'the event {record.event!r} is not known')
     kind = EVENTS[record.event]
-    return kind(**{name: _read(record.fields[name]) for name in _FIELDS[kind]})
+    read = {name: _read(record.fields[name]) for name in _FIELDS[kind] if name != 'signals'}
+    if 'signals' in record.fields:
+        read['signals'] = tuple(map(str, record.fields['signals']))
+    return kind(**read)
 
 
 def snapshot(state: State, parameters: Mapping[str, Any], model: Mapping[str, str]

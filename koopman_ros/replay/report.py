@@ -64,7 +64,7 @@ class ReplayedBag:
 
     stamps_ns: NDArray[np.int64] = field(init=False)  #: (n,) stamps of the commands
     measured: Array = field(init=False)  #: (n, n_y) measured; NaN in silence
-    setpoint: Array = field(init=False)  #: (n, n_x) tracked; NaN for none
+    setpoint: Array = field(init=False)  #: (n, n_c) tracked; NaN for none
     recorded: Array = field(init=False)  #: (n, n_u) commanded then
     #: (n, n_u) commanded by the replay; NaN where it knows no state
     commands: Array = field(init=False)
@@ -98,10 +98,12 @@ class ReplayedBag:
     @property
     def outside(self) -> int:
         """At how many commands the new model would have refused the tracked set-point."""
-        if self.new_range is None:
+        controller = self.found.controller
+        if self.new_range is None or controller is None:
             return 0
-        return int(np.count_nonzero(((self.setpoint < self.new_range.lower)
-                                     | (self.setpoint > self.new_range.upper)).any(axis=1)))
+        box = self.new_range.only(controller.controlled.names)
+        return int(np.count_nonzero(((self.setpoint < box.lower)
+                                     | (self.setpoint > box.upper)).any(axis=1)))
 
     @property
     def unexplained(self) -> int:

@@ -127,19 +127,17 @@ def _refuse_slow(path: Path, model: LiftedModel) -> None:
 def refuse_setpoints(model: LiftedModel, situation: Situation) -> None:
     """Raise ModelFileError for a model that cannot track what the operator asked for."""
     controller = Controller(model, situation.settings)
-    asked = situation.state.setpoint
-    for value in (*(value for _, value in asked.scheduled), asked.requested, asked.active):
-        if value is not None and (
-                refusal := controller.request_setpoint(situation.state, value)[1]) is not None:
-            raise ModelFileError(words_of(model)(refusal))
+    if (refusal := controller.untrained(situation.state.setpoint)) is not None:
+        raise ModelFileError(words_of(model)(refusal))
 
 
 def refuse_without_law(model: LiftedModel, situation: Situation) -> None:
     """Raise ModelFileError for a model without a law where the plant is or shall go."""
     controller, asked = Controller(model, situation.settings), situation.state.setpoint
     for setpoint in [value for value in (asked.active, asked.requested)
-                     if value is not None] or [model.states.center]:
-        for place in (setpoint, situation.measured):
+                     if value is not None and np.isfinite(value).all()] or [
+                         controller.controlled.center]:
+        for place in (controller.steady_state(setpoint), situation.measured):
             # neither before the first measurement, nor where the learned law would not act
             if not model.distance(place) <= situation.settings.supervisor.levels[0].margin:
                 continue

@@ -61,15 +61,20 @@ REACTORS = [[first, first, *others] for first, *others in (
     [controller('reactor_nz3', setpoint_ramp=np.array([0.2])), controller('reactor_linear')])]
 
 
-def random_controllers(n_x: int, n_u: int, seed: int, all_states: bool) -> list[Controller]:
+def random_controllers(n_x: int, n_u: int, seed: int, all_states: bool, n_c: int
+                       ) -> list[Controller]:
     model = random_lift(n_x, n_u=n_u, seed=seed)
     outputs = None if all_states else mixed(model)
-    return [tuned(model, outputs), tuned(model, outputs),
-            tuned(model, outputs, observer_bandwidth=0.0)]
+    n_c = min(n_c, n_u, n_x)
+    part = {'controlled': model.states.names[:n_c], 'setpoint_ramp': 0.1 * model.states.scale[
+        :n_c]} if n_c else {}
+    return [tuned(model, outputs, **part), tuned(model, outputs),
+            tuned(model, outputs, observer_bandwidth=0.0, **part)]
 
 
 controllers = st.one_of(st.sampled_from(REACTORS), st.builds(
-    random_controllers, st.integers(1, 4), st.integers(1, 3), st.integers(0, 5), st.booleans()))
+    random_controllers, st.integers(1, 4), st.integers(1, 3), st.integers(0, 5), st.booleans(),
+    st.integers(0, 3)))
 
 
 @settings(max_examples=150, deadline=None, derandomize=True)
@@ -107,9 +112,26 @@ def test_every_command_keeps_the_limits_of_each_input(controllers, sequence):
             case 'silence':
                 state, command, report = loop.hold(state, now)
             case 'setpoint' | 'schedule':
-                asked, refused = loop.request_setpoint(state, x, now * (kind == 'schedule'))
-                assert (refused is None) == (model.states.violation(x) == 0.0)
-                assert refused is None or asked is state
+                names = loop.controlled.names
+                # all of them, or the first one alone
+                signals = None if values[-1] > 0.0 else names[:1]
+                r = x[[model.states.names.index(name) for name in signals or names]]
+                when = now * (kind == 'schedule')
+                asked, refused = loop.request_setpoint(state, r, when, signals)
+                inside = loop.controlled.only(signals or names).violation(r) == 0.0
+                if refused is None:
+                    assert inside
+                else:
+                    assert asked is state
+                    assert not inside or refused.code in (
+                        Code.SETPOINT_NOT_HELD, Code.NO_SETPOINT_HELD)
+                if refused is not None and refused.code is Code.SETPOINT_NOT_HELD:
+                    # what is named as the nearest one can be asked for
+                    held = dict(refused.values['held'])
+                    assert loop.controlled.only(tuple(held)).violation(
+                        np.array(list(held.values()))) == 0.0
+                    assert loop.request_setpoint(
+                        state, np.array(list(held.values())), when, tuple(held))[1] is None
                 state = asked
             case 'manual':
                 asked, refused = loop.request_manual_input(state, u)

@@ -275,7 +275,7 @@ def kelvin(value):
 
 
 def moved(setpoint, now_ns=NOW, *, measured=320.0, ramp=np.inf, seconds=1.0, lag=0.0):
-    return advance(setpoint, kelvin(measured), MODEL, kelvin(ramp), now_ns, seconds, lag)
+    return advance(setpoint, kelvin(measured), MODEL.states, kelvin(ramp), now_ns, seconds, lag)
 
 
 def schedule(setpoint):
@@ -297,7 +297,7 @@ OUTSIDE = (' is outside the trained range 305 K to 327 K: the old one is kept; c
       for value in (np.nan, np.inf, -np.inf)),
 ])
 def test_refusals_say_why(value, text):
-    assert say(refusal(MODEL, kelvin(value))) == text
+    assert say(refusal(MODEL.states, kelvin(value))) == text
 
 
 @pytest.mark.parametrize(('effective_ns', 'waits'), [

@@ -1,0 +1,181 @@
+# SPDX-FileCopyrightText: 2026 The koopman_ros Authors
+# SPDX-License-Identifier: Apache-2.0
+
+"""Whether an input within its range can hold a set-point, and the nearest one that can be held."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from koopman_ros.arrays import Array
+from koopman_ros.control.laws.base import Target
+from koopman_ros.control.levels import Level
+from koopman_ros.control.limits import InputLimits
+from koopman_ros.control.target import nearest_steady_state, resting_state
+from koopman_ros.lifting import Coordinates
+from koopman_ros.reasons import Code, Reason, reason
+
+_HALVINGS = 24  # to 1e-7 of the way
+_MOST_MOVES = 10
+_SINGULAR = 1e9  # condition from which on a model has no steady state for each input
+_SWEEPS = 100
+# What rounding may add to an input, in scaled deviations, and to a state, in half widths.
+_SLACK = 1e-6
+# With fewer inputs than controlled states a set-point counts as held where a steady state is so
+# near, in half widths of the training box: nobody states one to all its digits.
+_NEAR = 0.01
+
+
+def bounded_least_squares(G: Array, y: Array, lower: Array, upper: Array) -> Array:
+    """
+    Minimise the sum of squares of G v - y over lower <= v <= upper, one coordinate after another.
+
+    :param G: (n, m), and y (n,); the bounds are (m,), around 0.
+    :return: v (m,), which few sweeps bring near enough for few coordinates.
+    """
+    sizes, v = (G * G).sum(axis=0), np.zeros(G.shape[1])
+    for _ in range(_SWEEPS):
+        for j in np.flatnonzero(sizes):
+            wanted = v[j] + G[:, j].dot(y - G.dot(v)) / sizes[j]
+            v[j] = min(max(wanted, lower[j]), upper[j])
+    return v
+
+
+@dataclass(frozen=True)
+class Holding:
+    """What a level can hold under a disturbance."""
+
+    level: Level  #: whose model tells
+    limits: InputLimits  #: whose ranges count
+    margin: float  #: distance outside the training box, in half widths, that is allowed
+    w: Array  #: (n_x,) disturbance of the state's rate, scaled
+    start: Array | None  #: (n_x + n_u,) where the steady state is looked for, in units
+
+    @property
+    def box(self) -> Coordinates:
+        """The controlled states."""
+        return self.level.controlled_states
+
+    def refusal(self, goal: Array, others: Iterable[Array | None], command: Array | None,
+                whole: bool) -> Reason | None:
+        """
+        Return why a set-point (n_c,), in state units, cannot be held, or None.
+
+        :param goal: NaN for what is left open.
+        :param others: (n_c,) set-points from which on the nearest one that can be held is looked
+            for, the first one that is held itself.
+        :param command: (n_u,) input that holds another one, in input units, or None.
+        :param whole: whether every signal was asked for: else the others are to stay.
+        """
+        known = np.isfinite(goal)
+        if not known.all():
+            kept = tuple(name for name, is_known in zip(self.box.names, known, strict=True)
+                         if is_known)
+            some = replace(self, level=self.level.controlling(kept))
+            return some.refusal(goal[known], (), command, whole)
+        cause = self._cause(self._target(goal))
+        if cause is None:
+            return None
+        nearest = self._on_the_way(goal, (*others, self.box.center, self._under(command)))
+        if nearest is not None and len(goal) > 1 and (whole or self._too_few_inputs):
+            nearest = self._nearer(nearest, goal)
+        shares = (goal - (self.box.center if nearest is None else nearest)) / (
+            self.box.upper - self.box.lower)
+        worst = int(np.argmax(np.abs(shares)))
+        signal, value = self.box.names[worst], float(goal[worst])
+        if nearest is None:
+            return reason(Code.NO_SETPOINT_HELD, signal=signal, value=value, cause=cause)
+        return reason(Code.SETPOINT_NOT_HELD, signal=signal, value=value, cause=cause,
+                      nearest=float(nearest[worst]),
+                      held=tuple(zip(self.box.names, nearest.tolist(), strict=True)))
+
+    def _target(self, setpoint: Array) -> Target | None:
+        return self.level.target(setpoint, self.w, self.limits, self.start)
+
+    def _under(self, command: Array | None) -> Array | None:
+        """Return what (n_c,) is held by a command (n_u,), or by the nominal input."""
+        model = self.level.model
+        u = self.limits.within(model.inputs.center if command is None else command)
+        start = np.zeros(model.n_x) if self.start is None else (
+            model.states.to_deviation(self.start[:model.n_x]))
+        x = resting_state(model, model.inputs.to_deviation(u), self.w, start)
+        return None if x is None else self.level.controlled_of(model.states.to_physical(x))
+
+    @property
+    def _too_few_inputs(self) -> bool:
+        """Whether the controlled states outnumber the inputs."""
+        return self.level.controls_all and self.level.model.n_u < self.level.model.n_x
+
+    def _on_the_way(self, goal: Array, others: Iterable[Array | None]) -> Array | None:
+        """Return the last set-point that is held on the way to a goal, None where none is."""
+        held = next((other for other in others if other is not None and self._held(other)), None)
+        if held is None:
+            return None
+        beyond = goal
+        for _ in range(_HALVINGS):
+            middle = 0.5 * (held + beyond)
+            if self._held(middle):
+                held = middle
+            else:
+                beyond = middle
+        return held
+
+    def _nearer(self, held: Array, goal: Array) -> Array:
+        """Move the inputs within their range for the least squares of what is left to a goal."""
+        model, half = self.level.model, 0.5 * (self.box.upper - self.box.lower)
+        lower, upper = map(model.inputs.to_deviation, (self.limits.lower, self.limits.upper))
+        for _ in range(_MOST_MOVES):
+            target, left = self._target(held), (goal - held) / half
+            assert target is not None  # it is held
+            slope = model.drift_jacobian(target.x)
+            if not np.linalg.cond(slope) < _SINGULAR:
+                break
+            gain = model.states.scale[:, None] * -np.linalg.solve(slope, model.B)
+            gain = np.array([self.level.controlled_of(column) for column in gain.T]).T
+            move = bounded_least_squares(gain / half[:, None], left, lower - target.u,
+                                         upper - target.u)
+            for halving in range(_MOST_MOVES):
+                x = resting_state(model, target.u + 0.5 ** halving * move, self.w, target.x)
+                if x is None:
+                    continue
+                found = self.level.controlled_of(model.states.to_physical(x))
+                shorter = float(np.linalg.norm(left) - np.linalg.norm((goal - found) / half))
+                if shorter > 0.0 and self._held(found):
+                    held = found
+                    break
+            else:
+                break
+            if shorter < _SLACK:
+                break
+        return held
+
+    def _held(self, setpoint: Array) -> bool:
+        return self.box.violation(setpoint) == 0.0 and self._cause(self._target(setpoint)) is None
+
+    def _cause(self, target: Target | None) -> Reason | None:
+        """Return what keeps a target from being held, or None."""
+        if target is None:
+            return reason(Code.NO_STEADY_STATE)
+        model = self.level.model
+        u, slack = model.inputs.to_physical(target.u), _SLACK * model.inputs.scale
+        for i, name in enumerate(model.inputs.names):
+            lower, upper = self.limits.lower[i], self.limits.upper[i]
+            if not lower - slack[i] <= u[i] <= upper + slack[i]:
+                return reason(Code.INPUT_NEEDED, signal=name, value=float(u[i]),
+                              lower=float(lower), upper=float(upper))
+        states = model.states
+        x, half = states.to_physical(target.x), 0.5 * (states.upper - states.lower)
+        reach = (self.margin + _SLACK) * half
+        for i, name in enumerate(states.names):
+            if not states.lower[i] - reach[i] <= x[i] <= states.upper[i] + reach[i]:
+                return reason(Code.STATE_LEAVES, signal=name, value=float(x[i]),
+                              lower=float(states.lower[i]), upper=float(states.upper[i]))
+        if self._too_few_inputs:
+            nearest = nearest_steady_state(model, target, self.w)
+            if nearest is None or not np.all(
+                    np.abs(nearest - target.x) * states.scale <= _NEAR * half):
+                return reason(Code.NO_STEADY_STATE)
+        return None

@@ -1,0 +1,479 @@
+# SPDX-FileCopyrightText: 2026 The koopman_ros Authors
+# SPDX-License-Identifier: Apache-2.0
+
+"""Set-points for some of the states: tanks, and other models, whose steady states are known."""
+
+from dataclasses import replace
+import json
+import math
+
+from hypothesis import given, settings
+from hypothesis import strategies as st
+import numpy as np
+import pytest
+from scipy.linalg import expm
+
+from koopman_ros.control import (
+    at,
+    Controller,
+    InputLimits,
+    run_closed_loop,
+    SetpointRequest,
+    Settings,
+    simulate,
+    State,
+    Weights,
+)
+from koopman_ros.control.events import Outcome
+from koopman_ros.estimation import Estimate
+from koopman_ros.lifting import Coordinates, LiftedModel, linearised_model, Provenance
+from koopman_ros.lifting.observables import PolynomialObservables
+from koopman_ros.reasons import Code, Words
+from koopman_ros.replay.records import decoded, event_of, fields_of, Record
+from koopman_ros.units import Displays
+from koopman_ros.units import NANOSECONDS as SECOND
+from support.closed_loops import content, EPOCH
+
+LEVELS, FLOWS = ('h1', 'h2', 'h3'), ('q1', 'q2')
+say = Words(Displays({**dict.fromkeys(LEVELS, 'm'), **dict.fromkeys(FLOWS, 'L/s')}))
+
+
+def tanks(slope, gain, *, level=1.0, flow=3.0):
+    """Return dh/dt = slope (h - level) + gain (q - flow), levels from 0 m to 2 m."""
+    n, m = np.shape(gain)
+    # scales that are no half widths, so that units count
+    states = Coordinates(LEVELS[:n], ('m',) * n, np.full(n, level), np.full(n, 0.5),
+                         np.zeros(n), np.full(n, 2.0 * level))
+    inputs = Coordinates(FLOWS[:m], ('L/s',) * m, np.full(m, flow), np.full(m, 2.0),
+                         np.zeros(m), np.full(m, 2.0 * flow))
+    return linearised_model(np.array(slope), np.array(gain), states, inputs, 's',
+                            Provenance('tanks'))
+
+
+# dh1/dt = -0.2 (h1 - 1) + 0.1 (q - 3) and dh2/dt = 0.2 (h1 - 1) - 0.1 (h2 - 1): at rest
+# 2 (h1 - 1) = h2 - 1 = q - 3
+SERIES = tanks([[-0.2, 0.0], [0.2, -0.1]], [[0.1], [0.0]])
+# dh1/dt = -(h1 - 1) + (q1 - 3) and dh2/dt = (h1 - 1) - (h2 - 1) + (q2 - 3)
+BOTH = tanks([[-1.0, 0.0], [1.0, -1.0]], [[1.0, 0.0], [0.0, 1.0]])
+# a third tank beside, of its own pump, fed by the second one as well
+THREE = tanks([[-0.2, 0.0, 0.0], [0.2, -0.1, 0.0], [0.0, 0.05, -0.1]],
+              [[0.1, 0.0], [0.0, 0.0], [0.0, 0.1]])
+
+
+def loop(model, *controlled, lower=0.0, upper=6.0, **others):
+    n_u = model.n_u
+    return Controller(model, Settings.for_model(
+        model, state_weight=np.ones(model.n_x), input_weight=np.ones(n_u),
+        limits=InputLimits(np.broadcast_to(lower, n_u).astype(float),
+                           np.broadcast_to(upper, n_u).astype(float), np.full(n_u, np.inf)),
+        controlled=controlled, observer_bandwidth=0.3, **others))
+
+
+def stepped(controller, state, x, second):
+    return controller.step(state, np.array(x), EPOCH + second * SECOND)
+
+
+def asked(controller, value, state=None, **others):
+    return controller.request_setpoint(state or State(), np.atleast_1d(value), **others)
+
+
+def disturbed(controller, x, w):
+    """Return a state in which a disturbance (n_x,), in units per second, is estimated."""
+    state = stepped(controller, State(), x, 0)[0]
+    return replace(state, estimate=Estimate(
+        state.estimate.x, np.array(w) / controller.model.states.scale))
+
+
+# The target.
+
+@pytest.mark.parametrize('w', [(0.0, 0.0), (0.02, 0.0), (0.0, -0.03), (-0.01, 0.04)])
+def test_one_of_two_levels_is_held_under_a_disturbance(w):
+    controller = loop(SERIES, 'h2')
+    state = disturbed(controller, [1.0, 1.0], w)
+    state, refused = asked(controller, 1.4, state)
+    assert refused is None
+    target = controller.levels['sdre'].target(
+        np.array([1.4]), state.estimate.w, controller.settings.limits, None)
+    # 0.2 (h1 - 1) = 0.1 * 0.4 - w2 and 0.1 (q - 3) = 0.2 (h1 - 1) - w1
+    h1 = 1.0 + (0.04 - w[1]) / 0.2
+    np.testing.assert_allclose(controller.model.states.to_physical(target.x), [h1, 1.4],
+                               rtol=0, atol=1e-9)
+    np.testing.assert_allclose(controller.model.inputs.to_physical(target.u),
+                               [3.0 + (0.04 - w[1] - w[0]) / 0.1], rtol=0, atol=1e-9)
+    assert target.residual < 1e-9
+    np.testing.assert_allclose(
+        target.forcing + target.drift, np.zeros(2), rtol=0, atol=1e-9)
+
+
+def test_the_report_says_where_the_law_goes():
+    controller = loop(SERIES, 'h2', setpoint_ramp=np.array([0.05]))
+    state, _, report = stepped(controller, State(), [1.0, 1.0], 0)
+    np.testing.assert_array_equal(report.target.setpoint, [1.0])
+    np.testing.assert_allclose(report.target.state, [1.0, 1.0], rtol=0, atol=1e-12)
+    np.testing.assert_allclose(report.target.input, [3.0], rtol=0, atol=1e-12)
+    state, refused = asked(controller, 1.2, state)
+    assert refused is None
+    state, _, report = stepped(controller, state, [1.0, 1.0], 2)
+    # on its ramp
+    np.testing.assert_allclose(report.target.setpoint, [1.1], rtol=1e-12)
+    np.testing.assert_allclose(report.target.state, [1.05, 1.1], rtol=0, atol=1e-3)
+    np.testing.assert_array_equal(state.target, [*report.target.state, *report.target.input])
+    # of every state, the target is the set-point
+    whole = loop(BOTH)
+    report = stepped(whole, State(), [1.1, 1.3], 0)[2]
+    np.testing.assert_array_equal(report.target.state, [1.1, 1.3])
+    np.testing.assert_allclose(report.target.input, [3.1, 3.2], rtol=1e-12)
+
+
+def test_inputs_to_spare_go_least_far_from_the_nominal_point():
+    # h1 = 1 + a, q1 = 3 + a, q2 = 3 + r - a; in scaled deviations a / 0.5, a / 2 and (r - a) / 2:
+    # the sum of squares is least where 4 a + 0.25 a = 0.25 (r - a)
+    target = loop(BOTH, 'h2').levels['sdre'].target(
+        np.array([1.9]), np.zeros(2), loop(BOTH).settings.limits, None)
+    a = 0.9 / 18.0
+    np.testing.assert_allclose(BOTH.states.to_physical(target.x), [1.0 + a, 1.9], atol=1e-9)
+    np.testing.assert_allclose(BOTH.inputs.to_physical(target.u), [3.0 + a, 3.9 - a], atol=1e-9)
+
+
+def test_an_input_makes_up_for_another_at_its_limit():
+    controller = loop(BOTH, 'h2', upper=[3.5, 3.2])
+    assert asked(controller, 1.65)[1] is None
+    target = controller.levels['sdre'].target(
+        np.array([1.65]), np.zeros(2), controller.settings.limits, None)
+    np.testing.assert_allclose(BOTH.inputs.to_physical(target.u), [3.45, 3.2], atol=1e-9)
+    # both together reach 0.5 + 0.2
+    refused = asked(controller, 1.9)[1]
+    assert refused.values['nearest'] == pytest.approx(1.7, abs=1e-6)
+
+
+def parabola(**others):
+    """Return dx/dt = -(x - 1) + (u - 1), dy/dt = x^2 - y: at rest y = x^2 and u = x."""
+    states = Coordinates(('x', 'y'), ('1', '1'), np.ones(2), np.ones(2), np.array([-1.5, -1.0]),
+                         np.array([2.0, 4.0]))
+    inputs = Coordinates(('u',), ('1',), np.ones(1), np.ones(1), -np.ones(1), np.full(1, 3.0))
+    # of deviations: x^2 - y = 2 xi + xi^2 - eta
+    A = np.array([[-1.0, 0.0, 0.0], [2.0, -1.0, 1.0], [0.0, 0.0, -2.0]])
+    model = LiftedModel(PolynomialObservables(np.array([[1, 0], [0, 1], [2, 0]])), A,
+                        np.array([[1.0], [0.0]]), states, inputs, 's', Provenance('parabola'))
+    return loop(model, 'y', lower=-5.0, upper=5.0, **others)
+
+
+@pytest.mark.parametrize('y', [0.01, 0.25, 1.0, 2.25, 3.9])
+def test_a_steady_state_that_is_not_linear_in_the_setpoint(y):
+    controller = parabola()
+    state, refused = asked(controller, y)
+    assert refused is None
+    report = stepped(controller, state, [1.0, 1.0], 0)[2]
+    np.testing.assert_allclose(report.target.state, [math.sqrt(y), y], rtol=0, atol=1e-8)
+    np.testing.assert_allclose(report.target.input, [math.sqrt(y)], rtol=0, atol=1e-8)
+
+
+def test_of_two_steady_states_the_one_before_is_followed():
+    controller = parabola()
+    for sign in (1.0, -1.0):
+        target = controller.levels['sdre'].target(
+            np.array([0.81]), np.zeros(2), controller.settings.limits,
+            np.array([sign, 1.0, sign]))
+        np.testing.assert_allclose(
+            controller.model.states.to_physical(target.x), [0.9 * sign, 0.81], atol=1e-8)
+
+
+def test_where_there_is_no_steady_state_the_law_fails_and_nothing_raises():
+    controller = parabola()
+    # y = x^2 + w2 is never below w2
+    state = disturbed(controller, [1.0, 1.0], [0.0, 0.0])
+    state, refused = asked(controller, 0.5, state)
+    assert refused is None
+    state = replace(state, estimate=Estimate(state.estimate.x, np.array([0.0, 0.7])))
+    state, command, report = controller.step(
+        state, np.array([1.0, 1.0]), EPOCH + SECOND // 1000)
+    assert report.level == 'linear'
+    assert (report.reason.code, report.reason.cause.code) == (
+        Code.LAW_FAILED, Code.NO_STEADY_STATE)
+    assert np.all(np.isfinite(command))
+    # the linearised model has one: 2 xi - eta + w2 = 0
+    np.testing.assert_allclose(report.target.setpoint, [0.5])
+    assert report.target.state[0] == pytest.approx(1.0 + 0.5 * (-0.5 - 0.7), abs=0.01)
+    refused = asked(controller, -0.5)[1]
+    assert (refused.code, refused.values['cause'].code) == (
+        Code.SETPOINT_NOT_HELD, Code.NO_STEADY_STATE)
+    assert refused.values['nearest'] == pytest.approx(0.0, abs=1e-3)
+
+
+# What cannot be held.
+
+@pytest.mark.parametrize(('value', 'upper', 'w', 'needed', 'nearest'), [
+    # q - 3 = h2 - 1
+    (1.9, 3.5, 0.0, 3.9, 1.5),
+    (0.2, 6.0, 0.0, 2.2, 0.5),
+    # a disturbance of the first tank is one of the pump: q - 3 = h2 - 1 - w1 / 0.1
+    (1.9, 3.5, 0.03, 3.6, 1.8),
+    (1.4, 3.5, -0.02, 3.6, 1.3),
+    # neither what is tracked nor the nominal level can be held now; what the command leads to can
+    (1.4, 3.5, -0.1, 4.4, 0.5)])
+def test_a_refusal_names_the_nearest_level_and_what_the_pump_would_need(
+        value, upper, w, needed, nearest):
+    controller = loop(SERIES, 'h2', lower=2.5, upper=upper)
+    state = disturbed(controller, [1.0, 1.0], [w, 0.0])
+    same, refused = asked(controller, value, state)
+    assert same is state
+    assert refused.code is Code.SETPOINT_NOT_HELD
+    assert (refused.values['signal'], refused.values['value']) == ('h2', value)
+    assert refused.values['nearest'] == pytest.approx(nearest, abs=1e-5)
+    why = refused.cause
+    assert (why.code, why.values['signal']) == (Code.INPUT_NEEDED, 'q1')
+    assert (why.values['lower'], why.values['upper']) == (2.5, upper)
+    assert why.values['value'] == pytest.approx(needed, abs=1e-9)
+    assert asked(controller, refused.values['nearest'], state)[1] is None
+
+
+def test_the_words_of_a_refusal():
+    controller = loop(SERIES, 'h2', upper=3.5)
+    assert say(asked(controller, 1.9)[1]) == (
+        'h2 set-point 1.9 m cannot be held, since q1 would have to be 3.9 L/s, its range is '
+        '0 L/s to 3.5 L/s: the old one is kept; the nearest that can be held is h2 1.5 m')
+    assert asked(controller, 2.1)[1].code is Code.SETPOINT_OUTSIDE
+    # nothing is held where no input of the range balances the disturbance
+    state = disturbed(controller, [1.0, 1.0], [-0.5, 0.0])
+    refused = asked(controller, 1.2, state)[1]
+    assert refused.code is Code.NO_SETPOINT_HELD
+    assert 'no other one is found that can' in say(refused)
+
+
+def test_another_level_that_would_overflow_refuses_too():
+    # h1 - 1 = (0.1 (h2 - 1) - w2) / 0.2 may go to 2 m and by the margin of 0.1 half widths beyond
+    controller = loop(SERIES, 'h2', lower=-9.0, upper=9.0)
+    state = disturbed(controller, [1.0, 1.0], [0.0, -0.2])
+    refused = asked(controller, 1.6, state)[1]
+    assert refused.code is Code.SETPOINT_NOT_HELD
+    assert (refused.cause.code, refused.cause.values['signal']) == (Code.STATE_LEAVES, 'h1')
+    assert refused.cause.values['value'] == pytest.approx(2.3, abs=1e-9)
+    assert refused.values['nearest'] == pytest.approx(1.2, abs=1e-5)
+
+
+def test_a_limit_tightened_afterwards_withdraws_nothing():
+    wide, narrow = loop(SERIES, 'h2'), loop(SERIES, 'h2', upper=3.5)
+    state, refused = asked(wide, 1.9)
+    assert refused is None
+    state = stepped(wide, state, [1.0, 1.0], 0)[0]
+    state = narrow.hand_over(wide, state)
+    state, command, report = stepped(narrow, state, [1.0, 1.0], 1)
+    np.testing.assert_array_equal(report.target.setpoint, [1.9])
+    assert command[0] <= 3.5
+
+
+def test_every_level_with_one_pump_has_to_be_a_steady_state():
+    controller = loop(SERIES)
+    # 2 (h1 - 1) = h2 - 1
+    assert asked(controller, [1.2, 1.4])[1] is None
+    refused = asked(controller, [1.4, 1.4])[1]
+    assert (refused.code, refused.cause.code) == (
+        Code.SETPOINT_NOT_HELD, Code.NO_STEADY_STATE)
+    held = dict(refused.values['held'])
+    # the foot of the perpendicular: (0.4, 0.4) . (1, 2) / 5 = 0.24
+    assert held == pytest.approx({'h1': 1.24, 'h2': 1.48}, abs=1e-4)
+
+
+def test_the_nearest_of_two_levels_is_that_of_least_squares():
+    # q1 - 3 = h1 - 1 = a and q2 - 3 = b = (h2 - 1) - a: with b at 0.2, a^2 + (a + 0.2 - 0.9)^2 is
+    # least at a = 0.35
+    controller = loop(BOTH, upper=[3.5, 3.2])
+    refused = asked(controller, [1.0, 1.9])[1]
+    assert dict(refused.values['held']) == pytest.approx({'h1': 1.35, 'h2': 1.55}, abs=1e-5)
+    # one alone leaves the other where it is
+    state = stepped(controller, State(), [1.0, 1.0], 0)[0]
+    refused = asked(controller, 1.9, state, signals=('h2',))[1]
+    assert dict(refused.values['held']) == pytest.approx({'h1': 1.0, 'h2': 1.2}, abs=1e-5)
+
+
+# Several signals.
+
+def test_one_signal_of_two_is_asked_for():
+    controller = loop(THREE, 'h2', 'h3')
+    state = stepped(controller, State(), [1.0, 1.0, 1.0], 0)[0]
+    state, refused = asked(controller, 1.3, state, signals=('h3',))
+    assert refused is None
+    np.testing.assert_array_equal(state.setpoint.requested, [1.0, 1.3])
+    state, refused = asked(controller, [0.9, 1.2], state, signals=('h3', 'h2'))
+    assert refused is None
+    np.testing.assert_array_equal(state.setpoint.requested, [1.2, 0.9])
+    report = stepped(controller, state, [1.0, 1.0, 1.0], 1)[2]
+    # 0.05 (h2 - 1) - 0.1 (h3 - 1) + 0.1 (q2 - 3) = 0
+    np.testing.assert_allclose(report.target.state, [1.1, 1.2, 0.9], rtol=0, atol=1e-9)
+    np.testing.assert_allclose(report.target.input, [3.2, 2.8], rtol=0, atol=1e-9)
+
+
+def test_one_signal_refused_is_brought_nearest_by_itself():
+    # q2 - 3 = (h3 - 1) - 0.5 (h2 - 1) is at most 0.5
+    controller = loop(THREE, 'h2', 'h3', upper=3.5)
+    state = stepped(controller, State(), [1.0, 1.0, 1.0], 0)[0]
+    state, refused = asked(controller, 1.4, state, signals=('h2',))
+    assert refused is None
+    refused = asked(controller, 1.9, state, signals=('h3',))[1]
+    assert refused.values['signal'] == 'h3'
+    assert dict(refused.values['held']) == pytest.approx({'h2': 1.4, 'h3': 1.7}, abs=1e-5)
+
+
+def test_before_the_first_measurement_the_other_signal_stays_open():
+    controller = loop(THREE, 'h2', 'h3')
+    state, refused = asked(controller, 1.3, signals=('h3',))
+    assert refused is None
+    report = stepped(controller, state, [0.9, 1.1, 1.0], 0)[2]
+    np.testing.assert_array_equal(report.target.setpoint, [1.1, 1.3])
+
+
+def test_schedules_are_kept_per_signal():
+    controller, tracked = loop(THREE, 'h2', 'h3'), []
+    state = stepped(controller, State(), [1.0, 1.0, 1.0], 0)[0]
+    for value, second, signals in (
+            ([1.1, 1.2], 2, None), (1.3, 4, ('h2',)), (1.4, 4, ('h3',)), (0.9, 6, ('h3',))):
+        state, refused = asked(controller, value, state, signals=signals,
+                               effective_ns=EPOCH + second * SECOND)
+        assert refused is None
+    assert len(state.setpoint.scheduled) == 3
+    # at once: this ends what was scheduled for h2, and leaves h3 what was
+    state, refused = asked(controller, 0.8, state, signals=('h2',))
+    assert refused is None
+    for second in range(1, 8):
+        state, _, report = stepped(controller, state, [1.0, 1.0, 1.0], second)
+        tracked.append(report.target.setpoint.tolist())
+    assert tracked == [[0.8, 1.0], [0.8, 1.2], [0.8, 1.2], [0.8, 1.4], [0.8, 1.4], [0.8, 0.9],
+                       [0.8, 0.9]]
+    assert state.setpoint.scheduled == ()
+
+
+@pytest.mark.parametrize(('signals', 'value', 'message'), [
+    (('h1',), [1.0], r"signals must be some of h2, h3, each once, got \['h1'\]"),
+    (('h2', 'h2'), [1.0, 1.0], 'each once'),
+    ((), [], 'some of h2, h3'),
+    (('h2',), [1.0, 1.0], 'incompatible set-point: expected one number for each of h2'),
+    (None, [1.0, 1.0, 1.0], 'expected one number for each of h2, h3')])
+def test_requests_that_fit_no_signal_are_errors(signals, value, message):
+    with pytest.raises(ValueError, match=message):
+        asked(loop(THREE, 'h2', 'h3'), value, signals=signals)
+
+
+@pytest.mark.parametrize(('model', 'names', 'message'), [
+    (THREE, ('h3', 'h2'), 'some of the states h1, h2, h3, each once and in this order'),
+    (THREE, ('h2', 'h2'), 'each once'),
+    (THREE, ('temperature',), 'some of the states h1, h2, h3, .* got temperature'),
+    (tanks(-np.eye(3), np.ones((3, 1))), ('h1', 'h2'),
+     r'1 inputs cannot hold 2 signals \(h1, h2\): name at most 1')])
+def test_signals_that_cannot_be_controlled_are_refused(model, names, message):
+    with pytest.raises(ValueError, match=message):
+        loop(model, *names)
+
+
+def test_a_successor_keeps_the_setpoints_of_the_same_signals():
+    before = loop(THREE, 'h2', 'h3')
+    state = stepped(before, State(), [1.0, 1.0, 1.0], 0)[0]
+    state = asked(before, [1.2, 1.3], state)[0]
+    state = stepped(before, state, [1.0, 1.0, 1.0], 1)[0]
+    again = loop(THREE, 'h2', 'h3', transfer_time=5.0).hand_over(before, state)
+    np.testing.assert_array_equal(again.setpoint.active, [1.2, 1.3])
+    other = loop(THREE, 'h1', 'h3')
+    moved = other.hand_over(before, state)
+    report = stepped(other, moved, [1.1, 1.0, 0.9], 2)[2]
+    np.testing.assert_array_equal(report.target.setpoint, [1.1, 0.9])
+
+
+# The loop, and its records.
+
+class Tanks:
+    """Tanks under a load that no model knows, in their exact motion."""
+
+    def __init__(self, model, load, x, u, time_ns=0):
+        self.model, self.load, self.x, self.u, self.time_ns = model, load, x, u, time_ns
+
+    def commanded(self, command, _):
+        return Tanks(self.model, self.load, self.x, command, self.time_ns)
+
+    def until(self, time_ns):
+        model, n, seconds = self.model, self.model.n_x, (time_ns - self.time_ns) / SECOND
+        rate = model.B @ model.inputs.to_deviation(self.u) + self.load / model.states.scale
+        block = expm(seconds * np.block([
+            [model.A, rate[:, None]], [np.zeros((1, n + 1))]]))
+        xi = block[:n, :n] @ model.states.to_deviation(self.x) + block[:n, n]
+        return Tanks(model, self.load, model.states.to_physical(xi), self.u, time_ns)
+
+
+def test_the_controlled_levels_arrive_and_the_others_where_they_are_needed():
+    controller, load = loop(THREE, 'h2', 'h3'), np.array([0.01, -0.02, 0.015])
+    run = simulate(controller, Tanks(THREE, load, np.ones(3), np.full(2, 3.0)), [
+        at(5.0, SetpointRequest(0, np.array([1.3]), ('h2',))),
+        at(5.0, SetpointRequest(0, np.array([0.8]), ('h3',)))], duration=400.0)
+    assert run.setpoints.shape == (401, 2)
+    assert run.levels[-1] == 'sdre'
+    # 0.2 (h1 - 1) = 0.1 * 0.3 + 0.02
+    np.testing.assert_allclose(run.states[-1], [1.25, 1.3, 0.8], rtol=0, atol=1e-6)
+    np.testing.assert_allclose(run.reports[-1].target.state, [1.25, 1.3, 0.8], rtol=0, atol=1e-6)
+    # 0.1 (q1 - 3) = 0.2 * 0.25 - 0.01, 0.1 (q2 - 3) = -0.1 * 0.2 - 0.05 * 0.3 - 0.015
+    np.testing.assert_allclose(run.commands[-1], [3.4, 2.5], rtol=0, atol=1e-6)
+
+
+def test_a_continuous_loop_goes_to_the_steady_state_of_its_setpoint():
+    weights = Weights(np.eye(2), np.eye(1))
+    centers = SERIES.states.center, SERIES.inputs.center
+
+    def rate(x, u):
+        return np.array([[-0.2, 0.0], [0.2, -0.1]]) @ (x - 1.0) + np.array([0.1, 0.0]) * (u - 3.0)
+
+    run = run_closed_loop(SERIES, rate, centers[0], np.array([1.4]), weights, 300.0,
+                          controlled=('h2',))
+    np.testing.assert_allclose(run.states[-1], [1.2, 1.4], rtol=0, atol=1e-6)
+    np.testing.assert_allclose(run.inputs[-1], [3.4], rtol=0, atol=1e-5)
+    with pytest.raises(ValueError, match=r'no steady state with y at \[-0\.5\]'):
+        run_closed_loop(parabola().model, rate, np.ones(2), np.array([-0.5]), weights, 1.0,
+                        controlled=('y',))
+
+
+def test_the_records_of_requests():
+    def written(event):
+        name, fields = fields_of(event, Outcome(State()))
+        return json.loads(json.dumps(fields)), event_of(
+            Record('run', 1, name, json.loads(json.dumps(fields))))
+
+    fields, again = written(SetpointRequest(7, np.array([1.5])))
+    assert 'signals' not in fields
+    assert again.signals is None
+    fields, again = written(SetpointRequest(7, np.array([1.5]), ('h3',)))
+    assert fields['signals'] == ['h3']
+    assert (again.stamp_ns, again.value.tolist(), again.signals) == (7, [1.5], ('h3',))
+
+
+changes = st.lists(st.tuples(
+    st.sampled_from(['measure'] * 4 + ['ask', 'schedule', 'silence']),
+    st.lists(st.one_of(st.floats(-0.5, 2.5), st.sampled_from([math.nan, math.inf, -1e300])),
+             min_size=3, max_size=3)), min_size=1, max_size=25)
+
+
+@settings(max_examples=60, deadline=None, derandomize=True)
+@given(st.sampled_from([
+    loop(SERIES, 'h2', lower=2.0, upper=4.0), loop(BOTH, 'h2', lower=2.0, upper=4.0),
+    loop(THREE, 'h2', 'h3', setpoint_ramp=np.array([0.1, np.inf])), loop(SERIES, 'h1'),
+    parabola(setpoint_filter=3.0)]), changes)
+def test_commands_are_numbers_within_limits_and_follow_from_the_state_alone(controller, sequence):
+    n, limits, state = controller.model.n_x, controller.settings.limits, State()
+    signals = controller.controlled.names
+    for second, (kind, values) in enumerate(sequence):
+        kept, now = content(state), EPOCH + second * SECOND
+        command = None
+        match kind:
+            case 'measure':
+                state, command, report = result = controller.step(state, np.array(values[:n]), now)
+                # a controller built afresh goes on from what was written down
+                again = replace(controller).step(
+                    decoded(json.loads(kept)), np.array(values[:n]), now)
+                assert content(again) == content(result)
+                target = report.target
+                if target is not None and target.state is not None:
+                    assert np.all(np.isfinite([*target.state, *target.input]))
+            case 'silence':
+                state, command, _ = controller.hold(state, now)
+            case _:
+                state, refused = asked(
+                    controller, values[0], state, signals=signals[second % len(signals):][:1],
+                    effective_ns=(now + 2 * SECOND) * (kind == 'schedule'))
+                assert refused is None or say(refused)
+        if command is not None:
+            assert np.all((limits.lower <= command) & (command <= limits.upper))
