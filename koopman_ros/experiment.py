@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 The koopman_ros Authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""The identification experiment: random steps of the input on a running plant, with a way back."""
+"""The identification experiment: random steps on a running plant, with a way back."""
 
 from __future__ import annotations
 
@@ -11,12 +11,12 @@ from functools import cached_property
 
 import numpy as np
 
-from koopman_ros.arrays import Array
+from koopman_ros.arrays import Array, frozen
 from koopman_ros.reasons import Code, Reason, reason
 from koopman_ros.units import LATE_NANOSECONDS, NANOSECONDS
 
-_FOLLOWS_WITHIN = 0.01  # in the input's unit
-_COMES_NEARER = 1e-4  # likewise, less than any rate limit allows
+_FOLLOWS_WITHIN = 1e-3  # of an input's range
+_COMES_NEARER = 1e-5  # likewise, less than any rate limit allows between two commands
 
 
 class Phase(Enum):
@@ -28,60 +28,85 @@ class Phase(Enum):
     ABORTED = 'aborted'
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Experiment:
-    """Steps of random height and length (paper, section on the reactor), and what ends them."""
+    """
+    Steps of random height and length (paper, section on the reactor), and what ends them.
+
+    What is stepped are inputs, or set-points of a controller in automatic mode, each by its own
+    steps: they coincide only where all last equally long.
+
+    :raises ValueError: when a number is missing, not finite, or contradicts another.
+    """
 
     duration: float  #: s
-    input_lower: float  #: lowest level, in the input's unit; levels are uniform between the two
-    input_upper: float  #: highest level
+    names: tuple[str, ...]  #: (m,) of the signals that are stepped; all in their units
+    lower: Array  #: (m,) lowest levels; levels are uniform between the two
+    upper: Array  #: (m,) highest levels
+    rate: Array  #: (m,) largest changes per s
+    #: (m,) where the signals start and return to: inputs that are safe whatever happened, or the
+    #: set-points from before
+    home: Array
     hold_shortest: float  #: shortest time of a level, in s; times are uniform between the two
     hold_longest: float  #: longest time of a level, in s
-    rate: float  #: largest change of the input, per s
-    state_lower: float  #: smallest state that may be measured, in its unit
-    state_upper: float  #: largest state
-    safe_input: float  #: input that is safe whatever happened
+    measured: tuple[str, ...]  #: (n,) names of the measured signals
+    measured_lower: Array  #: (n,) smallest values that may be measured; -infinity for any
+    measured_upper: Array  #: (n,) largest values; infinity for any
     seed: int  #: of numpy's default generator; the same seed gives the same steps
-    state: str = 'state'  #: name of the measured state
 
     def __post_init__(self) -> None:
-        for low, high in (('input_lower', 'input_upper'), ('state_lower', 'state_upper')):
-            if not getattr(self, low) < getattr(self, high):
-                raise ValueError(f'{low} = {getattr(self, low)} must be below {high} = '
-                                 f'{getattr(self, high)}')
+        for field, names in (('lower', self.names), ('upper', self.names), ('rate', self.names),
+                             ('home', self.names), ('measured_lower', self.measured),
+                             ('measured_upper', self.measured)):
+            object.__setattr__(self, field, frozen(
+                getattr(self, field), field, (len(names),), finite=names is self.names))
+        for names, low, high in ((self.names, self.lower, self.upper),
+                                 (self.measured, self.measured_lower, self.measured_upper)):
+            for name, lower, upper in zip(names, low, high, strict=True):
+                if not lower < upper:
+                    raise ValueError(f'{name}: lower = {lower} must be below upper = {upper}')
+        for name, rate in zip(self.names, self.rate, strict=True):
+            if not rate > 0.0:
+                raise ValueError(f'{name}: rate = {rate} must be above 0')
         if not 0.0 < self.hold_shortest <= self.hold_longest:
             raise ValueError(f'hold_shortest = {self.hold_shortest} s must be above 0 and not '
                              f'above hold_longest = {self.hold_longest} s')
-        for name in ('duration', 'rate'):
-            if not 0.0 < getattr(self, name) < np.inf:
-                raise ValueError(f'{name} = {getattr(self, name)} must be finite and above 0')
+        if not 0.0 < self.duration < np.inf:
+            raise ValueError(f'duration = {self.duration} s must be finite and above 0')
 
     @cached_property
-    def steps(self) -> tuple[Array, Array]:
-        """When each step ends (S,), in s after the start, and its level (S,)."""
+    def steps(self) -> tuple[tuple[Array, Array], ...]:
+        """For each signal when its steps end (S,), in s after the start, and their levels (S,)."""
         rng = np.random.default_rng(self.seed)
         count = int(self.duration / self.hold_shortest) + 1
-        ends = np.cumsum(rng.uniform(self.hold_shortest, self.hold_longest, count))
-        levels = rng.uniform(self.input_lower, self.input_upper, count)
-        used = int(np.searchsorted(ends, self.duration)) + 1
-        return ends[:used], levels[:used]
+        drawn = []
+        for lower, upper in zip(self.lower, self.upper, strict=True):
+            ends = np.cumsum(rng.uniform(self.hold_shortest, self.hold_longest, count))
+            levels = rng.uniform(lower, upper, count)
+            used = int(np.searchsorted(ends, self.duration)) + 1
+            drawn.append((ends[:used], levels[:used]))
+        return tuple(drawn)
 
-    def refusal(self, measured: float) -> Reason | None:
-        """Return why the experiment must not go on with a measurement, or None."""
-        if not np.isfinite(measured):
-            return reason(Code.NOT_FINITE, signal=self.state, value=measured)
-        return None if self.state_lower <= measured <= self.state_upper else reason(
-            Code.EXPERIMENT_BOUNDS, signal=self.state, value=measured,
-            lower=self.state_lower, upper=self.state_upper)
+    def refusal(self, measured: Array) -> Reason | None:
+        """Return why the experiment must not go on with a measurement (n,), or None."""
+        for name, value, lower, upper in zip(
+                self.measured, measured.tolist(), self.measured_lower.tolist(),
+                self.measured_upper.tolist(), strict=True):
+            if not np.isfinite(value):
+                return reason(Code.NOT_FINITE, signal=name, value=value)
+            if not lower <= value <= upper:
+                return reason(Code.EXPERIMENT_BOUNDS, signal=name, value=value, lower=lower,
+                              upper=upper)
+        return None
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Progress:
-    """How far an experiment is; it goes on commanding the safe input when it is over."""
+    """How far an experiment is; it goes on commanding the way home when it is over."""
 
     start_ns: int  #: stamp of the measurement it started with
     time_ns: int  #: stamp of the last measurement
-    command: float  #: last input
+    command: Array  #: (m,) last values of the signals that are stepped
     interval: float = np.inf  #: usual seconds between measurements; infinity before the second
     phase: Phase = Phase.RUNNING
     reason: Reason | None = None  #: why it was aborted
@@ -93,21 +118,21 @@ class Progress:
 
 
 def begin(experiment: Experiment, time_ns: int) -> Progress:
-    """Start with the safe input, at the stamp of the first measurement."""
-    return Progress(time_ns, time_ns, experiment.safe_input)
+    """Start at home, at the stamp of the first measurement."""
+    return Progress(time_ns, time_ns, experiment.home)
 
 
 def end(progress: Progress, phase: Phase, why: Reason | None = None) -> Progress:
-    """End the steps, unless they are over; the input then goes back to the safe one."""
+    """End the steps, unless they are over; the signals then go home."""
     if progress.phase is not Phase.RUNNING:
         return progress
     return replace(progress, phase=phase, reason=why)
 
 
-def advance(experiment: Experiment, progress: Progress, measured: float | None, time_ns: int
+def advance(experiment: Experiment, progress: Progress, measured: Array | None, time_ns: int
             ) -> Progress:
     """
-    Answer a measurement of the state, or the passing of time without one.
+    Answer a measurement (n,), or the passing of time without one.
 
     As in the control step, a stamp that is not later moves nothing, and the rate limit counts a
     gap in the measurements as twice the interval before it.
@@ -127,21 +152,22 @@ def advance(experiment: Experiment, progress: Progress, measured: float | None, 
         progress = end(progress, Phase.FINISHED)
     reach = experiment.rate * seconds
     change = level(experiment, progress) - progress.command
-    return replace(progress, command=progress.command + min(max(change, -reach), reach))
+    return replace(progress, command=progress.command + np.clip(change, -reach, reach))
 
 
-def level(experiment: Experiment, progress: Progress) -> float:
-    """Return where the input goes now."""
+def level(experiment: Experiment, progress: Progress) -> Array:
+    """Return where the signals go now (m,)."""
     if progress.phase is not Phase.RUNNING:
-        return experiment.safe_input
-    ends, levels = experiment.steps
-    return float(levels[np.searchsorted(ends, progress.elapsed, side='right')])
+        return experiment.home
+    return np.array([levels[np.searchsorted(ends, progress.elapsed, side='right')]
+                     for ends, levels in experiment.steps])
 
 
 @dataclass(frozen=True)
 class Following:
-    """Whether a controller in manual mode passes the input on, within limits of its own."""
+    """Whether a controller passes on one of the signals, within limits of its own."""
 
+    span: float  #: width of the signal's range, in its unit
     heard: float | None = None  #: what it commanded last, or None at first
     astray: int = 0  #: how many times in a row that was not, nor came nearer to, what was asked
     since: float = 0.0  #: time of the first of these, in s
@@ -149,7 +175,8 @@ class Following:
     def after(self, heard: float, asked: float, now: float) -> Following:
         """Return the same after the controller commanded `heard` where `asked` was asked."""
         gap = abs(heard - asked)
-        nearer = self.heard is None or gap < abs(self.heard - asked) - _COMES_NEARER
-        if gap <= _FOLLOWS_WITHIN or nearer:
-            return Following(heard, 0, now)
-        return Following(heard, self.astray + 1, self.since if self.astray else now)
+        nearer = self.heard is None or (
+            gap < abs(self.heard - asked) - _COMES_NEARER * self.span)
+        if gap <= _FOLLOWS_WITHIN * self.span or nearer:
+            return Following(self.span, heard, 0, now)
+        return Following(self.span, heard, self.astray + 1, self.since if self.astray else now)

@@ -6,6 +6,8 @@
 from dataclasses import dataclass
 from typing import Any
 
+import numpy as np
+
 from koopman_ros.experiment import Experiment
 from koopman_ros.parameters import wire
 from koopman_ros.parameters.table import parameter, ParameterTable
@@ -105,15 +107,17 @@ class TrainerParameters:
         """Return the plan of an experiment in SI units."""
         return Experiment(
             duration=self.experiment_duration * SECONDS_PER_MINUTE,
-            input_lower=to_kelvin(self.experiment_coolant_min),
-            input_upper=to_kelvin(self.experiment_coolant_max),
+            names=('coolant_temperature',),
+            lower=np.array([to_kelvin(self.experiment_coolant_min)]),
+            upper=np.array([to_kelvin(self.experiment_coolant_max)]),
+            rate=np.array([self.experiment_rate_limit / SECONDS_PER_MINUTE]),
+            home=np.array([to_kelvin(self.safe_coolant)]),
             hold_shortest=self.experiment_hold_min * SECONDS_PER_MINUTE,
             hold_longest=self.experiment_hold_max * SECONDS_PER_MINUTE,
-            rate=self.experiment_rate_limit / SECONDS_PER_MINUTE,
-            state_lower=to_kelvin(self.experiment_temperature_min),
-            state_upper=to_kelvin(self.experiment_temperature_max),
-            safe_input=to_kelvin(self.safe_coolant), seed=self.experiment_seed,
-            state='temperature')
+            measured=('temperature',),
+            measured_lower=np.array([to_kelvin(self.experiment_temperature_min)]),
+            measured_upper=np.array([to_kelvin(self.experiment_temperature_max)]),
+            seed=self.experiment_seed)
 
     def training(self) -> dict[str, Any]:
         """Return the fields of a :class:`koopman_ros.retraining.Task` that are settings."""

@@ -8,6 +8,7 @@ from __future__ import annotations
 from collections.abc import Callable
 import time
 
+import numpy as np
 from rclpy.callback_groups import MutuallyExclusiveCallbackGroup
 from rclpy.duration import Duration
 from rclpy.node import Node
@@ -16,6 +17,7 @@ from rclpy.task import Future
 from sensor_msgs.msg import Temperature
 from std_srvs.srv import SetBool
 
+from koopman_ros.arrays import Array
 from koopman_ros.experiment import advance, begin, end, Following, level, Phase, Progress
 from koopman_ros.parameters.trainer import TrainerParameters
 from koopman_ros.reasons import Code, Reason, reason
@@ -97,7 +99,7 @@ class CoolantExperiment:
         """End the steps, or let go of the coolant when they are over."""
         if self._run is None:
             return False, 'no experiment is running'
-        safe = in_celsius(self._run.plan.safe_input)
+        safe = in_celsius(float(self._run.plan.home[0]))
         if self._run.running:
             self._run.stop(Phase.ENDED)
             return True, (f'ended: the coolant returns to {safe} and is held there; call again '
@@ -146,12 +148,12 @@ class CoolantExperiment:
         if run.progress is None:
             return verdict
         held = '' if run.running else (
-            f'; the coolant returns to {in_celsius(run.plan.safe_input)} and is held there')
+            f'; the coolant returns to {in_celsius(float(run.plan.home[0]))} and is held there')
         left = max(0.0, run.plan.duration - run.progress.elapsed) if run.running else 0.0
         return Status(verdict.level, verdict.message + held, {
             'topic': run.topic,
-            'level [degC]': to_celsius(level(run.plan, run.progress)),
-            'coolant [degC]': to_celsius(run.progress.command),
+            'level [degC]': to_celsius(float(level(run.plan, run.progress)[0])),
+            'coolant [degC]': to_celsius(float(run.progress.command[0])),
             'left [s]': left,
             'seed': run.plan.seed,
         })
@@ -174,7 +176,7 @@ class ExperimentRun:
         self._node = node
         self._patience, self._on_end = settings.experiment_timeout, on_end
         self._frame_id, self._stamp_ns, self._heard_at = '', 0, time.monotonic()
-        self._following = Following()
+        self._following = Following(float(self.plan.upper[0] - self.plan.lower[0]))
         owned = Owned(node)
         self.destroy = owned.destroy  #: commands no more
         # a sensor driver may publish best effort
@@ -205,19 +207,19 @@ class ExperimentRun:
         """Leave the coolant at the safe temperature before the process ends."""
         if self.progress is None:
             return
-        self._command(self.plan.safe_input, self._stamp_ns)
+        self._command(self.plan.home, self._stamp_ns)
         # a plant in lock-step takes only the answer to its next measurement
         deadline = time.monotonic() + _FAREWELL
         with (handle := self._temperatures.handle):
             while time.monotonic() < deadline:
                 if taken := handle.take_message(Temperature, False):
-                    self._command(self.plan.safe_input, stamp_nanoseconds(taken[0].header.stamp))
+                    self._command(self.plan.home, stamp_nanoseconds(taken[0].header.stamp))
                 else:
                     time.sleep(0.001)
         self._publisher.wait_for_all_acked(Duration(seconds=_FAREWELL))
 
     def _on_temperature(self, message: Temperature) -> None:
-        measured = to_kelvin(message.temperature)
+        measured = np.array([to_kelvin(message.temperature)])
         stamp_ns = stamp_nanoseconds(message.header.stamp)
         if self.progress is None:
             if self.started.done():
@@ -235,19 +237,20 @@ class ExperimentRun:
         if was_running and not self.running:
             self._on_end(None)
 
-    def _command(self, kelvin: float, stamp_ns: int) -> None:
+    def _command(self, kelvin: Array, stamp_ns: int) -> None:
         self._publisher.publish(
-            temperature_message(kelvin, stamp_message(stamp_ns), self._frame_id))
+            temperature_message(float(kelvin[0]), stamp_message(stamp_ns), self._frame_id))
 
     def _on_coolant(self, message: Temperature) -> None:
         """Watch a controller that should be in manual mode."""
         if self.progress is None:
             return
         heard, now = to_kelvin(message.temperature), time.monotonic()
-        self._following = self._following.after(heard, self.progress.command, now)
+        asked = float(self.progress.command[0])
+        self._following = self._following.after(heard, asked, now)
         if self._following.astray >= _ASTRAY and now - self._following.since >= _ASTRAY_TIME:
             self._on_end(reason(Code.NOT_FOLLOWED, signal='coolant_temperature', value=heard,
-                                requested=self.progress.command))
+                                requested=asked))
 
     def _on_tick(self) -> None:
         """Look for other commanders, and for measurements that stay away."""

@@ -102,11 +102,11 @@ def test_steps_drive_the_plant_as_planned(ros: Harness) -> None:
     assert commands[-1].temperature == pytest.approx(SAFE, abs=1e-12)
     progress = begin(plan, stamp_nanoseconds(measured[0].header.stamp))
     for message in measured:
-        progress = advance(plan, progress, to_kelvin(message.temperature),
+        progress = advance(plan, progress, np.array([to_kelvin(message.temperature)]),
                            stamp_nanoseconds(message.header.stamp))
         if command := heard.pop(seconds(message), None):
             assert command.header == message.header
-            assert command.temperature == to_celsius(progress.command)
+            assert command.temperature == to_celsius(float(progress.command[0]))
     # a command may be heard before its measurement
     assert len(heard) <= 1
     assert progress.phase is Phase.FINISHED

@@ -81,9 +81,10 @@ def run_drifted(seed: int) -> tuple[Metrics, Models]:
     before, _ = _controlled(fouled, present.model, SYSTEM.nominal_state, 15.0, seed)
     loop, record = _controlled(fouled, present.model, SYSTEM.nominal_state, 10.0, seed + 1)
     plan = experiments.Experiment(
-        duration=3000.0, input_lower=276.0, input_upper=293.6, hold_shortest=30.0,
-        hold_longest=150.0, rate=1.0, state_lower=300.0, state_upper=328.0, safe_input=286.0,
-        seed=seed)
+        duration=3000.0, names=fouled.input_names, lower=np.array([276.0]),
+        upper=np.array([293.6]), rate=np.ones(1), home=np.array([286.0]), hold_shortest=30.0,
+        hold_longest=150.0, measured=fouled.state_names, measured_lower=np.array([300.0]),
+        measured_upper=np.array([328.0]), seed=seed)
     driven = _experiment(fouled, plan, loop[-1], seed + 2)
     found, learned = _learn([record, driven], present.model, seed)
     decision = decide(found, learned, present.model, Thresholds())
@@ -185,8 +186,8 @@ def _experiment(system: ControlAffineSystem, plan: experiments.Experiment, x0: A
     for number in range(round(plan.duration)):
         process = process.until((number + 1) * _NS)
         measured.append(process.x + NOISE * rng.standard_normal(system.n_x))
-        progress = experiments.advance(plan, progress, float(measured[-1][0]), process.time_ns)
-        inputs.append(np.array([progress.command]))
+        progress = experiments.advance(plan, progress, measured[-1], process.time_ns)
+        inputs.append(progress.command)
         process = replace(process, u=inputs[-1])
     return _recorded(np.array(measured), np.array(inputs))
 
