@@ -119,6 +119,13 @@ class LiftedModel:
         return bool(np.all(self.eigenvalues.real < 0.0))
 
     @cached_property
+    def adds_unstable_modes(self) -> bool:
+        """Whether more modes of A grow, or do not decay, than of the linearised model."""
+        grow = [int(np.sum(eigenvalues.real >= 0.0))
+                for eigenvalues in (self.eigenvalues, self.linearised.eigenvalues)]
+        return grow[0] > grow[1]
+
+    @cached_property
     def input_inverse(self) -> Array:
         """The pseudo-inverse (n_u, n_x) of B."""
         return frozen(np.linalg.pinv(self.B), 'inverse of B', (self.n_u, self.n_x))

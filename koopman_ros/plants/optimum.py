@@ -42,10 +42,14 @@ class Course:
     cost: float  #: integral of e' Q e + v' R v; infinite where the plant escaped
 
 
-def held(task: Task, inputs: Array) -> Course:
-    """Apply inputs (samples, n_u), e.g. those that a controller is recorded to have given."""
-    return _roll_out(task, inputs, np.zeros((*inputs.shape, task.system.n_x)),
-                     np.zeros((len(inputs), task.system.n_x)))
+def cost_along(task: Task, states: Array, inputs: Array) -> float:
+    """
+    Return the cost of what a controller did: states (N + 1 or N, n_x) and inputs (N, n_u) held.
+
+    Each sample is integrated from its own state, so that nothing adds up on an unstable plant.
+    """
+    y = np.concatenate([states[:len(inputs)], np.zeros((len(inputs), 1))], axis=1)
+    return float(np.sum(_after_a_period(task, y, inputs)[:, -1]))
 
 
 def linear_law(task: Task) -> Course:
@@ -106,24 +110,30 @@ def _constant_law(task: Task, u: Array, K: Array, x: Array) -> Course:
 
 def _roll_out(task: Task, inputs: Array, K: Array, about: Array) -> Course:
     """Apply inputs[k] - K[k] (x - about[k]): (N, n_u), (N, n_u, n_x) and (N or more, n_x)."""
-    system, h = task.system, task.period / task.substeps
-    states, applied = np.empty((len(inputs) + 1, system.n_x)), np.empty_like(inputs)
+    states, applied = np.empty((len(inputs) + 1, task.system.n_x)), np.empty_like(inputs)
     y = np.append(task.x0, 0.0)
     with np.errstate(all='ignore'):
         for k, u in enumerate(inputs):
             states[k] = y[:-1]
             applied[k] = u - K[k].dot(states[k] - about[k])
-            forcing, effort = system.B.dot(applied[k]), task.R.dot((applied[k] - task.u_ref) ** 2)
-
-            def rate(y: Array, forcing: Array = forcing, effort: float = effort) -> Array:
-                x = y[:-1]
-                return np.append(system.drift(x) + forcing,
-                                 task.Q.dot((x - task.x_ref) ** 2) + effort)
-
-            for _ in range(task.substeps):
-                y = runge_kutta_step(rate, y, h)
+            y = _after_a_period(task, y, applied[k])
     states[-1] = y[:-1]
     return Course(states, applied, float(y[-1]) if np.all(np.isfinite(y)) else math.inf)
+
+
+def _after_a_period(task: Task, y: Array, u: Array) -> Array:
+    """Return states with the cost so far (..., n_x + 1) a period later, u (..., n_u) held."""
+    forcing = u @ task.system.B.T
+    effort = (u - task.u_ref) ** 2 @ task.R
+
+    def rate(y: Array) -> Array:
+        x = y[..., :-1]
+        cost = (x - task.x_ref) ** 2 @ task.Q + effort
+        return np.concatenate([task.system.drift(x) + forcing, cost[..., None]], axis=-1)
+
+    for _ in range(task.substeps):
+        y = runge_kutta_step(rate, y, task.period / task.substeps)
+    return y
 
 
 def _improvement(task: Task, course: Course) -> tuple[Array, Array, float]:

@@ -83,17 +83,20 @@ def feedback(model: LiftedModel, x: Array, target: Target, weights: Weights, *,
     """
     Evaluate the law that suits the model.
 
-    Re-centred if A is Hurwitz and the lift has identity coordinates or as many as there are
-    states; projected otherwise, and when the re-centred law's equation cannot be solved. A free
-    lift with more coordinates than states has directions of z that no state reaches, in which
-    its weight C' Q C and so the gain are not determined near the target.
+    Re-centred with identity coordinates if A has no unstable modes but those of the linearised
+    plant, which its input moves, and with as many free ones as there are states if A is Hurwitz;
+    projected otherwise, and when the re-centred law's equation cannot be solved. A free lift with
+    more coordinates than states has directions of z that no state reaches, in which its weight
+    C' Q C and so the gain are not determined near the target; M^+ e, which its weight goes by, is
+    a poor factorisation of an unstable drift.
 
     :param x: (n_x,) scaled deviation of the measured state.
     :param max_gain: bound on the spectral norm of K.
     :param max_residual: bound on the relative Riccati residual.
     """
     bounds = {'max_gain': max_gain, 'max_residual': max_residual}
-    if model.is_hurwitz and (model.identity or model.n_z == model.n_x):
+    if (model.identity and not model.adds_unstable_modes) or (
+            model.is_hurwitz and model.n_z == model.n_x):
         result = recentred(model, x, target, weights, **bounds)
         if result.solved:
             return result
@@ -109,7 +112,8 @@ def recentred(model: LiftedModel, x: Array, target: Target, weights: Weights, *,
     the error of the state, so that A + H C takes the place of A. Only with identity coordinates
     is C e linear in e; a free lift goes by M^+ e, exact on the manifold of the lift.
 
-    Arguments and result as in :func:`feedback`; valid where every mode of A decays.
+    Arguments and result as in :func:`feedback`; of use where the input moves every mode of A that
+    does not decay.
     """
     z, J, M, H = model.lift_and_secants(x, target.x, target.forcing)
     n_x, n_z = model.n_x, model.n_z

@@ -21,8 +21,8 @@ class TwoStateExample(Constants):
     :raises ValueError: when a rate is no number or outside its range.
     """
 
-    mu: float = constant(-0.1, '1/s', -100.0, 100.0, 'growth rate of the first state')
-    lambda_: float = constant(1.0, '1/s', -100.0, 100.0, 'growth rate of the second state')
+    mu: float = constant(-0.1, '1/s', -1e6, 1e6, 'growth rate of the first state')
+    lambda_: float = constant(1.0, '1/s', -1e6, 1e6, 'growth rate of the second state')
 
     def system(self) -> ControlAffineSystem:
         """Build dx1/dt = mu x1, dx2/dt = lambda (x2 - x1^2) + u, nominal at the origin."""
