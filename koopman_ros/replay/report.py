@@ -101,9 +101,11 @@ class ReplayedBag:
         controller = self.found.controller
         if self.new_range is None or controller is None:
             return 0
-        box = self.new_range.only(controller.controlled.names)
-        return int(np.count_nonzero(((self.setpoint < box.lower)
-                                     | (self.setpoint > box.upper)).any(axis=1)))
+        # by their places, for the new model may have names of its own
+        names = controller.model.states.names
+        kept = [names.index(name) for name in controller.controlled.names]
+        return int(np.count_nonzero(((self.setpoint < self.new_range.lower[kept])
+                                     | (self.setpoint > self.new_range.upper[kept])).any(axis=1)))
 
     @property
     def unexplained(self) -> int:

@@ -113,12 +113,16 @@ def test_every_command_keeps_the_limits_of_each_input(controllers, sequence):
                 state, command, report = loop.hold(state, now)
             case 'setpoint' | 'schedule':
                 names = loop.controlled.names
-                # all of them, or the first one alone
+                # all of them, or the first one alone; anywhere, or in the trained range
                 signals = None if values[-1] > 0.0 else names[:1]
-                r = x[[model.states.names.index(name) for name in signals or names]]
+                asked_of = loop.controlled.only(signals or names)
+                r = x[[model.states.names.index(name) for name in asked_of.names]]
+                if values[-2] > 0.0:
+                    share = 0.5 + np.clip(values[:len(r)], -3.0, 3.0) / 6.0
+                    r = asked_of.lower + share * (asked_of.upper - asked_of.lower)
                 when = now * (kind == 'schedule')
                 asked, refused = loop.request_setpoint(state, r, when, signals)
-                inside = loop.controlled.only(signals or names).violation(r) == 0.0
+                inside = asked_of.violation(r) == 0.0
                 if refused is None:
                     assert inside
                 else:

@@ -28,6 +28,8 @@ from koopman_ros.control.events import Outcome
 from koopman_ros.estimation import Estimate
 from koopman_ros.lifting import Coordinates, LiftedModel, linearised_model, Provenance
 from koopman_ros.lifting.observables import PolynomialObservables
+from koopman_ros.plants import Actuator, Process
+from koopman_ros.plants.library.quadruple_tank import QuadrupleTank
 from koopman_ros.reasons import Code, Words
 from koopman_ros.replay.records import decoded, event_of, fields_of, Record
 from koopman_ros.units import Displays
@@ -409,6 +411,35 @@ def test_the_controlled_levels_arrive_and_the_others_where_they_are_needed():
     np.testing.assert_allclose(run.reports[-1].target.state, [1.25, 1.3, 0.8], rtol=0, atol=1e-6)
     # 0.1 (q1 - 3) = 0.2 * 0.25 - 0.01, 0.1 (q2 - 3) = -0.1 * 0.2 - 0.05 * 0.3 - 0.015
     np.testing.assert_allclose(run.commands[-1], [3.4, 2.5], rtol=0, atol=1e-6)
+
+
+def test_the_lower_two_of_four_tanks_under_a_model_that_is_not_the_plant():
+    tank = QuadrupleTank()
+    plant = tank.system()
+    x, u = plant.nominal_state, plant.nominal_input
+    states, inputs = (Coordinates(names, units, center, 0.5 * center, 0.2 * center, 1.8 * center)
+                      for names, units, center in (
+                          (plant.state_names, plant.state_units, x),
+                          (plant.input_names, plant.input_units, u)))
+    model = linearised_model(plant.drift_jacobian(x), plant.B, states, inputs, 's',
+                             Provenance('four tanks'))
+    controller = loop(model, 'level_1', 'level_2', upper=6.0)
+    wanted = x[:2] * [1.2, 0.85]
+    run = simulate(controller, Process(plant, 0, x, u, Actuator(), u), [
+        at(10.0, SetpointRequest(0, wanted[:1], ('level_1',))),
+        at(300.0, SetpointRequest(0, wanted[1:], ('level_2',)))], duration=2500.0, period=5.0)
+    # what leaves a tank, a sqrt(2 g h), fills the one below, beside what the pumps give
+    flow = np.array([tank.orifice_1, tank.orifice_2]) * np.sqrt(2.0 * 9.81 * wanted)
+    k = np.array([tank.pump_gain_1, tank.pump_gain_2])
+    pumps = np.linalg.solve(np.array([[tank.split_1, 1.0 - tank.split_2],
+                                      [1.0 - tank.split_1, tank.split_2]]) * k, flow)
+    upper = np.array([(1.0 - tank.split_2) * k[1] * pumps[1] / tank.orifice_3,
+                      (1.0 - tank.split_1) * k[0] * pumps[0] / tank.orifice_4])
+    rest = np.array([*wanted, *upper ** 2 / (2.0 * 9.81)])
+    np.testing.assert_allclose(run.states[-1], rest, rtol=1e-4)
+    np.testing.assert_allclose(run.reports[-1].target.state, rest, rtol=1e-4)
+    np.testing.assert_allclose(run.commands[-1], pumps, rtol=1e-4)
+    np.testing.assert_array_equal(run.setpoints[30], [wanted[0], x[1]])
 
 
 def test_a_continuous_loop_goes_to_the_steady_state_of_its_setpoint():
