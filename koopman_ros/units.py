@@ -6,6 +6,7 @@
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from functools import cache, cached_property
+import math
 from typing import Any, TypeVar
 
 import numpy as np
@@ -145,3 +146,8 @@ def seconds_text(nanoseconds: int) -> str:
     seconds, rest = divmod(abs(nanoseconds), NANOSECONDS)
     sign = '-' if nanoseconds < 0 else ''
     return f'{sign}{seconds}.{rest:09d}'.rstrip('0').rstrip('.')
+
+
+def in_steps(value: float, resolution: float) -> float:
+    """Return the nearest multiple of a sensor's resolution; 0 shows every value."""
+    return value if resolution == 0.0 else value - math.remainder(value, resolution)

@@ -17,9 +17,12 @@ from rich.markup import escape
 from rich.table import Table
 
 from koopman_ros.demo.loop import Row
+from koopman_ros.parameters.wire import Signals
 from koopman_ros.testing import reserved_output
+from koopman_ros.units import SECONDS_PER_MINUTE, shown, unit_label
 
-_COLUMNS = ('time [min]', 'temperature [°C]', 'set-point [°C]', 'error [K]', 'coolant [°C]')
+_ROWS = 20  # in the table of a run
+_IN_MINUTES = 300.0  # s; so long a run is told in minutes
 
 
 def read_options(args: list[str] | None, description: str | None, output: str, speed: float
@@ -56,11 +59,24 @@ def run_act(act: Callable[[Path, float], Mapping[str, object]], options: argpars
 
 
 class LiveTable:
-    """Show a run as it happens, with a row each `row_period` seconds of plant time."""
+    """
+    Show a run as it happens.
 
-    def __init__(self, title: str, row_period: float = 30.0) -> None:
+    :param signals: those of its loop.
+    :param duration: of the run in s of plant time, which twenty rows are for.
+    """
+
+    def __init__(self, title: str, signals: Signals, duration: float) -> None:
         self._title = title
-        self._row_period = row_period
+        self._row_period = duration / _ROWS
+        minutes = duration >= _IN_MINUTES
+        self._time = SECONDS_PER_MINUTE if minutes else 1.0
+        self._signals = signals
+        self._columns = ['time [min]' if minutes else 'time [s]', *(
+            f'{name} [{unit_label(unit)}]' for name, unit in signals.states.items()), *(
+            f'{name} set-point [{unit_label(signals.states[name])}]'
+            for name in signals.controlled), *(
+            f'{name} [{unit_label(unit)}]' for name, unit in signals.inputs.items())]
         self._console = Console()
         self._rows: list[tuple[str, ...]] = []
         self._next = 0.0
@@ -69,7 +85,7 @@ class LiveTable:
 
     def show(self, row: Row) -> None:
         """Show an answered measurement; on a terminal the last line follows every one."""
-        cells = _cells(row)
+        cells = self._cells(row)
         due = row.seconds >= self._next
         if due:
             self._next = row.seconds + self._row_period
@@ -77,20 +93,19 @@ class LiveTable:
         if self._live is not None:
             self._live.update(self._table(None if due else cells))
         elif due:
-            print('  '.join(f'{name} {cell}' for name, cell in zip(_COLUMNS, cells, strict=True)),
-                  flush=True)
+            print('  '.join(map(' '.join, zip(self._columns, cells, strict=True))), flush=True)
 
     def announce(self, text: str) -> None:
         """Say what happens now."""
         if self._live is not None:
-            self._rows.append((text, *[''] * (len(_COLUMNS) - 1)))
+            self._rows.append((text, *[''] * (len(self._columns) - 1)))
             self._live.update(self._table(None))
         else:
             print(text, flush=True)
 
     def _table(self, present: tuple[str, ...] | None) -> Table:
         table = Table(title=self._title, title_justify='left')
-        for column in _COLUMNS:
+        for column in self._columns:
             table.add_column(escape(column), justify='right')
         for cells in self._rows:
             table.add_row(*cells)
@@ -110,9 +125,10 @@ class LiveTable:
         if self._live is not None:
             self._live.stop()
 
-
-def _cells(row: Row) -> tuple[str, ...]:
-    setpoint, error = ('', '') if row.setpoint is None else (
-        f'{row.setpoint:.3f}', f'{row.temperature - row.setpoint:+.4f}')
-    return (f'{row.seconds / 60.0:.1f}', f'{row.temperature:.4f}', setpoint, error,
-            f'{row.coolant:.3f}')
+    def _cells(self, row: Row) -> tuple[str, ...]:
+        states, inputs = self._signals.states, self._signals.inputs
+        return (f'{row.seconds / self._time:.1f}', *(
+            f'{shown(row.measured[name], unit):.4f}' for name, unit in states.items()), *(
+            f'{shown(row.setpoints[name], states[name]):.4f}' if name in row.setpoints else ''
+            for name in self._signals.controlled), *(
+            f'{shown(row.commanded[name], unit):.4f}' for name, unit in inputs.items()))

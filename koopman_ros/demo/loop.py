@@ -8,15 +8,21 @@ import contextlib
 from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
+from typing import Any
 
 from diagnostic_msgs.msg import DiagnosticStatus
-import rclpy
-from sensor_msgs.msg import Temperature
+import numpy as np
+from rclpy.publisher import Publisher
+from rclpy.qos import QoSProfile
 
+from koopman_ros.parameters.trainer import preset_wiring
+from koopman_ros.parameters.wire import Wiring
 from koopman_ros.ros import topics
-from koopman_ros.ros.codec import stamp_nanoseconds, temperature_message
+from koopman_ros.ros.codec import stamp_message
+from koopman_ros.ros.signals import Heard, Inlet, Outlet
 from koopman_ros.testing import deferred_interrupt, Harness, HarnessError
 from koopman_ros.units import NANOSECONDS
+from koopman_ros.wire import Place
 
 _START_TIME = 1.0  # s of plant time at the first measurement
 _FIRST_STAMP_NS = round(_START_TIME * NANOSECONDS)
@@ -27,53 +33,70 @@ _TIMEOUT = 30.0  # s for the processes to find each other, and from one command 
 class Scenario:
     """What a closed loop does."""
 
-    model: str  #: name or path of the controller's model
-    setpoint: float  #: new set-point in K
-    step_time: float = 60.0  #: when it takes effect, in s after the first measurement
+    setpoints: Mapping[str, float]  #: new set-points, by signal and in its unit
+    system: str = 'reactor'  #: plant that is shipped
+    step_time: float = 60.0  #: when they take effect, in s after the first measurement
     duration: float = 600.0  #: length of the run in s of plant time, 0 for endless
     sample_period: float = 1.0  #: s between measurements
     speed: float = 0.0  #: simulated seconds per second, 0 for as fast as the machine can
-    #: further parameters of the plant node
+    #: further parameters of the nodes
     plant: Mapping[str, object] = field(default_factory=dict)
+    controller: Mapping[str, object] = field(default_factory=dict)
+
+    @property
+    def wiring(self) -> Wiring:
+        """Where its signals are on the wire."""
+        wiring = preset_wiring(self.system)
+        assert wiring is not None
+        return wiring
 
 
 @dataclass(frozen=True)
 class Row:
-    """What the operator sees at one command, temperatures in degrees Celsius."""
+    """What the operator sees at one command, by signal and in their units."""
 
     seconds: float  #: plant time since the first measurement
-    temperature: float  #: measured
-    setpoint: float | None  #: tracked, or None before it is known
-    coolant: float  #: commanded
+    measured: Mapping[str, float]
+    setpoints: Mapping[str, float]  #: tracked, as far as they are known
+    commanded: Mapping[str, float]
 
 
 class Operator:
-    """Set the set-point through its topic and watch the loop, whose processes `harness` runs."""
+    """Set the set-points through their topics and watch the loop, which `harness` runs."""
 
     def __init__(self, scenario: Scenario, harness: Harness, on_row: Callable[[Row], None]
                  ) -> None:
         self.scenario = scenario
         self.harness = harness
         self._on_row = on_row
-        # two topics: either message of a pair may come first
-        self._measured: dict[int, float] = {}
-        self._commanded: dict[int, float] = {}
-        self._active: float | None = None
+        # several topics: any message of those with one stamp may come first
+        self._measured: dict[int, dict[str, float]] = {}
+        self._commanded: dict[int, dict[str, float]] = {}
+        self._active: dict[str, float] = {}
         self.last_stamp_ns = 0
-        node = harness.node
-        self.setpoint = node.create_publisher(Temperature, topics.SETPOINT, topics.LOOP_QOS)
-        node.create_subscription(
-            Temperature, topics.TEMPERATURE, self._on_temperature, topics.LOOP_QOS)
-        node.create_subscription(
-            Temperature, topics.ACTIVE_SETPOINT, self._on_active, topics.LATCHED_QOS)
-        self._commands = node.create_subscription(
-            Temperature, topics.COOLANT_SETPOINT, self._on_command, topics.LOOP_QOS)
+        self._wiring = wiring = scenario.wiring
+        states, inputs = wiring.signals.states, wiring.signals.inputs
+        self._setpoints = Outlet(wiring.setpoints, states, self._publisher)
+        self._listen(wiring.measured, states, partial(self._on_part, self._measured))
+        self._listen(wiring.active_setpoints, states, lambda heard: self._active.update(
+            heard.values), topics.LATCHED_QOS)
+        self._commands = self._listen(
+            wiring.commands, inputs, partial(self._on_part, self._commanded))
+
+    def _publisher(self, topic: str, kind: Any) -> Publisher:
+        return self.harness.node.create_publisher(kind, topic, topics.LOOP_QOS)
+
+    def _listen(self, places: Mapping[str, Place], units: Mapping[str, str],
+                hear: Callable[[Heard], None], qos: QoSProfile = topics.LOOP_QOS) -> Inlet:
+        node = self.harness.node
+        return Inlet(node, lambda topic, callback, kind: node.create_subscription(
+            kind, topic, callback, qos), places, units, hear)
 
     @property
     def found_loop(self) -> bool:
-        """Whether controller and trainer are there and hear the set-point."""
-        return (self.setpoint.get_subscription_count() >= 2
-                and self._commands.get_publisher_count() >= 1)
+        """Whether controller and trainer are there and hear the set-points."""
+        return self._commands.published() and all(
+            publisher.get_subscription_count() >= 2 for publisher in self._setpoints.publishers)
 
     @property
     def seconds(self) -> float:
@@ -90,39 +113,28 @@ class Operator:
     def _answered_after(self, stamp_ns: int) -> bool:
         return self.last_stamp_ns > stamp_ns
 
-    def request_setpoint(self) -> None:
-        """Publish the set-point, stamped with the plant time from which it holds."""
+    def request_setpoints(self) -> None:
+        """Publish the set-points, stamped with the plant time from which they hold."""
         stamp = _FIRST_STAMP_NS + round(self.scenario.step_time * NANOSECONDS)
-        message = temperature_message(
-            self.scenario.setpoint, rclpy.time.Time(nanoseconds=stamp).to_msg(), 'operator')
-        self.setpoint.publish(message)
+        wanted = [self.scenario.setpoints[name] for name in self._wiring.setpoints]
+        self._setpoints.send(np.array(wanted), stamp_message(stamp), 'operator')
 
-    def _on_temperature(self, message: Temperature) -> None:
-        stamp = stamp_nanoseconds(message.header.stamp)
-        self._measured[stamp] = message.temperature
-        self._show_pair(stamp)
-
-    def _on_active(self, message: Temperature) -> None:
-        self._active = message.temperature
-
-    def _on_command(self, message: Temperature) -> None:
-        stamp = stamp_nanoseconds(message.header.stamp)
-        self._commanded[stamp] = message.temperature
-        self._show_pair(stamp)
-
-    def _show_pair(self, stamp: int) -> None:
-        if stamp in self._measured and stamp in self._commanded:
+    def _on_part(self, parts: dict[int, dict[str, float]], heard: Heard) -> None:
+        """Take a message, and show the row that it makes whole."""
+        stamp = heard.stamp_ns
+        parts.setdefault(stamp, {}).update(heard.values)
+        if (len(self._measured.get(stamp, ())) == len(self._wiring.measured)
+                and len(self._commanded.get(stamp, ())) == len(self._wiring.commands)):
             self.last_stamp_ns = stamp
-            self._on_row(Row((stamp - _FIRST_STAMP_NS) / NANOSECONDS,
-                             self._measured.pop(stamp), self._active,
-                             self._commanded.pop(stamp)))
+            self._on_row(Row((stamp - _FIRST_STAMP_NS) / NANOSECONDS, self._measured.pop(stamp),
+                             dict(self._active), self._commanded.pop(stamp)))
 
 
 @contextlib.contextmanager
 def running_loop(scenario: Scenario, logs: Path, trainer: Mapping[str, object],
                  on_row: Callable[[Row], None] = lambda _: None) -> Iterator[Operator]:
     """
-    Run plant, controller and trainer in lock-step, the set-point requested, until it is left.
+    Run plant, controller and trainer in lock-step, the set-points requested, until it is left.
 
     To be called from the main thread: it takes over Ctrl-C, so that the processes end.
 
@@ -135,14 +147,13 @@ def running_loop(scenario: Scenario, logs: Path, trainer: Mapping[str, object],
           Harness(logs, name='operator', timeout=_TIMEOUT, lasting=True,
                   each_turn=check_interrupt) as harness):
         operator = Operator(scenario, harness, on_row)
-        # the observer would make up for what a model does not know, which is what is to be seen
-        harness.start('controller', {'model': scenario.model, 'observer_bandwidth': 0.0})
-        harness.start('trainer', trainer)
+        harness.start('controller', {'system': scenario.system, **scenario.controller})
+        harness.start('trainer', {'system': scenario.system, **trainer})
         harness.wait_until(lambda: operator.found_loop,
                            'controller and trainer did not find each other')
-        operator.request_setpoint()
+        operator.request_setpoints()
         plant = harness.start('plant', {
-            **scenario.plant,
+            'system': scenario.system, **scenario.plant,
             'lockstep': True, 'speed': scenario.speed, 'duration': scenario.duration,
             'sample_period': scenario.sample_period, 'start_time': _START_TIME,
             # controller, trainer and operator: nobody misses the first measurement
@@ -160,10 +171,12 @@ def run_loop(scenario: Scenario, bag: Path, logs: Path,
     """Run a loop until the scenario's end, recorded whole by the trainer in a new bag."""
     samples = round(scenario.duration / scenario.sample_period) + 1
 
+    places = [*scenario.wiring.measured.values(), *scenario.wiring.commands.values()]
+
     def recorded(status: DiagnosticStatus) -> bool:
         counts = {item.key: item.value for item in status.values}
-        return all(int(counts.get(f'messages on /{topic}', 0)) >= samples
-                   for topic in (topics.TEMPERATURE, topics.COOLANT_SETPOINT))
+        return all(int(counts.get(f'messages on /{place.topic}', 0)) >= samples
+                   for place in places)
 
     with running_loop(scenario, logs, {'output': bag}, on_row) as operator:
         operator.run_until(scenario.duration)

@@ -8,7 +8,7 @@ Plant, controller and trainer run as three processes in lock-step; none is stopp
 The disturbance observer is off: it would make up for the drift, and for what a lift lacks.
 """
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 import json
 from pathlib import Path
 import shutil
@@ -18,17 +18,21 @@ from diagnostic_msgs.msg import DiagnosticStatus
 import numpy as np
 from std_srvs.srv import SetBool, Trigger
 
+from koopman_ros.demo import reactor
 from koopman_ros.demo.console import LiveTable, read_options, run_act
-from koopman_ros.demo.loop import Operator, running_loop, Scenario
+from koopman_ros.demo.loop import Operator, running_loop
 from koopman_ros.demo.results import plot_retraining, read_run
 from koopman_ros.learning import roll_out
 from koopman_ros.lifting import LiftedModel, load
-from koopman_ros.parameters.controller import ControllerParameters
-from koopman_ros.parameters.plant import PlantParameters
-from koopman_ros.plants import one_state_reactor, random_steps, RandomStepDesign
+from koopman_ros.parameters.trainer import MANUAL
+from koopman_ros.plants import (
+    one_state_reactor,
+    random_steps,
+    RandomStepDesign,
+    ReactorParameters,
+)
 from koopman_ros.reports import write_figures
 from koopman_ros.resources import model_path
-from koopman_ros.ros import topics
 from koopman_ros.testing import HarnessError
 
 STEP = -10.0  # K
@@ -39,15 +43,17 @@ _DRIFT_TIME = 360.0
 _EXPERIMENT_TIME = 960.0
 _EXPERIMENT_MINUTES = 45.0
 _AFTER = 960.0  # s of plant time from the reload to the end
+_SHOWN = 6000.0  # s of plant time, about as long as it all takes
 _TEST_SEED = 7
 _TRAINING_TIMEOUT = 300.0  # s
 _EXPERIMENT_TIMEOUT = 600.0  # s
 # What the fouled reactor bears; see the bounds of the experiment.
 _EXPERIMENT = {
-    'experiment_topic': topics.MANUAL_COOLANT_SETPOINT,
-    'experiment_duration': _EXPERIMENT_MINUTES, 'experiment_coolant_min': 5.5,
-    'experiment_coolant_max': 20.5, 'experiment_hold_max': 3.0, 'safe_coolant': 13.0,
-    'experiment_seed': 1,
+    'experiment_on': MANUAL, 'experiment_length': 60.0 * _EXPERIMENT_MINUTES,
+    'experiment_longest_hold': 180.0, 'experiment_seed': 1,
+    f'{reactor.COOLANT_TEMPERATURE}.experiment_min': 5.5,
+    f'{reactor.COOLANT_TEMPERATURE}.experiment_max': 20.5,
+    f'{reactor.COOLANT_TEMPERATURE}.safe': 13.0,
 }
 
 
@@ -58,36 +64,37 @@ def run_retraining(output: Path, speed: float) -> dict[str, object]:
         shutil.rmtree(output)
     logs = output / 'logs'
     logs.mkdir(parents=True)
-    parameters = ControllerParameters()
-    present = load(model_path(parameters.model))
+    present = load(model_path(reactor.MODEL))
     setpoint = float(present.states.center[0]) + STEP
-    scenario = Scenario(parameters.model, setpoint, step_time=_STEP_TIME, duration=0.0,
-                        speed=speed, plant={'noise': NOISE})
+    scenario = reactor.scenario(reactor.MODEL, setpoint, step_time=_STEP_TIME, duration=0.0,
+                                speed=speed, plant={'temperature.noise': NOISE})
     bags = [output / 'before.mcap', output / 'after.mcap']
     new_model = output / 'retrained.safetensors'
-    table = LiveTable('a controller without observer learns its plant anew', row_period=300.0)
+    table = LiveTable('a controller without observer learns its plant anew',
+                      scenario.wiring.signals, _SHOWN)
     trainer = {'output': bags[0], 'model_output': new_model, **_EXPERIMENT}
     with table, running_loop(scenario, logs, trainer, table.show) as operator:
         phases = _Actor(operator, table).act(bags[1], new_model)
-    drifted = PlantParameters(heat_transfer_coefficient=FOULING * PlantParameters(
-        ).heat_transfer_coefficient)
-    history = read_run(*bags)
+    history = read_run(scenario.wiring, *bags)
     learned = load(new_model)
     trained = json.loads(new_model.with_suffix('.json').read_text())
     plot_retraining(output / 'retraining.png', history, phases, setpoint, present, learned,
-                    parameters)
+                    reactor.coolant_parameters())
     reload = phases[-1][1]
     result: dict[str, object] = {
         'setpoint_kelvin': setpoint,
         'heat_transfer_left': FOULING,
         'noise_kelvin': NOISE,
-        'offset_before_kelvin': history.offset(setpoint, _EXPERIMENT_TIME),
-        'offset_after_kelvin': history.offset(setpoint, reload + _AFTER),
+        'offset_before_kelvin': history.offset(reactor.TEMPERATURE, setpoint, _EXPERIMENT_TIME),
+        'offset_after_kelvin': history.offset(
+            reactor.TEMPERATURE, setpoint, reload + _AFTER),
         'heldout_rw': trained['heldout_rw'],
         'heldout_error_kelvin': trained['heldout_error_kelvin'],
-        'rollout_rmse_kelvin': rollout_rmse(learned, drifted),
-        'max_coolant_step_before_kelvin': history.largest_step(reload - 120.0, reload - 30.0),
-        'max_coolant_step_at_reload_kelvin': history.largest_step(reload - 30.0, reload + 60.0),
+        'rollout_rmse_kelvin': rollout_rmse(learned),
+        'max_coolant_step_before_kelvin': history.largest_step(
+            reactor.COOLANT_TEMPERATURE, reload - 120.0, reload - 30.0),
+        'max_coolant_step_at_reload_kelvin': history.largest_step(
+            reactor.COOLANT_TEMPERATURE, reload - 30.0, reload + 60.0),
         'derivative_method': trained['derivative_method'],
         'wall_seconds': round(time.monotonic() - begin, 3),
     }
@@ -95,12 +102,15 @@ def run_retraining(output: Path, speed: float) -> dict[str, object]:
     return result
 
 
-def rollout_rmse(model: LiftedModel, plant: PlantParameters) -> float:
-    """Predict the reactor over 15 min of fresh steps without noise; return the RMS error in K."""
-    reactor = one_state_reactor(plant.constants(), nominal_state=model.states.center)
+def rollout_rmse(model: LiftedModel) -> float:
+    """Predict the fouled reactor over 15 min of fresh steps; return the RMS error in K."""
+    usual = ReactorParameters()
+    fouled = one_state_reactor(replace(
+        usual, heat_transfer_coefficient=FOULING * usual.heat_transfer_coefficient),
+        nominal_state=model.states.center)
     design = RandomStepDesign(model.inputs.lower, model.inputs.upper, model.states.lower,
                               model.states.upper, (0.5, 2.0), 1.0 / 60.0, rtol=1e-9)
-    truth = random_steps(reactor, design, 15.0, _TEST_SEED)
+    truth = random_steps(fouled, design, 15.0, _TEST_SEED)
     predicted = roll_out(model, truth.x[0], truth.u, design.sample_period)
     return float(np.sqrt(np.mean((predicted - truth.x) ** 2)))
 
@@ -122,8 +132,8 @@ class _Actor:
         operator = self.operator
         self._begin('shipped lift', 'set-point step of -10 K with the shipped lift')
         operator.run_until(_DRIFT_TIME)
-        heat_transfer = FOULING * PlantParameters().heat_transfer_coefficient
-        self._set('plant', heat_transfer_coefficient=heat_transfer)
+        self._set('plant', **{'constants.heat_transfer_coefficient': (
+            FOULING * reactor.constant('heat_transfer_coefficient'))})
         self._begin('fouling', 'the cooling jacket fouls: a fifth of its heat transfer is lost')
         # a new bag, so that the plant as it was is not among the data
         self._switch('trainer/record', False)

@@ -1,45 +1,74 @@
 # SPDX-FileCopyrightText: 2026 The koopman_ros Authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""The controller node: answers each temperature measurement with a coolant set-point."""
+"""The controller node: answers each measurement with a command."""
 
 from collections.abc import Mapping
-from dataclasses import asdict
+from dataclasses import dataclass
+import math
 import sys
 import threading
+from typing import Any
 
 from builtin_interfaces.msg import Time
 import numpy as np
 from rclpy.callback_groups import MutuallyExclusiveCallbackGroup
-from rclpy.publisher import Publisher
-from rclpy.qos_overriding_options import QoSOverridingOptions
 from rclpy.timer import Timer
-from sensor_msgs.msg import Temperature
 from std_srvs.srv import SetBool, Trigger
 
 from koopman_ros.arrays import Array
-from koopman_ros.control import Arrival, Controller, events, MANUAL, Mode, Report, State
+from koopman_ros.assembler import Assembler
+from koopman_ros.control import (
+    Arrival,
+    Controller,
+    events,
+    MANUAL,
+    Mode,
+    Report,
+    Setpoint,
+    State,
+)
 from koopman_ros.control.events import Event, ModeChange, Silence
-from koopman_ros.parameters.controller import ControllerParameters, TABLE
-from koopman_ros.parameters.wire import LONGEST_FRAME_ID
+from koopman_ros.parameters.controller import ControllerParameters, signals_of, table_of
+from koopman_ros.parameters.wire import LONGEST_FRAME_ID, preset, Wiring
 from koopman_ros.reasons import level_words
 from koopman_ros.replay import records
 from koopman_ros.ros import controller_messages as messages
 from koopman_ros.ros import topics
-from koopman_ros.ros.codec import stamp_message, stamp_nanoseconds, temperature_message
-from koopman_ros.ros.model_reload import load_suitable, ModelReload, rests_outside, Situation
-from koopman_ros.ros.node import DiagnosticsPublisher, LoopNode, Status, wall_timer, words_of
+from koopman_ros.ros.codec import stamp_message
+from koopman_ros.ros.managed import ManagedNode
+from koopman_ros.ros.model_reload import (
+    load_suitable,
+    LoadedModel,
+    ModelReload,
+    rests_outside,
+    Situation,
+)
+from koopman_ros.ros.node import Status, wall_timer, words_of
 from koopman_ros.ros.process import run
+from koopman_ros.ros.signals import Heard, Inlet, Outlet
 from koopman_ros.ros.watchdog import PERIOD, Timing, Watchdog
-from koopman_ros.units import NANOSECONDS, to_kelvin
+from koopman_ros.units import display_unit, NANOSECONDS, shown
+from koopman_ros.wire import stem
 
+# A measurement and the inputs that acted on it are stamped no further apart.
+_SAME_TIME_NS = 2 * NANOSECONDS
 _WATCH_STEP = NANOSECONDS // 2  # of plant time between two commands without a measurement
-_COOLANT_PATIENCE = 0.5  # s that the first answer waits for the applied coolant temperature
+_PATIENCE = 0.5  # s that the first answer waits for the measured inputs
 # A step that the watchdog has overtaken so often is given up, and its measurement with it.
 _ATTEMPTS = 2
 
 
-class ControllerNode(LoopNode):
+@dataclass(frozen=True)
+class _Sample:
+    """A measurement that is to be answered."""
+
+    stamp: Time
+    stamp_ns: int
+    values: Array  #: (n_y,) in the units of the signals
+
+
+class ControllerNode(ManagedNode):
     """
     Carry messages to and from the control step; docs/interfaces.md has its topics and services.
 
@@ -50,42 +79,68 @@ class ControllerNode(LoopNode):
 
     def __init__(self) -> None:
         super().__init__('controller')
-        self._settings = parameters = self.declare_table(TABLE)
+        self._watchdog: Watchdog | None = None
+        given = self.given()
+        system = str(given.get('system', 'reactor'))
+        own = preset(system, 'controller')
+        loaded = load_suitable(str(given.get('model') or own.get('model', '')))
+        self._table = table = table_of(loaded.model, given)
+        self._settings = self.declare_table(table)
+        self._loaded: LoadedModel | None = loaded
+
+    def configure(self) -> None:
+        """Load the model and make what the loop needs; nothing is commanded yet."""
+        table = self._table
+        self._settings = parameters = self.current(table)
+        # the one of the start, unless its name was changed since then
+        loaded, self._loaded = self._loaded, None
+        if loaded is None or loaded.name != parameters.model:
+            loaded = load_suitable(parameters.model)
+        self._signals = signals = signals_of(loaded.model, parameters.controlled)
+        self._words = words_of(signals)
         self._models = ModelReload(
-            self, load_suitable(parameters.model), lambda: Situation(
-                self._settings.settings(), self._state,
-                np.array([to_kelvin(self._temperature)])),
+            self, loaded, signals, lambda: Situation(
+                self._tuning, self._state, self._measured),
             lambda: self._exchange(records.MODEL, {'model': self._models.in_force.identity}),
             lambda: self._diagnostics.publish_if_changed())
+        self._tuning = parameters.settings(signals)
         self._controller = self._built()
         self._state = State()
         self._lock, self._telling = threading.Lock(), threading.Lock()
         self._report = self._logged = Report(Mode.AUTOMATIC, next(iter(self._controller.levels)))
         self._refused = self._rests_outside = ''
         self._counts = messages.Counts()
-        self._temperature, self._timing = np.nan, Timing(self)
-        self._coolant: Temperature | None = None
-        self._waiting: list[Temperature] = []  # measurements that came before the coolant
+        self._measured, self._timing = np.full(len(signals.states), np.nan), Timing(self)
+        self._assembler = Assembler(
+            tuple(signals.states), round(parameters.synchronisation_tolerance * NANOSECONDS))
+        self._applied: dict[str, tuple[int, float]] = {}  # stamp and value by name of the input
+        self._waiting: list[_Sample] = []  # measurements that came before the measured inputs
         self._patience: Timer | None = None
         self._frame_id, self._frame_length = '', 0  # the length where it is too long
 
-        self._matching = topics.Matching(
-            self, lambda: self._diagnostics.publish_if_changed(), topics.SINGLE)
-        self._commands = self._matching.publish(topics.COOLANT_SETPOINT)
-        self._active = self.create_publisher(*topics.of(topics.ACTIVE_SETPOINT))
-        self._predicted = self.create_publisher(*topics.of(topics.PREDICTED_TEMPERATURE))
-        self._internals = self.create_publisher(*topics.of(topics.CONTROLLER_STATE))
-        self._published_setpoint: float | None = None
-        self._diagnostics = DiagnosticsPublisher(self, 'control', 'controller', self._status)
+        wiring = Wiring(signals, parameters.states, parameters.inputs)
+        self._matching = matching = topics.Matching(
+            self, lambda: self._diagnostics.publish_if_changed(), self._single(wiring))
+        self._commands = Outlet(wiring.commands, signals.inputs, matching.publish)
+        self._active = Outlet(wiring.active_setpoints, signals.states, self._latched)
+        self._predicted = Outlet(wiring.predicted, signals.states, matching.publish)
+        self._internals = matching.publish(topics.CONTROLLER_STATE)
+        self._published_setpoint: Array | None = None
+        self._diagnostics = self.diagnostics.add(
+            'control', loaded.model.provenance.plant or parameters.system, self._status)
         # volatile, so that `ros2 topic pub` matches
-        self._matching.subscribe(topics.SETPOINT, self._on_setpoint)
-        self._matching.subscribe(topics.MANUAL_COOLANT_SETPOINT, lambda message: self._change(
-            messages.manual_command(message)))
-        self._coolants = self._matching.subscribe(topics.COOLANT_TEMPERATURE, self._on_coolant)
-        # a sensor driver that publishes best effort needs this overridden to match
-        self._matching.subscribe(
-            topics.TEMPERATURE, self._on_temperature,
-            qos_overriding_options=QoSOverridingOptions.with_default_policies())
+        for name, place in wiring.setpoints.items():
+            Inlet(self, matching.subscribe, {name: place}, signals.states, self._on_setpoint)
+        for name, place in wiring.manual.items():
+            Inlet(self, matching.subscribe, {name: place}, signals.inputs, self._on_manual)
+        self._inputs = Inlet(
+            self, matching.subscribe, wiring.applied, signals.inputs, self._on_applied)
+        measured = Inlet(
+            self, matching.subscribe, wiring.measured, signals.states, self._on_measurement)
+        if measured.unstamped:
+            self.get_logger().warning(
+                f'messages of {", ".join(measured.unstamped)} have no stamp: they are stamped at '
+                'their arrival')
         self.create_service(SetBool, '~/set_automatic', self._on_set_automatic)
         # a group of its own, or measurements would wait until a model is read
         self.create_service(Trigger, '~/reload_model', self._models.on_reload,
@@ -93,55 +148,91 @@ class ControllerNode(LoopNode):
         wall_timer(self, PERIOD, self._on_watch)
         self._records = messages.RecordPublisher(
             self._matching, lambda: records.snapshot(
-                self._state, asdict(self._settings), self._models.in_force.identity), self._lock)
-        self.follow_table(TABLE, parameters, self._on_parameters, self._models.accept)
+                self._state, table.values(self._settings), self._models.in_force.identity),
+            self._lock)
+        self.follow_table(table, parameters, self._on_parameters, self._models.accept)
         self.get_logger().info(self._models.in_force.about)
         self._warn_of_rest()
         self._watchdog = Watchdog(self._on_busy)
         self._watchdog.start()
 
+    def activate(self) -> None:
+        """Begin to command, from what acts then; set-points asked for before are kept."""
+        with self._lock:
+            asked = self._state.setpoint
+            self._state = State(self._state.mode, Setpoint(
+                asked.requested, scheduled=asked.scheduled))
+            self._waiting.clear()
+            self._records.publish_snapshot(records.START)
+
     def complete(self) -> None:
         """Let nobody command while the middleware is taken down."""
-        self._watchdog.end()
+        if self._watchdog is not None:
+            self._watchdog.end()
 
-    def _on_temperature(self, message: Temperature) -> None:
-        # whether the applied coolant temperature will be known in a moment
-        if self._waiting or (
-                self._state.command is None and self._coolant is None and self._patience is None
-                and self.count_publishers(self._coolants.topic_name) > 0):
-            self._waiting.append(message)
-            if self._patience is None:
-                self._patience = wall_timer(self, _COOLANT_PATIENCE, self._answer_waiting)
+    def _single(self, wiring: Wiring) -> dict[str, str]:
+        """Return what is done on topics on which only one node may publish."""
+        return {place.topic: f'{verb} the {what}' for verb, places in (
+            ('command', {stem(name, self._signals.inputs[name]): place
+                         for name, place in wiring.commands.items()}),
+            ('publish', wiring.measured)) for what, place in places.items()
+            # a message of named values may be one of several that make up a sample
+            if '[' not in place.field}
+
+    def _latched(self, topic: str, kind: Any) -> Any:
+        return self._matching.publish(topic, kind, topics.LATCHED_QOS)
+
+    def _on_measurement(self, heard: Heard) -> None:
+        self._frame_id = heard.frame_id[:LONGEST_FRAME_ID]
+        length = len(heard.frame_id)
+        self._frame_length = length if length > LONGEST_FRAME_ID else 0
+        whole = self._assembler.take(heard.stamp_ns, heard.values)
+        if whole is None or not self.active:
             return
-        self._answer(message)
+        sample = _Sample(heard.stamp if whole[0] == heard.stamp_ns else stamp_message(whole[0]),
+                         *whole)
+        # whether the measured inputs will be known in a moment
+        if self._waiting or (
+                self._state.command is None and len(self._applied) < len(self._signals.inputs)
+                and self._patience is None and self._inputs.published()):
+            self._waiting.append(sample)
+            if self._patience is None:
+                self._patience = wall_timer(self, _PATIENCE, self._answer_waiting)
+            return
+        self._answer(sample)
 
-    def _on_coolant(self, message: Temperature) -> None:
-        # only value and stamp are kept
-        message.header.frame_id = ''
-        self._coolant = message
-        if self._waiting:
+    def _on_applied(self, heard: Heard) -> None:
+        for name, value in heard.values.items():
+            self._applied[name] = (heard.stamp_ns, value)
+        if self._waiting and len(self._applied) == len(self._signals.inputs):
             self._answer_waiting()
 
     def _answer_waiting(self) -> None:
         if self._patience is not None:
             self._patience.cancel()
         waiting, self._waiting = self._waiting, []
-        for message in waiting:
-            self._answer(message)
+        for sample in waiting:
+            self._answer(sample)
 
-    def _answer(self, message: Temperature) -> None:
-        stamp_ns, arrived = stamp_nanoseconds(message.header.stamp), self._timing.now()
-        frame_id = message.header.frame_id
-        self._frame_id = frame_id[:LONGEST_FRAME_ID]
-        self._frame_length = len(frame_id) if len(frame_id) > LONGEST_FRAME_ID else 0
+    def _known_inputs(self, stamp_ns: int | None = None) -> Array | None:
+        """Return the inputs (n_u,) measured last, if they all are, and go with a stamp."""
+        found = [self._applied.get(name) for name in self._signals.inputs]
+        if any(entry is None or (
+                stamp_ns is not None and abs(entry[0] - stamp_ns) > _SAME_TIME_NS)
+                for entry in found):
+            return None
+        return np.array([entry[1] for entry in found if entry is not None])
+
+    def _answer(self, sample: _Sample) -> None:
+        stamp_ns, arrived = sample.stamp_ns, self._timing.now()
         for _ in range(_ATTEMPTS):
             before = state = self._state
             done: list[tuple[Event, events.Outcome]] = []
-            if state.command is None and self._coolant is not None:
-                initial = messages.initialisation(self._coolant)
+            if state.command is None and (known := self._known_inputs()) is not None:
+                initial = events.Initialisation(known)
                 done.append((initial, events.apply(self._controller, state, initial)))
                 state = done[0][1].state
-            asked = messages.measurement(message, self._coolant)
+            asked = events.Measurement(stamp_ns, sample.values, self._known_inputs(stamp_ns))
             outcome = events.apply(self._controller, state, asked)
             assert outcome.command is not None and outcome.report is not None
             with self._lock:
@@ -149,7 +240,7 @@ class ControllerNode(LoopNode):
                     # the watchdog has commanded meanwhile: the answer must go on from there
                     continue
                 self._state = outcome.state
-                self._publish(self._commands, outcome.command, message.header.stamp)
+                self._commands.send(outcome.command, sample.stamp, self._frame_id)
                 for event, led_to in (*done, (asked, outcome)):
                     self._records.publish_event(event, led_to)
                 if stamp_ns != before.time_ns:
@@ -162,15 +253,16 @@ class ControllerNode(LoopNode):
                 'waits: choose a smaller model', throttle_duration_sec=1.0)
             return
         report = outcome.report
-        self._temperature = message.temperature
+        self._measured = sample.values
         self._counts.measurements += 1
         self._counts.late += report.measurement.arrival is Arrival.LATE
         self._counts.missed += report.measurement.missed
         self._counts.refused += report.measurement.arrival is Arrival.REJECTED
-        self._tell(report, message.header.stamp)
+        self._tell(report, sample.stamp)
 
     def _on_watch(self) -> None:
         self._timing.busy = False
+        assert self._watchdog is not None
         self._watchdog.beat()
         watched = self._watch(self._timing.silence)
         if watched is not None:
@@ -191,10 +283,10 @@ class ControllerNode(LoopNode):
                 self._telling.release()
 
     def _watch(self, silence: float) -> tuple[Report, Time] | None:
-        """Hold the command, or go to the safe coolant, in a silence; return what was commanded."""
+        """Hold the command, or go to the safe one, in a silence; return what was commanded."""
         with self._lock:
             timeout, state = self._settings.measurement_timeout, self._state
-            if not timeout or not silence > timeout or state.time_ns is None:
+            if not self.active or not timeout or not silence > timeout or state.time_ns is None:
                 return None
             now_ns = state.time_ns + round(silence * NANOSECONDS)
             if state.commanded_ns is not None and now_ns - state.commanded_ns < _WATCH_STEP:
@@ -204,7 +296,7 @@ class ControllerNode(LoopNode):
             if outcome.command is None or outcome.report is None:
                 return None
             self._state, stamp = outcome.state, stamp_message(now_ns)
-            self._publish(self._commands, outcome.command, stamp)
+            self._commands.send(outcome.command, stamp, self._frame_id)
             self._records.publish_event(silence_ends, outcome)
             return outcome.report, stamp
 
@@ -215,7 +307,7 @@ class ControllerNode(LoopNode):
         if report.level not in (self._logged.level, MANUAL):
             change = f'{level_words(self._logged.level)} -> {level_words(report.level)}'
             if report.depth > self._logged.depth:
-                why = words_of(self._controller.model)(report.reason)
+                why = self._words(report.reason)
                 self.get_logger().warning(f'{change}: {why}', throttle_duration_sec=1.0)
             else:
                 self.get_logger().info(change, throttle_duration_sec=1.0)
@@ -228,23 +320,36 @@ class ControllerNode(LoopNode):
     def _publish_beside(self, report: Report, stamp: Time) -> None:
         self._report = report
         target, predicted = report.target, report.measurement.predicted
-        if target is not None and target.setpoint[0] != self._published_setpoint:
-            self._published_setpoint = float(target.setpoint[0])
-            self._publish(self._active, target.setpoint, stamp)
+        if target is not None and target.setpoint is not self._published_setpoint and (
+                self._published_setpoint is None
+                or (target.setpoint != self._published_setpoint).any()):
+            self._published_setpoint = target.setpoint
+            self._active.send(target.setpoint, stamp, self._frame_id)
         if predicted is not None:
-            self._publish(self._predicted, predicted, stamp)
-        self._internals.publish(messages.internals(report, stamp, self._frame_id))
+            self._predicted.send(predicted, stamp, self._frame_id)
+        self._internals.publish(messages.internals(self._signals, report, stamp, self._frame_id))
 
-    def _publish(self, publisher: Publisher, kelvin: Array, stamp: Time) -> None:
-        publisher.publish(temperature_message(float(kelvin[0]), stamp, self._frame_id))
+    def _on_setpoint(self, heard: Heard) -> None:
+        (name, value), = heard.values.items()
+        several = len(self._signals.controlled) > 1
+        if self._change(events.SetpointRequest(
+                heard.stamp_ns, np.array([value]), (name,) if several else None)):
+            scheduled = any(entry[0] == heard.stamp_ns
+                            for entry in self._state.setpoint.scheduled)
+            when = f', holds from {heard.stamp_ns / NANOSECONDS:.3f} s on' if scheduled else ''
+            unit = self._signals.states[name]
+            self.get_logger().info(
+                f'set-point {shown(value, unit):.6g} {display_unit(unit)} of {name} accepted'
+                f'{when}', throttle_duration_sec=1.0)
 
-    def _on_setpoint(self, message: Temperature) -> None:
-        stamp_ns = stamp_nanoseconds(message.header.stamp)
-        if self._change(messages.setpoint_request(message)):
-            scheduled = any(entry[0] == stamp_ns for entry in self._state.setpoint.scheduled)
-            when = f', holds from {stamp_ns / NANOSECONDS:.3f} s on' if scheduled else ''
-            self.get_logger().info(f'set-point {message.temperature:.6g} degC accepted{when}',
-                                   throttle_duration_sec=1.0)
+    def _on_manual(self, heard: Heard) -> None:
+        held = self._state.manual_input
+        if held is None:
+            held = self._state.command
+        # the others stay
+        asked = np.array([heard.values.get(name, math.nan if held is None else held[i])
+                          for i, name in enumerate(self._signals.inputs)])
+        self._change(events.ManualCommand(asked))
 
     def _on_set_automatic(self, request: SetBool.Request, response: SetBool.Response
                           ) -> SetBool.Response:
@@ -260,7 +365,7 @@ class ControllerNode(LoopNode):
             outcome = events.apply(self._controller, self._state, event)
             self._state = outcome.state
             self._records.publish_event(event, outcome)
-        self._refused = words_of(self._controller.model)(outcome.refused)
+        self._refused = self._words(outcome.refused)
         if self._refused:
             self.get_logger().warning(self._refused, throttle_duration_sec=1.0)
         elif isinstance(event, events.SetpointRequest):
@@ -269,13 +374,14 @@ class ControllerNode(LoopNode):
         return not self._refused
 
     def _built(self) -> Controller:
-        return Controller(self._models.in_force.model, self._settings.settings())
+        return Controller(self._models.in_force.model, self._tuning)
 
     def _on_parameters(self, parameters: ControllerParameters) -> None:
-        before, self._settings = self._settings, parameters
+        before = self._table.values(self._settings)
+        self._settings, self._tuning = parameters, parameters.settings(self._signals)
         fields: dict[str, object] = {'parameters': {
-            name: value for name, value in asdict(parameters).items()
-            if value != getattr(before, name)}}
+            name: value for name, value in self._table.values(parameters).items()
+            if value != before[name]}}
         if self._models.take_over():
             fields['model'] = self._models.in_force.identity
         self._exchange(records.PARAMETERS, fields)
@@ -291,7 +397,8 @@ class ControllerNode(LoopNode):
 
     def _warn_of_rest(self) -> None:
         """Say that the safe coolant leads out of the model's range, once for each reason."""
-        before, self._rests_outside = self._rests_outside, rests_outside(self._controller)
+        before, self._rests_outside = self._rests_outside, rests_outside(
+            self._controller)
         if self._rests_outside not in ('', before):
             self.get_logger().warning(self._rests_outside)
 
@@ -300,10 +407,11 @@ class ControllerNode(LoopNode):
                  f'{LONGEST_FRAME_ID} are passed on: shorten it at the sensor'
                  ) if self._frame_length else ''
         return messages.status(messages.Situation(
-            self._controller, self._settings, self._state, self._report, self._counts,
-            self._timing, self._matching.complaint or frame, self._refused, self._models.refused,
-            {**self._models.figures(), 'safe coolant': self._rests_outside or 'within reach'},
-            self._temperature))
+            self._controller, self._settings, self._signals, self._state, self._report,
+            self._counts, self._timing, self._matching.complaint or frame, self._refused,
+            self._models.refused,
+            {**self._models.figures(), 'safe input': self._rests_outside or 'within reach'},
+            self._measured, self._assembler))
 
 
 def main(args: list[str] | None = None) -> int:

@@ -1,26 +1,31 @@
 # SPDX-FileCopyrightText: 2026 The koopman_ros Authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""The plant node: a simulated reactor that publishes its temperature and takes a coolant."""
+"""The plant node: a simulated plant that publishes measurements and takes commands."""
 
 from dataclasses import replace
 from enum import Enum
 import math
 import sys
 import time
+from typing import Any
 
 import numpy as np
 from rosgraph_msgs.msg import Clock
-from sensor_msgs.msg import JointState, Temperature
 from std_srvs.srv import Trigger
 
 from koopman_ros import plants
-from koopman_ros.parameters.plant import PlantParameters, REACTORS, TABLE
+from koopman_ros.arrays import Array
+from koopman_ros.parameters.plant import PlantParameters, PlantTable
+from koopman_ros.parameters.wire import PLANT_KINDS, Wiring
 from koopman_ros.ros import topics
-from koopman_ros.ros.codec import stamp_message, stamp_nanoseconds, temperature_message
-from koopman_ros.ros.node import DiagnosticsPublisher, Level, LoopNode, Status, wall_timer
+from koopman_ros.ros.codec import stamp_message
+from koopman_ros.ros.managed import ManagedNode
+from koopman_ros.ros.node import Level, Status, wall_timer
 from koopman_ros.ros.process import run
-from koopman_ros.units import LAST_STAMP_SECONDS, NANOSECONDS, seconds_text, to_celsius, to_kelvin
+from koopman_ros.ros.signals import Heard, Inlet, Outlet
+from koopman_ros.units import display_unit, LAST_STAMP_SECONDS, NANOSECONDS, seconds_text, shown
+from koopman_ros.wire import stem
 
 _POLL_PERIOD = 0.01  # s; for what no message announces
 _LAST_STAMP_NS = (LAST_STAMP_SECONDS + 1) * NANOSECONDS - 1
@@ -38,13 +43,20 @@ class Phase(Enum):
     TRIPPED = 'stopped'
 
 
-class PlantNode(LoopNode):
-    """Run a reactor in time; docs/interfaces.md has its topics and services."""
+class PlantNode(ManagedNode):
+    """Run a plant in time; docs/interfaces.md has its topics and services."""
 
     def __init__(self) -> None:
         super().__init__('plant')
-        self._settings = parameters = self.declare_table(TABLE)
+        self._table = table = PlantTable(self.given())
+        self._settings = self.declare_table(table)
+
+    def configure(self) -> None:
+        """Build the plant at its initial state, and what publishes it."""
+        table = self._table
+        self._settings = parameters = self.current(table)
         system = self._build(parameters)
+        self._signals = signals = table.described
         self._real_time = parameters.speed == 1.0 and not parameters.lockstep
         self._period_ns = round(parameters.sample_period * NANOSECONDS)
         self._start_ns = round(parameters.start_time * NANOSECONDS)
@@ -56,20 +68,26 @@ class PlantNode(LoopNode):
         self._waiting_in_vain, self._rejection = False, ''
         self._wall_start = self._wall_published = self._last_command = time.monotonic()
 
-        # the subscription first: a controller that hears the measurement has then seen it, too
-        self._matching = topics.Matching(
-            self, lambda: self._diagnostics.publish_if_changed(), topics.SINGLE)
-        self._command_subscription = self._matching.subscribe(
-            topics.COOLANT_SETPOINT, self._on_command)
-        self._clock_publisher = self.create_publisher(*topics.of(topics.CLOCK)) if (
+        self._heard: dict[str, float] = {}  # of the commands for the last measurement
+        wiring = Wiring(signals, parameters.states, parameters.inputs, PLANT_KINDS)
+        # the subscriptions first: a controller that hears the measurement has then seen them, too
+        self._matching = matching = topics.Matching(
+            self, lambda: self._diagnostics.publish_if_changed(), {
+                place.topic: f'command the {stem(name, signals.inputs[name])}'
+                for name, place in wiring.commands.items()} | {
+                place.topic: f'publish the {name}' for name, place in wiring.measured.items()})
+        self._command_inlet = Inlet(
+            self, matching.subscribe, wiring.commands, signals.inputs, self._on_command)
+        self._clock_publisher = matching.publish(topics.CLOCK, qos=topics.CLOCK_QOS) if (
             parameters.publish_clock and not self._real_time) else None
-        self._concentration = self.create_publisher(*topics.of(topics.CONCENTRATION)) if (
-            system.n_x == 2) else None
-        # the temperature last: who has found it has found the coolant, too
-        self._coolant = self._matching.publish(topics.COOLANT_TEMPERATURE)
-        self._temperature = self._matching.publish(topics.TEMPERATURE)
-        self._diagnostics = DiagnosticsPublisher(
-            self, 'simulation', parameters.reactor, self._status)
+        # the states last: who has found them has found the inputs, too
+        self._applied = Outlet(wiring.applied, signals.inputs, self._latched)
+        self._states = Outlet(wiring.measured, signals.states, matching.publish)
+        counted = {wiring.measured[name].topic
+                   for name in tuple(filter(None, parameters.measured)) or signals.states}
+        self._counted = [publisher for publisher in self._states.publishers
+                         if publisher.topic_name in map(self.resolve_topic_name, counted)]
+        self._diagnostics = self.diagnostics.add('simulation', system.name, self._status)
         self.create_service(Trigger, '~/reset', self._on_reset)
         wall_period = parameters.sample_period / (parameters.speed or math.inf)
         if parameters.lockstep:
@@ -78,30 +96,42 @@ class PlantNode(LoopNode):
                 wall_timer(self, wall_period, self._step_in_lockstep)
         else:
             self._tick = wall_timer(self, wall_period, self._step_in_time)
-        self.follow_table(TABLE, parameters, self._on_parameters)
+        self.follow_table(table, parameters, self._on_parameters)
         pace = ('as fast as it can' if not parameters.speed else 'in real time'
                 if self._real_time else f'{parameters.speed:g} times as fast as the clock')
         start = '' if self._real_time else f' from {seconds_text(self._start_ns)} s on'
         lockstep = (f', in lock-step: it begins with {parameters.lockstep_subscribers} '
                     'subscribers and a controller') if parameters.lockstep else ''
-        self.get_logger().info(f'{parameters.reactor} reactor started: a measurement every '
+        self.get_logger().info(f'{system.name} started: a measurement every '
                                f'{parameters.sample_period:g} s{start}, {pace}{lockstep}')
 
+    def activate(self) -> None:
+        """Let time go on."""
+        if self._sample:
+            self._resynchronise()
+
+    def _latched(self, topic: str, kind: Any) -> Any:
+        return self._matching.publish(topic, kind, topics.LATCHED_QOS)
+
     def _build(self, parameters: PlantParameters) -> plants.ControlAffineSystem:
-        """Build the reactor, which starts from its steady state if it has one."""
-        build = REACTORS[parameters.reactor]
+        """Build the plant, which starts from its steady state if it has one."""
         try:
-            return build(parameters.constants())
+            return self._table.system(parameters)
         except plants.EquilibriumError as error:
-            nominal = build().nominal_state
+            nominal = self._table.system(self._table.snapshot({})).nominal_state
+            system = self._table.system(parameters, nominal)
             self.get_logger().warning(
-                f'{error}; the plant starts at {to_celsius(float(nominal[-1])):.3f} degC instead')
-            return build(parameters.constants(), nominal_state=nominal)
+                f'{error}; the plant starts at {system.describe_state(nominal)} instead')
+            return system
+
+    def _column(self, attribute: str) -> Array:
+        """Return a parameter of all states (n_x,)."""
+        return np.array([getattr(self._settings.states[name], attribute)
+                         for name in self._signals.states])
 
     def _initial(self, system: plants.ControlAffineSystem, time_ns: int) -> plants.Process:
-        x, u = system.nominal_state.copy(), system.nominal_input
-        x[-1] += self._settings.initial_temperature_offset
-        return plants.Process(system, time_ns, x, u, self._settings.actuator(), u)
+        x, u = system.nominal_state + self._column('initial_offset'), system.nominal_input
+        return plants.Process(system, time_ns, x, u, self._table.actuator(self._settings), u)
 
     def _now_ns(self) -> int:
         """Return the plant time that the wall clock stands for."""
@@ -109,6 +139,8 @@ class PlantNode(LoopNode):
         return self._start_ns + round(elapsed * self._settings.speed * NANOSECONDS)
 
     def _step_in_time(self) -> None:
+        if not self.active:
+            return
         if self._sample == 0:
             # time begins now, and the next tick is in a period from now: after a first one that
             # was late, all stamps would be ahead of the clock
@@ -127,10 +159,13 @@ class PlantNode(LoopNode):
 
     def _on_poll(self) -> None:
         """Start lock-step when the loop is complete, and watch for a command that is missing."""
+        if not self.active:
+            return
         if self._phase is Phase.WAITING:
-            listeners = self._temperature.get_subscription_count()
-            if (listeners >= self._settings.lockstep_subscribers
-                    and self._command_subscription.get_publisher_count() > 0):
+            listeners = min(publisher.get_subscription_count() for publisher in self._counted)
+            if listeners >= self._settings.lockstep_subscribers and all(
+                    self.count_publishers(heard.topic_name) > 0
+                    for heard in self._command_inlet.subscriptions):
                 self._phase = Phase.RUNNING
                 self._measure()
             return
@@ -146,7 +181,7 @@ class PlantNode(LoopNode):
             self._continue_lockstep()
 
     def _step_in_lockstep(self) -> None:
-        if self._phase is Phase.RUNNING and self._answered:
+        if self.active and self._phase is Phase.RUNNING and self._answered:
             self._measure()
 
     def _continue_lockstep(self) -> None:
@@ -166,32 +201,27 @@ class PlantNode(LoopNode):
         elif self._advance(instant):
             sample, self._sample = self._sample, self._sample + 1
             self._answered = False
+            self._heard = {}
             self._wall_published = time.monotonic()
             self._publish(sample)
         self._diagnostics.publish_if_changed()
 
     def _publish(self, sample: int) -> None:
-        """Publish the plant as it stands, the temperature, which is answered, last."""
+        """Publish the plant as it stands, the states, which are answered, last."""
         plant, settings = self._plant, self._settings
         stamp, frame_id = stamp_message(plant.time_ns), settings.frame_id
         if self._clock_publisher is not None:
             self._clock_publisher.publish(Clock(clock=stamp))
-        if self._concentration is not None:
-            message = JointState(
-                name=['reactant_concentration [mol/L]'], position=[float(plant.x[0])])
-            message.header.stamp, message.header.frame_id = stamp, frame_id
-            self._concentration.publish(message)
-        self._coolant.publish(temperature_message(float(plant.u[0]), stamp, frame_id))
-        noise = plants.sensor_noise(settings.noise, settings.seed, sample)
+        self._applied.send(plant.u, stamp, frame_id)
+        deviation, resolution = self._column('noise'), self._column('resolution')
+        noise = np.array([plants.sensor_noise(one, settings.seed, sample, i)
+                          for i, one in enumerate(deviation.tolist())])
         # the steps of the scale have the variance of a uniform error
-        variance = settings.noise ** 2 + settings.sensor_resolution ** 2 / 12.0
-        measured = temperature_message(
-            float(plant.x[-1]) + noise + settings.sensor_bias, stamp, frame_id, variance)
-        measured.temperature = plants.in_steps(measured.temperature, settings.sensor_resolution)
-        self._temperature.publish(measured)
+        self._states.send(plant.x + noise + self._column('bias'), stamp, frame_id,
+                          deviation ** 2 + resolution ** 2 / 12.0, resolution)
 
     def _advance(self, time_ns: int) -> bool:
-        """Bring the process to an instant; a reactor that ran away stops the plant."""
+        """Bring the process to an instant; a plant that ran away stops."""
         try:
             self._plant = self._plant.until(time_ns)
         except plants.IntegrationError as error:
@@ -201,27 +231,38 @@ class PlantNode(LoopNode):
             return False
         return True
 
-    def _on_command(self, message: Temperature) -> None:
-        stamp_ns = stamp_nanoseconds(message.header.stamp)
+    def _on_command(self, heard: Heard) -> None:
+        if not self.active:
+            return
         lockstep = self._settings.lockstep
-        if lockstep and stamp_ns != self._plant.time_ns:
+        if lockstep and heard.stamped and heard.stamp_ns != self._plant.time_ns:
             # it answers no measurement that is open: late, or from somebody else
             self._foreign += 1
             return
-        if math.isfinite(message.temperature):
+        self._heard |= heard.values
+        if lockstep and len(self._heard) < len(self._signals.inputs):
+            return
+        wrong = [name for name, value in self._heard.items() if not math.isfinite(value)]
+        if not wrong:
             self._commands += 1
             self._last_command, self._rejection = time.monotonic(), ''
             # in lock-step it was given at its measurement, otherwise now
             if lockstep or self._advance_to_now():
-                command = np.array([to_kelvin(message.temperature)])
-                self._plant = self._plant.commanded(command, self._plant.time_ns)
+                followed = dict(zip(self._signals.inputs, self._plant.followed.tolist(),
+                                    strict=True))
+                self._plant = self._plant.commanded(
+                    np.array(list((followed | self._heard).values())), self._plant.time_ns)
         else:
             self._rejected += 1
-            self._rejection = (f'coolant command {message.temperature} degC is not finite and '
-                               'was rejected: the last good one is held')
+            unit = self._signals.inputs[wrong[0]]
+            self._rejection = (
+                f'{stem(wrong[0], unit)} command {shown(self._heard[wrong[0]], unit)} '
+                f'{display_unit(unit)} is not finite and was rejected: the last good one is held')
             self.get_logger().warning(self._rejection, throttle_duration_sec=1.0)
             self._diagnostics.publish_if_changed()
-        if lockstep and self._phase is Phase.RUNNING and not self._answered:
+        if not lockstep:
+            self._heard = {}
+        elif self._phase is Phase.RUNNING and not self._answered:
             self._answered, self._waiting_in_vain = True, False
             self._continue_lockstep()
 
@@ -234,7 +275,7 @@ class PlantNode(LoopNode):
         return self._advance(min(now, ahead))
 
     def _on_reset(self, _: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
-        """Put the reactor back to its initial state; time goes on."""
+        """Put the plant back to its initial state; time goes on."""
         if self._phase in (Phase.FINISHED, Phase.OUT_OF_STAMPS):
             response.message = ('the duration is over: start the plant again'
                                 if self._phase is Phase.FINISHED else self._phase.value)
@@ -244,8 +285,9 @@ class PlantNode(LoopNode):
         if self._phase is Phase.TRIPPED:
             self._phase, self._trip = Phase.RUNNING, ''
             self._resynchronise()
-        response.message = (f'reset to {to_celsius(float(fresh.x[-1])):.3f} degC with coolant at '
-                            f'{to_celsius(float(fresh.u[0])):.3f} degC')
+        response.message = 'reset to ' + ', '.join(
+            f'{name} {value:.6g} {unit[1:-1]}' for (name, unit), value in (
+                (label.rsplit(' ', 1), value) for label, value in self._shown(fresh).items()))
         self.get_logger().info(response.message)
         self._diagnostics.publish_if_changed()
         return response
@@ -265,12 +307,12 @@ class PlantNode(LoopNode):
             self._advance_to_now()
         self._settings = parameters
         # the changed plant may have no steady state near; the nominal point stays what it was
-        self._plant = replace(self._plant, actuator=parameters.actuator(), system=REACTORS[
-            parameters.reactor](parameters.constants(),
-                                nominal_state=self._plant.system.nominal_state))
+        self._plant = replace(
+            self._plant, actuator=self._table.actuator(parameters),
+            system=self._table.system(parameters, self._plant.system.nominal_state))
 
     def _status(self) -> Status:
-        level, message = Level.OK, self._phase.value
+        level, message = Level.OK, self._phase.value if self.active else 'inactive'
         if self._phase is Phase.TRIPPED:
             level, message = Level.ERROR, f'stopped: {self._trip}; call ~/reset'
         elif self._phase is Phase.OUT_OF_STAMPS:
@@ -286,15 +328,24 @@ class PlantNode(LoopNode):
                 'running, but no command arrives: the last one is held; is the controller alive?')
         return Status(level, message, {
             'time [s]': seconds_text(self._plant.time_ns),
-            'temperature [degC]': to_celsius(float(self._plant.x[-1])),
-            'coolant [degC]': to_celsius(float(self._plant.u[0])),
-            'coolant command [degC]': to_celsius(float(self._plant.followed[0])),
+            **self._shown(self._plant),
+            **{f'{stem(name, unit)} command [{display_unit(unit)}]': shown(value, unit)
+               for (name, unit), value in zip(self._signals.inputs.items(),
+                                              self._plant.followed.tolist(), strict=True)},
             'measurements': self._sample,
             'commands': self._commands,
             'rejected commands': self._rejected,
             'missed commands': self._missed,
             'foreign commands': self._foreign,
         })
+
+    def _shown(self, plant: plants.Process) -> dict[str, float]:
+        """Return states and inputs with their names and units."""
+        inputs = {stem(name, unit): unit for name, unit in self._signals.inputs.items()}
+        signals = [*self._signals.states.items(), *inputs.items()]
+        return {f'{name} [{display_unit(unit)}]': shown(value, unit)
+                for (name, unit), value in zip(
+                    signals, [*plant.x.tolist(), *plant.u.tolist()], strict=True)}
 
     def _unanswered(self) -> bool:
         """Tell whether a controller that commanded before has fallen silent."""

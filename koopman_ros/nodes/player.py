@@ -3,18 +3,19 @@
 
 """The player: the inputs of a controller from a bag, as they were recorded."""
 
+import copy
 import sys
 import time
+from typing import Any
 
 from rclpy.duration import Duration
 from rclpy.publisher import Publisher
 from rclpy.qos import QoSProfile
 from rosgraph_msgs.msg import Clock as ClockMessage
-from sensor_msgs.msg import Temperature
 
 from koopman_ros import bags
 from koopman_ros.parameters.table import ConfigurationError
-from koopman_ros.parameters.trainer import PLAYER_TABLE
+from koopman_ros.parameters.trainer import player_table
 from koopman_ros.ros import topics
 from koopman_ros.ros.codec import stamp_message, stamp_nanoseconds
 from koopman_ros.ros.node import LoopNode, wall_timer
@@ -38,9 +39,9 @@ class PlayerNode(LoopNode):
 
     def __init__(self) -> None:
         super().__init__('player')
-        self._settings = settings = self.declare_table(PLAYER_TABLE)
+        self._settings = settings = self.declare_table(player_table(self.given()))
         if reason := topics.unusable(
-                self, (*settings.topics, settings.measurement, settings.answer)):
+                self, (*settings.topics, *settings.measurement, settings.answer)):
             raise ConfigurationError(reason)
         # by topic of the bag
         names = {'/' + name.lstrip('/'): name for name in settings.topics}
@@ -55,20 +56,27 @@ class PlayerNode(LoopNode):
             raise ConfigurationError(f'bag {settings.bag!r} has no message on {", ".join(names)}: '
                                      f'choose topics among {known or "none"}')
         self._total = sum(content.counts[topic] for topic in played)
-        self._measured = '/' + settings.measurement.lstrip('/')
+        # a measurement is whole when all of its parts are out
+        self._measured = {'/' + name.lstrip('/') for name in settings.measurement} & set(played)
+        self._parts: tuple[int, set[str]] = (0, set())  # stamp and topics of those that are
         self._lockstep = settings.rate == 0.0
 
         # the subscription first: a controller that hears the measurement has then seen it, too
-        self._answers = self.create_subscription(
-            Temperature, settings.answer, self._on_answer, topics.LOOP_QOS
-        ) if self._lockstep and self._measured in played else None
         self._clock_publisher = self.create_publisher(
-            *topics.of(topics.CLOCK)) if settings.clock else None
+            ClockMessage, topics.CLOCK, topics.CLOCK_QOS, qos_overriding_options=(
+                topics.overridable())) if settings.clock else None
         try:
+            answer_type = content.types.get(
+                '/' + settings.answer.lstrip('/'), settings.answer_type)
+            self._answers = self.create_subscription(
+                topics.message_class(answer_type), settings.answer, self._on_answer,
+                copy.copy(topics.LOOP_QOS), qos_overriding_options=topics.overridable(),
+            ) if self._lockstep and self._measured else None
             self._outlets: dict[str, Publisher] = {
                 topic: self.create_publisher(
                     topics.message_class(content.types[topic]), name,
-                    recorded_offer(content.offered_qos.get(topic, ())))
+                    recorded_offer(content.offered_qos.get(topic, ())),
+                    qos_overriding_options=topics.overridable())
                 for topic, name in played.items()}
         except LookupError as error:
             raise ConfigurationError(str(error)) from error
@@ -144,8 +152,8 @@ class PlayerNode(LoopNode):
                 return
             message, self._next = self._next, next(self._messages, None)
             self._publish(message)
-            if message.topic == self._measured:
-                self._open = stamp_nanoseconds(message.message.header.stamp)
+            if message.topic in self._measured and self._whole(message):
+                self._open = _stamp_ns(message)
                 self._asked = time.monotonic()
                 break
             following = self._next
@@ -163,15 +171,24 @@ class PlayerNode(LoopNode):
             self._received.add(message.topic)
         self._say_progress()
 
-    def _on_answer(self, message: Temperature) -> None:
-        if stamp_nanoseconds(message.header.stamp) == self._open:
+    def _whole(self, message: bags.BagMessage) -> bool:
+        """Tell whether a part of a measurement is its last one."""
+        stamp_ns = _stamp_ns(message) or 0
+        if stamp_ns != self._parts[0]:
+            self._parts = (stamp_ns, set())
+        self._parts[1].add(message.topic)
+        return self._parts[1] == self._measured
+
+    def _on_answer(self, message: Any) -> None:
+        header = getattr(message, 'header', None)
+        if header is None or stamp_nanoseconds(header.stamp) == (self._open or 0):
             self._open = None
             self._on_timer()
 
     def _publish(self, message: bags.BagMessage) -> None:
-        if self._clock_publisher is not None and message.topic == self._measured:
+        if self._clock_publisher is not None and message.topic in self._measured:
             self._clock_publisher.publish(ClockMessage(clock=stamp_message(
-                stamp_nanoseconds(message.message.header.stamp))))
+                _stamp_ns(message) or message.log_time_ns)))
         self._outlets[message.topic].publish(message.data)
         self._sent += 1
 

@@ -3,20 +3,28 @@
 
 """The replay: the records in bags through the control step again, and beside a new model."""
 
-from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
-from dataclasses import dataclass, fields
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
 import enum
 from pathlib import Path
 import sys
+from types import MappingProxyType
 from typing import Any
 
 import numpy as np
 
 from koopman_ros.bags import BagReadError, summary
 from koopman_ros.control import Settings
-from koopman_ros.parameters import controller
-from koopman_ros.parameters.controller import ControllerParameters, ReplayParameters
+from koopman_ros.lifting import LiftedModel
+from koopman_ros.parameters.controller import (
+    REPLAY_TABLE,
+    ReplayParameters,
+    signals_of,
+    table_of,
+)
 from koopman_ros.parameters.table import ConfigurationError
+from koopman_ros.parameters.trainer import preset_wiring
+from koopman_ros.parameters.wire import Wiring
 from koopman_ros.replay.loop import Alternative, Replay, replay
 from koopman_ros.replay.records import Record, RecordError
 from koopman_ros.replay.report import ReplayedBag, reproduced, verdict, write_report
@@ -26,6 +34,7 @@ from koopman_ros.ros import topics
 from koopman_ros.ros.model_reload import load_suitable
 from koopman_ros.ros.node import LoopNode
 from koopman_ros.ros.process import run_task
+from koopman_ros.wire import Place
 
 
 class Result(enum.IntEnum):
@@ -40,11 +49,20 @@ class Result(enum.IntEnum):
 class Names:
     """The topics of a controller in a bag, as absolute names."""
 
-    records: str = f'/{topics.CONTROLLER_EVENTS}'  #: where it wrote down what happened
-    commands: str = f'/{topics.COOLANT_SETPOINT}'  #: where it commanded the coolant
+    #: where it wrote down what happened
+    records: str = f'/{topics.CONTROLLER_EVENTS}'
+    namespace: str = '/'  #: of the controller
+    #: topics of commands that are remapped
+    commands: Mapping[str, str] = field(default_factory=dict)
+
+    def of(self, topic: str) -> str:
+        """Return the absolute name of a topic of commands."""
+        relative = f'{self.namespace.rstrip("/")}/{topic}'
+        return self.commands.get(topic, topic if topic.startswith('/') else relative)
 
 
-def replay_bags(parameters: ReplayParameters, names: Names, given: Collection[str] = ()) -> Result:
+def replay_bags(parameters: ReplayParameters, names: Names,
+                given: Mapping[str, Any] = MappingProxyType({})) -> Result:
     """
     Replay bags and write the report; `given` are the parameters that replace recorded ones.
 
@@ -68,7 +86,7 @@ def replay_bags(parameters: ReplayParameters, names: Names, given: Collection[st
         print(f'{bag.path}: {verdict(bag)}')
         if bag.new is not None:
             print(f'{bag.path}: {np.count_nonzero(bag.new.beyond)} commands of {new_model} '
-                  f'differ by more than {parameters.tolerance:g} K')
+                  f'differ by more than {parameters.tolerance:g}')
     write_report(folder, bags, pictures, new_model)
     print(f'see {folder / "report.md"}')
     if any(np.any(bag.check.beyond) for bag in bags):
@@ -77,23 +95,25 @@ def replay_bags(parameters: ReplayParameters, names: Names, given: Collection[st
 
 
 def replayed_bag(path: str, names: Names, parameters: ReplayParameters,
-                 given: Collection[str] = ()) -> ReplayedBag:
+                 given: Mapping[str, Any] = MappingProxyType({})) -> ReplayedBag:
     """Replay one bag; arguments and errors are those of :func:`replay_bags`."""
     alternative = None
     if parameters.new_model:
         new = load_suitable(parameters.new_model)
-        tuning = {item.name for item in fields(ControllerParameters)} - {'model'}
+        tuning = set(table_of(new.model, given).rows) - {'model', 'system'}
         alternative = Alternative(new.model, new.digest, {
-            name: getattr(parameters, name) for name in tuning.intersection(given)})
+            name: given[name] for name in tuning.intersection(given)})
     records = read_records(path, names.records, recover=parameters.recover)
     try:
-        found = replay_records(records, [Path(parameters.model).expanduser(),
-                                         model_path(parameters.model)], alternative)
+        found = replay_records(
+            records, [Path(parameters.model).expanduser(), model_path(parameters.model)]
+            if parameters.model else [], alternative)
     except RecordError as error:
         raise BagReadError(f'bag {path!r}: {error}') from error
+    places = _commands(found, names)
     return ReplayedBag(
         path, summary(path).complete, found,
-        command_counts(path, names.commands, recover=parameters.recover), parameters.tolerance,
+        command_counts(path, places, recover=parameters.recover), places, parameters.tolerance,
         None if alternative is None else alternative.model.states)
 
 
@@ -109,32 +129,54 @@ def replay_records(records: Iterable[Record], models: Sequence[Path] = (),
                   alternative)
 
 
-def _settings(values: Mapping[str, Any]) -> Settings:
-    unknown = ', '.join(sorted(set(values) - set(controller.TABLE.rows)))
-    if unknown:
+def _commands(found: Replay, names: Names) -> tuple[Place, ...]:
+    """Return where the inputs of a replayed controller were commanded, in the bag."""
+    if found.controller is None:
+        return ()
+    values = found.parameters
+    table = table_of(found.controller.model, values)
+    snapshot = table.snapshot(values)
+    wiring = Wiring(signals_of(found.controller.model, snapshot.controlled), snapshot.states,
+                    snapshot.inputs)
+    return tuple(replace(place, topic=names.of(place.topic))
+                 for place in wiring.commands.values())
+
+
+def _settings(values: Mapping[str, Any], model: LiftedModel) -> Settings:
+    values = {name: tuple(value) if isinstance(value, list) else value
+              for name, value in values.items()}
+    table = table_of(model, values)
+    if unknown := ', '.join(sorted(set(values) - set(table.rows))):
         raise RecordError(f'its controller had the parameters {unknown}, which this version has '
                           'not: take the package that recorded it')
-    snapshot = ControllerParameters(**values)
-    if reason := controller.TABLE.check(snapshot):
+    snapshot = table.snapshot(values)
+    if reason := table.check(snapshot):
         raise RecordError(f'its controller had parameters that this version refuses ({reason}): '
                           'take the package that recorded it')
-    return snapshot.settings()
+    return snapshot.settings(signals_of(model, snapshot.controlled))
 
 
 def _prepare() -> Callable[[], int]:
     """Read parameters and names, which remaps and the namespace change as for the controller."""
     node = LoopNode('replay', start_parameter_services=False, enable_rosout=False)
     try:
-        given = set(node.get_parameters_by_prefix(''))
-        parameters = node.declare_table(controller.REPLAY_TABLE)
-        names = Names(node.resolve_topic_name(topics.CONTROLLER_EVENTS),
-                      node.resolve_topic_name(topics.COOLANT_SETPOINT))
+        given = node.given()
+        new_model = str(given.get('new_model', ''))
+        # what a controller with the new model is tuned by may be given, too
+        beside = table_of(load_suitable(new_model).model, given).rows if new_model else ()
+        parameters = node.declare_table(REPLAY_TABLE, beside)
+        wiring = preset_wiring(parameters.system)
+        names = Names(
+            node.resolve_topic_name(topics.CONTROLLER_EVENTS), node.get_namespace(),
+            {} if wiring is None else {
+                place.topic: node.resolve_topic_name(place.topic)
+                for place in wiring.commands.values()})
     finally:
         node.destroy_node()
     return lambda: _run(parameters, names, given)
 
 
-def _run(parameters: ReplayParameters, names: Names, given: Collection[str]) -> int:
+def _run(parameters: ReplayParameters, names: Names, given: Mapping[str, Any]) -> int:
     try:
         result = replay_bags(parameters, names, given)
     except MemoryError:
@@ -143,7 +185,7 @@ def _run(parameters: ReplayParameters, names: Names, given: Collection[str]) -> 
         return 1
     if result is Result.DIFFERENT:
         print('replay: not all recorded commands are reproduced within '
-              f'{parameters.tolerance:g} K: see the report for the first, and replay with the '
+              f'{parameters.tolerance:g}: see the report for the first, and replay with the '
               'package that recorded them', file=sys.stderr)
     elif result is Result.NOTHING_COMPARED:
         print('replay: nothing to compare in a bag: its records hold no snapshot before a '

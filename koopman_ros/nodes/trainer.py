@@ -4,31 +4,61 @@
 """The trainer node: records the loop, drives the plant through experiments, trains from bags."""
 
 import sys
+from typing import Any
 
 from koopman_ros.jobs.training import JobState
+from koopman_ros.lifting import LiftedModel, load
 from koopman_ros.parameters.table import ConfigurationError
-from koopman_ros.parameters.trainer import TABLE, TrainerParameters
+from koopman_ros.parameters.trainer import (
+    trainer_signals,
+    trainer_table,
+    TrainerParameters,
+)
+from koopman_ros.parameters.wire import preset, Wiring
+from koopman_ros.resources import model_path
 from koopman_ros.ros import topics
-from koopman_ros.ros.experiment import CoolantExperiment
-from koopman_ros.ros.node import LoopNode
+from koopman_ros.ros.experiment import PlantExperiment
+from koopman_ros.ros.managed import ManagedNode
 from koopman_ros.ros.process import run
 from koopman_ros.ros.recording import Recording
 from koopman_ros.ros.training import Training
 
 
-class TrainerNode(LoopNode):
+class TrainerNode(ManagedNode):
     """Compose what the trainer does; docs/interfaces.md has its topics and services."""
 
     def __init__(self) -> None:
         super().__init__('trainer')
-        settings = self.declare_table(TABLE)
+        given = self.given()
+        present = _present(given)
+        table = trainer_table(present, given)
+        self._table, self._present = table, present
+        self._recording: Recording | None = None
+        self._experiment: PlantExperiment | None = None
+        self._training: Training | None = None
+        self.declare_table(table)
+
+    def configure(self) -> None:
+        """Make what records, experiments and trains; nothing of it begins yet."""
+        table, present = self._table, self._present
+        self._settings = settings = self.current(table)
         if reason := topics.unusable(self, settings.topics):
             raise ConfigurationError(reason)
-        self._recording = Recording(self, settings)
-        self._experiment = CoolantExperiment(self, settings)
-        self._training = Training(self, settings, self._recording.flushed, self._on_trained)
-        self.follow_table(TABLE, settings, self._on_parameters,
+        signals = trainer_signals(present, {
+            name: getattr(settings, name)
+            for name in ('states_measured', 'inputs_commanded', 'controlled')})
+        wiring = Wiring(signals, settings.states, settings.inputs)
+        self._recording = Recording(self, settings, wiring)
+        self._experiment = PlantExperiment(self, settings, wiring)
+        self._training = Training(
+            self, settings, wiring, self._recording.flushed, self._on_trained)
+        self.follow_table(table, settings, self._on_parameters,
                           lambda changed, _: topics.unusable(self, changed.topics))
+
+    def activate(self) -> None:
+        """Begin with what is asked for."""
+        settings = self._settings
+        assert self._training and self._recording
         try:
             if settings.task == 'train':
                 self._training.start()
@@ -37,23 +67,38 @@ class TrainerNode(LoopNode):
         except (OSError, ValueError) as error:
             raise ConfigurationError(f'cannot {settings.task}: {error}') from error
 
+    def deactivate(self) -> None:
+        """End what is under way, as at the end of the process."""
+        self.complete()
+
     def complete(self) -> None:
-        """Leave the coolant safe, complete the bag with all that arrived, then end a training."""
+        """Leave the inputs safe, complete the bag with all that arrived, then end a training."""
+        if self._experiment is None or self._recording is None or self._training is None:
+            return
         self._experiment.complete()
         # first, because a training may take seconds to end
         self._recording.complete()
         self._training.complete()
 
     def _on_trained(self, end: JobState) -> None:
-        if self._training.settings.task == 'train':
+        if self._settings.task == 'train':
             self.exit_code = 0 if end.accepted else 2 if end.refused else 1
 
     def _on_parameters(self, parameters: TrainerParameters) -> None:
+        self._settings = parameters
+        assert self._recording and self._experiment and self._training
         # a running recording keeps what it was started with, but for the room on the disk
         self._recording.settings = parameters
         # a running experiment keeps all
         self._experiment.settings = parameters
         self._training.settings = parameters
+
+
+def _present(given: dict[str, Any]) -> LiftedModel | None:
+    """Return the present lift, None where there is none yet."""
+    own = preset(str(given.get('system', 'reactor')), 'trainer')
+    name = str(given.get('model', own.get('model', '')))
+    return load(model_path(name)) if name else None
 
 
 def main(args: list[str] | None = None) -> int:

@@ -3,156 +3,258 @@
 
 """Parameters of the controller node, and of the replay: its own beside a controller's."""
 
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
+from functools import partial
 import math
+from types import MappingProxyType
+from typing import Any
 
 import numpy as np
 
+from koopman_ros.arrays import Array
 from koopman_ros.control import InputLimits, LevelSettings, Settings, SupervisorSettings
 from koopman_ros.estimation import SensorLimits
-from koopman_ros.parameters.table import parameter, ParameterTable
-from koopman_ros.units import SECONDS_PER_MINUTE, to_kelvin
+from koopman_ros.lifting import LiftedModel
+from koopman_ros.parameters.table import (
+    ConfigurationError,
+    parameter,
+    ParameterTable,
+    per_signal,
+)
+from koopman_ros.parameters.wire import (
+    InputPlaces,
+    named_units,
+    preset,
+    Signals,
+    StatePlaces,
+    Wiring,
+)
+from koopman_ros.units import conversion, display_unit
+
+# what stands for no bound, in any unit
+_UNBOUNDED = 1e9
+_DEFAULT_SYSTEM = 'reactor'
+
+
+@dataclass(frozen=True)
+class StateParameters(StatePlaces):
+    """What is tuned for a measured state."""
+
+    weight: float = parameter(1.0, 'cost of its squared error', '1/({unit})^2', 0.0, 1e12)
+    setpoint_ramp: float = parameter(
+        0.0, 'fastest change of the tracked set-point; 0 for a step', '{unit}/s', 0.0, 1e9)
+    sensor_min: float = parameter(
+        -_UNBOUNDED, 'lowest value that the sensor can measure', '{shown}', -_UNBOUNDED,
+        _UNBOUNDED)
+    sensor_max: float = parameter(
+        _UNBOUNDED, 'highest value that the sensor can measure', '{shown}', -_UNBOUNDED,
+        _UNBOUNDED)
+    max_rate: float = parameter(
+        0.0, 'fastest change that is physically possible; 0 for any', '{unit}/s', 0.0, 1e9)
+    max_jump: float = parameter(
+        0.0, 'change between two measurements that is accepted beside that rate, for noise; 0 for '
+        'any', '{unit}', 0.0, 1e9)
+
+
+@dataclass(frozen=True)
+class InputParameters(InputPlaces):
+    """What is tuned for an input."""
+
+    weight: float = parameter(
+        1.0, 'cost of its squared deviation from its steady value', '1/({unit})^2', 0.0, 1e12,
+        open_minimum=True)
+    min: float = parameter(0.0, 'lowest command', '{shown}', -_UNBOUNDED, _UNBOUNDED)
+    max: float = parameter(0.0, 'highest command', '{shown}', -_UNBOUNDED, _UNBOUNDED)
+    rate_limit: float = parameter(
+        0.0, 'fastest change of the command; 0 for any', '{unit}/s', 0.0, 1e9)
+    max_disturbance: float = parameter(
+        0.0, 'largest disturbance that is accepted, as a change of the input; 0 for any', '{unit}',
+        0.0, 1e9)
+    tolerance: float = parameter(
+        _UNBOUNDED, 'how far the measured input may be from its command before the observer goes '
+        'by it, as at a limit of the actuator', '{unit}', 0.0, _UNBOUNDED)
+    safe: float = parameter(
+        0.0, 'what is safe whatever happened, commanded when nothing else can be; brought within '
+        'min and max', '{shown}', -_UNBOUNDED, _UNBOUNDED)
 
 
 @dataclass(frozen=True)
 class ControllerParameters:
-    """Snapshot of the controller's parameters, temperatures in degrees Celsius."""
+    """Snapshot of the controller's parameters, in the units that people read."""
 
+    system: str = parameter(
+        _DEFAULT_SYSTEM, 'plant that is shipped, whose model, topics and tuning are the defaults '
+        'here; any other name for none', read_only=True)
     model: str = parameter(
-        'reactor_nz4', 'name of a shipped model, or path of a .safetensors model file')
-    temperature_weight: float = parameter(
-        1.0, 'cost of a squared temperature error', '1/K^2', 0.0, 1e6, open_minimum=True)
-    coolant_weight: float = parameter(
-        1.0, 'cost of a squared deviation of the coolant from its steady value', '1/K^2', 0.0, 1e6,
-        open_minimum=True)
-    coolant_min: float = parameter(
-        5.0, 'lowest coolant temperature commanded', 'degC', -50.0, 150.0)
-    coolant_max: float = parameter(
-        32.0, 'highest coolant temperature commanded', 'degC', -50.0, 150.0)
-    coolant_rate_limit: float = parameter(
-        60.0, 'fastest change of the coolant command', 'K/min', 0.0, 1e6, open_minimum=True)
-    setpoint_ramp: float = parameter(
-        1000.0, 'fastest change of the tracked set-point; a large value makes it a step', 'K/min',
-        0.0, 1e6, open_minimum=True)
+        '', 'name of a shipped model, or path of a .safetensors model file')
+    controlled: tuple[str, ...] = parameter(
+        ('',), 'measured signals that have a set-point, at most as many as there are inputs; an '
+        'empty name for all', read_only=True)
+    autostart: bool = parameter(
+        True, 'configure and activate itself at the start; false leaves that to a lifecycle '
+        'manager', read_only=True)
+    synchronisation_tolerance: float = parameter(
+        0.0, 'how far the stamps of messages may be apart that together are one measurement', 's',
+        0.0, 10.0, read_only=True)
     setpoint_filter: float = parameter(
         0.0, 'time constant with which the tracked set-point follows its ramp; 0 for none', 's',
         0.0, 86400.0)
-    observer_bandwidth: float = parameter(
-        6.0, 'how fast disturbances are estimated: more removes offsets sooner, less lets less '
-        'noise through to the coolant; 0 switches the observer off', '1/min', 0.0, 600.0)
-    max_disturbance: float = parameter(
-        20.0, 'largest disturbance that is accepted, as a change of the coolant', 'K', 0.0, 1000.0,
-        open_minimum=True)
-    coolant_tolerance: float = parameter(
-        2.0, 'how far the applied coolant temperature may be from its command before the '
-        'observer goes by it, as at a limit of the actuator', 'K', 0.0, 1000.0)
+    disturbance_bandwidth: float = parameter(
+        0.1, 'how fast disturbances are estimated: more removes offsets sooner, less lets less '
+        'noise through to the inputs; 0 switches the observer off', '1/s', 0.0, 1000.0)
     transfer_time: float = parameter(
-        30.0, 'time constant in which the coolant moves to what another law, model, tuning or '
-        'mode asks for', 's', 0.0, 86400.0)
-    safe_coolant: float = parameter(
-        5.0, 'coolant temperature that is safe whatever happened, commanded when nothing else can '
-        'be; brought within coolant_min and coolant_max', 'degC', -50.0, 150.0)
+        30.0, 'time constant in which the inputs move to what another law, model, tuning or mode '
+        'asks for', 's', 0.0, 86400.0)
     validity_margin: float = parameter(
         0.1, 'how far outside the trained range the learned law acts, in halves of its width; '
         'beyond, the linear law does', '', 0.0, 100.0)
     linear_margin: float = parameter(
         0.5, 'how far outside the trained range the linear law acts, in halves of its width; '
-        'beyond, the safe coolant is commanded', '', 0.0, 100.0)
+        'beyond, the safe inputs are commanded', '', 0.0, 100.0)
     hold_timeout: float = parameter(
-        60.0, 'how long the coolant is held without a usable measurement or law before it goes to '
-        'safe_coolant', 's', 0.0, 86400.0)
+        60.0, 'how long the inputs are held without a usable measurement or law before they go to '
+        'their safe values', 's', 0.0, 86400.0)
     recovery_time: float = parameter(
         10.0, 'how long a better law must have been possible before it acts again', 's', 0.0,
         86400.0)
     measurement_timeout: float = parameter(
-        10.0, 'plant time without a measurement after which the coolant is held and diagnostics '
+        10.0, 'plant time without a measurement after which the inputs are held and diagnostics '
         'turn to ERROR; 0 switches this off', 's', 0.0, 86400.0)
     max_measurement_age: float = parameter(
         5.0, 'age of a measurement at its arrival from which on diagnostics warn; 0 switches this '
         'off', 's', 0.0, 86400.0)
-    sensor_min: float = parameter(
-        -20.0, 'lowest temperature that the sensor can measure', 'degC', -273.15, 1000.0)
-    sensor_max: float = parameter(
-        150.0, 'highest temperature that the sensor can measure', 'degC', -273.15, 1000.0)
-    max_temperature_rate: float = parameter(
-        120.0, 'fastest change of the temperature that is physically possible', 'K/min', 0.0, 1e6,
-        open_minimum=True)
-    max_temperature_jump: float = parameter(
-        2.0, 'change between two measurements that is accepted beside that rate, for noise', 'K',
-        0.0, 1e6, open_minimum=True)
     frozen_timeout: float = parameter(
         20.0, 'how long a measurement may stay bit-identical while the model moves by more '
-        'than half of max_temperature_jump; 0 for ever', 's', 0.0, 86400.0)
+        'than half of its max_jump; 0 for ever', 's', 0.0, 86400.0)
     max_gain: float = parameter(
         1000.0, 'largest Riccati gain, in scaled coordinates, that is acted on; small weights '
         'need a large one', '', 0.0, 1e9, open_minimum=True)
     min_riccati_digits: float = parameter(
         8.0, 'decimal digits to which a solution must fulfil its Riccati equation to be acted on',
         '', 0.0, 15.0)
-    max_riccati_residual: float = parameter(
-        0.0, 'the same as a relative residual, as in former files: 1.0e-08 for 8 digits; 0 leaves '
-        'it to min_riccati_digits', '', 0.0, 1.0)
+    states: Mapping[str, StateParameters] = per_signal(StateParameters)
+    inputs: Mapping[str, InputParameters] = per_signal(InputParameters)
 
-    def settings(self) -> Settings:
-        """Return the tuning of the control step in SI units."""
+    def settings(self, signals: Signals) -> Settings:
+        """Return the tuning of the control step, in the units of the model."""
+        def column(of: Mapping[str, Any], attribute: str,
+                   change: Callable[[float], float] = lambda value: value) -> Array:
+            return np.array([change(getattr(of[name], attribute)) for name in of])
+
+        def value(attribute: str, of: Mapping[str, Any], units: Mapping[str, str]) -> Array:
+            return np.array([conversion(display_unit(unit), unit)(getattr(of[name], attribute))
+                             for name, unit in units.items()])
+
+        states, inputs, own = self.states, self.inputs, signals.inputs
+        controlled = {name: states[name] for name in signals.controlled}
         return Settings(
-            state_weight=np.array([self.temperature_weight]),
-            input_weight=np.array([self.coolant_weight]),
-            limits=InputLimits(np.array([to_kelvin(self.coolant_min)]),
-                               np.array([to_kelvin(self.coolant_max)]),
-                               np.array([self.coolant_rate_limit / SECONDS_PER_MINUTE])),
-            setpoint_ramp=np.array([self.setpoint_ramp / SECONDS_PER_MINUTE]),
+            controlled=() if tuple(states) == signals.controlled else signals.controlled,
+            state_weight=column(states, 'weight'),
+            input_weight=column(inputs, 'weight'),
+            limits=InputLimits(value('min', inputs, own), value('max', inputs, own),
+                               column(inputs, 'rate_limit', _or_any)),
+            setpoint_ramp=column(controlled, 'setpoint_ramp', _or_any),
             setpoint_filter=self.setpoint_filter,
-            observer_bandwidth=self.observer_bandwidth / SECONDS_PER_MINUTE,
-            max_disturbance=np.array([self.max_disturbance]),
-            input_tolerance=np.array([self.coolant_tolerance]),
+            observer_bandwidth=self.disturbance_bandwidth,
+            max_disturbance=column(inputs, 'max_disturbance', _or_any),
+            input_tolerance=column(inputs, 'tolerance'),
             transfer_time=self.transfer_time,
-            safe_input=np.array([to_kelvin(self.safe_coolant)]),
+            safe_input=value('safe', inputs, own),
             max_gain=self.max_gain,
-            max_residual=self.max_riccati_residual or 10.0 ** -self.min_riccati_digits,
+            max_residual=10.0 ** -self.min_riccati_digits,
             sensor=SensorLimits(
-                lower=np.array([to_kelvin(self.sensor_min)]),
-                upper=np.array([to_kelvin(self.sensor_max)]),
-                rate=np.array([self.max_temperature_rate / SECONDS_PER_MINUTE]),
-                jump=np.array([self.max_temperature_jump]),
-                frozen_timeout=self.frozen_timeout or math.inf),
+                lower=value('sensor_min', states, signals.states),
+                upper=value('sensor_max', states, signals.states),
+                rate=column(states, 'max_rate', _or_any),
+                jump=column(states, 'max_jump', _or_any),
+                frozen_timeout=_or_any(self.frozen_timeout)),
             supervisor=SupervisorSettings(
                 (LevelSettings('sdre', self.validity_margin),
                  LevelSettings('linear', self.linear_margin)),
                 self.hold_timeout, self.recovery_time))
 
 
-def _cross_check(values: ControllerParameters) -> str:
+def _or_any(bound: float) -> float:
+    """Return a bound, of which 0 stands for none."""
+    return bound or math.inf
+
+
+def _cross_check(signals: Signals, values: ControllerParameters) -> str:
     if values.validity_margin > values.linear_margin:
         return (f'validity_margin = {values.validity_margin} must be at most linear_margin = '
                 f'{values.linear_margin}: change the other one first')
-    return ''
+    return Wiring(signals, values.states, values.inputs).check()
 
 
-TABLE = ParameterTable(
-    ControllerParameters, _cross_check, ControllerParameters.settings,
-    (('coolant_min', 'coolant_max'), ('sensor_min', 'sensor_max')))
+def signals_of(model: LiftedModel, controlled: tuple[str, ...] = ()) -> Signals:
+    """Return the signals of a model, all states controlled by default."""
+    states, inputs = (dict(zip(of.names, of.units, strict=True))
+                      for of in (model.states, model.inputs))
+    named = tuple(filter(None, controlled))
+    # in the order of the states, as the control step wants them
+    own = tuple(name for name in states if name in named)
+    return Signals(states, inputs, (named if len(own) < len(named) else own) or tuple(states))
+
+
+def table_of(model: LiftedModel, given: Mapping[str, Any] = MappingProxyType({})
+             ) -> ParameterTable[ControllerParameters]:
+    """
+    Return the parameters of a controller with a model.
+
+    Its training box and scaling are the defaults, unless the preset of a plant says otherwise.
+
+    :param given: what is known of the values already, of which `system` and `controlled` count.
+    :raises ConfigurationError: for a preset that does not fit the model.
+    """
+    system = str(given.get('system', _DEFAULT_SYSTEM))
+    own = preset(system, 'controller')
+    if own and (found := signals_of(model)) != (expected := Signals(
+            named_units(own['states_measured']), named_units(own['inputs_commanded']),
+            found.controlled)):
+        raise ConfigurationError(
+            f'the model has {found}, the system {system!r} has {expected}: choose a model of that '
+            'system, or name in system what the model is of (an empty name: none that is shipped)')
+    signals = signals_of(model, tuple(given.get('controlled', own.get('controlled', ()))))
+    defaults: dict[str, Any] = dict(signals.defaults())
+    for name, scale in zip(model.states.names, model.states.scale.tolist(), strict=True):
+        defaults[f'{name}.weight'] = 1.0 / scale ** 2
+    box = model.inputs
+    for i, (name, unit) in enumerate(zip(box.names, box.units, strict=True)):
+        shown = conversion(unit, display_unit(unit))
+        defaults |= {f'{name}.weight': 1.0 / float(box.scale[i]) ** 2,
+                     f'{name}.min': shown(float(box.lower[i])),
+                     f'{name}.max': shown(float(box.upper[i])),
+                     f'{name}.safe': shown(float(box.center[i]))}
+    return ParameterTable(
+        ControllerParameters, partial(_cross_check, signals),
+        lambda values: values.settings(signals), (('min', 'max'), ('sensor_min', 'sensor_max')),
+        signals={'states': signals.states, 'inputs': signals.inputs},
+        defaults={**defaults, **own, 'system': system})
 
 
 @dataclass(frozen=True)
-class ReplayParameters(ControllerParameters):
-    """Snapshot of the replay's parameters; a controller's are for the new model alone."""
+class ReplayParameters:
+    """Snapshot of the replay's parameters; a controller's may be given for the new model."""
 
+    system: str = parameter(
+        _DEFAULT_SYSTEM, 'plant that is shipped, whose topics are those of the bag; any other '
+        'name for none')
     model: str = parameter(
-        'reactor_nz4', 'where a recorded model is looked for beside the shipped ones: a name, a '
-        '.safetensors file or a folder of them')
-
+        '', 'where a recorded model is looked for beside the shipped ones: a name, a .safetensors '
+        'file or a folder of them')
     bags: tuple[str, ...] = parameter(
         ('run_1',), 'bags to replay, each a run of its own: .mcap files or bag folders')
     new_model: str = parameter(
         '', 'model whose commands are compared with the recorded ones, by name or path, under the '
-        'recorded parameters but for those given here; empty only checks that the recorded '
-        'commands are reproduced')
+        'recorded parameters but for those of a controller that are given here, too; empty only '
+        'checks that the recorded commands are reproduced')
     output: str = parameter(
         'replay', 'folder for report.md, summary.json and the pictures; older ones in it are '
         'replaced')
     tolerance: float = parameter(
-        0.1, 'difference of two commands from which on it is counted and marked', 'K', 0.0, 100.0)
+        0.1, 'difference of two commands, in the unit of the input, from which on it is counted '
+        'and marked', '', 0.0, 1e9)
     recover: bool = parameter(
         False, 'read bags that were not closed or are damaged as far as they are whole')
 
@@ -162,8 +264,7 @@ def _check_replay(values: ReplayParameters) -> str:
         return f'bags = {list(values.bags)} must hold at least one path and no empty one'
     if not values.output:
         return "output = '' must name a folder, e.g. replay"
-    return _cross_check(values)
+    return ''
 
 
-REPLAY_TABLE = ParameterTable(
-    ReplayParameters, _check_replay, ReplayParameters.settings, TABLE.ordered)
+REPLAY_TABLE = ParameterTable(ReplayParameters, _check_replay)

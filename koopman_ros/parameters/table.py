@@ -1,12 +1,20 @@
 # SPDX-FileCopyrightText: 2026 The koopman_ros Authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""Parameter tables: one frozen dataclass a node gives declarations, checks, snapshot and YAML."""
+"""
+Parameter tables: one frozen dataclass a node gives declarations, checks, snapshot and YAML.
 
-from collections.abc import Callable
-from dataclasses import dataclass, field, fields, MISSING, replace
+A field made by :func:`per_signal` holds one further dataclass for each of some signals, whose
+rows are named after the signal: ``temperature.weight``.
+"""
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, Field, field, fields, replace
 import math
+from types import MappingProxyType
 from typing import Any, Generic, TypeVar
+
+from koopman_ros.units import display_unit
 
 T = TypeVar('T')
 
@@ -17,6 +25,7 @@ _TYPE_WORDS = {
     str: ('a string', 'text'),
     tuple: ('a list of strings', '[a, b]'),
 }
+_NUMBERS = ('a list of doubles', '[1.0, 2.0]')
 
 
 class ConfigurationError(ValueError):
@@ -73,9 +82,10 @@ class Specification:
 
     def type_error(self, value: Any) -> str:
         """Return the sentence for a value of another type."""
-        word, example = _TYPE_WORDS[type(self.default)]
+        numbers = isinstance(self.default, tuple) and isinstance(self.default[0], float)
+        word, example = _NUMBERS if numbers else _TYPE_WORDS[type(self.default)]
         if value == [] and isinstance(self.default, tuple):
-            word = 'a list of at least one string'
+            word = word.replace('list of', 'list of at least one').removesuffix('s')
         return f'{self.name} = {value!r} must be {word}, e.g. {example}'
 
 
@@ -87,11 +97,29 @@ def parameter(default: Any, description: str, unit: str = '', minimum: float = -
         **details})
 
 
+def per_signal(kind: type[Any]) -> Any:
+    """
+    Declare a field with one `kind`, a parameter dataclass, for each of some signals.
+
+    ``{unit}`` in its units stands for that of a difference of the signal, ``{shown}`` for that of
+    its values, as people read them.
+    """
+    return field(default_factory=dict, metadata={'per_signal': kind})
+
+
+def group() -> Any:
+    """Declare a field with numbers by name, whose rows ``field.name`` the table is given."""
+    return field(default_factory=dict, metadata={'group': True})
+
+
 class ParameterTable(Generic[T]):
     """
     The parameters of a node, from the dataclass that is also their typed, frozen snapshot.
 
-    :param ordered: names of which the first must be below the second.
+    :param signals: names and units of the signals, by field made with :func:`per_signal`.
+    :param groups: rows by field made with :func:`group`.
+    :param defaults: values, by name, in place of those of the dataclass; foreign ones are ignored.
+    :param ordered: names of which the first must be below the second, the same for each signal.
     :param cross_check: returns what is wrong with a whole snapshot, or an empty string.
     :param build: builds from a snapshot what the node will use, of which a ValueError or an
         ArithmeticError is the reason to refuse the snapshot.
@@ -99,15 +127,62 @@ class ParameterTable(Generic[T]):
 
     def __init__(self, kind: type[T], cross_check: Callable[[T], str] = lambda _: '',
                  build: Callable[[T], object] = lambda _: None,
-                 ordered: tuple[tuple[str, str], ...] = ()) -> None:
+                 ordered: tuple[tuple[str, str], ...] = (), *,
+                 signals: Mapping[str, Mapping[str, str]] = MappingProxyType({}),
+                 groups: Mapping[str, Sequence[Specification]] = MappingProxyType({}),
+                 defaults: Mapping[str, Any] = MappingProxyType({})) -> None:
         self.kind = kind
         self.ordered = ordered
         self.cross_check = cross_check
         self.build = build
+        self.signals = signals
         self.rows: dict[str, Specification] = {}
+        self._groups = {name: tuple(row.name for row in rows) for name, rows in groups.items()}
         for item in fields(kind):  # type: ignore[arg-type]
-            assert item.default is not MISSING
-            self.rows[item.name] = Specification(item.name, item.default, **item.metadata)
+            inner = item.metadata.get('per_signal')
+            if 'group' in item.metadata:
+                self.rows |= {f'{item.name}.{row.name}': replace(
+                    row, name=f'{item.name}.{row.name}') for row in groups[item.name]}
+                continue
+            for name, row, unit in [(item.name, item, '')] if inner is None else [
+                    (f'{signal}.{row.name}', row, unit)
+                    for signal, unit in signals.get(item.name, {}).items()
+                    for row in fields(inner)]:
+                self.rows[name] = _row(name, row, unit, defaults)
+
+    def snapshot(self, values: Mapping[str, Any]) -> T:
+        """Return the snapshot of values by name; those that are not given are the defaults."""
+        given = {name: values.get(name, row.default) for name, row in self.rows.items()}
+        parts: dict[str, Any] = {}
+        for item in fields(self.kind):  # type: ignore[arg-type]
+            inner = item.metadata.get('per_signal')
+            if item.name in self._groups:
+                parts[item.name] = MappingProxyType({
+                    name: given[f'{item.name}.{name}'] for name in self._groups[item.name]})
+                continue
+            parts[item.name] = given[item.name] if inner is None else MappingProxyType({
+                signal: inner(**{row.name: given[f'{signal}.{row.name}']
+                                 for row in fields(inner)})
+                for signal in self.signals.get(item.name, {})})
+        return self.kind(**parts)
+
+    def values(self, snapshot: T) -> dict[str, Any]:
+        """Return the values of a snapshot by name."""
+        flat: dict[str, Any] = {}
+        for item in fields(self.kind):  # type: ignore[arg-type]
+            value = getattr(snapshot, item.name)
+            if item.name in self._groups:
+                flat |= {f'{item.name}.{name}': number for name, number in value.items()}
+            elif 'per_signal' in item.metadata:
+                flat |= {f'{signal}.{row.name}': getattr(part, row.name)
+                         for signal, part in value.items() for row in fields(part)}
+            else:
+                flat[item.name] = value
+        return flat
+
+    def amended(self, snapshot: T, **values: Any) -> T:
+        """Return a snapshot with other values of some names."""
+        return self.snapshot({**self.values(snapshot), **values})
 
     def check(self, snapshot: T, before: T | None = None) -> str:
         """
@@ -115,30 +190,36 @@ class ParameterTable(Generic[T]):
 
         :param before: the one in force, which is known to be right; None for the defaults.
         """
+        values = self.values(snapshot)
         for name, row in self.rows.items():
-            if reason := row.check(getattr(snapshot, name)):
+            if reason := row.check(values[name]):
                 return reason
-        for low, high in self.ordered:
-            if not getattr(snapshot, low) < getattr(snapshot, high):
-                return (f'{self._given(snapshot, low)} must be below '
-                        f'{self._given(snapshot, high)}: change the other one first')
+        for low, high in self._ordered_rows():
+            if not values[low] < values[high]:
+                return (f'{self._given(low, values)} must be below '
+                        f'{self._given(high, values)}: change the other one first')
         return self.cross_check(snapshot) or self._unusable(
-            snapshot, self.kind() if before is None else before)
+            snapshot, self.snapshot({}) if before is None else before)
+
+    def _ordered_rows(self) -> list[tuple[str, str]]:
+        prefixes = ['', *(f'{name}.' for names in self.signals.values() for name in names)]
+        return [(prefix + low, prefix + high) for low, high in self.ordered
+                for prefix in prefixes if prefix + low in self.rows]
 
     def _unusable(self, snapshot: T, before: T) -> str:
         """Return why nothing can be built from values that fit each for itself, or ''."""
         if not (error := self._build_error(snapshot)):
             return ''
-        changed = [row for name, row in self.rows.items()
-                   if getattr(snapshot, name) != getattr(before, name)]
-        guilty = [row for row in changed if not self._build_error(replace(
-            snapshot, **{row.name: getattr(before, row.name)}))] or changed  # type: ignore
-        given = ' and '.join(self._given(snapshot, row.name) for row in guilty)
+        values, old = self.values(snapshot), self.values(before)
+        changed = [row for name, row in self.rows.items() if values[name] != old[name]]
+        guilty = [row for row in changed if not self._build_error(
+            self.amended(snapshot, **{row.name: old[row.name]}))] or changed
+        given = ' and '.join(self._given(row.name, values) for row in guilty)
         ranges = dict.fromkeys(f' in {row.range_text}' for row in guilty if row.range_text)
         return f'{given} cannot be used: {error}; choose another value{" or".join(ranges)}'
 
-    def _given(self, snapshot: T, name: str) -> str:
-        return f'{name} = {getattr(snapshot, name)} {self.rows[name].unit}'.rstrip()
+    def _given(self, name: str, values: Mapping[str, Any]) -> str:
+        return f'{name} = {values[name]} {self.rows[name].unit}'.rstrip()
 
     def _build_error(self, snapshot: T) -> str:
         try:
@@ -159,6 +240,16 @@ class ParameterTable(Generic[T]):
         return '\n'.join(lines) + '\n'
 
 
+def _row(name: str, item: Field[Any], unit: str, defaults: Mapping[str, Any]) -> Specification:
+    own = item.metadata['unit'].replace('({unit})', unit if unit.isalpha() else f'({unit})')
+    own = own.replace('{unit}', unit).replace('{shown}', display_unit(unit))
+    default = defaults.get(name, item.default)
+    if isinstance(item.default, (float, tuple)):
+        # a file may say 1 for 1.0, and has lists
+        default = type(item.default)(default)
+    return Specification(name, default, **{**item.metadata, 'unit': own})
+
+
 def _as_yaml(value: Any) -> str:
     """Write a value so that rcl reads back the same type."""
     if isinstance(value, bool):
@@ -172,5 +263,7 @@ def _as_yaml(value: Any) -> str:
             text = f'{mantissa}e{int(exponent):+03d}'
         return text
     if isinstance(value, tuple):
-        return '[' + ', '.join(item or "''" for item in value) + ']'
+        return '[' + ', '.join(_as_yaml(item) if isinstance(item, float) else (
+            item if item and item[0].isalnum() and '[' not in item else f"'{item}'")
+            for item in value) + ']'
     return repr(value) if isinstance(value, int) else f"'{value}'"

@@ -3,27 +3,79 @@
 
 """Parameters of the trainer node, which records bags, and of the player, which plays them."""
 
+from collections.abc import Mapping
 from dataclasses import dataclass
+from functools import partial
+from types import MappingProxyType
 from typing import Any
 
 import numpy as np
 
+from koopman_ros.arrays import Array
 from koopman_ros.experiment import Experiment
+from koopman_ros.lifting import LiftedModel
 from koopman_ros.parameters import wire
-from koopman_ros.parameters.table import parameter, ParameterTable
-from koopman_ros.units import SECONDS_PER_MINUTE, to_kelvin
+from koopman_ros.parameters.controller import signals_of
+from koopman_ros.parameters.table import ConfigurationError, parameter, ParameterTable, per_signal
+from koopman_ros.parameters.wire import InputPlaces, preset, Signals, StatePlaces, Wiring
+from koopman_ros.units import conversion, display_unit
 
-LOOP_TOPICS = (wire.TEMPERATURE, wire.CONCENTRATION, wire.SETPOINT, wire.ACTIVE_SETPOINT,
-               wire.COOLANT_SETPOINT, wire.COOLANT_TEMPERATURE,
-               wire.MANUAL_COOLANT_SETPOINT, wire.PREDICTED_TEMPERATURE,
-               wire.CONTROLLER_STATE, wire.CONTROLLER_EVENTS, wire.DIAGNOSTICS)
-EXPERIMENT_TOPICS = (wire.COOLANT_SETPOINT, wire.MANUAL_COOLANT_SETPOINT)
+_UNBOUNDED = 1e9  # what stands for no bound, in any unit
+COMMAND, MANUAL, SETPOINT = 'command', 'manual', 'setpoint'
+
+
+@dataclass(frozen=True)
+class StateParameters(StatePlaces):
+    """A measured state, and what an experiment may do to it."""
+
+    experiment_min: float = parameter(
+        -_UNBOUNDED, 'measurement below which the experiment is aborted', '{shown}', -_UNBOUNDED,
+        _UNBOUNDED)
+    experiment_max: float = parameter(
+        _UNBOUNDED, 'measurement above which the experiment is aborted', '{shown}', -_UNBOUNDED,
+        _UNBOUNDED)
+    setpoint_min: float = parameter(
+        0.0, 'lowest set-point of an experiment on set-points', '{shown}', -_UNBOUNDED, _UNBOUNDED)
+    setpoint_max: float = parameter(
+        0.0, 'highest set-point of an experiment on set-points', '{shown}', -_UNBOUNDED,
+        _UNBOUNDED)
+
+
+@dataclass(frozen=True)
+class InputParameters(InputPlaces):
+    """An input, and what an experiment does with it."""
+
+    experiment_min: float = parameter(
+        0.0, 'lowest value of a step', '{shown}', -_UNBOUNDED, _UNBOUNDED)
+    experiment_max: float = parameter(
+        0.0, 'highest value of a step', '{shown}', -_UNBOUNDED, _UNBOUNDED)
+    experiment_rate_limit: float = parameter(
+        0.0, 'fastest change in the experiment; 0 for any', '{unit}/s', 0.0, 1e9)
+    safe: float = parameter(
+        0.0, 'what is safe whatever happened; the experiment starts and ends with it', '{shown}',
+        -_UNBOUNDED, _UNBOUNDED)
+    delay: float = parameter(
+        0.0, 'dead time of the actuator: a command acts this long after it was given', 's', 0.0,
+        3600.0)
 
 
 @dataclass(frozen=True)
 class TrainerParameters:
-    """Snapshot of the trainer's parameters."""
+    """Snapshot of the trainer's parameters, in the units that people read."""
 
+    system: str = parameter(
+        'reactor', 'plant that is shipped, whose signals, topics and bounds are the defaults '
+        'here; any other name for none', read_only=True)
+    states_measured: tuple[str, ...] = parameter(
+        ('',), 'measured signals with their units, e.g. level [m]; an empty name for those of the '
+        'model', read_only=True)
+    inputs_commanded: tuple[str, ...] = parameter(
+        ('',), 'inputs with their units; an empty name for those of the model', read_only=True)
+    controlled: tuple[str, ...] = parameter(
+        ('',), 'measured signals that have a set-point; an empty name for all', read_only=True)
+    autostart: bool = parameter(
+        True, 'configure and activate itself at the start; false leaves that to a lifecycle '
+        'manager', read_only=True)
     task: str = parameter(
         'record', 'record: the node, which records, drives experiments and trains on request; '
         'train: train from the bags, and end', choices=('record', 'train'), read_only=True)
@@ -33,7 +85,7 @@ class TrainerParameters:
         '', 'where to record: a file ending in .mcap, or the folder of a new bag; empty names a '
         'folder after the date and time; never overwritten: where run exists, run_2 is taken')
     topics: tuple[str, ...] = parameter(
-        LOOP_TOPICS, 'topics to record; those that are not part of the loop are subscribed when '
+        ('',), 'topics to record; those that are not part of the loop are subscribed when '
         'somebody publishes them')
     compression: str = parameter(
         'none', 'compression of the bag; none is readable even when damaged',
@@ -47,40 +99,24 @@ class TrainerParameters:
     min_free_disk: float = parameter(
         100.0, 'room that the disk must have; with less, recording does not start, or stops', 'MB',
         0.0, 1e12)
-    experiment_topic: str = parameter(
-        EXPERIMENT_TOPICS[0], 'where the experiment commands the coolant: the plant, or a '
-        'controller in manual mode', choices=EXPERIMENT_TOPICS)
-    experiment_duration: float = parameter(
-        60.0, 'length of the experiment', 'min', 0.0, 1e4, open_minimum=True)
-    experiment_coolant_min: float = parameter(
-        8.5, 'lowest coolant temperature of a step', 'degC', -50.0, 150.0)
-    experiment_coolant_max: float = parameter(
-        27.5, 'highest coolant temperature of a step', 'degC', -50.0, 150.0)
-    experiment_hold_min: float = parameter(0.5, 'shortest step', 'min', 0.01, 1e4)
-    experiment_hold_max: float = parameter(2.0, 'longest step', 'min', 0.01, 1e4)
-    experiment_rate_limit: float = parameter(
-        60.0, 'fastest change of the coolant in the experiment', 'K/min', 0.0, 1e6,
-        open_minimum=True)
-    experiment_temperature_min: float = parameter(
-        31.85, 'temperature of the reactor below which the experiment is aborted', 'degC', -50.0,
-        300.0)
-    experiment_temperature_max: float = parameter(
-        53.85, 'temperature of the reactor above which the experiment is aborted', 'degC', -50.0,
-        300.0)
+    experiment_on: str = parameter(
+        COMMAND, 'what the experiment steps: the commands of the plant, those that a controller '
+        'in manual mode passes on, or the set-points of a controller in automatic mode',
+        choices=(COMMAND, MANUAL, SETPOINT))
+    experiment_length: float = parameter(
+        3600.0, 'length of the experiment', 's', 0.0, 1e6, open_minimum=True)
+    experiment_shortest_hold: float = parameter(30.0, 'shortest step', 's', 0.01, 1e6)
+    experiment_longest_hold: float = parameter(120.0, 'longest step', 's', 0.01, 1e6)
     experiment_timeout: float = parameter(
         10.0, 'wall time without a newer measurement after which the experiment is aborted', 's',
         0.0, 86400.0, open_minimum=True)
     experiment_seed: int = parameter(
         0, 'seed of the steps; the same seed gives the same steps', '', 0, 2 ** 31)
-    safe_coolant: float = parameter(
-        18.85, 'coolant temperature that is safe whatever happened; the experiment starts and '
-        'ends with it', 'degC', -50.0, 150.0)
-
     bags: tuple[str, ...] = parameter(
         ('',), 'what to train from: .mcap files or bag folders; an empty name for what this '
         'trainer records')
     model: str = parameter(
-        'reactor_nz4', 'present lift, which a new one has to beat: name of a shipped model, or '
+        '', 'present lift, which a new one has to beat: name of a shipped model, or '
         'path of a .safetensors model file')
     model_output: str = parameter(
         'retrained.safetensors', 'model file that an accepted lift is written to; the one before '
@@ -90,12 +126,12 @@ class TrainerParameters:
         3, 'starts of which each coordinate keeps the best', '', 1, 100)
     training_seed: int = parameter(
         0, 'seed of the training and of what is held out', '', 0, 2 ** 31)
-    input_gain: float = parameter(
-        0.0, 'change of dT/dt with the coolant temperature where it is known; 0 to learn it',
-        '1/min', -1e6, 1e6)
-    input_delay: float = parameter(
-        0.0, 'dead time of the actuator: a coolant acts this long after its command', 's', 0.0,
-        3600.0)
+    input_matrix: tuple[float, ...] = parameter(
+        (0.0,), 'B where it is known, row by row: change of the rate of each state, in its unit '
+        'per second, with each input; a single 0 to learn it')
+    synchronisation_tolerance: float = parameter(
+        0.0, 'how far the stamps of messages may be apart that together are one measurement', 's',
+        0.0, 10.0)
     gate_margin: float = parameter(
         0.1, 'share by which the held-out error of a new lift must be below those of the present '
         'lift and of the best linear model', '', 0.0, 0.99)
@@ -103,31 +139,111 @@ class TrainerParameters:
         1e4, 'largest condition number of the coordinates of a new lift', '', 1.0, 1e12,
         open_minimum=True)
 
-    def experiment(self) -> Experiment:
-        """Return the plan of an experiment in SI units."""
+    states: Mapping[str, StateParameters] = per_signal(StateParameters)
+    inputs: Mapping[str, InputParameters] = per_signal(InputParameters)
+
+    def experiment(self, signals: Signals, setpoints: Array | None = None) -> Experiment:
+        """
+        Return the plan of an experiment; a ValueError says what is missing.
+
+        :param setpoints: (n_c,) to come back to, for one that steps these; None steps the inputs.
+        """
+        on_setpoints = setpoints is not None
+        units = {name: signals.states[name] for name in signals.controlled
+                 } if on_setpoints else signals.inputs
+        of: Mapping[str, Any] = self.states if on_setpoints else self.inputs
+        low, high = ((f'{"setpoint" if on_setpoints else "experiment"}_{end}')
+                     for end in ('min', 'max'))
+
+        def own(attribute: str, among: Mapping[str, Any], described: Mapping[str, str]) -> Array:
+            return np.array([conversion(display_unit(unit), unit)(getattr(among[name], attribute))
+                             for name, unit in described.items()])
+
         return Experiment(
-            duration=self.experiment_duration * SECONDS_PER_MINUTE,
-            names=('coolant_temperature',),
-            lower=np.array([to_kelvin(self.experiment_coolant_min)]),
-            upper=np.array([to_kelvin(self.experiment_coolant_max)]),
-            rate=np.array([self.experiment_rate_limit / SECONDS_PER_MINUTE]),
-            home=np.array([to_kelvin(self.safe_coolant)]),
-            hold_shortest=self.experiment_hold_min * SECONDS_PER_MINUTE,
-            hold_longest=self.experiment_hold_max * SECONDS_PER_MINUTE,
-            measured=('temperature',),
-            measured_lower=np.array([to_kelvin(self.experiment_temperature_min)]),
-            measured_upper=np.array([to_kelvin(self.experiment_temperature_max)]),
+            duration=self.experiment_length,
+            names=tuple(units), lower=own(low, of, units), upper=own(high, of, units),
+            rate=np.array([getattr(of[name], 'experiment_rate_limit', 0.0) or _UNBOUNDED
+                           for name in units]),
+            home=own('safe', self.inputs, units) if setpoints is None else setpoints,
+            hold_shortest=self.experiment_shortest_hold,
+            hold_longest=self.experiment_longest_hold,
+            measured=tuple(signals.states),
+            measured_lower=own('experiment_min', self.states, signals.states),
+            measured_upper=own('experiment_max', self.states, signals.states),
             seed=self.experiment_seed)
 
     def training(self) -> dict[str, Any]:
         """Return the fields of a :class:`koopman_ros.retraining.Task` that are settings."""
         return {'coordinates': self.model_coordinates, 'seed': self.training_seed,
-                'starts': self.training_starts, 'input_gain': self.input_gain,
-                'input_delay': self.input_delay, 'margin': self.gate_margin,
+                'starts': self.training_starts, 'margin': self.gate_margin,
                 'condition': self.gate_condition}
 
 
-def _cross_check(values: TrainerParameters) -> str:
+def trainer_table(present: LiftedModel | None, given: Mapping[str, Any] = MappingProxyType({})
+                  ) -> ParameterTable[TrainerParameters]:
+    """
+    Return the parameters of a trainer.
+
+    :param present: the lift in use, whose signals and box are the defaults, or None without one.
+    :param given: what is known of the values already, of which system and signals count.
+    :raises ConfigurationError: where nothing says what the signals are.
+    """
+    system = str(given.get('system', 'reactor'))
+    own = preset(system, 'trainer')
+    signals = trainer_signals(present, {**own, **given})
+    defaults: dict[str, Any] = dict(signals.defaults())
+    defaults['topics'] = (*Wiring(signals, *_places(signals)).topics, wire.CONTROLLER_STATE,
+                          wire.CONTROLLER_EVENTS, wire.DIAGNOSTICS)
+    if present is not None:
+        for box, low, high in ((present.states, 'experiment_min', 'experiment_max'),
+                               (present.states, 'setpoint_min', 'setpoint_max'),
+                               (present.inputs, 'experiment_min', 'experiment_max')):
+            for i, (name, unit) in enumerate(zip(box.names, box.units, strict=True)):
+                shown = conversion(unit, display_unit(unit))
+                defaults |= {f'{name}.{low}': shown(float(box.lower[i])),
+                             f'{name}.{high}': shown(float(box.upper[i]))}
+                if box is present.inputs:
+                    defaults[f'{name}.safe'] = shown(float(box.center[i]))
+    return ParameterTable(
+        TrainerParameters, partial(_cross_check, signals), partial(_plan, signals),
+        signals={'states': signals.states, 'inputs': signals.inputs},
+        defaults={**defaults, **own, 'system': system})
+
+
+def trainer_signals(present: LiftedModel | None, given: Mapping[str, Any]) -> Signals:
+    """Return the signals that parameters name, or else those of a lift."""
+    states, inputs = (tuple(filter(None, given.get(name, ())))
+                      for name in ('states_measured', 'inputs_commanded'))
+    if bool(states) != bool(inputs) or not (states or present):
+        raise ConfigurationError(
+            'what is measured and commanded is not known: give states_measured and '
+            'inputs_commanded, or the model of the plant')
+    controlled = tuple(filter(None, given.get('controlled', ())))
+    if present is not None and not states:
+        return signals_of(present, controlled)
+    measured = wire.named_units(states)
+    return Signals(measured, wire.named_units(inputs), controlled or tuple(measured))
+
+
+def _places(signals: Signals) -> tuple[dict[str, StatePlaces], dict[str, InputPlaces]]:
+    """Return the places that signals have by default."""
+    topics = signals.defaults()
+
+    def own(name: str) -> dict[str, str]:
+        return {key.removeprefix(f'{name}.'): value for key, value in topics.items()
+                if key.startswith(f'{name}.')}
+
+    return ({name: StatePlaces(**own(name)) for name in signals.states},
+            {name: InputPlaces(**own(name)) for name in signals.inputs})
+
+
+def _plan(signals: Signals, values: TrainerParameters) -> None:
+    """Try the plan of an experiment, where there are bounds for one."""
+    if any(item.experiment_min != item.experiment_max for item in values.inputs.values()):
+        values.experiment(signals)
+
+
+def _cross_check(signals: Signals, values: TrainerParameters) -> str:
     if reason := wire.refusal(values.topics):
         return reason
     if values.output.endswith('.mcap') and (values.max_bag_size or values.max_bag_duration):
@@ -135,13 +251,11 @@ def _cross_check(values: TrainerParameters) -> str:
                 'max_bag_duration cannot split: give the name of a folder, without .mcap')
     if not values.model_output.endswith('.safetensors'):
         return f'model_output = {values.model_output!r} must end in .safetensors'
-    return ''
-
-
-TABLE = ParameterTable(
-    TrainerParameters, _cross_check, TrainerParameters.experiment,
-    tuple((f'experiment_{name}_min', f'experiment_{name}_max')
-          for name in ('coolant', 'temperature', 'hold')))
+    n_x, n_u = len(signals.states), len(signals.inputs)
+    if values.input_matrix != (0.0,) and len(values.input_matrix) != n_x * n_u:
+        return (f'input_matrix has {len(values.input_matrix)} numbers, must have {n_x} rows of '
+                f'{n_u}, or a single 0 to learn it')
+    return Wiring(signals, values.states, values.inputs).check()
 
 
 @dataclass(frozen=True)
@@ -149,18 +263,22 @@ class PlayerParameters:
     """Snapshot of the player's parameters."""
 
     bag: str = parameter('run_1', 'bag to play: a .mcap file or a bag folder', read_only=True)
+    system: str = parameter(
+        'reactor', 'plant that is shipped, whose topics are the defaults here; any other name for '
+        'none', read_only=True)
     topics: tuple[str, ...] = parameter(
-        (wire.COOLANT_TEMPERATURE, wire.TEMPERATURE, wire.SETPOINT, wire.MANUAL_COOLANT_SETPOINT),
-        'topics to play; a relative name stands for that below / in the bag, and follows '
+        ('',), 'topics to play; a relative name stands for that below / in the bag, and follows '
         'namespaces and remaps when it is published', read_only=True)
     rate: float = parameter(
         1.0, 'seconds of the recording, by the time of receipt, per second; 0 plays as fast as '
         'the controller answers, in lock-step', '', 0.0, 10000.0, smallest=1e-6, read_only=True)
-    measurement: str = parameter(
-        wire.TEMPERATURE, 'the topic among them whose messages are answered', read_only=True)
+    measurement: tuple[str, ...] = parameter(
+        ('',), 'the topics among them whose messages together are answered', read_only=True)
     answer: str = parameter(
-        wire.COOLANT_SETPOINT, 'where the answers are heard, which carry the stamps of the '
-        'measurements', read_only=True)
+        '', 'where the answers are heard, which carry the stamps of the measurements',
+        read_only=True)
+    answer_type: str = parameter(
+        '', 'type of the answers, where the bag has none', read_only=True)
     clock: bool = parameter(
         False, 'publish the stamp of each measurement on /clock before it, as the plant does, for '
         'nodes with use_sim_time', read_only=True)
@@ -181,7 +299,31 @@ class PlayerParameters:
 
 
 def _check_player(values: PlayerParameters) -> str:
-    return wire.refusal(values.topics) or wire.refusal((values.measurement, values.answer))
+    return wire.refusal(values.topics) or wire.refusal((*values.measurement, values.answer))
 
 
-PLAYER_TABLE = ParameterTable(PlayerParameters, _check_player)
+def player_table(given: Mapping[str, Any] = MappingProxyType({})
+                 ) -> ParameterTable[PlayerParameters]:
+    """Return the parameters of a player; `given` as for :func:`trainer_table`."""
+    defaults: dict[str, Any] = {}
+    if (wiring := preset_wiring(str(given.get('system', 'reactor')))) is not None:
+        defaults = {
+            'topics': tuple(dict.fromkeys(place.topic for places in (
+                wiring.applied, wiring.measured, wiring.setpoints, wiring.manual)
+                for place in places.values())),
+            'measurement': tuple(dict.fromkeys(
+                place.topic for place in wiring.measured.values())),
+            'answer': next(iter(wiring.commands.values())).topic,
+            'answer_type': next(iter(wiring.commands.values())).type}
+    return ParameterTable(PlayerParameters, _check_player, defaults=defaults)
+
+
+def preset_wiring(system: str) -> Wiring | None:
+    """Return the places of the signals of a plant that is shipped, or None for another."""
+    if not (own := preset(system, 'trainer')):
+        return None
+    signals = trainer_signals(None, own)
+    values = ParameterTable(
+        TrainerParameters, signals={'states': signals.states, 'inputs': signals.inputs},
+        defaults={**signals.defaults(), **own}).snapshot({})
+    return Wiring(signals, values.states, values.inputs)

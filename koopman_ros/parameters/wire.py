@@ -1,24 +1,268 @@
 # SPDX-FileCopyrightText: 2026 The koopman_ros Authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""Names of the topics of the loop, and what its messages have room for."""
+"""Where the signals of a plant are on the wire, by parameter; topics that are no signal's."""
 
-from collections.abc import Collection
+from __future__ import annotations
 
-TEMPERATURE = 'temperature'
-CONCENTRATION = 'concentration'
-SETPOINT = 'setpoint'
-ACTIVE_SETPOINT = 'active_setpoint'
-COOLANT_SETPOINT = 'coolant_setpoint'
-COOLANT_TEMPERATURE = 'coolant_temperature'
-MANUAL_COOLANT_SETPOINT = 'manual_coolant_setpoint'
-PREDICTED_TEMPERATURE = 'predicted_temperature'
+from collections.abc import Collection, Mapping
+from dataclasses import dataclass
+from functools import cached_property
+import re
+from typing import Any
+
+from koopman_ros.parameters.table import ConfigurationError, parameter, ParameterTable
+from koopman_ros.resources import config_directory
+from koopman_ros.wire import Place, place, stem
+
 CONTROLLER_STATE = 'controller_state'
 CONTROLLER_EVENTS = 'controller_events'
 DIAGNOSTICS = '/diagnostics'
 CLOCK = '/clock'
 
 LONGEST_FRAME_ID = 256  # characters that are passed on
+
+# The places of signals: of states, then of inputs.
+KINDS = ('measured', 'setpoints', 'active_setpoints', 'predicted', 'applied', 'commands', 'manual')
+PLANT_KINDS = ('measured', 'applied', 'commands')
+
+_PRESETS = 'plants'  # folder of the parameter files of the plants that are shipped
+_NAMED = re.compile(r'([A-Za-z_]\w*)\s*\[(.+)\]')
+
+
+def _topic(description: str) -> Any:
+    return parameter('', description, read_only=True)
+
+
+@dataclass(frozen=True)
+class MeasuredPlace:
+    """Where a signal is measured."""
+
+    topic: str = _topic('topic of its measurements; of an input, of what really acts')
+    type: str = _topic('type of their messages as package/msg/Name; empty for the usual one of '
+                       'its unit')
+    field: str = _topic('where in them the number is, e.g. temperature, twist.linear.x, data[2] '
+                        'or position[shaft]; empty for the usual one of the type')
+    unit: str = _topic('unit of that number; empty for the usual one of the type')
+
+
+@dataclass(frozen=True)
+class StatePlaces(MeasuredPlace):
+    """Where a measured state is; its set-points and prediction have the same type and field."""
+
+    setpoint_topic: str = _topic('where its set-point is asked for, where it is controlled')
+    active_setpoint_topic: str = _topic('where the set-point that is tracked is published')
+    predicted_topic: str = _topic('where it is published what was expected of the measurement')
+
+
+@dataclass(frozen=True)
+class CommandedPlaces(MeasuredPlace):
+    """Where an input is measured, and where it is commanded."""
+
+    command_topic: str = _topic('topic of its commands')
+    command_type: str = _topic('type of the commands; empty for that of the measurements')
+    command_field: str = _topic('where in them the number is; empty for the usual one of the type')
+    command_unit: str = _topic('unit of that number; empty for the usual one of the type')
+
+
+@dataclass(frozen=True)
+class InputPlaces(CommandedPlaces):
+    """The same with an operator."""
+
+    manual_topic: str = _topic('where an operator commands it in manual mode')
+
+
+@dataclass(frozen=True)
+class Signals:
+    """
+    The signals of a plant: names and units.
+
+    :raises ConfigurationError: for controlled signals that are no states, or too many.
+    """
+
+    states: Mapping[str, str]  #: units of the measured states, by name
+    inputs: Mapping[str, str]  #: units of the inputs, by name
+    controlled: tuple[str, ...] = ()  #: names of the states that have a set-point
+
+    def __post_init__(self) -> None:
+        wrong = [name for name in self.controlled if name not in self.states]
+        if wrong or len(set(self.controlled)) < len(self.controlled):
+            raise ConfigurationError(
+                f'controlled = {list(self.controlled)} must name different ones of the measured '
+                f'signals {", ".join(self.states)}')
+
+    def __str__(self) -> str:
+        """Write states and inputs with units."""
+        return ' and '.join(
+            f'{kind} ' + ', '.join(f'{name} [{unit}]' for name, unit in of.items())
+            for kind, of in (('states', self.states), ('inputs', self.inputs)))
+
+    def defaults(self) -> dict[str, str]:
+        """Return the topics of all places, by parameter."""
+        alone = len(self.controlled) == 1
+        topics: dict[str, str] = {}
+        for name in self.states:
+            of = '' if alone else f'{name}/'
+            controlled = name in self.controlled
+            topics |= {f'{name}.topic': name, f'{name}.predicted_topic': f'predicted_{name}',
+                       f'{name}.setpoint_topic': f'{of}setpoint' if controlled else '',
+                       f'{name}.active_setpoint_topic': (
+                           f'{of}active_setpoint' if controlled else '')}
+        for name, unit in self.inputs.items():
+            command = f'{stem(name, unit)}_setpoint'
+            topics |= {f'{name}.topic': name, f'{name}.command_topic': command,
+                       f'{name}.manual_topic': f'manual_{command}'}
+        return topics
+
+
+@dataclass(frozen=True)
+class Wiring:
+    """
+    The places of all signals.
+
+    :raises ConfigurationError: for a field that is no path in a message, or a missing topic.
+    """
+
+    signals: Signals
+    states: Mapping[str, Any]  #: places of a node's states, by name
+    inputs: Mapping[str, Any]  #: places of its inputs, by name
+    kinds: tuple[str, ...] = KINDS  #: which of the properties below the node has
+
+    @cached_property
+    def measured(self) -> dict[str, Place]:
+        """Where the states are measured."""
+        return {name: self._at(name, said.topic) for name, said in self.states.items()}
+
+    @cached_property
+    def predicted(self) -> dict[str, Place]:
+        """Where it is said what was expected of them."""
+        return {name: self._at(name, said.predicted_topic) for name, said in self.states.items()}
+
+    @cached_property
+    def setpoints(self) -> dict[str, Place]:
+        """Where the set-points of the controlled states are asked for."""
+        return {name: self._at(name, self.states[name].setpoint_topic)
+                for name in self.signals.controlled}
+
+    @cached_property
+    def active_setpoints(self) -> dict[str, Place]:
+        """Where it is said what is tracked."""
+        return {name: self._at(name, self.states[name].active_setpoint_topic)
+                for name in self.signals.controlled}
+
+    @cached_property
+    def commands(self) -> dict[str, Place]:
+        """Where the inputs are commanded."""
+        return {name: self._command(name, said.command_topic)
+                for name, said in self.inputs.items()}
+
+    @cached_property
+    def manual(self) -> dict[str, Place]:
+        """Where an operator commands them."""
+        return {name: self._command(name, said.manual_topic) for name, said in self.inputs.items()}
+
+    @cached_property
+    def applied(self) -> dict[str, Place]:
+        """Where it is measured what acts."""
+        return {name: _place(said.topic, name, self.signals.inputs[name], {
+            'type': said.type, 'field': said.field, 'unit': said.unit})
+            for name, said in self.inputs.items()}
+
+    def check(self) -> str:
+        """Say what is wrong with them, or return an empty string."""
+        try:
+            for kind in self.kinds:
+                places = getattr(self, kind)
+                if missing := [name for name, found in places.items() if not found.topic]:
+                    return f'{missing[0]} has no topic: name one'
+        except ValueError as error:
+            return str(error)
+        return ''
+
+    @property
+    def topics(self) -> tuple[str, ...]:
+        """All of them, each once."""
+        return tuple(dict.fromkeys(
+            found.topic for kind in self.kinds for found in getattr(self, kind).values()))
+
+    def _at(self, name: str, topic: str) -> Place:
+        said = self.states[name]
+        return _place(topic, name, self.signals.states[name], {
+            'type': said.type, 'field': said.field, 'unit': said.unit})
+
+    def _command(self, name: str, topic: str) -> Place:
+        said = self.inputs[name]
+        same = not said.command_type or said.command_type == said.type
+        return _place(topic, name, self.signals.inputs[name], {
+            'type': said.command_type or said.type,
+            'field': said.command_field or (said.field if same else ''),
+            'unit': said.command_unit or (said.unit if same else '')})
+
+
+def _place(topic: str, name: str, unit: str, given: Mapping[str, str]) -> Place:
+    try:
+        return place(topic, name, unit, given)
+    except ValueError as error:
+        raise ConfigurationError(f'{name}: {error}') from error
+
+
+def named_units(described: Collection[str]) -> dict[str, str]:
+    """Return units by name of signals described as ``name [unit]``; ConfigurationError if not."""
+    found = {}
+    for text in described:
+        match = _NAMED.fullmatch(text.strip())
+        if match is None or match[1] in found:
+            raise ConfigurationError(f'{text!r} must be a name and a unit, each name once, e.g. '
+                                     "'level [m]'")
+        found[match[1]] = match[2]
+    return found
+
+
+def preset(system: str, node: str) -> dict[str, Any]:
+    """
+    Return the defaults of a node, by parameter, from the file of a plant that is shipped.
+
+    A plant without a file has none.
+    """
+    path = config_directory() / _PRESETS / f'{system}.yaml'
+    if not system.isidentifier() or not path.is_file():
+        return {}
+    # in here: only at the start
+    import yaml
+
+    content = yaml.safe_load(path.read_text())
+    values: dict[str, Any] = {}
+    for section in ('/**', node):
+        _flatten('', content.get(section, {}).get('ros__parameters', {}), values)
+    return values
+
+
+def renamed(node: str, given: Mapping[str, Any], table: ParameterTable[Any]) -> str:
+    """Say what former parameters among those given are called now, or return an empty string."""
+    import yaml
+
+    path = config_directory() / 'renamed.yaml'
+    if not (unknown := set(given) - set(table.rows)) or not path.is_file():
+        return ''
+    said = []
+    for name, (now, factor) in yaml.safe_load(path.read_text()).get(node, {}).items():
+        if name in unknown and now in table.rows:
+            value = given[name]
+            if isinstance(factor, Mapping):
+                value = factor.get(value, value)
+            elif isinstance(value, float) and factor != 1:
+                value = float(f'{value * factor:.12g}')
+            said.append(f'{name} is now {now}' + (f' [{unit}]' if (
+                unit := table.rows[now].unit) else '') + f': write {now}: {value}')
+    return '; '.join(said)
+
+
+def _flatten(prefix: str, tree: Mapping[str, Any], into: dict[str, Any]) -> None:
+    for key, value in tree.items():
+        if isinstance(value, Mapping):
+            _flatten(f'{prefix}{key}.', value, into)
+        else:
+            into[f'{prefix}{key}'] = tuple(value) if isinstance(value, list) else value
 
 
 def refusal(names: Collection[str]) -> str:

@@ -13,7 +13,7 @@ from koopman_ros.plants.library.reactor import (
 )
 from koopman_ros.plants.library.scalar import scalar_example
 from koopman_ros.plants.library.two_state import two_state_example
-from koopman_ros.plants.process import Actuator, in_steps, Process, sensor_noise
+from koopman_ros.plants.process import Actuator, Process, sensor_noise
 from koopman_ros.plants.simulation import (
     advance,
     IntegrationError,
@@ -26,6 +26,6 @@ from koopman_ros.plants.system import ControlAffineSystem, equilibrium_input, Eq
 __all__ = ['PLANTS', 'Actuator', 'Constant', 'Constants', 'ControlAffineSystem',
            'EquilibriumError', 'ExcitationError', 'IntegrationError', 'IntegrationFailure',
            'Process', 'RandomStepDesign', 'ReactorParameters', 'advance', 'build', 'constant',
-           'constants_of', 'equilibrium_input', 'in_steps', 'one_state_reactor', 'plant_class',
+           'constants_of', 'equilibrium_input', 'one_state_reactor', 'plant_class',
            'random_steps', 'sample_derivatives', 'scalar_example', 'sensor_noise', 'simulate',
            'two_state_example', 'two_state_reactor']

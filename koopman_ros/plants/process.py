@@ -6,7 +6,6 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-import math
 
 import numpy as np
 
@@ -21,12 +20,12 @@ _SETTLED = 40.0
 
 @dataclass(frozen=True)
 class Actuator:
-    """How an input follows its command; by default it is the command."""
+    """How the inputs follow their commands, a number for all or (n_u,); by default at once."""
 
-    lower: float = -np.inf  #: lowest value that each input reaches, in input units
-    upper: float = np.inf  #: highest such value
-    delay: float = 0.0  #: how long after it was given a command takes effect, in s
-    lag: float = 0.0  #: time constant with which the input then follows, in s
+    lower: float | Array = -np.inf  #: lowest value that each input reaches, in input units
+    upper: float | Array = np.inf  #: highest such value
+    delay: float | Array = 0.0  #: how long after it was given a command takes effect, in s
+    lag: float | Array = 0.0  #: time constant with which the input then follows, in s
 
 
 @dataclass(frozen=True, eq=False)
@@ -39,8 +38,8 @@ class Process:
     u: Array  #: input (n_u,) that acts, up to the present time
     actuator: Actuator = Actuator()  #: between commands and input
     command: Array | None = None  #: what the input follows (n_u,); None for what it is
-    #: commands that take effect later, by rising time: (time in ns, command (n_u,))
-    pending: tuple[tuple[int, Array], ...] = ()
+    #: commands that take effect later, by rising time: (time in ns, number of the input, value)
+    pending: tuple[tuple[int, int, float], ...] = ()
 
     @property
     def followed(self) -> Array:
@@ -49,16 +48,24 @@ class Process:
 
     def commanded(self, command: Array, time_ns: int) -> Process:
         """Return the process with a command given, in place of any that would act later."""
-        effect_ns = time_ns + round(self.actuator.delay * NANOSECONDS)
-        earlier = tuple(entry for entry in self.pending if entry[0] < effect_ns)
-        return replace(self, pending=(*earlier, (effect_ns, command)))
+        delays = np.broadcast_to(self.actuator.delay, command.shape).tolist()
+        effect_ns = [time_ns + round(delay * NANOSECONDS) for delay in delays]
+        earlier = [entry for entry in self.pending if entry[0] < effect_ns[entry[1]]]
+        new = zip(effect_ns, range(len(command)), command.tolist(), strict=True)
+        return replace(self, pending=tuple(sorted([*earlier, *new])))
 
     def until(self, time_ns: int) -> Process:
         """Return the process at a later time, else itself; raise IntegrationError past bounds."""
         now = self
         while now.pending and now.pending[0][0] < time_ns:
-            (effect_ns, command), *later = now.pending
-            now = replace(now._following(effect_ns), command=command, pending=tuple(later))
+            effect_ns = now.pending[0][0]
+            now = now._following(effect_ns)
+            command = np.array(now.followed)
+            for due, i, value in now.pending:
+                if due == effect_ns:
+                    command[i] = value
+            now = replace(now, command=command, pending=tuple(
+                entry for entry in now.pending if entry[0] > effect_ns))
         return now._following(time_ns)
 
     def _following(self, time_ns: int) -> Process:
@@ -66,12 +73,13 @@ class Process:
         if time_ns <= self.time_ns:
             return self
         now, goal = self, np.clip(self.followed, self.actuator.lower, self.actuator.upper)
-        settled_ns = self.time_ns + round(_SETTLED * self.actuator.lag * NANOSECONDS)
-        if settled_ns > self.time_ns and np.any(self.u != goal):
+        lag = np.broadcast_to(self.actuator.lag, goal.shape)
+        settled_ns = self.time_ns + round(_SETTLED * float(np.max(lag, initial=0.0)) * NANOSECONDS)
+        u = np.where(lag > 0.0, self.u, goal)
+        if settled_ns > self.time_ns and np.any(u != goal):
             end_ns = min(time_ns, settled_ns)
-            both = _with_input_lag(
-                self.system, self.actuator.lag / self.system.seconds_per_time_unit)
-            reached = _moved(both, np.concatenate([self.x, self.u]), goal, end_ns - self.time_ns)
+            both = _with_input_lag(self.system, lag / self.system.seconds_per_time_unit)
+            reached = _moved(both, np.concatenate([self.x, u]), goal, end_ns - self.time_ns)
             x, u = np.split(reached, [self.system.n_x])
             now = replace(self, time_ns=end_ns, x=x, u=u)
             if time_ns < settled_ns:
@@ -87,14 +95,16 @@ def _moved(system: ControlAffineSystem, x: Array, u: Array, time_ns: int) -> Arr
     return advance(system, x, u, time_ns / NANOSECONDS / system.seconds_per_time_unit)
 
 
-def _with_input_lag(system: ControlAffineSystem, time_constant: float) -> ControlAffineSystem:
+def _with_input_lag(system: ControlAffineSystem, time_constants: Array) -> ControlAffineSystem:
     """
     Put a first-order lag before each input: d[x; v]/dt = [f(x) + B v; -v / tau] + [0; u / tau].
 
-    The inputs v that act become states; the time constant tau is in time units, above 0.
+    The inputs v that act become states; the time constants tau (n_u,) are in time units. An input
+    without one, of which tau is 0, stands still where it is.
     """
     n_x, n_u = system.n_x, system.n_u
-    rate = 1.0 / time_constant
+    rate = np.zeros(n_u)
+    np.divide(1.0, time_constants, out=rate, where=time_constants > 0.0)
 
     def drift(state: Array) -> Array:
         x, v = state[..., :n_x], state[..., n_x:]
@@ -104,7 +114,7 @@ def _with_input_lag(system: ControlAffineSystem, time_constant: float) -> Contro
         jacobian = np.zeros((*state.shape, n_x + n_u))
         jacobian[..., :n_x, :n_x] = system.drift_jacobian(state[..., :n_x])
         jacobian[..., :n_x, n_x:] = system.B
-        jacobian[..., n_x:, n_x:] = -rate * np.eye(n_u)
+        jacobian[..., n_x:, n_x:] = -np.diag(rate)
         return jacobian
 
     unbounded = np.full(n_u, np.inf)
@@ -115,20 +125,16 @@ def _with_input_lag(system: ControlAffineSystem, time_constant: float) -> Contro
         state_units=(*system.state_units, *system.input_units),
         drift=drift,
         drift_jacobian=drift_jacobian,
-        B=np.concatenate([np.zeros((n_x, n_u)), rate * np.eye(n_u)]),
+        B=np.concatenate([np.zeros((n_x, n_u)), np.diag(rate)]),
         nominal_state=np.concatenate([system.nominal_state, system.nominal_input]),
         state_lower=np.concatenate([system.state_lower, -unbounded]),
         state_upper=np.concatenate([system.state_upper, unbounded]),
     )
 
 
-def sensor_noise(deviation: float, seed: int, sample: int) -> float:
-    """Return the noise of one sample of a standard deviation, the same for seed and number."""
+def sensor_noise(deviation: float, seed: int, sample: int, signal: int = 0) -> float:
+    """Return the noise of one sample of a standard deviation, the same for seed and numbers."""
     if deviation == 0.0:
         return 0.0
-    return deviation * float(np.random.default_rng((seed, sample)).standard_normal())
-
-
-def in_steps(value: float, resolution: float) -> float:
-    """Return the nearest multiple of a sensor's resolution; 0 shows every value."""
-    return value if resolution == 0.0 else value - math.remainder(value, resolution)
+    number = (seed, sample, signal) if signal else (seed, sample)
+    return deviation * float(np.random.default_rng(number).standard_normal())

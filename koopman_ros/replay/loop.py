@@ -15,8 +15,8 @@ from koopman_ros.replay import records
 
 # The model of a name and a digest, read anew each time; raises RecordError where there is none.
 FindModel: TypeAlias = Callable[[str, str], LiftedModel]
-# The tuning that parameters by name stand for; raises ValueError where they do not fit.
-MakeSettings: TypeAlias = Callable[[Mapping[str, Any]], Settings]
+# The tuning of a model that parameters by name stand for; raises ValueError where they do not fit.
+MakeSettings: TypeAlias = Callable[[Mapping[str, Any], LiftedModel], Settings]
 
 
 @dataclass(frozen=True)
@@ -66,6 +66,8 @@ class Replay:
     models: list[str] = field(default_factory=list)
     #: the last one in force, or None where no state was found
     controller: Controller | None = None
+    #: its parameters by name
+    parameters: Mapping[str, Any] = field(default_factory=dict)
 
 
 def replay(recorded: Iterable[records.Record], find_model: FindModel, make_settings: MakeSettings,
@@ -135,9 +137,9 @@ class _Run:
 
     def _begin(self, record: records.Record) -> None:
         self._parameters = dict(record.fields['parameters'])
-        self._controller = Controller(
-            self._model(record), self._make_settings(self._parameters))
-        self._found.controller = self._controller
+        model = self._model(record)
+        self._controller = Controller(model, self._make_settings(self._parameters, model))
+        self._found.controller, self._found.parameters = self._controller, self._parameters
         self._state = records.state_of(record)
         if self._other is not None:
             same = self._other.digest == record.fields['model']['digest']
@@ -149,10 +151,9 @@ class _Run:
         """Put other parameters or another model in force."""
         self._parameters.update(record.fields.get('parameters', {}))
         predecessor = self._controller
-        self._controller = Controller(
-            self._model(record) if 'model' in record.fields else predecessor.model,
-            self._make_settings(self._parameters))
-        self._found.controller = self._controller
+        model = self._model(record) if 'model' in record.fields else predecessor.model
+        self._controller = Controller(model, self._make_settings(self._parameters, model))
+        self._found.controller, self._found.parameters = self._controller, self._parameters
         self._state = self._controller.hand_over(predecessor, state)
         if self._other is not None and 'parameters' in record.fields:
             predecessor = self._other_controller
@@ -195,4 +196,4 @@ class _Run:
     def _tuned(self, model: LiftedModel) -> Controller:
         assert self._other is not None
         return Controller(model, self._make_settings(
-            {**self._parameters, **self._other.parameters}))
+            {**self._parameters, **self._other.parameters}, model))

@@ -4,6 +4,7 @@
 """Recorded and replayed commands side by side, in numbers and as a report."""
 
 from collections import Counter
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -14,11 +15,10 @@ from numpy.typing import NDArray
 from koopman_ros.arrays import Array
 from koopman_ros.lifting import Coordinates
 from koopman_ros.replay.loop import Replay
-from koopman_ros.replay.sources import command_key
+from koopman_ros.replay.sources import Command, command_key
 from koopman_ros.reports import write_figures, write_page
 from koopman_ros.units import conversion
-
-_CELSIUS = conversion('K', 'degC')
+from koopman_ros.wire import Place
 
 
 @dataclass(frozen=True)
@@ -58,7 +58,8 @@ class ReplayedBag:
     found: Replay  #: what came of the replay
     #: commands on their topic by stamp and value, as :func:`command_counts` has them; empty where
     #: the bag has none
-    published: Counter[tuple[int, bytes]]
+    published: Counter[Command]
+    places: Sequence[Place]  #: (n_u,) where the inputs were commanded
     tolerance: float  #: difference in input units from which on a command is counted
     new_range: Coordinates | None = None  #: of the new model's training, or None without one
 
@@ -110,8 +111,14 @@ class ReplayedBag:
     @property
     def unexplained(self) -> int:
         """The number of commands on the topic of which there is no record with their bits."""
-        recorded = Counter(command_key(sample.stamp_ns, _CELSIUS(float(sample.recorded[0])))
-                           for sample in self.found.samples)
+        if self.found.controller is None:
+            return self.published.total()
+        units = self.found.controller.model.inputs.units
+        there = [conversion(unit, place.unit)
+                 for unit, place in zip(units, self.places, strict=True)]
+        recorded = Counter(command_key(i, sample.stamp_ns, there[i](value))
+                           for sample in self.found.samples
+                           for i, value in enumerate(sample.recorded.tolist()))
         return (self.published - recorded).total()
 
     def _compared(self, commands: Array) -> Comparison:
@@ -132,7 +139,7 @@ def write_report(folder: Path, bags: list[ReplayedBag], pictures: list[str], new
                  ) -> None:
     """Write report.md and summary.json; `new_model` is the new model's name, or empty."""
     write_figures(folder / 'summary.json', {
-        'new_model': new_model or None, 'tolerance_K': bags[0].tolerance,
+        'new_model': new_model or None, 'tolerance': bags[0].tolerance,
         'reproduced': all(reproduced(bag) for bag in bags),
         'bags': [_figures(bag) for bag in bags]})
     sections = [_about(new_model)]
@@ -156,14 +163,14 @@ def verdict(bag: ReplayedBag) -> str:
         return f'all {check.compared} recorded commands are reproduced bit for bit'
     beyond = int(np.count_nonzero(check.beyond))
     return (f'{check.identical} of {check.compared} recorded commands are reproduced bit for bit, '
-            f'{beyond} differ by more than {check.tolerance:g} K; {_worst(bag, check)}')
+            f'{beyond} differ by more than {check.tolerance:g}; {_worst(bag, check)}')
 
 
 def _worst(bag: ReplayedBag, comparison: Comparison) -> str:
     worst = comparison.worst
     if worst is None:
         return 'none differs'
-    return (f'the largest difference is {_largest(comparison.difference[worst]):+.3g} K, at '
+    return (f'the largest difference is {_largest(comparison.difference[worst]):+.3g}, at '
             f'{bag.seconds[worst]:.3f} s (stamp {bag.stamps_ns[worst] / 1e9:.3f} s)')
 
 
@@ -192,7 +199,7 @@ def _section(bag: ReplayedBag) -> list[str]:
     if bag.new is not None:
         beyond = int(np.count_nonzero(bag.new.beyond))
         lines.append(f'- New model: {beyond} of {bag.new.compared} commands differ from the '
-                     f'recorded ones by more than {bag.tolerance:g} K; {_worst(bag, bag.new)}.')
+                     f'recorded ones by more than {bag.tolerance:g}; {_worst(bag, bag.new)}.')
     for count, words in (
             (bag.outside, 'times the tracked set-point is outside the range that the new model '
                           'was trained for, which would have refused it'),
@@ -235,7 +242,7 @@ def _comparison(bag: ReplayedBag, comparison: Comparison) -> dict[str, Any]:
     return {
         'compared': comparison.compared, 'identical': comparison.identical,
         'beyond_tolerance': int(np.count_nonzero(comparison.beyond)),
-        'largest_difference_K': 0.0 if worst is None else _largest(comparison.difference[worst]),
+        'largest_difference': 0.0 if worst is None else _largest(comparison.difference[worst]),
         'largest_at_s': None if worst is None else float(bag.seconds[worst]),
         'largest_at_stamp_ns': None if worst is None else int(bag.stamps_ns[worst]),
     }

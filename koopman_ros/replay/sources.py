@@ -9,13 +9,15 @@ import contextlib
 import os
 from pathlib import Path
 import struct
+from typing import TypeAlias
 
 from koopman_ros.bags import BagMessage, BagReadError, read_messages, summary
 from koopman_ros.lifting import LiftedModel, load_with_digest, ModelFileError
 from koopman_ros.replay.records import parse, Record, RecordError
 from koopman_ros.units import NANOSECONDS
+from koopman_ros.wire import Place
 
-RECORD_TYPE, COMMAND_TYPE = 'std_msgs/msg/String', 'sensor_msgs/msg/Temperature'
+RECORD_TYPE = 'std_msgs/msg/String'
 
 
 def read_records(path: str | os.PathLike[str], topic: str, *, recover: bool = False
@@ -51,22 +53,29 @@ def _parsed(path: str | os.PathLike[str], messages: Iterator[BagMessage]) -> Ite
                                ) from error
 
 
-def command_counts(path: str | os.PathLike[str], topic: str, *, recover: bool = False
-                   ) -> Counter[tuple[int, bytes]]:
-    """Count the commands on a topic of a bag by :func:`command_key`; none where it has none."""
-    if summary(path).types.get(topic) != COMMAND_TYPE:
-        return Counter()
-    found: Counter[tuple[int, bytes]] = Counter()
-    for entry in read_messages(path, (topic,), recover=recover):
-        stamp = entry.message.header.stamp
-        found[command_key(stamp.sec * NANOSECONDS + stamp.nanosec,
-                          entry.message.temperature)] += 1
+# Number of an input, stamp [ns], and bytes of its float64.
+Command: TypeAlias = tuple[int, int, bytes]
+
+
+def command_counts(path: str | os.PathLike[str], places: Sequence[Place], *,
+                   recover: bool = False) -> Counter[Command]:
+    """Count the commands of the inputs in a bag by :func:`command_key`; none where it has none."""
+    found: Counter[Command] = Counter()
+    known = summary(path).types
+    for i, place in enumerate(places):
+        if known.get(place.topic) != place.type:
+            continue
+        for entry in read_messages(path, (place.topic,), recover=recover):
+            with contextlib.suppress(LookupError, AttributeError):
+                stamp = entry.message.header.stamp
+                found[command_key(i, stamp.sec * NANOSECONDS + stamp.nanosec,
+                                  place.get(entry.message))] += 1
     return found
 
 
-def command_key(stamp_ns: int, value: float) -> tuple[int, bytes]:
-    """Return stamp [ns] and bytes of the float64, equal for commands that are bit-identical."""
-    return stamp_ns, struct.pack('<d', value)
+def command_key(number: int, stamp_ns: int, value: float) -> Command:
+    """Return what is equal for commands of an input that are bit-identical."""
+    return number, stamp_ns, struct.pack('<d', value)
 
 
 class Models:

@@ -3,7 +3,7 @@
 
 """The controller's messages: into events of its step, and its status, internals and records."""
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Collection, Mapping
 from dataclasses import dataclass
 import math
 import secrets
@@ -17,49 +17,21 @@ from sensor_msgs.msg import JointState
 from std_msgs.msg import String
 
 from koopman_ros.arrays import Array
+from koopman_ros.assembler import Assembler
 from koopman_ros.control import Arrival, Controller, events, HOLD, Mode, Report, SAFE, State
 from koopman_ros.parameters.controller import ControllerParameters
+from koopman_ros.parameters.wire import Signals
 from koopman_ros.reasons import level_words
 from koopman_ros.replay.records import fields_of, Record, SNAPSHOT, START
 from koopman_ros.ros import topics
-from koopman_ros.ros.codec import stamp_nanoseconds
 from koopman_ros.ros.node import Level, Status, words_of
 from koopman_ros.ros.watchdog import Timing
-from koopman_ros.units import in_celsius, NANOSECONDS, to_celsius, to_kelvin
+from koopman_ros.units import display_unit, shown
+from koopman_ros.wire import stem
 
-# The temperatures of reactor and coolant at an instant are stamped no further apart.
-_SAME_TIME_NS = 2 * NANOSECONDS
 _SNAPSHOT_PERIOD = 10.0  # s by the wall
-_ACTIONS = {HOLD: 'the last command is held', SAFE: 'the safe coolant temperature is commanded'}
-_WAY_BACK = 'the coolant leads the reactor back from where the safe coolant keeps it'
-
-
-def measurement(message: Any, coolant: Any) -> events.Measurement:
-    """Return the event of a measurement, with the coolant measured last where it goes with it."""
-    kelvin, stamp_ns = to_kelvin(message.temperature), stamp_nanoseconds(message.header.stamp)
-    applied = None
-    if coolant is not None and (
-            abs(stamp_nanoseconds(coolant.header.stamp) - stamp_ns) <= _SAME_TIME_NS):
-        applied = np.array([to_kelvin(coolant.temperature)])
-    # below absolute zero there is nothing to measure
-    return events.Measurement(
-        stamp_ns, np.array([kelvin if kelvin >= 0.0 else math.nan]), applied)
-
-
-def initialisation(message: Any) -> events.Initialisation:
-    """Return the event of a start from the coolant temperature that is applied already."""
-    return events.Initialisation(np.array([to_kelvin(message.temperature)]))
-
-
-def setpoint_request(message: Any) -> events.SetpointRequest:
-    """Return the event of a set-point, whose stamp says from when it holds."""
-    return events.SetpointRequest(stamp_nanoseconds(message.header.stamp),
-                                  np.array([to_kelvin(message.temperature)]))
-
-
-def manual_command(message: Any) -> events.ManualCommand:
-    """Return the event of a coolant temperature commanded in manual mode."""
-    return events.ManualCommand(np.array([to_kelvin(message.temperature)]))
+_ACTIONS = {HOLD: 'the last command is held', SAFE: 'the safe {} is commanded'}
+_WAY_BACK = 'the {} leads the plant back from where the safe one keeps it'
 
 
 @dataclass
@@ -79,6 +51,7 @@ class Situation:
 
     controller: Controller
     parameters: ControllerParameters
+    signals: Signals
     state: State
     report: Report
     counts: Counts
@@ -87,12 +60,25 @@ class Situation:
     request_refused: str  #: why the operator's last request was refused, or empty
     model_refused: str  #: why the last model was refused, or empty
     model: Mapping[str, object]  #: figures of the model in force
-    temperature: float  #: last measured, in degrees Celsius
+    measured: Array  #: (n_y,) last measured, in the units of the signals
+    assembler: Assembler  #: what waits to be put together
 
     @property
     def reason(self) -> str:
         """Why the level acts, in words, or empty."""
-        return words_of(self.controller.model)(self.report.reason)
+        return words_of(self.signals)(self.report.reason)
+
+    @property
+    def input(self) -> str:
+        """What an operator calls the inputs."""
+        return ' and '.join(stem(name, unit) for name, unit in self.signals.inputs.items())
+
+    def commanded(self, command: Array) -> str:
+        """Write a command (n_u,) with names and units."""
+        return ', '.join(
+            f'{stem(name, unit)} at {shown(value, unit):.2f} {display_unit(unit)}'
+            for (name, unit), value in zip(self.signals.inputs.items(), command.tolist(),
+                                           strict=True))
 
 
 def status(now: Situation) -> Status:
@@ -104,37 +90,40 @@ def _verdict(now: Situation) -> tuple[Level, str]:
     report, mode = now.report, now.state.mode
     timeout = now.parameters.measurement_timeout
     if not now.counts.measurements:
-        return Level.WARN, now.complaint or 'waiting for the first temperature measurement'
+        awaited = f' of {now.assembler.awaited}' if now.assembler.awaited else ''
+        return Level.WARN, now.complaint or f'waiting for the first measurement{awaited}'
     if timeout and max(now.timing.silence, now.timing.wall_silence) > timeout:
         command = now.state.command
-        doing = '' if command is None else f', coolant at {in_celsius(float(command[0]))}'
+        doing = '' if command is None else f', {now.commanded(command)}'
         action = 'manual mode' if mode is Mode.MANUAL else (
-            _ACTIONS[HOLD] if report.depth == 0 else _action(report))
+            _ACTIONS[HOLD] if report.depth == 0 else _action(now))
         if now.timing.busy:
             return Level.ERROR, (f'no measurement answered for more than {timeout:g} s, as the '
                                  f'node is busy: {action}{doing}; ask for less at once')
-        return Level.ERROR, (f'no measurement for more than {timeout:g} s: {action}{doing}; check '
-                             'sensor and plant')
+        awaited = f' of {now.assembler.awaited}' if now.assembler.awaited else ''
+        return Level.ERROR, (f'no measurement{awaited} for more than {timeout:g} s: '
+                             f'{action}{doing}; check sensor and plant')
     if report.reason is not None and mode is Mode.MANUAL:
         return Level.ERROR, f'{mode.value}: {now.reason}'
     if mode is Mode.AUTOMATIC and report.depth > 0:
         level = Level.ERROR if report.level in _ACTIONS else Level.WARN
-        action = _WAY_BACK if report.command.way_back else _action(report)
+        action = _WAY_BACK.format(now.input) if report.command.way_back else _action(now)
         return level, f'{action}: {now.reason}'
     if warning := _warning(now):
         return Level.WARN, warning
     message = mode.value
     if mode is Mode.AUTOMATIC and not now.counts.setpoint_received:
-        message += ', no set-point yet: the temperature first measured is held'
+        message += ', no set-point yet: what was first measured is held'
     elif report.command.at_range:
-        message += ', coolant at its limit'
+        message += f', {now.input} at a limit'
     elif report.command.at_rate:
-        message += ', coolant at its rate limit'
+        message += f', {now.input} at a rate limit'
     return Level.OK, message
 
 
-def _action(report: Report) -> str:
-    return _ACTIONS.get(report.level) or level_words(report.level)
+def _action(now: Situation) -> str:
+    level = now.report.level
+    return _ACTIONS.get(level, '').format(now.input) or level_words(level)
 
 
 def _warning(now: Situation) -> str:
@@ -154,51 +143,84 @@ def _warning(now: Situation) -> str:
     if now.model_refused:
         return now.model_refused
     if report.measurement.outside > 0.0:
-        return (f'temperature is outside the trained range '
-                f'[{to_celsius(states.lower[0]):.2f}, {to_celsius(states.upper[0]):.2f}] degC: '
-                'the model extrapolates')
+        outside = [f'{name} is outside the trained range [{shown(lower, unit):.6g}, '
+                   f'{shown(upper, unit):.6g}] {display_unit(unit)}'
+                   for name, unit, lower, upper, value in zip(
+                       states.names, states.units, states.lower.tolist(), states.upper.tolist(),
+                       now.measured.tolist(), strict=True) if not lower <= value <= upper]
+        return f'{", ".join(outside) or "the state is far from the training data"}: ' \
+               'the model extrapolates'
     if oldest and abs(age) > oldest:
         return (f'measurements are {age:.1f} s old when they arrive, at most {oldest:g} s are '
                 'expected: check the connection and the clocks')
     if not report.measurement.follows:
-        return (f'the coolant does not follow its set-point within '
-                f'{now.parameters.coolant_tolerance:g} K: the observer goes by the coolant '
-                'temperature; check the actuator and its limits')
+        return (f'the {now.input} does not follow its command within '
+                f'{_listed(now, "tolerance")}: the observer goes by what is measured; check the '
+                'actuator and its limits')
     if report.estimate is not None and report.estimate.at_bound:
-        return (f'the disturbance estimate is at its bound of {now.parameters.max_disturbance:g} '
-                'K of coolant: the plant is far from its model; retrain')
+        return (f'the disturbance estimate is at its bound of {_listed(now, "max_disturbance")} '
+                f'of {now.input}: the plant is far from its model; retrain')
     return ''
 
 
+def _listed(now: Situation, parameter: str) -> str:
+    return ', '.join(f'{getattr(tuned, parameter):g} {now.signals.inputs[name]}'
+                     for name, tuned in now.parameters.inputs.items())
+
+
+def labelled(names: Collection[str], text: str) -> list[str]:
+    """Return a label for each of some signals, which are named where there are several."""
+    return [text] if len(names) == 1 else [f'{name} {text}' for name in names]
+
+
+def _each(signals: Mapping[str, str], text: str, values: Array | None, difference: bool = False
+          ) -> dict[str, float]:
+    """Return values by label with the unit of each; `{}` in the text stands for that."""
+    numbers = [math.nan] * len(signals) if values is None else values.tolist()
+    return {label.replace('{}', unit if difference else display_unit(unit)):
+            value if difference else shown(value, unit)
+            for label, unit, value in zip(labelled(signals, text), signals.values(), numbers,
+                                          strict=True)}
+
+
 def _figures(now: Situation) -> dict[str, object]:
-    report, state, timing = now.report, now.state, now.timing
-    target, law = report.target, report.command.law
-    setpoint, disturbance, transfer = _setpoint_disturbance_transfer(report)
-    bias = None if report.estimate is None else now.controller.equivalent_bias(state)
+    report, state, timing, signals = now.report, now.state, now.timing, now.signals
+    target, law, transfer = report.target, report.command.law, report.command.transfer
+    inputs = {stem(name, unit): unit for name, unit in signals.inputs.items()}
+    estimate = report.estimate
+    bias = None if estimate is None else now.controller.equivalent_bias(state)
+    unit = {name: signals.states[name] for name in signals.controlled}
     return {
         'mode': state.mode.value,
         'active law': level_words(report.level),
         'law': law.form or 'none',
         'reason': now.reason or 'none',
         **now.model,
-        'temperature [degC]': float(now.temperature),
-        'set-point [degC]': setpoint,
-        'coolant [degC]': to_celsius(_first(state.command)),
-        'disturbance [K of coolant]': disturbance,
-        'equivalent sensor bias [K]': _first(bias),
+        **{f'{name} [{display_unit(own)}]': shown(value, own) for (name, own), value in zip(
+            signals.states.items(), now.measured.tolist(), strict=True)},
+        **_each(unit, 'set-point [{}]', None if target is None else target.setpoint),
+        **{f'{name} [{display_unit(own)}]': value for (name, own), value in zip(
+            inputs.items(), _each(inputs, '{}', state.command).values(), strict=True)},
+        **_each(inputs, f'disturbance [{{}} of {now.input}]' if len(inputs) == 1
+                else 'disturbance [{}]', None if estimate is None else estimate.disturbance, True),
+        **_each(signals.states, 'equivalent sensor bias [{}]', bias, True),
         'distance outside training box [half widths]': float(report.measurement.outside),
         'set-point outside training box [half widths]': (
             np.nan if target is None else float(target.outside)),
-        'coolant outside training box [half widths]': float(report.command.outside),
+        f'{now.input} outside training box [half widths]': float(report.command.outside),
         'Riccati residual': float(law.residual),
         'gain norm': float(law.gain),
         'predicted growth per sample': float(law.growth),
-        'transfer [K]': transfer,
+        **_each(inputs, 'transfer [{}]', np.zeros(len(inputs)) if transfer is None else transfer,
+                True),
         'scheduled set-points': len(state.setpoint.scheduled),
         'measurements': now.counts.measurements,
         'late measurements': now.counts.late,
         'missed measurements': now.counts.missed,
         'measurements rejected': now.counts.refused,
+        **{f'{what} parts of {name}': count for what, counts in (
+            ('late', now.assembler.late), ('missing', now.assembler.missing),
+            ('doubled', now.assembler.doubled)) for name, count in counts.items()},
         'since last measurement [s]': timing.wall_silence,
         'age of measurement [s]': timing.age,
         'latency from stamp to command [s]': timing.age + timing.answer_seconds,
@@ -206,32 +228,26 @@ def _figures(now: Situation) -> dict[str, object]:
     }
 
 
-def _first(values: Array | None) -> float:
-    return np.nan if values is None else float(values[0])
-
-
-def _setpoint_disturbance_transfer(report: Report) -> tuple[float, float, float]:
-    transfer = report.command.transfer
-    return (to_celsius(_first(report.target.setpoint if report.target else None)),
-            _first(report.estimate.disturbance if report.estimate else None),
-            0.0 if transfer is None else _first(transfer))
-
-
-def internals(report: Report, stamp: Time, frame_id: str) -> JointState:
-    """Return what a person would plot beside the temperatures, under names with units."""
-    law = report.command.law
-    setpoint, disturbance, transfer = _setpoint_disturbance_transfer(report)
+def internals(signals: Signals, report: Report, stamp: Time, frame_id: str) -> JointState:
+    """Return what a person would plot beside the signals, under names with units."""
+    law, transfer, estimate = report.command.law, report.command.transfer, report.estimate
+    inputs, target = signals.inputs, report.target
     values = {
-        'disturbance [K]': disturbance,
-        'estimated_temperature [degC]': to_celsius(
-            _first(report.estimate.state if report.estimate else None)),
+        **_each(inputs, 'disturbance [{}]',
+                None if estimate is None else estimate.disturbance, True),
+        **{f'estimated_{name} [{display_unit(unit)}]': value for (name, unit), value in zip(
+            signals.states.items(),
+            _each(signals.states, '{}', None if estimate is None else estimate.state).values(),
+            strict=True)},
         'distance_outside [half widths]': float(report.measurement.outside),
         'level [0 learned, 1 linear, 2 hold, 3 safe, 4 manual]': float(report.depth),
         'gain': float(law.gain),
         'riccati_residual': float(law.residual),
         'growth_per_sample': float(law.growth),
-        'transfer [K]': transfer,
-        'setpoint [degC]': setpoint,
+        **_each(inputs, 'transfer [{}]', np.zeros(len(inputs)) if transfer is None else transfer,
+                True),
+        **_each({name: signals.states[name] for name in signals.controlled}, 'setpoint [{}]',
+                None if target is None else target.setpoint),
     }
     message = JointState(name=list(values), position=list(values.values()))
     message.header.stamp = stamp

@@ -6,25 +6,41 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from functools import partial
 import time
+from typing import Any
 
 import numpy as np
 from rclpy.callback_groups import MutuallyExclusiveCallbackGroup
 from rclpy.duration import Duration
 from rclpy.node import Node
 from rclpy.qos import ReliabilityPolicy
+from rclpy.subscription import Subscription
 from rclpy.task import Future
-from sensor_msgs.msg import Temperature
 from std_srvs.srv import SetBool
 
 from koopman_ros.arrays import Array
-from koopman_ros.experiment import advance, begin, end, Following, level, Phase, Progress
-from koopman_ros.parameters.trainer import TrainerParameters
+from koopman_ros.assembler import Assembler
+from koopman_ros.experiment import (
+    advance,
+    begin,
+    end,
+    Experiment,
+    Following,
+    level,
+    Phase,
+    Progress,
+)
+from koopman_ros.parameters.trainer import MANUAL, SETPOINT, TrainerParameters
+from koopman_ros.parameters.wire import Wiring
 from koopman_ros.reasons import Code, Reason, reason
 from koopman_ros.ros import topics
-from koopman_ros.ros.codec import stamp_message, stamp_nanoseconds, temperature_message
-from koopman_ros.ros.node import DiagnosticsPublisher, Level, OPERATOR, Owned, Status
-from koopman_ros.units import in_celsius, NANOSECONDS, to_celsius, to_kelvin
+from koopman_ros.ros.codec import stamp_message, stamp_nanoseconds
+from koopman_ros.ros.managed import ManagedNode
+from koopman_ros.ros.node import Level, Owned, Status, words_of
+from koopman_ros.ros.signals import Heard, Inlet, Outlet
+from koopman_ros.units import display_unit, NANOSECONDS, shown
+from koopman_ros.wire import Place, stem
 
 _TICK = 0.1  # s
 _ASTRAY = 10  # commands of a controller, and
@@ -32,20 +48,22 @@ _ASTRAY_TIME = 1.0  # s, after which it is said not to follow
 _FAREWELL = 0.2  # s in which a last measurement is answered
 
 
-class CoolantExperiment:
+class PlantExperiment:
     """
-    Drive the coolant with random steps on the service ``~/experiment``; reports by diagnostics.
+    Drive the plant with random steps on the service ``~/experiment``; reports by diagnostics.
 
-    When the steps are over, the coolant returns to the safe temperature along the rate limit and
-    is held there until the service is called with false once more, or another publisher comes.
+    When the steps are over, the inputs return to their safe values along the rate limit, or the
+    set-points to what they were, and are held there until the service is called with false once
+    more, or another publisher comes.
     """
 
-    def __init__(self, node: Node, settings: TrainerParameters) -> None:
+    def __init__(self, node: ManagedNode, settings: TrainerParameters, wiring: Wiring) -> None:
         self.settings = settings  # of the next experiment
-        self._node = node
+        self._node, self._wiring = node, wiring
+        self._words = words_of(wiring.signals)
         self._run: ExperimentRun | None = None
         self._outcome = Status(Level.OK, 'no experiment')
-        self._diagnostics = DiagnosticsPublisher(node, 'experiment', 'trainer', self._status)
+        self._diagnostics = node.diagnostics.add('experiment', 'trainer', self._status)
         # a group of its own: the service waits for the first measurement
         self._owned = Owned(node)
         self._owned.keep(node.create_service(
@@ -53,59 +71,66 @@ class CoolantExperiment:
             callback_group=MutuallyExclusiveCallbackGroup()))
 
     def complete(self) -> None:
-        """Leave the coolant at the safe temperature; publishes the last command."""
+        """Leave the inputs at their safe values; publishes the last command."""
         if self._run is not None:
             self._run.farewell()
 
     def destroy(self) -> None:
-        """Take the service down, and a run with it: the coolant is left where it is."""
+        """Take the service down, and a run with it: the inputs are left where they are."""
         self._let_go(self._outcome)
         self._owned.destroy()
         self._diagnostics.destroy()
 
     async def _on_service(self, request: SetBool.Request, response: SetBool.Response
                           ) -> SetBool.Response:
-        if not request.data:
+        if reason := self._node.refusal:
+            response.message = reason
+        elif not request.data:
             response.success, response.message = self._stop()
         elif self._run is not None and self._run.running:
             response.message = 'an experiment is running: call with false to end it'
         else:
             reason = self._start()
             if self._run is not None:
-                reason = OPERATOR(await self._run.started)
+                reason = self._words(await self._run.started)
             response.success = not reason
             response.message = f'refused: {reason}' if reason else (
-                f'running on {self._node.resolve_topic_name(self.settings.experiment_topic)}')
+                f'running on {self._run.topics if self._run else ""}')
             if reason:
                 self._let_go(Status(Level.WARN, response.message))
         self._say(response.message)
         return response
 
     def _start(self) -> str:
-        """Take the coolant in hand, or return why not."""
+        """Take the plant in hand, or return why not."""
         self._let_go(self._outcome)
-        topic = self._node.resolve_topic_name(self.settings.experiment_topic)
-        if others := other_publishers(self._node, topic):
-            return f'{others} publishes on {topic}: end it, or choose another experiment_topic'
-        answers = self._node.resolve_topic_name(topics.COOLANT_SETPOINT)
-        if topic != answers and not self._node.count_publishers(answers):
-            return (f'nobody publishes on {answers}: start the controller and switch it to '
-                    'manual mode')
-        self._run = ExperimentRun(self._node, self.settings, self._on_end)
+        resolve = self._node.resolve_topic_name
+        for place in stepped(self.settings, self._wiring).values():
+            topic = resolve(place.topic)
+            if others := other_publishers(self._node, topic):
+                return f'{others} publishes on {topic}: end it, or choose another experiment_on'
+        if self.settings.experiment_on in (MANUAL, SETPOINT):
+            answers = resolve(next(iter(self._wiring.commands.values())).topic)
+            if not self._node.count_publishers(answers):
+                mode = 'manual' if self.settings.experiment_on == MANUAL else 'automatic'
+                return (f'nobody publishes on {answers}: start the controller and switch it to '
+                        f'{mode} mode')
+        try:
+            self._run = ExperimentRun(self._node, self.settings, self._wiring, self._on_end)
+        except ValueError as error:
+            return str(error)
         self._diagnostics.publish_if_changed()
         return ''
 
     def _stop(self) -> tuple[bool, str]:
-        """End the steps, or let go of the coolant when they are over."""
+        """End the steps, or let go of the plant when they are over."""
         if self._run is None:
             return False, 'no experiment is running'
-        safe = in_celsius(float(self._run.plan.home[0]))
         if self._run.running:
             self._run.stop(Phase.ENDED)
-            return True, (f'ended: the coolant returns to {safe} and is held there; call again '
-                          'to let go of it')
+            return True, f'ended: {self._run.going_home}; call again to let go'
         self._let_go(self._verdict(self._run))
-        return True, 'the trainer does not command the coolant any more'
+        return True, 'the trainer does not command any more'
 
     def _on_end(self, why: Reason | None) -> None:
         """Say that the steps are over, or stop commanding at once for a reason."""
@@ -117,7 +142,7 @@ class CoolantExperiment:
         # an experiment that was over is over as it was
         run.stop(Phase.ABORTED, why)
         self._let_go(self._verdict(run))
-        self._say(f'the trainer does not command the coolant any more: {OPERATOR(why)}')
+        self._say(f'the trainer does not command any more: {self._words(why)}')
 
     def _let_go(self, outcome: Status) -> None:
         self._outcome = outcome
@@ -137,7 +162,7 @@ class CoolantExperiment:
         if run.progress is None:
             return Status(Level.OK, 'waiting for the first measurement')
         if run.progress.phase is Phase.ABORTED:
-            return Status(Level.ERROR, f'aborted: {OPERATOR(run.progress.reason)}')
+            return Status(Level.ERROR, f'aborted: {self._words(run.progress.reason)}')
         return Status(Level.OK, run.progress.phase.value)
 
     def _status(self) -> Status:
@@ -147,120 +172,190 @@ class CoolantExperiment:
         verdict = self._verdict(run)
         if run.progress is None:
             return verdict
-        held = '' if run.running else (
-            f'; the coolant returns to {in_celsius(float(run.plan.home[0]))} and is held there')
+        held = '' if run.running else f'; {run.going_home}'
         left = max(0.0, run.plan.duration - run.progress.elapsed) if run.running else 0.0
         return Status(verdict.level, verdict.message + held, {
-            'topic': run.topic,
-            'level [degC]': to_celsius(float(level(run.plan, run.progress)[0])),
-            'coolant [degC]': to_celsius(float(run.progress.command[0])),
+            'topic': run.topics,
+            **run.figures('level', level(run.plan, run.progress)),
+            **run.figures('command', run.progress.command),
             'left [s]': left,
             'seed': run.plan.seed,
         })
 
 
+def stepped(settings: TrainerParameters, wiring: Wiring) -> dict[str, Place]:
+    """Return where an experiment publishes, by name of the signal that it steps."""
+    if settings.experiment_on == SETPOINT:
+        return wiring.setpoints
+    return wiring.manual if settings.experiment_on == MANUAL else wiring.commands
+
+
 class ExperimentRun:
     """
-    Command the coolant from the first measurement on until :meth:`destroy`.
+    Step the signals from the first measurement on until :meth:`destroy`.
 
     :param on_end: called when the steps are over, with the reason when it must command no more.
+    :raises ValueError: for bounds that are no plan.
     """
 
-    def __init__(self, node: Node, settings: TrainerParameters,
+    def __init__(self, node: ManagedNode, settings: TrainerParameters, wiring: Wiring,
                  on_end: Callable[[Reason | None], None]) -> None:
-        self.plan = settings.experiment()
-        self.topic = node.resolve_topic_name(settings.experiment_topic)
+        places = stepped(settings, wiring)
+        signals = wiring.signals
+        self._settings, self._signals = settings, signals
+        self._on_setpoints = settings.experiment_on == SETPOINT
+        self._units = {name: (signals.states if self._on_setpoints else signals.inputs)[name]
+                       for name in places}
+        self._home: dict[str, float] = {}  # the set-points from before
+        self.plan: Experiment = settings.experiment(
+            signals, self._middle() if self._on_setpoints else None)
+        self._topics = [node.resolve_topic_name(place.topic) for place in places.values()]
         self.progress: Progress | None = None
         # why it cannot start, or None with the first measurement
         self.started = Future()
         self._node = node
         self._patience, self._on_end = settings.experiment_timeout, on_end
         self._frame_id, self._stamp_ns, self._heard_at = '', 0, time.monotonic()
-        self._following = Following(float(self.plan.upper[0] - self.plan.lower[0]))
-        owned = Owned(node)
+        self._sent: Array | None = None
+        self._following = [Following(float(span)) for span in self.plan.upper - self.plan.lower]
+        self._owned = owned = Owned(node)
         self.destroy = owned.destroy  #: commands no more
+        self._assembler = Assembler(
+            tuple(signals.states), round(settings.synchronisation_tolerance * NANOSECONDS))
+        self._measured = Inlet(
+            node, self._subscribe, wiring.measured, signals.states, self._on_measurement)
+        self._answers = Inlet(
+            node, self._subscribe, wiring.commands, signals.inputs, self._on_command) if (
+                settings.experiment_on != 'command') else None
+        if self._on_setpoints:
+            Inlet(node, partial(self._subscribe, latched=True), wiring.active_setpoints,
+                  signals.states, lambda heard: self._home.update(
+                      {} if self.progress else heard.values))
+        self._outlet = Outlet(places, self._units, lambda topic, kind: owned.keep(
+            node.create_publisher(kind, topic, topics.LOOP_QOS)))
+        owned.timer(_TICK, self._on_tick)
+
+    def _middle(self) -> Array:
+        """Return set-points with which the bounds can be tried before those of now are known."""
+        return np.zeros(len(self._units))
+
+    def _subscribe(self, topic: str, callback: Callable[[Any], None], kind: Any,
+                   latched: bool = False) -> Subscription:
         # a sensor driver may publish best effort
-        offers = node.get_publishers_info_by_topic(node.resolve_topic_name(topics.TEMPERATURE))
+        offers = self._node.get_publishers_info_by_topic(self._node.resolve_topic_name(topic))
         reliable = all(info.qos_profile.reliability is not ReliabilityPolicy.BEST_EFFORT
                        for info in offers)
-        self._temperatures = owned.keep(node.create_subscription(
-            Temperature, topics.TEMPERATURE, self._on_temperature,
-            topics.profile(topics.LOOP_QOS.depth, reliable=reliable)))
-        self._coolants = owned.keep(node.create_subscription(
-            Temperature, topics.COOLANT_SETPOINT, self._on_coolant, topics.LOOP_QOS)) if (
-                settings.experiment_topic == topics.MANUAL_COOLANT_SETPOINT) else None
-        self._publisher = owned.keep(
-            node.create_publisher(Temperature, self.topic, topics.LOOP_QOS))
-        owned.timer(_TICK, self._on_tick)
+        return self._owned.keep(self._node.create_subscription(
+            kind, topic, callback, topics.LATCHED_QOS if latched else topics.profile(
+                topics.LOOP_QOS.depth, reliable=reliable)))
+
+    @property
+    def topics(self) -> str:
+        """Where it publishes."""
+        return ', '.join(dict.fromkeys(self._topics))
 
     @property
     def running(self) -> bool:
         """Whether it waits for its first measurement, or steps."""
         return self.progress is None or self.progress.phase is Phase.RUNNING
 
+    @property
+    def going_home(self) -> str:
+        """Say where the signals go when the steps are over."""
+        where = ', '.join(
+            f'{self._called(name)} to {shown(value, unit):.6g} {display_unit(unit)}'
+            for (name, unit), value in zip(self._units.items(), self.plan.home.tolist(),
+                                           strict=True))
+        return f'{where}, held there'
+
+    def _called(self, name: str) -> str:
+        return name if self._on_setpoints else stem(name, self._units[name])
+
+    def figures(self, what: str, values: Array) -> dict[str, float]:
+        """Return values (m,) by name with unit."""
+        return {f'{self._called(name)} {what} [{display_unit(unit)}]': shown(value, unit)
+                for (name, unit), value in zip(self._units.items(), values.tolist(), strict=True)}
+
     def stop(self, phase: Phase, why: Reason | None = None) -> None:
-        """End the steps; the coolant then returns to the safe temperature."""
+        """End the steps; the signals then go home."""
         if self.progress is not None:
             self.progress = end(self.progress, phase, why)
 
     def farewell(self) -> None:
-        """Leave the coolant at the safe temperature before the process ends."""
+        """Leave the inputs at their safe values before the process ends."""
         if self.progress is None:
             return
         self._command(self.plan.home, self._stamp_ns)
         # a plant in lock-step takes only the answer to its next measurement
         deadline = time.monotonic() + _FAREWELL
-        with (handle := self._temperatures.handle):
-            while time.monotonic() < deadline:
-                if taken := handle.take_message(Temperature, False):
-                    self._command(self.plan.home, stamp_nanoseconds(taken[0].header.stamp))
-                else:
-                    time.sleep(0.001)
-        self._publisher.wait_for_all_acked(Duration(seconds=_FAREWELL))
+        while time.monotonic() < deadline:
+            for heard in self._measured.subscriptions:
+                with (handle := heard.handle):
+                    if taken := handle.take_message(heard.msg_type, False):
+                        header = getattr(taken[0], 'header', None)
+                        self._command(self.plan.home, self._stamp_ns if header is None else (
+                            stamp_nanoseconds(header.stamp)))
+                        break
+            else:
+                time.sleep(0.001)
+        for publisher in self._outlet.publishers:
+            publisher.wait_for_all_acked(Duration(seconds=_FAREWELL))
 
-    def _on_temperature(self, message: Temperature) -> None:
-        measured = np.array([to_kelvin(message.temperature)])
-        stamp_ns = stamp_nanoseconds(message.header.stamp)
+    def _on_measurement(self, heard: Heard) -> None:
+        whole = self._assembler.take(heard.stamp_ns, heard.values)
+        if whole is None:
+            return
+        stamp_ns, measured = whole
         if self.progress is None:
-            if self.started.done():
+            if self.started.done() or (
+                    self._on_setpoints and len(self._home) < len(self._units)):
                 return
+            if self._on_setpoints:
+                self.plan = self._settings.experiment(
+                    self._signals, np.array([self._home[name] for name in self._units]))
             self.started.set_result(refusal := self.plan.refusal(measured))
             if refusal is not None:
                 return
             self.progress = begin(self.plan, stamp_ns)
         if stamp_ns != self._stamp_ns:
             self._stamp_ns, self._heard_at = stamp_ns, time.monotonic()
-        self._frame_id = message.header.frame_id
+        self._frame_id = heard.frame_id
         was_running = self.running
         self.progress = advance(self.plan, self.progress, measured, stamp_ns)
         self._command(self.progress.command, stamp_ns)
         if was_running and not self.running:
             self._on_end(None)
 
-    def _command(self, kelvin: Array, stamp_ns: int) -> None:
-        self._publisher.publish(
-            temperature_message(float(kelvin[0]), stamp_message(stamp_ns), self._frame_id))
-
-    def _on_coolant(self, message: Temperature) -> None:
-        """Watch a controller that should be in manual mode."""
-        if self.progress is None:
+    def _command(self, values: Array, stamp_ns: int) -> None:
+        if self._on_setpoints and self._sent is not None and (values == self._sent).all():
+            # a set-point stays where it was asked to be
             return
-        heard, now = to_kelvin(message.temperature), time.monotonic()
-        asked = float(self.progress.command[0])
-        self._following = self._following.after(heard, asked, now)
-        if self._following.astray >= _ASTRAY and now - self._following.since >= _ASTRAY_TIME:
-            self._on_end(reason(Code.NOT_FOLLOWED, signal='coolant_temperature', value=heard,
-                                requested=asked))
+        self._sent = values
+        self._outlet.send(values, stamp_message(stamp_ns), self._frame_id)
+
+    def _on_command(self, heard: Heard) -> None:
+        """Watch a controller that should be in manual mode."""
+        if self.progress is None or self._on_setpoints:
+            return
+        now = time.monotonic()
+        for i, name in enumerate(self._units):
+            if name not in heard.values:
+                continue
+            value, asked = heard.values[name], float(self.progress.command[i])
+            following = self._following[i] = self._following[i].after(value, asked, now)
+            if following.astray >= _ASTRAY and now - following.since >= _ASTRAY_TIME:
+                self._on_end(reason(Code.NOT_FOLLOWED, signal=name, value=value, requested=asked))
+                return
 
     def _on_tick(self) -> None:
         """Look for other commanders, and for measurements that stay away."""
         why = None
-        if others := other_publishers(self._node, self.topic, own=1):
-            why = reason(Code.OTHER_PUBLISHER, nodes=others, topic=self.topic)
-        elif self._coolants is not None and not self._node.count_publishers(
-                self._coolants.topic_name):
+        for topic in dict.fromkeys(self._topics):
+            if others := other_publishers(self._node, topic, own=1):
+                why = reason(Code.OTHER_PUBLISHER, nodes=others, topic=topic)
+        if why is None and self._answers is not None and not self._answers.published():
             why = reason(Code.CONTROLLER_GONE)
-        elif time.monotonic() - self._heard_at > self._patience:
+        elif why is None and time.monotonic() - self._heard_at > self._patience:
             why = reason(Code.SILENCE, timeout=self._patience)
         if self.progress is None:
             if why is not None and not self.started.done():

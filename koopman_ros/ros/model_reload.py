@@ -7,6 +7,7 @@ from collections.abc import Callable, Collection
 import contextlib
 from dataclasses import dataclass, replace
 from datetime import datetime, UTC
+import math
 import os
 from pathlib import Path
 import re
@@ -20,19 +21,18 @@ from std_srvs.srv import Trigger
 
 from koopman_ros.arrays import Array
 from koopman_ros.control import Controller, Settings, State
-from koopman_ros.lifting import LiftedModel, load_with_digest, ModelFileError
-from koopman_ros.parameters.controller import ControllerParameters
+from koopman_ros.lifting import Coordinates, LiftedModel, load_with_digest, ModelFileError
+from koopman_ros.parameters.controller import ControllerParameters, signals_of, table_of
+from koopman_ros.parameters.wire import Signals
 from koopman_ros.resources import model_path
 from koopman_ros.ros.node import words_of
-from koopman_ros.units import in_celsius, NANOSECONDS
+from koopman_ros.units import display_unit, NANOSECONDS, shown
 
 _SHORT_WAIT = 0.2  # s that the loop may stand still for a parameter
 _LONG_WAIT = 10.0  # s that the service waits for a slow disk
 _MAX_READING = 8  # files that a dead disk may keep open at once
 _MOUNTS = Path('/proc/self/mountinfo')
 
-# Names of the other one: with these a model takes the coolant for what is controlled.
-_MISPLACED = ('coolant_temperature', 'temperature')
 _LONGEST_PATH = 4096  # bytes, as Linux has it
 # What a control step may take of a processor, in s: the largest model that is read takes some
 # milliseconds, and measurements come once a second.
@@ -57,9 +57,7 @@ class LoadedModel:
     @property
     def about(self) -> str:
         """The model in a few words."""
-        states = self.model.states
-        return (f'model {self.name}: n_z = {self.model.n_z}, trained for '
-                f'{in_celsius(states.lower[0])} to {in_celsius(states.upper[0])}')
+        return f'model {self.name}: n_z = {self.model.n_z}, trained for {ranges(self.model)}'
 
 
 @dataclass(frozen=True)
@@ -68,32 +66,40 @@ class Situation:
 
     settings: Settings
     state: State
-    measured: Array  #: (1,) last temperature in K; NaN before the first
+    measured: Array  #: (n_x,) last measurement; NaN before the first
 
 
-def load_suitable(name: str) -> LoadedModel:
-    """Load a model of one temperature and one coolant, or raise ModelFileError with the reason."""
+def ranges(model: LiftedModel) -> str:
+    """Write the training range of each state for the operator."""
+    states = model.states
+    return ', '.join(
+        f'{name} {shown(low, unit):.6g} to {shown(high, unit):.6g} {display_unit(unit)}'
+        for name, unit, low, high in zip(states.names, states.units, states.lower.tolist(),
+                                         states.upper.tolist(), strict=True))
+
+
+def load_suitable(name: str, signals: Signals | None = None) -> LoadedModel:
+    """Load a model, of these signals where they are given; ModelFileError with the reason."""
+    if not name:
+        raise ModelFileError('model is empty: name a shipped model or a .safetensors file')
     if len(name.encode()) > _LONGEST_PATH or '\0' in name:
         raise ModelFileError(f'model = {name[:50]!r}... is no path of a file, which has at most '
                              f'{_LONGEST_PATH} bytes: check it')
     path = model_path(name)
     model, digest = load_with_digest(path)
-    if (model.states.units, model.inputs.units) != (('K',), ('K',)):
+    own = signals_of(model)
+    if signals is not None and (own.states, own.inputs) != (signals.states, signals.inputs):
         raise ModelFileError(
-            f'{path} has states in {model.states.units} and inputs in {model.inputs.units}, the '
-            "controller needs one of each in ('K',): choose a model of the one-state reactor")
-    names = (model.states.names[0], model.inputs.names[0])
-    if names[0] == names[1] or any(map(str.__eq__, names, _MISPLACED)):
-        raise ModelFileError(
-            f'{path} has {names[0]!r} as state and {names[1]!r} as input, the controller needs '
-            'the temperature as state and that of the coolant as input: choose a model of the '
-            'one-state reactor')
+            f'{path} has {own}, this controller was started for {signals}: choose a model of '
+            'the same signals, or start it anew')
     for box in (model.states, model.inputs):
-        if not 0.0 < box.lower[0] <= box.center[0] <= box.upper[0]:
-            raise ModelFileError(
-                f'{path} was trained for a {box.names[0]} of {box.lower[0]:.6g} to '
-                f'{box.upper[0]:.6g} K around {box.center[0]:.6g} K, which cannot be: train the '
-                'model again')
+        for unit, low, center, high, one in zip(
+                box.units, box.lower, box.center, box.upper, box.names, strict=True):
+            lowest = 0.0 if unit == 'K' else -math.inf
+            if not lowest < low <= center <= high:
+                raise ModelFileError(
+                    f'{path} was trained for a {one} of {low:.6g} to {high:.6g} {unit} around '
+                    f'{center:.6g} {unit}, which cannot be: train the model again')
     _refuse_slow(path, model)
     written = 'unknown'
     # the file may be gone since it was read
@@ -104,7 +110,8 @@ def load_suitable(name: str) -> LoadedModel:
 
 
 def _refuse_slow(path: Path, model: LiftedModel) -> None:
-    controller, state = Controller(model, ControllerParameters().settings()), State()
+    controller, state = Controller(model, table_of(model, {'system': ''}).snapshot({}).settings(
+        signals_of(model))), State()
     needed = []
     for k in range(1, _TRIALS + 1):
         # of this thread alone, for a busy machine says nothing of a model
@@ -128,7 +135,7 @@ def refuse_setpoints(model: LiftedModel, situation: Situation) -> None:
     """Raise ModelFileError for a model that cannot track what the operator asked for."""
     controller = Controller(model, situation.settings)
     if (refusal := controller.untrained(situation.state.setpoint)) is not None:
-        raise ModelFileError(words_of(model)(refusal))
+        raise ModelFileError(words_of(signals_of(model))(refusal))
 
 
 def refuse_without_law(model: LiftedModel, situation: Situation) -> None:
@@ -143,32 +150,42 @@ def refuse_without_law(model: LiftedModel, situation: Situation) -> None:
                 continue
             if (problem := controller.try_law(place, setpoint)) is not None:
                 raise ModelFileError(
-                    f'tried at {in_celsius(float(place[0]))} with the set-point '
-                    f'{in_celsius(float(setpoint[0]))} the model fails '
-                    f'({words_of(model)(problem)}): train it again, or change the weights')
+                    f'tried at {listed(model.states, place)} with the set-point '
+                    f'{listed(controller.controlled, setpoint)} the model fails '
+                    f'({words_of(signals_of(model))(problem)}): train it again, or change the '
+                    'weights')
+
+
+def listed(signals: Coordinates, values: Array) -> str:
+    """Write values (n,) for the operator."""
+    return ', '.join(
+        f'{name} {shown(value, unit):.6g} {display_unit(unit)}' for name, unit, value in zip(
+            signals.names, signals.units, values.tolist(), strict=True))
 
 
 def rests_outside(controller: Controller) -> str:
-    """Say that the safe coolant keeps the reactor where no law may act, or return ''."""
+    """Say that the safe input keeps the plant where no law may act, or return ''."""
     model, rest = controller.model, controller.rest
     # a model without training data is a linearisation, which does not know where that is
     if rest.holding is None or not model.provenance.data_digest:
         return ''
-    safe, holding = float(controller.safe_input[0]), float(rest.holding[0])
-    states, place = model.states, float(rest.x[0])
-    where = 'does not come to rest' if np.isnan(place) else (
-        f'rests at about {in_celsius(place)} if one extrapolates')
-    return (f'under safe_coolant = {in_celsius(safe)} the reactor leaves the trained range, '
-            f'{in_celsius(states.lower[0])} to {in_celsius(states.upper[0])}, and {where}: no law '
-            'can act there, and the way back is slow; record data from there and train again, or '
-            f'set safe_coolant to {in_celsius(holding)} or {"more" if holding > safe else "less"} '
-            'if that is still safe')
+    safe, holding = controller.safe_input, rest.holding
+    where = 'does not come to rest' if np.isnan(rest.x).any() else (
+        f'rests at about {listed(model.states, rest.x)} if one extrapolates')
+    better = ', '.join(
+        f'{name}.safe = {shown(held, unit):.6g} {display_unit(unit)} or '
+        f'{"more" if held > now else "less"}'
+        for name, unit, now, held in zip(model.inputs.names, model.inputs.units, safe.tolist(),
+                                         holding.tolist(), strict=True))
+    return (f'under the safe input the plant leaves the trained range, {ranges(model)}, and '
+            f'{where}: no law can act there, and the way back is slow; record data from there and '
+            f'train again, or set {better} if that is still safe')
 
 
 class _Trial:
     """A model file on its way, in a thread of its own that does not keep the process."""
 
-    def __init__(self, node: Node, name: str, situation: Situation) -> None:
+    def __init__(self, node: Node, name: str, signals: Signals, situation: Situation) -> None:
         self.outcome = Future()
         self.path = name
         # the folder in which the process was started may be gone
@@ -176,13 +193,14 @@ class _Trial:
             self.path = os.path.abspath(os.path.expanduser(name))
         self.mount = _mount_of(self.path)
         self.reading = True
-        self.thread = threading.Thread(target=self._run, args=(name, situation), daemon=True)
+        self.thread = threading.Thread(
+            target=self._run, args=(name, signals, situation), daemon=True)
         self._node = node
 
-    def _run(self, name: str, situation: Situation) -> None:
+    def _run(self, name: str, signals: Signals, situation: Situation) -> None:
         outcome: LoadedModel | str
         try:
-            outcome = load_suitable(name)
+            outcome = load_suitable(name, signals)
             refuse_setpoints(outcome.model, situation)
             refuse_without_law(outcome.model, situation)
         except (ModelFileError, FileNotFoundError) as error:
@@ -218,8 +236,10 @@ class ModelReload:
     :param refused: called there when a model was refused.
     """
 
-    def __init__(self, node: Node, in_force: LoadedModel, situation: Callable[[], Situation],
-                 reloaded: Callable[[], None], refused: Callable[[], None]) -> None:
+    def __init__(self, node: Node, in_force: LoadedModel, signals: Signals,
+                 situation: Callable[[], Situation], reloaded: Callable[[], None],
+                 refused: Callable[[], None]) -> None:
+        self._signals = signals
         self.in_force, self.reloads, self.refused = in_force, 0, ''
         self._node, self._situation = node, situation
         self._on_reloaded, self._on_refused = reloaded, refused
@@ -260,7 +280,7 @@ class ModelReload:
         if 'model' not in changes:
             return ''
         trial = self._start(parameters.model, replace(
-            self._situation(), settings=parameters.settings()))
+            self._situation(), settings=parameters.settings(self._signals)))
         if not trial.outcome.done():
             trial.thread.join(_SHORT_WAIT)
         outcome = trial.outcome.result() if trial.outcome.done() else (
@@ -289,7 +309,7 @@ class ModelReload:
         }
 
     def _start(self, name: str, situation: Situation) -> _Trial:
-        trial = _Trial(self._node, name, situation)
+        trial = _Trial(self._node, name, self._signals, situation)
         self._reading = [other for other in self._reading if other.reading]
         beside = [other.path for other in self._reading if other.mount == trial.mount]
         if trial.path in beside:

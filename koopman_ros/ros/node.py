@@ -5,11 +5,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Collection, Mapping, Sequence
 import copy
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 import difflib
 from enum import Enum
+from functools import cached_property
 import math
 import time
 from typing import Any, TypeVar
@@ -21,14 +22,15 @@ from rclpy.exceptions import InvalidParameterTypeException
 from rclpy.node import Node
 from rclpy.parameter import Parameter
 from rclpy.publisher import Publisher
+from rclpy.qos import QoSProfile
+from rclpy.qos_overriding_options import QoSOverridingOptions
 from rclpy.service import Service
 from rclpy.subscription import Subscription
 from rclpy.timer import Timer
 from rosgraph_msgs.msg import Clock as ClockMessage
 
-from koopman_ros.lifting import LiftedModel
 from koopman_ros.parameters.table import ConfigurationError, ParameterTable, Specification
-from koopman_ros.parameters.wire import DIAGNOSTICS
+from koopman_ros.parameters.wire import DIAGNOSTICS, renamed, Signals
 from koopman_ros.reasons import Words
 from koopman_ros.ros.codec import stamp_message
 from koopman_ros.units import Display, Displays, NANOSECONDS
@@ -44,7 +46,6 @@ _DESTROY: dict[type, Callable[[Node, Any], object]] = {
     Service: Node.destroy_service, Timer: Node.destroy_timer}
 
 _SHOWN = {'K': Display('K', 'degC', '.2f')}
-OPERATOR = Words(Displays({'temperature': 'K', 'coolant_temperature': 'K'}, _SHOWN))
 
 
 def wall_timer(node: Node, seconds: float, callback: Callable[[], Any], **options: Any) -> Timer:
@@ -95,40 +96,69 @@ class Status:
         default_factory=dict)
 
 
-class DiagnosticsPublisher:
-    """Publish the status ``<node>: <task>`` of a node, as diagnostic_updater would."""
+class Diagnostics:
+    """Publish what the tasks of a node say of themselves, as diagnostic_updater would."""
 
-    def __init__(self, node: Node, task: str, hardware_id: str,
+    def __init__(self, node: Node) -> None:
+        self._node = node
+        self._tasks: list[DiagnosticTask] = []
+        # as everywhere, by parameter
+        self._publisher = node.create_publisher(
+            DiagnosticArray, DIAGNOSTICS, QoSProfile(depth=10),
+            qos_overriding_options=QoSOverridingOptions.with_default_policies())
+        wall_timer(node, 1.0, lambda: self.publish(self._tasks))
+
+    def add(self, task: str, hardware_id: str, collect: Callable[[], Status]) -> DiagnosticTask:
+        """Report a further task under the name ``<node>: <task>``."""
+        name = f'{self._node.get_fully_qualified_name().lstrip("/")}: {task}'
+        self._tasks.append(DiagnosticTask(self, name, hardware_id, collect))
+        return self._tasks[-1]
+
+    def remove(self, task: DiagnosticTask) -> None:
+        """Report a task no more."""
+        self._tasks.remove(task)
+
+    def clear(self) -> None:
+        """Report none any more."""
+        self._tasks.clear()
+
+    def publish(self, tasks: Sequence[DiagnosticTask]) -> None:
+        """Publish the present status of some tasks in one message."""
+        message = DiagnosticArray(status=[task.status() for task in tasks])
+        message.header.stamp = stamp_message(time.time_ns())
+        self._publisher.publish(message)
+
+
+class DiagnosticTask:
+    """What one task of a node says of itself."""
+
+    def __init__(self, diagnostics: Diagnostics, name: str, hardware_id: str,
                  collect: Callable[[], Status]) -> None:
-        self._name = f'{node.get_fully_qualified_name().lstrip("/")}: {task}'
-        self._hardware_id = hardware_id
-        self._collect = collect
+        self._diagnostics, self._name = diagnostics, name
+        self._hardware_id, self._collect = hardware_id, collect
         self._last: tuple[Level, str] | None = None
-        owned = Owned(node)
-        self._publisher = owned.keep(node.create_publisher(DiagnosticArray, DIAGNOSTICS, 10))
-        owned.timer(1.0, self.publish)
-        self.destroy = owned.destroy  #: reports no more
 
-    def publish(self) -> None:
-        """Publish the present status."""
+    def status(self) -> DiagnosticStatus:
+        """Return its present status as a message."""
         status = self._collect()
         self._last = (status.level, status.message)
         values = status.values() if callable(status.values) else status.values
-        message = DiagnosticArray()
-        message.header.stamp = stamp_message(time.time_ns())
-        message.status.append(DiagnosticStatus(
+        return DiagnosticStatus(
             level=status.level.value, name=self._name, message=status.message,
             hardware_id=self._hardware_id,
             values=[KeyValue(key=key, value=(
                 f'{value:.9g}' if isinstance(value, float) else str(value)))
-                for key, value in values.items()]))
-        self._publisher.publish(message)
+                for key, value in values.items()])
 
     def publish_if_changed(self) -> None:
         """Publish at once when the level or the sentence differ from the last ones."""
         status = self._collect()
         if (status.level, status.message) != self._last:
-            self.publish()
+            self._diagnostics.publish([self])
+
+    def destroy(self) -> None:
+        """Report no more."""
+        self._diagnostics.remove(self)
 
 
 class LoopNode(Node):
@@ -145,8 +175,21 @@ class LoopNode(Node):
     _clocks_refused = 0
 
     def __init__(self, name: str, **options: Any) -> None:
+        self._table_of = name
+        self._followers: list[Any] = []  # callbacks by which tables are followed
         self._ranges: dict[str, msg.FloatingPointRange | msg.IntegerRange] = {}
         super().__init__(name, automatically_declare_parameters_from_overrides=True, **options)
+
+    @cached_property
+    def diagnostics(self) -> Diagnostics:
+        """What the node says of itself, once a second and on change."""
+        return Diagnostics(self)
+
+    def given(self) -> dict[str, Any]:
+        """Return the parameters that the node was started with, before a table is declared."""
+        given: dict[str, Any] = dict(self.get_parameters_by_prefix(''))
+        return {name: _as_python(parameter.value) for name, parameter in given.items()
+                if parameter.value is not None}
 
     def complete(self) -> None:
         """Complete that work, if there is any; what is published here goes out last."""
@@ -188,17 +231,21 @@ class LoopNode(Node):
             descriptor.floating_point_range = [limits]
         return descriptor
 
-    def declare_table(self, table: ParameterTable[T]) -> T:
+    def declare_table(self, table: ParameterTable[T], beside: Collection[str] = ()) -> T:
         """
         Declare every parameter of a table, and validate the whole.
 
         Names that no table knows are ignored with a warning: a file may serve several nodes.
 
-        :raises ConfigurationError: naming the parameter, its value and the allowed range.
+        :param beside: further names that count as known.
+        :raises ConfigurationError: naming the parameter, its value and the allowed range, or what
+            a former one is called now.
         """
         given: dict[str, Any] = dict(self.get_parameters_by_prefix(''))
+        if former := renamed(self._table_of, self.given(), table):
+            raise ConfigurationError(former)
         # as if they had not been given, like in any node
-        unknown = [name for name in given if name not in table.rows
+        unknown = [name for name in given if name not in table.rows and name not in beside
                    and name not in _RCLPY_PARAMETERS and not name.startswith('qos_overrides')]
         for name in [*unknown, *set(given).intersection(table.rows)]:
             self.undeclare_parameter(name)
@@ -208,7 +255,7 @@ class LoopNode(Node):
                 'parameters that this node does not have are ignored: ' + ', '.join(
                     f'{name!r}' + ''.join(f' (did you mean {other}?)' for other in near[name])
                     for name in unknown))
-        snapshot = table.kind(**{
+        snapshot = table.snapshot({
             name: self._declare_row(row, given[name].value if name in given else row.default)
             for name, row in table.rows.items()})
         if reason := table.check(snapshot):
@@ -249,7 +296,7 @@ class LoopNode(Node):
         def validate(changes: list[Parameter]) -> msg.SetParametersResult:
             # rclpy has refused values of another type
             values = changed(changes)
-            merged = replace(current, **values)  # type: ignore[type-var]
+            merged = table.amended(current, **values)
             reason = table.check(merged, current) or accept(merged, set(values))
             if reason:
                 self.get_logger().warning(f'parameter change refused: {reason}')
@@ -258,11 +305,27 @@ class LoopNode(Node):
         def take_over(changes: list[Parameter]) -> None:
             nonlocal current
             if values := changed(changes):
-                current = replace(current, **values)  # type: ignore[type-var]
+                current = table.amended(current, **values)
                 apply(current)
 
         self.add_on_set_parameters_callback(validate)
         self.add_post_set_parameters_callback(take_over)
+        self._followers.append((validate, take_over))
+
+    def forget_tables(self) -> None:
+        """Keep no snapshot in step any more."""
+        while self._followers:
+            validate, take_over = self._followers.pop()
+            self.remove_on_set_parameters_callback(validate)
+            self.remove_post_set_parameters_callback(take_over)
+
+    def current(self, table: ParameterTable[T]) -> T:
+        """Return the snapshot of a table that is declared; ConfigurationError where it is none."""
+        snapshot = table.snapshot({
+            name: _as_python(self.get_parameter(name).value) for name in table.rows})
+        if reason := table.check(snapshot):
+            raise ConfigurationError(reason)
+        return snapshot
 
 
 def range_of(row: Specification) -> msg.FloatingPointRange | msg.IntegerRange | None:
@@ -281,8 +344,6 @@ def _as_python(value: Any) -> Any:
     return tuple(value)
 
 
-def words_of(model: LiftedModel) -> Words:
-    """Return the words for the signals of a model."""
-    return Words(Displays({name: unit for signals in (model.states, model.inputs)
-                           for name, unit in zip(signals.names, signals.units, strict=True)},
-                          _SHOWN))
+def words_of(signals: Signals) -> Words:
+    """Return the words for some signals."""
+    return Words(Displays({**signals.states, **signals.inputs}, _SHOWN))

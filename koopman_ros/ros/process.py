@@ -10,20 +10,17 @@ import signal
 import sys
 
 import rclpy
-from rclpy.exceptions import ParameterException
 from rclpy.executors import SingleThreadedExecutor
 from rclpy.logging import LoggingSeverity, set_logger_level
 from rclpy.signals import SignalHandlerOptions
 from rclpy.utilities import remove_ros_args
 
 from koopman_ros.resources import LOOPBACK_PROFILE
+from koopman_ros.ros.managed import ManagedNode, START_ERRORS
 from koopman_ros.ros.node import LoopNode
 from koopman_ros.ros.watchdog import end_in_time
 from koopman_ros.startup import end_by_force, handle_signals
 
-# A parameter or a model that does not fit is a ValueError; rclpy raises RCLError for an unreadable
-# parameter file, a RuntimeError whose class is private to the extension.
-_START_ERRORS = (OSError, ParameterException, RuntimeError, ValueError)
 _PROFILES = ('FASTDDS_DEFAULT_PROFILES_FILE', 'FASTRTPS_DEFAULT_PROFILES_FILE')
 _LONGEST_WAIT = 0.1  # s from a signal to the end
 _TAKE_DOWN_PATIENCE = 5.0  # s; taking down a participant needs some ten milliseconds
@@ -47,7 +44,9 @@ def run(name: str, create: Callable[[], LoopNode], args: list[str] | None = None
         try:
             _init(args)
             node = create()
-        except _START_ERRORS as error:
+            if isinstance(node, ManagedNode) and node.get_parameter('autostart').value:
+                node.start()
+        except START_ERRORS as error:
             print(f'{name}: cannot start: {_one_line(error)}', file=sys.stderr)
             return 1
         if note := open_to_the_network(os.environ):
@@ -85,7 +84,7 @@ def run_task(name: str, prepare: Callable[[], Callable[[], int]],
         finally:
             rclpy.try_shutdown()
         return task()
-    except _START_ERRORS as error:
+    except START_ERRORS as error:
         print(f'{name}: {_one_line(error)}', file=sys.stderr)
         return 1
     except KeyboardInterrupt:

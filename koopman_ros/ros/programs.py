@@ -14,9 +14,11 @@ import sys
 from typing import Any
 from xml.etree import ElementTree
 
+from koopman_ros.lifting import load
 from koopman_ros.parameters import controller, plant, trainer
 from koopman_ros.parameters.table import ParameterTable
-from koopman_ros.resources import config_directory
+from koopman_ros.parameters.wire import preset
+from koopman_ros.resources import config_directory, model_path
 from koopman_ros.ros import topics
 
 POLICY_FILE = 'sros2_policy.xml'
@@ -29,7 +31,17 @@ STANDARD_SERVICES = (
 # `ros2 topic pub` and its like start a node with this service, named after their process
 _COMMAND_LINE_SERVICE = '/_ros2cli_*/get_type_description'
 
-_LOOP = tuple(name for name in topics.TYPES if name != topics.CLOCK)
+_SYSTEM = 'reactor'
+_TRANSITIONS = '~/transition_event'
+
+
+def tables(system: str = _SYSTEM) -> dict[str, ParameterTable[Any]]:
+    """Return the tables of all programs for a plant that is shipped."""
+    given = {'system': system}
+    model = load(model_path(preset(system, 'controller')['model']))
+    return {'plant': plant.PlantTable(given), 'controller': controller.table_of(model, given),
+            'trainer': trainer.trainer_table(model, given),
+            'player': trainer.player_table(given), 'replay': controller.REPLAY_TABLE}
 
 
 @dataclass(frozen=True)
@@ -44,54 +56,75 @@ class Program:
     calls: tuple[str, ...] = ()  #: services of others
 
 
-PROGRAMS = {
-    'plant': Program(
-        'Simulates the reactor: publishes its temperature and takes a coolant temperature.',
-        publishes=(topics.TEMPERATURE, topics.CONCENTRATION, topics.COOLANT_TEMPERATURE,
-                   topics.CLOCK, topics.DIAGNOSTICS, *STANDARD_TOPICS),
-        subscribes=(topics.COOLANT_SETPOINT,),
-        serves=('~/reset', *STANDARD_SERVICES)),
-    'controller': Program(
-        'Answers each measured temperature with a coolant set-point, by a learned model.',
-        publishes=(topics.COOLANT_SETPOINT, topics.ACTIVE_SETPOINT,
-                   topics.PREDICTED_TEMPERATURE, topics.CONTROLLER_STATE,
-                   topics.CONTROLLER_EVENTS, topics.DIAGNOSTICS, *STANDARD_TOPICS),
-        subscribes=(topics.TEMPERATURE, topics.COOLANT_TEMPERATURE, topics.SETPOINT,
-                    topics.MANUAL_COOLANT_SETPOINT, topics.CLOCK),
-        serves=('~/set_automatic', '~/reload_model', *STANDARD_SERVICES)),
-    'trainer': Program(
-        'Records the loop to MCAP bags, excites the plant, and learns models from bags.',
-        f'{Program.codes}; with task:=train 0 for an accepted model, 2 for a refused one, 1 for a '
-        'failure',
-        publishes=(*trainer.EXPERIMENT_TOPICS, topics.DIAGNOSTICS, *STANDARD_TOPICS),
-        subscribes=(*trainer.LOOP_TOPICS, topics.CLOCK),
-        serves=('~/record', '~/experiment', '~/train', '~/cancel_training',
-                *STANDARD_SERVICES)),
-    'player': Program(
-        'Publishes the measurements and set-points of a bag again, by the clock or in lock-step.',
-        '0 when all was played or after a signal, 1 when it cannot start or go on, 2 for an '
-        'unknown argument',
-        publishes=(*trainer.PlayerParameters().topics, topics.CLOCK, *STANDARD_TOPICS),
-        subscribes=(topics.COOLANT_SETPOINT,),
-        serves=STANDARD_SERVICES),
-    'replay': Program(
-        'Takes the records in bags through the control step again, also with a new model.',
-        '0 when the recorded commands are reproduced, 1 when not or when it cannot run, 2 for an '
-        'unknown argument, 3 when there is nothing to compare in a bag, 130 when interrupted',
-        publishes=('/parameter_events',), serves=('~/get_type_description',)),
-}
+def _programs() -> dict[str, Program]:
+    wiring = trainer.preset_wiring(_SYSTEM)
+    assert wiring is not None
 
-TABLES: dict[str, ParameterTable[Any]] = {
-    'plant': plant.TABLE, 'controller': controller.TABLE, 'trainer': trainer.TABLE,
-    'player': trainer.PLAYER_TABLE, 'replay': controller.REPLAY_TABLE}
+    def topics_of(*kinds: str) -> tuple[str, ...]:
+        return tuple(place.topic for kind in kinds for place in getattr(wiring, kind).values())
 
-# whoever moves the set-point, calls the services, tunes and watches: a person or a panel
-OPERATOR = Program(
-    publishes=(topics.SETPOINT, topics.MANUAL_COOLANT_SETPOINT, *STANDARD_TOPICS),
-    subscribes=(*_LOOP, topics.CLOCK, *STANDARD_TOPICS),
-    serves=(*STANDARD_SERVICES, _COMMAND_LINE_SERVICE),
-    calls=tuple(f'{node}/{service.removeprefix("~/")}' for node, program in PROGRAMS.items()
-                if node != 'replay' for service in program.serves))
+    concentration = ('concentration',)  # of the reactor of two states
+    lifecycle = ('~/change_state', '~/get_state', '~/get_available_states',
+                 '~/get_available_transitions', '~/get_transition_graph')
+    return {
+        'plant': Program(
+            'Simulates a plant: publishes its measurements and takes commands.',
+            publishes=(*topics_of('measured', 'applied'), *concentration, topics.CLOCK,
+                       topics.DIAGNOSTICS, _TRANSITIONS, *STANDARD_TOPICS),
+            subscribes=topics_of('commands'),
+            serves=('~/reset', *lifecycle, *STANDARD_SERVICES)),
+        'controller': Program(
+            'Answers each measurement with a command, by a learned model.',
+            publishes=(*topics_of('commands', 'active_setpoints', 'predicted'),
+                       topics.CONTROLLER_STATE, topics.CONTROLLER_EVENTS, topics.DIAGNOSTICS,
+                       _TRANSITIONS, *STANDARD_TOPICS),
+            subscribes=(*topics_of('measured', 'applied', 'setpoints', 'manual'), topics.CLOCK),
+            serves=('~/set_automatic', '~/reload_model', *lifecycle, *STANDARD_SERVICES)),
+        'trainer': Program(
+            'Records the loop to MCAP bags, excites the plant, and learns models from bags.',
+            f'{Program.codes}; with task:=train 0 for an accepted model, 2 for a refused one, 1 '
+            'for a failure',
+            publishes=(*topics_of('commands', 'manual', 'setpoints'), topics.DIAGNOSTICS,
+                       _TRANSITIONS, *STANDARD_TOPICS),
+            subscribes=(*wiring.topics, *concentration, topics.CONTROLLER_STATE,
+                        topics.CONTROLLER_EVENTS, topics.DIAGNOSTICS, topics.CLOCK),
+            serves=('~/record', '~/experiment', '~/train', '~/cancel_training', *lifecycle,
+                    *STANDARD_SERVICES)),
+        'player': Program(
+            'Publishes the measurements and set-points of a bag again, by the clock or in '
+            'lock-step.',
+            '0 when all was played or after a signal, 1 when it cannot start or go on, 2 for an '
+            'unknown argument',
+            publishes=(*topics_of('applied', 'measured', 'setpoints', 'manual'), topics.CLOCK,
+                       *STANDARD_TOPICS),
+            subscribes=topics_of('commands'),
+            serves=STANDARD_SERVICES),
+        'replay': Program(
+            'Takes the records in bags through the control step again, also with a new model.',
+            '0 when the recorded commands are reproduced, 1 when not or when it cannot run, 2 for '
+            'an unknown argument, 3 when there is nothing to compare in a bag, 130 when '
+            'interrupted',
+            publishes=('/parameter_events',), serves=('~/get_type_description',)),
+    }
+
+
+PROGRAMS = _programs()
+
+
+def _operator() -> Program:
+    """Whoever moves the set-point, calls the services, tunes and watches: a person or a panel."""
+    wiring = trainer.preset_wiring(_SYSTEM)
+    assert wiring is not None
+    asks = (*wiring.setpoints.values(), *wiring.manual.values())
+    return Program(
+        publishes=(*(place.topic for place in asks), *STANDARD_TOPICS),
+        subscribes=(*PROGRAMS['trainer'].subscribes, *STANDARD_TOPICS),
+        serves=(*STANDARD_SERVICES, _COMMAND_LINE_SERVICE),
+        calls=tuple(f'{node}/{service.removeprefix("~/")}' for node, program in PROGRAMS.items()
+                    if node != 'replay' for service in program.serves))
+
+
+OPERATOR = _operator()
 
 
 def policy() -> str:
@@ -120,7 +153,7 @@ def policy() -> str:
 def help_text(name: str) -> str:
     """Return what `--help` prints."""
     program = PROGRAMS[name]
-    rows = TABLES[name].rows.values()
+    rows = tables()[name].rows.values()
     width = max(len(row.name) for row in rows)
     parameters = '\n'.join(
         f'  {row.name:{width}}  {row.description}' + (f' [{row.unit}]' if row.unit else '')
@@ -130,6 +163,7 @@ def help_text(name: str) -> str:
             ('subscribes to', program.subscribes), ('publishes', program.publishes),
             ('serves', program.serves))
         if (own := [item for item in names if item not in STANDARD_TOPICS + STANDARD_SERVICES]))
+    file = config_directory() / f'{name}.yaml'
     return f"""\
 usage: ros2 run koopman_ros {name} [--ros-args [-p name:=value ...] [--params-file file] ...]
 
@@ -137,7 +171,7 @@ usage: ros2 run koopman_ros {name} [--ros-args [-p name:=value ...] [--params-fi
 
 {lists}exit codes: {program.codes}
 
-Parameters, whose defaults and ranges are in {config_directory() / f'{name}.yaml'}:
+Parameters for the system {_SYSTEM}, with defaults and ranges in {file}:
 {parameters}"""
 
 
@@ -145,7 +179,7 @@ def parameter_file(node: str) -> str:
     """Return the text of a node's parameter file, every parameter at its default."""
     return (f'# Parameters of the {node} node, all at their defaults. Use a copy with\n'
             f'#   ros2 run koopman_ros {node} --ros-args --params-file {node}.yaml\n'
-            f'{TABLES[node].yaml()}')
+            f'{tables()[node].yaml()}')
 
 
 def main(args: list[str] | None = None) -> int:
@@ -153,7 +187,7 @@ def main(args: list[str] | None = None) -> int:
     parser = argparse.ArgumentParser(description=main.__doc__)
     parser.add_argument('--output', type=Path, default=Path('config'))
     output = parser.parse_args(args).output
-    for node in TABLES:
+    for node in PROGRAMS:
         (output / f'{node}.yaml').write_text(parameter_file(node))
     (output / POLICY_FILE).write_text(policy())
     return 0

@@ -48,14 +48,20 @@ class Recorder:
     """
     Write every message of some topics to a bag, byte for byte, from now until :meth:`close`.
 
+    `known` has type and quality of service of topics before anybody publishes them.
+
     Messages wait in the middleware until :meth:`take`. Any method raises OSError where the bag
     cannot be written, and LookupError where the definition of a type is not installed.
     """
 
-    def __init__(self, node: Node, writer: BagWriter, names: tuple[str, ...]) -> None:
+    def __init__(self, node: Node, writer: BagWriter, names: tuple[str, ...],
+                 known: Mapping[str, tuple[Any, QoSProfile]]) -> None:
         self._node, self._writer = node, writer
         self._names = {node.resolve_topic_name(name): name for name in names}
-        self._types = {topic: topics.TYPES.get(name) for topic, name in self._names.items()}
+        self._known = known
+        self._types: dict[str, Any] = {
+            topic: known[name][0] if name in known else None
+            for topic, name in self._names.items()}
         self._group = _OutsideTheExecutor()
         self._subscriptions: dict[str, Subscription] = {}
         self._empty_ns: dict[str, int] = {}  # when nothing waited in each
@@ -75,7 +81,8 @@ class Recorder:
                     continue
             if (message_type := self._types[topic]) is None:
                 continue
-            wanted = _matching_qos(self._names[topic], publishers)
+            _, usual = self._known.get(self._names[topic], (None, topics.LOOP_QOS))
+            wanted = _matching_qos(usual, publishers)
             existing = self._subscriptions.get(topic)
             if existing is not None:
                 present = existing.qos_profile
@@ -171,9 +178,9 @@ def receipt_ns(info: Mapping[str, int], take_ns: int, empty_ns: int) -> int:
         max(source_ns, empty_ns), latest_ns)
 
 
-def _matching_qos(topic: str, publishers: list[TopicEndpointInfo]) -> QoSProfile:
+def _matching_qos(usual: QoSProfile, publishers: list[TopicEndpointInfo]) -> QoSProfile:
     """Ask for reliability and history only where every publisher offers them."""
-    offers = [info.qos_profile for info in publishers] or [topics.qos(topic)]
+    offers = [info.qos_profile for info in publishers] or [usual]
     reliable = all(o.reliability is not ReliabilityPolicy.BEST_EFFORT for o in offers)
     latched = all(o.durability is DurabilityPolicy.TRANSIENT_LOCAL for o in offers)
     return topics.profile(_QUEUE_DEPTH, reliable=reliable, latched=latched)

@@ -11,12 +11,14 @@ import os
 from pathlib import Path
 import shutil
 
-from rclpy.node import Node
 from std_srvs.srv import SetBool
 
 from koopman_ros.bags import BagWriter
 from koopman_ros.parameters.trainer import TrainerParameters
-from koopman_ros.ros.node import DiagnosticsPublisher, Level, Owned, Status
+from koopman_ros.parameters.wire import Wiring
+from koopman_ros.ros import topics
+from koopman_ros.ros.managed import ManagedNode
+from koopman_ros.ros.node import Level, Owned, Status
 from koopman_ros.ros.recorder import Recorder
 
 _TAKE_PERIOD = 0.05  # s, for new messages
@@ -28,12 +30,12 @@ _MEGABYTE = 1_000_000
 class Recording:
     """Record the loop to one bag after another, on ``~/record``; reports by diagnostics."""
 
-    def __init__(self, node: Node, settings: TrainerParameters) -> None:
+    def __init__(self, node: ManagedNode, settings: TrainerParameters, wiring: Wiring) -> None:
         self.settings = settings  # of the next recording
-        self._node = node
+        self._node, self._known = node, topics.known(wiring)
         self._recorder: Recorder | None = None
         self._problem = self._path = ''
-        self._diagnostics = DiagnosticsPublisher(node, 'recording', 'trainer', self._status)
+        self._diagnostics = node.diagnostics.add('recording', 'trainer', self._status)
         self._owned = Owned(node)
         self._owned.keep(node.create_service(SetBool, '~/record', self._on_record))
         self._timers = [
@@ -54,7 +56,7 @@ class Recording:
             max_file_bytes=round(self.settings.max_bag_size * _MEGABYTE),
             max_file_duration_s=self.settings.max_bag_duration)
         self._problem = ''
-        self._recorder = Recorder(self._node, writer, self.settings.topics)
+        self._recorder = Recorder(self._node, writer, self.settings.topics, self._known)
         self._path = str(output)
         for timer in self._timers:
             timer.reset()
@@ -127,6 +129,9 @@ class Recording:
 
     def _on_record(self, request: SetBool.Request, response: SetBool.Response
                    ) -> SetBool.Response:
+        if reason := self._node.refusal:
+            response.success, response.message = False, reason
+            return response
         recording = self._recorder is not None
         response.success = request.data != recording
         if not response.success:

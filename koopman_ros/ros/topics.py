@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 The koopman_ros Authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""The topics of the loop: names, types, quality of service, and others who do not match."""
+"""Topics: names, types, quality of service, and others who do not match."""
 
 from __future__ import annotations
 
@@ -19,47 +19,33 @@ from rclpy.exceptions import InvalidTopicNameException
 from rclpy.node import Node
 from rclpy.publisher import Publisher
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
+from rclpy.qos_overriding_options import QoSOverridingOptions
 from rclpy.subscription import Subscription
 from rclpy.topic_endpoint_info import TopicEndpointInfo
 from rclpy.validate_topic_name import validate_topic_name
 from rosgraph_msgs.msg import Clock
-from sensor_msgs.msg import JointState, Temperature
+from sensor_msgs.msg import JointState
 from std_msgs.msg import String
 
 from koopman_ros.parameters.wire import (
-    ACTIVE_SETPOINT,
     CLOCK,
-    CONCENTRATION,
     CONTROLLER_EVENTS,
     CONTROLLER_STATE,
-    COOLANT_SETPOINT,
-    COOLANT_TEMPERATURE,
     DIAGNOSTICS,
-    MANUAL_COOLANT_SETPOINT,
-    PREDICTED_TEMPERATURE,
-    SETPOINT,
-    TEMPERATURE,
+    Wiring,
 )
 from koopman_ros.ros.node import Owned
 
 # JointState is the one stamped type of common_interfaces that carries named float64 values.
 # Records are lines of JSON, which keep a float64 bit-identical at a third of the time.
-TYPES = {
-    TEMPERATURE: Temperature, CONCENTRATION: JointState, SETPOINT: Temperature,
-    ACTIVE_SETPOINT: Temperature, COOLANT_SETPOINT: Temperature, COOLANT_TEMPERATURE: Temperature,
-    MANUAL_COOLANT_SETPOINT: Temperature, PREDICTED_TEMPERATURE: Temperature,
-    CONTROLLER_STATE: JointState, CONTROLLER_EVENTS: String, DIAGNOSTICS: DiagnosticArray,
-    CLOCK: Clock}
+TYPES = {CONTROLLER_STATE: JointState, CONTROLLER_EVENTS: String, DIAGNOSTICS: DiagnosticArray,
+         CLOCK: Clock}
 
 # Every message counts: reliable, with room for a receiver that falls behind a fast plant.
 LOOP_QOS = QoSProfile(depth=1000)
-# A late joiner learns what is tracked, and which coolant is applied.
+# A late joiner learns what is tracked, and which inputs act.
 LATCHED_QOS = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
 CLOCK_QOS = QoSProfile(depth=1, reliability=ReliabilityPolicy.BEST_EFFORT)
-_QOS = {ACTIVE_SETPOINT: LATCHED_QOS, COOLANT_TEMPERATURE: LATCHED_QOS, CLOCK: CLOCK_QOS}
-
-# Topics of the loop on which only one node may publish, and what it does.
-SINGLE = {COOLANT_SETPOINT: 'command the coolant', TEMPERATURE: 'publish the temperature'}
 
 _LOOK_PERIOD = 0.5  # s
 # What does not pass: policy, offered, asked for.
@@ -67,14 +53,17 @@ _CONFLICTS = (('reliability', ReliabilityPolicy.BEST_EFFORT, ReliabilityPolicy.R
               ('durability', DurabilityPolicy.VOLATILE, DurabilityPolicy.TRANSIENT_LOCAL))
 
 
-def qos(topic: str) -> QoSProfile:
-    """Return the quality of service of a topic of the loop, or the default for any other."""
-    return _QOS.get(topic, LOOP_QOS)
+def overridable() -> QoSOverridingOptions:
+    """Return options by which history, depth and reliability can be set by parameter."""
+    return QoSOverridingOptions.with_default_policies()
 
 
-def of(topic: str) -> tuple[Any, str, QoSProfile]:
-    """Return type, name and quality of service of a topic of the loop."""
-    return TYPES[topic], topic, qos(topic)
+def known(wiring: Wiring) -> dict[str, tuple[Any, QoSProfile]]:
+    """Return type and quality of service of all topics that are known beforehand."""
+    found = {place.topic: (message_class(place.type), LATCHED_QOS if (
+        kind in ('active_setpoints', 'applied')) else LOOP_QOS)
+        for kind in wiring.kinds for place in getattr(wiring, kind).values()}
+    return {**found, **{topic: (kind, LOOP_QOS) for topic, kind in TYPES.items()}}
 
 
 def unusable(node: Node, names: Collection[str]) -> str:
@@ -115,7 +104,7 @@ class Matching:
     Make a node's publishers and subscriptions, and say which others conflict or do not match.
 
     :param on_change: called when the complaint is another.
-    :param single: topics that only one node may publish, as in `SINGLE`.
+    :param single: what is done on topics on which only one node may publish, in words.
     """
 
     def __init__(self, node: Node, on_change: Callable[[], None],
@@ -123,7 +112,6 @@ class Matching:
         self._node, self._on_change, self._single = node, on_change, single or {}
         self._owned = Owned(node)
         self._own: list[Publisher | Subscription] = []
-        self._overridable: set[str] = set()  # subscribed, with quality of service by parameter
         self._policies: dict[str, str] = {}  # last reported by the middleware, by topic
         self._said: tuple[str, ...] = ('', '')
         self._owned.timer(_LOOK_PERIOD, self._look)
@@ -135,27 +123,25 @@ class Matching:
         return next(filter(None, self._said), '')
 
     def subscribe(self, topic: str, callback: Callable[[Any], Any], kind: Any = None,
-                  **options: Any) -> Subscription:
-        """Subscribe to a topic of the loop, or to another one of a type; options as in rclpy."""
+                  qos: QoSProfile = LOOP_QOS) -> Subscription:
+        """Subscribe to a topic, by default of its type in `TYPES`."""
         # overriding parameters change the profile itself
         made = self._owned.keep(self._node.create_subscription(
-            kind or TYPES[topic], topic, callback, copy.copy(qos(topic)),
+            kind or TYPES[topic], topic, callback, copy.copy(qos),
             event_callbacks=SubscriptionEventCallbacks(
                 incompatible_qos=self._found(topic), incompatible_type=lambda _: self._look()),
-            **options))
+            qos_overriding_options=overridable()))
         self._own.append(made)
-        if 'qos_overriding_options' in options:
-            self._overridable.add(made.topic_name)
         return made
 
-    def publish(self, topic: str, kind: Any = None, matched: Callable[[Any], None] | None = None
-                ) -> Publisher:
-        """Publish a topic of the loop, or another one of a type; matched is an event of rclpy."""
+    def publish(self, topic: str, kind: Any = None, qos: QoSProfile = LOOP_QOS,
+                matched: Callable[[Any], None] | None = None) -> Publisher:
+        """Publish a topic, by default of its type in `TYPES`; matched is an event of rclpy."""
         made = self._owned.keep(self._node.create_publisher(
-            kind or TYPES[topic], topic, copy.copy(qos(topic)),
+            kind or TYPES[topic], topic, copy.copy(qos),
             event_callbacks=PublisherEventCallbacks(
                 incompatible_qos=self._found(topic), incompatible_type=lambda _: self._look(),
-                matched=matched)))
+                matched=matched), qos_overriding_options=overridable()))
         self._own.append(made)
         return made
 
@@ -182,8 +168,10 @@ class Matching:
 
     def _conflict(self, topic: str) -> str:
         # who publishes something else is not in conflict; a node may be there twice
+        kinds = {type_name(own.msg_type) for own in self._own
+                 if own.topic_name == self._node.resolve_topic_name(topic)}
         names = sorted(node_name(info) for info in self._node.get_publishers_info_by_topic(topic)
-                       if info.topic_type == type_name(TYPES[topic]))
+                       if info.topic_type in kinds)
         return '' if len(names) < 2 else (
             f'{len(names)} nodes {self._single[topic]}: {", ".join(names)}; end all but one')
 
@@ -212,7 +200,7 @@ class Matching:
                 does += f' with {(too_little if subscribes else too_much).short_key}'
                 break
         remedy = f'use {wanted} there'
-        if subscribes and topic in self._overridable and policy == 'reliability':
+        if subscribes and policy == 'reliability':
             remedy += (f', or start this node with -p qos_overrides.{topic}.subscription.'
                        'reliability:=best_effort')
         return (f'{topic}: {node_name(other)} {does}, which is incompatible in {policy}, so '

@@ -4,18 +4,22 @@
 """Training as the trainer offers it: on request, or as the one task of the process."""
 
 from collections.abc import Callable
+from dataclasses import asdict
 import os
 import sys
 import time
+from typing import Any
 
-from rclpy.node import Node
+import numpy as np
 from std_srvs.srv import Trigger
 
 from koopman_ros.jobs.training import JobState, RetrainingJob
 from koopman_ros.parameters.trainer import TrainerParameters
+from koopman_ros.parameters.wire import Wiring
 from koopman_ros.resources import model_path
-from koopman_ros.ros import topics
-from koopman_ros.ros.node import DiagnosticsPublisher, Level, Owned, Status
+from koopman_ros.ros.managed import ManagedNode
+from koopman_ros.ros.node import Level, Owned, Status
+from koopman_ros.wire import Place
 
 _POLL_PERIOD = 0.1  # s
 _LINE_PERIOD = 5.0  # s between plain lines of progress
@@ -25,14 +29,16 @@ _BAR_WIDTH = 30
 class Training:
     """Retrain in a process of its own, on ``~/train``; ``~/cancel_training`` ends it."""
 
-    def __init__(self, node: Node, settings: TrainerParameters, recorded: Callable[[], str],
+    def __init__(self, node: ManagedNode, settings: TrainerParameters, wiring: Wiring,
+                 recorded: Callable[[], str],
                  on_end: Callable[[JobState], None] = lambda _: None) -> None:
         self.settings = settings  # of the next training
-        self._node, self._recorded, self._on_end = node, recorded, on_end
+        self._node, self._wiring = node, wiring
+        self._recorded, self._on_end = recorded, on_end
         self._job: RetrainingJob | None = None
         self._state: JobState | None = None
         self._last_line = 0.0
-        self._diagnostics = DiagnosticsPublisher(node, 'training', 'trainer', self._status)
+        self._diagnostics = node.diagnostics.add('training', 'trainer', self._status)
         self._owned = owned = Owned(node)
         owned.keep(node.create_service(Trigger, '~/train', self._on_train))
         owned.keep(node.create_service(Trigger, '~/cancel_training', self._on_cancel))
@@ -45,19 +51,39 @@ class Training:
                 if bag]
         if not bags:
             raise ValueError('there is no bag to train from: record one, or name it in bags')
-        name = self._node.resolve_topic_name
+        if not settings.model:
+            raise ValueError('there is no present lift to compare with: name it in model')
         self._job = RetrainingJob({
             'bags': [os.path.abspath(bag) for bag in bags],
             'output': os.path.abspath(settings.model_output),
             'model': os.path.abspath(model_path(settings.model)),
-            'temperature_topic': name(topics.TEMPERATURE),
-            'coolant_topic': name(topics.COOLANT_SETPOINT), **settings.training()})
+            **self._signals(), **settings.training()})
         self._state = self._job.state
         self._last_line = time.monotonic()
         self._timer.reset()
         said = f'training from {", ".join(bags)}'
         self._node.get_logger().info(said)
         return said
+
+    def _signals(self) -> dict[str, Any]:
+        """Return where the signals are in the bags."""
+        wiring, settings = self._wiring, self.settings
+
+        def found(place: Place) -> dict[str, str]:
+            return {**asdict(place), 'topic': self._node.resolve_topic_name(place.topic)}
+
+        states, inputs = wiring.signals.states, wiring.signals.inputs
+        gains = np.reshape(settings.input_matrix, (-1, len(inputs))).tolist() if (
+            settings.input_matrix != (0.0,)) else []
+        return {
+            'states': [{'name': name, 'unit': unit, 'place': found(wiring.measured[name])}
+                       for name, unit in states.items()],
+            'inputs': [{'name': name, 'unit': unit, 'command': found(wiring.commands[name]),
+                        'measured': found(wiring.applied[name]),
+                        'delay': settings.inputs[name].delay} for name, unit in inputs.items()],
+            'tolerance': settings.synchronisation_tolerance,
+            'input_gain': {state: dict(zip(inputs, row, strict=True))
+                           for state, row in zip(states, gains, strict=False)}}
 
     def complete(self) -> None:
         """End a training that is under way; nothing is written then."""
@@ -76,8 +102,8 @@ class Training:
         self._diagnostics.destroy()
 
     def _on_train(self, _: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
-        if self._job is not None:
-            response.message = 'already training'
+        if self._job is not None or self._node.refusal:
+            response.message = self._node.refusal or 'already training'
             return response
         try:
             response.message, response.success = self.start(), True

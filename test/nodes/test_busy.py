@@ -18,6 +18,7 @@ from rosgraph_msgs.msg import Clock
 from sensor_msgs.msg import Temperature
 from std_msgs.msg import String
 
+from koopman_ros.demo import reactor
 from koopman_ros.ros import topics
 from koopman_ros.ros.watchdog import Watchdog
 from koopman_ros.testing import Harness
@@ -25,8 +26,8 @@ from support.controller_bench import reproduced, STATUS, STEADY
 from support.nodes import opened, seconds, temperature
 
 SAFE = 10.0  # degC
-SETTINGS = {'measurement_timeout': 0.3, 'hold_timeout': 0.2, 'coolant_rate_limit': 1200.0,
-            'safe_coolant': SAFE}
+SETTINGS = {'measurement_timeout': 0.3, 'hold_timeout': 0.2, 'coolant_temperature.rate_limit': 20.0,
+            'coolant_temperature.safe': SAFE}
 
 # A control step that takes as long as somebody keeps the pipe of the second argument open, and a
 # watchdog that is five times as quick as it is.
@@ -57,9 +58,9 @@ class BusyBench:
         self.process = ros.start(
             'controller', SETTINGS, ('-p', f'use_sim_time:={simulated}'.lower()),
             (sys.executable, '-c', BUSY, str(pipe)))
-        self.commands = ros.listen(Temperature, topics.COOLANT_SETPOINT)
+        self.commands = ros.listen(Temperature, reactor.COOLANT_SETPOINT)
         self.records = ros.listen(String, topics.CONTROLLER_EVENTS)
-        self.thermometer = ros.speak(Temperature, topics.TEMPERATURE, to='controller')
+        self.thermometer = ros.speak(Temperature, reactor.TEMPERATURE, to='controller')
         if simulated:
             ros.wait_until(lambda: time.get_subscription_count() > 0)
             time.publish(Clock(clock=temperature(0.0, 100.0).header.stamp))

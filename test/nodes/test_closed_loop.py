@@ -11,6 +11,7 @@ import pytest
 from rosgraph_msgs.msg import Clock
 from sensor_msgs.msg import Temperature
 
+from koopman_ros.demo import reactor
 from koopman_ros.parameters.plant import PlantParameters
 from koopman_ros.ros import topics
 from koopman_ros.testing import Harness
@@ -24,16 +25,16 @@ LOCKSTEP = {'lockstep': True, 'lockstep_subscribers': 2}
 class Loop:
     """A controller and a plant without noise, and an operator who hears them."""
 
-    def __init__(self, ros: Harness, prefix: str = '', measured: str = topics.TEMPERATURE
+    def __init__(self, ros: Harness, prefix: str = '', measured: str = reactor.TEMPERATURE
                  ) -> None:
         self.ros, self._prefix = ros, prefix
         self.measured = ros.listen(Temperature, f'{prefix}{measured}')
-        self.commands = ros.listen(Temperature, f'{prefix}{topics.COOLANT_SETPOINT}')
+        self.commands = ros.listen(Temperature, f'{prefix}{reactor.COOLANT_SETPOINT}')
         self.clock = ros.listen(Clock, topics.CLOCK, topics.CLOCK_QOS)
         self._setpoint = ros.node.create_publisher(
-            Temperature, f'{prefix}{topics.SETPOINT}', topics.LOOP_QOS)
+            Temperature, f'{prefix}{reactor.SETPOINT}', topics.LOOP_QOS)
         self._remaps = (*(('-r', f'__ns:={prefix[:-1]}') if prefix else ()),
-                        '-r', f'{topics.TEMPERATURE}:={measured}')
+                        '-r', f'{reactor.TEMPERATURE}:={measured}')
 
     def start_controller(self, celsius: float) -> None:
         """Start a controller, and turn the set-point when it hears the operator."""
@@ -97,7 +98,7 @@ def test_no_offset_is_left_and_the_next_controller_takes_over_the_coolant_in_for
     loop.start_controller(SETPOINT)
     # not as fast as it can: a publisher keeps the last hundred commands, and a bench that a busy
     # machine lets wait for longer than they last misses some
-    loop.start_plant(**LOCKSTEP, speed=200.0, heat_transfer_coefficient=FOULED,
+    loop.start_plant(**LOCKSTEP, speed=200.0, **{'constants.heat_transfer_coefficient': FOULED / 60.0},
                      lockstep_timeout=0.3)
     loop.rest()
     rested = seconds(loop.commands[-1])
@@ -112,9 +113,9 @@ def test_no_offset_is_left_and_the_next_controller_takes_over_the_coolant_in_for
 
     loop.controller.stop(signal.SIGKILL)
     ros.wait_for_status('plant: simulation', lambda s: 'no command arrives' in s.message)
-    coolants = ros.listen(Temperature, topics.COOLANT_TEMPERATURE)
+    coolants = ros.listen(Temperature, reactor.COOLANT_TEMPERATURE)
     # what the old one said is still on its way to the other subscription
-    commands = ros.listen(Temperature, topics.COOLANT_SETPOINT)
+    commands = ros.listen(Temperature, reactor.COOLANT_SETPOINT)
     ros.start('controller')
     ros.wait_until(lambda: len(commands) > 50)
     in_force = {seconds(message): message.temperature for message in coolants}

@@ -15,6 +15,7 @@ import pytest
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 from sensor_msgs.msg import JointState, Temperature
 
+from koopman_ros.demo import reactor
 from koopman_ros.lifting import load, save
 from koopman_ros.resources import model_path
 from koopman_ros.ros import topics
@@ -69,16 +70,16 @@ def test_long_frame_id_is_cut_and_reported(bench: Bench) -> None:
 
 def test_first_command_waits_for_the_coolant_in_force(ros: Harness) -> None:
     """Which has another name here."""
-    commands = ros.listen(Temperature, topics.COOLANT_SETPOINT)
+    commands = ros.listen(Temperature, reactor.COOLANT_SETPOINT)
     # patient, or a busy machine could be too slow for it
     program = ('import sys\n'
                'from koopman_ros.nodes import controller\n'
                'controller._COOLANT_PATIENCE = 100.0\n'
                'sys.exit(controller.main())\n')
-    ros.start('controller', arguments=('-r', f'{topics.COOLANT_TEMPERATURE}:=jacket'),
+    ros.start('controller', arguments=('-r', f'{reactor.COOLANT_TEMPERATURE}:=jacket'),
               command=(sys.executable, '-c', program))
     coolant = ros.speak(Temperature, 'jacket', topics.LATCHED_QOS, to='controller')
-    thermometer = ros.speak(Temperature, topics.TEMPERATURE, to='controller')
+    thermometer = ros.speak(Temperature, reactor.TEMPERATURE, to='controller')
     thermometer.publish(temperature(STEADY, 1.0))
     ros.meet('controller')
     assert not commands
@@ -91,10 +92,10 @@ def test_first_command_waits_for_the_coolant_in_force(ros: Harness) -> None:
 def test_setpoint_of_a_volatile_publisher_is_heard_and_the_active_one_latched(
         bench: Bench) -> None:
     """`ros2 topic pub` publishes reliable and volatile."""
-    late = bench.ros.listen(Temperature, topics.ACTIVE_SETPOINT, topics.LATCHED_QOS)
+    late = bench.ros.listen(Temperature, reactor.ACTIVE_SETPOINT, topics.LATCHED_QOS)
     bench.ros.wait_until(lambda: late)
     assert late[0].temperature == pytest.approx(STEADY)
-    setpoint = bench.ros.speak(Temperature, topics.SETPOINT, QoSProfile(
+    setpoint = bench.ros.speak(Temperature, reactor.SETPOINT, QoSProfile(
         depth=1, reliability=ReliabilityPolicy.RELIABLE, durability=DurabilityPolicy.VOLATILE),
         to='controller')
     setpoint.publish(temperature(45.0))
@@ -112,7 +113,7 @@ def test_setpoint_of_a_volatile_publisher_is_heard_and_the_active_one_latched(
 
 
 def test_manual_mode_commands_what_the_operator_asks(bench: Bench) -> None:
-    manual = bench.ros.speak(Temperature, topics.MANUAL_COOLANT_SETPOINT, to='controller')
+    manual = bench.ros.speak(Temperature, reactor.MANUAL_COOLANT_SETPOINT, to='controller')
     at, held = bench.settle(STEADY, 2.0)
     manual.publish(temperature(20.0))
     status = bench.status(lambda s: 'switch to manual mode' in s.message)
@@ -141,24 +142,24 @@ def test_manual_mode_commands_what_the_operator_asks(bench: Bench) -> None:
 def test_limits_ramp_and_weights_change_while_the_loop_runs(bench: Bench) -> None:
     held = bench.measure(STEADY, 2.0).temperature
     assert held > 25.0
-    bench.ros.set_parameters('controller', coolant_rate_limit=6.0)
+    bench.ros.set_parameters('controller', **{'coolant_temperature.rate_limit': 0.1})
     assert bench.measure(STEADY + 3.0, 3.0).temperature == pytest.approx(held - 0.1)
-    bench.ros.set_parameters('controller', coolant_rate_limit=60.0, coolant_max=24.0)
+    bench.ros.set_parameters('controller', **{'coolant_temperature.rate_limit': 1.0, 'coolant_temperature.max': 24.0})
     commands = [bench.measure(STEADY, float(at)).temperature for at in range(4, 10)]
     # at the rate limit of 1 K/s
     assert max(a - b for a, b in itertools.pairwise(commands)) == pytest.approx(1.0)
     assert commands[-1] == pytest.approx(24.0)
 
-    bench.ros.set_parameters('controller', coolant_max=32.0)
+    bench.ros.set_parameters('controller', **{'coolant_temperature.max': 32.0})
     at, held = bench.settle(STEADY, 10.0)
     at, before = bench.settle(STEADY + 1.0, at + 1.0)
-    bench.ros.set_parameters('controller', coolant_weight=100.0)
+    bench.ros.set_parameters('controller', **{'coolant_temperature.weight': 100.0})
     at, dear = bench.settle(STEADY + 1.0, at + 1.0)
-    bench.ros.set_parameters('controller', temperature_weight=10000.0)
+    bench.ros.set_parameters('controller', **{'temperature.weight': 10000.0})
     at, eager = bench.settle(STEADY + 1.0, at + 1.0)
     assert eager < before < dear < held
 
-    bench.ros.set_parameters('controller', setpoint_ramp=6.0)
+    bench.ros.set_parameters('controller', **{'temperature.setpoint_ramp': 0.1})
     bench.ask(STEADY - 10.0)
     for k in range(1, 12):
         bench.measure(STEADY, at + k)
@@ -174,7 +175,7 @@ def measure_on(bench: Bench, count: int, first: float) -> float:
 
 
 def test_status_tells_mode_law_reason_and_figures(bench: Bench) -> None:
-    bench.ros.set_parameters('controller', observer_bandwidth=6.0)
+    bench.ros.set_parameters('controller', **{'disturbance_bandwidth': 0.1})
     # whole seconds of the clock of the node, so that ages are known
     last = measure_on(bench, 20, float(int(time.time()) - 40))
     status = bench.status()
@@ -222,9 +223,9 @@ def test_stamps_that_stand_still_and_a_temperature_outside_the_trained_range_are
 
 
 def test_internals_carry_the_stamp_of_the_measurement(bench: Bench) -> None:
-    bench.ros.set_parameters('controller', observer_bandwidth=6.0)
+    bench.ros.set_parameters('controller', **{'disturbance_bandwidth': 0.1})
     internals = bench.ros.listen(JointState, topics.CONTROLLER_STATE)
-    predicted = bench.ros.listen(Temperature, topics.PREDICTED_TEMPERATURE)
+    predicted = bench.ros.listen(Temperature, reactor.PREDICTED_TEMPERATURE)
     bench.ros.meet('controller')
     last = measure_on(bench, 10, 2.0)
     bench.ros.wait_until(lambda: all(
@@ -256,14 +257,14 @@ def test_a_model_that_does_not_reach_to_the_safe_coolant_says_so(
     status = bench.ros.wait_for_status(STATUS, lambda s: words in value(s, 'safe coolant'))
     assert 'leaves the trained range' in value(status, 'safe coolant')
     bench.ros.wait_until(lambda: words in bench.process.output())
-    bench.ros.set_parameters('controller', safe_coolant=27.0)
+    bench.ros.set_parameters('controller', **{'coolant_temperature.safe': 27.0})
     bench.ros.wait_for_status(STATUS, lambda s: value(s, 'safe coolant') == 'within reach')
     bench.ros.set_parameters('controller', model='reactor_nz4')
 
 
 def test_second_controller_is_told_by_both_while_it_lasts(ros: Harness) -> None:
     """Beside a best-effort thermometer, and a coolant that is promised and never told."""
-    ros.node.create_publisher(Temperature, topics.COOLANT_TEMPERATURE, topics.LATCHED_QOS)
+    ros.node.create_publisher(Temperature, reactor.COOLANT_TEMPERATURE, topics.LATCHED_QOS)
     override = ('-p', 'qos_overrides./temperature.subscription.reliability:=best_effort')
     bench = Bench(ros, arguments=override, qos=QoSProfile(
         depth=10, reliability=ReliabilityPolicy.BEST_EFFORT))

@@ -14,6 +14,7 @@ from rclpy.qos import QoSProfile, ReliabilityPolicy
 from sensor_msgs.msg import Temperature
 
 from koopman_ros.bags import read_messages
+from koopman_ros.demo import reactor
 from koopman_ros.experiment import advance, begin, Phase
 from koopman_ros.parameters.plant import PlantParameters
 from koopman_ros.parameters.trainer import TABLE, TrainerParameters
@@ -74,7 +75,7 @@ class Bench:
 
 def start_with_plant(ros: Harness, subscribers: int = 2, **trainer: object) -> list[Temperature]:
     """Start both, and an experiment that both know of; return the measurements to come."""
-    measured = ros.listen(Temperature, topics.TEMPERATURE)
+    measured = ros.listen(Temperature, reactor.TEMPERATURE)
     ros.start('trainer', {**IDLE, **trainer})
     ros.start('plant', {'lockstep': True, 'speed': 0.0, 'lockstep_subscribers': subscribers})
     ros.meet('plant')
@@ -85,9 +86,9 @@ def start_with_plant(ros: Harness, subscribers: int = 2, **trainer: object) -> l
 
 
 def test_steps_drive_the_plant_as_planned(ros: Harness) -> None:
-    commands = ros.listen(Temperature, topics.COOLANT_SETPOINT)
-    given = {'experiment_duration': 5.0, 'experiment_seed': 5, 'experiment_hold_min': 0.25,
-             'experiment_hold_max': 1.0}
+    commands = ros.listen(Temperature, reactor.COOLANT_SETPOINT)
+    given = {'experiment_length': 300.0, 'experiment_seed': 5, 'experiment_shortest_hold': 15.0,
+             'experiment_longest_hold': 60.0}
     measured = start_with_plant(ros, **given)
     status = ros.wait_for_status(STATUS, lambda s: s.message.startswith('finished'))
     assert status.level == DiagnosticStatus.OK
@@ -136,9 +137,9 @@ def test_what_is_in_the_way_refuses_the_start(shared_bench: Bench) -> None:
     # a busy machine may be as slow
     bench.set(experiment_timeout=10.0)
 
-    bench.set(experiment_topic='manual_coolant_setpoint')
+    bench.set(**{'experiment_on': 'manual'})
     assert 'start the controller and switch it to manual mode' in bench.start()[1]
-    bench.set(experiment_topic='coolant_setpoint')
+    bench.set(**{'experiment_on': 'command'})
 
 
 def test_contradicting_limits_are_refused() -> None:
@@ -173,7 +174,7 @@ def test_service_ends_the_steps_and_then_lets_go(shared_bench: Bench) -> None:
 
 def test_silent_sensor_brings_the_safe_coolant(shared_bench: Bench) -> None:
     bench, ros = shared_bench, shared_bench.ros
-    bench.set(experiment_timeout=0.5, experiment_rate_limit=600.0)
+    bench.set(experiment_timeout=0.5, **{'coolant_temperature.experiment_rate_limit': 10.0})
     # which a busy machine may miss
     ros.wait_until(lambda: bench.start()[0])
     for _ in range(5):
@@ -186,7 +187,7 @@ def test_silent_sensor_brings_the_safe_coolant(shared_bench: Bench) -> None:
     # a sensor that comes back is answered, with the same
     assert bench.answer() == pytest.approx(SAFE, abs=1e-9)
     assert bench.ask(False)[1] == LOST
-    bench.set(experiment_timeout=10.0, experiment_rate_limit=60.0)
+    bench.set(experiment_timeout=10.0, **{'coolant_temperature.experiment_rate_limit': 1.0})
 
 
 def test_another_commander_ends_it_at_once_and_refuses_the_next(shared_bench: Bench) -> None:
@@ -211,11 +212,11 @@ def test_another_commander_ends_it_at_once_and_refuses_the_next(shared_bench: Be
 def test_reactor_that_leaves_its_bounds_and_trainer_that_ends_leave_the_safe_coolant(
         ros: Harness, tmp_path: Path) -> None:
     bag = tmp_path / 'run.mcap'
-    commands = ros.listen(Temperature, topics.COOLANT_SETPOINT)
+    commands = ros.listen(Temperature, reactor.COOLANT_SETPOINT)
     measured = start_with_plant(
-        ros, 3, experiment_duration=1000.0, record_at_start=True, output=bag)
+        ros, 3, **{'experiment_length': 60000.0}, record_at_start=True, output=bag)
     ros.wait_until(lambda: len(commands) > 50)
-    ros.set_parameters('plant', feed_temperature=-20.0)
+    ros.set_parameters('plant', **{'constants.feed_temperature': -20.0})
     status = ros.wait_for_status(STATUS, lambda s: s.level == DiagnosticStatus.ERROR)
     assert status.message.startswith('aborted: the temperature ')
     assert 'is outside the bounds of the experiment, 31.85 degC to 53.85 degC' in status.message
@@ -226,7 +227,7 @@ def test_reactor_that_leaves_its_bounds_and_trainer_that_ends_leave_the_safe_coo
     ros.wait_until(lambda: len(commands) > first + 50)
     assert {round(message.temperature, 9) for message in commands[first + 12:]} == {SAFE}
 
-    ros.set_parameters('plant', feed_temperature=PlantParameters().feed_temperature)
+    ros.set_parameters('plant', **{'constants.feed_temperature': PlantParameters().feed_temperature})
     assert ros.trigger('plant/reset').success
     assert ros.set_bool(SERVICE, True).success
     ros.wait_until(lambda: abs(commands[-1].temperature - SAFE) > 2.0)
@@ -241,13 +242,13 @@ def test_reactor_that_leaves_its_bounds_and_trainer_that_ends_leave_the_safe_coo
 
 
 def test_experiment_through_a_controller_in_manual_mode(ros: Harness) -> None:
-    commands = ros.listen(Temperature, topics.COOLANT_SETPOINT)
+    commands = ros.listen(Temperature, reactor.COOLANT_SETPOINT)
     ros.start('controller')
     ros.meet('controller')
     ros.set_bool('controller/set_automatic', False)
-    ros.start('trainer', {**IDLE, 'experiment_topic': topics.MANUAL_COOLANT_SETPOINT,
-                          'experiment_duration': 1000.0, 'experiment_hold_min': 0.1,
-                          'experiment_hold_max': 0.2})
+    ros.start('trainer', {**IDLE, 'experiment_on': reactor.MANUAL_COOLANT_SETPOINT,
+                          'experiment_length': 60000.0, 'experiment_shortest_hold': 6.0,
+                          'experiment_longest_hold': 12.0})
     ros.meet('trainer')
     ros.start('plant', {'lockstep': True, 'speed': 200.0})
     ros.wait_until(lambda: commands)
@@ -263,4 +264,4 @@ def test_experiment_through_a_controller_in_manual_mode(ros: Harness) -> None:
     status = ros.wait_for_status(STATUS, lambda s: s.level == DiagnosticStatus.ERROR)
     assert status.message.startswith('aborted: the controller commands ')
     assert 'switch it to manual mode' in status.message
-    ros.wait_until(lambda: ros.node.count_publishers(topics.MANUAL_COOLANT_SETPOINT) == 0)
+    ros.wait_until(lambda: ros.node.count_publishers(reactor.MANUAL_COOLANT_SETPOINT) == 0)

@@ -13,13 +13,14 @@ import pytest
 from sensor_msgs.msg import JointState
 
 from koopman_ros.control import Mode, Report
+from koopman_ros.demo import reactor
 from koopman_ros.resources import config_directory
 from koopman_ros.ros import topics
 from koopman_ros.ros.controller_messages import internals
 
 # What a layout shows: topics with one value by themselves, and internals by their names.
-TEMPERATURES = {topics.TEMPERATURE, topics.ACTIVE_SETPOINT, topics.PREDICTED_TEMPERATURE,
-                topics.COOLANT_SETPOINT, topics.COOLANT_TEMPERATURE}
+TEMPERATURES = {reactor.TEMPERATURE, reactor.ACTIVE_SETPOINT, reactor.PREDICTED_TEMPERATURE,
+                reactor.COOLANT_SETPOINT, reactor.COOLANT_TEMPERATURE}
 INTERNALS = {'disturbance', 'transfer', 'gain', 'growth_per_sample', 'level', 'distance_outside'}
 NAMES = list(internals(Report(Mode.AUTOMATIC, 'sdre'), Time(), '').name)
 

@@ -25,6 +25,7 @@ from sensor_msgs.msg import Temperature
 from std_srvs.srv import SetBool, Trigger
 
 from koopman_ros.bags import BagReadError
+from koopman_ros.demo import reactor
 from koopman_ros.nodes.controller import ControllerNode
 from koopman_ros.nodes.plant import PlantNode
 from koopman_ros.nodes.player import PlayerNode
@@ -181,11 +182,11 @@ class Loop:
 
     def __init__(self, place: Site) -> None:
         self.place, self.sent = place, 0
-        self.commands = place.listen(topics.COOLANT_SETPOINT)
+        self.commands = place.listen(reactor.COOLANT_SETPOINT)
         self.sensor = place.bench.create_publisher(
-            Temperature, topics.TEMPERATURE, topics.LOOP_QOS)
+            Temperature, reactor.TEMPERATURE, topics.LOOP_QOS)
         place.spin_until(lambda: self.sensor.get_subscription_count()
-                         and place.node.count_subscribers(topics.COOLANT_SETPOINT))
+                         and place.node.count_subscribers(reactor.COOLANT_SETPOINT))
 
     def answer(self) -> None:
         self.sent += 1
@@ -232,9 +233,9 @@ def test_controller_answers_with_all_parameters_at_ends_at_once() -> None:
 @pytest.mark.parametrize('reactor', TABLES['plant'].rows['reactor'].choices)
 def test_plant_runs_with_every_changeable_parameter_at_its_ends(reactor: str) -> None:
     with site(PlantNode, reactor=reactor, speed=0.0, sample_period=0.1) as place:
-        heard = place.listen(topics.TEMPERATURE)
+        heard = place.listen(reactor.TEMPERATURE)
         coolant = place.bench.create_publisher(
-            Temperature, topics.COOLANT_SETPOINT, topics.LOOP_QOS)
+            Temperature, reactor.COOLANT_SETPOINT, topics.LOOP_QOS)
         place.spin_until(lambda: heard and coolant.get_subscription_count())
         for change in cases('plant', read_only=False):
             if place.change(**change):
@@ -255,7 +256,7 @@ def test_plant_starts_with_every_fixed_parameter_at_its_ends(change: dict[str, A
     beside: dict[str, Any] = {'lockstep': True} if name.startswith('lockstep') else {
         'speed': 2.0} if name in ('start_time', 'publish_clock') else {}
     with site(PlantNode, **{**beside, **change}) as place:
-        heard = place.listen(topics.TEMPERATURE)
+        heard = place.listen(reactor.TEMPERATURE)
 
         def ran() -> bool:
             place.fire_timers()
@@ -312,8 +313,8 @@ def test_trainer_refuses_names_that_cannot_be_topics() -> None:
 
 def test_trainer_steps_with_every_parameter_of_the_experiment_at_its_ends() -> None:
     with site(TrainerNode, record_at_start=False) as place:
-        sensor = place.bench.create_publisher(Temperature, topics.TEMPERATURE, topics.LOOP_QOS)
-        commands, sent = place.listen(topics.COOLANT_SETPOINT), 0
+        sensor = place.bench.create_publisher(Temperature, reactor.TEMPERATURE, topics.LOOP_QOS)
+        commands, sent = place.listen(reactor.COOLANT_SETPOINT), 0
         for change in cases('trainer', read_only=False):
             if not next(iter(change)).startswith(EXPERIMENT):
                 continue

@@ -13,6 +13,7 @@ import pytest
 from rclpy.node import Node
 from sensor_msgs.msg import JointState, Temperature
 
+from koopman_ros.demo import reactor
 from koopman_ros.parameters.plant import PlantParameters, TABLE
 from koopman_ros.plants import sensor_noise
 from koopman_ros.ros import topics
@@ -38,12 +39,12 @@ class Bench:
         self.commanded: dict[float, float] = {}  # by the stamp that is answered
         self.sent_ns: list[int] = []  # when each was measured
         ros.node.create_subscription(
-            Temperature, topics.TEMPERATURE, self._on_measurement, topics.LOOP_QOS)
+            Temperature, reactor.TEMPERATURE, self._on_measurement, topics.LOOP_QOS)
         ros.start(
             'plant', {'lockstep': True, 'speed': 0.0, 'lockstep_timeout': 3600.0, **parameters})
         before()
         self._commands = ros.node.create_publisher(
-            Temperature, topics.COOLANT_SETPOINT, topics.LOOP_QOS)
+            Temperature, reactor.COOLANT_SETPOINT, topics.LOOP_QOS)
 
     def _on_measurement(self, message: Temperature, info: Mapping[str, int]) -> None:
         self.sent_ns.append(info['source_timestamp'])
@@ -106,7 +107,7 @@ def bench(shared_bench: Bench) -> Bench:
 def test_sensor_is_noisy_biased_and_coarse_as_it_is_set_while_it_runs(bench: Bench) -> None:
     (steady,) = bench.wait_for_more(1)
     assert steady.variance == 0.0
-    bench.set(noise=0.5)
+    bench.set(**{'temperature.noise': 0.5})
     bench.ros.wait_until(lambda: bench.measured[-1].variance > 0.0)
     measured = bench.wait_for_more(50)
     assert {message.variance for message in measured} == {0.25}
@@ -115,14 +116,14 @@ def test_sensor_is_noisy_biased_and_coarse_as_it_is_set_while_it_runs(bench: Ben
         [steady.temperature + sensor_noise(0.5, SEED, round(seconds(message)) - 1)
          for message in measured], abs=1e-6)
 
-    bench.set(noise=0.0, sensor_bias=2.0)
+    bench.set(**{'temperature.noise': 0.0, 'temperature.bias': 2.0})
     bench.wait_for(lambda celsius: celsius == pytest.approx(steady.temperature + 2.0, abs=1e-6))
     biased = seconds(bench.measured[-1])
     status = bench.status(lambda s: float(value(s, 'time [s]')) >= biased)
     assert float(value(status, 'temperature [degC]')) == pytest.approx(
         steady.temperature, abs=1e-6)
 
-    bench.set(sensor_bias=0.0, sensor_resolution=0.25)
+    bench.set(**{'temperature.bias': 0.0, 'temperature.resolution': 0.25})
     bench.ros.wait_until(lambda: bench.measured[-1].variance > 0.0)
     bench.coolant = 25.0
     measured = bench.wait_for_more(50)
@@ -134,8 +135,8 @@ def test_sensor_is_noisy_biased_and_coarse_as_it_is_set_while_it_runs(bench: Ben
 def test_real_time_stamps_are_the_wall_clock_and_silence_is_reported_while_it_lasts(
         ros: Harness) -> None:
     """Of a plant, here, that has no steady state to start from."""
-    heard = ros.listen(Temperature, topics.TEMPERATURE)
-    process = ros.start('plant', {'sample_period': 0.1, 'heat_transfer_coefficient': 0.0})
+    heard = ros.listen(Temperature, reactor.TEMPERATURE)
+    process = ros.start('plant', {'sample_period': 0.1, 'constants.heat_transfer_coefficient': 0.0})
     ros.wait_until(lambda: len(heard) >= 5)
     now = time.time_ns()
     stamps = [stamp_nanoseconds(message.header.stamp) for message in heard]
@@ -146,9 +147,8 @@ def test_real_time_stamps_are_the_wall_clock_and_silence_is_reported_while_it_la
                for early, late in pairwise(stamps))
     assert ros.node.count_publishers(topics.CLOCK) == 0
     # or it would run away before long
-    ros.set_parameters('plant', heat_transfer_coefficient=(
-        TABLE.rows['heat_transfer_coefficient'].default))
-    command = ros.speak(Temperature, topics.COOLANT_SETPOINT, to='plant')
+    ros.set_parameters('plant', **{'constants.heat_transfer_coefficient': TABLE.rows['heat_transfer_coefficient'].default / 60.0}))
+    command = ros.speak(Temperature, reactor.COOLANT_SETPOINT, to='plant')
     command.publish(temperature(26.0))
     status = ros.wait_for_status(STATUS, lambda s: s.level == DiagnosticStatus.WARN)
     assert 'no command arrives: the last one is held' in status.message
@@ -163,7 +163,7 @@ def test_lockstep_waits_for_a_controller_and_is_paced(ros: Harness) -> None:
         status = ros.wait_for_status(STATUS, lambda s: s.level == DiagnosticStatus.WARN)
         assert status.message == 'waiting for the loop: no controller yet'
 
-    concentrations = ros.listen(JointState, topics.CONCENTRATION)
+    concentrations = ros.listen(JointState, reactor.CONCENTRATION)
     bench = Bench(ros, wait, reactor='two_state', speed=20.0, sample_period=0.5, start_time=7.0)
     measured = bench.wait_for_more(21)
     assert [seconds(message) for message in measured] == [7.0 + 0.5 * k for k in range(21)]
@@ -181,7 +181,7 @@ def test_lockstep_waits_for_a_controller_and_is_paced(ros: Harness) -> None:
 
 
 def test_reset_returns_to_the_start_until_the_duration_is_over(ros: Harness) -> None:
-    bench = Bench(ros, initial_temperature_offset=-5.0, start_time=10.0, duration=210.0,
+    bench = Bench(ros, **{'temperature.initial_offset': -5.0}, start_time=10.0, duration=210.0,
                   sample_period=0.7)
     initial = bench.wait_for_more(1)[0].temperature
     bench.wait_for(lambda celsius: celsius > initial + 1.0)
@@ -234,7 +234,7 @@ def test_time_is_written_with_all_digits() -> None:
 
 def test_coolant_in_force_is_told_before_each_measurement_and_latched(bench: Bench) -> None:
     sent: dict[str, list[tuple[float, int, float]]] = {'coolant': [], 'measured': []}
-    for name, topic in (('coolant', topics.COOLANT_TEMPERATURE), ('measured', topics.TEMPERATURE)):
+    for name, topic in (('coolant', reactor.COOLANT_TEMPERATURE), ('measured', reactor.TEMPERATURE)):
         bench.ros.node.create_subscription(
             Temperature, topic, lambda message, info, name=name: sent[name].append(
                 (seconds(message), info['source_timestamp'], message.temperature)),
@@ -249,24 +249,24 @@ def test_coolant_in_force_is_told_before_each_measurement_and_latched(bench: Ben
     for stamp, *_ in told[1:]:
         assert coolants[stamp][1] == pytest.approx(bench.commanded[stamp - 1.0], abs=1e-9)
     bench.pause()
-    late = bench.ros.listen(Temperature, topics.COOLANT_TEMPERATURE, topics.LATCHED_QOS)
+    late = bench.ros.listen(Temperature, reactor.COOLANT_TEMPERATURE, topics.LATCHED_QOS)
     bench.ros.wait_until(lambda: late and late[-1].header == bench.measured[-1].header)
     assert late[-1].temperature == pytest.approx(25.0)
     bench.resume()
 
 
 @pytest.mark.parametrize(('parameters', 'expected'), [
-    ({'coolant_lag': 8.0},
+    ({'coolant_temperature.lag': 8.0},
      lambda n: 20.0 + (NOMINAL_COOLANT - 20.0) * math.exp(-n / 8.0)),
     # in force for the first time in the hold that ends three samples later
-    ({'command_delay': 2.0}, lambda n: NOMINAL_COOLANT if n < 3 else 20.0),
+    ({'coolant_temperature.delay': 2.0}, lambda n: NOMINAL_COOLANT if n < 3 else 20.0),
     # a range that narrows leaves the command
-    ({'coolant_min': 22.5}, lambda n: NOMINAL_COOLANT if n == 0 else 22.5),
+    ({'coolant_temperature.min': 22.5}, lambda n: NOMINAL_COOLANT if n == 0 else 22.5),
 ])
 def test_coolant_follows_its_command_as_the_actuator_lets_it(
         bench: Bench, parameters: dict[str, float], expected: Callable[[int], float]) -> None:
     bench.set(**parameters)
-    heard = bench.ros.listen(Temperature, topics.COOLANT_TEMPERATURE)
+    heard = bench.ros.listen(Temperature, reactor.COOLANT_TEMPERATURE)
     bench.ros.meet('plant')
     bench.wait_for_more(3)
     bench.coolant = 20.0
@@ -296,7 +296,7 @@ def test_command_beyond_the_range_is_limited_and_one_that_is_no_number_rejected(
 def test_command_that_answers_no_open_measurement_is_not_taken(bench: Bench) -> None:
     bench.wait_for_more(5)
     stamp = bench.pause()
-    strangers = bench.ros.speak(Temperature, topics.COOLANT_SETPOINT, to='plant')
+    strangers = bench.ros.speak(Temperature, reactor.COOLANT_SETPOINT, to='plant')
     strangers.publish(temperature(10.0, stamp - 1.0))
     status = bench.status(lambda s: value(s, 'foreign commands') == '1')
     assert float(value(status, 'coolant [degC]')) == pytest.approx(NOMINAL_COOLANT)
@@ -322,7 +322,7 @@ def test_runaway_stops_the_plant_and_reset_recovers_it(bench: Bench) -> None:
 
 def test_reactor_changes_while_it_runs_but_for_what_is_fixed_at_start(bench: Bench) -> None:
     steady = bench.wait_for_more(1)[0].temperature
-    bench.set(concentration=0.85)
+    bench.set(**{'constants.concentration': 850.0})
     bench.wait_for(lambda celsius: celsius < steady - 0.5)
     (result,) = bench.ros.set_parameters('plant', speed=2.0)
     assert not result.successful
@@ -333,7 +333,7 @@ def test_reactor_changes_while_it_runs_but_for_what_is_fixed_at_start(bench: Ben
 def test_others_are_told_by_their_names_while_they_last(bench: Bench) -> None:
     bench.status(lambda s: s.level == DiagnosticStatus.OK)
     intruder = Node('intruder', context=bench.ros.node.context, namespace='/elsewhere')
-    for topic in (topics.COOLANT_SETPOINT, topics.TEMPERATURE):
+    for topic in (reactor.COOLANT_SETPOINT, reactor.TEMPERATURE):
         intruder.create_publisher(Temperature, f'/{topic}', topics.LOOP_QOS)
     # names come a moment after their topics
     status = bench.ros.wait_for_status(STATUS, lambda s: (

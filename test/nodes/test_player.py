@@ -22,6 +22,7 @@ from sensor_msgs.msg import Temperature
 import yaml
 
 from koopman_ros import bags
+from koopman_ros.demo import reactor
 from koopman_ros.demo.loop import run_loop, Scenario
 from koopman_ros.nodes import player
 from koopman_ros.nodes.replay import Names, replayed_bag
@@ -42,8 +43,8 @@ TOPICS = {'/temperature', '/concentration', '/setpoint', '/active_setpoint', '/c
 LATCHED = {'/active_setpoint', '/coolant_temperature'}
 # A minute of a loop with a step, a noisy two-state reactor and a slow coolant.
 SCENARIO = Scenario('reactor_nz4', SETPOINT + 273.15, step_time=20.0, duration=60.0,
-                    plant={'reactor': 'two_state', 'noise': 0.05, 'seed': 3,
-                           'command_delay': 1.0, 'coolant_lag': 2.0})
+                    plant={'reactor': 'two_state', 'temperature.noise': 0.05, 'seed': 3,
+                           'coolant_temperature.delay': 1.0, 'coolant_temperature.lag': 2.0})
 
 
 @pytest.fixture(scope='module')
@@ -137,8 +138,8 @@ def stamps(messages: Sequence[Any]) -> list[int]:
 
 def test_lockstep_gives_bit_identical_commands(ros: Harness, recorded_loop: Path) -> None:
     recorded = bags.read_series(recorded_loop, '/coolant_setpoint')
-    commands = ros.listen(Temperature, topics.COOLANT_SETPOINT)
-    ros.start('controller', {'observer_bandwidth': 0.0})
+    commands = ros.listen(Temperature, reactor.COOLANT_SETPOINT)
+    ros.start('controller', {'disturbance_bandwidth': 0.0})
     ros.meet('controller')
     said = play(ros, recorded_loop, rate=0.0)
     ros.wait_until(lambda: len(commands) >= SAMPLES)
@@ -189,7 +190,7 @@ def test_measurements_come_at_their_times(ros: Harness, tmp_path: Path) -> None:
     bag = write_bag(tmp_path / 'slow.mcap', [
         ('/temperature', temperature(50.0 - 0.1 * k, float(k)), float(k)) for k in range(9)])
     arrived: list[float] = []
-    ros.node.create_subscription(Temperature, topics.TEMPERATURE, lambda _: arrived.append(
+    ros.node.create_subscription(Temperature, reactor.TEMPERATURE, lambda _: arrived.append(
         time.monotonic()), topics.LOOP_QOS)
     ros.start('controller')
     process = ros.start('player', {'bag': bag, 'rate': 4.0, 'wait_for_subscribers': 2})
@@ -207,8 +208,8 @@ def test_clock_shows_the_stamp_of_each_measurement(ros: Harness, tmp_path: Path)
         ('/temperature', temperature(50.0, 101.0), 1.2),
         ('/temperature', temperature(50.0, 20.0), 1.3)])
     ticks = ros.listen(Clock, topics.CLOCK, topics.CLOCK_QOS)
-    heard = ros.listen(Temperature, topics.TEMPERATURE)
-    ros.listen(Temperature, topics.SETPOINT)
+    heard = ros.listen(Temperature, reactor.TEMPERATURE)
+    ros.listen(Temperature, reactor.SETPOINT)
     play(ros, bag, clock=True)
     ros.wait_until(lambda: len(heard) >= 3 and ticks and ticks[-1].clock.sec == 20)
     # single ticks may be lost, and the first ones before the bench is known
@@ -221,7 +222,7 @@ def test_order_is_that_of_receipt_and_the_offset_leaves_out_the_beginning(
     bag = write_bag(tmp_path / 'bag.mcap', [
         ('/temperature', temperature(float(k), float(k)), received)
         for k, received in [(0, 10.0), (3, 10.8), (1, 10.4), (2, 10.6), (4, 1.0)]])
-    heard = ros.listen(Temperature, topics.TEMPERATURE)
+    heard = ros.listen(Temperature, reactor.TEMPERATURE)
     play(ros, bag, rate=100.0)
     # the recorder's clock was set back by more than it can have fallen behind: a later part
     ros.wait_until(lambda: len(heard) >= 5)
@@ -288,7 +289,7 @@ def test_what_cannot_be_played_is_refused_in_one_line(
 def test_signal_ends_it(ros: Harness, tmp_path: Path) -> None:
     bag = write_bag(tmp_path / 'bag.mcap', [
         ('/temperature', temperature(50.0, float(k)), 3600.0 * k) for k in range(2)])
-    heard = ros.listen(Temperature, topics.TEMPERATURE)
+    heard = ros.listen(Temperature, reactor.TEMPERATURE)
     process = ros.start('player', {'bag': bag})
     ros.wait_until(lambda: heard)
     before = time.monotonic()

@@ -21,6 +21,7 @@ from sensor_msgs.msg import Temperature
 from std_msgs.msg import String
 
 from koopman_ros.bags import BagMessage, read_messages, summary
+from koopman_ros.demo import reactor
 from koopman_ros.nodes import trainer
 from koopman_ros.parameters.trainer import TABLE, TrainerParameters
 from koopman_ros.ros import topics
@@ -70,7 +71,7 @@ def test_kill_loses_no_more_than_the_last_second(
         ros: Harness, tmp_path: Path, output: str, parameters: dict[str, object]) -> None:
     bag = tmp_path / output
     process = ros.start('trainer', {'output': bag, **parameters})
-    publisher = ros.speak(Temperature, topics.TEMPERATURE, to='trainer')
+    publisher = ros.speak(Temperature, reactor.TEMPERATURE, to='trainer')
     sent = say_until(ros, publisher, lambda sent: sent and sent[-1] > sent[0] + 1.75)
     now = time.monotonic()
     assert process.stop(signal.SIGKILL) == -signal.SIGKILL
@@ -124,7 +125,7 @@ def record(ros: Harness, output: Path, qos: QoSProfile = topics.LOOP_QOS, subscr
     assert result.successful, result.reason
     response = ros.set_bool('trainer/record', True)
     assert response.success, response.message
-    return ros.speak(Temperature, topics.TEMPERATURE, qos, to='trainer', subscribers=subscribers)
+    return ros.speak(Temperature, reactor.TEMPERATURE, qos, to='trainer', subscribers=subscribers)
 
 
 def test_recording_stops_and_starts_by_service(shared: Harness, tmp_path: Path) -> None:
@@ -160,7 +161,7 @@ def test_takes_the_next_name_beside_a_recording(shared: Harness, tmp_path: Path)
 
 def test_best_effort_publisher_is_recorded(shared: Harness, tmp_path: Path) -> None:
     bag = tmp_path / 'run.mcap'
-    received = shared.listen(Temperature, topics.TEMPERATURE, BEST_EFFORT)
+    received = shared.listen(Temperature, reactor.TEMPERATURE, BEST_EFFORT)
     publisher = record(shared, bag, BEST_EFFORT, subscribers=2)
     for k in range(20):
         publisher.publish(temperature(float(k)))
@@ -226,7 +227,7 @@ def test_full_disk_stops_the_recording_but_not_the_node(ros: Harness, tmp_path: 
                'resource.setrlimit(resource.RLIMIT_FSIZE, (60000, 60000))\n'
                'sys.exit(main())\n')
     process = ros.start('trainer', {'output': bag}, command=(sys.executable, '-c', program))
-    publisher = ros.speak(Temperature, topics.TEMPERATURE, to='trainer')
+    publisher = ros.speak(Temperature, reactor.TEMPERATURE, to='trainer')
     say(publisher, 100)
     # which is flushed twice a second
     ros.wait_until(lambda: summary(bag).counts.get(TOPIC, 0) >= 100)

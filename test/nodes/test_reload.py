@@ -23,6 +23,7 @@ from sensor_msgs.msg import Temperature
 from std_msgs.msg import String
 from std_srvs.srv import Trigger
 
+from koopman_ros.demo import reactor
 from koopman_ros.lifting import LiftedModel, load, save
 from koopman_ros.replay.records import MODEL, PARAMETERS
 from koopman_ros.resources import model_path
@@ -33,7 +34,7 @@ from support.nodes import opened, temperature, value
 
 NAMES = ('reactor_nz3', 'reactor_nz4', 'reactor_linear')
 SETPOINTS = [(20.0 * k, 46.0 + math.sin(k)) for k in range(1, 150)]
-SETTINGS = {'setpoint_ramp': 3.0, 'observer_bandwidth': 1.0}
+SETTINGS = {'temperature.setpoint_ramp': 0.05, 'disturbance_bandwidth': 0.0166666666667}
 
 
 def put(content: bytes, path: Path) -> None:
@@ -49,12 +50,12 @@ class Bench:
     def __init__(self, ros: Harness) -> None:
         self.ros = ros
         self.sent: list[Temperature] = []
-        self.commands = ros.listen(Temperature, topics.COOLANT_SETPOINT)
+        self.commands = ros.listen(Temperature, reactor.COOLANT_SETPOINT)
         self._reload = ros.node.create_client(Trigger, 'controller/reload_model')
         self._set = ros.node.create_client(SetParameters, 'controller/set_parameters')
         for client in (self._reload, self._set):
             ros.wait_until(client.service_is_ready)
-        self._thermometer = ros.speak(Temperature, topics.TEMPERATURE, to='controller')
+        self._thermometer = ros.speak(Temperature, reactor.TEMPERATURE, to='controller')
 
     def ask_to_reload(self) -> Future:
         return self._reload.call_async(Trigger.Request())
@@ -103,7 +104,7 @@ def test_forty_reloads_under_load_leave_no_trace(ros: Harness, tmp_path: Path) -
     ros.start('controller', {'model': file, **SETTINGS, **PATIENT})
     records = ros.listen(String, topics.CONTROLLER_EVENTS)
     bench = Bench(ros)
-    setpoint = ros.speak(Temperature, topics.SETPOINT, to='controller')
+    setpoint = ros.speak(Temperature, reactor.SETPOINT, to='controller')
     # with the snapshot for who listens
     ros.wait_until(lambda: records)
     for at, celsius in SETPOINTS:

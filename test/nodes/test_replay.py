@@ -19,6 +19,7 @@ from sensor_msgs.msg import Temperature
 from std_msgs.msg import String
 
 from koopman_ros.bags import BagReadError
+from koopman_ros.demo import reactor
 from koopman_ros.nodes import replay
 from koopman_ros.nodes.replay import Names
 from koopman_ros.parameters.controller import ReplayParameters
@@ -35,7 +36,7 @@ from support.recorded_runs import Recorded
 
 COOLANT = 24.5  # degC, not what the law would command
 # The rate limit is active through every step of the set-point, and the ramp takes some samples.
-SETTINGS = {'coolant_rate_limit': 30.0, 'setpoint_ramp': 60.0, 'measurement_timeout': 0.0}
+SETTINGS = {'coolant_temperature.rate_limit': 0.5, 'temperature.setpoint_ramp': 1.0, 'measurement_timeout': 0.0}
 RECORDS = f'/{topics.CONTROLLER_EVENTS}'
 
 
@@ -49,14 +50,14 @@ class Operator:
         self.model = folder / 'own.safetensors'
         ros.start('trainer', {'output': folder / 'day'})
         ros.node.create_subscription(
-            Temperature, topics.COOLANT_SETPOINT, self._on_command, topics.LOOP_QOS)
+            Temperature, reactor.COOLANT_SETPOINT, self._on_command, topics.LOOP_QOS)
         coolant = ros.node.create_publisher(
-            Temperature, topics.COOLANT_TEMPERATURE, topics.LATCHED_QOS)
+            Temperature, reactor.COOLANT_TEMPERATURE, topics.LATCHED_QOS)
         coolant.publish(temperature(COOLANT, 1.0))
         self.controller = ros.start('controller', SETTINGS)
         self.thermometer, self.setpoint, self.manual = (
             ros.speak(Temperature, topic, to='controller', subscribers=2)
-            for topic in (topics.TEMPERATURE, topics.SETPOINT, topics.MANUAL_COOLANT_SETPOINT))
+            for topic in (reactor.TEMPERATURE, reactor.SETPOINT, reactor.MANUAL_COOLANT_SETPOINT))
         ros.wait_until(lambda: coolant.get_subscription_count() >= 2)
         ros.meet('trainer')
         self.wait_for_records(1)
@@ -127,9 +128,9 @@ def tune_and_swap(operator: Operator) -> None:
     """Change parameters and models, also to what is refused, and go on a little each time."""
     shutil.copy(model_path('reactor_nz3'), operator.model)
     for change, taken in (
-            ({'coolant_weight': 0.3}, True), ({'coolant_weight': -1.0}, False),
-            ({'setpoint_filter': 15.0, 'observer_bandwidth': 3.0}, True),
-            ({'model': str(operator.model), 'coolant_weight': 0.5}, True),
+            ({'coolant_temperature.weight': 0.3}, True), ({'coolant_temperature.weight': -1.0}, False),
+            ({'setpoint_filter': 15.0, 'disturbance_bandwidth': 0.05}, True),
+            ({'model': str(operator.model), 'coolant_temperature.weight': 0.5}, True),
             ({'model': 'none'}, False)):
         assert operator.set(**change) is taken
         operator.measure_on(5, 46.0, -0.05)

@@ -82,13 +82,13 @@ def test_no_orphan_and_no_file_when_the_trainer_ends(ros: Harness, tmp_path: Pat
 def test_trains_beside_the_running_loop(ros: Harness, tmp_path: Path) -> None:
     # no quicker: what is recorded while the machine is busy is what there is to train from
     ros.start('plant', {'lockstep': True, 'speed': 50.0, 'lockstep_subscribers': 2,
-                        'noise': 0.1, 'heat_transfer_coefficient': 4e4})
+                        'temperature.noise': 0.1, 'constants.heat_transfer_coefficient': 666.666666667})
     process = ros.start('trainer', {
         **QUICK, 'output': tmp_path / 'run.mcap', 'model_output': tmp_path / 'new.safetensors',
         # which no lift meets
         'gate_margin': 0.99,
         'bags': [tmp_path / 'none.mcap'],
-        'experiment_duration': 10.0, 'experiment_coolant_min': 4.0, 'min_free_disk': 0.0})
+        'experiment_length': 600.0, 'coolant_temperature.experiment_min': 4.0, 'min_free_disk': 0.0})
     ros.meet('plant')
     assert ros.set_bool('trainer/experiment', True).success
 

@@ -54,9 +54,10 @@ HAPPENS = st.one_of(
     st.tuples(st.just('mode'), st.sampled_from(Mode)),
     st.tuples(st.just('applied'), st.floats(COOLANT - 30.0, COOLANT + 30.0)),
     st.tuples(st.just('exchange'), st.sampled_from([
-        {'model': 'reactor_nz3'}, {'model': 'reactor_nz4'}, {'coolant_weight': 0.3},
-        {'model': 'reactor_linear', 'observer_bandwidth': 0.0}, {'observer_bandwidth': 6.0},
-        {'setpoint_filter': 20.0, 'setpoint_ramp': 6.0}, {'coolant_rate_limit': 12.0}])),
+        {'model': 'reactor_nz3'}, {'model': 'reactor_nz4'}, {'coolant_temperature.weight': 0.3},
+        {'model': 'reactor_linear', 'disturbance_bandwidth': 0.0}, {'disturbance_bandwidth': 0.1},
+        {'setpoint_filter': 20.0, 'temperature.setpoint_ramp': 0.1},
+        {'coolant_temperature.rate_limit': 0.2}])),
     st.tuples(st.just('snapshot')))
 
 
@@ -149,12 +150,12 @@ def test_controllers_on_one_topic_and_one_that_is_started_again() -> None:
 
 
 def test_same_model_under_the_same_parameters_commands_the_same() -> None:
-    controller = Recorded(setpoint_ramp=6.0)
+    controller = Recorded(**{'temperature.setpoint_ramp': 0.1})
     for k in range(40):
         if k == 10:
             controller.do(events.SetpointRequest(0, np.array([STEADY - 6.0])))
         if k == 20:
-            controller.exchange(coolant_weight=0.5)
+            controller.exchange(**{'coolant_temperature.weight': 0.5})
         if k in (25, 30):
             controller.do(events.ModeChange(Mode.MANUAL if k == 25 else Mode.AUTOMATIC))
         controller.measure(STEADY - 0.1 * k)
@@ -163,7 +164,8 @@ def test_same_model_under_the_same_parameters_commands_the_same() -> None:
         found = replayed(texts, Alternative(model, digest))
         assert records.parse(texts[0]).event in (records.START, records.SNAPSHOT)
         assert all(identical(found, 'alternative'))
-    found = replayed(controller.texts, Alternative(model, digest, {'coolant_weight': 0.1}))
+    found = replayed(controller.texts, Alternative(
+        model, digest, {'coolant_temperature.weight': 0.1}))
     assert not all(identical(found, 'alternative'))
     assert all(identical(found))
 
@@ -208,7 +210,8 @@ def event(measured: object) -> dict[str, object]:
     (0, lambda fields: fields['state'].update(command={
         '@': 'array', 'dtype': '<f8', 'shape': [3], 'values': [1.0, 2.0, 3.0]}), 'record 1'),
     (0, lambda fields: fields['model'].update(digest='0' * 64), 'neither shipped nor found'),
-    (0, lambda fields: fields['parameters'].update(coolant_weight=-1.0), 'refuses .coolant_weig'),
+    (0, lambda fields: fields['parameters'].update({'coolant_temperature.weight': -1.0}),
+     r'refuses .coolant_temperature\.weight = -1\.0'),
     (0, lambda fields: fields['parameters'].update(other=1.0), 'parameters other, which this'),
     # what has a default may be missing, as in a later version
     (0, lambda fields: fields['state'].pop('mode'), ''),

@@ -14,6 +14,7 @@ from rcl_interfaces.srv import DescribeParameters
 from rosgraph_msgs.msg import Clock
 from sensor_msgs.msg import Temperature
 
+from koopman_ros.demo import reactor
 from koopman_ros.parameters.controller import TABLE
 from koopman_ros.ros import topics
 from koopman_ros.ros.node import range_of
@@ -34,13 +35,13 @@ def running(shared_ros: Harness) -> Harness:
 
 
 @pytest.mark.parametrize(('change', 'words'), [
-    ({'coolant_max': 500.0}, 'coolant_max = 500.0 degC must be in [-50, 150] degC'),
-    ({'temperature_weight': 0.0}, 'temperature_weight = 0.0 1/K^2 must be in (0, 1000000] 1/K^2'),
-    ({'setpoint_ramp': math.nan}, 'setpoint_ramp = nan K/min must be in (0, 1000000] K/min'),
-    ({'coolant_min': math.inf}, 'coolant_min = inf degC must be in [-50, 150] degC'),
-    ({'coolant_weight': 1}, "expected 'Type.DOUBLE' got 'Type.INTEGER'"),
-    ({'coolant_weight': 'much'}, "expected 'Type.DOUBLE' got 'Type.STRING'"),
-    ({'coolant_min': 40.0}, 'coolant_min = 40.0 degC must be below coolant_max = 32.0 degC: '
+    ({'coolant_temperature.max': 500.0}, 'coolant_max = 500.0 degC must be in [-50, 150] degC'),
+    ({'temperature.weight': 0.0}, 'temperature_weight = 0.0 1/K^2 must be in (0, 1000000] 1/K^2'),
+    ({'temperature.setpoint_ramp': math.nan / 60.0}, 'setpoint_ramp = nan K/min must be in (0, 1000000] K/min'),
+    ({'coolant_temperature.min': math.inf}, 'coolant_min = inf degC must be in [-50, 150] degC'),
+    ({'coolant_temperature.weight': 1}, "expected 'Type.DOUBLE' got 'Type.INTEGER'"),
+    ({'coolant_temperature.weight': 'much'}, "expected 'Type.DOUBLE' got 'Type.STRING'"),
+    ({'coolant_temperature.min': 40.0}, 'coolant_min = 40.0 degC must be below coolant_max = 32.0 degC: '
      'change the other one first'),
     ({'model': 'reactor_nz5'}, 'the old model is kept: no model file at '),
     ({'no_such_thing': 1.0}, 'undeclared parameter'),
@@ -48,9 +49,9 @@ def running(shared_ros: Harness) -> Harness:
      f'{TABLE.rows["linear_margin"].default}: change the other one first'),
     ({'min_riccati_digits': 16.0}, 'min_riccati_digits = 16.0 must be in [0, 15]'),
     # what fits, and cannot be used: 0 per second
-    ({'coolant_rate_limit': 5e-324}, 'coolant_rate_limit = 5e-324 K/min cannot be used: input '
+    ({'coolant_temperature.rate_limit': 0.0}, 'coolant_rate_limit = 5e-324 K/min cannot be used: input '
      'rate must be above 0, got [0.0]; choose another value in (0, 1000000] K/min'),
-    ({'setpoint_ramp': 5e-324}, 'setpoint_ramp = 5e-324 K/min cannot be used: setpoint_ramp must '
+    ({'temperature.setpoint_ramp': 0.0}, 'setpoint_ramp = 5e-324 K/min cannot be used: setpoint_ramp must '
      'be above 0, got [0.0]; choose another value in (0, 1000000] K/min'),
 ])
 def test_change_that_does_not_fit_is_refused_with_the_reason(
@@ -65,14 +66,14 @@ def test_change_that_does_not_fit_is_refused_with_the_reason(
 
 def test_two_limits_that_cross_on_the_way_change_together(running: Harness) -> None:
     default = {name: TABLE.rows[name].default for name in ('coolant_min', 'coolant_max')}
-    for limits in ({'coolant_min': 40.0, 'coolant_max': 60.0}, default):
+    for limits in ({'coolant_temperature.min': 40.0, 'coolant_temperature.max': 60.0}, default):
         result = running.set_parameters_atomically(CONTROLLER, **limits)
         assert result.successful, result.reason
         assert running.get_parameters(CONTROLLER, *limits) == list(limits.values())
 
 
 @pytest.mark.parametrize(('changes', 'words'), [
-    ({'max_gain': 7.0, 'coolant_max': 500.0}, 'coolant_max = 500.0 degC must be in '),
+    ({'max_gain': 7.0, 'coolant_temperature.max': 500.0}, 'coolant_max = 500.0 degC must be in '),
     # equal in K
     *(({f'{name}_min': 20.0, f'{name}_max': 20.00000000000001},
        f'{name}_min = 20.0 degC and {name}_max = 20.00000000000001 degC cannot be used: {kind} '
@@ -208,8 +209,8 @@ def test_simulated_time_that_nobody_publishes_is_told_and_silence_in_it_ends_at_
     assert value(status, 'age of measurement [s]') == 'nan'
 
     # a plant of which the controller hears the time alone
-    elsewhere = [part for name in (topics.TEMPERATURE, topics.COOLANT_SETPOINT,
-                                   topics.COOLANT_TEMPERATURE)
+    elsewhere = [part for name in (reactor.TEMPERATURE, reactor.COOLANT_SETPOINT,
+                                   reactor.COOLANT_TEMPERATURE)
                  for part in ('-r', f'{name}:=elsewhere/{name}')]
     clock = ros.listen(Clock, topics.CLOCK, topics.CLOCK_QOS)
     ros.start('plant', {'speed': 50.0}, tuple(elsewhere))
@@ -245,7 +246,7 @@ def test_simulated_time_that_nobody_publishes_is_told_and_silence_in_it_ends_at_
 def test_silence_by_the_wall_clock_ends_at_the_safe_coolant_or_with_the_operator(
         ros: Harness) -> None:
     bench = Bench(ros, {'measurement_timeout': 0.3, 'hold_timeout': 1.5,
-                        'coolant_rate_limit': 6000.0, 'safe_coolant': 10.0})
+                        'coolant_temperature.rate_limit': 100.0, 'coolant_temperature.safe': 10.0})
     held = bench.commands[0].temperature
     ros.wait_until(lambda: bench.commands[-1].temperature == 10.0)
     own = own_commands(bench, 1.0)
@@ -263,7 +264,7 @@ def test_silence_by_the_wall_clock_ends_at_the_safe_coolant_or_with_the_operator
     ros.set_bool('controller/set_automatic', False)
     last = math.floor(seconds(bench.commands[-1])) + 60.0
     held = bench.measure(STEADY, last).temperature
-    manual = ros.speak(Temperature, topics.MANUAL_COOLANT_SETPOINT, to='controller')
+    manual = ros.speak(Temperature, reactor.MANUAL_COOLANT_SETPOINT, to='controller')
     manual.publish(temperature(held - 0.5))
     ros.wait_until(lambda: bench.commands[-1].temperature == pytest.approx(held - 0.5))
     assert own_commands(bench, last)

@@ -24,6 +24,7 @@ from sensor_msgs.msg import JointState, Temperature
 from std_srvs.srv import SetBool
 
 from koopman_ros.bags import BagWriter, message_definition
+from koopman_ros.demo import reactor
 from koopman_ros.nodes import replay
 from koopman_ros.parameters.trainer import PlayerParameters
 from koopman_ros.ros import topics
@@ -96,14 +97,14 @@ def test_the_trainer_does_what_it_is_granted(ros: Harness, tmp_path: Path) -> No
                           'experiment_timeout': 0.5})
     client = ros.node.create_client(SetBool, '/trainer/experiment')
     ros.wait_until(client.service_is_ready)
-    for topic in (topics.COOLANT_SETPOINT, topics.MANUAL_COOLANT_SETPOINT):
-        assert ros.set_parameters('/trainer', experiment_topic=topic)[0].successful
+    for topic in (reactor.COOLANT_SETPOINT, reactor.MANUAL_COOLANT_SETPOINT):
+        assert ros.set_parameters('/trainer', **{'experiment_on': topic})[0].successful
         # it publishes while it waits for the measurement that does not come
         waiting = client.call_async(SetBool.Request(data=True))
         watch(ros, 'trainer', seen, publishes={f'/{topic}'})
         ros.wait_until(waiting.done)
         # without a controller nobody drives it by hand
-        ros.node.create_publisher(Temperature, topics.COOLANT_SETPOINT, topics.LOOP_QOS)
+        ros.node.create_publisher(Temperature, reactor.COOLANT_SETPOINT, topics.LOOP_QOS)
     check(ros, 'trainer', seen)
 
 

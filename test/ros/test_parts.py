@@ -18,6 +18,7 @@ from sensor_msgs.msg import Temperature
 
 from koopman_ros.bags import BagWriter, read_messages
 from koopman_ros.control import Controller
+from koopman_ros.demo import reactor
 from koopman_ros.lifting import load, ModelFileError, save
 from koopman_ros.parameters.trainer import TrainerParameters
 from koopman_ros.resources import model_path
@@ -33,7 +34,7 @@ from koopman_ros.testing import Harness
 from koopman_ros.units import NANOSECONDS
 from support.nodes import temperature, TIMEOUT
 
-NAMES = (topics.TEMPERATURE, topics.SETPOINT, topics.COOLANT_SETPOINT)
+NAMES = (reactor.TEMPERATURE, reactor.SETPOINT, reactor.COOLANT_SETPOINT)
 
 
 def made(part: str, node: Node, folder: Path) -> Callable[[], object]:
@@ -52,7 +53,7 @@ def made(part: str, node: Node, folder: Path) -> Callable[[], object]:
             made.start()
         case 'experiment':
             made = CoolantExperiment(
-                node, TrainerParameters(experiment_topic=topics.COOLANT_SETPOINT))
+                node, TrainerParameters(experiment_topic=reactor.COOLANT_SETPOINT))
             assert made._start() == ''
         case 'training':
             made = Training(node, TrainerParameters(), lambda: str(folder / 'missing'))

@@ -15,7 +15,7 @@ from scipy.optimize import root
 from koopman_ros import control, plants
 from koopman_ros.arrays import Array
 from koopman_ros.lifting import LiftedModel, load
-from koopman_ros.parameters.controller import ControllerParameters
+from koopman_ros.parameters.controller import signals_of, table_of
 from koopman_ros.reasons import Words
 from koopman_ros.replay.records import encoded
 from koopman_ros.units import Displays
@@ -61,15 +61,16 @@ def run_reactor(model: LiftedModel, law: Law, R: float, minutes: float) -> tuple
 EPOCH = 1_785_000_000 * SECOND
 LOWER, UPPER, RATE = 278.15, 305.15, 1.0  # K, K, K/s
 SAFE = LOWER
+USUAL = table_of(shipped('reactor_nz4')).snapshot({}).settings(
+    signals_of(shipped('reactor_nz4')))
 
 
 def controller(model: Any = 'reactor_nz4', *, supervisor: Mapping[str, float] | None = None,
                sensor: Mapping[str, Any] | None = None, **changes: Any) -> control.Controller:
     """Return a controller with the default parameters of its node."""
     model = shipped(model) if isinstance(model, str) else model
-    usual = ControllerParameters().settings()
     return control.Controller(model, replace(
-        usual, sensor=replace(usual.sensor, **(sensor or {})),
+        USUAL, sensor=replace(USUAL.sensor, **(sensor or {})),
         supervisor=supervisor_settings(**(supervisor or {})), **changes))
 
 

@@ -13,20 +13,24 @@ from rclpy.qos import QoSProfile
 from sensor_msgs.msg import Temperature
 from std_msgs.msg import String
 
+from koopman_ros.demo import reactor
+from koopman_ros.lifting import load
 from koopman_ros.nodes.replay import replay_records
-from koopman_ros.parameters.controller import TABLE
+from koopman_ros.parameters.controller import table_of
 from koopman_ros.replay.records import parse, Record
+from koopman_ros.resources import model_path
 from koopman_ros.ros import topics
 from koopman_ros.testing import Harness
 from koopman_ros.units import to_celsius
 from support.nodes import seconds, temperature, TIMEOUT, value
 
 STATUS = 'controller: control'
+TABLE = table_of(load(model_path(reactor.MODEL)))
 STEADY = 51.8  # degC, near the plant's steady state
 # Silence is told by the wall clock, and a busy machine may be silent where no test means it.
 PATIENT = {'measurement_timeout': 0.0}
 # The law alone, which the temperature of a moment determines.
-PURE = {'observer_bandwidth': 0.0, 'transfer_time': 0.0, 'frozen_timeout': 0.0, **PATIENT}
+PURE = {'disturbance_bandwidth': 0.0, 'transfer_time': 0.0, 'frozen_timeout': 0.0, **PATIENT}
 # What a test may have set. The model is left out: it is read in a moment that a busy machine may
 # miss, and no test on a shared bench sets it.
 RESET = {name: PURE.get(name, row.default)
@@ -50,10 +54,10 @@ class Bench:
         self.ros = ros
         self.sent = 0  # measurements
         self.process = ros.start('controller', {**PATIENT, **(parameters or {})}, arguments)
-        self.commands = ros.listen(Temperature, topics.COOLANT_SETPOINT)
-        self.tracked = ros.listen(Temperature, topics.ACTIVE_SETPOINT, topics.LATCHED_QOS)
-        self.thermometer = ros.speak(Temperature, topics.TEMPERATURE, qos, to='controller')
-        self._setpoint = ros.speak(Temperature, topics.SETPOINT, to='controller')
+        self.commands = ros.listen(Temperature, reactor.COOLANT_SETPOINT)
+        self.tracked = ros.listen(Temperature, reactor.ACTIVE_SETPOINT, topics.LATCHED_QOS)
+        self.thermometer = ros.speak(Temperature, reactor.TEMPERATURE, qos, to='controller')
+        self._setpoint = ros.speak(Temperature, reactor.SETPOINT, to='controller')
         self.measure(STEADY, first)
         self.active_since(STEADY)
 

@@ -4,7 +4,7 @@
 """Runs of a reactor as a trainer would have recorded them, and a controller with its records."""
 
 from collections.abc import Callable, Iterable, Mapping
-from dataclasses import asdict, dataclass, replace
+from dataclasses import dataclass, replace
 import importlib
 from pathlib import Path
 from typing import Any
@@ -14,10 +14,10 @@ import numpy as np
 
 from koopman_ros import plants
 from koopman_ros.bags import BagWriter, message_definition
-from koopman_ros.control import Controller, State
+from koopman_ros.control import Controller, Settings, State
 from koopman_ros.control.events import apply, Event, Measurement, Outcome, Silence
 from koopman_ros.lifting import load_with_digest
-from koopman_ros.parameters.controller import ControllerParameters
+from koopman_ros.parameters.controller import signals_of, table_of
 from koopman_ros.plant_data import Episode
 from koopman_ros.replay import records
 from koopman_ros.resources import model_path
@@ -109,6 +109,7 @@ def write_messages(path: Path, rows: Iterable[tuple[int, float, float]],
 STEADY, COOLANT = 324.9, 300.0  # K
 MODELS = {name: load_with_digest(model_path(name))
           for name in ('reactor_nz3', 'reactor_nz4', 'reactor_linear')}
+TABLE = table_of(MODELS['reactor_nz4'][0])
 
 
 class Recorded:
@@ -116,21 +117,26 @@ class Recorded:
 
     def __init__(self, name: str = 'reactor_nz4', run: str = 'a', **parameters: float) -> None:
         self.run, self.now = run, 0
-        self.parameters = ControllerParameters(model=name, **parameters)
-        self.controller = Controller(MODELS[name][0], self.parameters.settings())
+        self.parameters = {**TABLE.values(TABLE.snapshot({})), 'model': name, **parameters}
+        self.controller = Controller(MODELS[name][0], self.settings)
         self.state = State()
         self.texts: list[str] = []
         self.answers: list[tuple[int, float, float]] = []  # stamp in ns, measured and command in K
         self.commands: list[np.ndarray] = []
         self.snapshot(records.START)
 
+    @property
+    def settings(self) -> Settings:
+        """The tuning that the parameters stand for, of every one of the models."""
+        return TABLE.snapshot(self.parameters).settings(signals_of(MODELS['reactor_nz4'][0]))
+
     def write(self, event: str, fields: Mapping[str, object]) -> None:
         self.texts.append(records.Record(self.run, len(self.texts), event, fields).text())
 
     def snapshot(self, event: str = records.SNAPSHOT) -> None:
-        name = self.parameters.model
-        self.write(event, records.snapshot(self.state, asdict(self.parameters),
-                                   {'name': name, 'digest': MODELS[name][1]}))
+        name = self.parameters['model']
+        self.write(event, records.snapshot(
+            self.state, self.parameters, {'name': name, 'digest': MODELS[name][1]}))
 
     def do(self, event: Event) -> Outcome:
         outcome = apply(self.controller, self.state, event)
@@ -149,15 +155,15 @@ class Recorded:
 
     def exchange(self, **parameters: object) -> None:
         """Set parameters; the same model once more is read again."""
-        self.parameters = replace(self.parameters, **parameters)
+        self.parameters |= parameters
         model = self.controller.model
         fields: dict[str, object] = {'parameters': parameters}
         if 'model' in parameters:
-            name = self.parameters.model
+            name = str(parameters['model'])
             model = load_with_digest(model_path(name))[0]
             fields['model'] = {'name': name, 'digest': MODELS[name][1]}
         predecessor = self.controller
-        self.controller = Controller(model, self.parameters.settings())
+        self.controller = Controller(model, self.settings)
         self.state = self.controller.hand_over(predecessor, self.state)
         event = records.PARAMETERS if len(parameters) > ('model' in parameters) else records.MODEL
         self.write(event, fields)

@@ -16,8 +16,8 @@ def main() -> int:
     """Answer until the process is told to end."""
     rclpy.init()
     node = rclpy.create_node('echo')
-    answers = node.create_publisher(Temperature, topics.COOLANT_SETPOINT, topics.LOOP_QOS)
-    node.create_subscription(Temperature, topics.TEMPERATURE, answers.publish, topics.LOOP_QOS)
+    answers = node.create_publisher(Temperature, 'coolant_setpoint', topics.LOOP_QOS)
+    node.create_subscription(Temperature, 'temperature', answers.publish, topics.LOOP_QOS)
     try:
         rclpy.spin(node)
     except (KeyboardInterrupt, ExternalShutdownException):

@@ -17,6 +17,7 @@ import psutil
 from sensor_msgs.msg import Temperature
 from std_srvs.srv import Trigger
 
+from koopman_ros.demo import reactor
 from koopman_ros.reports import table
 from koopman_ros.ros import topics
 from koopman_ros.ros.codec import stamp_message, stamp_nanoseconds
@@ -108,9 +109,9 @@ class _Probe:
         self._rng = np.random.default_rng(0)
         self._answers: dict[int, int] = {}  # stamp -> arrival
         self._measurements = harness.node.create_publisher(
-            Temperature, f'{namespace}/{topics.TEMPERATURE}', topics.LOOP_QOS)
+            Temperature, f'{namespace}/{reactor.TEMPERATURE}', topics.LOOP_QOS)
         harness.node.create_subscription(
-            Temperature, f'{namespace}/{topics.COOLANT_SETPOINT}', self._on_command,
+            Temperature, f'{namespace}/{reactor.COOLANT_SETPOINT}', self._on_command,
             topics.LOOP_QOS)
 
     def _on_command(self, message: Temperature) -> None:
@@ -248,7 +249,7 @@ def _lockstep(figures: dict[str, Any], harness: Harness, seconds: float) -> str:
     """Let plant and controller run in lock-step as fast as they can, and weigh all nodes."""
     arrivals: list[float] = []
     harness.node.create_subscription(
-        Temperature, f'/lockstep/{topics.TEMPERATURE}',
+        Temperature, f'/lockstep/{reactor.TEMPERATURE}',
         lambda _: arrivals.append(time.monotonic()), topics.LOOP_QOS, raw=True)
     with _start(harness, 'trainer', '/idle', record_at_start=False) as trainer, \
             _start(harness, 'plant', '/lockstep', speed=0.0, lockstep=True, duration=seconds,

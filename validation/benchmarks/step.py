@@ -27,7 +27,7 @@ from koopman_ros.control import (
 )
 from koopman_ros.control.simulate import after_a_second
 from koopman_ros.lifting import LiftedModel, load, NetworkObservables
-from koopman_ros.parameters.controller import ControllerParameters
+from koopman_ros.parameters.controller import signals_of, table_of
 from koopman_ros.resources import model_path
 from koopman_ros.units import NANOSECONDS
 from validation.benchmarks.process import Tell
@@ -46,7 +46,7 @@ _NEAR = 1e-6
 def compare(n_z: int, samples: int) -> dict[str, Any]:
     """Time both sides on one course, block by block in turns, once they are seen to agree."""
     model = _lift(n_z)
-    ours = Controller(model, ControllerParameters().settings())
+    ours = Controller(model, table_of(model).snapshot({}).settings(signals_of(model)))
     course, requested = _course(ours, samples)
     if any(report.command.law.form != Form.RECENTRED.value for report in course.reports):
         raise ValueError(f'the re-centred law is not always in force for n_z = {n_z}')

@@ -14,7 +14,7 @@ from typing import NamedTuple, TYPE_CHECKING
 import numpy as np
 
 from koopman_ros.arrays import Array
-from koopman_ros.parameters.controller import ControllerParameters
+from koopman_ros.demo import reactor
 from koopman_ros.reasons import Code
 
 if TYPE_CHECKING:
@@ -22,7 +22,7 @@ if TYPE_CHECKING:
 
 SETPOINT = 46.0  # degC; 5 K below the steady state that the reactor starts from
 LOCKSTEP = {'lockstep': True, 'speed': 0.0, 'lockstep_timeout': 0.5}
-RATE = ControllerParameters.coolant_rate_limit / 60.0  # K/s
+RATE = reactor.coolant_parameters().rate_limit  # K/s
 BAND = 0.3  # K around the set-point that counts as back
 
 

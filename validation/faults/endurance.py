@@ -41,17 +41,17 @@ def _happen(event: str, loop: FaultHarness, random: Generator) -> None:
         case 'set-point':
             loop.request(float(random.uniform(42.0, 50.0)))
         case 'disturbance':
-            loop.set_parameters(
-                'plant', feed_temperature=float(random.uniform(74.0, 80.0)),
-                heat_transfer_coefficient=float(random.uniform(45000.0, 55000.0)),
-                noise=float(random.uniform(0.0, 0.05)))
+            loop.set_parameters('plant', **{
+                'constants.feed_temperature': float(random.uniform(74.0, 80.0)),
+                'constants.heat_transfer_coefficient': float(random.uniform(750.0, 917.0)),
+                'temperature.noise': float(random.uniform(0.0, 0.05))})
         case 'impossible set-point':
             celsius = float(random.choice([math.nan, 90.0, -1e9]))
             loop.setpoint.publish(Temperature(temperature=celsius))
         case 'weights':
-            loop.set_parameters(
-                'controller', coolant_weight=float(10.0 ** random.uniform(-1.0, 1.0)),
-                temperature_weight=float(random.choice([1.0, math.nan])))
+            loop.set_parameters('controller', **{
+                'coolant_temperature.weight': float(10.0 ** random.uniform(-1.0, 1.0)),
+                'temperature.weight': float(random.choice([1.0, math.nan]))})
         case 'manual mode':
             loop.ros.set_bool('controller/set_automatic', False)
             loop.run_for(float(random.uniform(5.0, 60.0)))

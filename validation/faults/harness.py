@@ -17,6 +17,7 @@ from typing import Any, TypeVar
 from rclpy.publisher import Publisher
 from sensor_msgs.msg import Temperature
 
+from koopman_ros.demo import reactor
 from koopman_ros.ros import topics
 from koopman_ros.testing import Harness, HarnessError, NodeProcess
 from validation.faults.case import Case, Trace
@@ -89,7 +90,7 @@ class FaultHarness:
                            each_turn=self._each_turn)
         self.interceptor = Interceptor(self.ros.node, between)
         self.trace = self.interceptor.trace
-        self.setpoint = self.publisher(topics.SETPOINT)
+        self.setpoint = self.publisher(reactor.SETPOINT)
 
     def __enter__(self) -> FaultHarness:
         return self
@@ -168,7 +169,7 @@ class FaultHarness:
         """Request a set-point until the controller, which may be new, reports to track it."""
         tracked: list[Any] = []
         subscription = self.ros.node.create_subscription(
-            Temperature, topics.ACTIVE_SETPOINT, tracked.append, topics.LATCHED_QOS)
+            Temperature, reactor.ACTIVE_SETPOINT, tracked.append, topics.LATCHED_QOS)
         self._meet_controller()
         due = steady_since = 0.0
 

@@ -17,6 +17,7 @@ from rclpy.node import Node
 from sensor_msgs.msg import Temperature
 from std_msgs.msg import String
 
+from koopman_ros.demo import reactor
 from koopman_ros.ros import topics
 from koopman_ros.ros.codec import stamp_message, stamp_nanoseconds
 from koopman_ros.units import NANOSECONDS
@@ -28,8 +29,8 @@ MOST_RECORDS = 100_000
 PLANT_TEMPERATURE = 'plant/temperature'
 PLANT_COOLANT = 'plant/coolant_setpoint'
 # What a plant is started with when messages are altered.
-REMAPPED = ('-r', f'{topics.TEMPERATURE}:={PLANT_TEMPERATURE}',
-            '-r', f'{topics.COOLANT_SETPOINT}:={PLANT_COOLANT}')
+REMAPPED = ('-r', f'{reactor.TEMPERATURE}:={PLANT_TEMPERATURE}',
+            '-r', f'{reactor.COOLANT_SETPOINT}:={PLANT_COOLANT}')
 
 
 class Packet(NamedTuple):
@@ -142,20 +143,20 @@ class Interceptor:
         self._held: float | None = None  # the command that the actuator stands at
         if between:
             self._to_controller = node.create_publisher(
-                Temperature, topics.TEMPERATURE, topics.LOOP_QOS)
+                Temperature, reactor.TEMPERATURE, topics.LOOP_QOS)
             self._to_plant = node.create_publisher(Temperature, PLANT_COOLANT, topics.LOOP_QOS)
         for kind, topic, callback, qos in (
                 (DiagnosticArray, topics.DIAGNOSTICS, self._on_diagnostics, topics.LOOP_QOS),
                 (String, topics.CONTROLLER_EVENTS, self._on_record,
                  topics.profile(MOST_RECORDS, reliable=True)),
-                (Temperature, topics.COOLANT_TEMPERATURE, self._on_coolant, topics.LATCHED_QOS),
-                (Temperature, topics.COOLANT_SETPOINT, self._on_command, topics.LOOP_QOS)):
+                (Temperature, reactor.COOLANT_TEMPERATURE, self._on_coolant, topics.LATCHED_QOS),
+                (Temperature, reactor.COOLANT_SETPOINT, self._on_command, topics.LOOP_QOS)):
             node.create_subscription(kind, topic, callback, qos)
 
     def open(self) -> None:
         """Trace the plant from now on."""
         self._node.create_subscription(
-            Temperature, PLANT_TEMPERATURE if self._between else topics.TEMPERATURE,
+            Temperature, PLANT_TEMPERATURE if self._between else reactor.TEMPERATURE,
             self._on_temperature, topics.LOOP_QOS)
 
     def _on_temperature(self, message: Temperature) -> None:

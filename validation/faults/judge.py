@@ -12,15 +12,15 @@ from typing import Any
 
 import numpy as np
 
+from koopman_ros.demo import reactor
 from koopman_ros.nodes.replay import replay_records
-from koopman_ros.parameters.controller import ControllerParameters
 from koopman_ros.replay.records import parse, RecordError
 from validation.faults.case import Case, RATE, Trace
 
 RUNAWAY = 60.0  # degC; the reactor's operating points end below 54 degC
 LONGEST_GAP = 3.0  # s between two commands, of those for which a larger step is allowed
 _LAST = 30.0  # s at the end of a trace, in which an offset is looked for
-_LOWEST, _HIGHEST = ControllerParameters.coolant_min, ControllerParameters.coolant_max  # degC
+_LOWEST, _HIGHEST = reactor.coolant_parameters().min, reactor.coolant_parameters().max  # degC
 
 
 def judge(trace: Trace, case: Case) -> dict[str, Any]:

@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import Any, TYPE_CHECKING
 
 from koopman_ros import reports
-from koopman_ros.parameters.controller import ControllerParameters
+from koopman_ros.demo import reactor
 from validation.faults.case import BAND, Trace
 from validation.faults.judge import RUNAWAY
 
@@ -132,8 +132,8 @@ def _draw_case(upper: Axes, lower: Axes, trace: Trace) -> None:
                color='black', linewidth=1.0, label='set-point')
     lower.plot([command.seconds for command in trace.commands],
                [command.celsius for command in trace.commands], label='command')
-    limits = ControllerParameters()
-    reports.draw_limits(lower, (limits.coolant_min, limits.coolant_max), 'limits')
+    limits = reactor.coolant_parameters()
+    reports.draw_limits(lower, (limits.min, limits.max), 'limits')
     for axes in (upper, lower):
         axes.axvspan(trace.begin, max(trace.end, trace.begin + 2.0), alpha=0.2,
                      color='tab:red', linewidth=0.0, label='fault')

@@ -14,8 +14,9 @@ from koopman_ros import control, plants
 from koopman_ros.arrays import Array
 from koopman_ros.control import Controller, Simulation
 from koopman_ros.lifting import LiftedModel, load
-from koopman_ros.parameters.controller import ControllerParameters
+from koopman_ros.parameters.controller import signals_of, table_of
 from koopman_ros.resources import model_path
+from koopman_ros.units import SECONDS_PER_MINUTE
 
 REACTOR = plants.one_state_reactor()
 START = float(REACTOR.nominal_state[0])
@@ -44,10 +45,12 @@ def reactor_controller(*, bandwidth: float = BANDWIDTH, coolant_weight: float = 
     :param fallback: whether the distance from the training data decides which law acts.
     :param linear_margin: up to which the linear law does, in half widths.
     """
-    settings = ControllerParameters(
-        observer_bandwidth=bandwidth, coolant_weight=coolant_weight, linear_margin=linear_margin
-        ).settings()
-    return Controller(model or shipped_model(), settings if fallback else replace(
+    model = model or shipped_model()
+    settings = table_of(model).snapshot({
+        'disturbance_bandwidth': bandwidth / SECONDS_PER_MINUTE,
+        'coolant_temperature.weight': coolant_weight, 'linear_margin': linear_margin,
+    }).settings(signals_of(model))
+    return Controller(model, settings if fallback else replace(
         settings, supervisor=replace(settings.supervisor, levels=NO_FALLBACK)))
 
 

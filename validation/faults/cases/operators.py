@@ -18,9 +18,8 @@ from rclpy.task import Future
 from sensor_msgs.msg import Temperature
 from std_srvs.srv import SetBool
 
-from koopman_ros.parameters.controller import ControllerParameters
+from koopman_ros.demo import reactor
 from koopman_ros.reasons import Code
-from koopman_ros.ros import topics
 from validation.faults.case import Case, LOCKSTEP, SETPOINT
 from validation.faults.harness import FaultHarness
 
@@ -30,7 +29,9 @@ _STORM = 2.0  # s of wall time
 _WORKED_OFF = 30.0  # s of wall time, within which a storm is worked off on a busy machine
 STUCK_AT = 25.0  # degC; the set-point needs 23.4 degC, and the reactor gets 2.1 K too warm
 WINDUP = 3.0  # K; who has wound up meanwhile goes further to the other side
-CONCENTRATION = 0.87725294608097  # mol/L, that of the plant
+_COOLANT = reactor.COOLANT_TEMPERATURE
+_TUNED = ('temperature.weight', 'temperature.setpoint_ramp', *(
+    f'{_COOLANT}.{name}' for name in ('weight', 'min', 'max', 'rate_limit')))
 
 
 def _send(loop: FaultHarness, kind: Any, service: str, requests: Iterable[Any]) -> list[Any]:
@@ -64,11 +65,11 @@ def _drawn(seed: int, ranges: Mapping[str, tuple[float, float]], exponents: bool
 
 
 _BAD: tuple[dict[str, Any], ...] = (
-    {'temperature_weight': math.nan}, {'temperature_weight': -1.0}, {'temperature_weight': 1},
-    {'coolant_weight': 0.0}, {'coolant_weight': math.inf}, {'coolant_weight': 'much'},
-    {'coolant_min': 60.0}, {'coolant_max': -10.0}, {'coolant_max': math.nan},
-    {'coolant_rate_limit': 0.0}, {'setpoint_ramp': -math.inf}, {'max_gain': 0.0},
-    {'max_riccati_residual': 2.0}, {'measurement_timeout': math.nan},
+    {'temperature.weight': math.nan}, {'temperature.weight': -1.0}, {'temperature.weight': 1},
+    {f'{_COOLANT}.weight': 0.0}, {f'{_COOLANT}.weight': math.inf}, {f'{_COOLANT}.weight': 'much'},
+    {f'{_COOLANT}.min': 60.0}, {f'{_COOLANT}.max': -10.0}, {f'{_COOLANT}.max': math.nan},
+    {f'{_COOLANT}.rate_limit': -1.0}, {'temperature.setpoint_ramp': -math.inf}, {'max_gain': 0.0},
+    {'min_riccati_digits': -1.0}, {'measurement_timeout': math.nan},
     {'model': ''}, {'model': '/nowhere/lift.safetensors'}, {'model': 3.0})
 
 
@@ -88,9 +89,9 @@ def _storm_of_parameters(loop: FaultHarness, make: Callable[[], Iterable[Mapping
         else:
             reasons = {result.reason for result in results if not result.successful}
             loop.expect(not reasons, f'good values were refused: {sorted(reasons)[:2]}')
+            defaults = reactor.controller_table().rows
             last = loop.set_parameters(
-                'controller', temperature_weight=1.0, coolant_weight=1.0, coolant_min=5.0,
-                coolant_max=32.0, coolant_rate_limit=60.0, setpoint_ramp=1000.0)
+                'controller', **{name: defaults[name].default for name in _TUNED})
             loop.expect(not last, f'the defaults were refused: {last}')
 
 
@@ -114,7 +115,7 @@ def _storm_of_setpoints(loop: FaultHarness, values: tuple[float, ...]) -> None:
 
 def _storm_of_modes(loop: FaultHarness) -> None:
     """Between operator and law, while a manual command is always on its way."""
-    manual = loop.publisher(topics.MANUAL_COOLANT_SETPOINT)
+    manual = loop.publisher(reactor.MANUAL_COOLANT_SETPOINT)
 
     def requests() -> Iterator[SetBool.Request]:
         for number in range(_REQUESTS):
@@ -146,9 +147,14 @@ def _changed(loop: FaultHarness, parameters: Mapping[str, float], setpoint: floa
 def _without_the_cold(loop: FaultHarness, node: str, usual: float) -> None:
     """Take the lower part of a node's range of the coolant for 15 min."""
     with loop.fault():
-        loop.set_parameters(node, coolant_min=STUCK_AT)
+        loop.set_parameters(node, **{f'{_COOLANT}.min': STUCK_AT})
         loop.run_for(900.0)
-        loop.set_parameters(node, coolant_min=usual)
+        loop.set_parameters(node, **{f'{_COOLANT}.min': usual})
+
+
+def _scaled(name: str, factor: float) -> dict[str, float]:
+    """Return a constant of the plant by a factor of its usual value."""
+    return {f'constants.{name}': factor * reactor.constant(name)}
 
 
 def _parameters(name: str, does: str, make: Callable[[], Iterable[Mapping[str, Any]]],
@@ -169,12 +175,12 @@ def _constant(name: str, does: str, play: Callable[[FaultHarness], None], **deta
 
 CASES = (
     _parameters('weights-storm', 'changes of both weights by factors of up to 10,000', partial(
-        _drawn, 0, {'temperature_weight': (-2.0, 2.0), 'coolant_weight': (-2.0, 2.0)}, True)),
+        _drawn, 0, {'temperature.weight': (-2.0, 2.0), f'{_COOLANT}.weight': (-2.0, 2.0)}, True)),
     _parameters('limits-storm', 'changes of range and rate of the coolant', partial(
-        _drawn, 1, {'coolant_min': (5.0, 22.0), 'coolant_max': (24.0, 32.0),
-                    'coolant_rate_limit': (1.0, 60.0)})),
+        _drawn, 1, {f'{_COOLANT}.min': (5.0, 22.0), f'{_COOLANT}.max': (24.0, 32.0),
+                    f'{_COOLANT}.rate_limit': (0.02, 1.0)})),
     _parameters('ramps-storm', 'changes of the ramp of the set-point', partial(
-        _drawn, 2, {'setpoint_ramp': (-3.0, 3.0)}, True)),
+        _drawn, 2, {'temperature.setpoint_ramp': (-5.0, 1.0)}, True)),
     _parameters('bad-values-storm', 'parameters that cannot be',
                 lambda: itertools.islice(itertools.cycle(_BAD), _REQUESTS), refused=True),
     _setpoints('setpoint-storm', ', all the same', SETPOINT),
@@ -188,25 +194,26 @@ CASES = (
          _storm_of_modes),
     *(_constant(name, f'{does}, for good', partial(_changed, parameters=changes))
       for name, does, changes in (
-          ('heat-transfer-low', 'UA -20 %', {'heat_transfer_coefficient': 40000.0}),
-          ('heat-transfer-high', 'UA +20 %', {'heat_transfer_coefficient': 60000.0}),
-          ('feed-warm', 'T_i +5 K', {'feed_temperature': 81.85}),
-          ('feed-cold', 'T_i -5 K', {'feed_temperature': 71.85}),
-          ('concentration-high', 'C_A +10 %', {'concentration': 1.1 * CONCENTRATION}),
-          ('concentration-low', 'C_A -10 %', {'concentration': 0.9 * CONCENTRATION}))),
+          ('heat-transfer-low', 'UA -20 %', _scaled('heat_transfer_coefficient', 0.8)),
+          ('heat-transfer-high', 'UA +20 %', _scaled('heat_transfer_coefficient', 1.2)),
+          ('feed-warm', 'T_i +5 K', {'constants.feed_temperature': 81.85}),
+          ('feed-cold', 'T_i -5 K', {'constants.feed_temperature': 71.85}),
+          ('concentration-high', 'C_A +10 %', _scaled('concentration', 1.1)),
+          ('concentration-low', 'C_A -10 %', _scaled('concentration', 0.9)))),
     _constant('actuator-lag', 'the coolant follows its command with 5 s, for good, and the '
               'set-point steps',
-              partial(_changed, parameters={'coolant_lag': 5.0}, setpoint=42.0)),
+              partial(_changed, parameters={f'{_COOLANT}.lag': 5.0}, setpoint=42.0)),
     _constant('actuator-late', 'commands act one sample late, for good, and the set-point steps',
-              partial(_changed, parameters={'command_delay': 1.0}, setpoint=42.0)),
+              partial(_changed, parameters={f'{_COOLANT}.delay': 1.0}, setpoint=42.0)),
     _constant('actuator-saturated', f'the coolant does not get below {STUCK_AT:g} degC, 15 min',
               partial(_without_the_cold, node='plant', usual=-20.0), worst=WINDUP),
     _constant('coolant-limited', f'the controller may not command less than {STUCK_AT:g} degC, '
               '15 min', partial(_without_the_cold, node='controller',
-                                usual=ControllerParameters.coolant_min), worst=WINDUP),
-    _constant('noise', 'noise of 0.1 K, for good', partial(_changed, parameters={'noise': 0.1}),
-              band=0.5, offset=0.5),
+                                usual=reactor.coolant_parameters().min),
+              worst=WINDUP),
+    _constant('noise', 'noise of 0.1 K, for good',
+              partial(_changed, parameters={'temperature.noise': 0.1}), band=0.5, offset=0.5),
     _constant('two-state', 'the concentration moves, which the model does not know, and the feed '
               'gets 1 K warmer; near the stable point',
-              partial(_changed, parameters={'feed_temperature': 77.85}), setpoint=50.5,
-              plant={**LOCKSTEP, 'reactor': 'two_state'}))
+              partial(_changed, parameters={'constants.feed_temperature': 77.85}), setpoint=50.5,
+              plant={**LOCKSTEP, 'system': 'two_state'}))

@@ -19,8 +19,8 @@ from rclpy.node import Node
 from sensor_msgs.msg import Temperature
 
 from koopman_ros.bags import read_messages
+from koopman_ros.demo import reactor
 from koopman_ros.resources import model_path
-from koopman_ros.ros import topics
 from validation.faults.case import Case, LOCKSTEP, SETPOINT
 from validation.faults.harness import FaultHarness, SkipError
 
@@ -67,14 +67,14 @@ def _controller_in_a_step(loop: FaultHarness) -> None:
 
 
 def _controller_while_disturbed(loop: FaultHarness) -> None:
-    loop.set_parameters('plant', feed_temperature=78.85)
+    loop.set_parameters('plant', **{'constants.feed_temperature': 78.85})
     loop.run_for(30.0)
     _controller_again(loop, dead=60.0)
 
 
 def _controller_in_manual_mode(loop: FaultHarness) -> None:
     loop.ros.set_bool('controller/set_automatic', False)
-    loop.publisher(topics.MANUAL_COOLANT_SETPOINT).publish(Temperature(temperature=22.0))
+    loop.publisher(reactor.MANUAL_COOLANT_SETPOINT).publish(Temperature(temperature=22.0))
     loop.run_for(120.0)
     _controller_again(loop)
 
@@ -149,8 +149,8 @@ def _reload(loop: FaultHarness, spoil: str) -> None:
 
 def _second_controller(loop: FaultHarness) -> None:
     with loop.fault():
-        loop.start('controller', {'coolant_weight': 0.1}, ('-r', '__node:=controller_2'),
-                   called='controller_2')
+        loop.start('controller', {'coolant_temperature.weight': 0.1},
+                   ('-r', '__node:=controller_2'), called='controller_2')
         loop.request(45.0)
         loop.wait_for_report(*_TWO_CONTROLLERS)
         loop.linger(1.0)

@@ -1,0 +1,126 @@
+# SPDX-FileCopyrightText: 2026 The koopman_ros Authors
+# SPDX-License-Identifier: Apache-2.0
+
+"""Messages to the numbers of signals and back, once, at the boundary."""
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from functools import partial
+import math
+from typing import Any
+
+from builtin_interfaces.msg import Time
+from rclpy.node import Node
+from rclpy.publisher import Publisher
+from rclpy.subscription import Subscription
+
+from koopman_ros.arrays import Array
+from koopman_ros.ros import topics
+from koopman_ros.ros.codec import stamp_nanoseconds
+from koopman_ros.units import conversion, in_steps
+from koopman_ros.wire import Place
+
+
+@dataclass(frozen=True)
+class Heard:
+    """What a message says of some signals."""
+
+    stamp: Time  #: of the message, or of its arrival where it has none
+    frame_id: str  #: of the message, or empty
+    values: Mapping[str, float]  #: of the signals that it carries, in their own units
+    stamped: bool  #: whether the message has a stamp
+
+    @property
+    def stamp_ns(self) -> int:
+        """The stamp in integer nanoseconds."""
+        return stamp_nanoseconds(self.stamp)
+
+
+class Inlet:
+    """
+    Subscribe to some signals.
+
+    A number that its type of message cannot mean, as a temperature below absolute zero, is NaN;
+    a message without any of the signals is somebody else's and passed over.
+
+    :param subscribe: makes a subscription of topic, callback and message class.
+    :param places: by name of the signal.
+    :param units: of the signals, in which the numbers are handed over.
+    """
+
+    def __init__(self, node: Node, subscribe: Callable[..., Subscription],
+                 places: Mapping[str, Place], units: Mapping[str, str],
+                 hear: Callable[[Heard], None]) -> None:
+        self._node, self._hear = node, hear
+        self.subscriptions: list[Subscription] = []
+        self.unstamped: list[str] = []  #: topics whose messages are stamped at their arrival
+        for topic in dict.fromkeys(place.topic for place in places.values()):
+            own = {name: (place, conversion(place.unit, units[name]))
+                   for name, place in places.items() if place.topic == topic}
+            kind = topics.message_class(next(iter(own.values()))[0].type)
+            if not hasattr(kind, 'header'):
+                self.unstamped.append(topic)
+            self.subscriptions.append(subscribe(topic, partial(self._take, own), kind))
+
+    def _take(self, own: Mapping[str, Any], message: Any) -> None:
+        values = {}
+        for name, (place, converted) in own.items():
+            try:
+                number = place.get(message)
+            except LookupError:
+                continue
+            lowest, highest = place.range
+            values[name] = converted(number) if lowest <= number <= highest else math.nan
+        if values:
+            header = getattr(message, 'header', None)
+            self._hear(Heard(self._node.get_clock().now().to_msg() if header is None
+                             else header.stamp, header.frame_id if header else '', values,
+                             header is not None))
+
+    def published(self) -> bool:
+        """Tell whether anybody publishes one of the topics."""
+        return any(self._node.count_publishers(own.topic_name) for own in self.subscriptions)
+
+
+class Outlet:
+    """
+    Publish some signals, those of one topic in one message.
+
+    :param places: by name of the signal, in the order of the numbers.
+    :param units: of the signals, in which the numbers are given.
+    """
+
+    def __init__(self, places: Mapping[str, Place], units: Mapping[str, str],
+                 make: Callable[[str, Any], Publisher]) -> None:
+        self._parts = []
+        for topic in dict.fromkeys(place.topic for place in places.values()):
+            own = [(i, place, conversion(units[name], place.unit))
+                   for i, (name, place) in enumerate(places.items()) if place.topic == topic]
+            kind = topics.message_class(own[0][1].type)
+            self._parts.append((make(topic, kind), kind, own))
+
+    @property
+    def publishers(self) -> list[Publisher]:
+        """All publishers."""
+        return [publisher for publisher, *_ in self._parts]
+
+    def send(self, values: Array, stamp: Time, frame_id: str, variances: Array | None = None,
+             resolutions: Array | None = None) -> None:
+        """
+        Publish values (n,), of which NaN stands for none.
+
+        :param variances: (n,) in the squares of their units, for types that tell; 0 for unknown.
+        :param resolutions: (n,) of what measured them, in their units; 0 for every value.
+        """
+        for publisher, kind, own in self._parts:
+            message = kind()
+            for i, place, converted in own:
+                number = converted(float(values[i]))
+                if resolutions is not None:
+                    number = in_steps(number, float(resolutions[i]) * converted.factor)
+                place.put(message, number)
+                if variances is not None and hasattr(message, 'variance'):
+                    message.variance = float(variances[i]) * converted.factor ** 2
+            if hasattr(message, 'header'):
+                message.header.stamp, message.header.frame_id = stamp, frame_id
+            publisher.publish(message)
