@@ -58,8 +58,10 @@ class RetrainingJob:
         self._complaints: list[str] = []
         stdin, *outputs = self._process.stdin, self._process.stdout, self._process.stderr
         assert stdin is not None
-        stdin.write(json.dumps(dict(task)) + '\n')
-        stdin.flush()
+        # one that ended at once has read nothing, and says why below
+        with contextlib.suppress(BrokenPipeError):
+            stdin.write(json.dumps(dict(task)) + '\n')
+            stdin.flush()
         self._threads = [
             threading.Thread(target=read, args=(stream,), daemon=True) for read, stream in zip(
                 (self._read_lines, self._read_complaints), outputs, strict=True)]

@@ -85,6 +85,16 @@ def test_process_that_breaks_down(
     job.close()
 
 
+def test_process_that_ends_before_it_has_read_its_task(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(
+        training, '_command', lambda: (sys.executable, '-c', 'raise SystemExit("no time")'))
+    # more than a pipe holds
+    job = RetrainingJob({'output': 'x' * 1_000_000})
+    *_, last = follow(job)
+    assert last == JobState(0.0, 'the training process ended with code 1: no time', True)
+    job.close()
+
+
 @pytest.mark.parametrize('word', ['starting', 'estimating'])
 def test_process_ends_with_its_parent_that_is_killed(
         task: dict[str, object], tmp_path: Path, word: str) -> None:
