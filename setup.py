@@ -21,13 +21,15 @@ def _data_files() -> list[tuple[str, list[str]]]:
         (os.path.join(share, 'config'),
          sorted(glob('config/*.yaml') + glob('config/*.xml') + glob('config/*.json'))),
         (os.path.join(share, 'config', 'models'), sorted(glob('config/models/*'))),
+        (os.path.join(share, 'config', 'plants'), sorted(glob('config/plants/*'))),
+        (os.path.join(share, 'launch'), sorted(glob('examples/*.launch.py'))),
     ]
 
 
 setup(
     name=PACKAGE,
     version='0.1.0',
-    description='Learned linear representations (Koopman lifts) in control of a reactor, on ROS 2',
+    description='Control of nonlinear plants by learned linear representations, on ROS 2',
     maintainer='The koopman_ros developers',
     maintainer_email='no-mailbox@koopman-ros.invalid',
     license='Apache-2.0',

@@ -16,7 +16,7 @@ from xml.etree import ElementTree
 
 from koopman_ros.lifting import load
 from koopman_ros.parameters import controller, plant, trainer
-from koopman_ros.parameters.table import ParameterTable
+from koopman_ros.parameters.table import ConfigurationError, ParameterTable
 from koopman_ros.parameters.wire import preset
 from koopman_ros.resources import config_directory, model_path
 from koopman_ros.ros import topics
@@ -38,7 +38,11 @@ _TRANSITIONS = '~/transition_event'
 def tables(system: str = _SYSTEM) -> dict[str, ParameterTable[Any]]:
     """Return the tables of all programs for a plant that is shipped."""
     given = {'system': system}
-    model = load(model_path(preset(system, 'controller')['model']))
+    name = preset(system, 'controller').get('model', '')
+    if not name:
+        raise ConfigurationError(
+            f'the system {system!r} has no model: name one in config/plants/{system}.yaml')
+    model = load(model_path(name))
     return {'plant': plant.PlantTable(given), 'controller': controller.table_of(model, given),
             'trainer': trainer.trainer_table(model, given),
             'player': trainer.player_table(given), 'replay': controller.REPLAY_TABLE}
@@ -56,20 +60,26 @@ class Program:
     calls: tuple[str, ...] = ()  #: services of others
 
 
-def _programs() -> dict[str, Program]:
-    wiring = trainer.preset_wiring(_SYSTEM)
-    assert wiring is not None
+def programs(system: str = _SYSTEM) -> dict[str, Program]:
+    """Return all programs, with the topics of a plant that is shipped."""
+    wiring = trainer.preset_wiring(system)
+    if wiring is None:
+        raise ConfigurationError(f'no file says what the signals of the system {system!r} are: '
+                                 f'write config/plants/{system}.yaml')
+    recorded = tables(system)['trainer'].rows['topics'].default
 
     def topics_of(*kinds: str) -> tuple[str, ...]:
         return tuple(place.topic for kind in kinds for place in getattr(wiring, kind).values())
 
-    concentration = ('concentration',)  # of the reactor of two states
+    # states that are recorded where the plant has them, and not measured
+    unmeasured = tuple(topic for topic in recorded
+                       if topic not in wiring.topics and topic not in topics.TYPES)
     lifecycle = ('~/change_state', '~/get_state', '~/get_available_states',
                  '~/get_available_transitions', '~/get_transition_graph')
     return {
         'plant': Program(
             'Simulates a plant: publishes its measurements and takes commands.',
-            publishes=(*topics_of('measured', 'applied'), *concentration, topics.CLOCK,
+            publishes=(*topics_of('measured', 'applied'), *unmeasured, topics.CLOCK,
                        topics.DIAGNOSTICS, _TRANSITIONS, *STANDARD_TOPICS),
             subscribes=topics_of('commands'),
             serves=('~/reset', *lifecycle, *STANDARD_SERVICES)),
@@ -86,8 +96,7 @@ def _programs() -> dict[str, Program]:
             'for a failure',
             publishes=(*topics_of('commands', 'manual', 'setpoints'), topics.DIAGNOSTICS,
                        _TRANSITIONS, *STANDARD_TOPICS),
-            subscribes=(*wiring.topics, *concentration, topics.CONTROLLER_STATE,
-                        topics.CONTROLLER_EVENTS, topics.DIAGNOSTICS, topics.CLOCK),
+            subscribes=(*dict.fromkeys((*wiring.topics, *recorded)), topics.CLOCK),
             serves=('~/record', '~/experiment', '~/train', '~/cancel_training', *lifecycle,
                     *STANDARD_SERVICES)),
         'player': Program(
@@ -108,33 +117,34 @@ def _programs() -> dict[str, Program]:
     }
 
 
-PROGRAMS = _programs()
-
-
-def _operator() -> Program:
-    """Whoever moves the set-point, calls the services, tunes and watches: a person or a panel."""
-    wiring = trainer.preset_wiring(_SYSTEM)
+def operator(system: str = _SYSTEM) -> Program:
+    """Whoever moves set-points, calls the services, tunes and watches: a person or a panel."""
+    nodes = programs(system)
+    wiring = trainer.preset_wiring(system)
     assert wiring is not None
     asks = (*wiring.setpoints.values(), *wiring.manual.values())
     return Program(
         publishes=(*(place.topic for place in asks), *STANDARD_TOPICS),
-        subscribes=(*PROGRAMS['trainer'].subscribes, *STANDARD_TOPICS),
+        subscribes=(*nodes['trainer'].subscribes, *STANDARD_TOPICS, *(
+            f'{node}/{name.removeprefix("~/")}' for node, program in nodes.items()
+            for name in program.publishes if name.startswith('~/'))),
         serves=(*STANDARD_SERVICES, _COMMAND_LINE_SERVICE),
-        calls=tuple(f'{node}/{service.removeprefix("~/")}' for node, program in PROGRAMS.items()
+        calls=tuple(f'{node}/{service.removeprefix("~/")}' for node, program in nodes.items()
                     if node != 'replay' for service in program.serves))
 
 
-OPERATOR = _operator()
+PROGRAMS = programs()
+OPERATOR = operator()
 
 
-def policy() -> str:
+def policy(system: str = _SYSTEM) -> str:
     """Return the text of the SROS2 policy: one enclave for each node, and one for operators."""
     root = ElementTree.Element('policy', version='0.2.0')
     root.append(ElementTree.Comment(
         ' Least privilege for each node, written by `make config`: see docs/security.md. For '
         'nodes in\n       a namespace replace every ns="/" by it. '))
     enclaves = ElementTree.SubElement(root, 'enclaves')
-    for name, own in {**PROGRAMS, 'operator': OPERATOR}.items():
+    for name, own in {**programs(system), 'operator': operator(system)}.items():
         enclave = ElementTree.SubElement(enclaves, 'enclave', path=f'/koopman_ros/{name}')
         profiles = ElementTree.SubElement(enclave, 'profiles')
         profile = ElementTree.SubElement(profiles, 'profile', ns='/', node=name)
@@ -175,21 +185,27 @@ Parameters for the system {_SYSTEM}, with defaults and ranges in {file}:
 {parameters}"""
 
 
-def parameter_file(node: str) -> str:
+def parameter_file(node: str, system: str = _SYSTEM) -> str:
     """Return the text of a node's parameter file, every parameter at its default."""
     return (f'# Parameters of the {node} node, all at their defaults. Use a copy with\n'
             f'#   ros2 run koopman_ros {node} --ros-args --params-file {node}.yaml\n'
-            f'{tables()[node].yaml()}')
+            f'{tables(system)[node].yaml()}')
 
 
 def main(args: list[str] | None = None) -> int:
-    """Write all parameter files and the policy."""
+    """Write all parameter files and the policy, for a plant that has a file in config/plants."""
     parser = argparse.ArgumentParser(description=main.__doc__)
     parser.add_argument('--output', type=Path, default=Path('config'))
-    output = parser.parse_args(args).output
-    for node in PROGRAMS:
-        (output / f'{node}.yaml').write_text(parameter_file(node))
-    (output / POLICY_FILE).write_text(policy())
+    parser.add_argument('--system', default=_SYSTEM)
+    given = parser.parse_args(args)
+    try:
+        written = {f'{node}.yaml': parameter_file(node, given.system) for node in PROGRAMS}
+        written[POLICY_FILE] = policy(given.system)
+    except ConfigurationError as error:
+        parser.error(str(error))
+    given.output.mkdir(parents=True, exist_ok=True)
+    for name, text in written.items():
+        (given.output / name).write_text(text)
     return 0
 
 

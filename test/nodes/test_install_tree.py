@@ -70,7 +70,8 @@ class Installation:
 
 def sources(folder: Path) -> Path:
     """Copy what the package is built from, but none of its builds."""
-    wanted = {'package.xml', 'setup.py', 'setup.cfg', 'resource', 'config', 'koopman_ros'}
+    wanted = {'package.xml', 'setup.py', 'setup.cfg', 'resource', 'config', 'examples',
+              'koopman_ros'}
     return shutil.copytree(ROOT, folder, ignore=lambda path, names: {'__pycache__'} | (
         {*names} - wanted if Path(path) == ROOT else set()))
 
@@ -134,6 +135,7 @@ def test_everything_is_installed(installation: Installation) -> None:
     share = installation.share
     assert (share.parent / 'ament_index/resource_index/packages/koopman_ros').is_file()
     assert (share / 'package.xml').is_file()
+    assert (share / 'launch' / 'loop.launch.py').is_file()
     shipped = {path.relative_to(ROOT / 'config') for path in (ROOT / 'config').rglob('*.*')}
     assert {path.relative_to(share / 'config')
             for path in (share / 'config').rglob('*.*')} == shipped

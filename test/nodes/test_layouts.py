@@ -14,6 +14,7 @@ from sensor_msgs.msg import JointState
 
 from koopman_ros.control import Mode, Report
 from koopman_ros.demo import reactor
+from koopman_ros.parameters.trainer import preset_wiring
 from koopman_ros.resources import config_directory
 from koopman_ros.ros import topics
 from koopman_ros.ros.controller_messages import internals
@@ -22,12 +23,15 @@ from koopman_ros.ros.controller_messages import internals
 TEMPERATURES = {reactor.TEMPERATURE, reactor.ACTIVE_SETPOINT, reactor.PREDICTED_TEMPERATURE,
                 reactor.COOLANT_SETPOINT, reactor.COOLANT_TEMPERATURE}
 INTERNALS = {'disturbance', 'transfer', 'gain', 'growth_per_sample', 'level', 'distance_outside'}
-NAMES = list(internals(Report(Mode.AUTOMATIC, 'sdre'), Time(), '').name)
+WIRING = preset_wiring('reactor')
+assert WIRING is not None
+TYPES = {topic: kind for topic, (kind, _) in topics.known(WIRING).items()}
+NAMES = list(internals(WIRING.signals, Report(Mode.AUTOMATIC, 'sdre'), Time(), '').name)
 
 
 def published(topic: str, field: str, name: str = '') -> str:
     """Return what a curve shows, after a look at the message that it is taken from."""
-    kind = topics.TYPES[topic]
+    kind = TYPES[topic]
     assert kind.get_fields_and_field_types()[field] in ('double', 'sequence<double>')
     assert (kind is JointState) == bool(name)
     return name.split(' [')[0] or topic

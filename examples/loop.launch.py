@@ -1,0 +1,35 @@
+# SPDX-FileCopyrightText: 2026 The koopman_ros Authors
+# SPDX-License-Identifier: Apache-2.0
+
+"""
+A whole loop from one parameter file: plant, controller and trainer.
+
+``ros2 launch koopman_ros loop.launch.py system:=two_tanks`` takes that of a plant that is shipped,
+``parameters:=loop.yaml`` one's own. Each node configures and activates itself; with
+``autostart:=false`` it waits for a lifecycle manager.
+"""
+
+from launch import LaunchDescription
+from launch.actions import DeclareLaunchArgument
+from launch.substitutions import LaunchConfiguration
+from launch_ros.actions import Node
+from launch_ros.parameter_descriptions import ParameterValue
+from launch_ros.substitutions import FindPackageShare
+
+
+def generate_launch_description():
+    """Describe the three nodes."""
+    shipped = [FindPackageShare('koopman_ros'), '/config/plants/', LaunchConfiguration('system'),
+               '.yaml']
+    autostart = ParameterValue(LaunchConfiguration('autostart'), value_type=bool)
+    return LaunchDescription([
+        DeclareLaunchArgument('system', default_value='reactor',
+                              description='plant that is shipped'),
+        DeclareLaunchArgument('parameters', default_value=shipped,
+                              description='parameter file of the whole loop'),
+        DeclareLaunchArgument('autostart', default_value='true',
+                              description='false leaves the start to a lifecycle manager'),
+        *(Node(package='koopman_ros', executable=name, name=name, output='screen',
+               parameters=[LaunchConfiguration('parameters'), {'autostart': autostart}])
+          for name in ('plant', 'controller', 'trainer')),
+    ])
