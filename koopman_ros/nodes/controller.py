@@ -163,7 +163,7 @@ class ControllerNode(ManagedNode):
             self._state = State(self._state.mode, Setpoint(
                 asked.requested, scheduled=asked.scheduled))
             self._waiting.clear()
-            self._records.publish_snapshot(records.START)
+            self._records.start()
 
     def complete(self) -> None:
         """Let nobody command while the middleware is taken down."""

@@ -126,7 +126,7 @@ class _Run:
                 self._state = None
         self._next = record.number + 1
         if record.event in (records.START, records.SNAPSHOT):
-            if self._state is None:
+            if self._state is None or record.event == records.START:
                 self._begin(record)
         elif self._state is None:
             self._keep(record, None, None, None)

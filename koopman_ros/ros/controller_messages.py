@@ -259,15 +259,20 @@ class RecordPublisher:
     """
     Publish numbered records; the caller holds the lock of the controller's state meanwhile.
 
-    A replay begins at a snapshot of that state: there is one at the start, one for each new
-    subscriber, and one every ten seconds.
+    A replay begins at a snapshot of that state: there is one when the controller begins to act,
+    before which nothing is published, one for each new subscriber, and one every ten seconds.
     """
 
     def __init__(self, matching: topics.Matching, snapshot: Callable[[], Mapping[str, Any]],
                  lock: threading.Lock) -> None:
         self._snapshot, self._lock = snapshot, lock
         self._run, self._number, self._due = secrets.token_hex(8), 0, 0.0
+        self._started = False
         self._publisher = matching.publish(topics.CONTROLLER_EVENTS, matched=self._on_matched)
+
+    def start(self) -> None:
+        """Publish the state from which the controller begins to act."""
+        self._started = True
         self.publish_snapshot(START)
 
     def _on_matched(self, info: Any) -> None:
@@ -291,6 +296,8 @@ class RecordPublisher:
             self.publish_snapshot()
 
     def _publish(self, event: str, fields: Mapping[str, Any]) -> None:
+        if not self._started:
+            return
         record = Record(self._run, self._number, event, fields)
         self._number += 1
         self._publisher.publish(String(data=record.text()))
