@@ -5,13 +5,18 @@
 
 import ast
 from collections.abc import Iterator
+from dataclasses import fields
+from fractions import Fraction
 from functools import cache
 from pathlib import Path
 import re
 
 import pytest
+import yaml
 
+from koopman_ros.parameters.trainer import preset_wiring
 from koopman_ros.ros import programs, topics
+from koopman_ros.wire import CARRIERS, place
 
 ROOT = Path(__file__).parent.parent
 PAGES = [ROOT / 'README.md', ROOT / 'CONTRIBUTING.md', *sorted(ROOT.glob('docs/*.md'))]
@@ -69,13 +74,79 @@ def test_continuous_integration_runs_what_the_pages_say() -> None:
 
 
 def test_interfaces_list_the_topics_with_their_types_and_the_services() -> None:
-    assert [row[:2] for row in _rows('interfaces.md') if '_msgs/' in row[1]] == [
-        [f'`{name}`', f'{kind.__module__.split(".")[0]}/{kind.__name__}']
-        for name, kind in topics.TYPES.items()]
+    assert [row[:2] for row in _rows('interfaces.md') if '_msgs/' in row[1] and '`' not in row[1]
+            ] == [[f'`{name}`', f'{kind.__module__.split(".")[0]}/{kind.__name__}']
+                  for name, kind in topics.TYPES.items()]
     services = {row[0].strip('`') for row in _rows('interfaces.md') if 'std_srvs/' in row[1]}
-    assert services == {
-        service.replace('~', f'/{name}') for name, node in programs.PROGRAMS.items()
-        for service in node.serves if service not in programs.STANDARD_SERVICES}
+    text = (ROOT / 'docs' / 'interfaces.md').read_text()
+    managed = set(re.findall(r'`(~/\w+_\w+)`', text[text.index('## Lifecycle'):]))
+    for name, node in programs.PROGRAMS.items():
+        serves = set(node.serves) - set(programs.STANDARD_SERVICES)
+        own = {service for service in serves if service.replace('~', f'/{name}') in services}
+        assert serves - own == (managed & serves), name
+        assert not serves - own or managed <= {*node.serves, *node.publishes}, name
+        services -= {service.replace('~', f'/{name}') for service in own}
+    assert not services
+
+
+@pytest.mark.parametrize(('system', 'column'), [('reactor', 2), ('two_tanks', 3)])
+def test_interfaces_list_where_signals_are(system: str, column: int) -> None:
+    wiring = preset_wiring(system)
+    assert wiring is not None
+    listed = {row[1].strip('`'): re.findall('`(.+?)`', row[column])
+              for row in _rows('interfaces.md') if re.match('`<(state|input)>.*topic`', row[1])}
+    assert listed == {
+        f'<{kind}>.{row.name}': [getattr(places, row.name) for places in of.values()]
+        for kind, of in (('state', wiring.states), ('input', wiring.inputs))
+        for row in fields(next(iter(of.values()))) if row.name.endswith('topic')}
+
+
+def test_interfaces_list_the_message_types() -> None:
+    text = (ROOT / 'docs' / 'interfaces.md').read_text()
+    for kind in CARRIERS:
+        assert f'`{kind}`' in text
+    rows = [row for row in _rows('interfaces.md') if '/msg/' in row[1] and len(row) == 4]
+    for units, kind, field, there in rows:
+        for unit in units.replace('any other', 'V').split(', '):
+            found = place('here', '<signal>', unit)
+            assert [kind, field] == [f'`{found.type}`', f'`{found.field}`']
+            assert there.replace('that of the signal', unit) == found.unit
+    assert len(rows) > 4
+
+
+def test_interfaces_list_what_there_is_of_each_signal() -> None:
+    """Beside its places, with the unit of each."""
+    rows = {row[0]: row[1:] for row in _rows('interfaces.md') if 'unit]' in row[1]}
+    for node, cells in rows.items():
+        table = programs.tables()[node]
+        for cell, kind in zip(cells, ('states', 'inputs'), strict=True):
+            (name, unit), = table.signals[kind].items()
+            listed = {}
+            for names, symbol in re.findall(r'((?:`\w+`,? ?)+)\[(.+?)\]', cell):
+                for parameter in re.findall(r'\w+', names):
+                    listed[parameter] = symbol.replace('unit²', 'unit^2').replace('unit', unit)
+            own = {row.removeprefix(f'{name}.'): about.unit.replace('degC', unit)
+                   for row, about in table.rows.items()
+                   if row.startswith(f'{name}.') and about.unit}
+            assert listed == own, (node, kind)
+    assert len(rows) == 3
+
+
+def test_changelog_has_the_former_names_of_all_parameters() -> None:
+    rows = re.findall(r'^   (\w+), ``(.+)``, ``(.+)``, (.+), (.+)$',
+                      (ROOT / 'CHANGELOG.rst').read_text(), re.MULTILINE)
+    renamed = yaml.safe_load((ROOT / 'config' / 'renamed.yaml').read_text())
+    assert [row[:3] for row in rows] == [
+        (node, name, now) for node, names in renamed.items() for name, (now, _) in names.items()]
+    tables = programs.tables()
+    for node, name, now, unit, by in rows:
+        assert unit == (tables[node].rows[now].unit or '-')
+        factor = renamed[node][name][1]
+        if isinstance(factor, dict):
+            assert by == '; '.join(
+                f'{was} is now {new}' for was, new in factor.items() if was != new)
+        else:
+            assert float(Fraction(by)) == pytest.approx(factor, rel=1e-12)
 
 
 def test_operation_quotes_what_diagnostics_say() -> None:
@@ -111,8 +182,11 @@ def _words() -> set[str]:
     """Return all words of the sources, and of the configuration."""
     paths = [ROOT / 'Makefile', *(path for part in PARTS.split('|') if part != 'docs'
                                   for path in ROOT.glob(f'{part}/**/*'))]
+    wirings = map(preset_wiring, ('reactor', 'two_tanks'))
+    of_topics = ' '.join(topic for wiring in wirings if wiring for topic in wiring.topics)
     return {word for path in paths if path.suffix in ('', '.py', '.yaml') and path.is_file()
-            for word in re.findall(r'\w+', f'{path.stem} {path.read_text()}')}
+            for word in re.findall(r'\w+', f'{path.stem} {path.read_text()}')
+            } | set(re.findall(r'\w+', of_topics))
 
 
 @cache
