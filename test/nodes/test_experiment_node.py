@@ -16,8 +16,10 @@ from sensor_msgs.msg import Temperature
 from koopman_ros.bags import read_messages
 from koopman_ros.demo import reactor
 from koopman_ros.experiment import advance, begin, Phase
-from koopman_ros.parameters.plant import PlantParameters
-from koopman_ros.parameters.trainer import TABLE, TrainerParameters
+from koopman_ros.lifting import load
+from koopman_ros.parameters.trainer import trainer_table
+from koopman_ros.parameters.wire import Signals
+from koopman_ros.resources import model_path
 from koopman_ros.ros import topics
 from koopman_ros.ros.codec import stamp_nanoseconds
 from koopman_ros.testing import Harness
@@ -27,9 +29,11 @@ from support.nodes import seconds, temperature, value
 STATUS = 'trainer: experiment'
 SERVICE = 'trainer/experiment'
 TRAINER, JACKET = 'unit_1/trainer', '/unit_1/jacket'
-SAFE = TrainerParameters().safe_coolant
+TABLE = trainer_table(load(model_path(reactor.MODEL)))
+SIGNALS = Signals({'temperature': 'K'}, {'coolant_temperature': 'K'}, ('temperature',))
+SAFE = TABLE.snapshot({}).inputs['coolant_temperature'].safe
 IDLE = {'record_at_start': False}
-LOST = 'the trainer does not command the coolant any more'
+LOST = 'the trainer does not command any more'
 
 
 class Bench:
@@ -92,10 +96,10 @@ def test_steps_drive_the_plant_as_planned(ros: Harness) -> None:
     measured = start_with_plant(ros, **given)
     status = ros.wait_for_status(STATUS, lambda s: s.message.startswith('finished'))
     assert status.level == DiagnosticStatus.OK
-    assert status.message == 'finished; the coolant returns to 18.85 degC and is held there'
+    assert status.message == 'finished; coolant to 18.85 degC, held there'
     ros.wait_until(lambda: len(commands) > 350)
 
-    plan = TrainerParameters(**given).experiment()
+    plan = TABLE.snapshot(given).experiment(SIGNALS)
     # the first ones may have been given before the bench was known
     heard = {seconds(message): message for message in commands}
     assert all(late - early == 1.0 for early, late in pairwise(heard))
@@ -144,12 +148,14 @@ def test_what_is_in_the_way_refuses_the_start(shared_bench: Bench) -> None:
 
 def test_contradicting_limits_are_refused() -> None:
     for name, given, words in (
-            ('coolant_min', 30.0, 'experiment_coolant_min = 30.0 degC must be below '
-             'experiment_coolant_max = 27.5 degC'),
-            ('temperature_max', 20.0, 'must be below experiment_temperature_max = 20.0 degC'),
-            ('hold_max', 0.4, 'experiment_hold_min = 0.5 min must be below'),
-            ('topic', 'setpoint', 'must be one of coolant_setpoint, manual_coolant_setpoint')):
-        assert words in TABLE.check(TrainerParameters(**{f'experiment_{name}': given}))
+            ('coolant_temperature.experiment_min', 30.0,
+             'coolant_temperature.experiment_min = 30.0 degC cannot be used: '
+             'coolant_temperature: lower = 303.15 must be below upper = 300.65'),
+            ('temperature.experiment_max', 20.0, 'temperature.experiment_max = 20.0 degC cannot'),
+            ('experiment_longest_hold', 10.0, 'experiment_longest_hold = 10.0 s cannot be used: '
+             'hold_shortest = 30.0 s must be above 0 and not above hold_longest = 10.0 s'),
+            ('experiment_on', 'setpoints', 'must be one of command, manual, setpoint')):
+        assert words in TABLE.check(TABLE.snapshot({name: given}))
 
 
 def test_service_ends_the_steps_and_then_lets_go(shared_bench: Bench) -> None:
@@ -162,8 +168,8 @@ def test_service_ends_the_steps_and_then_lets_go(shared_bench: Bench) -> None:
     assert bench.answer() != pytest.approx(SAFE, abs=0.5)
     assert value(bench.status('running'), 'topic') == JACKET
 
-    assert 'the coolant returns to 18.85 degC' in bench.ask(False)[1]
-    bench.status('ended; the coolant returns')
+    assert 'ended: coolant to 18.85 degC, held there; call again to let go' == bench.ask(False)[1]
+    bench.status('ended; coolant to 18.85 degC')
     for _ in range(20):
         bench.answer()
     assert bench.answer() == pytest.approx(SAFE)
@@ -205,7 +211,7 @@ def test_another_commander_ends_it_at_once_and_refuses_the_next(shared_bench: Be
     assert ros.wait_until(lambda: '/bench publishes' in (answer := bench.start())[1]
                           and answer) == (
         False, 'refused: /bench publishes on /unit_1/jacket: end it, or choose another '
-        'experiment_topic')
+        'experiment_on')
     ros.node.destroy_publisher(other)
 
 
@@ -220,14 +226,14 @@ def test_reactor_that_leaves_its_bounds_and_trainer_that_ends_leave_the_safe_coo
     status = ros.wait_for_status(STATUS, lambda s: s.level == DiagnosticStatus.ERROR)
     assert status.message.startswith('aborted: the temperature ')
     assert 'is outside the bounds of the experiment, 31.85 degC to 53.85 degC' in status.message
-    assert status.message.endswith('; the coolant returns to 18.85 degC and is held there')
+    assert status.message.endswith('; coolant to 18.85 degC, held there')
     # 10 K at 1 K/s, and then for good
     first = ros.wait_until(lambda: next(
         (k for k, message in enumerate(measured) if message.temperature < 31.85), None))
     ros.wait_until(lambda: len(commands) > first + 50)
     assert {round(message.temperature, 9) for message in commands[first + 12:]} == {SAFE}
 
-    ros.set_parameters('plant', **{'constants.feed_temperature': PlantParameters().feed_temperature})
+    ros.set_parameters('plant', **{'constants.feed_temperature': reactor.constant('feed_temperature')})
     assert ros.trigger('plant/reset').success
     assert ros.set_bool(SERVICE, True).success
     ros.wait_until(lambda: abs(commands[-1].temperature - SAFE) > 2.0)
@@ -246,7 +252,7 @@ def test_experiment_through_a_controller_in_manual_mode(ros: Harness) -> None:
     ros.start('controller')
     ros.meet('controller')
     ros.set_bool('controller/set_automatic', False)
-    ros.start('trainer', {**IDLE, 'experiment_on': reactor.MANUAL_COOLANT_SETPOINT,
+    ros.start('trainer', {**IDLE, 'experiment_on': 'manual',
                           'experiment_length': 60000.0, 'experiment_shortest_hold': 6.0,
                           'experiment_longest_hold': 12.0})
     ros.meet('trainer')
