@@ -100,6 +100,7 @@ class Code(Enum):
     CLOCK_WENT_BACK = 'clock_went_back', 'the stamps of the measurements went back'
     SILENCE = 'silence', 'no newer measurement for more than {timeout:g} s: check sensor and plant'
     OTHER_PUBLISHER = 'other_publisher', '{nodes} publishes on {topic}, too'
+    ENDED_EARLY = 'ended_early', 'it was ended before the first measurement'
     CONTROLLER_GONE = 'controller_gone', 'the controller is gone'
     NOT_FOLLOWED = 'not_followed', (
         'the controller commands {value:value} where {requested:value} is requested: switch it '

@@ -4,7 +4,7 @@
 """The controller node: answers each measurement with a command."""
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 import math
 import sys
 import threading
@@ -44,7 +44,7 @@ from koopman_ros.ros.model_reload import (
     rests_outside,
     Situation,
 )
-from koopman_ros.ros.node import Status, wall_timer, words_of
+from koopman_ros.ros.node import Level, Status, wall_timer, words_of
 from koopman_ros.ros.process import run
 from koopman_ros.ros.signals import Heard, Inlet, Outlet
 from koopman_ros.ros.watchdog import PERIOD, Timing, Watchdog
@@ -86,6 +86,7 @@ class ControllerNode(ManagedNode):
         loaded = load_suitable(str(given.get('model') or own.get('model', '')))
         self._table = table = table_of(loaded.model, given)
         self._settings = self.declare_table(table)
+        self._signals = signals_of(loaded.model, self._settings.controlled)
         self._loaded: LoadedModel | None = loaded
 
     def configure(self) -> None:
@@ -95,8 +96,8 @@ class ControllerNode(ManagedNode):
         # the one of the start, unless its name was changed since then
         loaded, self._loaded = self._loaded, None
         if loaded is None or loaded.name != parameters.model:
-            loaded = load_suitable(parameters.model)
-        self._signals = signals = signals_of(loaded.model, parameters.controlled)
+            loaded = load_suitable(parameters.model, self._signals)
+        signals = self._signals
         self._words = words_of(signals)
         self._models = ModelReload(
             self, loaded, signals, lambda: Situation(
@@ -165,10 +166,16 @@ class ControllerNode(ManagedNode):
             self._waiting.clear()
             self._records.start()
 
+    def deactivate(self) -> None:
+        """Answer nothing that waits; a command of the watchdog that is on its way goes out."""
+        with self._lock:
+            self._waiting.clear()
+
     def complete(self) -> None:
         """Let nobody command while the middleware is taken down."""
         if self._watchdog is not None:
             self._watchdog.end()
+            self._models.end()
 
     def _single(self, wiring: Wiring) -> dict[str, str]:
         """Return what is done on topics on which only one node may publish."""
@@ -406,12 +413,14 @@ class ControllerNode(ManagedNode):
         frame = (f'the frame_id of the measurement has {self._frame_length} characters, of which '
                  f'{LONGEST_FRAME_ID} are passed on: shorten it at the sensor'
                  ) if self._frame_length else ''
-        return messages.status(messages.Situation(
+        status = messages.status(messages.Situation(
             self._controller, self._settings, self._signals, self._state, self._report,
             self._counts, self._timing, self._matching.complaint or frame, self._refused,
             self._models.refused,
             {**self._models.figures(), 'safe input': self._rests_outside or 'within reach'},
             self._measured, self._assembler))
+        # without measurements answered there is nothing to complain of
+        return status if self.active else replace(status, level=Level.OK, message='inactive')
 
 
 def main(args: list[str] | None = None) -> int:

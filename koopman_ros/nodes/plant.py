@@ -267,7 +267,7 @@ class PlantNode(ManagedNode):
             self._continue_lockstep()
 
     def _advance_to_now(self) -> bool:
-        if self._phase is not Phase.RUNNING:
+        if self._phase is not Phase.RUNNING or not self.active:
             return False
         # never past the next sample, which is measured under the command of its time
         ahead = self._start_ns + self._sample * self._period_ns
@@ -312,8 +312,10 @@ class PlantNode(ManagedNode):
             system=self._table.system(parameters, self._plant.system.nominal_state))
 
     def _status(self) -> Status:
-        level, message = Level.OK, self._phase.value if self.active else 'inactive'
-        if self._phase is Phase.TRIPPED:
+        level, message = Level.OK, self._phase.value
+        if not self.active:
+            message = 'inactive'
+        elif self._phase is Phase.TRIPPED:
             level, message = Level.ERROR, f'stopped: {self._trip}; call ~/reset'
         elif self._phase is Phase.OUT_OF_STAMPS:
             level = Level.ERROR

@@ -81,7 +81,7 @@ class TrainerNode(ManagedNode):
         self._training.complete()
 
     def _on_trained(self, end: JobState) -> None:
-        if self._settings.task == 'train':
+        if self._settings.task == 'train' and self.active:
             self.exit_code = 0 if end.accepted else 2 if end.refused else 1
 
     def _on_parameters(self, parameters: TrainerParameters) -> None:

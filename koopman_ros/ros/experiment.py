@@ -71,9 +71,12 @@ class PlantExperiment:
             callback_group=MutuallyExclusiveCallbackGroup()))
 
     def complete(self) -> None:
-        """Leave the inputs at their safe values; publishes the last command."""
-        if self._run is not None:
-            self._run.farewell()
+        """Leave the inputs at their safe values, and let go; publishes the last command."""
+        run = self._run
+        if run is not None:
+            run.stop(Phase.ENDED)
+            run.farewell()
+            self._let_go(self._verdict(run))
 
     def destroy(self) -> None:
         """Take the service down, and a run with it: the inputs are left where they are."""
@@ -145,10 +148,12 @@ class PlantExperiment:
         self._say(f'the trainer does not command any more: {self._words(why)}')
 
     def _let_go(self, outcome: Status) -> None:
+        run, self._run = self._run, None
         self._outcome = outcome
-        if self._run is not None:
-            self._run.destroy()
-        self._run = None
+        if run is not None:
+            run.destroy()
+            if not run.started.done():
+                run.started.set_result(reason(Code.ENDED_EARLY))
 
     def _say(self, sentence: str) -> None:
         # two lines, because rclpy allows one severity a line

@@ -6,11 +6,14 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+import traceback
 from typing import Any
 
+from lifecycle_msgs.srv import ChangeState
 from rclpy.exceptions import ParameterException
 from rclpy.lifecycle import LifecycleState, TransitionCallbackReturn
 from rclpy.lifecycle.node import LifecycleNodeMixin
+from rosgraph_msgs.msg import Clock
 
 from koopman_ros.ros.node import LoopNode
 
@@ -34,16 +37,22 @@ class ManagedNode(LifecycleNodeMixin, LoopNode):
         LoopNode.__init__(self, name)
         LifecycleNodeMixin.__init__(self)
         self._failure: Exception | None = None
-        self._kept = self._entities()
+        self._alone = False  # whether nobody is told of a failure but by an exception
         # reports in each state
         assert self.diagnostics
+        self._kept = self._entities()
+        change = self._service_change_state.callback
+        self._service_change_state.callback = lambda request, response: self._on_change(
+            change, request, response)
 
     def start(self) -> None:
         """Configure and activate, as without a manager; raises what went wrong."""
-        self._kept = self._entities()
+        self._alone = True
         for transition in (self.trigger_configure, self.trigger_activate):
             if transition() != TransitionCallbackReturn.SUCCESS:
-                raise self._failure or RuntimeError('a transition failed')
+                assert self._failure is not None
+                raise self._failure
+        self._alone = False
 
     def configure(self) -> None:
         """Make publishers, subscriptions, services and timers; raise what is in the way."""
@@ -61,7 +70,6 @@ class ManagedNode(LifecycleNodeMixin, LoopNode):
 
     def on_configure(self, state: LifecycleState) -> TransitionCallbackReturn:
         """Configure; what was made until an error is taken down again."""
-        self._kept = self._entities()
         done = self._attempt(self.configure)
         if done != TransitionCallbackReturn.SUCCESS:
             self._clean_up()
@@ -75,10 +83,10 @@ class ManagedNode(LifecycleNodeMixin, LoopNode):
         return done
 
     def on_deactivate(self, state: LifecycleState) -> TransitionCallbackReturn:
-        """Act no more."""
-        done = self._attempt(self.deactivate)
+        """Act no more, whatever goes wrong with what is left behind."""
         self.active = False
-        return done
+        self._attempt(self.deactivate)
+        return TransitionCallbackReturn.SUCCESS
 
     def on_cleanup(self, state: LifecycleState) -> TransitionCallbackReturn:
         """Take down what was configured."""
@@ -88,8 +96,7 @@ class ManagedNode(LifecycleNodeMixin, LoopNode):
     def on_shutdown(self, state: LifecycleState) -> TransitionCallbackReturn:
         """Act no more, and end the process."""
         if self.active:
-            self._attempt(self.deactivate)
-            self.active = False
+            self.on_deactivate(state)
         self.exit_code = 0
         return TransitionCallbackReturn.SUCCESS
 
@@ -99,12 +106,29 @@ class ManagedNode(LifecycleNodeMixin, LoopNode):
         self._clean_up()
         return TransitionCallbackReturn.SUCCESS
 
+    def _on_change(self, change: Callable[..., ChangeState.Response],
+                   request: ChangeState.Request, response: ChangeState.Response
+                   ) -> ChangeState.Response:
+        try:
+            return change(request, response)
+        except RuntimeError as error:
+            # rclpy lets a transition that there is not in this state end the process
+            self.get_logger().error(f'no such transition now: {one_line(error)}')
+            response.success = False
+            return response
+
     def _attempt(self, work: Callable[[], None]) -> TransitionCallbackReturn:
         try:
             work()
-        except START_ERRORS as error:
+        except Exception as error:
+            # rclpy would not tell of it
             self._failure = error
-            self.get_logger().error(' '.join(str(error).split()) or type(error).__name__)
+            expected = isinstance(error, START_ERRORS)
+            if not self._alone:
+                self.get_logger().error(
+                    one_line(error) if expected else traceback.format_exc())
+            if not expected:
+                raise
             return TransitionCallbackReturn.FAILURE
         return TransitionCallbackReturn.SUCCESS
 
@@ -115,11 +139,18 @@ class ManagedNode(LifecycleNodeMixin, LoopNode):
         destroyers: tuple[Callable[[Any], Any], ...] = (
             self.destroy_timer, self.destroy_service, self.destroy_subscription,
             self.destroy_publisher)
-        for destroy, entities in zip(destroyers, self._entities(), strict=True):
+        for destroy, entities, kept in zip(destroyers, self._entities(), self._kept, strict=True):
             for entity in entities:
-                if not any(entity is kept for some in self._kept for kept in some):
+                if not any(entity is other for other in kept):
                     destroy(entity)
 
     def _entities(self) -> tuple[list[Any], ...]:
-        return (list(self.timers), list(self.services), list(self.subscriptions),
-                list(self.publishers))
+        # rclpy subscribes to the time whenever `use_sim_time` is set
+        heard = [one for one in self.subscriptions if one.msg_type is not Clock]
+        return list(self.timers), list(self.services), heard, list(self.publishers)
+
+
+def one_line(error: Exception) -> str:
+    """Return the words of an error, which rcl repeats over several lines."""
+    text = str(error).split(', at ./')[0].split(', at /')[0]
+    return ' '.join(text.split()) or type(error).__name__

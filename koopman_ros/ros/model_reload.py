@@ -245,6 +245,7 @@ class ModelReload:
         self._on_reloaded, self._on_refused = reloaded, refused
         self._accepted: LoadedModel | None = None
         self._reading: list[_Trial] = []
+        self._ended = False
 
     async def on_reload(self, _: Trigger.Request, response: Trigger.Response
                         ) -> Trigger.Response:
@@ -257,6 +258,9 @@ class ModelReload:
         patience.start()
         outcome: LoadedModel | str = await trial.outcome
         patience.cancel()
+        if self._ended:
+            # nobody is there who would hear the answer
+            return response
         if name != self.in_force.name:
             outcome = f'the model was changed to {self.in_force.name} while {name} was read'
         if isinstance(outcome, LoadedModel):
@@ -297,6 +301,10 @@ class ModelReload:
         if accepted is not None:
             self._swap(accepted)
         return accepted is not None
+
+    def end(self) -> None:
+        """Put no model in force any more, not even one that is being read."""
+        self._ended = True
 
     def figures(self) -> dict[str, object]:
         """Return what diagnostics show of the model in force."""

@@ -6,6 +6,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Collection, Mapping, Sequence
+import contextlib
 import copy
 from dataclasses import dataclass, field
 import difflib
@@ -18,7 +19,7 @@ from typing import Any, TypeVar
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
 from rcl_interfaces import msg
 from rclpy.clock import Clock, ClockType
-from rclpy.exceptions import InvalidParameterTypeException
+from rclpy.exceptions import InvalidHandle, InvalidParameterTypeException
 from rclpy.node import Node
 from rclpy.parameter import Parameter
 from rclpy.publisher import Publisher
@@ -101,29 +102,31 @@ class Diagnostics:
 
     def __init__(self, node: Node) -> None:
         self._node = node
-        self._tasks: list[DiagnosticTask] = []
+        self.tasks: list[DiagnosticTask] = []  #: that are reported
         # as everywhere, by parameter
         self._publisher = node.create_publisher(
             DiagnosticArray, DIAGNOSTICS, QoSProfile(depth=10),
             qos_overriding_options=QoSOverridingOptions.with_default_policies())
-        wall_timer(node, 1.0, lambda: self.publish(self._tasks))
+        wall_timer(node, 1.0, lambda: self.publish(self.tasks))
 
     def add(self, task: str, hardware_id: str, collect: Callable[[], Status]) -> DiagnosticTask:
         """Report a further task under the name ``<node>: <task>``."""
         name = f'{self._node.get_fully_qualified_name().lstrip("/")}: {task}'
-        self._tasks.append(DiagnosticTask(self, name, hardware_id, collect))
-        return self._tasks[-1]
+        self.tasks.append(DiagnosticTask(self, name, hardware_id, collect))
+        return self.tasks[-1]
 
     def remove(self, task: DiagnosticTask) -> None:
         """Report a task no more."""
-        self._tasks.remove(task)
+        self.tasks.remove(task)
 
     def clear(self) -> None:
         """Report none any more."""
-        self._tasks.clear()
+        self.tasks.clear()
 
     def publish(self, tasks: Sequence[DiagnosticTask]) -> None:
         """Publish the present status of some tasks in one message."""
+        if not tasks:
+            return
         message = DiagnosticArray(status=[task.status() for task in tasks])
         message.header.stamp = stamp_message(time.time_ns())
         self._publisher.publish(message)
@@ -152,6 +155,9 @@ class DiagnosticTask:
 
     def publish_if_changed(self) -> None:
         """Publish at once when the level or the sentence differ from the last ones."""
+        # what is late in a part that was taken down has nobody to report to
+        if self not in self._diagnostics.tasks:
+            return
         status = self._collect()
         if (status.level, status.message) != self._last:
             self._diagnostics.publish([self])
@@ -211,6 +217,20 @@ class LoopNode(Node):
         # rclpy subscribes through here for `use_sim_time`, and a negative time ends it in spin
         return super().create_subscription(
             msg_type, topic, hear if msg_type is ClockMessage else callback, *args, **options)
+
+    def create_service(self, srv_type: Any, srv_name: str, callback: Callable[..., Any],
+                       **options: Any) -> Service:
+        """Serve as any node does; an answer that comes after the service's end is dropped."""
+        made = super().create_service(srv_type, srv_name, callback, **options)
+        send = made.send_response
+
+        def answer(response: Any, header: Any) -> None:
+            # rclpy ends spin where a service went while its answer was awaited
+            with contextlib.suppress(InvalidHandle):
+                send(response, header)
+
+        made.send_response = answer  # type: ignore[method-assign]
+        return made
 
     def declare_parameters(self, namespace: str, parameters: list[Any],
                            ignore_override: bool = False) -> list[Parameter]:

@@ -16,7 +16,7 @@ from rclpy.signals import SignalHandlerOptions
 from rclpy.utilities import remove_ros_args
 
 from koopman_ros.resources import LOOPBACK_PROFILE
-from koopman_ros.ros.managed import ManagedNode, START_ERRORS
+from koopman_ros.ros.managed import ManagedNode, one_line, START_ERRORS
 from koopman_ros.ros.node import LoopNode
 from koopman_ros.ros.watchdog import end_in_time
 from koopman_ros.startup import end_by_force, handle_signals
@@ -47,7 +47,7 @@ def run(name: str, create: Callable[[], LoopNode], args: list[str] | None = None
             if isinstance(node, ManagedNode) and node.get_parameter('autostart').value:
                 node.start()
         except START_ERRORS as error:
-            print(f'{name}: cannot start: {_one_line(error)}', file=sys.stderr)
+            print(f'{name}: cannot start: {one_line(error)}', file=sys.stderr)
             return 1
         if note := open_to_the_network(os.environ):
             node.get_logger().warning(note)
@@ -85,7 +85,7 @@ def run_task(name: str, prepare: Callable[[], Callable[[], int]],
             rclpy.try_shutdown()
         return task()
     except START_ERRORS as error:
-        print(f'{name}: {_one_line(error)}', file=sys.stderr)
+        print(f'{name}: {one_line(error)}', file=sys.stderr)
         return 1
     except KeyboardInterrupt:
         return 128 + signal.SIGINT
@@ -109,12 +109,6 @@ def _init(args: list[str] | None) -> None:
     # publishes or asks fails, and an interrupt inside the extension comes out as another error
     rclpy.init(args=args, signal_handler_options=SignalHandlerOptions.NO)
     set_logger_level('rcl', LoggingSeverity.UNSET)
-
-
-def _one_line(error: Exception) -> str:
-    # rcl repeats itself over several
-    text = str(error).split(', at ./')[0].split(', at /')[0]
-    return ' '.join(text.split()) or type(error).__name__
 
 
 def answer(name: str, args: list[str] | None) -> int | None:

@@ -168,7 +168,7 @@ def test_service_ends_the_steps_and_then_lets_go(shared_bench: Bench) -> None:
     assert bench.answer() != pytest.approx(SAFE, abs=0.5)
     assert value(bench.status('running'), 'topic') == JACKET
 
-    assert 'ended: coolant to 18.85 degC, held there; call again to let go' == bench.ask(False)[1]
+    assert bench.ask(False)[1] == 'ended: coolant to 18.85 degC, held there; call again to let go'
     bench.status('ended; coolant to 18.85 degC')
     for _ in range(20):
         bench.answer()
@@ -233,7 +233,8 @@ def test_reactor_that_leaves_its_bounds_and_trainer_that_ends_leave_the_safe_coo
     ros.wait_until(lambda: len(commands) > first + 50)
     assert {round(message.temperature, 9) for message in commands[first + 12:]} == {SAFE}
 
-    ros.set_parameters('plant', **{'constants.feed_temperature': reactor.constant('feed_temperature')})
+    ros.set_parameters('plant', **{
+        'constants.feed_temperature': reactor.constant('feed_temperature')})
     assert ros.trigger('plant/reset').success
     assert ros.set_bool(SERVICE, True).success
     ros.wait_until(lambda: abs(commands[-1].temperature - SAFE) > 2.0)

@@ -22,8 +22,10 @@ from std_msgs.msg import String
 
 from koopman_ros.bags import BagMessage, read_messages, summary
 from koopman_ros.demo import reactor
+from koopman_ros.lifting import load
 from koopman_ros.nodes import trainer
-from koopman_ros.parameters.trainer import TABLE, TrainerParameters
+from koopman_ros.parameters.trainer import trainer_table
+from koopman_ros.resources import model_path
 from koopman_ros.ros import topics
 from koopman_ros.ros.recording import free_name
 from koopman_ros.testing import Harness
@@ -270,9 +272,10 @@ def test_free_name(tmp_path: Path) -> None:
 
 
 def test_single_file_is_not_split() -> None:
+    table = trainer_table(load(model_path(reactor.MODEL)))
     for limit in ({'max_bag_size': 1.0}, {'max_bag_duration': 60.0}):
-        assert TABLE.check(TrainerParameters(output='run.mcap', **limit)) == (
+        assert table.check(table.snapshot({'output': 'run.mcap', **limit})) == (
             "output = 'run.mcap' is one file, which max_bag_size and max_bag_duration cannot "
             'split: give the name of a folder, without .mcap')
-        assert not TABLE.check(TrainerParameters(output='run', **limit))
-        assert not TABLE.check(TrainerParameters(output='', **limit))
+        assert not table.check(table.snapshot({'output': 'run', **limit}))
+        assert not table.check(table.snapshot({'output': '', **limit}))

@@ -12,6 +12,7 @@ from diagnostic_msgs.msg import DiagnosticStatus
 import pytest
 
 from koopman_ros.bags import summary
+from koopman_ros.demo.reactor import constant
 from koopman_ros.lifting import load
 from koopman_ros.nodes import trainer
 from koopman_ros.testing import Harness
@@ -81,14 +82,16 @@ def test_no_orphan_and_no_file_when_the_trainer_ends(ros: Harness, tmp_path: Pat
 
 def test_trains_beside_the_running_loop(ros: Harness, tmp_path: Path) -> None:
     # no quicker: what is recorded while the machine is busy is what there is to train from
-    ros.start('plant', {'lockstep': True, 'speed': 50.0, 'lockstep_subscribers': 2,
-                        'temperature.noise': 0.1, 'constants.heat_transfer_coefficient': 666.666666667})
+    ros.start('plant', {
+        'lockstep': True, 'speed': 50.0, 'lockstep_subscribers': 2, 'temperature.noise': 0.1,
+        'constants.heat_transfer_coefficient': 0.8 * constant('heat_transfer_coefficient')})
     process = ros.start('trainer', {
         **QUICK, 'output': tmp_path / 'run.mcap', 'model_output': tmp_path / 'new.safetensors',
         # which no lift meets
         'gate_margin': 0.99,
         'bags': [tmp_path / 'none.mcap'],
-        'experiment_length': 600.0, 'coolant_temperature.experiment_min': 4.0, 'min_free_disk': 0.0})
+        'experiment_length': 600.0, 'coolant_temperature.experiment_min': 4.0,
+        'min_free_disk': 0.0})
     ros.meet('plant')
     assert ros.set_bool('trainer/experiment', True).success
 

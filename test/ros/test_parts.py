@@ -13,19 +13,20 @@ from typing import Any
 import numpy as np
 import pytest
 from rclpy.duration import Duration
-from rclpy.node import Node
 from sensor_msgs.msg import Temperature
 
 from koopman_ros.bags import BagWriter, read_messages
 from koopman_ros.control import Controller
 from koopman_ros.demo import reactor
 from koopman_ros.lifting import load, ModelFileError, save
-from koopman_ros.parameters.trainer import TrainerParameters
+from koopman_ros.parameters.controller import signals_of
+from koopman_ros.parameters.trainer import trainer_table
+from koopman_ros.parameters.wire import Wiring
 from koopman_ros.resources import model_path
 from koopman_ros.ros import model_reload, recorder, topics
-from koopman_ros.ros.experiment import CoolantExperiment
+from koopman_ros.ros.experiment import PlantExperiment
 from koopman_ros.ros.model_reload import load_suitable
-from koopman_ros.ros.node import DiagnosticsPublisher, Level, Status
+from koopman_ros.ros.node import Level, LoopNode, Status
 from koopman_ros.ros.recorder import receipt_ns, Recorder
 from koopman_ros.ros.recording import Recording
 from koopman_ros.ros.training import Training
@@ -34,29 +35,38 @@ from koopman_ros.testing import Harness
 from koopman_ros.units import NANOSECONDS
 from support.nodes import temperature, TIMEOUT
 
+SIGNALS = signals_of(load(model_path(reactor.MODEL)))
 NAMES = (reactor.TEMPERATURE, reactor.SETPOINT, reactor.COOLANT_SETPOINT)
 
 
-def made(part: str, node: Node, folder: Path) -> Callable[[], object]:
+class Part(LoopNode):
+    """A node as the parts of one know it, active."""
+
+    refusal = ''
+
+
+def made(part: str, node: Part, folder: Path) -> Callable[[], object]:
     """Make a part of a node, and return what takes it down."""
+    table = trainer_table(load(model_path(reactor.MODEL)))
+    settings = table.snapshot({'output': str(folder / 'bag')})
+    wiring = Wiring(SIGNALS, settings.states, settings.inputs)
     match part:
         case 'diagnostics':
-            made = DiagnosticsPublisher(node, 'task', 'x', lambda: Status(Level.OK, 'well'))
+            made = node.diagnostics.add('task', 'x', lambda: Status(Level.OK, 'well'))
         case 'matching':
-            made = topics.Matching(node, lambda: None, topics.SINGLE)
+            made = topics.Matching(node, lambda: None)
             made.publish('mine', Temperature)
             made.subscribe('other', lambda _: None, Temperature)
         case 'recorder':
-            return Recorder(node, BagWriter(folder / 'bag'), NAMES).close
+            return Recorder(node, BagWriter(folder / 'bag'), NAMES, topics.known(wiring)).close
         case 'recording':
-            made = Recording(node, TrainerParameters(output=str(folder / 'bag')))
+            made = Recording(node, settings, wiring)
             made.start()
         case 'experiment':
-            made = CoolantExperiment(
-                node, TrainerParameters(experiment_topic=reactor.COOLANT_SETPOINT))
+            made = PlantExperiment(node, settings, wiring)
             assert made._start() == ''
         case 'training':
-            made = Training(node, TrainerParameters(), lambda: str(folder / 'missing'))
+            made = Training(node, settings, wiring, lambda: str(folder / 'missing'))
             made.start()
         case 'watchdog':
             made = Watchdog(lambda _: None)
@@ -72,17 +82,20 @@ def test_what_a_part_has_created_goes_with_it(
     # a training that loads no library, and ends when it is asked to
     monkeypatch.setattr('koopman_ros.jobs.training._command', lambda: (
         'sh', '-c', 'cat > /dev/null'))
-    node = shared_ros.node
+    node = Part('part', context=shared_ros.node.context)
+    # which outlive the parts that report
+    diagnostics = node.diagnostics
 
     def created() -> tuple[object, ...]:
         return (*map(set, (node.publishers, node.subscriptions, node.services, node.timers)),
-                set(threading.enumerate()))
+                set(threading.enumerate()), tuple(diagnostics.tasks))
 
     before = created()
     destroy = made(part, node, tmp_path)
     assert created() != before
     destroy()
     assert created() == before
+    node.destroy_node()
 
 
 def stamped_at_the_take(handle: Any, message_type: type) -> Any:
@@ -98,7 +111,8 @@ def test_batch_is_recorded_in_the_order_of_sending(
     if at_the_take:
         monkeypatch.setattr(recorder, 'take_raw', stamped_at_the_take)
     publishers = [ros.node.create_publisher(Temperature, name, topics.LOOP_QOS) for name in NAMES]
-    recording = Recorder(ros.node, BagWriter(tmp_path / 'run.mcap'), NAMES)
+    recording = Recorder(ros.node, BagWriter(tmp_path / 'run.mcap'), NAMES,
+                         dict.fromkeys(NAMES, (Temperature, topics.LOOP_QOS)))
     ros.wait_until(lambda: all(p.get_subscription_count() for p in publishers))
     recording.take()
     sent = []
@@ -140,19 +154,23 @@ def test_time_of_receipt(received: float, source: float, found: float) -> None:
 
 
 @pytest.mark.parametrize(('state', 'coolant', 'fits'), [
-    ('temperature', 'coolant_temperature', True), ('T', 'T_c', True), ('reactor', 'jacket', True),
-    ('temperature', 'coolant', True), ('coolant_temperature', 'temperature', False),
-    ('coolant_temperature', 'heater', False), ('x', 'temperature', False), ('x', 'x', False)])
-def test_model_that_takes_the_coolant_for_what_is_controlled_is_refused(
+    ('temperature', 'coolant_temperature', True), ('T', 'coolant_temperature', False),
+    ('temperature', 'coolant', False), ('coolant_temperature', 'temperature', False)])
+def test_model_of_other_signals_than_the_controller_was_started_for_is_refused(
         tmp_path: Path, state: str, coolant: str, fits: bool) -> None:
+    """By name: one that takes the coolant for what is controlled would cool where it is cold."""
     path, shipped = tmp_path / 'x.safetensors', load(model_path('reactor_nz4'))
     save(replace(shipped, states=replace(shipped.states, names=(state,)),
                  inputs=replace(shipped.inputs, names=(coolant,))), path)
+    # it may be the one to start with
+    assert load_suitable(str(path)).model.states.names[0] == state
     if fits:
-        assert load_suitable(str(path)).model.states.names[0] == state
+        assert load_suitable(str(path), SIGNALS).model.states.names[0] == state
         return
-    with pytest.raises(ModelFileError, match='needs the temperature as state and that of the coo'):
-        load_suitable(str(path))
+    with pytest.raises(ModelFileError, match=(
+            rf'has states {state} \[K\] and inputs {coolant} \[K\], this controller was started '
+            r'for states temperature \[K\] and inputs coolant_temperature \[K\]: choose a model')):
+        load_suitable(str(path), SIGNALS)
 
 
 def test_model_whose_step_takes_too_long_is_refused_with_its_time(

@@ -1,0 +1,275 @@
+# SPDX-FileCopyrightText: 2026 The koopman_ros Authors
+# SPDX-License-Identifier: Apache-2.0
+
+"""Managed nodes across processes: nothing acts before it is active, and all can be taken down."""
+
+import os
+from pathlib import Path
+import sys
+from typing import Any
+
+from lifecycle_msgs.msg import Transition
+from lifecycle_msgs.srv import ChangeState, GetState
+import pytest
+from sensor_msgs.msg import Temperature
+from std_srvs.srv import SetBool, Trigger
+
+from koopman_ros.bags import read_messages, summary
+from koopman_ros.demo import reactor
+from koopman_ros.ros import topics
+from koopman_ros.testing import Harness, NodeProcess
+from support.nodes import opened, seconds, temperature, value
+
+
+def change(ros: Harness, node: str, label: str) -> bool:
+    return bool(ros.call(ChangeState, f'{node}/change_state', ChangeState.Request(
+        transition=Transition(label=label))).success)
+
+
+def change_by_number(ros: Harness, node: str, number: int) -> bool:
+    return bool(ros.call(ChangeState, f'{node}/change_state', ChangeState.Request(
+        transition=Transition(id=number))).success)
+
+
+def state(ros: Harness, node: str) -> str:
+    return str(ros.call(GetState, f'{node}/get_state', GetState.Request()).current_state.label)
+
+
+def parts(ros: Harness, node: str) -> set[str]:
+    """Return topics and services of a node that only a configured one has."""
+    always = {'/rosout', '/parameter_events', '/diagnostics', f'/{node}/transition_event',
+              *(f'/{node}/{service}' for service in (
+                  'change_state', 'get_state', 'get_available_states',
+                  'get_available_transitions', 'get_transition_graph', 'describe_parameters',
+                  'get_parameter_types', 'get_parameters', 'list_parameters', 'set_parameters',
+                  'set_parameters_atomically', 'get_type_description'))}
+    of = ros.node
+    found = {name for look in (of.get_publisher_names_and_types_by_node,
+                               of.get_subscriber_names_and_types_by_node,
+                               of.get_service_names_and_types_by_node)
+             for name, _ in look(node, '/')}
+    return found - always
+
+
+def started(ros: Harness, node: str, command: tuple[str, ...] | None = None, **parameters: Any
+            ) -> NodeProcess:
+    process = ros.start(node, {'autostart': False, **parameters}, command=command)
+    assert state(ros, node) == 'unconfigured'
+    ros.wait_until(lambda: node in ros.node.get_node_names())
+    assert parts(ros, node) == set()
+    return process
+
+
+def take_down(ros: Harness, node: str) -> None:
+    assert change(ros, node, 'cleanup')
+    assert state(ros, node) == 'unconfigured'
+    ros.wait_until(lambda: parts(ros, node) == set())
+    ros.statuses.clear()
+    # answered after its next report would have come
+    for _ in range(3):
+        assert state(ros, node) == 'unconfigured'
+
+
+def test_plant(ros: Harness) -> None:
+    measured = ros.listen(Temperature, reactor.TEMPERATURE)
+    process = started(ros, 'plant', speed=20.0)
+    # neither by name nor by number, which managers use
+    assert not change(ros, 'plant', 'activate')
+    assert not change_by_number(ros, 'plant', Transition.TRANSITION_ACTIVATE)
+    assert state(ros, 'plant') == 'unconfigured'
+
+    assert change_by_number(ros, 'plant', Transition.TRANSITION_CONFIGURE)
+    assert '/plant/reset' in parts(ros, 'plant')
+    still = ros.wait_for_status('plant: simulation', lambda s: s.message == 'inactive')
+    # which moves nothing either
+    assert ros.set_parameters('plant', **{'constants.feed_temperature': 10.0})[0].successful
+    assert value(ros.wait_for_status('plant: simulation', lambda s: s is not still),
+                 'temperature [degC]') == value(still, 'temperature [degC]')
+    assert not measured
+
+    assert change(ros, 'plant', 'activate')
+    ros.wait_until(lambda: len(measured) > 20)
+    assert change(ros, 'plant', 'deactivate')
+    still = ros.wait_for_status('plant: simulation', lambda s: s.message == 'inactive')
+    count = len(measured)
+    ros.wait_for_status('plant: simulation', lambda s: s is not still)
+    assert len(measured) == count
+    assert value(still, 'measurements') == str(count)
+
+    take_down(ros, 'plant')
+    assert not [s for s in ros.statuses if s.name.startswith('plant')]
+    # it begins afresh, with what was set meanwhile
+    assert all(result.successful for result in ros.set_parameters('plant', **{
+        'constants.feed_temperature': reactor.constant('feed_temperature'),
+        'temperature.bias': 3.0}))
+    assert change(ros, 'plant', 'configure')
+    assert change(ros, 'plant', 'activate')
+    ros.wait_until(lambda: len(measured) > count + 5)
+    again = measured[count:]
+    assert seconds(again[0]) == seconds(measured[0])
+    assert again[0].temperature == pytest.approx(measured[0].temperature + 3.0)
+    assert change(ros, 'plant', 'shutdown')
+    assert ros.wait_for_end(process) == 0
+    assert 'Traceback' not in process.output()
+
+
+class Loop:
+    """A controller that is measured by the test."""
+
+    def __init__(self, ros: Harness) -> None:
+        self.ros, self._time = ros, 0.0
+        self.commands = ros.listen(Temperature, reactor.COOLANT_SETPOINT)
+        self._sensor = ros.node.create_publisher(
+            Temperature, reactor.TEMPERATURE, topics.LOOP_QOS)
+
+    def measure(self) -> None:
+        self._time += 1.0
+        self._sensor.publish(temperature(42.85, self._time))
+
+    def answered(self) -> bool:
+        """Measure, and tell whether that is answered before the node does anything else."""
+        self.measure()
+        state(self.ros, 'controller')
+        state(self.ros, 'controller')
+        return bool(self.commands) and seconds(self.commands[-1]) == self._time
+
+
+def test_controller(ros: Harness, tmp_path: Path) -> None:
+    loop = Loop(ros)
+    process = started(ros, 'controller', measurement_timeout=0.3)
+    assert change(ros, 'controller', 'configure')
+    assert '/coolant_setpoint' in parts(ros, 'controller')
+    ros.meet('controller')
+    for _ in range(3):
+        assert not loop.answered()
+    ros.wait_for_status('controller: control', lambda s: s.message == 'inactive')
+    assert not loop.commands
+
+    assert change(ros, 'controller', 'activate')
+    ros.wait_until(loop.answered)
+    # silence: it holds its command, again and again
+    ros.wait_until(lambda: len(loop.commands) > 4)
+    assert change(ros, 'controller', 'deactivate')
+    count = len(loop.commands)
+    assert not loop.answered()
+    first = ros.wait_for_status('controller: control', lambda s: s.message == 'inactive')
+    ros.wait_for_status('controller: control', lambda s: s is not first)
+    assert len(loop.commands) == count
+
+    take_down(ros, 'controller')
+    assert not [s for s in ros.statuses if s.name.startswith('controller')]
+    bad = tmp_path / 'bad.safetensors'
+    bad.write_text('nonsense')
+    assert ros.set_parameters('controller', model=str(bad))[0].successful
+    assert not change(ros, 'controller', 'configure')
+    assert state(ros, 'controller') == 'unconfigured'
+    ros.wait_until(lambda: parts(ros, 'controller') == set())
+    (line,) = [line for line in process.output().splitlines() if '[ERROR]' in line]
+    assert str(bad) in line
+
+    assert ros.set_parameters(
+        'controller', model='reactor_linear', measurement_timeout=0.0)[0].successful
+    assert change(ros, 'controller', 'configure')
+    assert change(ros, 'controller', 'activate')
+    ros.meet('controller')
+    ros.wait_until(loop.answered)
+    assert value(ros.wait_for_status('controller: control', lambda s: s.message != 'inactive'),
+                 'model') == 'reactor_linear'
+    assert change(ros, 'controller', 'deactivate')
+    assert change(ros, 'controller', 'shutdown')
+    assert ros.wait_for_end(process) == 0
+    assert 'Traceback' not in process.output()
+
+
+def test_controller_that_is_taken_down_while_it_reads_a_model(ros: Harness, tmp_path: Path
+                                                              ) -> None:
+    """From a disk that is slow: the answer comes when nobody is there who could give it."""
+    pipe = tmp_path / 'disk'
+    os.mkfifo(pipe)
+    process = started(ros, 'controller', command=(sys.executable, '-c', f"""
+import sys
+from koopman_ros.nodes import controller
+from koopman_ros.ros import model_reload
+
+def slowly(*args, read=model_reload.load_suitable):
+    open({str(pipe)!r}).read()
+    return read(*args)
+
+model_reload.load_suitable = slowly
+sys.exit(controller.main())
+"""))
+    assert change(ros, 'controller', 'configure')
+    client = ros.node.create_client(Trigger, 'controller/reload_model')
+    ros.wait_until(client.service_is_ready)
+    ros.meet('controller')
+    client.call_async(Trigger.Request())
+    with opened(ros, pipe):
+        take_down(ros, 'controller')
+    # the file is read, and the node goes on
+    assert change(ros, 'controller', 'configure')
+    assert change(ros, 'controller', 'activate')
+    loop = Loop(ros)
+    ros.meet('controller')
+    ros.wait_until(loop.answered)
+    assert change(ros, 'controller', 'shutdown')
+    assert ros.wait_for_end(process) == 0
+    assert 'Traceback' not in process.output()
+
+
+def test_trainer(ros: Harness, tmp_path: Path) -> None:
+    loop, bag = Loop(ros), tmp_path / 'run.mcap'
+    process = started(ros, 'trainer', output=bag, experiment_timeout=60.0)
+    assert change(ros, 'trainer', 'configure')
+    words = 'trainer is not active: activate it first'
+    for name in ('experiment', 'record'):
+        response = ros.set_bool(f'trainer/{name}', True)
+        assert (response.success, response.message) == (False, words)
+    response = ros.trigger('trainer/train')
+    assert (response.success, response.message) == (False, words)
+    assert not bag.exists()
+
+    def begin() -> None:
+        timer = ros.node.create_timer(0.02, loop.measure)
+        response = ros.set_bool('trainer/experiment', True)
+        assert response.success, response.message
+        ros.wait_until(lambda: len({message.temperature for message in loop.commands}) > 5)
+        ros.node.destroy_timer(timer)
+
+    assert change(ros, 'trainer', 'activate')
+    begin()
+    assert change(ros, 'trainer', 'deactivate')
+    ros.wait_until(lambda: ros.node.count_publishers(reactor.COOLANT_SETPOINT) == 0)
+    count = len(loop.commands)
+    assert loop.commands[-1].temperature == pytest.approx(18.85)
+    assert summary(bag).complete
+    last = list(read_messages(bag, ['/coolant_setpoint']))[-1].message
+    assert (seconds(last), last.temperature) == (
+        seconds(loop.commands[-1]), loop.commands[-1].temperature)
+    ros.wait_for_status('trainer: recording', lambda s: s.message == 'not recording')
+    ros.wait_for_status('trainer: experiment', lambda s: s.message == 'ended')
+    assert ros.set_bool('trainer/record', True).message == words
+
+    # while it waits for a first measurement
+    assert change(ros, 'trainer', 'activate')
+    client = ros.node.create_client(SetBool, 'trainer/experiment')
+    ros.wait_until(client.service_is_ready)
+    ros.meet('trainer')
+    asked = client.call_async(SetBool.Request(data=True))
+    ros.wait_until(lambda: ros.node.count_publishers(reactor.COOLANT_SETPOINT))
+    assert change(ros, 'trainer', 'deactivate')
+    ros.wait_until(asked.done)
+    assert asked.result().message == 'refused: it was ended before the first measurement'
+
+    take_down(ros, 'trainer')
+    assert not [s for s in ros.statuses if s.name.startswith('trainer')]
+    assert len(loop.commands) == count
+    assert ros.set_parameters('trainer', **{'coolant_temperature.safe': 10.0})[0].successful
+    assert change(ros, 'trainer', 'configure')
+    assert change(ros, 'trainer', 'activate')
+    begin()
+    # ends what is under way, too
+    assert change(ros, 'trainer', 'shutdown')
+    assert ros.wait_for_end(process) == 0
+    ros.wait_until(lambda: loop.commands[-1].temperature == pytest.approx(10.0))
+    assert summary(tmp_path / 'run_3.mcap').complete
+    assert 'Traceback' not in process.output()
