@@ -177,9 +177,10 @@ def rests_outside(controller: Controller) -> str:
         f'{"more" if held > now else "less"}'
         for name, unit, now, held in zip(model.inputs.names, model.inputs.units, safe.tolist(),
                                          holding.tolist(), strict=True))
-    safest = ', '.join(f'{name}.safe = {shown(now, unit):.6g} {display_unit(unit)}' for name, unit, now
-                       in zip(model.inputs.names, model.inputs.units, safe.tolist(), strict=True))
-    return (f'under {safest} the plant leaves the trained range, {ranges(model)}, and '
+    under = ', '.join(
+        f'{name}.safe = {shown(now, unit):.6g} {display_unit(unit)}' for name, unit, now in zip(
+            model.inputs.names, model.inputs.units, safe.tolist(), strict=True))
+    return (f'under {under} the plant leaves the trained range, {ranges(model)}, and '
             f'{where}: no law can act there, and the way back is slow; record data from there and '
             f'train again, or set {better} if that is still safe')
 

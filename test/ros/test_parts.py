@@ -13,19 +13,20 @@ from typing import Any
 import numpy as np
 import pytest
 from rclpy.duration import Duration
-from rclpy.node import Node
 from sensor_msgs.msg import Temperature
 
 from koopman_ros.bags import BagWriter, read_messages
 from koopman_ros.control import Controller
 from koopman_ros.demo import reactor
 from koopman_ros.lifting import load, ModelFileError, save
-from koopman_ros.parameters.trainer import TrainerParameters
+from koopman_ros.parameters.controller import signals_of
+from koopman_ros.parameters.trainer import trainer_table
+from koopman_ros.parameters.wire import Wiring
 from koopman_ros.resources import model_path
 from koopman_ros.ros import model_reload, recorder, topics
-from koopman_ros.ros.experiment import CoolantExperiment
+from koopman_ros.ros.experiment import PlantExperiment
 from koopman_ros.ros.model_reload import load_suitable
-from koopman_ros.ros.node import DiagnosticsPublisher, Level, Status
+from koopman_ros.ros.node import Level, LoopNode, Status
 from koopman_ros.ros.recorder import receipt_ns, Recorder
 from koopman_ros.ros.recording import Recording
 from koopman_ros.ros.training import Training
@@ -35,28 +36,32 @@ from koopman_ros.units import NANOSECONDS
 from support.nodes import temperature, TIMEOUT
 
 NAMES = (reactor.TEMPERATURE, reactor.SETPOINT, reactor.COOLANT_SETPOINT)
+MODEL = load(model_path(reactor.MODEL))
+TABLE = trainer_table(MODEL)
+DEFAULTS = TABLE.snapshot({})
+WIRING = Wiring(signals_of(MODEL), DEFAULTS.states, DEFAULTS.inputs)
 
 
-def made(part: str, node: Node, folder: Path) -> Callable[[], object]:
+def made(part: str, node: LoopNode, folder: Path) -> Callable[[], object]:
     """Make a part of a node, and return what takes it down."""
+    settings = TABLE.snapshot({'output': str(folder / 'bag')})
     match part:
         case 'diagnostics':
-            made = DiagnosticsPublisher(node, 'task', 'x', lambda: Status(Level.OK, 'well'))
+            made = node.diagnostics.add('task', 'x', lambda: Status(Level.OK, 'well'))
         case 'matching':
-            made = topics.Matching(node, lambda: None, topics.SINGLE)
+            made = topics.Matching(node, lambda: None, {'mine': 'speak'})
             made.publish('mine', Temperature)
             made.subscribe('other', lambda _: None, Temperature)
         case 'recorder':
-            return Recorder(node, BagWriter(folder / 'bag'), NAMES).close
+            return Recorder(node, BagWriter(folder / 'bag'), NAMES, topics.known(WIRING)).close
         case 'recording':
-            made = Recording(node, TrainerParameters(output=str(folder / 'bag')))
+            made = Recording(node, settings, WIRING)
             made.start()
         case 'experiment':
-            made = CoolantExperiment(
-                node, TrainerParameters(experiment_topic=reactor.COOLANT_SETPOINT))
+            made = PlantExperiment(node, settings, WIRING)
             assert made._start() == ''
         case 'training':
-            made = Training(node, TrainerParameters(), lambda: str(folder / 'missing'))
+            made = Training(node, settings, WIRING, lambda: str(folder / 'missing'))
             made.start()
         case 'watchdog':
             made = Watchdog(lambda _: None)
@@ -72,17 +77,19 @@ def test_what_a_part_has_created_goes_with_it(
     # a training that loads no library, and ends when it is asked to
     monkeypatch.setattr('koopman_ros.jobs.training._command', lambda: (
         'sh', '-c', 'cat > /dev/null'))
-    node = shared_ros.node
+    node = LoopNode('parts', context=shared_ros.node.context)
+    tasks = node.diagnostics._tasks
 
     def created() -> tuple[object, ...]:
         return (*map(set, (node.publishers, node.subscriptions, node.services, node.timers)),
-                set(threading.enumerate()))
+                set(threading.enumerate()), set(map(id, tasks)))
 
     before = created()
     destroy = made(part, node, tmp_path)
     assert created() != before
     destroy()
     assert created() == before
+    node.destroy_node()
 
 
 def stamped_at_the_take(handle: Any, message_type: type) -> Any:
@@ -98,7 +105,8 @@ def test_batch_is_recorded_in_the_order_of_sending(
     if at_the_take:
         monkeypatch.setattr(recorder, 'take_raw', stamped_at_the_take)
     publishers = [ros.node.create_publisher(Temperature, name, topics.LOOP_QOS) for name in NAMES]
-    recording = Recorder(ros.node, BagWriter(tmp_path / 'run.mcap'), NAMES)
+    recording = Recorder(
+        ros.node, BagWriter(tmp_path / 'run.mcap'), NAMES, topics.known(WIRING))
     ros.wait_until(lambda: all(p.get_subscription_count() for p in publishers))
     recording.take()
     sent = []
@@ -139,20 +147,22 @@ def test_time_of_receipt(received: float, source: float, found: float) -> None:
         found * NANOSECONDS)
 
 
-@pytest.mark.parametrize(('state', 'coolant', 'fits'), [
-    ('temperature', 'coolant_temperature', True), ('T', 'T_c', True), ('reactor', 'jacket', True),
-    ('temperature', 'coolant', True), ('coolant_temperature', 'temperature', False),
-    ('coolant_temperature', 'heater', False), ('x', 'temperature', False), ('x', 'x', False)])
-def test_model_that_takes_the_coolant_for_what_is_controlled_is_refused(
-        tmp_path: Path, state: str, coolant: str, fits: bool) -> None:
-    path, shipped = tmp_path / 'x.safetensors', load(model_path('reactor_nz4'))
-    save(replace(shipped, states=replace(shipped.states, names=(state,)),
-                 inputs=replace(shipped.inputs, names=(coolant,))), path)
-    if fits:
-        assert load_suitable(str(path)).model.states.names[0] == state
+@pytest.mark.parametrize('other', [
+    {'names': ('T',)}, {'units': ('degC',)}, {'names': ('coolant_temperature',)}])
+@pytest.mark.parametrize('kind', ['states', 'inputs'])
+def test_model_of_other_signals_is_refused_by_a_controller_that_runs(
+        tmp_path: Path, kind: str, other: dict[str, Any]) -> None:
+    path, own = tmp_path / 'x.safetensors', signals_of(MODEL)
+    save(replace(MODEL, **{kind: replace(getattr(MODEL, kind), **other)}), path)
+    found = load_suitable(str(path)).model
+    if signals_of(found) == own:
+        assert (kind, other) == ('inputs', {'names': ('coolant_temperature',)})
+        assert load_suitable(str(path), own).model.inputs.names == ('coolant_temperature',)
         return
-    with pytest.raises(ModelFileError, match='needs the temperature as state and that of the coo'):
-        load_suitable(str(path))
+    with pytest.raises(ModelFileError, match=(
+            r'has states .*, this controller was started for states temperature \[K\] and inputs '
+            r'coolant_temperature \[K\]: choose a model of the same signals, or start it anew$')):
+        load_suitable(str(path), own)
 
 
 def test_model_whose_step_takes_too_long_is_refused_with_its_time(
