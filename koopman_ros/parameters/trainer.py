@@ -15,9 +15,15 @@ from koopman_ros.arrays import Array
 from koopman_ros.experiment import Experiment
 from koopman_ros.lifting import LiftedModel
 from koopman_ros.parameters import wire
-from koopman_ros.parameters.controller import signals_of
 from koopman_ros.parameters.table import ConfigurationError, parameter, ParameterTable, per_signal
-from koopman_ros.parameters.wire import InputPlaces, preset, Signals, StatePlaces, Wiring
+from koopman_ros.parameters.wire import (
+    InputPlaces,
+    preset,
+    Signals,
+    signals_of,
+    StatePlaces,
+    Wiring,
+)
 from koopman_ros.units import conversion, display_unit
 
 _UNBOUNDED = 1e9  # what stands for no bound, in any unit

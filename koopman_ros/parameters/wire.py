@@ -11,6 +11,7 @@ from functools import cached_property
 import re
 from typing import Any
 
+from koopman_ros.lifting import LiftedModel
 from koopman_ros.parameters.table import ConfigurationError, parameter, ParameterTable
 from koopman_ros.resources import config_directory
 from koopman_ros.wire import Place, place, stem
@@ -113,6 +114,16 @@ class Signals:
             topics |= {f'{name}.topic': name, f'{name}.command_topic': command,
                        f'{name}.manual_topic': f'manual_{command}'}
         return topics
+
+
+def signals_of(model: LiftedModel, controlled: tuple[str, ...] = ()) -> Signals:
+    """Return the signals of a model, all states controlled by default."""
+    states, inputs = (dict(zip(of.names, of.units, strict=True))
+                      for of in (model.states, model.inputs))
+    named = tuple(filter(None, controlled))
+    # in the order of the states, as the control step wants them
+    own = tuple(name for name in states if name in named)
+    return Signals(states, inputs, (named if len(own) < len(named) else own) or tuple(states))
 
 
 @dataclass(frozen=True)

@@ -22,8 +22,8 @@ from std_srvs.srv import Trigger
 from koopman_ros.arrays import Array
 from koopman_ros.control import Controller, Settings, State
 from koopman_ros.lifting import Coordinates, LiftedModel, load_with_digest, ModelFileError
-from koopman_ros.parameters.controller import ControllerParameters, signals_of, table_of
-from koopman_ros.parameters.wire import Signals
+from koopman_ros.parameters.controller import ControllerParameters, table_of
+from koopman_ros.parameters.wire import Signals, signals_of
 from koopman_ros.resources import model_path
 from koopman_ros.ros.node import words_of
 from koopman_ros.units import display_unit, NANOSECONDS, shown
