@@ -38,6 +38,7 @@ from koopman_ros.units import conversion, display_unit, shown, unit_label
 
 _MAX_ITERATIONS = 50
 _STEADY = 1e-12  # of the states' scales
+_LINEAR = 'linear law'
 
 
 @dataclass(frozen=True)
@@ -82,8 +83,8 @@ def run_plant(name: str, output: Path, speed: float) -> dict[str, object]:
     bag, picture = output / 'closed_loop.mcap', output / 'closed_loop.png'
     for old in (bag, picture, output / 'summary.json'):
         old.unlink(missing_ok=True)
-    wanted = ', '.join(f'{signal} -> {told.states[signal].setpoint:g} '
-                       f'{unit_label(signals.states[signal])}' for signal in setpoints)
+    wanted = ', '.join(f'{signal} -> {told.states[signal].setpoint:g}{_unit(signals, signal)}'
+                       for signal in setpoints)
     with LiveTable(f'{system.name}: {wanted} after {told.step_time:g} s', signals,
                    told.duration) as table:
         run_loop(scenario, bag, logs, table.show)
@@ -103,13 +104,15 @@ def run_plant(name: str, output: Path, speed: float) -> dict[str, object]:
     cost = cost_along(task, states, inputs[:-1])
     title = (f'{system.name}: {wanted}. Cost over that of the optimum: learned '
              f'{cost / best.cost:.4f}, linear {linear.cost / best.cost:.4f}')
-    _plot(picture, title, run, {'linear law': linear, 'optimum': best}, signals, scenario,
+    _plot(picture, title, run, {_LINEAR: linear, 'optimum': best}, signals, scenario,
           model.states, tuning)
     counts = summary(bag).counts
     result: dict[str, object] = {
         **{signal: {
             'unit': signals.states[signal], 'setpoint': setpoint,
             'final_error': abs(run.final_error(signal, setpoint)),
+            'linear_final_error': float(abs(linear.states[-1, list(signals.states).index(signal)]
+                                            - setpoint)),
             'settling_time_seconds': run.settling_time(
                 signal, setpoint, told.step_time, told.states[signal].tolerance),
         } for signal, setpoint in setpoints.items()},
@@ -147,11 +150,17 @@ def resting_point(system: ControlAffineSystem, setpoints: Mapping[str, float]
     raise ValueError(f'{system.name} does not rest at {dict(setpoints)}: choose other set-points')
 
 
+def _unit(signals: Signals, signal: str) -> str:
+    """Return the unit of a signal as it follows a number."""
+    unit = {**signals.states, **signals.inputs}[signal]
+    return '' if unit == '1' else f' {unit_label(unit)}'
+
+
 def _plot(path: Path, title: str, run: Run, courses: Mapping[str, Course], signals: Signals,
           scenario: Scenario, box: Coordinates, tuning: ControllerParameters) -> None:
     """Draw each signal: states with set-points and training range, inputs with limits."""
     styles: dict[str, dict[str, Any]] = {
-        'linear law': {'color': 'tab:red'},
+        _LINEAR: {'color': 'tab:red'},
         'optimum': {'color': 'black', 'linestyle': (0, (1, 2)), 'linewidth': 1.5}}
     later = scenario.step_time + scenario.sample_period * np.arange(
         1 + max(len(course.inputs) for course in courses.values()))
@@ -162,9 +171,14 @@ def _plot(path: Path, title: str, run: Run, courses: Mapping[str, Course], signa
             low, high = (float(shown(float(end[i]), unit)) for end in (box.lower, box.upper))
             panel.axhspan(low, high, label='training range', **DRAWN_RANGE)
             if signal in scenario.setpoints:
-                goal = float(shown(scenario.setpoints[signal], unit))
+                setpoint = scenario.setpoints[signal]
+                goal = float(shown(setpoint, unit))
                 panel.plot([scenario.step_time, run.seconds[-1]], [goal, goal], 'k--',
                            linewidth=1.0, label='set-point')
+                panel.text(
+                    0.99, 0.06, f'ends {run.final_error(signal, setpoint):+.0e} off, linear law '
+                    f'{courses[_LINEAR].states[-1, i] - setpoint:+.0e}',
+                    transform=panel.transAxes, ha='right', fontsize=8)
             panel.plot(run.seconds, shown(run.measured[signal], unit), color='tab:green',
                        linewidth=2.5, label='learned controller')
             for name, course in courses.items():

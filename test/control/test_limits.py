@@ -222,7 +222,7 @@ def test_a_controller_succeeds_itself_without_a_trace():
 
 
 def test_who_wants_no_transfer_is_answered_by_the_law_from_the_first_measurement_on():
-    free = controller(transfer_time=0.0, limits=InputLimits(
+    free = controller(transfer_time=0.0, observer_bandwidth=0.0, limits=InputLimits(
         np.array([278.15]), np.array([305.15]), np.array([np.inf])))
     measured = np.array([START + 2.0])
     _, alone, _ = free.step(State(), measured, EPOCH)
