@@ -311,9 +311,10 @@ def _check_player(values: PlayerParameters) -> str:
 def player_table(given: Mapping[str, Any] = MappingProxyType({})
                  ) -> ParameterTable[PlayerParameters]:
     """Return the parameters of a player; `given` as for :func:`trainer_table`."""
-    defaults: dict[str, Any] = {}
-    if (wiring := preset_wiring(str(given.get('system', 'reactor')))) is not None:
-        defaults = {
+    system = str(given.get('system', 'reactor'))
+    defaults: dict[str, Any] = {'system': system}
+    if (wiring := preset_wiring(system)) is not None:
+        defaults |= {
             'topics': tuple(dict.fromkeys(place.topic for places in (
                 wiring.applied, wiring.measured, wiring.setpoints, wiring.manual)
                 for place in places.values())),

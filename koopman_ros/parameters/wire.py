@@ -12,7 +12,12 @@ import re
 from typing import Any
 
 from koopman_ros.lifting import LiftedModel
-from koopman_ros.parameters.table import ConfigurationError, parameter, ParameterTable
+from koopman_ros.parameters.table import (
+    as_yaml,
+    ConfigurationError,
+    parameter,
+    ParameterTable,
+)
 from koopman_ros.resources import config_directory
 from koopman_ros.wire import Place, place, stem
 
@@ -258,13 +263,14 @@ def renamed(node: str, given: Mapping[str, Any], table: ParameterTable[Any]) -> 
     said = []
     for name, (now, factor) in yaml.safe_load(path.read_text()).get(node, {}).items():
         if name in unknown and now in table.rows:
-            value = given[name]
+            value, row = given[name], table.rows[now]
             if isinstance(factor, Mapping):
                 value = factor.get(value, value)
-            elif isinstance(value, float) and factor != 1:
+            elif isinstance(value, (int, float)):
                 value = float(f'{value * factor:.12g}')
-            said.append(f'{name} is now {now}' + (f' [{unit}]' if (
-                unit := table.rows[now].unit) else '') + f': write {now}: {value}')
+            written = as_yaml((value,) if isinstance(row.default, tuple) else value)
+            said.append(f'{name} is now {now}' + (f' [{row.unit}]' if row.unit else '')
+                        + f': write {now}: {written}')
     return '; '.join(said)
 
 
