@@ -41,7 +41,8 @@ class Assembler:
             self._open.clear()
             self._last_ns = None
         if self._last_ns is not None and stamp_ns <= self._last_ns + self.tolerance_ns:
-            self.late.update(values)
+            # the names: of a mapping it would add the values
+            self.late.update(list(values))
             return None
         near = [time for time in self._open if abs(time - stamp_ns) <= self.tolerance_ns]
         at = min(near, key=lambda time: abs(time - stamp_ns), default=stamp_ns)
