@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 from sensor_msgs.msg import JointState, Temperature
 
+from koopman_ros.parameters.table import ConfigurationError
 from koopman_ros.ros import topics
 from koopman_ros.ros.codec import stamp_message
 from koopman_ros.ros.signals import Heard, Inlet, Outlet
@@ -135,3 +136,35 @@ def test_measurement_is_coarse_and_tells_its_variance_in_the_unit_of_the_message
     assert raw[0].fluid_pressure == pytest.approx(1.2e5)
     assert raw[0].variance == pytest.approx(1e8)
     assert ends.wait_for(1)[0].values['pressure'] == pytest.approx(1.2)
+
+
+def refuse(*_: Any) -> Any:
+    raise AssertionError('nothing is made for a place that cannot be')
+
+
+@pytest.mark.parametrize(('unit', 'given', 'words'), [
+    ('K', {'type': 'no_such_msgs/msg/Thing', 'field': 'x'},
+     "signal: message type 'no_such_msgs/msg/Thing' is not installed here: source its workspace"),
+    ('K', {'field': 'heat'},
+     'signal: sensor_msgs/msg/Temperature has no heat: name another field'),
+    ('K', {'field': 'header.stamp'},
+     'signal: header.stamp of sensor_msgs/msg/Temperature is no number: name another field'),
+    ('m/s', {**TWIST, 'field': 'twist.linear.w'},
+     'signal: geometry_msgs/msg/TwistStamped has no twist.linear.w: name another field'),
+    ('K', {'unit': 'm'}, "signal: '(K|m)' cannot be converted to '(K|m)': .*: name another unit"),
+])
+def test_place_that_cannot_be_is_refused(
+        shared_ros: Harness, unit: str, given: dict[str, str], words: str) -> None:
+    places, units = {'signal': place('nowhere', 'signal', unit, given)}, {'signal': unit}
+    for make in (lambda: Inlet(shared_ros.node, refuse, places, units, refuse),
+                 lambda: Outlet(places, units, refuse)):
+        with pytest.raises(ConfigurationError, match=f'^{words}$'):
+            make()
+
+
+def test_signals_of_one_topic_have_one_type() -> None:
+    places = {'heat': place('both', 'heat', 'K'), 'angle': place('both', 'angle', 'rad')}
+    with pytest.raises(ConfigurationError, match=(
+            'heat and angle share the topic both and differ in the type of its messages, '
+            'sensor_msgs/msg/Temperature and sensor_msgs/msg/JointState: give them one type')):
+        Outlet(places, {'heat': 'K', 'angle': 'rad'}, refuse)
