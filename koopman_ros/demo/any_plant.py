@@ -151,9 +151,8 @@ def resting_point(system: ControlAffineSystem, setpoints: Mapping[str, float]
 
 
 def _unit(signals: Signals, signal: str) -> str:
-    """Return the unit of a signal as it follows a number."""
-    unit = {**signals.states, **signals.inputs}[signal]
-    return '' if unit == '1' else f' {unit_label(unit)}'
+    """Return the unit of a state as it follows a number."""
+    return '' if signals.states[signal] == '1' else f' {unit_label(signals.states[signal])}'
 
 
 def _plot(path: Path, title: str, run: Run, courses: Mapping[str, Course], signals: Signals,
@@ -176,8 +175,8 @@ def _plot(path: Path, title: str, run: Run, courses: Mapping[str, Course], signa
                 panel.plot([scenario.step_time, run.seconds[-1]], [goal, goal], 'k--',
                            linewidth=1.0, label='set-point')
                 panel.text(
-                    0.99, 0.06, f'ends {run.final_error(signal, setpoint):+.0e} off, linear law '
-                    f'{courses[_LINEAR].states[-1, i] - setpoint:+.0e}',
+                    0.99, 0.06, f'ends {run.final_error(signal, setpoint):+.1e} off, linear law '
+                    f'{courses[_LINEAR].states[-1, i] - setpoint:+.1e}{_unit(signals, signal)}',
                     transform=panel.transAxes, ha='right', fontsize=8)
             panel.plot(run.seconds, shown(run.measured[signal], unit), color='tab:green',
                        linewidth=2.5, label='learned controller')
