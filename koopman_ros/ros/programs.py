@@ -118,7 +118,9 @@ def _operator() -> Program:
     asks = (*wiring.setpoints.values(), *wiring.manual.values())
     return Program(
         publishes=(*(place.topic for place in asks), *STANDARD_TOPICS),
-        subscribes=(*PROGRAMS['trainer'].subscribes, *STANDARD_TOPICS),
+        subscribes=(*PROGRAMS['trainer'].subscribes, *STANDARD_TOPICS, *(
+            _TRANSITIONS.replace('~', node) for node, program in PROGRAMS.items()
+            if _TRANSITIONS in program.publishes)),
         serves=(*STANDARD_SERVICES, _COMMAND_LINE_SERVICE),
         calls=tuple(f'{node}/{service.removeprefix("~/")}' for node, program in PROGRAMS.items()
                     if node != 'replay' for service in program.serves))

@@ -18,7 +18,6 @@ from rclpy.duration import Duration
 from rclpy.executors import SingleThreadedExecutor
 from rclpy.node import Node, NodeNameNonExistentError
 from rclpy.qos import QoSProfile
-from rclpy.qos_overriding_options import QoSOverridingOptions
 from rclpy.serialization import serialize_message
 from sensor_msgs.msg import JointState, Temperature
 from std_srvs.srv import SetBool
@@ -26,7 +25,7 @@ from std_srvs.srv import SetBool
 from koopman_ros.bags import BagWriter, message_definition
 from koopman_ros.demo import reactor
 from koopman_ros.nodes import replay
-from koopman_ros.parameters.trainer import PlayerParameters
+from koopman_ros.parameters.trainer import player_table
 from koopman_ros.ros import topics
 from koopman_ros.ros.node import LoopNode
 from koopman_ros.ros.programs import OPERATOR, policy, Program, PROGRAMS
@@ -75,7 +74,7 @@ def check(ros: Harness, node: str, seen: Seen) -> None:
 
 
 @pytest.mark.parametrize(('node', 'parameters'), [
-    ('plant', {'reactor': 'two_state', 'speed': 2.0}),
+    ('plant', {'system': 'two_state', 'speed': 2.0}),
     ('controller', {'use_sim_time': True}),
     ('player', {'bag': 'all.mcap', 'rate': 0.0, 'clock': True}),
 ])
@@ -84,7 +83,7 @@ def test_a_node_does_what_it_is_granted(
     if 'bag' in parameters:
         parameters = {**parameters, 'bag': tmp_path / parameters['bag']}
         with BagWriter(parameters['bag']) as writer:
-            for number, name in enumerate(PlayerParameters().topics):
+            for number, name in enumerate(player_table().snapshot({}).topics):
                 writer.add_topic(f'/{name}', message_definition('sensor_msgs/msg/Temperature'), ())
                 writer.write(f'/{name}', serialize_message(temperature(40.0, 1.0)), number)
     ros.start(node, parameters)
@@ -93,12 +92,16 @@ def test_a_node_does_what_it_is_granted(
 
 def test_the_trainer_does_what_it_is_granted(ros: Harness, tmp_path: Path) -> None:
     seen: Seen = {}
+    # no signal of this loop: it is recorded where somebody publishes it
+    ros.node.create_publisher(JointState, reactor.CONCENTRATION, topics.LOOP_QOS)
     ros.start('trainer', {'use_sim_time': True, 'output': tmp_path / 'run.mcap',
                           'experiment_timeout': 0.5})
     client = ros.node.create_client(SetBool, '/trainer/experiment')
     ros.wait_until(client.service_is_ready)
-    for topic in (reactor.COOLANT_SETPOINT, reactor.MANUAL_COOLANT_SETPOINT):
-        assert ros.set_parameters('/trainer', **{'experiment_on': topic})[0].successful
+    for steps, topic in (('command', reactor.COOLANT_SETPOINT),
+                         ('manual', reactor.MANUAL_COOLANT_SETPOINT),
+                         ('setpoint', reactor.SETPOINT)):
+        assert ros.set_parameters('/trainer', experiment_on=steps)[0].successful
         # it publishes while it waits for the measurement that does not come
         waiting = client.call_async(SetBool.Request(data=True))
         watch(ros, 'trainer', seen, publishes={f'/{topic}'})
@@ -167,8 +170,7 @@ class Pair:
         self.matching = topics.Matching(self.own, lambda: None)
         self.speaker = self.matching.publish('command', Temperature)
         self.matching.subscribe(
-            'temperature', lambda _: None,
-            qos_overriding_options=QoSOverridingOptions((qos.QoSPolicyKind.RELIABILITY,)))
+            'temperature', lambda _: None, Temperature)
 
     def _node(self, name: str) -> Node:
         context = Context()
