@@ -33,7 +33,7 @@ from koopman_ros.parameters.wire import preset, Signals
 from koopman_ros.plants import ControlAffineSystem
 from koopman_ros.plants.optimum import cost_along, Course, linear_law, optimum, Task
 from koopman_ros.reports import draw_limits, drawing, DRAWN_RANGE, legend, write_figures
-from koopman_ros.resources import model_path
+from koopman_ros.resources import config_directory, model_path
 from koopman_ros.units import conversion, display_unit, shown, unit_label
 
 _MAX_ITERATIONS = 50
@@ -63,9 +63,9 @@ def run_plant(name: str, output: Path, speed: float) -> dict[str, object]:
     """Run the loop of a plant, compare it, and write and return what came of it."""
     begin = time.monotonic()
     wiring = preset_wiring(name)
-    if wiring is None or not (own := preset(name, 'demo')).get('duration'):
-        raise ValueError(f'there is no demo of {name!r}: choose a plant whose file in '
-                         'config/plants has the section demo')
+    if wiring is None or 'duration' not in (own := preset(name, 'demo')):
+        known = sorted(file.stem for file in (config_directory() / 'plants').glob('*.yaml'))
+        raise ValueError(f'there is no demo of {name!r}: choose one of {", ".join(known)}')
     signals = wiring.signals
     told = ParameterTable(_Parameters, signals={'states': signals.states}, defaults=own
                           ).snapshot({})
