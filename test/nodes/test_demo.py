@@ -16,6 +16,7 @@ import pytest
 
 from koopman_ros.bags import summary
 from koopman_ros.demo.any_plant import resting_point
+from koopman_ros.plants.library.pendulum import Pendulum
 from koopman_ros.plants.library.two_tanks import TwoTanks
 from koopman_ros.testing import reserved_output
 
@@ -73,8 +74,8 @@ def test_a_plant_rests_where_its_flows_are_in_balance() -> None:
                tanks.orifice_2 * math.sqrt(2.0 * 9.81 * 0.15)]
     np.testing.assert_allclose(tanks.pump_gain * u, [through[0], through[1] - through[0]],
                                rtol=1e-10)
-    with pytest.raises(ValueError, match=r'two tanks does not rest at .*choose other set-points'):
-        resting_point(tanks.system(), {'level_1': -0.1})
+    with pytest.raises(ValueError, match=r'pendulum does not rest at .*choose other set-points'):
+        resting_point(Pendulum().system(), {'rate': 1.0})
 
 
 def test_demo_says_in_one_line_why_it_cannot_run(tmp_path: Path) -> None:
