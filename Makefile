@@ -48,8 +48,8 @@ $(VENV)/bench.stamp: setup.py $(LOCK) $(VENV)/run.stamp
 	$(INSTALL) --editable '.[ros,demo,train,bench]'
 	@touch $@
 
-demo: $(VENV)/run.stamp  ## closed loop of three processes: live table, bag, picture -> out/demo
-	$(BIN)/python -m koopman_ros.demo
+demo: $(VENV)/run.stamp  ## closed loop of three processes: live table, bag, picture -> out/demo (PLANT=pendulum: out/demo-pendulum)
+	$(BIN)/python -m koopman_ros.demo $(if $(PLANT),--plant $(PLANT))
 
 demo-retrain: $(VENV)/retrain.stamp  ## the plant drifts, is recorded, learned and controlled anew -> out/demo-retrain
 	$(BIN)/python -m koopman_ros.demo.retrain

@@ -91,6 +91,17 @@ class Place:
             raise LookupError(f'{self.field} of a message of {self.topic} ({self.type}) is no '
                               'number') from error
 
+    def expect(self, message: Any) -> None:
+        """Raise LookupError where no message of its kind, here an empty one, has the number."""
+        for name, key in _steps(self.field):
+            if not hasattr(message, name):
+                raise LookupError(f'{self.type} has no {self.field}: name another field')
+            if key:
+                return
+            message = getattr(message, name)
+        if not isinstance(message, (int, float)):
+            raise LookupError(f'{self.field} of {self.type} is no number: name another field')
+
     def put(self, message: Any, value: float) -> None:
         """Write a number into a message, whose arrays grow where they are too short."""
         *path, (name, key) = _steps(self.field)

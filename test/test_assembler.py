@@ -1,78 +1,105 @@
 # SPDX-FileCopyrightText: 2026 The koopman_ros Authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""Signals of several messages become one measurement by stamp; what goes wrong is counted."""
-
-from collections import Counter
+"""Samples that are put together from messages by stamp."""
 
 import pytest
 
 from koopman_ros.assembler import Assembler
-from koopman_ros.units import NANOSECONDS
+from koopman_ros.units import NANOSECONDS as SECOND
 
-SECOND = NANOSECONDS
-
-
-def assembler(tolerance: float = 0.0) -> Assembler:
-    return Assembler(('level_1', 'level_2'), round(tolerance * SECOND))
+NAMES = ('level', 'flow')
 
 
-def taken(found: object) -> tuple[int, list[float]] | None:
-    return None if found is None else (found[0], found[1].tolist())  # type: ignore[index]
+def taken(assembler, *parts):
+    """Take parts (stamp in ns, name, value); return what was completed, as stamp and values."""
+    found = [assembler.take(stamp, {name: value}) for stamp, name, value in parts]
+    return [(sample[0], sample[1].tolist()) for sample in found if sample is not None]
 
 
-def test_a_message_with_all_is_whole_by_itself() -> None:
-    parts = assembler()
-    assert taken(parts.take(5, {'level_2': 2.0, 'level_1': 1.0})) == (5, [1.0, 2.0])
-    assert parts.awaited == ''
+def counts(assembler):
+    return dict(assembler.late), dict(assembler.missing), dict(assembler.doubled)
 
 
-@pytest.mark.parametrize('first', ['level_1', 'level_2'])
-def test_parts_of_one_stamp_are_a_measurement_in_any_order(first: str) -> None:
-    values = {'level_1': 1.0, 'level_2': 2.0}
-    second = next(name for name in values if name != first)
-    parts = assembler()
-    assert parts.take(SECOND, {first: values[first]}) is None
-    assert parts.awaited == second
-    assert taken(parts.take(SECOND, {second: values[second]})) == (SECOND, [1.0, 2.0])
-    assert parts.awaited == ''
+def test_message_with_all_signals_is_a_sample_whatever_its_stamp():
+    assembler = Assembler(NAMES)
+    for stamp in (5, 5, 3, -SECOND):
+        found = assembler.take(stamp, {'flow': 2.0, 'level': 1.0})
+        assert (found[0], found[1].tolist()) == (stamp, [1.0, 2.0])
+    assert counts(assembler) == ({}, {}, {})
 
 
-@pytest.mark.parametrize(('apart', 'whole'), [(0.05, True), (0.06, False)])
-def test_stamps_may_be_apart_by_the_tolerance_and_the_last_one_counts(
-        apart: float, whole: bool) -> None:
-    parts = assembler(tolerance=0.05)
-    assert parts.take(SECOND, {'level_1': 1.0}) is None
-    at = SECOND + round(apart * SECOND)
-    assert taken(parts.take(at, {'level_2': 2.0})) == ((at, [1.0, 2.0]) if whole else None)
+def test_parts_of_one_stamp_are_a_sample_in_any_order():
+    assembler = Assembler(NAMES)
+    assert taken(assembler, (1, 'level', 1.0), (1, 'flow', 2.0), (2, 'flow', 4.0),
+                 (2, 'level', 3.0)) == [(1, [1.0, 2.0]), (2, [3.0, 4.0])]
+    # of several that are open, too
+    assert taken(assembler, (3, 'level', 5.0), (4, 'level', 7.0), (3, 'flow', 6.0),
+                 (4, 'flow', 8.0)) == [(3, [5.0, 6.0]), (4, [7.0, 8.0])]
+    assert counts(assembler) == ({}, {}, {})
+    assert assembler.awaited == ''
 
 
-def test_what_is_missing_late_or_doubled_is_counted_for_its_signal() -> None:
-    parts = assembler()
-    parts.take(1 * SECOND, {'level_1': 1.0})  # whose other part does not come
-    parts.take(2 * SECOND, {'level_1': 1.5})
-    parts.take(2 * SECOND, {'level_1': 2.0})  # again: this one counts
-    assert taken(parts.take(2 * SECOND, {'level_2': 3.0})) == (2 * SECOND, [2.0, 3.0])
-    parts.take(round(1.5 * SECOND), {'level_2': 9.0})  # when its measurement is over
-    assert parts.missing == Counter(level_2=1)
-    assert parts.doubled == Counter(level_1=1)
-    assert parts.late == Counter(level_2=1)
+@pytest.mark.parametrize(('apart', 'found'), [
+    (0, [(100, [1.0, 2.0])]), (10, [(110, [1.0, 2.0])]), (-10, [(100, [1.0, 2.0])]),
+    (11, []), (-11, [])])
+def test_stamps_may_be_apart_by_the_tolerance(apart, found):
+    """The stamp of the sample is the last of its parts."""
+    assembler = Assembler(NAMES, tolerance_ns=10)
+    assert taken(assembler, (100, 'level', 1.0), (100 + apart, 'flow', 2.0)) == found
 
 
-def test_time_that_is_set_back_begins_anew() -> None:
-    parts = assembler()
-    parts.take(100 * SECOND, {'level_1': 1.0})
-    parts.take(100 * SECOND, {'level_2': 2.0})
-    parts.take(101 * SECOND, {'level_1': 1.0})
-    # more than a second back; what waited belongs to the time before
-    assert parts.take(50 * SECOND, {'level_1': 3.0}) is None
-    assert taken(parts.take(50 * SECOND, {'level_2': 4.0})) == (50 * SECOND, [3.0, 4.0])
-    assert not parts.late
+def test_part_goes_to_the_nearest_of_the_samples_that_wait_for_it():
+    assembler = Assembler(('level', 'flow', 'heat'), tolerance_ns=10)
+    assert not taken(assembler, (100, 'level', 1.0), (115, 'level', 2.0), (109, 'flow', 3.0))
+    assert taken(assembler, (116, 'heat', 4.0)) == [(116, [2.0, 3.0, 4.0])]
 
 
-def test_what_never_becomes_whole_does_not_grow_without_end() -> None:
-    parts = assembler()
-    for k in range(1000):
-        assert parts.take(k * SECOND, {'level_1': float(k)}) is None
-    # a hundred are waited for
-    assert parts.missing == Counter(level_2=900)
+def test_what_comes_after_its_sample_is_late():
+    assembler = Assembler(NAMES, tolerance_ns=10)
+    assert taken(assembler, (100, 'level', 1.0), (100, 'flow', 2.0)) == [(100, [1.0, 2.0])]
+    assert not taken(assembler, (100, 'level', 9.0), (90, 'flow', 9.0), (110, 'flow', 9.0))
+    assert counts(assembler) == ({'level': 1, 'flow': 2}, {}, {})
+    assert assembler.awaited == ''
+
+
+def test_what_does_not_come_before_a_later_sample_is_missing():
+    assembler = Assembler(NAMES)
+    assert taken(assembler, (1, 'level', 1.0), (2, 'level', 2.0), (3, 'flow', 3.0)) == []
+    assert assembler.awaited == 'flow'
+    assert taken(assembler, (3, 'level', 4.0)) == [(3, [4.0, 3.0])]
+    assert counts(assembler) == ({}, {'flow': 2}, {})
+    # and late, if it comes nevertheless
+    assert not taken(assembler, (2, 'flow', 5.0))
+    assert counts(assembler) == ({'flow': 1}, {'flow': 2}, {})
+
+
+def test_of_a_part_that_comes_twice_the_later_one_counts():
+    assembler = Assembler(NAMES)
+    assert taken(assembler, (1, 'level', 1.0), (1, 'level', 2.0), (1, 'flow', 3.0)) == [
+        (1, [2.0, 3.0])]
+    assert counts(assembler) == ({}, {}, {'level': 1})
+
+
+def test_time_that_is_set_back_begins_afresh():
+    assembler = Assembler(NAMES)
+    late = 100 * SECOND
+    assert taken(assembler, (late, 'level', 1.0), (late, 'flow', 2.0), (late + 1, 'level', 3.0)
+                 ) == [(late, [1.0, 2.0])]
+    # by a second at most it is out of order
+    assert not taken(assembler, (late - SECOND, 'level', 4.0), (late - SECOND, 'flow', 5.0))
+    assert counts(assembler) == ({'level': 1, 'flow': 1}, {}, {})
+    assert taken(assembler, (SECOND, 'level', 6.0), (SECOND, 'flow', 7.0)) == [
+        (SECOND, [6.0, 7.0])]
+    # what waited belonged to the other time: neither completed nor missing
+    assert not taken(assembler, (late + 1, 'flow', 8.0))
+    assert counts(assembler) == ({'level': 1, 'flow': 1}, {}, {})
+
+
+def test_what_waits_is_bounded():
+    assembler = Assembler(NAMES)
+    assert not taken(assembler, *((stamp, 'level', 1.0) for stamp in range(1000)))
+    assert len(assembler._open) == 100
+    assert counts(assembler) == ({}, {'flow': 900}, {})
+    # the oldest were given up
+    assert taken(assembler, (900, 'flow', 2.0)) == [(900, [1.0, 2.0])]

@@ -423,7 +423,7 @@ class Controller:
             passing = state.supervisor.resumes is not None
             return (state if passing else amended(state, law=None, law_input=None,
                                                   law_memory=None), held, done)
-        if state.law != level and state.command is not None:
+        if state.law != level and state.command is not None and self.settings.transfer_time:
             # somebody else has commanded so far
             transfer = shifted(None, held - result.u)
         state = amended(state, law=level, law_input=result.u, law_memory=result.memory,

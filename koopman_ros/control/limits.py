@@ -70,7 +70,9 @@ def limit(limits: InputLimits, wanted: Array, previous: Array | None, seconds: f
     if previous is None:
         within.setflags(write=False)
         return LimitedInput(within, at_range, False)
-    reach = limits.rate * seconds if seconds > 0.0 else np.zeros_like(limits.rate)
+    # 0 s times infinity is no number
+    reach = limits.rate * seconds if seconds > 0.0 else np.where(
+        np.isinf(limits.rate), np.inf, 0.0)
     reached = np.minimum(np.maximum(within, previous - reach), previous + reach)
     reached.setflags(write=False)
     return LimitedInput(reached, at_range, bool((reached != within).any()))

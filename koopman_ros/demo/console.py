@@ -25,16 +25,24 @@ _ROWS = 20  # in the table of a run
 _IN_MINUTES = 300.0  # s; so long a run is told in minutes
 
 
-def read_options(args: list[str] | None, description: str | None, output: str, speed: float
-                 ) -> argparse.Namespace:
-    """Read `output` and `speed` from a command line, with these defaults."""
+def read_options(args: list[str] | None, description: str | None, output: str, speed: float,
+                 plant: str = '') -> argparse.Namespace:
+    """Read `output`, `speed` and, where there is a choice, `plant`, with these defaults."""
     parser = argparse.ArgumentParser(description=description)
-    parser.add_argument('--output', type=Path, default=Path(output),
-                        help='folder for the results (default: %(default)s)')
+    of = f', of another plant {output}-PLANT' if plant else ''
+    parser.add_argument('--output', type=Path,
+                        help=f'folder for the results (default: {output}{of})')
+    if plant:
+        parser.add_argument('--plant', default=plant, help='plant that is shipped, by the name '
+                            'of its file in config/plants (default: %(default)s)')
     parser.add_argument('--speed', type=float, default=speed,
                         help='simulated seconds per second, 0 for as fast as the machine can '
                         '(default: %(default)s)')
-    return parser.parse_args(args)
+    options = parser.parse_args(args)
+    if options.output is None:
+        other = plant and options.plant != plant
+        options.output = Path(f'{output}-{options.plant}' if other else output)
+    return options
 
 
 def run_act(act: Callable[[Path, float], Mapping[str, object]], options: argparse.Namespace,

@@ -7,11 +7,13 @@ The demo: bring the reactor 10 K down with the learned lift, and with the linear
 The disturbance observer is off, so that what is seen is what each model knows.
 """
 
+from functools import partial
 from pathlib import Path
 import time
 
 from koopman_ros.bags import summary
 from koopman_ros.demo import reactor
+from koopman_ros.demo.any_plant import run_plant
 from koopman_ros.demo.console import LiveTable, read_options, run_act
 from koopman_ros.demo.loop import run_loop
 from koopman_ros.demo.results import plot, read_run
@@ -63,7 +65,8 @@ def run_demo(output: Path, speed: float) -> dict[str, object]:
 
 
 def main(args: list[str] | None = None) -> int:
-    """Run the demo from the command line."""
-    options = read_options(args, __doc__, 'out/demo', 60.0)
-    return run_act(run_demo, options, (HarnessError, OSError),
+    """Run the demo from the command line: this one, or that of another plant."""
+    options = read_options(args, __doc__, 'out/demo', 60.0, plant=reactor.SYSTEM)
+    act = run_demo if options.plant == reactor.SYSTEM else partial(run_plant, options.plant)
+    return run_act(act, options, (HarnessError, OSError, ValueError),
                    'closed_loop.png, closed_loop.mcap and summary.json')

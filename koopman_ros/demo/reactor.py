@@ -16,7 +16,7 @@ from koopman_ros.parameters.table import ParameterTable
 from koopman_ros.resources import model_path
 from koopman_ros.units import to_celsius
 
-MODEL, LINEAR_MODEL = 'reactor_nz4', 'reactor_linear'
+SYSTEM, MODEL, LINEAR_MODEL = 'reactor', 'reactor_nz4', 'reactor_linear'
 TEMPERATURE = 'temperature'
 CONCENTRATION = 'concentration'
 SETPOINT = 'setpoint'

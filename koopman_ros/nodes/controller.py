@@ -29,8 +29,8 @@ from koopman_ros.control import (
     State,
 )
 from koopman_ros.control.events import Event, ModeChange, Silence
-from koopman_ros.parameters.controller import ControllerParameters, signals_of, table_of
-from koopman_ros.parameters.wire import LONGEST_FRAME_ID, preset, Wiring
+from koopman_ros.parameters.controller import ControllerParameters, table_of
+from koopman_ros.parameters.wire import LONGEST_FRAME_ID, preset, signals_of, Wiring
 from koopman_ros.reasons import level_words
 from koopman_ros.replay import records
 from koopman_ros.ros import controller_messages as messages

@@ -19,12 +19,11 @@ from koopman_ros.lifting import LiftedModel
 from koopman_ros.parameters.controller import (
     REPLAY_TABLE,
     ReplayParameters,
-    signals_of,
     table_of,
 )
 from koopman_ros.parameters.table import ConfigurationError
 from koopman_ros.parameters.trainer import preset_wiring
-from koopman_ros.parameters.wire import Wiring
+from koopman_ros.parameters.wire import signals_of, Wiring
 from koopman_ros.replay.loop import Alternative, Replay, replay
 from koopman_ros.replay.records import Record, RecordError
 from koopman_ros.replay.report import ReplayedBag, reproduced, verdict, write_report

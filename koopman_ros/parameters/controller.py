@@ -27,6 +27,7 @@ from koopman_ros.parameters.wire import (
     named_units,
     preset,
     Signals,
+    signals_of,
     StatePlaces,
     Wiring,
 )
@@ -185,16 +186,6 @@ def _cross_check(signals: Signals, values: ControllerParameters) -> str:
         return (f'validity_margin = {values.validity_margin} must be at most linear_margin = '
                 f'{values.linear_margin}: change the other one first')
     return Wiring(signals, values.states, values.inputs).check()
-
-
-def signals_of(model: LiftedModel, controlled: tuple[str, ...] = ()) -> Signals:
-    """Return the signals of a model, all states controlled by default."""
-    states, inputs = (dict(zip(of.names, of.units, strict=True))
-                      for of in (model.states, model.inputs))
-    named = tuple(filter(None, controlled))
-    # in the order of the states, as the control step wants them
-    own = tuple(name for name in states if name in named)
-    return Signals(states, inputs, (named if len(own) < len(named) else own) or tuple(states))
 
 
 def table_of(model: LiftedModel, given: Mapping[str, Any] = MappingProxyType({})

@@ -236,7 +236,7 @@ class ParameterTable(Generic[T]):
             notes += ['fixed at start'] if row.read_only else []
             lines += ['', f'    # {row.description}' + (f' [{row.unit}]' if row.unit else '')]
             lines += [f'    #   {"; ".join(notes)}'] if notes else []
-            lines.append(f'    {name}: {_as_yaml(row.default)}')
+            lines.append(f'    {name}: {as_yaml(row.default)}')
         return '\n'.join(lines) + '\n'
 
 
@@ -250,7 +250,7 @@ def _row(name: str, item: Field[Any], unit: str, defaults: Mapping[str, Any]) ->
     return Specification(name, default, **{**item.metadata, 'unit': own})
 
 
-def _as_yaml(value: Any) -> str:
+def as_yaml(value: Any) -> str:
     """Write a value so that rcl reads back the same type."""
     if isinstance(value, bool):
         return 'true' if value else 'false'
@@ -263,7 +263,7 @@ def _as_yaml(value: Any) -> str:
             text = f'{mantissa}e{int(exponent):+03d}'
         return text
     if isinstance(value, tuple):
-        return '[' + ', '.join(_as_yaml(item) if isinstance(item, float) else (
+        return '[' + ', '.join(as_yaml(item) if isinstance(item, float) else (
             item if item and item[0].isalnum() and '[' not in item else f"'{item}'")
             for item in value) + ']'
     return repr(value) if isinstance(value, int) else f"'{value}'"

@@ -4,7 +4,7 @@
 """Parameters of the trainer node, which records bags, and of the player, which plays them."""
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from functools import partial
 from types import MappingProxyType
 from typing import Any
@@ -15,9 +15,15 @@ from koopman_ros.arrays import Array
 from koopman_ros.experiment import Experiment
 from koopman_ros.lifting import LiftedModel
 from koopman_ros.parameters import wire
-from koopman_ros.parameters.controller import signals_of
 from koopman_ros.parameters.table import ConfigurationError, parameter, ParameterTable, per_signal
-from koopman_ros.parameters.wire import InputPlaces, preset, Signals, StatePlaces, Wiring
+from koopman_ros.parameters.wire import (
+    InputPlaces,
+    preset,
+    Signals,
+    signals_of,
+    StatePlaces,
+    Wiring,
+)
 from koopman_ros.units import conversion, display_unit
 
 _UNBOUNDED = 1e9  # what stands for no bound, in any unit
@@ -192,7 +198,7 @@ def trainer_table(present: LiftedModel | None, given: Mapping[str, Any] = Mappin
     own = preset(system, 'trainer')
     signals = trainer_signals(present, {**own, **given})
     defaults: dict[str, Any] = dict(signals.defaults())
-    defaults['topics'] = (*Wiring(signals, *_places(signals)).topics, wire.CONTROLLER_STATE,
+    defaults['topics'] = (*_wiring(signals, {**own, **given}).topics, wire.CONTROLLER_STATE,
                           wire.CONTROLLER_EVENTS, wire.DIAGNOSTICS)
     if present is not None:
         for box, low, high in ((present.states, 'experiment_min', 'experiment_max'),
@@ -225,16 +231,16 @@ def trainer_signals(present: LiftedModel | None, given: Mapping[str, Any]) -> Si
     return Signals(measured, wire.named_units(inputs), controlled or tuple(measured))
 
 
-def _places(signals: Signals) -> tuple[dict[str, StatePlaces], dict[str, InputPlaces]]:
-    """Return the places that signals have by default."""
-    topics = signals.defaults()
+def _wiring(signals: Signals, given: Mapping[str, Any]) -> Wiring:
+    """Return the places of signals, the usual ones but for those that parameters name."""
+    said = {**signals.defaults(), **given}
 
-    def own(name: str) -> dict[str, str]:
-        return {key.removeprefix(f'{name}.'): value for key, value in topics.items()
-                if key.startswith(f'{name}.')}
+    def own(kind: type[Any], name: str) -> Any:
+        return kind(**{row.name: said[f'{name}.{row.name}'] for row in fields(kind)
+                       if f'{name}.{row.name}' in said})
 
-    return ({name: StatePlaces(**own(name)) for name in signals.states},
-            {name: InputPlaces(**own(name)) for name in signals.inputs})
+    return Wiring(signals, {name: own(StatePlaces, name) for name in signals.states},
+                  {name: own(InputPlaces, name) for name in signals.inputs})
 
 
 def _plan(signals: Signals, values: TrainerParameters) -> None:
@@ -305,9 +311,10 @@ def _check_player(values: PlayerParameters) -> str:
 def player_table(given: Mapping[str, Any] = MappingProxyType({})
                  ) -> ParameterTable[PlayerParameters]:
     """Return the parameters of a player; `given` as for :func:`trainer_table`."""
-    defaults: dict[str, Any] = {}
-    if (wiring := preset_wiring(str(given.get('system', 'reactor')))) is not None:
-        defaults = {
+    system = str(given.get('system', 'reactor'))
+    defaults: dict[str, Any] = {'system': system}
+    if (wiring := preset_wiring(system)) is not None:
+        defaults |= {
             'topics': tuple(dict.fromkeys(place.topic for places in (
                 wiring.applied, wiring.measured, wiring.setpoints, wiring.manual)
                 for place in places.values())),
@@ -322,8 +329,4 @@ def preset_wiring(system: str) -> Wiring | None:
     """Return the places of the signals of a plant that is shipped, or None for another."""
     if not (own := preset(system, 'trainer')):
         return None
-    signals = trainer_signals(None, own)
-    values = ParameterTable(
-        TrainerParameters, signals={'states': signals.states, 'inputs': signals.inputs},
-        defaults={**signals.defaults(), **own}).snapshot({})
-    return Wiring(signals, values.states, values.inputs)
+    return _wiring(trainer_signals(None, own), own)

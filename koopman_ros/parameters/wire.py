@@ -11,7 +11,13 @@ from functools import cached_property
 import re
 from typing import Any
 
-from koopman_ros.parameters.table import ConfigurationError, parameter, ParameterTable
+from koopman_ros.lifting import LiftedModel
+from koopman_ros.parameters.table import (
+    as_yaml,
+    ConfigurationError,
+    parameter,
+    ParameterTable,
+)
 from koopman_ros.resources import config_directory
 from koopman_ros.wire import Place, place, stem
 
@@ -113,6 +119,16 @@ class Signals:
             topics |= {f'{name}.topic': name, f'{name}.command_topic': command,
                        f'{name}.manual_topic': f'manual_{command}'}
         return topics
+
+
+def signals_of(model: LiftedModel, controlled: tuple[str, ...] = ()) -> Signals:
+    """Return the signals of a model, all states controlled by default."""
+    states, inputs = (dict(zip(of.names, of.units, strict=True))
+                      for of in (model.states, model.inputs))
+    named = tuple(filter(None, controlled))
+    # in the order of the states, as the control step wants them
+    own = tuple(name for name in states if name in named)
+    return Signals(states, inputs, (named if len(own) < len(named) else own) or tuple(states))
 
 
 @dataclass(frozen=True)
@@ -247,13 +263,14 @@ def renamed(node: str, given: Mapping[str, Any], table: ParameterTable[Any]) -> 
     said = []
     for name, (now, factor) in yaml.safe_load(path.read_text()).get(node, {}).items():
         if name in unknown and now in table.rows:
-            value = given[name]
+            value, row = given[name], table.rows[now]
             if isinstance(factor, Mapping):
                 value = factor.get(value, value)
-            elif isinstance(value, float) and factor != 1:
+            elif isinstance(value, (int, float)):
                 value = float(f'{value * factor:.12g}')
-            said.append(f'{name} is now {now}' + (f' [{unit}]' if (
-                unit := table.rows[now].unit) else '') + f': write {now}: {value}')
+            written = as_yaml((value,) if isinstance(row.default, tuple) else value)
+            said.append(f'{name} is now {now}' + (f' [{row.unit}]' if row.unit else '')
+                        + f': write {now}: {written}')
     return '; '.join(said)
 
 

@@ -22,8 +22,8 @@ from std_srvs.srv import Trigger
 from koopman_ros.arrays import Array
 from koopman_ros.control import Controller, Settings, State
 from koopman_ros.lifting import Coordinates, LiftedModel, load_with_digest, ModelFileError
-from koopman_ros.parameters.controller import ControllerParameters, signals_of, table_of
-from koopman_ros.parameters.wire import Signals
+from koopman_ros.parameters.controller import ControllerParameters, table_of
+from koopman_ros.parameters.wire import Signals, signals_of
 from koopman_ros.resources import model_path
 from koopman_ros.ros.node import words_of
 from koopman_ros.units import display_unit, NANOSECONDS, shown
@@ -177,7 +177,10 @@ def rests_outside(controller: Controller) -> str:
         f'{"more" if held > now else "less"}'
         for name, unit, now, held in zip(model.inputs.names, model.inputs.units, safe.tolist(),
                                          holding.tolist(), strict=True))
-    return (f'under the safe input the plant leaves the trained range, {ranges(model)}, and '
+    under = ', '.join(
+        f'{name}.safe = {shown(now, unit):.6g} {display_unit(unit)}' for name, unit, now in zip(
+            model.inputs.names, model.inputs.units, safe.tolist(), strict=True))
+    return (f'under {under} the plant leaves the trained range, {ranges(model)}, and '
             f'{where}: no law can act there, and the way back is slow; record data from there and '
             f'train again, or set {better} if that is still safe')
 

@@ -3,7 +3,7 @@
 
 """Messages to the numbers of signals and back, once, at the boundary."""
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
 from functools import partial
 import math
@@ -15,9 +15,10 @@ from rclpy.publisher import Publisher
 from rclpy.subscription import Subscription
 
 from koopman_ros.arrays import Array
+from koopman_ros.parameters.table import ConfigurationError
 from koopman_ros.ros import topics
 from koopman_ros.ros.codec import stamp_nanoseconds
-from koopman_ros.units import conversion, in_steps
+from koopman_ros.units import Conversion, conversion, in_steps
 from koopman_ros.wire import Place
 
 
@@ -36,12 +37,38 @@ class Heard:
         return stamp_nanoseconds(self.stamp)
 
 
+def _by_topic(places: Mapping[str, Place]) -> Iterator[tuple[str, Any, list[str]]]:
+    """Yield each topic, the class of its messages and the names of the signals in them."""
+    for topic in dict.fromkeys(place.topic for place in places.values()):
+        names = [name for name, place in places.items() if place.topic == topic]
+        if len(kinds := dict.fromkeys(places[name].type for name in names)) > 1:
+            raise ConfigurationError(
+                f'{" and ".join(names)} share the topic {topic} and differ in the type of its '
+                f'messages, {" and ".join(kinds)}: give them one type, or topics of their own')
+        for name in names:
+            try:
+                kind = topics.message_class(places[name].type)
+                places[name].expect(kind())
+            except LookupError as error:
+                raise ConfigurationError(f'{name}: {error}') from error
+        yield topic, kind, names
+
+
+def _converted(name: str, unit: str, wanted: str) -> Conversion:
+    try:
+        return conversion(unit, wanted)
+    except ValueError as error:
+        raise ConfigurationError(f'{name}: {error}: name another unit') from error
+
+
 class Inlet:
     """
     Subscribe to some signals.
 
     A number that its type of message cannot mean, as a temperature below absolute zero, is NaN;
     a message without any of the signals is somebody else's and passed over.
+
+    Both ends raise ConfigurationError for a place that is in no message of its type.
 
     :param subscribe: makes a subscription of topic, callback and message class.
     :param places: by name of the signal.
@@ -54,10 +81,9 @@ class Inlet:
         self._node, self._hear = node, hear
         self.subscriptions: list[Subscription] = []
         self.unstamped: list[str] = []  #: topics whose messages are stamped at their arrival
-        for topic in dict.fromkeys(place.topic for place in places.values()):
-            own = {name: (place, conversion(place.unit, units[name]))
-                   for name, place in places.items() if place.topic == topic}
-            kind = topics.message_class(next(iter(own.values()))[0].type)
+        for topic, kind, names in _by_topic(places):
+            own = {name: (places[name], _converted(name, places[name].unit, units[name]))
+                   for name in names}
             if not hasattr(kind, 'header'):
                 self.unstamped.append(topic)
             self.subscriptions.append(subscribe(topic, partial(self._take, own), kind))
@@ -93,10 +119,9 @@ class Outlet:
     def __init__(self, places: Mapping[str, Place], units: Mapping[str, str],
                  make: Callable[[str, Any], Publisher]) -> None:
         self._parts = []
-        for topic in dict.fromkeys(place.topic for place in places.values()):
-            own = [(i, place, conversion(units[name], place.unit))
-                   for i, (name, place) in enumerate(places.items()) if place.topic == topic]
-            kind = topics.message_class(own[0][1].type)
+        for topic, kind, names in _by_topic(places):
+            own = [(i, place, _converted(name, units[name], place.unit))
+                   for i, (name, place) in enumerate(places.items()) if name in names]
             self._parts.append((make(topic, kind), kind, own))
 
     @property

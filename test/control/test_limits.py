@@ -23,6 +23,7 @@ from koopman_ros.control import (
 from koopman_ros.control.limits import shifted, Transfer
 from support.closed_loops import (
     controller,
+    EPOCH,
     largest_step,
     Reactor,
     SETPOINT,
@@ -45,8 +46,8 @@ from validation.robustness.loop import changed_reactor
     (1.0, 1.0, 0.0, 2.0, 1.0, False, False),
     # a range that was tightened is reached at the rate
     (8.0, 3.0, 0.1, 2.0, 7.8, False, True), (8.0, 9.0, 0.1, 2.0, 7.8, True, True),
-    # no rate limit, but none without elapsed time either
-    (-1.0, 4.0, 1e-9, np.inf, 4.0, False, False), (-1.0, 4.0, 0.0, np.inf, -1.0, False, True)])
+    # no rate limit, at the first answer of all, too
+    (-1.0, 4.0, 1e-9, np.inf, 4.0, False, False), (-1.0, 4.0, 0.0, np.inf, 4.0, False, False)])
 def test_limits(previous, wanted, seconds, rate, u, at_range, at_rate):
     bounds = InputLimits(np.array([-1.0]), np.array([5.0]), np.array([rate]))
     limited = limit(bounds, np.array([wanted]), None if previous is None else np.array([previous]),
@@ -218,3 +219,17 @@ def test_a_controller_succeeds_itself_without_a_trace():
     later = state.time_ns + 10 ** 9
     np.testing.assert_array_equal(again.step(again.hand_over(before, state), x, later)[1],
                                   before.step(state, x, later)[1])
+
+
+def test_who_wants_no_transfer_is_answered_by_the_law_from_the_first_measurement_on():
+    free = controller(transfer_time=0.0, observer_bandwidth=0.0, limits=InputLimits(
+        np.array([278.15]), np.array([305.15]), np.array([np.inf])))
+    measured = np.array([START + 2.0])
+    _, alone, _ = free.step(State(), measured, EPOCH)
+    _, after, _ = free.step(free.initialise(State(), np.array([290.0])), measured, EPOCH)
+    assert alone[0] != 290.0
+    np.testing.assert_array_equal(after, alone)
+    # with a transfer it begins where the input is
+    usual = controller()
+    _, begun, _ = usual.step(usual.initialise(State(), np.array([290.0])), measured, EPOCH)
+    assert begun[0] == 290.0

@@ -26,8 +26,8 @@ from support.controller_bench import reproduced, STATUS, STEADY
 from support.nodes import opened, seconds, temperature
 
 SAFE = 10.0  # degC
-SETTINGS = {'measurement_timeout': 0.3, 'hold_timeout': 0.2, 'coolant_temperature.rate_limit': 20.0,
-            'coolant_temperature.safe': SAFE}
+SETTINGS = {'measurement_timeout': 0.3, 'hold_timeout': 0.2,
+            'coolant_temperature.rate_limit': 20.0, 'coolant_temperature.safe': SAFE}
 
 # A control step that takes as long as somebody keeps the pipe of the second argument open, and a
 # watchdog that is five times as quick as it is.
@@ -105,7 +105,7 @@ def test_watchdog_commands_while_the_control_step_is_busy(
     ros.wait_until(lambda: bench.commands[-1].temperature == SAFE)
     ros.wait_for_status(STATUS, lambda s: s.level == DiagnosticStatus.ERROR and s.message == (
         'no measurement answered for more than 0.3 s, as the node is busy: the safe coolant '
-        'temperature is commanded, coolant at 10.00 degC; ask for less at once'))
+        'is commanded, coolant at 10.00 degC; ask for less at once'))
     assert not bench.answered(2.03)
     own = bench.commands[1:]
     stamps = np.array([seconds(message) for message in bench.commands[:-1]])

@@ -74,7 +74,7 @@ def test_first_command_waits_for_the_coolant_in_force(ros: Harness) -> None:
     # patient, or a busy machine could be too slow for it
     program = ('import sys\n'
                'from koopman_ros.nodes import controller\n'
-               'controller._COOLANT_PATIENCE = 100.0\n'
+               'controller._PATIENCE = 100.0\n'
                'sys.exit(controller.main())\n')
     ros.start('controller', arguments=('-r', f'{reactor.COOLANT_TEMPERATURE}:=jacket'),
               command=(sys.executable, '-c', program))
@@ -144,7 +144,8 @@ def test_limits_ramp_and_weights_change_while_the_loop_runs(bench: Bench) -> Non
     assert held > 25.0
     bench.ros.set_parameters('controller', **{'coolant_temperature.rate_limit': 0.1})
     assert bench.measure(STEADY + 3.0, 3.0).temperature == pytest.approx(held - 0.1)
-    bench.ros.set_parameters('controller', **{'coolant_temperature.rate_limit': 1.0, 'coolant_temperature.max': 24.0})
+    bench.ros.set_parameters('controller', **{
+        'coolant_temperature.rate_limit': 1.0, 'coolant_temperature.max': 24.0})
     commands = [bench.measure(STEADY, float(at)).temperature for at in range(4, 10)]
     # at the rate limit of 1 K/s
     assert max(a - b for a, b in itertools.pairwise(commands)) == pytest.approx(1.0)
@@ -175,7 +176,7 @@ def measure_on(bench: Bench, count: int, first: float) -> float:
 
 
 def test_status_tells_mode_law_reason_and_figures(bench: Bench) -> None:
-    bench.ros.set_parameters('controller', **{'disturbance_bandwidth': 0.1})
+    bench.ros.set_parameters('controller', disturbance_bandwidth=0.1)
     # whole seconds of the clock of the node, so that ages are known
     last = measure_on(bench, 20, float(int(time.time()) - 40))
     status = bench.status()
@@ -223,7 +224,7 @@ def test_stamps_that_stand_still_and_a_temperature_outside_the_trained_range_are
 
 
 def test_internals_carry_the_stamp_of_the_measurement(bench: Bench) -> None:
-    bench.ros.set_parameters('controller', **{'disturbance_bandwidth': 0.1})
+    bench.ros.set_parameters('controller', disturbance_bandwidth=0.1)
     internals = bench.ros.listen(JointState, topics.CONTROLLER_STATE)
     predicted = bench.ros.listen(Temperature, reactor.PREDICTED_TEMPERATURE)
     bench.ros.meet('controller')
@@ -245,7 +246,7 @@ def test_internals_carry_the_stamp_of_the_measurement(bench: Bench) -> None:
 
 def test_a_model_that_does_not_reach_to_the_safe_coolant_says_so(
         bench: Bench, tmp_path: Path) -> None:
-    bench.ros.wait_for_status(STATUS, lambda s: value(s, 'safe coolant') == 'within reach')
+    bench.ros.wait_for_status(STATUS, lambda s: value(s, 'safe input') == 'within reach')
     model = load(model_path('reactor_nz4'))
     lower, upper = model.states.center - 1.5, model.states.center + 1.5
     narrow = tmp_path / 'narrow.safetensors'
@@ -253,12 +254,12 @@ def test_a_model_that_does_not_reach_to_the_safe_coolant_says_so(
     # accepted nevertheless
     (result,) = bench.ros.set_parameters('controller', model=str(narrow))
     assert result.successful, result.reason
-    words = 'under safe_coolant = 5'
-    status = bench.ros.wait_for_status(STATUS, lambda s: words in value(s, 'safe coolant'))
-    assert 'leaves the trained range' in value(status, 'safe coolant')
+    words = 'under coolant_temperature.safe = 5 degC'
+    status = bench.ros.wait_for_status(STATUS, lambda s: words in value(s, 'safe input'))
+    assert 'leaves the trained range' in value(status, 'safe input')
     bench.ros.wait_until(lambda: words in bench.process.output())
     bench.ros.set_parameters('controller', **{'coolant_temperature.safe': 27.0})
-    bench.ros.wait_for_status(STATUS, lambda s: value(s, 'safe coolant') == 'within reach')
+    bench.ros.wait_for_status(STATUS, lambda s: value(s, 'safe input') == 'within reach')
     bench.ros.set_parameters('controller', model='reactor_nz4')
 
 

@@ -5,14 +5,19 @@
 
 import contextlib
 import json
+import math
 from pathlib import Path
 import signal
 import subprocess
 import sys
 
+import numpy as np
 import pytest
 
 from koopman_ros.bags import summary
+from koopman_ros.demo.any_plant import resting_point
+from koopman_ros.plants.library.pendulum import Pendulum
+from koopman_ros.plants.library.two_tanks import TwoTanks
 from koopman_ros.testing import reserved_output
 
 
@@ -30,6 +35,47 @@ def test_demo_leaves_bag_picture_and_summary(tmp_path: Path) -> None:
     assert (tmp_path / 'closed_loop.png').read_bytes().startswith(b'\x89PNG')
     assert 'final_error_kelvin' in done.stdout
     assert done.stdout.count('time [min]') >= 20
+
+
+def test_demo_of_another_plant_is_measured_by_the_optimum(tmp_path: Path) -> None:
+    """Of the pendulum from 60 degrees, whose angle and rate come in one message."""
+    done = subprocess.run(
+        [sys.executable, '-m', 'koopman_ros.demo', '--plant', 'pendulum', '--speed', '0',
+         '--output', tmp_path], capture_output=True, text=True, timeout=240, check=False)
+    assert (done.returncode, done.stderr) == (0, '')
+    result = json.loads((tmp_path / 'summary.json').read_text())
+    assert result['angle']['setpoint'] == 0.0
+    assert result['angle']['final_error'] < 1e-3
+    assert 0.5 < result['angle']['settling_time_seconds'] < 3.0
+    assert 1.0 - 1e-6 < result['cost'] / result['optimal_cost'] < 1.02
+    assert result['cost'] < result['linear_cost']
+    assert result['measurements'] == result['commands'] == 301
+    assert summary(tmp_path / 'closed_loop.mcap').message_count == result['bag_messages']
+    assert (tmp_path / 'closed_loop.png').read_bytes().startswith(b'\x89PNG')
+    assert done.stdout.count('angle set-point [rad]') >= 20
+
+
+def test_demo_says_which_plants_it_knows(tmp_path: Path) -> None:
+    done = subprocess.run(
+        [sys.executable, '-m', 'koopman_ros.demo', '--plant', 'volcano', '--output', tmp_path],
+        capture_output=True, text=True, timeout=240, check=False)
+    assert done.returncode == 1
+    (line,) = done.stderr.splitlines()
+    assert line.startswith("demo: there is no demo of 'volcano': choose one of pendulum, ")
+    assert 'two_tanks' in line
+
+
+def test_a_plant_rests_where_its_flows_are_in_balance() -> None:
+    """Against the sums of Torricelli's outflows."""
+    tanks = TwoTanks()
+    x, u = resting_point(tanks.system(), {'level_1': 0.1, 'level_2': 0.15})
+    np.testing.assert_allclose(x, [0.1, 0.15], rtol=1e-12)
+    through = [tanks.orifice_1 * math.sqrt(2.0 * 9.81 * 0.1),
+               tanks.orifice_2 * math.sqrt(2.0 * 9.81 * 0.15)]
+    np.testing.assert_allclose(tanks.pump_gain * u, [through[0], through[1] - through[0]],
+                               rtol=1e-10)
+    with pytest.raises(ValueError, match=r'pendulum does not rest at .*choose other set-points'):
+        resting_point(Pendulum().system(), {'rate': 1.0})
 
 
 def test_demo_says_in_one_line_why_it_cannot_run(tmp_path: Path) -> None:

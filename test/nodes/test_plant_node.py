@@ -14,7 +14,7 @@ from rclpy.node import Node
 from sensor_msgs.msg import JointState, Temperature
 
 from koopman_ros.demo import reactor
-from koopman_ros.parameters.plant import PlantParameters, TABLE
+from koopman_ros.parameters.plant import PlantTable
 from koopman_ros.plants import sensor_noise
 from koopman_ros.ros import topics
 from koopman_ros.ros.codec import stamp_nanoseconds
@@ -25,6 +25,7 @@ from support.nodes import seconds, temperature, value
 STATUS = 'plant: simulation'
 NOMINAL_COOLANT = 26.85  # degC
 SEED = 3
+TABLE = PlantTable()
 
 
 class Bench:
@@ -136,7 +137,8 @@ def test_real_time_stamps_are_the_wall_clock_and_silence_is_reported_while_it_la
         ros: Harness) -> None:
     """Of a plant, here, that has no steady state to start from."""
     heard = ros.listen(Temperature, reactor.TEMPERATURE)
-    process = ros.start('plant', {'sample_period': 0.1, 'constants.heat_transfer_coefficient': 0.0})
+    process = ros.start('plant', {
+        'sample_period': 0.1, 'constants.heat_transfer_coefficient': 0.0})
     ros.wait_until(lambda: len(heard) >= 5)
     now = time.time_ns()
     stamps = [stamp_nanoseconds(message.header.stamp) for message in heard]
@@ -147,7 +149,8 @@ def test_real_time_stamps_are_the_wall_clock_and_silence_is_reported_while_it_la
                for early, late in pairwise(stamps))
     assert ros.node.count_publishers(topics.CLOCK) == 0
     # or it would run away before long
-    ros.set_parameters('plant', **{'constants.heat_transfer_coefficient': TABLE.rows['heat_transfer_coefficient'].default / 60.0}))
+    ros.set_parameters('plant', **{'constants.heat_transfer_coefficient': reactor.constant(
+        'heat_transfer_coefficient')})
     command = ros.speak(Temperature, reactor.COOLANT_SETPOINT, to='plant')
     command.publish(temperature(26.0))
     status = ros.wait_for_status(STATUS, lambda s: s.level == DiagnosticStatus.WARN)
@@ -164,7 +167,7 @@ def test_lockstep_waits_for_a_controller_and_is_paced(ros: Harness) -> None:
         assert status.message == 'waiting for the loop: no controller yet'
 
     concentrations = ros.listen(JointState, reactor.CONCENTRATION)
-    bench = Bench(ros, wait, reactor='two_state', speed=20.0, sample_period=0.5, start_time=7.0)
+    bench = Bench(ros, wait, system='two_state', speed=20.0, sample_period=0.5, start_time=7.0)
     measured = bench.wait_for_more(21)
     assert [seconds(message) for message in measured] == [7.0 + 0.5 * k for k in range(21)]
     assert [message.temperature for message in measured] == pytest.approx(
@@ -181,14 +184,14 @@ def test_lockstep_waits_for_a_controller_and_is_paced(ros: Harness) -> None:
 
 
 def test_reset_returns_to_the_start_until_the_duration_is_over(ros: Harness) -> None:
-    bench = Bench(ros, **{'temperature.initial_offset': -5.0}, start_time=10.0, duration=210.0,
-                  sample_period=0.7)
+    bench = Bench(ros, start_time=10.0, duration=210.0, sample_period=0.7,
+                  **{'temperature.initial_offset': -5.0})
     initial = bench.wait_for_more(1)[0].temperature
     bench.wait_for(lambda celsius: celsius > initial + 1.0)
     bench.pause()
     response = ros.trigger('plant/reset')
     assert (response.success, response.message) == (
-        True, f'reset to {initial:.3f} degC with coolant at {NOMINAL_COOLANT:.3f} degC')
+        True, f'reset to temperature {initial:.6g} degC, coolant {NOMINAL_COOLANT:.6g} degC')
     bench.resume()
     assert bench.wait_for_more(1)[0].temperature == pytest.approx(initial, abs=0.5)
     bench.status(lambda s: s.message == 'finished: the duration is over')
@@ -215,13 +218,13 @@ def test_stands_still_where_the_stamps_end(ros: Harness) -> None:
 
 def test_stamps_and_frames_that_a_message_can_hold() -> None:
     for parameters in ({'start_time': 2147483647.0}, {'frame_id': 'x' * 256}):
-        assert TABLE.check(PlantParameters(**parameters)) == ''
+        assert TABLE.check(TABLE.snapshot(parameters)) == ''
     for parameters, words in (
             ({'start_time': 2147483648.0}, 'must be in [0.001, 2147483647] s'),
             ({'start_time': 2e9, 'duration': 1e9},
              'start_time + duration = 3000000000 s must be at most'),
             ({'frame_id': 'x' * 50_000}, 'frame_id has 50000 characters, must have at most 256')):
-        reason = TABLE.check(PlantParameters(**parameters))
+        reason = TABLE.check(TABLE.snapshot(parameters))
         assert words in reason
         assert len(reason) < 200
 
@@ -234,7 +237,8 @@ def test_time_is_written_with_all_digits() -> None:
 
 def test_coolant_in_force_is_told_before_each_measurement_and_latched(bench: Bench) -> None:
     sent: dict[str, list[tuple[float, int, float]]] = {'coolant': [], 'measured': []}
-    for name, topic in (('coolant', reactor.COOLANT_TEMPERATURE), ('measured', reactor.TEMPERATURE)):
+    for name, topic in (
+            ('coolant', reactor.COOLANT_TEMPERATURE), ('measured', reactor.TEMPERATURE)):
         bench.ros.node.create_subscription(
             Temperature, topic, lambda message, info, name=name: sent[name].append(
                 (seconds(message), info['source_timestamp'], message.temperature)),
@@ -248,6 +252,7 @@ def test_coolant_in_force_is_told_before_each_measurement_and_latched(bench: Ben
     # what acted until then is the answer to the measurement before
     for stamp, *_ in told[1:]:
         assert coolants[stamp][1] == pytest.approx(bench.commanded[stamp - 1.0], abs=1e-9)
+    bench.wait_for_more(3)
     bench.pause()
     late = bench.ros.listen(Temperature, reactor.COOLANT_TEMPERATURE, topics.LATCHED_QOS)
     bench.ros.wait_until(lambda: late and late[-1].header == bench.measured[-1].header)
@@ -327,7 +332,7 @@ def test_reactor_changes_while_it_runs_but_for_what_is_fixed_at_start(bench: Ben
     (result,) = bench.ros.set_parameters('plant', speed=2.0)
     assert not result.successful
     assert 'read-only parameter: speed' in result.reason
-    assert bench.ros.get_parameters('plant', 'concentration', 'speed') == [0.85, 0.0]
+    assert bench.ros.get_parameters('plant', 'constants.concentration', 'speed') == [850.0, 0.0]
 
 
 def test_others_are_told_by_their_names_while_they_last(bench: Bench) -> None:

@@ -23,7 +23,7 @@ import yaml
 
 from koopman_ros import bags
 from koopman_ros.demo import reactor
-from koopman_ros.demo.loop import run_loop, Scenario
+from koopman_ros.demo.loop import run_loop
 from koopman_ros.nodes import player
 from koopman_ros.nodes.replay import Names, replayed_bag
 from koopman_ros.parameters.controller import ReplayParameters
@@ -42,9 +42,10 @@ TOPICS = {'/temperature', '/concentration', '/setpoint', '/active_setpoint', '/c
           '/controller_events', '/diagnostics'}
 LATCHED = {'/active_setpoint', '/coolant_temperature'}
 # A minute of a loop with a step, a noisy two-state reactor and a slow coolant.
-SCENARIO = Scenario('reactor_nz4', SETPOINT + 273.15, step_time=20.0, duration=60.0,
-                    plant={'reactor': 'two_state', 'temperature.noise': 0.05, 'seed': 3,
-                           'coolant_temperature.delay': 1.0, 'coolant_temperature.lag': 2.0})
+SCENARIO = reactor.scenario(
+    reactor.MODEL, SETPOINT + 273.15, step_time=20.0, duration=60.0,
+    plant={'system': 'two_state', 'temperature.noise': 0.05, 'seed': 3,
+           'coolant_temperature.delay': 1.0, 'coolant_temperature.lag': 2.0})
 
 
 @pytest.fixture(scope='module')

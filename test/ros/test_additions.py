@@ -43,7 +43,7 @@ ROW = """
     class Wider(PlantParameters):
         leak: float = parameter(0.5, 'Share of the level that leaks', '1/min', 0.0, 2.0)
 
-    TABLE = ParameterTable(Wider)
+    TABLE = ParameterTable(Wider, groups={'constants': ()})
     """
 TYPE = """
     from koopman_ros.wire import Carrier, CARRIERS

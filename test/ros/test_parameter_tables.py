@@ -3,9 +3,11 @@
 
 """Parameter tables: words for ranges and refusals, and the shipped files that they write."""
 
+from collections.abc import Collection, Iterator, Mapping
 from dataclasses import dataclass
 import math
 from pathlib import Path
+import re
 from typing import Any
 
 import pytest
@@ -13,17 +15,23 @@ from rclpy.node import Node
 from rclpy.parameter import parameter_dict_from_yaml_file, parameter_value_to_python
 import yaml
 
-from koopman_ros.parameters.plant import PlantParameters
+from koopman_ros.parameters.plant import PlantTable
 from koopman_ros.parameters.table import (
     ConfigurationError,
+    group,
     parameter,
     ParameterTable,
+    per_signal,
     Specification,
 )
 from koopman_ros.resources import config_directory
 from koopman_ros.ros.node import LoopNode, range_of
-from koopman_ros.ros.programs import main, POLICY_FILE, TABLES
+from koopman_ros.ros.programs import main, POLICY_FILE, tables
 from koopman_ros.testing import Harness
+
+TABLES = tables()
+PLANTS = sorted(path.stem for path in config_directory().glob('plants/*.yaml'))
+FORMER = yaml.safe_load((config_directory() / 'renamed.yaml').read_text())
 
 
 def row(default: Any, **details: Any) -> Specification:
@@ -180,12 +188,12 @@ def test_names_of_other_nodes_are_ignored_with_one_warning(
       for node, name in (('trainer', 'topics'), ('trainer', 'bags'), ('player', 'topics'),
                          ('replay', 'bags'))),
     ('plant', ('speed:=[]',), 'speed = [] must be a double, e.g. 1.0'),
-    ('controller', ('coolant_min:=20.0', 'coolant_max:=20.00000000000001'),
-     'coolant_min = 20.0 degC and coolant_max = 20.00000000000001 degC cannot be used: '),
-    ('replay', ('sensor_min:=20.0', 'sensor_max:=20.00000000000001'),
-     'sensor_min = 20.0 degC and sensor_max = 20.00000000000001 degC cannot be used: '),
-    ('trainer', ('experiment_coolant_max:=8.500000000000002',),
-     'experiment_coolant_max = 8.500000000000002 degC cannot be used: '),
+    ('controller', ('coolant_temperature.min:=20.0',
+                    'coolant_temperature.max:=20.00000000000001'),
+     'coolant_temperature.min = 20.0 degC and coolant_temperature.max = 20.00000000000001 degC '
+     'cannot be used: '),
+    ('trainer', ('coolant_temperature.experiment_max:=8.500000000000002',),
+     'coolant_temperature.experiment_max = 8.500000000000002 degC cannot be used: '),
     ('trainer', ('max_bag_size:=1.0e+308',),
      'max_bag_size = 1e+308 MB must be 0, or in [1e-06, 1000000000] MB'),
 ])
@@ -199,38 +207,158 @@ def test_start_with_what_cannot_be_used_is_refused(
 
 
 def test_concentration_too_small_to_integrate_is_refused() -> None:
-    table = TABLES['plant']
-    assert table.check(PlantParameters(feed_concentration=1e-315)) == ''
-    assert table.check(PlantParameters(reactor='two_state', feed_concentration=1e-315)).startswith(
-        'reactor = two_state and feed_concentration = 1e-315 mol/L cannot be used: atol is ')
-    for harmless in (0.0, 1e-100):
-        assert table.check(PlantParameters(
-            reactor='two_state', feed_concentration=harmless)) == ''
+    one, two = PlantTable(), PlantTable({'system': 'two_state'})
+
+    def check(table: PlantTable, concentration: float) -> str:
+        return table.check(table.snapshot({'constants.feed_concentration': concentration}))
+
+    assert check(one, 1e-312) == ''
+    assert check(two, 1e-312).startswith(
+        'constants.feed_concentration = 1e-312 mol/m^3 cannot be used: atol is ')
+    assert [check(two, harmless) for harmless in (0.0, 1e-97)] == ['', '']
 
 
-@pytest.mark.parametrize(('given', 'residual'), [
-    ({}, 1e-8), ({'min_riccati_digits': 6.0}, 1e-6), ({'max_riccati_residual': 1e-5}, 1e-5),
-    ({'max_riccati_residual': 1e-9, 'min_riccati_digits': 3.0}, 1e-9),
+# Signals.
+
+
+@dataclass(frozen=True)
+class Tuned:
+    """What is tuned for one signal."""
+
+    low: float = parameter(0.0, 'lowest value', '{shown}', -500.0, 500.0)
+    high: float = parameter(1.0, 'highest value', '{shown}', -500.0, 500.0)
+    rate: float = parameter(0.0, 'fastest change', '{unit}/s', 0.0, 10.0)
+    weight: float = parameter(1.0, 'cost', '1/({unit})^2', 0.0, 10.0)
+
+
+@dataclass(frozen=True)
+class Several:
+    """Parameters of a node, of its signals, and of a group."""
+
+    period: float = parameter(1.0, 'time between samples', 's', 0.0, 10.0)
+    signals: Mapping[str, Tuned] = per_signal(Tuned)
+    constants: Mapping[str, float] = group()
+
+
+SEVERAL = ParameterTable(
+    Several, ordered=(('low', 'high'),), signals={'signals': {'heat': 'K', 'flow': 'm^3/s'}},
+    groups={'constants': [Specification('gravity', 9.81, 'm/s^2', 'of the earth', 0.0, 20.0)]},
+    defaults={'flow.high': 2, 'heat.nothing': 3.0, 'foreign': 1.0})
+
+
+def test_each_signal_has_rows_of_its_own_in_its_units() -> None:
+    assert {name: row.unit for name, row in SEVERAL.rows.items()} == {
+        'period': 's',
+        'heat.low': 'degC', 'heat.high': 'degC', 'heat.rate': 'K/s', 'heat.weight': '1/K^2',
+        'flow.low': 'm^3/s', 'flow.high': 'm^3/s', 'flow.rate': 'm^3/s/s',
+        'flow.weight': '1/(m^3/s)^2', 'constants.gravity': 'm/s^2'}
+    given = SEVERAL.snapshot({'heat.low': -5.0, 'constants.gravity': 1.6, 'foreign': 4.0})
+    assert (given.period, given.signals['heat'], dict(given.constants)) == (
+        1.0, Tuned(low=-5.0), {'gravity': 1.6})
+    # of the defaults, and a double though it was given as 2
+    assert repr(given.signals['flow'].high) == '2.0'
+    values = SEVERAL.values(given)
+    assert list(values) == list(SEVERAL.rows)
+    assert SEVERAL.snapshot(values) == given
+    assert SEVERAL.amended(given, **{'flow.rate': 3.0}).signals['flow'].rate == 3.0
+
+
+@pytest.mark.parametrize(('given', 'words'), [
+    ({'heat.rate': 11.0}, 'heat.rate = 11.0 K/s must be in [0, 10] K/s'),
+    ({'flow.low': 2.0}, 'flow.low = 2.0 m^3/s must be below flow.high = 2.0 m^3/s: change the '
+     'other one first'),
+    ({'heat.low': 3.0}, 'heat.low = 3.0 degC must be below heat.high = 1.0 degC: change the other '
+     'one first'),
+    ({'constants.gravity': -1.0}, 'constants.gravity = -1.0 m/s^2 must be in [0, 20] m/s^2'),
+    ({}, ''),
 ])
-def test_former_form_of_the_riccati_bound_still_counts(
-        given: dict[str, float], residual: float) -> None:
-    for node in ('controller', 'replay'):
-        settings = TABLES[node].kind(**given).settings()
-        assert settings.max_residual == pytest.approx(residual, rel=1e-15)
+def test_values_of_a_signal_are_refused_by_its_name(given: dict[str, float], words: str) -> None:
+    assert SEVERAL.check(SEVERAL.snapshot(given)) == words
 
 
-def test_rcl_reads_back_what_the_table_writes(ros: Harness, tmp_path: Path) -> None:
-    file = tmp_path / 'odd.yaml'
-    file.write_text(ODD.yaml())
+def read(ros: Harness, file: Path, names: Collection[str]) -> dict[str, Any]:
+    """Return parameters as rcl reads them from a file."""
     node = Node('odd', context=ros.node.context,
                 cli_args=['--ros-args', '--params-file', str(file)],
                 automatically_declare_parameters_from_overrides=True)
-    read = {name: node.get_parameter(name).value for name in ODD.rows}
+    found = {name: node.get_parameter(name).value for name in names}
     node.destroy_node()
-    default = {name: item.default for name, item in ODD.rows.items()}
-    assert read == {**default, 'names': list(default['names'])}
-    assert [type(found) for found in read.values()] == [
-        float, float, float, float, int, bool, str, str, list]
+    return found
+
+
+@pytest.mark.parametrize('name', ['odd', 'several', *TABLES])
+def test_rcl_reads_back_what_the_table_writes(ros: Harness, tmp_path: Path, name: str) -> None:
+    table = {**TABLES, 'odd': ODD, 'several': SEVERAL}[name]
+    file = tmp_path / 'written.yaml'
+    file.write_text(table.yaml())
+    default = {name: list(item.default) if isinstance(item.default, tuple) else item.default
+               for name, item in table.rows.items()}
+    found = read(ros, file, table.rows)
+    assert found == default
+    assert [type(value) for value in found.values()] == [type(value) for value in default.values()]
+
+
+# Plants that are shipped, and former names.
+
+
+def _leaves(tree: Mapping[str, Any], prefix: str = '') -> Iterator[tuple[str, Any]]:
+    for key, value in tree.items():
+        if isinstance(value, Mapping):
+            yield from _leaves(value, f'{prefix}{key}.')
+        else:
+            yield f'{prefix}{key}', value
+
+
+@pytest.mark.parametrize('system', PLANTS)
+def test_file_of_a_plant_fits_the_tables_of_its_nodes(system: str) -> None:
+    content = yaml.safe_load((config_directory() / 'plants' / f'{system}.yaml').read_text())
+    sections = {name: dict(_leaves(section['ros__parameters']))
+                for name, section in content.items() if name != 'demo'}
+    of_plant = tables(system)
+    assert set(sections) <= {'/**', *of_plant}
+    known = {name for table in of_plant.values() for name in table.rows}
+    assert set(sections['/**']) <= known
+    assert sections['/**']['system'] == system
+    for node, table in of_plant.items():
+        assert set(sections.get(node, ())) <= set(table.rows), node
+        given = {**sections['/**'], **sections.get(node, {})}
+        for name, row in table.rows.items():
+            # a replay has one table for all plants
+            if name in given and node != 'replay':
+                # what a node starts with is what is written, and of its type
+                default = list(row.default) if isinstance(row.default, tuple) else row.default
+                assert default == given[name], name
+                numbers = (int, float) if isinstance(row.default, float) else type(default)
+                assert isinstance(given[name], numbers), name
+        assert table.check(table.snapshot({})) == '', node
+
+
+@pytest.mark.parametrize('system', PLANTS)
+def test_rcl_reads_the_file_of_a_plant(ros: Harness, system: str) -> None:
+    """As a whole loop is started with it."""
+    file = config_directory() / 'plants' / f'{system}.yaml'
+    assert declared(ros, '--params-file', str(file), name='plant',
+                    table=PlantTable({'system': system}))[0].system == system
+
+
+@pytest.mark.parametrize(('node', 'name'), [
+    (node, name) for node, rows in FORMER.items() for name in rows])
+def test_former_name_is_refused_with_the_line_to_write(ros: Harness, node: str, name: str) -> None:
+    now, factor = FORMER[node][name]
+    row = TABLES[node].rows[now]
+    old, new = next(iter(factor.items())) if isinstance(factor, dict) else (3, 3.0 * factor)
+    with pytest.raises(ConfigurationError) as refusal:
+        declared(ros, '-p', f'{name}:={old}', name=node, table=TABLES[node])
+    unit = f' [{row.unit}]' if row.unit else ''
+    said = re.fullmatch(rf'(\w+) is now ([\w.]+){re.escape(unit)}: write ([\w.]+): (.+)',
+                        str(refusal.value))
+    assert said is not None
+    assert said.groups()[:3] == (name, now, now)
+    # of the type that the row takes
+    written = yaml.safe_load(said[4])
+    assert isinstance(written, list if isinstance(row.default, tuple) else type(row.default))
+    found = written[0] if isinstance(written, list) else written
+    assert found == (new if isinstance(factor, dict) else pytest.approx(new, rel=1e-11))
 
 
 # The shipped files.

@@ -19,9 +19,8 @@ from koopman_ros.bags import BagWriter, read_messages
 from koopman_ros.control import Controller
 from koopman_ros.demo import reactor
 from koopman_ros.lifting import load, ModelFileError, save
-from koopman_ros.parameters.controller import signals_of
 from koopman_ros.parameters.trainer import trainer_table
-from koopman_ros.parameters.wire import Wiring
+from koopman_ros.parameters.wire import signals_of, Wiring
 from koopman_ros.resources import model_path
 from koopman_ros.ros import model_reload, recorder, topics
 from koopman_ros.ros.experiment import PlantExperiment

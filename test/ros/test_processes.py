@@ -23,10 +23,12 @@ from koopman_ros.resources import model_path
 from koopman_ros.ros import topics
 from koopman_ros.ros.codec import stamp_message
 from koopman_ros.ros.process import answer, open_to_the_network
-from koopman_ros.ros.programs import TABLES
+from koopman_ros.ros.programs import tables
 from koopman_ros.testing import Harness
 from koopman_ros.units import NANOSECONDS
 from support.nodes import run_here, TIMEOUT
+
+TABLES = tables()
 
 
 def importing(names: tuple[str, ...], act: str, main: str) -> tuple[str, ...]:
@@ -61,7 +63,7 @@ def test_signal_ends_a_node_on_loopback_cleanly_that_loads_only_what_it_needs(
         assert '/dev/shm/fastrtps' not in Path(f'/proc/{process.process.pid}/maps').read_text()
     assert process.stop(number) == 0
     assert 'Traceback' not in process.output()
-    said = {'plant': r'one_state reactor started: ', 'controller': 'reactor_nz4',
+    said = {'plant': r'one-state reactor started: ', 'controller': 'reactor_nz4',
             'trainer': rf'recorded \d+ messages to {re.escape(str(tmp_path))}/bag\n'}[name]
     assert re.search(said, process.output())
 
@@ -242,8 +244,10 @@ PARAMETERS = '/**:\n  ros__parameters:\n    '
     (player, f'{PARAMETERS}topics: []\n',
      'topics = [] must be a list of at least one string, e.g. [a, b]'),
     (plant, f'{PARAMETERS}speed: 1\n', 'speed = 1 must be a double, e.g. 1.0'),
-    (controller, f'{PARAMETERS}coolant_max: 500.0\n',
-     'coolant_max = 500.0 degC must be in [-50, 150] degC'),
+    (controller, f'{PARAMETERS}coolant_temperature: {{max_disturbance: -1.0}}\n',
+     'coolant_temperature.max_disturbance = -1.0 K must be in [0, 1000000000] K'),
+    (controller, f'{PARAMETERS}coolant_max: 30.0\n',
+     'coolant_max is now coolant_temperature.max [degC]: write coolant_temperature.max: 30.0'),
     (controller, f'{PARAMETERS}model: /nowhere/lift.safetensors\n', '/nowhere/lift.safetensors'),
     (controller, f'{PARAMETERS}model: {{folder}}/cut.safetensors\n', 'cut.safetensors'),
 ])

@@ -15,7 +15,8 @@ from scipy.optimize import root
 from koopman_ros import control, plants
 from koopman_ros.arrays import Array
 from koopman_ros.lifting import LiftedModel, load
-from koopman_ros.parameters.controller import signals_of, table_of
+from koopman_ros.parameters.controller import table_of
+from koopman_ros.parameters.wire import signals_of
 from koopman_ros.reasons import Words
 from koopman_ros.replay.records import encoded
 from koopman_ros.units import Displays

@@ -5,6 +5,7 @@
 
 from collections.abc import Iterator
 import errno
+import gc
 import os
 from pathlib import Path
 import time
@@ -64,6 +65,8 @@ def shared_ros(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Harness]:
 def run_here(program: ModuleType, *arguments: str, **parameters: object) -> int:
     """Run a program with ROS arguments after its parameters; return its exit code."""
     given = [part for name, value in parameters.items() for part in ('-p', f'{name}:={value}')]
+    # a node that could not start before may still be there, whose name would be taken
+    gc.collect()
     with isolated_domain():
         return int(program.main(['program', '--ros-args', *given, *arguments]))
 

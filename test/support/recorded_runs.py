@@ -17,7 +17,8 @@ from koopman_ros.bags import BagWriter, message_definition
 from koopman_ros.control import Controller, Settings, State
 from koopman_ros.control.events import apply, Event, Measurement, Outcome, Silence
 from koopman_ros.lifting import load_with_digest
-from koopman_ros.parameters.controller import signals_of, table_of
+from koopman_ros.parameters.controller import table_of
+from koopman_ros.parameters.wire import signals_of
 from koopman_ros.plant_data import Episode
 from koopman_ros.replay import records
 from koopman_ros.resources import model_path

@@ -27,7 +27,8 @@ from koopman_ros.control import (
 )
 from koopman_ros.control.simulate import after_a_second
 from koopman_ros.lifting import LiftedModel, load, NetworkObservables
-from koopman_ros.parameters.controller import signals_of, table_of
+from koopman_ros.parameters.controller import table_of
+from koopman_ros.parameters.wire import signals_of
 from koopman_ros.resources import model_path
 from koopman_ros.units import NANOSECONDS
 from validation.benchmarks.process import Tell

@@ -14,7 +14,8 @@ from koopman_ros import control, plants
 from koopman_ros.arrays import Array
 from koopman_ros.control import Controller, Simulation
 from koopman_ros.lifting import LiftedModel, load
-from koopman_ros.parameters.controller import signals_of, table_of
+from koopman_ros.parameters.controller import table_of
+from koopman_ros.parameters.wire import signals_of
 from koopman_ros.resources import model_path
 from koopman_ros.units import SECONDS_PER_MINUTE
 
