@@ -32,7 +32,7 @@ ALLOWED = {
     'identification': {'learning', 'lifting'},
     'retraining': {'bags', 'control', 'identification', 'learning', 'lifting'},
     'replay': {'bags', 'control', 'lifting'},
-    'parameters': {'control', 'estimation', 'plants'},
+    'parameters': {'control', 'estimation', 'lifting', 'plants'},
     'jobs': set(),
     'ros': {'bags', 'control', 'jobs', 'lifting', 'parameters', 'plants', 'replay'},
     'nodes': {'bags', 'control', 'jobs', 'lifting', 'parameters', 'plants', 'replay', 'ros'},
