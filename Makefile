@@ -72,7 +72,7 @@ lint: $(VENV)/test.stamp  ## style and type checks
 	$(BIN)/mypy
 
 models: $(VENV)/train.stamp  ## train the shipped lifts again -> config/models
-	$(BIN)/python -m validation.paper.shipped_models
+	$(BIN)/python -m validation.shipped_models
 
 studies: $(VENV)/train.stamp  ## the paper's experiments from SEEDS seeds: figures, report -> out/studies
 	$(BIN)/python -m validation.paper --seeds $(SEEDS)

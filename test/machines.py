@@ -26,7 +26,7 @@ NUMERICAL = ('test/plants', 'test/lifting', 'test/control', 'test/learning',
              'test/identification', 'test/retraining', 'test/validation/paper',
              'test/validation/robustness', 'test/test_examples.py')
 # Trainings, which amplify rounding: half a minute of them.
-TRAINING = ('test/validation/paper/test_shipped_models.py', 'test/learning/test_training.py')
+TRAINING = ('test/validation/test_shipped_models.py', 'test/learning/test_training.py')
 QUICK = ('oldest', 'disturbed')
 
 

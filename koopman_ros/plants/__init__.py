@@ -21,11 +21,16 @@ from koopman_ros.plants.simulation import (
     sample_derivatives,
     simulate,
 )
-from koopman_ros.plants.system import ControlAffineSystem, equilibrium_input, EquilibriumError
+from koopman_ros.plants.system import (
+    ControlAffineSystem,
+    equilibrium_input,
+    EquilibriumError,
+    steady_state,
+)
 
 __all__ = ['PLANTS', 'Actuator', 'Constant', 'Constants', 'ControlAffineSystem',
            'EquilibriumError', 'ExcitationError', 'IntegrationError', 'IntegrationFailure',
            'Process', 'RandomStepDesign', 'ReactorParameters', 'advance', 'build', 'constant',
            'constants_of', 'equilibrium_input', 'one_state_reactor', 'plant_class',
            'random_steps', 'sample_derivatives', 'scalar_example', 'sensor_noise', 'simulate',
-           'two_state_example', 'two_state_reactor']
+           'steady_state', 'two_state_example', 'two_state_reactor']

@@ -3,7 +3,7 @@
 
 """The control-affine system dx/dt = f(x) + B u that every plant is, and its holding inputs."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -13,6 +13,8 @@ from koopman_ros.arrays import Array, frozen
 from koopman_ros.units import SECONDS_PER_TIME_UNIT
 
 ArrayFunction = Callable[[Array], Array]
+
+_NEWTON_STEPS = 50  # which are quick, and more than a plant near its nominal point needs
 
 
 def checked_vector(name: str, value: ArrayLike, length: int, *, finite: bool = True) -> Array:
@@ -157,3 +159,29 @@ def equilibrium_input(system: ControlAffineSystem, state: ArrayLike) -> Array:
             f'{system.state_units[worst]}/{system.time_unit}; '
             'choose a steady state')
     return u
+
+
+def steady_state(system: ControlAffineSystem, wanted: Mapping[str, float]
+                 ) -> tuple[Array, Array]:
+    """
+    Find the state (n_x,) and the input (n_u,) that hold some states at values, given by name.
+
+    Newton's method from the nominal point, by least norm where values leave a choice.
+
+    :raises ValueError: for a name that is no state.
+    :raises EquilibriumError: when no input holds them.
+    """
+    if unknown := wanted.keys() - set(system.state_names):
+        raise ValueError(f'{min(unknown)} is no state of {system.name}: choose of '
+                         f'{", ".join(system.state_names)}')
+    held = np.array([name in wanted for name in system.state_names])
+    x, u = system.nominal_state.copy(), system.nominal_input
+    x[held] = [wanted[name] for name in system.state_names if name in wanted]
+    others = np.eye(system.n_x)[:, ~held]
+    for _ in range(_NEWTON_STEPS):
+        slope = np.hstack([system.drift_jacobian(x) @ others, system.B])
+        change = np.linalg.lstsq(slope, -system.derivative(x, u), rcond=None)[0]
+        x = x + others @ change[:others.shape[1]]
+        u = u + change[others.shape[1]:]
+    equilibrium_input(system, x)
+    return x, u

@@ -7,7 +7,13 @@ import numpy as np
 import pytest
 from scipy.linalg import eigvals
 
-from koopman_ros.plants import equilibrium_input, plant_class, simulate
+from koopman_ros.plants import (
+    equilibrium_input,
+    EquilibriumError,
+    plant_class,
+    simulate,
+    steady_state,
+)
 
 
 def plant(name, **constants):
@@ -22,6 +28,9 @@ def test_quadruple_tank_has_the_published_operating_point():
         100.0 * system.nominal_state, [12.4, 12.7, 1.8, 1.4], rtol=0, atol=0.2)
     slope = system.drift_jacobian(system.nominal_state)
     np.testing.assert_allclose(-1.0 / np.diag(slope), [62.0, 90.0, 23.0, 30.0], rtol=0, atol=1.0)
+    x, u = steady_state(system, {'level_1': 0.10, 'level_2': 0.14})
+    np.testing.assert_allclose(system.derivative(x, u), 0.0, atol=1e-15)
+    np.testing.assert_array_equal(x[:2], [0.10, 0.14])
     # and the published zeros of pumps to lower levels, of which one is near the origin
     pencil = np.block([[slope, system.B], [np.eye(2, 4), np.zeros((2, 2))]])
     finite = [zero for zero in eigvals(pencil, np.diag([1.0] * 4 + [0.0] * 2))
@@ -79,3 +88,14 @@ def test_a_pendulum_at_thirty_degrees_is_held_by_half_the_torque_of_its_weight()
     # m g l sin 30 degrees
     np.testing.assert_allclose(
         equilibrium_input(plant('pendulum'), [np.pi / 6.0, 0.0]), [-0.25 * 9.81], rtol=1e-12)
+
+
+def test_a_steady_state_is_found_by_some_of_its_states_or_refused():
+    pendulum = plant('pendulum')
+    x, u = steady_state(pendulum, {'angle': 0.3})
+    np.testing.assert_allclose(x, [0.3, 0.0], atol=1e-15)
+    np.testing.assert_allclose(u, [-0.5 * 9.81 * np.sin(0.3)], rtol=1e-12)
+    with pytest.raises(EquilibriumError, match=r'no input holds .*rate = 1 rad/s: angle still'):
+        steady_state(pendulum, {'rate': 1.0})
+    with pytest.raises(ValueError, match='level is no state of pendulum: choose of angle, rate'):
+        steady_state(pendulum, {'level': 1.0})
