@@ -162,6 +162,20 @@ def test_laws_of_the_two_state_example(R, cost, K, linear_ratio):
 
 # Choice of the law.
 
+@pytest.mark.parametrize(('mu', 'adds', 'form'), [
+    (-0.1, False, Form.RECENTRED),
+    # x1^2 grows by itself, and no input reaches it
+    (0.1, True, Form.PROJECTED)])
+def test_a_lift_with_unstable_modes_of_its_own_is_controlled_by_the_projected_law(mu, adds, form):
+    model = exact_two_state_model(mu, -1.0)
+    assert model.adds_unstable_modes is adds
+    target = steady_state_target(model, np.zeros(2))
+    # x1 is not moved by the input either
+    found = feedback(model, np.array([0.5, 0.3]), target,
+                     Weights(np.diag([0.0, 1.0]), np.eye(1)))
+    assert found.form is form
+
+
 def test_the_projected_law_takes_over():
     model = shipped('reactor_nz4')
     # at the cold end the gain on the lifted state is the larger one
