@@ -36,7 +36,8 @@ from support.recorded_runs import Recorded
 
 COOLANT = 24.5  # degC, not what the law would command
 # The rate limit is active through every step of the set-point, and the ramp takes some samples.
-SETTINGS = {'coolant_temperature.rate_limit': 0.5, 'temperature.setpoint_ramp': 1.0, 'measurement_timeout': 0.0}
+SETTINGS = {'coolant_temperature.rate_limit': 0.5, 'temperature.setpoint_ramp': 1.0,
+            'measurement_timeout': 0.0}
 RECORDS = f'/{topics.CONTROLLER_EVENTS}'
 
 
@@ -128,7 +129,8 @@ def tune_and_swap(operator: Operator) -> None:
     """Change parameters and models, also to what is refused, and go on a little each time."""
     shutil.copy(model_path('reactor_nz3'), operator.model)
     for change, taken in (
-            ({'coolant_temperature.weight': 0.3}, True), ({'coolant_temperature.weight': -1.0}, False),
+            ({'coolant_temperature.weight': 0.3}, True),
+            ({'coolant_temperature.weight': -1.0}, False),
             ({'setpoint_filter': 15.0, 'disturbance_bandwidth': 0.05}, True),
             ({'model': str(operator.model), 'coolant_temperature.weight': 0.5}, True),
             ({'model': 'none'}, False)):
