@@ -89,7 +89,7 @@ def run_retraining(output: Path, speed: float) -> dict[str, object]:
         'offset_after_kelvin': history.offset(
             reactor.TEMPERATURE, setpoint, reload + _AFTER),
         'heldout_rw': trained['heldout_rw'],
-        'heldout_error_kelvin': trained['heldout_error_kelvin'],
+        'heldout_error_kelvin': trained['heldout_error'][reactor.TEMPERATURE],
         'rollout_rmse_kelvin': rollout_rmse(learned),
         'max_coolant_step_before_kelvin': history.largest_step(
             reactor.COOLANT_TEMPERATURE, reload - 120.0, reload - 30.0),

@@ -42,10 +42,14 @@ METHODS: Mapping[str, Method] = {
     'total variation': total_variation,
 }
 DEGREES = (1, 2, 3, 4, 5, 6)
+# Of a drift: those of degree 6 for two states, of 4 for three, of 3 for four. Output error takes
+# minutes for more, and an hour does not determine them.
+_MOST_COEFFICIENTS = 150
 OUTPUT_ERROR = 'output error'
 
 _SEGMENT_SAMPLES = (20, 240)
 _SEGMENTS = 15
+_FITTED = 0.6  # share of them that are fitted; they hold the extremes of all signals
 # For two states and an input, six of them may hold the extremes.
 _FEWEST = 8
 # Mean squared errors this close count as equal: on a few segments that hold one estimate against
@@ -83,7 +87,7 @@ class Identified:
     held_out: tuple[Episode, ...]  #: segments that neither fit nor choice has seen
 
 
-def identify(plant: Plant, episodes: Sequence[Episode], *, degrees: Sequence[int] = DEGREES,
+def identify(plant: Plant, episodes: Sequence[Episode], *, degrees: Sequence[int] | None = None,
              methods: Mapping[str, Method] = METHODS, seed: int = 0,
              watch: Watch = lambda *_: False) -> Identified:
     """
@@ -96,13 +100,17 @@ def identify(plant: Plant, episodes: Sequence[Episode], *, degrees: Sequence[int
     held out for good.
 
     :param plant: names, units, and B where it is known.
-    :param degrees: of f that are tried, rising, the first one 1.
+    :param degrees: of f that are tried, rising, the first one 1; by default those whose drift has
+        few enough coefficients for so many states.
     :param methods: by name; those that go by a rough B come after one that learns it.
     :param seed: of the split.
     :raises ValueError: when the episodes are too short, or nothing fits.
     :raises Stopped: when `watch` asked for it.
     """
-    parts = _segments(episodes)
+    n_x, n_u = len(plant.state_names), len(plant.input_names)
+    degrees = degrees or tuple(degree for degree in DEGREES if degree == 1
+                               or n_x * math.comb(n_x + degree, degree) <= _MOST_COEFFICIENTS)
+    parts = _segments(episodes, n_x + n_u)
     box = box_of(plant, parts)
     fit, choose, held_out = _split(parts, seed)
     step = longest_step(parts)
@@ -154,13 +162,15 @@ def identify(plant: Plant, episodes: Sequence[Episode], *, degrees: Sequence[int
                       (*fit, *choose), tuple(held_out))
 
 
-def _segments(episodes: Sequence[Episode]) -> list[Episode]:
+def _segments(episodes: Sequence[Episode], signals: int) -> list[Episode]:
+    """Cut into segments, of which three fifths may hold the extremes of so many signals."""
     low, high = _SEGMENT_SAMPLES
+    count = max(_SEGMENTS, math.ceil(2 * signals / _FITTED))
     total = sum(len(episode) for episode in episodes)
     if total < _FEWEST * low:
         raise ValueError(f'{total} samples are too few to learn from and to judge by: record at '
                          f'least {_FEWEST * low}, better some thousand')
-    parts = cut(episodes, min(high, max(low, total // _SEGMENTS)))
+    parts = cut(episodes, min(high, max(low, total // count)))
     kept = [part for part in parts if len(part) >= low // 2]
     if len(kept) < _FEWEST:
         raise ValueError(f'the episodes have {len(kept)} uninterrupted segments of {low // 2} '

@@ -149,8 +149,26 @@ def _in_words(summary: Mapping[str, Any]) -> str:
         reasons = '; '.join(summary['reasons'])
         kept = f'; it is kept as {summary["model_file"]}' if summary['model_file'] else ''
         return f'the new lift is refused: {reasons}{kept}'
-    present = summary['heldout_error_of_present_lift_kelvin']
+    present = summary['heldout_error_of_present_lift']
     return (f'the new lift is accepted: error on held-out records '
-            f'{summary["heldout_error_kelvin"]:.4g} K, that of the present one '
-            + ('infinite, as it diverges' if present is None else f'{present:.4g} K')
+            f'{_errors(summary, "heldout_error")}, that of the present one '
+            + ('infinite, as it diverges' if None in present.values()
+               else _errors(summary, 'heldout_error_of_present_lift'))
             + f'; written to {summary["model_file"]}')
+
+
+def _errors(summary: Mapping[str, Any], key: str) -> str:
+    errors, units = summary[key], summary['units']
+    return ', '.join(f'{value:.4g} {units[name]}' + (f' in {name}' if len(errors) > 1 else '')
+                     for name, value in errors.items())
+
+
+def scalars(summary: Mapping[str, Any]) -> dict[str, bool | float | str]:
+    """Return the figures of a summary one by one, those of a signal under its name."""
+    found: dict[str, bool | float | str] = {}
+    for key, value in summary.items():
+        if isinstance(value, Mapping):
+            found |= {f'{key}: {name}': one for name, one in scalars(value).items()}
+        elif isinstance(value, (bool, int, float, str)):
+            found[key] = value
+    return found

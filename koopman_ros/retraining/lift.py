@@ -4,7 +4,6 @@
 """Training of a lift on an estimated drift, and its acceptance on data held out of both."""
 
 from dataclasses import dataclass, replace
-import itertools
 
 import numpy as np
 from numpy.typing import NDArray
@@ -21,7 +20,7 @@ from koopman_ros.plant_data import Episode, Plant, Samples
 
 # More samples of a smooth drift tell nothing new.
 _MAX_SAMPLES = 2000
-# Cells a state by which samples are spread over the range.
+# Cells a state by which samples are spread over the range; fewer where there were too many.
 _CELLS = 20
 # Parts among which the samples are dealt out.
 _SHARES = 10
@@ -33,6 +32,8 @@ _LOST = 1e3
 _ARRIVED = 0.05
 # Set-points at these places between the corners of the box.
 _PLACES = (0.1, 0.5, 0.9)
+# Closed loops of several states start at so many of them beside the middle.
+_STARTS = 8
 _MAX_EVALUATIONS = 5000
 # A prediction this far from the nominal point, in units of the scale, has diverged.
 _DIVERGED = 1e6
@@ -72,8 +73,13 @@ def _spread(xi: Array) -> NDArray[np.int64]:
     tell its coordinates apart by the few others.
     """
     low, high = xi.min(axis=0), xi.max(axis=0)
-    cell = np.minimum((_CELLS * (xi - low) / (high - low)).astype(int), _CELLS - 1)
-    cell = np.unique(cell, axis=0, return_inverse=True)[1].ravel()
+    share = (xi - low) / (high - low)
+    for count in range(_CELLS, 0, -1):
+        cells = np.minimum((count * share).astype(int), count - 1)
+        visited, cell = np.unique(cells, axis=0, return_inverse=True)
+        if len(visited) <= _MAX_SAMPLES:
+            break
+    cell = cell.ravel()
     # the rank of each sample within its cell, taken evenly along the episode
     order = np.argsort(cell, kind='stable')
     sizes = np.bincount(cell)
@@ -247,15 +253,25 @@ def _warnings(found: Identified, model: LiftedModel, error: Array) -> tuple[str,
 
 
 def _closed_loops(model: LiftedModel, drift: DriftModel) -> tuple[int, int]:
-    """Control the estimated drift from the corners and the middle of the box to set-points."""
+    """
+    Control the estimated drift from the ends and the middle of the data to set-points.
+
+    A box of several states has corners that no plant comes to: the loops start at training states
+    far from each other then. Set-points lie along the box's diagonal, or as near to it as an input
+    can hold the plant.
+    """
     lower, upper = model.states.lower, model.states.upper
-    corners = [np.where(bits, upper, lower)
-               for bits in itertools.product((False, True), repeat=model.n_x)]
-    starts = [*corners, 0.5 * (lower + upper)]
+    far = model.training_states
+    ends = [lower, upper] if far is None else list(model.states.to_physical(far.states[:_STARTS]))
+    starts = [*ends, 0.5 * (lower + upper) if far is None else model.states.center]
     weights = Weights(np.eye(model.n_x), np.eye(model.n_u))
     loops = arrived = 0
     for place in _PLACES:
-        x_ref = lower + place * (upper - lower)
+        try:
+            x_ref, _ = steady_point(drift, lower + place * (upper - lower), model.inputs.center)
+        except ValueError:
+            # where the plant is known to stand still
+            x_ref = model.states.center
         duration = settling_time(
             linearised_model(drift.slope(x_ref), drift.input_matrix, model.states, model.inputs,
                              model.time_unit, Provenance(model.provenance.plant)), weights)
@@ -275,5 +291,6 @@ def _size(rmse: Array, scale: Array) -> float:
 
 
 def _text(rmse: Array, model: LiftedModel) -> str:
-    return ', '.join(f'{value:.4g} {unit}'
-                     for value, unit in zip(rmse, model.states.units, strict=True))
+    names, units = model.states.names, model.states.units
+    return ', '.join(f'{value:.4g} {unit}' + (f' in {name}' if len(names) > 1 else '')
+                     for value, unit, name in zip(rmse, units, names, strict=True))

@@ -33,7 +33,9 @@ def write_report(retrained: Retrained) -> list[Path]:
 
 def _sections(retrained: Retrained) -> Iterator[str]:
     found, decision, trained = retrained.found, retrained.decision, retrained.trained
-    unit, input_unit = retrained.present.states.units[0], retrained.present.inputs.units[0]
+    states, inputs = retrained.present.states, retrained.present.inputs
+    errors = tuple(f'error of {name} [{unit}]'
+                   for name, unit in zip(states.names, states.units, strict=True))
     yield f'**The new lift is {"accepted" if retrained.accepted else "refused"}.**'
     warnings = () if decision is None else decision.warnings
     yield bullets([*retrained.reasons, *(f'Beware: {warning}.' for warning in warnings)])
@@ -43,26 +45,35 @@ def _sections(retrained: Retrained) -> Iterator[str]:
     yield bullets(map(str, retrained.task.bags))
     yield bullets([
         *retrained.account.lines(),
-        f'{100.0 * retrained.coverage:.0f} % of the cells of the state-input box visited '
-        f'({CELLS} along each)',
-        f'noise from sample to sample: {found.noise[0]:.3g} {unit}',
+        *(f'{100.0 * share:.0f} % of the cells of {first} and {second} visited ({CELLS} along '
+          'each)' for (first, second), share in retrained.coverage.items()),
+        *(f'noise of {name} from sample to sample: {noise:.3g} {unit}' for name, noise, unit in
+          zip(states.names, found.noise, states.units, strict=True)),
         f'{len(found.fitted)} segments to estimate and learn from, '
         f'{len(found.held_out)} held out to judge by'])
     yield '## Estimates of the drift'
-    yield (f'Taken: {found.method}, degree {found.drift.degree}; '
-           f'B = {found.drift.input_matrix[0, 0]:.5g} {unit} per {input_unit} and time unit.')
-    yield table(('degree', 'method', f'error on the segments to choose by [{unit}]'),
-                ((score.degree, score.method, f'{score.rmse[0]:.5f}') for score in found.scores),
-                (2,))
+    yield f'Taken: {found.method}, degree {found.drift.degree}, with the input matrix B'
+    yield table(('per second by', *(f'{name} [1/({unit})]' for name, unit in
+                                     zip(inputs.names, inputs.units, strict=True))),
+                ((f'{name} [{unit}]', *(f'{gain:.5g}' for gain in row)) for name, unit, row in zip(
+                    states.names, states.units,
+                    found.drift.input_matrix / retrained.present.seconds_per_time_unit,
+                    strict=True)), range(1, 1 + len(inputs)))
+    yield 'Errors on the segments to choose by:'
+    yield table(('degree', 'method', *errors),
+                ((score.degree, score.method, *(f'{error:.5g}' for error in score.rmse))
+                 for score in found.scores), range(2, 2 + len(states)))
     if decision is None or trained is None:
         return
     yield '## On held-out segments'
-    yield table(('prediction of the measurements by', f'root mean square error [{unit}]'),
-                ((name, f'{rmse[0]:.5f}') for name, rmse in (
+    yield 'Root mean square errors of predictions of the measurements:'
+    yield table(('prediction by', *errors),
+                ((name, *(f'{error:.5g}' for error in rmse)) for name, rmse in (
                     ('the new lift', decision.rmse),
                     ('the drift that it was learned from', decision.drift_rmse),
                     ('the present lift', decision.current_rmse),
-                    ('the best linear model', decision.linear_rmse))), (1,))
+                    ('the best linear model', decision.linear_rmse))),
+                range(1, 1 + len(states)))
     yield 'The noise of the measurements is part of each.'
     eigenvalues = ', '.join(f'{value:.3g}' for value in trained.model.eigenvalues)
     yield (f'Lift: n_z = {trained.model.n_z}, rw = {trained.figures.fit.rw:.2g}, condition number '
@@ -71,17 +82,20 @@ def _sections(retrained: Retrained) -> Iterator[str]:
            f'of {decision.loops} reach their set-point.')
 
 
-def _label(signals: Coordinates) -> str:
-    return f'{signals.names[0].replace("_", " ")} [{unit_label(signals.units[0])}]'
+def _label(signals: Coordinates, k: int) -> str:
+    return f'{signals.names[k].replace("_", " ")} [{unit_label(signals.units[k])}]'
 
 
 def _draw(path: Path, retrained: Retrained) -> bool:
     """Draw where the data lie, what was learned, and how it predicts; False without matplotlib."""
+    n_x = len(retrained.present.states)
     try:
-        with drawing(path, 1, 3, size=(15.0, 4.6)) as (figure, (left, middle, right)):
-            _draw_coverage(left, retrained.found)
-            _draw_drift(middle, retrained)
-            _draw_prediction(right, retrained)
+        with drawing(path, n_x, 3, size=(15.0, 4.6 * n_x)) as (figure, panels):
+            for i in range(n_x):
+                left, middle, right = panels[3 * i:3 * i + 3]
+                _draw_coverage(left, retrained.found, i)
+                _draw_drift(middle, retrained, i)
+                _draw_prediction(right, retrained, i)
             word = 'accepted' if retrained.accepted else 'refused'
             figure.suptitle(f'Retraining: the new lift is {word}')
     except ImportError:
@@ -89,21 +103,23 @@ def _draw(path: Path, retrained: Retrained) -> bool:
     return True
 
 
-def _draw_coverage(axes: Any, found: Identified) -> None:
+def _draw_coverage(axes: Any, found: Identified, i: int) -> None:
+    """Draw where a state was, over the input that moves it most."""
     box = found.drift.box
+    j = int(np.argmax(np.abs(found.drift.B[i])))
     episodes = [*found.fitted, *found.held_out]
     visited = np.full((CELLS, CELLS), np.nan)
-    for i, j in visited_cells(episodes, box):
-        visited[j, i] = 1.0
-    edges = [shown(np.linspace(a.lower[0], a.upper[0], CELLS + 1), a.units[0])
-             for a in (box.states, box.inputs)]
+    cells = visited_cells(episodes, box)
+    visited[cells[:, len(box.states) + j], cells[:, i]] = 1.0
+    edges = [shown(np.linspace(a.lower[k], a.upper[k], CELLS + 1), a.units[k])
+             for a, k in ((box.states, i), (box.inputs, j))]
     axes.pcolormesh(*edges, visited, cmap='Greens', vmin=0.0, vmax=3.0)
     for episode in episodes:
-        axes.plot(shown(episode.x[:, 0], box.states.units[0]),
-                  shown(episode.inputs_at(episode.time)[:, 0], box.inputs.units[0]), '.',
+        axes.plot(shown(episode.x[:, i], box.states.units[i]),
+                  shown(episode.inputs_at(episode.time)[:, j], box.inputs.units[j]), '.',
                   markersize=1.0, color='tab:blue')
     axes.grid(False)  # the cells are one
-    axes.set(xlabel=_label(box.states), ylabel=_label(box.inputs),
+    axes.set(xlabel=_label(box.states, i), ylabel=_label(box.inputs, j),
              title='where the measurements lie (visited cells in green)')
 
 
@@ -115,36 +131,37 @@ def _lifts(retrained: Retrained) -> list[tuple[str, Rate, str]]:
     return [('present lift', lifted_rate(retrained.present, unit), 'tab:red'), *new]
 
 
-def _draw_drift(axes: Any, retrained: Retrained) -> None:
+def _draw_drift(axes: Any, retrained: Retrained, i: int) -> None:
+    """Draw a state's rate over the state, the others and the inputs in the middle."""
     found, current = retrained.found, retrained.present
     box = found.drift.box
-    x = np.linspace(box.states.lower, box.states.upper, 200)
-    u = np.broadcast_to(box.inputs.center, (len(x), 1))
-    estimated = found.drift.rate(x, u)[:, 0]
+    x = np.tile(box.states.center, (200, 1))
+    x[:, i] = np.linspace(box.states.lower[i], box.states.upper[i], 200)
+    u = np.broadcast_to(box.inputs.center, (len(x), len(box.inputs)))
+    estimated = found.drift.rate(x, u)[:, i]
     for name, rate, color in [*_lifts(retrained), ('best linear model', found.linear.rate, '0.5')]:
-        axes.plot(shown(x[:, 0], box.states.units[0]), rate(x, u)[:, 0] - estimated,
+        axes.plot(shown(x[:, i], box.states.units[i]), rate(x, u)[:, i] - estimated,
                   color=color, label=name)
     axes.axhline(0.0, color='k', linestyle='--', linewidth=1.0,
                  label='estimated from the data')
-    held = shown(float(u[0, 0]), box.inputs.units[0])
-    axes.set(xlabel=_label(box.states),
-             ylabel=f'difference of the rate [{box.states.units[0]}/{current.time_unit}]',
-             title=f'rate at {held:.1f} {_label(box.inputs)}, less the estimate')
+    axes.set(xlabel=_label(box.states, i),
+             ylabel=f'difference of the rate [{box.states.units[i]}/{current.time_unit}]',
+             title='rate in the middle of the range, less the estimate')
     axes.legend()
 
 
-def _draw_prediction(axes: Any, retrained: Retrained) -> None:
+def _draw_prediction(axes: Any, retrained: Retrained, i: int) -> None:
     found, current, states = retrained.found, retrained.present, retrained.present.states
     episode = found.held_out[0]
     segments = Segments.of([episode], longest_step([episode]))
-    minutes = np.concatenate(([0.0], np.cumsum(segments.steps[:, 0])))
+    times = np.concatenate(([0.0], np.cumsum(segments.steps[:, 0])))
     measured = segments.measured[:, 0]
-    axes.plot(minutes[measured], shown(segments.x[measured, 0, 0], states.units[0]),
+    axes.plot(times[measured], shown(segments.x[measured, 0, i], states.units[i]),
               '.', color='0.6', markersize=3.0, label='measured')
     for name, rate, color in _lifts(retrained):
         x0, _ = fitted_starts(rate, segments, found.drift.box.states.scale)
-        path = segments.path(rate, x0)[:, 0, 0]
-        axes.plot(minutes, shown(path, states.units[0]), color=color, label=name)
-    axes.set(xlabel=f'time [{current.time_unit}]', ylabel=_label(states),
+        path = segments.path(rate, x0)[:, 0, i]
+        axes.plot(times, shown(path, states.units[i]), color=color, label=name)
+    axes.set(xlabel=f'time [{current.time_unit}]', ylabel=_label(states, i),
              title='prediction of a held-out segment')
     axes.legend()

@@ -5,26 +5,33 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
 import hashlib
+import itertools
 import json
+import math
 import os
 from pathlib import Path
 import shutil
+from typing import TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
 
+from koopman_ros.arrays import Array
 from koopman_ros.bags import Account, loop_episodes, RecordedInput, RecordedState
 from koopman_ros.identification import Identified, identify, Stopped
 from koopman_ros.learning import NoUsefulLift, Progress, Trained
-from koopman_ros.lifting import Box, LiftedModel, load, save
+from koopman_ros.lifting import Box, Coordinates, LiftedModel, load, save
 from koopman_ros.plant_data import Episode
 from koopman_ros.retraining.lift import decide, Decision, learn_lift, Thresholds
-from koopman_ros.wire import place
+from koopman_ros.units import NANOSECONDS
+from koopman_ros.wire import Place
 
-CELLS = 10  # along each state and input, by which the visited share of their range is told
+CELLS = 10  # along each of two signals, by which the visited share of their ranges is told
+# A smaller change, in half widths of the present lift's box, is neither a spike nor a jump.
+_LEAST_JUMP = 0.1
 
 # Shares of the whole at which estimating, learning and judging begin and end.
 _STAGES = {'estimate': (0.05, 0.35), 'learn': (0.35, 0.9), 'decide': (0.9, 1.0)}
@@ -40,13 +47,15 @@ class Task:
     bags: tuple[str, ...]  #: files or folders
     output: str  #: model file to write, ending in ``.safetensors``
     model: str  #: file of the present lift
-    temperature_topic: str = '/temperature'  #: absolute name of the measurements
-    coolant_topic: str = '/coolant_setpoint'  #: absolute name of the coolant temperature that acts
+    states: tuple[RecordedState, ...]  #: those of the present lift, in any order
+    inputs: tuple[RecordedInput, ...]  #: likewise
+    tolerance: float = 0.0  #: how far stamps of one sample of several states may lie apart, in s
     coordinates: int = 3  #: n_z of the new lift
     seed: int = 0  #: of the split and of the training
     starts: int = 3  #: of each round of the training
-    input_gain: float = 0.0  #: B in 1/min where it is known, 0 to learn it
-    input_delay: float = 0.0  #: dead time of the actuator, in s
+    #: B where it is known, in state unit per input unit and second, by state and input; what is
+    #: not named is 0; empty to learn B
+    input_gain: Mapping[str, Mapping[str, float]] = field(default_factory=dict)
     margin: float = 0.1  #: see :class:`Thresholds`
     condition: float = 1e4  #: likewise
 
@@ -54,7 +63,14 @@ class Task:
     def from_json(cls, text: str) -> Task:
         """Read a task; unknown or missing fields are a TypeError."""
         values = json.loads(text)
-        return cls(**{**values, 'bags': tuple(values['bags'])})
+        states = tuple(RecordedState(**{**signal, 'place': Place(**signal['place'])})
+                       for signal in values['states'])
+        inputs = tuple(RecordedInput(**{
+            **signal, 'command': Place(**signal['command']),
+            'measured': Place(**signal['measured']) if signal.get('measured') else None})
+            for signal in values['inputs'])
+        return cls(**{**values, 'bags': tuple(values['bags']), 'states': states,
+                      'inputs': inputs})
 
 
 @dataclass(frozen=True)
@@ -67,7 +83,8 @@ class Retrained:
     trained: Trained | None  #: the lift, None when there is none worth judging
     decision: Decision | None  #: its figures, None without a lift
     reasons: tuple[str, ...]  #: why it was refused; empty when it was accepted
-    coverage: float  #: share of the cells of the state-input box that the episodes visit
+    #: share of the cells of two signals' ranges that the episodes visit, for all pairs of signals
+    coverage: Mapping[tuple[str, str], float]
     present: LiftedModel  #: the lift that was in use; its time unit is that of the drift
     model_file: str = ''  #: where the lift was written, or an empty string
 
@@ -78,26 +95,34 @@ class Retrained:
 
     def summary(self) -> dict[str, object]:
         """Return the figures by name, for a JSON file; None is an error that is infinite."""
-        drift = self.found.drift
+        states, inputs = self.present.states, self.present.inputs
+        gains = self.found.drift.input_matrix / self.present.seconds_per_time_unit
+
+        def by_state(values: Array) -> dict[str, float | None]:
+            return {name: float(value) if np.isfinite(value) else None
+                    for name, value in zip(states.names, values, strict=True)}
+
         figures: dict[str, object] = {
             'accepted': self.accepted,
             'reasons': list(self.reasons),
             'warnings': list(self.decision.warnings) if self.decision else [],
             'model_file': self.model_file,
+            'units': dict(zip((*states.names, *inputs.names), (*states.units, *inputs.units),
+                              strict=True)),
             'measurements_read': self.account.measurements,
             'measurements_used': self.account.used,
-            'coverage': self.coverage,
+            'coverage': {', '.join(pair): share for pair, share in self.coverage.items()},
             'derivative_method': self.found.method,
-            'drift_degree': drift.degree,
-            'input_gain_per_minute': (float(drift.input_matrix[0, 0])
-                                      * 60.0 / self.present.seconds_per_time_unit),
-            'noise_kelvin': float(self.found.noise[0]),
+            'drift_degree': self.found.drift.degree,
+            'input_gain': {name: dict(zip(inputs.names, map(float, row), strict=True))
+                           for name, row in zip(states.names, gains, strict=True)},
+            'noise': by_state(self.found.noise),
         }
         if self.decision and self.trained:
             figures |= {
-                'heldout_error_kelvin': float(self.decision.rmse[0]),
-                'heldout_error_of_present_lift_kelvin': float(self.decision.current_rmse[0]),
-                'heldout_error_of_linear_model_kelvin': float(self.decision.linear_rmse[0]),
+                'heldout_error': by_state(self.decision.rmse),
+                'heldout_error_of_present_lift': by_state(self.decision.current_rmse),
+                'heldout_error_of_linear_model': by_state(self.decision.linear_rmse),
                 'heldout_rw': self.trained.figures.fit.rw,
                 'heldout_rx': self.trained.figures.fit.rx,
                 'condition': self.trained.figures.fit.cond,
@@ -124,22 +149,21 @@ def retrain(task: Task, on_progress: OnProgress = lambda *_: False) -> Retrained
     if Path(task.output).suffix != '.safetensors':
         raise ValueError(f'output = {task.output!r} must end in .safetensors')
     current = load(task.model)
-    _check_signals(current, task.model)
+    states = _in_order(task.states, current.states, 'state', task.model)
+    inputs = _in_order(task.inputs, current.inputs, 'input', task.model)
+    B = _known_gain(task, current)
     # a folder that cannot be written should fail now, not after the training
     Path(task.output).parent.mkdir(parents=True, exist_ok=True)
     _stop_if(on_progress(0.0, 'reading bags'))
-    (x,), (x_unit,) = current.states.names, current.states.units
-    (u,), (u_unit,) = current.inputs.names, current.inputs.units
     recorded, account = loop_episodes(
-        task.bags, [RecordedState(x, x_unit, place(task.temperature_topic, x, x_unit))],
-        [RecordedInput(u, u_unit, place(task.coolant_topic, u, u_unit), delay=task.input_delay)])
+        task.bags, states, inputs, tolerance_ns=round(task.tolerance * NANOSECONDS),
+        least_jumps=(_LEAST_JUMP * current.states.scale).tolist())
     if not recorded:
         raise ValueError('the bags hold no usable segment of measurements: '
                          + '; '.join(account.lines()))
     seconds = current.seconds_per_time_unit
     episodes = [replace(episode, time=episode.time / seconds,
                         input_time=episode.input_time / seconds) for episode in recorded]
-    B = np.array([[task.input_gain * seconds / 60.0]]) if task.input_gain else None
     found = identify(
         replace(current.plant, B=B), episodes, seed=task.seed,
         watch=lambda done, total, text: on_progress(
@@ -157,7 +181,8 @@ def retrain(task: Task, on_progress: OnProgress = lambda *_: False) -> Retrained
     _stop_if(on_progress(_at('decide', 0.0), 'judging'))
     decision = decide(found, trained, current, thresholds)
     _stop_if(on_progress(_at('decide', 0.9), 'writing'))
-    model = _with_provenance(trained.model, found, decision, bare.coverage, episodes)
+    model = _with_provenance(trained.model, found, decision, min(bare.coverage.values()),
+                             episodes)
     path = _place(Path(task.output), decision.accepted)
     save(model, path)
     return replace(bare, trained=replace(trained, model=model), decision=decision,
@@ -174,21 +199,52 @@ def visited_cells(episodes: Sequence[Episode], box: Box) -> NDArray[np.int64]:
     return np.unique(np.concatenate(found), axis=0)
 
 
-def coverage(episodes: Sequence[Episode], box: Box) -> float:
-    """Return the share of the cells of the box that are visited."""
+def coverage(episodes: Sequence[Episode], box: Box) -> dict[tuple[str, str], float]:
+    """
+    Return the share of the cells of two signals' ranges that are visited, for all pairs.
+
+    Not of all signals at once: an hour of samples cannot fill the cells of six.
+    """
     cells = visited_cells(episodes, box)
-    return len(cells) / float(CELLS) ** cells.shape[1]
+    names = enumerate((*box.states.names, *box.inputs.names))
+    return {(first, second): len(np.unique(cells[:, [i, j]], axis=0)) / CELLS ** 2
+            for (i, first), (j, second) in itertools.combinations(names, 2)}
 
 
-def _check_signals(model: LiftedModel, path: str) -> None:
-    if (model.n_x, model.n_u) == (1, 1):
-        return
-    states, inputs = (
-        ', '.join(f'{name} [{unit}]' for name, unit in zip(a.names, a.units, strict=True))
-        for a in (model.states, model.inputs))
-    raise ValueError(
-        f'the present lift {path} has {states} as states and {inputs} as inputs, bags of the '
-        'loop hold one of each: name a lift of these')
+_Signal = TypeVar('_Signal', RecordedState, RecordedInput)
+
+
+def _in_order(given: Sequence[_Signal], wanted: Coordinates, kind: str, path: str
+              ) -> list[_Signal]:
+    """Return signals in the order of a lift; ValueError where they are not the same."""
+    by_name = {signal.name: signal for signal in given}
+    found = {(signal.name, signal.unit) for signal in given}
+    if len(by_name) != len(given) or found != set(zip(wanted.names, wanted.units, strict=True)):
+        said, needed = (
+            ', '.join(f'{name} [{unit}]' for name, unit in pairs) or 'none'
+            for pairs in (((s.name, s.unit) for s in given),
+                          zip(wanted.names, wanted.units, strict=True)))
+        raise ValueError(f'the present lift {path} has the {kind}s {needed}, the task has {said}: '
+                         'give the same names and units, each once')
+    return [by_name[name] for name in wanted.names]
+
+
+def _known_gain(task: Task, model: LiftedModel) -> Array | None:
+    """Return B (n_x, n_u) of a task per time unit of a model, None to learn it."""
+    if not task.input_gain:
+        return None
+    B = np.zeros((model.n_x, model.n_u))
+    for state, row in task.input_gain.items():
+        for name, gain in row.items():
+            if state not in model.states.names or name not in model.inputs.names:
+                raise ValueError(
+                    f'input_gain names {name} acting on {state}: the present lift has the states '
+                    f'{", ".join(model.states.names)} and the inputs '
+                    f'{", ".join(model.inputs.names)}')
+            if not math.isfinite(gain):
+                raise ValueError(f'input_gain of {name} on {state} is {gain}, must be finite')
+            B[model.states.names.index(state), model.inputs.names.index(name)] = gain
+    return B * model.seconds_per_time_unit
 
 
 def _at(stage: str, share: float) -> float:
@@ -212,8 +268,12 @@ def _with_provenance(model: LiftedModel, found: Identified, decision: Decision, 
     for episode in episodes:
         for array in (episode.time, episode.x, episode.input_time, episode.u):
             sha.update(np.ascontiguousarray(array).astype('<f8').tobytes())
-    metrics = {**model.provenance.metrics, 'rollout_rmse': float(decision.rmse[0]),
-               'noise': float(decision.noise[0]), 'coverage': covered}
+        sha.update(bytes(episode.linear))
+    metrics = {**model.provenance.metrics, 'coverage': covered}
+    for label, values in (('rollout_rmse', decision.rmse), ('noise', decision.noise)):
+        labels = [label] if len(values) == 1 else [
+            f'{label}_{name}' for name in model.states.names]
+        metrics |= dict(zip(labels, map(float, values), strict=True))
     # a refused lift may diverge
     metrics = {name: value for name, value in metrics.items() if np.isfinite(value)}
     return replace(model, provenance=replace(

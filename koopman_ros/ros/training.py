@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 from std_srvs.srv import Trigger
 
-from koopman_ros.jobs.training import JobState, RetrainingJob
+from koopman_ros.jobs.training import JobState, RetrainingJob, scalars
 from koopman_ros.parameters.trainer import TrainerParameters
 from koopman_ros.parameters.wire import Wiring
 from koopman_ros.resources import model_path
@@ -158,9 +158,7 @@ class Training:
         state = self._state
         if state is None:
             return Status(Level.OK, 'not training')
-        values = {'done [%]': 100.0 * state.share, **{
-            key: value for key, value in (state.summary or {}).items()
-            if isinstance(value, (bool, int, float, str))}}
+        values = {'done [%]': 100.0 * state.share, **scalars(state.summary or {})}
         if not state.ended or state.accepted:
             # the sentence stays while the figures move, or there would be a status a step
             text = state.text if state.ended else state.text.split(',')[0]

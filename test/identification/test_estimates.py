@@ -9,6 +9,7 @@ Exact derivatives and recovery, order of the quadrature, what noise does, and wh
 
 import numpy as np
 import pytest
+from scipy.integrate import quad
 from scipy.stats import chi2
 import torch
 
@@ -23,10 +24,10 @@ from koopman_ros.identification import (
     weak_form,
 )
 from koopman_ros.identification.output_error import _Problem
-from koopman_ros.identification.regression import smoothed
+from koopman_ros.identification.regression import _input_integral, smoothed
 from koopman_ros.learning.levenberg_marquardt import normal_equations
 from koopman_ros.plant_data import cut, Episode
-from support.known_plants import CUBIC, PAIR
+from support.known_plants import box, CUBIC, PAIR
 
 NOISE = 0.02
 
@@ -266,3 +267,16 @@ def test_too_short(call, words):
     record = CUBIC.excited(30, 0.1)
     with pytest.raises(ValueError, match=words):
         call(record, box_of(CUBIC.plant, [record]))
+
+
+@pytest.mark.parametrize('linear', [False, True])
+def test_weak_form_integrates_inputs_exactly(linear):
+    episode = Episode(np.array([0.0, 1.0, 4.0]), np.zeros((3, 1)), np.array([-1.0, 0.7, 1.9, 5.0]),
+                      np.array([[1.0], [-2.0], [4.0], [0.5]]), (linear,) if linear else ())
+    unit = box([-1.0], [1.0], [-1.0], [1.0])
+
+    def integrand(t):
+        return (1.0 - ((t - 2.0) / 2.0) ** 2) ** 3 * episode.inputs_at(np.array([t]))[0, 0]
+
+    expected, _ = quad(integrand, 0.0, 4.0, points=[0.7, 1.9], epsabs=1e-13)
+    assert _input_integral(episode, unit, 2.0, 2.0) == pytest.approx([expected], abs=1e-12)

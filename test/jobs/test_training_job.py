@@ -4,6 +4,7 @@
 """The process that retrains, as its parent sees it."""
 
 from collections.abc import Iterator
+from dataclasses import asdict
 import itertools
 import os
 from pathlib import Path
@@ -18,7 +19,7 @@ from koopman_ros.jobs import training
 from koopman_ros.jobs.training import JobState, RetrainingJob
 from koopman_ros.resources import model_path
 from support.nodes import TIMEOUT, wait_until_ended
-from support.recorded_runs import driven, reactor, write_bag
+from support.recorded_runs import driven, INPUTS, reactor, STATES, write_bag
 
 
 @pytest.fixture(scope='module')
@@ -29,7 +30,8 @@ def bag(tmp_path_factory: pytest.TempPathFactory) -> Path:
 @pytest.fixture
 def task(bag: Path, tmp_path: Path) -> dict[str, object]:
     return {'bags': [str(bag)], 'output': str(tmp_path / 'new.safetensors'),
-            'model': str(model_path('reactor_nz4')), 'coordinates': 2, 'starts': 1}
+            'model': str(model_path('reactor_nz4')), 'coordinates': 2, 'starts': 1,
+            'states': list(map(asdict, STATES)), 'inputs': list(map(asdict, INPUTS))}
 
 
 def follow(job: RetrainingJob) -> Iterator[JobState]:
@@ -124,3 +126,18 @@ def test_process_that_does_not_end_is_killed(monkeypatch: pytest.MonkeyPatch) ->
     job.close()
     assert job._process.returncode == -signal.SIGKILL
     assert job.poll().text == 'cancelled, nothing was written'
+
+
+def test_figures_of_signals_are_told_one_by_one() -> None:
+    assert training.scalars({
+        'accepted': True, 'reasons': ['no'], 'noise': {'low': 0.5, 'high': None},
+        'input_gain': {'low': {'pump': 2.0}}}) == {
+            'accepted': True, 'noise: low': 0.5, 'input_gain: low: pump': 2.0}
+    errors = {'low': 0.25, 'high': 3.0}
+    summary = {'accepted': True, 'model_file': 'new', 'units': {'low': 'm', 'high': 'Pa'},
+               'heldout_error': errors, 'heldout_error_of_present_lift': {**errors, 'low': 1.0}}
+    words = ('the new lift is accepted: error on held-out records 0.25 m in low, 3 Pa in high, '
+             'that of the present one {}; written to new')
+    assert training._in_words(summary) == words.format('1 m in low, 3 Pa in high')
+    summary['heldout_error_of_present_lift'] = {**errors, 'low': None}
+    assert training._in_words(summary) == words.format('infinite, as it diverges')

@@ -128,12 +128,14 @@ def test_trains_beside_the_running_loop(ros: Harness, tmp_path: Path) -> None:
     status = ros.wait_for_status(STATUS, lambda status: status.message.startswith('the new lift'))
     figures = json.loads((tmp_path / 'new.json').read_text())
     assert value(status, 'done [%]') == '100'
-    assert float(value(status, 'noise_kelvin')) == pytest.approx(figures['noise_kelvin'])
-    assert figures['noise_kelvin'] == pytest.approx(0.1, rel=0.2)
+    noise = figures['noise']['temperature']
+    assert float(value(status, 'noise: temperature')) == pytest.approx(noise)
+    assert noise == pytest.approx(0.1, rel=0.2)
     assert figures['measurements_used'] > 250
     assert 'was not closed or is damaged' in (tmp_path / 'new.md').read_text()
     # the benchmark's 2.092 1/min are of 5e4 J/(min K)
-    assert figures['input_gain_per_minute'] == pytest.approx(0.8 * 2.0921, rel=0.15)
+    gain = 60.0 * figures['input_gain']['temperature']['coolant_temperature']
+    assert gain == pytest.approx(0.8 * 2.0921, rel=0.15)
     assert (status.level, figures['accepted']) == (DiagnosticStatus.WARN, False)
     assert status.message.startswith('the new lift is refused: ')
     assert not (tmp_path / 'new.safetensors').exists()

@@ -23,7 +23,13 @@ from koopman_ros.plant_data import Episode
 from koopman_ros.plants import two_state_reactor
 from koopman_ros.resources import model_path
 from koopman_ros.retraining import decide, learn_lift, Thresholds
-from koopman_ros.retraining.lift import _spread, drift_samples, lifted_rate, steady_point
+from koopman_ros.retraining.lift import (
+    _closed_loops,
+    _spread,
+    drift_samples,
+    lifted_rate,
+    steady_point,
+)
 from support.known_plants import box, methods
 from support.random_lifts import random_lift
 from support.recorded_runs import driven, NOISE, reactor
@@ -178,6 +184,21 @@ def test_warns_of_a_state_that_is_not_measured(trained, shipped):
     assert warning not in decision.reasons
 
 
+def test_loops_of_more_states_than_inputs_go_where_an_input_holds_them():
+    """dx1/dt = -x1 + x2, dx2/dt = -x2 + u stands still where x1 = x2, off its box's diagonal."""
+    wide = box([-1.0, -4.0], [1.0, 4.0], [-4.0], [4.0])
+    A, B = np.array([[-1.0, 1.0], [0.0, -1.0]]), np.array([[0.0], [1.0]])
+    model = linearised_model(A, B, wide.states, wide.inputs, 's', Provenance('cascade'))
+    coefficients = np.zeros((3, 2))
+    drift = DriftModel(wide, 1, coefficients, wide.input_matrix(B))
+    for monomial, value in ((np.array([0.5, 0.0]), 0), (np.array([0.0, 0.5]), 1)):
+        row = int(np.argmax(drift.features(monomial)[1:])) + 1
+        coefficients[row] = A[:, value] * wide.states.scale[value] / wide.states.scale
+    probe = np.array([0.5, -2.0])
+    assert drift.rate(probe, np.array([0.7])) == pytest.approx(A @ probe + 0.7 * B[:, 0])
+    assert _closed_loops(model, drift) == (9, 9)
+
+
 # The steady point and the samples of a drift.
 
 BOX = box([-1.0], [3.0], [-2.0], [2.0])
@@ -291,3 +312,6 @@ def test_samples_fill_the_range_and_few_are_all_kept():
     assert counts.max() <= 1000
     xi = np.random.default_rng(0).uniform(-1.0, 1.0, (300, 2))
     assert np.array_equal(_spread(xi), np.arange(300))
+    # of four states nearly every sample has a cell of its own
+    kept = _spread(np.random.default_rng(0).uniform(-1.0, 1.0, (5000, 4)))
+    assert 1000 < len(kept) <= 2000

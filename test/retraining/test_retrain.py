@@ -20,7 +20,15 @@ from koopman_ros.retraining import retrain, Task, write_report
 from koopman_ros.retraining import task as task_module
 from support.known_plants import box, methods
 from support.random_lifts import random_lift
-from support.recorded_runs import driven, linear_run, NOISE, reactor, write_bag
+from support.recorded_runs import (
+    driven,
+    INPUTS,
+    linear_run,
+    NOISE,
+    reactor,
+    STATES,
+    write_bag,
+)
 
 SHIPPED = str(model_path('reactor_nz4'))
 
@@ -41,7 +49,8 @@ def few_methods():
 
 
 def small(bag, output, present=SHIPPED, **others):
-    return Task((str(bag),), str(output), str(present), coordinates=2, starts=1, **others)
+    return Task((str(bag),), str(output), str(present), STATES, INPUTS, coordinates=2, starts=1,
+                **others)
 
 
 @pytest.fixture(scope='module')
@@ -85,8 +94,9 @@ def test_file_says_where_it_comes_from(accepted):
     assert origin.method == f'{found.method}, drift of degree {found.drift.degree}'
     assert origin.metrics['noise'] == float(found.noise[0]) == pytest.approx(NOISE, rel=0.1)
     assert origin.metrics['rollout_rmse'] == float(retrained.decision.rmse[0])
-    assert origin.metrics['coverage'] == retrained.coverage
-    assert 0.2 < retrained.coverage < 1.0
+    assert {('temperature', 'coolant_temperature'): origin.metrics['coverage']} == (
+        retrained.coverage)
+    assert 0.2 < origin.metrics['coverage'] < 1.0
     assert {'rw', 'rx', 'cond'} < set(origin.metrics)
 
 
@@ -129,17 +139,18 @@ def test_report(accepted):
     assert figures['accepted'] is True
     assert figures['measurements_used'] == figures['measurements_read'] == 1201
     # UA is 0.8 of 2.092 1/min
-    assert figures['input_gain_per_minute'] == pytest.approx(0.8 * 2.0921, rel=0.02)
+    gain = figures['input_gain']['temperature']['coolant_temperature']
+    assert 60.0 * gain == pytest.approx(0.8 * 2.0921, rel=0.02)
     page = files[1].read_text()
     for words in ('**The new lift is accepted.**', '1201 of 1201 measurements used',
-                  f'| the present lift | {retrained.decision.current_rmse[0]:.5f} |',
+                  f'| the present lift | {retrained.decision.current_rmse[0]:.5g} |',
                   '![Data, drift and prediction](new.png)'):
         assert words in page
     assert files[2].read_bytes().startswith(b'\x89PNG')
     diverging = replace(retrained, decision=replace(
         retrained.decision, current_rmse=np.array([np.inf])))
     figures = json.loads(json.dumps(diverging.summary(), allow_nan=False))
-    assert figures['heldout_error_of_present_lift_kelvin'] is None
+    assert figures['heldout_error_of_present_lift'] == {'temperature': None}
 
 
 @pytest.mark.usefixtures('learned')
@@ -167,11 +178,12 @@ def test_previous_model_is_copied_where_there_are_no_hard_links(tmp_path, monkey
 
 
 def test_a_linear_plant_of_known_gain_needs_no_lift(tmp_path):
-    """The gain is given in 1/min whatever the time unit of the present lift, here seconds."""
+    """The gain is given in 1/s whatever the time unit of the present lift, here seconds."""
     bag = write_bag(tmp_path / 'linear.mcap', linear_run(200))
     present, seconds = load(SHIPPED), tmp_path / 'seconds.safetensors'
     save(replace(present, A=present.A / 60.0, B=present.B / 60.0, time_unit='s'), seconds)
-    retrained = retrain(small(bag, tmp_path / 'new.safetensors', seconds, input_gain=1.0))
+    gain = {'temperature': {'coolant_temperature': 1.0 / 60.0}}
+    retrained = retrain(small(bag, tmp_path / 'new.safetensors', seconds, input_gain=gain))
     (reason,) = retrained.reasons
     assert 'does not predict the motion better than a linear model' in reason
     assert (retrained.trained, retrained.decision, retrained.model_file) == (None, None, '')
@@ -179,7 +191,8 @@ def test_a_linear_plant_of_known_gain_needs_no_lift(tmp_path):
     # dT/dt = -(T - 315) / 2 + (Tc - 288), in minutes
     assert retrained.found.drift.degree == 1
     assert retrained.found.drift.input_matrix == pytest.approx(np.array([[1.0 / 60.0]]), rel=1e-12)
-    assert retrained.summary()['input_gain_per_minute'] == pytest.approx(1.0, rel=1e-12)
+    assert retrained.summary()['input_gain'] == {
+        'temperature': {'coolant_temperature': pytest.approx(1.0 / 60.0, rel=1e-12)}}
     files = write_report(retrained)
     assert '**The new lift is refused.**' in files[1].read_text()
     assert json.loads(files[0].read_text())['accepted'] is False
@@ -204,23 +217,37 @@ def test_stops_at_any_stage_and_writes_nothing(bag, tmp_path, request, stage, do
 
 
 def test_a_task_survives_json():
-    task = Task(('a', 'b'), 'new.safetensors', 'x.safetensors', seed=3, input_gain=2.1)
+    task = Task(('a', 'b'), 'new.safetensors', 'x.safetensors', STATES,
+                (*INPUTS, replace(INPUTS[0], name='other', measured=None, delay=2.5)), seed=3,
+                input_gain={'temperature': {'other': 2.1}})
     assert Task.from_json(json.dumps(asdict(task))) == task
     with pytest.raises(TypeError, match='nonsense'):
-        Task.from_json('{"bags": [], "output": "", "model": "", "nonsense": 1}')
+        Task.from_json(json.dumps({**asdict(task), 'nonsense': 1}))
+    with pytest.raises(TypeError, match='nonsense'):
+        Task.from_json(json.dumps({**asdict(task), 'states': [
+            {**asdict(STATES[0]), 'nonsense': 1}]}))
 
 
 @pytest.mark.parametrize(('values', 'error', 'words'), [
     ({'model': '/nowhere/x.safetensors'}, ModelFileError, 'no model file at /nowhere/x.safetens'),
     ({'model': '/dev/zero'}, ModelFileError, '/dev/zero: it is a device, not a regular file'),
-    ({'model': 'two.safetensors'}, ValueError, r'x0 \[K\], x1 \[K\] as states and u0 \[K\] as '
-     'inputs, bags of the loop hold one of each: name a lift'),
+    ({'model': 'two.safetensors'}, ValueError, r'has the states x0 \[K\], x1 \[K\], the task has '
+     r'temperature \[K\]: give the same'),
+    ({'inputs': (replace(INPUTS[0], unit='degC'),)}, ValueError, r'inputs coolant_temperature '
+     r'\[K\], the task has coolant_temperature \[degC\]'),
+    ({'states': STATES * 2}, ValueError, r'has temperature \[K\], temperature \[K\]: give'),
+    ({'states': ()}, ValueError, 'the task has none'),
+    ({'input_gain': {'temperature': {'valve': 1.0}}}, ValueError,
+     'input_gain names valve acting on temperature'),
+    ({'input_gain': {'temperature': {'coolant_temperature': float('nan')}}}, ValueError,
+     'is nan, must be finite'),
     ({'output': 'new.bin'}, ValueError, "output = 'new.bin' must end in .safetensors"),
     ({'output': 'file/new.safetensors'}, OSError, 'file'),
     ({'bags': ('/nowhere/run.mcap',)}, BagReadError, '/nowhere/run.mcap'),
     ({'bags': ('short.mcap',)}, ValueError, 'no usable segment of measurements: 0 of 9 '
      'measurements used; 9 dropped: too short'),
-    ({'temperature_topic': '/other'}, BagReadError, "has no topic '/other', it has /coolant_se"),
+    ({'states': (replace(STATES[0], place=replace(STATES[0].place, topic='/other')),)},
+     BagReadError, "has no topic '/other', it has /coolant_se"),
     ({'margin': 2.0}, ValueError, 'margin = 2.0'),
 ])
 def test_what_does_not_fit_is_said_at_once(bag, tmp_path, monkeypatch, values, error, words):
@@ -229,7 +256,7 @@ def test_what_does_not_fit_is_said_at_once(bag, tmp_path, monkeypatch, values, e
     save(random_lift(), tmp_path / 'two.safetensors')
     write_bag(tmp_path / 'short.mcap', linear_run(9))
     with pytest.raises(error, match=words):
-        retrain(replace(Task((str(bag),), 'new.safetensors', SHIPPED), **values))
+        retrain(replace(Task((str(bag),), 'new.safetensors', SHIPPED, STATES, INPUTS), **values))
 
 
 BOX = box([0.0], [10.0], [100.0], [200.0])
@@ -256,5 +283,9 @@ TWO_STATES = Episode(np.arange(2.0), np.array([[0.05, 0.95], [0.55, 0.45]]), np.
     ([TWO_STATES], box([0.0, 0.0], [1.0, 1.0], [0.0], [1.0]), [[0, 9, 3], [5, 4, 3]])])
 def test_visited_cells_and_their_share_of_all(episodes, within, cells):
     assert task_module.visited_cells(episodes, within).tolist() == cells
-    share = len(cells) / 10.0 ** len(cells[0])
-    assert task_module.coverage(episodes, within) == pytest.approx(share)
+    shares = task_module.coverage(episodes, within)
+    if len(cells[0]) == 2:
+        assert shares == {('x1', 'u1'): pytest.approx(len(cells) / 100.0)}
+    else:
+        # no two of these cells share a pair of states, or of a state and the input
+        assert shares == dict.fromkeys([('x1', 'x2'), ('x1', 'u1'), ('x2', 'u1')], 0.02)

@@ -13,7 +13,7 @@ import warnings
 import numpy as np
 
 from koopman_ros import plants
-from koopman_ros.bags import BagWriter, message_definition
+from koopman_ros.bags import BagWriter, message_definition, RecordedInput, RecordedState
 from koopman_ros.control import Controller, Settings, State
 from koopman_ros.control.events import apply, Event, Measurement, Outcome, Silence
 from koopman_ros.lifting import load_with_digest
@@ -24,9 +24,14 @@ from koopman_ros.replay import records
 from koopman_ros.resources import model_path
 from koopman_ros.units import NANOSECONDS as SECOND
 from koopman_ros.units import to_celsius
+from koopman_ros.wire import place
 from support.disturbance import disturbed
 
 NOISE = 0.1  # K
+# of the reactor, as a task names them
+STATES = (RecordedState('temperature', 'K', place('/temperature', '', 'K')),)
+INPUTS = (RecordedInput('coolant_temperature', 'K', place('/coolant_setpoint', '', 'K'),
+                        place('/coolant_temperature', '', 'K')),)
 
 
 @dataclass(frozen=True)
