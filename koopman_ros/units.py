@@ -42,6 +42,8 @@ class Conversion:
 # What each node needs at its start, without the registry.
 _AT_HAND = {('K', 'degC'): Conversion(offset=-ZERO_CELSIUS),
             ('degC', 'K'): Conversion(offset=ZERO_CELSIUS)}
+# Likewise: units that there are.
+_USUAL = {'K', 'degC', 'Pa', 'm', 'm/s', 'rad', 'rad/s', 'N', 'N m', 'V', 'W', 'mol/L', '1'}
 
 
 @cache
@@ -55,9 +57,7 @@ def conversion(unit: str, wanted: str) -> Conversion:
         return Conversion()
     if (unit, wanted) in _AT_HAND:
         return _AT_HAND[unit, wanted]
-    # in here: the registry takes 0.4 s
-    import pint
-
+    # not before: it takes 0.4 s
     registry = _registry()
     try:
         offset = float(registry.Quantity(0.0, unit).to(wanted).magnitude)
@@ -67,9 +67,23 @@ def conversion(unit: str, wanted: str) -> Conversion:
             source = registry.Quantity(1.0, unit) - registry.Quantity(0.0, unit)
             target = registry.Quantity(1.0, wanted) - registry.Quantity(0.0, wanted)
             factor = float((source / target).to('dimensionless').magnitude)
-    except (pint.UndefinedUnitError, pint.DimensionalityError, AttributeError) as error:
-        raise ValueError(f'{unit!r} cannot be converted to {wanted!r}: {error}') from error
+    # its parser fails in many ways, also by assertions
+    except Exception as error:
+        why = ' '.join(str(error).split()) or 'one of them is no unit'
+        raise ValueError(f'{unit!r} cannot be converted to {wanted!r}: {why}') from error
     return Conversion(factor, offset)
+
+
+def check_unit(unit: str) -> None:
+    """Raise ValueError for a unit that there is not."""
+    if unit in _USUAL:
+        return
+    try:
+        _registry().Quantity(1.0, unit)
+    # as above
+    except Exception as error:
+        raise ValueError(f'there is no unit {unit!r}: write one like K, m/s, L/min or N m, or 1 '
+                         'for none') from error
 
 
 def display_unit(unit: str) -> str:

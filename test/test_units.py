@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from koopman_ros.reasons import Code, reason, Words
-from koopman_ros.units import Conversion, conversion, Display, Displays
+from koopman_ros.units import check_unit, Conversion, conversion, Display, Displays
 
 
 @pytest.mark.parametrize(('unit', 'wanted', 'value', 'converted'), [
@@ -69,3 +69,11 @@ def test_every_code_has_its_words() -> None:
         Code.OUTSIDE_SENSOR, signal='T', value=473.15, lower=273.15, upper=373.15))) == (
             'the measured T 200.00 degC is outside the range of the sensor, 0.00 degC to '
             '100.00 degC: check it; held for longer than 60 s')
+
+
+@pytest.mark.parametrize('unit', ['Kelvin', 'l/mn', 'm/', 'metre metre2'])
+def test_unit_that_there_is_not_is_named(unit):
+    with pytest.raises(ValueError, match=f"there is no unit '{unit}': write one like K"):
+        check_unit(unit)
+    for one in ('K', 'L/min', 'N m', '%', '1', 'm^3/s'):
+        check_unit(one)

@@ -5,8 +5,12 @@
 
 from types import SimpleNamespace
 
+import numpy as np
 import pytest
 
+from koopman_ros.parameters.table import ConfigurationError
+from koopman_ros.parameters.trainer import trainer_signals, trainer_table
+from koopman_ros.parameters.wire import named_units, Signals
 from koopman_ros.wire import Place, place, stem
 
 
@@ -67,3 +71,35 @@ def test_rest_of_a_place_follows_from_what_is_said(unit, given, expected):
 def test_commands_are_named_after_what_is_commanded():
     assert stem('coolant_temperature', 'K') == 'coolant'
     assert stem('flow', 'm^3/s') == 'flow'
+
+
+def test_signals_have_names_of_topics_and_units_that_there_are():
+    with pytest.raises(ConfigurationError, match="'my level' is a signal, which topics"):
+        Signals({'my level': 'm'}, {})
+    with pytest.raises(ConfigurationError, match=r"'level \[Metre\]': there is no unit 'Metre'"):
+        named_units(['level [Metre]'])
+    assert named_units(['level [m]', 'flow [L/min]']) == {'level': 'm', 'flow': 'L/min'}
+
+
+def test_bounds_of_an_experiment_are_asked_for_by_name():
+    given = {'system': '', 'states_measured': ('level [m]', 'oven [K]'),
+             'inputs_commanded': ('flow [L/min]',), 'controlled': ('level',)}
+    table, signals = trainer_table(None, given), trainer_signals(None, given)
+    bounds = {'level.experiment_max': 2.0, 'oven.experiment_min': 20.0,
+              'oven.experiment_max': 90.0}
+    values = table.snapshot(bounds)
+    # a trainer that only records needs none
+    assert table.check(values) == ''
+    with pytest.raises(ValueError, match=(
+            r'give flow.experiment_min \[L/min\], flow.experiment_max \[L/min\], '
+            r'level.experiment_min \[m\]$')):
+        values.experiment(signals)
+    given = bounds | {'flow.experiment_max': 8.0, 'level.experiment_min': 0.1}
+    assert table.snapshot(given).experiment(signals).measured_lower.tolist() == [0.1, 293.15]
+    with pytest.raises(ValueError, match=r'level.setpoint_min \[m\], level.setpoint_max \[m\]$'):
+        table.snapshot(given).experiment(signals, np.array([1.0]))
+
+
+def test_trainer_that_knows_no_signals_says_how_to_name_them():
+    with pytest.raises(ConfigurationError, match=r"system 'oven': give .* like \['level \[m\]'\]"):
+        trainer_table(None, {'system': 'oven'})

@@ -17,7 +17,7 @@ from std_srvs.srv import Trigger
 from koopman_ros import plants
 from koopman_ros.arrays import Array
 from koopman_ros.parameters.plant import PlantParameters, PlantTable
-from koopman_ros.parameters.wire import PLANT_KINDS, Wiring
+from koopman_ros.parameters.wire import PLANT_KINDS, SIGNALS, Wiring
 from koopman_ros.ros import topics
 from koopman_ros.ros.codec import stamp_message
 from koopman_ros.ros.managed import ManagedNode
@@ -49,7 +49,8 @@ class PlantNode(ManagedNode):
     def __init__(self) -> None:
         super().__init__('plant')
         self._table = table = PlantTable(self.given())
-        self._settings = self.declare_table(table)
+        # in the file of a whole loop; a plant has its own
+        self._settings = self.declare_table(table, SIGNALS)
 
     def configure(self) -> None:
         """Build the plant at its initial state, and what publishes it."""

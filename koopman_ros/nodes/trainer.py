@@ -14,13 +14,14 @@ from koopman_ros.parameters.trainer import (
     trainer_table,
     TrainerParameters,
 )
-from koopman_ros.parameters.wire import preset, Wiring
+from koopman_ros.parameters.wire import preset, SIGNALS, Wiring
 from koopman_ros.resources import model_path
 from koopman_ros.ros import topics
 from koopman_ros.ros.experiment import PlantExperiment
 from koopman_ros.ros.managed import ManagedNode
 from koopman_ros.ros.process import run
 from koopman_ros.ros.recording import Recording
+from koopman_ros.ros.signals import by_topic
 from koopman_ros.ros.training import Training
 
 
@@ -45,9 +46,11 @@ class TrainerNode(ManagedNode):
         if reason := topics.unusable(self, settings.topics):
             raise ConfigurationError(reason)
         signals = trainer_signals(present, {
-            name: getattr(settings, name)
-            for name in ('states_measured', 'inputs_commanded', 'controlled')})
+            name: getattr(settings, name) for name in SIGNALS})
         wiring = Wiring(signals, settings.states, settings.inputs)
+        for kind in wiring.kinds:
+            # what is in none of its messages is refused now, and not when a bag holds nothing
+            list(by_topic(getattr(wiring, kind)))
         self._recording = Recording(self, settings, wiring)
         self._experiment = PlantExperiment(self, settings, wiring)
         self._training = Training(

@@ -89,6 +89,11 @@ class ControllerParameters:
         'here; any other name for none', read_only=True)
     model: str = parameter(
         '', 'name of a shipped model, or path of a .safetensors model file')
+    states_measured: tuple[str, ...] = parameter(
+        ('',), 'measured signals with their units, e.g. level [m], which the model must have; an '
+        'empty name for those that it has', read_only=True)
+    inputs_commanded: tuple[str, ...] = parameter(
+        ('',), 'inputs with their units, likewise', read_only=True)
     controlled: tuple[str, ...] = parameter(
         ('',), 'measured signals that have a set-point, at most as many as there are inputs; an '
         'empty name for all', read_only=True)
@@ -195,14 +200,16 @@ def table_of(model: LiftedModel, given: Mapping[str, Any] = MappingProxyType({})
 
     Its training box and scaling are the defaults, unless the preset of a plant says otherwise.
 
-    :param given: what is known of the values already, of which `system` and `controlled` count.
-    :raises ConfigurationError: for a preset that does not fit the model.
+    :param given: what is known of the values already, of which system and signals count.
+    :raises ConfigurationError: for signals, given or of a preset, that the model has not.
     """
     system = str(given.get('system', _DEFAULT_SYSTEM))
     own = preset(system, 'controller')
-    if own and (found := signals_of(model)) != (expected := Signals(
-            named_units(own['states_measured']), named_units(own['inputs_commanded']),
-            found.controlled)):
+    found = signals_of(model)
+    named = [named_units(tuple(filter(None, given.get(kind, ()))) or own.get(kind, ()))
+             for kind in ('states_measured', 'inputs_commanded')]
+    if (expected := Signals(named[0] or found.states, named[1] or found.inputs)) != Signals(
+            found.states, found.inputs):
         raise ConfigurationError(
             f'the model has {found}, the system {system!r} has {expected}: choose a model of that '
             'system, or name in system what the model is of (an empty name: none that is shipped)')

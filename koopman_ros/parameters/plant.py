@@ -38,7 +38,7 @@ from koopman_ros.plants import (
     plant_class,
 )
 from koopman_ros.plants.simulation import integration_limits
-from koopman_ros.units import conversion, display_unit, LAST_STAMP_SECONDS
+from koopman_ros.units import check_unit, conversion, display_unit, LAST_STAMP_SECONDS
 
 _UNBOUNDED = 1e9  # what stands for no bound, in any unit
 
@@ -129,6 +129,8 @@ class PlantTable(ParameterTable[PlantParameters]):
         try:
             self.plant = plant_class(system)
             reference = build(self.plant, {})
+            for unit in (*reference.state_units, *reference.input_units):
+                check_unit(unit)
         except ValueError as error:
             raise ConfigurationError(f'system = {system!r}: {error}') from error
         self.described = signals = Signals(

@@ -155,6 +155,9 @@ class TrainerParameters:
         :param setpoints: (n_c,) to come back to, for one that steps these; None steps the inputs.
         """
         on_setpoints = setpoints is not None
+        if missing := self.missing(signals, on_setpoints):
+            raise ValueError('the bounds of the experiment are not known: give '
+                             + ', '.join(missing))
         units = {name: signals.states[name] for name in signals.controlled
                  } if on_setpoints else signals.inputs
         of: Mapping[str, Any] = self.states if on_setpoints else self.inputs
@@ -177,6 +180,19 @@ class TrainerParameters:
             measured_lower=own('experiment_min', self.states, signals.states),
             measured_upper=own('experiment_max', self.states, signals.states),
             seed=self.experiment_seed)
+
+    def missing(self, signals: Signals, on_setpoints: bool = False) -> list[str]:
+        """Return the parameters without which there is no experiment, with their units."""
+        what = 'setpoint' if on_setpoints else 'experiment'
+        stepped = {name: self.states[name] for name in signals.controlled
+                   } if on_setpoints else self.inputs
+        units = {**signals.states, **signals.inputs}
+        return [f'{name}.{row} [{display_unit(units[name])}]' for name, row in [
+            *((name, f'{what}_{end}') for name, item in stepped.items() for end in ('min', 'max')
+              if getattr(item, f'{what}_min') == getattr(item, f'{what}_max')),
+            *((name, f'experiment_{end}') for name, item in self.states.items()
+              for end, none in (('min', -_UNBOUNDED), ('max', _UNBOUNDED))
+              if getattr(item, f'experiment_{end}') == none)]]
 
     def training(self) -> dict[str, Any]:
         """Return the fields of a :class:`koopman_ros.retraining.Task` that are settings."""
@@ -222,8 +238,9 @@ def trainer_signals(present: LiftedModel | None, given: Mapping[str, Any]) -> Si
                       for name in ('states_measured', 'inputs_commanded'))
     if bool(states) != bool(inputs) or not (states or present):
         raise ConfigurationError(
-            'what is measured and commanded is not known: give states_measured and '
-            'inputs_commanded, or the model of the plant')
+            f'what is measured and commanded is not known of the system '
+            f'{given.get("system", "reactor")!r}: give states_measured and inputs_commanded, each '
+            "a list like ['level [m]'], or the model of the plant")
     controlled = tuple(filter(None, given.get('controlled', ())))
     if present is not None and not states:
         return signals_of(present, controlled)
@@ -245,7 +262,7 @@ def _wiring(signals: Signals, given: Mapping[str, Any]) -> Wiring:
 
 def _plan(signals: Signals, values: TrainerParameters) -> None:
     """Try the plan of an experiment, where there are bounds for one."""
-    if any(item.experiment_min != item.experiment_max for item in values.inputs.values()):
+    if not values.missing(signals):
         values.experiment(signals)
 
 

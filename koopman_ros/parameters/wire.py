@@ -19,6 +19,7 @@ from koopman_ros.parameters.table import (
     ParameterTable,
 )
 from koopman_ros.resources import config_directory
+from koopman_ros.units import check_unit, conversion
 from koopman_ros.wire import Place, place, stem
 
 CONTROLLER_STATE = 'controller_state'
@@ -31,8 +32,10 @@ LONGEST_FRAME_ID = 256  # characters that are passed on
 # The places of signals: of states, then of inputs.
 KINDS = ('measured', 'setpoints', 'active_setpoints', 'predicted', 'applied', 'commands', 'manual')
 PLANT_KINDS = ('measured', 'applied', 'commands')
+SIGNALS = ('states_measured', 'inputs_commanded', 'controlled')  # parameters that name them
 
 _PRESETS = 'plants'  # folder of the parameter files of the plants that are shipped
+_NAME = re.compile(r'[A-Za-z]\w*', re.ASCII)
 _NAMED = re.compile(r'([A-Za-z_]\w*)\s*\[(.+)\]')
 
 
@@ -91,6 +94,11 @@ class Signals:
     controlled: tuple[str, ...] = ()  #: names of the states that have a set-point
 
     def __post_init__(self) -> None:
+        for name in (*self.states, *self.inputs):
+            if not _NAME.fullmatch(name):
+                raise ConfigurationError(
+                    f'{name!r} is a signal, which topics and parameters are named after: use '
+                    'letters, digits and _, beginning with a letter')
         wrong = [name for name in self.controlled if name not in self.states]
         if wrong or len(set(self.controlled)) < len(self.controlled):
             raise ConfigurationError(
@@ -217,9 +225,11 @@ class Wiring:
 
 def _place(topic: str, name: str, unit: str, given: Mapping[str, str]) -> Place:
     try:
-        return place(topic, name, unit, given)
+        found = place(topic, name, unit, given)
+        conversion(found.unit, unit)
     except ValueError as error:
         raise ConfigurationError(f'{name}: {error}') from error
+    return found
 
 
 def named_units(described: Collection[str]) -> dict[str, str]:
@@ -230,6 +240,10 @@ def named_units(described: Collection[str]) -> dict[str, str]:
         if match is None or match[1] in found:
             raise ConfigurationError(f'{text!r} must be a name and a unit, each name once, e.g. '
                                      "'level [m]'")
+        try:
+            check_unit(match[2])
+        except ValueError as error:
+            raise ConfigurationError(f'{text!r}: {error}') from error
         found[match[1]] = match[2]
     return found
 

@@ -40,9 +40,13 @@ def plant_class(name: str) -> Any:
     # in here: no other name needs it
     from importlib.metadata import entry_points
 
-    return plug(name, 'plant', {
-        **PLANTS, **{entry.name: entry.value for entry in entry_points(group=ENTRY_POINTS)
-                     if entry.name not in PLANTS}})
+    known = PLANTS | {entry.name: entry.value for entry in entry_points(group=ENTRY_POINTS)
+                      if entry.name not in PLANTS}
+    if name not in known:
+        raise ValueError(f'there is no plant {name!r}: choose one of {", ".join(known)}, or write '
+                         'module:Class; a package that offers one by name must be built, and its '
+                         'workspace sourced')
+    return plug(name, 'plant', known)
 
 
 def build(plant: Any, values: Mapping[str, float], nominal_state: ArrayLike | None = None
@@ -57,9 +61,17 @@ def build(plant: Any, values: Mapping[str, float], nominal_state: ArrayLike | No
         factory that returns no ControlAffineSystem.
     :raises EquilibriumError: where the plant says so.
     """
-    made = plant(**in_plant_units(plant, values))
-    if not isinstance(made, ControlAffineSystem) and hasattr(made, 'system'):
-        made = made.system() if nominal_state is None else made.system(nominal_state)
+    constants = in_plant_units(plant, values)
+    try:
+        made = plant(**constants)
+        if not isinstance(made, ControlAffineSystem) and hasattr(made, 'system'):
+            made = made.system() if nominal_state is None else made.system(nominal_state)
+    except ValueError:
+        raise
+    except Exception as error:  # a plant of one's own may fail in every way
+        cause = ' '.join(f'{type(error).__name__}: {error}'.split())
+        raise ValueError(f'the plant {plant.__name__} cannot be built ({cause}): correct its '
+                         'class') from error
     if not isinstance(made, ControlAffineSystem):
         raise ValueError(f'the plant {plant.__name__} returned a {type(made).__name__}, must be a '
                          'ControlAffineSystem: return one from its method system')

@@ -37,8 +37,12 @@ class Heard:
         return stamp_nanoseconds(self.stamp)
 
 
-def _by_topic(places: Mapping[str, Place]) -> Iterator[tuple[str, Any, list[str]]]:
-    """Yield each topic, the class of its messages and the names of the signals in them."""
+def by_topic(places: Mapping[str, Place]) -> Iterator[tuple[str, Any, list[str]]]:
+    """
+    Yield each topic, the class of its messages and the names of the signals in them.
+
+    :raises ConfigurationError: for a place that is in no message of its type.
+    """
     for topic in dict.fromkeys(place.topic for place in places.values()):
         names = [name for name, place in places.items() if place.topic == topic]
         if len(kinds := dict.fromkeys(places[name].type for name in names)) > 1:
@@ -81,7 +85,7 @@ class Inlet:
         self._node, self._hear = node, hear
         self.subscriptions: list[Subscription] = []
         self.unstamped: list[str] = []  #: topics whose messages are stamped at their arrival
-        for topic, kind, names in _by_topic(places):
+        for topic, kind, names in by_topic(places):
             own = {name: (places[name], _converted(name, places[name].unit, units[name]))
                    for name in names}
             if not hasattr(kind, 'header'):
@@ -119,7 +123,7 @@ class Outlet:
     def __init__(self, places: Mapping[str, Place], units: Mapping[str, str],
                  make: Callable[[str, Any], Publisher]) -> None:
         self._parts = []
-        for topic, kind, names in _by_topic(places):
+        for topic, kind, names in by_topic(places):
             own = [(i, place, _converted(name, units[name], place.unit))
                    for i, (name, place) in enumerate(places.items()) if name in names]
             self._parts.append((make(topic, kind), kind, own))

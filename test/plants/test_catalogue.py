@@ -123,3 +123,15 @@ def test_plants_of_other_packages_are_found(monkeypatch, tmp_path):
     with pytest.raises(ValueError, match=r"'broken:plant' cannot be loaded "
                                          r"\(ModuleNotFoundError: No module named 'no_such_"):
         plant_class('broken:plant')
+
+
+class Untidy:
+    def system(self):
+        raise RuntimeError('no pump')
+
+
+@pytest.mark.parametrize(('plant', 'cause'), [
+    (Untidy, 'RuntimeError: no pump'), (lambda pump: pump, 'TypeError: .* argument: .pump')])
+def test_plant_that_fails_is_named_with_the_cause(plant, cause):
+    with pytest.raises(ValueError, match=rf'cannot be built \({cause}.*\): correct its class'):
+        build(plant, {})
