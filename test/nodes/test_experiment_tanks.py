@@ -1,0 +1,211 @@
+# SPDX-FileCopyrightText: 2026 The koopman_ros Authors
+# SPDX-License-Identifier: Apache-2.0
+
+"""Experiments with two inputs, and on set-points, across processes: two tanks and their pumps."""
+
+from itertools import pairwise
+from pathlib import Path
+from typing import Any
+
+from diagnostic_msgs.msg import DiagnosticStatus
+import numpy as np
+import pytest
+from sensor_msgs.msg import JointState
+
+from koopman_ros.lifting import Coordinates, linearised_model, Provenance, save
+from koopman_ros.plants.library.two_tanks import TwoTanks
+from koopman_ros.ros import topics
+from koopman_ros.ros.codec import stamp_message
+from koopman_ros.testing import Harness
+from koopman_ros.units import NANOSECONDS
+from support.nodes import seconds, value
+
+TANKS = TwoTanks().system()
+LEVELS, PUMPS = TANKS.state_names, TANKS.input_names
+STATUS, SERVICE = 'trainer: experiment', 'trainer/experiment'
+LOW, HIGH, RATE, SAFE = (5.0, 1.0), (7.5, 3.0), (0.5, 0.125), (6.0, 2.0)  # V, V/s
+TRAINER = {
+    'system': 'two_tanks', 'record_at_start': False, 'experiment_shortest_hold': 5.0,
+    'experiment_longest_hold': 20.0, **{
+        f'{name}.{key}': numbers[i] for i, name in enumerate(PUMPS) for key, numbers in (
+            ('experiment_min', LOW), ('experiment_max', HIGH), ('experiment_rate_limit', RATE),
+            ('safe', SAFE))},
+    **{f'{name}.experiment_{end}': bound for name in LEVELS
+       for end, bound in (('min', 0.02), ('max', 0.5))}}
+PLANT = {'system': 'two_tanks', 'sample_period': 1.0, 'lockstep': True, 'speed': 0.0}
+
+
+def linear(folder: Path, gain: float = 1.0) -> Path:
+    """Write a linear model of the tanks, whose pumps are so much stronger than they are."""
+    span = 0.4 * TANKS.nominal_state, 2.0 * TANKS.nominal_state
+    boxes = (Coordinates.spanning(LEVELS, ('m', 'm'), *span, TANKS.nominal_state),
+             Coordinates.spanning(PUMPS, ('V', 'V'), np.zeros(2), np.array([12.0, 6.0]),
+                                  TANKS.nominal_input))
+    save(linearised_model(TANKS.drift_jacobian(TANKS.nominal_state), gain * TANKS.B, *boxes, 's',
+                          Provenance('two tanks')), folder / 'linear.safetensors')
+    return folder / 'linear.safetensors'
+
+
+def numbers(messages: list[Any]) -> np.ndarray:
+    return np.array([message.position[0] for message in messages])
+
+
+class Bench:
+    """A trainer whose levels are measured by the test."""
+
+    def __init__(self, ros: Harness, folder: Path) -> None:
+        self.ros, self._time = ros, 0
+        self.commands = [ros.listen(JointState, f'{name}_setpoint') for name in PUMPS]
+        self._sensors = [ros.node.create_publisher(JointState, name, topics.LOOP_QOS)
+                         for name in LEVELS]
+        ros.start('trainer', {**TRAINER, 'model': linear(folder)})
+        ros.meet('trainer')
+
+    def measure(self, *levels: float) -> None:
+        self._time += 1
+        for name, level, sensor in zip(LEVELS, levels, self._sensors, strict=True):
+            message = JointState(name=[name], position=[level])
+            message.header.stamp = stamp_message(self._time * NANOSECONDS)
+            sensor.publish(message)
+
+    def start(self, *levels: float) -> tuple[bool, str]:
+        timer = self.ros.node.create_timer(0.02, lambda: self.measure(*levels))
+        response = self.ros.set_bool(SERVICE, True)
+        self.ros.node.destroy_timer(timer)
+        return response.success, response.message
+
+    def answer(self, *levels: float) -> list[float]:
+        self.measure(*levels)
+        self.ros.wait_until(lambda: all(
+            heard and seconds(heard[-1]) == self._time for heard in self.commands))
+        return [float(heard[-1].position[0]) for heard in self.commands]
+
+
+def test_bounds_of_each_signal_refuse_and_abort(ros: Harness, tmp_path: Path) -> None:
+    bench = Bench(ros, tmp_path)
+    inside = 0.15, 0.25
+    for levels, words in (
+            ((0.6, 0.25), 'refused: the level_1 0.6 m is outside the bounds of the experiment, '
+             '0.02 m to 0.5 m'),
+            ((0.15, 0.01), 'refused: the level_2 0.01 m is outside the bounds of the')):
+        started, said = bench.start(*levels)
+        assert not started
+        assert said.startswith(words)
+    for levels, name in (((0.51, 0.25), 'level_1'), ((0.15, 0.019), 'level_2')):
+        started, said = bench.start(*inside)
+        assert (started, said) == (True, 'running on /pump_1_setpoint, /pump_2_setpoint')
+        for _ in range(10):
+            away = bench.answer(*inside)
+        assert all(abs(np.subtract(away, SAFE)) > 0.1)
+        back = [away, *(bench.answer(*levels) for _ in range(12))]
+        status = ros.wait_for_status(STATUS, lambda s: s.level == DiagnosticStatus.ERROR)
+        assert status.message.startswith(f'aborted: the {name} ')
+        assert status.message.endswith('; pump_1 to 6 V, pump_2 to 2 V, held there')
+        # each along its own limit, straight
+        for one, rate, safe in zip(zip(*back, strict=True), RATE, SAFE, strict=True):
+            way = np.sign(safe - one[0]) * np.minimum(
+                rate * np.arange(len(back)), abs(safe - one[0]))
+            assert one == pytest.approx(one[0] + way)
+        assert back[-1] == pytest.approx(SAFE)
+        assert ros.set_bool(SERVICE, False).success
+
+
+def test_inputs_move_independently_each_within_its_limits(ros: Harness, tmp_path: Path) -> None:
+    commands = [ros.listen(JointState, f'{name}_setpoint') for name in PUMPS]
+    ros.start('trainer', {**TRAINER, 'model': linear(tmp_path), 'experiment_length': 400.0})
+    ros.start('plant', PLANT)
+    ros.meet('plant')
+    assert ros.set_bool(SERVICE, True).success
+    status = ros.wait_for_status(STATUS, lambda s: s.message.startswith('finished'))
+    assert status.message == 'finished; pump_1 to 6 V, pump_2 to 2 V, held there'
+    assert value(status, 'pump_2 level [V]') == '2'
+    ros.wait_until(lambda: all(len(heard) > 430 for heard in commands))
+    moving = []
+    for heard, low, high, rate, safe in zip(commands, LOW, HIGH, RATE, SAFE, strict=True):
+        # what is sent for one sample carries its stamp
+        assert all(late - early == 1.0 for early, late in pairwise(map(seconds, heard)))
+        volts = numbers(heard)
+        assert low <= volts.min() < low + 0.2 * (high - low)
+        assert high >= volts.max() > high - 0.2 * (high - low)
+        assert abs(np.diff(volts)).max() == pytest.approx(rate)
+        assert volts[420:] == pytest.approx(safe)
+        moving.append(np.diff(volts[:390]))
+    both = min(map(len, moving))
+    assert abs(np.corrcoef(moving[0][:both], moving[1][:both])[0, 1]) < 0.25
+    assert np.mean((moving[0][:both] == 0.0) != (moving[1][:both] == 0.0)) > 0.2
+
+
+def test_setpoints_move_and_come_back_to_what_they_were(ros: Harness, tmp_path: Path) -> None:
+    before = 1.1 * TANKS.nominal_state
+    low, high = 0.85 * TANKS.nominal_state, 1.2 * TANKS.nominal_state
+    measured = [ros.listen(JointState, name) for name in LEVELS]
+    active = [ros.listen(JointState, f'{name}/active_setpoint', topics.LATCHED_QOS)
+              for name in LEVELS]
+    model = linear(tmp_path)
+    ros.start('controller', {'system': 'two_tanks', 'model': model, **{
+        f'{name}.{key}': number for name in PUMPS for key, number in (
+            ('min', 0.0), ('max', 12.0), ('safe', 2.0))}, **{
+        f'{name}.weight': 1e4 for name in LEVELS}})
+    asked = [ros.speak(JointState, f'{name}/setpoint', to='controller') for name in LEVELS]
+    ros.start('trainer', {
+        **TRAINER, 'model': model, 'experiment_on': 'setpoint', 'experiment_length': 600.0,
+        'experiment_shortest_hold': 30.0, 'experiment_longest_hold': 90.0, **{
+            f'{name}.setpoint_{end}': float(bound[i]) for i, name in enumerate(LEVELS)
+            for end, bound in (('min', low), ('max', high))}})
+    ros.meet('trainer')
+    # who asks for set-points beside the experiment is in its way
+    said = ros.set_bool(SERVICE, True).message
+    assert said.startswith('refused: /bench publishes on /level_1/setpoint: end it, or choose')
+    for name, publisher, level in zip(LEVELS, asked, before, strict=True):
+        publisher.publish(JointState(name=[name], position=[float(level)]))
+    ros.start('plant', {**PLANT, 'lockstep_subscribers': 2})
+    ros.wait_until(lambda: all(heard and heard[-1].position[0] == level
+                               for heard, level in zip(active, before, strict=True)))
+    for publisher in asked:
+        ros.node.destroy_publisher(publisher)
+    ros.wait_until(lambda: ros.node.count_publishers(f'{LEVELS[1]}/setpoint') == 0)
+
+    # until the graph tells the trainer the same
+    said = ros.wait_until(lambda: (answer := ros.set_bool(SERVICE, True)).success and answer)
+    assert said.message == 'running on /level_1/setpoint, /level_2/setpoint'
+    first = len(measured[0])
+    status = ros.wait_for_status(STATUS, lambda s: s.message.startswith('finished'))
+    home = ', '.join(f'{name} to {level:.6g} m' for name, level in zip(
+        LEVELS, before, strict=True))
+    assert status.message == f'finished; {home}, held there'
+    last = len(measured[0])
+    for heard, level, least, most, true in zip(active, before, low, high, measured, strict=True):
+        ros.wait_until(lambda heard=heard, level=level: heard[-1].position[0] == level)
+        levels = numbers(heard)
+        steps = levels[(levels != level)]
+        assert len(steps) > 5
+        assert least <= steps.min() < steps.max() <= most
+        # the plant went there
+        assert np.ptp(numbers(true[first:last])) > 0.5 * np.ptp(steps)
+    ros.wait_until(lambda: len(measured[0]) > last + 200)
+    assert [heard[-1].position[0] for heard in measured] == pytest.approx(before, rel=0.02)
+    assert 'manual' not in ros.processes[1].output()
+
+
+def test_pumps_through_a_controller_that_leaves_manual_mode(ros: Harness, tmp_path: Path) -> None:
+    model = linear(tmp_path)
+    commands = [ros.listen(JointState, f'{name}_setpoint') for name in PUMPS]
+    ros.start('controller', {'system': 'two_tanks', 'model': model, **{
+        f'{name}.{key}': number for name in PUMPS for key, number in (
+            ('min', 0.0), ('max', 12.0), ('safe', 2.0))}})
+    ros.meet('controller')
+    ros.set_bool('controller/set_automatic', False)
+    ros.start('trainer', {**TRAINER, 'model': model, 'experiment_on': 'manual',
+                          'experiment_length': 60000.0})
+    ros.meet('trainer')
+    ros.start('plant', {**PLANT, 'speed': 200.0})
+    ros.wait_until(lambda: commands[0])
+    said = ros.set_bool(SERVICE, True).message
+    assert said == 'running on /manual_pump_1_setpoint, /manual_pump_2_setpoint'
+    ros.wait_until(lambda: all(np.ptp(numbers(heard) if heard else [0.0]) > 1.0
+                               for heard in commands))
+    ros.wait_for_status(STATUS, lambda s: s.message == 'running')
+    ros.set_bool('controller/set_automatic', True)
+    status = ros.wait_for_status(STATUS, lambda s: s.level == DiagnosticStatus.ERROR)
+    assert status.message.startswith('aborted: the controller commands ')
+    assert 'switch it to manual mode' in status.message
