@@ -105,6 +105,14 @@ class Code(Enum):
     NOT_FOLLOWED = 'not_followed', (
         'the controller commands {value:value} where {requested:value} is requested: switch it '
         'to manual mode, and choose levels within its limits')
+    NOT_TRACKED = 'not_tracked', (
+        'the controller tracks {value:value} where {requested:value} is requested: choose '
+        'set-points that it can hold')
+    IN_MANUAL_MODE = 'in_manual_mode', (
+        'the controller is in manual mode: switch it to automatic mode')
+    NOTHING_TRACKED = 'nothing_tracked', (
+        'for {timeout:g} s it is not known which set-points are tracked: switch the controller to '
+        'automatic mode, and check sensor and plant')
 
 
 @dataclass(frozen=True)

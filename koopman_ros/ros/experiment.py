@@ -5,7 +5,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
+import contextlib
 from functools import partial
 import time
 from typing import Any
@@ -17,6 +18,7 @@ from rclpy.node import Node
 from rclpy.qos import ReliabilityPolicy
 from rclpy.subscription import Subscription
 from rclpy.task import Future
+from std_msgs.msg import String
 from std_srvs.srv import SetBool
 
 from koopman_ros.arrays import Array
@@ -34,6 +36,7 @@ from koopman_ros.experiment import (
 from koopman_ros.parameters.trainer import MANUAL, SETPOINT, TrainerParameters
 from koopman_ros.parameters.wire import Wiring
 from koopman_ros.reasons import Code, Reason, reason
+from koopman_ros.replay import records
 from koopman_ros.ros import topics
 from koopman_ros.ros.codec import stamp_message, stamp_nanoseconds
 from koopman_ros.ros.managed import ManagedNode
@@ -211,7 +214,9 @@ class ExperimentRun:
         self._on_setpoints = settings.experiment_on == SETPOINT
         self._units = {name: (signals.states if self._on_setpoints else signals.inputs)[name]
                        for name in places}
-        self._home: dict[str, float] = {}  # the set-points from before
+        # what is known of the controller
+        self._tracked: dict[str, float] = {}  # set-points, by name
+        self._automatic = False
         self.plan: Experiment = settings.experiment(
             signals, self._middle() if self._on_setpoints else None)
         self._topics = [node.resolve_topic_name(place.topic) for place in places.values()]
@@ -234,8 +239,8 @@ class ExperimentRun:
                 settings.experiment_on != 'command') else None
         if self._on_setpoints:
             Inlet(node, partial(self._subscribe, latched=True), wiring.active_setpoints,
-                  signals.states, lambda heard: self._home.update(
-                      {} if self.progress else heard.values))
+                  signals.states, lambda heard: self._tracked.update(heard.values))
+            self._subscribe(topics.CONTROLLER_EVENTS, self._on_record, String)
         self._outlet = Outlet(places, self._units, lambda topic, kind: owned.keep(
             node.create_publisher(kind, topic, topics.LOOP_QOS)))
         owned.timer(_TICK, self._on_tick)
@@ -263,6 +268,11 @@ class ExperimentRun:
     def running(self) -> bool:
         """Whether it waits for its first measurement, or steps."""
         return self.progress is None or self.progress.phase is Phase.RUNNING
+
+    @property
+    def _setpoints_missing(self) -> bool:
+        return self._on_setpoints and (
+            not self._automatic or len(self._tracked) < len(self._units))
 
     @property
     def going_home(self) -> str:
@@ -312,12 +322,11 @@ class ExperimentRun:
             return
         stamp_ns, measured = whole
         if self.progress is None:
-            if self.started.done() or (
-                    self._on_setpoints and len(self._home) < len(self._units)):
+            if self.started.done() or self._setpoints_missing:
                 return
             if self._on_setpoints:
                 self.plan = self._settings.experiment(
-                    self._signals, np.array([self._home[name] for name in self._units]))
+                    self._signals, np.array([self._tracked[name] for name in self._units]))
             self.started.set_result(refusal := self.plan.refusal(measured))
             if refusal is not None:
                 return
@@ -326,6 +335,8 @@ class ExperimentRun:
             self._stamp_ns, self._heard_at = stamp_ns, time.monotonic()
         self._frame_id = heard.frame_id
         was_running = self.running
+        if self._on_setpoints and not self._followed(self._tracked, Code.NOT_TRACKED):
+            return
         self.progress = advance(self.plan, self.progress, measured, stamp_ns)
         self._command(self.progress.command, stamp_ns)
         if was_running and not self.running:
@@ -340,17 +351,34 @@ class ExperimentRun:
 
     def _on_command(self, heard: Heard) -> None:
         """Watch a controller that should be in manual mode."""
-        if self.progress is None or self._on_setpoints:
-            return
+        if self.progress is not None and not self._on_setpoints:
+            self._followed(heard.values, Code.NOT_FOLLOWED)
+
+    def _on_record(self, message: String) -> None:
+        """Watch a controller that should be in automatic mode."""
+        with contextlib.suppress(records.RecordError):
+            mode = records.parse(message.data).fields.get('mode')
+            self._automatic = self._automatic or mode == 'automatic'
+            if mode == 'manual':
+                why = reason(Code.IN_MANUAL_MODE)
+                if self.progress is not None:
+                    self._on_end(why)
+                elif not self.started.done():
+                    self.started.set_result(why)
+
+    def _followed(self, values: Mapping[str, float], code: Code) -> bool:
+        """Tell whether a controller does as it is asked; where it does not, all is over."""
+        assert self.progress is not None
         now = time.monotonic()
         for i, name in enumerate(self._units):
-            if name not in heard.values:
+            if name not in values:
                 continue
-            value, asked = heard.values[name], float(self.progress.command[i])
+            value, asked = values[name], float(self.progress.command[i])
             following = self._following[i] = self._following[i].after(value, asked, now)
             if following.astray >= _ASTRAY and now - following.since >= _ASTRAY_TIME:
-                self._on_end(reason(Code.NOT_FOLLOWED, signal=name, value=value, requested=asked))
-                return
+                self._on_end(reason(code, signal=name, value=value, requested=asked))
+                return False
+        return True
 
     def _on_tick(self) -> None:
         """Look for other commanders, and for measurements that stay away."""
@@ -361,7 +389,8 @@ class ExperimentRun:
         if why is None and self._answers is not None and not self._answers.published():
             why = reason(Code.CONTROLLER_GONE)
         elif why is None and time.monotonic() - self._heard_at > self._patience:
-            why = reason(Code.SILENCE, timeout=self._patience)
+            why = reason(Code.NOTHING_TRACKED if self._setpoints_missing else Code.SILENCE,
+                         timeout=self._patience)
         if self.progress is None:
             if why is not None and not self.started.done():
                 self.started.set_result(why)

@@ -5,6 +5,7 @@
 
 from itertools import pairwise
 from pathlib import Path
+import re
 from typing import Any
 
 from diagnostic_msgs.msg import DiagnosticStatus
@@ -53,12 +54,12 @@ def numbers(messages: list[Any]) -> np.ndarray:
 class Bench:
     """A trainer whose levels are measured by the test."""
 
-    def __init__(self, ros: Harness, folder: Path) -> None:
+    def __init__(self, ros: Harness, folder: Path, **trainer: object) -> None:
         self.ros, self._time = ros, 0
         self.commands = [ros.listen(JointState, f'{name}_setpoint') for name in PUMPS]
         self._sensors = [ros.node.create_publisher(JointState, name, topics.LOOP_QOS)
                          for name in LEVELS]
-        ros.start('trainer', {**TRAINER, 'model': linear(folder)})
+        ros.start('trainer', {**TRAINER, 'model': linear(folder), **trainer})
         ros.meet('trainer')
 
     def measure(self, *levels: float) -> None:
@@ -184,7 +185,40 @@ def test_setpoints_move_and_come_back_to_what_they_were(ros: Harness, tmp_path: 
         assert np.ptp(numbers(true[first:last])) > 0.5 * np.ptp(steps)
     ros.wait_until(lambda: len(measured[0]) > last + 200)
     assert [heard[-1].position[0] for heard in measured] == pytest.approx(before, rel=0.02)
-    assert 'manual' not in ros.processes[1].output()
+
+    # one that the controller refuses
+    assert ros.set_bool(SERVICE, False).success
+    (result,) = ros.set_parameters('trainer', **{'level_2.setpoint_max': 5.0})
+    assert result.successful, result.reason
+    assert ros.set_bool(SERVICE, True).success
+    status = ros.wait_for_status(STATUS, lambda s: s.level == DiagnosticStatus.ERROR)
+    assert re.fullmatch(r'aborted: the controller tracks [0-9.]+ m where [0-9.]+ m is requested: '
+                        'choose set-points that it can hold', status.message)
+    ros.wait_until(lambda: ros.node.count_publishers(f'{LEVELS[0]}/setpoint') == 0)
+
+    # in manual mode it moves nothing
+    (result,) = ros.set_parameters('trainer', **{'level_2.setpoint_max': float(high[1])})
+    assert result.successful, result.reason
+    assert ros.set_bool(SERVICE, True).success
+    ros.set_bool('controller/set_automatic', False)
+    words = 'the controller is in manual mode: switch it to automatic mode'
+    ros.wait_for_status(STATUS, lambda s: s.message == f'aborted: {words}')
+    assert ros.set_bool(SERVICE, True).message == f'refused: {words}'
+
+
+def test_setpoints_that_nobody_tracks_refuse_the_start(ros: Harness, tmp_path: Path) -> None:
+    bench = Bench(ros, tmp_path, experiment_on='setpoint', experiment_timeout=1.0, **{
+        f'{name}.setpoint_{end}': bound for name in LEVELS
+        for end, bound in (('min', 0.1), ('max', 0.2))})
+    assert bench.start(0.15, 0.25)[1] == (
+        'refused: nobody publishes on /pump_1_setpoint: start the controller and switch it to '
+        'automatic mode')
+    ros.node.create_publisher(JointState, 'pump_1_setpoint', topics.LOOP_QOS)
+    # until the graph tells the trainer
+    said = ros.wait_until(lambda: 'tracked' in (said := bench.start(0.15, 0.25)[1]) and said)
+    assert said == (
+        'refused: for 1 s it is not known which set-points are tracked: switch the controller to '
+        'automatic mode, and check sensor and plant')
 
 
 def test_pumps_through_a_controller_that_leaves_manual_mode(ros: Harness, tmp_path: Path) -> None:
