@@ -21,9 +21,9 @@ myst_fence_as_directive = ['math']
 myst_heading_anchors = 3
 
 # The reference is built without ROS and without torch.
-autodoc_mock_imports = ['builtin_interfaces', 'diagnostic_msgs', 'joblib', 'matplotlib',
-                        'rcl_interfaces', 'rclpy', 'rosgraph_msgs', 'sensor_msgs', 'std_msgs',
-                        'std_srvs', 'torch', 'tqdm']
+autodoc_mock_imports = ['builtin_interfaces', 'diagnostic_msgs', 'joblib', 'lifecycle_msgs',
+                        'matplotlib', 'rcl_interfaces', 'rclpy', 'rosgraph_msgs', 'sensor_msgs',
+                        'std_msgs', 'std_srvs', 'torch', 'tqdm']
 autodoc_typehints = 'description'
 autodoc_typehints_format = 'short'
 autodoc_type_aliases = {'Array': 'Array', 'FloatArray': 'Array'}

@@ -13,13 +13,13 @@ from koopman_ros.plants import (
     Actuator,
     advance,
     ControlAffineSystem,
-    in_steps,
     IntegrationError,
     one_state_reactor,
     Process,
     scalar_example,
     sensor_noise,
 )
+from koopman_ros.units import in_steps
 from koopman_ros.units import NANOSECONDS as SECOND
 
 SLOPE, GAIN = -0.7, 0.4  # 1/s, of the linear plant
@@ -138,8 +138,8 @@ def test_a_delay_takes_effect_in_the_middle_of_a_hold_and_the_lag_follows(
 def test_a_command_supersedes_those_that_would_act_later() -> None:
     plant = given(given(actuated(Actuator(delay=5.0)), 1.0).until(SECOND), 2.0)
     plant = given(replace(plant, actuator=Actuator(delay=4.5)), 3.0)
-    assert [(time_ns, u[0]) for time_ns, u in plant.pending] == [
-        (5 * SECOND, 1.0), (11 * SECOND // 2, 3.0)]
+    # of the first input, which is the only one
+    assert plant.pending == ((5 * SECOND, 0, 1.0), (11 * SECOND // 2, 0, 3.0))
     plant = given(replace(plant, actuator=Actuator()), 4.0).until(20 * SECOND)
     assert plant.u[0] == plant.command[0] == 4.0
     # an earlier instant changes nothing

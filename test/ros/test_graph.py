@@ -25,10 +25,18 @@ from std_srvs.srv import SetBool
 from koopman_ros.bags import BagWriter, message_definition
 from koopman_ros.demo import reactor
 from koopman_ros.nodes import replay
-from koopman_ros.parameters.trainer import COMMAND, MANUAL, player_table, SETPOINT
+from koopman_ros.parameters.table import ConfigurationError
+from koopman_ros.parameters.trainer import (
+    COMMAND,
+    MANUAL,
+    player_table,
+    preset_wiring,
+    SETPOINT,
+)
+from koopman_ros.resources import config_directory
 from koopman_ros.ros import topics
 from koopman_ros.ros.node import LoopNode
-from koopman_ros.ros.programs import OPERATOR, policy, Program, PROGRAMS
+from koopman_ros.ros.programs import OPERATOR, policy, Program, PROGRAMS, programs
 from koopman_ros.testing import Harness, isolated_domain
 from support.nodes import temperature, TIMEOUT
 
@@ -66,9 +74,9 @@ def watch(ros: Harness, node: str, seen: Seen, **wanted: set[str]) -> None:
     ros.wait_until(found)
 
 
-def check(ros: Harness, node: str, seen: Seen) -> None:
+def check(ros: Harness, node: str, seen: Seen, system: str = 'reactor') -> None:
     """Compare what a node does, and did, with what is granted."""
-    granted = resolved(PROGRAMS[node], node)
+    granted = resolved(programs(system)[node], node)
     watch(ros, node, seen, **granted)
     assert seen == granted
 
@@ -88,6 +96,24 @@ def test_a_node_does_what_it_is_granted(
                 writer.write(f'/{name}', serialize_message(temperature(40.0, 1.0)), number)
     ros.start(node, parameters)
     check(ros, node, {})
+
+
+@pytest.mark.parametrize(('node', 'parameters'), [
+    ('plant', {'speed': 2.0}), ('controller', {'use_sim_time': True})])
+def test_a_node_of_another_plant_does_what_its_policy_grants(
+        ros: Harness, node: str, parameters: dict[str, Any]) -> None:
+    ros.start(node, {'system': 'two_tanks', **parameters})
+    check(ros, node, {}, 'two_tanks')
+
+
+def test_there_is_a_policy_for_each_plant_that_is_shipped() -> None:
+    files = [path.stem for path in (config_directory() / 'plants').glob('*.yaml')]
+    assert {'reactor', 'two_tanks'} < set(files)
+    for system in files:
+        topic = preset_wiring(system).commands.popitem()[1].topic  # type: ignore[union-attr]
+        assert f'<topic>{topic}</topic>' in policy(system)
+    with pytest.raises(ConfigurationError, match=r'write config/plants/nowhere\.yaml'):
+        policy('nowhere')
 
 
 def test_the_trainer_does_what_it_is_granted(ros: Harness, tmp_path: Path) -> None:
