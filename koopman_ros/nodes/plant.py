@@ -50,7 +50,7 @@ class PlantNode(ManagedNode):
         super().__init__('plant')
         self._table = table = PlantTable(self.given())
         # in the file of a whole loop; a plant has its own
-        self._settings = self.declare_table(table, SIGNALS)
+        self._settings = self.declare_table(table, (*SIGNALS, 'model'))
 
     def configure(self) -> None:
         """Build the plant at its initial state, and what publishes it."""

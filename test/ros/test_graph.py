@@ -102,8 +102,11 @@ def test_a_node_does_what_it_is_granted(
     ('plant', {'speed': 2.0}), ('controller', {'use_sim_time': True})])
 def test_a_node_of_another_plant_does_what_its_policy_grants(
         ros: Harness, node: str, parameters: dict[str, Any]) -> None:
-    ros.start(node, {'system': 'two_tanks', **parameters})
+    file = config_directory() / 'plants' / 'two_tanks.yaml'
+    process = ros.start(node, parameters, ('--params-file', str(file)))
     check(ros, node, {}, 'two_tanks')
+    # the file is that of the whole loop
+    assert 'ignored' not in process.output()
 
 
 def test_there_is_a_policy_for_each_plant_that_is_shipped() -> None:
