@@ -23,7 +23,7 @@ from koopman_ros.parameters.controller import (
 )
 from koopman_ros.parameters.table import ConfigurationError
 from koopman_ros.parameters.trainer import preset_wiring
-from koopman_ros.parameters.wire import signals_of, Wiring
+from koopman_ros.parameters.wire import renamed, signals_of, Wiring
 from koopman_ros.replay.loop import Alternative, Replay, replay
 from koopman_ros.replay.records import Record, RecordError
 from koopman_ros.replay.report import ReplayedBag, reproduced, verdict, write_report
@@ -99,9 +99,7 @@ def replayed_bag(path: str, names: Names, parameters: ReplayParameters,
     alternative = None
     if parameters.new_model:
         new = load_suitable(parameters.new_model)
-        tuning = set(table_of(new.model, given).rows) - {'model', 'system'}
-        alternative = Alternative(new.model, new.digest, {
-            name: given[name] for name in tuning.intersection(given)})
+        alternative = Alternative(new.model, new.digest, _tuning(new.model, given))
     records = read_records(path, names.records, recover=parameters.recover)
     try:
         found = replay_records(
@@ -114,6 +112,21 @@ def replayed_bag(path: str, names: Names, parameters: ReplayParameters,
         path, summary(path).complete, found,
         command_counts(path, places, recover=parameters.recover), places, parameters.tolerance,
         None if alternative is None else alternative.model.states)
+
+
+def _tuning(model: LiftedModel, given: Mapping[str, Any]) -> dict[str, Any]:
+    """Return what is given of a controller with a model; ConfigurationError where it is wrong."""
+    table = table_of(model, given)
+    if former := renamed('controller', given, table):
+        raise ConfigurationError(former)
+    own = {name: value for name, value in given.items()
+           if name in table.rows and name not in ('model', 'system')}
+    for name, value in own.items():
+        if type(value) is not type(table.rows[name].default):
+            raise ConfigurationError(table.rows[name].type_error(value))
+    if reason := table.check(table.snapshot(own)):
+        raise ConfigurationError(reason)
+    return own
 
 
 def replay_records(records: Iterable[Record], models: Sequence[Path] = (),
@@ -162,7 +175,7 @@ def _prepare() -> Callable[[], int]:
         given = node.given()
         new_model = str(given.get('new_model', ''))
         # what a controller with the new model is tuned by may be given, too
-        beside = table_of(load_suitable(new_model).model, given).rows if new_model else ()
+        beside = _tuning(load_suitable(new_model).model, given) if new_model else ()
         parameters = node.declare_table(REPLAY_TABLE, beside)
         wiring = preset_wiring(parameters.system)
         names = Names(

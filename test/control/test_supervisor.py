@@ -307,9 +307,10 @@ def test_a_lift_of_narrow_data_says_that_the_safe_coolant_leads_out_of_its_range
                            SAFE, 305.0))
     assert narrowed.rest.holding[0] == pytest.approx(holding, abs=0.05)
     words = rests_outside(narrowed)
-    assert 'under safe_coolant = 5' in words
+    assert 'under coolant_temperature.safe = 5 degC' in words
     assert 'leaves the trained range' in words
-    assert 'record data from there and train again, or set safe_coolant to 25.8' in words
+    assert ('record data from there and train again, or set coolant_temperature.safe = 25.8'
+            ) in words
     assert rests_outside(controller(narrow(), safe_input=np.array([holding + 0.1]))) == ''
     # and one that drives the reactor up
     hot = controller(safe_input=np.array([305.15]))

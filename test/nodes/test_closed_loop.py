@@ -12,12 +12,11 @@ from rosgraph_msgs.msg import Clock
 from sensor_msgs.msg import Temperature
 
 from koopman_ros.demo import reactor
-from koopman_ros.parameters.plant import PlantParameters
 from koopman_ros.ros import topics
 from koopman_ros.testing import Harness
 from support.nodes import seconds, temperature, value
 
-FOULED = 0.8 * PlantParameters().heat_transfer_coefficient
+FOULED = 0.8 * reactor.constant('heat_transfer_coefficient')  # W/K
 SETPOINT = 45.0  # degC
 LOCKSTEP = {'lockstep': True, 'lockstep_subscribers': 2}
 
@@ -99,7 +98,7 @@ def test_no_offset_is_left_and_the_next_controller_takes_over_the_coolant_in_for
     # not as fast as it can: a publisher keeps the last hundred commands, and a bench that a busy
     # machine lets wait for longer than they last misses some
     loop.start_plant(**LOCKSTEP, speed=200.0, lockstep_timeout=0.3,
-                     **{'constants.heat_transfer_coefficient': FOULED / 60.0})
+                     **{'constants.heat_transfer_coefficient': FOULED})
     loop.rest()
     rested = seconds(loop.commands[-1])
     truth = ros.wait_for_status(

@@ -27,7 +27,7 @@ from koopman_ros.demo.loop import run_loop
 from koopman_ros.nodes import player
 from koopman_ros.nodes.replay import Names, replayed_bag
 from koopman_ros.parameters.controller import ReplayParameters
-from koopman_ros.parameters.trainer import PlayerParameters
+from koopman_ros.parameters.trainer import player_table, preset_wiring
 from koopman_ros.resources import config_directory
 from koopman_ros.ros import topics
 from koopman_ros.ros.codec import stamp_nanoseconds
@@ -43,7 +43,7 @@ TOPICS = {'/temperature', '/concentration', '/setpoint', '/active_setpoint', '/c
 LATCHED = {'/active_setpoint', '/coolant_temperature'}
 # A minute of a loop with a step, a noisy two-state reactor and a slow coolant.
 SCENARIO = reactor.scenario(
-    reactor.MODEL, SETPOINT + 273.15, step_time=20.0, duration=60.0,
+    reactor.MODEL, SETPOINT + 273.15, step_time=20.0, duration=60.0, speed=60.0,
     plant={'system': 'two_state', 'temperature.noise': 0.05, 'seed': 3,
            'coolant_temperature.delay': 1.0, 'coolant_temperature.lag': 2.0})
 
@@ -68,8 +68,9 @@ def test_another_reader_finds_every_measurement_and_command(recorded_loop: Path)
     assert set(heard) == TOPICS
     assert seconds['/temperature'] == seconds['/coolant_setpoint'] == whole
     # of what keeps the last only, a recorder that is found late misses the first
-    for topic in ('/coolant_temperature', '/concentration'):
-        assert seconds[topic][-50:] == whole[-50:]
+    assert seconds['/coolant_temperature'][-50:] == whole[-50:]
+    # and of what is no signal of its loop, it looks for publishers
+    assert seconds['/concentration'] == whole[-len(seconds['/concentration']):]
     assert [m.temperature for m in heard['/setpoint']] == pytest.approx([SETPOINT])
     assert heard['/active_setpoint'][-1].temperature == pytest.approx(SETPOINT)
     assert seconds['/active_setpoint'] == [1, 21]
@@ -91,8 +92,11 @@ def test_types_and_offers_are_those_of_ros(ros: Harness, recorded_loop: Path) ->
         channels = make_reader(stream).get_summary().channels.values()
     stored = {channel.topic: channel.metadata for channel in channels}
     assert set(stored) == TOPICS
+    wiring = preset_wiring('two_state')
+    assert wiring is not None
+    known = topics.known(wiring)
     for topic, metadata in stored.items():
-        kind = topics.TYPES.get(topic) or topics.TYPES[topic.removeprefix('/')]
+        kind, _ = known.get(topic) or known[topic.removeprefix('/')]
         ros.node.create_publisher(kind, topic, 1)
         (info, *_) = ros.node.get_publishers_info_by_topic(topic)
         assert metadata['topic_type_hash'] == str(info.topic_type_hash)
@@ -147,7 +151,7 @@ def test_lockstep_gives_bit_identical_commands(ros: Harness, recorded_loop: Path
     assert stamps(commands) == recorded.stamp_ns.tolist()
     assert [command.temperature for command in commands] == recorded.values.tolist()
     # the coolant in force with each measurement, and one set-point
-    inputs = {f'/{name}' for name in PlayerParameters().topics}
+    inputs = {f'/{name}' for name in player_table().snapshot({}).topics}
     counts = bags.summary(recorded_loop).counts
     assert f'played {sum(counts[topic] for topic in inputs & set(counts))} messages' in said
 
@@ -258,7 +262,7 @@ def test_bag_in_a_namespace_is_played_into_another_controller(
     ros.start('controller', arguments=('-r', '__ns:=/unit_2'))
     ros.meet('unit_2/controller')
     play(
-        ros, bag, rate=0.0, topics=['/unit_1/temperature'], measurement='/unit_1/temperature',
+        ros, bag, rate=0.0, topics=['/unit_1/temperature'], measurement=['/unit_1/temperature'],
         answer='/unit_2/coolant_setpoint',
         arguments=('-r', '/unit_1/temperature:=/unit_2/temperature'))
     ros.wait_until(lambda: len(commands) >= 5)

@@ -152,7 +152,10 @@ def with_states(**changes: object) -> LiftedModel:
 
 
 BAD_MODELS = {
-    'other unit': (with_states(units=('degC',)), "has states in ('degC',)"),
+    'other unit': (
+        with_states(units=('degC',)),
+        'has states temperature [degC] and inputs coolant_temperature '
+        '[K], this controller was started for states temperature [K] and inputs'),
     'nominal point outside its range': (
         with_states(center=np.array([400.0])),
         'trained for a temperature of 305 to 327 K around 400 K, which cannot be'),
@@ -163,8 +166,8 @@ BAD_MODELS = {
         f'set-point {STEADY:.2f} degC is outside the trained range 31.85 degC to 51.65 degC'),
     'input without effect': (
         replace(SHIPPED, A=-SHIPPED.A, B=np.zeros((1, 1))),
-        f'tried at {STEADY:.2f} degC with the set-point {STEADY:.2f} degC the model fails (no '
-        'feedback gain: the Hamiltonian has no stable subspace of full size'),
+        f'tried at temperature {STEADY:.6g} degC with the set-point temperature {STEADY:.6g} degC '
+        'the model fails (no feedback gain: the Hamiltonian has no stable subspace of full size'),
     'gain beyond its bound': (
         replace(SHIPPED, A=1e6 * np.abs(SHIPPED.A)), 'the model fails'),
     'numbers that overflow': (replace(SHIPPED, A=1e300 * SHIPPED.A), 'the model fails'),
@@ -204,7 +207,7 @@ def test_unsuitable_model_is_refused_with_the_reason(
     assert measure() == pytest.approx(before, abs=1e-9)
 
     assert running.reload() == (
-        True, 'model reactor_nz3: n_z = 3, trained for 31.85 degC to 53.85 degC')
+        True, 'model reactor_nz3: n_z = 3, trained for temperature 31.85 to 53.85 degC')
     status = ros.wait_for_status(STATUS, lambda s: s.level == DiagnosticStatus.OK)
     assert value(status, 'model refused') == 'none'
 
@@ -229,10 +232,10 @@ import os, sys
 from koopman_ros.nodes import controller
 from koopman_ros.ros import model_reload
 read = model_reload.load_suitable
-def slowly(name):
+def slowly(name, *others):
     if os.path.exists(name + '.disk'):
         open(name + '.disk', 'rb').read()
-    return read(name)
+    return read(name, *others)
 model_reload.load_suitable = slowly
 """
 

@@ -253,7 +253,7 @@ def altered(whole: list[Record]) -> list[Record]:
 
 
 @pytest.mark.parametrize(('change', 'code', 'words'), [
-    (altered, 1, 'replay: not all recorded commands are reproduced within 0.1 K'),
+    (altered, 1, 'replay: not all recorded commands are reproduced within 0.1: '),
     (lambda whole: whole[-5:], 3, 'replay: nothing to compare in a bag'),
     (lambda whole: whole[:1], 3, 'replay: nothing to compare in a bag'),
     (lambda whole: [*whole[:9], *whole[:9]], 1, 'comes again, or after record'),
@@ -288,8 +288,9 @@ def test_run_without_its_start_and_with_a_lost_record_is_reproduced_from_the_sna
 def test_report_tells_where_the_new_model_and_the_new_tuning_differ(
         tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:
     path = write_run(tmp_path / 'run.mcap')
-    for new, tuning in (('reactor_linear', ()), ('reactor_nz4', ('-p', 'coolant_weight:=5.0')),
-                        ('reactor_nz4', ())):
+    for new, tuning in (
+            ('reactor_linear', ()), ('reactor_nz4', ('-p', 'coolant_temperature.weight:=5.0')),
+            ('reactor_nz4', ())):
         assert run_here(
             replay, '--params-file', str(config_directory() / 'controller.yaml'), *tuning,
             bags=f'[{path}]', new_model=new, output=tmp_path / 'out') == 0
@@ -324,7 +325,12 @@ def test_several_bags_and_the_shipped_parameter_file(tmp_path: Path) -> None:
                               'has /controller_events, /coolant_setpoint, /temperature'),
     (('-r', 'controller_events:=coolant_setpoint'),
      'is sensor_msgs/msg/Temperature and not std_msgs'),
-    (('-p', 'coolant_min:=40.0'), 'coolant_min = 40.0 degC must be below'),
+    *((('-p', 'new_model:=reactor_nz4', '-p', given), words) for given, words in (
+        ('coolant_temperature.min:=40.0', 'coolant_temperature.min = 40.0 degC must be below'),
+        ('coolant_temperature.min:=40',
+         'coolant_temperature.min = 40 must be a double, e.g. 1.0'),
+        ('coolant_min:=10.0', 'coolant_min is now coolant_temperature.min [degC]: write '
+                              'coolant_temperature.min: 10.0'))),
     (('-p', 'output:=/dev/null/out'), 'Not a directory'),
 ])
 def test_what_cannot_be_replayed_is_refused_in_one_line(
