@@ -107,7 +107,7 @@ def stamped_number(path: str | os.PathLike[str], entry: BagMessage, place: Place
 
 def _other_type(path: str | os.PathLike[str], topic: str, found: str, wanted: str) -> BagReadError:
     return BagReadError(f'topic {topic!r} of bag {os.fspath(path)!r} is {found}, not {wanted}: '
-                        'name another topic')
+                        'name another topic, or its type')
 
 
 def spikes_and_jumps(values: NDArray[np.float64], least: float = 0.0

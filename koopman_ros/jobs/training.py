@@ -150,10 +150,12 @@ def _in_words(summary: Mapping[str, Any]) -> str:
         kept = f'; it is kept as {summary["model_file"]}' if summary['model_file'] else ''
         return f'the new lift is refused: {reasons}{kept}'
     present = summary['heldout_error_of_present_lift']
+    other, name = (('heldout_error_of_linear_model', 'best linear model') if present is None else (
+        'heldout_error_of_present_lift', 'present one'))
     return (f'the new lift is accepted: error on held-out records '
-            f'{_errors(summary, "heldout_error")}, that of the present one '
-            + ('infinite, as it diverges' if None in present.values()
-               else _errors(summary, 'heldout_error_of_present_lift'))
+            f'{_errors(summary, "heldout_error")}, that of the {name} '
+            + ('infinite, as it diverges' if None in summary[other].values()
+               else _errors(summary, other))
             + f'; written to {summary["model_file"]}')
 
 

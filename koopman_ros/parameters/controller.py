@@ -212,7 +212,8 @@ def table_of(model: LiftedModel, given: Mapping[str, Any] = MappingProxyType({})
             found.states, found.inputs):
         raise ConfigurationError(
             f'the model has {found}, the system {system!r} has {expected}: choose a model of that '
-            'system, or name in system what the model is of (an empty name: none that is shipped)')
+            'system, correct states_measured and inputs_commanded, or name in system what the '
+            'model is of (an empty name: none that is shipped)')
     signals = signals_of(model, tuple(given.get('controlled', own.get('controlled', ()))))
     defaults: dict[str, Any] = dict(signals.defaults())
     for name, scale in zip(model.states.names, model.states.scale.tolist(), strict=True):

@@ -123,7 +123,7 @@ class TrainerParameters:
         'trainer records')
     model: str = parameter(
         '', 'present lift, which a new one has to beat: name of a shipped model, or '
-        'path of a .safetensors model file')
+        'path of a .safetensors model file; empty to learn the first one')
     model_output: str = parameter(
         'retrained.safetensors', 'model file that an accepted lift is written to; the one before '
         'it is kept as .previous.safetensors')

@@ -153,8 +153,8 @@ def learn_lift(found: Identified, plant: Plant, n_z: int, *, seed: int, starts: 
 class Thresholds:
     """Thresholds that a lift has to reach."""
 
-    #: by this share its held-out error must be smaller than those of the present lift and of the
-    #: best linear model
+    #: by this share its held-out error must be smaller than those of the present lift, where
+    #: there is one, and of the best linear model
     margin: float = 0.1
     condition: float = 1e4  #: largest condition number of E[z z']
 
@@ -173,7 +173,7 @@ class Decision:
     warnings: tuple[str, ...]  #: for the user, in either case
     rmse: Array  #: (n_x,) error of its predictions of the measurements, in state units
     drift_rmse: Array  #: (n_x,) the same of the drift that it was learned from
-    current_rmse: Array  #: (n_x,) the same of the present lift
+    current_rmse: Array | None  #: (n_x,) the same of the present lift, None without one
     linear_rmse: Array  #: (n_x,) the same of the best linear model
     noise: Array  #: (n_x,) standard deviation of the measurements from sample to sample
     loops: int  #: number of closed loops on the estimated drift that were tried
@@ -204,20 +204,23 @@ def lifted_rate(model: LiftedModel, time_unit_seconds: float) -> Rate:
     return rate
 
 
-def decide(found: Identified, trained: Trained, current: LiftedModel, thresholds: Thresholds
-          ) -> Decision:
+def decide(found: Identified, trained: Trained, current: LiftedModel | None,
+           thresholds: Thresholds) -> Decision:
     """Compare a new lift with the present and a linear one, held out, and close its loop."""
     model, scale = trained.model, found.drift.box.states.scale
     unit = model.seconds_per_time_unit
     held_out = Segments.of(found.held_out, longest_step(found.held_out))
-    rmse, drift_rmse, current_rmse, linear_rmse = (
+    rmse, drift_rmse, linear_rmse = (
         prediction_error(rate, held_out, scale)
-        for rate in (lifted_rate(model, unit), found.drift.rate, lifted_rate(current, unit),
-                     found.linear.rate))
+        for rate in (lifted_rate(model, unit), found.drift.rate, found.linear.rate))
+    current_rmse = None if current is None else prediction_error(
+        lifted_rate(current, unit), held_out, scale)
     reasons = []
     own = _size(rmse, scale)
     for name, other in (('the present lift', current_rmse),
                         ('the best linear model', linear_rmse)):
+        if other is None:
+            continue
         if not np.isfinite(own) or own > (1.0 - thresholds.margin) * _size(other, scale):
             reasons.append(
                 f'its error on held-out records, {_text(rmse, model)}, is not '

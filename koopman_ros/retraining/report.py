@@ -15,7 +15,7 @@ from koopman_ros.lifting import Coordinates
 from koopman_ros.reports import bullets, drawing, table, write_figures, write_page
 from koopman_ros.retraining.lift import lifted_rate
 from koopman_ros.retraining.task import CELLS, Retrained, visited_cells
-from koopman_ros.units import shown, unit_label
+from koopman_ros.units import SECONDS_PER_TIME_UNIT, shown, unit_label
 
 
 def write_report(retrained: Retrained) -> list[Path]:
@@ -33,7 +33,7 @@ def write_report(retrained: Retrained) -> list[Path]:
 
 def _sections(retrained: Retrained) -> Iterator[str]:
     found, decision, trained = retrained.found, retrained.decision, retrained.trained
-    states, inputs = retrained.present.states, retrained.present.inputs
+    states, inputs = found.drift.box.states, found.drift.box.inputs
     errors = tuple(f'error of {name} [{unit}]'
                    for name, unit in zip(states.names, states.units, strict=True))
     yield f'**The new lift is {"accepted" if retrained.accepted else "refused"}.**'
@@ -57,7 +57,7 @@ def _sections(retrained: Retrained) -> Iterator[str]:
                                      zip(inputs.names, inputs.units, strict=True))),
                 ((f'{name} [{unit}]', *(f'{gain:.5g}' for gain in row)) for name, unit, row in zip(
                     states.names, states.units,
-                    found.drift.input_matrix / retrained.present.seconds_per_time_unit,
+                    found.drift.input_matrix / SECONDS_PER_TIME_UNIT[retrained.plant.time_unit],
                     strict=True)), range(1, 1 + len(inputs)))
     yield 'Errors on the segments to choose by:'
     yield table(('degree', 'method', *errors),
@@ -72,7 +72,7 @@ def _sections(retrained: Retrained) -> Iterator[str]:
                     ('the new lift', decision.rmse),
                     ('the drift that it was learned from', decision.drift_rmse),
                     ('the present lift', decision.current_rmse),
-                    ('the best linear model', decision.linear_rmse))),
+                    ('the best linear model', decision.linear_rmse)) if rmse is not None),
                 range(1, 1 + len(states)))
     yield 'The noise of the measurements is part of each.'
     eigenvalues = ', '.join(f'{value:.3g}' for value in trained.model.eigenvalues)
@@ -88,7 +88,7 @@ def _label(signals: Coordinates, k: int) -> str:
 
 def _draw(path: Path, retrained: Retrained) -> bool:
     """Draw where the data lie, what was learned, and how it predicts; False without matplotlib."""
-    n_x = len(retrained.present.states)
+    n_x = len(retrained.found.drift.box.states)
     try:
         with drawing(path, n_x, 3, size=(15.0, 4.6 * n_x)) as (figure, panels):
             for i in range(n_x):
@@ -124,16 +124,16 @@ def _draw_coverage(axes: Any, found: Identified, i: int) -> None:
 
 
 def _lifts(retrained: Retrained) -> list[tuple[str, Rate, str]]:
-    """Return label, rate and colour of the present lift and of the new one, where there is one."""
-    unit = retrained.present.seconds_per_time_unit
-    new = [] if retrained.trained is None else [
-        ('new lift', lifted_rate(retrained.trained.model, unit), 'tab:green')]
-    return [('present lift', lifted_rate(retrained.present, unit), 'tab:red'), *new]
+    """Return label, rate and colour of the present lift and of the new one, where they are."""
+    new = None if retrained.trained is None else retrained.trained.model
+    return [(name, lifted_rate(model, SECONDS_PER_TIME_UNIT[retrained.plant.time_unit]), color)
+            for name, model, color in (('present lift', retrained.present, 'tab:red'),
+                                       ('new lift', new, 'tab:green')) if model is not None]
 
 
 def _draw_drift(axes: Any, retrained: Retrained, i: int) -> None:
     """Draw a state's rate over the state, the others and the inputs in the middle."""
-    found, current = retrained.found, retrained.present
+    found = retrained.found
     box = found.drift.box
     x = np.tile(box.states.center, (200, 1))
     x[:, i] = np.linspace(box.states.lower[i], box.states.upper[i], 200)
@@ -145,13 +145,14 @@ def _draw_drift(axes: Any, retrained: Retrained, i: int) -> None:
     axes.axhline(0.0, color='k', linestyle='--', linewidth=1.0,
                  label='estimated from the data')
     axes.set(xlabel=_label(box.states, i),
-             ylabel=f'difference of the rate [{box.states.units[i]}/{current.time_unit}]',
+             ylabel=f'difference of the rate [{box.states.units[i]}/{retrained.plant.time_unit}]',
              title='rate in the middle of the range, less the estimate')
     axes.legend()
 
 
 def _draw_prediction(axes: Any, retrained: Retrained, i: int) -> None:
-    found, current, states = retrained.found, retrained.present, retrained.present.states
+    found = retrained.found
+    states = found.drift.box.states
     episode = found.held_out[0]
     segments = Segments.of([episode], longest_step([episode]))
     times = np.concatenate(([0.0], np.cumsum(segments.steps[:, 0])))
@@ -162,6 +163,6 @@ def _draw_prediction(axes: Any, retrained: Retrained, i: int) -> None:
         x0, _ = fitted_starts(rate, segments, found.drift.box.states.scale)
         path = segments.path(rate, x0)[:, 0, i]
         axes.plot(times, shown(path, states.units[i]), color=color, label=name)
-    axes.set(xlabel=f'time [{current.time_unit}]', ylabel=_label(states, i),
+    axes.set(xlabel=f'time [{retrained.plant.time_unit}]', ylabel=_label(states, i),
              title='prediction of a held-out segment')
     axes.legend()

@@ -24,9 +24,9 @@ from koopman_ros.bags import Account, loop_episodes, RecordedInput, RecordedStat
 from koopman_ros.identification import Identified, identify, Stopped
 from koopman_ros.learning import NoUsefulLift, Progress, Trained
 from koopman_ros.lifting import Box, Coordinates, LiftedModel, load, save
-from koopman_ros.plant_data import Episode
+from koopman_ros.plant_data import Episode, Plant
 from koopman_ros.retraining.lift import decide, Decision, learn_lift, Thresholds
-from koopman_ros.units import NANOSECONDS
+from koopman_ros.units import NANOSECONDS, SECONDS_PER_TIME_UNIT
 from koopman_ros.wire import Place
 
 CELLS = 10  # along each of two signals, by which the visited share of their ranges is told
@@ -46,9 +46,10 @@ class Task:
 
     bags: tuple[str, ...]  #: files or folders
     output: str  #: model file to write, ending in ``.safetensors``
-    model: str  #: file of the present lift
+    model: str  #: file of the present lift, empty to learn the first one
     states: tuple[RecordedState, ...]  #: those of the present lift, in any order
     inputs: tuple[RecordedInput, ...]  #: likewise
+    plant: str = ''  #: what a first lift calls the plant
     tolerance: float = 0.0  #: how far stamps of one sample of several states may lie apart, in s
     coordinates: int = 3  #: n_z of the new lift
     seed: int = 0  #: of the split and of the training
@@ -85,7 +86,8 @@ class Retrained:
     reasons: tuple[str, ...]  #: why it was refused; empty when it was accepted
     #: share of the cells of two signals' ranges that the episodes visit, for all pairs of signals
     coverage: Mapping[tuple[str, str], float]
-    present: LiftedModel  #: the lift that was in use; its time unit is that of the drift
+    plant: Plant  #: names, units and nominal point; its time unit is that of the drift
+    present: LiftedModel | None  #: the lift that was in use, where there was one
     model_file: str = ''  #: where the lift was written, or an empty string
 
     @property
@@ -95,8 +97,9 @@ class Retrained:
 
     def summary(self) -> dict[str, object]:
         """Return the figures by name, for a JSON file; None is an error that is infinite."""
-        states, inputs = self.present.states, self.present.inputs
-        gains = self.found.drift.input_matrix / self.present.seconds_per_time_unit
+        box = self.found.drift.box
+        states, inputs = box.states, box.inputs
+        gains = self.found.drift.input_matrix / SECONDS_PER_TIME_UNIT[self.plant.time_unit]
 
         def by_state(values: Array) -> dict[str, float | None]:
             return {name: float(value) if np.isfinite(value) else None
@@ -121,7 +124,8 @@ class Retrained:
         if self.decision and self.trained:
             figures |= {
                 'heldout_error': by_state(self.decision.rmse),
-                'heldout_error_of_present_lift': by_state(self.decision.current_rmse),
+                'heldout_error_of_present_lift': None if self.decision.current_rmse is None else (
+                    by_state(self.decision.current_rmse)),
                 'heldout_error_of_linear_model': by_state(self.decision.linear_rmse),
                 'heldout_rw': self.trained.figures.fit.rw,
                 'heldout_rx': self.trained.figures.fit.rx,
@@ -148,30 +152,38 @@ def retrain(task: Task, on_progress: OnProgress = lambda *_: False) -> Retrained
     thresholds = Thresholds(task.margin, task.condition)
     if Path(task.output).suffix != '.safetensors':
         raise ValueError(f'output = {task.output!r} must end in .safetensors')
-    current = load(task.model)
-    states = _in_order(task.states, current.states, 'state', task.model)
-    inputs = _in_order(task.inputs, current.inputs, 'input', task.model)
-    B = _known_gain(task, current)
+    current = load(task.model) if task.model else None
+    states: Sequence[RecordedState] = task.states
+    inputs: Sequence[RecordedInput] = task.inputs
+    if current is not None:
+        states = _in_order(states, current.states, 'state', task.model)
+        inputs = _in_order(inputs, current.inputs, 'input', task.model)
+    plant = _unknown(task) if current is None else current.plant
+    plant = replace(plant, B=_known_gain(task, plant))
     # a folder that cannot be written should fail now, not after the training
     Path(task.output).parent.mkdir(parents=True, exist_ok=True)
     _stop_if(on_progress(0.0, 'reading bags'))
     recorded, account = loop_episodes(
         task.bags, states, inputs, tolerance_ns=round(task.tolerance * NANOSECONDS),
-        least_jumps=(_LEAST_JUMP * current.states.scale).tolist())
+        least_jumps=None if current is None else (_LEAST_JUMP * current.states.scale).tolist())
     if not recorded:
         raise ValueError('the bags hold no usable segment of measurements: '
                          + '; '.join(account.lines()))
-    seconds = current.seconds_per_time_unit
+    seconds = SECONDS_PER_TIME_UNIT[plant.time_unit]
     episodes = [replace(episode, time=episode.time / seconds,
                         input_time=episode.input_time / seconds) for episode in recorded]
     found = identify(
-        replace(current.plant, B=B), episodes, seed=task.seed,
+        plant, episodes, seed=task.seed,
         watch=lambda done, total, text: on_progress(
             _at('estimate', done / total), f'estimating: {text}'))
+    if current is None:
+        # an input that keeps the plant somewhere in the middle is not far
+        plant = replace(plant, nominal_state=found.drift.box.states.center,
+                        nominal_input=found.drift.box.inputs.center)
     bare = Retrained(task, account, found, None, None, (), coverage(episodes, found.drift.box),
-                     current)
+                     plant, current)
     try:
-        trained = learn_lift(found, current.plant, task.coordinates, seed=task.seed,
+        trained = learn_lift(found, plant, task.coordinates, seed=task.seed,
                              starts=task.starts, watch=lambda now: on_progress(
                                  _at('learn', now.finished / now.total), _learning(now)))
     except NoUsefulLift as error:
@@ -229,22 +241,31 @@ def _in_order(given: Sequence[_Signal], wanted: Coordinates, kind: str, path: st
     return [by_name[name] for name in wanted.names]
 
 
-def _known_gain(task: Task, model: LiftedModel) -> Array | None:
-    """Return B (n_x, n_u) of a task per time unit of a model, None to learn it."""
+def _unknown(task: Task) -> Plant:
+    """Return what is known of a plant without a lift, but for its nominal point."""
+    states, inputs = task.states, task.inputs
+    return Plant(task.plant, tuple(signal.name for signal in states),
+                 tuple(signal.unit for signal in states), tuple(signal.name for signal in inputs),
+                 tuple(signal.unit for signal in inputs), 's', np.full(len(states), np.nan),
+                 np.full(len(inputs), np.nan), None)
+
+
+def _known_gain(task: Task, plant: Plant) -> Array | None:
+    """Return B (n_x, n_u) of a task per time unit of a plant, None to learn it."""
     if not task.input_gain:
         return None
-    B = np.zeros((model.n_x, model.n_u))
+    B = np.zeros((len(plant.state_names), len(plant.input_names)))
     for state, row in task.input_gain.items():
         for name, gain in row.items():
-            if state not in model.states.names or name not in model.inputs.names:
+            if state not in plant.state_names or name not in plant.input_names:
                 raise ValueError(
-                    f'input_gain names {name} acting on {state}: the present lift has the states '
-                    f'{", ".join(model.states.names)} and the inputs '
-                    f'{", ".join(model.inputs.names)}')
+                    f'input_gain names {name} acting on {state}: the lift has the states '
+                    f'{", ".join(plant.state_names)} and the inputs '
+                    f'{", ".join(plant.input_names)}')
             if not math.isfinite(gain):
                 raise ValueError(f'input_gain of {name} on {state} is {gain}, must be finite')
-            B[model.states.names.index(state), model.inputs.names.index(name)] = gain
-    return B * model.seconds_per_time_unit
+            B[plant.state_names.index(state), plant.input_names.index(name)] = gain
+    return B * SECONDS_PER_TIME_UNIT[plant.time_unit]
 
 
 def _at(stage: str, share: float) -> float:

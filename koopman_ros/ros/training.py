@@ -51,12 +51,11 @@ class Training:
                 if bag]
         if not bags:
             raise ValueError('there is no bag to train from: record one, or name it in bags')
-        if not settings.model:
-            raise ValueError('there is no present lift to compare with: name it in model')
         self._job = RetrainingJob({
             'bags': [os.path.abspath(bag) for bag in bags],
             'output': os.path.abspath(settings.model_output),
-            'model': os.path.abspath(model_path(settings.model)),
+            'model': os.path.abspath(model_path(settings.model)) if settings.model else '',
+            'plant': settings.system,
             **self._signals(), **settings.training()})
         self._state = self._job.state
         self._last_line = time.monotonic()

@@ -289,3 +289,36 @@ def test_visited_cells_and_their_share_of_all(episodes, within, cells):
     else:
         # no two of these cells share a pair of states, or of a state and the input
         assert shares == dict.fromkeys([('x1', 'x2'), ('x1', 'u1'), ('x2', 'u1')], 0.02)
+
+
+def test_first_lift_is_learned_without_a_present_one(bag, tmp_path):
+    """Its nominal point is found in the data; B is known here, in 1/s."""
+    rate = float(reactor(0.8).B[0, 0]) / 60.0
+    retrained = retrain(small(
+        bag, tmp_path / 'first.safetensors', '', plant='jacket',
+        input_gain={'temperature': {'coolant_temperature': rate}}))
+    assert retrained.reasons == ()
+    assert retrained.present is None
+    model = load(retrained.model_file)
+    assert (model.provenance.plant, model.time_unit) == ('jacket', 's')
+    assert [(box.names, box.units) for box in (model.states, model.inputs)] == [
+        ((signal.name,), (signal.unit,)) for signal in (*STATES, *INPUTS)]
+    # in the middle of the data, and held there by its nominal input, but for 0.01 K/s
+    middle = 0.5 * (model.states.lower + model.states.upper)
+    np.testing.assert_allclose(model.states.center, middle, atol=0.1 * model.states.scale[0])
+    drift = reactor(0.8).derivative(model.states.center, model.inputs.center) / 60.0
+    assert abs(drift[0]) < 0.01
+    # compared with a linear model alone, in figures and on the page
+    figures = retrained.summary()
+    assert figures['heldout_error_of_present_lift'] is None
+    assert figures['heldout_error']['temperature'] < 0.9 * figures[
+        'heldout_error_of_linear_model']['temperature']
+    paths = write_report(retrained)
+    assert [path.suffix for path in paths] == ['.json', '.md', '.png']
+    assert 'present lift' not in paths[1].read_text()
+
+
+def test_input_gain_of_a_first_lift_names_its_signals(bag, tmp_path):
+    with pytest.raises(ValueError, match='names steam acting on temperature: the lift has the st'):
+        retrain(small(bag, tmp_path / 'new.safetensors', '',
+                      input_gain={'temperature': {'steam': 1.0}}))
