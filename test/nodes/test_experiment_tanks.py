@@ -13,16 +13,13 @@ import numpy as np
 import pytest
 from sensor_msgs.msg import JointState
 
-from koopman_ros.lifting import Coordinates, linearised_model, Provenance, save
-from koopman_ros.plants.library.two_tanks import TwoTanks
 from koopman_ros.ros import topics
 from koopman_ros.ros.codec import stamp_message
 from koopman_ros.testing import Harness
 from koopman_ros.units import NANOSECONDS
 from support.nodes import seconds, value
+from support.tanks import LEVELS, linear, PUMPS, TANKS
 
-TANKS = TwoTanks().system()
-LEVELS, PUMPS = TANKS.state_names, TANKS.input_names
 STATUS, SERVICE = 'trainer: experiment', 'trainer/experiment'
 LOW, HIGH, RATE, SAFE = (5.0, 1.0), (7.5, 3.0), (0.5, 0.125), (6.0, 2.0)  # V, V/s
 TRAINER = {
@@ -34,17 +31,6 @@ TRAINER = {
     **{f'{name}.experiment_{end}': bound for name in LEVELS
        for end, bound in (('min', 0.02), ('max', 0.5))}}
 PLANT = {'system': 'two_tanks', 'sample_period': 1.0, 'lockstep': True, 'speed': 0.0}
-
-
-def linear(folder: Path, gain: float = 1.0) -> Path:
-    """Write a linear model of the tanks, whose pumps are so much stronger than they are."""
-    span = 0.4 * TANKS.nominal_state, 2.0 * TANKS.nominal_state
-    boxes = (Coordinates.spanning(LEVELS, ('m', 'm'), *span, TANKS.nominal_state),
-             Coordinates.spanning(PUMPS, ('V', 'V'), np.zeros(2), np.array([12.0, 6.0]),
-                                  TANKS.nominal_input))
-    save(linearised_model(TANKS.drift_jacobian(TANKS.nominal_state), gain * TANKS.B, *boxes, 's',
-                          Provenance('two tanks')), folder / 'linear.safetensors')
-    return folder / 'linear.safetensors'
 
 
 def numbers(messages: list[Any]) -> np.ndarray:
