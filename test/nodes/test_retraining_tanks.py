@@ -16,8 +16,6 @@ from koopman_ros.testing import Harness
 from support.nodes import value
 from support.tanks import LEVELS, linear, PUMPS, TANKS
 
-# half a minute of computing, several of them beside other programs
-pytestmark = pytest.mark.timeout(600)
 LAG = 10.0  # s
 NOISE = 2e-4  # m
 TRAINER = {
