@@ -18,7 +18,6 @@ from typing import Any
 
 import numpy as np
 
-from koopman_ros.arrays import Array
 from koopman_ros.bags import summary
 from koopman_ros.demo.console import LiveTable
 from koopman_ros.demo.loop import run_loop, Scenario
@@ -30,14 +29,12 @@ from koopman_ros.parameters.plant import PlantTable
 from koopman_ros.parameters.table import parameter, ParameterTable, per_signal
 from koopman_ros.parameters.trainer import preset_wiring
 from koopman_ros.parameters.wire import preset, Signals
-from koopman_ros.plants import ControlAffineSystem
+from koopman_ros.plants import steady_state
 from koopman_ros.plants.optimum import cost_along, Course, linear_law, optimum, Task
 from koopman_ros.reports import draw_limits, drawing, DRAWN_RANGE, legend, write_figures
 from koopman_ros.resources import config_directory, model_path
 from koopman_ros.units import conversion, display_unit, shown, unit_label
 
-_MAX_ITERATIONS = 50
-_STEADY = 1e-12  # of the states' scales
 _LINEAR = 'linear law'
 
 
@@ -95,7 +92,7 @@ def run_plant(name: str, output: Path, speed: float) -> dict[str, object]:
     first = round(told.step_time / plant.sample_period)
     states, inputs = (np.stack(list(of.values()), axis=1)[first:]
                       for of in (run.measured, run.commanded))
-    x_ref, u_ref = resting_point(system, setpoints)
+    x_ref, u_ref = steady_state(system, setpoints)
     task = Task(system, states[0], x_ref, u_ref,
                 np.array([tuning.states[signal].weight for signal in signals.states]),
                 np.array([tuning.inputs[signal].weight for signal in signals.inputs]),
@@ -108,14 +105,17 @@ def run_plant(name: str, output: Path, speed: float) -> dict[str, object]:
           model.states, tuning)
     counts = summary(bag).counts
     result: dict[str, object] = {
-        **{signal: {
-            'unit': signals.states[signal], 'setpoint': setpoint,
-            'final_error': abs(run.final_error(signal, setpoint)),
-            'linear_final_error': float(abs(linear.states[-1, list(signals.states).index(signal)]
-                                            - setpoint)),
-            'settling_time_seconds': run.settling_time(
-                signal, setpoint, told.step_time, told.states[signal].tolerance),
-        } for signal, setpoint in setpoints.items()},
+        'unit': {signal: signals.states[signal] for signal in setpoints},
+        'setpoint': setpoints,
+        'final_error': {signal: abs(run.final_error(signal, setpoint))
+                        for signal, setpoint in setpoints.items()},
+        'linear_final_error': {
+            signal: float(abs(linear.states[-1, list(signals.states).index(signal)] - setpoint))
+            for signal, setpoint in setpoints.items()},
+        'settling_time_seconds': {
+            signal: run.settling_time(signal, setpoint, told.step_time,
+                                      told.states[signal].tolerance)
+            for signal, setpoint in setpoints.items()},
         'cost': cost, 'optimal_cost': best.cost, 'linear_cost': linear.cost,
         'measurements': len(run.seconds), 'commands': len(run.command_seconds),
         'bag_messages': sum(counts.values()),
@@ -123,31 +123,6 @@ def run_plant(name: str, output: Path, speed: float) -> dict[str, object]:
     }
     write_figures(output / 'summary.json', result)
     return result
-
-
-def resting_point(system: ControlAffineSystem, setpoints: Mapping[str, float]
-                  ) -> tuple[Array, Array]:
-    """
-    Return state (n_x,) and input (n_u,) at which a plant rests with some states where they should.
-
-    Newton's method from the nominal point.
-
-    :raises ValueError: when it finds none.
-    """
-    held = [system.state_names.index(signal) for signal in setpoints]
-    goal = np.array(list(setpoints.values()))
-    n, scale = system.n_x, np.concatenate([system.state_scale, system.state_scale[held]])
-    point = np.concatenate([system.nominal_state, system.nominal_input])
-    for _ in range(_MAX_ITERATIONS):
-        x, u = np.split(point, [n])
-        miss = np.concatenate([system.derivative(x, u), x[held] - goal]) / scale
-        if np.max(np.abs(miss)) <= _STEADY:
-            return x, u
-        slope = np.zeros((len(miss), len(point)))
-        slope[:n, :n], slope[:n, n:] = system.drift_jacobian(x), system.B
-        slope[n + np.arange(len(held)), held] = 1.0
-        point -= np.linalg.lstsq(slope / scale[:, None], miss, rcond=None)[0]
-    raise ValueError(f'{system.name} does not rest at {dict(setpoints)}: choose other set-points')
 
 
 def _unit(signals: Signals, signal: str) -> str:

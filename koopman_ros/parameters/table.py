@@ -14,7 +14,7 @@ import math
 from types import MappingProxyType
 from typing import Any, Generic, TypeVar
 
-from koopman_ros.units import display_unit
+from koopman_ros.units import display_unit, ZERO_CELSIUS
 
 T = TypeVar('T')
 
@@ -247,7 +247,10 @@ def _row(name: str, item: Field[Any], unit: str, defaults: Mapping[str, Any]) ->
     if isinstance(item.default, (float, tuple)):
         # a file may say 1 for 1.0, and has lists
         default = type(item.default)(default)
-    return Specification(name, default, **{**item.metadata, 'unit': own})
+    row = Specification(name, default, **{**item.metadata, 'unit': own})
+    # there is nothing below absolute zero
+    return replace(row, default=max(default, -ZERO_CELSIUS), minimum=max(
+        row.minimum, -ZERO_CELSIUS)) if own == 'degC' and math.isfinite(row.minimum) else row
 
 
 def as_yaml(value: Any) -> str:

@@ -8,6 +8,7 @@ from __future__ import annotations
 from collections.abc import Collection, Mapping
 from dataclasses import dataclass
 from functools import cached_property
+import math
 import re
 from typing import Any
 
@@ -199,6 +200,11 @@ class Wiring:
                 places = getattr(self, kind)
                 if missing := [name for name, found in places.items() if not found.topic]:
                     return f'{missing[0]} has no topic: name one'
+            heard = {found.topic: name for name, found in self.measured.items()}
+            for name, found in self.commands.items():
+                if found.topic in heard:
+                    return (f'{name} is commanded on {found.topic!r}, where {heard[found.topic]} '
+                            'is measured: name another topic for one of them')
         except ValueError as error:
             return str(error)
         return ''
@@ -280,6 +286,8 @@ def renamed(node: str, given: Mapping[str, Any], table: ParameterTable[Any]) -> 
             value, row = given[name], table.rows[now]
             if isinstance(factor, Mapping):
                 value = factor.get(value, value)
+            elif factor == 'digits':
+                value = round(-math.log10(value), 6) if 0.0 < value < 1.0 else row.default
             elif isinstance(value, (int, float)):
                 value = float(f'{value * factor:.12g}')
             written = as_yaml((value,) if isinstance(row.default, tuple) else value)

@@ -346,7 +346,8 @@ def test_rcl_reads_the_file_of_a_plant(ros: Harness, system: str) -> None:
 def test_former_name_is_refused_with_the_line_to_write(ros: Harness, node: str, name: str) -> None:
     now, factor = FORMER[node][name]
     row = TABLES[node].rows[now]
-    old, new = next(iter(factor.items())) if isinstance(factor, dict) else (3, 3.0 * factor)
+    old, new = next(iter(factor.items())) if isinstance(factor, dict) else (
+        ('1.0e-06', 6.0) if factor == 'digits' else (3, 3.0 * factor))
     with pytest.raises(ConfigurationError) as refusal:
         declared(ros, '-p', f'{name}:={old}', name=node, table=TABLES[node])
     unit = f' [{row.unit}]' if row.unit else ''
@@ -359,6 +360,19 @@ def test_former_name_is_refused_with_the_line_to_write(ros: Harness, node: str, 
     assert isinstance(written, list if isinstance(row.default, tuple) else type(row.default))
     found = written[0] if isinstance(written, list) else written
     assert found == (new if isinstance(factor, dict) else pytest.approx(new, rel=1e-11))
+
+
+def test_a_topic_is_not_commanded_and_measured_at_once() -> None:
+    table = TABLES['controller']
+    said = table.check(table.snapshot({'coolant_temperature.command_topic': 'temperature'}))
+    assert said == ("coolant_temperature is commanded on 'temperature', where temperature is "
+                    'measured: name another topic for one of them')
+
+
+def test_nothing_is_below_absolute_zero() -> None:
+    table = TABLES['controller']
+    said = table.check(table.snapshot({'temperature.sensor_min': -300.0}))
+    assert said.startswith('temperature.sensor_min = -300.0 degC must be in [-273.15, ')
 
 
 # The shipped files.
