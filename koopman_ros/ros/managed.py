@@ -33,8 +33,8 @@ class ManagedNode(LifecycleNodeMixin, LoopNode):
 
     active = False
 
-    def __init__(self, name: str) -> None:
-        LoopNode.__init__(self, name)
+    def __init__(self, name: str, **options: Any) -> None:
+        LoopNode.__init__(self, name, **options)
         LifecycleNodeMixin.__init__(self)
         self._failure: Exception | None = None
         self._alone = False  # whether nobody is told of a failure but by an exception

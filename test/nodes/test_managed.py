@@ -160,12 +160,14 @@ def test_controller(ros: Harness, tmp_path: Path) -> None:
     assert not [s for s in ros.statuses if s.name.startswith('controller')]
     bad = tmp_path / 'bad.safetensors'
     bad.write_text('nonsense')
-    assert ros.set_parameters('controller', model=str(bad))[0].successful
-    assert not change(ros, 'controller', 'configure')
-    assert state(ros, 'controller') == 'unconfigured'
-    ros.wait_until(lambda: parts(ros, 'controller') == set())
-    (line,) = [line for line in process.output().splitlines() if '[ERROR]' in line]
-    assert str(bad) in line
+    for model, words in ((str(bad), str(bad)),
+                         ('two_tanks', 'this controller was started for states temperature [K]')):
+        assert ros.set_parameters('controller', model=model)[0].successful
+        assert not change(ros, 'controller', 'configure')
+        assert state(ros, 'controller') == 'unconfigured'
+        ros.wait_until(lambda: parts(ros, 'controller') == set())
+        *_, line = [line for line in process.output().splitlines() if '[ERROR]' in line]
+        assert words in line
 
     assert ros.set_parameters(
         'controller', model='reactor_linear', measurement_timeout=0.0)[0].successful
