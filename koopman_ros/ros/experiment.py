@@ -36,7 +36,6 @@ from koopman_ros.experiment import (
 from koopman_ros.parameters.trainer import MANUAL, SETPOINT, TrainerParameters
 from koopman_ros.parameters.wire import Wiring
 from koopman_ros.reasons import Code, Reason, reason
-from koopman_ros.replay import records
 from koopman_ros.ros import topics
 from koopman_ros.ros.codec import stamp_message, stamp_nanoseconds
 from koopman_ros.ros.managed import ManagedNode
@@ -356,6 +355,9 @@ class ExperimentRun:
 
     def _on_record(self, message: String) -> None:
         """Watch a controller that should be in automatic mode."""
+        # in here: it loads the control step, which other experiments do without
+        from koopman_ros.replay import records
+
         with contextlib.suppress(records.RecordError):
             mode = records.parse(message.data).fields.get('mode')
             self._automatic = self._automatic or mode == 'automatic'
