@@ -35,13 +35,13 @@ def running(shared_ros: Harness) -> Harness:
 
 @pytest.mark.parametrize(('change', 'words'), [
     ({'coolant_temperature.max': 2e9}, 'coolant_temperature.max = 2000000000.0 degC must be in '
-     '[-1000000000, 1000000000] degC'),
+     '[-273.15, 1000000000] degC'),
     ({'coolant_temperature.weight': 0.0},
      'coolant_temperature.weight = 0.0 1/K^2 must be in (0, 1e+12] 1/K^2'),
     ({'temperature.setpoint_ramp': math.nan},
      'temperature.setpoint_ramp = nan K/s must be in [0, 1000000000] K/s'),
     ({'coolant_temperature.min': math.inf},
-     'coolant_temperature.min = inf degC must be in [-1000000000, 1000000000] degC'),
+     'coolant_temperature.min = inf degC must be in [-273.15, 1000000000] degC'),
     ({'coolant_temperature.weight': 1}, "expected 'Type.DOUBLE' got 'Type.INTEGER'"),
     ({'coolant_temperature.weight': 'much'}, "expected 'Type.DOUBLE' got 'Type.STRING'"),
     ({'coolant_temperature.min': 40.0}, 'coolant_temperature.min = 40.0 degC must be below '
