@@ -24,11 +24,11 @@ os.environ['ROS_PYTHON_CHECK_FIELDS'] = '1'
 
 # What takes longest, first: where each core takes the next file, none is then idle at the end.
 LONGEST = ('test_training_benchmark', 'test_examples', 'test_campaign', 'test_identify',
-           'test_training', 'test_observer', 'test_shipped_models', 'test_install_tree',
-           'test_retrain', 'test_training_node', 'test_retraining_tanks', 'test_estimates',
-           'test_demo', 'test_replay', 'test_parallel', 'test_parameter_ends', 'test_player',
-           'test_node_benchmarks', 'test_controller_process', 'test_experiment_node',
-           'test_experiment_tanks', 'test_fault_campaign',
+           'test_training', 'test_own_plant', 'test_observer', 'test_shipped_models',
+           'test_install_tree', 'test_retrain', 'test_training_node', 'test_retraining_tanks',
+           'test_estimates', 'test_demo', 'test_replay', 'test_parallel', 'test_parameter_ends',
+           'test_player', 'test_node_benchmarks', 'test_controller_process',
+           'test_experiment_node', 'test_experiment_tanks', 'test_fault_campaign',
            'test_plant_node', 'test_processes')
 
 

@@ -3,6 +3,7 @@
 
 """Real processes over real DDS: each test in a ROS domain of its own, on loopback."""
 
+from support.installation import colcon
 from support.nodes import ros, shared_ros, type_support
 
-__all__ = ['ros', 'shared_ros', 'type_support']
+__all__ = ['colcon', 'ros', 'shared_ros', 'type_support']

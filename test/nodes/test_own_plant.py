@@ -1,0 +1,217 @@
+# SPDX-FileCopyrightText: 2026 The koopman_ros Authors
+# SPDX-License-Identifier: Apache-2.0
+
+"""A plant of one's own as docs/own_plant.md has it: its commands, its files, its messages."""
+
+from dataclasses import replace
+from pathlib import Path
+import re
+import shlex
+import shutil
+import sys
+from types import ModuleType
+from typing import Any
+
+import numpy as np
+import pytest
+from rosbags.rosbag2 import StoragePlugin, Writer
+from rosbags.typesys import get_typestore, Stores
+from sensor_msgs.msg import Temperature
+from std_msgs.msg import Float32, Float64
+import yaml
+
+from koopman_ros.bags import read_series
+from koopman_ros.lifting import load
+from koopman_ros.nodes import controller, plant, trainer
+from koopman_ros.ros import topics
+from koopman_ros.testing import Harness
+from koopman_ros.testing.process import NodeProcess
+from koopman_ros.units import to_kelvin
+from koopman_ros.wire import Place
+from support.installation import Installation, ROOT, run
+from support.nodes import run_here
+
+OVEN = ROOT / 'examples' / 'oven'
+PAGE = (ROOT / 'docs' / 'own_plant.md').read_text()
+# node and arguments of each command on the page that takes a file, in the order there
+RECORD, SIMULATE, TRAIN, CONTROL, RUN, AGAIN, FROM_BAG, ON_TOPICS = (
+    (node, tuple(shlex.split(text))) for node, text in re.findall(
+        r'^ros2 run koopman_ros (\w+) --ros-args (--params-file .*)$', PAGE, re.MULTILINE))
+ACCEPTED = r'the new lift is accepted: error on held-out records ([\d.]+) K, that of the best ' \
+    r'linear model ([\d.]+) K; written to (\S+\.safetensors)'
+
+
+@pytest.fixture(scope='module')
+def overlay(colcon: Installation, tmp_path_factory: pytest.TempPathFactory) -> Installation:
+    """Build the oven's package in a workspace over that of this one."""
+    folder = tmp_path_factory.mktemp('overlay')
+    shutil.copytree(OVEN, folder / 'src' / 'oven')
+    built = run(('bash', '-c', f'{colcon.before} && cd {folder} && exec {sys.executable} -m '
+                 'colcon build --packages-select oven'))
+    assert built.returncode == 0, built.stdout + built.stderr
+    return replace(colcon, before=f'unset PYTHONPATH && . {folder}/install/setup.bash',
+                   notes=folder / 'src' / 'oven' / 'notes')
+
+
+@pytest.fixture(scope='module')
+def folder(overlay: Installation) -> Path:
+    """Return the folder of the package, in which the page's commands are given."""
+    return overlay.notes.parent
+
+
+def start(ros: Harness, overlay: Installation, command: tuple[str, tuple[str, ...]],
+          *others: str) -> NodeProcess:
+    """Run a command of the page, with further ROS arguments."""
+    node, arguments = command
+    return ros.start(node, {}, (*arguments, *others), overlay.command(
+        str(overlay.executables / node)))
+
+
+def train(ros: Harness, overlay: Installation, command: tuple[str, tuple[str, ...]]) -> Any:
+    """Train as the page has it; return the errors of the lift and of the linear model, in K."""
+    process = start(ros, overlay, command, '-p', 'training_starts:=1')
+    assert ros.wait_for_end(process) == 0, process.output()
+    said = re.search(ACCEPTED, process.output())
+    assert said, process.output()
+    return float(said[1]), float(said[2])
+
+
+@pytest.fixture(scope='module')
+def recorded(overlay: Installation, folder: Path, tmp_path_factory: pytest.TempPathFactory
+             ) -> Path:
+    """Record the simulated oven under the experiment."""
+    (service,) = re.findall(
+        r"ros2 service call /(\S+) std_srvs/srv/SetBool '\{data: true\}'", PAGE)
+    with Harness(tmp_path_factory.mktemp('record')) as ros:
+        processes = [start(ros, overlay, RECORD), start(ros, overlay, SIMULATE)]
+        assert ros.set_bool(service, True).success
+        ros.wait_for_status('plant: simulation', lambda status: 'duration' in status.message)
+        assert [process.stop() for process in processes] == [0, 0]
+    return folder / 'run_1'
+
+
+def test_first_lift_is_accepted_and_brings_the_oven_to_its_set_point(
+        overlay: Installation, folder: Path, recorded: Path, ros: Harness) -> None:
+    lift, linear = train(ros, overlay, TRAIN)
+    # the noise of the sensor is 0.2 K
+    assert lift < 0.25 < 1.0 < linear
+    model = load(folder / 'oven.safetensors')
+    assert (model.provenance.plant, model.n_z) == ('oven', 2)
+
+    measured = ros.listen(Temperature, '/temperature')
+    start(ros, overlay, CONTROL, '-p', 'controller:disturbance_bandwidth:=0.0')
+    ros.meet('controller')
+    # the law alone, without noise: what is left is the error of the lift
+    start(ros, overlay, RUN, '-p', 'speed:=0.0', '-p', 'plant:temperature.noise:=0.0')
+    ((topic, kind, content),) = re.findall(r"ros2 topic pub --once (\S+) (\S+) '(.*)'", PAGE)
+    asked = topics.message_class(kind)(**yaml.safe_load(content))
+    ros.speak(type(asked), topic, to='controller').publish(asked)
+    goal = asked.temperature
+
+    def arrived() -> bool:
+        last = np.array([message.temperature for message in measured[-50:]])
+        return len(last) == 50 and abs(last[-1] - goal) < 2.0 and float(np.ptp(last)) < 0.01
+
+    ros.wait_until(arrived, lambda: f'{[message.temperature for message in measured[-5:]]}')
+    # derived by hand: the tangent at 290 degC, in the middle of the range, would end 33 K lower
+    assert measured[-1].temperature == pytest.approx(goal, abs=1.0)
+
+
+def write_day(recorded: Path, bag: Path) -> None:
+    """Write a record as rosbag2 would, of an oven with the topics of the page."""
+    store = get_typestore(Stores.ROS2_JAZZY)
+    signals = {'/temperature': ('/oven/thermocouple', 'std_msgs/msg/Float32'),
+               '/power': ('/oven/meter', 'std_msgs/msg/Float64MultiArray'),
+               '/power_setpoint': ('/oven/heater', 'std_msgs/msg/Float64')}
+    layout = store.types['std_msgs/msg/MultiArrayLayout']([], 0)
+    with Writer(bag, version=9, storage_plugin=StoragePlugin.MCAP) as writer:
+        for topic, (name, kind) in signals.items():
+            joint, unit = 'sensor_msgs/msg/JointState', 'W'
+            series = read_series(recorded, topic if topic == '/temperature' else Place(
+                topic, joint, 'position[power]', unit))
+            connection = writer.add_connection(name, kind, typestore=store)
+            for stamp, value in zip(series.stamp_ns.tolist(), series.values, strict=True):
+                message = store.types[kind](
+                    layout, np.array([230.0, 1e-3 * value])) if 'Array' in kind else (
+                    store.types[kind](value))
+                # the command is heard after the measurement that it answers
+                writer.write(connection, stamp + 1000 * (name == '/oven/heater'),
+                             store.serialize_cdr(message, kind))
+
+
+def test_bag_of_other_topics_is_trained_from_and_its_lift_controls_them(
+        overlay: Installation, folder: Path, recorded: Path, ros: Harness) -> None:
+    write_day(recorded, folder / 'day_1')
+    lift, linear = train(ros, overlay, FROM_BAG)
+    assert lift < 0.25 < 1.0 < linear
+    commands = ros.listen(Float64, '/oven/heater')
+    start(ros, overlay, ON_TOPICS)
+    thermocouple = ros.speak(Float32, '/oven/thermocouple', to='controller')
+    model = load(folder / 'existing.safetensors')
+    celsius = float(model.states.center[0]) - to_kelvin(0.0)
+
+    def commanded() -> bool:
+        thermocouple.publish(Float32(data=celsius))
+        return len(commands) > 3
+
+    ros.wait_until(commanded)
+    # in W, what holds the middle of the range
+    assert commands[-1].data == pytest.approx(float(model.inputs.center[0]), rel=0.05)
+
+
+QUICK = {'autostart': 'true', 'system': 'oven'}
+SIGNALS = {'states_measured': '["temperature [K]"]', 'inputs_commanded': '["power [W]"]'}
+BAD = """
+from koopman_ros.plants import two_state_example
+class Empty: pass
+class Failing:
+    def system(self): return 1.0 / 0.0
+"""
+
+
+@pytest.mark.parametrize(('program', 'given', 'words'), [
+    (plant, {'system': 'ovn'}, ("there is no plant 'ovn': choose one of", 'workspace sourced')),
+    (plant, {'system': 'no_oven:Oven'}, ('cannot be loaded (ModuleNotFoundError', 'check module')),
+    (plant, {'system': 'bad_oven:Empty'}, ('must be a ControlAffineSystem', 'method system')),
+    (plant, {'system': 'bad_oven:Failing'}, ('cannot be built (ZeroDivisionError', 'its class')),
+    (trainer, {}, ('what is measured and commanded is not known', "like ['level [m]']")),
+    (trainer, {**SIGNALS, 'states_measured': '["temperature [Kelvin]"]'},
+     ("there is no unit 'Kelvin'", 'write one like K')),
+    (trainer, {**SIGNALS, 'temperature.type': 'ovens/msg/Heat', 'temperature.field': 'heat'},
+     ("message type 'ovens/msg/Heat' is not installed here", 'source its workspace')),
+    (trainer, {**SIGNALS, 'temperature.field': 'temprature'},
+     ('sensor_msgs/msg/Temperature has no temprature: name another field',)),
+    (trainer, {**SIGNALS, 'temperature.unit': 'W'}, ("'W' cannot be converted to 'K'",)),
+    (controller, {**SIGNALS, 'model': 'reactor_nz4'},
+     ('has states temperature [K] and inputs power [W]', 'choose a model of that system')),
+])
+def test_start_with_what_is_wrong_says_so(
+        program: ModuleType, given: dict[str, str], words: tuple[str, ...], tmp_path: Path,
+        monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]) -> None:
+    (tmp_path / 'bad_oven.py').write_text(BAD)
+    monkeypatch.syspath_prepend(tmp_path)
+    monkeypatch.chdir(tmp_path)
+    assert run_here(program, **{**QUICK, **given}) == 1
+    said = capfd.readouterr().err
+    for word in words:
+        assert word in said
+    assert 'Traceback' not in said
+
+
+def test_page_names_the_files_and_quotes_what_is_said() -> None:
+    sources = {path.suffix: [p.read_text() for p in OVEN.glob(f'*{path.suffix}')]
+               for path in OVEN.iterdir() if path.suffix}
+    on_ros = PAGE.partition('## From Python')[0]
+    for kind, suffix in (('yaml', '.yaml'), ('python', '.py')):
+        blocks = re.findall(rf'```{kind}\n(.*?)```', on_ros, re.DOTALL)
+        assert blocks
+        for block in blocks:
+            assert any(block in source for source in sources[suffix]), block
+    (shown,) = re.findall(r'```text\n(the new lift.*)\n```', PAGE)
+    assert re.fullmatch(ACCEPTED, shown)
+    said = '\0'.join(path.read_text() for path in (ROOT / 'koopman_ros').rglob('*.py'))
+    quotes = [quote for row in re.findall(r'^\| `(.*?)` \|', PAGE, re.MULTILINE)
+              for quote in row.split('…')]
+    assert len(quotes) > 10
+    for quote in quotes:
+        assert quote.strip("')(") in said, quote
