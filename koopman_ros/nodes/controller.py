@@ -127,8 +127,8 @@ class ControllerNode(ManagedNode):
         self._predicted = Outlet(wiring.predicted, signals.states, matching.publish)
         self._internals = matching.publish(topics.CONTROLLER_STATE)
         self._published_setpoint: Array | None = None
-        self._diagnostics = self.diagnostics.add(
-            'control', loaded.model.provenance.plant or parameters.system, self._status)
+        self.diagnostics.hardware_id = loaded.model.provenance.plant or parameters.system
+        self._diagnostics = self.diagnostics.add('control', self._status)
         # volatile, so that `ros2 topic pub` matches
         for name, place in wiring.setpoints.items():
             Inlet(self, matching.subscribe, {name: place}, signals.states, self._on_setpoint)

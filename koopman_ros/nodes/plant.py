@@ -88,7 +88,8 @@ class PlantNode(ManagedNode):
                    for name in tuple(filter(None, parameters.measured)) or signals.states}
         self._counted = [publisher for publisher in self._states.publishers
                          if publisher.topic_name in map(self.resolve_topic_name, counted)]
-        self._diagnostics = self.diagnostics.add('simulation', system.name, self._status)
+        self.diagnostics.hardware_id = system.name
+        self._diagnostics = self.diagnostics.add('simulation', self._status)
         self.create_service(Trigger, '~/reset', self._on_reset)
         wall_period = parameters.sample_period / (parameters.speed or math.inf)
         if parameters.lockstep:

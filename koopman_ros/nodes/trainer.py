@@ -47,6 +47,8 @@ class TrainerNode(ManagedNode):
             raise ConfigurationError(reason)
         signals = trainer_signals(present, {
             name: getattr(settings, name) for name in SIGNALS})
+        self.diagnostics.hardware_id = settings.system if present is None else (
+            present.provenance.plant or settings.system)
         wiring = Wiring(signals, settings.states, settings.inputs)
         for kind in wiring.kinds:
             # what is in none of its messages is refused now, and not when a bag holds nothing

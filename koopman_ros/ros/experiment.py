@@ -65,7 +65,7 @@ class PlantExperiment:
         self._words = words_of(wiring.signals)
         self._run: ExperimentRun | None = None
         self._outcome = Status(Level.OK, 'no experiment')
-        self._diagnostics = node.diagnostics.add('experiment', 'trainer', self._status)
+        self._diagnostics = node.diagnostics.add('experiment', self._status)
         # a group of its own: the service waits for the first measurement
         self._owned = Owned(node)
         self._owned.keep(node.create_service(

@@ -98,7 +98,13 @@ class Status:
 
 
 class Diagnostics:
-    """Publish what the tasks of a node say of themselves, as diagnostic_updater would."""
+    """
+    Publish what the tasks of a node say of themselves, as diagnostic_updater would.
+
+    :ivar hardware_id: names the plant.
+    """
+
+    hardware_id = ''
 
     def __init__(self, node: Node) -> None:
         self._node = node
@@ -109,10 +115,10 @@ class Diagnostics:
             qos_overriding_options=QoSOverridingOptions.with_default_policies())
         wall_timer(node, 1.0, lambda: self.publish(self.tasks))
 
-    def add(self, task: str, hardware_id: str, collect: Callable[[], Status]) -> DiagnosticTask:
+    def add(self, task: str, collect: Callable[[], Status]) -> DiagnosticTask:
         """Report a further task under the name ``<node>: <task>``."""
         name = f'{self._node.get_fully_qualified_name().lstrip("/")}: {task}'
-        self.tasks.append(DiagnosticTask(self, name, hardware_id, collect))
+        self.tasks.append(DiagnosticTask(self, name, collect))
         return self.tasks[-1]
 
     def remove(self, task: DiagnosticTask) -> None:
@@ -135,10 +141,9 @@ class Diagnostics:
 class DiagnosticTask:
     """What one task of a node says of itself."""
 
-    def __init__(self, diagnostics: Diagnostics, name: str, hardware_id: str,
-                 collect: Callable[[], Status]) -> None:
-        self._diagnostics, self._name = diagnostics, name
-        self._hardware_id, self._collect = hardware_id, collect
+    def __init__(self, diagnostics: Diagnostics, name: str, collect: Callable[[], Status]
+                 ) -> None:
+        self._diagnostics, self._name, self._collect = diagnostics, name, collect
         self._last: tuple[Level, str] | None = None
 
     def status(self) -> DiagnosticStatus:
@@ -148,7 +153,7 @@ class DiagnosticTask:
         values = status.values() if callable(status.values) else status.values
         return DiagnosticStatus(
             level=status.level.value, name=self._name, message=status.message,
-            hardware_id=self._hardware_id,
+            hardware_id=self._diagnostics.hardware_id,
             values=[KeyValue(key=key, value=(
                 f'{value:.9g}' if isinstance(value, float) else str(value)))
                 for key, value in values.items()])

@@ -35,7 +35,7 @@ class Recording:
         self._node, self._known = node, topics.known(wiring)
         self._recorder: Recorder | None = None
         self._problem = self._path = ''
-        self._diagnostics = node.diagnostics.add('recording', 'trainer', self._status)
+        self._diagnostics = node.diagnostics.add('recording', self._status)
         self._owned = Owned(node)
         self._owned.keep(node.create_service(SetBool, '~/record', self._on_record))
         self._timers = [

@@ -38,7 +38,7 @@ class Training:
         self._job: RetrainingJob | None = None
         self._state: JobState | None = None
         self._last_line = 0.0
-        self._diagnostics = node.diagnostics.add('training', 'trainer', self._status)
+        self._diagnostics = node.diagnostics.add('training', self._status)
         self._owned = owned = Owned(node)
         owned.keep(node.create_service(Trigger, '~/train', self._on_train))
         owned.keep(node.create_service(Trigger, '~/cancel_training', self._on_cancel))

@@ -5,7 +5,7 @@
 
 import signal
 
-from diagnostic_msgs.msg import DiagnosticStatus
+from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
 import numpy as np
 import pytest
 from rosgraph_msgs.msg import Clock
@@ -124,3 +124,16 @@ def test_no_offset_is_left_and_the_next_controller_takes_over_the_coolant_in_for
     assert np.max(np.abs(np.diff([message.temperature for message in commands]))) < 0.05
     # of the set-point it knows nothing: it holds what it finds
     loop.rest()
+
+
+def test_each_node_tells_of_all_its_tasks_in_one_message_and_names_the_plant(ros: Harness) -> None:
+    heard: list[DiagnosticArray] = ros.listen(DiagnosticArray, topics.DIAGNOSTICS)
+    tasks = {'plant': ('simulation',), 'controller': ('control',),
+             'trainer': ('recording', 'experiment', 'training')}
+    for node in tasks:
+        ros.start(node, {'record_at_start': False} if node == 'trainer' else None)
+    wanted = {tuple(f'{node}: {task}' for task in names) for node, names in tasks.items()}
+    ros.wait_until(lambda: wanted <= {
+        tuple(status.name for status in message.status) for message in heard})
+    assert {status.hardware_id for message in heard for status in message.status} == {
+        'one-state reactor'}

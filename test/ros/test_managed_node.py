@@ -30,7 +30,7 @@ class Failing(ManagedNode):
         self.create_subscription(String, 'other', lambda _: None, 1)
         self.create_service(Trigger, '~/service', lambda _, response: response)
         wall_timer(self, 1.0, lambda: None)
-        self.diagnostics.add('task', 'x', lambda: Status(Level.OK, 'well'))
+        self.diagnostics.add('task', lambda: Status(Level.OK, 'well'))
         self._fail('configure')
 
     def activate(self) -> None:

@@ -51,7 +51,7 @@ def made(part: str, node: Part, folder: Path) -> Callable[[], object]:
     wiring = Wiring(SIGNALS, settings.states, settings.inputs)
     match part:
         case 'diagnostics':
-            made = node.diagnostics.add('task', 'x', lambda: Status(Level.OK, 'well'))
+            made = node.diagnostics.add('task', lambda: Status(Level.OK, 'well'))
         case 'matching':
             made = topics.Matching(node, lambda: None)
             made.publish('mine', Temperature)
