@@ -308,10 +308,15 @@ class PlantNode(ManagedNode):
         if not self._settings.lockstep:
             self._advance_to_now()
         self._settings = parameters
-        # the changed plant may have no steady state near; the nominal point stays what it was
+        before = self._plant.system
+        try:
+            system = self._table.system(parameters)
+        except plants.EquilibriumError:
+            system = self._table.system(parameters, before.nominal_state)
+        # the nominal point stays what it was, for ~/reset
         self._plant = replace(
-            self._plant, actuator=self._table.actuator(parameters),
-            system=self._table.system(parameters, self._plant.system.nominal_state))
+            self._plant, actuator=self._table.actuator(parameters), system=replace(
+                system, nominal_state=before.nominal_state, nominal_input=before.nominal_input))
 
     def _status(self) -> Status:
         level, message = Level.OK, self._phase.value
