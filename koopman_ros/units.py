@@ -150,11 +150,6 @@ def to_celsius(kelvin: float) -> float:
     return kelvin - ZERO_CELSIUS
 
 
-def in_celsius(kelvin: float) -> str:
-    """Write a temperature given in K for the operator."""
-    return f'{to_celsius(kelvin):.2f} degC'
-
-
 def seconds_text(nanoseconds: int) -> str:
     """Write integer nanoseconds in seconds, with all digits, e.g. '1700000000.25'."""
     seconds, rest = divmod(abs(nanoseconds), NANOSECONDS)

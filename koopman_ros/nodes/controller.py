@@ -30,7 +30,7 @@ from koopman_ros.control import (
 )
 from koopman_ros.control.events import Event, ModeChange, Silence
 from koopman_ros.parameters.controller import ControllerParameters, table_of
-from koopman_ros.parameters.wire import LONGEST_FRAME_ID, preset, signals_of, Wiring
+from koopman_ros.parameters.wire import LONGEST_FRAME_ID, preset, signals_of, system_of, Wiring
 from koopman_ros.reasons import level_words
 from koopman_ros.replay import records
 from koopman_ros.ros import controller_messages as messages
@@ -81,7 +81,7 @@ class ControllerNode(ManagedNode):
         super().__init__('controller')
         self._watchdog: Watchdog | None = None
         given = self.given()
-        system = str(given.get('system', 'reactor'))
+        system = system_of(given)
         own = preset(system, 'controller')
         loaded = load_suitable(str(given.get('model') or own.get('model', '')))
         self._table = table = table_of(loaded.model, given)
@@ -403,7 +403,7 @@ class ControllerNode(ManagedNode):
         self._diagnostics.publish_if_changed()
 
     def _warn_of_rest(self) -> None:
-        """Say that the safe coolant leads out of the model's range, once for each reason."""
+        """Say that the safe input leads out of the model's range, once for each reason."""
         before, self._rests_outside = self._rests_outside, rests_outside(
             self._controller)
         if self._rests_outside not in ('', before):

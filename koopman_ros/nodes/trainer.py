@@ -14,7 +14,7 @@ from koopman_ros.parameters.trainer import (
     trainer_table,
     TrainerParameters,
 )
-from koopman_ros.parameters.wire import preset, SIGNALS, Wiring
+from koopman_ros.parameters.wire import preset, SIGNALS, system_of, Wiring
 from koopman_ros.resources import model_path
 from koopman_ros.ros import topics
 from koopman_ros.ros.experiment import PlantExperiment
@@ -101,7 +101,7 @@ class TrainerNode(ManagedNode):
 
 def _present(given: dict[str, Any]) -> LiftedModel | None:
     """Return the present lift, None where there is none yet."""
-    own = preset(str(given.get('system', 'reactor')), 'trainer')
+    own = preset(system_of(given), 'trainer')
     name = str(given.get('model', own.get('model', '')))
     return load(model_path(name)) if name else None
 

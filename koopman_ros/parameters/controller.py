@@ -23,19 +23,20 @@ from koopman_ros.parameters.table import (
     per_signal,
 )
 from koopman_ros.parameters.wire import (
+    DEFAULT_SYSTEM,
     InputPlaces,
     named_units,
     preset,
     Signals,
     signals_of,
     StatePlaces,
+    system_of,
     Wiring,
 )
 from koopman_ros.units import conversion, display_unit
 
 # what stands for no bound, in any unit
 _UNBOUNDED = 1e9
-_DEFAULT_SYSTEM = 'reactor'
 
 
 @dataclass(frozen=True)
@@ -85,7 +86,7 @@ class ControllerParameters:
     """Snapshot of the controller's parameters, in the units that people read."""
 
     system: str = parameter(
-        _DEFAULT_SYSTEM, 'plant that is shipped, whose model, topics and tuning are the defaults '
+        DEFAULT_SYSTEM, 'plant that is shipped, whose model, topics and tuning are the defaults '
         'here; any other name for none', read_only=True)
     model: str = parameter(
         '', 'name of a shipped model, or path of a .safetensors model file')
@@ -203,7 +204,7 @@ def table_of(model: LiftedModel, given: Mapping[str, Any] = MappingProxyType({})
     :param given: what is known of the values already, of which system and signals count.
     :raises ConfigurationError: for signals, given or of a preset, that the model has not.
     """
-    system = str(given.get('system', _DEFAULT_SYSTEM))
+    system = system_of(given)
     own = preset(system, 'controller')
     found = signals_of(model)
     named = [named_units(tuple(filter(None, given.get(kind, ()))) or own.get(kind, ()))
@@ -237,7 +238,7 @@ class ReplayParameters:
     """Snapshot of the replay's parameters; a controller's may be given for the new model."""
 
     system: str = parameter(
-        _DEFAULT_SYSTEM, 'plant that is shipped, whose topics are those of the bag; any other '
+        DEFAULT_SYSTEM, 'plant that is shipped, whose topics are those of the bag; any other '
         'name for none')
     model: str = parameter(
         '', 'where a recorded model is looked for beside the shipped ones: a name, a .safetensors '

@@ -22,11 +22,13 @@ from koopman_ros.parameters.table import (
 )
 from koopman_ros.parameters.wire import (
     CommandedPlaces,
+    DEFAULT_SYSTEM,
     LONGEST_FRAME_ID,
     MeasuredPlace,
     PLANT_KINDS,
     preset,
     Signals,
+    system_of,
     Wiring,
 )
 from koopman_ros.plants import (
@@ -79,8 +81,8 @@ class PlantParameters:
     """Snapshot of the plant's parameters, in the units that people read."""
 
     system: str = parameter(
-        'reactor', 'what is simulated: a plant of the library, the name of an entry point of the '
-        'group koopman_ros.plants, or package.module:Class', read_only=True)
+        DEFAULT_SYSTEM, 'what is simulated: a plant of the library, the name of an entry point of '
+        'the group koopman_ros.plants, or package.module:Class', read_only=True)
     measured: tuple[str, ...] = parameter(
         ('',), 'states that lock-step wants subscribers for; an empty name for all',
         read_only=True)
@@ -125,7 +127,7 @@ class PlantTable(ParameterTable[PlantParameters]):
     """
 
     def __init__(self, given: Mapping[str, Any] = MappingProxyType({})) -> None:
-        system = str(given.get('system', 'reactor'))
+        system = system_of(given)
         try:
             self.plant = plant_class(system)
             reference = build(self.plant, {})

@@ -22,6 +22,7 @@ from koopman_ros.parameters.wire import (
     Signals,
     signals_of,
     StatePlaces,
+    system_of,
     Wiring,
 )
 from koopman_ros.units import conversion, display_unit
@@ -70,8 +71,8 @@ class TrainerParameters:
     """Snapshot of the trainer's parameters, in the units that people read."""
 
     system: str = parameter(
-        'reactor', 'plant that is shipped, whose signals, topics and bounds are the defaults '
-        'here; any other name for none', read_only=True)
+        wire.DEFAULT_SYSTEM, 'plant that is shipped, whose signals, topics and bounds are the '
+        'defaults here; any other name for none', read_only=True)
     states_measured: tuple[str, ...] = parameter(
         ('',), 'measured signals with their units, e.g. level [m]; an empty name for those of the '
         'model', read_only=True)
@@ -210,7 +211,7 @@ def trainer_table(present: LiftedModel | None, given: Mapping[str, Any] = Mappin
     :param given: what is known of the values already, of which system and signals count.
     :raises ConfigurationError: where nothing says what the signals are.
     """
-    system = str(given.get('system', 'reactor'))
+    system = system_of(given)
     own = preset(system, 'trainer')
     signals = trainer_signals(present, {**own, **given})
     defaults: dict[str, Any] = dict(signals.defaults())
@@ -239,7 +240,7 @@ def trainer_signals(present: LiftedModel | None, given: Mapping[str, Any]) -> Si
     if bool(states) != bool(inputs) or not (states or present):
         raise ConfigurationError(
             f'what is measured and commanded is not known of the system '
-            f'{given.get("system", "reactor")!r}: give states_measured and inputs_commanded, each '
+            f'{system_of(given)!r}: give states_measured and inputs_commanded, each '
             "a list like ['level [m]'], or the model of the plant")
     controlled = tuple(filter(None, given.get('controlled', ())))
     if present is not None and not states:
@@ -287,8 +288,8 @@ class PlayerParameters:
 
     bag: str = parameter('run_1', 'bag to play: a .mcap file or a bag folder', read_only=True)
     system: str = parameter(
-        'reactor', 'plant that is shipped, whose topics are the defaults here; any other name for '
-        'none', read_only=True)
+        wire.DEFAULT_SYSTEM, 'plant that is shipped, whose topics are the defaults here; any '
+        'other name for none', read_only=True)
     topics: tuple[str, ...] = parameter(
         ('',), 'topics to play; a relative name stands for that below / in the bag, and follows '
         'namespaces and remaps when it is published', read_only=True)
@@ -328,7 +329,7 @@ def _check_player(values: PlayerParameters) -> str:
 def player_table(given: Mapping[str, Any] = MappingProxyType({})
                  ) -> ParameterTable[PlayerParameters]:
     """Return the parameters of a player; `given` as for :func:`trainer_table`."""
-    system = str(given.get('system', 'reactor'))
+    system = system_of(given)
     defaults: dict[str, Any] = {'system': system}
     if (wiring := preset_wiring(system)) is not None:
         defaults |= {

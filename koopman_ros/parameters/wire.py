@@ -28,6 +28,9 @@ CONTROLLER_EVENTS = 'controller_events'
 DIAGNOSTICS = '/diagnostics'
 CLOCK = '/clock'
 
+#: what is controlled where nothing else is said
+DEFAULT_SYSTEM = 'reactor'
+
 LONGEST_FRAME_ID = 256  # characters that are passed on
 
 # The places of signals: of states, then of inputs.
@@ -252,6 +255,11 @@ def named_units(described: Collection[str]) -> dict[str, str]:
             raise ConfigurationError(f'{text!r}: {error}') from error
         found[match[1]] = match[2]
     return found
+
+
+def system_of(given: Mapping[str, Any]) -> str:
+    """Return the system that parameters name, or the default."""
+    return str(given.get('system', DEFAULT_SYSTEM))
 
 
 def preset(system: str, node: str) -> dict[str, Any]:

@@ -17,7 +17,7 @@ from xml.etree import ElementTree
 from koopman_ros.lifting import load
 from koopman_ros.parameters import controller, plant, trainer
 from koopman_ros.parameters.table import ConfigurationError, ParameterTable
-from koopman_ros.parameters.wire import preset
+from koopman_ros.parameters.wire import DEFAULT_SYSTEM, preset
 from koopman_ros.resources import config_directory, model_path
 from koopman_ros.ros import topics
 
@@ -31,11 +31,10 @@ STANDARD_SERVICES = (
 # `ros2 topic pub` and its like start a node with this service, named after their process
 _COMMAND_LINE_SERVICE = '/_ros2cli_*/get_type_description'
 
-_SYSTEM = 'reactor'
 _TRANSITIONS = '~/transition_event'
 
 
-def tables(system: str = _SYSTEM) -> dict[str, ParameterTable[Any]]:
+def tables(system: str = DEFAULT_SYSTEM) -> dict[str, ParameterTable[Any]]:
     """Return the tables of all programs for a plant that is shipped."""
     given = {'system': system}
     name = preset(system, 'controller').get('model', '')
@@ -60,7 +59,7 @@ class Program:
     calls: tuple[str, ...] = ()  #: services of others
 
 
-def programs(system: str = _SYSTEM) -> dict[str, Program]:
+def programs(system: str = DEFAULT_SYSTEM) -> dict[str, Program]:
     """Return all programs, with the topics of a plant that is shipped."""
     wiring = trainer.preset_wiring(system)
     if wiring is None:
@@ -117,7 +116,7 @@ def programs(system: str = _SYSTEM) -> dict[str, Program]:
     }
 
 
-def operator(system: str = _SYSTEM) -> Program:
+def operator(system: str = DEFAULT_SYSTEM) -> Program:
     """Whoever moves set-points, calls the services, tunes and watches: a person or a panel."""
     nodes = programs(system)
     wiring = trainer.preset_wiring(system)
@@ -137,7 +136,7 @@ PROGRAMS = programs()
 OPERATOR = operator()
 
 
-def policy(system: str = _SYSTEM) -> str:
+def policy(system: str = DEFAULT_SYSTEM) -> str:
     """Return the text of the SROS2 policy: one enclave for each node, and one for operators."""
     root = ElementTree.Element('policy', version='0.2.0')
     root.append(ElementTree.Comment(
@@ -181,11 +180,11 @@ usage: ros2 run koopman_ros {name} [--ros-args [-p name:=value ...] [--params-fi
 
 {lists}exit codes: {program.codes}
 
-Parameters for the system {_SYSTEM}, with defaults and ranges in {file}:
+Parameters for the system {DEFAULT_SYSTEM}, with defaults and ranges in {file}:
 {parameters}"""
 
 
-def parameter_file(node: str, system: str = _SYSTEM) -> str:
+def parameter_file(node: str, system: str = DEFAULT_SYSTEM) -> str:
     """Return the text of a node's parameter file, every parameter at its default."""
     return (f'# Parameters of the {node} node, all at their defaults. Use a copy with\n'
             f'#   ros2 run koopman_ros {node} --ros-args --params-file {node}.yaml\n'
@@ -196,7 +195,7 @@ def main(args: list[str] | None = None) -> int:
     """Write all parameter files and the policy, for a plant that has a file in config/plants."""
     parser = argparse.ArgumentParser(description=main.__doc__)
     parser.add_argument('--output', type=Path, default=Path('config'))
-    parser.add_argument('--system', default=_SYSTEM)
+    parser.add_argument('--system', default=DEFAULT_SYSTEM)
     given = parser.parse_args(args)
     try:
         written = {f'{node}.yaml': parameter_file(node, given.system) for node in PROGRAMS}
