@@ -60,8 +60,8 @@ def test_every_code_has_its_words() -> None:
         for _, name, form, _ in string.Formatter().parse(code.template):
             if name and name != 'signal':
                 values[name] = {
-                    'ranges': (('T', 300.0, 310.0),), 'values': (('T', 300.0),), 'level': 'sdre', 'cause': reason(
-                        Code.NO_MEASUREMENT)}.get(form or name, 300.0)
+                    'ranges': (('T', 300.0, 310.0),), 'values': (('T', 300.0),),
+                    'level': 'sdre', 'cause': reason(Code.NO_MEASUREMENT)}.get(form or name, 300.0)
         words = say(reason(code, **values))
         assert words
         assert '{' not in words
