@@ -162,12 +162,16 @@ def place(topic: str, name: str, unit: str, given: Mapping[str, str] | None = No
 
     :param topic: by default.
     :param unit: of the signal itself.
+    :raises ValueError: for a type without a usual field where none is given.
     """
     said = {key: value for key, value in (given or {}).items() if value}
     kind, array = _TYPES.get(unit, (JOINT_STATE, ''))
     kind = said.get('type', kind)
     carrier = CARRIERS.get(kind, _ANY)
     field = said.get('field') or (array if kind == JOINT_STATE and array else carrier.field)
+    if not field:
+        raise ValueError(f'where the number is in a {kind} is not known: name its field, e.g. '
+                         'twist.linear.x or data[2]')
     return Place(said.get('topic', topic), kind, field.replace('{name}', name),
                  said.get('unit') or carrier.unit or display_unit(unit))
 

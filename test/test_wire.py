@@ -103,3 +103,11 @@ def test_bounds_of_an_experiment_are_asked_for_by_name():
 def test_trainer_that_knows_no_signals_says_how_to_name_them():
     with pytest.raises(ConfigurationError, match=r"system 'oven': give .* like \['level \[m\]'\]"):
         trainer_table(None, {'system': 'oven'})
+
+
+def test_type_without_a_usual_field_wants_one():
+    with pytest.raises(ValueError, match='where the number is in a geometry_msgs/msg/Twist is not '
+                                         'known: name its field'):
+        place('s', 's', 'm/s', {'type': 'geometry_msgs/msg/Twist'})
+    said = {'type': 'geometry_msgs/msg/Twist', 'field': 'linear.x'}
+    assert place('s', 's', 'm/s', said).unit == 'm/s'

@@ -28,11 +28,11 @@ from koopman_ros.parameters.controller import ControllerParameters, table_of
 from koopman_ros.parameters.plant import PlantTable
 from koopman_ros.parameters.table import parameter, ParameterTable, per_signal
 from koopman_ros.parameters.trainer import preset_wiring
-from koopman_ros.parameters.wire import preset, Signals
+from koopman_ros.parameters.wire import preset, shipped, Signals
 from koopman_ros.plants import steady_state
 from koopman_ros.plants.optimum import cost_along, Course, linear_law, optimum, Task
 from koopman_ros.reports import draw_limits, drawing, DRAWN_RANGE, legend, write_figures
-from koopman_ros.resources import config_directory, model_path
+from koopman_ros.resources import model_path
 from koopman_ros.units import conversion, display_unit, shown, unit_label
 
 _LINEAR = 'linear law'
@@ -61,8 +61,7 @@ def run_plant(name: str, output: Path, speed: float) -> dict[str, object]:
     begin = time.monotonic()
     wiring = preset_wiring(name)
     if wiring is None or 'duration' not in (own := preset(name, 'demo')):
-        known = sorted(file.stem for file in (config_directory() / 'plants').glob('*.yaml'))
-        raise ValueError(f'there is no demo of {name!r}: choose one of {", ".join(known)}')
+        raise ValueError(f'there is no demo of {name!r}: choose one of {", ".join(shipped())}')
     signals = wiring.signals
     told = ParameterTable(_Parameters, signals={'states': signals.states}, defaults=own
                           ).snapshot({})

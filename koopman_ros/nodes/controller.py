@@ -30,7 +30,15 @@ from koopman_ros.control import (
 )
 from koopman_ros.control.events import Event, ModeChange, Silence
 from koopman_ros.parameters.controller import ControllerParameters, table_of
-from koopman_ros.parameters.wire import LONGEST_FRAME_ID, preset, signals_of, system_of, Wiring
+from koopman_ros.parameters.table import ConfigurationError
+from koopman_ros.parameters.wire import (
+    LONGEST_FRAME_ID,
+    preset,
+    shipped,
+    signals_of,
+    system_of,
+    Wiring,
+)
 from koopman_ros.reasons import level_words
 from koopman_ros.replay import records
 from koopman_ros.ros import controller_messages as messages
@@ -82,8 +90,12 @@ class ControllerNode(ManagedNode):
         self._watchdog: Watchdog | None = None
         given = self.given()
         system = system_of(given)
-        own = preset(system, 'controller')
-        loaded = load_suitable(str(given.get('model') or own.get('model', '')))
+        model = str(given.get('model') or preset(system, 'controller').get('model', ''))
+        if not model:
+            raise ConfigurationError(
+                f'there is no model of the system {system!r}: name one in model, or in system one '
+                f'of {", ".join(shipped())}')
+        loaded = load_suitable(model)
         self._table = table = table_of(loaded.model, given)
         self._settings = self.declare_table(table)
         self._signals = signals_of(loaded.model, self._settings.controlled)

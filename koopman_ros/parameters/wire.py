@@ -262,6 +262,11 @@ def system_of(given: Mapping[str, Any]) -> str:
     return str(given.get('system', DEFAULT_SYSTEM))
 
 
+def shipped() -> list[str]:
+    """Return the names of the plants that have a parameter file."""
+    return sorted(file.stem for file in (config_directory() / _PRESETS).glob('*.yaml'))
+
+
 def preset(system: str, node: str) -> dict[str, Any]:
     """
     Return the defaults of a node, by parameter, from the file of a plant that is shipped.
