@@ -108,10 +108,10 @@ class ControllerParameters:
         0.0, 'time constant with which the tracked set-point follows its ramp; 0 for none', 's',
         0.0, 86400.0)
     disturbance_bandwidth: float = parameter(
-        0.1, 'how fast disturbances are estimated: more removes offsets sooner, less lets less '
+        0.0, 'how fast disturbances are estimated: more removes offsets sooner, less lets less '
         'noise through to the inputs; 0 switches the observer off', '1/s', 0.0, 1000.0)
     transfer_time: float = parameter(
-        30.0, 'time constant in which the inputs move to what another law, model, tuning or mode '
+        0.0, 'time constant in which the inputs move to what another law, model, tuning or mode '
         'asks for', 's', 0.0, 86400.0)
     validity_margin: float = parameter(
         0.1, 'how far outside the trained range the learned law acts, in halves of its width; '
@@ -194,12 +194,22 @@ def _cross_check(signals: Signals, values: ControllerParameters) -> str:
     return Wiring(signals, values.states, values.inputs).check()
 
 
+def _times(model: LiftedModel) -> dict[str, float]:
+    """Return the times that suit a model's fastest mode; an unstable plant cannot wait."""
+    modes = np.linalg.eigvals(model.drift_jacobian(np.zeros(model.n_x)))
+    fastest = float(np.max(np.abs(modes))) / model.seconds_per_time_unit
+    stable = bool(np.all(modes.real < 0.0)) and fastest > 0.0
+    return {'transfer_time': min(float(f'{0.5 / fastest:.2g}'), 86400.0) if stable else 0.0,
+            'disturbance_bandwidth': min(float(f'{fastest:.2g}'), 1000.0) if stable else 0.0}
+
+
 def table_of(model: LiftedModel, given: Mapping[str, Any] = MappingProxyType({})
              ) -> ParameterTable[ControllerParameters]:
     """
     Return the parameters of a controller with a model.
 
-    Its training box and scaling are the defaults, unless the preset of a plant says otherwise.
+    Its training box, scaling and time constants are the defaults, unless the preset of a plant
+    says otherwise.
 
     :param given: what is known of the values already, of which system and signals count.
     :raises ConfigurationError: for signals, given or of a preset, that the model has not.
@@ -216,7 +226,7 @@ def table_of(model: LiftedModel, given: Mapping[str, Any] = MappingProxyType({})
             'system, correct states_measured and inputs_commanded, or name in system what the '
             'model is of (an empty name: none that is shipped)')
     signals = signals_of(model, tuple(given.get('controlled', own.get('controlled', ()))))
-    defaults: dict[str, Any] = dict(signals.defaults())
+    defaults: dict[str, Any] = {**signals.defaults(), **_times(model)}
     for name, scale in zip(model.states.names, model.states.scale.tolist(), strict=True):
         defaults[f'{name}.weight'] = 1.0 / scale ** 2
     box = model.inputs

@@ -10,11 +10,14 @@ from pathlib import Path
 import re
 from typing import Any
 
+import numpy as np
 import pytest
 from rclpy.node import Node
 from rclpy.parameter import parameter_dict_from_yaml_file, parameter_value_to_python
 import yaml
 
+from koopman_ros.lifting import load
+from koopman_ros.parameters.controller import table_of
 from koopman_ros.parameters.plant import PlantTable
 from koopman_ros.parameters.table import (
     ConfigurationError,
@@ -24,7 +27,8 @@ from koopman_ros.parameters.table import (
     per_signal,
     Specification,
 )
-from koopman_ros.resources import config_directory
+from koopman_ros.plants import build, plant_class
+from koopman_ros.resources import config_directory, model_path
 from koopman_ros.ros.node import LoopNode, range_of
 from koopman_ros.ros.programs import main, POLICY_FILE, tables
 from koopman_ros.testing import Harness
@@ -373,6 +377,18 @@ def test_nothing_is_below_absolute_zero() -> None:
     table = TABLES['controller']
     said = table.check(table.snapshot({'temperature.sensor_min': -300.0}))
     assert said.startswith('temperature.sensor_min = -300.0 degC must be in [-273.15, ')
+
+
+@pytest.mark.parametrize('name', ['two_tanks', 'pendulum'])
+def test_times_follow_from_the_modes_of_the_plant(name: str) -> None:
+    """Of the true one, whose pendulum falls by itself."""
+    plant = build(plant_class(name), {})
+    modes = np.linalg.eigvals(plant.drift_jacobian(plant.nominal_state))
+    fastest = 0.0 if np.any(modes.real > 0.0) else float(np.max(np.abs(modes)))
+    rows = table_of(load(model_path(name)), {'system': ''}).rows
+    assert rows['disturbance_bandwidth'].default == pytest.approx(fastest, rel=0.05)
+    assert rows['transfer_time'].default == pytest.approx(
+        0.5 / fastest if fastest else 0.0, rel=0.05)
 
 
 # The shipped files.
