@@ -132,11 +132,12 @@ class Supervisor:
         if requested.level == HOLD:
             bad_since = time_ns if self.bad_since_ns is None else self.bad_since_ns
             held = (time_ns - bad_since) / NANOSECONDS
-            # the safe input once commanded stays until there is a law again
-            if held > settings.hold_timeout or (
-                    self.level == SAFE and self.bad_since_ns is not None):
+            too_long = held > settings.hold_timeout
+            if too_long:
                 assert why is not None
                 why = reason(Code.HELD_TOO_LONG, cause=why, timeout=settings.hold_timeout)
+            # the safe input once commanded stays until there is a law again
+            if too_long or (self.level == SAFE and self.bad_since_ns is not None):
                 requested = Requested(SAFE, why)
         settled = settings.order[depth(self.settled)]
         if requested.passing and depth(settled) < depth(requested.level):

@@ -71,6 +71,10 @@ def test_reasons_tell_what_is_waited_for():
     assert say(recovering[5].reason) == f'{say(FAR)} (over, waiting for it to stay so)'
     assert recovering[-1].reason is None
     assert say(walk([HOLD] * 62)[-1].reason) == f'{say(NO_LAW)}; held for longer than 60 s'
+    # under the safe input for another reason, a hold is not said to last longer than it does
+    blind = walk([Requested('safe', FAR), *[BLIND] * 62])
+    assert all(supervisor.reason is BLIND.reason for supervisor in blind[1:-1])
+    assert say(blind[-1].reason) == f'{say(BLIND.reason)}; held for longer than 60 s'
 
 
 @pytest.mark.parametrize(('level', 'outside', 'allowed'), [
