@@ -191,12 +191,14 @@ class ControllerNode(ManagedNode):
 
     def _single(self, wiring: Wiring) -> dict[str, str]:
         """Return what is done on topics on which only one node may publish."""
+        own = self._signals.defaults().values()
         return {place.topic: f'{verb} the {what}' for verb, places in (
             ('command', {stem(name, self._signals.inputs[name]): place
                          for name, place in wiring.commands.items()}),
             ('publish', wiring.measured)) for what, place in places.items()
-            # a message of named values may be one of several that make up a sample
-            if '[' not in place.field}
+            # a message of named values may be one of several that make up a sample, but not on
+            # the topic that is named after one of them
+            if '[' not in place.field or place.topic in own}
 
     def _latched(self, topic: str, kind: Any) -> Any:
         return self._matching.publish(topic, kind, topics.LATCHED_QOS)
