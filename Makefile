@@ -86,7 +86,7 @@ studies-robustness: $(VENV)/bench.stamp  ## margins, attraction, disturbances, n
 bench: $(VENV)/bench.stamp  ## speed beside other programs, thirteen minutes (BENCH=--quick: two) -> out/bench
 	$(BIN)/python -m validation.benchmarks $(BENCH)
 
-faults: $(VENV)/run.stamp  ## put faults into the loop, and soak it for a day, ten minutes (FAULTS=--quick: half a one) -> out/faults
+faults: $(VENV)/run.stamp  ## put faults into the loops of the reactor and of two tank plants, and soak the first for a day, a quarter of an hour (FAULTS=--quick: a minute; FAULTS=two_tanks: one plant) -> out/faults
 	$(BIN)/python -m validation.faults $(FAULTS)
 
 docs: $(VENV)/docs.stamp  ## the pages and a reference of the Python API, half a minute -> out/docs

@@ -15,22 +15,24 @@ from validation.faults.case import Case, Trace
 from validation.faults.cases import CASES
 from validation.faults.endurance import HOURS, run_endurance
 from validation.faults.harness import run
+from validation.faults.plants import PLANTS
 
 SOAK = 'soak'
 # One of each group, quick ones that say much.
 QUICK = ('nan-short', 'measurements-lost', 'clock-zero', 'controller-killed', 'bad-values-storm',
-         'feed-warm')
+         'feed-warm', 'two_tanks-nan-one', 'quadruple_tank-controller-killed')
 
 
 def main(args: list[str] | None = None) -> int:
     """Run the cases asked for and the endurance run; return 1 where one was not survived."""
-    groups = dict.fromkeys(case.group for case in CASES.values())
+    groups = dict.fromkeys([*PLANTS, *(case.group for case in CASES.values())])
     parser = argparse.ArgumentParser(
         prog='python -m validation.faults',
         description='Put faults into the loop and judge what it does.')
     parser.add_argument('names', nargs='*', metavar='name',
-                        help=f'a case, a group ({", ".join(groups)}), or {SOAK} (default: all)')
-    parser.add_argument('--quick', action='store_true', help='six cases, no soak: half a minute')
+                        help=f'a case, a plant or group ({", ".join(groups)}), or {SOAK} '
+                             '(default: all)')
+    parser.add_argument('--quick', action='store_true', help='eight cases, no soak: a minute')
     parser.add_argument('--list', action='store_true', help='show the cases, and run none')
     parser.add_argument('--hours', type=float, default=HOURS,
                         help='plant time of the endurance run (default: %(default)g)')
@@ -42,9 +44,10 @@ def main(args: list[str] | None = None) -> int:
     if not given.hours > 0.0:
         parser.error(f'--hours is {given.hours} h, must be above 0 h')
     names = given.names or (QUICK if given.quick else [*CASES, SOAK])
-    cases = [case for case in CASES.values() if case.name in names or case.group in names]
+    cases = [case for case in CASES.values()
+             if {case.name, case.group, case.on.name}.intersection(names)]
     if given.list:
-        print(*(f'{case.name:34s}{case.group:14s}{case.does}' for case in cases), sep='\n')
+        print(*(f'{case.name:49s}{case.group:14s}{case.does}' for case in cases), sep='\n')
         return 0
     return _run(cases, given.hours if SOAK in names else 0.0, given.output)
 
@@ -56,7 +59,7 @@ def _run(cases: Sequence[Case], hours: float, folder: Path) -> int:
     try:
         with deferred_interrupt() as check:
             for number, case in enumerate(cases, 1):
-                print(f'[{number:2d}/{len(cases)}] {case.name:34s}', end='', flush=True)
+                print(f'[{number:2d}/{len(cases)}] {case.name:49s}', end='', flush=True)
                 results[case.name], traces[case.name] = run(
                     case, folder / 'logs' / case.name, check)
                 print(report.line(results[case.name]), flush=True)
@@ -69,7 +72,7 @@ def _run(cases: Sequence[Case], hours: float, folder: Path) -> int:
         return 130
     survived = report.write(folder, results, endured, traces)
     print(f'\n{sum(result["survived"] for result in results.values())} of {len(results)} cases '
-          f'survived; see {folder / "report.md"}')
+          f'survived ({report.by_plant(results)}); see {folder / "report.md"}')
     return 0 if survived else 1
 
 

@@ -7,28 +7,22 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
-import itertools
 import math
 from typing import NamedTuple, TYPE_CHECKING
 
 import numpy as np
 
 from koopman_ros.arrays import Array
-from koopman_ros.demo import reactor
 from koopman_ros.reasons import Code
+from validation.faults.plants import LOCKSTEP, Plant, REACTOR
 
 if TYPE_CHECKING:
     from validation.faults.harness import FaultHarness
 
-SETPOINT = 46.0  # degC; 5 K below the steady state that the reactor starts from
-LOCKSTEP = {'lockstep': True, 'speed': 0.0, 'lockstep_timeout': 0.5}
-RATE = reactor.coolant_parameters().rate_limit  # K/s
-BAND = 0.3  # K around the set-point that counts as back
-
 
 @dataclass(frozen=True)
 class Case:
-    """A fault, and what the loop is to make of it."""
+    """A fault, and what the loop is to make of it; values are in the units of the messages."""
 
     group: str  #: heading in the report
     name: str  #: by which it is called on the command line
@@ -37,22 +31,23 @@ class Case:
     play: Callable[[FaultHarness], None]
 
     between: bool = False  #: whether messages are altered
+    on: Plant = REACTOR  #: what the loop controls
     plant: Mapping[str, object] = field(default_factory=lambda: LOCKSTEP)  #: parameters
     controller: Mapping[str, object] = field(default_factory=dict)  #: parameters
-    setpoint: float = SETPOINT  #: degC, requested at the start
-    settle: float = 240.0  #: plant time from the start until it is played, s
-    afterwards: float = 360.0  #: plant time that the loop runs on after the fault, s
+    setpoint: tuple[float, ...] = REACTOR.setpoint  #: requested at the start
+    settle: float = REACTOR.settle  #: plant time from the start until it is played, s
+    afterwards: float = REACTOR.afterwards  #: plant time that the loop runs on after it, s
 
-    #: largest step between two commands, K; never less than the rate limit allows for the time
+    #: largest step between two commands; never less than the rate limit allows for the time
     #: between them, where a busy machine has missed measurements
-    largest_step: float = RATE
-    #: plant time from the end of the fault within which the reactor must be back, s
-    recovery: float = 300.0
-    bump: float = math.inf  #: largest step from the fault on, K, where nothing calls for any
-    #: distance from the set-point that counts as back, K; infinity where none is asked
-    band: float = BAND
-    offset: float = math.inf  #: largest distance from the set-point in the last seconds, K
-    worst: float = math.inf  #: largest distance from the set-point from the fault on, K
+    largest_step: float = 0.0
+    #: plant time from the end of the fault within which the plant must be back, s
+    recovery: float = REACTOR.recovery
+    bump: float = math.inf  #: largest step from the fault on, where nothing calls for any
+    #: distance from the set-point that counts as back
+    band: float = REACTOR.band
+    offset: float = math.inf  #: largest distance from the set-point in the last seconds
+    worst: float = math.inf  #: largest distance from the set-point from the fault on
     #: regular expressions that diagnostics (``<node>: <task>: <sentence>``) must have matched from
     #: the beginning of the fault on
     says: tuple[str, ...] = ()
@@ -61,10 +56,10 @@ class Case:
 
 
 class Command(NamedTuple):
-    """A coolant command, with the stamp that it carries."""
+    """A command, with the stamp that it carries."""
 
     seconds: float
-    celsius: float
+    values: tuple[float, ...]  #: by input
     stamp_ns: int
 
 
@@ -80,14 +75,20 @@ class Status(NamedTuple):
 
 @dataclass
 class Trace:
-    """All that was seen of a case; times are plant time in seconds since the first measurement."""
+    """
+    All that was seen of a case.
 
-    #: (when, true temperature before any fault of the sensor in degrees Celsius)
-    samples: list[tuple[float, float]] = field(default_factory=list)
-    #: what the operator wanted: (from when on, degrees Celsius)
-    setpoints: list[tuple[float, float]] = field(default_factory=list)
+    Times are plant time in seconds since the first measurement, values those of the messages.
+    """
+
+    on: Plant = REACTOR
+    #: when, and the true states before any fault of a sensor
+    samples: list[tuple[float, tuple[float, ...]]] = field(default_factory=list)
+    #: what the operator wanted of the controlled states, and from when on
+    setpoints: list[tuple[float, tuple[float, ...]]] = field(default_factory=list)
     commands: list[Command] = field(default_factory=list)  #: as the controller published them
-    coolants: dict[int, float] = field(default_factory=dict)  #: measured input in degC by stamp
+    #: measured inputs by stamp and name
+    applied: dict[int, dict[str, float]] = field(default_factory=dict)
     delivered: list[int] = field(default_factory=list)  #: stamps that reached the controller
     statuses: list[Status] = field(default_factory=list)  #: of all nodes
     #: what the controller recorded of itself: (plant time, text)
@@ -108,23 +109,30 @@ class Trace:
 
     def steps(self) -> tuple[Array, Array]:
         """
-        Return the times (N - 1,) of the commands after the first and their steps in K.
+        Return the times (N - 1,) of the commands after the first and their largest steps.
 
-        A step is that from the command before, or from the measured input, whichever is
-        less: when messages are lost it is not the one, and when the controller is a new one
-        it need not be the other.
+        A step is that of an input from the command before, or from what was measured of it,
+        whichever is less: when messages are lost it is not the one, and when the controller is a
+        new one it need not be the other.
         """
         times = np.array([command.seconds for command in self.commands[1:]])
-        steps = [min(abs(after.celsius - before.celsius),
-                     abs(after.celsius - self.coolants.get(after.stamp_ns, math.inf)))
-                 for before, after in itertools.pairwise(self.commands)]
-        return times, np.array(steps, dtype=np.float64)
+        values = np.array([command.values for command in self.commands]).reshape(
+            -1, len(self.on.inputs))
+        measured = np.array([[self.applied.get(command.stamp_ns, {}).get(name, math.nan)
+                              for name in self.on.inputs] for command in self.commands[1:]]
+                            ).reshape(-1, len(self.on.inputs))
+        # of commands that are infinite, too
+        with np.errstate(invalid='ignore'):
+            return times, np.max(np.fmin(
+                np.abs(np.diff(values, axis=0)), np.abs(values[1:] - measured)), axis=1)
 
     def errors(self) -> tuple[Array, Array]:
-        """Return the times (N,) of the samples and |T - set-point| (N,) in K."""
-        samples = np.array(self.samples, dtype=np.float64).reshape(-1, 2)
-        since, wanted = np.array(self.setpoints, dtype=np.float64).reshape(-1, 2).T
-        latest = np.searchsorted(since, samples[:, 0], side='right') - 1
+        """Return the times (N,) of the samples and the largest distance (N,) from set-points."""
+        held = [self.on.states.index(name) for name in self.on.controlled]
+        times = np.array([seconds for seconds, _ in self.samples])
+        states = np.array([x for _, x in self.samples]).reshape(-1, len(self.on.states))[:, held]
+        since = np.array([seconds for seconds, _ in self.setpoints])
+        wanted = np.array([r for _, r in self.setpoints]).reshape(-1, len(held))
+        latest = np.searchsorted(since, times, side='right') - 1
         asked = latest >= 0
-        times, temperatures = samples[asked].T
-        return times, np.abs(temperatures - wanted[latest[asked]])
+        return times[asked], np.max(np.abs(states[asked] - wanted[latest[asked]]), axis=1)

@@ -14,16 +14,16 @@ from typing import Any
 
 import numpy as np
 from numpy.random import default_rng, Generator
-from sensor_msgs.msg import Temperature
 
 from koopman_ros.arrays import Array
 from koopman_ros.bags import summary
 from koopman_ros.testing import HarnessError
 from validation.faults import interceptor
-from validation.faults.case import LOCKSTEP, SETPOINT, Trace
+from validation.faults.case import Trace
 from validation.faults.harness import FaultHarness
 from validation.faults.interceptor import Alteration, value
 from validation.faults.judge import out_of_range, responses
+from validation.faults.plants import LOCKSTEP, REACTOR
 
 HOURS = 24.0
 _EVENT_PERIOD = 300.0  # s, mean time between two events
@@ -47,7 +47,7 @@ def _happen(event: str, loop: FaultHarness, random: Generator) -> None:
                 'temperature.noise': float(random.uniform(0.0, 0.05))})
         case 'impossible set-point':
             celsius = float(random.choice([math.nan, 90.0, -1e9]))
-            loop.setpoint.publish(Temperature(temperature=celsius))
+            loop.ask(temperature=celsius)
         case 'weights':
             loop.set_parameters('controller', **{
                 'coolant_temperature.weight': float(10.0 ** random.uniform(-1.0, 1.0)),
@@ -98,7 +98,7 @@ def run_endurance(folder: Path, check: Callable[[], None], hours: float = HOURS
         try:
             loop.start('trainer', {'output': folder / 'bag', 'min_free_disk': 0.0,
                                    'topics': _RECORDED})
-            loop.start_loop(SETPOINT, LOCKSTEP, {})
+            loop.start_loop(REACTOR.setpoint, LOCKSTEP, {})
             _let_happen(loop, hours, happened, looks)
             # what is on its way arrives, so that the counts can agree
             loop.kill('plant', signal.SIGINT)
@@ -120,7 +120,7 @@ def run_endurance(folder: Path, check: Callable[[], None], hours: float = HOURS
                      'growth_when_warm': round(growth(*np.array(seen).T), 3)}
               for name, seen in looks.items()}
     reasons = list(_held_against(trace, answers, memory, recorded))
-    hottest = max((celsius for _, celsius in trace.samples), default=math.nan)
+    hottest = max((celsius for _, (celsius,) in trace.samples), default=math.nan)
     mean_error = float(np.mean(trace.errors()[1])) if trace.samples else math.nan
     return {'survived': not reasons, 'reasons': reasons, 'hours': hours,
             'wall_seconds': round(time.monotonic() - started, 1), 'answers': answers,

@@ -5,8 +5,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 import contextlib
+from functools import partial
+import math
 from pathlib import Path
 import re
 import signal
@@ -15,14 +17,15 @@ from types import TracebackType
 from typing import Any, TypeVar
 
 from rclpy.publisher import Publisher
-from sensor_msgs.msg import Temperature
 
-from koopman_ros.demo import reactor
 from koopman_ros.ros import topics
+from koopman_ros.ros.signals import by_topic
 from koopman_ros.testing import Harness, HarnessError, NodeProcess
+from koopman_ros.wire import Place
 from validation.faults.case import Case, Trace
-from validation.faults.interceptor import Alteration, Interceptor, REMAPPED, unchanged
+from validation.faults.interceptor import Alteration, Interceptor, message_of, remapped, unchanged
 from validation.faults.judge import judge
+from validation.faults.plants import Plant, REACTOR
 
 T = TypeVar('T')
 _STEADY = 0.3  # s of wall time that a set-point must stay the one tracked
@@ -48,7 +51,7 @@ def run(case: Case, folder: Path, check: Callable[[], None] = lambda: None
     started = time.monotonic()
     folder.mkdir(parents=True, exist_ok=True)
     skipped = ''
-    with FaultHarness(folder, LIMIT, check, case.between) as loop:
+    with FaultHarness(folder, LIMIT, check, case.between, case.on) as loop:
         try:
             loop.start_loop(case.setpoint, case.plant, case.controller)
             loop.run_until(case.settle)
@@ -61,7 +64,8 @@ def run(case: Case, folder: Path, check: Callable[[], None] = lambda: None
         except SkipError as reason:
             skipped = str(reason)
     figures = {'survived': False, 'skipped': skipped} if skipped else judge(loop.trace, case)
-    return {'group': case.group, 'does': case.does, 'notes': loop.trace.notes, **figures,
+    return {'plant': case.on.name, 'group': case.group, 'does': case.does,
+            'notes': loop.trace.notes, **figures,
             'wall_seconds': round(time.monotonic() - started, 2)}, loop.trace
 
 
@@ -72,25 +76,27 @@ class FaultHarness:
     :param limit: wall time of the case, s.
     :param check: called at every turn; may raise to end the case.
     :param between: whether the interceptor stands between plant and controller.
+    :param on: what the loop controls.
 
     :ivar ros: the processes' harness, whose node is the operator's.
     :ivar interceptor: traces the messages between plant and controller, and alters them.
     :ivar processes: by name; those that are missed when they end.
-    :ivar setpoint: the publisher of set-points, for those that the trace is not to hold.
     """
 
     def __init__(self, folder: Path, limit: float, check: Callable[[], None],
-                 between: bool = False) -> None:
-        self.folder = folder
+                 between: bool = False, on: Plant = REACTOR) -> None:
+        self.folder, self.on = folder, on
         self.processes: dict[str, NodeProcess] = {}
         self._deadline = time.monotonic() + limit
         self._check = check
         self._between = between
+        self._spoken: list[Publisher] = []
         self.ros = Harness(folder, name='operator', timeout=PATIENCE, lasting=True,
                            each_turn=self._each_turn)
-        self.interceptor = Interceptor(self.ros.node, between)
+        self.interceptor = Interceptor(self.ros.node, on, between)
         self.trace = self.interceptor.trace
-        self.setpoint = self.publisher(reactor.SETPOINT)
+        self._asks = self._publishers(on.wiring.setpoints)
+        self._hands = self._publishers(on.wiring.manual)
 
     def __enter__(self) -> FaultHarness:
         return self
@@ -114,13 +120,16 @@ class FaultHarness:
               called: str = '') -> NodeProcess:
         """Start a process as :class:`Harness` does; it is `called` as the node by default."""
         called = called or name
+        if name in ('plant', 'controller'):
+            parameters = {'system': self.on.name, **self.on.wired,
+                          **(self.on.tuned if name == 'controller' else {}), **(parameters or {})}
         if self._between and called == 'plant':
-            arguments += REMAPPED
+            arguments += remapped(self.on)
         process = self.ros.start(name, parameters, arguments, command, called)
         self.processes[called] = process
         return process
 
-    def start_loop(self, celsius: float, plant: Mapping[str, object],
+    def start_loop(self, setpoint: Sequence[float], plant: Mapping[str, object],
                    controller: Mapping[str, object]) -> None:
         """Start plant and controller, and ask for a set-point before the first measurement."""
         lockstep = bool(plant.get('lockstep'))
@@ -130,7 +139,7 @@ class FaultHarness:
         if lockstep:
             self.start('plant', {**plant, **subscribers})
         self._meet_controller()
-        self.request(celsius)
+        self.request(*setpoint)
         if 'trainer' in self.processes:
             self.wait(lambda: self.trace.last('trainer: recording'), 'the trainer does not start')
             # it finds the controller meanwhile
@@ -152,39 +161,71 @@ class FaultHarness:
 
     # The operator.
 
-    def publisher(self, topic: str) -> Publisher:
-        """Return a publisher of temperatures."""
-        return self.ros.node.create_publisher(Temperature, topic, topics.LOOP_QOS)
+    def _publishers(self, places: Mapping[str, Place]
+                    ) -> dict[str, Callable[[float], None]]:
+        """Return what publishes a value of each signal."""
+        made: dict[str, Callable[[float], None]] = {}
+        for topic, kind, names in by_topic(places):
+            publisher = self.ros.node.create_publisher(kind, topic, topics.LOOP_QOS)
+            self._spoken.append(publisher)
+            for name in names:
+                made[name] = partial(self._speak, publisher, kind, name, places)
+        return made
+
+    @staticmethod
+    def _speak(publisher: Publisher, kind: Any, name: str, places: Mapping[str, Place],
+               value: float) -> None:
+        publisher.publish(message_of(kind, places, {name: value}))
 
     def _meet_controller(self) -> None:
         self.ros.meet('controller')
-        self.wait(self.setpoint.get_subscription_count, 'nobody subscribes to the set-point')
+        for publisher in self._spoken:
+            self.wait(publisher.get_subscription_count,
+                      f'nobody subscribes to {publisher.topic_name}')
 
-    def request(self, celsius: float) -> None:
-        """Request a set-point."""
-        self.trace.setpoints.append((self.now, celsius))
-        self.setpoint.publish(Temperature(temperature=celsius))
+    def ask(self, **values: float) -> None:
+        """Ask for set-points by signal, which the trace is not to hold."""
+        for name, value in values.items():
+            self._asks[name](value)
 
-    def request_until_tracked(self, celsius: float) -> None:
-        """Request a set-point until the controller, which may be new, reports to track it."""
-        tracked: list[Any] = []
-        subscription = self.ros.node.create_subscription(
-            Temperature, reactor.ACTIVE_SETPOINT, tracked.append, topics.LATCHED_QOS)
+    def by_hand(self, *values: float) -> None:
+        """Command the inputs as an operator does in manual mode."""
+        for name, value in zip(self.on.inputs, values, strict=True):
+            self._hands[name](value)
+
+    def request(self, *values: float) -> None:
+        """Request set-points of all controlled states."""
+        self.trace.setpoints.append((self.now, values))
+        self.ask(**dict(zip(self.on.controlled, values, strict=True)))
+
+    def request_until_tracked(self, *values: float) -> None:
+        """Request set-points until the controller, which may be new, reports to track them."""
+        wanted = dict(zip(self.on.controlled, values, strict=True))
+        places, tracked, node = self.on.wiring.active_setpoints, dict[str, float](), self.ros.node
+
+        def hear(names: list[str], message: Any) -> None:
+            tracked.update({name: places[name].get(message) for name in names})
+
+        subscriptions = [node.create_subscription(
+            kind, topic, partial(hear, names), topics.LATCHED_QOS)
+            for topic, kind, names in by_topic(places)]
         self._meet_controller()
         due = steady_since = 0.0
 
         def steady() -> bool:
             nonlocal due, steady_since
             if (now := time.monotonic()) >= due:
-                self.setpoint.publish(Temperature(temperature=celsius))
+                self.ask(**wanted)
                 due = now + _ASK_AGAIN
-            if not tracked or abs(tracked[-1].temperature - celsius) > 1e-6:
+            if any(not abs(tracked.get(name, math.nan) - value) <= 1e-6
+                   for name, value in wanted.items()):
                 steady_since = now
             return now - steady_since > _STEADY
 
         self.wait(steady, 'the controller does not track the set-point requested')
-        self.ros.node.destroy_subscription(subscription)
-        self.trace.setpoints.append((self.now, celsius))
+        for subscription in subscriptions:
+            node.destroy_subscription(subscription)
+        self.trace.setpoints.append((self.now, values))
 
     def set_parameters(self, node: str, **values: Any) -> list[str]:
         """Set parameters one by one; return why they were refused, if any was."""

@@ -12,25 +12,24 @@ from typing import Any
 
 import numpy as np
 
-from koopman_ros.demo import reactor
 from koopman_ros.nodes.replay import replay_records
 from koopman_ros.replay.records import parse, RecordError
-from validation.faults.case import Case, RATE, Trace
+from validation.faults.case import Case, Trace
 
-RUNAWAY = 60.0  # degC; the reactor's operating points end below 54 degC
-LONGEST_GAP = 3.0  # s between two commands, of those for which a larger step is allowed
+LONGEST_GAP = 3.0  # samples between two commands, for which a larger step is allowed
 _LAST = 30.0  # s at the end of a trace, in which an offset is looked for
-_LOWEST, _HIGHEST = reactor.coolant_parameters().min, reactor.coolant_parameters().max  # degC
 
 
 def judge(trace: Trace, case: Case) -> dict[str, Any]:
     """
     Judge the trace of a case.
 
-    :return: `reasons` why it was not survived, in sentences; largest |T - set-point| and step
-        between two commands from the fault on; plant time from its end until the temperature
-        stays within the band (infinity for never); largest |T - set-point| in the last seconds.
+    :return: `reasons` why it was not survived, in sentences; largest distance of a controlled
+        state from its set-point and step between two commands from the fault on; plant time from
+        its end until all stay within the band (infinity for never); largest distance in the last
+        seconds.
     """
+    unit, input_unit = case.on.unit, case.on.input_unit
     times, errors = trace.errors()
     stepped, steps = trace.steps()
     offset = float(np.max(errors[times >= times[-1] - _LAST])) if len(times) else math.nan
@@ -40,24 +39,26 @@ def judge(trace: Trace, case: Case) -> dict[str, Any]:
     recovery = _recovery(trace, case.band)
     reasons = [*trace.complaints]
     if math.isnan(worst):
-        reasons.append('no temperature was measured after the fault began')
+        reasons.append('nothing was measured after the fault began')
     elif not recovery <= case.recovery:
         taken = 'not back' if math.isinf(recovery) else f'back only after {recovery:.0f} s'
-        reasons.append(f'{taken} within {case.band:g} K of the set-point; {case.recovery:g} s '
-                       f'are allowed, and {errors[-1]:.2f} K are left')
+        reasons.append(f'{taken} within {case.band:g} {unit} of the set-point; '
+                       f'{case.recovery:g} s are allowed, and {errors[-1]:.3g} {unit} are left')
     if not offset <= case.offset:
-        reasons.append(f'an offset of {offset:.3f} K is left, {case.offset:g} K are allowed')
+        reasons.append(f'an offset of {offset:.3g} {unit} is left, {case.offset:g} {unit} are '
+                       'allowed')
     if worst > case.worst:
-        reasons.append(f'the temperature was {worst:.2f} K from the set-point, {case.worst:g} K '
-                       'are allowed')
+        reasons.append(f'it was {worst:.3g} {unit} from the set-point, {case.worst:g} {unit} are '
+                       'allowed')
     reasons += [*out_of_range(trace), *_too_large_steps(trace, case)]
     if step > case.bump:
-        reasons.append(f'the coolant command stepped by {step:.3f} K after the fault, '
-                       f'{case.bump:g} K are allowed')
+        reasons.append(f'a command stepped by {step:.3g} {input_unit} after the fault, '
+                       f'{case.bump:g} {input_unit} are allowed')
     reasons += [*_reports(trace, case), *_records(trace, case)]
     return {'survived': not reasons, 'reasons': reasons,
-            'worst_temperature_error_K': round(worst, 6), 'worst_coolant_step_K': round(step, 6),
-            'time_to_recover_s': round(recovery, 6), 'offset_at_the_end_K': round(offset, 6)}
+            'unit': unit, 'input_unit': input_unit,
+            'worst_error': round(worst, 6), 'worst_step': round(step, 6),
+            'time_to_recover_s': round(recovery, 6), 'offset_at_the_end': round(offset, 6)}
 
 
 def _recovery(trace: Trace, band: float) -> float:
@@ -71,15 +72,20 @@ def _recovery(trace: Trace, band: float) -> float:
 
 
 def out_of_range(trace: Trace) -> Iterator[str]:
-    """Say whether the reactor ran away, and which command is the first outside its range."""
-    hottest = max((celsius for _, celsius in trace.samples), default=-math.inf)
-    if not hottest < RUNAWAY:
-        yield f'the reactor reached {hottest:.1f} degC, {RUNAWAY:g} degC is a runaway'
+    """Say whether the plant was lost, and which command is the first outside its range."""
+    on = trace.on
+    unit, input_unit = on.shown_units
+    highest = max((value for _, states in trace.samples for name, value in zip(
+        on.states, states, strict=True) if name in on.controlled), default=-math.inf)
+    if not highest < on.highest:
+        yield f'it reached {highest:g} {unit}, and is lost from {on.highest:g} {unit} on'
     for command in trace.commands:
-        if not _LOWEST <= command.celsius <= _HIGHEST:
-            yield (f'the command {command.celsius:g} degC at {command.seconds:.0f} s is not '
-                   f'within {_LOWEST:g} to {_HIGHEST:g} degC')
-            return
+        for value, (name, tuned) in zip(
+                command.values, on.parameters.inputs.items(), strict=True):
+            if not tuned.min <= value <= tuned.max:
+                yield (f'the command {name} = {value:g} {input_unit} at {command.seconds:.0f} s '
+                       f'is not within {tuned.min:g} to {tuned.max:g} {input_unit}')
+                return
 
 
 def _too_large_steps(trace: Trace, case: Case) -> Iterator[str]:
@@ -88,11 +94,13 @@ def _too_large_steps(trace: Trace, case: Case) -> Iterator[str]:
         return
     times, steps = trace.steps()
     gaps = np.diff(times, prepend=trace.commands[0].seconds)
-    allowed = np.maximum(case.largest_step, RATE * np.minimum(gaps, LONGEST_GAP))
+    period, rate, unit = case.on.period, case.on.rate, case.on.input_unit
+    allowed = np.maximum(case.largest_step,
+                         rate * np.clip(gaps, period, LONGEST_GAP * period))
     # written so that NaN counts
     for first in np.flatnonzero(~(steps <= allowed + 1e-6))[:1]:
-        yield (f'the coolant command stepped by {steps[first]:.2f} K at {times[first]:.0f} s, '
-               f'{allowed[first]:g} K are allowed after {gaps[first]:g} s')
+        yield (f'a command stepped by {steps[first]:.3g} {unit} at {times[first]:.0f} s, '
+               f'{allowed[first]:g} {unit} are allowed after {gaps[first]:g} s')
 
 
 def _reports(trace: Trace, case: Case) -> Iterator[str]:

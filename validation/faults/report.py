@@ -5,15 +5,15 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Iterator, Mapping
 import math
 from pathlib import Path
 from typing import Any, TYPE_CHECKING
 
 from koopman_ros import reports
-from koopman_ros.demo import reactor
-from validation.faults.case import BAND, Trace
-from validation.faults.judge import RUNAWAY
+from validation.faults.case import Trace
+from validation.faults.plants import PLANTS
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -21,7 +21,7 @@ if TYPE_CHECKING:
 FIGURE = 'cases.png'
 # Drawn, because they tell most.
 TELLING = ('nan-long', 'bias', 'feed-warm', 'controller-killed-in-a-step', 'plant-reset',
-           'actuator-saturated')
+           'actuator-saturated', 'two_tanks-silent-one', 'quadruple_tank-frozen-one')
 _BEFORE, _AFTER = 30.0, 300.0  # s around the fault
 
 
@@ -47,28 +47,47 @@ def write(folder: Path, results: Mapping[str, dict[str, Any]], run: dict[str, An
 def line(result: dict[str, Any]) -> str:
     """Write a case as one line of the terminal."""
     *_, error, step, back, _, verdict = _row('', result)
-    figures = f'worst error {error:>6} K, step {step:>5} K, back after {back:>5} s'
+    units = (result.get('unit', ''), result.get('input_unit', ''))
+    figures = (f'worst error {error:>6} {units[0]}, step {step:>5} {units[1]}, '
+               f'back after {back:>5} s')
     return '; '.join([f'{verdict:12} {figures}' if error else verdict,
                       *result.get('reasons', ())])
+
+
+def by_plant(results: Mapping[str, dict[str, Any]]) -> str:
+    """Say of each plant how many of its cases were survived."""
+    counts = Counter(result['plant'] for result in results.values())
+    survived = Counter(result['plant'] for result in results.values() if result['survived'])
+    return ', '.join(f'{name} {survived[name]} of {count}' for name, count in counts.items())
 
 
 def _sections(figures: dict[str, Any], picture: str) -> Iterator[str]:
     results = figures['results']
     skipped = f', {figures["skipped"]} skipped' if figures['skipped'] else ''
-    yield (f'{figures["survived"]} of {figures["cases"]} cases survived{skipped}. Plant and '
-           'controller are real processes; times are plant time.')
+    yield (f'{figures["survived"]} of {figures["cases"]} cases survived{skipped}: '
+           f'{by_plant(results)}. Plant and controller are real processes; times are plant time.')
     yield ('A case is survived when every command was finite, within its range and without a '
-           f'bump, the reactor stayed below {RUNAWAY:g} °C and came back to within {BAND:g} K of '
-           'its set-point in time (unless the case says otherwise), diagnostics said what they '
-           'should, and no process failed. The worst error is that of the true temperature from '
-           'the set-point, steps of the set-point included; the worst step is that between two '
-           'commands, of which the rate limit allows 1 K a second.')
-    for group in dict.fromkeys(result['group'] for result in results.values()):
-        yield f'## {group.capitalize()}'
-        yield reports.table(
-            ('case', 'what is done', 'worst error [K]', 'worst step [K]', 'back after [s]',
-             'left [K]', ''), (_row(name, result) for name, result in results.items()
-                               if result['group'] == group), (2, 3, 4, 5))
+           'bump, the plant was not lost and came back to its set-points in time, diagnostics '
+           'said what they should, the commands follow from the records to the bit, and no '
+           'process failed. The worst error is the largest of a true state from its set-point, '
+           'steps of the set-point included; the worst step is that of an input between two '
+           'commands.')
+    present = {PLANTS[result['plant']] for result in results.values()}
+    on = [plant for plant in PLANTS.values() if plant in present]
+    yield reports.table(
+        ('plant', 'back within', 'in at most [s]', 'lost from', 'fastest command'),
+        ((plant.name, f'{plant.band:g} {plant.unit}', f'{plant.recovery:g}',
+          f'{plant.highest:g} {plant.shown_units[0]}', f'{plant.rate:g} {plant.input_unit}/s')
+         for plant in on), (2,))
+    for plant in on:
+        own = {name: result for name, result in results.items() if result['plant'] == plant.name}
+        for group in dict.fromkeys(result['group'] for result in own.values()):
+            yield f'## {plant.name}: {group}'
+            yield reports.table(
+                ('case', 'what is done', f'worst error [{plant.unit}]',
+                 f'worst step [{plant.input_unit}]', 'back after [s]', f'left [{plant.unit}]', ''),
+                (_row(name, result) for name, result in own.items()
+                 if result['group'] == group), (2, 3, 4, 5))
     if picture:
         yield f'![Some of the cases]({picture})'
     failed = [f'**{name}**: {"; ".join(result["reasons"])}' for name, result in results.items()
@@ -85,10 +104,9 @@ def _row(name: str, result: dict[str, Any]) -> tuple[str, ...]:
     if 'skipped' in result:
         return name, does, '', '', '', '', f'skipped: {result["skipped"]}'
     back = result['time_to_recover_s']
-    return (name, does, f'{result["worst_temperature_error_K"]:.2f}',
-            f'{result["worst_coolant_step_K"]:.2f}',
+    return (name, does, f'{result["worst_error"]:.3g}', f'{result["worst_step"]:.2f}',
             f'{back:.0f}' if math.isfinite(back) else 'never',
-            f'{result["offset_at_the_end_K"]:.3f}',
+            f'{result["offset_at_the_end"]:.2g}',
             'survived' if result['survived'] else '**failed**')
 
 
@@ -108,7 +126,7 @@ def _endurance_sections(run: dict[str, Any]) -> Iterator[str]:
 
 
 def _draw(traces: Mapping[str, Trace], path: Path) -> bool:
-    """Draw temperature and coolant of the telling cases; return whether there was one."""
+    """Draw the first controlled state and the first input of telling cases, if there are any."""
     shown = {name: trace for name in TELLING if (trace := traces.get(name)) is not None
              and trace.commands and math.isfinite(trace.end)}
     if not shown:
@@ -118,26 +136,32 @@ def _draw(traces: Mapping[str, Trace], path: Path) -> bool:
         for upper, lower, name in zip(panels, panels[len(shown):], shown, strict=False):
             _draw_case(upper, lower, shown[name])
             upper.set_title(name, fontsize='medium')
-        for panel, quantity in ((panels[0], 'temperature'), (panels[len(shown)], 'coolant')):
-            panel.set_ylabel(f'{quantity} [°C]')
+        for panel in (panels[0], panels[len(shown)]):
             panel.legend(fontsize='small')
     return True
 
 
 def _draw_case(upper: Axes, lower: Axes, trace: Trace) -> None:
-    times, temperatures = zip(*trace.samples, strict=True)
-    upper.plot(times, temperatures, label='reactor, true')
-    since, wanted = zip(*trace.setpoints, strict=True)
+    on = trace.on
+    state, values = on.controlled[0], on.parameters.inputs[on.inputs[0]]
+    for axes, name, unit in zip((upper, lower), (state, on.inputs[0]), on.shown_units,
+                                strict=True):
+        axes.set_ylabel(f'{name} [{unit}]')
+    times = [seconds for seconds, _ in trace.samples]
+    true = [states[on.states.index(state)] for _, states in trace.samples]
+    upper.plot(times, true, label='true')
+    since = [seconds for seconds, _ in trace.setpoints]
+    wanted = [setpoint[0] for _, setpoint in trace.setpoints]
     upper.step([*since, times[-1]], [*wanted, wanted[-1]], where='post', linestyle='--',
                color='black', linewidth=1.0, label='set-point')
     lower.plot([command.seconds for command in trace.commands],
-               [command.celsius for command in trace.commands], label='command')
-    limits = reactor.coolant_parameters()
-    reports.draw_limits(lower, (limits.min, limits.max), 'limits')
+               [command.values[0] for command in trace.commands], label='command')
+    reports.draw_limits(lower, (values.min, values.max), 'limits')
     for axes in (upper, lower):
         axes.axvspan(trace.begin, max(trace.end, trace.begin + 2.0), alpha=0.2,
                      color='tab:red', linewidth=0.0, label='fault')
     upper.set_xlim(trace.begin - _BEFORE, min(trace.end + _AFTER, times[-1]))
-    near = [celsius for seconds, celsius in trace.samples if seconds > trace.begin - _BEFORE]
-    upper.set_ylim(min(*near, *wanted) - 0.5, max(*near, *wanted) + 0.5)
+    near = [*wanted, *(value for seconds, value in zip(times, true, strict=True)
+                       if seconds > trace.begin - _BEFORE)]
+    upper.set_ylim(min(near) - 2.0 * on.band, max(near) + 2.0 * on.band)
     lower.set_xlabel('plant time [s]')

@@ -3,6 +3,7 @@
 
 """The fault campaign: its judge, its alterations, cases across real processes, its report."""
 
+from collections import Counter
 from dataclasses import replace
 import json
 import math
@@ -17,10 +18,12 @@ from validation.faults import interceptor
 from validation.faults.__main__ import main
 from validation.faults.case import Case, Command, Status, Trace
 from validation.faults.cases import CASES
+from validation.faults.cases.processes import second_controller
 from validation.faults.endurance import growth, run_endurance
 from validation.faults.harness import run
 from validation.faults.interceptor import Packet
-from validation.faults.judge import judge, responses
+from validation.faults.judge import judge, out_of_range, responses
+from validation.faults.plants import QUADRUPLE_TANK
 from validation.faults.report import write
 
 # the type support's parser imports a module that Python deprecated
@@ -37,11 +40,11 @@ def trace(temperature=lambda t: 46.0 + (1.0 if BEGIN <= t < END + 20 else 0.0),
           coolant=lambda t: 20.0 + 0.01 * t):
     """Return a trace that keeps to the bounds: 1 K off until 20 s after the fault."""
     return Trace(
-        samples=[(float(t), temperature(t)) for t in range(SECONDS)],
-        setpoints=[(0.0, 46.0)], begin=float(BEGIN), end=float(END),
+        samples=[(float(t), (temperature(t),)) for t in range(SECONDS)],
+        setpoints=[(0.0, (46.0,))], begin=float(BEGIN), end=float(END),
         statuses=[Status(55.0, CONTROL, 2, 'hold: the sensor is frozen', {}),
                   Status(70.0, CONTROL, 0, 'automatic', {})],
-        commands=[Command(float(t), coolant(t), t) for t in range(SECONDS)])
+        commands=[Command(float(t), (coolant(t),), t) for t in range(SECONDS)])
 
 
 def reasons(found, **bounds):
@@ -51,8 +54,8 @@ def reasons(found, **bounds):
 def test_figures_of_a_case_that_is_survived():
     verdict = judge(trace(), CASE)
     assert verdict == {
-        'survived': True, 'reasons': [], 'worst_temperature_error_K': 1.0,
-        'worst_coolant_step_K': 0.01, 'time_to_recover_s': 20.0, 'offset_at_the_end_K': 0.0}
+        'survived': True, 'reasons': [], 'unit': 'K', 'input_unit': 'K', 'worst_error': 1.0,
+        'worst_step': 0.01, 'time_to_recover_s': 20.0, 'offset_at_the_end': 0.0}
 
 
 def test_commands_that_do_not_follow_from_the_records_are_not_survived():
@@ -86,20 +89,21 @@ def test_reason_is_looked_for_in_the_records_from_the_fault_on():
 @pytest.mark.parametrize('celsius', [4.9, 32.1, math.nan, math.inf, -math.inf])
 def test_command_out_of_range_is_not_survived(celsius):
     found = trace(coolant=lambda t: celsius if t == 100 else 20.0)
-    assert f'the command {celsius:g} degC at 100 s is not within 5 to 32 degC' in reasons(found)
+    assert f'coolant_temperature = {celsius:g} °C at 100 s is not within' in reasons(
+        found)
 
 
 def test_bump_of_the_command_is_not_survived():
     found = trace(coolant=lambda t: 20.0 if t < 100 else 25.0)
     assert reasons(found) == (
-        'the coolant command stepped by 5.00 K at 100 s, 1 K are allowed after 1 s')
-    assert judge(found, CASE)['worst_coolant_step_K'] == 5.0
+        'a command stepped by 5 K at 100 s, 1 K are allowed after 1 s')
+    assert judge(found, CASE)['worst_step'] == 5.0
     # from what acts there is no bump
-    found.coolants[100] = 24.8
+    found.applied[100] = {'coolant_temperature': 24.8}
     assert not reasons(found)
-    assert judge(found, CASE)['worst_coolant_step_K'] == 0.2
-    found.coolants[100] = 22.0
-    assert 'the coolant command stepped by 3.00 K at 100 s' in reasons(found)
+    assert judge(found, CASE)['worst_step'] == 0.2
+    found.applied[100] = {'coolant_temperature': 22.0}
+    assert 'a command stepped by 3 K at 100 s' in reasons(found)
     # after missed measurements, as the rate limit allows in the time that counts
     for missed, step, words in ((1, 2.0, ''), (1, 2.1, '2 K are allowed after 2 s'),
                                 (2, 3.0, ''), (9, 3.1, '3 K are allowed after 10 s')):
@@ -111,15 +115,15 @@ def test_bump_of_the_command_is_not_survived():
 
 @pytest.mark.parametrize(('temperature', 'bound', 'enough', 'words'), [
     (None, {'bump': 0.001}, {'bump': 0.02},
-     'the coolant command stepped by 0.010 K after the fault, 0.001 K are allowed'),
+     'a command stepped by 0.01 K after the fault, 0.001 K are allowed'),
     (None, {'worst': 0.9}, {'worst': 1.1},
-     'the temperature was 1.00 K from the set-point, 0.9 K are allowed'),
+     'it was 1 K from the set-point, 0.9 K are allowed'),
     (lambda t: 46.0 if t < BEGIN else 46.02, {'offset': 0.01}, {},
-     'an offset of 0.020 K is left, 0.01 K are allowed'),
+     'an offset of 0.02 K is left, 0.01 K are allowed'),
     (lambda t: 47.0 if BEGIN <= t < END + 51 else 46.0, {}, {'recovery': 51.0},
-     'back only after 51 s within 0.3 K of the set-point; 50 s are allowed, and 0.00 K are left'),
+     'back only after 51 s within 0.3 K of the set-point; 50 s are allowed, and 0 K are left'),
     (lambda t: 46.0 if t < BEGIN else 46.4, {}, {'band': 0.5},
-     'not back within 0.3 K of the set-point; 50 s are allowed, and 0.40 K are left')])
+     'not back within 0.3 K of the set-point; 50 s are allowed, and 0.4 K are left')])
 def test_bounds_are_kept_to(temperature, bound, enough, words):
     found = trace() if temperature is None else trace(temperature)
     assert reasons(found, **bound) == words
@@ -128,8 +132,8 @@ def test_bounds_are_kept_to(temperature, bound, enough, words):
 
 def test_error_and_recovery_are_those_of_the_set_point_of_their_time():
     found = trace(temperature=lambda t: 46.0 if t < 100 else 44.0)
-    found.setpoints.append((100.0, 44.0))
-    assert judge(found, CASE)['worst_temperature_error_K'] == 0.0
+    found.setpoints.append((100.0, (44.0,)))
+    assert judge(found, CASE)['worst_error'] == 0.0
     # coming back is not being back
     found = trace(temperature=lambda t: 46.5 if BEGIN <= t < END or t == 150 else 46.0)
     assert judge(found, CASE)['time_to_recover_s'] == 91.0
@@ -138,9 +142,9 @@ def test_error_and_recovery_are_those_of_the_set_point_of_their_time():
 @pytest.mark.parametrize(('change', 'words'), [
     ({'commands': []}, 'the controller never commanded'),
     ({'end': math.inf}, 'not back'),
-    ({'begin': math.inf}, 'no temperature was measured after the fault began'),
-    ({'samples': [*trace().samples, (200.0, 61.0), (201.0, 46.0)]},
-     'the reactor reached 61.0 degC, 60 degC is a runaway'),
+    ({'begin': math.inf}, 'nothing was measured after the fault began'),
+    ({'samples': [*trace().samples, (200.0, (61.0,)), (201.0, (46.0,))]},
+     'it reached 61 °C, and is lost from 60 °C on'),
     ({'complaints': ['controller ended with code -6']}, 'controller ended with code -6'),
     # before the fault, or by another node
     ({'statuses': [Status(10.0, CONTROL, 2, 'hold: the sensor is frozen', {}),
@@ -168,7 +172,7 @@ def test_responses_are_counted(delivered, answers, expected):
 
 VALUES = [5, 6, 7, 8, 9, 10]
 STAMPS = [k * 1_000_000_000 for k in VALUES]
-SENT = [Packet(stamp, float(k)) for stamp, k in zip(STAMPS, VALUES, strict=True)]
+SENT = [Packet(stamp, {'x': float(k)}) for stamp, k in zip(STAMPS, VALUES, strict=True)]
 
 
 def arriving(alter, sent=SENT):
@@ -189,18 +193,46 @@ def arriving(alter, sent=SENT):
     (interceptor.frozen('stamp_ns'), VALUES, STAMPS[:1] * 6)])
 def test_what_arrives(alter, values, stamps):
     packets = arriving(alter)
-    assert [packet.celsius for packet in packets] == values
+    assert [packet.values['x'] for packet in packets] == values
     assert stamps in (None, [packet.stamp_ns for packet in packets])
 
 
+BOTH = Packet(7, {'x': 1.0, 'y': 2.0})
+
+
+@pytest.mark.parametrize(('alter', 'arriving'), [
+    # of one message where the stamp is the same
+    (interceptor.value(lambda *_: 5.0), [BOTH._replace(values={'x': 1.0, 'y': 5.0})]),
+    (interceptor.lost(), [Packet(7, {'x': 1.0})]),
+    (interceptor.twice, [BOTH, Packet(7, {'y': 2.0})]),
+    (interceptor.stamped(lambda stamp_ns: stamp_ns - 2),
+     [Packet(7, {'x': 1.0}), Packet(5, {'y': 2.0})])])
+def test_what_arrives_of_one_of_two_signals(alter, arriving):
+    assert interceptor.part(alter, 'y')(BOTH) == arriving
+
+
+def test_distances_and_steps_of_several_signals_are_the_largest():
+    """Of tanks whose levels 3 and 4 have no set-point."""
+    found = Trace(QUADRUPLE_TANK, samples=[(float(t), (0.15, 0.11, t, t)) for t in range(3)],
+                  setpoints=[(0.0, (0.15, 0.1))],
+                  commands=[Command(0.0, (3.0, 3.0), 0), Command(1.0, (3.1, 2.5), 1)])
+    np.testing.assert_allclose(found.errors()[1], 0.01)
+    np.testing.assert_allclose(found.steps()[1], 0.5)
+    found.applied[1] = {'pump_1': 3.0, 'pump_2': 2.6}
+    np.testing.assert_allclose(found.steps()[1], 0.1)
+    found.commands.append(Command(2.0, (3.0, 10.5), 2))
+    assert list(out_of_range(found)) == [
+        'the command pump_2 = 10.5 V at 2 s is not within 0 to 10 V']
+
+
 def test_a_share_is_lost_the_same_every_time_and_noise_has_its_deviation():
-    many = [Packet(k, 40.0) for k in range(4000)]
+    many = [Packet(k, {'x': 40.0}) for k in range(4000)]
     lossy = arriving(interceptor.lost(0.3), many)
     assert len(lossy) == pytest.approx(2800, abs=150)
     assert arriving(interceptor.lost(0.3), many) == lossy
     noisy = arriving(interceptor.noise(2.0), many)
     assert [packet.stamp_ns for packet in noisy] == list(range(4000))
-    shown = [packet.celsius for packet in noisy]
+    shown = [packet.values['x'] for packet in noisy]
     assert np.mean(shown) == pytest.approx(40.0, abs=0.15)
     assert np.std(shown) == pytest.approx(2.0, rel=0.05)
 
@@ -222,6 +254,22 @@ def test_faults_of_messages_models_and_processes_are_survived(tmp_path):
     assert result['reasons'] == []
     assert len(trace.samples) > 300
     assert len(list(tmp_path.glob('controller_*.log'))) == 2
+
+
+def test_a_bad_signal_of_two_and_a_second_controller_are_survived(tmp_path):
+    """On two levels and two pumps, each on a topic of its own."""
+    case = CASES['two_tanks-nan-one']
+
+    def play(loop):
+        second_controller(loop, says=('^controller: control: 2 nodes command the pump_1',))
+        loop.run_for(20.0)
+        case.play(loop)
+
+    result, found = run(replace(case, play=play, largest_step=math.inf), tmp_path)
+    assert result['reasons'] == []
+    assert (result['plant'], result['unit'], result['input_unit']) == ('two_tanks', 'm', 'V')
+    assert {len(states) for _, states in found.samples} == {2}
+    assert {len(command.values) for command in found.commands} == {2}
 
 
 def test_what_goes_wrong_is_held_against_the_case(tmp_path):
@@ -260,13 +308,13 @@ def test_growth_is_that_of_a_warm_process():
     assert growth(seconds, 50.0 + 0.1 * seconds) == pytest.approx(7.5)
 
 
-GOOD = {'group': 'sensor', 'does': 'NaN', 'notes': ['a note'], 'survived': True, 'reasons': [],
-        'worst_temperature_error_K': 1.0, 'worst_coolant_step_K': 0.5, 'time_to_recover_s': 20.0,
-        'offset_at_the_end_K': 0.0, 'wall_seconds': 2.0}
-BAD = {**GOOD, 'survived': False, 'reasons': ['not back'], 'worst_temperature_error_K': 9.0,
-       'time_to_recover_s': math.inf, 'offset_at_the_end_K': 3.0}
-SKIPPED = {'group': 'processes', 'does': 'full', 'notes': [], 'survived': False,
-           'skipped': 'no disk'}
+GOOD = {'plant': 'reactor', 'group': 'sensor', 'does': 'NaN', 'notes': ['a note'],
+        'survived': True, 'reasons': [], 'worst_error': 1.0, 'worst_step': 0.5,
+        'time_to_recover_s': 20.0, 'offset_at_the_end': 0.0, 'wall_seconds': 2.0}
+BAD = {**GOOD, 'survived': False, 'reasons': ['not back'], 'worst_error': 9.0,
+       'time_to_recover_s': math.inf, 'offset_at_the_end': 3.0}
+SKIPPED = {'plant': 'two_tanks', 'group': 'processes', 'does': 'full', 'notes': [],
+           'survived': False, 'skipped': 'no disk'}
 ENDURED = {
     'survived': True, 'reasons': [], 'hours': 1.0, 'wall_seconds': 9.0,
     'answers': {'measurements': 3}, 'events': {'weights': 2}, 'recorded': {'/temperature': 3},
@@ -277,23 +325,28 @@ ENDURED = {
 def test_report_says_what_failed_and_why(tmp_path):
     assert not write(tmp_path, {'nan-short': GOOD, 'bias': BAD, 'disk-full': SKIPPED}, ENDURED)
     text = (tmp_path / 'report.md').read_text()
-    assert '1 of 3 cases survived, 1 skipped' in text
+    assert '1 of 3 cases survived, 1 skipped: reactor 1 of 2, two_tanks 0 of 1.' in text
+    assert '## two_tanks: processes' in text
     assert '- **bias**: not back' in text
-    assert '| 9.00 | 0.50 | never | 3.000 | **failed** |' in text
+    assert '| 9 | 0.50 | never | 3 | **failed** |' in text
     assert 'skipped: no disk' in text
     assert 'a note' in text
     assert '| plant | 80.0 | 80.1 | 0.02 |' in text
     summary = json.loads((tmp_path / 'summary.json').read_text())
     assert (summary['cases'], summary['survived'], summary['skipped']) == (3, 1, 1)
     assert summary['results']['bias']['time_to_recover_s'] is None
-    assert summary['results']['nan-short']['worst_temperature_error_K'] == 1.0
+    assert summary['results']['nan-short']['worst_error'] == 1.0
     assert summary['soak']['survived']
     assert write(tmp_path, {'good': GOOD, 'skipped': SKIPPED}, ENDURED)
     assert not write(tmp_path, {'good': GOOD}, {**ENDURED, 'survived': False})
 
 
 def test_command_line(capsys):
-    assert len(CASES) >= 80
+    counts = Counter(case.on.name for case in CASES.values())
+    assert counts['reactor'] == 80
+    assert min(counts['two_tanks'], counts['quadruple_tank']) >= 15
+    assert all(name.startswith(case.on.name) for name, case in CASES.items()
+               if case.on.name != 'reactor')
     assert all(case.does and case.group for case in CASES.values())
     assert main(['sensor', 'feed-warm', '--list']) == 0
     listed = capsys.readouterr().out

@@ -3,6 +3,7 @@
 
 """The cases of the campaign, by group."""
 
-from validation.faults.cases import messages, operators, processes
+from validation.faults.cases import any_plant, messages, operators, processes
 
-CASES = {case.name: case for case in (*messages.CASES, *processes.CASES, *operators.CASES)}
+CASES = {case.name: case for case in (*messages.CASES, *processes.CASES, *operators.CASES,
+                                    *any_plant.CASES)}

@@ -11,20 +11,20 @@ from typing import Any
 from koopman_ros.reasons import Code
 from koopman_ros.units import NANOSECONDS
 from validation.faults import interceptor
-from validation.faults.case import Case, LOCKSTEP
+from validation.faults.case import Case
 from validation.faults.harness import FaultHarness
 from validation.faults.interceptor import Alteration, lost, noise, Packet, stamped, value
+from validation.faults.plants import LOCKSTEP, REACTOR
 
 Maker = Callable[[], Alteration]
 _BIAS = 'equivalent sensor bias [K]'
-_TO = 44.0  # degC, to which the set-point steps
 
 
-def _altered(loop: FaultHarness, make: Maker, seconds: float, setpoint: float | None = None,
-             wait: float = 0.0, what: str = 'measurements') -> None:
+def altered(loop: FaultHarness, make: Maker, seconds: float, setpoint: tuple[float, ...] = (),
+            wait: float = 0.0, what: str = 'measurements') -> None:
     """Alter measurements or commands for some seconds of plant time, after a step if asked to."""
-    if setpoint is not None:
-        loop.request(setpoint)
+    if setpoint:
+        loop.request(*setpoint)
         loop.run_for(wait)
     with loop.fault():
         loop.alter(seconds, **{what: make()})
@@ -59,7 +59,7 @@ def _biased(loop: FaultHarness) -> None:
 def _sensor(name: str, does: str, make: Maker, seconds: float, code: Code | None = None,
             **details: Any) -> Case:
     return Case('sensor', name, f'{does}, {seconds:g} s',
-                partial(_altered, make=make, seconds=seconds), True, code=code, **details)
+                partial(altered, make=make, seconds=seconds), True, code=code, **details)
 
 
 _SENSOR = (
@@ -79,15 +79,16 @@ _SENSOR = (
             _shifted(lambda seconds: 20.0 * (seconds % 7.0 == 0.0)), 140.0, Code.JUMPED),
     _sensor('frozen-at-rest', 'bit-identical values', interceptor.frozen, 120.0),
     Case('sensor', 'frozen-in-a-step', 'bit-identical values, 10 s after a step of the set-point, '
-         '90 s', partial(_altered, make=interceptor.frozen, seconds=90.0, setpoint=42.0,
-                         wait=10.0), True, code=Code.FROZEN),
+         '90 s', partial(altered, make=interceptor.frozen, seconds=90.0, setpoint=(42.0,),
+                        wait=10.0), True, code=Code.FROZEN),
     _sensor('drift', 'drifts by 1 K/min', _shifted(lambda seconds: seconds / 60.0), 180.0),
     Case('sensor', 'bias', 'wrong by +2 K, 300 s and more', _biased, True, recovery=360.0,
          afterwards=420.0),
     _sensor('noise-burst', 'noise of 1 K', lambda: noise(1.0), 60.0),
     _sensor('noise-wild', 'noise of 10 K', lambda: noise(10.0), 60.0, Code.JUMPED),
     _sensor('quantised', 'in steps of 0.5 K, the set-point between two of them',
-            lambda: value(lambda _, measured: round(2.0 * measured) / 2.0), 300.0, setpoint=45.8),
+            lambda: value(lambda _, measured: round(2.0 * measured) / 2.0), 300.0,
+            setpoint=(45.8,)),
     _sensor('dropout-short', 'no measurement', lost, 5.0),
     _sensor('dropout-long', 'no measurement', lost, 150.0, Code.NO_MEASUREMENT,
             plant={'lockstep': True, 'speed': 60.0}, controller={'use_sim_time': True},
@@ -98,8 +99,8 @@ _SENSOR = (
 def _in_a_step(group: str, name: str, does: str, make: Maker, seconds: float, *,
                what: str = 'measurements', largest_step: float = 2.0, **details: Any) -> Case:
     return Case(group, name, f'{does}, while the set-point steps, {seconds:g} s',
-                partial(_altered, make=make, seconds=seconds, setpoint=_TO, what=what), True,
-                largest_step=largest_step, **details)
+                partial(altered, make=make, seconds=seconds, setpoint=REACTOR.other, what=what),
+                True, largest_step=largest_step, **details)
 
 
 _MESSAGES = tuple(
@@ -127,12 +128,13 @@ def _jittered(stamp_ns: int) -> int:
 
 
 def _twin(packet: Packet) -> list[Packet]:
-    return [packet, packet._replace(celsius=packet.celsius + 0.01)]
+    return [packet, packet._replace(values={
+        name: value + 0.01 for name, value in packet.values.items()})]
 
 
 def _without_clock(loop: FaultHarness) -> None:
     with loop.fault():
-        loop.request(_TO)
+        loop.request(*REACTOR.other)
         loop.wait_for_report(_NO_CLOCK)
 
 

@@ -19,13 +19,11 @@ from rclpy.node import Node
 from sensor_msgs.msg import Temperature
 
 from koopman_ros.bags import read_messages
-from koopman_ros.demo import reactor
 from koopman_ros.resources import model_path
-from validation.faults.case import Case, LOCKSTEP, SETPOINT
+from validation.faults.case import Case
 from validation.faults.harness import FaultHarness, SkipError
+from validation.faults.plants import LOCKSTEP, PATIENT
 
-# While a controller is dead, the plant goes on at twenty times real time.
-PATIENT = {**LOCKSTEP, 'lockstep_timeout': 0.05}
 RUNNING = {'speed': 20.0}  # without lock-step
 RUNNING_STEP = 5.0  # K; what is late by a few samples may step as far as in these
 _DISK = '1m'  # size of a small disk
@@ -38,7 +36,8 @@ _TWO_CONTROLLERS = ('^controller: control: 2 nodes command the coolant',
 _TWO_PLANTS = ('^controller: control: .*2 nodes publish the temperature',)
 
 
-def _plant_again(loop: FaultHarness, number: int) -> None:
+def plant_again(loop: FaultHarness, number: int) -> None:
+    """End the plant by a signal, and start another."""
     with loop.fault():
         loop.kill('plant', number)
         before = loop.now
@@ -46,37 +45,41 @@ def _plant_again(loop: FaultHarness, number: int) -> None:
         loop.wait(lambda: loop.now > before, 'the new plant does not measure')
 
 
-def _plant_reset(loop: FaultHarness) -> None:
+def plant_reset(loop: FaultHarness) -> None:
+    """Put the plant back to where it started."""
     with loop.fault():
         answer = loop.ros.trigger('plant/reset')
         loop.expect(answer.success, f'the reset was refused: {answer.message}')
 
 
-def _controller_again(loop: FaultHarness, setpoint: float = SETPOINT, dead: float = 0.0) -> None:
+def controller_again(loop: FaultHarness, setpoint: tuple[float, ...] = (), dead: float = 0.0
+                     ) -> None:
+    """Kill the controller, and start another some plant time later."""
     with loop.fault():
         loop.kill('controller')
         loop.run_for(dead)
         loop.start('controller')
-        loop.request_until_tracked(setpoint)
+        loop.request_until_tracked(*setpoint or loop.on.setpoint)
 
 
 def _controller_in_a_step(loop: FaultHarness) -> None:
     loop.request(41.0)
     loop.run_for(15.0)
-    _controller_again(loop, 41.0)
+    controller_again(loop, (41.0,))
 
 
 def _controller_while_disturbed(loop: FaultHarness) -> None:
     loop.set_parameters('plant', **{'constants.feed_temperature': 78.85})
     loop.run_for(30.0)
-    _controller_again(loop, dead=60.0)
+    controller_again(loop, dead=60.0)
 
 
-def _controller_in_manual_mode(loop: FaultHarness) -> None:
+def controller_in_manual_mode(loop: FaultHarness) -> None:
+    """Kill the controller in manual mode, and start another."""
     loop.ros.set_bool('controller/set_automatic', False)
-    loop.publisher(reactor.MANUAL_COOLANT_SETPOINT).publish(Temperature(temperature=22.0))
+    loop.by_hand(*loop.on.by_hand)
     loop.run_for(120.0)
-    _controller_again(loop)
+    controller_again(loop)
 
 
 def _controller_stopped(loop: FaultHarness) -> None:
@@ -147,22 +150,26 @@ def _reload(loop: FaultHarness, spoil: str) -> None:
             loop.expect('the old model is kept' in answer.message, f'the reason: {answer.message}')
 
 
-def _second_controller(loop: FaultHarness) -> None:
+def second_controller(loop: FaultHarness, says: tuple[str, ...] = _TWO_CONTROLLERS) -> None:
+    """Let a controller with another weight command, too, until both nodes say so."""
+    weight = f'{loop.on.inputs[0]}.weight'
     with loop.fault():
-        loop.start('controller', {'coolant_temperature.weight': 0.1},
+        loop.start('controller', {weight: 0.1 * loop.on.default(weight)},
                    ('-r', '__node:=controller_2'), called='controller_2')
-        loop.request(45.0)
-        loop.wait_for_report(*_TWO_CONTROLLERS)
+        loop.request(*loop.on.other)
+        loop.wait_for_report(*says)
         loop.linger(1.0)
         loop.kill('controller_2', signal.SIGINT)
 
 
-def _second_plant(loop: FaultHarness) -> None:
+def second_plant(loop: FaultHarness, says: tuple[str, ...] = _TWO_PLANTS) -> None:
+    """Let another plant measure, too, until the controller says so."""
+    away = (word for place in loop.on.wiring.applied.values()
+            for word in ('-r', f'{place.topic}:=plant_2/{place.topic}'))
     with loop.fault():
-        loop.start('plant', {'speed': 20.0, 'start_time': 5000.0}, (
-            '-r', '__node:=plant_2', '-r', 'coolant_temperature:=plant_2/coolant_temperature'),
-                   called='plant_2')
-        loop.wait_for_report(*_TWO_PLANTS)
+        loop.start('plant', {'speed': 20.0, 'start_time': 5000.0},
+                   ('-r', '__node:=plant_2', *away), called='plant_2')
+        loop.wait_for_report(*says)
         loop.linger(1.0)
         loop.kill('plant_2', signal.SIGINT)
 
@@ -214,21 +221,21 @@ def _starved(loop: FaultHarness) -> None:
 _process, _neighbour = partial(Case, 'processes'), partial(Case, 'neighbours')
 CASES = (
     _process('plant-restart', 'the plant is ended and started again, 5 K too warm and at time 1 s',
-             partial(_plant_again, number=signal.SIGINT)),
+             partial(plant_again, number=signal.SIGINT)),
     _process('plant-killed', 'the plant is killed and started again',
-             partial(_plant_again, number=signal.SIGKILL)),
-    _process('plant-reset', 'the plant is reset, which makes it 5 K warmer at once', _plant_reset),
+             partial(plant_again, number=signal.SIGKILL)),
+    _process('plant-reset', 'the plant is reset, which makes it 5 K warmer at once', plant_reset),
     _process('plant-stopped', 'the plant is stopped (SIGSTOP) for 3 s of wall time',
              _plant_stopped),
     _process('controller-killed', 'the controller is killed at rest and started again',
-             _controller_again, plant=PATIENT, bump=0.01),
+             controller_again, plant=PATIENT, bump=0.01),
     _process('controller-killed-in-a-step', 'killed 15 s after a step of the set-point, and '
              'started again', _controller_in_a_step, plant=PATIENT),
     _process('controller-killed-while-disturbed', 'killed while the feed is 2 K too warm, and '
              'started again after a minute', _controller_while_disturbed, plant=PATIENT,
              afterwards=420.0, recovery=360.0),
     _process('controller-killed-in-manual-mode', 'killed in manual mode, and started again',
-             _controller_in_manual_mode, plant=PATIENT),
+             controller_in_manual_mode, plant=PATIENT),
     _process('controller-stopped', 'stopped (SIGSTOP) for 4 s of wall time, 80 s of plant '
              'time, while the set-point steps', _controller_stopped, plant=RUNNING, settle=100.0,
              largest_step=RUNNING_STEP, afterwards=120.0, recovery=120.0),
@@ -244,9 +251,9 @@ CASES = (
           ('deleted', 'the model file is deleted and read again'),
           ('changed', 'another lift takes the place of the model file and is read'))),
     _neighbour('two-controllers', 'a second controller, tuned otherwise, commands the same plant, '
-               'in turn', _second_controller, largest_step=27.0, says=_TWO_CONTROLLERS),
+               'in turn', second_controller, largest_step=27.0, says=_TWO_CONTROLLERS),
     _neighbour('two-plants', 'a second plant, 5 K warmer and at another time, measures, too',
-               _second_plant, True, largest_step=2.0, says=_TWO_PLANTS),
+               second_plant, True, largest_step=2.0, says=_TWO_PLANTS),
     _neighbour('participants', f'{_PARTICIPANTS} participants at a time come and go for 5 s',
                _flooded),
     _neighbour('starved', 'two busy processes on each core, while the set-point steps', _starved,
