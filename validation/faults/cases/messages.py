@@ -67,7 +67,7 @@ _SENSOR = (
     _sensor('nan-long', 'NaN', _constant(math.nan), 180.0, Code.NOT_FINITE),
     _sensor('infinity', '+inf', _constant(math.inf), 10.0, Code.NOT_FINITE),
     _sensor('minus-infinity', '-inf', _constant(-math.inf), 10.0, Code.NOT_FINITE),
-    _sensor('huge', '1e300 degC', _constant(1e300), 10.0, Code.OUTSIDE_SENSOR),
+    _sensor('huge', '1e300 degC', _constant(1e300), 10.0, Code.NOT_FINITE),
     _sensor('minus-zero', '-0.0 degC', _constant(-0.0), 10.0, Code.JUMPED),
     _sensor('below-absolute-zero', '-300 degC', _constant(-300.0), 10.0, Code.NOT_FINITE),
     _sensor('out-of-range', '200 degC', _constant(200.0), 20.0, Code.OUTSIDE_SENSOR),
