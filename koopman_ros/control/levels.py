@@ -179,8 +179,8 @@ class Estimating:
         w = np.zeros(self.model.n_x) if before is None else before.w
 
         def travel(then: FrozenCheck) -> Array:
-            if self._far_out(x) or state.way_back is not None:
-                # what the model says of its motion is worth nothing; under the safe input even a
+            if self.model.distance(x) > 0.0 or state.way_back is not None:
+                # what the model says of its motion is worth little; under the safe input even a
                 # plant that it does not expect to may rest there
                 return np.zeros_like(y)
             frozen = None if before is None else Estimate(before.x, then.w)

@@ -292,6 +292,14 @@ def test_a_plant_at_rest_is_not_frozen_and_nothing_is_when_that_is_switched_off(
     assert levels(loop.run(60, lambda _: START)) == ['sdre']
 
 
+def test_a_plant_that_rests_where_the_model_was_not_trained_is_not_frozen():
+    """As an empty tank, which the extrapolated model expects to go on falling."""
+    own = controller()
+    loop, outside = asked(own), float(own.model.states.lower[0]) - 3.0
+    # when the jump there is believed
+    assert levels(loop.run(100, lambda _: outside)[40:]) == ['linear']
+
+
 def test_steps_of_the_sensor_are_no_fault():
     loop = asked(noise=0.02)
     samples = loop.run(400, lambda kelvin: 0.1 * round(kelvin / 0.1))
