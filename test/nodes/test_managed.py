@@ -94,7 +94,9 @@ def test_plant(ros: Harness) -> None:
     count = len(measured)
     ros.wait_for_status('plant: simulation', lambda s: s is not still)
     assert len(measured) == count
-    assert value(still, 'measurements') == str(count)
+    # of which a busy machine skips some
+    passed = seconds(measured[-1]) - seconds(measured[0])
+    assert int(value(still, 'measurements')) == passed + 1
 
     take_down(ros, 'plant')
     assert not [s for s in ros.statuses if s.name.startswith('plant')]
