@@ -15,11 +15,12 @@ from rclpy.lifecycle import LifecycleState, TransitionCallbackReturn
 from rclpy.lifecycle.node import LifecycleNodeMixin
 from rosgraph_msgs.msg import Clock
 
-from koopman_ros.ros.node import LoopNode
+from koopman_ros.ros.node import LoopNode, wall_timer
 
 # A parameter or a model that does not fit is a ValueError; rclpy raises RCLError for an unreadable
 # parameter file, a RuntimeError whose class is private to the extension.
 START_ERRORS = (OSError, ParameterException, RuntimeError, ValueError)
+_FAREWELL = 0.5  # s
 
 
 class ManagedNode(LifecycleNodeMixin, LoopNode):
@@ -97,8 +98,12 @@ class ManagedNode(LifecycleNodeMixin, LoopNode):
         """Act no more, and end the process."""
         if self.active:
             self.on_deactivate(state)
-        self.exit_code = 0
+        # whoever asked for it hears the answer first, which would be lost with its sender
+        wall_timer(self, _FAREWELL, self._end)
         return TransitionCallbackReturn.SUCCESS
+
+    def _end(self) -> None:
+        self.exit_code = 0
 
     def on_error(self, state: LifecycleState) -> TransitionCallbackReturn:
         """Go back to the unconfigured state."""

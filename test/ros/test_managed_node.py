@@ -4,10 +4,12 @@
 """What a managed node does where its own work fails."""
 
 from collections.abc import Iterator
+import time
 from typing import Any
 
 import pytest
 from rclpy.context import Context
+from rclpy.executors import SingleThreadedExecutor
 from rclpy.lifecycle import TransitionCallbackReturn
 from rclpy.parameter import Parameter
 from std_msgs.msg import String
@@ -16,6 +18,7 @@ from std_srvs.srv import Trigger
 from koopman_ros.ros.managed import ManagedNode
 from koopman_ros.ros.node import Level, Status, wall_timer
 from koopman_ros.testing import Harness
+from support.nodes import TIMEOUT
 
 
 class Failing(ManagedNode):
@@ -104,3 +107,17 @@ def test_time_that_is_simulated_meanwhile_stays_so(node: Failing) -> None:
     assert node.trigger_deactivate() == TransitionCallbackReturn.SUCCESS
     assert node.trigger_cleanup() == TransitionCallbackReturn.SUCCESS
     assert [heard.topic_name for heard in node.subscriptions] == ['/clock']
+
+
+def test_the_process_does_not_end_before_the_answer_to_a_shutdown_is_out(node: Failing) -> None:
+    node.start()
+    assert node.trigger_shutdown() == TransitionCallbackReturn.SUCCESS
+    assert not node.active
+    assert node.exit_code is None
+    executor = SingleThreadedExecutor(context=node.context)
+    executor.add_node(node)
+    deadline = time.monotonic() + TIMEOUT
+    while node.exit_code is None and time.monotonic() < deadline:
+        executor.spin_once(timeout_sec=1.0)
+    executor.shutdown()
+    assert node.exit_code == 0
