@@ -18,9 +18,12 @@ from koopman_ros.estimation import SensorLimits
 from koopman_ros.lifting import LiftedModel
 from koopman_ros.parameters.table import (
     ConfigurationError,
+    in_own_units,
     parameter,
     ParameterTable,
     per_signal,
+    signal_value,
+    UNBOUNDED,
 )
 from koopman_ros.parameters.wire import (
     DEFAULT_SYSTEM,
@@ -35,9 +38,6 @@ from koopman_ros.parameters.wire import (
 )
 from koopman_ros.units import conversion, display_unit
 
-# what stands for no bound, in any unit
-_UNBOUNDED = 1e9
-
 
 @dataclass(frozen=True)
 class StateParameters(StatePlaces):
@@ -46,12 +46,10 @@ class StateParameters(StatePlaces):
     weight: float = parameter(1.0, 'cost of its squared error', '1/({unit})^2', 0.0, 1e12)
     setpoint_ramp: float = parameter(
         0.0, 'fastest change of the tracked set-point; 0 for a step', '{unit}/s', 0.0, 1e9)
-    sensor_min: float = parameter(
-        -_UNBOUNDED, 'lowest value that the sensor can measure', '{shown}', -_UNBOUNDED,
-        _UNBOUNDED)
-    sensor_max: float = parameter(
-        _UNBOUNDED, 'highest value that the sensor can measure', '{shown}', -_UNBOUNDED,
-        _UNBOUNDED)
+    sensor_min: float = signal_value(
+        -UNBOUNDED, 'lowest value that the sensor can measure')
+    sensor_max: float = signal_value(
+        UNBOUNDED, 'highest value that the sensor can measure')
     max_rate: float = parameter(
         0.0, 'fastest change that is physically possible; 0 for any', '{unit}/s', 0.0, 1e9)
     max_jump: float = parameter(
@@ -66,19 +64,19 @@ class InputParameters(InputPlaces):
     weight: float = parameter(
         1.0, 'cost of its squared deviation from its steady value', '1/({unit})^2', 0.0, 1e12,
         open_minimum=True)
-    min: float = parameter(0.0, 'lowest command', '{shown}', -_UNBOUNDED, _UNBOUNDED)
-    max: float = parameter(0.0, 'highest command', '{shown}', -_UNBOUNDED, _UNBOUNDED)
+    min: float = signal_value(0.0, 'lowest command')
+    max: float = signal_value(0.0, 'highest command')
     rate_limit: float = parameter(
         0.0, 'fastest change of the command; 0 for any', '{unit}/s', 0.0, 1e9)
     max_disturbance: float = parameter(
         0.0, 'largest disturbance that is accepted, as a change of the input; 0 for any', '{unit}',
         0.0, 1e9)
     tolerance: float = parameter(
-        _UNBOUNDED, 'how far the measured input may be from its command before the observer goes '
-        'by it, as at a limit of the actuator', '{unit}', 0.0, _UNBOUNDED)
-    safe: float = parameter(
+        UNBOUNDED, 'how far the measured input may be from its command before the observer goes '
+        'by it, as at a limit of the actuator', '{unit}', 0.0, UNBOUNDED)
+    safe: float = signal_value(
         0.0, 'what is safe whatever happened, commanded when nothing else can be; brought within '
-        'min and max', '{shown}', -_UNBOUNDED, _UNBOUNDED)
+        'min and max')
 
 
 @dataclass(frozen=True)
@@ -149,17 +147,13 @@ class ControllerParameters:
                    change: Callable[[float], float] = lambda value: value) -> Array:
             return np.array([change(getattr(of[name], attribute)) for name in of])
 
-        def value(attribute: str, of: Mapping[str, Any], units: Mapping[str, str]) -> Array:
-            return np.array([conversion(display_unit(unit), unit)(getattr(of[name], attribute))
-                             for name, unit in units.items()])
-
         states, inputs, own = self.states, self.inputs, signals.inputs
         controlled = {name: states[name] for name in signals.controlled}
         return Settings(
             controlled=() if tuple(states) == signals.controlled else signals.controlled,
             state_weight=column(states, 'weight'),
             input_weight=column(inputs, 'weight'),
-            limits=InputLimits(value('min', inputs, own), value('max', inputs, own),
+            limits=InputLimits(in_own_units(inputs, 'min', own), in_own_units(inputs, 'max', own),
                                column(inputs, 'rate_limit', _or_any)),
             setpoint_ramp=column(controlled, 'setpoint_ramp', _or_any),
             setpoint_filter=self.setpoint_filter,
@@ -167,12 +161,12 @@ class ControllerParameters:
             max_disturbance=column(inputs, 'max_disturbance', _or_any),
             input_tolerance=column(inputs, 'tolerance'),
             transfer_time=self.transfer_time,
-            safe_input=value('safe', inputs, own),
+            safe_input=in_own_units(inputs, 'safe', own),
             max_gain=self.max_gain,
             max_residual=10.0 ** -self.min_riccati_digits,
             sensor=SensorLimits(
-                lower=value('sensor_min', states, signals.states),
-                upper=value('sensor_max', states, signals.states),
+                lower=in_own_units(states, 'sensor_min', signals.states),
+                upper=in_own_units(states, 'sensor_max', signals.states),
                 rate=column(states, 'max_rate', _or_any),
                 jump=column(states, 'max_jump', _or_any),
                 frozen_timeout=_or_any(self.frozen_timeout)),

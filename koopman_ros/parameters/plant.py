@@ -15,10 +15,13 @@ from koopman_ros.arrays import Array
 from koopman_ros.parameters.table import (
     ConfigurationError,
     group,
+    in_own_units,
     parameter,
     ParameterTable,
     per_signal,
+    signal_value,
     Specification,
+    UNBOUNDED,
 )
 from koopman_ros.parameters.wire import (
     CommandedPlaces,
@@ -40,9 +43,7 @@ from koopman_ros.plants import (
     plant_class,
 )
 from koopman_ros.plants.simulation import integration_limits
-from koopman_ros.units import check_unit, conversion, display_unit, LAST_STAMP_SECONDS
-
-_UNBOUNDED = 1e9  # what stands for no bound, in any unit
+from koopman_ros.units import check_unit, LAST_STAMP_SECONDS
 
 
 @dataclass(frozen=True)
@@ -52,11 +53,11 @@ class StateParameters(MeasuredPlace):
     noise: float = parameter(
         0.0, 'standard deviation of its measurement', '{unit}', 0.0, 1e9)
     bias: float = parameter(
-        0.0, 'by how much it is measured too high', '{unit}', -_UNBOUNDED, _UNBOUNDED)
+        0.0, 'by how much it is measured too high', '{unit}', -UNBOUNDED, UNBOUNDED)
     resolution: float = parameter(
         0.0, 'smallest difference that the measurement shows; 0 for all', '{unit}', 0.0, 1e9)
     initial_offset: float = parameter(
-        0.0, 'start this far from the steady state', '{unit}', -_UNBOUNDED, _UNBOUNDED,
+        0.0, 'start this far from the steady state', '{unit}', -UNBOUNDED, UNBOUNDED,
         read_only=True)
 
 
@@ -64,10 +65,10 @@ class StateParameters(MeasuredPlace):
 class InputParameters(CommandedPlaces):
     """The actuator of an input."""
 
-    min: float = parameter(
-        -_UNBOUNDED, 'lowest value that the actuator reaches', '{shown}', -_UNBOUNDED, _UNBOUNDED)
-    max: float = parameter(
-        _UNBOUNDED, 'highest value that the actuator reaches', '{shown}', -_UNBOUNDED, _UNBOUNDED)
+    min: float = signal_value(
+        -UNBOUNDED, 'lowest value that the actuator reaches')
+    max: float = signal_value(
+        UNBOUNDED, 'highest value that the actuator reaches')
     delay: float = parameter(
         0.0, 'how much later a command takes effect; the sample_period for one sample', 's', 0.0,
         3600.0)
@@ -156,14 +157,10 @@ class PlantTable(ParameterTable[PlantParameters]):
     def actuator(self, values: PlantParameters) -> Actuator:
         """Return what stands before the inputs, in the plant's units."""
         units = self.described.inputs
-        tuned = [values.inputs[name] for name in units]
-
-        def own(attribute: str) -> Array:
-            return np.array([conversion(display_unit(unit), unit)(getattr(item, attribute))
-                             for unit, item in zip(units.values(), tuned, strict=True)])
-
-        return Actuator(own('min'), own('max'), np.array([item.delay for item in tuned]),
-                        np.array([item.lag for item in tuned]))
+        tuned = values.inputs
+        return Actuator(in_own_units(tuned, 'min', units), in_own_units(tuned, 'max', units),
+                        np.array([tuned[name].delay for name in units]),
+                        np.array([tuned[name].lag for name in units]))
 
     def _build(self, values: PlantParameters) -> None:
         """Build what a plant starts with, down to the tolerances of its integration."""

@@ -14,7 +14,10 @@ import math
 from types import MappingProxyType
 from typing import Any, Generic, TypeVar
 
-from koopman_ros.units import display_unit, ZERO_CELSIUS
+import numpy as np
+
+from koopman_ros.arrays import Array
+from koopman_ros.units import conversion, display_unit, ZERO_CELSIUS
 
 T = TypeVar('T')
 
@@ -26,6 +29,10 @@ _TYPE_WORDS = {
     tuple: ('a list of strings', '[a, b]'),
 }
 _NUMBERS = ('a list of doubles', '[1.0, 2.0]')
+
+
+#: what stands for no bound, in any unit
+UNBOUNDED = 1e9
 
 
 class ConfigurationError(ValueError):
@@ -95,6 +102,11 @@ def parameter(default: Any, description: str, unit: str = '', minimum: float = -
     return field(default=default, metadata={
         'unit': unit, 'description': description, 'minimum': minimum, 'maximum': maximum,
         **details})
+
+
+def signal_value(default: float, description: str, **details: Any) -> Any:
+    """Declare a value of a signal, in the unit in which people read it, that may be any."""
+    return parameter(default, description, '{shown}', -UNBOUNDED, UNBOUNDED, **details)
 
 
 def per_signal(kind: type[Any]) -> Any:
@@ -238,6 +250,12 @@ class ParameterTable(Generic[T]):
             lines += [f'    #   {"; ".join(notes)}'] if notes else []
             lines.append(f'    {name}: {as_yaml(row.default)}')
         return '\n'.join(lines) + '\n'
+
+
+def in_own_units(tuned: Mapping[str, Any], attribute: str, units: Mapping[str, str]) -> Array:
+    """Return what :func:`signal_value` declared for signals (n,), in their own units."""
+    return np.array([conversion(display_unit(unit), unit)(getattr(tuned[name], attribute))
+                     for name, unit in units.items()])
 
 
 def _row(name: str, item: Field[Any], unit: str, defaults: Mapping[str, Any]) -> Specification:

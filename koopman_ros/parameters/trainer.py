@@ -15,7 +15,15 @@ from koopman_ros.arrays import Array
 from koopman_ros.experiment import Experiment
 from koopman_ros.lifting import LiftedModel
 from koopman_ros.parameters import wire
-from koopman_ros.parameters.table import ConfigurationError, parameter, ParameterTable, per_signal
+from koopman_ros.parameters.table import (
+    ConfigurationError,
+    in_own_units,
+    parameter,
+    ParameterTable,
+    per_signal,
+    signal_value,
+    UNBOUNDED,
+)
 from koopman_ros.parameters.wire import (
     InputPlaces,
     preset,
@@ -27,7 +35,6 @@ from koopman_ros.parameters.wire import (
 )
 from koopman_ros.units import conversion, display_unit
 
-_UNBOUNDED = 1e9  # what stands for no bound, in any unit
 COMMAND, MANUAL, SETPOINT = 'command', 'manual', 'setpoint'
 
 
@@ -35,32 +42,28 @@ COMMAND, MANUAL, SETPOINT = 'command', 'manual', 'setpoint'
 class StateParameters(StatePlaces):
     """A measured state, and what an experiment may do to it."""
 
-    experiment_min: float = parameter(
-        -_UNBOUNDED, 'measurement below which the experiment is aborted', '{shown}', -_UNBOUNDED,
-        _UNBOUNDED)
-    experiment_max: float = parameter(
-        _UNBOUNDED, 'measurement above which the experiment is aborted', '{shown}', -_UNBOUNDED,
-        _UNBOUNDED)
-    setpoint_min: float = parameter(
-        0.0, 'lowest set-point of an experiment on set-points', '{shown}', -_UNBOUNDED, _UNBOUNDED)
-    setpoint_max: float = parameter(
-        0.0, 'highest set-point of an experiment on set-points', '{shown}', -_UNBOUNDED,
-        _UNBOUNDED)
+    experiment_min: float = signal_value(
+        -UNBOUNDED, 'measurement below which the experiment is aborted')
+    experiment_max: float = signal_value(
+        UNBOUNDED, 'measurement above which the experiment is aborted')
+    setpoint_min: float = signal_value(
+        0.0, 'lowest set-point of an experiment on set-points')
+    setpoint_max: float = signal_value(
+        0.0, 'highest set-point of an experiment on set-points')
 
 
 @dataclass(frozen=True)
 class InputParameters(InputPlaces):
     """An input, and what an experiment does with it."""
 
-    experiment_min: float = parameter(
-        0.0, 'lowest value of a step', '{shown}', -_UNBOUNDED, _UNBOUNDED)
-    experiment_max: float = parameter(
-        0.0, 'highest value of a step', '{shown}', -_UNBOUNDED, _UNBOUNDED)
+    experiment_min: float = signal_value(
+        0.0, 'lowest value of a step')
+    experiment_max: float = signal_value(
+        0.0, 'highest value of a step')
     experiment_rate_limit: float = parameter(
         0.0, 'fastest change in the experiment; 0 for any', '{unit}/s', 0.0, 1e9)
-    safe: float = parameter(
-        0.0, 'what is safe whatever happened; the experiment starts and ends with it', '{shown}',
-        -_UNBOUNDED, _UNBOUNDED)
+    safe: float = signal_value(
+        0.0, 'what is safe whatever happened; the experiment starts and ends with it')
     delay: float = parameter(
         0.0, 'dead time of the actuator: a command acts this long after it was given', 's', 0.0,
         3600.0)
@@ -164,22 +167,18 @@ class TrainerParameters:
         of: Mapping[str, Any] = self.states if on_setpoints else self.inputs
         low, high = ((f'{"setpoint" if on_setpoints else "experiment"}_{end}')
                      for end in ('min', 'max'))
-
-        def own(attribute: str, among: Mapping[str, Any], described: Mapping[str, str]) -> Array:
-            return np.array([conversion(display_unit(unit), unit)(getattr(among[name], attribute))
-                             for name, unit in described.items()])
-
         return Experiment(
             duration=self.experiment_length,
-            names=tuple(units), lower=own(low, of, units), upper=own(high, of, units),
-            rate=np.array([getattr(of[name], 'experiment_rate_limit', 0.0) or _UNBOUNDED
+            names=tuple(units), lower=in_own_units(of, low, units),
+            upper=in_own_units(of, high, units),
+            rate=np.array([getattr(of[name], 'experiment_rate_limit', 0.0) or UNBOUNDED
                            for name in units]),
-            home=own('safe', self.inputs, units) if setpoints is None else setpoints,
+            home=in_own_units(self.inputs, 'safe', units) if setpoints is None else setpoints,
             hold_shortest=self.experiment_shortest_hold,
             hold_longest=self.experiment_longest_hold,
             measured=tuple(signals.states),
-            measured_lower=own('experiment_min', self.states, signals.states),
-            measured_upper=own('experiment_max', self.states, signals.states),
+            measured_lower=in_own_units(self.states, 'experiment_min', signals.states),
+            measured_upper=in_own_units(self.states, 'experiment_max', signals.states),
             seed=self.experiment_seed)
 
     def missing(self, signals: Signals, on_setpoints: bool = False) -> list[str]:
@@ -192,7 +191,7 @@ class TrainerParameters:
             *((name, f'{what}_{end}') for name, item in stepped.items() for end in ('min', 'max')
               if getattr(item, f'{what}_min') == getattr(item, f'{what}_max')),
             *((name, f'experiment_{end}') for name, item in self.states.items()
-              for end, none in (('min', -_UNBOUNDED), ('max', _UNBOUNDED))
+              for end, none in (('min', -UNBOUNDED), ('max', UNBOUNDED))
               if getattr(item, f'experiment_{end}') == none)]]
 
     def training(self) -> dict[str, Any]:

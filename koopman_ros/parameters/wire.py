@@ -159,23 +159,24 @@ class Wiring:
     @cached_property
     def measured(self) -> dict[str, Place]:
         """Where the states are measured."""
-        return {name: self._at(name, said.topic) for name, said in self.states.items()}
+        return {name: self._state(name, said.topic) for name, said in self.states.items()}
 
     @cached_property
     def predicted(self) -> dict[str, Place]:
         """Where it is said what was expected of them."""
-        return {name: self._at(name, said.predicted_topic) for name, said in self.states.items()}
+        return {name: self._state(name, said.predicted_topic)
+                for name, said in self.states.items()}
 
     @cached_property
     def setpoints(self) -> dict[str, Place]:
         """Where the set-points of the controlled states are asked for."""
-        return {name: self._at(name, self.states[name].setpoint_topic)
+        return {name: self._state(name, self.states[name].setpoint_topic)
                 for name in self.signals.controlled}
 
     @cached_property
     def active_setpoints(self) -> dict[str, Place]:
         """Where it is said what is tracked."""
-        return {name: self._at(name, self.states[name].active_setpoint_topic)
+        return {name: self._state(name, self.states[name].active_setpoint_topic)
                 for name in self.signals.controlled}
 
     @cached_property
@@ -192,9 +193,8 @@ class Wiring:
     @cached_property
     def applied(self) -> dict[str, Place]:
         """Where it is measured what acts."""
-        return {name: _place(said.topic, name, self.signals.inputs[name], {
-            'type': said.type, 'field': said.field, 'unit': said.unit})
-            for name, said in self.inputs.items()}
+        return {name: _at(name, said.topic, self.signals.inputs[name], said)
+                for name, said in self.inputs.items()}
 
     def check(self) -> str:
         """Say what is wrong with them, or return an empty string."""
@@ -218,10 +218,8 @@ class Wiring:
         return tuple(dict.fromkeys(
             found.topic for kind in self.kinds for found in getattr(self, kind).values()))
 
-    def _at(self, name: str, topic: str) -> Place:
-        said = self.states[name]
-        return _place(topic, name, self.signals.states[name], {
-            'type': said.type, 'field': said.field, 'unit': said.unit})
+    def _state(self, name: str, topic: str) -> Place:
+        return _at(name, topic, self.signals.states[name], self.states[name])
 
     def _command(self, name: str, topic: str) -> Place:
         said = self.inputs[name]
@@ -230,6 +228,11 @@ class Wiring:
             'type': said.command_type or said.type,
             'field': said.command_field or (said.field if same else ''),
             'unit': said.command_unit or (said.unit if same else '')})
+
+
+def _at(name: str, topic: str, unit: str, said: MeasuredPlace) -> Place:
+    return _place(topic, name, unit, {
+        'type': said.type, 'field': said.field, 'unit': said.unit})
 
 
 def _place(topic: str, name: str, unit: str, given: Mapping[str, str]) -> Place:

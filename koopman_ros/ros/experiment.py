@@ -33,7 +33,7 @@ from koopman_ros.experiment import (
     Phase,
     Progress,
 )
-from koopman_ros.parameters.trainer import MANUAL, SETPOINT, TrainerParameters
+from koopman_ros.parameters.trainer import COMMAND, MANUAL, SETPOINT, TrainerParameters
 from koopman_ros.parameters.wire import Wiring
 from koopman_ros.reasons import Code, Reason, reason
 from koopman_ros.ros import topics
@@ -216,8 +216,9 @@ class ExperimentRun:
         # what is known of the controller
         self._tracked: dict[str, float] = {}  # set-points, by name
         self._automatic = False
+        # set-points stand in with which the bounds can be tried before those of now are known
         self.plan: Experiment = settings.experiment(
-            signals, self._middle() if self._on_setpoints else None)
+            signals, np.zeros(len(places)) if self._on_setpoints else None)
         self._topics = [node.resolve_topic_name(place.topic) for place in places.values()]
         self.progress: Progress | None = None
         # why it cannot start, or None with the first measurement
@@ -235,7 +236,7 @@ class ExperimentRun:
             node, self._subscribe, wiring.measured, signals.states, self._on_measurement)
         self._answers = Inlet(
             node, self._subscribe, wiring.commands, signals.inputs, self._on_command) if (
-                settings.experiment_on != 'command') else None
+                settings.experiment_on != COMMAND) else None
         if self._on_setpoints:
             Inlet(node, partial(self._subscribe, latched=True), wiring.active_setpoints,
                   signals.states, lambda heard: self._tracked.update(heard.values))
@@ -243,10 +244,6 @@ class ExperimentRun:
         self._outlet = Outlet(places, self._units, lambda topic, kind: owned.keep(
             node.create_publisher(kind, topic, topics.LOOP_QOS)))
         owned.timer(_TICK, self._on_tick)
-
-    def _middle(self) -> Array:
-        """Return set-points with which the bounds can be tried before those of now are known."""
-        return np.zeros(len(self._units))
 
     def _subscribe(self, topic: str, callback: Callable[[Any], None], kind: Any,
                    latched: bool = False) -> Subscription:
