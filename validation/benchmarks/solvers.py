@@ -206,8 +206,9 @@ def measure_cost(tell: Tell, sizes: list[tuple[int, int, int, int]], limit: floa
     """
     Measure what an iteration of our learner takes whose step is accepted.
 
-    Tells for each size (N, n_x, n_z, hidden units) the median of processor time in s and the peak
-    memory in MB beyond that of the process with the data, None where the system does not tell it.
+    Tells for each size (N, n_x, n_z, hidden units) the median of the time in s, on the wall (some
+    systems count processor time in ticks longer than an iteration), and the peak memory in MB
+    beyond that of the process with the data, None where the system does not tell it.
     """
     allow(tell, limit, f'stopped after {limit:g} s')
     for size in sizes:
@@ -236,8 +237,8 @@ def _seconds_of_accepted(case: Case, wanted: int) -> list[float]:
         nonlocal stamp, accepted
         # the first iteration holds the evaluation at the start as well; a refused step is cheaper
         if accepted and iteration > 1:
-            taken.append(time.process_time() - stamp)
-        stamp, accepted = time.process_time(), False
+            taken.append(time.perf_counter() - stamp)
+        stamp, accepted = time.perf_counter(), False
         return len(taken) == wanted
 
     minimise(residuals, case.theta, max_iterations=10 * wanted, tolerance=0.0, monitor=monitor)
