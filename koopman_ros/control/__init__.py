@@ -13,7 +13,7 @@ from koopman_ros.control.events import (
     SetpointRequest,
     Silence,
 )
-from koopman_ros.control.laws import Feedback, feedback, Form, LAWS, projected, recentred, Weights
+from koopman_ros.control.laws import averaged, Feedback, feedback, Form, LAWS, recentred, Weights
 from koopman_ros.control.laws.base import steady_state_target, Target
 from koopman_ros.control.limits import InputLimits, limit
 from koopman_ros.control.setpoint import Setpoint
@@ -47,6 +47,6 @@ __all__ = ['HOLD', 'LAWS', 'MANUAL', 'SAFE', 'Arrival', 'Change', 'ClosedLoop', 
            'Event', 'Feedback', 'Form', 'Initialisation', 'InputLimits', 'LevelSettings', 'Loop',
            'ManualCommand', 'Measurement', 'Mode', 'ModeChange', 'Plant', 'Report', 'Sensor',
            'Setpoint', 'SetpointRequest', 'Settings', 'Silence', 'Simulation', 'State',
-           'Supervisor', 'SupervisorSettings', 'Target', 'Timed', 'Weights', 'at', 'exchange',
-           'feedback', 'limit', 'perfect', 'projected', 'recentred', 'restart', 'run_closed_loop',
+           'Supervisor', 'SupervisorSettings', 'Target', 'Timed', 'Weights', 'at', 'averaged',
+           'exchange', 'feedback', 'limit', 'perfect', 'recentred', 'restart', 'run_closed_loop',
            'simulate', 'steady_state_target']

@@ -10,7 +10,7 @@ import pytest
 from scipy.stats import kstest
 import torch
 
-from koopman_ros.control import projected, run_closed_loop, steady_state_target, Weights
+from koopman_ros.control import averaged, run_closed_loop, steady_state_target, Weights
 from koopman_ros.learning import Algorithm1, Edmd, evaluate, fit, Linearisation
 from koopman_ros.learning.levenberg_marquardt import MinimumStatus, normal_equations
 from koopman_ros.learning.network import Layout
@@ -76,7 +76,7 @@ def test_a_drift_of_monomials_is_found_exactly(degree, B):
         np.testing.assert_allclose(
             model.drift(x) * model.states.scale,
             van_der_pol(model.states.to_physical(x), np.zeros(1)), rtol=0, atol=1e-10)
-        law = projected(model, x, target, Weights(np.eye(2), np.eye(1)))
+        law = averaged(model, x, target, Weights(np.eye(2), np.eye(1)))
         np.testing.assert_allclose(law.drift @ (x - xi[0]), model.drift(x) - model.drift(xi[0]),
                                    rtol=0, atol=1e-10)
     np.testing.assert_allclose(model.linearised.A * model.states.scale[:, None]

@@ -68,6 +68,38 @@ def test_drift_of_a_dictionary_by_hand():
     np.testing.assert_array_equal(model.linearised.A, [[-1.0]])
 
 
+def test_averaged_jacobian_of_a_cubic_drift_by_hand():
+    """x1' = x2, x2' = -x1 + x2 - x1^2 x2; Simpson's rule gives the means of squares."""
+    observables = PolynomialObservables(np.array([[1, 0], [0, 1], [2, 1]]))
+    A = np.array([[0.0, 1.0, 0.0], [-1.0, 1.0, -1.0], [0.0, 0.0, 0.0]])
+    model = replace(random_lift(2), observables=observables, A=A)
+    for x, x_ref in zip(states(2), states(2, seed=2), strict=True):
+        ends = np.array([x, 0.5 * (x + x_ref), x_ref])
+        mixed, square = np.array([1.0, 4.0, 1.0]) / 6.0 @ np.stack(
+            (ends[:, 0] * ends[:, 1], ends[:, 0] ** 2), axis=1)
+        found = model.averaged_drift_jacobian(x, x_ref)
+        np.testing.assert_allclose(found, [[0.0, 1.0], [-1.0 - 2.0 * mixed, 1.0 - square]],
+                                   rtol=0, atol=1e-9)
+        np.testing.assert_allclose(found @ (x - x_ref), model.drift(x) - model.drift(x_ref),
+                                   rtol=0, atol=1e-9)
+
+
+@pytest.mark.parametrize('n_x', [1, 2, 3])
+def test_averaged_jacobian_makes_the_difference_of_the_drift(n_x):
+    model = random_lift(n_x)
+    for x, x_ref in zip(0.5 * states(n_x), 0.5 * states(n_x, seed=2), strict=True):
+        A = model.averaged_drift_jacobian(x, x_ref)
+        np.testing.assert_allclose(A @ (x - x_ref), model.drift(x) - model.drift(x_ref),
+                                   rtol=0, atol=1e-5)
+        # at the reference it is the slope there
+        np.testing.assert_allclose(model.averaged_drift_jacobian(x, x), model.drift_jacobian(x),
+                                   rtol=0, atol=1e-9)
+    batch = states(n_x, 6).reshape(2, 3, n_x)
+    for x, of_batch in zip(batch.reshape(6, n_x), model.drift_jacobian(batch).reshape(
+            6, n_x, n_x), strict=True):
+        np.testing.assert_allclose(of_batch, model.drift_jacobian(x), rtol=0, atol=1e-9)
+
+
 def linear_reactor():
     system = two_state_reactor()
     below, above = np.array([0.1, 9.0]), np.array([0.1, 5.0])

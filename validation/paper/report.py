@@ -99,7 +99,7 @@ def _two_state(part: dict[str, Any]) -> str:
     weights = list(part['cost_ratio_to_exact'])
     rows = [*_exact_rows(part), *(
         (f'cost ratio of the linearised law, {R}', _spread(part['linear_cost_ratio'][R]))
-        for R in weights), ('cost ratio of EDMD (degree 2), projected law, R=1',
+        for R in weights), ('cost ratio of EDMD (degree 2), averaged law, R=1',
                             _spread(part['edmd_cost_ratio']['R=1']))]
     ratios = ', '.join(f'{_median(part["linear_cost_ratio"][R]):.3f} ({R})' for R in weights)
     return (
@@ -112,7 +112,7 @@ def _two_state(part: dict[str, Any]) -> str:
         f'agree. The path left the training box in {_count(part["left_box"])} seeds. '
         'Polynomial EDMD of degree 2 holds the exact drift and the exact lift, yet its other '
         'monomials do not close and bring unstable products that no input reaches: the law of '
-        'the lift cannot be used with it, the projected one can.')
+        'the lift cannot be used with it, the averaged one can.')
 
 
 def _reactor(part: dict[str, Any]) -> str:

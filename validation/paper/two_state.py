@@ -13,9 +13,9 @@ from scipy.integrate import solve_ivp
 from koopman_ros import learning
 from koopman_ros.arrays import Array
 from koopman_ros.control import (
+    averaged,
     ClosedLoop,
     Feedback,
-    projected,
     recentred,
     run_closed_loop,
     Target,
@@ -72,9 +72,9 @@ def samples(box: Box, seed: int, episodes: int = 40, duration: float = 1.0) -> S
 
 
 def _law(model: LiftedModel, x: Array, target: Target, weights: Weights) -> Feedback:
-    """Evaluate the paper's law, or the projected one where its Riccati equation has no answer."""
+    """Evaluate the paper's law, or the averaged one where its Riccati equation has no answer."""
     found = recentred(model, x, target, weights)
-    return found if found.solved else projected(model, x, target, weights)
+    return found if found.solved else averaged(model, x, target, weights)
 
 
 def close_loop(model: LiftedModel, R: float, law: Callable[..., Feedback] = _law) -> ClosedLoop:
@@ -110,7 +110,7 @@ def run(seed: int) -> tuple[Metrics, Models]:
     Learn on the wide box.
 
     :return: as :func:`judged`, and for each weight `linear_cost_ratio`; for R = 1
-        `edmd_cost_ratio` of the projected law.
+        `edmd_cost_ratio` of the averaged law.
     """
     data, plant = samples(WIDE, seed), describe(SYSTEM)
     model = _learned(data, WIDE_RECIPE, seed, STARTS)
@@ -118,7 +118,7 @@ def run(seed: int) -> tuple[Metrics, Models]:
     edmd = learning.Edmd(degree=2).learn(plant, data)
     return {**judged(model, seed), 'linear_cost_ratio': {
         f'R={R:g}': _ratio(close_loop(linear, R), R) for R in INPUT_WEIGHTS},
-        'edmd_cost_ratio': {'R=1': _ratio(close_loop(edmd, 1.0, projected), 1.0)},
+        'edmd_cost_ratio': {'R=1': _ratio(close_loop(edmd, 1.0, averaged), 1.0)},
     }, {'wide': model, 'linear': linear}
 
 

@@ -7,11 +7,11 @@ from collections.abc import Callable
 
 from koopman_ros.control.laws.base import Figures, Law, LawResult, Tuning, Weights
 from koopman_ros.control.laws.riccati import (
+    averaged,
     Feedback,
     feedback,
     Form,
     Linear,
-    projected,
     recentred,
     StateDependentRiccati,
 )
@@ -21,4 +21,4 @@ LAWS: dict[str, Callable[[LiftedModel, Tuning], Law]] = {
     'sdre': StateDependentRiccati, 'linear': Linear}
 
 __all__ = ['LAWS', 'Feedback', 'Figures', 'Form', 'Law', 'LawResult', 'Linear',
-           'StateDependentRiccati', 'Tuning', 'Weights', 'feedback', 'projected', 'recentred']
+           'StateDependentRiccati', 'Tuning', 'Weights', 'averaged', 'feedback', 'recentred']

@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 The koopman_ros Authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""Laws by Riccati equations: state-dependent, re-centred and projected, and the linear one."""
+"""Laws by Riccati equations: state-dependent, re-centred and averaged, and the linear one."""
 
 from dataclasses import dataclass, replace
 from enum import Enum
@@ -31,7 +31,7 @@ class Form(Enum):
     """The forms of the feedback; the value is the word an operator reads."""
 
     RECENTRED = 're-centred'
-    PROJECTED = 'projected'
+    AVERAGED = 'averaged'
 
 
 @dataclass(frozen=True)
@@ -100,7 +100,7 @@ def feedback(model: LiftedModel, x: Array, target: Target, weights: Weights, *,
         result = recentred(model, x, target, weights, **bounds)
         if result.solved:
             return result
-    return projected(model, x, target, weights, **bounds)
+    return averaged(model, x, target, weights, **bounds)
 
 
 def recentred(model: LiftedModel, x: Array, target: Target, weights: Weights, *,
@@ -132,22 +132,22 @@ def recentred(model: LiftedModel, x: Array, target: Target, weights: Weights, *,
                     model.onto_states(J, model.A.dot(M) + H), -model.B.dot(riccati.K.dot(M)))
 
 
-def projected(model: LiftedModel, x: Array, target: Target, weights: Weights, *,
-              max_gain: float = 1e6, max_residual: float = 1e-8) -> Feedback:
+def averaged(model: LiftedModel, x: Array, target: Target, weights: Weights, *,
+             max_gain: float = 1e6, max_residual: float = 1e-8) -> Feedback:
     """
-    Solve the Riccati equation of the state's error e = x - x_ref under the projected dynamics.
+    Solve the Riccati equation of the state's error e = x - x_ref under the averaged Jacobian.
 
-    e' = J^+ (A M + H) e + B v, with N(x) - N(x_ref) = M e; for monomials the rows of the states
-    take the place of J^+. It needs no more than that (df/dx, B) be stabilisable, so unstable
-    modes of A and their products do no harm.
+    e' = f(x) - f(x_ref) + B v = A(x) e + B v, A the mean of df/dx from x_ref to x. Of all A with
+    that property it is the one that says where the drift goes beside e, too. It needs no more
+    than that (A(x), B) be stabilisable, so unstable modes of the lift and their products do no
+    harm.
 
     Arguments and result as in :func:`feedback`.
     """
-    _, J, M, H = model.lift_and_secants(x, target.x, target.forcing)
-    A = model.onto_states(J, model.A @ M + H)
+    A = model.averaged_drift_jacobian(x, target.x)
     riccati = solve_riccati(A, model.B, weights.Q, weights.R,
                             max_gain=max_gain, max_residual=max_residual)
-    return Feedback(target.u - riccati.K @ (x - target.x), Form.PROJECTED, riccati,
+    return Feedback(target.u - riccati.K @ (x - target.x), Form.AVERAGED, riccati,
                     A, -model.B @ riccati.K)
 
 

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from scipy.linalg import solve_continuous_are
 
-from koopman_ros.control import projected, steady_state_target, Weights
+from koopman_ros.control import averaged, steady_state_target, Weights
 from koopman_ros.learning import Edmd, fit, Linearisation
 from koopman_ros.plants import ControlAffineSystem, one_state_reactor, scalar_example
 from validation.paper import reactor, two_state
@@ -63,7 +63,7 @@ def test_monomials_control_the_two_state_example_by_its_exact_drift():
     weights = Weights(np.diag(scale ** 2), np.diag(model.inputs.scale ** 2))
     origin = steady_state_target(model, model.states.to_deviation(np.zeros(2)))
     for x in samples.x[::8]:
-        found = projected(model, model.states.to_deviation(x), origin, weights)
+        found = averaged(model, model.states.to_deviation(x), origin, weights)
         A = np.array([[-0.1, 0.0], [-x[0], 1.0]])
         P = solve_continuous_are(A, two_state.SYSTEM.B, np.eye(2), np.eye(1))
         expected = -two_state.SYSTEM.B.T @ P @ x
