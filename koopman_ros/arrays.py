@@ -3,10 +3,51 @@
 
 """Checked, read-only arrays."""
 
+from collections.abc import Mapping
+from dataclasses import fields, is_dataclass
+from typing import Any, cast
+
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 Array = NDArray[np.float64]
+
+# Arrays and lists of so few are written out where something is described.
+_FEW = 4
+
+
+def as_arrays(holder: object, *names: str) -> None:
+    """
+    Turn what a frozen dataclass was given as lists into float64 arrays; leave arrays as they are.
+
+    :raises ValueError: naming the field that holds no numbers, or rows of different lengths.
+    """
+    for name in names:
+        try:
+            array = np.asarray(getattr(holder, name), dtype=np.float64)
+        except (TypeError, ValueError) as error:
+            raise ValueError(f'{name} must be numbers, got {getattr(holder, name)!r}') from error
+        object.__setattr__(holder, name, array)
+
+
+def brief(holder: object) -> str:
+    """Describe a dataclass on one line: long arrays by their shape, other dataclasses by name."""
+    shown = ', '.join(f'{field.name}={_brief(getattr(holder, field.name))}'
+                      for field in fields(cast(Any, holder)) if field.repr)
+    return f'{type(holder).__name__}({shown})'
+
+
+def _brief(value: object) -> str:
+    if isinstance(value, np.ndarray):
+        few = value.ndim == 1 and len(value) <= _FEW
+        return f'[{", ".join(f"{number:.6g}" for number in value)}]' if few else (
+            f'<array {value.shape}>')
+    if is_dataclass(value) and not isinstance(value, type):
+        return f'{type(value).__name__}(...)'
+    if isinstance(value, tuple | list | Mapping):
+        plain = len(value) <= _FEW and all(isinstance(item, str | int | float) for item in value)
+        return repr(value) if plain or not value else f'<{len(value)} items>'
+    return repr(value)
 
 
 def frozen(value: ArrayLike, name: str, shape: tuple[int | None, ...], *, finite: bool = True

@@ -12,12 +12,17 @@ import itertools
 
 import numpy as np
 
-from koopman_ros.arrays import Array
+from koopman_ros.arrays import Array, brief, frozen
+from koopman_ros.units import check_time_unit
 
 
 @dataclass(frozen=True)
 class Plant:
-    """What is known of the plant beside its data."""
+    """
+    What is known of the plant beside its data.
+
+    :raises ValueError: naming what does not fit the names, or a time unit that there is not.
+    """
 
     name: str  #: name of the plant
     state_names: tuple[str, ...]  #: one name a state
@@ -25,9 +30,30 @@ class Plant:
     input_names: tuple[str, ...]  #: one name an input
     input_units: tuple[str, ...]  #: one unit an input
     time_unit: str  #: ``'s'`` or ``'min'``
-    nominal_state: Array  #: (n_x,) fixed point under the nominal input
-    nominal_input: Array  #: (n_u,) nominal input
+    #: (n_x,) steady state under the nominal input; NaN where it is not known yet
+    nominal_state: Array
+    nominal_input: Array  #: (n_u,) nominal input, likewise
     B: Array | None  #: (n_x, n_u) input matrix, in units, or None to learn it
+
+    __repr__ = brief
+
+    def __post_init__(self) -> None:
+        check_time_unit(self.time_unit)
+        for kind in ('state', 'input'):
+            names, units = (tuple(getattr(self, f'{kind}_{what}')) for what in ('names', 'units'))
+            if len(units) != len(names) or len(set(names)) != len(names):
+                raise ValueError(f'incompatible {kind}_names and {kind}_units: expected different '
+                                 f'names and as many units, got {list(names)} and {list(units)}')
+            nominal = np.array(getattr(self, f'nominal_{kind}'), dtype=np.float64)
+            if nominal.shape != (len(names),):
+                raise ValueError(f'incompatible nominal_{kind}: expected one number for each of '
+                                 f'{list(names)}, got {nominal.tolist()}')
+            for field, value in ((f'{kind}_names', names), (f'{kind}_units', units),
+                                 (f'nominal_{kind}', nominal)):
+                object.__setattr__(self, field, value)
+        if self.B is not None:
+            object.__setattr__(self, 'B', frozen(
+                self.B, 'B', (len(self.state_names), len(self.input_names))))
 
 
 @dataclass(frozen=True)
@@ -50,6 +76,8 @@ class Episode:
     u: Array  #: (M, n_u) those inputs, in input units
     #: (n_u,) whether each is linear between those times; empty where all are held
     linear: tuple[bool, ...] = ()
+
+    __repr__ = brief
 
     def __post_init__(self) -> None:
         for times, values in (('time', 'x'), ('input_time', 'u')):
@@ -139,7 +167,14 @@ class Samples:
     #: roll-out can be judged)
     time: Array | None = None
 
+    __repr__ = brief
+
     def __post_init__(self) -> None:
+        episode = np.ascontiguousarray(self.episode)
+        if episode.ndim != 1 or not np.array_equal(episode, episode.astype(np.int64)):
+            raise ValueError('episode must hold one whole number a sample, that of its episode, '
+                             f'got an array {episode.shape} of {episode.dtype}')
+        object.__setattr__(self, 'episode', episode)
         for name in ('x', 'dxdt', 'u'):
             array = np.ascontiguousarray(getattr(self, name), dtype=np.float64)
             if array.ndim != 2 or len(array) != len(self):

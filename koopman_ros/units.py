@@ -86,6 +86,13 @@ def check_unit(unit: str) -> None:
                          'for none') from error
 
 
+def check_time_unit(unit: str) -> None:
+    """Raise ValueError for a time unit that rates are not given in."""
+    if unit not in SECONDS_PER_TIME_UNIT:
+        raise ValueError(f"time_unit must be 's' or 'min', got {unit!r}: give times and rates in "
+                         'one of them')
+
+
 def display_unit(unit: str) -> str:
     """Return the unit in which people read values: degrees Celsius in place of kelvins."""
     return 'degC' if unit == 'K' else unit

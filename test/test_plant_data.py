@@ -9,8 +9,9 @@ import math
 import numpy as np
 import pytest
 
-from koopman_ros.plant_data import cut, Episode, split_by_episode
-from support.small_plants import bent_samples
+from koopman_ros.control import Simulation
+from koopman_ros.plant_data import cut, Episode, Samples, split_by_episode
+from support.small_plants import BENT, bent_samples, TWO_STATE
 
 
 def irregular(n=40, seed=0):
@@ -185,3 +186,42 @@ def test_split_depends_on_its_seed_alone_and_needs_three_episodes():
     assert sorted(int(part.episode[0]) for part in split_by_episode(everything, 0)) == [-2, 7, 40]
     with pytest.raises(ValueError, match='at least 3 episodes to hold some out, got 2'):
         split_by_episode(bent_samples(2), 0)
+
+
+# What is given is checked where it is given.
+
+@pytest.mark.parametrize(('plant', 'change', 'message'), [
+    (BENT, {'time_unit': 'h'}, "time_unit must be 's' or 'min', got 'h': give times and rates"),
+    (BENT, {'state_units': ()}, r"incompatible state_names and state_units: .* \['level'\] and "),
+    (TWO_STATE, {'state_names': ('x', 'x')}, 'expected different names and as many units'),
+    (BENT, {'nominal_state': [3.0, 1.0]}, r"nominal_state: expected one number for each of \['"),
+    (BENT, {'nominal_input': 0.5}, r"nominal_input: expected .* of \['flow'\], got 0\.5"),
+    (BENT, {'B': [2.0]}, r'incompatible B: expected \(1, 1\), got \(1,\)'),
+    (TWO_STATE, {'B': [[0.0, 1.0]]}, r'incompatible B: expected \(2, 1\), got \(1, 2\)'),
+    (BENT, {'B': [[np.nan]]}, 'B must be finite')])
+def test_a_plant_that_contradicts_itself(plant, change, message):
+    with pytest.raises(ValueError, match=message):
+        replace(plant, **change)
+
+
+def test_lists_are_taken_for_arrays():
+    plant = replace(TWO_STATE, state_names=['a', 'b'], nominal_state=[1, 2], B=[[0], [1]])
+    assert plant.state_names == ('a', 'b')
+    assert (plant.nominal_state.tolist(), plant.B.tolist()) == ([1.0, 2.0], [[0.0], [1.0]])
+    samples = Samples([[1.0], [2.0], [3.0]], [[0.0]] * 3, [[0.5]] * 3, [0, 0, 1], [0, 1, 0])
+    assert samples.take([0]).x.tolist() == [[1.0], [2.0]]
+    assert samples.digest() == replace(samples, episode=np.array([0, 0, 1])).digest()
+    with pytest.raises(ValueError, match='episode must hold one whole number a sample'):
+        replace(samples, episode=[0.0, 0.5, 1.0])
+
+
+@pytest.mark.parametrize('described', [
+    bent_samples(), BENT, irregular(), Simulation(
+        *(np.zeros((400, n)) for n in (1, 2, 2, 1, 1, 2)), (None,) * 400, '', None)],
+    ids=lambda value: type(value).__name__)
+def test_what_holds_many_numbers_is_described_on_one_line(described):
+    text = repr(described)
+    assert text.startswith(f'{type(described).__name__}(')
+    assert '\n' not in text
+    assert len(text) < 250
+    assert text == repr(BENT) or '<array (' in text

@@ -5,13 +5,15 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
 import math
 
 import numpy as np
+from numpy.typing import ArrayLike
 
-from koopman_ros.arrays import Array
+from koopman_ros.arrays import Array, brief
 from koopman_ros.control import setpoint as setpoints
 from koopman_ros.control.holding import Holding
 from koopman_ros.control.laws import LawResult
@@ -60,6 +62,8 @@ class Controller:
     model: LiftedModel  #: the lift
     settings: Settings  #: the tuning
     outputs: Outputs | None = None  #: what is measured; every state by default
+
+    __repr__ = brief
 
     def __post_init__(self) -> None:
         self.settings.check(self.model, self.measured)
@@ -131,9 +135,7 @@ class Controller:
         if not asked or len(set(asked)) != len(asked) or not set(asked) <= set(every.names):
             raise ValueError(f'signals must be some of {", ".join(every.names)}, each once, got '
                              f'{list(asked)}')
-        if np.shape(value) != (len(asked),):
-            raise ValueError(f'incompatible set-point: expected one number for each of '
-                             f'{", ".join(asked)}, got {np.asarray(value).tolist()}')
+        value = _numbers('set-point', value, asked)
         refusal = setpoints.refusal(every.only(asked), value)
         if refusal is not None:
             return state, refusal
@@ -181,10 +183,13 @@ class Controller:
 
         :param value: (n_u,) in input units; brought within the limits when commanded.
         :return: as :meth:`request_setpoint`.
+        :raises ValueError: for another size.
         """
         if state.mode is not Mode.MANUAL:
             return state, reason(Code.NOT_IN_MANUAL_MODE)
-        for name, number in zip(self.model.inputs.names, value.tolist(), strict=True):
+        names = self.model.inputs.names
+        value = _numbers('manual input', value, names)
+        for name, number in zip(names, value.tolist(), strict=True):
             if not math.isfinite(number):
                 return state, reason(Code.MANUAL_NOT_FINITE, signal=name, value=number)
         return amended(state, manual_input=_kept(value)), None
@@ -209,8 +214,10 @@ class Controller:
         """
         Start from the input (n_u,) that is applied already, as after a restart.
 
-        Nothing is changed after the first command, nor by what is not finite.
+        Nothing is changed after the first command, nor by what is not finite; another size is a
+        ValueError.
         """
+        applied = _numbers('applied input', applied, self.model.inputs.names)
         if state.command is not None or not np.all(np.isfinite(applied)):
             return state
         return amended(state, command=_kept(self.settings.limits.within(applied)))
@@ -273,7 +280,11 @@ class Controller:
             :meth:`Estimating.applied`.
         :return: the new state, the command (n_u,) in input units, always finite and within the
             limits, and the report.
+        :raises ValueError: for a measurement or an input of another size.
         """
+        y = _numbers('measurement', y, self.measured.names)
+        if applied is not None:
+            applied = _numbers('applied input', applied, self.model.inputs.names)
         outside = self._outside(y)
         ahead = 1 if state.time_ns is None else time_ns - state.time_ns
         if state.command is not None and -LATE_NANOSECONDS <= ahead <= 0:
@@ -491,6 +502,15 @@ def _afresh(state: State) -> State:
 
 def _without_law(state: State) -> State:
     return amended(state, law=None, law_input=None, law_memory=None, transfer=None)
+
+
+def _numbers(what: str, value: ArrayLike, names: Sequence[str]) -> Array:
+    """Return one number for each of some signals (n,) as an array; ValueError for another size."""
+    array = np.asarray(value, dtype=np.float64)
+    if array.shape != (len(names),):
+        raise ValueError(f'incompatible {what}: expected one number for each of '
+                         f'{", ".join(names)}, got {array.tolist()}')
+    return array
 
 
 def _kept(value: Array) -> Array:

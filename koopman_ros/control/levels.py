@@ -102,9 +102,7 @@ def levels_of(model: LiftedModel, settings: Settings) -> dict[str, Level]:
 
     :raises ValueError: for a law or an estimator that there is not.
     """
-    # the cost in the model's scaled deviations
-    weights = Weights(np.diag(settings.state_weight * model.states.scale ** 2),
-                      np.diag(settings.input_weight * model.inputs.scale ** 2))
+    weights = Weights.physical(model, settings.state_weight, settings.input_weight)
     tuning = Tuning(weights, settings.max_gain, settings.max_residual)
     estimator = plug(settings.estimator or (
         'disturbance_observer' if settings.observer_bandwidth > 0.0 else 'measured_state'),

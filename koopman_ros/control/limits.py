@@ -11,7 +11,7 @@ import math
 
 import numpy as np
 
-from koopman_ros.arrays import Array
+from koopman_ros.arrays import Array, as_arrays
 from koopman_ros.signals import per_signal
 
 
@@ -24,6 +24,7 @@ class InputLimits:
     rate: Array  #: (n_u,) largest change per second; infinity for none
 
     def __post_init__(self) -> None:
+        as_arrays(self, 'lower', 'upper', 'rate')
         if not np.all(self.lower < self.upper):
             raise ValueError(f'input limits must be lower < upper, got {self.lower.tolist()} and '
                              f'{self.upper.tolist()}')

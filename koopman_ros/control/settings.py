@@ -8,7 +8,7 @@ from typing import Any, Self
 
 import numpy as np
 
-from koopman_ros.arrays import Array
+from koopman_ros.arrays import Array, as_arrays, brief
 from koopman_ros.control.limits import InputLimits
 from koopman_ros.control.supervisor import SupervisorSettings
 from koopman_ros.estimation import SensorLimits
@@ -47,8 +47,12 @@ class Settings:
     #: which laws act, and when
     supervisor: SupervisorSettings = field(default_factory=SupervisorSettings)
 
+    __repr__ = brief
+
     def __post_init__(self) -> None:
-        weights, costs = np.asarray(self.state_weight), np.asarray(self.input_weight)
+        as_arrays(self, 'state_weight', 'input_weight', 'setpoint_ramp', 'max_disturbance',
+                  'input_tolerance', 'safe_input')
+        weights, costs = self.state_weight, self.input_weight
         for name, fits, words in (
                 ('state_weight', np.isfinite(weights) & (weights >= 0.0) & np.any(weights > 0.0),
                  'finite, at least 0 and not all 0'),

@@ -10,13 +10,13 @@ from typing import Protocol, Self, TypeAlias
 
 import numpy as np
 
-from koopman_ros.arrays import Array
+from koopman_ros.arrays import Array, brief, frozen
 from koopman_ros.control.controller import Controller
 from koopman_ros.control.events import apply, Event, Measurement, Silence
 from koopman_ros.control.laws import Feedback, feedback, Weights
 from koopman_ros.control.laws.base import steady_state_target, Target
 from koopman_ros.control.state import Report, State
-from koopman_ros.control.target import partial_target
+from koopman_ros.control.target import nearest_steady_state, partial_target
 from koopman_ros.lifting import LiftedModel
 from koopman_ros.reasons import Code, reason, Words
 from koopman_ros.signals import per_signal
@@ -55,6 +55,8 @@ class Loop:
     controller: Controller  #: that acts
     state: State  #: what it remembers
     plant: Plant  #: under it
+
+    __repr__ = brief
 
 
 Change: TypeAlias = Callable[[Loop], Loop]
@@ -108,6 +110,8 @@ class Simulation:
     failure: str  #: why the plant could not go on to the end; empty when it could
     loop: Loop  #: after the last sample, to go on from
 
+    __repr__ = brief
+
     @property
     def levels(self) -> tuple[str, ...]:
         """The control levels that acted."""
@@ -147,6 +151,7 @@ def simulate(controller: Controller, plant: Plant, events: Iterable[Timed] = (),
                              f'{"above" if name == "period" else "at least"} 0')
     observe = _outputs(controller, plant, C)
     if noise is not None:
+        noise = np.asarray(noise, dtype=np.float64)
         per_signal('noise', noise, controller.measured.names)
     waiting = sorted(events, key=lambda event: event.seconds)
     loop = Loop(controller, state or State(), plant)
@@ -185,6 +190,7 @@ def simulate(controller: Controller, plant: Plant, events: Iterable[Timed] = (),
 def _outputs(controller: Controller, plant: Plant, C: Array | None) -> Callable[[Array], Array]:
     n, outputs = len(plant.x), controller.measured
     if C is not None:
+        C = np.asarray(C, dtype=np.float64)
         if C.shape != (len(outputs.names), n):
             raise ValueError(f'incompatible C: expected ({len(outputs.names)}, {n}) for '
                              f'{", ".join(outputs.names)} of the plant, got {C.shape}')
@@ -222,6 +228,8 @@ class ClosedLoop:
     cost: float  #: integral of e' Q e + v' R v; infinite when the loop failed
     failure: str = ''  #: why it ended early, empty when it did not
 
+    __repr__ = brief
+
     def distance(self, model: LiftedModel) -> float:
         """Return how far the path leaves the training box, in halves of its width."""
         return max(model.states.violation(x) for x in self.states)
@@ -231,9 +239,32 @@ class _Failed(Exception):  # noqa: N818
     """The loop cannot go on; the message says why."""
 
 
+# A set-point for all states is held where a steady state is so near, in half widths of the box.
+_NEAR = 0.1
+
+
 def _target(model: LiftedModel, setpoint: Array, controlled: tuple[str, ...]) -> Target:
+    states = model.states
+    box = states.only(controlled or states.names)
+    per_signal('set-point', setpoint, box.names)
+    for name, unit, value, lower, upper in zip(
+            box.names, box.units, setpoint, box.lower, box.upper, strict=True):
+        if not lower <= value <= upper:
+            raise ValueError(f'{name} = {value:.6g} {unit} is outside the trained range '
+                             f'{lower:.6g} {unit} to {upper:.6g} {unit}: choose a set-point '
+                             'inside, or a model trained over a wider range')
     if not controlled:
-        return steady_state_target(model, model.states.to_deviation(setpoint))
+        target = steady_state_target(model, states.to_deviation(setpoint))
+        nearest = target.x if model.n_u >= model.n_x else (
+            nearest_steady_state(model, target, np.zeros(model.n_x)))
+        if nearest is None or not np.all(np.abs(nearest - target.x) * states.scale
+                                         <= _NEAR * 0.5 * (states.upper - states.lower)):
+            where = '' if nearest is None else (
+                f'; the nearest steady state is {states.to_physical(nearest).tolist()}')
+            raise ValueError(f'no input of the model holds {", ".join(states.names)} at '
+                             f'{setpoint.tolist()}{where}: choose another set-point, or name in '
+                             'controlled the states that have one')
+        return target
     endless = np.full(model.n_u, np.inf)
     found = partial_target(
         model, np.array([model.states.names.index(name) for name in controlled], dtype=np.intp),
@@ -256,8 +287,9 @@ def run_closed_loop(model: LiftedModel, rate: Callable[[Array, Array], Array], x
     :param rate: the plant's dx/dt (n_x,) of state and input, e.g.
         ``ControlAffineSystem.derivative``.
     :param x0: (n_x,) start, in state units.
-    :param x_ref: (n_c,) set-point, in state units.
-    :param weights: weights of the law and of the cost, on the model's scaled deviations.
+    :param x_ref: (n_c,) set-point within the trained range, in state units.
+    :param weights: weights of the law and of the cost, on the model's scaled deviations; see
+        :meth:`Weights.physical` for weights in the signals' units.
     :param duration: in the model's time unit.
     :param law: feedback(model, x, target, weights).
     :param controlled: (n_c,) names of the states with a set-point, empty for all.
@@ -267,12 +299,17 @@ def run_closed_loop(model: LiftedModel, rate: Callable[[Array, Array], Array], x
     :param escape: the loop has failed when a state is further than this from the nominal point,
         in units of its scale.
     :param max_evaluations: of the law, after which the loop has failed: it chatters or is stiff.
-    :raises ValueError: where the model has no steady state with the set-point.
+    :raises ValueError: where the set-point is outside the trained range, no input of the model
+        holds it, or an argument does not fit the model.
     """
     # in here: no node needs it, and it would make a fourth of their start
     from scipy.integrate import DOP853
 
-    target = _target(model, np.asarray(x_ref), controlled)
+    target = _target(model, np.asarray(x_ref, dtype=np.float64), controlled)
+    x0 = frozen(x0, 'x0', (model.n_x,))
+    for name, matrix, n in (('Q', weights.Q, model.n_x), ('R', weights.R, model.n_u)):
+        if matrix.shape != (n, n):
+            raise ValueError(f'incompatible {name}: expected {(n, n)}, got {matrix.shape}')
     v_ref = target.u if u_ref is None else model.inputs.to_deviation(np.asarray(u_ref))
 
     def act(x: Array) -> tuple[Array, Array]:
@@ -289,7 +326,7 @@ def run_closed_loop(model: LiftedModel, rate: Callable[[Array, Array], Array], x
                          float(e @ weights.Q @ e + v @ weights.R @ v))
 
     times = np.linspace(0.0, duration, samples)
-    states = [np.asarray(x0, dtype=np.float64)]
+    states = [x0]
     inputs: list[Array] = []
     cost, failure = np.inf, ''
     try:

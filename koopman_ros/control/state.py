@@ -10,7 +10,7 @@ from typing import TypeVar
 
 import numpy as np
 
-from koopman_ros.arrays import Array
+from koopman_ros.arrays import Array, brief
 from koopman_ros.control.laws.base import Figures, NO_FIGURES
 from koopman_ros.control.limits import Transfer
 from koopman_ros.control.setpoint import Setpoint
@@ -67,6 +67,8 @@ class State:
     #: (n_x + n_u,) steady state that was last aimed at and its input, in their units, where the
     #: next one is looked for; None at first, and where every state has a set-point
     target: Array | None = None
+
+    __repr__ = brief
 
 
 class Arrival(Enum):
@@ -142,3 +144,5 @@ class Report:
     estimate: EstimateReport | None = None  #: the estimate, or None
     target: TargetReport | None = None  #: where the law goes, or None before the first measurement
     command: CommandReport = field(default_factory=CommandReport)  #: the command
+
+    __repr__ = brief

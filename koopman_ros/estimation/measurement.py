@@ -12,7 +12,7 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
-from koopman_ros.arrays import Array
+from koopman_ros.arrays import Array, as_arrays
 from koopman_ros.reasons import Code, Reason, reason
 from koopman_ros.signals import Outputs, per_signal
 from koopman_ros.units import NANOSECONDS
@@ -75,6 +75,7 @@ class SensorLimits:
     frozen_timeout: float = math.inf
 
     def __post_init__(self) -> None:
+        as_arrays(self, 'lower', 'upper', 'rate', 'jump')
         if not np.all(self.lower < self.upper):
             raise ValueError(f'sensor limits must be lower < upper, got {self.lower.tolist()} '
                              f'and {self.upper.tolist()}')

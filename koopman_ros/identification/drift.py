@@ -13,6 +13,7 @@ import math
 
 import numpy as np
 
+from koopman_ros.arrays import brief
 from koopman_ros.lifting import Box, PolynomialObservables
 from koopman_ros.plant_data import Array, Episode, Plant
 from koopman_ros.solvers import runge_kutta_step
@@ -38,6 +39,8 @@ class DriftModel:
     degree: int  #: highest total degree of the monomials
     coefficients: Array  #: (1 + m, n_x) of 1 and of the m monomials, in scale units a time unit
     B: Array  #: (n_x, n_u) likewise
+
+    __repr__ = brief
 
     @cached_property
     def monomials(self) -> PolynomialObservables:
@@ -81,6 +84,8 @@ class Segments:
     u: Array  #: (K, M, n_u) inputs held over them, or their means where they were linear
     x: Array  #: (K + 1, M, n_x) measured states, 0 where none was measured
     measured: np.ndarray  #: (K + 1, M) whether one was
+
+    __repr__ = brief
 
     @classmethod
     def of(cls, episodes: Sequence[Episode], longest_step: float) -> Segments:

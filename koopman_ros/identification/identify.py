@@ -10,6 +10,7 @@ import math
 
 import numpy as np
 
+from koopman_ros.arrays import brief
 from koopman_ros.identification.drift import (
     box_of,
     DriftModel,
@@ -85,6 +86,8 @@ class Identified:
     noise: Array  #: (n_x,) standard deviation of the measurement noise, from sample to sample
     fitted: tuple[Episode, ...]  #: the segments that it was fitted to
     held_out: tuple[Episode, ...]  #: segments that neither fit nor choice has seen
+
+    __repr__ = brief
 
 
 def identify(plant: Plant, episodes: Sequence[Episode], *, degrees: Sequence[int] | None = None,

@@ -12,7 +12,7 @@ import math
 
 import numpy as np
 
-from koopman_ros.arrays import Array, frozen
+from koopman_ros.arrays import Array, brief, frozen
 from koopman_ros.plant_data import Plant
 
 MAX_TRAINING_STATES = 256
@@ -35,6 +35,8 @@ class Coordinates:
     lower: Array  #: (n,) lower corner of the training box, in units
     upper: Array  #: (n,) upper corner of the training box, in units
 
+    __repr__ = brief
+
     def __post_init__(self) -> None:
         n = len(self.names)
         if len(self.units) != n:
@@ -55,6 +57,7 @@ class Coordinates:
 
         :raises ValueError: when a range is empty, naming the coordinate, or the sizes do not fit.
         """
+        lower, upper = np.asarray(lower, dtype=np.float64), np.asarray(upper, dtype=np.float64)
         if not len(names) == len(lower) == len(upper):
             raise ValueError(f'there are values of {len(lower)} signals for {len(names)} names: '
                              f'{", ".join(names)}')
@@ -112,6 +115,8 @@ class Box:
     inputs: Coordinates  #: the inputs' likewise
     time_unit: str  #: ``'s'`` or ``'min'``
 
+    __repr__ = brief
+
     @staticmethod
     def of(plant: Plant, x: Array, u: Array, *, nominal: bool = True) -> Box:
         """
@@ -122,7 +127,7 @@ class Box:
         :raises ValueError: when a state or an input never moves, or the sizes do not fit.
         """
         states, inputs = (
-            Coordinates.spanning(names, units, values.min(axis=0), values.max(axis=0),
+            Coordinates.spanning(names, units, np.min(values, axis=0), np.max(values, axis=0),
                                  center if nominal else None)
             for names, units, center, values in (
                 (plant.state_names, plant.state_units, plant.nominal_state, x),
@@ -151,6 +156,8 @@ class TrainingStates:
     #: largest distance of any training state from the nearest of these, in half widths of the
     #: training box
     fill_distance: float
+
+    __repr__ = brief
 
     def __post_init__(self) -> None:
         shape = np.shape(self.states)

@@ -13,11 +13,11 @@ import numpy as np
 from numpy.polynomial.legendre import leggauss
 from numpy.typing import NDArray
 
-from koopman_ros.arrays import Array, frozen
+from koopman_ros.arrays import Array, brief, frozen
 from koopman_ros.lifting.coordinates import Coordinates, TrainingStates
 from koopman_ros.lifting.observables import NetworkObservables, Observables
 from koopman_ros.plant_data import Plant
-from koopman_ros.units import SECONDS_PER_TIME_UNIT
+from koopman_ros.units import check_time_unit, SECONDS_PER_TIME_UNIT
 
 # Of scaled deviations: rounding and the third derivative both leave about ten digits.
 _DIFFERENCE = 1e-5
@@ -61,10 +61,11 @@ class LiftedModel:
     #: where the data were, within their box; None when that is not known
     training_states: TrainingStates | None = None
 
+    __repr__ = brief
+
     def __post_init__(self) -> None:
         n_x, n_z = self.observables.n_x, self.observables.n_z
-        if self.time_unit not in SECONDS_PER_TIME_UNIT:
-            raise ValueError(f"time_unit must be 's' or 'min', got {self.time_unit!r}")
+        check_time_unit(self.time_unit)
         if n_x != self.n_x:
             raise ValueError(f'incompatible observables: expected {self.n_x} states, got {n_x}')
         object.__setattr__(self, 'A', frozen(self.A, 'A', (n_z, n_z)))

@@ -12,7 +12,7 @@ from typing import final, Self
 import numpy as np
 from numpy.typing import NDArray
 
-from koopman_ros.arrays import Array, frozen
+from koopman_ros.arrays import Array, brief, frozen
 from koopman_ros.lifting.activations import Activation, activation_named
 
 
@@ -87,6 +87,8 @@ class NetworkObservables(Observables):
     output: Array  #: (n_z - n_x, h) with `identity`, else (n_z, h): weights of the last layer
     identity: bool  #: whether z starts with the state
     activation: str = 'tanh'  #: of every hidden layer, a name in ``ACTIVATIONS``
+
+    __repr__ = brief
 
     def __post_init__(self) -> None:
         activation_named(self.activation)
@@ -220,6 +222,8 @@ class PolynomialObservables(Observables):
 
     exponents: NDArray[np.int64]
     identity: bool = field(default=True, init=False)
+
+    __repr__ = brief
 
     def __post_init__(self) -> None:
         given = np.asarray(self.exponents)

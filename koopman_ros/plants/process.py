@@ -9,7 +9,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from koopman_ros.arrays import Array
+from koopman_ros.arrays import Array, brief
 from koopman_ros.plants.simulation import advance
 from koopman_ros.plants.system import ControlAffineSystem
 from koopman_ros.units import NANOSECONDS
@@ -40,6 +40,8 @@ class Process:
     command: Array | None = None  #: what the input follows (n_u,); None for what it is
     #: commands that take effect later, by rising time: (time in ns, number of the input, value)
     pending: tuple[tuple[int, int, float], ...] = ()
+
+    __repr__ = brief
 
     @property
     def followed(self) -> Array:

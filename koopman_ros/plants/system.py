@@ -9,7 +9,7 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import ArrayLike
 
-from koopman_ros.arrays import Array, frozen
+from koopman_ros.arrays import Array, brief, frozen
 from koopman_ros.units import SECONDS_PER_TIME_UNIT
 
 ArrayFunction = Callable[[Array], Array]
@@ -49,6 +49,8 @@ class ControlAffineSystem:
     state_lower: Array = field(default_factory=lambda: np.array(-np.inf))
     #: highest such states (n_x,); none by default
     state_upper: Array = field(default_factory=lambda: np.array(np.inf))
+
+    __repr__ = brief
 
     def __post_init__(self) -> None:
         if self.time_unit not in SECONDS_PER_TIME_UNIT:

@@ -382,3 +382,41 @@ def test_the_filter_follows_a_step_with_its_time_constant():
 def test_the_ramp_starts_from_the_first_measurement_and_with_time(before):
     setpoint = request(before, kelvin(310.0), 0, NOW)
     np.testing.assert_array_equal(moved(setpoint, ramp=0.5, seconds=0.0).active, [320.0])
+
+
+# What is given as lists, and what has another size.
+
+def test_lists_do_as_arrays_do():
+    model = shipped('reactor_nz4')
+    lists = Controller(model, Settings.for_model(
+        model, state_weight=[1.0], input_weight=[1.0], limits=InputLimits(
+            [LOWER], [UPPER], [RATE])))
+    arrays = controller()
+    assert lists.settings.state_weight.dtype == np.float64
+    np.testing.assert_array_equal(lists.initialise(State(), [290.0]).command, [290.0])
+    one, other = (loop.step(State(), value, NOW)[0] for loop, value in (
+        (lists, [START]), (arrays, np.array([START]))))
+    assert content(one) == content(other)
+    one, other = (loop.request_setpoint(state, value)[0] for loop, state, value in (
+        (lists, one, [SETPOINT]), (arrays, other, np.array([SETPOINT]))))
+    assert content(lists.step(one, [START], NOW + SECOND, [290.0])) == content(
+        arrays.step(other, np.array([START]), NOW + SECOND, np.array([290.0])))
+    manual = lists.set_mode(one, Mode.MANUAL)
+    np.testing.assert_array_equal(lists.request_manual_input(manual, [290])[0].manual_input, 290.0)
+
+
+@pytest.mark.parametrize(('act', 'message'), [
+    (lambda loop, state: loop.step(state, [START, 1.0], NOW + SECOND),
+     r'incompatible measurement: expected one number for each of temperature, got \['),
+    (lambda loop, state: loop.step(state, START, NOW + SECOND), 'incompatible measurement: '),
+    (lambda loop, state: loop.step(state, [START], NOW + SECOND, [290.0, 290.0]),
+     'incompatible applied input: expected one number for each of coolant_temperature, got '),
+    (lambda loop, state: loop.initialise(State(), [[290.0]]), 'incompatible applied input: '),
+    (lambda loop, state: loop.request_setpoint(state, SETPOINT), 'incompatible set-point: '),
+    (lambda loop, state: loop.request_manual_input(loop.set_mode(state, Mode.MANUAL), []),
+     'incompatible manual input: expected one number for each of coolant_temperature, got ')],
+    ids=['measurement', 'no list', 'applied', 'found', 'set-point', 'manual'])
+def test_another_size_is_refused(act, message):
+    loop = controller()
+    with pytest.raises(ValueError, match=message):
+        act(loop, started(loop))

@@ -399,3 +399,56 @@ def test_a_law_without_an_answer_at_a_time_of_the_report():
     loop = limited(itertools.count())
     assert loop.failure.startswith(UNSOLVED)
     assert len(loop.times) == len(loop.states) == len(loop.inputs)
+
+
+# What does not fit.
+
+SHAFT = linear_model()
+
+
+@pytest.mark.parametrize(('change', 'message'), [
+    ({'x_ref': [3.4, 9.0]}, r'x1 = 9 K is outside the trained range -2 K to 2\.5 K: choose'),
+    ({'x_ref': [np.inf, 1.0]}, 'x0 = inf K is outside the trained range'),
+    ({'x_ref': 3.0}, 'incompatible set-point: expected one number for each of x0, x1, got 3.0'),
+    ({'x_ref': [3.0], 'controlled': ()}, 'incompatible set-point: expected one number for each'),
+    # 0 = 0.4 a + b + 0.2 v and 0 = -0.3 a - 0.5 b + 1.5 v hold a and b on a line
+    ({'x_ref': [3.4, 2.0]}, r'no input of the model holds x0, x1 at \[3\.4, 2\.0\]; the nearest '
+                            r'steady state is \[.*\]: choose another set-point, or name in contr'),
+    ({'x0': 3.0}, r'incompatible x0: expected \(2,\), got \(\)'),
+    ({'x0': [3.0, np.nan]}, 'x0 must be finite'),
+    ({'weights': Weights(np.eye(1), np.eye(1))}, r'incompatible Q: expected \(2, 2\), got \(1,'),
+    ({'weights': Weights(np.eye(2), np.eye(2))}, r'incompatible R: expected \(1, 1\), got \(2,'),
+])
+def test_a_loop_of_what_does_not_fit(change, message):
+    usual = {'x0': STATES.center, 'x_ref': STATES.center, 'weights': WEIGHTS, 'duration': 1.0}
+    with pytest.raises(ValueError, match=message):
+        run_closed_loop(SHAFT, rate, **{**usual, **change})
+
+
+@pytest.mark.parametrize(('Q', 'R', 'message'), [
+    (1.0, [[1.0]], r'incompatible Q: expected a square matrix, got \(\); Weights.physical takes'),
+    ([[1.0, 2.0]], [[1.0]], r'incompatible Q: expected a square matrix, got \(1, 2\)'),
+    ([[1.0, 2.0], [0.0, 1.0]], [[1.0]], 'Q must be symmetric, positive semidefinite and not zero'),
+    ([[1.0, 2.0], [2.0, 1.0]], [[1.0]], 'Q must be symmetric, positive semidefinite and not zero'),
+    ([[0.0]], [[1.0]], 'Q must be symmetric, positive semidefinite and not zero'),
+    ([[np.nan]], [[1.0]], r'Q must be finite: entry \[0, 0\] is nan'),
+    ([[1.0]], [[0.0]], r'R must be symmetric, positive definite, got \[\[0\.0\]\]'),
+    ([[1.0]], [[-1.0]], 'R must be symmetric, positive definite')])
+def test_weights_that_are_none(Q, R, message):
+    with pytest.raises(ValueError, match=message):
+        Weights(Q, R)
+
+
+def test_weights_in_the_units_of_the_signals():
+    """With e = scale e_scaled, q e^2 is q scale^2 e_scaled^2."""
+    weights = Weights.physical(SHAFT, [2.0, 0.0], [3.0])
+    np.testing.assert_allclose(weights.Q, np.diag([2.0 * STATES.scale[0] ** 2, 0.0]))
+    np.testing.assert_allclose(weights.R, [[3.0 * INPUTS.scale[0] ** 2]])
+    with pytest.raises(ValueError, match=r'incompatible state weights: expected \(2,\), got \(\)'):
+        Weights.physical(SHAFT, 1.0, [3.0])
+    # the cost comes out in these units, whatever the scale
+    loop = run_closed_loop(SHAFT, rate, [3.6, -0.4], STATES.center, Weights.physical(
+        SHAFT, [2.0, 0.5], [0.7]), 40.0)
+    P = solve_continuous_are(JACOBIAN, B, np.diag([2.0, 0.5]), [[0.7]])
+    e = np.array([3.6, -0.4]) - STATES.center
+    assert loop.cost == pytest.approx(e @ P @ e, rel=1e-7)

@@ -49,8 +49,7 @@ def close_loop(model: LiftedModel) -> ClosedLoop:
     The cost is the integral of e^2 + v^2, e and v the deviations from the set-point and from
     the coolant that really holds it, in units of 10 K.
     """
-    weights = Weights(np.diag((model.states.scale / UNIT) ** 2),
-                      INPUT_WEIGHT * np.diag((model.inputs.scale / UNIT) ** 2))
+    weights = Weights.physical(model, [1.0 / UNIT ** 2], [INPUT_WEIGHT / UNIT ** 2])
     return run_closed_loop(
         model, SYSTEM.derivative, np.array([START]), np.array([SETPOINT]), weights, HORIZON,
         u_ref=equilibrium_input(SYSTEM, [SETPOINT]))

@@ -83,7 +83,7 @@ def close_loop(model: LiftedModel, R: float, law: Callable[..., Feedback] = _law
 
     The cost is the integral of x1^2 + x2^2 + R u^2.
     """
-    weights = Weights(np.diag(model.states.scale ** 2), R * np.diag(model.inputs.scale ** 2))
+    weights = Weights.physical(model, [1.0, 1.0], [R])
     return run_closed_loop(model, SYSTEM.derivative, START, np.zeros(2), weights, HORIZON,
                            law=law, escape=100.0, samples=1601,
                            max_evaluations=_MAX_EVALUATIONS[R])

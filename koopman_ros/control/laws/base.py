@@ -5,11 +5,12 @@
 
 from dataclasses import dataclass
 import math
-from typing import Protocol
+from typing import Protocol, Self
 
 import numpy as np
+from numpy.typing import ArrayLike
 
-from koopman_ros.arrays import Array
+from koopman_ros.arrays import Array, frozen
 from koopman_ros.control.limits import InputLimits
 from koopman_ros.estimation import Estimate
 from koopman_ros.lifting import LiftedModel
@@ -54,10 +55,43 @@ def steady_state_target(model: LiftedModel, x_ref: Array, w: Array | None = None
 
 @dataclass(frozen=True)
 class Weights:
-    """Quadratic cost on scaled deviations from the target: e' Q e + v' R v."""
+    """
+    Quadratic cost on scaled deviations from the target: e' Q e + v' R v.
+
+    :raises ValueError: naming the matrix that is not square, symmetric and definite.
+    """
 
     Q: Array  #: (n_x, n_x) symmetric, positive semidefinite, not zero
     R: Array  #: (n_u, n_u) symmetric, positive definite
+
+    def __post_init__(self) -> None:
+        for name, least in (('Q', 'semidefinite and not zero'), ('R', 'definite')):
+            shape = np.shape(getattr(self, name))
+            if len(shape) != 2 or shape[0] != shape[1]:
+                raise ValueError(f'incompatible {name}: expected a square matrix, got {shape}; '
+                                 'Weights.physical takes one weight a signal')
+            M = frozen(getattr(self, name), name, shape)
+            values = np.linalg.eigvalsh(M)
+            size = float(np.max(np.abs(values), initial=0.0))
+            definite = np.all(values > 0.0) if name == 'R' else (
+                size > 0.0 and np.all(values >= -1e-9 * size))
+            if not (definite and np.allclose(M, M.T, rtol=1e-9, atol=1e-12 * size)):
+                raise ValueError(f'{name} must be symmetric, positive {least}, got {M.tolist()}')
+            object.__setattr__(self, name, M)
+
+    @classmethod
+    def physical(cls, model: LiftedModel, states: ArrayLike, inputs: ArrayLike) -> Self:
+        """
+        Return the weights on a model's scaled deviations that weigh its signals in their units.
+
+        :param states: (n_x,) weights of squared state errors, per state unit squared.
+        :param inputs: (n_u,) weights of squared input deviations, per input unit squared.
+        :raises ValueError: for other sizes, and as the class.
+        """
+        return cls(*(
+            np.diag(frozen(weights, f'{name} weights', (len(signals),)) * signals.scale ** 2)
+            for name, weights, signals in (
+                ('state', states, model.states), ('input', inputs, model.inputs))))
 
 
 @dataclass(frozen=True)
