@@ -19,7 +19,9 @@ import numpy as np
 import torch
 
 from koopman_ros import __version__
+from koopman_ros.arrays import brief
 from koopman_ros.learning.baselines import Algorithm1, Edmd
+from koopman_ros.learning.contradictions import check_nominal_point, check_rates
 from koopman_ros.learning.growth import Grown, Growth, Monitor
 from koopman_ros.learning.levenberg_marquardt import MinimumStatus
 from koopman_ros.learning.residuals import deviations, ScaledSamples
@@ -69,6 +71,8 @@ class Trained:
     path: tuple[LiftedModel, ...]
     starts: int  #: number of starts that finished
 
+    __repr__ = brief
+
 
 class NoUsefulLift(ValueError):  # noqa: N818
     """Training ended without a lift that is better than a linear model; the message says why."""
@@ -107,8 +111,9 @@ def train(plant: Plant, samples: Samples, recipe: Recipe, *, seed: int = 0, star
     :param threads: torch's threads for each start, for a number of which the bits are the same.
     :raises NoUsefulLift: when no start gives a lift that can be judged, or none that beats the
         linear model on validation episodes.
-    :raises ValueError: on too few episodes, held-out episodes that hardly move, or a recipe that
-        does not fit.
+    :raises ValueError: on too few episodes, held-out episodes that hardly move, a recipe that
+        does not fit, times that contradict the derivatives, or a nominal point where the plant
+        moves.
     :raises KeyboardInterrupt: when interrupted before the first start finished.
     """
     if starts < 1:
@@ -116,6 +121,8 @@ def train(plant: Plant, samples: Samples, recipe: Recipe, *, seed: int = 0, star
     rounds = recipe.rounds(samples.x.shape[1])
     parts = split_by_episode(samples, split_seed)
     box = Box.of(plant, samples.x, samples.u)
+    check_rates(plant, samples)
+    check_nominal_point(plant, samples, box)
     assembly = _Assembly(plant, box, parts[0], samples.digest(), seed,
                          _training_states(box, samples))
     data = assembly.data(device)

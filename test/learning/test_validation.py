@@ -112,6 +112,20 @@ def test_a_roll_out_without_inputs_and_one_that_diverges():
         roll_out(linear_model(50.0 * np.eye(2)), np.ones(2), np.zeros((40, 1)), 1.0)
 
 
+def test_a_roll_out_into_a_state_where_the_lift_is_singular_ends():
+    """With z = sin(x) and dz/dt = z the drift is tan(x): infinite at pi/2, and beyond it back."""
+    c = Coordinates(('x',), ('1',), np.zeros(1), np.ones(1), -np.ones(1), np.ones(1))
+    observables = NetworkObservables(((np.eye(1), np.zeros(1)),), np.eye(1), identity=False,
+                                     activation='sine')
+    model = LiftedModel(observables, np.eye(1), np.eye(1), c, c, 's', Provenance('test'))
+    # sin(x) = sin(0.5) exp(t) is 1 after 0.735 s
+    path = roll_out(model, np.array([0.5]), np.zeros((7, 1)), 0.1)
+    np.testing.assert_allclose(np.sin(path[:, 0]), np.sin(0.5) * np.exp(0.1 * np.arange(8)),
+                               rtol=1e-7)
+    with pytest.raises(RuntimeError, match='diverged after 8 samples'):
+        roll_out(model, np.array([0.5]), np.zeros((9, 1)), 0.1)
+
+
 def test_roll_outs_side_by_side_are_those_one_by_one():
     model, rng = random_lift(2, (6,)), np.random.default_rng(3)
     # slow enough to stay where the lift was drawn
