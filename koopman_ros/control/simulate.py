@@ -247,8 +247,9 @@ def _target(model: LiftedModel, setpoint: Array, controlled: tuple[str, ...]) ->
     states = model.states
     box = states.only(controlled or states.names)
     per_signal('set-point', setpoint, box.names)
-    for name, unit, value, lower, upper in zip(
-            box.names, box.units, setpoint, box.lower, box.upper, strict=True):
+    # the nominal point is known, wherever the data are
+    ends = np.minimum(box.lower, box.center), np.maximum(box.upper, box.center)
+    for name, unit, value, lower, upper in zip(box.names, box.units, setpoint, *ends, strict=True):
         if not lower <= value <= upper:
             raise ValueError(f'{name} = {value:.6g} {unit} is outside the trained range '
                              f'{lower:.6g} {unit} to {upper:.6g} {unit}: choose a set-point '

@@ -194,6 +194,14 @@ class TrainerParameters:
               for end, none in (('min', -UNBOUNDED), ('max', UNBOUNDED))
               if getattr(item, f'experiment_{end}') == none)]]
 
+    def setpoint_ranges(self, signals: Signals) -> dict[str, tuple[float, float]]:
+        """Return the lowest and highest set-point of states that have a range, in their units."""
+        lows, highs = (in_own_units(self.states, f'setpoint_{end}', signals.states).tolist()
+                       for end in ('min', 'max'))
+        return {name: (low, high)
+                for name, low, high in zip(signals.states, lows, highs, strict=True)
+                if name in signals.controlled and low < high}
+
     def training(self) -> dict[str, Any]:
         """Return the fields of a :class:`koopman_ros.retraining.Task` that are settings."""
         return {'coordinates': self.model_coordinates, 'seed': self.training_seed,

@@ -3,20 +3,22 @@
 
 """Training of a lift on an estimated drift, and its acceptance on data held out of both."""
 
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
-from koopman_ros.arrays import Array
+from koopman_ros.arrays import Array, brief
 from koopman_ros.control import run_closed_loop, Weights
 from koopman_ros.identification import DriftModel, fitted_starts, Identified, longest_step
 from koopman_ros.identification.drift import prediction_error, Rate, Segments
 from koopman_ros.learning import Growth, train, Trained
 from koopman_ros.learning.training import Watch
 from koopman_ros.learning.validation import settling_time
-from koopman_ros.lifting import LiftedModel, linearised_model, Provenance
+from koopman_ros.lifting import Coordinates, LiftedModel, linearised_model, Provenance
 from koopman_ros.plant_data import Episode, Plant, Samples
+from koopman_ros.units import Display, display_unit
 
 # More samples of a smooth drift tell nothing new.
 _MAX_SAMPLES = 2000
@@ -40,6 +42,10 @@ _DIVERGED = 1e6
 # An error is more than noise when it is this unlikely, and this large beside the range.
 _SIGMAS = 5.0
 _NOTICEABLE = 1e-3
+# White errors have none; those of a fitted start stay far below.
+_LEAST_AUTOCORRELATION = 0.3
+# A share of the set-points' range that may be missing: noise moves the ends of a record.
+_MISSING = 0.05
 
 
 def drift_samples(drift: DriftModel, episodes: tuple[Episode, ...]) -> Samples:
@@ -179,6 +185,8 @@ class Decision:
     loops: int  #: number of closed loops on the estimated drift that were tried
     arrived: int  #: number of those that reached their set-point
 
+    __repr__ = brief
+
     @property
     def accepted(self) -> bool:
         """Whether the lift may be used."""
@@ -233,26 +241,66 @@ def decide(found: Identified, trained: Trained, current: LiftedModel | None,
     if arrived < loops:
         reasons.append(f'its controller brings the estimated drift to the set-point in {arrived} '
                        f'of {loops} closed loops over its box')
-    return Decision(tuple(reasons), _warnings(found, model, drift_rmse), rmse, drift_rmse,
-                   current_rmse, linear_rmse, found.noise, loops, arrived)
+    warnings = _warnings(found, model, drift_rmse, _autocorrelation(found.drift, held_out))
+    return Decision(tuple(reasons), warnings, rmse, drift_rmse, current_rmse, linear_rmse,
+                    found.noise, loops, arrived)
 
 
-def _warnings(found: Identified, model: LiftedModel, error: Array) -> tuple[str, ...]:
-    """Say where the best drift errs by more than the noise explains."""
+def _autocorrelation(drift: DriftModel, segments: Segments) -> Array:
+    """Return the autocorrelation (n_x,) of a drift's errors from one measurement to the next."""
+    starts = fitted_starts(drift.rate, segments, drift.box.states.scale)[0]
+    errors = segments.errors(drift.rate, starts)
+    products, squares = np.zeros((2, errors.shape[2]))
+    for j in range(errors.shape[1]):
+        own = errors[segments.measured[:, j], j]
+        products += np.sum(own[1:] * own[:-1], axis=0)
+        squares += 0.5 * np.sum(own[1:] ** 2 + own[:-1] ** 2, axis=0)
+    return products / np.where(squares > 0.0, squares, 1.0)
+
+
+def _warnings(found: Identified, model: LiftedModel, error: Array, autocorrelation: Array
+              ) -> tuple[str, ...]:
+    """Say where the best drift errs by more than white noise explains."""
     warnings = []
     count = sum(len(episode) for episode in found.held_out)
     for i, (name, unit) in enumerate(zip(model.states.names, model.states.units, strict=True)):
+        noticeable, r = _NOTICEABLE * found.drift.box.states.scale[i], autocorrelation[i]
+        if error[i] > noticeable and r > max(_LEAST_AUTOCORRELATION, _SIGMAS / np.sqrt(count)):
+            warnings.append(
+                f'the noise of {name} is coloured (autocorrelation {r:.2f} from sample to sample '
+                'of what the best drift leaves): a filter before the record does that, or what '
+                f'is not measured; it tells as much as {100.0 * (1.0 - r) / (1.0 + r):.0f} % of '
+                'the samples would with white noise, so record longer, or without the filter')
         noise = found.noise[i]
         excess = float(np.sqrt(max(0.0, error[i] ** 2 - noise ** 2)))
         # the mean square of `count` white errors strays by this share
         chance = noise * (_SIGMAS * np.sqrt(2.0 / count)) ** 0.5
-        if excess > max(chance, _NOTICEABLE * found.drift.box.states.scale[i]):
+        if excess > max(chance, noticeable):
             warnings.append(
                 f'the best drift errs by {error[i]:.3g} {unit} in {name}, of which {excess:.3g} '
                 f'{unit} is not noise ({noise:.3g} {unit} from sample to sample): something that '
                 'is not measured acts too, such as another state or a disturbance, and no lift '
                 'of what is measured can know it')
     return tuple(warnings)
+
+
+def shortfalls(states: Coordinates, wanted: Mapping[str, Sequence[float]]) -> tuple[str, ...]:
+    """
+    Say which set-points that are wanted a trained range leaves out.
+
+    :param wanted: lowest and highest set-point of some of the states by name, in their units.
+    """
+    found = []
+    for name, (low, high) in wanted.items():
+        i = states.names.index(name)
+        lower, upper = states.lower[i], states.upper[i]
+        if max(lower - low, high - upper) > _MISSING * (high - low):
+            unit = Display(states.units[i], display_unit(states.units[i]), '.4g')
+            found.append(
+                f'{name} was trained from {unit.text(lower)} to {unit.text(upper)}, set-points '
+                f'are wanted from {unit.text(low)} to {unit.text(high)}: those outside will be '
+                'refused, record what is missing or narrow setpoint_min and setpoint_max')
+    return tuple(found)
 
 
 def _closed_loops(model: LiftedModel, drift: DriftModel) -> tuple[int, int]:
@@ -281,9 +329,13 @@ def _closed_loops(model: LiftedModel, drift: DriftModel) -> tuple[int, int]:
         for x0 in starts:
             loops += 1
             # a loop that runs away ends as a failure, whatever overflows meanwhile
-            with np.errstate(all='ignore'):
-                run = run_closed_loop(model, drift.rate, x0, x_ref, weights, duration, samples=2,
-                                      rtol=1e-6, max_evaluations=_MAX_EVALUATIONS)
+            try:
+                with np.errstate(all='ignore'):
+                    run = run_closed_loop(model, drift.rate, x0, x_ref, weights, duration,
+                                          samples=2, rtol=1e-6, max_evaluations=_MAX_EVALUATIONS)
+            except ValueError:
+                # outside the lift's range, or held by no input of the lift
+                continue
             miss = np.abs(run.states[-1] - x_ref) / model.states.scale
             arrived += int(not run.failure and bool(np.all(miss < _ARRIVED)))
     return loops, arrived

@@ -76,6 +76,10 @@ def _sections(retrained: Retrained) -> Iterator[str]:
                 range(1, 1 + len(states)))
     yield 'The noise of the measurements is part of each.'
     eigenvalues = ', '.join(f'{value:.3g}' for value in trained.model.eigenvalues)
+    own = trained.model.states
+    yield 'Set-points can be given within ' + ', '.join(
+        f'{low:.5g} to {high:.5g} {unit} of {name}'
+        for name, unit, low, high in zip(own.names, own.units, own.lower, own.upper, strict=True))
     yield (f'Lift: n_z = {trained.model.n_z}, rw = {trained.figures.fit.rw:.2g}, condition number '
            f'{trained.figures.fit.cond:.3g}, eigenvalues {eigenvalues} '
            f'1/{trained.model.time_unit}. Closed loops on the estimated drift: {decision.arrived} '

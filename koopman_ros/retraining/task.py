@@ -19,13 +19,13 @@ from typing import TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
-from koopman_ros.arrays import Array
+from koopman_ros.arrays import Array, brief
 from koopman_ros.bags import Account, loop_episodes, RecordedInput, RecordedState
 from koopman_ros.identification import Identified, identify, Stopped
 from koopman_ros.learning import NoUsefulLift, Progress, Trained
 from koopman_ros.lifting import Box, Coordinates, LiftedModel, load, save
 from koopman_ros.plant_data import Episode, Plant
-from koopman_ros.retraining.lift import decide, Decision, learn_lift, Thresholds
+from koopman_ros.retraining.lift import decide, Decision, learn_lift, shortfalls, Thresholds
 from koopman_ros.units import NANOSECONDS, SECONDS_PER_TIME_UNIT
 from koopman_ros.wire import Place
 
@@ -57,6 +57,9 @@ class Task:
     #: B where it is known, in state unit per input unit and second, by state and input; what is
     #: not named is 0; empty to learn B
     input_gain: Mapping[str, Mapping[str, float]] = field(default_factory=dict)
+    #: lowest and highest set-point that the lift is wanted for, of some states by name, in their
+    #: units
+    setpoints: Mapping[str, tuple[float, float]] = field(default_factory=dict)
     margin: float = 0.1  #: see :class:`Thresholds`
     condition: float = 1e4  #: likewise
 
@@ -90,6 +93,8 @@ class Retrained:
     present: LiftedModel | None  #: the lift that was in use, where there was one
     model_file: str = ''  #: where the lift was written, or an empty string
 
+    __repr__ = brief
+
     @property
     def accepted(self) -> bool:
         """Whether the lift may be used."""
@@ -122,7 +127,10 @@ class Retrained:
             'noise': by_state(self.found.noise),
         }
         if self.decision and self.trained:
+            trained = self.trained.model.states
             figures |= {
+                'trained_from': by_state(trained.lower),
+                'trained_to': by_state(trained.upper),
                 'heldout_error': by_state(self.decision.rmse),
                 'heldout_error_of_present_lift': None if self.decision.current_rmse is None else (
                     by_state(self.decision.current_rmse)),
@@ -192,6 +200,8 @@ def retrain(task: Task, on_progress: OnProgress = lambda *_: False) -> Retrained
     # a training that was stopped ends with its best so far
     _stop_if(on_progress(_at('decide', 0.0), 'judging'))
     decision = decide(found, trained, current, thresholds)
+    decision = replace(decision, warnings=(
+        *decision.warnings, *shortfalls(trained.model.states, task.setpoints)))
     _stop_if(on_progress(_at('decide', 0.9), 'writing'))
     model = _with_provenance(trained.model, found, decision, min(bare.coverage.values()),
                              episodes)

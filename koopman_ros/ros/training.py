@@ -80,6 +80,7 @@ class Training:
             'inputs': [{'name': name, 'unit': unit, 'command': found(wiring.commands[name]),
                         'measured': found(wiring.applied[name]),
                         'delay': settings.inputs[name].delay} for name, unit in inputs.items()],
+            'setpoints': settings.setpoint_ranges(wiring.signals),
             'tolerance': settings.synchronisation_tolerance,
             'input_gain': {state: dict(zip(inputs, row, strict=True))
                            for state, row in zip(states, gains, strict=False)}}

@@ -4,6 +4,7 @@
 """From a drift to a lift: steady point, samples; the gate: what is let through, and why."""
 
 from dataclasses import replace
+import re
 import sys
 
 import numpy as np
@@ -28,6 +29,7 @@ from koopman_ros.retraining.lift import (
     _spread,
     drift_samples,
     lifted_rate,
+    shortfalls,
     steady_point,
 )
 from support.known_plants import box, methods
@@ -173,7 +175,9 @@ def test_warns_of_a_state_that_is_not_measured(trained, shipped):
     run = driven(two_state_reactor(), 20.0, coolant=(294.0, 302.0), seed=2, noise=0.03)
     found = identify(shipped.plant, [run.episode()], degrees=(1, 2), methods=methods(20))
     decision = decide(found, trained, shipped, Thresholds())
-    (warning,) = decision.warnings
+    coloured, warning = decision.warnings
+    # what is not measured moves slowly
+    assert coloured.startswith('the noise of temperature is coloured (autocorrelation 0.')
     assert warning.startswith(
         f'the best drift errs by {decision.drift_rmse[0]:.3g} K in temperature, of which ')
     assert 'something that is not measured acts too' in warning
@@ -182,6 +186,45 @@ def test_warns_of_a_state_that_is_not_measured(trained, shipped):
     assert decision.drift_rmse > 1.5 * decision.noise
     # it is judged by what it does, not by the warning
     assert warning not in decision.reasons
+
+
+@pytest.mark.usefixtures('no_loops')
+def test_noise_that_is_coloured_is_named(found, trained, shipped):
+    """The autocorrelation of n_k = 0.8 n_(k-1) + e_k is 0.8."""
+    rng = np.random.default_rng(0)
+
+    def noisy(colour):
+        episodes = []
+        for clean in found.held_out:
+            n = rng.standard_normal(len(clean))
+            for k in range(1, len(n)):
+                n[k] = colour * n[k - 1] + np.sqrt(1.0 - colour ** 2) * n[k]
+            segments = Segments.of([clean], longest_step([clean]))
+            path = segments.path(found.drift.rate, clean.x[:1])[segments.measured[:, 0], 0]
+            episodes.append(replace(clean, x=path + NOISE * n[:, None]))
+        return decide(replace(found, held_out=tuple(episodes)), trained, shipped, Thresholds())
+
+    assert noisy(0.0).warnings == ()
+    (said, *_) = noisy(0.8).warnings
+    match = re.match(r'the noise of temperature is coloured \(autocorrelation (0\.\d\d) from '
+                     r'sample to sample .*it tells as much as (\d+) % of the samples', said)
+    # of three segments of 60 samples, whose starts are fitted
+    r = float(match[1])
+    assert r == pytest.approx(0.8, abs=0.2)
+    assert float(match[2]) == pytest.approx(100.0 * (1.0 - r) / (1.0 + r), abs=1.0)
+
+
+@pytest.mark.parametrize(('wanted', 'words'), [
+    ({}, ()), ({'temperature': (306.0, 326.0)}, ()),
+    # by less than a twentieth of 20 K
+    ({'temperature': (306.0, 327.9)}, ()),
+    ({'temperature': (306.0, 329.5)}, ('temperature was trained from 31.85 degC to 53.85 degC, '
+                                       'set-points are wanted from 32.85 degC to 56.35 degC',)),
+    ({'temperature': (290.0, 326.0)}, ('temperature was trained from',))])
+def test_set_points_that_a_trained_range_leaves_out(shipped, wanted, words):
+    said = shortfalls(shipped.states, wanted)
+    assert len(said) == len(words)
+    assert all(text.startswith(word) for text, word in zip(said, words, strict=True))
 
 
 def test_loops_of_more_states_than_inputs_go_where_an_input_holds_them():
