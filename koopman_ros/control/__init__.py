@@ -13,6 +13,7 @@ from koopman_ros.control.events import (
     SetpointRequest,
     Silence,
 )
+from koopman_ros.control.hindsight import compare, Comparison, Recent, Windows
 from koopman_ros.control.laws import averaged, Feedback, feedback, Form, LAWS, recentred, Weights
 from koopman_ros.control.laws.base import steady_state_target, Target
 from koopman_ros.control.limits import InputLimits, limit
@@ -43,10 +44,10 @@ from koopman_ros.control.supervisor import (
     SupervisorSettings,
 )
 
-__all__ = ['HOLD', 'LAWS', 'MANUAL', 'SAFE', 'Arrival', 'Change', 'ClosedLoop', 'Controller',
-           'Event', 'Feedback', 'Form', 'Initialisation', 'InputLimits', 'LevelSettings', 'Loop',
-           'ManualCommand', 'Measurement', 'Mode', 'ModeChange', 'Plant', 'Report', 'Sensor',
-           'Setpoint', 'SetpointRequest', 'Settings', 'Silence', 'Simulation', 'State',
-           'Supervisor', 'SupervisorSettings', 'Target', 'Timed', 'Weights', 'at', 'averaged',
-           'exchange', 'feedback', 'limit', 'perfect', 'recentred', 'restart', 'run_closed_loop',
-           'simulate', 'steady_state_target']
+__all__ = ['HOLD', 'LAWS', 'MANUAL', 'SAFE', 'Arrival', 'Change', 'ClosedLoop', 'Comparison',
+           'Controller', 'Event', 'Feedback', 'Form', 'Initialisation', 'InputLimits',
+           'LevelSettings', 'Loop', 'ManualCommand', 'Measurement', 'Mode', 'ModeChange', 'Plant',
+           'Recent', 'Report', 'Sensor', 'Setpoint', 'SetpointRequest', 'Settings', 'Silence',
+           'Simulation', 'State', 'Supervisor', 'SupervisorSettings', 'Target', 'Timed', 'Weights',
+           'Windows', 'at', 'averaged', 'compare', 'exchange', 'feedback', 'limit', 'perfect',
+           'recentred', 'restart', 'run_closed_loop', 'simulate', 'steady_state_target']

@@ -24,6 +24,7 @@ from koopman_ros.control import (
     events,
     MANUAL,
     Mode,
+    Recent,
     Report,
     Setpoint,
     State,
@@ -113,12 +114,15 @@ class ControllerNode(ManagedNode):
         self._words = words_of(signals)
         self._models = ModelReload(
             self, loaded, signals, lambda: Situation(
-                self._tuning, self._state, self._measured),
+                self._tuning, self._state, self._measured,
+                self._recent.windows(self._settings.model_check_length),
+                self._settings.model_check_factor),
             lambda: self._exchange(records.MODEL, {'model': self._models.in_force.identity}),
             lambda: self._diagnostics.publish_if_changed())
         self._tuning = parameters.settings(signals)
         self._controller = self._built()
         self._state = State()
+        self._recent = Recent()
         self._lock, self._telling = threading.Lock(), threading.Lock()
         self._report = self._logged = Report(Mode.AUTOMATIC, next(iter(self._controller.levels)))
         self._refused = self._rests_outside = ''
@@ -274,6 +278,8 @@ class ControllerNode(ManagedNode):
                 'waits: choose a smaller model', throttle_duration_sec=1.0)
             return
         report = outcome.report
+        self._recent.add(
+            asked, report.measurement, before.command, self._settings.model_check_length)
         self._measured = sample.values
         self._counts.measurements += 1
         self._counts.late += report.measurement.arrival is Arrival.LATE

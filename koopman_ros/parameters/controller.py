@@ -138,6 +138,13 @@ class ControllerParameters:
     min_riccati_digits: float = parameter(
         8.0, 'decimal digits to which a solution must fulfil its Riccati equation to be acted on',
         '', 0.0, 15.0)
+    model_check_factor: float = parameter(
+        2.0, 'how many times worse than the present model another one may predict what was '
+        'measured lately, and yet be put into the running loop; 0 for any', '', 0.0, 1e6,
+        smallest=1.0)
+    model_check_length: float = parameter(
+        600.0, 'how much of what was measured is kept for that', 's', 0.0, 86400.0,
+        open_minimum=True)
     states: Mapping[str, StateParameters] = per_signal(StateParameters)
     inputs: Mapping[str, InputParameters] = per_signal(InputParameters)
 
@@ -189,11 +196,15 @@ def _cross_check(signals: Signals, values: ControllerParameters) -> str:
 
 
 def _times(model: LiftedModel) -> dict[str, float]:
-    """Return the times that suit a model's fastest mode; an unstable plant cannot wait."""
-    modes = np.linalg.eigvals(model.drift_jacobian(np.zeros(model.n_x)))
-    fastest = float(np.max(np.abs(modes))) / model.seconds_per_time_unit
+    """Return the times that suit a model's modes; an unstable plant cannot wait."""
+    modes = np.linalg.eigvals(
+        model.drift_jacobian(np.zeros(model.n_x))) / model.seconds_per_time_unit
+    fastest, slowest = float(np.max(np.abs(modes))), float(np.min(np.abs(modes)))
     stable = bool(np.all(modes.real < 0.0)) and fastest > 0.0
-    return {'transfer_time': min(float(f'{0.5 / fastest:.2g}'), 86400.0) if stable else 0.0,
+    # a window, a fifth of it, is to show the slowest mode, and not to let an unstable one run off
+    shown = max(slowest, 0.1 * fastest, float(np.max(modes.real)), 1e-3)
+    return {'model_check_length': min(float(f'{10.0 / shown:.2g}'), 86400.0),
+            'transfer_time': min(float(f'{0.5 / fastest:.2g}'), 86400.0) if stable else 0.0,
             'disturbance_bandwidth': min(float(f'{fastest:.2g}'), 1000.0) if stable else 0.0}
 
 

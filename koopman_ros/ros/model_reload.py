@@ -20,7 +20,7 @@ from rclpy.task import Future
 from std_srvs.srv import Trigger
 
 from koopman_ros.arrays import Array
-from koopman_ros.control import Controller, Settings, State
+from koopman_ros.control import compare, Controller, Settings, State, Windows
 from koopman_ros.lifting import Coordinates, LiftedModel, load_with_digest, ModelFileError
 from koopman_ros.parameters.controller import ControllerParameters, table_of
 from koopman_ros.parameters.wire import Signals, signals_of
@@ -48,6 +48,7 @@ class LoadedModel:
     model: LiftedModel
     file_time: str  #: when the file was written, in UTC
     digest: str  #: SHA-256 of the file
+    comparison: str = ''  #: with the model before, on what was measured then; empty at the start
 
     @property
     def identity(self) -> dict[str, str]:
@@ -67,6 +68,8 @@ class Situation:
     settings: Settings
     state: State
     measured: Array  #: (n_x,) last measurement; NaN before the first
+    recent: Windows | None  #: what was measured lately; None while that is too little
+    max_ratio: float  #: of the errors with which it and the present model predict that; 0 for any
 
 
 def ranges(model: LiftedModel) -> str:
@@ -156,6 +159,29 @@ def refuse_without_law(model: LiftedModel, situation: Situation) -> None:
                     'weights')
 
 
+def refuse_worse(present: LiftedModel, model: LiftedModel, situation: Situation) -> str:
+    """
+    Raise ModelFileError for a model that predicts what was measured lately much worse.
+
+    :return: how well it does beside the present one, in words.
+    """
+    found = None if situation.recent is None else compare(present, model, situation.recent)
+    if found is None:
+        return 'not compared with the model before: too little was measured so far'
+    i = int(np.argmax(found.ratio))
+    name, unit = model.states.names[i], model.states.units[i]
+    words = (f'predicts {name} of the last {found.seconds:.3g} s with an error of '
+             f'{found.candidate[i]:.2g} {unit}, the {{}} with {found.present[i]:.2g} {unit}')
+    # written so that NaN is refused, too
+    if situation.max_ratio and not found.ratio[i] <= situation.max_ratio:
+        raise ModelFileError(
+            f'the model {words.format("present one")}, at most '
+            f'{situation.max_ratio * found.allowance[i]:.2g} {unit} are allowed: train it again '
+            'with more data, or set model_check_factor = 0 to load it all the same')
+    return words.format('model before') + (
+        '' if found.tells else '; nothing moved that would tell more')
+
+
 def listed(signals: Coordinates, values: Array) -> str:
     """Write values (n,) for the operator."""
     return ', '.join(
@@ -188,7 +214,8 @@ def rests_outside(controller: Controller) -> str:
 class _Trial:
     """A model file on its way, in a thread of its own that does not keep the process."""
 
-    def __init__(self, node: Node, name: str, signals: Signals, situation: Situation) -> None:
+    def __init__(self, node: Node, name: str, signals: Signals, situation: Situation,
+                 present: LiftedModel) -> None:
         self.outcome = Future()
         self.path = name
         # the folder in which the process was started may be gone
@@ -197,15 +224,17 @@ class _Trial:
         self.mount = _mount_of(self.path)
         self.reading = True
         self.thread = threading.Thread(
-            target=self._run, args=(name, signals, situation), daemon=True)
+            target=self._run, args=(name, signals, situation, present), daemon=True)
         self._node = node
 
-    def _run(self, name: str, signals: Signals, situation: Situation) -> None:
+    def _run(self, name: str, signals: Signals, situation: Situation,
+             present: LiftedModel) -> None:
         outcome: LoadedModel | str
         try:
             outcome = load_suitable(name, signals)
             refuse_setpoints(outcome.model, situation)
             refuse_without_law(outcome.model, situation)
+            outcome = replace(outcome, comparison=refuse_worse(present, outcome.model, situation))
         except (ModelFileError, FileNotFoundError) as error:
             outcome = str(error)
         except Exception as error:
@@ -287,7 +316,8 @@ class ModelReload:
         if 'model' not in changes:
             return ''
         trial = self._start(parameters.model, replace(
-            self._situation(), settings=parameters.settings(self._signals)))
+            self._situation(), settings=parameters.settings(self._signals),
+            max_ratio=parameters.model_check_factor))
         if not trial.outcome.done():
             trial.thread.join(_SHORT_WAIT)
         outcome = trial.outcome.result() if trial.outcome.done() else (
@@ -317,10 +347,11 @@ class ModelReload:
             'model training data': self.in_force.model.provenance.data_digest[:12] or 'none',
             'model reloads': self.reloads,
             'model refused': self.refused or 'none',
+            'model check': self.in_force.comparison or 'none',
         }
 
     def _start(self, name: str, situation: Situation) -> _Trial:
-        trial = _Trial(self._node, name, self._signals, situation)
+        trial = _Trial(self._node, name, self._signals, situation, self.in_force.model)
         self._reading = [other for other in self._reading if other.reading]
         beside = [other.path for other in self._reading if other.mount == trial.mount]
         if trial.path in beside:
@@ -336,7 +367,7 @@ class ModelReload:
     def _swap(self, loaded: LoadedModel) -> None:
         self.in_force, self.refused = loaded, ''
         self.reloads += 1
-        self._node.get_logger().info(loaded.about)
+        self._node.get_logger().info(f'{loaded.about}; {loaded.comparison}')
 
     def _refuse(self, reason: str) -> str:
         self.refused = f'the old model is kept: {reason}'

@@ -9,6 +9,7 @@ import itertools
 import math
 import os
 from pathlib import Path
+import re
 import sys
 from typing import Any
 
@@ -25,10 +26,13 @@ from std_srvs.srv import Trigger
 
 from koopman_ros.demo import reactor
 from koopman_ros.lifting import LiftedModel, load, save
+from koopman_ros.plants import Process
 from koopman_ros.replay.records import MODEL, PARAMETERS
 from koopman_ros.resources import model_path
 from koopman_ros.ros import model_reload, topics
 from koopman_ros.testing import Harness
+from koopman_ros.units import NANOSECONDS, to_celsius, ZERO_CELSIUS
+from support.closed_loops import REACTOR
 from support.controller_bench import PATIENT, reproduced, STATUS, STEADY
 from support.nodes import opened, temperature, value
 
@@ -50,6 +54,7 @@ class Bench:
     def __init__(self, ros: Harness) -> None:
         self.ros = ros
         self.sent: list[Temperature] = []
+        self.period = 0.1  # s between measurements
         self.commands = ros.listen(Temperature, reactor.COOLANT_SETPOINT)
         self._reload = ros.node.create_client(Trigger, 'controller/reload_model')
         self._set = ros.node.create_client(SetParameters, 'controller/set_parameters')
@@ -85,7 +90,7 @@ class Bench:
     def measure(self, celsius: float | None = None) -> None:
         k = len(self.sent) + 1
         message = temperature(
-            46.0 + math.sin(0.02 * k) if celsius is None else celsius, 0.1 * k)
+            46.0 + math.sin(0.02 * k) if celsius is None else celsius, self.period * k)
         self.sent.append(message)
         self._thermometer.publish(message)
 
@@ -222,6 +227,60 @@ def test_model_changes_with_the_weights_that_it_needs(running: Bench) -> None:
     assert result.successful, result.reason
     assert running.ros.get_parameters('controller', 'model', 'max_gain') == [
         'reactor_linear', 500.0]
+
+
+def test_model_that_predicts_what_was_measured_much_worse_is_refused(
+        ros: Harness, tmp_path: Path) -> None:
+    """It takes over neither by parameter nor by service, unless the operator insists."""
+    file = tmp_path / 'model.safetensors'
+    put(model_path('reactor_nz4').read_bytes(), file)
+    ros.start('controller', {'model': file, 'transfer_time': 0.0, **PATIENT})
+    bench = Bench(ros)
+    bench.period = 5.0
+    setpoint = ros.speak(Temperature, reactor.SETPOINT, to='controller')
+    plant = Process(REACTOR, 0, REACTOR.nominal_state, REACTOR.nominal_input)
+
+    def track(celsius: float, samples: int = 40) -> None:
+        nonlocal plant
+        setpoint.publish(temperature(celsius, 0.0))
+        ros.meet('controller')
+        for _ in range(samples):
+            bench.measure(to_celsius(float(plant.x[0])))
+            plant = plant.commanded(np.array(
+                [bench.wait_for_answers() + ZERO_CELSIUS]), plant.time_ns)
+            plant = plant.until(plant.time_ns + 5 * NANOSECONDS)
+        assert to_celsius(float(plant.x[0])) == pytest.approx(celsius, abs=0.1)
+
+    bench.measure(to_celsius(float(plant.x[0])))
+    bench.wait_for_answers()
+    # nothing is known yet, and what is as good is taken over
+    assert bench.reload()[0]
+    track(45.0)
+    track(48.0)
+    assert bench.set('reactor_nz3')[0]
+    status = ros.wait_for_status(STATUS, lambda s: value(s, 'model') == 'reactor_nz3')
+    assert re.fullmatch(r'predicts temperature of the last 400 s with an error of 0\.00\d+ K, '
+                        r'the model before with 0\.00\d+ K', value(status, 'model check'))
+    assert bench.set(file)[0]
+
+    save(replace(SHIPPED, B=-SHIPPED.B), file)
+    why = (r'the old model is kept: the model predicts temperature of the last 400 s with an '
+           r'error of (\S+) K, the present one with (\S+) K, at most (\S+) K are allowed: train '
+           r'it again with more data, or set model_check_factor = 0 to load it all the same')
+    for done, reason in (bench.reload(), bench.set(f'{file.parent}/./{file.name}')):
+        assert not done
+        found = re.fullmatch(why, reason)
+        assert found, reason
+        wrong, present, allowed = map(float, found.groups())
+        # the response of the plant, turned round, and less than a hundredth of it
+        assert wrong > 0.5 > 0.01 > present
+        assert present < allowed < wrong
+    ros.wait_for_status(STATUS, lambda s: s.message == reason)
+    track(44.0)
+    result = bench.until_read(lambda: ros.set_parameters_atomically(
+        'controller', model=f'{file.parent}/./{file.name}', model_check_factor=0.0))
+    assert result.successful, result.reason
+    assert bench.reload()[0]
 
 
 # Disks that do not answer. A file with a pipe beside it is read when somebody has written to that:

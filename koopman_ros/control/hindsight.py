@@ -1,0 +1,205 @@
+# SPDX-FileCopyrightText: 2026 The koopman_ros Authors
+# SPDX-License-Identifier: Apache-2.0
+
+"""What was measured lately, and how well models predict it: a check before one takes over."""
+
+from __future__ import annotations
+
+from collections import deque
+from dataclasses import dataclass
+import itertools
+
+import numpy as np
+from numpy.typing import NDArray
+
+from koopman_ros.arrays import Array
+from koopman_ros.control.events import Measurement
+from koopman_ros.control.limits import finite
+from koopman_ros.control.state import Arrival, MeasurementReport
+from koopman_ros.lifting import LiftedModel
+from koopman_ros.units import NANOSECONDS
+
+# A row for each hundredth of what is remembered: ten in a time constant by default.
+_ROWS = 100
+# Windows are a fifth of what is remembered, half of one in the next, and no shorter than this.
+_WINDOWS = 5
+_LEAST_STEPS = 8
+_GAP = 3.0  # so many usual steps without a row end a window
+_DIFFERENCE = 1e-5  # of scaled deviations, for slopes
+# An error is as good as none below this share of what a signal moved, and of its training box.
+_SHARE_OF_MOTION, _SHARE_OF_BOX = 0.1, 5e-4
+
+
+class Recent:
+    """
+    The last measurements of all states and the inputs that acted between them.
+
+    It costs the same for each sample, and no more memory however many there are: of rows closer
+    than a hundredth of what is to be remembered some are left out, their inputs averaged.
+    """
+
+    def __init__(self) -> None:
+        self._rows: deque[tuple[int, Array, Array]] = deque(maxlen=_ROWS + 1)
+        self._time_ns = self._row_ns = 0  # of the last sample, of the last row
+        self._impulse: Array | float = 0.0  # integral of the inputs since that row, in ns
+
+    def add(self, event: Measurement, report: MeasurementReport, command: Array | None,
+            seconds: float) -> None:
+        """
+        Take a measurement of all states into account; one that is older begins anew.
+
+        :param report: what became of it.
+        :param command: (n_u,) in force before it, or None; where the input is measured, that
+            counts.
+        :param seconds: how much is to be remembered.
+        """
+        if report.arrival not in (Arrival.ACCEPTED, Arrival.REJECTED):
+            return
+        known = event.applied is not None and finite(event.applied)
+        u = event.applied if known else command
+        if event.stamp_ns <= self._time_ns or u is None:
+            self._rows.clear()
+        elif self._rows:
+            self._impulse = self._impulse + (event.stamp_ns - self._time_ns) * u
+        self._time_ns = event.stamp_ns
+        passed = event.stamp_ns - self._row_ns
+        if report.arrival is Arrival.REJECTED or (
+                self._rows and passed * _ROWS < seconds * NANOSECONDS):
+            return
+        # nothing has acted before the first
+        mean = self._impulse / passed if self._rows else np.empty(0)
+        self._rows.append((event.stamp_ns, event.measured, np.asarray(mean)))
+        self._row_ns, self._impulse = event.stamp_ns, 0.0
+
+    def windows(self, seconds: float) -> Windows | None:
+        """Cut what is younger into windows, or return None where it is too little for one."""
+        oldest = self._time_ns - round(seconds * NANOSECONDS)
+        # where measurements are that rare, they are all there is
+        count = max(_LEAST_STEPS + 1, sum(row[0] >= oldest for row in self._rows))
+        rows = list(self._rows)[-count:]
+        if len(rows) <= _LEAST_STEPS:
+            return None
+        x = np.array([row[1] for row in rows])
+        u = np.array([row[2] for row in rows[1:]])
+        steps = np.array([(row[0] - before[0]) / NANOSECONDS
+                          for before, row in itertools.pairwise(rows)])
+        usual = float(np.median(steps))
+        K = max(_LEAST_STEPS, round(seconds / _WINDOWS / usual))
+        # the last one ends with the last row
+        places = np.arange(len(steps) - K, -1, -max(1, K // 2))[:, None] + np.arange(K)
+        places = places[(steps[places] <= _GAP * usual).all(axis=1)]
+        return Windows(x, u, steps, places) if len(places) else None
+
+
+@dataclass(frozen=True)
+class Windows:
+    """N measurements in M windows of K steps each."""
+
+    x: Array  #: (N, n_x) measured, in units
+    u: Array  #: (N - 1, n_u) inputs held between them, in units
+    steps: Array  #: (N - 1,) time between them, in s
+    places: NDArray[np.intp]  #: (M, K) which steps are in a window
+
+    @property
+    def seconds(self) -> float:
+        """How long ago they began."""
+        return float(self.steps.sum())
+
+    @property
+    def motion(self) -> Array:
+        """How far (n_x,) the signals moved: root mean square distance from a window's mean."""
+        x = self.x[self.places]
+        return rms(np.mean(np.square(x - x.mean(axis=1, keepdims=True)), axis=1))
+
+    def squares(self, model: LiftedModel, size: Array) -> Array:
+        """
+        Return the mean squared errors (M, n_x) with which a model predicts, in units squared.
+
+        Start and a constant disturbance of each window are those that suit the model best: a
+        measured start would bring its noise into the prediction, and whatever is constant an
+        observer makes up for. The drift is linearised at what was measured, which makes that one
+        linear fit and holds near it; far from it the error is large either way. What is not
+        finite has an infinite error.
+
+        :param size: (n_x,) in which errors of the states are weighed, in units.
+        """
+        n, (M, K) = model.n_x, self.places.shape
+        every = np.full((M, n), np.inf)
+        x, eye = model.states.to_deviation(self.x), np.eye(n)
+        h = (self.steps / model.seconds_per_time_unit)[:, None]
+        try:
+            around = model.drift(x + _DIFFERENCE * np.concatenate(
+                [np.zeros((1, n)), eye, -eye])[:, None])
+            f = around[0]
+            # (N, n_x, n_x): df/dx, times half a step
+            F = np.moveaxis(around[1:n + 1] - around[n + 1:], 0, -1) / (2.0 * _DIFFERENCE)
+            half = 0.5 * h[..., None]
+            # the trapezoidal rule for the error e: e' = F e + w + (f + B u - dx/dt)
+            lack = h * (0.5 * (f[1:] + f[:-1]) + model.inputs.to_deviation(self.u) @ model.B.T)
+            right = np.concatenate([(lack - np.diff(x, axis=0))[..., None], np.broadcast_to(
+                h[..., None] * eye, (len(h), n, n)), eye + half * F[:-1]], axis=-1)
+            step = np.linalg.solve(eye - half * F[1:], right)
+        except np.linalg.LinAlgError:
+            return every
+        # columns: without a fit, by disturbance, by start
+        e = np.broadcast_to(np.concatenate([np.zeros((n, 1 + n)), eye], axis=1), (M, n, 2 * n + 1))
+        path = [e]
+        for k in self.places.T:
+            e = step[k, :, n + 1:] @ e
+            e[..., :n + 1] += step[k, :, :n + 1]
+            path.append(e)
+        # (M, K + 1, n_x, 2 n_x + 1), in sizes
+        errors = np.stack(path, axis=1) * (model.states.scale / size)[:, None]
+        usable = np.isfinite(errors).all(axis=(1, 2, 3))
+        rows = errors[usable].reshape(-1, (K + 1) * n, 2 * n + 1)
+        length = np.linalg.norm(rows[..., 1:], axis=1, keepdims=True)
+        fitted = rows[..., 1:] / np.maximum(length, np.finfo(np.float64).tiny)
+        rest = rows[..., :1] - fitted @ (np.linalg.pinv(fitted) @ rows[..., :1])
+        every[usable] = np.mean(np.square(rest.reshape(-1, K + 1, n)), axis=1) * size ** 2
+        return every
+
+
+def rms(squares: Array) -> Array:
+    """Return the root of the mean (n,) over windows of squares (M, n)."""
+    found: Array = np.sqrt(squares.mean(axis=0))
+    return found
+
+
+@dataclass(frozen=True)
+class Comparison:
+    """How well two models predict what was measured lately."""
+
+    seconds: float  #: how long that was
+    present: Array  #: (n_x,) root mean square error of the model in force, in units
+    candidate: Array  #: (n_x,) of the one that is to take over; infinite where it diverges
+    motion: Array  #: (n_x,) how far the signals moved
+    negligible: Array  #: (n_x,) an error that is as good as none
+
+    @property
+    def allowance(self) -> Array:
+        """What the candidate's errors (n_x,) are measured by, in units."""
+        found: Array = np.maximum(self.present, self.negligible)
+        return found
+
+    @property
+    def ratio(self) -> Array:
+        """How many times (n_x,) as much as the present model the candidate errs."""
+        return self.candidate / self.allowance
+
+    @property
+    def tells(self) -> bool:
+        """Whether something moved, and as the present model says."""
+        return bool(np.any((self.motion > self.negligible) & (self.present < 0.5 * self.motion)))
+
+
+def compare(present: LiftedModel, candidate: LiftedModel, windows: Windows
+            ) -> Comparison | None:
+    """Let two models of the same states predict; None where the present one never can."""
+    box, motion = present.states, windows.motion
+    negligible = np.maximum(_SHARE_OF_MOTION * motion, _SHARE_OF_BOX * (box.upper - box.lower))
+    with np.errstate(all='ignore'):
+        own, new = (windows.squares(model, negligible) for model in (present, candidate))
+    known = np.isfinite(own).all(axis=1)
+    if not known.any():
+        return None
+    return Comparison(windows.seconds, rms(own[known]), rms(new[known]), motion, negligible)

@@ -1,0 +1,199 @@
+# SPDX-FileCopyrightText: 2026 The koopman_ros Authors
+# SPDX-License-Identifier: Apache-2.0
+
+"""What was measured lately, and which models predict it no worse than the present one."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from scipy.signal import cont2discrete
+
+from koopman_ros.control import SetpointRequest
+from koopman_ros.control.events import Measurement
+from koopman_ros.control.hindsight import compare, Recent, Windows
+from koopman_ros.control.simulate import at, simulate
+from koopman_ros.control.state import Arrival, MeasurementReport
+from koopman_ros.lifting import Coordinates, LiftedModel, linearised_model, Provenance
+from koopman_ros.plants import Process
+from support.closed_loops import controller, REACTOR, SECOND, shipped, START
+
+ACCEPTED, REJECTED = MeasurementReport(Arrival.ACCEPTED), MeasurementReport(Arrival.REJECTED)
+A, B = np.array([[-0.02, 0.01], [0.0, -0.05]]), np.array([[0.0], [0.1]])
+
+
+def model(A: np.ndarray = A, B: np.ndarray = B) -> LiftedModel:
+    """Return dx/dt = A x + B u of two states, in s."""
+    x, u = (Coordinates(names, ('1',) * n, np.full(n, 3.0), np.full(n, 2.0), np.zeros(n),
+                        np.full(n, 6.0))
+            for names, n in ((('x1', 'x2'), 2), (('u',), 1)))
+    return linearised_model(A, B, x, u, 's', Provenance('two lags'))
+
+
+def recent(x: np.ndarray, u: np.ndarray, length: float, seconds: float = 1.0) -> Recent:
+    """Remember samples (N, n_x), before each of which inputs (N, n_u) acted."""
+    found = Recent()
+    for k, (value, held) in enumerate(zip(x, u, strict=True)):
+        found.add(Measurement(round((1 + k * seconds) * SECOND), value), ACCEPTED, held, length)
+    return found
+
+
+def two_lags(u: np.ndarray, A: np.ndarray = A, B: np.ndarray = B) -> np.ndarray:
+    """Respond to deviations (N, 1) of the input from 3, held over the second before each."""
+    step, gain, *_ = cont2discrete((A, B, np.eye(2), np.zeros((2, 1))), 1.0)
+    x = np.zeros((len(u), 2))
+    for k in range(1, len(u)):
+        x[k] = step @ x[k - 1] + gain @ u[k]
+    return x
+
+
+def random_steps(count: int, seed: int = 0) -> np.ndarray:
+    return np.repeat(np.random.default_rng(seed).uniform(-1.0, 1.0, (count // 20 + 1, 1)), 20,
+                     axis=0)[:count]
+
+
+def test_errors_are_those_of_the_best_start_and_disturbance():
+    """Against the exact response of the wrong model, and a least-squares fit of each window."""
+    u = random_steps(101)
+    x = two_lags(u)
+    windows = recent(x + 3.0, u + 3.0, 100.0).windows(100.0)
+    K = 20
+    assert windows.places.tolist() == [
+        list(range(start, start + K)) for start in range(80, -1, -10)]
+    wrong = -0.5 * B
+    found = windows.squares(model(B=wrong), np.array([1.0, 4.0]))
+    weights = np.array([1.0, 0.25])
+    for squares, (first, *_) in zip(found, windows.places, strict=True):
+        part = np.concatenate([np.zeros((1, 1)), u[first + 1:first + K + 1]])
+        alone = two_lags(part, B=wrong)
+        constant = np.concatenate([np.zeros((1, 1)), np.ones((K, 1))])
+        columns = [two_lags(constant, B=unit[:, None]) for unit in np.eye(2)]
+        decay = cont2discrete((A, B, np.eye(2), np.zeros((2, 1))), 1.0)[0]
+        columns += [np.array([np.linalg.matrix_power(decay, k) @ unit for k in range(K + 1)])
+                    for unit in np.eye(2)]
+        fit = np.stack([(column * weights).ravel() for column in columns], axis=1)
+        target = ((alone - x[first:first + K + 1]) * weights).ravel()
+        rest = target - fit @ np.linalg.lstsq(fit, target)[0]
+        expected = np.mean(np.square(rest.reshape(K + 1, 2) / weights), axis=0)
+        # the trapezoidal rule errs by (0.05 s / s)^2 / 12 in each step
+        np.testing.assert_allclose(np.sqrt(squares), np.sqrt(expected), rtol=0.01, atol=1e-4)
+    np.testing.assert_allclose(np.sqrt(windows.squares(model(), np.ones(2))), 0.0, atol=1e-4)
+
+
+@pytest.mark.parametrize(('other', 'accepted'), [
+    (model(), True), (model(B=1.1 * B), True), (model(A=1.2 * A), True),
+    (model(B=-B), False), (model(B=0.0 * B), False), (model(B=5.0 * B), False),
+    (model(A=-A), False), (model(A=20.0 * A), False), (model(A=1e300 * A), False),
+    (model(B=1e300 * B), False)])
+@pytest.mark.parametrize('noise', [0.0, 0.01])
+def test_models_are_told_apart_where_something_moves(other, accepted, noise):
+    u = random_steps(301, 1)
+    x = two_lags(u) + noise * np.random.default_rng(2).normal(size=(301, 2))
+    found = compare(model(), other, recent(x + 3.0, u + 3.0, 200.0).windows(200.0))
+    assert found.tells
+    assert found.seconds == 200.0
+    assert bool(np.all(found.ratio <= 2.0)) is accepted
+
+
+def test_steady_noise_tells_nothing():
+    noise = 0.1 * np.random.default_rng(3).normal(size=(300, 2))
+    held = np.full((300, 1), 3.0)
+    for x in (3.0 + noise, np.full((300, 2), 3.0)):
+        windows = recent(x, held, 200.0).windows(200.0)
+        for other in (model(B=-B), model(A=0.5 * A)):
+            found = compare(model(), other, windows)
+            assert not found.tells
+            assert np.all(found.ratio <= 1.1)
+
+
+@pytest.mark.parametrize('noise', [0.0, 0.1])
+def test_reactor_under_control_tells_lifts_from_models_of_another(noise):
+    lift = shipped('reactor_nz4')
+    run = simulate(
+        controller(lift, observer_bandwidth=0.1),
+        Process(REACTOR, 0, REACTOR.nominal_state, REACTOR.nominal_input),
+        [at(500.0, SetpointRequest(0, np.array([START - 4.0]))),
+         at(700.0, SetpointRequest(0, np.array([START - 1.0])))],
+        duration=1000.0, noise=np.array([noise]))
+    windows = recent(run.measured, run.inputs, 600.0).windows(600.0)
+    ratio = {name: float(compare(lift, other, windows).ratio[0]) for name, other in {
+        'fewer coordinates': shipped('reactor_nz3'), 'linear': shipped('reactor_linear'),
+        'other way': replace(lift, B=-lift.B), 'no way': replace(lift, B=0.0 * lift.B),
+        'ten times slower': replace(lift, A=0.1 * lift.A, B=0.1 * lift.B)}.items()}
+    assert {name for name, found in ratio.items() if found <= 2.0} == {
+        'fewer coordinates', 'linear'}
+    # the other way about, the better model is welcome
+    assert compare(replace(lift, B=-lift.B), lift, windows).ratio[0] < 0.5
+
+
+def test_model_that_cannot_predict_has_no_opinion():
+    windows = recent(3.0 + two_lags(random_steps(101)), 3.0 + random_steps(101), 100.0
+                     ).windows(100.0)
+    hopeless = model(B=1e300 * B)
+    assert compare(hopeless, model(), windows) is None
+    assert np.all(compare(model(), hopeless, windows).candidate == np.inf)
+
+
+def test_memory_is_bounded_and_averages_the_inputs():
+    """Of samples 1 ms apart a row in ten is kept, with the mean of five ups and five downs."""
+    u = np.tile([[2.0], [0.0]], (2000, 1))
+    x = np.arange(4000.0)[:, None]
+    windows = recent(x, u, 1.0, 1e-3).windows(1.0)
+    assert windows.x.ravel().tolist() == list(range(3000, 4000, 10))
+    np.testing.assert_allclose(windows.u, 1.0, rtol=1e-12)
+    np.testing.assert_allclose(windows.steps, 0.01, rtol=1e-9)
+    assert windows.places.shape == (8, 20)
+
+
+def samples(found: Recent, times: range, report: MeasurementReport = ACCEPTED,
+            u: np.ndarray | None = None, applied: np.ndarray | None = None) -> Recent:
+    for time in times:
+        found.add(Measurement(time * SECOND, np.array([float(time)]), applied), report,
+                  np.zeros(1) if u is None else u, 100.0)
+    return found
+
+
+def cut(found: Recent, seconds: float = 40.0) -> Windows:
+    windows = found.windows(seconds)
+    assert windows is not None
+    return windows
+
+
+def test_too_little_is_no_window():
+    assert Recent().windows(40.0) is None
+    assert samples(Recent(), range(1, 9)).windows(40.0) is None
+    assert cut(samples(Recent(), range(1, 10))).places.tolist() == [list(range(8))]
+    # a fifth of what is to be remembered
+    assert samples(Recent(), range(1, 20)).windows(100.0) is None
+    # rare measurements are all there is
+    assert cut(samples(Recent(), range(100, 1000, 100))).places.shape == (1, 8)
+
+
+def test_clock_that_goes_back_or_an_unknown_input_begins_anew():
+    assert cut(samples(samples(Recent(), range(50, 90)), range(1, 10))).x.ravel().tolist() == list(
+        range(1, 10))
+    found = samples(Recent(), range(1, 30))
+    found.add(Measurement(30 * SECOND, np.array([30.0])), ACCEPTED, None, 100.0)
+    assert found.windows(40.0) is None
+
+
+def test_no_window_spans_a_gap():
+    windows = cut(samples(samples(Recent(), range(1, 12)), range(20, 40)))
+    assert np.max(windows.steps) == 9.0
+    assert np.all(windows.steps[windows.places] == 1.0)
+    assert len(windows.places) == 4
+
+
+def test_rejected_measurement_leaves_its_input_and_late_ones_nothing():
+    found = samples(Recent(), range(1, 10))
+    samples(found, range(10, 11), REJECTED, np.ones(1))
+    samples(found, range(9, 10), MeasurementReport(Arrival.LATE), np.full(1, 9.0))
+    windows = cut(samples(found, range(11, 12)))
+    assert windows.x.ravel().tolist() == [*range(1, 10), 11]
+    assert windows.u.ravel().tolist() == [0.0] * 8 + [0.5]
+
+
+def test_measured_input_counts_where_it_is_a_number():
+    found = samples(Recent(), range(1, 6), u=np.ones(1), applied=np.full(1, 2.0))
+    samples(found, range(6, 11), u=np.ones(1), applied=np.full(1, np.nan))
+    assert cut(found).u.ravel().tolist() == [2.0] * 4 + [1.0] * 5
