@@ -11,6 +11,7 @@ import hashlib
 import itertools
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from koopman_ros.arrays import Array, brief, frozen
 from koopman_ros.units import check_time_unit
@@ -147,6 +148,27 @@ def cut(episodes: Sequence[Episode], samples: int) -> list[Episode]:
         count = max(1, -(-(len(episode) - 1) // (samples - 1)))
         edges = np.round(np.linspace(0, len(episode) - 1, count + 1)).astype(int)
         parts += [episode.part(a, b + 1) for a, b in itertools.pairwise(edges) if b > a]
+    return parts
+
+
+def within(episodes: Sequence[Episode], lower: ArrayLike, upper: ArrayLike, samples: int = 2
+           ) -> list[Episode]:
+    """
+    Cut episodes where a state leaves a range, for a training box that ends there.
+
+    :param lower: lower corner of the range, a scalar or (n_x,), in state units; upper likewise.
+    :param samples: the least of a part; shorter ones are left out.
+    :raises ValueError: when nothing is left.
+    """
+    low, high = (np.asarray(corner, dtype=np.float64) for corner in (lower, upper))
+    parts: list[Episode] = []
+    for episode in episodes:
+        inside = np.all((episode.x >= low) & (episode.x <= high), axis=1)
+        edges = np.flatnonzero(np.diff(inside, prepend=False, append=False)).reshape(-1, 2)
+        parts += [episode.part(a, b) for a, b in edges.tolist() if b - a >= samples]
+    if not parts:
+        raise ValueError(f'no {samples} samples in a row lie between {low} and {high}: choose '
+                         'a wider range, or record within this one')
     return parts
 
 

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from koopman_ros.control import Simulation
-from koopman_ros.plant_data import cut, Episode, Samples, split_by_episode
+from koopman_ros.plant_data import cut, Episode, Samples, split_by_episode, within
 from support.small_plants import BENT, bent_samples, TWO_STATE
 
 
@@ -189,6 +189,21 @@ def test_split_depends_on_its_seed_alone_and_needs_three_episodes():
 
 
 # What is given is checked where it is given.
+
+def test_episodes_are_cut_where_a_state_leaves_a_range():
+    x = np.array([[0.0, 5.0], [1.0, 5.0], [2.0, 5.0], [1.0, 9.5], [1.0, 5.0], [0.5, 5.0],
+                  [0.4, -1.0], [0.3, 5.0]])
+    episode = Episode(np.arange(8.0), x, np.array([0.0, 4.5]), np.array([[1.0], [2.0]]))
+    first, second = within([episode], [0.0, 0.0], [2.0, 9.0])
+    assert (first.time.tolist(), second.time.tolist()) == ([0.0, 1.0, 2.0], [4.0, 5.0])
+    # with the inputs that acted
+    assert second.inputs_at(second.time)[:, 0].tolist() == [1.0, 2.0]
+    parts = within([episode, episode], 0.0, 9.0, samples=1)
+    assert [len(part) for part in parts] == [3, 2, 1, 3, 2, 1]
+    assert [len(part) for part in within([episode], -9.0, 99.0)] == [8]
+    with pytest.raises(ValueError, match=r'no 4 samples in a row lie between \[0. 0.\] and'):
+        within([episode], [0, 0], [2, 9], samples=4)
+
 
 @pytest.mark.parametrize(('plant', 'change', 'message'), [
     (BENT, {'time_unit': 'h'}, "time_unit must be 's' or 'min', got 'h': give times and rates"),
