@@ -7,7 +7,6 @@ from koopman_ros.learning.baselines import Algorithm1, Edmd, Linearisation
 from koopman_ros.learning.growth import Growth
 from koopman_ros.learning.training import NoUsefulLift, Progress, train, Trained
 from koopman_ros.learning.validation import (
-    compare_closed_loops,
     evaluate,
     Figures,
     Fit,
@@ -18,5 +17,5 @@ from koopman_ros.learning.validation import (
 
 __all__ = [
     'Algorithm1', 'Edmd', 'Figures', 'Fit', 'Growth', 'Linearisation', 'NoUsefulLift', 'Progress',
-    'Trained', 'compare_closed_loops', 'evaluate', 'fit', 'roll_out', 'rollout_rmse', 'train',
+    'Trained', 'evaluate', 'fit', 'roll_out', 'rollout_rmse', 'train',
 ]

@@ -6,7 +6,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Generator
-from contextlib import closing
+import contextlib
 from dataclasses import dataclass, replace
 from functools import cached_property
 import math
@@ -20,21 +20,19 @@ import torch
 
 from koopman_ros import __version__
 from koopman_ros.arrays import brief
+from koopman_ros.control.law_check import check_law, LawCheck, LOOPS, Rate
 from koopman_ros.learning.baselines import Algorithm1, Edmd
 from koopman_ros.learning.contradictions import check_nominal_point, check_rates
 from koopman_ros.learning.growth import Grown, Growth, Monitor
 from koopman_ros.learning.levenberg_marquardt import MinimumStatus
 from koopman_ros.learning.residuals import deviations, ScaledSamples
-from koopman_ros.learning.validation import (
-    ClosedLoopComparison,
-    compare_closed_loops,
-    evaluate,
-    Figures,
-    Fit,
-    fit,
-)
+from koopman_ros.learning.validation import evaluate, Figures, Fit, fit, lifted_rate
 from koopman_ros.lifting import Box, LiftedModel, NetworkObservables, Provenance, TrainingStates
 from koopman_ros.plant_data import Plant, Samples, split_by_episode
+
+# Polynomials on which a law is tried.
+_HIGHEST_DEGREE = 5
+_SAMPLES_OF_MONOMIAL = 5
 
 Recipe = Growth | Algorithm1
 
@@ -49,6 +47,7 @@ class Progress:
     iteration: int  #: step within a start that is under way in this process, else 0
     residual: float  #: root mean square of the residuals there, else NaN
     rw: float  #: best validation figure so far, NaN before the first
+    checked: float = 0.0  #: share that is done of the closed loops, which come last
 
 
 # Called after every step and start; True ends the training with the best so far.
@@ -63,9 +62,9 @@ class Trained:
     model: LiftedModel
     figures: Figures  #: those figures
     linear: Figures  #: the figures of the linear model that fits the training episodes best
-    #: the winner's law beside the linear one's; None without inputs, or when nothing was to be
-    #: refused
-    closed_loop: ClosedLoopComparison | None
+    #: closed loops of the winner's law; None without inputs, when none were wanted, and when they
+    #: were interrupted
+    law_check: LawCheck | None
     status: str  #: the sentence with which its training ended
     #: the winner of every round, smallest n_z first, each with its figures
     path: tuple[LiftedModel, ...]
@@ -92,7 +91,7 @@ class _Candidate:
 
 def train(plant: Plant, samples: Samples, recipe: Recipe, *, seed: int = 0, starts: int = 4,
           split_seed: int = 0, watch: Watch | None = None, refuse: bool = True,
-          device: str = 'cpu', threads: int = 1) -> Trained:
+          loops: int = LOOPS, device: str = 'cpu', threads: int = 1) -> Trained:
     """
     Learn a lifted model in rounds of starts, of which validation episodes choose the best.
 
@@ -106,11 +105,14 @@ def train(plant: Plant, samples: Samples, recipe: Recipe, *, seed: int = 0, star
     :param samples: at least three episodes.
     :param starts: number of starts in each round; their seeds are drawn from `seed`.
     :param split_seed: seed of the split into training, validation and test episodes.
-    :param refuse: whether a lift that is no better than the linear model is refused.
+    :param refuse: whether a lift that is no better than the linear model, or whose law fails, is
+        refused.
+    :param loops: closed loops in which the law is tried before, see
+        :func:`~koopman_ros.control.law_check.check_law`; 0 for none.
     :param device: where the residuals are evaluated, as torch names it.
     :param threads: torch's threads for each start, for a number of which the bits are the same.
     :raises NoUsefulLift: when no start gives a lift that can be judged, or none that beats the
-        linear model on validation episodes.
+        linear model on validation episodes, or when its law fails in closed loop.
     :raises ValueError: on too few episodes, held-out episodes that hardly move, a recipe that
         does not fit, times that contradict the derivatives, or a nominal point where the plant
         moves.
@@ -135,8 +137,8 @@ def train(plant: Plant, samples: Samples, recipe: Recipe, *, seed: int = 0, star
         best: _Candidate | None = None
         interrupted = False
         try:
-            with closing(_run_starts(recipe, data, n_z, parent, seed, starts,
-                                     threads, tracker)) as finds:
+            with contextlib.closing(_run_starts(recipe, data, n_z, parent, seed, starts,
+                                                threads, tracker)) as finds:
                 for grown in finds:
                     candidate = _judged(assembly, grown, parts[1])
                     if isinstance(candidate, str):
@@ -161,11 +163,11 @@ def train(plant: Plant, samples: Samples, recipe: Recipe, *, seed: int = 0, star
             break
     if not path:
         raise NoUsefulLift(reasons[-1] if reasons else 'stopped before a start finished')
-    return _conclude(plant, parts, path, interrupted, tracker.finished, refuse)
+    return _conclude(plant, parts, path, interrupted, tracker, loops if refuse else 0, refuse)
 
 
 def _conclude(plant: Plant, parts: tuple[Samples, Samples, Samples], path: list[_Candidate],
-              interrupted: bool, finished: int, refuse: bool) -> Trained:
+              interrupted: bool, tracker: _Tracker, loops: int, refuse: bool) -> Trained:
     """Compare the winner with the linear model and report on the untouched episodes."""
     winner = path[-1]
     box = Box(winner.model.states, winner.model.inputs, plant.time_unit)
@@ -176,15 +178,18 @@ def _conclude(plant: Plant, parts: tuple[Samples, Samples, Samples], path: list[
             f'the lift with n_z = {winner.model.n_z} does not predict the motion better than a '
             f'linear model (relative error rx = {winner.fit.rx:.2g} against {rx:.2g} on '
             'validation episodes): keep the linear model, or excite the plant over a wider range')
-    closed_loop = None
-    if refuse and winner.model.n_u:
-        closed_loop = compare_closed_loops(winner.model, linear, parts[1])
-        if closed_loop.arrived < closed_loop.linear_arrived:
+    law_check = None
+    if loops and winner.model.n_u:
+        # one that was ended before gets its loops all the same
+        watch = (lambda _: False) if tracker.stop else tracker.check
+        with contextlib.suppress(KeyboardInterrupt):
+            law_check = check_law(winner.model, _reference(plant, box, parts, winner.model),
+                                  loops=loops, watch=watch)
+        interrupted = interrupted or law_check is None
+        if law_check is not None and not law_check.accepted:
             raise NoUsefulLift(
-                f'the lift with n_z = {winner.model.n_z} does not bring its own drift to the '
-                f'nominal point from {closed_loop.starts - closed_loop.arrived} of '
-                f'{closed_loop.starts} states where a linear controller does: use identity '
-                'coordinates, a smaller n_z, or more starts')
+                f'the lift with n_z = {winner.model.n_z} is no controller: {law_check}: use '
+                'identity coordinates, a smaller n_z, more starts, or a narrower range')
     models, figures = [], []
     for candidate in path:
         figures.append(evaluate(candidate.model, parts[2]))
@@ -192,8 +197,27 @@ def _conclude(plant: Plant, parts: tuple[Samples, Samples, Samples], path: list[
         models.append(replace(candidate.model, provenance=replace(
             candidate.model.provenance, metrics=metrics)))
     status = MinimumStatus.INTERRUPTED if interrupted else winner.grown.status
-    return Trained(models[-1], figures[-1], evaluate(linear, parts[2]), closed_loop, status.value,
-                   tuple(models), finished)
+    return Trained(models[-1], figures[-1], evaluate(linear, parts[2]), law_check, status.value,
+                   tuple(models), tracker.finished)
+
+
+def _reference(plant: Plant, box: Box, parts: tuple[Samples, Samples, Samples],
+               model: LiftedModel) -> Rate:
+    """
+    Return the drift that predicts the validation episodes best, on which a law is tried.
+
+    Polynomials, which share nothing with the lift but its samples, or the lift's own drift where
+    it is better than all of them: errors of the polynomials should not count against it.
+    """
+    candidates = [model]
+    for degree in range(1, _HIGHEST_DEGREE + 1):
+        # with so few samples to a monomial it would follow each of them
+        if math.comb(model.n_x + degree, degree) * _SAMPLES_OF_MONOMIAL <= len(parts[0]):
+            candidates.append(Edmd(degree).learn(plant, parts[0], box))
+    rates = [lifted_rate(one, one.seconds_per_time_unit) for one in candidates]
+    errors = [float(np.sum(((rate(parts[1].x, parts[1].u) - parts[1].dxdt) / box.states.scale
+                            ) ** 2)) for rate in rates]
+    return rates[int(np.argmin(errors))]
 
 
 def _training_states(box: Box, samples: Samples) -> TrainingStates | None:
@@ -234,10 +258,13 @@ class _Tracker:
         self.finished, self._rw = self.finished + 1, rw
         self._report(0, math.nan)
 
-    def _report(self, iteration: int, residual: float) -> bool:
+    def check(self, share: float) -> bool:
+        return self._report(0, math.nan, share)
+
+    def _report(self, iteration: int, residual: float, checked: float = 0.0) -> bool:
         if self._watch is not None and not self.stop:
             self.stop = self._watch(Progress(self.n_z, self.finished, self._total, iteration,
-                                             residual, self._rw))
+                                             residual, self._rw, checked))
         return self.stop
 
 

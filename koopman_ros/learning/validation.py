@@ -10,19 +10,16 @@ from numpy.typing import NDArray
 from scipy.integrate import DOP853
 
 from koopman_ros.arrays import brief
-from koopman_ros.control import run_closed_loop, Weights
+from koopman_ros.control.law_check import Rate
 from koopman_ros.lifting import LiftedModel
 from koopman_ros.plant_data import Array, Samples
-from koopman_ros.solvers import solve_riccati
 
 # Beyond it S is singular to working precision, and rw is noise.
 _MAX_COND = 1e13
-# A closed loop has arrived when it ends within this distance, in units of the states' scale.
-_ARRIVED = 0.05
-# A law that needs more to get there chatters.
-_MAX_EVALUATIONS = 5000
 # Of the drift in a roll-out, for each sample; a model a thousand times faster needs a fifth.
 _MAX_DRIFTS = 10_000
+# A prediction this far from the nominal point, in units of the scale, has diverged.
+_DIVERGED = 1e6
 
 
 @dataclass(frozen=True)
@@ -34,18 +31,6 @@ class Fit:
     rw: float
     rx: float  #: relative mean-square error of the drift of x that the lift implies
     cond: float  #: condition number of S; large when coordinates have collapsed onto each other
-
-
-@dataclass(frozen=True)
-class ClosedLoopComparison:
-    """The lift's controller beside the linear model's, both on the lift's own drift."""
-
-    #: cost with the lift's law over cost with the linear law, summed over the starts; 0 when only
-    #: the lift arrives, infinite when only the linear law does, NaN when neither does
-    cost_ratio: float
-    arrived: int  #: number of starts from which the lift's law reaches the nominal point
-    linear_arrived: int  #: the same of the linear law
-    starts: int  #: number of starts
 
 
 @dataclass(frozen=True)
@@ -130,7 +115,7 @@ def roll_out(model: LiftedModel, x0: Array, inputs: Array, sample_period: float 
             while solver.status == 'running' and solver.nfev < _MAX_DRIFTS:
                 solver.step()
         xi = solver.y.reshape(shape)
-        if solver.status != 'finished' or not np.all(np.abs(xi) < 1e6):
+        if solver.status != 'finished' or not np.all(np.abs(xi) < _DIVERGED):
             raise RuntimeError(f'the prediction diverged after {len(path)} samples: keep the '
                                'inputs within the training box')
         path.append(xi)
@@ -164,47 +149,21 @@ def rollout_rmse(model: LiftedModel, samples: Samples) -> Array | None:
     return np.sqrt(squares / count) if count else None
 
 
-def compare_closed_loops(model: LiftedModel, linear: LiftedModel, samples: Samples,
-                         starts: int = 3) -> ClosedLoopComparison:
-    """
-    Regulate the lift's own drift to the nominal point, by its law and by a linear model's.
 
-    The drift stands in for the plant, which training does not have; how close the two are is
-    what the other figures say. Weights are 1 on scaled states and inputs.
-
-    :param linear: a linear model of the same plant in the same coordinates.
-    :param samples: held-out samples; the starts are taken evenly in order of their distance.
-    :raises ValueError: for a plant without inputs.
+def lifted_rate(model: LiftedModel, time_unit_seconds: float) -> Rate:
     """
-    if model.n_u == 0:
-        raise ValueError('a plant without inputs has no closed loop')
-    weights = Weights(np.eye(model.n_x), np.eye(model.n_u))
-    order = np.argsort(np.linalg.norm(model.states.to_deviation(samples.x), axis=1))
-    chosen = samples.x[order[np.linspace(0, len(order) - 1, starts + 1).astype(int)[1:]]]
-    duration = settling_time(linear, weights)
+    Return dx/dt of a model's drift, in units and per a time unit of so many seconds.
+
+    It is NaN for states that have diverged: their pseudo-inverse does not exist.
+    """
+    factor = time_unit_seconds / model.seconds_per_time_unit
 
     def rate(x: Array, u: Array) -> Array:
-        return model.states.scale * (model.drift(model.states.to_deviation(x))
-                                     + model.B @ model.inputs.to_deviation(u))
+        xi = model.states.to_deviation(x)
+        followed = np.all(np.abs(xi) < _DIVERGED, axis=-1, keepdims=True)
+        drift = np.where(followed, model.drift(np.where(followed, xi, 0.0)), np.nan)
+        forcing = model.inputs.to_deviation(u) @ model.B.T
+        scaled: Array = factor * model.states.scale * (drift + forcing)
+        return scaled
 
-    costs, arrived = np.zeros(2), [0, 0]
-    for x0 in chosen:
-        for i, used in enumerate((model, linear)):
-            loop = run_closed_loop(used, rate, x0, model.states.center, weights, duration,
-                                   samples=2, rtol=1e-6, max_evaluations=_MAX_EVALUATIONS)
-            end = np.linalg.norm(model.states.to_deviation(loop.states[-1]))
-            costs[i] += loop.cost
-            arrived[i] += int(not loop.failure and end < _ARRIVED)
-    ratio = np.nan
-    if np.isfinite(costs).any():
-        ratio = 0.0 if np.isinf(costs[1]) else costs[0] / costs[1]
-    return ClosedLoopComparison(float(ratio), arrived[0], arrived[1], starts)
-
-
-def settling_time(linear: LiftedModel, weights: Weights) -> float:
-    """Return six time constants of the slowest mode under the linear law, in time units."""
-    # not of the open loop: an integrator never settles by itself
-    riccati = solve_riccati(linear.A, linear.B, weights.Q, weights.R)
-    rates = np.abs(np.linalg.eigvals(linear.A - linear.B @ riccati.K).real)
-    # steps are as short as the fastest mode, so that the span of rates bounds the work
-    return 6.0 / max(float(rates.min()), 1e-3 * float(rates.max()), 1e-9)
+    return rate

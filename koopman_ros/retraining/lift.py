@@ -3,20 +3,20 @@
 
 """Training of a lift on an estimated drift, and its acceptance on data held out of both."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
 from koopman_ros.arrays import Array, brief
-from koopman_ros.control import run_closed_loop, Weights
-from koopman_ros.identification import DriftModel, fitted_starts, Identified, longest_step
-from koopman_ros.identification.drift import prediction_error, Rate, Segments
+from koopman_ros.control.law_check import check_law, LawCheck, LOOPS
+from koopman_ros.identification import DriftModel, fitted_starts, Identified, longest_step, Stopped
+from koopman_ros.identification.drift import prediction_error, Segments
 from koopman_ros.learning import Growth, train, Trained
 from koopman_ros.learning.training import Watch
-from koopman_ros.learning.validation import settling_time
-from koopman_ros.lifting import Coordinates, LiftedModel, linearised_model, Provenance
+from koopman_ros.learning.validation import lifted_rate
+from koopman_ros.lifting import Coordinates, LiftedModel
 from koopman_ros.plant_data import Episode, Plant, Samples
 from koopman_ros.units import Display, display_unit
 
@@ -30,15 +30,6 @@ _SHARES = 10
 _SLIGHTLY_OUTSIDE = 1.1
 # A search that is so far outside does not come back.
 _LOST = 1e3
-# A closed loop has arrived when it ends this close to the set-point, in units of the scale.
-_ARRIVED = 0.05
-# Set-points at these places between the corners of the box.
-_PLACES = (0.1, 0.5, 0.9)
-# Closed loops of several states start at so many of them beside the middle.
-_STARTS = 8
-_MAX_EVALUATIONS = 5000
-# A prediction this far from the nominal point, in units of the scale, has diverged.
-_DIVERGED = 1e6
 # An error is more than noise when it is this unlikely, and this large beside the range.
 _SIGMAS = 5.0
 _NOTICEABLE = 1e-3
@@ -152,7 +143,8 @@ def learn_lift(found: Identified, plant: Plant, n_z: int, *, seed: int, starts: 
                         np.where(within, plant.nominal_state, 0.5 * (lower + upper)),
                         plant.nominal_input)
     known = replace(plant, nominal_state=x, nominal_input=u, B=found.drift.input_matrix)
-    return train(known, samples, Growth(n_z), seed=seed, starts=starts, watch=watch)
+    return train(known, samples, Growth(n_z), seed=seed, starts=starts, watch=watch,
+                 loops=0)
 
 
 @dataclass(frozen=True)
@@ -182,8 +174,7 @@ class Decision:
     current_rmse: Array | None  #: (n_x,) the same of the present lift, None without one
     linear_rmse: Array  #: (n_x,) the same of the best linear model
     noise: Array  #: (n_x,) standard deviation of the measurements from sample to sample
-    loops: int  #: number of closed loops on the estimated drift that were tried
-    arrived: int  #: number of those that reached their set-point
+    law_check: LawCheck  #: closed loops on the estimated drift
 
     __repr__ = brief
 
@@ -193,28 +184,15 @@ class Decision:
         return not self.reasons
 
 
-def lifted_rate(model: LiftedModel, time_unit_seconds: float) -> Rate:
-    """
-    Return dx/dt of a lift's projected drift, in units and per a time unit of so many seconds.
-
-    It is NaN for states that have diverged: their pseudo-inverse does not exist.
-    """
-    factor = time_unit_seconds / model.seconds_per_time_unit
-
-    def rate(x: Array, u: Array) -> Array:
-        xi = model.states.to_deviation(x)
-        followed = np.all(np.abs(xi) < _DIVERGED, axis=-1, keepdims=True)
-        drift = np.where(followed, model.drift(np.where(followed, xi, 0.0)), np.nan)
-        forcing = model.inputs.to_deviation(u) @ model.B.T
-        scaled: Array = factor * model.states.scale * (drift + forcing)
-        return scaled
-
-    return rate
-
-
 def decide(found: Identified, trained: Trained, current: LiftedModel | None,
-           thresholds: Thresholds) -> Decision:
-    """Compare a new lift with the present and a linear one, held out, and close its loop."""
+           thresholds: Thresholds, *, loops: int = LOOPS,
+           watch: Callable[[float], bool] = lambda _: False) -> Decision:
+    """
+    Compare a new lift with the present and a linear one, held out, and close its loop.
+
+    :param loops: see :func:`~koopman_ros.control.law_check.check_law`, as for `watch`.
+    :raises Stopped: when `watch` ended it.
+    """
     model, scale = trained.model, found.drift.box.states.scale
     unit = model.seconds_per_time_unit
     held_out = Segments.of(found.held_out, longest_step(found.held_out))
@@ -237,13 +215,17 @@ def decide(found: Identified, trained: Trained, current: LiftedModel | None,
     if not cond <= thresholds.condition:
         reasons.append(f'the condition number of its coordinates, {cond:.3g}, is above '
                        f'{thresholds.condition:.3g}: use fewer coordinates')
-    loops, arrived = _closed_loops(model, found.drift)
-    if arrived < loops:
-        reasons.append(f'its controller brings the estimated drift to the set-point in {arrived} '
-                       f'of {loops} closed loops over its box')
+    # as it was measured, as far as that matters
+    period = float(np.median(np.concatenate([np.diff(part.time) for part in found.held_out])))
+    law_check = check_law(model, found.drift.rate, interval=period * unit, loops=loops,
+                          watch=watch)
+    if law_check is None:
+        raise Stopped
+    if not law_check.accepted:
+        reasons.append(f'it is no controller of the estimated drift: {law_check}')
     warnings = _warnings(found, model, drift_rmse, _autocorrelation(found.drift, held_out))
     return Decision(tuple(reasons), warnings, rmse, drift_rmse, current_rmse, linear_rmse,
-                    found.noise, loops, arrived)
+                    found.noise, law_check)
 
 
 def _autocorrelation(drift: DriftModel, segments: Segments) -> Array:
@@ -301,44 +283,6 @@ def shortfalls(states: Coordinates, wanted: Mapping[str, Sequence[float]]) -> tu
                 f'are wanted from {unit.text(low)} to {unit.text(high)}: those outside will be '
                 'refused, record what is missing or narrow setpoint_min and setpoint_max')
     return tuple(found)
-
-
-def _closed_loops(model: LiftedModel, drift: DriftModel) -> tuple[int, int]:
-    """
-    Control the estimated drift from the ends and the middle of the data to set-points.
-
-    A box of several states has corners that no plant comes to: the loops start at training states
-    far from each other then. Set-points lie along the box's diagonal, or as near to it as an input
-    can hold the plant.
-    """
-    lower, upper = model.states.lower, model.states.upper
-    far = model.training_states
-    ends = [lower, upper] if far is None else list(model.states.to_physical(far.states[:_STARTS]))
-    starts = [*ends, 0.5 * (lower + upper) if far is None else model.states.center]
-    weights = Weights(np.eye(model.n_x), np.eye(model.n_u))
-    loops = arrived = 0
-    for place in _PLACES:
-        try:
-            x_ref, _ = steady_point(drift, lower + place * (upper - lower), model.inputs.center)
-        except ValueError:
-            # where the plant is known to stand still
-            x_ref = model.states.center
-        duration = settling_time(
-            linearised_model(drift.slope(x_ref), drift.input_matrix, model.states, model.inputs,
-                             model.time_unit, Provenance(model.provenance.plant)), weights)
-        for x0 in starts:
-            loops += 1
-            # a loop that runs away ends as a failure, whatever overflows meanwhile
-            try:
-                with np.errstate(all='ignore'):
-                    run = run_closed_loop(model, drift.rate, x0, x_ref, weights, duration,
-                                          samples=2, rtol=1e-6, max_evaluations=_MAX_EVALUATIONS)
-            except ValueError:
-                # outside the lift's range, or held by no input of the lift
-                continue
-            miss = np.abs(run.states[-1] - x_ref) / model.states.scale
-            arrived += int(not run.failure and bool(np.all(miss < _ARRIVED)))
-    return loops, arrived
 
 
 def _size(rmse: Array, scale: Array) -> float:

@@ -11,9 +11,9 @@ import numpy as np
 
 from koopman_ros.identification import fitted_starts, Identified, longest_step, Segments
 from koopman_ros.identification.drift import Rate
+from koopman_ros.learning.validation import lifted_rate
 from koopman_ros.lifting import Coordinates
 from koopman_ros.reports import bullets, drawing, table, write_figures, write_page
-from koopman_ros.retraining.lift import lifted_rate
 from koopman_ros.retraining.task import CELLS, Retrained, visited_cells
 from koopman_ros.units import SECONDS_PER_TIME_UNIT, shown, unit_label
 
@@ -82,8 +82,7 @@ def _sections(retrained: Retrained) -> Iterator[str]:
         for name, unit, low, high in zip(own.names, own.units, own.lower, own.upper, strict=True))
     yield (f'Lift: n_z = {trained.model.n_z}, rw = {trained.figures.fit.rw:.2g}, condition number '
            f'{trained.figures.fit.cond:.3g}, eigenvalues {eigenvalues} '
-           f'1/{trained.model.time_unit}. Closed loops on the estimated drift: {decision.arrived} '
-           f'of {decision.loops} reach their set-point.')
+           f'1/{trained.model.time_unit}. On the estimated drift {decision.law_check}.')
 
 
 def _label(signals: Coordinates, k: int) -> str:

@@ -128,6 +128,7 @@ class Retrained:
         }
         if self.decision and self.trained:
             trained = self.trained.model.states
+            check = self.decision.law_check
             figures |= {
                 'trained_from': by_state(trained.lower),
                 'trained_to': by_state(trained.upper),
@@ -138,8 +139,11 @@ class Retrained:
                 'heldout_rw': self.trained.figures.fit.rw,
                 'heldout_rx': self.trained.figures.fit.rx,
                 'condition': self.trained.figures.fit.cond,
-                'closed_loops': self.decision.loops,
-                'closed_loops_arrived': self.decision.arrived,
+                'closed_loops': check.loops,
+                'closed_loops_arrived': check.arrived,
+                'closed_loops_failed': int(np.sum(check.failed)),
+                'closed_loop_cost_beside_linear': check.median_ratio,
+                'worst_closed_loop_cost_beside_linear': check.worst_ratio,
             }
         return {name: None if isinstance(value, float) and not np.isfinite(value) else value
                 for name, value in figures.items()}
@@ -199,7 +203,8 @@ def retrain(task: Task, on_progress: OnProgress = lambda *_: False) -> Retrained
         return replace(bare, reasons=(str(error),))
     # a training that was stopped ends with its best so far
     _stop_if(on_progress(_at('decide', 0.0), 'judging'))
-    decision = decide(found, trained, current, thresholds)
+    decision = decide(found, trained, current, thresholds, watch=lambda share: on_progress(
+        _at('decide', 0.8 * share), 'judging'))
     decision = replace(decision, warnings=(
         *decision.warnings, *shortfalls(trained.model.states, task.setpoints)))
     _stop_if(on_progress(_at('decide', 0.9), 'writing'))

@@ -97,7 +97,7 @@ def test_a_linear_plant_needs_no_lift_and_gets_one_where_it_is_asked_for():
         train(BENT, linear, SMALL, starts=1)
     trained = train(BENT, linear, SMALL, starts=1, refuse=False)
     assert trained.figures.fit.rx > trained.linear.fit.rx
-    assert trained.closed_loop is None
+    assert trained.law_check is None
 
 
 def test_a_held_out_episode_at_rest():
@@ -120,8 +120,18 @@ def test_a_lift_that_loses_a_state_is_refused_whatever_its_rw():
     with pytest.raises(NoUsefulLift, match='does not predict the motion better than a linear'):
         train(plant, samples, replace(exact, n_z=2), starts=1)
     # with the states as its first coordinates the same data are enough
-    kept = train(plant, samples, replace(exact, identity=True), starts=1)
+    kept = train(plant, samples, replace(exact, identity=True), starts=1, loops=16)
     assert kept.figures.fit.rx < 1e-6
+
+
+def test_a_lift_whose_law_goes_nowhere_is_no_controller():
+    """The drift x + 0.3 x^2 runs away, and the input does nothing to it."""
+    samples = bent_samples()
+    x = samples.x - 3.0
+    runaway = replace(samples, dxdt=x + 0.3 * x * x)
+    with pytest.raises(NoUsefulLift, match=r'the lift with n_z = 2 is no controller: no law arrive'
+                                           r's in any of \d+ closed loops over the box'):
+        train(replace(BENT, B=np.zeros((1, 1))), runaway, SMALL, starts=1, loops=16)
 
 
 # Watching, and interrupting.
@@ -183,6 +193,22 @@ def test_an_interrupt_keeps_the_best_so_far(act, place, n_z, starts):
     # the watch is not asked again after it has ended the training
     last = (seen[-1].n_z, seen[-1].finished, seen[-1].iteration)
     assert last == place or (act is press_interrupt and last[:2] <= (place[0], place[1] + 1))
+
+
+@pytest.mark.parametrize('act', [lambda now: True, press_interrupt],
+                         ids=['the watch', 'the keyboard'])
+def test_an_interrupt_of_the_closed_loops_keeps_the_model(act):
+    seen = []
+
+    def watch(now):
+        seen.append(now.checked)
+        return now.checked > 0.3 and act(now)
+
+    trained = train(BENT, bent_samples(), SMALL, starts=1, watch=watch)
+    assert (trained.model.n_z, trained.law_check) == (2, None)
+    assert trained.status == MinimumStatus.INTERRUPTED.value
+    assert seen == sorted(seen)
+    assert 0.3 < seen[-1] < 0.5
 
 
 def test_an_interrupt_keeps_the_bits_of_the_starts_that_finished():

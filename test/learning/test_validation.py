@@ -10,7 +10,6 @@ import pytest
 from scipy.linalg import block_diag, expm
 
 from koopman_ros.learning import (
-    compare_closed_loops,
     evaluate,
     Figures,
     Fit,
@@ -181,37 +180,3 @@ def test_the_error_of_roll_outs_is_measured_over_all_episodes():
 def test_finite_figures_by_name(error, names, expected):
     figures = Figures(Fit(0.1, np.nan, 3.0), np.ones(1), error)
     assert figures.metrics(names) == {'rw': 0.1, 'cond': 3.0, **expected}
-
-
-@pytest.mark.parametrize('jacobian', [
-    JACOBIAN,
-    # the open loop never settles, the closed loop does at rates of order one
-    np.array([[0.0, 1.0], [0.0, 0.0]])], ids=['stable', 'integrator'])
-def test_closed_loops_of_the_same_model_cost_the_same(jacobian):
-    model = linear_model(jacobian)
-    found = compare_closed_loops(model, model, linear_episodes(), starts=2)
-    assert (found.cost_ratio, found.arrived, found.linear_arrived, found.starts) == (1.0, 2, 2, 2)
-
-
-def test_a_worse_law_costs_more():
-    """On the linear drift of the model its own law is the optimum."""
-    other = linear_model(np.array([[-1.0, -4.0], [2.0, -0.5]]))
-    found = compare_closed_loops(linear_model(), other, linear_episodes())
-    assert found.cost_ratio < 0.999
-
-
-def test_where_one_law_arrives_or_neither():
-    good, samples = linear_model(), linear_episodes()
-    useless = replace(linear_model(np.eye(2)), B=np.zeros((2, 1)))
-    only_lift = compare_closed_loops(good, useless, samples, starts=2)
-    assert (only_lift.cost_ratio, only_lift.arrived, only_lift.linear_arrived) == (0.0, 2, 0)
-    neither = compare_closed_loops(useless, useless, samples, starts=2)
-    assert np.isnan(neither.cost_ratio)
-    only_linear = compare_closed_loops(useless, good, samples, starts=2)
-    assert (only_linear.arrived, only_linear.starts) == (0, 2)
-
-
-def test_a_plant_without_inputs_has_no_closed_loop():
-    free = random_lift(2, n_u=0)
-    with pytest.raises(ValueError, match='a plant without inputs has no closed loop'):
-        compare_closed_loops(free, free, linear_episodes())

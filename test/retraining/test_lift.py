@@ -12,23 +12,24 @@ import pytest
 from scipy.integrate import solve_ivp
 from scipy.optimize import brentq
 
+from koopman_ros.control.law_check import LawCheck
 from koopman_ros.identification import (
     DriftModel,
     identify,
     longest_step,
     prediction_error,
     Segments,
+    Stopped,
 )
+from koopman_ros.learning.validation import lifted_rate
 from koopman_ros.lifting import linearised_model, load, Provenance
 from koopman_ros.plant_data import Episode
 from koopman_ros.plants import two_state_reactor
 from koopman_ros.resources import model_path
 from koopman_ros.retraining import decide, learn_lift, Thresholds
 from koopman_ros.retraining.lift import (
-    _closed_loops,
     _spread,
     drift_samples,
-    lifted_rate,
     shortfalls,
     steady_point,
 )
@@ -55,9 +56,10 @@ def trained(found, shipped):
 
 
 @pytest.fixture
-def no_loops(monkeypatch):
+def no_loops(monkeypatch, shipped):
     """Leave the closed loops out where another figure decides."""
-    monkeypatch.setattr(sys.modules[decide.__module__], '_closed_loops', lambda *_: (9, 9))
+    passed = LawCheck(shipped.states, *np.zeros((2, 9, 1)), np.ones(9), np.zeros(9, bool), 0)
+    monkeypatch.setattr(sys.modules[decide.__module__], 'check_law', lambda *_, **__: passed)
 
 
 def linear_lift(model, slope, input_matrix):
@@ -102,7 +104,8 @@ def test_a_better_lift_is_accepted(found, trained, shipped):
     decision = decide(found, trained, shipped, Thresholds())
     assert decision.accepted
     assert (decision.reasons, decision.warnings) == ((), ())
-    assert (decision.loops, decision.arrived) == (9, 9)
+    assert decision.law_check.arrived == decision.law_check.loops == 128
+    assert decision.law_check.worst_ratio < 1.01
     # nothing but noise is left of its error, and kelvins of the present one's
     assert decision.rmse == pytest.approx([NOISE], rel=0.15)
     assert decision.noise == pytest.approx([NOISE], rel=0.15)
@@ -140,10 +143,18 @@ def test_coordinates_that_have_collapsed(found, trained, shipped):
 
 def test_a_controller_that_destabilises_is_refused(found, trained, shipped):
     wrong = replace(trained, model=replace(trained.model, B=-trained.model.B))
-    decision = decide(found, wrong, shipped, Thresholds())
-    assert decision.arrived == 0
-    assert ('its controller brings the estimated drift to the set-point in 0 of 9 closed loops '
-            'over its box') in decision.reasons
+    decision = decide(found, wrong, shipped, Thresholds(), loops=16)
+    assert decision.law_check.share_failed == 1.0
+    (reason,) = (reason for reason in decision.reasons if 'controller' in reason)
+    assert reason.startswith('it is no controller of the estimated drift: the law fails in 16 of '
+                             '16 closed loops over the box (')
+    assert 'not arriving' in reason
+    assert f'{decision.law_check.region}' in reason
+
+
+def test_loops_that_are_ended_leave_no_decision(found, trained, shipped):
+    with pytest.raises(Stopped):
+        decide(found, trained, shipped, Thresholds(), watch=lambda share: share > 0.5)
 
 
 @pytest.mark.usefixtures('no_loops')
@@ -225,21 +236,6 @@ def test_set_points_that_a_trained_range_leaves_out(shipped, wanted, words):
     said = shortfalls(shipped.states, wanted)
     assert len(said) == len(words)
     assert all(text.startswith(word) for text, word in zip(said, words, strict=True))
-
-
-def test_loops_of_more_states_than_inputs_go_where_an_input_holds_them():
-    """dx1/dt = -x1 + x2, dx2/dt = -x2 + u stands still where x1 = x2, off its box's diagonal."""
-    wide = box([-1.0, -4.0], [1.0, 4.0], [-4.0], [4.0])
-    A, B = np.array([[-1.0, 1.0], [0.0, -1.0]]), np.array([[0.0], [1.0]])
-    model = linearised_model(A, B, wide.states, wide.inputs, 's', Provenance('cascade'))
-    coefficients = np.zeros((3, 2))
-    drift = DriftModel(wide, 1, coefficients, wide.input_matrix(B))
-    for monomial, value in ((np.array([0.5, 0.0]), 0), (np.array([0.0, 0.5]), 1)):
-        row = int(np.argmax(drift.features(monomial)[1:])) + 1
-        coefficients[row] = A[:, value] * wide.states.scale[value] / wide.states.scale
-    probe = np.array([0.5, -2.0])
-    assert drift.rate(probe, np.array([0.7])) == pytest.approx(A @ probe + 0.7 * B[:, 0])
-    assert _closed_loops(model, drift) == (9, 9)
 
 
 # The steady point and the samples of a drift.

@@ -156,8 +156,8 @@ def test_report(accepted):
 @pytest.mark.usefixtures('learned')
 def test_refused_lift_that_diverges_is_kept_all_the_same(bag, tmp_path, monkeypatch):
     original = task_module.decide
-    monkeypatch.setattr(task_module, 'decide', lambda *arguments: replace(
-        original(*arguments), rmse=np.array([np.inf]), reasons=('it diverges',)))
+    monkeypatch.setattr(task_module, 'decide', lambda *arguments, **named: replace(
+        original(*arguments, **named), rmse=np.array([np.inf]), reasons=('it diverges',)))
     retrained = retrain(small(bag, tmp_path / 'new.safetensors'))
     metrics = load(retrained.model_file).provenance.metrics
     assert 'rollout_rmse' not in metrics

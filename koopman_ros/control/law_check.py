@@ -1,0 +1,383 @@
+# SPDX-FileCopyrightText: 2026 The koopman_ros Authors
+# SPDX-License-Identifier: Apache-2.0
+
+"""Closed loops all over a model's training box, by which its law is judged beside linear ones."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+import math
+
+import numpy as np
+from numpy.typing import NDArray
+
+from koopman_ros.arrays import Array
+from koopman_ros.control.laws import Law, LAWS, Linear, Tuning, Weights
+from koopman_ros.control.laws.base import steady_state_target, Target
+from koopman_ros.control.limits import finite, InputLimits
+from koopman_ros.estimation import Estimate
+from koopman_ros.lifting import Coordinates, LiftedModel, NetworkObservables
+from koopman_ros.solvers import runge_kutta_step, solve_riccati
+
+# dx/dt (M, n_x) of states (M, n_x) and inputs (M, n_u), in units a time unit of the model
+Rate = Callable[[Array, Array], Array]
+# inputs (M, n_u) of states (M, n_x), as far as these are active; NaN where there is none
+_Feedback = Callable[[Array, NDArray[np.bool_]], Array]
+
+#: Closed loops that a law is judged by.
+LOOPS = 128
+#: A law may cost so many times as much as a linear one.
+MOST_COST = 1.1
+#: Share of the closed loops that may fail.
+MOST_FAILURES = 0.01
+
+# A loop has arrived when it ends this close to the set-point, in units of the scale; it starts
+# several times as far away.
+_ARRIVED = 0.05
+_APART = 0.25
+# It is lost when a state is further than this from the nominal point, in units of its scale.
+_ESCAPED = 10.0
+# Slowest time constants of the linear loop that a loop lasts, and the slowest rate beside the
+# fastest that is waited for.
+_DURATION = 6.0
+_SLOWEST = 1e-3
+# Samples in the fastest time constant of the linear loop, and steps of integration.
+_SAMPLES, _STEPS = 4, 8
+# A slow plant takes many samples: fewer loops then, so that the law is called so often in all.
+_MOST_CALLS = 200 * LOOPS
+_FEWEST_LOOPS = 16
+# Attempts for each set-point.
+_ATTEMPTS = 4
+_NEWTON_STEPS = 30
+_LONGEST_STEP = 0.5
+# What is left of a step, and a difference quotient's step, in scaled deviations.
+_RESOLUTION = 1e-9
+_DIFFERENCE = 1e-5
+
+
+@dataclass(frozen=True, eq=False)
+class LawCheck:
+    """N closed loops under a model's law from states to set-points within its training box."""
+
+    states: Coordinates  #: names and units
+    starts: Array  #: (N, n_x) where they began, in state units
+    setpoints: Array  #: (N, n_x) where they were to go
+    #: (N,) cost over that of the better of two linear laws, that of the plant's linearisation and
+    #: that of the model's; infinite where the law does not arrive and 0 where these do not
+    ratios: Array
+    no_gain: NDArray[np.bool_]  #: (N,) whether the law had no gain somewhere on the way
+    hopeless: int  #: further loops, which do not count: from there none of the laws arrives
+
+    @property
+    def failed(self) -> NDArray[np.bool_]:
+        """Tell which (N,) had no gain, did not arrive, or cost over 1.1 times a linear law."""
+        failed: NDArray[np.bool_] = ~(self.ratios <= MOST_COST)
+        return failed
+
+    @property
+    def loops(self) -> int:
+        """Number of loops that count, N."""
+        return len(self.ratios)
+
+    @property
+    def arrived(self) -> int:
+        """Number of those that reached their set-point."""
+        return int(np.sum(np.isfinite(self.ratios)))
+
+    @property
+    def share_failed(self) -> float:
+        """Share of the loops that failed; 1 where none counts."""
+        return float(np.mean(self.failed)) if self.loops else 1.0
+
+    @property
+    def accepted(self) -> bool:
+        """Whether the model may control: at most 1 % of the loops failed."""
+        return self.share_failed <= MOST_FAILURES
+
+    @property
+    def median_ratio(self) -> float:
+        """Median of the ratios of costs; NaN without loops."""
+        return float(np.median(self.ratios)) if self.loops else math.nan
+
+    @property
+    def worst_ratio(self) -> float:
+        """Largest ratio of costs; NaN without loops."""
+        return float(np.max(self.ratios)) if self.loops else math.nan
+
+    @property
+    def region(self) -> str:
+        """Say in which ranges the failed loops began and were to end; empty where none failed."""
+        failed = self.failed
+        return '' if not failed.any() else (
+            f'begun at {self._ranges(self.starts[failed])} and bound for '
+            f'{self._ranges(self.setpoints[failed])}')
+
+    def _ranges(self, x: Array) -> str:
+        return ', '.join(
+            f'{name} {low:.4g} to {high:.4g} {unit}'.rstrip() for name, unit, low, high in zip(
+                self.states.names, self.states.units, x.min(axis=0), x.max(axis=0), strict=True))
+
+    def __str__(self) -> str:
+        """Say in one clause how many loops failed, how, and where."""
+        if not self.loops:
+            return (f'no law arrives in any of {self.hopeless} closed loops over the box, linear '
+                    'ones included')
+        text = f'the law fails in {np.sum(self.failed)} of {self.loops} closed loops over the box'
+        if not self.failed.any():
+            return f'{text}, costing at most {self.worst_ratio:.3g} times as much as a linear one'
+        lost = ~np.isfinite(self.ratios)
+        counts = ((int(np.sum(self.no_gain)), 'without a gain'),
+                  (int(np.sum(lost & ~self.no_gain)), 'not arriving'),
+                  (int(np.sum(self.failed & ~lost)),
+                   f'costing over {MOST_COST:g} times as much as a linear law'))
+        return f'{text} ({", ".join(f"{n} {what}" for n, what in counts if n)}), {self.region}'
+
+    def __repr__(self) -> str:
+        """Keep the arrays out."""
+        return f'<LawCheck: {self}>'
+
+
+def check_law(model: LiftedModel, rate: Rate, *, tuning: Tuning | None = None,
+              law: Callable[[LiftedModel, Tuning], Law] = LAWS['sdre'],
+              limits: InputLimits | None = None, interval: float = 0.0, loops: int = LOOPS,
+              watch: Callable[[float], bool] = lambda _: False) -> LawCheck | None:
+    """
+    Let a model's law control a drift that the model was not learned from, all over its box.
+
+    Starts and set-points fill the data's range evenly (a scrambled Sobol sequence of fixed seed);
+    the latter are steady states of that drift, which an input within its limits holds. All laws
+    get the input that does: what a disturbance observer finds at rest. Inputs are held from
+    sample to sample. The loops run side by side.
+
+    :param rate: dx/dt (M, n_x) of states (M, n_x) and inputs (M, n_u), in state and input units
+        and per time unit of the model; affine in the input.
+    :param tuning: of all laws; by default with weights of 1 on scaled deviations.
+    :param limits: of the inputs; by default their range in the model's training box.
+    :param interval: seconds between samples; by default, and at least, a fourth of the fastest
+        time constant of the linear loop.
+    :param loops: closed loops to run; fewer where these take many samples.
+    :param watch: called with the share that is done; True ends the check.
+    :return: None where `watch` ended it.
+    :raises ValueError: for a model without inputs.
+    """
+    if model.n_u == 0:
+        raise ValueError('a plant without inputs has no closed loop')
+    tuning = tuning or Tuning(Weights(np.eye(model.n_x), np.eye(model.n_u)))
+    limits = limits or InputLimits(model.inputs.lower, model.inputs.upper,
+                                   np.full(model.n_u, np.inf))
+    plant = _Plant(model, rate)
+    linear = plant.linearised
+    slowest, fastest = _closed_loop_rates(linear, tuning.weights)
+    interval = max(interval / model.seconds_per_time_unit, 1.0 / (_SAMPLES * fastest))
+    samples = math.ceil(_DURATION / (slowest * interval))
+    loops = min(loops, max(_MOST_CALLS // samples, _FEWEST_LOOPS))
+    starts, targets, inputs = _cases(plant, limits, loops)
+    seconds = interval * model.seconds_per_time_unit
+    feedbacks = (_called(law(model, tuning), targets, inputs, limits, seconds),
+                 *(_constant(Linear(one, tuning), targets, inputs, limits, seconds)
+                   for one in (linear, model)))
+    ended = _run(plant, feedbacks, starts, targets, inputs, tuning.weights, interval, samples,
+                 math.ceil(_STEPS * interval * fastest), watch)
+    if ended is None:
+        return None
+    (own, *others), no_gain = ended
+    linear_cost = np.min(others, axis=0)
+    arrives = np.isfinite(linear_cost)
+    ratios = np.where(arrives, own / np.where(arrives, linear_cost, 1.0), 0.0)
+    counts = arrives | np.isfinite(own)
+    x0, x_ref = (model.states.to_physical(x[counts]) for x in (starts, targets))
+    return LawCheck(model.states, x0, x_ref, ratios[counts], no_gain[counts],
+                    int(np.sum(~counts)))
+
+
+@dataclass(frozen=True)
+class _Plant:
+    """A drift in the scaled deviations of a model; rows are states or inputs side by side."""
+
+    model: LiftedModel  #: whose names and scaling
+    physical: Rate  #: in units
+
+    def rate(self, x: Array, v: Array) -> Array:
+        states = self.model.states
+        scaled: Array = self.physical(states.to_physical(x), self.model.inputs.to_physical(v)
+                                      ) / states.scale
+        return scaled
+
+    def slope(self, x: Array, v: Array) -> Array:
+        """Return the derivatives (M, n_x, n_x + n_u) of the rate by state and input."""
+        n = x.shape[1]
+        both = np.hstack([x, v])
+        columns = []
+        for step in _DIFFERENCE * np.eye(both.shape[1]):
+            ahead, behind = both + step, both - step
+            columns.append(self.rate(ahead[:, :n], ahead[:, n:])
+                           - self.rate(behind[:, :n], behind[:, n:]))
+        return np.stack(columns, axis=-1) / (2.0 * _DIFFERENCE)
+
+    @property
+    def linearised(self) -> LiftedModel:
+        """The linear model of the plant at the model's nominal point."""
+        model, n = self.model, self.model.n_x
+        slope = self.slope(np.zeros((1, n)), np.zeros((1, model.n_u)))[0]
+        itself = NetworkObservables((), np.zeros((0, n)), identity=True)
+        return replace(model, observables=itself, A=slope[:, :n], B=slope[:, n:])
+
+
+def _closed_loop_rates(linear: LiftedModel, weights: Weights) -> tuple[float, float]:
+    """Return the slowest and the fastest rate of a linear model under its own law."""
+    # not of the open loop: an integrator never settles by itself
+    riccati = solve_riccati(linear.A, linear.B, weights.Q, weights.R)
+    rates = np.abs(np.linalg.eigvals(linear.A - linear.B @ riccati.K).real)
+    fastest = max(float(rates.max()), _RESOLUTION)
+    # samples are as short as the fastest mode, so that the span of rates bounds the work
+    return max(float(rates.min()), _SLOWEST * fastest), fastest
+
+
+def _cases(plant: _Plant, limits: InputLimits, loops: int) -> tuple[Array, Array, Array]:
+    """Return starts (M, n_x), set-points (M, n_x) and the inputs (M, n_u) that hold these."""
+    # in here: no node needs it, and it takes long to import
+    from scipy.stats import qmc
+
+    model = plant.model
+    n, m = model.n_x, model.n_u
+    points = qmc.Sobol(2 * n + m, seed=0).random_base2(math.ceil(math.log2(_ATTEMPTS * loops)))
+    starts = _within_data(model, points[:loops, :n], np.arange(loops))
+    numbers = np.random.default_rng(0).permutation(len(points))
+    anchors = _within_data(model, points[:, n:2 * n], numbers)
+    # the nominal point, too, lest there be none
+    x, v = _steady(plant, np.vstack([np.zeros(n), anchors]),
+                   np.vstack([np.zeros(m), _between(model.inputs, points[:, 2 * n:])]))
+    u, physical = model.inputs.to_physical(v), model.states.to_physical(x)
+    slack = _RESOLUTION * model.inputs.scale
+    held = ((u >= limits.lower - slack) & (u <= limits.upper + slack)).all(axis=1)
+    held &= np.array([model.distance(row) <= _RESOLUTION for row in physical])
+    x, v = x[held], v[held]
+    chosen: list[tuple[int, int]] = []
+    for k, start in enumerate(starts):
+        apart = np.flatnonzero(np.max(np.abs(x - start), axis=1, initial=0.0) >= _APART)
+        if len(apart):
+            # each set-point in its turn
+            chosen.append((k, int(apart[k % len(apart)])))
+    first, second = np.array(chosen, dtype=np.int64).reshape(-1, 2).T
+    return starts[first], x[second], v[second]
+
+
+def _between(box: Coordinates, shares: Array) -> Array:
+    """Return scaled deviations at these shares (M, n) of the way through a box."""
+    return box.to_deviation(box.lower + shares * (box.upper - box.lower))
+
+
+def _within_data(model: LiftedModel, shares: Array, numbers: NDArray[np.int64]) -> Array:
+    """Return states (M, n_x) where the data are: in the box, or around training states in it."""
+    known = model.training_states
+    if known is None:
+        return _between(model.states, shares)
+    states = model.states
+    lower, upper = states.to_deviation(states.lower), states.to_deviation(states.upper)
+    around = (2.0 * shares - 1.0) * known.fill_distance * 0.5 * (upper - lower)
+    return np.clip(known.states[numbers % len(known.states)] + around, lower, upper)
+
+
+def _steady(plant: _Plant, x: Array, v: Array) -> tuple[Array, Array]:
+    """Move states and inputs as little as it takes to rest; those that do not are left out."""
+    n = x.shape[1]
+    with np.errstate(all='ignore'):
+        for _ in range(_NEWTON_STEPS):
+            rate, slope = plant.rate(x, v), plant.slope(x, v)
+            good = np.isfinite(rate).all(axis=1) & np.isfinite(slope).all(axis=(1, 2))
+            x, v, rate, slope = x[good], v[good], rate[good], slope[good]
+            change = -(np.linalg.pinv(slope) @ rate[..., None])[..., 0]
+            length = np.max(np.abs(change), axis=1, keepdims=True, initial=_LONGEST_STEP)
+            change *= _LONGEST_STEP / length
+            x, v = x + change[:, :n], v + change[:, n:]
+            if np.max(np.abs(change), initial=0.0) < _RESOLUTION:
+                break
+        still = np.max(np.abs(change), axis=1, initial=0.0) < _RESOLUTION
+    return x[still], v[still]
+
+
+def _target(model: LiftedModel, x_ref: Array, v: Array) -> Target | None:
+    """Return a target of a model with the disturbance under which this input holds it."""
+    try:
+        w = -(model.drift(x_ref) + model.B @ v)
+        return steady_state_target(model, x_ref, w) if finite(w) else None
+    except np.linalg.LinAlgError:
+        return None
+
+
+def _called(law: Law, setpoints: Array, inputs: Array, limits: InputLimits, seconds: float
+            ) -> _Feedback:
+    """Return a law's inputs, found for one state after another."""
+    model = law.model
+    targets = [_target(model, *pair) for pair in zip(setpoints, inputs, strict=True)]
+    memory: list[object] = [None] * len(targets)
+
+    def act(x: Array, active: NDArray[np.bool_]) -> Array:
+        v = np.full(inputs.shape, np.nan)
+        for k in np.flatnonzero(active):
+            target = targets[k]
+            if target is None:
+                continue
+            w = -(target.drift + model.B.dot(target.u))
+            found = law.compute(Estimate(x[k], w), target, limits, memory[k], seconds)
+            memory[k] = found.memory
+            if found.u is not None:
+                v[k] = model.inputs.to_deviation(found.u)
+        return v
+
+    return act
+
+
+def _constant(law: Law, setpoints: Array, inputs: Array, limits: InputLimits, seconds: float
+              ) -> _Feedback:
+    """Return the inputs of a law with one gain, which is read off what it does without limits."""
+    model, n = law.model, setpoints.shape[1]
+    endless = np.full(model.n_u, np.inf)
+    at_nominal = _called(law, np.zeros((n, n)), np.zeros((n, model.n_u)),
+                         InputLimits(-endless, endless, endless), seconds)
+    gain = at_nominal(np.eye(n), np.full(n, True)).T
+
+    def act(x: Array, active: NDArray[np.bool_]) -> Array:
+        u = model.inputs.to_physical(inputs + (x - setpoints) @ gain.T)
+        return model.inputs.to_deviation(limits.within(u))
+
+    return act
+
+
+def _run(plant: _Plant, feedbacks: Sequence[_Feedback], starts: Array, setpoints: Array,
+         inputs: Array, weights: Weights, interval: float, samples: int, steps: int,
+         watch: Callable[[float], bool]) -> tuple[Array, NDArray[np.bool_]] | None:
+    """
+    Run M loops under each of F laws; None where `watch` ended it.
+
+    :return: costs (F, M), infinite where a loop does not arrive, and whether (M,) the first law
+        had no gain on the way.
+    """
+    n, (M, m) = starts.shape[1], inputs.shape
+    y = np.tile(np.hstack([starts, np.zeros((M, 1))]), (len(feedbacks), 1, 1))
+    no_gain = np.zeros(M, dtype=bool)
+    # a loop that runs away ends as one that failed, whatever overflows meanwhile
+    with np.errstate(all='ignore'):
+        for number in range(samples):
+            if watch(number / samples):
+                return None
+            active = (np.abs(y[..., :n]) < _ESCAPED).all(axis=-1)
+            v = np.array([act(x, on) for act, x, on in zip(
+                feedbacks, y[..., :n], active, strict=True)])
+            no_gain |= active[0] & ~np.isfinite(v[0]).all(axis=-1)
+            u = v - inputs
+            held = np.einsum('...i,ij,...j->...', u, weights.R, u)
+
+            def flow(y: Array, v: Array = v, held: Array = held) -> Array:
+                x = y[..., :n]
+                e = x - setpoints
+                cost = np.einsum('...i,ij,...j->...', e, weights.Q, e) + held
+                rate = plant.rate(x.reshape(-1, n), v.reshape(-1, m)).reshape(x.shape)
+                return np.concatenate([rate, cost[..., None]], axis=-1)
+
+            y[~active] = np.nan
+            for _ in range(steps):
+                y = runge_kutta_step(flow, y, interval / steps)
+        there = (np.abs(y[..., :n] - setpoints) < _ARRIVED).all(axis=-1)
+    return np.where(there & np.isfinite(y[..., n]), y[..., n], np.inf), no_gain

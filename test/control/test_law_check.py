@@ -1,0 +1,209 @@
+# SPDX-FileCopyrightText: 2026 The koopman_ros Authors
+# SPDX-License-Identifier: Apache-2.0
+
+"""Closed loops over a box: which laws pass, which fail, where, and beside what."""
+
+from dataclasses import dataclass, replace
+import math
+
+import numpy as np
+import pytest
+from scipy.integrate import quad
+
+from koopman_ros.control.law_check import check_law
+from koopman_ros.control.laws import LawResult, Linear, Tuning, Weights
+from koopman_ros.control.laws.base import steady_state_target
+from koopman_ros.control.limits import InputLimits
+from koopman_ros.estimation import Estimate
+from koopman_ros.lifting import (
+    Coordinates,
+    LiftedModel,
+    linearised_model,
+    PolynomialObservables,
+    Provenance,
+    TrainingStates,
+)
+
+STATE = Coordinates(('level',), ('m',), np.zeros(1), np.ones(1), -np.ones(1), np.ones(1))
+INPUT = Coordinates(('flow',), ('m/s',), np.zeros(1), np.ones(1), np.full(1, -3.0),
+                    np.full(1, 3.0))
+TWO = Coordinates(('a', 'b'), ('m', 'K'), np.array([2.0, 300.0]), np.array([0.5, 20.0]),
+                  np.array([1.5, 280.0]), np.array([2.5, 320.0]))
+A, B = np.array([[0.3, 1.0], [-2.0, -0.5]]), np.array([[0.0, 0.4], [1.5, 0.0]])
+INPUTS = Coordinates(('u', 'v'), ('V', 'V'), np.array([1.0, 2.0]), np.ones(2),
+                     np.array([-9.0, -9.0]), np.array([9.0, 9.0]))
+
+
+def scalar(a=1.0, b=1.0):
+    """Return the model of dx/dt = a x + b u."""
+    return linearised_model(np.array([[a]]), np.array([[b]]), STATE, INPUT, 's', Provenance('s'))
+
+
+def linear_rate(a, b=1.0):
+    return lambda x, u: a * x + b * u
+
+
+def two_states(B=B):
+    """Return a model in units that differ from its scaled deviations, and minutes."""
+    D = TWO.scale[:, None]
+    return linearised_model(D * A / TWO.scale, D * B, TWO, INPUTS, 'min', Provenance('two'))
+
+
+def two_state_rate(x, u):
+    return TWO.scale * (TWO.to_deviation(x) @ A.T + INPUTS.to_deviation(u) @ B.T)
+
+
+def test_on_a_linear_plant_the_law_is_the_linear_one():
+    found = check_law(two_states(), two_state_rate, loops=32)
+    assert (found.loops, found.arrived, found.hopeless) == (32, 32, 0)
+    assert found.ratios == pytest.approx(np.ones(32), abs=1e-8)
+    assert found.accepted
+    assert found.region == ''
+    assert str(found).startswith('the law fails in 0 of 32 closed loops over the box, costing at')
+    # all over the box, in each of its quarters
+    for x in (found.starts, found.setpoints):
+        assert np.all((x >= TWO.lower) & (x <= TWO.upper))
+        quarters = (x > TWO.center) @ [1, 2]
+        assert min(np.bincount(quarters, minlength=4)) >= 4
+    assert np.all(np.max(np.abs(found.starts - found.setpoints) / TWO.scale, axis=1) >= 0.25)
+
+
+def test_an_input_of_the_wrong_sign_is_refused():
+    found = check_law(two_states(-B), two_state_rate, loops=16)
+    assert not found.accepted
+    assert (found.loops, found.arrived, found.share_failed) == (16, 0, 1.0)
+    assert not found.no_gain.any()
+    assert math.isinf(found.worst_ratio)
+    assert '16 of 16 closed loops over the box (16 not arriving), begun at a 1.5' in str(found)
+    assert len(repr(found)) < 300
+
+
+def test_a_model_without_a_gain_is_refused():
+    """What drifts away in it is moved by no input."""
+    found = check_law(scalar(1.0, 0.0), linear_rate(1.0), loops=16)
+    assert found.no_gain.all()
+    assert '(16 without a gain), begun at level' in str(found)
+
+
+def test_a_law_that_fails_in_a_part_of_its_box_is_refused_with_that_part():
+    """
+    The plant is dx/dt = 0.5 x + u, the model has -1.5 (x^3 + x^4) beside.
+
+    Where its secant S is below -0.75 the gain S + sqrt(S^2 + 1) is below the 0.5 it takes.
+    """
+    A = np.zeros((4, 4))
+    A[0] = 0.5, 0.0, -1.5, -1.5
+    observables = PolynomialObservables.total_degree(1, 4)
+    model = LiftedModel(observables, A, np.ones((1, 1)), STATE, INPUT, 's', Provenance('wrong'))
+    found = check_law(model, linear_rate(0.5))
+    x0, r = found.starts[:, 0], found.setpoints[:, 0]
+    secant = 0.5 - 1.5 * (x0 ** 3 - r ** 3 + x0 ** 4 - r ** 4) / (x0 - r)
+    lost = (x0 > r) & (x0 > 0.0) & (secant < -0.8)
+    assert np.sum(lost) > 10
+    assert np.isinf(found.ratios[lost]).all()
+    sound = (x0 < 0.1) & (r < 0.1)
+    assert np.sum(sound) > 20
+    assert np.isfinite(found.ratios[sound]).all()
+    assert not found.accepted
+    failed = found.failed
+    low, high = found.starts[failed].min(), found.starts[failed].max()
+    assert f'begun at level {low:.4g} to {high:.4g} m and bound for level ' in found.region
+    assert found.region in str(found)
+    assert np.maximum(x0, r)[failed].min() > 0.1
+    # the right one passes
+    right = replace(model, A=np.diag([0.5, 0.0, 0.0, 0.0]))
+    assert check_law(right, linear_rate(0.5), loops=32).accepted
+
+
+@dataclass(frozen=True)
+class Constant:
+    """A law with a gain of 5."""
+
+    model: LiftedModel
+    tuning: Tuning
+
+    def compute(self, estimate, target, limits, memory, interval, deadline=math.inf):
+        return LawResult(limits.within(
+            self.model.inputs.to_physical(target.u - 5.0 * (estimate.x - target.x))))
+
+
+def held_cost(a, gain, h):
+    """Return the cost from x = 1 of dx/dt = a x + u, u = -gain x held over h."""
+    def x(t):
+        return math.exp(a * t) - gain * math.expm1(a * t) / a
+    return (quad(lambda t: x(t) ** 2, 0.0, h)[0] + h * gain ** 2) / (1.0 - x(h) ** 2)
+
+
+def test_a_costly_law_is_refused_by_what_it_costs():
+    endless = InputLimits(np.full(1, -np.inf), np.full(1, np.inf), np.full(1, np.inf))
+    model, h = scalar(), 0.2  # longer than a fourth of 1 / sqrt(2)
+    found = check_law(model, linear_rate(1.0), law=Constant, limits=endless, interval=h, loops=16)
+    tuning = Tuning(Weights(np.eye(1), np.eye(1)))
+    u = Linear(model, tuning).compute(
+        Estimate(np.ones(1), np.zeros(1)), steady_state_target(model, np.zeros(1)), endless, None,
+        h).u
+    expected = held_cost(1.0, 5.0, h) / held_cost(1.0, -float(u[0]), h)
+    assert expected > 1.1
+    assert found.ratios == pytest.approx(np.full(16, expected), rel=1e-4)
+    assert '(16 costing over 1.1 times as much as a linear law)' in str(found)
+
+
+def test_what_no_law_can_do_is_not_held_against_it():
+    """With |u| <= 0.5 nothing brings dx/dt = x + u back from |x| > 0.5."""
+    tight = InputLimits(np.full(1, -0.5), np.full(1, 0.5), np.full(1, np.inf))
+    found = check_law(scalar(), linear_rate(1.0), limits=tight, loops=64)
+    assert found.accepted
+    assert 20 < found.hopeless < 44
+    assert found.loops + found.hopeless == 64
+    assert np.max(np.abs(found.starts)) < 0.5
+    assert np.max(np.abs(found.setpoints)) <= 0.5 + 1e-9
+    # nor is it a recommendation where there is nothing else
+    lost = check_law(scalar(1.0, -1.0), lambda x, u: x, limits=tight, loops=16)
+    assert lost.loops == 0
+    assert not lost.accepted
+    assert 'no law arrives in any of ' in str(lost)
+    assert math.isnan(lost.worst_ratio)
+
+
+def test_setpoints_are_where_an_input_holds_the_plant():
+    """dx1/dt = -x1 + x2, dx2/dt = -x2 + u stands still where x1 = x2 = u."""
+    states = Coordinates.spanning(('x1', 'x2'), ('', ''), np.array([-1.0, -4.0]),
+                                  np.array([1.0, 4.0]))
+    slope, b = np.array([[-1.0, 1.0], [0.0, -1.0]]), np.array([[0.0], [1.0]])
+    model = linearised_model(slope, b, states, INPUT, 's', Provenance('cascade'))
+    found = check_law(model, lambda x, u: x @ slope.T + u @ b.T, loops=32)
+    assert found.setpoints[:, 0] == pytest.approx(found.setpoints[:, 1], abs=1e-6)
+    assert np.ptp(found.setpoints[:, 0]) > 1.0
+    assert found.accepted
+
+
+def test_loops_begin_and_end_where_the_data_are():
+    line = np.linspace(-1.0, 1.0, 41)
+    data = TrainingStates.of(np.stack([line, line], 1), np.ones(2))
+    model = replace(two_states(), training_states=data)
+    found = check_law(model, two_state_rate, loops=32)
+    assert found.loops > 8
+    for x in (*found.starts, *found.setpoints):
+        assert model.distance(x) <= 1e-9
+
+
+def test_a_lift_is_not_charged_for_an_offset_that_an_observer_removes():
+    found = check_law(scalar(-1.0), lambda x, u: 0.3 - x + u, loops=16)
+    assert found.ratios == pytest.approx(np.ones(16), abs=1e-6)
+
+
+def test_the_watch_sees_it_and_can_end_it():
+    seen = []
+    assert check_law(scalar(), linear_rate(1.0), loops=2, watch=seen.append) is not None
+    assert seen[0] == 0.0
+    assert 0.9 < seen[-1] < 1.0
+    assert seen == sorted(seen)
+    assert check_law(scalar(), linear_rate(1.0), watch=lambda share: share > 0.3) is None
+
+
+def test_a_plant_without_inputs_has_no_closed_loop():
+    none = Coordinates((), (), *np.zeros((4, 0)))
+    model = LiftedModel(PolynomialObservables.total_degree(1, 1), -np.eye(1), np.zeros((1, 0)),
+                        STATE, none, 's', Provenance('free'))
+    with pytest.raises(ValueError, match='a plant without inputs has no closed loop'):
+        check_law(model, lambda x, u: -x)
