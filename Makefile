@@ -12,7 +12,7 @@ export ROS_AUTOMATIC_DISCOVERY_RANGE ?= LOCALHOST
 # How many seeds each experiment is run from: make studies SEEDS=5
 SEEDS ?= 20
 
-.PHONY: help demo demo-retrain test test-machines lint models studies studies-sensors studies-robustness bench faults docs config lock clean
+.PHONY: help demo demo-retrain test test-machines lint models studies studies-sensors studies-robustness studies-general bench faults docs config lock clean
 
 help:  ## show this list
 	@grep -E '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed 's/:.*## /\t/'
@@ -82,6 +82,10 @@ studies-sensors: $(VENV)/train.stamp  ## learning from noisy data of a sensor, t
 
 studies-robustness: $(VENV)/bench.stamp  ## margins, attraction, disturbances, noise, narrow data, three minutes -> out/studies-robustness
 	$(BIN)/python -m validation.robustness
+
+studies-general: SEEDS = 10
+studies-general: $(VENV)/train.stamp  ## the law on seven plants by models of each class, SEEDS=10 -> out/studies-general
+	$(BIN)/python -m validation.general --seeds $(SEEDS)
 
 bench: $(VENV)/bench.stamp  ## speed beside other programs, thirteen minutes (BENCH=--quick: two) -> out/bench
 	$(BIN)/python -m validation.benchmarks $(BENCH)

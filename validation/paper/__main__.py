@@ -15,7 +15,7 @@ import time
 
 from koopman_ros import __version__
 from koopman_ros.reports import write_figures
-from validation.paper.campaign import run_campaign
+from validation.paper.campaign import run_campaign, SENSOR_EXPERIMENTS
 from validation.paper.figures import draw_figures
 from validation.paper.report import write_report
 
@@ -40,7 +40,7 @@ def main(args: list[str] | None = None) -> int:
     # a request to end is an interrupt: what is done is reported
     signal.signal(signal.SIGTERM, signal.default_int_handler)
     start = time.monotonic()
-    campaign = run_campaign(options.seeds, of_sensors=options.sensors)
+    campaign = run_campaign(options.seeds, SENSOR_EXPERIMENTS if options.sensors else None)
     summary = {
         'package_version': __version__, 'seeds': options.seeds, 'complete': campaign.complete,
         'errors': campaign.errors, 'wall_seconds': round(time.monotonic() - start, 1),

@@ -8,7 +8,7 @@ from dataclasses import dataclass, field
 import math
 import os
 import sys
-from typing import Any
+from typing import Any, TypeAlias
 
 import joblib
 from tqdm import tqdm
@@ -18,8 +18,10 @@ from koopman_ros.lifting import LiftedModel
 from validation.paper import reactor, scalar, sensors, two_state
 from validation.paper.datasets import Metrics, Models
 
+# What is run for a seed.
+Experiment: TypeAlias = Callable[[int], tuple[Metrics, Models]]
 # Each experiment with the place of its figures in the summary; the slow ones first.
-EXPERIMENTS: dict[str, Callable[[int], tuple[Metrics, Models]]] = {
+EXPERIMENTS: dict[str, Experiment] = {
     'reactor': reactor.run,
     'two_state': two_state.run,
     'narrow': two_state.run_narrow,
@@ -28,7 +30,7 @@ EXPERIMENTS: dict[str, Callable[[int], tuple[Metrics, Models]]] = {
     'scalar': scalar.run,
 }
 # The same for what the paper leaves open: data from a sensor.
-SENSOR_EXPERIMENTS: dict[str, Callable[[int], tuple[Metrics, Models]]] = {
+SENSOR_EXPERIMENTS: dict[str, Experiment] = {
     'sensors/drifted': sensors.run_drifted,
     'sensors/noisy': sensors.run_noisy,
     'sensors/noise_free': sensors.run_noise_free,
@@ -65,17 +67,16 @@ class Campaign:
         return nested
 
 
-def run_campaign(seeds: int, *, of_sensors: bool = False) -> Campaign:
+def run_campaign(seeds: int, experiments: Mapping[str, Experiment] | None = None) -> Campaign:
     """
     Run every experiment for the seeds 0 ... `seeds` - 1; an interrupt keeps what is done.
 
     joblib spreads the runs over the cores; within ``joblib.parallel_config(...)`` they go where
     that says.
 
-    :param of_sensors: whether to run the experiments on data from a sensor instead of the
-        paper's.
+    :param experiments: by the place of their figures in the summary; the paper's by default.
     """
-    experiments = SENSOR_EXPERIMENTS if of_sensors else EXPERIMENTS
+    experiments = EXPERIMENTS if experiments is None else experiments
     campaign = Campaign()
     # seed by seed, so that an interrupted campaign is whole for the first ones
     runs = [(name, seed) for seed in range(seeds) for name in experiments]
@@ -109,7 +110,7 @@ def run_campaign(seeds: int, *, of_sensors: bool = False) -> Campaign:
     return campaign
 
 
-def _run(name: str, seed: int, experiment: Callable[[int], tuple[Metrics, Models]]
+def _run(name: str, seed: int, experiment: Experiment
          ) -> tuple[str, int, tuple[Metrics, Models] | str]:
     try:
         return name, seed, experiment(seed)

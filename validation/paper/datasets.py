@@ -9,6 +9,7 @@ from typing import TypeAlias
 
 import numpy as np
 
+from koopman_ros.arrays import Array
 from koopman_ros.lifting import LiftedModel
 from koopman_ros.plant_data import Episode, Plant, Samples
 from koopman_ros.plants import (
@@ -48,7 +49,7 @@ def random_step_episodes(system: ControlAffineSystem, design: RandomStepDesign, 
 
 
 def box_episodes(system: ControlAffineSystem, design: RandomStepDesign, episodes: int,
-                 duration: float, seed: int) -> Samples:
+                 duration: float, seed: int, starts: tuple[Array, Array] | None = None) -> Samples:
     """
     Simulate short episodes of random input steps from random states within a box.
 
@@ -56,10 +57,11 @@ def box_episodes(system: ControlAffineSystem, design: RandomStepDesign, episodes
 
     :param duration: of each, in the plant's time unit.
     :param seed: of the initial states and of the steps.
+    :param starts: corners of that box, each (n_x,); by default the box that they may not leave.
     """
     rng = np.random.default_rng(seed)
-    lower = np.broadcast_to(design.state_lower, system.n_x)
-    upper = np.broadcast_to(design.state_upper, system.n_x)
+    lower, upper = (np.broadcast_to(bound, system.n_x) for bound in starts or (
+        design.state_lower, design.state_upper))
     found: list[Episode] = []
     while len(found) < episodes:
         x0, step_seed = rng.uniform(lower, upper), int(rng.integers(2 ** 31))

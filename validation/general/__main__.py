@@ -1,0 +1,56 @@
+# SPDX-FileCopyrightText: 2026 The koopman_ros Authors
+# SPDX-License-Identifier: Apache-2.0
+
+"""Run the study (needs the `train` and `demo` requirements): report and figure."""
+
+import argparse
+from pathlib import Path
+import signal
+import sys
+import time
+
+from koopman_ros import __version__
+from koopman_ros.reports import write_figures
+from validation.general.report import write_report
+from validation.general.study import EXPERIMENTS
+from validation.paper.campaign import run_campaign
+
+
+def main(args: list[str] | None = None) -> int:
+    """Run the study and write what it found."""
+    parser = argparse.ArgumentParser(
+        prog='python -m validation.general',
+        description='Hold the law on models of several classes to plants that it was not made '
+        'for.')
+    parser.add_argument('plants', nargs='*', metavar='plant', help='which: '
+                        f'{", ".join(EXPERIMENTS)} (default: all)')
+    parser.add_argument('--seeds', type=int, default=10, help='number of seeds, at least 1 '
+                        '(default: %(default)s)')
+    parser.add_argument('--output', type=Path, default=Path('out/studies-general'),
+                        help='folder for figure and report (default: %(default)s)')
+    options = parser.parse_args(args)
+    if options.seeds < 1:
+        parser.error(f'--seeds is {options.seeds}, must be at least 1')
+    if unknown := set(options.plants) - EXPERIMENTS.keys():
+        parser.error(f'there is no plant {", ".join(sorted(unknown))}: choose of '
+                     f'{", ".join(EXPERIMENTS)}')
+    # a request to end is an interrupt: what is done is reported
+    signal.signal(signal.SIGTERM, signal.default_int_handler)
+    start = time.monotonic()
+    campaign = run_campaign(options.seeds, {
+        name: EXPERIMENTS[name] for name in options.plants or EXPERIMENTS})
+    summary = {
+        'package_version': __version__, 'seeds': options.seeds, 'complete': campaign.complete,
+        'errors': campaign.errors, 'wall_seconds': round(time.monotonic() - start, 1),
+        **campaign.summary()}
+    write_figures(options.output / 'summary.json', summary)
+    write_report(summary, options.output)
+    for line in campaign.errors:
+        print(f'failed: {line}', file=sys.stderr)
+    print(f'wrote {options.output}/report.md, summary.json and a figure in '
+          f'{time.monotonic() - start:.0f} s')
+    return 0 if campaign.complete and not campaign.errors else 1
+
+
+if __name__ == '__main__':
+    sys.exit(main())

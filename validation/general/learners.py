@@ -1,0 +1,66 @@
+# SPDX-FileCopyrightText: 2026 The koopman_ros Authors
+# SPDX-License-Identifier: Apache-2.0
+
+"""Classes of models that are set beside each other; to add one, name it in LEARNERS."""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+import time
+from typing import TypeAlias
+
+from koopman_ros.learning import Edmd, Growth, NoUsefulLift, train
+from koopman_ros.learning.training import Recipe
+from koopman_ros.lifting import Box, LiftedModel
+from koopman_ros.plant_data import Plant, Samples, split_by_episode
+
+
+@dataclass(frozen=True)
+class Learned:
+    """A model and what learning it took."""
+
+    model: LiftedModel
+    seconds: float  #: of the processor, of a training that decides by itself
+    refused: str | None = None  #: why it was refused, '' where it was not; None for what never is
+
+
+Learner: TypeAlias = Callable[[Plant, Samples, int], Learned]
+
+
+def _polynomial(degree: int) -> Learner:
+    def learn(plant: Plant, samples: Samples, seed: int) -> Learned:
+        begin = time.process_time()
+        known, box = split_by_episode(samples, 0)[0], Box.of(plant, samples.x, samples.u)
+        model = Edmd(degree).learn(plant, known, box)
+        return Learned(model, time.process_time() - begin)
+
+    return learn
+
+
+def _trained(recipe: Callable[[int], Recipe]) -> Learner:
+    """Return the learner of a recipe that is made for a number of states."""
+    def learn(plant: Plant, samples: Samples, seed: int) -> Learned:
+        made = recipe(samples.x.shape[1])
+        begin = time.process_time()
+        try:
+            refused, model = '', train(plant, samples, made, seed=seed, starts=1).model
+        except NoUsefulLift as error:
+            refused = str(error)
+        seconds = time.process_time() - begin
+        if refused:
+            # the same once more, to see what the refusal is worth
+            model = train(plant, samples, made, seed=seed, starts=1, refuse=False).model
+        return Learned(model, seconds, refused)
+
+    return learn
+
+
+_STEPS = 300  # of Levenberg-Marquardt, for each size
+LEARNERS: dict[str, Learner] = {
+    'linear': _polynomial(1),
+    'EDMD-3': _polynomial(3),
+    'EDMD-5': _polynomial(5),
+    'identity lift': _trained(
+        lambda n_x: Growth(n_x + 3, hidden_first=16, max_iterations=_STEPS)),
+    'free lift': _trained(
+        lambda n_x: Growth(n_x, identity=False, hidden_first=16, max_iterations=_STEPS)),
+}
