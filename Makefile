@@ -84,7 +84,7 @@ studies-robustness: $(VENV)/bench.stamp  ## margins, attraction, disturbances, n
 	$(BIN)/python -m validation.robustness
 
 studies-general: SEEDS = 10
-studies-general: $(VENV)/train.stamp  ## the law on seven plants by models of each class, SEEDS=10 -> out/studies-general
+studies-general: $(VENV)/bench.stamp  ## the law on seven plants by models of each class, SEEDS=10 -> out/studies-general
 	$(BIN)/python -m validation.general --seeds $(SEEDS)
 
 bench: $(VENV)/bench.stamp  ## speed beside other programs, thirteen minutes (BENCH=--quick: two) -> out/bench

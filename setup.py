@@ -50,7 +50,7 @@ setup(
         'demo': ['matplotlib', 'rich'],
         'train': ['torch==2.13.0', 'joblib', 'tqdm'],
         # what validation and benchmarks compare with
-        'bench': ['casadi==3.8.2', 'control', 'psutil'],
+        'bench': ['casadi==3.8.2', 'control', 'psutil', 'pysindy==2.1.0'],
         'docs': ['furo', 'myst-parser', 'sphinx'],
         'test': [
             'colcon-common-extensions',

@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 The koopman_ros Authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""Run the study (needs the `train` and `demo` requirements): report and figure."""
+"""Run the study (needs the `train`, `demo` and `bench` requirements): report and figure."""
 
 import argparse
 from pathlib import Path

@@ -4,13 +4,15 @@
 """Classes of models that are set beside each other; to add one, name it in LEARNERS."""
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 import time
 from typing import TypeAlias
 
+import numpy as np
+
 from koopman_ros.learning import Edmd, Growth, NoUsefulLift, train
 from koopman_ros.learning.training import Recipe
-from koopman_ros.lifting import Box, LiftedModel
+from koopman_ros.lifting import Box, LiftedModel, PolynomialObservables
 from koopman_ros.plant_data import Plant, Samples, split_by_episode
 
 
@@ -32,6 +34,37 @@ def _polynomial(degree: int) -> Learner:
         known, box = split_by_episode(samples, 0)[0], Box.of(plant, samples.x, samples.u)
         model = Edmd(degree).learn(plant, known, box)
         return Learned(model, time.process_time() - begin)
+
+    return learn
+
+
+_RIDGE = 1e-9  # the data are exact: its usual 0.05 keeps terms that are not there
+
+
+def _sparse(degree: int, threshold: float = 0.01) -> Learner:
+    """
+    Return SINDy (Brunton, Proctor, Kutz 2016) of pysindy: monomials, most of them left out.
+
+    :param threshold: coefficients below are 0, with states in halves of their range and rates in
+        units of their root mean square.
+    """
+    def learn(plant: Plant, samples: Samples, seed: int) -> Learned:
+        import pysindy
+
+        full = _polynomial(degree)(plant, samples, seed).model
+        begin = time.process_time()
+        known = split_by_episode(samples, 0)[0]
+        rate = known.dxdt / full.states.scale - full.inputs.to_deviation(known.u) @ full.B.T
+        pace = np.sqrt(np.mean(rate ** 2))
+        terms = pysindy.PolynomialLibrary(degree=degree, include_bias=False)
+        found = pysindy.SINDy(pysindy.STLSQ(threshold=threshold, alpha=_RIDGE), terms).fit(
+            full.states.to_deviation(known.x), t=1.0, x_dot=rate / pace)
+        weights = {tuple(powers): pace * column for powers, column in zip(
+            terms.powers_.tolist(), found.coefficients().T, strict=True)}
+        exponents = PolynomialObservables.total_degree(full.n_x, degree).exponents
+        drift = np.stack([weights[tuple(powers)] for powers in exponents.tolist()])
+        return Learned(replace(full, A=np.vstack([drift.T, full.A[full.n_x:]])),
+                       time.process_time() - begin)
 
     return learn
 
@@ -59,6 +92,7 @@ LEARNERS: dict[str, Learner] = {
     'linear': _polynomial(1),
     'EDMD-3': _polynomial(3),
     'EDMD-5': _polynomial(5),
+    'SINDy-5': _sparse(5),
     'identity lift': _trained(
         lambda n_x: Growth(n_x + 3, hidden_first=16, max_iterations=_STEPS)),
     'free lift': _trained(

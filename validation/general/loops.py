@@ -79,7 +79,7 @@ def loops(case: Case, model: LiftedModel, starts: int,
 
         loop = run_closed_loop(
             model, case.system.derivative, x0, nominal, case.weights(model), case.horizon,
-            law=watched, u_ref=case.system.nominal_input, samples=2, rtol=1e-6,
+            law=watched, u_ref=case.system.nominal_input, samples=2, rtol=1e-5,
             max_evaluations=_MAX_EVALUATIONS)
         away = float(np.max(np.abs(loop.states[-1] - nominal) / case.units[0]))
         ends.append(End(loop.cost if away < ARRIVED else math.inf, not all(solved)))

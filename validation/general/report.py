@@ -96,7 +96,7 @@ def _draw(cases: Mapping[str, Mapping[str, Mapping[str, Values]]], path: Path) -
                     if rx is None:
                         continue
                     worst = m['ratio_worst'][i]
-                    lost = m['not_arrived'][i] or worst is None
+                    lost = bool(m['not_arrived'][i]) or worst is None
                     refused = m['accepted'][i] is False
                     axis.plot(rx, _HIGHEST if lost or worst is None else min(worst, _HIGHEST),
                               'x' if lost else 'o', color=f'C{number}', label=label,
@@ -104,8 +104,8 @@ def _draw(cases: Mapping[str, Mapping[str, Mapping[str, Values]]], path: Path) -
             for number, known in enumerate(label for label in models if label not in trained):
                 if 'missed' not in models[known]:
                     continue
-                worst = [v for v in models[known]['ratio_worst'] if v is not None]
-                axis.axhline(min(max(worst, default=_HIGHEST), _HIGHEST), color='0.3',
+                highest = max(_present(models[known]['ratio_worst']), default=_HIGHEST)
+                axis.axhline(min(highest, _HIGHEST), color='0.3',
                              linestyle=(':', '--')[number % 2], label=known)
             axis.axhline(HELD_TO, color='tab:red', linewidth=0.8, label=f'{HELD_TO}')
             axis.set(title=CASES[name].system.name, xlabel='rx [1]', xscale='log', yscale='log',

@@ -117,6 +117,18 @@ def test_a_refused_model_is_judged_all_the_same(monkeypatch):
     assert learned.model.n_z == 3
 
 
+def test_sindy_leaves_out_what_van_der_pol_does_not_have():
+    pytest.importorskip('pysindy')
+    case = CASES['van_der_pol']
+    model = learners.LEARNERS['SINDy-5'](describe(case.system), case.samples(0, 20), 0).model
+    # x2 in the first rate; x1, x2 and x1^2 x2 in the second, of the 20 monomials
+    assert np.count_nonzero(model.A[:2], axis=1).tolist() == [1, 3]
+    x = case.starts(5)
+    deviations = model.states.to_deviation(x)
+    np.testing.assert_allclose(model.drift(deviations) * model.states.scale,
+                               case.system.drift(x), atol=1e-6)
+
+
 @pytest.fixture(scope='module')
 def folder(tmp_path_factory):
     """Run one plant and one seed, few starts, linear and cubic models and a hasty lift."""
