@@ -10,11 +10,12 @@ import statistics
 from typing import Any
 
 from koopman_ros.reports import drawing, legend, Picture, table, write_page
-from validation.general.loops import HELD_TO, STARTS
+from validation.general.loops import HELD_TO, OPTIMA, STARTS
 from validation.general.systems import CASES
 
 Values = Sequence[float | bool | None]
 _HIGHEST = 3.0  # cost ratio drawn; above it, or where a start did not arrive, at the upper edge
+_LOWEST = 1e-10  # rx drawn; rounding is below
 _COLUMNS = ('model', 'rx', 'roll-out', 'learning [s]', 'accepted', 'no gain', 'not arrived',
             'missed', 'cost', 'cost, worst', 'over the least, worst')
 
@@ -34,8 +35,8 @@ def write_report(summary: Mapping[str, Any], folder: Path) -> None:
         'largest]; `accepted` counts seeds. Of all starts and seeds: where the law had no gain, '
         f'where the plant did not arrive, and where it either did not or cost more than {HELD_TO} '
         'times the better of two laws that know the plant; that cost ratio where it arrived, at '
-        'the median and the worst, and the worst over the least cost. The least is found with '
-        'inputs held, so that ratios a little below 1 mean 1.',
+        f'the median and the worst, and the worst over the least cost from {OPTIMA} of the '
+        'starts. The least is found with inputs held, so that ratios a little below 1 mean 1.',
         '## What every law is held to', _overall(cases),
         '## Does acceptance tell?', _acceptance(cases), '## Figure', str(picture), *(
             f'## {CASES[name].system.name}\n\n{_table(models)}'
@@ -92,24 +93,27 @@ def _draw(cases: Mapping[str, Mapping[str, Mapping[str, Values]]], path: Path) -
         for axis, (name, models) in zip(axes, cases.items(), strict=False):
             trained = {label: m for label, m in models.items() if 'rx' in m and 'missed' in m}
             for number, (label, m) in enumerate(trained.items()):
+                color = f'C{number}'
+                axis.plot([], [], 's', color=color, label=label)
                 for i, rx in enumerate(m['rx']):
                     if rx is None:
                         continue
                     worst = m['ratio_worst'][i]
                     lost = bool(m['not_arrived'][i]) or worst is None
                     refused = m['accepted'][i] is False
-                    axis.plot(rx, _HIGHEST if lost or worst is None else min(worst, _HIGHEST),
-                              'x' if lost else 'o', color=f'C{number}', label=label,
-                              markerfacecolor='none' if refused else None)
+                    axis.plot(max(rx, _LOWEST),
+                              _HIGHEST if lost or worst is None else min(worst, _HIGHEST),
+                              'X' if lost else 'o', color=color, alpha=0.8,
+                              markerfacecolor='none' if refused else color)
             for number, known in enumerate(label for label in models if label not in trained):
                 if 'missed' not in models[known]:
                     continue
                 highest = max(_present(models[known]['ratio_worst']), default=_HIGHEST)
                 axis.axhline(min(highest, _HIGHEST), color='0.3',
                              linestyle=(':', '--')[number % 2], label=known)
-            axis.axhline(HELD_TO, color='tab:red', linewidth=0.8, label=f'{HELD_TO}')
+            axis.axhline(HELD_TO, color='tab:red', linewidth=0.8, label=f'held to: {HELD_TO}')
             axis.set(title=CASES[name].system.name, xlabel='rx [1]', xscale='log', yscale='log',
-                     ylim=(0.97, 1.03 * _HIGHEST))
+                     xlim=(0.5 * _LOWEST, 100.0), ylim=(0.97, 1.05 * _HIGHEST))
             axis.set_yticks([1.0, 1.1, 1.3, 2.0, 3.0], ['1', '1.1', '1.3', '2', '≥ 3'])
             axis.minorticks_off()
         for axis in axes[len(cases):]:
@@ -119,8 +123,9 @@ def _draw(cases: Mapping[str, Mapping[str, Mapping[str, Values]]], path: Path) -
         legend(figure, axes[:len(cases)], 5)
     return Picture(path.name, (
         'Cost on the true plant over that of the better law that knows it, at the worst of '
-        f'{STARTS} starts, by the error of the learned drift; a point a model and seed. Crosses: '
-        'the plant did not arrive from every start. Hollow: training refused the model.'))
+        f'{STARTS} starts, by the error of the learned drift (at the left edge: exact to '
+        'rounding); a point a model and seed. Crosses: the plant did not arrive from every '
+        'start. Hollow: training refused the model.'))
 
 
 def _present(values: Values | None) -> list[float]:
