@@ -9,6 +9,7 @@ import numpy as np
 
 from koopman_ros.learning import fit, rollout_rmse
 from koopman_ros.lifting.bounds import MAX_COORDINATES
+from koopman_ros.plant_data import Samples
 from validation.general.learners import Learned, LEARNERS
 from validation.general.loops import judged, known, loops, STARTS
 from validation.general.systems import Case, CASES
@@ -29,17 +30,17 @@ def run(name: str, seed: int, starts: int = STARTS) -> tuple[Metrics, Models]:
     """
     case, beside = CASES[name], known(name, starts)
     found = {LQR: judged(beside.lqr, beside), SDRE: judged(beside.sdre, beside)}
-    samples = case.samples(seed)
+    samples, held_out = case.samples(seed), case.samples(1000 + seed, _HELD_OUT)
     for label, learn in LEARNERS.items():
         learned = learn(describe(case.system), samples, seed)
-        found[label] = predicted(case, learned, seed)
+        found[label] = predicted(case, learned, held_out)
         if learned.model.n_z <= MAX_COORDINATES:
             found[label] |= judged(loops(case, learned.model, starts), beside)
     return {f'{label}/{figure}': value for label, figures in found.items()
             for figure, value in figures.items()}, {}
 
 
-def predicted(case: Case, learned: Learned, seed: int) -> Metrics:
+def predicted(case: Case, learned: Learned, held_out: Samples) -> Metrics:
     """
     Judge a model on held-out episodes.
 
@@ -47,9 +48,8 @@ def predicted(case: Case, learned: Learned, seed: int) -> Metrics:
         in half widths of the box, None of a drift that is no better than none; `seconds` of
         learning; `accepted`, None where nothing decides.
     """
-    held = case.samples(1000 + seed, _HELD_OUT)
-    found = fit(learned.model, held.x, held.dxdt, held.u)
-    error = rollout_rmse(learned.model, held) if found.rx < 1.0 else None
+    found = fit(learned.model, held_out.x, held_out.dxdt, held_out.u)
+    error = rollout_rmse(learned.model, held_out) if found.rx < 1.0 else None
     return {'rw': found.rw, 'rx': found.rx,
             'rollout': None if error is None else float(np.max(error / case.units[0])),
             'seconds': learned.seconds,
