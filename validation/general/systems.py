@@ -14,10 +14,10 @@ from scipy.stats import qmc
 from koopman_ros.arrays import Array
 from koopman_ros.control import Weights
 from koopman_ros.learning import Linearisation
-from koopman_ros.learning.validation import settling_time
 from koopman_ros.lifting import Box, LiftedModel
 from koopman_ros.plant_data import Samples
 from koopman_ros.plants import ControlAffineSystem, RandomStepDesign, two_state_reactor
+from koopman_ros.solvers import solve_riccati
 from validation.paper.datasets import box_episodes, describe
 from validation.shipped_models import library_system, LIFTS
 
@@ -58,7 +58,9 @@ class Case:
     @cached_property
     def horizon(self) -> float:
         """Six time constants of the slowest mode under the linear law, in time units."""
-        return settling_time(self.truth, self.weights(self.truth))
+        truth, weights = self.truth, self.weights(self.truth)
+        K = solve_riccati(truth.A, truth.B, weights.Q, weights.R).K
+        return 6.0 / float(np.min(np.abs(np.linalg.eigvals(truth.A - truth.B @ K).real)))
 
     def weights(self, model: LiftedModel) -> Weights:
         """Return the weights in a model's scales: 1 on errors in :attr:`units`."""
