@@ -9,6 +9,7 @@ from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import partial
 import itertools
+import math
 
 import torch
 from torch import Tensor
@@ -28,6 +29,7 @@ class Grown:
     layout: Layout  #: its sizes
     theta: Tensor  #: (p,) parameters
     status: MinimumStatus  #: how the last minimisation ended
+    decrease: float = math.nan  #: see :class:`Minimum`
 
 
 @dataclass(frozen=True)
@@ -87,7 +89,7 @@ class Growth:
             last = problem.with_weights(replace(problem.weights,
                                                 decoder=1e-3 * self.decoder_weight))
             minimum = run(last.add_residuals, minimum.theta)
-        return Grown(layout, minimum.theta, minimum.status)
+        return Grown(layout, minimum.theta, minimum.status, minimum.decrease)
 
     def _root(self, data: ScaledSamples) -> Grown:
         """Return the lift without a network that growth starts from."""

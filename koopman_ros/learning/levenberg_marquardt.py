@@ -16,6 +16,7 @@ from torch import Tensor
 # The damping rises by this when a step is refused, and by twice as much each further time.
 _FACTOR = 2.0
 _MAX_DAMPING = 1e12
+PATIENCE = 20  # accepted steps over which the decrease of the cost is judged
 
 
 class MinimumStatus(Enum):
@@ -37,6 +38,9 @@ class Minimum:
     cost: float  #: half the sum of squares there
     iterations: int  #: accepted and rejected steps together
     status: MinimumStatus  #: why it ended
+    #: at the limit of steps, the share of the cost that the last `patience` accepted ones took
+    #: off; NaN otherwise, and where there was none
+    decrease: float = math.nan
 
 
 class NormalEquations:
@@ -92,7 +96,7 @@ def normal_equations(residuals: Residuals, theta: Tensor, *, derivatives: bool =
 
 
 def minimise(residuals: Residuals, theta: Tensor, *, max_iterations: int,
-             tolerance: float = 1e-3, patience: int = 20,
+             tolerance: float = 1e-3, patience: int = PATIENCE,
              monitor: Callable[[int, float], bool] | None = None) -> Minimum:
     """
     Minimise 0.5 ||r(theta)||^2 by Levenberg-Marquardt with Marquardt's diagonal scaling.
@@ -129,7 +133,9 @@ def minimise(residuals: Residuals, theta: Tensor, *, max_iterations: int,
         if state is None:
             raise
         return state.minimum(MinimumStatus.INTERRUPTED)
-    return state.minimum(MinimumStatus.MAX_ITERATIONS)
+    before = costs[-1 - min(patience, len(costs) - 1)]
+    return replace(state.minimum(MinimumStatus.MAX_ITERATIONS),
+                   decrease=(before - costs[-1]) / before if before > costs[-1] else math.nan)
 
 
 @dataclass(frozen=True)

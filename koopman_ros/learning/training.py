@@ -24,7 +24,7 @@ from koopman_ros.control.law_check import check_law, LawCheck, LOOPS, Rate
 from koopman_ros.learning.baselines import Algorithm1, Edmd
 from koopman_ros.learning.contradictions import check_nominal_point, check_rates
 from koopman_ros.learning.growth import Grown, Growth, Monitor
-from koopman_ros.learning.levenberg_marquardt import MinimumStatus
+from koopman_ros.learning.levenberg_marquardt import MinimumStatus, PATIENCE
 from koopman_ros.learning.residuals import deviations, ScaledSamples
 from koopman_ros.learning.validation import evaluate, Figures, Fit, fit, lifted_rate
 from koopman_ros.lifting import Box, LiftedModel, NetworkObservables, Provenance, TrainingStates
@@ -177,7 +177,8 @@ def _conclude(plant: Plant, parts: tuple[Samples, Samples, Samples], path: list[
         raise NoUsefulLift(
             f'the lift with n_z = {winner.model.n_z} does not predict the motion better than a '
             f'linear model (relative error rx = {winner.fit.rx:.2g} against {rx:.2g} on '
-            'validation episodes): keep the linear model, or excite the plant over a wider range')
+            'validation episodes): keep the linear model, or excite the plant over a wider range'
+            + ('' if winner.model.identity else ', or use identity coordinates'))
     law_check = None
     if loops and winner.model.n_u:
         # one that was ended before gets its loops all the same
@@ -189,16 +190,31 @@ def _conclude(plant: Plant, parts: tuple[Samples, Samples, Samples], path: list[
         if law_check is not None and not law_check.accepted:
             raise NoUsefulLift(
                 f'the lift with n_z = {winner.model.n_z} is no controller: {law_check}: use '
-                'identity coordinates, a smaller n_z, more starts, or a narrower range')
+                f'{_remedies(winner.model)}')
     models, figures = [], []
     for candidate in path:
         figures.append(evaluate(candidate.model, parts[2]))
         metrics = figures[-1].metrics(candidate.model.states.names)
         models.append(replace(candidate.model, provenance=replace(
             candidate.model.provenance, metrics=metrics)))
-    status = MinimumStatus.INTERRUPTED if interrupted else winner.grown.status
-    return Trained(models[-1], figures[-1], evaluate(linear, parts[2]), law_check, status.value,
-                   tuple(models), tracker.finished)
+    return Trained(models[-1], figures[-1], evaluate(linear, parts[2]), law_check,
+                   _ending(winner.grown, interrupted), tuple(models), tracker.finished)
+
+
+def _remedies(model: LiftedModel) -> str:
+    """Say what else can be tried than this lift."""
+    identity = [] if model.identity else ['identity coordinates']
+    smaller = ['a smaller n_z'] if model.n_z > model.n_x + model.identity else []
+    return ', '.join([*identity, *smaller, 'more starts, or a narrower range'])
+
+
+def _ending(grown: Grown, interrupted: bool) -> str:
+    """Say how a training ended, and where at a limit how far it was from its end."""
+    if interrupted:
+        return MinimumStatus.INTERRUPTED.value
+    return grown.status.value + ('' if math.isnan(grown.decrease) else (
+        f'; with n_z = {grown.layout.n_z} the last {PATIENCE} steps took '
+        f'{100.0 * grown.decrease:.2g} % off the cost'))
 
 
 def _reference(plant: Plant, box: Box, parts: tuple[Samples, Samples, Samples],

@@ -277,7 +277,11 @@ def test_the_default_tolerance_is_a_thousandth_over_twenty_steps():
 
         return minimise(residuals, vector(0.0), max_iterations=limit)
 
-    assert steps(6e-5, 200).status is MinimumStatus.MAX_ITERATIONS
+    found = steps(6e-5, 200)
+    assert found.status is MinimumStatus.MAX_ITERATIONS
+    assert found.decrease == pytest.approx(20 * 6e-5, rel=1e-2)
+    # of fewer steps, all of them
+    assert steps(6e-5, 5).decrease == pytest.approx(5 * 6e-5, rel=1e-2)
     found = steps(4e-5, 200)
     assert (found.status, found.iterations) == (MinimumStatus.CONVERGED, 20)
 
