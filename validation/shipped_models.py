@@ -20,8 +20,14 @@ from koopman_ros.learning.progress import training_progress
 from koopman_ros.learning.training import Watch
 from koopman_ros.lifting import LiftedModel, linearised_model, Provenance, save
 from koopman_ros.plant_data import Samples
-from koopman_ros.plants import ControlAffineSystem, plant_class, random_steps, RandomStepDesign
-from validation.paper.datasets import box_episodes, describe
+from koopman_ros.plants import (
+    box_episodes,
+    ControlAffineSystem,
+    plant_class,
+    random_steps,
+    RandomStepDesign,
+)
+from validation.paper.datasets import describe
 from validation.paper.reactor import SYSTEM, TRAINING, training_samples
 
 SEED = 2026

@@ -5,7 +5,12 @@
 
 from koopman_ros.plants.catalogue import build, plant_class, PLANTS
 from koopman_ros.plants.constants import Constant, constant, Constants, constants_of
-from koopman_ros.plants.excitation import ExcitationError, random_steps, RandomStepDesign
+from koopman_ros.plants.excitation import (
+    box_episodes,
+    ExcitationError,
+    random_steps,
+    RandomStepDesign,
+)
 from koopman_ros.plants.library.reactor import (
     one_state_reactor,
     ReactorParameters,
@@ -30,7 +35,7 @@ from koopman_ros.plants.system import (
 
 __all__ = ['PLANTS', 'Actuator', 'Constant', 'Constants', 'ControlAffineSystem',
            'EquilibriumError', 'ExcitationError', 'IntegrationError', 'IntegrationFailure',
-           'Process', 'RandomStepDesign', 'ReactorParameters', 'advance', 'build', 'constant',
-           'constants_of', 'equilibrium_input', 'one_state_reactor', 'plant_class',
+           'Process', 'RandomStepDesign', 'ReactorParameters', 'advance', 'box_episodes', 'build',
+           'constant', 'constants_of', 'equilibrium_input', 'one_state_reactor', 'plant_class',
            'random_steps', 'sample_derivatives', 'scalar_example', 'sensor_noise', 'simulate',
            'steady_state', 'two_state_example', 'two_state_reactor']

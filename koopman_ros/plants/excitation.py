@@ -3,6 +3,7 @@
 
 """Random step inputs that excite a plant without driving it out of a box of states."""
 
+import contextlib
 from dataclasses import dataclass
 import math
 
@@ -10,14 +11,20 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from koopman_ros.arrays import Array
-from koopman_ros.plant_data import Episode
+from koopman_ros.plant_data import Episode, Samples
 from koopman_ros.plants.simulation import (
     integration_limits,
     IntegrationError,
     IntegrationFailure,
+    sample_derivatives,
     simulate,
 )
 from koopman_ros.plants.system import checked_vector, ControlAffineSystem
+
+# Share of the episodes that start in a corner of their box.
+_AT_CORNERS = 0.2
+# For each episode that is wanted, so many starts are tried.
+_MOST_STARTS = 100
 
 
 class ExcitationError(ValueError):
@@ -121,6 +128,40 @@ def random_steps(system: ControlAffineSystem, design: RandomStepDesign, duration
         state, sample = step.x[-1], sample + len(step.u)
     times = design.sample_period * np.arange(holds + 1, dtype=np.float64)
     return Episode(times, np.concatenate(states), times[:-1], np.concatenate(inputs))
+
+
+def box_episodes(system: ControlAffineSystem, design: RandomStepDesign, episodes: int,
+                 duration: float, seed: int, starts: tuple[Array, Array] | None = None) -> Samples:
+    """
+    Simulate short episodes of random input steps from random states within a box.
+
+    A fifth of them starts in corners of the box, so that no part of it is left to extrapolation.
+
+    :param duration: of each, in the plant's time unit.
+    :param seed: of the initial states and of the steps.
+    :param starts: corners of that box, each (n_x,); by default the box that they may not leave.
+    :raises ExcitationError: when hardly any start can be kept in the box.
+    :raises ValueError: as :func:`random_steps`.
+    """
+    rng = np.random.default_rng(seed)
+    lower, upper = (np.broadcast_to(bound, system.n_x) for bound in starts or (
+        design.state_lower, design.state_upper))
+    found: list[Episode] = []
+    for _ in range(_MOST_STARTS * episodes):
+        if len(found) == episodes:
+            break
+        x0, step_seed = rng.uniform(lower, upper), int(rng.integers(2 ** 31))
+        if rng.random() < _AT_CORNERS:
+            x0 = np.where(rng.random(system.n_x) < 0.5, lower, upper)
+        # no input within the bounds keeps some states inside the box
+        with contextlib.suppress(ExcitationError):
+            found.append(random_steps(system, design, duration, step_seed, x0=x0))
+    if len(found) < episodes:
+        raise ExcitationError(
+            f'{system.name}: of {_MOST_STARTS * episodes} starts {len(found)} could be kept in '
+            f'the box for {duration} {system.time_unit}, {episodes} are wanted; shorten the '
+            'episodes, widen the input bounds or the box')
+    return sample_derivatives(system, found)
 
 
 def _bounds(system: ControlAffineSystem, design: RandomStepDesign

@@ -9,9 +9,16 @@ from scipy.linalg import solve_continuous_are
 
 from koopman_ros.control import averaged, steady_state_target, Weights
 from koopman_ros.learning import Edmd, fit, Linearisation
-from koopman_ros.plants import ControlAffineSystem, one_state_reactor, scalar_example
+from koopman_ros.plants import (
+    box_episodes,
+    ControlAffineSystem,
+    ExcitationError,
+    one_state_reactor,
+    RandomStepDesign,
+    scalar_example,
+)
 from validation.paper import reactor, two_state
-from validation.paper.datasets import box_episodes, describe
+from validation.paper.datasets import describe
 from validation.paper.optimal_control import (
     exact_two_state_cost,
     exact_two_state_gain,
@@ -31,6 +38,13 @@ def test_samples_stay_within_their_box_and_fill_it(box):
         assert x.max() - x.min() > 0.75 * (high - low)
     np.testing.assert_allclose(
         samples.dxdt, two_state.SYSTEM.derivative(samples.x, samples.u), rtol=1e-12)
+
+
+def test_episodes_that_no_input_keeps_in_their_box():
+    design = RandomStepDesign(276.0, 277.0, 320.0, 321.0, 1.0, 0.5, max_redraws=0)
+    with pytest.raises(ExcitationError, match=r'of 100 starts 0 could be kept in the box for 5\.0 '
+                                              r'min, 1 are wanted; shorten the episodes'):
+        box_episodes(one_state_reactor(), design, 1, 5.0, 0)
 
 
 def test_the_same_seed_gives_the_same_samples():
