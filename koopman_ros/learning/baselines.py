@@ -135,10 +135,10 @@ class Edmd:
         else:
             B = box.input_matrix(plant.B)
         drift = (J @ (rate - u @ B.T)[..., None])[..., 0]
-        A = np.linalg.lstsq(z, drift, rcond=None)[0].T
-        return LiftedModel(observables, A.astype(np.float64), B.astype(np.float64),
+        A = np.linalg.lstsq(z, drift, rcond=None)[0].T.astype(np.float64)
+        return LiftedModel(observables, A, B.astype(np.float64),
                            box.states, box.inputs, box.time_unit,
-                           _provenance(plant, samples))
+                           _provenance(plant, samples), readout=A[:x.shape[1]])
 
 
 def _provenance(plant: Plant, samples: Samples) -> Provenance:

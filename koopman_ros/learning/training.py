@@ -23,6 +23,7 @@ from koopman_ros.arrays import brief
 from koopman_ros.control.law_check import check_law, LawCheck, LOOPS, Rate
 from koopman_ros.learning.baselines import Algorithm1, Edmd
 from koopman_ros.learning.contradictions import check_nominal_point, check_rates
+from koopman_ros.learning.drift import SMALLEST, with_readout
 from koopman_ros.learning.growth import Grown, Growth, Monitor
 from koopman_ros.learning.levenberg_marquardt import MinimumStatus, PATIENCE
 from koopman_ros.learning.residuals import deviations, ScaledSamples
@@ -80,8 +81,8 @@ class NoUsefulLift(ValueError):  # noqa: N818
 @dataclass(frozen=True)
 class _Candidate:
     grown: Grown
-    model: LiftedModel
-    fit: Fit
+    model: LiftedModel  # its drift read off the rate of z or out of its features
+    fit: Fit  # of a lift without that choice: features hide that z has lost a state
 
     @property
     def score(self) -> float:
@@ -251,12 +252,16 @@ def _judged(assembly: _Assembly, grown: Grown | str, validation: Samples) -> _Ca
         return grown.status.value
     try:
         model = assembly.model(grown)
-        found = fit(model, validation.x, validation.dxdt, validation.u)
+        readings = [model, *(with_readout(model, assembly.samples, smallest)
+                             for smallest in SMALLEST)]
+        fits = [fit(reading, validation.x, validation.dxdt, validation.u) for reading in readings]
+        best = int(np.nanargmin([found.rx for found in fits]))
     except (ValueError, np.linalg.LinAlgError) as error:
         return str(error)
+    found = fits[0]
     if not math.isfinite(found.rw + found.rx):
         return 'its figures are not finite: check the data and try another seed'
-    return _Candidate(grown, model, found)
+    return _Candidate(grown, readings[best], found)
 
 
 class _Tracker:

@@ -19,7 +19,7 @@ from koopman_ros.lifting import bounds
 from koopman_ros.lifting.activations import activation_named
 from koopman_ros.lifting.coordinates import Coordinates, TrainingStates
 from koopman_ros.lifting.model import LiftedModel, Provenance
-from koopman_ros.lifting.observables import NetworkObservables
+from koopman_ros.lifting.observables import NetworkObservables, PolynomialObservables
 
 FORMAT = 'koopman_ros.lift'
 FORMAT_VERSION = 1
@@ -40,26 +40,32 @@ def save(model: LiftedModel, path: str | os.PathLike[str]) -> None:
     Write a model as safetensors; a reader sees the old file or the new one, never a part.
 
     :raises OSError: when the folder cannot be written.
-    :raises TypeError: when the lift is not a network's.
+    :raises TypeError: when the lift is neither a network's nor of monomials.
     :raises ValueError: when :func:`load` would refuse it, e.g. for a metric that is not finite.
     """
-    network = model.observables
-    if not isinstance(network, NetworkObservables):
-        raise TypeError(f'only network lifts can be saved, got {type(network).__name__}: keep the '
-                        'program that makes the model instead')
+    lift, network = model.observables, {}
+    tensors = {'A': model.A, 'B': model.B}
+    if isinstance(lift, PolynomialObservables):
+        tensors['exponents'] = lift.exponents
+    elif isinstance(lift, NetworkObservables):
+        network = {'activation': lift.activation, 'hidden_layers': len(lift.hidden),
+                   'identity': lift.identity}
+        tensors['output'] = lift.output
+        for i, (weight, bias) in enumerate(lift.hidden):
+            tensors[f'hidden.{i}.weight'] = weight
+            tensors[f'hidden.{i}.bias'] = bias
+    else:
+        raise TypeError('only lifts of networks and of monomials can be saved, got '
+                        f'{type(lift).__name__}: keep the program that makes the model instead')
     bounds.check(model)
-    tensors = {'A': model.A, 'B': model.B, 'output': network.output}
-    for i, (weight, bias) in enumerate(network.hidden):
-        tensors[f'hidden.{i}.weight'] = weight
-        tensors[f'hidden.{i}.bias'] = bias
     known = model.training_states
     if known is not None:
         tensors['training_states'] = known.states
+    if model.readout is not None:
+        tensors['readout'] = model.readout
     description = json.dumps({
-        'activation': network.activation,
+        **network,
         **({'fill_distance': known.fill_distance} if known is not None else {}),
-        'hidden_layers': len(network.hidden),
-        'identity': network.identity,
         'inputs': _describe(model.inputs),
         'n_u': model.n_u,
         'n_x': model.n_x,
@@ -119,7 +125,7 @@ def load_with_digest(path: str | os.PathLike[str]) -> tuple[LiftedModel, str]:
         raise ModelFileError(
             f'the model file {path} has format version {version!r}, this package reads '
             f'{FORMAT_VERSION}: retrain the model, or install the matching package')
-    if len(header) > 2 * bounds.MAX_LAYERS + 4:
+    if len(header) > 2 * bounds.MAX_LAYERS + 5:
         _refuse(path, f'it holds {len(header)} arrays, more than any lift')
     tensors = {name: _tensor(path, name, entry, data) for name, entry in header.items()}
     try:
@@ -138,17 +144,22 @@ def load_with_digest(path: str | os.PathLike[str]) -> tuple[LiftedModel, str]:
 
 def _build(about: dict[str, Any], tensors: dict[str, np.ndarray]) -> LiftedModel:
     """Assemble the model; whatever does not fit raises one of the errors `load` translates."""
-    activation_named(about['activation'])
-    layers = _integer(about, 'hidden_layers')
+    monomials = 'exponents' in tensors
+    layers = 0
+    if not monomials:
+        activation_named(about['activation'])
+        layers = _integer(about, 'hidden_layers')
     if layers > len(tensors):
         raise ValueError(f'{len(tensors)} arrays cannot make up {layers} hidden layers')
-    expected = {'A', 'B', 'output'} | {
+    expected = {'A', 'B', 'exponents' if monomials else 'output'} | {
         f'hidden.{i}.{part}' for i in range(layers) for part in ('weight', 'bias')}
     if 'fill_distance' in about:
         expected.add('training_states')
+    # files without one are of lifts whose drift is read off the rate of z
+    expected |= {'readout'} & set(tensors)
     if set(tensors) != expected:
         raise ValueError(f'expected the arrays {sorted(expected)}, got {sorted(tensors)}')
-    if not isinstance(about['identity'], bool):
+    if not monomials and not isinstance(about['identity'], bool):
         raise TypeError('identity must be true or false')
     origin = about['provenance']
     metrics = {name: float(value) for name, value in origin['metrics'].items()}
@@ -157,7 +168,7 @@ def _build(about: dict[str, Any], tensors: dict[str, np.ndarray]) -> LiftedModel
             not isinstance(filled, int | float) or isinstance(filled, bool)):
         raise TypeError(f'fill_distance must be a number, got {filled!r}')
     model = LiftedModel(
-        observables=NetworkObservables(
+        observables=_monomials(tensors['exponents']) if monomials else NetworkObservables(
             hidden=tuple((tensors[f'hidden.{i}.weight'], tensors[f'hidden.{i}.bias'])
                          for i in range(layers)),
             output=tensors['output'], identity=about['identity'],
@@ -172,11 +183,19 @@ def _build(about: dict[str, Any], tensors: dict[str, np.ndarray]) -> LiftedModel
             package_version=origin['package_version'],
             method=origin.get('method', '')),
         training_states=None if 'fill_distance' not in about else TrainingStates(
-            tensors['training_states'], float(filled)))
+            tensors['training_states'], float(filled)),
+        readout=tensors.get('readout'))
     for name, actual in (('n_x', model.n_x), ('n_u', model.n_u), ('n_z', model.n_z)):
         if _integer(about, name) != actual:
             raise ValueError(f'{name} is given as {about[name]}, the arrays say {actual}')
     return model
+
+
+def _monomials(exponents: np.ndarray) -> PolynomialObservables:
+    rounded = np.rint(np.clip(exponents, -1.0, bounds.MAX_DEGREE + 1.0))
+    if not np.array_equal(rounded, exponents):
+        raise ValueError(f'exponents must be whole numbers from 0 to {bounds.MAX_DEGREE}')
+    return PolynomialObservables(rounded.astype(np.int64))
 
 
 def _checksum(description: str, arrays: dict[str, Any], data: bytes) -> str:

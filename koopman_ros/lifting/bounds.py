@@ -7,8 +7,10 @@ import math
 import os
 import stat
 
+import numpy as np
+
 from koopman_ros.lifting.model import LiftedModel
-from koopman_ros.lifting.observables import NetworkObservables
+from koopman_ros.lifting.observables import NetworkObservables, PolynomialObservables
 
 # Riccati equations of n_z coordinates cost n_z^3: 32 take some milliseconds on a processor of
 # 2020, four times what training from bags allows; 50 take ten times as long, as BLAS divides
@@ -18,6 +20,7 @@ MAX_STATES = 32  # and inputs; as many as coordinates
 MAX_LAYERS = 8  # training makes 1 or 2
 # All weights of the lift: training makes some hundred, 2^18 take a millisecond a step.
 MAX_WEIGHTS = 1 << 18
+MAX_DEGREE = 32  # of monomials; beyond some ten, little of them is left in numbers
 MAX_TEXT = 100  # characters; a SHA-256 in hexadecimal has 64
 MAX_LONG_TEXT = 200  # for what is written in words
 MAX_METRICS = 100
@@ -41,6 +44,8 @@ def check(model: LiftedModel) -> None:
         weights = network.output.size + sum(w.size + b.size for w, b in network.hidden)
         sizes += [('the number of hidden layers', len(network.hidden), MAX_LAYERS),
                   ('the number of weights', weights, MAX_WEIGHTS)]
+    elif isinstance(network, PolynomialObservables):
+        sizes += [('the degree', int(np.max(np.sum(network.exponents, axis=1))), MAX_DEGREE)]
     for name, size, limit in sizes:
         if size > limit:
             raise ValueError(f'{name} is {size}, at most {limit} can be controlled with')

@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 The koopman_ros Authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""The run-time lifted model: lift, Jacobian, secants and projected drift, in numpy alone."""
+"""The run-time lifted model: lift, Jacobian, secants and drift, in numpy alone."""
 
 from __future__ import annotations
 
@@ -60,6 +60,9 @@ class LiftedModel:
     provenance: Provenance  #: origin and held-out figures
     #: where the data were, within their box; None when that is not known
     training_states: TrainingStates | None = None
+    #: (n_x, n_phi) weights of the features phi in the drift, in 1/time unit; None where it is read
+    #: off the rate of z
+    readout: Array | None = None
 
     __repr__ = brief
 
@@ -70,6 +73,9 @@ class LiftedModel:
             raise ValueError(f'incompatible observables: expected {self.n_x} states, got {n_x}')
         object.__setattr__(self, 'A', frozen(self.A, 'A', (n_z, n_z)))
         object.__setattr__(self, 'B', frozen(self.B, 'B', (n_x, self.n_u)))
+        if self.readout is not None:
+            shape = (n_x, self.observables.features.n_z)
+            object.__setattr__(self, 'readout', frozen(self.readout, 'readout', shape))
         if self.training_states is not None and self.training_states.states.shape[1] != n_x:
             raise ValueError(f'incompatible training_states: expected {n_x} states, got '
                              f'{self.training_states.states.shape[1]}')
@@ -137,11 +143,15 @@ class LiftedModel:
     @cached_property
     def linearised(self) -> LiftedModel:
         """The model linearised at its nominal point: dx/dt = (df/dx)(0) x + B u, f its drift."""
-        J = self.jacobian(np.zeros(self.n_x))
+        origin = np.zeros(self.n_x)
+        if self.readout is None:
+            # exact, as N(0) = 0
+            J = self.jacobian(origin)
+            slope = np.linalg.pinv(J) @ self.A @ J
+        else:
+            slope = self.drift_jacobian(origin)
         observables = NetworkObservables((), np.zeros((0, self.n_x)), identity=True)
-        # an axis more, because the shortcut for one state rounds otherwise
-        onto = self.onto_states(J[None], self.A[None])[0]
-        return replace(self, observables=observables, A=onto @ J)
+        return replace(self, observables=observables, A=slope, readout=None)
 
     def distance(self, x: Array) -> float:
         """
@@ -175,30 +185,48 @@ class LiftedModel:
         return self.observables.lift_and_secants(x, x_ref, w)
 
     def onto_states(self, J: Array, rate: Array) -> Array:
-        """Read the rate of the state off a rate of z; see :meth:`Observables.onto_states`."""
-        return self.observables.onto_states(J, rate)
+        """
+        Read the rate of the state off a rate of z, by J_N(x)^+: (..., n_z, k) -> (..., n_x, k).
+
+        :param J: (..., n_z, n_x) from the state x in question.
+        :param rate: what the rate of the state is wanted of; (n_z,) gives (n_x,).
+        """
+        # all coordinates share in what training left over, so that all of them are asked
+        if self.identity and J.shape[1:] == (1,):
+            # one state: the same without a singular value decomposition; J holds a 1
+            found: Array = J.T.dot(rate) / J[:, 0].dot(J[:, 0])
+            return found
+        return np.linalg.pinv(J) @ rate
 
     def drift(self, x: Array) -> Array:
-        """Evaluate f, the rate of the state that A N(x) implies: (..., n_x) -> same."""
+        """Evaluate f, the rate of the state without inputs: (..., n_x) -> same; f(0) = 0."""
+        if self.readout is not None:
+            return self.observables.features.lift(x) @ self.readout.T
         z, J = self.lift_and_jacobian(x)
         if x.ndim == 1:
             return self.onto_states(J, self.A.dot(z))
         return self.onto_states(J, (z @ self.A.T)[..., None])[..., 0]
 
     def drift_jacobian(self, x: Array) -> Array:
-        """Evaluate df/dx of the drift, (..., n_x) -> (..., n_x, n_x), by central differences."""
-        # J_N^+ changes with x as well, so that the exact one would need second derivatives
+        """Evaluate df/dx of the drift, (..., n_x) -> (..., n_x, n_x): of a read-out exactly."""
+        if self.readout is not None:
+            return self.readout @ self.observables.features.lift_and_jacobian(x)[1]
+        # by central differences: J_N^+ changes with x as well, so that the exact one would need
+        # second derivatives
         steps, x = _DIFFERENCE * np.eye(self.n_x), x[..., None, :]
         ahead, behind = self.drift(np.array((x + steps, x - steps)))
         return np.asarray(ahead - behind).swapaxes(-1, -2) / (2.0 * _DIFFERENCE)
 
     def averaged_drift_jacobian(self, x: Array, x_ref: Array) -> Array:
         """
-        Average df/dx along the segment from x_ref to x, both (n_x,), by Gauss and Legendre.
+        Average df/dx along the segment from x_ref to x, both (n_x,).
 
-        :return: A (n_x, n_x) with f(x) - f(x_ref) = A (x - x_ref): for a drift of up to the tenth
-            degree exactly, otherwise closely.
+        :return: A (n_x, n_x) with f(x) - f(x_ref) = A (x - x_ref): of a read-out exactly, by its
+            features' secants, otherwise closely, by Gauss and Legendre.
         """
+        if self.readout is not None:
+            # w and what comes of it are not asked for
+            return self.readout @ self.observables.features.lift_and_secants(x, x_ref, x)[2]
         along = self.drift_jacobian(x_ref + _NODES[:, None] * (x - x_ref))
         return _WEIGHTS.dot(along.reshape(len(_WEIGHTS), -1)).reshape(self.n_x, self.n_x)
 

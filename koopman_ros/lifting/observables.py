@@ -59,16 +59,10 @@ class Observables(ABC):
         :return: (n_z,), (n_z, n_x), M (n_z, n_x) and H (n_z, n_x).
         """
 
+    @property
     @abstractmethod
-    def onto_states(self, J: Array, rate: Array) -> Array:
-        """
-        Read the rate of the state off a rate of z: (..., n_z, k) -> (..., n_x, k).
-
-        A network's lift is read by J_N(x)^+, monomials by the rows of the states.
-
-        :param J: (..., n_z, n_x) from the state x in question.
-        :param rate: what the rate of the state is wanted of; (n_z,) gives (n_x,).
-        """
+    def features(self) -> 'Observables':
+        """The functions phi that a drift is read out of: as a lift, the states first."""
 
 
 @final
@@ -116,6 +110,14 @@ class NetworkObservables(Observables):
     def n_z(self) -> int:
         """Number of lifted coordinates."""
         return self.output.shape[0] + (self.n_x if self.identity else 0)
+
+    @cached_property
+    def features(self) -> Observables:
+        """The states and the units of the last hidden layer, less their values at the origin."""
+        if not self.hidden:
+            return self
+        units = np.eye(self.output.shape[1])
+        return NetworkObservables(self.hidden, units, identity=True, activation=self.activation)
 
     @cached_property
     def _activation(self) -> Activation:
@@ -192,15 +194,6 @@ class NetworkObservables(Observables):
                 self._with_states(eye, T.dot(rows)).T, self._with_states(eye, S.dot(rows)).T,
                 G.dot(rows).T)
 
-    def onto_states(self, J: Array, rate: Array) -> Array:
-        """Evaluate J_N(x)^+ times a rate of z; shapes as in the interface."""
-        # all coordinates share in what training left over, so that all of them are asked
-        if self.identity and J.shape[1:] == (1,):
-            # one state: the same without a singular value decomposition; J holds a 1
-            found: Array = J.T.dot(rate) / J[:, 0].dot(J[:, 0])
-            return found
-        return np.linalg.pinv(J) @ rate
-
     def _with_states(self, states: Array, rows: Array) -> Array:
         """Fill in what the coordinates (..., n_z) of `rows` begin with where z does."""
         if self.identity:
@@ -266,6 +259,11 @@ class PolynomialObservables(Observables):
         """Number of lifted coordinates."""
         return self.exponents.shape[0]
 
+    @property
+    def features(self) -> Observables:
+        """The monomials."""
+        return self
+
     @cached_property
     def _first(self) -> tuple[Array, NDArray[np.int64]]:
         return _differentiated(np.ones(self.n_z), self.exponents)
@@ -302,16 +300,6 @@ class PolynomialObservables(Observables):
         second, exponents = self._second
         H: Array = np.tensordot(weights, second * _monomials(points, exponents) @ w, 1)
         return *self.lift_and_jacobian(x), M, H
-
-    def onto_states(self, J: Array, rate: Array) -> Array:
-        """
-        Take the rows of the states; shapes as in the interface.
-
-        Least squares fit each row of A by itself, those of the states to dx/dt. The other
-        monomials' rates are mostly not in the span of the dictionary: J_N(x)^+ would bring in
-        what they lack.
-        """
-        return rate[:self.n_x] if rate.ndim == 1 else rate[..., :self.n_x, :]
 
 
 def _product(rows: Array, matrix: Array) -> Array:

@@ -156,7 +156,8 @@ def parabola(**others):
     # of deviations: x^2 - y = 2 xi + xi^2 - eta
     A = np.array([[-1.0, 0.0, 0.0], [2.0, -1.0, 1.0], [0.0, 0.0, -2.0]])
     model = LiftedModel(PolynomialObservables(np.array([[1, 0], [0, 1], [2, 0]])), A,
-                        np.array([[1.0], [0.0]]), states, inputs, 's', Provenance('parabola'))
+                        np.array([[1.0], [0.0]]), states, inputs, 's', Provenance('parabola'),
+                        readout=A[:2])
     return loop(model, 'y', lower=-5.0, upper=5.0, **others)
 
 

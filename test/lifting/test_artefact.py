@@ -11,6 +11,7 @@ import os
 from pathlib import Path
 import resource
 import stat
+from types import SimpleNamespace
 from typing import Any, TypeAlias
 
 import numpy as np
@@ -41,6 +42,11 @@ MODELS = {
     'softplus': random_lift(1, activation='softplus'),
     'with training states': replace(random_lift(), training_states=TrainingStates.of(
         np.random.default_rng(0).normal(size=(300, 2)), np.ones(2))),
+    'with a read-out': replace(random_lift(widths=(5, 4)), readout=np.random.default_rng(
+        0).normal(size=(2, 6))),
+    'monomials': replace(
+        random_lift(), observables=PolynomialObservables.total_degree(2, 2),
+        readout=np.random.default_rng(0).normal(size=(2, 5))),
     'extreme': replace(random_lift(), A=np.diag(
         [5e-324, -0.0, np.finfo(float).max, np.pi, -np.finfo(float).tiny])),
     'other alphabets': replace(
@@ -113,17 +119,29 @@ def test_round_trip_is_exact(model, path):
     assert content(load(path)) == content(model)
 
 
-def test_a_shipped_file_is_written_again_bit_for_bit_and_a_dictionary_is_not(path):
+def test_a_shipped_file_is_written_again_bit_for_bit(path):
     for shipped in SHIPPED.glob('*.safetensors'):
         save(load(shipped), path)
         assert path.read_bytes() == shipped.read_bytes(), shipped
         path.unlink()
-    dictionary = replace(MODELS['one layer'],
-                         observables=PolynomialObservables.total_degree(2, 2))
+
+
+def test_a_lift_of_another_kind_is_not_written(path):
+    other = SimpleNamespace(n_x=2, n_z=5, identity=True)
     with pytest.raises(
-            TypeError, match='only network lifts can be saved, got PolynomialObservables'):
-        save(dictionary, path)
+            TypeError, match='only lifts of networks and of monomials can be saved, got Simp'):
+        save(replace(MODELS['one layer'], observables=other), path)
     assert not path.exists()
+
+
+@pytest.mark.parametrize(('number', 'words'), [
+    (0.5, 'exponents must be whole numbers from 0 to 32'), (-1.0, 'exponents must be at least 0'),
+    (1e300, 'exponents must be whole numbers from 0 to 32'),
+    (33.0, 'the degree is 33, at most 32 can be controlled with'),
+    (1.0, 'the row [0, 1] of exponents comes 2 times'), (3.0, 'checksum')])
+def test_monomials_that_do_not_fit_are_refused(path, number, words):
+    save(MODELS['monomials'], path)
+    assert words in refusal(path, value('exponents', number)[0](path.read_bytes()))
 
 
 def test_a_file_cut_off_anywhere_is_refused(path, sound):
@@ -393,6 +411,23 @@ def test_what_does_not_fit_is_refused(path, sound, case):
 def test_training_states_that_do_not_fit_are_refused(path, change, words):
     save(MODELS['with training states'], path)
     assert words in refusal(path, about(change, words)[0](path.read_bytes()))
+
+
+def test_a_read_out_that_does_not_fit_is_refused(path):
+    save(MODELS['with a read-out'], path)
+    sound = path.read_bytes()
+    changes = (header(lambda h: h['readout'].update(shape=[6, 2]),
+                      'incompatible readout: expected (2, 6), got (6, 2)'),
+               value('readout', np.nan), value('readout', 7.0))
+    for change, words in changes:
+        assert words in refusal(path, change(sound))
+
+
+def test_a_file_without_a_read_out_is_of_a_lift_read_by_its_rates(path, sound):
+    assert 'readout' not in split(sound)[0]
+    model, x = load(path), np.array([0.3, -0.2])
+    z, J = model.lift_and_jacobian(x)
+    np.testing.assert_allclose(model.drift(x), np.linalg.lstsq(J, model.A @ z)[0], rtol=1e-12)
 
 
 @pytest.mark.parametrize('case', [name for name in UNTOLD if 'is ' not in name])

@@ -15,6 +15,7 @@ from koopman_ros.lifting import (
     Box,
     Coordinates,
     linearised_model,
+    NetworkObservables,
     PolynomialObservables,
     Provenance,
     TrainingStates,
@@ -59,8 +60,9 @@ def test_a_lift_that_stands_still_moves_no_state():
 
 def test_drift_of_a_dictionary_by_hand():
     """With z = (x, x^2) the first row of A z is the rate of x, whatever the second one says."""
+    A = np.array([[-1.0, 0.25], [0.5, -3.0]])
     model = replace(random_lift(1), observables=PolynomialObservables.total_degree(1, 2),
-                    A=np.array([[-1.0, 0.25], [0.5, -3.0]]))
+                    A=A, readout=A[:1])
     x = np.linspace(-2.0, 2.0, 9)[:, None]
     expected = -x + 0.25 * x ** 2
     np.testing.assert_allclose(model.drift(x), expected, rtol=1e-13)
@@ -72,16 +74,16 @@ def test_averaged_jacobian_of_a_cubic_drift_by_hand():
     """x1' = x2, x2' = -x1 + x2 - x1^2 x2; Simpson's rule gives the means of squares."""
     observables = PolynomialObservables(np.array([[1, 0], [0, 1], [2, 1]]))
     A = np.array([[0.0, 1.0, 0.0], [-1.0, 1.0, -1.0], [0.0, 0.0, 0.0]])
-    model = replace(random_lift(2), observables=observables, A=A)
+    model = replace(random_lift(2, n_free=1), observables=observables, A=A, readout=A[:2])
     for x, x_ref in zip(states(2), states(2, seed=2), strict=True):
         ends = np.array([x, 0.5 * (x + x_ref), x_ref])
         mixed, square = np.array([1.0, 4.0, 1.0]) / 6.0 @ np.stack(
             (ends[:, 0] * ends[:, 1], ends[:, 0] ** 2), axis=1)
         found = model.averaged_drift_jacobian(x, x_ref)
         np.testing.assert_allclose(found, [[0.0, 1.0], [-1.0 - 2.0 * mixed, 1.0 - square]],
-                                   rtol=0, atol=1e-9)
+                                   rtol=0, atol=1e-13)
         np.testing.assert_allclose(found @ (x - x_ref), model.drift(x) - model.drift(x_ref),
-                                   rtol=0, atol=1e-9)
+                                   rtol=0, atol=1e-13)
 
 
 @pytest.mark.parametrize('n_x', [1, 2, 3])
@@ -98,6 +100,50 @@ def test_averaged_jacobian_makes_the_difference_of_the_drift(n_x):
     for x, of_batch in zip(batch.reshape(6, n_x), model.drift_jacobian(batch).reshape(
             6, n_x, n_x), strict=True):
         np.testing.assert_allclose(of_batch, model.drift_jacobian(x), rtol=0, atol=1e-9)
+
+
+def read_out(n_x=2, widths=(5, 4), seed=0, **options):
+    """Return a random lift with a random read-out of its last hidden layer."""
+    model = random_lift(n_x, widths, seed=seed, **options)
+    weights = np.random.default_rng(seed).normal(size=(n_x, n_x + widths[-1]))
+    return replace(model, readout=weights)
+
+
+def test_a_read_out_by_hand():
+    """Of f = 3 x - 2 (tanh(2 x + 1) - tanh(1)), beside whatever z and A are."""
+    model = replace(random_lift(1, (1,)), observables=NetworkObservables(
+        ((np.array([[2.0]]), np.array([1.0])),), np.ones((3, 1)), identity=True),
+        readout=np.array([[3.0, -2.0]]))
+    x = np.linspace(-1.0, 1.0, 7)
+    np.testing.assert_allclose(model.drift(x[:, None])[:, 0],
+                               3.0 * x - 2.0 * (np.tanh(2.0 * x + 1.0) - np.tanh(1.0)),
+                               rtol=0, atol=1e-14)
+    slope = 3.0 - 4.0 / np.cosh(2.0 * x + 1.0) ** 2
+    np.testing.assert_allclose([model.drift_jacobian(np.array([v]))[0, 0] for v in x], slope,
+                               rtol=0, atol=1e-14)
+    np.testing.assert_allclose(model.linearised.A, [[3.0 - 4.0 / np.cosh(1.0) ** 2]], rtol=1e-14)
+    assert model.linearised.readout is None
+
+
+@pytest.mark.parametrize('model', [
+    read_out(), read_out(3, (6,), identity=False), read_out(1, (4,)),
+    read_out(activation='softplus'),
+    replace(random_lift(n_free=7), observables=PolynomialObservables.total_degree(2, 3),
+            readout=np.random.default_rng(0).normal(size=(2, 9)))],
+    ids=['two layers', 'free', 'one state', 'softplus', 'monomials'])
+def test_the_drift_of_a_read_out_and_its_slope(model):
+    """At rest at the nominal point exactly; its slope is that of differences."""
+    np.testing.assert_array_equal(model.drift(np.zeros(model.n_x)), 0.0)
+    batch = states(model.n_x, 6)
+    np.testing.assert_allclose(model.drift(batch), [model.drift(x) for x in batch],
+                               rtol=0, atol=1e-13)
+    for x in batch:
+        step = 1e-6 * np.eye(model.n_x)
+        slope = (model.drift(x + step) - model.drift(x - step)).T / 2e-6
+        np.testing.assert_allclose(model.drift_jacobian(x), slope, rtol=0, atol=2e-8)
+        difference = model.drift(x) - model.drift(batch[0])
+        np.testing.assert_allclose(model.averaged_drift_jacobian(x, batch[0]) @ (x - batch[0]),
+                                   difference, rtol=0, atol=1e-12)
 
 
 def linear_reactor():
@@ -165,6 +211,8 @@ def test_a_model_cannot_be_changed():
      r'incompatible A: expected \(3, 3\), got \(5, 5\)'),
     ({'observables': PolynomialObservables.total_degree(2, 3)},
      r'incompatible A: expected \(9, 9\), got \(5, 5\)'),
+    ({'readout': np.zeros((2, 5))}, r'incompatible readout: expected \(2, 7\), got \(2, 5\)'),
+    ({'readout': np.full((2, 7), np.nan)}, 'readout must be finite'),
     ({'time_unit': 'h'}, "time_unit must be 's' or 'min', got 'h'"),
     ({'training_states': TrainingStates(np.zeros((1, 3)), 0.0)},
      'incompatible training_states: expected 2 states, got 3'),

@@ -22,14 +22,14 @@ def exact_two_state_model(mu: float = -0.1, lambda_: float = 1.0) -> LiftedModel
 
     J(x) B = (0, 1, 0) at every state, so the lifted system is linear in state and input.
     """
+    A = np.array([[mu, 0.0, 0.0], [0.0, lambda_, -lambda_], [0.0, 0.0, 2.0 * mu]])
     return LiftedModel(
-        PolynomialObservables(np.array([[1, 0], [0, 1], [2, 0]])),
-        np.array([[mu, 0.0, 0.0], [0.0, lambda_, -lambda_], [0.0, 0.0, 2.0 * mu]]), _B[:2],
+        PolynomialObservables(np.array([[1, 0], [0, 1], [2, 0]])), A, _B[:2],
         Coordinates(('x1', 'x2'), ('1', '1'), np.zeros(2), np.ones(2), np.array([-6.0, -6.0]),
                     np.array([6.0, 8.0])),
         Coordinates(('u',), ('1/s',), np.zeros(1), np.ones(1), np.array([-50.0]),
                     np.array([50.0])),
-        's', Provenance('two-state example'))
+        's', Provenance('two-state example'), readout=A[:2])
 
 
 def exact_two_state_gain(R: float) -> Array:

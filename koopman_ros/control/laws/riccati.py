@@ -128,8 +128,10 @@ def recentred(model: LiftedModel, x: Array, target: Target, weights: Weights, *,
     # dot takes a third of the time of @ here
     riccati = solve_riccati(A, J.dot(model.B), Q, weights.R, max_gain=max_gain,
                             max_residual=max_residual)
+    drift = (model.onto_states(J, model.A.dot(M) + H) if model.readout is None
+             else model.averaged_drift_jacobian(x, target.x))
     return Feedback(target.u - riccati.K.dot(z - target.z), Form.RECENTRED, riccati,
-                    model.onto_states(J, model.A.dot(M) + H), -model.B.dot(riccati.K.dot(M)))
+                    drift, -model.B.dot(riccati.K.dot(M)))
 
 
 def averaged(model: LiftedModel, x: Array, target: Target, weights: Weights, *,
