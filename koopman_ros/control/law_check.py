@@ -221,7 +221,8 @@ class _Plant:
         model, n = self.model, self.model.n_x
         slope = self.slope(np.zeros((1, n)), np.zeros((1, model.n_u)))[0]
         itself = NetworkObservables((), np.zeros((0, n)), identity=True)
-        return replace(model, observables=itself, A=slope[:, :n], B=slope[:, n:])
+        return replace(model, observables=itself, A=slope[:, :n], B=slope[:, n:],
+                       readout=None)
 
 
 def _closed_loop_rates(linear: LiftedModel, weights: Weights) -> tuple[float, float]:

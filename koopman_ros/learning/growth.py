@@ -30,6 +30,7 @@ class Grown:
     theta: Tensor  #: (p,) parameters
     status: MinimumStatus  #: how the last minimisation ended
     decrease: float = math.nan  #: see :class:`Minimum`
+    drift_alone: bool = False  #: whether it is the lift z = x, for a read-out of hidden units
 
 
 @dataclass(frozen=True)

@@ -23,11 +23,11 @@ from koopman_ros.arrays import brief
 from koopman_ros.control.law_check import check_law, LawCheck, LOOPS, Rate
 from koopman_ros.learning.baselines import Algorithm1, Edmd
 from koopman_ros.learning.contradictions import check_nominal_point, check_rates
-from koopman_ros.learning.drift import SMALLEST, with_readout
+from koopman_ros.learning.drift import NeuralDrift, SMALLEST, with_readout
 from koopman_ros.learning.growth import Grown, Growth, Monitor
 from koopman_ros.learning.levenberg_marquardt import MinimumStatus, PATIENCE
 from koopman_ros.learning.residuals import deviations, ScaledSamples
-from koopman_ros.learning.validation import evaluate, Figures, Fit, fit, lifted_rate
+from koopman_ros.learning.validation import evaluate, Figures, Fit, fit, lifted_rate, ROUNDING
 from koopman_ros.lifting import Box, LiftedModel, NetworkObservables, Provenance, TrainingStates
 from koopman_ros.plant_data import Plant, Samples, split_by_episode
 
@@ -35,7 +35,7 @@ from koopman_ros.plant_data import Plant, Samples, split_by_episode
 _HIGHEST_DEGREE = 5
 _SAMPLES_OF_MONOMIAL = 5
 
-Recipe = Growth | Algorithm1
+Recipe = Growth | Algorithm1 | NeuralDrift
 
 
 @dataclass(frozen=True)
@@ -82,7 +82,8 @@ class NoUsefulLift(ValueError):  # noqa: N818
 class _Candidate:
     grown: Grown
     model: LiftedModel  # its drift read off the rate of z or out of its features
-    fit: Fit  # of a lift without that choice: features hide that z has lost a state
+    # of a lift by the rate of z, since features hide that z has lost a state; of a drift its own
+    fit: Fit
 
     @property
     def score(self) -> float:
@@ -174,7 +175,7 @@ def _conclude(plant: Plant, parts: tuple[Samples, Samples, Samples], path: list[
     box = Box(winner.model.states, winner.model.inputs, plant.time_unit)
     linear = Edmd(degree=1).learn(plant, parts[0], box)
     rx = fit(linear, parts[1].x, parts[1].dxdt, parts[1].u).rx
-    if refuse and not winner.fit.rx < rx:
+    if refuse and not winner.fit.rx + ROUNDING < rx:
         raise NoUsefulLift(
             f'the lift with n_z = {winner.model.n_z} does not predict the motion better than a '
             f'linear model (relative error rx = {winner.fit.rx:.2g} against {rx:.2g} on '
@@ -258,7 +259,7 @@ def _judged(assembly: _Assembly, grown: Grown | str, validation: Samples) -> _Ca
         best = int(np.nanargmin([found.rx for found in fits]))
     except (ValueError, np.linalg.LinAlgError) as error:
         return str(error)
-    found = fits[0]
+    found = fits[best if grown.drift_alone else 0]
     if not math.isfinite(found.rw + found.rx):
         return 'its figures are not finite: check the data and try another seed'
     return _Candidate(grown, readings[best], found)
@@ -318,9 +319,11 @@ class _Assembly:
         B = np.zeros((grown.layout.n_x, 0)) if parts.B is None else self.pace * parts.B.numpy()
         if self.plant.B is not None:
             B = self.box.input_matrix(self.plant.B)
+        alone = grown.drift_alone
         observables = NetworkObservables(
-            tuple((W.numpy(), b.numpy()) for W, b in parts.hidden), parts.V.numpy(),
-            grown.layout.identity, grown.layout.activation)
+            tuple((W.numpy(), b.numpy()) for W, b in parts.hidden),
+            parts.V.numpy()[:0 if alone else None], alone or grown.layout.identity,
+            grown.layout.activation)
         origin = Provenance(self.plant.name, self.seed, self.digest, {}, __version__)
         return LiftedModel(observables, self.pace * parts.A.numpy(), B, self.box.states,
                            self.box.inputs, self.box.time_unit, origin, self.training_states)

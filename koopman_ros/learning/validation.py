@@ -16,6 +16,8 @@ from koopman_ros.plant_data import Array, Samples
 
 # Beyond it S is singular to working precision, and rw is noise.
 _MAX_COND = 1e13
+# Of relative mean-square errors below it, which is smaller says nothing.
+ROUNDING = 1e-20
 # Of the drift in a roll-out, for each sample; a model a thousand times faster needs a fifth.
 _MAX_DRIFTS = 10_000
 # A prediction this far from the nominal point, in units of the scale, has diverged.

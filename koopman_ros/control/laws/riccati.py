@@ -85,7 +85,7 @@ def feedback(model: LiftedModel, x: Array, target: Target, weights: Weights, *,
 
     Re-centred with identity coordinates if A has no unstable modes but those of the linearised
     plant, which its input moves, and with as many free ones as there are states if A is Hurwitz;
-    projected otherwise, and when the re-centred law's equation cannot be solved. A free lift with
+    averaged otherwise, and when the re-centred law's equation cannot be solved. A free lift with
     more coordinates than states has directions of z that no state reaches, in which its weight
     C' Q C and so the gain are not determined near the target; M^+ e, which its weight goes by, is
     a poor factorisation of an unstable drift.
@@ -95,8 +95,10 @@ def feedback(model: LiftedModel, x: Array, target: Target, weights: Weights, *,
     :param max_residual: bound on the relative Riccati residual.
     """
     bounds = {'max_gain': max_gain, 'max_residual': max_residual}
-    if (model.identity and not model.adds_unstable_modes) or (
-            model.is_hurwitz and model.n_z == model.n_x):
+    # z = x of a read-out is not linear, nor meant to be
+    of_drift = model.readout is not None and model.identity and model.n_z == model.n_x
+    if not of_drift and ((model.identity and not model.adds_unstable_modes) or (
+            model.is_hurwitz and model.n_z == model.n_x)):
         result = recentred(model, x, target, weights, **bounds)
         if result.solved:
             return result
