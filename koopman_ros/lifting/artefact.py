@@ -46,7 +46,7 @@ def save(model: LiftedModel, path: str | os.PathLike[str]) -> None:
     lift, network = model.observables, {}
     tensors = {'A': model.A, 'B': model.B}
     if isinstance(lift, PolynomialObservables):
-        tensors['exponents'] = lift.exponents
+        tensors['exponents'] = lift.exponents.astype(np.float64)
     elif isinstance(lift, NetworkObservables):
         network = {'activation': lift.activation, 'hidden_layers': len(lift.hidden),
                    'identity': lift.identity}
