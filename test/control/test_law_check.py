@@ -94,7 +94,8 @@ def test_a_law_that_fails_in_a_part_of_its_box_is_refused_with_that_part():
     A = np.zeros((4, 4))
     A[0] = 0.5, 0.0, -1.5, -1.5
     observables = PolynomialObservables.total_degree(1, 4)
-    model = LiftedModel(observables, A, np.ones((1, 1)), STATE, INPUT, 's', Provenance('wrong'))
+    model = LiftedModel(observables, A, np.ones((1, 1)), STATE, INPUT, 's', Provenance('wrong'),
+                        readout=A[:1])
     found = check_law(model, linear_rate(0.5))
     x0, r = found.starts[:, 0], found.setpoints[:, 0]
     secant = 0.5 - 1.5 * (x0 ** 3 - r ** 3 + x0 ** 4 - r ** 4) / (x0 - r)
