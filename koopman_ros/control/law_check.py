@@ -51,6 +51,8 @@ _FEWEST_LOOPS = 16
 _ATTEMPTS = 4
 _NEWTON_STEPS = 30
 _LONGEST_STEP = 0.5
+# Share of the box to which ranges are told.
+_ROUNDED = 1e-3
 # What is left of a step, and a difference quotient's step, in scaled deviations.
 _RESOLUTION = 1e-9
 _DIFFERENCE = 1e-5
@@ -114,9 +116,13 @@ class LawCheck:
             f'{self._ranges(self.setpoints[failed])}')
 
     def _ranges(self, x: Array) -> str:
+        step = _ROUNDED * (self.states.upper - self.states.lower)
+        # what is nearly 0 is 0, not 1e-17; and not -0
+        low, high = (step * np.round(end / step) + 0.0 for end in (x.min(axis=0), x.max(axis=0)))
         return ', '.join(
-            f'{name} {low:.4g} to {high:.4g} {unit}'.rstrip() for name, unit, low, high in zip(
-                self.states.names, self.states.units, x.min(axis=0), x.max(axis=0), strict=True))
+            f'{name} {a:.4g}{f" to {b:.4g}" if b > a else ""} {unit}'.rstrip()
+            for name, unit, a, b in zip(self.states.names, self.states.units, low, high,
+                                        strict=True))
 
     def __str__(self) -> str:
         """Say in one clause how many loops failed, how, and where."""

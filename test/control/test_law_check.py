@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from scipy.integrate import quad
 
-from koopman_ros.control.law_check import check_law
+from koopman_ros.control.law_check import check_law, LawCheck
 from koopman_ros.control.laws import LawResult, Linear, Tuning, Weights
 from koopman_ros.control.laws.base import steady_state_target
 from koopman_ros.control.limits import InputLimits
@@ -107,7 +107,8 @@ def test_a_law_that_fails_in_a_part_of_its_box_is_refused_with_that_part():
     assert np.isfinite(found.ratios[sound]).all()
     assert not found.accepted
     failed = found.failed
-    low, high = found.starts[failed].min(), found.starts[failed].max()
+    # to a thousandth of the box
+    low, high = (round(500.0 * x) / 500.0 for x in (x0[failed].min(), x0[failed].max()))
     assert f'begun at level {low:.4g} to {high:.4g} m and bound for level ' in found.region
     assert found.region in str(found)
     assert np.maximum(x0, r)[failed].min() > 0.1
@@ -165,6 +166,12 @@ def test_what_no_law_can_do_is_not_held_against_it():
     assert not lost.accepted
     assert 'no law arrives in any of ' in str(lost)
     assert math.isnan(lost.worst_ratio)
+
+
+def test_ranges_are_told_to_what_tells():
+    found = LawCheck(TWO, np.array([[2.0004, 300.0]]), np.array([[-1e-17, 310.012]]),
+                     np.array([np.inf]), np.array([False]), 0)
+    assert found.region == 'begun at a 2 m, b 300 K and bound for a 0 m, b 310 K'
 
 
 def test_setpoints_are_where_an_input_holds_the_plant():

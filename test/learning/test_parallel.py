@@ -26,7 +26,7 @@ RECIPE = replace(SMALL, n_z=3)
 
 
 def trained():
-    return train(BENT, bent_samples(), RECIPE, starts=3, seed=5)
+    return train(BENT, bent_samples(), RECIPE, starts=3, seed=5, loops=16)
 
 
 @pytest.fixture(scope='module')
@@ -87,9 +87,9 @@ def test_many_samples_go_to_processes():
     some = bent_samples(length=40_000)
     assert some.x.nbytes > 1 << 20
     recipe = replace(SMALL, max_iterations=2, tolerance=0.0)
-    one = train(BENT, some, recipe, starts=1)
+    one = train(BENT, some, recipe, starts=1, loops=16)
     with joblib.parallel_config('loky', n_jobs=2):
-        assert bits(train(BENT, some, recipe, starts=1).model) == bits(one.model)
+        assert bits(train(BENT, some, recipe, starts=1, loops=16).model) == bits(one.model)
     assert np.isfinite(one.figures.fit.rw)
 
 
@@ -101,7 +101,8 @@ def test_the_watch_can_end_starts_in_processes():
         return now.finished == 4
 
     with joblib.parallel_config('loky', n_jobs=2):
-        kept = train(BENT, bent_samples(), RECIPE, starts=3, seed=5, watch=watch)
+        kept = train(BENT, bent_samples(), RECIPE, starts=3, seed=5, loops=16,
+                     watch=watch)
     # processes tell of whole starts only
     assert [(now.n_z, now.finished, now.iteration) for now in seen] == [
         (2, 1, 0), (2, 2, 0), (2, 3, 0), (3, 4, 0)]

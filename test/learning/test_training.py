@@ -182,7 +182,7 @@ def test_the_model_describes_its_origin(small):
 
 def test_figures_come_from_the_untouched_episodes():
     everything = bent_samples()
-    trained = train(BENT, everything, SMALL, starts=1, split_seed=3)
+    trained = train(BENT, everything, SMALL, starts=1, split_seed=3, loops=16)
     training, _, held_out = split_by_episode(everything, 3)
     assert trained.figures.fit == fit(trained.model, held_out.x, held_out.dxdt, held_out.u)
     assert trained.model.provenance.metrics == trained.figures.metrics(('level',))
@@ -193,7 +193,8 @@ def test_figures_come_from_the_untouched_episodes():
 
 def test_there_is_a_model_for_every_size():
     held_out = split_by_episode(bent_samples(), 0)[2]
-    trained = train(BENT, bent_samples(), Growth(4, hidden_first=3, max_iterations=60), starts=2)
+    trained = train(BENT, bent_samples(), Growth(4, hidden_first=3, max_iterations=60), starts=2,
+                    loops=16)
     assert [model.n_z for model in trained.path] == [2, 3, 4]
     assert trained.path[-1] is trained.model
     assert trained.starts == 6
@@ -252,7 +253,7 @@ def test_b_is_learned(plant, samples):
 
 def test_the_recipe_of_the_paper():
     recipe = Algorithm1(2, identity=True, hidden=(4,), decoder=4, max_rounds=3, max_iterations=60)
-    trained = train(BENT, bent_samples(), recipe, starts=2)
+    trained = train(BENT, bent_samples(), recipe, starts=2, loops=16)
     assert trained.model.n_z == 2
     assert trained.figures.fit.rx < trained.linear.fit.rx
 
@@ -274,9 +275,10 @@ def test_a_plant_without_inputs(B):
 def test_the_time_unit_does_not_matter():
     samples = bent_samples()
     recipe = replace(SMALL, max_iterations=30)
-    per_second = train(BENT, samples, recipe, starts=1)
+    per_second = train(BENT, samples, recipe, starts=1, loops=16)
     per_minute = train(replace(BENT, time_unit='min', B=60.0 * BENT.B),
-                       replace(samples, dxdt=60.0 * samples.dxdt), recipe, starts=1)
+                       replace(samples, dxdt=60.0 * samples.dxdt), recipe, starts=1,
+                       loops=16)
     assert per_minute.figures.fit.rw == pytest.approx(per_second.figures.fit.rw, rel=1e-2)
     np.testing.assert_allclose(per_minute.model.eigenvalues, 60.0 * per_second.model.eigenvalues,
                                rtol=1e-2)
@@ -287,7 +289,7 @@ def test_torch_keeps_its_threads():
     torch.set_num_threads(2)
     try:
         within = set()
-        train(BENT, bent_samples(), SMALL, starts=1,
+        train(BENT, bent_samples(), SMALL, starts=1, loops=16,
               watch=lambda now: bool(now.iteration and within.add(torch.get_num_threads())))
         assert within == {1}
         assert torch.get_num_threads() == 2
