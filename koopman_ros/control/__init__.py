@@ -14,6 +14,7 @@ from koopman_ros.control.events import (
     Silence,
 )
 from koopman_ros.control.hindsight import compare, Comparison, Recent, Windows
+from koopman_ros.control.law_check import check_law, LawCheck
 from koopman_ros.control.laws import averaged, Feedback, feedback, Form, LAWS, recentred, Weights
 from koopman_ros.control.laws.base import steady_state_target, Target
 from koopman_ros.control.limits import InputLimits, limit
@@ -45,9 +46,10 @@ from koopman_ros.control.supervisor import (
 )
 
 __all__ = ['HOLD', 'LAWS', 'MANUAL', 'SAFE', 'Arrival', 'Change', 'ClosedLoop', 'Comparison',
-           'Controller', 'Event', 'Feedback', 'Form', 'Initialisation', 'InputLimits',
+           'Controller', 'Event', 'Feedback', 'Form', 'Initialisation', 'InputLimits', 'LawCheck',
            'LevelSettings', 'Loop', 'ManualCommand', 'Measurement', 'Mode', 'ModeChange', 'Plant',
            'Recent', 'Report', 'Sensor', 'Setpoint', 'SetpointRequest', 'Settings', 'Silence',
-           'Simulation', 'State', 'Supervisor', 'SupervisorSettings', 'Target', 'Timed', 'Weights',
-           'Windows', 'at', 'averaged', 'compare', 'exchange', 'feedback', 'limit', 'perfect',
-           'recentred', 'restart', 'run_closed_loop', 'simulate', 'steady_state_target']
+           'Simulation', 'State', 'Supervisor', 'SupervisorSettings', 'Target', 'Timed',
+           'Weights', 'Windows', 'at', 'averaged', 'check_law', 'compare', 'exchange', 'feedback',
+           'limit', 'perfect', 'recentred', 'restart', 'run_closed_loop', 'simulate',
+           'steady_state_target']

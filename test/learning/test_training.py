@@ -9,11 +9,12 @@ import numpy as np
 import pytest
 import torch
 
-from koopman_ros.learning import Algorithm1, Edmd, evaluate, fit, Growth, train
+from koopman_ros.learning import Algorithm1, Edmd, evaluate, fit, Growth, train, training
 from koopman_ros.learning.growth import least_squares
 from koopman_ros.learning.levenberg_marquardt import MinimumStatus
 from koopman_ros.learning.network import Pass
 from koopman_ros.learning.residuals import ScaledSamples
+from koopman_ros.learning.validation import lifted_rate
 from koopman_ros.lifting import Box
 from koopman_ros.plant_data import Plant, Samples, split_by_episode
 from koopman_ros.plants import scalar_example
@@ -178,6 +179,22 @@ def test_the_model_describes_its_origin(small):
     assert small.law_check.arrived == small.law_check.loops == 128
     assert 0.9 < small.law_check.median_ratio < 1.0
     assert small.law_check.worst_ratio < 1.1
+
+
+def test_a_law_is_tried_on_the_drift_that_predicts_best(small):
+    """The plant's is a polynomial of degree 2."""
+    parts = split_by_episode(bent_samples(), 0)
+    box = Box(small.model.states, small.model.inputs, 's')
+    x, u = np.array([[2.2], [3.9]]), np.array([[0.1], [1.2]])
+    true = -(x - 3.0) - 0.3 * (x - 3.0) ** 2 + 2.0 * (u - 0.5)
+    found = training._reference(BENT, box, parts, small.model)(x, u)
+    np.testing.assert_allclose(found, true, rtol=0, atol=1e-12)
+    # 12 samples are too few for any but the linear one, and the lift is better than that
+    few = (bent_samples(1, 12), *parts[1:])
+    found = training._reference(BENT, box, few, small.model)(x, u)
+    own = lifted_rate(small.model, 1.0)(x, u)
+    np.testing.assert_array_equal(found, own)
+    assert np.max(np.abs(own - true)) > 1e-6
 
 
 def test_figures_come_from_the_untouched_episodes():
