@@ -10,7 +10,7 @@ from typing import TypeAlias
 
 import numpy as np
 
-from koopman_ros.learning import Edmd, Growth, NoUsefulLift, train
+from koopman_ros.learning import Edmd, Growth, NeuralDrift, NoUsefulLift, train
 from koopman_ros.learning.training import Recipe
 from koopman_ros.lifting import Box, LiftedModel, PolynomialObservables
 from koopman_ros.plant_data import Plant, Samples, split_by_episode
@@ -63,8 +63,8 @@ def _sparse(degree: int, threshold: float = 0.01) -> Learner:
             terms.powers_.tolist(), found.coefficients().T, strict=True)}
         exponents = PolynomialObservables.total_degree(full.n_x, degree).exponents
         drift = np.stack([weights[tuple(powers)] for powers in exponents.tolist()])
-        return Learned(replace(full, A=np.vstack([drift.T, full.A[full.n_x:]])),
-                       time.process_time() - begin)
+        A = np.vstack([drift.T, full.A[full.n_x:]])
+        return Learned(replace(full, A=A, readout=drift.T), time.process_time() - begin)
 
     return learn
 
@@ -97,4 +97,5 @@ LEARNERS: dict[str, Learner] = {
         lambda n_x: Growth(n_x + 3, hidden_first=16, max_iterations=_STEPS)),
     'free lift': _trained(
         lambda n_x: Growth(n_x, identity=False, hidden_first=16, max_iterations=_STEPS)),
+    'neural drift': _trained(lambda n_x: NeuralDrift((16,), max_iterations=_STEPS)),
 }
