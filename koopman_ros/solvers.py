@@ -4,7 +4,8 @@
 """
 Riccati equations and Runge-Kutta steps, in numpy and scipy; imports nothing of ours but arrays.
 
-The continuous algebraic Riccati equation is solved by an ordered Schur form, and checked.
+The algebraic Riccati equations of the continuous and of the sampled regulator are solved by an
+ordered Schur form, and checked.
 """
 
 from collections.abc import Callable
@@ -13,7 +14,7 @@ from enum import Enum
 import math
 
 import numpy as np
-from scipy.linalg import blas, lapack
+from scipy.linalg import blas, expm, lapack
 
 from koopman_ros.arrays import Array
 
@@ -39,7 +40,12 @@ class RiccatiStatus(Enum):
 
 @dataclass(frozen=True)
 class RiccatiSolution:
-    """Solution of A'P + PA - P B R^-1 B' P + Q = 0 with the gain K = R^-1 B' P."""
+    """
+    Solution of a Riccati equation with its gain.
+
+    In continuous time A'P + PA - P B R^-1 B' P + Q = 0 and K = R^-1 B' P; of the sampled regulator
+    see :func:`solve_riccati`.
+    """
 
     P: Array  #: (n, n) symmetric; zeros when there is no stable subspace to take it from
     K: Array  #: (m, n); zeros likewise
@@ -54,10 +60,16 @@ def _in_left_half_plane(real: float, imaginary: float) -> bool:
 
 # values so large that something overflows end in a residual or a gain that is refused
 @np.errstate(all='ignore')
-def solve_riccati(A: Array, B: Array, Q: Array, R: Array, *, max_residual: float = 1e-8,
-                  max_gain: float = 1e6) -> RiccatiSolution:
+def solve_riccati(A: Array, B: Array, Q: Array, R: Array, *, interval: float = 0.0,
+                  max_residual: float = 1e-8, max_gain: float = 1e6) -> RiccatiSolution:
     """
-    Solve the Riccati equation of the infinite-horizon regulator (Laub, 1979).
+    Solve the Riccati equation of the infinite-horizon regulator of dx/dt = A x + B u.
+
+    With an interval it is that of the sampled regulator: the input is held between samples so far
+    apart, and the cost is still the integral of x'Q x + u'R u. Then it is a discrete equation,
+    P = Phi'P Phi + Q_d - K'(R_d + Gamma'P Gamma) K, K = (R_d + Gamma'P Gamma)^-1 (Gamma'P Phi +
+    N_d'), with the plant and the weights over an interval (Van Loan, 1978). Its gain tends to the
+    continuous one as the interval goes to 0.
 
     A returned status other than SOLVED means that K must not be used: near the border of
     stabilisability the Schur method yields a P with enormous gains and eigenvalues that look
@@ -66,40 +78,19 @@ def solve_riccati(A: Array, B: Array, Q: Array, R: Array, *, max_residual: float
     :param A: (n, n), and B (n, m).
     :param Q: (n, n) symmetric, positive semidefinite, not zero.
     :param R: (m, m) symmetric, positive definite.
+    :param interval: in the unit of time of A; 0 for continuous time.
     :param max_residual: largest relative residual taken as solved.
     :param max_gain: largest spectral norm of K taken as solved.
-    :raises numpy.linalg.LinAlgError: when R is singular.
+    :raises numpy.linalg.LinAlgError: when R is singular, in continuous time.
     """
-    n, m = B.shape
-    R_inverse_Bt = _solution(R, B.T)
-    if R_inverse_Bt is None:
-        raise np.linalg.LinAlgError('Singular matrix: the input weight R')
-    G = B.dot(R_inverse_Bt)
-    size_Q, size_G = _size(Q), _size(G)
-    # P scaled to order one, so that neither block of the Hamiltonian dominates
-    scale = math.sqrt(size_Q / size_G) if size_G > 0.0 and size_Q > 0.0 else 1.0
-    H = np.empty((2 * n, 2 * n), order='F')
-    H[:n, :n], H[:n, n:] = A, G * -scale
-    H[n:, :n], H[n:, n:] = Q / -scale, -A.T
-    size_H = _size(H)
-    if not (math.isfinite(size_H) and size_Q > 0.0):
-        return _unsolved(B, RiccatiStatus.NOT_STABILISABLE)
-    _, stable, real, _, vectors, _, info = lapack.dgees(
-        _in_left_half_plane, H, sort_t=1, lwork=16 * n, overwrite_a=1)
-    if info != 0 or stable != n or not (real[:n] < -_AXIS_MARGIN * size_H).all():
-        return _unsolved(B, RiccatiStatus.NOT_STABILISABLE)
-    P = _solution(vectors[:n, :n].T, vectors[n:, :n].T)
-    if P is None:
-        return _unsolved(B, RiccatiStatus.NOT_STABILISABLE)
-    P = (0.5 * scale) * (P + P.T)
-    K = R_inverse_Bt.dot(P)
-    PA = P.dot(A)
-    PGP = P.dot(G).dot(P)
-    # the rounding of the sum grows with its terms, so that Q alone would be too strict a measure
-    size = size_Q + 2.0 * _size(PA) + _size(PGP)
-    residual = _size(PA + PA.T - PGP + Q) / size
+    solved = _sampled(A, B, Q, R, interval) if interval > 0.0 else _continuous(A, B, Q, R)
+    if solved is None:
+        n, m = B.shape
+        return RiccatiSolution(np.zeros((n, n)), np.zeros((m, n)), np.inf, np.inf,
+                               RiccatiStatus.NOT_STABILISABLE)
+    P, K, residual = solved
     gain = _size(K)
-    if min(m, n) > 1 and math.isfinite(gain):
+    if min(K.shape) > 1 and math.isfinite(gain):
         gain = float(np.linalg.norm(K, 2))
     if not residual <= max_residual:
         status = RiccatiStatus.INACCURATE
@@ -108,6 +99,126 @@ def solve_riccati(A: Array, B: Array, Q: Array, R: Array, *, max_residual: float
     else:
         status = RiccatiStatus.SOLVED
     return RiccatiSolution(P, K, residual, gain, status)
+
+
+def _continuous(A: Array, B: Array, Q: Array, R: Array) -> tuple[Array, Array, float] | None:
+    """Return P, K and the residual; None without a stable subspace of full size (Laub, 1979)."""
+    n = len(A)
+    R_inverse_Bt = _solution(R, B.T)
+    if R_inverse_Bt is None:
+        raise np.linalg.LinAlgError('Singular matrix: the input weight R')
+    G = B.dot(R_inverse_Bt)
+    size_Q, scale = _size(Q), _scale(Q, G)
+    H = np.empty((2 * n, 2 * n), order='F')
+    H[:n, :n], H[:n, n:] = A, G * -scale
+    H[n:, :n], H[n:, n:] = Q / -scale, -A.T
+    P = _stable_graph(H, scale) if size_Q > 0.0 else None
+    if P is None:
+        return None
+    PA = P.dot(A)
+    PGP = P.dot(G).dot(P)
+    # the rounding of the sum grows with its terms, so that Q alone would be too strict a measure
+    size = size_Q + 2.0 * _size(PA) + _size(PGP)
+    return P, R_inverse_Bt.dot(P), _size(PA + PA.T - PGP + Q) / size
+
+
+def _sampled(A: Array, B: Array, Q: Array, R: Array, interval: float
+             ) -> tuple[Array, Array, float] | None:
+    """
+    Return the same of the sampled regulator.
+
+    The Cayley transform (S + I)^-1 (S - I) of the symplectic pencil is a Hamiltonian matrix with
+    the same stable subspace. It inverts no transition matrix, so that modes may decay as fast as
+    they like within an interval.
+    """
+    n = len(A)
+    held = _over_interval(A, B, Q, R, interval)
+    if held is None:
+        return None
+    D, W = held
+    step, push = D[:n, :n], D[:n, n:]
+    Q_d, N, R_d = W[:n, :n], W[:n, n:], W[n:, n:]
+    # what the cross term makes of input and weight
+    by_R = _solution(R_d, np.concatenate((push.T, N.T), axis=1))
+    if by_R is None:
+        return None
+    rest, G, Q_rest = step - push.dot(by_R[:, n:]), push.dot(by_R[:, :n]), Q_d - N.dot(by_R[:, n:])
+    scale = _scale(Q_rest, G)
+    less = np.empty((2 * n, 2 * n), order='F')
+    less[:n, :n], less[:n, n:] = rest, G * -scale
+    less[n:, :n], less[n:, n:] = Q_rest / -scale, -rest.T
+    more = less.copy(order='F')
+    more[:, n:] *= -1.0
+    more.ravel(order='K')[::2 * n + 1] += 2.0
+    H = _solution(more, less)
+    P = _stable_graph(H, scale) if H is not None and _size(Q_d) > 0.0 else None
+    if P is None:
+        return None
+    P_step, P_push = P.dot(step), P.dot(push)
+    right = N.T + push.T.dot(P_step) + P_push.T
+    K = _solution(R_d + push.T.dot(P_push), right)
+    if K is None:
+        return None
+    # the equation less P on both sides, whose terms shrink with the interval
+    square, feedback = step.T.dot(P_step), right.T.dot(K)
+    size = _size(Q_d) + 2.0 * _size(P_step) + _size(square) + _size(feedback)
+    return P, K, _size(P_step + P_step.T + square + Q_d - feedback) / size
+
+
+def _over_interval(A: Array, B: Array, Q: Array, R: Array, interval: float
+                   ) -> tuple[Array, Array] | None:
+    """
+    Integrate state, held input and cost over an interval; None for what is not finite.
+
+    :return: with y = (x, u), the D (n + m, n + m) of y(interval) = (I + D) y(0), whose lower rows
+        are zeros, and W of the cost y(0)'W y(0).
+    """
+    n, m = B.shape
+    N = n + m
+    F, W = np.zeros((N, N)), np.zeros((N, N))
+    F[:n, :n], F[:n, n:] = A, B
+    W[:n, :n], W[n:, n:] = Q, R
+    size_W = _size(W)
+    doublings = max(0, math.frexp(_size(F) * interval)[1])
+    part = math.ldexp(interval, -doublings)
+    F *= part
+    # by blocks the exponential of F and its integral, of which D loses no digits when F is small,
+    # and of the weights
+    block = np.zeros((3 * N, 3 * N))
+    block[:N, :N], block[:N, N:2 * N] = -F.T, W / size_W
+    block[N:2 * N, N:2 * N], block[N:2 * N, 2 * N:] = F, np.eye(N)
+    if not math.isfinite(_size(block)):
+        return None
+    exponential = expm(block)
+    D = F.dot(exponential[N:2 * N, 2 * N:])
+    W = exponential[N:2 * N, N:2 * N].T.dot(exponential[:N, N:2 * N])
+    W = (0.5 * part * size_W) * (W + W.T)
+    # twice the time, again and again: the same blocks over all of it would overflow where modes
+    # decay fast
+    for _ in range(doublings):
+        DW = D.T.dot(W)
+        W = 2.0 * W + DW + DW.T + DW.dot(D)
+        D = 2.0 * D + D.dot(D)
+    return D, W
+
+
+def _scale(Q: Array, G: Array) -> float:
+    """Return by how much to divide P for order one, so that no block dominates the Hamiltonian."""
+    size_Q, size_G = _size(Q), _size(G)
+    return math.sqrt(size_Q / size_G) if size_G > 0.0 and size_Q > 0.0 else 1.0
+
+
+def _stable_graph(H: Array, scale: float) -> Array | None:
+    """Return `scale` times the P whose graph is the stable subspace of a Hamiltonian, or None."""
+    n, size = len(H) // 2, _size(H)
+    if not math.isfinite(size):
+        return None
+    _, stable, real, _, vectors, _, info = lapack.dgees(
+        _in_left_half_plane, H, sort_t=1, lwork=16 * n, overwrite_a=1)
+    if info != 0 or stable != n or not (real[:n] < -_AXIS_MARGIN * size).all():
+        return None
+    P = _solution(vectors[:n, :n].T, vectors[n:, :n].T)
+    return None if P is None else (0.5 * scale) * (P + P.T)
 
 
 # LAPACK and BLAS themselves: numpy's functions take several times as long for a few numbers.
@@ -121,11 +232,6 @@ def _solution(matrix: Array, right: Array) -> Array | None:
 def _size(matrix: Array) -> float:
     """Return the Frobenius norm."""
     return float(blas.dnrm2(matrix.ravel('K')))
-
-
-def _unsolved(B: Array, status: RiccatiStatus) -> RiccatiSolution:
-    n, m = B.shape
-    return RiccatiSolution(np.zeros((n, n)), np.zeros((m, n)), np.inf, np.inf, status)
 
 
 def runge_kutta_step(rate: Callable[[Array], Array], x: Array, h: Array | float) -> Array:

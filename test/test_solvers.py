@@ -5,7 +5,7 @@
 
 import numpy as np
 import pytest
-from scipy.linalg import block_diag, solve_continuous_are
+from scipy.linalg import block_diag, expm, solve_continuous_are, solve_discrete_are
 
 from koopman_ros.solvers import RiccatiStatus, runge_kutta_step, solve_riccati
 
@@ -60,11 +60,13 @@ def test_scalar_plants_in_closed_form(a, b, q, r):
     assert solution.K[0, 0] == pytest.approx(p * b / r, rel=1e-12)
 
 
+@pytest.mark.parametrize('h', [0.0, 0.3])
 @pytest.mark.parametrize('factor', [1e-9, 1e9])
-def test_the_unit_of_the_cost_does_not_matter(factor):
+def test_the_unit_of_the_cost_does_not_matter(factor, h):
     for n, m in SIZES:
         A, B, Q, R = random_problem(n, m, seed=7)
-        solution, other = solve_riccati(A, B, Q, R), solve_riccati(A, B, factor * Q, factor * R)
+        solution = solve_riccati(A, B, Q, R, interval=h)
+        other = solve_riccati(A, B, factor * Q, factor * R, interval=h)
         assert other.status is RiccatiStatus.SOLVED, (n, m)
         assert_close(other, factor * solution.P, solution.K)
 
@@ -122,10 +124,11 @@ BEYOND = {
 }
 
 
+@pytest.mark.parametrize('h', [0.0, 0.3])
 @pytest.mark.parametrize('case', BEYOND)
-def test_what_has_no_stabilising_solution(case):
+def test_what_has_no_stabilising_solution(case, h):
     A, b, Q = BEYOND[case]
-    solution = solve_riccati(A, np.array(b)[:, None], Q, np.eye(1))
+    solution = solve_riccati(A, np.array(b)[:, None], Q, np.eye(1), interval=h)
     assert solution.status is RiccatiStatus.NOT_STABILISABLE
     assert not np.any(solution.K)
     assert not np.any(solution.P)
@@ -135,28 +138,31 @@ def test_what_has_no_stabilising_solution(case):
         T = np.random.default_rng(seed).normal(size=A.shape)
         inverse = np.linalg.inv(T)
         solution = solve_riccati(T @ A @ inverse, (T @ b)[:, None], inverse.T @ Q @ inverse,
-                                 np.eye(1))
+                                 np.eye(1), interval=h)
         assert solution.status is not RiccatiStatus.SOLVED, seed
 
 
-def test_what_is_not_finite_or_weighs_nothing_is_not_solved():
+@pytest.mark.parametrize('h', [0.0, 0.3])
+def test_what_is_not_finite_or_weighs_nothing_is_not_solved(h):
     for place, name in enumerate('ABQR'):
         for value in (np.nan, np.inf, -np.inf):
             problem = [-np.eye(2), np.eye(2), np.eye(2), np.eye(2)]
             problem[place] = np.full((2, 2), value)
-            assert solve_riccati(*problem).status is not RiccatiStatus.SOLVED, (name, value)
-    solution = solve_riccati(-np.eye(2), np.eye(2), np.zeros((2, 2)), np.eye(2))
+            solution = solve_riccati(*problem, interval=h)
+            assert solution.status is not RiccatiStatus.SOLVED, (name, value)
+    solution = solve_riccati(-np.eye(2), np.eye(2), np.zeros((2, 2)), np.eye(2), interval=h)
     assert solution.status is RiccatiStatus.NOT_STABILISABLE
 
 
-def test_nothing_escapes_at_any_magnitude():
+@pytest.mark.parametrize('h', [0.0, 0.3])
+def test_nothing_escapes_at_any_magnitude(h):
     rng = np.random.default_rng(8)
     solved = 0
     for _ in range(1000):
         n, m = int(rng.integers(1, 5)), int(rng.integers(1, 3))
         A, B, Q, R = (array * 10.0 ** rng.uniform(-300.0, 300.0)
                       for array in random_problem(n, m, seed=1))
-        solution = solve_riccati(A, B, Q, R)
+        solution = solve_riccati(A, B, Q, R, interval=h)
         if solution.status is RiccatiStatus.SOLVED:
             solved += 1
             assert np.all(np.isfinite(solution.K))
@@ -171,6 +177,124 @@ def test_no_input_costs_what_it_costs_and_no_weight_of_it_is_an_error():
     np.testing.assert_array_equal(solution.K, np.zeros((1, 2)))
     with pytest.raises(np.linalg.LinAlgError, match='Singular'):
         solve_riccati(-np.eye(1), np.eye(1), np.eye(1), np.zeros((1, 1)))
+
+
+# The sampled regulator.
+
+def over_interval(A, B, Q, R, h, nodes=24):
+    """Integrate plant and weights over an interval by Gauss's nodes, an exponential at each."""
+    n, m = B.shape
+    F, W = np.zeros((n + m, n + m)), block_diag(Q, R)
+    F[:n, :n], F[:n, n:] = A, B
+    times, shares = np.polynomial.legendre.leggauss(nodes)
+    weight = sum(0.5 * h * share * expm(t * F).T @ W @ expm(t * F)
+                 for t, share in zip(0.5 * h * (1.0 + times), shares, strict=True))
+    end = expm(h * F)
+    return end[:n, :n], end[:n, n:], weight[:n, :n], weight[:n, n:], weight[n:, n:]
+
+
+def assert_solves(solution, phi, gamma, Q, N, R):
+    """Compare with scipy's solution of the discrete equation."""
+    assert solution.status is RiccatiStatus.SOLVED
+    P = solve_discrete_are(phi, gamma, 0.5 * (Q + Q.T), 0.5 * (R + R.T), s=N)
+    K = np.linalg.solve(R + gamma.T @ P @ gamma, gamma.T @ P @ phi + N.T)
+    assert_close(solution, P, K)
+    assert np.max(np.abs(np.linalg.eigvals(phi - gamma @ solution.K))) < 1.0
+
+
+@pytest.mark.parametrize('h', [0.03, 0.3, 2.0])
+def test_sampled_random_pairs_against_scipy(h):
+    for n, m in SIZES:
+        problem = random_problem(n, m, seed=3)
+        assert_solves(solve_riccati(*problem, interval=h), *over_interval(*problem, h))
+
+
+@pytest.mark.parametrize('h', [0.1, 1.0, 5.0])
+@pytest.mark.parametrize(('a', 'b', 'q', 'r'), [
+    (1.0, 2.0, 3.0, 0.5), (-1.0, 2.0, 3.0, 0.5), (-0.957887316, 2.092050209, 1.0, 0.1)])
+def test_sampled_scalar_plants_in_closed_form(a, b, q, r, h):
+    phi, phi_2 = np.exp(a * h), np.exp(2.0 * a * h)
+    gamma = b / a * (phi - 1.0)
+    # integrals of e^2at, e^at (e^at - 1) and (e^at - 1)^2
+    once, twice = (phi - 1.0) / a, (phi_2 - 1.0) / (2.0 * a)
+    Q, N, R = q * twice, q * b / a * (twice - once), (
+        r * h + q * (b / a) ** 2 * (twice - 2.0 * once + h))
+    # (p (1 - phi^2) - Q) (R + gamma^2 p) + (gamma phi p + N)^2 = 0
+    p = max(np.roots([gamma ** 2, (1.0 - phi_2) * R - Q * gamma ** 2 + 2.0 * gamma * phi * N,
+                      N * N - Q * R]))
+    solution = solve_riccati(*(np.array([[value]]) for value in (a, b, q, r)), interval=h)
+    assert solution.status is RiccatiStatus.SOLVED
+    assert solution.P[0, 0] == pytest.approx(p, rel=1e-10)
+    assert solution.K[0, 0] == pytest.approx(
+        (gamma * p * phi + N) / (R + gamma ** 2 * p), rel=1e-10)
+
+
+@pytest.mark.parametrize('h', [0.01, 0.5, 4.0])
+def test_sampled_double_integrator_by_hand(h):
+    A, B = np.array([[0.0, 1.0], [0.0, 0.0]]), np.array([[0.0], [1.0]])
+    solution = solve_riccati(A, B, np.eye(2), 0.2 * np.eye(1), interval=h)
+    assert_solves(
+        solution, np.array([[1.0, h], [0.0, 1.0]]), np.array([[h * h / 2.0], [h]]),
+        np.array([[h, h ** 2 / 2.0], [h ** 2 / 2.0, h + h ** 3 / 3.0]]),
+        np.array([[h ** 3 / 6.0], [h ** 4 / 8.0 + h ** 2 / 2.0]]),
+        np.array([[0.2 * h + h ** 5 / 20.0 + h ** 3 / 3.0]]))
+
+
+def test_what_the_sampled_regulator_costs_is_its_solution_and_least():
+    """Summed over 100 intervals of 10 Runge-Kutta steps each, for several gains at once."""
+    A, B, Q, R = random_problem(3, 1, seed=4)
+    h, start = 0.4, np.array([1.0, -0.5, 0.3])
+    solution = solve_riccati(A, B, Q, R, interval=h)
+
+    changes = 0.05 * np.vstack((np.zeros(3), np.eye(3), -np.eye(3)))
+    gains = np.vstack((solution.K + changes, solve_riccati(A, B, Q, R).K))
+    y = np.tile(np.append(start, 0.0), (len(gains), 1))
+    for _ in range(100):
+        u = -np.sum(gains * y[:, :3], axis=1, keepdims=True)
+        effort = R[0, 0] * u ** 2
+
+        def rate(y, u=u, effort=effort):
+            x = y[:, :3]
+            return np.hstack((x @ A.T + u @ B.T, np.sum(x @ Q * x, 1, keepdims=True) + effort))
+
+        for _ in range(10):
+            y = runge_kutta_step(rate, y, h / 10)
+    least, *others, continuous = y[:, 3]
+    assert least == pytest.approx(start @ solution.P @ start, rel=1e-5)
+    assert min(others) > least
+    assert continuous > 1.001 * least
+
+
+def test_the_sampled_gain_tends_to_the_continuous_one():
+    for n, m in SIZES:
+        problem = random_problem(n, m, seed=5)
+        continuous = solve_riccati(*problem).K
+        far, near = (solve_riccati(*problem, interval=h).K for h in (2e-6, 1e-6))
+        assert np.linalg.norm(far - continuous) > 0.0
+        # what remains after the term in h is of its square
+        assert np.linalg.norm(2.0 * near - far - continuous) <= 1e-9 * np.linalg.norm(continuous)
+        # nor is anything lost where samples come in a burst
+        assert solve_riccati(*problem, interval=1e-12).residual <= 1e-9
+
+
+@pytest.mark.parametrize('rate', [1e3, 1e6, 1e9])
+def test_modes_that_decay_within_an_interval(rate):
+    """One that only follows the input counts as weight of the input, but for h rate = inf."""
+    h, slow = 2.0, np.array([[0.5]])
+    A, B = np.diag([-rate, 0.5]), np.array([[rate], [1.0]])
+    found = solve_riccati(A, B, np.diag([0.3, 1.0]), 0.2 * np.eye(1), interval=h)
+    reduced = solve_riccati(slow, np.eye(1), np.eye(1), 0.5 * np.eye(1), interval=h)
+    assert found.status is RiccatiStatus.SOLVED
+    assert found.K[0, 1] == pytest.approx(reduced.K[0, 0], rel=2.0 / (h * rate) + 1e-12)
+    # and one without weight that moves nothing else does not count
+    found = solve_riccati(A, B, np.diag([0.0, 1.0]), 0.5 * np.eye(1), interval=h)
+    np.testing.assert_allclose(found.K, [[0.0, reduced.K[0, 0]]], rtol=1e-9, atol=1e-12)
+
+
+def test_samples_as_far_apart_as_a_period_do_not_see_an_oscillation():
+    problem = OSCILLATOR, np.array([[0.0], [1.0]]), np.eye(2), np.eye(1)
+    assert solve_riccati(*problem, interval=0.9 * np.pi).status is RiccatiStatus.SOLVED
+    assert solve_riccati(*problem, interval=np.pi).status is not RiccatiStatus.SOLVED
 
 
 # Runge-Kutta steps.

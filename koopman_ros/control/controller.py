@@ -240,7 +240,7 @@ class Controller:
         if level is None or state.setpoint.active is None:
             return state
         now = level.compute(state.setpoint.active, state.estimate, self.settings.limits, None,
-                            0.0, state.target)[1]
+                            _spacing(state), state.target)[1]
         if now.u is None:
             return state
         return amended(state, law_input=now.u, law_memory=now.memory, transfer=shifted(
@@ -300,7 +300,7 @@ class Controller:
             since_ns = state.time_ns
         elapsed = 0.0 if since_ns is None else max(0.0, (time_ns - since_ns) / NANOSECONDS)
         # neither a gap nor a burst is the spacing of the samples, nor the first of them
-        spacing = 0.0 if math.isinf(state.interval) else min(state.interval, elapsed)
+        spacing = min(_spacing(state), elapsed)
         state, seconds, missed = _passed(state, time_ns, elapsed)
         # a measurement of 1e300 may overflow on its way; the result is checked and limited
         with np.errstate(all='ignore'):
@@ -491,6 +491,11 @@ def _passed(state: State, time_ns: int, elapsed: float) -> tuple[State, float, i
     # a burst of measurements does not make the next regular one a gap
     usual = 0.0 if math.isinf(state.interval) else 0.5 * state.interval
     return (amended(state, interval=max(seconds, usual)), min(seconds, elapsed), missed)
+
+
+def _spacing(state: State) -> float:
+    """Return the usual seconds between measurements; 0 before the second."""
+    return 0.0 if math.isinf(state.interval) else state.interval
 
 
 def _afresh(state: State) -> State:

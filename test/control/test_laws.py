@@ -11,12 +11,26 @@ from scipy.linalg import solve_continuous_are
 from scipy.optimize import brentq
 
 from koopman_ros.control import exchange, LevelSettings, run_closed_loop, SupervisorSettings
-from koopman_ros.control.laws import averaged, feedback, Form, recentred, Weights
+from koopman_ros.control.laws import (
+    averaged,
+    feedback,
+    Form,
+    LAWS,
+    recentred,
+    Tuning,
+    Weights,
+)
 from koopman_ros.control.laws.base import steady_state_target
+from koopman_ros.control.laws.riccati import checked
+from koopman_ros.estimation import Estimate
 from koopman_ros.lifting import Coordinates, linearised_model, Provenance
 from koopman_ros.plants import two_state_example, two_state_reactor
+from koopman_ros.plants.optimum import cost_along, optimum, Task
+from koopman_ros.reasons import Code
+from koopman_ros.solvers import runge_kutta_step, solve_riccati
 from support.closed_loops import (
     controller,
+    COOLANT,
     REACTOR,
     Reactor,
     reactor_weights,
@@ -233,6 +247,69 @@ def test_a_free_lift_with_more_coordinates_than_states_takes_the_averaged_law(
     found = feedback(model, np.array([0.3]), target, Weights(np.eye(1), np.eye(1)))
     assert found.solved
     assert found.form is law
+
+
+# The sampled loop.
+
+def sampled_loop(law, seconds, R, interval):
+    """Step the true reactor to the set-point by a held input; return task, states and inputs."""
+    model, h = shipped('reactor_nz4'), seconds / 60.0
+    weights, target = reactor_weights(model, R), setpoint_target(model)
+    task = Task(REACTOR, np.array([START]), np.array([SETPOINT]), np.array([COOLANT]),
+                np.full(1, UNIT ** -2), np.full(1, R * UNIT ** -2), h, round(15.0 / h))
+    states, inputs = [task.x0], []
+    for _ in range(task.samples):
+        found = law(model, model.states.to_deviation(states[-1]), target, weights,
+                    interval=interval)
+        assert found.solved
+        inputs.append(model.inputs.to_physical(found.u))
+        x = states[-1]
+        for _ in range(task.substeps):
+            x = runge_kutta_step(lambda x: REACTOR.derivative(x, inputs[-1]), x,
+                                 h / task.substeps)
+        states.append(x)
+    return task, np.array(states), np.array(inputs)
+
+
+@pytest.mark.parametrize('law', [recentred, averaged])
+def test_a_law_that_knows_the_interval_costs_hardly_more_than_the_least(law):
+    task, states, inputs = sampled_loop(law, 15.0, 0.1, interval=0.25)
+    least = optimum(task).cost
+    assert least * (1.0 - 1e-6) < cost_along(task, states, inputs) < 1.002 * least
+    assert states[-1][0] == pytest.approx(SETPOINT, abs=1e-3)
+    unaware = sampled_loop(law, 15.0, 0.1, interval=0.0)
+    assert cost_along(*unaware) > 1.5 * least
+
+
+def test_an_interval_makes_gains_smaller_and_predictions_stable():
+    model = shipped('reactor_nz4')
+    arguments = (model, np.array([-0.5]), setpoint_target(model), reactor_weights(model, 1e-6))
+    unaware, aware = (feedback(*arguments, interval=h, max_gain=1e9) for h in (0.0, 1.0 / 60.0))
+    assert unaware.solved
+    assert aware.solved
+    assert aware.riccati.gain < 0.5 * unaware.riccati.gain
+    assert aware.growth(1.0 / 60.0) < 1.0 < unaware.growth(1.0 / 60.0)
+    # nor is a gain used that came from elsewhere
+    limits = controller().settings.limits
+    assert checked(model, aware, limits, 1.0).failure is None
+    refused = checked(model, unaware, limits, 1.0)
+    assert refused.failure.code is Code.PREDICTED_UNSTABLE
+    assert refused.failure.values['interval'] == 1.0
+
+
+def test_the_linear_law_is_solved_for_the_interval_and_once():
+    model = shipped('reactor_nz4')
+    weights, linear = reactor_weights(model, 0.1), model.linearised
+    law = LAWS['linear'](model, Tuning(weights))
+    target, limits = setpoint_target(linear, 323.0), controller().settings.limits
+    estimate = Estimate(linear.states.to_deviation(np.array([324.0])), np.zeros(1))
+    for seconds in (1.0, 15.0, 1.0, 0.0):
+        found = law.compute(estimate, target, limits, None, seconds)
+        K = solve_riccati(linear.A, linear.B, weights.Q, weights.R, interval=seconds / 60.0).K
+        u = linear.inputs.to_physical(target.u - K @ (estimate.x - target.x))
+        np.testing.assert_allclose(found.u, u, rtol=1e-12)
+        again = law.compute(estimate, target, limits, None, seconds)
+        assert again.u.tobytes() == found.u.tobytes()
 
 
 # What CONTRIBUTING says how to add, added from a temporary folder.

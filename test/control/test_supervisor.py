@@ -148,8 +148,7 @@ def test_a_disturbance_that_drives_the_reactor_out_is_overcome():
 @pytest.mark.parametrize(('change', 'words'), [
     ({'max_gain': 1e-9}, 'the gain exceeds its bound'),
     ({'max_residual': -1.0}, 'the Riccati residual is too large'),
-    ({'input_weight': np.array([1e-6]), 'max_gain': 1e9}, 'predicted unstable at a sample every'),
-], ids=['gain', 'residual', 'sampling'])
+], ids=['gain', 'residual'])
 def test_without_a_law_the_command_is_held_then_safe_and_the_loop_comes_back(change, words):
     loop = Reactor(controller())
     loop.run(30)

@@ -29,7 +29,7 @@ PACKAGES = ('numpy', 'scipy', 'torch', 'control')
 MEANING = {
     'step_us': 'median time of a control step, by n_z; step has the 99th percentiles, too',
     'step_ratio_to_naive': 'how many times as long the same law takes by torch jacrev and '
-                           'control.lqr, by n_z; medians of processor time, since a busy machine '
+                           'control.dlqr, by n_z; medians of processor time, since a busy machine '
                            'interrupts the longer one more often',
     'latency_ratio_median': 'measurement published to command received, over that of a bare echo',
     'latency_ratio_p99': 'the same for 99th percentiles',

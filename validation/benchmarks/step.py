@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 The koopman_ros Authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""What a control step takes, beside the same law with general tools: jacrev and lqr."""
+"""What a control step takes, beside the same law with general tools: jacrev and dlqr."""
 
 from __future__ import annotations
 
@@ -10,6 +10,7 @@ from time import perf_counter_ns, thread_time_ns
 from typing import Any
 
 import numpy as np
+from scipy.linalg import block_diag, expm
 import torch
 from torch.func import jacrev
 
@@ -150,6 +151,7 @@ class NaiveLaw:
         self._setpoint = np.full(1, np.nan)
         self._x, self._w = np.full(1, np.nan), np.zeros(1)
         self._command: Array | None = None
+        self._interval = 0.0
 
     def step(self, measurement: Array, setpoint: Array, seconds: float) -> Array:
         """Answer a measurement (1,), so many seconds after the one before, by a command (1,)."""
@@ -163,8 +165,8 @@ class NaiveLaw:
         u_ref = np.linalg.solve(model.B, -self._f_ref - self._w)
         z, J = self._lift_and_jacobian(x)
         H = self._secant(x, x_ref, J) @ (model.B @ u_ref + self._w)[:, None]
-        K, _, _ = control.lqr(model.A + H @ self._C, J @ model.B, self._C.T @ self._Q @ self._C,
-                              self._R)
+        K = self._gain(model.A + H @ self._C, J @ model.B, min(self._interval, seconds))
+        self._interval = seconds
         u = np.clip(model.inputs.to_physical(u_ref - K @ (z - self._z_ref)),
                     self._limits.lower, self._limits.upper)
         if self._command is not None:
@@ -172,6 +174,21 @@ class NaiveLaw:
             u = np.clip(u, self._command - reach, self._command + reach)
         self._command = u
         return u
+
+    def _gain(self, A: Array, B: Array, seconds: float) -> Array:
+        """Return the gain (1, n_z) under an input held for so long; 0 for continuous time."""
+        Q, h = self._C.T @ self._Q @ self._C, seconds / self._model.seconds_per_time_unit
+        if not h > 0.0:
+            continuous: Array = control.lqr(A, B, Q, self._R)[0]
+            return continuous
+        n, F = len(A), np.block([[A, B], [np.zeros((1, len(A) + 1))]])
+        exponential = expm(h * np.block([[-F.T, block_diag(Q, self._R)], [np.zeros_like(F), F]]))
+        end = exponential[n + 1:, n + 1:]
+        W = end.T @ exponential[:n + 1, n + 1:]
+        W = 0.5 * (W + W.T)
+        sampled: Array = control.dlqr(
+            end[:n, :n], end[:n, n:], W[:n, :n], W[n:, n:], W[:n, n:])[0]
+        return sampled
 
     def _observed(self, x: Array, seconds: float) -> Array:
         """Return the observer's state (1,), which predicts by one step of Heun's method."""

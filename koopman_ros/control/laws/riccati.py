@@ -3,9 +3,10 @@
 
 """Laws by Riccati equations: state-dependent, re-centred and averaged, and the linear one."""
 
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from enum import Enum
-from functools import cached_property
+from functools import cached_property, lru_cache
 import math
 
 import numpy as np
@@ -79,7 +80,7 @@ class Feedback:
 
 
 def feedback(model: LiftedModel, x: Array, target: Target, weights: Weights, *,
-             max_gain: float = 1e6, max_residual: float = 1e-8) -> Feedback:
+             interval: float = 0.0, max_gain: float = 1e6, max_residual: float = 1e-8) -> Feedback:
     """
     Evaluate the law that suits the model.
 
@@ -91,22 +92,25 @@ def feedback(model: LiftedModel, x: Array, target: Target, weights: Weights, *,
     a poor factorisation of an unstable drift.
 
     :param x: (n_x,) scaled deviation of the measured state.
+    :param interval: for which the input will be held, in the model's time unit: the gain is that
+        of the sampled regulator, and with 0 that of the continuous one.
     :param max_gain: bound on the spectral norm of K.
     :param max_residual: bound on the relative Riccati residual.
     """
-    bounds = {'max_gain': max_gain, 'max_residual': max_residual}
+    how = {'interval': interval, 'max_gain': max_gain, 'max_residual': max_residual}
     # z = x of a read-out is not linear, nor meant to be
     of_drift = model.readout is not None and model.identity and model.n_z == model.n_x
     if not of_drift and ((model.identity and not model.adds_unstable_modes) or (
             model.is_hurwitz and model.n_z == model.n_x)):
-        result = recentred(model, x, target, weights, **bounds)
+        result = recentred(model, x, target, weights, **how)
         if result.solved:
             return result
-    return averaged(model, x, target, weights, **bounds)
+    return averaged(model, x, target, weights, **how)
 
 
 def recentred(model: LiftedModel, x: Array, target: Target, weights: Weights, *,
-              max_gain: float = 1e6, max_residual: float = 1e-8) -> Feedback:
+              interval: float = 0.0, max_gain: float = 1e6, max_residual: float = 1e-8
+              ) -> Feedback:
     """
     Solve the Riccati equation of the lifted error e = N(x) - z_ref.
 
@@ -128,8 +132,8 @@ def recentred(model: LiftedModel, x: Array, target: Target, weights: Weights, *,
         C = np.linalg.pinv(M)
         A, Q = model.A + H @ C, C.T @ weights.Q @ C
     # dot takes a third of the time of @ here
-    riccati = solve_riccati(A, J.dot(model.B), Q, weights.R, max_gain=max_gain,
-                            max_residual=max_residual)
+    riccati = solve_riccati(A, J.dot(model.B), Q, weights.R, interval=interval,
+                            max_gain=max_gain, max_residual=max_residual)
     drift = (model.onto_states(J, model.A.dot(M) + H) if model.readout is None
              else model.averaged_drift_jacobian(x, target.x))
     return Feedback(target.u - riccati.K.dot(z - target.z), Form.RECENTRED, riccati,
@@ -137,7 +141,7 @@ def recentred(model: LiftedModel, x: Array, target: Target, weights: Weights, *,
 
 
 def averaged(model: LiftedModel, x: Array, target: Target, weights: Weights, *,
-             max_gain: float = 1e6, max_residual: float = 1e-8) -> Feedback:
+             interval: float = 0.0, max_gain: float = 1e6, max_residual: float = 1e-8) -> Feedback:
     """
     Solve the Riccati equation of the state's error e = x - x_ref under the averaged Jacobian.
 
@@ -149,7 +153,7 @@ def averaged(model: LiftedModel, x: Array, target: Target, weights: Weights, *,
     Arguments and result as in :func:`feedback`.
     """
     A = model.averaged_drift_jacobian(x, target.x)
-    riccati = solve_riccati(A, model.B, weights.Q, weights.R,
+    riccati = solve_riccati(A, model.B, weights.Q, weights.R, interval=interval,
                             max_gain=max_gain, max_residual=max_residual)
     return Feedback(target.u - riccati.K @ (x - target.x), Form.AVERAGED, riccati,
                     A, -model.B @ riccati.K)
@@ -168,6 +172,7 @@ class StateDependentRiccati:
         tuning = self.tuning
         try:
             found = feedback(self.model, estimate.x, target, tuning.weights,
+                             interval=interval / self.model.seconds_per_time_unit,
                              max_gain=tuning.max_gain, max_residual=tuning.max_residual)
             return checked(self.model, found, limits, interval)
         except np.linalg.LinAlgError as error:
@@ -204,17 +209,24 @@ class Linear:
         return self.lift.linearised
 
     @cached_property
-    def _at_nominal(self) -> Feedback:
+    def _at_nominal(self) -> Callable[[float], Feedback]:
         origin = np.zeros(self.model.n_x)
-        return feedback(self.model, origin, steady_state_target(self.model, origin),
-                        self.tuning.weights, max_gain=self.tuning.max_gain,
-                        max_residual=self.tuning.max_residual)
+        target = steady_state_target(self.model, origin)
+
+        # where samples are equally far apart, one solution does for all of them
+        @lru_cache(maxsize=4)
+        def held_for(interval: float) -> Feedback:
+            return feedback(self.model, origin, target, self.tuning.weights,
+                            interval=interval / self.model.seconds_per_time_unit,
+                            max_gain=self.tuning.max_gain, max_residual=self.tuning.max_residual)
+
+        return held_for
 
     def compute(self, estimate: Estimate, target: Target, limits: InputLimits, memory: object,
                 interval: float, deadline: float = math.inf) -> LawResult:
         """Apply the gain; see :class:`~koopman_ros.control.laws.base.Law`."""
         try:
-            found = self._at_nominal
+            found = self._at_nominal(interval)
             return checked(self.model, replace(
                 found, u=target.u - found.riccati.K.dot(estimate.x - target.x)), limits, interval)
         except np.linalg.LinAlgError as error:
