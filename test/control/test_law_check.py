@@ -111,7 +111,8 @@ def test_a_law_that_fails_in_a_part_of_its_box_is_refused_with_that_part():
     low, high = (round(500.0 * x) / 500.0 for x in (x0[failed].min(), x0[failed].max()))
     assert f'begun at level {low:.4g} to {high:.4g} m and bound for level ' in found.region
     assert found.region in str(found)
-    assert np.maximum(x0, r)[failed].min() > 0.1
+    # elsewhere it costs more than it might
+    assert np.maximum(x0, r)[np.isinf(found.ratios)].min() > 0.1
     # the right one passes
     A = np.diag([0.5, 0.0, 0.0, 0.0])
     right = replace(model, A=A, readout=A[:1])
