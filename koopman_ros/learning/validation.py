@@ -70,10 +70,13 @@ def fit(model: LiftedModel, x: Array, dxdt: Array, u: Array) -> Fit:
     :param x: (N, n_x) states, in state units.
     :param dxdt: (N, n_x) their derivatives, in state units per time unit.
     :param u: (N, n_u) inputs, in input units.
-    :raises ValueError: when the samples do not distinguish the coordinates.
+    :raises ValueError: when the samples do not distinguish the coordinates, or do not fit the
+        model.
     """
+    x, dxdt = (model.states.array(name, a) for name, a in (('x', x), ('dxdt', dxdt)))
     xi = model.states.to_deviation(x)
-    f = dxdt / model.states.scale - model.inputs.to_deviation(u) @ model.B.T
+    f = dxdt / model.states.scale - (
+        model.inputs.to_deviation(model.inputs.array('u', u)) @ model.B.T)
     z, J = model.lift_and_jacobian(xi)
     dz = (J @ f[..., None])[..., 0]
     S = z.T @ z / len(z)
@@ -99,14 +102,22 @@ def roll_out(model: LiftedModel, x0: Array, inputs: Array, sample_period: float 
     :param sample_period: in the model's time unit, or (K,) periods.
     :return: (..., K + 1, n_x) states at the samples, in state units.
     :raises RuntimeError: when the prediction diverges.
+    :raises ValueError: for what does not fit the model, or periods that are not above 0.
     """
-    inputs = np.asarray(inputs, dtype=np.float64)
-    holds = inputs.shape[-2]
-    xi = model.states.to_deviation(np.asarray(x0, dtype=np.float64))
+    inputs = model.inputs.array('inputs', inputs)
+    xi = model.states.to_deviation(model.states.array('x0', x0))
     shape = xi.shape
+    if inputs.ndim != xi.ndim + 1:
+        raise ValueError(f'incompatible inputs: expected ({", ".join(map(str, shape[:-1]))}'
+                         f'{", " if shape[:-1] else ""}K, {model.n_u}), got {inputs.shape}')
+    holds = inputs.shape[-2]
+    periods = np.asarray(sample_period, dtype=np.float64)
+    if periods.shape not in ((), (holds,)) or not np.all(periods > 0.0):
+        raise ValueError(f'sample_period must be above 0 {model.time_unit}, one number or one for '
+                         f'each of {holds} inputs, got {sample_period}')
     forcing = model.inputs.to_deviation(inputs) @ model.B.T
     path = [xi]
-    for k, period in enumerate(np.broadcast_to(sample_period, (holds,))):
+    for k, period in enumerate(np.broadcast_to(periods, (holds,))):
         # a prediction that overflows is reported below
         with np.errstate(all='ignore'):
             solver = DOP853(

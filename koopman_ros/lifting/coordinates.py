@@ -11,6 +11,7 @@ from functools import cached_property
 import math
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from koopman_ros.arrays import Array, brief, frozen
 from koopman_ros.plant_data import Plant
@@ -71,10 +72,21 @@ class Coordinates:
     def __len__(self) -> int:
         return len(self.names)
 
+    def array(self, what: str, values: ArrayLike) -> Array:
+        """Return values (..., n) of these coordinates as an array; ValueError for another size."""
+        array = np.asarray(values, dtype=np.float64)
+        if array.shape[-1:] != (len(self.names),):
+            raise ValueError(f'incompatible {what}: expected one number for each of '
+                             f'{", ".join(self.names)} in the last axis, got {array.shape}')
+        return array
+
     def only(self, names: Sequence[str]) -> Coordinates:
         """Return these coordinates alone; raise ValueError for one that there is not."""
         if tuple(names) == self.names:
             return self
+        if unknown := [name for name in names if name not in self.names]:
+            raise ValueError(f'there is no {", ".join(unknown)}: choose some of '
+                             f'{", ".join(self.names)}')
         chosen = [self.names.index(name) for name in names]
         return Coordinates(tuple(names), tuple(self.units[i] for i in chosen), *(
             value[chosen] for value in (self.center, self.scale, self.lower, self.upper)))
@@ -126,6 +138,10 @@ class Box:
         :param nominal: whether deviations are from the nominal point or from the middle.
         :raises ValueError: when a state or an input never moves, or the sizes do not fit.
         """
+        for what, given in (('x', x), ('u', u)):
+            if np.ndim(given) != 2:
+                raise ValueError(f'incompatible {what}: expected one row a sample, got an array '
+                                 f'{np.shape(given)}')
         states, inputs = (
             Coordinates.spanning(names, units, np.min(values, axis=0), np.max(values, axis=0),
                                  center if nominal else None)

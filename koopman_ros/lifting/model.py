@@ -160,6 +160,7 @@ class LiftedModel:
         :return: in half widths of the training box: the larger of the distance from the box and,
             where it is known, that from the data in it; infinity for what is not finite.
         """
+        x = self.states.array('state', x)
         outside = self.states.violation(x)
         if self.training_states is None:
             return outside
@@ -168,16 +169,16 @@ class LiftedModel:
             states.to_deviation(x), 0.5 * (states.upper - states.lower) / states.scale))
 
     def lift(self, x: Array) -> Array:
-        """Evaluate z = N(x): (..., n_x) -> (..., n_z)."""
-        return self.observables.lift(x)
+        """Evaluate z = N(x): (..., n_x) -> (..., n_z); ValueError for another size."""
+        return self.observables.lift(self.states.array('state', x))
 
     def jacobian(self, x: Array) -> Array:
         """Evaluate J_N(x) = dN/dx: (..., n_x) -> (..., n_z, n_x)."""
-        return self.observables.lift_and_jacobian(x)[1]
+        return self.lift_and_jacobian(x)[1]
 
     def lift_and_jacobian(self, x: Array) -> tuple[Array, Array]:
         """Evaluate N(x) and J_N(x) at once."""
-        return self.observables.lift_and_jacobian(x)
+        return self.observables.lift_and_jacobian(self.states.array('state', x))
 
     def lift_and_secants(self, x: Array, x_ref: Array, w: Array
                          ) -> tuple[Array, Array, Array, Array]:
@@ -200,9 +201,10 @@ class LiftedModel:
 
     def drift(self, x: Array) -> Array:
         """Evaluate f, the rate of the state without inputs: (..., n_x) -> same; f(0) = 0."""
+        x = self.states.array('state', x)
         if self.readout is not None:
             return self.observables.features.lift(x) @ self.readout.T
-        z, J = self.lift_and_jacobian(x)
+        z, J = self.observables.lift_and_jacobian(x)
         if x.ndim == 1:
             return self.onto_states(J, self.A.dot(z))
         return self.onto_states(J, (z @ self.A.T)[..., None])[..., 0]

@@ -125,6 +125,27 @@ def test_a_roll_out_into_a_state_where_the_lift_is_singular_ends():
         roll_out(model, np.array([0.5]), np.zeros((9, 1)), 0.1)
 
 
+@pytest.mark.parametrize(('change', 'message'), [
+    ({'x0': [2.2]}, r'incompatible x0: expected one number for each of x0, x1 in the last axis, '),
+    ({'inputs': [1.0, 2.0]}, r'incompatible inputs: expected one number for each of u0 in'),
+    ({'inputs': [1.0]}, r'incompatible inputs: expected \(K, 1\), got \(1,\)'),
+    ({'x0': [[2.2, 1.7]] * 3}, r'incompatible inputs: expected \(3, K, 1\), got \(2, 1\)'),
+    ({'sample_period': [0.1] * 3}, r'sample_period must be above 0 s, .* for each of 2 inputs'),
+    ({'sample_period': -0.1}, r'sample_period must be above 0 s, .*, got -0\.1')])
+def test_a_roll_out_of_what_does_not_fit(change, message):
+    usual = {'x0': [2.2, 1.7], 'inputs': [[1.0], [2.0]], 'sample_period': 0.1}
+    assert roll_out(linear_model(), **usual).shape == (3, 2)
+    with pytest.raises(ValueError, match=message):
+        roll_out(linear_model(), **{**usual, **change})
+
+
+def test_samples_of_another_plant_are_no_fit():
+    # a single column would stand for both
+    with pytest.raises(ValueError, match=r'incompatible dxdt: expected one number for each of x0, '
+                                         r'x1 in the last axis, got \(9, 1\)'):
+        fit(linear_model(), np.zeros((9, 2)), np.zeros((9, 1)), np.zeros((9, 1)))
+
+
 def test_roll_outs_side_by_side_are_those_one_by_one():
     model, rng = random_lift(2, (6,)), np.random.default_rng(3)
     # slow enough to stay where the lift was drawn

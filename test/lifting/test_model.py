@@ -368,3 +368,17 @@ def test_training_on_several_states_notes_them_and_on_one_does_not():
     assert model.distance(np.array([-6.0, 12.0])) > 0.5
     assert train(BENT, bent_samples(), Growth(2, hidden_first=3, max_iterations=2), starts=1,
                  refuse=False).model.training_states is None
+
+
+def test_lists_do_as_arrays_do_and_another_size_is_refused():
+    model, x = random_lift(), [0.3, -0.2]
+    for act in (model.lift, model.jacobian, model.drift, model.distance):
+        np.testing.assert_array_equal(act(x), act(np.array(x)))
+        with pytest.raises(ValueError, match=r'incompatible state: expected one number for each '
+                                             r'of x0, x1 in the last axis, got \(3,\)'):
+            act(np.zeros(3))
+    with pytest.raises(ValueError, match='there is no level: choose some of x0, x1'):
+        model.states.only(['level'])
+    plant = replace(model.plant, nominal_state=[1.0, 1.0])
+    with pytest.raises(ValueError, match=r'incompatible x: expected one row a sample, got an'):
+        Box.of(plant, [1.0, 2.0], [[1.0]])
