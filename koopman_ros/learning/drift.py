@@ -8,6 +8,7 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 
 import numpy as np
+from scipy.linalg import block_diag
 import torch
 from torch import Tensor
 
@@ -15,7 +16,7 @@ from koopman_ros.learning.growth import Grown, linear_drift, Monitor, xavier
 from koopman_ros.learning.levenberg_marquardt import minimise, NormalEquations
 from koopman_ros.learning.network import check_activation, Layout, Parameters, Pass
 from koopman_ros.learning.residuals import ScaledSamples
-from koopman_ros.lifting import LiftedModel
+from koopman_ros.lifting import LiftedModel, NetworkObservables
 from koopman_ros.plant_data import Samples
 
 # Directions of the features smaller than this beside the largest are left out of a fit: their
@@ -40,6 +41,25 @@ def with_readout(model: LiftedModel, samples: Samples, smallest: float = SMALLES
     unit = np.divide(1.0, size, out=np.zeros_like(size), where=size > 0.0)
     weights = np.linalg.lstsq(phi * unit, f, rcond=smallest)[0].T
     return replace(model, readout=weights * unit)
+
+
+def with_units_of(drift: LiftedModel, lift: LiftedModel) -> LiftedModel:
+    """
+    Add the hidden units of a network to those of a lift, whose z they leave as it is.
+
+    :raises ValueError: for networks that differ in their activation or number of layers.
+    """
+    ours, theirs = lift.observables, drift.observables
+    if not (isinstance(ours, NetworkObservables) and isinstance(theirs, NetworkObservables)
+            and ours.activation == theirs.activation and len(ours.hidden) == len(theirs.hidden)):
+        raise ValueError('units of networks of different kinds cannot stand in one layer')
+    hidden = []
+    for i, ((W, b), (more_W, more_b)) in enumerate(zip(ours.hidden, theirs.hidden, strict=True)):
+        weight = block_diag(W, more_W) if i else np.vstack([W, more_W])
+        hidden.append((weight, np.concatenate([b, more_b])))
+    idle = np.zeros((len(ours.output), theirs.output.shape[1]))
+    return replace(lift, readout=None, observables=replace(
+        ours, hidden=tuple(hidden), output=np.hstack([ours.output, idle])))
 
 
 @dataclass(frozen=True)

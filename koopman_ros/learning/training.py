@@ -128,7 +128,7 @@ def train(plant: Plant, samples: Samples, recipe: Recipe, *, seed: int = 0, star
     check_rates(plant, samples)
     check_nominal_point(plant, samples, box)
     assembly = _Assembly(plant, box, parts[0], samples.digest(), seed,
-                         _training_states(box, samples))
+                         training_states(box, samples))
     data = assembly.data(device)
     tracker = _Tracker(watch, starts * len(rounds))
     path: list[_Candidate] = []
@@ -186,7 +186,7 @@ def _conclude(plant: Plant, parts: tuple[Samples, Samples, Samples], path: list[
         # one that was ended before gets its loops all the same
         watch = (lambda _: False) if tracker.stop else tracker.check
         with contextlib.suppress(KeyboardInterrupt):
-            law_check = check_law(winner.model, _reference(plant, box, parts, winner.model),
+            law_check = check_law(winner.model, reference_drift(plant, box, parts, winner.model),
                                   loops=loops, watch=watch)
         interrupted = interrupted or law_check is None
         if law_check is not None and not law_check.accepted:
@@ -219,7 +219,7 @@ def _ending(grown: Grown, interrupted: bool) -> str:
         f'{100.0 * grown.decrease:.2g} % off the cost'))
 
 
-def _reference(plant: Plant, box: Box, parts: tuple[Samples, Samples, Samples],
+def reference_drift(plant: Plant, box: Box, parts: tuple[Samples, Samples, Samples],
                model: LiftedModel) -> Rate:
     """
     Return the drift that predicts the validation episodes best, on which a law is tried.
@@ -238,7 +238,7 @@ def _reference(plant: Plant, box: Box, parts: tuple[Samples, Samples, Samples],
     return rates[int(np.argmin(errors))]
 
 
-def _training_states(box: Box, samples: Samples) -> TrainingStates | None:
+def training_states(box: Box, samples: Samples) -> TrainingStates | None:
     """Return where the data are, held-out ones included; None for one state: its box says it."""
     states = box.states
     return None if len(states) == 1 else TrainingStates.of(
