@@ -166,7 +166,7 @@ class _Judge:
         return fit(model, self._validation.x, self._validation.dxdt, self._validation.u).rx
 
     def linear_contender(self) -> Contender:
-        """Return the linear model, which its own law need not be compared with."""
+        """Return the linear model, which is what there is where all others are refused."""
         return self.contender(LINEAR, self._linear, self._begin)
 
     def polynomial(self, degrees: Sequence[int]) -> Contender:
@@ -198,10 +198,10 @@ class _Judge:
         """Judge a model, and note its figures in it."""
         seconds = time.perf_counter() - begin
         law_check, refusal = None, ''
-        if self._loops and model is not self._linear and model.n_u:
+        if self._loops and model.n_u:
             law_check = check_law(model, reference_drift(
                 self._plant, self._box, self._parts, model), loops=self._loops)
-            if law_check is not None and not law_check.accepted:
+            if model is not self._linear and law_check is not None and not law_check.accepted:
                 refusal = f'no controller: {law_check}'
         figures = evaluate(model, self._test)
         model = replace(model, training_states=self._known, provenance=replace(
