@@ -45,7 +45,7 @@ class Contender:
     figures: Figures | None  #: its figures on the test episodes, which chose nothing
     law_check: LawCheck | None  #: its law in closed loops, where there are any
     seconds: float  #: that it took to learn
-    refusal: str = ''  #: why it is not to be used; empty when it may be
+    refusal: str = ''  #: why it should not be used; empty when it may be
 
 
 @dataclass(frozen=True)
@@ -81,7 +81,7 @@ class Comparison:
                 '' if found is None else f'{found.fit.rx:.1e}', *errors,
                 *(('', '') if law is None else (f'{law.failed.sum()} of {law.loops}',
                                                 f'{law.median_ratio:.3f}')), f'{one.seconds:.1f}',
-                'chosen' if one is self.chosen else one.refusal])
+                '; '.join(filter(None, ['chosen' * (one is self.chosen), one.refusal]))])
         return table(head, rows, range(1, len(head) - 1))
 
 
@@ -103,15 +103,16 @@ def compare(plant: Plant, samples: Samples, recipes: Mapping[str, Recipe] | None
 
     In order of plainness: linear, polynomial, and the recipes, by default a neural drift, a lift
     with identity coordinates and a free one. Refused are networks whose `rx` on validation
-    episodes is not below the linear one's, and models whose law fails in closed loops; the linear
-    one never is. Of the others the plainest is taken whose `rx` there is at most twice the
-    smallest; below 1e-20 it is rounding and counts as equal. The degree of the polynomial is
-    chosen likewise. The read-out of a lift after a neural drift may use the units of that, too.
+    episodes is not below the linear one's, and models whose law fails in closed loops. Of the
+    others the plainest is taken whose `rx` there is at most twice the smallest; below 1e-20 it is
+    rounding and counts as equal. Where every law fails, it is the one that does in the smallest
+    share of the loops. The degree of the polynomial is chosen by the same rule from `rx`. The
+    read-out of a lift after a neural drift may use the units of that, too.
 
     :param recipes: those of the networks by name, in the order of the choice; the usual ones by
         default. Other arguments as in :func:`train`.
     :param choose: the name of the class to take whatever the rule says.
-    :raises NoUsefulLift: when the class that was asked for is refused.
+    :raises NoUsefulLift: when there is no model of the class that was asked for.
     :raises ValueError: for a name that there is not; otherwise as :func:`train`.
     """
     recipes = usual_recipes(samples.x.shape[1]) if recipes is None else recipes
@@ -137,14 +138,21 @@ def compare(plant: Plant, samples: Samples, recipes: Mapping[str, Recipe] | None
     chosen = plainest(found)
     if choose is not None:
         chosen = found[names.index(choose)]
-        if chosen.refusal:
+        if chosen.model is None:
             raise NoUsefulLift(chosen.refusal)
     return Comparison(tuple(found), chosen, plant.state_names, plant.state_units)
 
 
 def plainest(contenders: Sequence[Contender]) -> Contender:
-    """Return the first, in their order, whose error is at most twice the smallest."""
+    """
+    Return of those that pass the first whose error is at most twice the smallest.
+
+    Where none passes, the one whose law fails in the smallest share of its closed loops.
+    """
     able = [one for one in contenders if not one.refusal]
+    if not able:
+        tried = [one for one in contenders if one.law_check is not None]
+        return min(tried, key=lambda one: one.law_check.share_failed if one.law_check else 1.0)
     limit = _FACTOR * max(min(one.rx for one in able), ROUNDING)
     return next(one for one in able if one.rx <= limit)
 
@@ -166,7 +174,7 @@ class _Judge:
         return fit(model, self._validation.x, self._validation.dxdt, self._validation.u).rx
 
     def linear_contender(self) -> Contender:
-        """Return the linear model, which is what there is where all others are refused."""
+        """Return the linear model."""
         return self.contender(LINEAR, self._linear, self._begin)
 
     def polynomial(self, degrees: Sequence[int]) -> Contender:
@@ -201,7 +209,7 @@ class _Judge:
         if self._loops and model.n_u:
             law_check = check_law(model, reference_drift(
                 self._plant, self._box, self._parts, model), loops=self._loops)
-            if model is not self._linear and law_check is not None and not law_check.accepted:
+            if law_check is not None and not law_check.accepted:
                 refusal = f'no controller: {law_check}'
         figures = evaluate(model, self._test)
         model = replace(model, training_states=self._known, provenance=replace(
