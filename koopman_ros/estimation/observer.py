@@ -23,7 +23,7 @@ class Estimate:
     """
     What is known of the plant, in scaled deviations and the model's time unit.
 
-    dx/dt = f(x) + B u + w with f the model's projected drift, the same that the target is
+    dx/dt = f(x) + B u + w with f the model's drift, the same that the target is
     calculated from: any difference between the two would be left as an offset.
     """
 
