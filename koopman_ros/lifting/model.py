@@ -21,6 +21,8 @@ from koopman_ros.units import check_time_unit, SECONDS_PER_TIME_UNIT
 
 # Of scaled deviations: rounding and the third derivative both leave about ten digits.
 _DIFFERENCE = 1e-5
+# States of a box whose data are not known.
+_TRIED = 256
 # On [0, 1].
 _NODES, _WEIGHTS = 0.5 * np.add(leggauss(5), [[1.0], [0.0]])
 
@@ -134,6 +136,27 @@ class LiftedModel:
         grow = [int(np.sum(eigenvalues.real >= 0.0))
                 for eigenvalues in (self.eigenvalues, self.linearised.eigenvalues)]
         return grow[0] > grow[1]
+
+    @cached_property
+    def mismatch(self) -> float:
+        """
+        How far A z is from J_N f, the rate of z under the model's drift f: 0 for a closed lift.
+
+        As the training figure ``rw``, a mean square without unit, over the training states or all
+        over the box; 0 also for what moves nowhere.
+        """
+        if self.training_states is not None:
+            x = self.training_states.states
+        else:
+            box = self.states
+            x = box.to_deviation(np.random.default_rng(0).uniform(
+                box.lower, box.upper, (_TRIED, self.n_x)))
+        z, J = self.lift_and_jacobian(x)
+        rate = (J @ self.drift(x)[..., None])[..., 0]
+        rest = rate - z @ self.A.T
+        whitening = np.linalg.pinv(z.T @ z)
+        size = float(np.sum(rate @ whitening * rate))
+        return float(np.sum(rest @ whitening * rest)) / size if size > 0.0 else 0.0
 
     @cached_property
     def input_inverse(self) -> Array:

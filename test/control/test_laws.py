@@ -190,6 +190,20 @@ def test_a_lift_with_unstable_modes_of_its_own_is_controlled_by_the_averaged_law
     assert found.form is form
 
 
+@pytest.mark.parametrize(('rate', 'form'), [(-0.2, Form.RECENTRED), (-0.25, Form.AVERAGED)])
+def test_a_lift_that_is_not_closed_is_controlled_by_the_averaged_law(rate, form):
+    """x1^2 of x1' = -0.1 x1 decays at twice that rate."""
+    model = exact_two_state_model()
+    A = np.array(model.A)
+    assert A[2, 2] == pytest.approx(-0.2)
+    A[2, 2] = rate
+    model = replace(model, A=A)
+    assert not model.adds_unstable_modes
+    found = feedback(model, np.array([0.5, 0.3]), steady_state_target(model, np.zeros(2)),
+                     Weights(np.eye(2), np.eye(1)))
+    assert found.form is form
+
+
 def test_the_averaged_law_takes_over():
     model = shipped('reactor_nz4')
     # at the cold end the gain on the lifted state is the larger one
@@ -238,8 +252,8 @@ def test_averaged_law_of_a_free_lift_by_hand(x):
 
 
 @pytest.mark.parametrize(('identity', 'n_free', 'law'), [
-    (True, 1, Form.RECENTRED), (False, 1, Form.RECENTRED), (False, 2, Form.AVERAGED)])
-def test_a_free_lift_with_more_coordinates_than_states_takes_the_averaged_law(
+    (False, 1, Form.RECENTRED), (False, 2, Form.AVERAGED), (True, 1, Form.AVERAGED)])
+def test_a_free_lift_with_more_coordinates_than_states_and_an_open_one_take_the_averaged_law(
         identity, n_free, law):
     model = random_lift(1, identity=identity, n_free=n_free)
     model = replace(model, A=-np.eye(model.n_z), B=np.eye(1))

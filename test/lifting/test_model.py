@@ -70,6 +70,26 @@ def test_drift_of_a_dictionary_by_hand():
     np.testing.assert_array_equal(model.linearised.A, [[-1.0]])
 
 
+def test_the_mismatch_of_a_lift_is_how_far_its_coordinates_go_another_way():
+    """
+    Of z = (x, x^2) with dx/dt = -x, dz/dt = (-x, -2 x^2), by hand.
+
+    With as many states to both sides the two coordinates are whitened each by itself, and an A
+    that has -2 + d makes d^2 / (1 + 4) of it.
+    """
+    lift = PolynomialObservables.total_degree(1, 2)
+    x = np.linspace(-1.0, 1.0, 21)[:, None]
+    for d in (0.0, 0.1, -0.5):
+        model = replace(random_lift(1), observables=lift, A=np.diag([-1.0, -2.0 + d]),
+                        readout=np.array([[-1.0, 0.0]]), training_states=TrainingStates(x, 0.1))
+        assert model.mismatch == pytest.approx(d * d / 5.0, rel=1e-10, abs=1e-20)
+        # without known states they are all over the box, which is not even about the middle
+        spread = replace(model, training_states=None).mismatch
+        assert (0.1 * d * d < spread < d * d) if d else spread < 1e-20
+    assert replace(model, A=np.zeros((2, 2)), readout=np.zeros((1, 2))).mismatch == 0.0
+    assert random_lift().linearised.mismatch < 1e-20
+
+
 def test_averaged_jacobian_of_a_cubic_drift_by_hand():
     """x1' = x2, x2' = -x1 + x2 - x1^2 x2; Simpson's rule gives the means of squares."""
     observables = PolynomialObservables(np.array([[1, 0], [0, 1], [2, 1]]))
