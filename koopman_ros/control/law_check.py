@@ -43,9 +43,9 @@ _ESCAPED = 10.0
 _DURATION = 6.0
 _SLOWEST = 1e-3
 # Samples in the fastest time constant of the linear loop, and steps of integration.
-_SAMPLES, _STEPS = 4, 8
+_SAMPLES, _STEPS = 2, 8
 # A slow plant takes many samples: fewer loops then, so that the law is called so often in all.
-_MOST_CALLS = 200 * LOOPS
+_MOST_CALLS = 150 * LOOPS
 _FEWEST_LOOPS = 16
 # Attempts for each set-point.
 _ATTEMPTS = 4
@@ -160,7 +160,7 @@ def check_law(model: LiftedModel, rate: Rate, *, tuning: Tuning | None = None,
         and per time unit of the model; affine in the input.
     :param tuning: of all laws; by default with weights of 1 on scaled deviations.
     :param limits: of the inputs; by default their range in the model's training box.
-    :param interval: seconds between samples; by default, and at least, a fourth of the fastest
+    :param interval: seconds between samples; by default, and at least, half of the fastest
         time constant of the linear loop.
     :param loops: closed loops to run; fewer where these take many samples.
     :param watch: called with the share that is done; True ends the check.

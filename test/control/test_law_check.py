@@ -121,14 +121,14 @@ def test_a_law_that_fails_in_a_part_of_its_box_is_refused_with_that_part():
 
 @dataclass(frozen=True)
 class Constant:
-    """A law with a gain of 5."""
+    """A law with a gain of 4."""
 
     model: LiftedModel
     tuning: Tuning
 
     def compute(self, estimate, target, limits, memory, interval, deadline=math.inf):
         return LawResult(limits.within(
-            self.model.inputs.to_physical(target.u - 5.0 * (estimate.x - target.x))))
+            self.model.inputs.to_physical(target.u - 4.0 * (estimate.x - target.x))))
 
 
 def held_cost(a, gain, h):
@@ -140,13 +140,13 @@ def held_cost(a, gain, h):
 
 def test_a_costly_law_is_refused_by_what_it_costs():
     endless = InputLimits(np.full(1, -np.inf), np.full(1, np.inf), np.full(1, np.inf))
-    model, h = scalar(), 0.2  # longer than a fourth of 1 / sqrt(2)
+    model, h = scalar(), 0.4  # longer than half of 1 / sqrt(2)
     found = check_law(model, linear_rate(1.0), law=Constant, limits=endless, interval=h, loops=16)
     tuning = Tuning(Weights(np.eye(1), np.eye(1)))
     u = Linear(model, tuning).compute(
         Estimate(np.ones(1), np.zeros(1)), steady_state_target(model, np.zeros(1)), endless, None,
         h).u
-    expected = held_cost(1.0, 5.0, h) / held_cost(1.0, -float(u[0]), h)
+    expected = held_cost(1.0, 4.0, h) / held_cost(1.0, -float(u[0]), h)
     assert expected > 1.1
     assert found.ratios == pytest.approx(np.full(16, expected), rel=1e-4)
     assert '(16 costing over 1.1 times as much as a linear law)' in str(found)
