@@ -187,11 +187,11 @@ def test_a_law_is_tried_on_the_drift_that_predicts_best(small):
     box = Box(small.model.states, small.model.inputs, 's')
     x, u = np.array([[2.2], [3.9]]), np.array([[0.1], [1.2]])
     true = -(x - 3.0) - 0.3 * (x - 3.0) ** 2 + 2.0 * (u - 0.5)
-    found = training._reference(BENT, box, parts, small.model)(x, u)
+    found = training.reference_drift(BENT, box, parts, small.model)(x, u)
     np.testing.assert_allclose(found, true, rtol=0, atol=1e-12)
     # 12 samples are too few for any but the linear one, and the lift is better than that
     few = (bent_samples(1, 12), *parts[1:])
-    found = training._reference(BENT, box, few, small.model)(x, u)
+    found = training.reference_drift(BENT, box, few, small.model)(x, u)
     own = lifted_rate(small.model, 1.0)(x, u)
     np.testing.assert_array_equal(found, own)
     assert np.max(np.abs(own - true)) > 1e-6
