@@ -23,11 +23,11 @@ from koopman_ros.control.laws import (
 from koopman_ros.control.laws.base import steady_state_target
 from koopman_ros.control.laws.riccati import checked
 from koopman_ros.estimation import Estimate
-from koopman_ros.lifting import Coordinates, linearised_model, Provenance
+from koopman_ros.lifting import Coordinates, linearised_model, NetworkObservables, Provenance
 from koopman_ros.plants import two_state_example, two_state_reactor
 from koopman_ros.plants.optimum import cost_along, optimum, Task
 from koopman_ros.reasons import Code
-from koopman_ros.solvers import runge_kutta_step, solve_riccati
+from koopman_ros.solvers import RiccatiStatus, runge_kutta_step, solve_riccati
 from support.closed_loops import (
     controller,
     COOLANT,
@@ -249,6 +249,38 @@ def test_averaged_law_of_a_free_lift_by_hand(x):
     found = averaged(model, np.array([x]), target, Weights(q * np.eye(1), r * np.eye(1)))
     assert found.solved
     assert found.u[0] == pytest.approx(-p * b / r * x, rel=1e-8)
+
+
+def test_the_averaged_law_has_a_gain_where_the_secant_of_the_lift_has_none():
+    """
+    Of z = (x1 + g(x2), x2), g = tanh, which is linear, the input moving x2.
+
+    Then f1 = x1 + g + b x2 - g' (x1 + g), and at (1, 1) the secant of the lift is
+    [[1 - g', g + b - g' g], [1, g]]: with b = g' g - g no input reaches its growing mode.
+    """
+    g, slope = np.tanh(1.0), 1.0 - np.tanh(1.0) ** 2
+    b = slope * g - g
+    small = 1e-4
+    hidden = np.array([[small, 0.0], [0.0, small], [0.0, 1.0]]), np.zeros(3)
+    lift = NetworkObservables((hidden,), np.array([[1.0 / small, 0.0, 1.0],
+                                                   [0.0, 1.0 / small, 0.0]]), identity=False)
+    model = replace(saddle_model(), observables=lift, A=np.array([[1.0, b], [1.0, 0.0]]),
+                    B=np.array([[0.0], [1.0]]))
+    x, origin = np.ones(2), np.zeros(2)
+    _, J, M, _ = model.lift_and_secants(x, origin, origin)
+    secant = model.onto_states(J, model.A @ M)
+    np.testing.assert_allclose(secant, [[1.0 - slope, 0.0], [1.0, g]], rtol=0, atol=1e-7)
+    assert solve_riccati(secant, model.B, np.eye(2), np.eye(1), max_gain=1e3).status is not (
+        RiccatiStatus.SOLVED)
+    # with the means of g', g'^2, s g'' and g g'' on the way, in parts
+    mean_square = g - g ** 3 / 3.0
+    across = g + b - mean_square - (slope - g) - (slope * g - mean_square)
+    found = feedback(model, x, steady_state_target(model, origin),
+                     Weights(np.eye(2), np.eye(1)))
+    assert found.form is Form.AVERAGED
+    np.testing.assert_allclose(found.drift, [[1.0 - g, across], [1.0, g]], rtol=0, atol=1e-5)
+    assert found.solved
+    assert found.riccati.gain < 10.0
 
 
 @pytest.mark.parametrize(('identity', 'n_free', 'law'), [
