@@ -20,6 +20,8 @@ _NEAR = 0.02
 # The drift there is told from zero where it is so many standard errors, and so many times what
 # another degree of the polynomial makes of it.
 _ERRORS, _DIFFERENCES = 5.0, 3.0
+# Likewise what the polynomial leaves, on average, of so many samples nearby.
+_MISFITS, _FEWEST_NEAR = 4.0, 10
 _DEGREES = (5, 4, 3, 2)
 _ROWS, _MOST_COLUMNS = 2000, 130
 _NEWTON_STEPS = 20
@@ -71,7 +73,8 @@ def check_nominal_point(plant: Plant, samples: Samples, box: Box) -> None:
     Look at the drift at the nominal point, where a lift has none.
 
     It is the constant of a polynomial fit; how far it can be relied on tell the fit's standard
-    error and a fit of one degree less.
+    error, a fit of one degree less, and what both leave of the samples nearest to the point, as
+    where the drift has a kink.
 
     :raises ValueError: when the plant moves there, with a steady state nearby if there is one.
     """
@@ -89,15 +92,21 @@ def check_nominal_point(plant: Plant, samples: Samples, box: Box) -> None:
             continue
         inverse = np.linalg.pinv(left)
         solution = inverse @ rate
-        noise = np.sqrt(np.mean((rate - left @ solution) ** 2, axis=0))
-        fits.append((solution, noise * np.linalg.norm(inverse[0]), monomials))
+        rest = rate - left @ solution
+        error = np.sqrt(np.mean(rest ** 2, axis=0)) * np.linalg.norm(inverse[0])
+        fits.append((solution, error, monomials, rest))
         if len(fits) == 2:
             break
     else:
         return
-    (solution, error, monomials), (other, _, _) = fits
+    (solution, error, monomials, rest), (other, *_) = fits
     drift = solution[0]
-    moves = np.abs(drift) > _ERRORS * error + _DIFFERENCES * np.abs(drift - other[0])
+    nearest = rest[np.argsort(np.max(np.abs(x), axis=1), kind='stable')[
+        :max(_FEWEST_NEAR, len(x) // 30)]]
+    spread = np.sqrt(np.mean(nearest ** 2, axis=0) / len(nearest))
+    moves = (np.abs(drift) > _ERRORS * error + _DIFFERENCES * np.abs(drift - other[0])) & (
+        np.abs(drift) > _ERRORS * spread) & (
+        np.abs(drift) > _MISFITS * np.abs(np.mean(nearest, axis=0)))
     if not moves.any():
         return
     B = solution[1:1 + u.shape[1]].T if plant.B is None else box.input_matrix(plant.B)

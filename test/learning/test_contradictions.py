@@ -57,6 +57,12 @@ def test_times_or_rates_in_another_unit_are_refused(factor, noise):
     assert 'give time in s and dxdt in m per s, or another time_unit' in str(error.value)
 
 
+# -0.2 at -1, 0.3 at -0.8, 0 from -0.4 to 0, -0.7 at 0.3 and -0.4 from 0.4 on, besides 2 u
+KINKED = replace(bent_samples(), dxdt=2.0 * (bent_samples().u - 0.5) + np.interp(
+    bent_samples().x - 3.0,
+    [-1.0, -0.8, -0.4, 0.0, 0.3, 0.4], [-0.2, 0.3, 0.0, 0.0, -0.7, -0.4]))
+
+
 def look(plant, samples):
     check_nominal_point(plant, samples, Box.of(plant, samples.x, samples.u))
 
@@ -65,11 +71,13 @@ def look(plant, samples):
     (BENT, bent_samples()), (replace(BENT, B=None), bent_samples()),
     (TWO_STATE, two_state_samples()), (replace(TWO_STATE, B=None), two_state_samples()),
     (DECAY, decaying(0.1, 0.5)),
+    # kinks, which no polynomial follows
+    (BENT, KINKED),
     # as near as a nominal point that was measured may be
     (replace(BENT, nominal_state=[3.01]), bent_samples()),
     # too few samples to tell
     (replace(BENT, nominal_state=[3.1]), bent_samples(3, 3))],
-    ids=['known B', 'learned B', 'two states', 'their B learned', 'noisy', 'near', 'few'])
+    ids=['known B', 'learned B', 'two states', 'their B learned', 'noisy', 'kinks', 'near', 'few'])
 def test_a_steady_state_is_accepted(plant, samples):
     look(plant, samples)
 
