@@ -14,6 +14,8 @@ from koopman_ros.plant_data import Array, Plant, Samples
 # Times and derivatives contradict each other beyond this factor, by so many steps at least.
 _FACTOR = 2.0
 _ALIKE = 2.0
+# The share of all steps whose derivatives are alike where samples resolve the motion.
+_RESOLVED = 0.5
 _FEWEST_STEPS = 20
 # A steady state this near, in half widths, is taken for the nominal point.
 _NEAR = 0.02
@@ -32,7 +34,8 @@ def check_rates(plant: Plant, samples: Samples) -> None:
     Compare differences of the states with derivatives and times, where the latter are known.
 
     Counted are steps whose derivatives at both ends are alike; between them the state cannot have
-    moved otherwise. Noise of derivatives or of states draws the two estimates of the factor apart.
+    moved otherwise. Where few are, samples do not resolve the motion and tell nothing. Noise of
+    derivatives or of states draws the two estimates of the factor apart.
 
     :raises ValueError: when both are beyond half or twice, as by times in another unit.
     """
@@ -43,12 +46,15 @@ def check_rates(plant: Plant, samples: Samples) -> None:
     steps = np.diff(samples.time[order])[within]
     moved = np.diff(samples.x[order], axis=0)[within]
     begin, end = (samples.dxdt[order][rows][within] for rows in (slice(-1), slice(1, None)))
+    if plant.B is not None:
+        # under the input of the step, not of the next one
+        end = end - np.diff(samples.u[order], axis=0)[within] @ plant.B.T
     for i, name in enumerate(plant.state_names):
         first, last = begin[:, i], end[:, i]
         alike = (first * last > 0.0) & (np.abs(first) < _ALIKE * np.abs(last)) & (
             np.abs(last) < _ALIKE * np.abs(first))
         expected, found = (0.5 * (first + last) * steps)[alike], moved[alike, i]
-        if len(found) < _FEWEST_STEPS:
+        if len(found) < max(_FEWEST_STEPS, _RESOLVED * len(alike)):
             continue
         # a median of 0 is that of a state which was not resolved
         low, high = _middle_ratio(found, expected), 1.0 / (_middle_ratio(expected, found) or 1.0)
@@ -57,8 +63,8 @@ def check_rates(plant: Plant, samples: Samples) -> None:
             raise ValueError(
                 f'{name} changes {factor:.3g} times as much from sample to sample as dxdt and '
                 f'time say, must be 1 (0.5 to 2 is allowed for noise): give time in '
-                f'{plant.time_unit} and dxdt in {plant.state_units[i]} per {plant.time_unit}, or '
-                'another time_unit')
+                f'{plant.time_unit} and dxdt in {plant.state_units[i]} per {plant.time_unit}, '
+                'another time_unit, or no time where samples lie a whole oscillation apart')
 
 
 def _middle_ratio(a: Array, b: Array) -> float:

@@ -7,6 +7,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from scipy.linalg import expm
 
 from koopman_ros.learning import train
 from koopman_ros.learning.contradictions import check_nominal_point, check_rates
@@ -43,6 +44,22 @@ def test_times_that_do_not_contradict_the_rates(samples):
     check_rates(DECAY, samples)
 
 
+@pytest.mark.parametrize('period', [0.5, 2.0, 2.5, 4.0, 5.0, 8.0])
+@pytest.mark.parametrize('damping', [0.01, 0.5])
+def test_an_oscillation_that_is_not_resolved_is_no_contradiction(damping, period):
+    """The derivatives of dx1/dt = x2, dx2/dt = -x1 - 2 D x2 are exact, however far apart."""
+    plant = replace(TWO_STATE, B=None)
+    A = np.array([[0.0, 1.0], [-1.0, -2.0 * damping]])
+    start = np.random.default_rng(0).uniform(-1.0, 1.0, (40, 2))
+    x = np.stack([start @ expm(A * period * k).T for k in range(6)], axis=1).reshape(-1, 2)
+    samples = Samples(x, x @ A.T, np.zeros((240, 1)), np.repeat(np.arange(40), 6),
+                      np.tile(period * np.arange(6), 40))
+    check_rates(plant, samples)
+    if period == 0.5:
+        with pytest.raises(ValueError, match=r'0\.10\d times as much'):
+            check_rates(plant, replace(samples, time=10.0 * samples.time))
+
+
 @pytest.mark.parametrize('noise', [0.0, 0.005])
 @pytest.mark.parametrize('factor', [10.0, 1.0 / 60.0, -1.0])
 def test_times_or_rates_in_another_unit_are_refused(factor, noise):
@@ -54,7 +71,7 @@ def test_times_or_rates_in_another_unit_are_refused(factor, noise):
                                          r'as dxdt and time say, must be 1') as error:
         train(DECAY, wrong, SMALL, starts=1)
     assert float(str(error.value).split()[2]) == pytest.approx(1.0 / factor, rel=0.1)
-    assert 'give time in s and dxdt in m per s, or another time_unit' in str(error.value)
+    assert 'give time in s and dxdt in m per s, another time_unit, or no time' in str(error.value)
 
 
 # -0.2 at -1, 0.3 at -0.8, 0 from -0.4 to 0, -0.7 at 0.3 and -0.4 from 0.4 on, besides 2 u
