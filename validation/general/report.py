@@ -91,9 +91,11 @@ def _draw(cases: Mapping[str, Mapping[str, Mapping[str, Values]]], path: Path) -
     with drawing(path, rows, columns, size=(3.2 * columns + 0.6, 3.0 * rows + 0.6),
                  sharey=True) as (figure, axes):
         for axis, (name, models) in zip(axes, cases.items(), strict=False):
-            trained = {label: m for label, m in models.items() if 'rx' in m and 'missed' in m}
-            for number, (label, m) in enumerate(trained.items()):
-                color = f'C{number}'
+            trained = [label for label, m in models.items() if 'rx' in m]
+            for number, label in enumerate(trained):
+                m, color = models[label], f'C{number}'
+                if 'missed' not in m:
+                    continue
                 axis.plot([], [], 's', color=color, label=label)
                 for i, rx in enumerate(m['rx']):
                     if rx is None:
@@ -106,14 +108,13 @@ def _draw(cases: Mapping[str, Mapping[str, Mapping[str, Values]]], path: Path) -
                               'X' if lost else 'o', color=color, alpha=0.8,
                               markerfacecolor='none' if refused else color)
             for number, known in enumerate(label for label in models if label not in trained):
-                if 'missed' not in models[known]:
-                    continue
                 highest = max(_present(models[known]['ratio_worst']), default=_HIGHEST)
                 axis.axhline(min(highest, _HIGHEST), color='0.3',
                              linestyle=(':', '--')[number % 2], label=known)
             axis.axhline(HELD_TO, color='tab:red', linewidth=0.8, label=f'held to: {HELD_TO}')
             axis.set(title=CASES[name].system.name, xlabel='rx [1]', xscale='log', yscale='log',
                      xlim=(0.5 * _LOWEST, 100.0), ylim=(0.97, 1.05 * _HIGHEST))
+            axis.set_xticks([1e-10, 1e-7, 1e-4, 1e-1])
             axis.set_yticks([1.0, 1.1, 1.3, 2.0, 3.0], ['1', '1.1', '1.3', '2', '≥ 3'])
             axis.minorticks_off()
         for axis in axes[len(cases):]:
