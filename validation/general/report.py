@@ -88,7 +88,8 @@ def _acceptance(cases: Mapping[str, Mapping[str, Mapping[str, Values]]]) -> str:
 def _draw(cases: Mapping[str, Mapping[str, Mapping[str, Values]]], path: Path) -> Picture:
     columns = min(4, len(cases))
     rows = -(-len(cases) // columns)
-    with drawing(path, rows, columns, size=(3.2 * columns + 0.6, 3.0 * rows + 0.6),
+    labels = columns + 1  # beside each other in the legend
+    with drawing(path, rows, columns, size=(3.2 * columns + 0.6, 3.0 * rows + 3.0 / labels),
                  sharey=True) as (figure, axes):
         for axis, (name, models) in zip(axes, cases.items(), strict=False):
             trained = [label for label, m in models.items() if 'rx' in m]
@@ -121,7 +122,7 @@ def _draw(cases: Mapping[str, Mapping[str, Mapping[str, Values]]], path: Path) -
             axis.set_axis_off()
         for axis in axes[::columns]:
             axis.set_ylabel('cost, worst start [1]')
-        legend(figure, axes[:len(cases)], 5)
+        legend(figure, axes[:len(cases)], labels)
     return Picture(path.name, (
         'Cost on the true plant over that of the better law that knows it, at the worst of '
         f'{STARTS} starts, by the error of the learned drift (at the left edge: exact to '
