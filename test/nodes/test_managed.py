@@ -79,7 +79,7 @@ def test_plant(ros: Harness) -> None:
     assert state(ros, 'plant') == 'unconfigured'
 
     assert change_by_number(ros, 'plant', Transition.TRANSITION_CONFIGURE)
-    assert '/plant/reset' in parts(ros, 'plant')
+    ros.wait_until(lambda: '/plant/reset' in parts(ros, 'plant'))
     still = ros.wait_for_status('plant: simulation', lambda s: s.message == 'inactive')
     # which moves nothing either
     assert ros.set_parameters('plant', **{'constants.feed_temperature': 10.0})[0].successful
@@ -140,7 +140,7 @@ def test_controller(ros: Harness, tmp_path: Path) -> None:
     loop = Loop(ros)
     process = started(ros, 'controller', measurement_timeout=0.3)
     assert change(ros, 'controller', 'configure')
-    assert '/coolant_setpoint' in parts(ros, 'controller')
+    ros.wait_until(lambda: '/coolant_setpoint' in parts(ros, 'controller'))
     ros.meet('controller')
     for _ in range(3):
         assert not loop.answered()
