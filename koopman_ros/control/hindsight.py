@@ -25,7 +25,6 @@ _ROWS = 100
 _WINDOWS = 5
 _LEAST_STEPS = 8
 _GAP = 3.0  # so many usual steps without a row end a window
-_DIFFERENCE = 1e-5  # of scaled deviations, for slopes
 # An error is as good as none below this share of what a signal moved, and of its training box.
 _SHARE_OF_MOTION, _SHARE_OF_BOX = 0.1, 5e-4
 
@@ -128,12 +127,7 @@ class Windows:
         x, eye = model.states.to_deviation(self.x), np.eye(n)
         h = (self.steps / model.seconds_per_time_unit)[:, None]
         try:
-            around = model.drift(x + _DIFFERENCE * np.concatenate(
-                [np.zeros((1, n)), eye, -eye])[:, None])
-            f = around[0]
-            # (N, n_x, n_x): df/dx, times half a step
-            F = np.moveaxis(around[1:n + 1] - around[n + 1:], 0, -1) / (2.0 * _DIFFERENCE)
-            half = 0.5 * h[..., None]
+            f, F, half = model.drift(x), model.drift_jacobian(x), 0.5 * h[..., None]
             # the trapezoidal rule for the error e: e' = F e + w + (f + B u - dx/dt)
             lack = h * (0.5 * (f[1:] + f[:-1]) + model.inputs.to_deviation(self.u) @ model.B.T)
             right = np.concatenate([(lack - np.diff(x, axis=0))[..., None], np.broadcast_to(
