@@ -8,8 +8,17 @@ from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from koopman_ros.arrays import Array, frozen
+
+
+def numbers(name: str, value: ArrayLike, signals: Sequence[str]) -> Array:
+    """Return one number for each of some signals (n,) as an array; ValueError for another size."""
+    array = np.asarray(value, dtype=np.float64)
+    if array.shape != (len(signals),):
+        raise _wrong_size(name, array, signals)
+    return array
 
 
 def per_signal(name: str, value: Array, signals: Sequence[str]) -> None:
@@ -19,10 +28,14 @@ def per_signal(name: str, value: Array, signals: Sequence[str]) -> None:
     :raises ValueError: when the sizes differ, or a number is NaN.
     """
     if not isinstance(value, np.ndarray) or value.shape != (len(signals),):
-        raise ValueError(f'incompatible {name}: expected one number for each of '
-                         f'{", ".join(signals)}, got {np.asarray(value).tolist()}')
+        raise _wrong_size(name, value, signals)
     if np.isnan(value).any():
         raise ValueError(f'{name} must be numbers, got {value.tolist()}')
+
+
+def _wrong_size(name: str, value: ArrayLike, signals: Sequence[str]) -> ValueError:
+    return ValueError(f'incompatible {name}: expected one number for each of '
+                      f'{", ".join(signals)}, got {np.asarray(value).tolist()}')
 
 
 @dataclass(frozen=True)

@@ -5,13 +5,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
 import math
 
 import numpy as np
-from numpy.typing import ArrayLike
 
 from koopman_ros.arrays import Array, brief
 from koopman_ros.control import setpoint as setpoints
@@ -46,7 +44,7 @@ from koopman_ros.control.supervisor import (
 from koopman_ros.estimation import equivalent_bias, Estimate, Verdict
 from koopman_ros.lifting import Coordinates, LiftedModel
 from koopman_ros.reasons import Code, Reason, reason
-from koopman_ros.signals import Outputs
+from koopman_ros.signals import numbers, Outputs
 from koopman_ros.units import LATE_NANOSECONDS, NANOSECONDS
 
 
@@ -135,7 +133,7 @@ class Controller:
         if not asked or len(set(asked)) != len(asked) or not set(asked) <= set(every.names):
             raise ValueError(f'signals must be some of {", ".join(every.names)}, each once, got '
                              f'{list(asked)}')
-        value = _numbers('set-point', value, asked)
+        value = numbers('set-point', value, asked)
         refusal = setpoints.refusal(every.only(asked), value)
         if refusal is not None:
             return state, refusal
@@ -188,7 +186,7 @@ class Controller:
         if state.mode is not Mode.MANUAL:
             return state, reason(Code.NOT_IN_MANUAL_MODE)
         names = self.model.inputs.names
-        value = _numbers('manual input', value, names)
+        value = numbers('manual input', value, names)
         for name, number in zip(names, value.tolist(), strict=True):
             if not math.isfinite(number):
                 return state, reason(Code.MANUAL_NOT_FINITE, signal=name, value=number)
@@ -217,7 +215,7 @@ class Controller:
         Nothing is changed after the first command, nor by what is not finite; another size is a
         ValueError.
         """
-        applied = _numbers('applied input', applied, self.model.inputs.names)
+        applied = numbers('applied input', applied, self.model.inputs.names)
         if state.command is not None or not np.all(np.isfinite(applied)):
             return state
         return amended(state, command=_kept(self.settings.limits.within(applied)))
@@ -282,9 +280,9 @@ class Controller:
             limits, and the report.
         :raises ValueError: for a measurement or an input of another size.
         """
-        y = _numbers('measurement', y, self.measured.names)
+        y = numbers('measurement', y, self.measured.names)
         if applied is not None:
-            applied = _numbers('applied input', applied, self.model.inputs.names)
+            applied = numbers('applied input', applied, self.model.inputs.names)
         outside = self._outside(y)
         ahead = 1 if state.time_ns is None else time_ns - state.time_ns
         if state.command is not None and -LATE_NANOSECONDS <= ahead <= 0:
@@ -507,15 +505,6 @@ def _afresh(state: State) -> State:
 
 def _without_law(state: State) -> State:
     return amended(state, law=None, law_input=None, law_memory=None, transfer=None)
-
-
-def _numbers(what: str, value: ArrayLike, names: Sequence[str]) -> Array:
-    """Return one number for each of some signals (n,) as an array; ValueError for another size."""
-    array = np.asarray(value, dtype=np.float64)
-    if array.shape != (len(names),):
-        raise ValueError(f'incompatible {what}: expected one number for each of '
-                         f'{", ".join(names)}, got {array.tolist()}')
-    return array
 
 
 def _kept(value: Array) -> Array:
