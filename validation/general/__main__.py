@@ -8,12 +8,11 @@ from pathlib import Path
 import signal
 import sys
 import time
+from typing import Any
 
-from koopman_ros import __version__
-from koopman_ros.reports import write_figures
 from validation.general.report import write_report
 from validation.general.study import EXPERIMENTS
-from validation.paper.campaign import run_campaign
+from validation.paper.campaign import conclude, run_campaign
 
 
 def main(args: list[str] | None = None) -> int:
@@ -39,17 +38,12 @@ def main(args: list[str] | None = None) -> int:
     start = time.monotonic()
     campaign = run_campaign(options.seeds, {
         name: EXPERIMENTS[name] for name in options.plants or EXPERIMENTS})
-    summary = {
-        'package_version': __version__, 'seeds': options.seeds, 'complete': campaign.complete,
-        'errors': campaign.errors, 'wall_seconds': round(time.monotonic() - start, 1),
-        **campaign.summary()}
-    write_figures(options.output / 'summary.json', summary)
-    write_report(summary, options.output)
-    for line in campaign.errors:
-        print(f'failed: {line}', file=sys.stderr)
-    print(f'wrote {options.output}/report.md, summary.json and a figure in '
-          f'{time.monotonic() - start:.0f} s')
-    return 0 if campaign.complete and not campaign.errors else 1
+
+    def report(summary: dict[str, Any]) -> str:
+        write_report(summary, options.output)
+        return 'a figure'
+
+    return conclude(campaign, options.seeds, start, options.output, report)
 
 
 if __name__ == '__main__':

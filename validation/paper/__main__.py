@@ -12,10 +12,9 @@ from pathlib import Path
 import signal
 import sys
 import time
+from typing import Any
 
-from koopman_ros import __version__
-from koopman_ros.reports import write_figures
-from validation.paper.campaign import run_campaign, SENSOR_EXPERIMENTS
+from validation.paper.campaign import conclude, run_campaign, SENSOR_EXPERIMENTS
 from validation.paper.figures import draw_figures
 from validation.paper.report import write_report
 
@@ -41,18 +40,13 @@ def main(args: list[str] | None = None) -> int:
     signal.signal(signal.SIGTERM, signal.default_int_handler)
     start = time.monotonic()
     campaign = run_campaign(options.seeds, SENSOR_EXPERIMENTS if options.sensors else None)
-    summary = {
-        'package_version': __version__, 'seeds': options.seeds, 'complete': campaign.complete,
-        'errors': campaign.errors, 'wall_seconds': round(time.monotonic() - start, 1),
-        **campaign.summary()}
-    write_figures(options.output / 'summary.json', summary)
-    figures = draw_figures(campaign, options.output)
-    write_report(summary, figures, options.output / 'report.md')
-    for line in campaign.errors:
-        print(f'failed: {line}', file=sys.stderr)
-    print(f'wrote {options.output}/report.md, summary.json and {len(figures)} figures in '
-          f'{time.monotonic() - start:.0f} s')
-    return 0 if campaign.complete and not campaign.errors else 1
+
+    def report(summary: dict[str, Any]) -> str:
+        figures = draw_figures(campaign, options.output)
+        write_report(summary, figures, options.output / 'report.md')
+        return f'{len(figures)} figures'
+
+    return conclude(campaign, options.seeds, start, options.output, report)
 
 
 if __name__ == '__main__':

@@ -7,14 +7,18 @@ from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field
 import math
 import os
+from pathlib import Path
 import sys
+import time
 from typing import Any, TypeAlias
 
 import joblib
 from tqdm import tqdm
 
+from koopman_ros import __version__
 from koopman_ros.control import ClosedLoop
 from koopman_ros.lifting import LiftedModel
+from koopman_ros.reports import write_figures
 from validation.paper import reactor, scalar, sensors, two_state
 from validation.paper.datasets import Metrics, Models
 
@@ -108,6 +112,27 @@ def run_campaign(seeds: int, experiments: Mapping[str, Experiment] | None = None
         bar.close()
     campaign.errors.sort()
     return campaign
+
+
+def conclude(campaign: Campaign, seeds: int, begin: float, folder: Path,
+             report: Callable[[dict[str, Any]], str]) -> int:
+    """
+    Write what a campaign of so many seeds found, tell what failed, and return the exit status.
+
+    :param begin: when it began, by ``time.monotonic()``.
+    :param report: writes ``report.md`` and figures of a summary; returns how many these are.
+    """
+    summary = {
+        'package_version': __version__, 'seeds': seeds, 'complete': campaign.complete,
+        'errors': campaign.errors, 'wall_seconds': round(time.monotonic() - begin, 1),
+        **campaign.summary()}
+    write_figures(folder / 'summary.json', summary)
+    figures = report(summary)
+    for line in campaign.errors:
+        print(f'failed: {line}', file=sys.stderr)
+    print(f'wrote {folder}/report.md, summary.json and {figures} in '
+          f'{time.monotonic() - begin:.0f} s')
+    return 0 if campaign.complete and not campaign.errors else 1
 
 
 def _run(name: str, seed: int, experiment: Experiment
