@@ -220,7 +220,7 @@ def _ending(grown: Grown, interrupted: bool) -> str:
 
 
 def reference_drift(plant: Plant, box: Box, parts: tuple[Samples, Samples, Samples],
-               model: LiftedModel) -> Rate:
+                    model: LiftedModel) -> Rate:
     """
     Return the drift that predicts the validation episodes best, on which a law is tried.
 
