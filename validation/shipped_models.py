@@ -23,11 +23,11 @@ from koopman_ros.plant_data import Samples
 from koopman_ros.plants import (
     box_episodes,
     ControlAffineSystem,
+    describe,
     plant_class,
     random_steps,
     RandomStepDesign,
 )
-from validation.paper.datasets import describe
 from validation.paper.reactor import SYSTEM, TRAINING, training_samples
 
 SEED = 2026

@@ -28,6 +28,7 @@ from koopman_ros.plants.simulation import (
 )
 from koopman_ros.plants.system import (
     ControlAffineSystem,
+    describe,
     equilibrium_input,
     EquilibriumError,
     steady_state,
@@ -36,6 +37,6 @@ from koopman_ros.plants.system import (
 __all__ = ['PLANTS', 'Actuator', 'Constant', 'Constants', 'ControlAffineSystem',
            'EquilibriumError', 'ExcitationError', 'IntegrationError', 'IntegrationFailure',
            'Process', 'RandomStepDesign', 'ReactorParameters', 'advance', 'box_episodes', 'build',
-           'constant', 'constants_of', 'equilibrium_input', 'one_state_reactor', 'plant_class',
-           'random_steps', 'sample_derivatives', 'scalar_example', 'sensor_noise', 'simulate',
-           'steady_state', 'two_state_example', 'two_state_reactor']
+           'constant', 'constants_of', 'describe', 'equilibrium_input', 'one_state_reactor',
+           'plant_class', 'random_steps', 'sample_derivatives', 'scalar_example', 'sensor_noise',
+           'simulate', 'steady_state', 'two_state_example', 'two_state_reactor']

@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from koopman_ros.arrays import Array, brief, frozen
+from koopman_ros.plant_data import Plant
 from koopman_ros.units import SECONDS_PER_TIME_UNIT
 
 ArrayFunction = Callable[[Array], Array]
@@ -134,6 +135,13 @@ class ControlAffineSystem:
         return ', '.join(
             f'{name} = {value:.10g}' + ('' if unit == '1' else f' {unit}')
             for name, value, unit in zip(self.state_names, x, self.state_units, strict=True))
+
+
+def describe(system: ControlAffineSystem) -> Plant:
+    """Return what training may know of a plant beside its data: all but the drift."""
+    return Plant(system.name, system.state_names, system.state_units, system.input_names,
+                 system.input_units, system.time_unit, system.nominal_state,
+                 system.nominal_input, system.B)
 
 
 class EquilibriumError(ValueError):

@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 
 from koopman_ros.plants import (
+    describe,
     equilibrium_input,
     EquilibriumError,
     one_state_reactor,
@@ -207,6 +208,15 @@ def test_state_that_no_input_holds(system, state, message):
     with pytest.raises(ValueError, match=message) as caught:
         equilibrium_input(system, state)
     assert isinstance(caught.value, EquilibriumError) is ('no input' in message)
+
+
+def test_training_is_told_everything_of_a_plant_but_its_drift():
+    system = two_tanks()
+    known = describe(system)
+    for field in fields(known):
+        np.testing.assert_array_equal(getattr(known, field.name), getattr(system, field.name))
+    assert {field.name for field in fields(system)} - {field.name for field in fields(known)} == {
+        'drift', 'drift_jacobian', 'state_lower', 'state_upper'}
 
 
 # The reactors and the examples of the paper.

@@ -10,11 +10,12 @@ import numpy as np
 from koopman_ros.learning import fit, rollout_rmse
 from koopman_ros.lifting.bounds import MAX_COORDINATES
 from koopman_ros.plant_data import Samples
+from koopman_ros.plants import describe
 from validation.general.learners import Learned, LEARNERS
 from validation.general.loops import judged, known, loops, STARTS
 from validation.general.systems import Case, CASES
 from validation.paper.campaign import Experiment
-from validation.paper.datasets import describe, Metrics, Models
+from validation.paper.datasets import Metrics, Models
 
 _HELD_OUT = 40  # episodes that no training has seen
 LQR, SDRE = 'LQR on the truth', 'natural SDRE on the truth'

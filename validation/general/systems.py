@@ -19,11 +19,11 @@ from koopman_ros.plant_data import Samples
 from koopman_ros.plants import (
     box_episodes,
     ControlAffineSystem,
+    describe,
     RandomStepDesign,
     two_state_reactor,
 )
 from koopman_ros.solvers import solve_riccati
-from validation.paper.datasets import describe
 from validation.shipped_models import library_system, LIFTS
 
 # Of half the box: nearer than that to the nominal state, a secant is the slope.

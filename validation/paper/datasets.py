@@ -7,7 +7,7 @@ from collections.abc import Mapping
 from typing import TypeAlias
 
 from koopman_ros.lifting import LiftedModel
-from koopman_ros.plant_data import Plant, Samples
+from koopman_ros.plant_data import Samples
 from koopman_ros.plants import (
     ControlAffineSystem,
     random_steps,
@@ -19,13 +19,6 @@ from koopman_ros.plants import (
 Metrics: TypeAlias = dict[str, float | bool | dict[str, 'float | bool | None'] | None]
 # Models by name, for the figures.
 Models: TypeAlias = Mapping[str, LiftedModel]
-
-
-def describe(system: ControlAffineSystem) -> Plant:
-    """Return what training may know of a plant beside its data."""
-    return Plant(system.name, system.state_names, system.state_units, system.input_names,
-                 system.input_units, system.time_unit, system.nominal_state,
-                 system.nominal_input, system.B)
 
 
 def random_step_episodes(system: ControlAffineSystem, design: RandomStepDesign, episodes: int,

@@ -10,8 +10,14 @@ from koopman_ros import learning
 from koopman_ros.control import ClosedLoop, run_closed_loop, steady_state_target, Weights
 from koopman_ros.lifting import LiftedModel
 from koopman_ros.plant_data import Samples
-from koopman_ros.plants import box_episodes, equilibrium_input, one_state_reactor, RandomStepDesign
-from validation.paper.datasets import describe, Metrics, Models, random_step_episodes
+from koopman_ros.plants import (
+    box_episodes,
+    describe,
+    equilibrium_input,
+    one_state_reactor,
+    RandomStepDesign,
+)
+from validation.paper.datasets import Metrics, Models, random_step_episodes
 from validation.paper.optimal_control import scalar_optimal_cost
 
 SYSTEM = one_state_reactor()

@@ -15,9 +15,9 @@ from koopman_ros.identification import Identified, identify
 from koopman_ros.learning import NoUsefulLift, roll_out, Trained
 from koopman_ros.lifting import Box, LiftedModel, linearised_model, Provenance
 from koopman_ros.plant_data import Episode
-from koopman_ros.plants import ControlAffineSystem, RandomStepDesign
+from koopman_ros.plants import ControlAffineSystem, describe, RandomStepDesign
 from koopman_ros.retraining import decide, Decision, learn_lift, Thresholds
-from validation.paper.datasets import describe, Metrics, Models
+from validation.paper.datasets import Metrics, Models
 from validation.paper.reactor import SETPOINT, SYSTEM
 
 NOISE = 0.1  # K

@@ -23,8 +23,8 @@ from koopman_ros.control import (
 )
 from koopman_ros.lifting import LiftedModel
 from koopman_ros.plant_data import Samples
-from koopman_ros.plants import box_episodes, RandomStepDesign, two_state_example
-from validation.paper.datasets import describe, Metrics, Models
+from koopman_ros.plants import box_episodes, describe, RandomStepDesign, two_state_example
+from validation.paper.datasets import Metrics, Models
 from validation.paper.optimal_control import (
     exact_two_state_cost,
     exact_two_state_gain,

@@ -12,9 +12,9 @@ from koopman_ros import control
 from koopman_ros.control import at, Controller, Simulation
 from koopman_ros.learning import Growth, Linearisation, train
 from koopman_ros.lifting import LiftedModel
-from koopman_ros.plants import box_episodes, RandomStepDesign
+from koopman_ros.plants import box_episodes, describe, RandomStepDesign
 from validation.paper import two_state
-from validation.paper.datasets import describe, Metrics
+from validation.paper.datasets import Metrics
 from validation.robustness import loop
 from validation.robustness.loop import REACTOR, START
 

@@ -14,12 +14,12 @@ import numpy as np
 import pytest
 
 from koopman_ros.learning import Growth, NoUsefulLift
+from koopman_ros.plants import describe
 from koopman_ros.solvers import solve_riccati
 from validation.general import learners, loops, study
 from validation.general.__main__ import main
 from validation.general.loops import End, judged, Known
 from validation.general.systems import CASES, oscillator
-from validation.paper.datasets import describe
 
 
 @pytest.mark.parametrize('name', CASES)

@@ -13,12 +13,12 @@ import pytest
 
 from koopman_ros.learning import Edmd, fit, Linearisation
 from koopman_ros.lifting import load
-from koopman_ros.plants import box_episodes
+from koopman_ros.plants import box_episodes, describe
 from koopman_ros.resources import model_path
 from validation.paper import campaign as campaigns
 from validation.paper import figures, reactor, report, scalar, two_state
 from validation.paper.campaign import Campaign, run_campaign
-from validation.paper.datasets import describe, random_step_episodes
+from validation.paper.datasets import random_step_episodes
 from validation.paper.optimal_control import exact_two_state_model
 
 

@@ -12,13 +12,13 @@ from koopman_ros.learning import Edmd, fit, Linearisation
 from koopman_ros.plants import (
     box_episodes,
     ControlAffineSystem,
+    describe,
     ExcitationError,
     one_state_reactor,
     RandomStepDesign,
     scalar_example,
 )
 from validation.paper import reactor, two_state
-from validation.paper.datasets import describe
 from validation.paper.optimal_control import (
     exact_two_state_cost,
     exact_two_state_gain,
