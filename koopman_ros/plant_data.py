@@ -5,7 +5,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 import hashlib
 import itertools
@@ -34,7 +34,11 @@ class Plant:
     #: (n_x,) steady state under the nominal input; NaN where it is not known yet
     nominal_state: Array
     nominal_input: Array  #: (n_u,) nominal input, likewise
-    B: Array | None  #: (n_x, n_u) input matrix, in units, or None to learn it
+    #: (n_x, n_u) input matrix, in units; None to learn it; where it depends on the state, a
+    #: function of states (..., n_x), in their units, to (..., n_x, n_u)
+    B: Array | Callable[[Array], Array] | None
+    #: degree of the polynomial B(x) that is learned where B is None; 0 for a constant one
+    input_matrix_degree: int = 0
 
     __repr__ = brief
 
@@ -52,9 +56,29 @@ class Plant:
             for field, value in ((f'{kind}_names', names), (f'{kind}_units', units),
                                  (f'nominal_{kind}', nominal)):
                 object.__setattr__(self, field, value)
-        if self.B is not None:
+        if self.input_matrix_degree < 0 or (self.input_matrix_degree and self.B is not None):
+            raise ValueError(f'input_matrix_degree is {self.input_matrix_degree}, must be at '
+                             'least 0, and 0 where B is given')
+        if self.B is not None and not callable(self.B):
             object.__setattr__(self, 'B', frozen(
                 self.B, 'B', (len(self.state_names), len(self.input_names))))
+
+    def input_matrix(self, x: Array) -> Array:
+        """
+        Return the known B at states (..., n_x), in units: (..., n_x, n_u).
+
+        :raises ValueError: when B is left to learn, or its function gives another shape.
+        """
+        shape = (*np.shape(x), len(self.input_names))
+        if self.B is None:
+            raise ValueError('B is not known: give it to the plant')
+        if not callable(self.B):
+            return np.broadcast_to(self.B, shape)
+        found = np.asarray(self.B(x), dtype=np.float64)
+        if found.shape != shape:
+            raise ValueError(f'incompatible B(x) at x of shape {np.shape(x)}: expected {shape}, '
+                             f'got {found.shape}')
+        return found
 
 
 @dataclass(frozen=True)

@@ -105,8 +105,8 @@ def linear_model(like: LiftedModel) -> LiftedModel:
     """Return the linearisation at the nominal point, with the box of a lift."""
     provenance = Provenance(SYSTEM.name, package_version=like.provenance.package_version)
     return _with_roll_out(linearised_model(
-        SYSTEM.drift_jacobian(SYSTEM.nominal_state), SYSTEM.B, like.states, like.inputs,
-        SYSTEM.time_unit, provenance))
+        SYSTEM.drift_jacobian(SYSTEM.nominal_state), SYSTEM.input_matrix(SYSTEM.nominal_state),
+        like.states, like.inputs, SYSTEM.time_unit, provenance))
 
 
 def _with_roll_out(model: LiftedModel) -> LiftedModel:

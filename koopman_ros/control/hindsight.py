@@ -128,11 +128,15 @@ class Windows:
         h = (self.steps / model.seconds_per_time_unit)[:, None]
         try:
             f, F, half = model.drift(x), model.drift_jacobian(x), 0.5 * h[..., None]
-            # the trapezoidal rule for the error e: e' = F e + w + (f + B u - dx/dt)
-            lack = h * (0.5 * (f[1:] + f[:-1]) + model.inputs.to_deviation(self.u) @ model.B.T)
+            u = model.inputs.to_deviation(self.u)
+            (f0, F0), (f1, F1) = (
+                (f[rows] + model.forcing(x[rows], u), F[rows] + model.forcing_jacobian(x[rows], u))
+                for rows in (slice(-1), slice(1, None)))
+            # the trapezoidal rule for the error e: e' = F e + w + (f + B(x) u - dx/dt)
+            lack = h * (0.5 * (f0 + f1))
             right = np.concatenate([(lack - np.diff(x, axis=0))[..., None], np.broadcast_to(
-                h[..., None] * eye, (len(h), n, n)), eye + half * F[:-1]], axis=-1)
-            step = np.linalg.solve(eye - half * F[1:], right)
+                h[..., None] * eye, (len(h), n, n)), eye + half * F0], axis=-1)
+            step = np.linalg.solve(eye - half * F1, right)
         except np.linalg.LinAlgError:
             return every
         # columns: without a fit, by disturbance, by start

@@ -130,10 +130,11 @@ class Holding:
         for _ in range(_MOST_MOVES):
             target, left = self._target(held), (goal - held) / half
             assert target is not None  # it is held
-            slope = model.drift_jacobian(target.x)
+            slope = model.drift_jacobian(target.x) + model.forcing_jacobian(target.x, target.u)
             if not np.linalg.cond(slope) < _SINGULAR:
                 break
-            gain = model.states.scale[:, None] * -np.linalg.solve(slope, model.B)
+            gain = model.states.scale[:, None] * -np.linalg.solve(
+                slope, model.input_matrix(target.x))
             gain = np.array([self.level.controlled_of(column) for column in gain.T]).T
             move = bounded_least_squares(gain / half[:, None], left, lower - target.u,
                                          upper - target.u)

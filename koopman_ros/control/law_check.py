@@ -228,7 +228,7 @@ class _Plant:
         slope = self.slope(np.zeros((1, n)), np.zeros((1, model.n_u)))[0]
         itself = NetworkObservables((), np.zeros((0, n)), identity=True)
         return replace(model, observables=itself, A=slope[:, :n], B=slope[:, n:],
-                       readout=None)
+                       readout=None, input_terms=None)
 
 
 def _closed_loop_rates(linear: LiftedModel, weights: Weights) -> tuple[float, float]:
@@ -307,7 +307,7 @@ def _steady(plant: _Plant, x: Array, v: Array) -> tuple[Array, Array]:
 def _target(model: LiftedModel, x_ref: Array, v: Array) -> Target | None:
     """Return a target of a model with the disturbance under which this input holds it."""
     try:
-        w = -(model.drift(x_ref) + model.B @ v)
+        w = -model.rate_under(v)(x_ref)
         return steady_state_target(model, x_ref, w) if finite(w) else None
     except np.linalg.LinAlgError:
         return None
@@ -326,7 +326,7 @@ def _called(law: Law, setpoints: Array, inputs: Array, limits: InputLimits, seco
             target = targets[k]
             if target is None:
                 continue
-            w = -(target.drift + model.B.dot(target.u))
+            w = -(target.drift + model.forcing(target.x, target.u))
             found = law.compute(Estimate(x[k], w), target, limits, memory[k], seconds)
             memory[k] = found.memory
             if found.u is not None:

@@ -257,10 +257,11 @@ class Estimating:
         x = old.states.to_physical(estimate.x)
         # the rates that the old model estimated, per second, which all models share
         rate = estimate.w + predecessor.level(state).model.drift(estimate.x) + (
-            old.B @ _command(old, state))
+            old.forcing(estimate.x, _command(old, state)))
         factor = (old.states.scale / old.seconds_per_time_unit
                   / (new.states.scale / new.seconds_per_time_unit))
-        moved = Estimate(new.states.to_deviation(x), factor * rate - new.B @ _command(new, state))
+        x_new = new.states.to_deviation(x)
+        moved = Estimate(x_new, factor * rate - new.forcing(x_new, _command(new, state)))
         moved = estimator.rebased(moved, np.zeros_like(moved.w))
         # what it holds of the disturbance is in the old model's units, and distances from its data
         return amended(state, estimate=moved, accepted=None, way_back=None)

@@ -211,8 +211,9 @@ def leads_home(model: LiftedModel, x: Array, safe: Array, nominal: Array) -> boo
     On the other side, as that of a runaway, it is the safe input that does. State (n_x,) and
     inputs (n_u,) are in their units.
     """
-    push = model.B @ (model.inputs.to_deviation(nominal) - model.inputs.to_deviation(safe))
-    return bool(model.states.to_deviation(x) @ push < 0.0)
+    difference = model.inputs.to_deviation(nominal) - model.inputs.to_deviation(safe)
+    deviation = model.states.to_deviation(x)
+    return bool(deviation @ model.forcing(deviation, difference) < 0.0)
 
 
 @dataclass(frozen=True)
@@ -244,9 +245,10 @@ def rest_under(model: LiftedModel, u: Array, known: float) -> Rest:
 
 
 def _followed(model: LiftedModel, u: Array, known: float) -> Rest:
-    push = model.B @ model.inputs.to_deviation(u)
+    v = model.inputs.to_deviation(u)
+    rate_at = model.rate_under(v)
     x = np.zeros(model.n_x)
-    rate = model.drift(x) + push
+    rate = rate_at(x)
     # of the deviations: steps of a fraction of the box, and of the time in which the rate changes
     width = float(np.min((model.states.upper - model.states.lower) / model.states.scale))
     time = np.inf
@@ -256,20 +258,21 @@ def _followed(model: LiftedModel, u: Array, known: float) -> Rest:
             break
         before, rate_before = x, rate
         x = x + min(_STEP * width / speed, _STEP_SHARE * time) * rate
-        rate = model.drift(x) + push
+        rate = rate_at(x)
         if not model.distance(model.states.to_physical(x)) <= known:
-            return _beyond(model, x, rate)
+            return _beyond(model, x, v, rate)
         change = float(np.linalg.norm(rate - rate_before))
         time = float(np.linalg.norm(x - before)) / change if change > 0.0 else np.inf
     place = model.states.to_physical(x)
     return Rest(place, model.distance(place))
 
 
-def _beyond(model: LiftedModel, x: Array, rate: Array) -> Rest:
-    """Extrapolate from a state (n_x,) that moves at a rate (n_x,), in scaled deviations."""
-    slope = model.drift_jacobian(x)
+def _beyond(model: LiftedModel, x: Array, u: Array, rate: Array) -> Rest:
+    """Extrapolate from a state (n_x,) moving at a rate (n_x,) under (n_u,), all scaled."""
+    slope = model.drift_jacobian(x) + model.forcing_jacobian(x, u)
     place, outside = np.full(model.n_x, np.nan), np.nan
     if np.all(np.isfinite(slope)) and np.all(np.linalg.eigvals(slope).real < 0.0):
         place = model.states.to_physical(x - np.linalg.solve(slope, rate))
         outside = model.distance(place)
-    return Rest(place, outside, model.inputs.to_physical(-model.input_inverse @ model.drift(x)))
+    return Rest(place, outside, model.inputs.to_physical(
+        -model.input_inverse(x) @ model.drift(x)))

@@ -29,7 +29,7 @@ _REACH = 1e3
 def equilibrium(model: LiftedModel, w: Array, start: Array, free: NDArray[np.bool_],
                 anchor: Array, reach: Array) -> Array | None:
     """
-    Solve f(x) + B u + w = 0 for some of y = (x, u) by Gauss-Newton steps.
+    Solve f(x) + B(x) u + w = 0 for some of y = (x, u) by Gauss-Newton steps.
 
     Of several solutions it is one nearest to the anchor: each step goes to the solution of the
     linearised equation that is.
@@ -45,9 +45,10 @@ def equilibrium(model: LiftedModel, w: Array, start: Array, free: NDArray[np.boo
     settles = int(np.count_nonzero(free)) > n
     anchor, reach = anchor[free], reach[free]
     try:
-        rate = model.drift(y[:n]) + model.B.dot(y[n:]) + w
+        rate = model.drift(y[:n]) + model.forcing(y[:n], y[n:]) + w
         for _ in range(_MOST_STEPS):
-            J = np.concatenate((model.drift_jacobian(y[:n]), model.B), axis=1)[:, free]
+            J = np.concatenate((model.drift_jacobian(y[:n]) + model.forcing_jacobian(y[:n], y[n:]),
+                                model.input_matrix(y[:n])), axis=1)[:, free]
             if not (finite(J.ravel()) and finite(rate)):
                 return None
             wanted = J.dot(y[free] - anchor) - rate
@@ -55,7 +56,7 @@ def equilibrium(model: LiftedModel, w: Array, start: Array, free: NDArray[np.boo
             length = max(map(abs, step.tolist()), default=0.0)
             y = y.copy()
             y[free] += step * min(1.0, _LONGEST_STEP / length) if length > 0.0 else step
-            rate = model.drift(y[:n]) + model.B.dot(y[n:]) + w
+            rate = model.drift(y[:n]) + model.forcing(y[:n], y[n:]) + w
             if math.sqrt(rate.dot(rate)) <= _RESOLUTION * math.sqrt(float((J * J).sum())) and (
                     length <= _STILL or not settles):
                 return y
@@ -119,6 +120,6 @@ def resting_state(model: LiftedModel, u: Array, w: Array, start: Array) -> Array
 
 def _target(model: LiftedModel, y: Array, w: Array) -> Target:
     x, u = y[:model.n_x], y[model.n_x:]
-    drift, forcing = model.drift(x), model.B.dot(u) + w
+    drift, forcing = model.drift(x), model.forcing(x, u) + w
     rest = drift + forcing
     return Target(x, model.lift(x), drift, u, forcing, math.sqrt(rest.dot(rest)))

@@ -89,11 +89,11 @@ def simulated(model: LiftedModel, estimate: Estimate, u: Array, seconds: float) 
     if steps > _MAX_STEPS:
         return None
     h = duration / steps
-    forcing, x, drift = model.B.dot(u) + estimate.w, estimate.x, model.drift
+    x, rate = estimate.x, model.rate_under(u, estimate.w)
     for _ in range(steps):
         # Heun's method
-        slope = drift(x) + forcing
-        x = x + (0.5 * h) * (slope + drift(x + h * slope) + forcing)
+        slope = rate(x)
+        x = x + (0.5 * h) * (slope + rate(x + h * slope))
     return Estimate(x, estimate.w)
 
 
@@ -109,7 +109,7 @@ class DisturbanceObserver:
 
     model: LiftedModel  #: whose drift predicts
     bandwidth: float  #: in 1/s, above 0
-    max_disturbance: Array  #: (n_u,) bound on each input of B^+ w, in scaled deviations
+    max_disturbance: Array  #: (n_u,) bound on each input of B(0)^+ w, in scaled deviations
 
     @property
     def remembers(self) -> bool:
@@ -134,7 +134,7 @@ class DisturbanceObserver:
             return Estimate(x, predicted.w)
         if u is None:
             return Estimate(x, np.zeros_like(x))
-        return Estimate(x, self.bounded(-self.model.drift(x) - self.model.B @ u))
+        return Estimate(x, self.bounded(-self.model.rate_under(u)(x)))
 
     def rebased(self, estimate: Estimate, rate: Array) -> Estimate:
         """Let the disturbance make up for the difference between the two models."""
@@ -150,7 +150,7 @@ class DisturbanceObserver:
 
     def as_input(self, w: Array) -> Array:
         """Return the (n_u,) input that would act like a disturbance, in scaled deviations."""
-        return self.model.input_inverse.dot(w)
+        return self.model.input_inverse().dot(w)
 
     def at_bound(self, w: Array) -> bool:
         """Tell whether a disturbance is as large as is allowed, but for rounding."""

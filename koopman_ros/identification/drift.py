@@ -14,7 +14,7 @@ import math
 import numpy as np
 
 from koopman_ros.arrays import brief
-from koopman_ros.lifting import Box, PolynomialObservables
+from koopman_ros.lifting import Box, InputTerms, PolynomialObservables
 from koopman_ros.plant_data import Array, Episode, Plant
 from koopman_ros.solvers import runge_kutta_step
 
@@ -33,27 +33,48 @@ def box_of(plant: Plant, episodes: Sequence[Episode]) -> Box:
 
 @dataclass(frozen=True)
 class DriftModel:
-    """dx/dt = f(x) + B u with f a polynomial, in deviations within a box."""
+    """dx/dt = f(x) + B(x) u with f and B polynomials, in deviations within a box."""
 
     box: Box  #: the deviations' origin and scale
     degree: int  #: highest total degree of the monomials
     coefficients: Array  #: (1 + m, n_x) of 1 and of the m monomials, in scale units a time unit
-    B: Array  #: (n_x, n_u) likewise
+    #: (n_x, n_u (1 + n_phi)) likewise, of the inputs and, where B depends on the state, of their
+    #: products with monomials, see :meth:`InputTerms.regressors`
+    B: Array
 
     __repr__ = brief
 
     @cached_property
     def monomials(self) -> PolynomialObservables:
         """The monomials from degree 1 on."""
-        return PolynomialObservables.total_degree(self.B.shape[0], self.degree)
+        return PolynomialObservables.total_degree(len(self.box.states), self.degree)
 
     def features(self, xi: Array) -> Array:
         """Evaluate 1 and the monomials: (..., n_x) -> (..., 1 + m)."""
         return np.concatenate((np.ones((*xi.shape[:-1], 1)), self.monomials.lift(xi)), axis=-1)
 
+    @cached_property
+    def _split(self) -> tuple[Array, InputTerms | None]:
+        return InputTerms.split(self.B, len(self.box.inputs))
+
+    @property
+    def input_degree(self) -> int:
+        """Degree of the polynomial B(x)."""
+        terms = self._split[1]
+        return 0 if terms is None else terms.degree
+
+    def scaled_input_matrix(self, xi: Array) -> Array:
+        """Evaluate B(x) in deviations: (..., n_x) -> (..., n_x, n_u), one for all if constant."""
+        B, terms = self._split
+        return B if terms is None else B + terms.matrix(xi)
+
     def scaled_rate(self, xi: Array, v: Array) -> Array:
         """Evaluate the rate in deviations: (..., n_x) and (..., n_u) -> (..., n_x)."""
-        return self.features(xi) @ self.coefficients + v @ self.B.T
+        return self.features(xi) @ self.coefficients + self.regressors(xi, v) @ self.B.T
+
+    def regressors(self, xi: Array, v: Array) -> Array:
+        """Return what `B` holds the weights of: (..., n_x), (..., n_u) -> (..., columns of B)."""
+        return InputTerms.regressors(xi, v, self.input_degree)
 
     def rate(self, x: Array, u: Array) -> Array:
         """Evaluate dx/dt in units: (..., n_x) and (..., n_u) -> (..., n_x)."""
@@ -65,15 +86,26 @@ class DriftModel:
         scale = self.box.states.scale
         return scale[:, None] * self.scaled_slope(self.box.states.to_deviation(x)) / scale
 
-    def scaled_slope(self, xi: Array) -> Array:
-        """Evaluate the Jacobian of the scaled drift: (..., n_x) -> (..., n_x, n_x)."""
+    def scaled_slope(self, xi: Array, v: Array | None = None) -> Array:
+        """
+        Evaluate the Jacobian of the scaled rate: (..., n_x) -> (..., n_x, n_x).
+
+        :param v: (..., n_u) inputs in deviations; those of the box's middle by default.
+        """
         J = self.monomials.lift_and_jacobian(xi)[1]
-        return np.einsum('ji,...jl->...il', self.coefficients[1:], J)
+        slope: Array = np.einsum('ji,...jl->...il', self.coefficients[1:], J)
+        terms = self._split[1]
+        return slope if terms is None or v is None else slope + terms.jacobian(xi, v)
 
     @property
     def input_matrix(self) -> Array:
-        """B (n_x, n_u) in state units per input and time unit."""
-        return self.box.states.scale[:, None] * self.B / self.box.inputs.scale
+        """B (n_x, n_u) in state units per input and time unit, in the middle of the box."""
+        return self.input_matrix_at(self.box.states.center)
+
+    def input_matrix_at(self, x: Array) -> Array:
+        """Evaluate B(x) in units: (..., n_x) -> (..., n_x, n_u), one for all if constant."""
+        B = self.scaled_input_matrix(self.box.states.to_deviation(x))
+        return self.box.states.scale[:, None] * B / self.box.inputs.scale
 
 
 @dataclass(frozen=True)

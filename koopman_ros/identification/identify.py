@@ -20,26 +20,29 @@ from koopman_ros.identification.drift import (
 )
 from koopman_ros.identification.output_error import output_error
 from koopman_ros.identification.regression import noise_level, total_variation, weak_form
+from koopman_ros.learning.inputs import InputModel
 from koopman_ros.lifting import Box
 from koopman_ros.plant_data import Array, cut, Episode, Plant
 
-# Fits a drift to episodes: their box, the degree, B (n_x, n_u) scaled or None to learn it, and a
-# rough B: that of the method before, None for the first where B is to be learned. A method that
+# Fits a drift to episodes: their box, the degree, B as DriftModel has it or None to learn it, and
+# a rough B: that of the method before, None for the first where B is to be learned. A method that
 # raises ValueError, as on short episodes, is left out.
 Method = Callable[[Sequence[Episode], Box, int, Array | None, Array | None], DriftModel]
 
 
-def weak_forms(*windows: int) -> dict[str, Method]:
-    """Return the weak form with windows of so many samples, by name."""
+def weak_forms(*windows: int, input_degree: int = 0) -> dict[str, Method]:
+    """Return the weak form with windows of so many samples, by name, for B(x) of a degree."""
     def method(window: int) -> Method:
-        return lambda episodes, box, degree, B, _: weak_form(episodes, box, degree, B, window)
+        return lambda episodes, box, degree, B, _: weak_form(episodes, box, degree, B, window,
+                                                             input_degree)
 
     return {f'weak form, {window} samples': method(window) for window in windows}
 
 
+_WINDOWS = (10, 20, 40, 80)
 # A row for each method; the widest window knows B best, and is what total variation goes by.
 METHODS: Mapping[str, Method] = {
-    **weak_forms(10, 20, 40, 80),
+    **weak_forms(*_WINDOWS),
     'total variation': total_variation,
 }
 DEGREES = (1, 2, 3, 4, 5, 6)
@@ -91,10 +94,10 @@ class Identified:
 
 
 def identify(plant: Plant, episodes: Sequence[Episode], *, degrees: Sequence[int] | None = None,
-             methods: Mapping[str, Method] = METHODS, seed: int = 0,
+             methods: Mapping[str, Method] | None = None, seed: int = 0,
              watch: Watch = lambda *_: False) -> Identified:
     """
-    Estimate dx/dt = f(x) + B u from sampled, noisy measurements.
+    Estimate dx/dt = f(x) + B(x) u from sampled, noisy measurements.
 
     For each degree of f every method gives an estimate; the best on segments held out for the
     choice is refined by output error, where that pays. Of the degrees that predict about as well
@@ -102,10 +105,11 @@ def identify(plant: Plant, episodes: Sequence[Episode], *, degrees: Sequence[int
     fitted segments is taken, which reach further than the others, and refitted to all but those
     held out for good.
 
-    :param plant: names, units, and B where it is known.
+    :param plant: names, units, and B where it is known, or the degree of the B(x) to learn.
     :param degrees: of f that are tried, rising, the first one 1; by default those whose drift has
         few enough coefficients for so many states.
-    :param methods: by name; those that go by a rough B come after one that learns it.
+    :param methods: by name; those that go by a rough B come after one that learns it. By default
+        ``METHODS``, or the weak forms where B depends on the state.
     :param seed: of the split.
     :raises ValueError: when the episodes are too short, or nothing fits.
     :raises Stopped: when `watch` asked for it.
@@ -118,7 +122,10 @@ def identify(plant: Plant, episodes: Sequence[Episode], *, degrees: Sequence[int
     fit, choose, held_out = _split(parts, seed)
     step = longest_step(parts)
     chooser, fitter = Segments.of(choose, step), Segments.of(fit, step)
-    known = None if plant.B is None else box.input_matrix(plant.B)
+    inputs = InputModel.of(plant, box, np.concatenate([part.x for part in parts]))
+    known = inputs.weights
+    methods = methods or (weak_forms(*_WINDOWS, input_degree=inputs.degree) if inputs.degree
+                          else METHODS)
     scores: list[Score] = []
     best: dict[int, tuple[DriftModel, Score]] = {}
 

@@ -133,15 +133,15 @@ def _rates(model: DriftModel, v: Array, learn: bool, y: Array) -> Array:
     """Evaluate the rates of states and, beside them, of their sensitivities: (M, n_x, 1 + ...)."""
     x, S = y[..., 0], y[..., 1:]
     n_x = x.shape[1]
-    features = model.features(x)
-    rate = features @ model.coefficients + v @ model.B.T
+    features, inputs = model.features(x), model.regressors(x, v)
+    rate = features @ model.coefficients + inputs @ model.B.T
     if not S.shape[-1]:
         return rate[..., None]
-    dS = model.scaled_slope(x) @ S
-    m, n_u = features.shape[1], v.shape[1]
+    dS = model.scaled_slope(x, v) @ S
+    m, n_B = features.shape[1], inputs.shape[1]
     for i in range(n_x):
         dS[:, i, i:m * n_x:n_x] += features
         if learn:
-            first = m * n_x + i * n_u
-            dS[:, i, first:first + n_u] += v
+            first = m * n_x + i * n_B
+            dS[:, i, first:first + n_B] += inputs
     return np.concatenate((rate[..., None], dS), axis=-1)

@@ -6,15 +6,18 @@
 from collections.abc import Sequence
 
 import numpy as np
+from numpy.polynomial.legendre import leggauss
 from scipy.linalg import solveh_banded
 
 from koopman_ros.identification.drift import DriftModel
-from koopman_ros.lifting import Box
+from koopman_ros.lifting import Box, InputTerms
 from koopman_ros.plant_data import Array, Episode
 
 # Exponent of the test functions (1 - s^2)^p, which are zero at the first and at the last sample.
 _POWER = 3
 _NARROWEST = 4
+# On [0, 1].
+_NODES, _WEIGHTS = 0.5 * np.add(leggauss(3), [[1.0], [0.0]])
 
 # Of total variation: steps towards the weight, and samples that an episode needs.
 _SWEEPS = 30
@@ -29,7 +32,8 @@ def regress(box: Box, degree: int, features: Array, inputs: Array, rates: Array,
 
     Features (K, 1 + m), inputs (K, n_u) and rates (K, n_x), or integrals of them, in deviations.
 
-    :param B: (n_x, n_u) scaled, where it is known; None to fit it.
+    :param B: (n_x, n_u) scaled, where it is known; None to fit it. Inputs and it may have more
+        columns, see :class:`DriftModel`.
     :raises ValueError: when the samples do not determine the coefficients.
     """
     if B is not None:
@@ -47,22 +51,24 @@ def regress(box: Box, degree: int, features: Array, inputs: Array, rates: Array,
 
 
 def weak_form(episodes: Sequence[Episode], box: Box, degree: int, B: Array | None,
-              window: int) -> DriftModel:
+              window: int, input_degree: int = 0) -> DriftModel:
     """
-    Fit the drift to -integral(phi' x) = integral(phi f(x)) + B integral(phi u).
+    Fit the drift to -integral(phi' x) = integral(phi f(x)) + integral(phi B(x) u).
 
     phi = (1 - s^2)^3 on windows that overlap by three quarters; x enters as measured. (Weak SINDy:
     Messenger and Bortz 2021.)
 
-    :param B: (n_x, n_u) scaled, or None to learn it.
+    :param B: weights of the inputs as :class:`DriftModel` has them, or None to learn them.
     :param window: samples of a window, at least 4.
+    :param input_degree: of the polynomial B(x) that is learned.
     :raises ValueError: when the window or the episodes are too short.
     """
     if window < _NARROWEST:
         raise ValueError(f'a window of {window} samples is too short, at least {_NARROWEST} are '
                          'needed')
     n_x, n_u = episodes[0].x.shape[1], episodes[0].u.shape[1]
-    shape = DriftModel(box, degree, np.empty(0), np.empty((n_x, n_u)))
+    shape = DriftModel(box, degree, np.empty(0), np.empty((n_x, n_u)) if B is None else B)
+    input_degree = input_degree if B is None else shape.input_degree
     features, inputs, rates = [], [], []
     for episode in episodes:
         xi = box.states.to_deviation(episode.x)
@@ -77,7 +83,8 @@ def weak_form(episodes: Sequence[Episode], box: Box, degree: int, B: Array | Non
             weights = _trapezoid(t)
             features.append((weights * phi) @ P[rows])
             rates.append(-(weights * slope) @ xi[rows])
-            inputs.append(_input_integral(episode, box, middle, half))
+            inputs.append(_product_integral(episode, box, middle, half, input_degree)
+                          if input_degree else _input_integral(episode, box, middle, half))
     if not features:
         raise ValueError(f'no episode has {window} samples: record longer')
     return regress(box, degree, np.array(features), np.array(inputs), np.array(rates), B)
@@ -98,6 +105,22 @@ def _input_integral(episode: Episode, box: Box, middle: float, half: float) -> A
     once, twice = _antiderivatives(s)
     area = np.diff(once)
     return half * (area @ begin + (once[1:] - np.diff(twice) / np.diff(s)) @ (end - begin))
+
+
+def _product_integral(episode: Episode, box: Box, middle: float, half: float, degree: int
+                      ) -> Array:
+    """Integrate phi times the scaled input and its products with monomials, x as interpolated."""
+    t = np.union1d(episode.time, episode.input_time)
+    edges = np.unique(np.clip(t, middle - half, middle + half))
+    begin, end = map(box.inputs.to_deviation, episode.inputs_between(edges))
+    share = _NODES[:, None]
+    times = edges[:-1] + share * np.diff(edges)
+    s = (times - middle) / half
+    weights = _WEIGHTS[:, None] * np.diff(edges) * (1.0 - s * s) ** _POWER
+    x = np.stack([np.interp(times, episode.time, column) for column in episode.x.T], axis=-1)
+    products = InputTerms.regressors(box.states.to_deviation(x),
+                                     begin + share[..., None] * (end - begin), degree)
+    return np.einsum('nk,nkj->j', weights, products)
 
 
 def _antiderivatives(s: Array) -> tuple[Array, Array]:
@@ -121,6 +144,8 @@ def total_variation(episodes: Sequence[Episode], box: Box, degree: int, B: Array
     """
     if assumed is None:
         raise ValueError('total variation needs a rough B: take one from the weak form')
+    if assumed.shape[1] != len(box.inputs):
+        raise ValueError('total variation needs a constant B: take the weak form')
     shape = DriftModel(box, degree, np.empty(0), assumed)
     features, inputs, rates = [], [], []
     for episode in episodes:
@@ -151,7 +176,8 @@ def noise_level(episodes: Sequence[Episode], model: DriftModel) -> Array:
     found = []
     for episode in episodes:
         if len(episode) >= _SHORTEST:
-            rest = model.box.states.to_deviation(episode.x) - _moved(episode, model.box, model.B)
+            rest = model.box.states.to_deviation(episode.x) - _moved(episode, model.box,
+                                                                     model.scaled_input_matrix(np.zeros(len(model.B))))
             D = _third_differences(episode.time)
             found.append([_noise(D, rest[:, j]) for j in range(rest.shape[1])])
     if not found:

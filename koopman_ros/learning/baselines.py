@@ -10,6 +10,7 @@ import torch
 
 from koopman_ros import __version__
 from koopman_ros.learning.growth import Grown, Monitor
+from koopman_ros.learning.inputs import InputModel
 from koopman_ros.learning.levenberg_marquardt import minimise, MinimumStatus
 from koopman_ros.learning.network import check_activation, Layout
 from koopman_ros.learning.residuals import deviations, Problem, ResidualWeights, ScaledSamples
@@ -102,10 +103,9 @@ class Linearisation:
 
     def learn(self, plant: Plant, samples: Samples, box: Box | None = None) -> LiftedModel:
         """Return the model in a box, the samples' by default; ValueError when B is unknown."""
-        if plant.B is None:
-            raise ValueError('a linearisation needs the B of the plant')
         box = box or Box.of(plant, samples.x, samples.u)
-        return linearised_model(self.jacobian, plant.B, box.states, box.inputs,
+        B = plant.input_matrix(plant.nominal_state)
+        return linearised_model(self.jacobian, B, box.states, box.inputs,
                                 box.time_unit, _provenance(plant, samples))
 
 
@@ -114,7 +114,7 @@ class Edmd:
     """
     Extended dynamic mode decomposition of the generator, with inputs, on monomials.
 
-    dz/dt = A z + J(x) B u by linear least squares on J (dx/dt - B u), z all monomials of the
+    dz/dt = A z + J(x) B(x) u by linear least squares on J (dx/dt - B(x) u), z all monomials of the
     scaled states up to a degree; degree 1 is the linear model that fits the samples best. The
     drift is read off the rows of the states, which are a fit to dx/dt by itself. Where B is not
     known it comes from them, too. (Williams, Kevrekidis, Rowley 2015;
@@ -129,16 +129,19 @@ class Edmd:
         x, rate, u = deviations(box, samples)
         observables = PolynomialObservables.total_degree(x.shape[1], self.degree)
         z, J = observables.lift_and_jacobian(x)
-        if plant.B is None:
-            both = np.linalg.lstsq(np.hstack([z, u]), rate, rcond=None)[0]
-            B = both[z.shape[1]:].T
-        else:
-            B = box.input_matrix(plant.B)
-        drift = (J @ (rate - u @ B.T)[..., None])[..., 0]
-        A = np.linalg.lstsq(z, drift, rcond=None)[0].T.astype(np.float64)
-        return LiftedModel(observables, A, B.astype(np.float64),
-                           box.states, box.inputs, box.time_unit,
-                           _provenance(plant, samples), readout=A[:x.shape[1]])
+        inputs = InputModel.of(plant, box, samples.x)
+        drift, regressors = inputs.apart(x, rate, u)
+        learned = None
+        if regressors is not None:
+            both = np.linalg.lstsq(np.hstack([z, regressors]), rate, rcond=None)[0]
+            learned = both[z.shape[1]:].T.astype(np.float64)
+            drift = rate - regressors @ learned.T
+        B, terms = inputs.matrix(learned)
+        z_rate = (J @ drift[..., None])[..., 0]
+        A = np.linalg.lstsq(z, z_rate, rcond=None)[0].T.astype(np.float64)
+        return LiftedModel(observables, A, B, box.states, box.inputs, box.time_unit,
+                           _provenance(plant, samples), readout=A[:x.shape[1]],
+                           input_terms=terms)
 
 
 def _provenance(plant: Plant, samples: Samples) -> Provenance:

@@ -7,6 +7,7 @@ import math
 
 import numpy as np
 
+from koopman_ros.learning.inputs import InputModel
 from koopman_ros.learning.residuals import deviations
 from koopman_ros.lifting import Box, Coordinates, PolynomialObservables
 from koopman_ros.plant_data import Array, Plant, Samples
@@ -48,7 +49,9 @@ def check_rates(plant: Plant, samples: Samples) -> None:
     begin, end = (samples.dxdt[order][rows][within] for rows in (slice(-1), slice(1, None)))
     if plant.B is not None:
         # under the input of the step, not of the next one
-        end = end - np.diff(samples.u[order], axis=0)[within] @ plant.B.T
+        change = np.diff(samples.u[order], axis=0)[within]
+        B = plant.input_matrix(samples.x[order][1:][within])
+        end = end - (B @ change[..., None])[..., 0]
     for i, name in enumerate(plant.state_names):
         first, last = begin[:, i], end[:, i]
         alike = (first * last > 0.0) & (np.abs(first) < _ALIKE * np.abs(last)) & (
@@ -88,8 +91,9 @@ def check_nominal_point(plant: Plant, samples: Samples, box: Box) -> None:
     rows = np.linspace(0, len(x) - 1, min(len(x), _ROWS)).astype(int)
     x, rate, u = x[rows], rate[rows], u[rows]
     n_x = x.shape[1]
-    if plant.B is not None:
-        rate, u = rate - u @ box.input_matrix(plant.B).T, u[:, :0]
+    inputs = InputModel.of(plant, box, samples.x[rows])
+    rate, regressors = inputs.apart(x, rate, u)
+    u = u[:, :0] if regressors is None else regressors
     fits = []
     for degree in _DEGREES:
         monomials = PolynomialObservables.total_degree(n_x, degree)
@@ -115,15 +119,18 @@ def check_nominal_point(plant: Plant, samples: Samples, box: Box) -> None:
         np.abs(drift) > _MISFITS * np.abs(np.mean(nearest, axis=0)))
     if not moves.any():
         return
-    B = solution[1:1 + u.shape[1]].T if plant.B is None else box.input_matrix(plant.B)
+    B, terms = inputs.matrix(solution[1:1 + u.shape[1]].T if plant.B is None else None)
     coefficients = solution[1 + u.shape[1]:]
     y = np.zeros(n_x + B.shape[1])
     held = np.linalg.matrix_rank(B) == n_x
     for _ in range(_NEWTON_STEPS):
         z, J = monomials.lift_and_jacobian(y[:n_x])
+        here = B if terms is None else B + terms.matrix(y[:n_x])
         slope = 0.0 * B[:, :0] if held else coefficients.T @ J
-        step = np.linalg.pinv(np.hstack([slope, B])) @ (
-            drift + coefficients.T @ z + B @ y[n_x:])
+        if terms is not None and not held:
+            slope = slope + terms.jacobian(y[:n_x], y[n_x:])
+        step = np.linalg.pinv(np.hstack([slope, here])) @ (
+            drift + coefficients.T @ z + here @ y[n_x:])
         y[n_x if held else 0:] -= step
         if not np.max(np.abs(y), initial=0.0) <= 2.0 or np.max(np.abs(step), initial=0.0) < 1e-9:
             break

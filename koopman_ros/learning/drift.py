@@ -34,8 +34,10 @@ def with_readout(model: LiftedModel, samples: Samples, smallest: float = SMALLES
 
     :param smallest: share of the largest singular value below which a direction is left out.
     """
-    phi = model.observables.features.lift(model.states.to_deviation(samples.x))
-    f = samples.dxdt / model.states.scale - model.inputs.to_deviation(samples.u) @ model.B.T
+    x = model.states.to_deviation(samples.x)
+    phi = model.observables.features.lift(x)
+    f = samples.dxdt / model.states.scale - model.forcing(
+        x, model.inputs.to_deviation(samples.u))
     # each feature in units of its size; one that is 0 on all samples gets no weight
     size = np.sqrt(np.mean(phi ** 2, axis=0))
     unit = np.divide(1.0, size, out=np.zeros_like(size), where=size > 0.0)

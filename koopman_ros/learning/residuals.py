@@ -28,8 +28,10 @@ class ScaledSamples:
     """Samples in the scaled deviations from the nominal point that a lift is learned from."""
 
     x: Tensor  #: (N, n_x) states, float64
-    f: Tensor  #: (N, n_x) rates dx/dt, less B u where B is known
-    u: Tensor | None = None  #: (N, n_u) inputs whose B is to be learned, or None where it is known
+    f: Tensor  #: (N, n_x) rates dx/dt, less B(x) u where it is known
+    #: (N, n_u) inputs whose B is to be learned, and their products with monomials of the state
+    #: where it depends on that; None where B is known
+    u: Tensor | None = None
 
     def drift(self, B: Tensor | None) -> Tensor:
         """Return the rates without what the inputs do, (N, n_x)."""

@@ -25,6 +25,7 @@ from koopman_ros.learning.baselines import Algorithm1, Edmd
 from koopman_ros.learning.contradictions import check_nominal_point, check_rates
 from koopman_ros.learning.drift import NeuralDrift, SMALLEST, with_readout
 from koopman_ros.learning.growth import Grown, Growth, Monitor
+from koopman_ros.learning.inputs import InputModel
 from koopman_ros.learning.levenberg_marquardt import MinimumStatus, PATIENCE
 from koopman_ros.learning.residuals import deviations, ScaledSamples
 from koopman_ros.learning.validation import evaluate, Figures, Fit, fit, lifted_rate, ROUNDING
@@ -308,17 +309,20 @@ class _Assembly:
         _, rate, _ = deviations(self.box, self.samples)
         return float(np.sqrt(np.mean(rate ** 2))) or 1.0
 
+    @cached_property
+    def inputs(self) -> InputModel:
+        """What is known of B."""
+        return InputModel.of(self.plant, self.box, self.samples.x)
+
     def data(self, device: str) -> ScaledSamples:
         x, rate, u = deviations(self.box, self.samples)
-        arrays = (x, rate / self.pace, u) if self.plant.B is None else (
-            x, (rate - u @ self.box.input_matrix(self.plant.B).T) / self.pace)
+        f, regressors = self.inputs.apart(x, rate, u)
+        arrays = (x, f / self.pace, *([] if regressors is None else [regressors]))
         return ScaledSamples(*(torch.from_numpy(a).to(device) for a in arrays))
 
     def model(self, grown: Grown) -> LiftedModel:
         parts = grown.layout.split(grown.theta.cpu())
-        B = np.zeros((grown.layout.n_x, 0)) if parts.B is None else self.pace * parts.B.numpy()
-        if self.plant.B is not None:
-            B = self.box.input_matrix(self.plant.B)
+        B, terms = self.inputs.matrix(None if parts.B is None else self.pace * parts.B.numpy())
         alone = grown.drift_alone
         observables = NetworkObservables(
             tuple((W.numpy(), b.numpy()) for W, b in parts.hidden),
@@ -326,7 +330,8 @@ class _Assembly:
             grown.layout.activation)
         origin = Provenance(self.plant.name, self.seed, self.digest, {}, __version__)
         return LiftedModel(observables, self.pace * parts.A.numpy(), B, self.box.states,
-                           self.box.inputs, self.box.time_unit, origin, self.training_states)
+                           self.box.inputs, self.box.time_unit, origin, self.training_states,
+                           input_terms=terms)
 
 
 def _run_starts(recipe: Recipe, data: ScaledSamples, n_z: int, parent: Grown | None, seed: int,

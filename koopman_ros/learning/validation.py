@@ -26,7 +26,7 @@ _DIVERGED = 1e6
 
 @dataclass(frozen=True)
 class Fit:
-    """Residuals of a lift in dz/dt = A z + J_N(x) B u on samples."""
+    """Residuals of a lift in dz/dt = A z + J_N(x) B(x) u on samples."""
 
     #: ||(J_N f - A N) S^(-1/2)||^2 / ||J_N f S^(-1/2)||^2 with S = E[z z'], invariant under linear
     #: maps of z, so that it cannot be lowered by shrinking z
@@ -75,8 +75,8 @@ def fit(model: LiftedModel, x: Array, dxdt: Array, u: Array) -> Fit:
     """
     x, dxdt = (model.states.array(name, a) for name, a in (('x', x), ('dxdt', dxdt)))
     xi = model.states.to_deviation(x)
-    f = dxdt / model.states.scale - (
-        model.inputs.to_deviation(model.inputs.array('u', u)) @ model.B.T)
+    f = dxdt / model.states.scale - model.forcing(
+        xi, model.inputs.to_deviation(model.inputs.array('u', u)))
     z, J = model.lift_and_jacobian(xi)
     dz = (J @ f[..., None])[..., 0]
     S = z.T @ z / len(z)
@@ -95,7 +95,7 @@ def fit(model: LiftedModel, x: Array, dxdt: Array, u: Array) -> Fit:
 
 def roll_out(model: LiftedModel, x0: Array, inputs: Array, sample_period: float | Array) -> Array:
     """
-    Predict the states under inputs that are held, from the model's drift: dx/dt = f(x) + B u.
+    Predict the states under inputs that are held, from the model's drift: dx/dt = f(x) + B(x) u.
 
     :param x0: (..., n_x) start, in state units; leading dimensions are predicted side by side.
     :param inputs: (..., K, n_u) inputs, each held for one sample period, in input units.
@@ -115,15 +115,15 @@ def roll_out(model: LiftedModel, x0: Array, inputs: Array, sample_period: float 
     if periods.shape not in ((), (holds,)) or not np.all(periods > 0.0):
         raise ValueError(f'sample_period must be above 0 {model.time_unit}, one number or one for '
                          f'each of {holds} inputs, got {sample_period}')
-    forcing = model.inputs.to_deviation(inputs) @ model.B.T
+    v = model.inputs.to_deviation(inputs)
     path = [xi]
     for k, period in enumerate(np.broadcast_to(periods, (holds,))):
         # a prediction that overflows is reported below
         with np.errstate(all='ignore'):
+            rate = model.rate_under(v[..., k, :])
             solver = DOP853(
-                lambda _, y, held=forcing[..., k, :]: (
-                    model.drift(y.reshape(shape)) + held).ravel(),
-                0.0, xi.ravel(), period, rtol=1e-9, atol=1e-12)
+                lambda _, y, rate=rate: rate(y.reshape(shape)).ravel(), 0.0, xi.ravel(), period,
+                rtol=1e-9, atol=1e-12)
             # near a state where J_N is singular the steps may become ever shorter
             while solver.status == 'running' and solver.nfev < _MAX_DRIFTS:
                 solver.step()
@@ -174,9 +174,9 @@ def lifted_rate(model: LiftedModel, time_unit_seconds: float) -> Rate:
     def rate(x: Array, u: Array) -> Array:
         xi = model.states.to_deviation(x)
         followed = np.all(np.abs(xi) < _DIVERGED, axis=-1, keepdims=True)
-        drift = np.where(followed, model.drift(np.where(followed, xi, 0.0)), np.nan)
-        forcing = model.inputs.to_deviation(u) @ model.B.T
-        scaled: Array = factor * model.states.scale * (drift + forcing)
+        xi = np.where(followed, xi, 0.0)
+        found = model.drift(xi) + model.forcing(xi, model.inputs.to_deviation(u))
+        scaled: Array = factor * model.states.scale * np.where(followed, found, np.nan)
         return scaled
 
     return rate

@@ -18,6 +18,7 @@ import numpy as np
 from koopman_ros.lifting import bounds
 from koopman_ros.lifting.activations import activation_named
 from koopman_ros.lifting.coordinates import Coordinates, TrainingStates
+from koopman_ros.lifting.input_terms import InputTerms
 from koopman_ros.lifting.model import LiftedModel, Provenance
 from koopman_ros.lifting.observables import NetworkObservables, PolynomialObservables
 
@@ -63,6 +64,9 @@ def save(model: LiftedModel, path: str | os.PathLike[str]) -> None:
         tensors['training_states'] = known.states
     if model.readout is not None:
         tensors['readout'] = model.readout
+    if model.input_terms is not None:
+        C = model.input_terms.coefficients
+        tensors['input_terms'] = C.reshape(len(C), -1)
     description = json.dumps({
         **network,
         **({'fill_distance': known.fill_distance} if known is not None else {}),
@@ -125,7 +129,7 @@ def load_with_digest(path: str | os.PathLike[str]) -> tuple[LiftedModel, str]:
         raise ModelFileError(
             f'the model file {path} has format version {version!r}, this package reads '
             f'{FORMAT_VERSION}: retrain the model, or install the matching package')
-    if len(header) > 2 * bounds.MAX_LAYERS + 5:
+    if len(header) > 2 * bounds.MAX_LAYERS + 6:
         _refuse(path, f'it holds {len(header)} arrays, more than any lift')
     tensors = {name: _tensor(path, name, entry, data) for name, entry in header.items()}
     try:
@@ -155,8 +159,8 @@ def _build(about: dict[str, Any], tensors: dict[str, np.ndarray]) -> LiftedModel
         f'hidden.{i}.{part}' for i in range(layers) for part in ('weight', 'bias')}
     if 'fill_distance' in about:
         expected.add('training_states')
-    # files without one are of lifts whose drift is read off the rate of z
-    expected |= {'readout'} & set(tensors)
+    # files without them are of lifts whose drift is read off the rate of z, whose B is constant
+    expected |= {'readout', 'input_terms'} & set(tensors)
     if set(tensors) != expected:
         raise ValueError(f'expected the arrays {sorted(expected)}, got {sorted(tensors)}')
     if not monomials and not isinstance(about['identity'], bool):
@@ -184,7 +188,9 @@ def _build(about: dict[str, Any], tensors: dict[str, np.ndarray]) -> LiftedModel
             method=origin.get('method', '')),
         training_states=None if 'fill_distance' not in about else TrainingStates(
             tensors['training_states'], float(filled)),
-        readout=tensors.get('readout'))
+        readout=tensors.get('readout'),
+        input_terms=None if 'input_terms' not in tensors else InputTerms(
+            tensors['input_terms'].reshape(len(tensors['input_terms']), *tensors['B'].shape)))
     for name, actual in (('n_x', model.n_x), ('n_u', model.n_u), ('n_z', model.n_z)):
         if _integer(about, name) != actual:
             raise ValueError(f'{name} is given as {about[name]}, the arrays say {actual}')

@@ -46,6 +46,10 @@ def check(model: LiftedModel) -> None:
                   ('the number of weights', weights, MAX_WEIGHTS)]
     elif isinstance(network, PolynomialObservables):
         sizes += [('the degree', int(np.max(np.sum(network.exponents, axis=1))), MAX_DEGREE)]
+    if model.input_terms is not None:
+        sizes += [('the degree of the input matrix', model.input_terms.degree, MAX_DEGREE),
+                  ('the size of the input matrix', model.input_terms.coefficients.size,
+                   MAX_WEIGHTS)]
     for name, size, limit in sizes:
         if size > limit:
             raise ValueError(f'{name} is {size}, at most {limit} can be controlled with')

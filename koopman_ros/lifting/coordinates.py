@@ -151,9 +151,9 @@ class Box:
         return Box(states, inputs, plant.time_unit)
 
     def input_matrix(self, B: Array) -> Array:
-        """Scale B (n_x, n_u) from units to deviations; raise ValueError for another shape."""
+        """Scale B (..., n_x, n_u) from units to deviations; raise ValueError for another shape."""
         n_x, n_u = len(self.states), len(self.inputs)
-        if np.shape(B) != (n_x, n_u):
+        if np.shape(B)[-2:] != (n_x, n_u):
             raise ValueError(f'incompatible B: expected {(n_x, n_u)}, got {np.shape(B)}')
         return np.asarray(B) * self.inputs.scale / self.states.scale[:, None]
 

@@ -5,7 +5,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 
@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 
 from koopman_ros.arrays import Array, brief, frozen
 from koopman_ros.lifting.coordinates import Coordinates, TrainingStates
+from koopman_ros.lifting.input_terms import InputTerms
 from koopman_ros.lifting.observables import NetworkObservables, Observables
 from koopman_ros.plant_data import Plant
 from koopman_ros.units import check_time_unit, SECONDS_PER_TIME_UNIT
@@ -45,7 +46,9 @@ class Provenance:
 @dataclass(frozen=True)
 class LiftedModel:
     """
-    A lift z = N(x) with dz/dt = A z + J_N(x) B u (paper, equation for control-affine systems).
+    A lift z = N(x) with dz/dt = A z + J_N(x) B(x) u (paper, equation for control-affine systems).
+
+    B is constant but where there are `input_terms`.
 
     All methods work in scaled deviations from the nominal point (see :class:`Coordinates`),
     with time in `time_unit`. With a network without hidden layers it is a linearisation.
@@ -55,7 +58,7 @@ class LiftedModel:
 
     observables: Observables  #: the lift N, with N(0) = 0
     A: Array  #: (n_z, n_z) in 1/time unit
-    B: Array  #: (n_x, n_u) in scaled coordinates
+    B: Array  #: (n_x, n_u) in scaled coordinates, at the nominal point
     states: Coordinates  #: the states' names, units, scaling and training box
     inputs: Coordinates  #: the inputs' names, units, scaling and training box
     time_unit: str  #: ``'s'`` or ``'min'``
@@ -65,6 +68,7 @@ class LiftedModel:
     #: (n_x, n_phi) weights of the features phi in the drift, in 1/time unit; None where it is read
     #: off the rate of z
     readout: Array | None = None
+    input_terms: InputTerms | None = None  #: what B(x) has beside B; None where it is constant
 
     __repr__ = brief
 
@@ -78,6 +82,10 @@ class LiftedModel:
         if self.readout is not None:
             shape = (n_x, self.observables.features.n_z)
             object.__setattr__(self, 'readout', frozen(self.readout, 'readout', shape))
+        if self.input_terms is not None and (
+                self.input_terms.coefficients.shape[1:] != self.B.shape):
+            raise ValueError(f'incompatible input terms: expected {("any", *self.B.shape)}, got '
+                             f'{self.input_terms.coefficients.shape}')
         if self.training_states is not None and self.training_states.states.shape[1] != n_x:
             raise ValueError(f'incompatible training_states: expected {n_x} states, got '
                              f'{self.training_states.states.shape[1]}')
@@ -159,13 +167,47 @@ class LiftedModel:
         return float(np.sum(rest @ whitening * rest)) / size if size > 0.0 else 0.0
 
     @cached_property
-    def input_inverse(self) -> Array:
-        """The pseudo-inverse (n_u, n_x) of B."""
+    def _nominal_inverse(self) -> Array:
         return frozen(np.linalg.pinv(self.B), 'inverse of B', (self.n_u, self.n_x))
+
+    def input_inverse(self, x: Array | None = None) -> Array:
+        """Return the pseudo-inverse (n_u, n_x) of B(x) at a state (n_x,), or the nominal one."""
+        if x is None or self.input_terms is None:
+            return self._nominal_inverse
+        return np.asarray(np.linalg.pinv(self.input_matrix(x)), dtype=np.float64)
+
+    def input_matrix(self, x: Array) -> Array:
+        """Evaluate B(x): (..., n_x) -> (..., n_x, n_u); one (n_x, n_u) where it is constant."""
+        return self.B if self.input_terms is None else self.B + self.input_terms.matrix(x)
+
+    def forcing(self, x: Array, u: Array) -> Array:
+        """Evaluate B(x) u, what inputs add to the rate: (..., n_x), (..., n_u) -> (..., n_x)."""
+        if self.input_terms is not None:
+            return (self.input_matrix(x) @ u[..., None])[..., 0]
+        # dot takes a third of the time of @ here
+        return self.B.dot(u) if u.ndim == 1 else u @ self.B.T
+
+    def forcing_jacobian(self, x: Array, u: Array) -> Array:
+        """Evaluate d(B(x) u)/dx, (..., n_x), (..., n_u) -> (..., n_x, n_x); 0 for a constant B."""
+        if self.input_terms is None:
+            return np.zeros((self.n_x, self.n_x))
+        return self.input_terms.jacobian(x, u)
+
+    def rate_under(self, u: Array, w: Array | float = 0.0) -> Callable[[Array], Array]:
+        """
+        Return the rate of the state under a held input, x -> f(x) + B(x) u + w.
+
+        :param u: (..., n_u) scaled deviations.
+        :param w: (..., n_x) disturbance.
+        """
+        if self.input_terms is not None:
+            return lambda x: self.drift(x) + self.forcing(x, u) + w
+        constant = (self.B.dot(u) if u.ndim == 1 else u @ self.B.T) + w
+        return lambda x: self.drift(x) + constant
 
     @cached_property
     def linearised(self) -> LiftedModel:
-        """The model linearised at its nominal point: dx/dt = (df/dx)(0) x + B u, f its drift."""
+        """The model linearised at its nominal point: dx/dt = (df/dx)(0) x + B(0) u."""
         origin = np.zeros(self.n_x)
         if self.readout is None:
             # exact, as N(0) = 0
@@ -174,7 +216,8 @@ class LiftedModel:
         else:
             slope = self.drift_jacobian(origin)
         observables = NetworkObservables((), np.zeros((0, self.n_x)), identity=True)
-        return replace(self, observables=observables, A=slope, readout=None)
+        return replace(self, observables=observables, A=slope, readout=None,
+                       input_terms=None)
 
     def distance(self, x: Array) -> float:
         """

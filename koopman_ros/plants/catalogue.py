@@ -17,6 +17,7 @@ _LIBRARY = 'koopman_ros.plants.library'
 PLANTS = {
     'reactor': f'{_LIBRARY}.reactor:OneStateReactor',
     'two_state': f'{_LIBRARY}.reactor:TwoStateReactor',
+    'fed_reactor': f'{_LIBRARY}.reactor:FedReactor',
     'two_state_example': f'{_LIBRARY}.two_state:TwoStateExample',
     'two_tanks': f'{_LIBRARY}.two_tanks:TwoTanks',
     'quadruple_tank': f'{_LIBRARY}.quadruple_tank:QuadrupleTank',

@@ -60,14 +60,15 @@ def linear_law(task: Task) -> Course:
     states at the set-point.
     """
     system = task.system
-    A, weighted = system.drift_jacobian(system.nominal_state), task.Q > 0.0
+    A, weighted = system.slope(system.nominal_state, system.nominal_input), task.Q > 0.0
+    B = system.input_matrix(system.nominal_state)
     C = np.eye(system.n_x)[weighted]
     # in units of the states, which matter where no input holds them all
     unit = np.concatenate([system.state_scale, system.state_scale[weighted]])
-    held_so = np.block([[A, system.B], [C, np.zeros((len(C), system.n_u))]]) / unit[:, None]
+    held_so = np.block([[A, B], [C, np.zeros((len(C), system.n_u))]]) / unit[:, None]
     offset = np.concatenate([np.zeros(system.n_x), C @ (task.x_ref - system.nominal_state)])
     x, u = np.split(np.linalg.lstsq(held_so, offset / unit, rcond=None)[0], [system.n_x])
-    K = solve_riccati(A, system.B, np.diag(task.Q), np.diag(task.R)).K
+    K = solve_riccati(A, B, np.diag(task.Q), np.diag(task.R)).K
     return _constant_law(task, system.nominal_input + u, K, system.nominal_state + x)
 
 
@@ -81,9 +82,9 @@ def optimum(task: Task) -> Course:
     :raises ValueError: when that law loses the plant, or the iteration does not end.
     """
     system = task.system
-    riccati = solve_riccati(system.drift_jacobian(task.x_ref), system.B, np.diag(task.Q),
-                            np.diag(task.R))
-    K = riccati.K if riccati.status is RiccatiStatus.SOLVED else np.zeros_like(system.B.T)
+    riccati = solve_riccati(system.slope(task.x_ref, task.u_ref), system.input_matrix(task.x_ref),
+                            np.diag(task.Q), np.diag(task.R))
+    K = riccati.K if riccati.status is RiccatiStatus.SOLVED else np.zeros_like(riccati.K)
     course = _constant_law(task, task.u_ref, K, task.x_ref)
     if not math.isfinite(course.cost):
         raise ValueError(f'{system.name}: the linear law does not hold the plant from '
@@ -123,13 +124,12 @@ def _roll_out(task: Task, inputs: Array, K: Array, about: Array) -> Course:
 
 def _after_a_period(task: Task, y: Array, u: Array) -> Array:
     """Return states with the cost so far (..., n_x + 1) a period later, u (..., n_u) held."""
-    forcing = u @ task.system.B.T
     effort = (u - task.u_ref) ** 2 @ task.R
 
     def rate(y: Array) -> Array:
         x = y[..., :-1]
         cost = (x - task.x_ref) ** 2 @ task.Q + effort
-        return np.concatenate([task.system.drift(x) + forcing, cost[..., None]], axis=-1)
+        return np.concatenate([task.system.derivative(x, u), cost[..., None]], axis=-1)
 
     for _ in range(task.substeps):
         y = runge_kutta_step(rate, y, task.period / task.substeps)
@@ -165,14 +165,15 @@ def _expansion(task: Task, course: Course) -> tuple[Array, Array, Array]:
     p = n + system.n_u
     effort = np.concatenate([np.zeros((N, n)), 2.0 * task.R * (course.inputs - task.u_ref)], 1)
     weight = np.diag(np.concatenate([np.zeros(n), 2.0 * task.R]))
-    into = np.concatenate([np.zeros((n, n)), system.B], 1)
+    from_input = np.eye(p)[n:]
     ends = np.cumsum([n, n * p, p, p * p])
 
     def rate(y: Array) -> Array:
         x, F = y[:, :n], y[:, ends[0]:ends[1]].reshape(N, n, p)
         QF = 2.0 * task.Q[:, None] * F
         return np.concatenate([part.reshape(N, -1) for part in (
-            system.derivative(x, course.inputs), system.drift_jacobian(x) @ F + into,
+            system.derivative(x, course.inputs),
+            system.slope(x, course.inputs) @ F + system.input_matrix(x) @ from_input,
             np.einsum('kip,ki->kp', QF, x - task.x_ref) + effort,
             F.transpose(0, 2, 1) @ QF + weight)], axis=1)
 

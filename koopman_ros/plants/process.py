@@ -99,7 +99,7 @@ def _moved(system: ControlAffineSystem, x: Array, u: Array, time_ns: int) -> Arr
 
 def _with_input_lag(system: ControlAffineSystem, time_constants: Array) -> ControlAffineSystem:
     """
-    Put a first-order lag before each input: d[x; v]/dt = [f(x) + B v; -v / tau] + [0; u / tau].
+    Put a first-order lag before each input: d[x; v]/dt = [f(x) + B(x) v; -v / tau] + [0; u / tau].
 
     The inputs v that act become states; the time constants tau (n_u,) are in time units. An input
     without one, of which tau is 0, stands still where it is.
@@ -114,8 +114,9 @@ def _with_input_lag(system: ControlAffineSystem, time_constants: Array) -> Contr
 
     def drift_jacobian(state: Array) -> Array:
         jacobian = np.zeros((*state.shape, n_x + n_u))
-        jacobian[..., :n_x, :n_x] = system.drift_jacobian(state[..., :n_x])
-        jacobian[..., :n_x, n_x:] = system.B
+        x, v = state[..., :n_x], state[..., n_x:]
+        jacobian[..., :n_x, :n_x] = system.slope(x, v)
+        jacobian[..., :n_x, n_x:] = system.input_matrix(x)
         jacobian[..., n_x:, n_x:] = -np.diag(rate)
         return jacobian
 

@@ -96,10 +96,10 @@ def hold(system: ControlAffineSystem, start: Array, u: Array, duration: float,
     :return: the state at its end (n_x,).
     :raises IntegrationError: when the end is not reached.
     """
-    forcing = u @ system.B.T
+    constant = None if callable(system.B) else u @ system.B.T
 
     def rate(_: float, x: Array) -> Array:
-        return system.drift(x) + forcing
+        return system.drift(x) + (system.forcing(x, u) if constant is None else constant)
 
     def failed(failure: IntegrationFailure, elapsed: float, x: Array) -> IntegrationError:
         return _integration_error(system, limits, failure, start_time + elapsed, x)

@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 The koopman_ros Authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""The control-affine system dx/dt = f(x) + B u that every plant is, and its holding inputs."""
+"""The control-affine system dx/dt = f(x) + B(x) u that every plant is, and its holding inputs."""
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
@@ -15,6 +15,9 @@ from koopman_ros.units import SECONDS_PER_TIME_UNIT
 
 ArrayFunction = Callable[[Array], Array]
 
+# Of each state, by which B(x) is differentiated: rounding and curvature both leave about ten
+# digits.
+_DIFFERENCE = 1e-5
 _NEWTON_STEPS = 50  # which are quick, and more than a plant near its nominal point needs
 
 
@@ -28,7 +31,7 @@ def checked_vector(name: str, value: ArrayLike, length: int, *, finite: bool = T
 @dataclass(frozen=True, eq=False)
 class ControlAffineSystem:
     """
-    A plant dx/dt = f(x) + B u (paper, eq. 22), with names, units and a nominal point.
+    A plant dx/dt = f(x) + B(x) u (paper, eq. 22), with names, units and a nominal point.
 
     :raises ValueError: when a shape, a unit or a bound does not fit, naming it.
     """
@@ -43,7 +46,8 @@ class ControlAffineSystem:
     drift: ArrayFunction = field(repr=False)  #: f, states (..., n_x) to rates (..., n_x)
     #: df/dx, states (..., n_x) to (..., n_x, n_x)
     drift_jacobian: ArrayFunction = field(repr=False)
-    B: Array  #: input matrix (n_x, n_u)
+    #: input matrix (n_x, n_u), or a function of states (..., n_x) to (..., n_x, n_u)
+    B: Array | ArrayFunction
     nominal_state: Array  #: the point (n_x,) that deviations are measured from
     nominal_input: Array  #: the input (n_u,) that goes with it
     #: lowest states (n_x,) at which the model means anything; none by default
@@ -67,7 +71,8 @@ class ControlAffineSystem:
                                  f'got ({len(units)},)')
         if not self.state_names:
             raise ValueError('state_names is empty, a system has at least one state')
-        object.__setattr__(self, 'B', frozen(self.B, 'B', (self.n_x, self.n_u)))
+        if not callable(self.B):
+            object.__setattr__(self, 'B', frozen(self.B, 'B', (self.n_x, self.n_u)))
         for name, checked in (
                 ('nominal_state', self.checked_state), ('nominal_input', self.checked_input),
                 ('state_lower', self.checked_bound), ('state_upper', self.checked_bound)):
@@ -81,6 +86,7 @@ class ControlAffineSystem:
             for name, function, expected in (
                 ('drift(x)', self.drift, state.shape),
                 ('drift_jacobian(x)', self.drift_jacobian, (*state.shape, self.n_x)),
+                ('B(x)', self.input_matrix, (*state.shape, self.n_u)),
             ):
                 got = np.shape(function(state))
                 if got != expected:
@@ -110,13 +116,37 @@ class ControlAffineSystem:
         return np.where(magnitude > 0.0, magnitude, 1.0)
 
     def derivative(self, x: ArrayLike, u: ArrayLike) -> Array:
-        """Evaluate dx/dt = f(x) + B u: (..., n_x), (..., n_u) that broadcast -> (..., n_x)."""
+        """Evaluate dx/dt = f(x) + B(x) u: (..., n_x), (..., n_u) that broadcast -> (..., n_x)."""
         x, u = np.asarray(x, dtype=np.float64), np.asarray(u, dtype=np.float64)
         for name, value, length in (('x', x, self.n_x), ('u', u, self.n_u)):
             if value.ndim == 0 or value.shape[-1] != length:
                 raise ValueError(
                     f'incompatible {name}: expected (..., {length}), got {value.shape}')
-        return self.drift(x) + u @ self.B.T
+        return self.drift(x) + self.forcing(x, u)
+
+    def input_matrix(self, x: Array) -> Array:
+        """Evaluate B(x): (..., n_x) -> (..., n_x, n_u)."""
+        if callable(self.B):
+            return np.asarray(self.B(x), dtype=np.float64)
+        return np.broadcast_to(self.B, (*x.shape, self.n_u))
+
+    def forcing(self, x: Array, u: Array) -> Array:
+        """Evaluate B(x) u: (..., n_x), (..., n_u) that broadcast -> (..., n_x)."""
+        if callable(self.B):
+            return (self.input_matrix(x) @ u[..., None])[..., 0]
+        return u @ self.B.T
+
+    def slope(self, x: Array, u: Array) -> Array:
+        """Evaluate d(f(x) + B(x) u)/dx: (..., n_x), (..., n_u) -> (..., n_x, n_x)."""
+        slope = self.drift_jacobian(x)
+        if not callable(self.B):
+            return slope
+        # of B by central differences
+        steps = _DIFFERENCE * np.diag(self.state_scale)
+        ahead, behind = (self.forcing(x[..., None, :] + sign * steps, u[..., None, :])
+                         for sign in (1.0, -1.0))
+        columns = (ahead - behind) / (2.0 * _DIFFERENCE * self.state_scale[:, None])
+        return slope + columns.swapaxes(-1, -2)
 
     def checked_state(self, name: str, value: ArrayLike) -> Array:
         """Return `value` as a read-only state (n_x,); raise ValueError naming it if it is none."""
@@ -150,7 +180,7 @@ class EquilibriumError(ValueError):
 
 def equilibrium_input(system: ControlAffineSystem, state: ArrayLike) -> Array:
     """
-    Find the constant input (n_u,) that holds a state (n_x,): B u = -f(x) by least squares.
+    Find the constant input (n_u,) that holds a state (n_x,): B(x) u = -f(x) by least squares.
 
     A state is held when no state variable changes by more than 1e-9 of itself a time unit.
 
@@ -158,7 +188,8 @@ def equilibrium_input(system: ControlAffineSystem, state: ArrayLike) -> Array:
     :raises EquilibriumError: when no input holds that state.
     """
     held = system.checked_state('state', state)
-    u = np.asarray(np.linalg.lstsq(system.B, -system.drift(held), rcond=None)[0], np.float64)
+    u = np.asarray(np.linalg.lstsq(
+        system.input_matrix(held), -system.drift(held), rcond=None)[0], np.float64)
     rate = system.derivative(held, u)
     magnitude = np.where(held != 0.0, np.abs(held), system.state_scale)
     worst = int(np.argmax(np.abs(rate) / magnitude))
@@ -189,7 +220,7 @@ def steady_state(system: ControlAffineSystem, wanted: Mapping[str, float]
     x[held] = [wanted[name] for name in system.state_names if name in wanted]
     others = np.eye(system.n_x)[:, ~held]
     for _ in range(_NEWTON_STEPS):
-        slope = np.hstack([system.drift_jacobian(x) @ others, system.B])
+        slope = np.hstack([system.slope(x, u) @ others, system.input_matrix(x)])
         change = np.linalg.lstsq(slope, -system.derivative(x, u), rcond=None)[0]
         x = x + others @ change[:others.shape[1]]
         u = u + change[others.shape[1]:]

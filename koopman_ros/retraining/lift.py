@@ -111,11 +111,11 @@ def steady_point(drift: DriftModel, x: Array, u: Array) -> tuple[Array, Array]:
     box = drift.box
     xi, v = box.states.to_deviation(x), box.inputs.to_deviation(u)
     n_x = len(xi)
-    held = np.linalg.matrix_rank(drift.B) == n_x
+    held = np.linalg.matrix_rank(drift.scaled_input_matrix(xi)) == n_x
     for _ in range(50):
         rate = drift.scaled_rate(xi, v)
-        slope = drift.scaled_slope(xi)
-        change = -np.linalg.pinv(np.hstack([0.0 * slope if held else slope, drift.B])) @ rate
+        slope, B = drift.scaled_slope(xi, v), drift.scaled_input_matrix(xi)
+        change = -np.linalg.pinv(np.hstack([0.0 * slope if held else slope, B])) @ rate
         xi, v = xi + change[:n_x], v + change[n_x:]
         # far outside, the polynomial means nothing and overflows at last
         if np.max(np.abs(change)) < 1e-13 or np.max(np.abs(xi)) > _LOST:
@@ -142,7 +142,9 @@ def learn_lift(found: Identified, plant: Plant, n_z: int, *, seed: int, starts: 
     x, u = steady_point(found.drift,
                         np.where(within, plant.nominal_state, 0.5 * (lower + upper)),
                         plant.nominal_input)
-    known = replace(plant, nominal_state=x, nominal_input=u, B=found.drift.input_matrix)
+    drift = found.drift
+    known = replace(plant, nominal_state=x, nominal_input=u, input_matrix_degree=0,
+                    B=drift.input_matrix_at if drift.input_degree else drift.input_matrix)
     return train(known, samples, Growth(n_z), seed=seed, starts=starts, watch=watch,
                  loops=0)
 

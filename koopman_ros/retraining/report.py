@@ -109,7 +109,7 @@ def _draw(path: Path, retrained: Retrained) -> bool:
 def _draw_coverage(axes: Any, found: Identified, i: int) -> None:
     """Draw where a state was, over the input that moves it most."""
     box = found.drift.box
-    j = int(np.argmax(np.abs(found.drift.B[i])))
+    j = int(np.argmax(np.abs(found.drift.input_matrix[i] * box.inputs.scale)))
     episodes = [*found.fitted, *found.held_out]
     visited = np.full((CELLS, CELLS), np.nan)
     cells = visited_cells(episodes, box)

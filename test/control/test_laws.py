@@ -376,7 +376,7 @@ class Proportional:
     tuning: Tuning
 
     def compute(self, estimate, target, limits, memory, interval, deadline=math.inf):
-        u = target.u - 2.0 * self.model.input_inverse @ (estimate.x - target.x)
+        u = target.u - 2.0 * self.model.input_inverse() @ (estimate.x - target.x)
         calls = (memory or 0) + 1
         return LawResult(limits.within(self.model.inputs.to_physical(u)), memory=calls)
 """

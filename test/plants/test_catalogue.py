@@ -61,10 +61,11 @@ def test_each_plant_of_the_library_is_built_from_its_defaults_in_si_to_the_bit(n
     assert all(row.lower <= row.default <= row.upper and row.description for row in rows)
     from_si = build(plant, {row.name: row.default for row in rows})
     usual = plant().system()
-    for attribute in ('B', 'nominal_state', 'nominal_input'):
+    for attribute in ('nominal_state', 'nominal_input'):
         np.testing.assert_array_equal(getattr(from_si, attribute), getattr(usual, attribute))
     x = 1.01 * usual.nominal_state + 0.01
     np.testing.assert_array_equal(from_si.drift(x), usual.drift(x))
+    np.testing.assert_array_equal(from_si.input_matrix(x), usual.input_matrix(x))
     # the ends of the ranges, converted there and back, lie within them
     for row in rows:
         for end in (row.lower, row.upper):

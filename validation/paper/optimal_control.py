@@ -61,7 +61,7 @@ def scalar_optimal_cost(system: ControlAffineSystem, start: float, setpoint: flo
     equation e^2 + V' F - (b V')^2 / (4 R) = 0 is quadratic in V'; the root with the sign of e is
     the one whose closed loop decays.
     """
-    b = float(system.B[0, 0])
+    b = float(system.input_matrix(system.nominal_state)[0, 0])
     held = equilibrium_input(system, [setpoint])
 
     def slope(e: float) -> float:

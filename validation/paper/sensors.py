@@ -127,8 +127,9 @@ def _like() -> LiftedModel:
     """Return a model with the names, units and nominal point of the reactor."""
     plant = describe(SYSTEM)
     box = Box.of(plant, np.array([[305.0], [327.0]]), np.array([[281.3], [301.1]]))
-    return linearised_model(SYSTEM.drift_jacobian(SYSTEM.nominal_state), SYSTEM.B, box.states,
-                            box.inputs, SYSTEM.time_unit, Provenance(SYSTEM.name))
+    return linearised_model(
+        SYSTEM.drift_jacobian(SYSTEM.nominal_state), SYSTEM.input_matrix(SYSTEM.nominal_state),
+        box.states, box.inputs, SYSTEM.time_unit, Provenance(SYSTEM.name))
 
 
 def _drive(system: ControlAffineSystem, design: RandomStepDesign, seed: int,
@@ -149,7 +150,8 @@ def _learn(episodes: list[Episode], like: LiftedModel, seed: int) -> tuple[Ident
 
 
 def _gain_error(found: Identified, system: ControlAffineSystem) -> float:
-    return abs(float(found.drift.input_matrix[0, 0] / system.B[0, 0]) - 1.0)
+    b = system.input_matrix(system.nominal_state)[0, 0]
+    return abs(float(found.drift.input_matrix[0, 0] / b) - 1.0)
 
 
 def _roll_out_error(model: LiftedModel, system: ControlAffineSystem, design: RandomStepDesign,

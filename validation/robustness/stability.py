@@ -119,8 +119,9 @@ def grows(controller: Controller, temperature: float, *, factor: float = 1.0, de
     """Simulate whether a deviation grows when the coolant's is amplified, or late by some s."""
     held = equilibrium_input(REACTOR, [temperature])
     # the coolant deviates by the factor from what holds the temperature
-    plant = replace(REACTOR, B=factor * REACTOR.B,
-                    drift=lambda x: REACTOR.drift(x) + (1.0 - factor) * (REACTOR.B @ held))
+    B = REACTOR.input_matrix(REACTOR.nominal_state)
+    plant = replace(REACTOR, B=factor * B,
+                    drift=lambda x: REACTOR.drift(x) + (1.0 - factor) * (B @ held))
     course = loop.run_loop(
         controller, plant, np.array([temperature + _KICK]), float(held[0]), seconds,
         [at(0.0, at_setpoint(temperature))], actuator=Actuator(delay=delay))

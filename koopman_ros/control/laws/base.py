@@ -25,14 +25,14 @@ class Target:
     z: Array  #: (n_z,) z_ref = N(x_ref) (paper, section on the optimal control problem)
     drift: Array  #: (n_x,) the model's drift there
     u: Array  #: (n_u,) input that balances drift and disturbance
-    forcing: Array  #: (n_x,) B u_ref + w, what acts on the state beside the drift
+    forcing: Array  #: (n_x,) B(x_ref) u_ref + w, what acts on the state beside the drift
     residual: float  #: size of the rate that no input balances; 0 where x can be held
 
 
 def steady_state_target(model: LiftedModel, x_ref: Array, w: Array | None = None, *,
                         known: Target | None = None) -> Target:
     """
-    Solve f(x_ref) + B u_ref + w = 0 for u_ref by least squares, f the model's drift.
+    Solve f(x_ref) + B(x_ref) u_ref + w = 0 for u_ref by least squares, f the model's drift.
 
     The feed-forward comes from the lifted model: the linearisation's would leave a large
     offset far from the nominal point.
@@ -47,8 +47,8 @@ def steady_state_target(model: LiftedModel, x_ref: Array, w: Array | None = None
         z, drift = model.lift(x_ref), model.drift(x_ref)
     w = np.zeros(model.n_x) if w is None else w
     load = drift + w
-    u = -model.input_inverse.dot(load)
-    forcing = model.B.dot(u)
+    u = -model.input_inverse(x_ref).dot(load)
+    forcing = model.forcing(x_ref, u)
     rest = load + forcing
     return Target(x_ref, z, drift, u, forcing + w, math.sqrt(rest.dot(rest)))
 

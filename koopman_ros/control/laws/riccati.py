@@ -118,13 +118,17 @@ def recentred(model: LiftedModel, x: Array, target: Target, weights: Weights, *,
 
     e' = A e + J(x) B v + (J(x) - J(x_ref)) (B u_ref + w), and the last term is H C e with C e
     the error of the state, so that A + H C takes the place of A. Only with identity coordinates
-    is C e linear in e; a free lift goes by M^+ e, exact on the manifold of the lift.
+    is C e linear in e; a free lift goes by M^+ e, exact on the manifold of the lift. Where B
+    depends on the state it is B(x) with v and B(x_ref) with u_ref, and (B(x) - B(x_ref)) u_ref
+    = D (x - x_ref) adds J(x) D to H.
 
     Arguments and result as in :func:`feedback`; of use where the input moves every mode of A that
     does not decay.
     """
     z, J, M, H = model.lift_and_secants(x, target.x, target.forcing)
-    n_x, n_z = model.n_x, model.n_z
+    n_x, n_z, B, D = model.n_x, model.n_z, model.input_matrix(x), _input_secant(model, x, target)
+    if D is not None:
+        H = H + J.dot(D)
     if model.identity:
         # C picks the first coordinates: the products are written out, which is faster
         A, Q = model.A.copy(), np.zeros((n_z, n_z))
@@ -134,12 +138,12 @@ def recentred(model: LiftedModel, x: Array, target: Target, weights: Weights, *,
         C = np.linalg.pinv(M)
         A, Q = model.A + H @ C, C.T @ weights.Q @ C
     # dot takes a third of the time of @ here
-    riccati = solve_riccati(A, J.dot(model.B), Q, weights.R, interval=interval,
+    riccati = solve_riccati(A, J.dot(B), Q, weights.R, interval=interval,
                             max_gain=max_gain, max_residual=max_residual)
     drift = (model.onto_states(J, model.A.dot(M) + H) if model.readout is None
-             else model.averaged_drift_jacobian(x, target.x))
+             else _averaged_jacobian(model, x, target, D))
     return Feedback(target.u - riccati.K.dot(z - target.z), Form.RECENTRED, riccati,
-                    drift, -model.B.dot(riccati.K.dot(M)))
+                    drift, -B.dot(riccati.K.dot(M)))
 
 
 def averaged(model: LiftedModel, x: Array, target: Target, weights: Weights, *,
@@ -147,18 +151,30 @@ def averaged(model: LiftedModel, x: Array, target: Target, weights: Weights, *,
     """
     Solve the Riccati equation of the state's error e = x - x_ref under the averaged Jacobian.
 
-    e' = f(x) - f(x_ref) + B v = A(x) e + B v, A the mean of df/dx from x_ref to x. Of all A with
-    that property it is the one that says where the drift goes beside e, too. It needs no more
-    than that (A(x), B) be stabilisable, so unstable modes of the lift and their products do no
-    harm.
+    e' = f(x) - f(x_ref) + B v = A(x) e + B v, A the mean of df/dx from x_ref to x, and of
+    d(f + B(x) u_ref)/dx where B depends on the state. Of all A with that property it is the one
+    that says where the drift goes beside e, too. It needs no more than that (A(x), B) be
+    stabilisable, so unstable modes of the lift and their products do no harm.
 
     Arguments and result as in :func:`feedback`.
     """
-    A = model.averaged_drift_jacobian(x, target.x)
-    riccati = solve_riccati(A, model.B, weights.Q, weights.R, interval=interval,
+    A = _averaged_jacobian(model, x, target, _input_secant(model, x, target))
+    B = model.input_matrix(x)
+    riccati = solve_riccati(A, B, weights.Q, weights.R, interval=interval,
                             max_gain=max_gain, max_residual=max_residual)
     return Feedback(target.u - riccati.K @ (x - target.x), Form.AVERAGED, riccati,
-                    A, -model.B @ riccati.K)
+                    A, -B @ riccati.K)
+
+
+def _input_secant(model: LiftedModel, x: Array, target: Target) -> Array | None:
+    """Return D (n_x, n_x) with (B(x) - B(x_ref)) u_ref = D (x - x_ref); None where it is 0."""
+    terms = model.input_terms
+    return None if terms is None else terms.averaged_jacobian(x, target.x, target.u)
+
+
+def _averaged_jacobian(model: LiftedModel, x: Array, target: Target, D: Array | None) -> Array:
+    A = model.averaged_drift_jacobian(x, target.x)
+    return A if D is None else A + D
 
 
 @dataclass(frozen=True)

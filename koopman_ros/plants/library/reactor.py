@@ -1,9 +1,9 @@
 # SPDX-FileCopyrightText: 2026 The koopman_ros Authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""The continuous stirred tank reactor (CSTR) with a cooling jacket, as one state and as two."""
+"""The continuous stirred tank reactor (CSTR) with a cooling jacket, of one state and of two."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 
 import numpy as np
@@ -114,6 +114,32 @@ def two_state_reactor(parameters: ReactorParameters | None = None, *,
                     ('concentration',), ('mol/L',))
 
 
+def fed_reactor(parameters: ReactorParameters | None = None, *,
+                nominal_state: ArrayLike | None = None) -> ControlAffineSystem:
+    """
+    Build the two-state reactor with its feed flow as an input beside the coolant.
+
+    What the flow q does depends on the state: q/V (C_Af - C_A) and q/V (T_i - T). Parameters and
+    errors are those of :func:`one_state_reactor`; the flow rate is the nominal one.
+    """
+    constants = parameters or ReactorParameters()
+    fixed = two_state_reactor(constants, nominal_state=nominal_state)
+    feed = np.array([constants.feed_concentration, constants.feed_temperature])
+
+    def input_matrix(x: Array) -> Array:
+        B = np.zeros((*x.shape, 2))
+        B[..., 0] = (feed - x) / constants.volume
+        B[..., 1, 1] = constants.cooling_rate
+        return B
+
+    return replace(
+        fixed, name='fed reactor', input_names=('feed_flow', *fixed.input_names),
+        input_units=('L/min', *fixed.input_units),
+        drift=lambda x: fixed.drift(x) - constants.dilution_rate * (feed - x),
+        drift_jacobian=lambda x: fixed.drift_jacobian(x) + constants.dilution_rate * np.eye(2),
+        B=input_matrix, nominal_input=np.array([constants.flow_rate, *fixed.nominal_input]))
+
+
 @dataclass(frozen=True)
 class OneStateReactor(ReactorParameters):
     """The reactor of the paper as a plant of the catalogue."""
@@ -130,6 +156,15 @@ class TwoStateReactor(ReactorParameters):
     def system(self, nominal_state: ArrayLike | None = None) -> ControlAffineSystem:
         """Build it as :func:`two_state_reactor` does."""
         return two_state_reactor(self, nominal_state=nominal_state)
+
+
+@dataclass(frozen=True)
+class FedReactor(ReactorParameters):
+    """The benchmark reactor, its feed flow an input, as a plant of the catalogue."""
+
+    def system(self, nominal_state: ArrayLike | None = None) -> ControlAffineSystem:
+        """Build it as :func:`fed_reactor` does."""
+        return fed_reactor(self, nominal_state=nominal_state)
 
 
 def _reactor(name: str, constants: ReactorParameters, drift: ArrayFunction,
