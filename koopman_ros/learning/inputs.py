@@ -37,7 +37,9 @@ class InputModel:
         """
         n_u = len(box.inputs)
         if plant.B is None:
-            return InputModel(n_u, plant.input_matrix_degree, None)
+            # nothing is left to learn without inputs
+            return InputModel(n_u, plant.input_matrix_degree, None if n_u else np.zeros(
+                (len(box.states), 0)))
         nominal = box.input_matrix(plant.input_matrix(box.states.center))
         if not callable(plant.B):
             return InputModel(n_u, 0, nominal)

@@ -23,13 +23,13 @@ from koopman_ros.plant_data import Samples
 from koopman_ros.plants import (
     advance,
     box_episodes,
+    describe,
     equilibrium_input,
     RandomStepDesign,
     simulate,
     steady_state,
 )
 from koopman_ros.plants.library.reactor import fed_reactor
-from validation.paper.datasets import describe
 
 PLANT = fed_reactor()
 HALF_X, HALF_U = np.array([0.08, 8.0]), np.array([50.0, 10.0])
