@@ -53,6 +53,10 @@ LIFTS = {
     'two_state': Lift(RandomStepDesign(
         input_lower=281.0, input_upper=303.0, state_lower=[0.8, 305.0], state_upper=[1.0, 330.0],
         hold_time=(0.5, 1.0), sample_period=0.25), 240, 1.0, _FREE),
+    # likewise, the feed between 0.6 and 1.5 of what it is there
+    'fed_reactor': Lift(RandomStepDesign(
+        input_lower=[60.0, 281.0], input_upper=[150.0, 303.0], state_lower=[0.8, 305.0],
+        state_upper=[1.0, 330.0], hold_time=(0.5, 1.0), sample_period=0.25), 240, 1.0, _FREE),
     # the way from (5, 5) to the origin, and its mirror image
     'two_state_example': Lift(RandomStepDesign(
         input_lower=-20.0, input_upper=60.0, state_lower=[-6.0, -6.0], state_upper=[6.0, 8.0],
