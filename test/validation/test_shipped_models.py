@@ -189,7 +189,7 @@ PROMISES = {
                          1.0, 600, 1.002, 3.0, 0.005),
     # another conversion at another temperature takes another feed
     'fed_reactor': Promise(1e-7, {'concentration': 0.92, 'temperature': 318.0}, (100.0, 1.0),
-                           ((60.0, 278.15), (150.0, 305.15)), 1.0, 300, 1.002, 1.05, 0.005),
+                           ((60.0, 278.15), (150.0, 305.15)), 1.0, 300, 1.002, 20.0, 0.005),
     # x1 decays as it likes
     'two_state_example': Promise(1e-8, {'x1': 0.0, 'x2': 0.0}, (1.0, 1.0), ((-50.0,), (50.0,)),
                                  0.05, 1600, 1.0009, 4.5, 0.0017, (5.0, 5.0)),
