@@ -228,7 +228,7 @@ class _Plant:
         slope = self.slope(np.zeros((1, n)), np.zeros((1, model.n_u)))[0]
         itself = NetworkObservables((), np.zeros((0, n)), identity=True)
         return replace(model, observables=itself, A=slope[:, :n], B=slope[:, n:],
-                       readout=None, input_terms=None)
+                       readout=None, input_terms=None, pre_feedback=None)
 
 
 def _closed_loop_rates(linear: LiftedModel, weights: Weights) -> tuple[float, float]:

@@ -29,7 +29,8 @@ class Fit:
     """Residuals of a lift in dz/dt = A z + J_N(x) B(x) u on samples."""
 
     #: ||(J_N f - A N) S^(-1/2)||^2 / ||J_N f S^(-1/2)||^2 with S = E[z z'], invariant under linear
-    #: maps of z, so that it cannot be lowered by shrinking z
+    #: maps of z, so that it cannot be lowered by shrinking z; f is the drift under the model's
+    #: pre-feedback, where it has one
     rw: float
     rx: float  #: relative mean-square error of the drift of x that the lift implies
     cond: float  #: condition number of S; large when coordinates have collapsed onto each other
@@ -78,7 +79,8 @@ def fit(model: LiftedModel, x: Array, dxdt: Array, u: Array) -> Fit:
     f = dxdt / model.states.scale - model.forcing(
         xi, model.inputs.to_deviation(model.inputs.array('u', u)))
     z, J = model.lift_and_jacobian(xi)
-    dz = (J @ f[..., None])[..., 0]
+    # of the plant under the pre-feedback of A
+    dz = (J @ (f + model.pre_feedback_rate(xi))[..., None])[..., 0]
     S = z.T @ z / len(z)
     cond = float(np.linalg.cond(S))
     if not cond < _MAX_COND:

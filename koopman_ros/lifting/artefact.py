@@ -67,6 +67,8 @@ def save(model: LiftedModel, path: str | os.PathLike[str]) -> None:
     if model.input_terms is not None:
         C = model.input_terms.coefficients
         tensors['input_terms'] = C.reshape(len(C), -1)
+    if model.pre_feedback is not None:
+        tensors['pre_feedback'] = model.pre_feedback
     description = json.dumps({
         **network,
         **({'fill_distance': known.fill_distance} if known is not None else {}),
@@ -159,8 +161,9 @@ def _build(about: dict[str, Any], tensors: dict[str, np.ndarray]) -> LiftedModel
         f'hidden.{i}.{part}' for i in range(layers) for part in ('weight', 'bias')}
     if 'fill_distance' in about:
         expected.add('training_states')
-    # files without them are of lifts whose drift is read off the rate of z, whose B is constant
-    expected |= {'readout', 'input_terms'} & set(tensors)
+    # files without them are of lifts whose drift is read off the rate of z, whose B is constant,
+    # and whose A is of the plant alone
+    expected |= {'readout', 'input_terms', 'pre_feedback'} & set(tensors)
     if set(tensors) != expected:
         raise ValueError(f'expected the arrays {sorted(expected)}, got {sorted(tensors)}')
     if not monomials and not isinstance(about['identity'], bool):
@@ -190,7 +193,8 @@ def _build(about: dict[str, Any], tensors: dict[str, np.ndarray]) -> LiftedModel
             tensors['training_states'], float(filled)),
         readout=tensors.get('readout'),
         input_terms=None if 'input_terms' not in tensors else InputTerms(
-            tensors['input_terms'].reshape(len(tensors['input_terms']), *tensors['B'].shape)))
+            tensors['input_terms'].reshape(len(tensors['input_terms']), *tensors['B'].shape)),
+        pre_feedback=tensors.get('pre_feedback'))
     for name, actual in (('n_x', model.n_x), ('n_u', model.n_u), ('n_z', model.n_z)):
         if _integer(about, name) != actual:
             raise ValueError(f'{name} is given as {about[name]}, the arrays say {actual}')

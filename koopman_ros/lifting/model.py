@@ -50,6 +50,10 @@ class LiftedModel:
 
     B is constant but where there are `input_terms`.
 
+    With a pre-feedback K the lift is one of the plant under it, f(x) + B K x, for which there is
+    an A where the plant alone is unstable: dz/dt = A z - J_N(x) B K x + J_N(x) B(x) u. Inputs and
+    drift stay those of the plant.
+
     All methods work in scaled deviations from the nominal point (see :class:`Coordinates`),
     with time in `time_unit`. With a network without hidden layers it is a linearisation.
 
@@ -69,6 +73,8 @@ class LiftedModel:
     #: off the rate of z
     readout: Array | None = None
     input_terms: InputTerms | None = None  #: what B(x) has beside B; None where it is constant
+    #: (n_u, n_x) gain K of the pre-feedback that A holds under, in scaled coordinates, or None
+    pre_feedback: Array | None = None
 
     __repr__ = brief
 
@@ -86,6 +92,9 @@ class LiftedModel:
                 self.input_terms.coefficients.shape[1:] != self.B.shape):
             raise ValueError(f'incompatible input terms: expected {("any", *self.B.shape)}, got '
                              f'{self.input_terms.coefficients.shape}')
+        if self.pre_feedback is not None:
+            object.__setattr__(self, 'pre_feedback', frozen(
+                self.pre_feedback, 'pre_feedback', (self.n_u, n_x)))
         if self.training_states is not None and self.training_states.states.shape[1] != n_x:
             raise ValueError(f'incompatible training_states: expected {n_x} states, got '
                              f'{self.training_states.states.shape[1]}')
@@ -140,15 +149,22 @@ class LiftedModel:
 
     @cached_property
     def adds_unstable_modes(self) -> bool:
-        """Whether more modes of A grow, or do not decay, than of the linearised model."""
+        """
+        Whether more modes of A grow, or do not decay, than of the linearised model.
+
+        Both under the pre-feedback, if there is one.
+        """
+        slope = self.linearised.A + self.pre_feedback_slope
         grow = [int(np.sum(eigenvalues.real >= 0.0))
-                for eigenvalues in (self.eigenvalues, self.linearised.eigenvalues)]
+                for eigenvalues in (self.eigenvalues, np.linalg.eigvals(slope))]
         return grow[0] > grow[1]
 
     @cached_property
     def mismatch(self) -> float:
         """
         How far A z is from J_N f, the rate of z under the model's drift f: 0 for a closed lift.
+
+        Under the pre-feedback, if there is one.
 
         As the training figure ``rw``, a mean square without unit, over the training states or all
         over the box; 0 also for what moves nowhere.
@@ -160,7 +176,7 @@ class LiftedModel:
             x = box.to_deviation(np.random.default_rng(0).uniform(
                 box.lower, box.upper, (_TRIED, self.n_x)))
         z, J = self.lift_and_jacobian(x)
-        rate = (J @ self.drift(x)[..., None])[..., 0]
+        rate = (J @ (self.drift(x) + self.pre_feedback_rate(x))[..., None])[..., 0]
         rest = rate - z @ self.A.T
         whitening = np.linalg.pinv(z.T @ z)
         size = float(np.sum(rate @ whitening * rate))
@@ -212,12 +228,12 @@ class LiftedModel:
         if self.readout is None:
             # exact, as N(0) = 0
             J = self.jacobian(origin)
-            slope = np.linalg.pinv(J) @ self.A @ J
+            slope = np.linalg.pinv(J) @ self.A @ J - self.pre_feedback_slope
         else:
             slope = self.drift_jacobian(origin)
         observables = NetworkObservables((), np.zeros((0, self.n_x)), identity=True)
         return replace(self, observables=observables, A=slope, readout=None,
-                       input_terms=None)
+                       input_terms=None, pre_feedback=None)
 
     def distance(self, x: Array) -> float:
         """
@@ -271,9 +287,20 @@ class LiftedModel:
         if self.readout is not None:
             return self.observables.features.lift(x) @ self.readout.T
         z, J = self.observables.lift_and_jacobian(x)
-        if x.ndim == 1:
-            return self.onto_states(J, self.A.dot(z))
-        return self.onto_states(J, (z @ self.A.T)[..., None])[..., 0]
+        rate = (self.onto_states(J, self.A.dot(z)) if x.ndim == 1 else
+                self.onto_states(J, (z @ self.A.T)[..., None])[..., 0])
+        return rate if self.pre_feedback is None else rate - self.pre_feedback_rate(x)
+
+    @cached_property
+    def pre_feedback_slope(self) -> Array:
+        """B K (n_x, n_x); zeros where there is no pre-feedback."""
+        shape = (self.n_x, self.n_x)
+        slope = np.zeros(shape) if self.pre_feedback is None else self.B @ self.pre_feedback
+        return frozen(slope, 'slope of the pre-feedback', shape)
+
+    def pre_feedback_rate(self, x: Array) -> Array:
+        """Evaluate B K x, what the pre-feedback adds to the drift: (..., n_x) -> same."""
+        return x @ self.pre_feedback_slope.T
 
     def drift_jacobian(self, x: Array) -> Array:
         """Evaluate df/dx of the drift, (..., n_x) -> (..., n_x, n_x): of a read-out exactly."""

@@ -174,6 +174,31 @@ def test_laws_of_the_two_state_example(R, cost, K, linear_ratio):
         np.testing.assert_allclose(run.states[-1], [5.0 * np.exp(-10.0), 0.0], rtol=0, atol=1e-6)
 
 
+# A pre-feedback changes what is learned, not what the law does.
+
+@pytest.mark.parametrize('reference', [0.0, 0.4])
+def test_weights_on_the_input_stay_so_under_a_pre_feedback(reference):
+    """The same plant with A of its own and of the loop under K has the same gain on u."""
+    K, weights = np.array([[0.3, -3.0]]), Weights(np.diag([1.0, 2.0]), np.array([[0.7]]))
+    for model in (exact_two_state_model(), saddle_model()):
+        A = np.array(model.A)
+        A[:, :2] += model.jacobian(np.zeros(2)) @ model.B @ K
+        closed = replace(model, A=A, pre_feedback=K)
+        target, same = (steady_state_target(one, np.array([0.0, reference]))
+                        for one in (model, closed))
+        np.testing.assert_allclose(same.u, target.u, rtol=0, atol=1e-13)
+        for law in (feedback, recentred, averaged):
+            for interval in (0.0, 0.3):
+                found, wanted = (
+                    law(one, np.array([0.5, -0.8]), aim, weights, interval=interval)
+                    for one, aim in ((closed, same), (model, target)))
+                assert found.form is wanted.form
+                np.testing.assert_allclose(found.riccati.K, wanted.riccati.K, rtol=1e-8,
+                                           atol=1e-12)
+                np.testing.assert_allclose(found.u, wanted.u, rtol=1e-8)
+                np.testing.assert_allclose(found.drift, wanted.drift, rtol=1e-8, atol=1e-10)
+
+
 # Choice of the law.
 
 @pytest.mark.parametrize(('mu', 'adds', 'form'), [
@@ -236,6 +261,25 @@ def test_recentred_law_of_a_free_lift_by_hand(x, reference):
     found = recentred(model, np.array([x]), target, Weights(q * np.eye(1), r * np.eye(1)))
     assert found.solved
     assert found.u[0] == pytest.approx(target.u[0] - p * b / r * (t - t_ref), rel=1e-10)
+
+
+@pytest.mark.parametrize('x', [1.3, -0.8])
+def test_recentred_law_of_a_free_lift_under_a_pre_feedback_by_hand(x):
+    """Here dz/dt = -z + J(x) B (u - k x): open loop it has k of the linear drift less."""
+    k, q, r, b, reference = -2.0, 2.0, 0.3, 0.7, 0.4
+    model = replace(change_of_variable(gain=b), pre_feedback=np.array([[k]]))
+    target = steady_state_target(model, np.array([reference]))
+    t, t_ref = np.tanh(x), np.tanh(reference)
+    J, J_ref = 1.0 - t * t, 1.0 - t_ref * t_ref
+    v_ref = t_ref / (b * J_ref)
+    assert target.u[0] == pytest.approx(v_ref + k * reference, rel=1e-13)
+    C = (x - reference) / (t - t_ref)
+    a = -1.0 + (J - J_ref) * b * v_ref / (t - t_ref) - J * b * k * C
+    p = r / (b * J) ** 2 * (a + np.sqrt(a * a + (b * J) ** 2 * q * C * C / r))
+    found = recentred(model, np.array([x]), target, Weights(q * np.eye(1), r * np.eye(1)))
+    assert found.u[0] == pytest.approx(target.u[0] - p * b * J / r * (t - t_ref), rel=1e-10)
+    assert found.drift[0, 0] * (x - reference) == pytest.approx(
+        model.drift(np.array([x]))[0] - model.drift(np.array([reference]))[0], rel=1e-10)
 
 
 @pytest.mark.parametrize('x', [1.3, -0.8, 1e-3])

@@ -52,6 +52,19 @@ def test_a_wrong_slope_is_measured_and_none_where_the_model_is_exact():
     assert figures.cond == 1.0
 
 
+def test_figures_under_a_pre_feedback_are_those_of_the_plant_under_it():
+    """The plant with the slope -1 + 2 under u = -1.5 x, modelled as -2 x + 0.1 x there."""
+    c, K = coordinates('x', 1), np.array([[-1.5]])
+    model = replace(linearised_model([[-1.9]], [[2.0]], c, replace(c, names=('u',)), 's',
+                                     Provenance('test')), pre_feedback=K)
+    x, u = np.linspace(c.lower, c.upper, 20), np.linspace(-1.0, 2.0, 20)[:, None]
+    dxdt = (x - c.center) + 2.0 * (u - c.center)
+    figures = fit(model, x, dxdt, u)
+    assert figures.rw == pytest.approx((0.1 / 2.0) ** 2, rel=1e-10)
+    # of the drift itself, which is smaller
+    assert figures.rx == pytest.approx(0.1 ** 2, rel=1e-10)
+
+
 def test_rw_is_the_residual_in_whitened_coordinates():
     model = random_lift(2, (8,), identity=False)
     rng = np.random.default_rng(6)

@@ -44,6 +44,8 @@ MODELS = {
         np.random.default_rng(0).normal(size=(300, 2)), np.ones(2))),
     'with a read-out': replace(random_lift(widths=(5, 4)), readout=np.random.default_rng(
         0).normal(size=(2, 6))),
+    'with a pre-feedback': replace(random_lift(n_u=2), pre_feedback=np.random.default_rng(
+        0).normal(size=(2, 2))),
     'monomials': replace(
         random_lift(), observables=PolynomialObservables.total_degree(2, 2),
         readout=np.random.default_rng(0).normal(size=(2, 5))),

@@ -24,6 +24,7 @@ from koopman_ros.plant_data import Plant
 from koopman_ros.plants import two_state_reactor
 from support.random_lifts import coordinates, random_lift, random_network
 from support.small_plants import BENT, bent_samples, TWO_STATE, two_state_samples
+from validation.paper.optimal_control import exact_two_state_model
 
 
 def states(n_x, count=20, seed=1):
@@ -83,6 +84,11 @@ def test_the_mismatch_of_a_lift_is_how_far_its_coordinates_go_another_way():
         model = replace(random_lift(1), observables=lift, A=np.diag([-1.0, -2.0 + d]),
                         readout=np.array([[-1.0, 0.0]]), training_states=TrainingStates(x, 0.1))
         assert model.mismatch == pytest.approx(d * d / 5.0, rel=1e-10, abs=1e-20)
+        # the same under a pre-feedback that makes up for another drift
+        K = np.array([[-2.0]])
+        pushed = replace(model, pre_feedback=K,
+                         readout=model.readout - model.B @ K @ [[1.0, 0.0]])
+        assert pushed.mismatch == pytest.approx(model.mismatch, rel=1e-10, abs=1e-20)
         # without known states they are all over the box, which is not even about the middle
         spread = replace(model, training_states=None).mismatch
         assert (0.1 * d * d < spread < d * d) if d else spread < 1e-20
@@ -143,6 +149,55 @@ def test_a_read_out_by_hand():
                                rtol=0, atol=1e-14)
     np.testing.assert_allclose(model.linearised.A, [[3.0 - 4.0 / np.cosh(1.0) ** 2]], rtol=1e-14)
     assert model.linearised.readout is None
+
+
+@pytest.mark.parametrize('identity', [True, False])
+def test_a_pre_feedback_is_taken_out_of_the_drift(identity):
+    """A z is the rate under u = K x, of which B K x is the input's share."""
+    model = replace(random_lift(3, n_u=2, identity=identity),
+                    pre_feedback=np.random.default_rng(5).normal(size=(2, 3)))
+    for x in states(3, 5):
+        z, J = model.lift_and_jacobian(x)
+        expected = np.linalg.lstsq(J, model.A @ z, rcond=None)[0] - (
+            model.B @ model.pre_feedback @ x)
+        np.testing.assert_allclose(model.drift(x), expected, rtol=0, atol=1e-12)
+        np.testing.assert_allclose(model.drift(np.array([x, x])), [expected] * 2,
+                                   rtol=0, atol=1e-12)
+        # what the features say is the drift itself
+        weights = np.ones((3, model.observables.features.n_z))
+        np.testing.assert_array_equal(
+            replace(model, readout=weights).drift(x),
+            replace(model, readout=weights, pre_feedback=None).drift(x))
+    step = 1e-6 * np.eye(3)
+    slope = (model.drift(step) - model.drift(-step)).T / 2e-6
+    linear = model.linearised
+    np.testing.assert_allclose(linear.A, slope, rtol=0, atol=1e-8)
+    assert linear.pre_feedback is None
+    np.testing.assert_allclose(linear.drift(step), step @ linear.A.T, rtol=0, atol=1e-20)
+
+
+def under_pre_feedback(model, K):
+    """Return the model of the same plant whose A is that of the plant under u = K x."""
+    push = model.jacobian(np.zeros(model.n_x)) @ model.B
+    A = np.array(model.A)
+    A[:, :model.n_x] += push @ K
+    return replace(model, A=A, pre_feedback=K)
+
+
+def test_a_plant_is_the_same_with_and_without_pre_feedback():
+    """The exact lift of the two-state example, whose J B is constant: drift, modes, mismatch."""
+    exact, x = exact_two_state_model(), states(2)
+    for model in (exact, replace(exact, readout=None)):
+        closed = under_pre_feedback(model, np.array([[0.3, -3.0]]))
+        np.testing.assert_allclose(closed.drift(x), model.drift(x), rtol=0, atol=1e-13)
+        np.testing.assert_allclose(closed.linearised.A, model.linearised.A, rtol=0, atol=1e-14)
+        assert closed.mismatch < 1e-25
+        # the eigenvalues are those of the closed loop
+        assert (model.is_hurwitz, closed.is_hurwitz) == (False, True)
+        assert not closed.adds_unstable_modes
+    assert under_pre_feedback(exact, np.array([[0.0, 2.0]])).adds_unstable_modes is False
+    grows = replace(exact, A=exact.A + np.diag([0.0, 0.0, 1.0]))
+    assert under_pre_feedback(grows, np.array([[0.0, -3.0]])).adds_unstable_modes
 
 
 @pytest.mark.parametrize('model', [
@@ -233,6 +288,9 @@ def test_a_model_cannot_be_changed():
      r'incompatible A: expected \(9, 9\), got \(5, 5\)'),
     ({'readout': np.zeros((2, 5))}, r'incompatible readout: expected \(2, 7\), got \(2, 5\)'),
     ({'readout': np.full((2, 7), np.nan)}, 'readout must be finite'),
+    ({'pre_feedback': np.zeros((2, 1))},
+     r'incompatible pre_feedback: expected \(1, 2\), got \(2, 1\)'),
+    ({'pre_feedback': np.full((1, 2), np.inf)}, 'pre_feedback must be finite'),
     ({'time_unit': 'h'}, "time_unit must be 's' or 'min', got 'h'"),
     ({'training_states': TrainingStates(np.zeros((1, 3)), 0.0)},
      'incompatible training_states: expected 2 states, got 3'),

@@ -120,15 +120,21 @@ def recentred(model: LiftedModel, x: Array, target: Target, weights: Weights, *,
     the error of the state, so that A + H C takes the place of A. Only with identity coordinates
     is C e linear in e; a free lift goes by M^+ e, exact on the manifold of the lift. Where B
     depends on the state it is B(x) with v and B(x_ref) with u_ref, and (B(x) - B(x_ref)) u_ref
-    = D (x - x_ref) adds J(x) D to H.
+    = D (x - x_ref) adds J(x) D to H. Where A holds under a pre-feedback K it takes J(x) B K from
+    H, and B K x_ref from B u_ref + w, so that v and its weight R stay those of the input itself.
 
     Arguments and result as in :func:`feedback`; of use where the input moves every mode of A that
     does not decay.
     """
-    z, J, M, H = model.lift_and_secants(x, target.x, target.forcing)
     n_x, n_z, B, D = model.n_x, model.n_z, model.input_matrix(x), _input_secant(model, x, target)
+    forcing = target.forcing
+    if model.pre_feedback is not None:
+        forcing = forcing - model.pre_feedback_rate(target.x)
+    z, J, M, H = model.lift_and_secants(x, target.x, forcing)
     if D is not None:
         H = H + J.dot(D)
+    if model.pre_feedback is not None:
+        H = H - J.dot(model.pre_feedback_slope)
     if model.identity:
         # C picks the first coordinates: the products are written out, which is faster
         A, Q = model.A.copy(), np.zeros((n_z, n_z))
