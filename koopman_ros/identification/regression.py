@@ -174,10 +174,11 @@ def noise_level(episodes: Sequence[Episode], model: DriftModel) -> Array:
     nothing but noise. ValueError when no episode is long enough.
     """
     found = []
+    # in the middle: kinks of the few steps of an input do not move the median
+    B = model.scaled_input_matrix(np.zeros(len(model.B)))
     for episode in episodes:
         if len(episode) >= _SHORTEST:
-            rest = model.box.states.to_deviation(episode.x) - _moved(episode, model.box,
-                                                                     model.scaled_input_matrix(np.zeros(len(model.B))))
+            rest = model.box.states.to_deviation(episode.x) - _moved(episode, model.box, B)
             D = _third_differences(episode.time)
             found.append([_noise(D, rest[:, j]) for j in range(rest.shape[1])])
     if not found:

@@ -124,7 +124,7 @@ class LiftedModel:
         """What the model knows of its plant: names, units, nominal point; B is left to learn."""
         return Plant(self.provenance.plant, self.states.names, self.states.units,
                      self.inputs.names, self.inputs.units, self.time_unit, self.states.center,
-                     self.inputs.center, None)
+                     self.inputs.center, None, self.input_matrix_degree)
 
     @property
     def seconds_per_time_unit(self) -> float:
@@ -181,6 +181,11 @@ class LiftedModel:
         whitening = np.linalg.pinv(z.T @ z)
         size = float(np.sum(rate @ whitening * rate))
         return float(np.sum(rest @ whitening * rest)) / size if size > 0.0 else 0.0
+
+    @property
+    def input_matrix_degree(self) -> int:
+        """Degree of the polynomial B(x); 0 where it is constant."""
+        return 0 if self.input_terms is None else self.input_terms.degree
 
     @cached_property
     def _nominal_inverse(self) -> Array:

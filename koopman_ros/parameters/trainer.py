@@ -139,6 +139,9 @@ class TrainerParameters:
     input_matrix: tuple[float, ...] = parameter(
         (0.0,), 'B where it is known, row by row: change of the rate of each state, in its unit '
         'per second, with each input; a single 0 to learn it')
+    input_matrix_degree: int = parameter(
+        0, 'degree of the polynomial in the states that a learned B is, where what an input does '
+        'depends on them; 0 for a constant B', '', 0, 5)
     synchronisation_tolerance: float = parameter(
         0.0, 'how far the stamps of messages may be apart that together are one measurement', 's',
         0.0, 10.0)
@@ -205,7 +208,8 @@ class TrainerParameters:
     def training(self) -> dict[str, Any]:
         """Return the fields of a :class:`koopman_ros.retraining.Task` that are settings."""
         return {'coordinates': self.model_coordinates, 'seed': self.training_seed,
-                'starts': self.training_starts, 'margin': self.gate_margin,
+                'starts': self.training_starts,
+                'input_matrix_degree': self.input_matrix_degree, 'margin': self.gate_margin,
                 'condition': self.gate_condition}
 
 
@@ -225,6 +229,7 @@ def trainer_table(present: LiftedModel | None, given: Mapping[str, Any] = Mappin
     defaults['topics'] = (*_wiring(signals, {**own, **given}).topics, wire.CONTROLLER_STATE,
                           wire.CONTROLLER_EVENTS, wire.DIAGNOSTICS)
     if present is not None:
+        defaults['input_matrix_degree'] = present.input_matrix_degree
         for box, low, high in ((present.states, 'experiment_min', 'experiment_max'),
                                (present.states, 'setpoint_min', 'setpoint_max'),
                                (present.inputs, 'experiment_min', 'experiment_max')):
@@ -286,6 +291,9 @@ def _cross_check(signals: Signals, values: TrainerParameters) -> str:
     if values.input_matrix != (0.0,) and len(values.input_matrix) != n_x * n_u:
         return (f'input_matrix has {len(values.input_matrix)} numbers, must have {n_x} rows of '
                 f'{n_u}, or a single 0 to learn it')
+    if values.input_matrix != (0.0,) and values.input_matrix_degree:
+        return (f'input_matrix_degree is {values.input_matrix_degree}, must be 0 where '
+                'input_matrix is given, of which nothing is learned')
     return Wiring(signals, values.states, values.inputs).check()
 
 

@@ -52,7 +52,9 @@ def _sections(retrained: Retrained) -> Iterator[str]:
         f'{len(found.fitted)} segments to estimate and learn from, '
         f'{len(found.held_out)} held out to judge by'])
     yield '## Estimates of the drift'
-    yield f'Taken: {found.method}, degree {found.drift.degree}, with the input matrix B'
+    degree = found.drift.input_degree
+    yield (f'Taken: {found.method}, degree {found.drift.degree}, with the input matrix B'
+           + f', of degree {degree} in the states, in the middle of the range' * bool(degree))
     yield table(('per second by', *(f'{name} [1/({unit})]' for name, unit in
                                      zip(inputs.names, inputs.units, strict=True))),
                 ((f'{name} [{unit}]', *(f'{gain:.5g}' for gain in row)) for name, unit, row in zip(

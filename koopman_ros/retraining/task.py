@@ -57,6 +57,8 @@ class Task:
     #: B where it is known, in state unit per input unit and second, by state and input; what is
     #: not named is 0; empty to learn B
     input_gain: Mapping[str, Mapping[str, float]] = field(default_factory=dict)
+    #: degree of the polynomial B(x) that is learned; 0 for a constant, and where B is known
+    input_matrix_degree: int = 0
     #: lowest and highest set-point that the lift is wanted for, of some states by name, in their
     #: units
     setpoints: Mapping[str, tuple[float, float]] = field(default_factory=dict)
@@ -171,7 +173,8 @@ def retrain(task: Task, on_progress: OnProgress = lambda *_: False) -> Retrained
         states = _in_order(states, current.states, 'state', task.model)
         inputs = _in_order(inputs, current.inputs, 'input', task.model)
     plant = _unknown(task) if current is None else current.plant
-    plant = replace(plant, B=_known_gain(task, plant))
+    plant = replace(plant, B=_known_gain(task, plant),
+                    input_matrix_degree=task.input_matrix_degree)
     # a folder that cannot be written should fail now, not after the training
     Path(task.output).parent.mkdir(parents=True, exist_ok=True)
     _stop_if(on_progress(0.0, 'reading bags'))

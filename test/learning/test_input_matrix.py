@@ -19,6 +19,7 @@ from koopman_ros.identification import identify
 from koopman_ros.learning import Edmd, fit, Growth, NeuralDrift, roll_out, train
 from koopman_ros.learning.inputs import InputModel
 from koopman_ros.lifting import Box, load, save
+from koopman_ros.parameters.trainer import trainer_table
 from koopman_ros.plant_data import Samples
 from koopman_ros.plants import (
     advance,
@@ -30,6 +31,7 @@ from koopman_ros.plants import (
     steady_state,
 )
 from koopman_ros.plants.library.reactor import fed_reactor
+from koopman_ros.retraining.lift import learn_lift
 
 PLANT = fed_reactor()
 HALF_X, HALF_U = np.array([0.08, 8.0]), np.array([50.0, 10.0])
@@ -182,16 +184,22 @@ def test_lifts_and_drifts_are_learned_with_it():
         assert np.all(np.abs(path[1:5] - fresh.x[1:5]) < [1e-3, 0.1])
 
 
-def test_it_is_identified_from_noisy_samples():
+def test_it_is_identified_and_lifted_from_noisy_samples():
     rng = np.random.default_rng(4)
     inputs = np.repeat(PLANT.nominal_input + HALF_U * rng.uniform(-1.0, 1.0, (60, 2)), 4,
                        axis=0)
     episode = simulate(PLANT, PLANT.nominal_state, inputs, 0.05)
     noisy = replace(episode, x=episode.x + rng.normal(0.0, [1e-4, 0.02], episode.x.shape))
-    found = identify(UNKNOWN, [noisy], degrees=(1, 2)).drift
-    assert found.input_degree == 1
+    found = identify(UNKNOWN, [noisy], degrees=(1, 2))
+    drift = found.drift
+    assert drift.input_degree == 1
     x = episode.x[::25]
-    assert wrong(found.input_matrix_at(x), x) < 0.2 * wrong(found.input_matrix, x)
+    assert wrong(drift.input_matrix_at(x), x) < 0.2 * wrong(drift.input_matrix, x)
+    lift = learn_lift(found, UNKNOWN, 3, seed=0, starts=1).model
+    np.testing.assert_allclose(matrix_of(lift, x), drift.input_matrix_at(x), rtol=1e-6, atol=1e-9)
+    # it retrains as what it is
+    assert (lift.plant.input_matrix_degree, lift.plant.B) == (1, None)
+    assert trainer_table(lift).snapshot({}).input_matrix_degree == 1
 
 
 def test_the_plant_itself_is_held_and_differentiated():
