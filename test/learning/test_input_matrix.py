@@ -199,7 +199,7 @@ def test_it_is_identified_and_lifted_from_noisy_samples():
     np.testing.assert_allclose(matrix_of(lift, x), drift.input_matrix_at(x), rtol=1e-6, atol=1e-9)
     # it retrains as what it is
     assert (lift.plant.input_matrix_degree, lift.plant.B) == (1, None)
-    table = trainer_table(lift)
+    table = trainer_table(lift, {'system': 'fed_reactor'})
     assert table.snapshot({}).input_matrix_degree == 1
     given = table.snapshot({'input_matrix': [0.0] * 4})
     assert table.check(given).startswith('input_matrix_degree is 1, must be 0 where input_matrix')
