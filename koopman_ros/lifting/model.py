@@ -24,8 +24,8 @@ from koopman_ros.units import check_time_unit, SECONDS_PER_TIME_UNIT
 _DIFFERENCE = 1e-5
 # States of a box whose data are not known.
 _TRIED = 256
-# On [0, 1].
-_NODES, _WEIGHTS = 0.5 * np.add(leggauss(5), [[1.0], [0.0]])
+# Of Gauss and Legendre on [0, 1].
+NODES, WEIGHTS = 0.5 * np.add(leggauss(5), [[1.0], [0.0]])
 
 
 @dataclass(frozen=True)
@@ -327,8 +327,8 @@ class LiftedModel:
         if self.readout is not None:
             # w and what comes of it are not asked for
             return self.readout @ self.observables.features.lift_and_secants(x, x_ref, x)[2]
-        along = self.drift_jacobian(x_ref + _NODES[:, None] * (x - x_ref))
-        return _WEIGHTS.dot(along.reshape(len(_WEIGHTS), -1)).reshape(self.n_x, self.n_x)
+        along = self.drift_jacobian(x_ref + NODES[:, None] * (x - x_ref))
+        return WEIGHTS.dot(along.reshape(len(WEIGHTS), -1)).reshape(self.n_x, self.n_x)
 
 
 def linearised_model(jacobian: Array, B: Array, states: Coordinates, inputs: Coordinates,

@@ -169,9 +169,34 @@ def test_what_no_law_can_do_is_not_held_against_it():
     assert math.isnan(lost.worst_ratio)
 
 
+def test_what_a_perfect_model_does_no_better_is_not_the_models_fault():
+    """Of dx/dt = 2 x - 2 x^3 + u the law loses some loops that a linear one does not."""
+    A = np.zeros((3, 3))
+    A[0] = 2.0, 0.0, -2.0
+    model = LiftedModel(PolynomialObservables.total_degree(1, 3), A, np.ones((1, 1)), STATE, INPUT,
+                        's', Provenance('right'), readout=A[:1])
+
+    def rate(x, u):
+        return 2.0 * (x - x ** 3) + u
+
+    found = check_law(model, rate)
+    assert np.mean(found.poor) > 0.01
+    assert np.all(found.excess[found.poor] <= 1.001)
+    assert np.isnan(found.excess[~found.poor]).all()
+    assert found.accepted
+    assert found.region == ''
+    assert str(found).endswith(f', but for {np.sum(found.poor)} in which it would with a perfect '
+                               'model, too')
+    # a model of a third of that drift is to blame for what it loses
+    blamed = check_law(replace(model, A=A / 3.0, readout=A[:1] / 3.0), rate)
+    assert not blamed.accepted
+    assert np.all(blamed.excess[blamed.failed] > 1.05)
+    assert 0.5 < blamed.share_failed < np.mean(blamed.poor)
+
+
 def test_ranges_are_told_to_what_tells():
     found = LawCheck(TWO, np.array([[2.0004, 300.0]]), np.array([[-1e-17, 310.012]]),
-                     np.array([np.inf]), np.array([False]), 0)
+                     np.array([np.inf]), np.array([False]), np.array([np.inf]), 0)
     assert found.region == 'begun at a 2 m, b 300 K and bound for a 0 m, b 310 K'
 
 
