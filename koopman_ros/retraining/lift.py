@@ -132,7 +132,8 @@ def learn_lift(found: Identified, plant: Plant, n_z: int, *, seed: int, starts: 
     """
     Learn a lift of an estimated drift; the arguments are those of :func:`learning.train`.
 
-    :param plant: names, units and, where the episodes surround it, the nominal point.
+    :param plant: names, units and the nominal point. Where it is not known, or the episodes do not
+        surround it, a steady state in the middle of their range is taken.
     :raises NoUsefulLift: when no lift is better than a linear model.
     :raises ValueError: when the episodes hold no steady state.
     """
@@ -141,7 +142,8 @@ def learn_lift(found: Identified, plant: Plant, n_z: int, *, seed: int, starts: 
     within = (plant.nominal_state > lower) & (plant.nominal_state < upper)
     x, u = steady_point(found.drift,
                         np.where(within, plant.nominal_state, 0.5 * (lower + upper)),
-                        plant.nominal_input)
+                        np.where(np.isfinite(plant.nominal_input), plant.nominal_input,
+                                 found.drift.box.inputs.center))
     drift = found.drift
     known = replace(plant, nominal_state=x, nominal_input=u, input_matrix_degree=0,
                     B=drift.input_matrix_at if drift.input_degree else drift.input_matrix)

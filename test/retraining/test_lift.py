@@ -52,7 +52,8 @@ def found(shipped):
 
 @pytest.fixture(scope='module')
 def trained(found, shipped):
-    return learn_lift(found, shipped.plant, 2, seed=0, starts=1)
+    plant = replace(shipped.plant, nominal_input=np.array([np.nan]))
+    return learn_lift(found, plant, 2, seed=0, starts=1)
 
 
 @pytest.fixture
@@ -99,6 +100,13 @@ def test_the_shipped_lift_predicts_its_own_plant():
     segments = Segments.of([run], longest_step([run]))
     error = prediction_error(lifted_rate(shipped, 60.0), segments, shipped.states.scale)
     assert error == pytest.approx([NOISE], rel=0.15)
+
+
+def test_nominal_input_that_is_not_known_is_the_one_that_holds_the_nominal_state(
+        found, trained, shipped):
+    states, inputs = trained.model.states, trained.model.inputs
+    assert states.center == shipped.states.center
+    assert found.drift.rate(states.center, inputs.center) == pytest.approx([0.0], abs=1e-9)
 
 
 def test_a_better_lift_is_accepted(found, trained, shipped):
