@@ -4,15 +4,11 @@
 """
 A disturbance of the data that trainings see, in place of a processor that rounds differently.
 
-``DISTURB_TRAINING=1e-13`` in the environment switches it on, for pytest and for a script as
-``python test/support/disturbance.py SCRIPT ARGUMENTS``. Rounding of one part in 2^53 is carried
-that far by the simulations of samples; what a test asks of a training has to hold with it.
+``DISTURB_TRAINING=1e-13`` in the environment switches it on. Rounding of one part in 2^53 is
+carried that far by the simulations of samples; what a test asks of a training has to hold with it.
 """
 
 import os
-from pathlib import Path
-import runpy
-import sys
 
 import numpy as np
 
@@ -42,14 +38,3 @@ def disturb_training() -> None:
     from koopman_ros.learning import training
     original = training.ScaledSamples
     training.ScaledSamples = lambda *arrays: disturbed_data(original(*arrays))
-
-
-def script(path: Path) -> list[str]:
-    """Return the command that runs a script, disturbed where these tests are."""
-    return [sys.executable, *([__file__] if SIZE else []), str(path)]
-
-
-if __name__ == '__main__':
-    disturb_training()
-    sys.argv = sys.argv[1:]
-    runpy.run_path(sys.argv[0], run_name='__main__')
