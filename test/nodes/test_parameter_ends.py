@@ -52,7 +52,7 @@ STANDSTILL = ('waiting for the loop', 'finished', 'stopped: ')
 RECORDING = ('max_bag', 'min_free', 'compression')
 EXPERIMENT = ('experiment', 'coolant_temperature.experiment', 'coolant_temperature.safe',
               'temperature.experiment', 'temperature.setpoint')
-TRAINING = ('model_coordinates', 'training', 'gate', 'synchronisation',
+TRAINING = ('model_coordinates', 'input_matrix_degree', 'training', 'gate', 'synchronisation',
             'coolant_temperature.delay')
 # A lower limit and its upper one, which must change together to reach the ends.
 PAIRS = (('validity_margin', 'linear_margin'),
