@@ -55,6 +55,9 @@ class Code(Enum):
     LAW_FAILED = 'law_failed', 'the {level:level} fails: {cause}'
     HELD_TOO_LONG = 'held_too_long', '{cause}; held for longer than {timeout:g} s'
     RECOVERING = 'recovering', '{cause} (over, waiting for it to stay so)'
+    LOST_HERE = 'lost_here', (
+        'the {level:level} did not arrive when it was tried between such a state and set-point, '
+        'but a linear law did')
     NOT_STABILISABLE = 'riccati_not_stabilisable', (
         'no feedback gain: the Hamiltonian has no stable subspace of full size: the pair (A, B) '
         'is not stabilisable, or a mode on the imaginary axis is not weighted')

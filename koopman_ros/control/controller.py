@@ -395,11 +395,15 @@ class Controller:
             target, result = level.compute(
                 state.setpoint.active, estimate, self.settings.limits, memory, spacing,
                 state.target)
-            if result.failure is None:
-                return supervisor, target, result
             below = settings.order[settings.depth(level.name) + 1]
-            requested = Requested(below, reason(
-                Code.LAW_FAILED, level=level.name, cause=result.failure))
+            if result.failure is not None:
+                why = reason(Code.LAW_FAILED, level=level.name, cause=result.failure)
+            # a poor law is better than none
+            elif below in self.levels and level.lost(estimate, target):
+                why = reason(Code.LOST_HERE, level=level.name)
+            else:
+                return supervisor, target, result
+            requested = Requested(below, why)
 
     def _supervised(self, state: State, supervisor: Supervisor, verdict: Verdict,
                     outside: float, time_ns: int) -> State:

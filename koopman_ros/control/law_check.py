@@ -17,7 +17,8 @@ from koopman_ros.control.laws import Law, LAWS, Linear, Tuning, Weights
 from koopman_ros.control.laws.base import steady_state_target, Target
 from koopman_ros.control.limits import finite, InputLimits
 from koopman_ros.estimation import Estimate
-from koopman_ros.lifting import Coordinates, LiftedModel, NetworkObservables
+from koopman_ros.lifting import Coordinates, LiftedModel, NetworkObservables, TriedLoops
+from koopman_ros.lifting.coordinates import MAX_TRIED_LOOPS
 from koopman_ros.lifting.model import NODES, WEIGHTS
 from koopman_ros.solvers import RiccatiStatus, runge_kutta_step, solve_riccati
 
@@ -41,9 +42,10 @@ _ARRIVED = 0.05
 _APART = 0.25
 # It is lost when a state is further than this from the nominal point, in units of its scale.
 _ESCAPED = 10.0
-# Slowest time constants of the linear loop that a loop lasts, and the slowest rate beside the
-# fastest that is waited for.
+# Slowest time constants of the linear loop that a loop lasts, how many times as long one that has
+# not arrived may go on, and the slowest rate beside the fastest that is waited for.
 _DURATION = 6.0
+_PATIENCE = 4
 _SLOWEST = 1e-3
 # Samples in the fastest time constant of the linear loop, and steps of integration.
 _SAMPLES, _STEPS = 2, 8
@@ -88,6 +90,21 @@ class LawCheck:
         """Tell which (N,) of the poor ones are the model's fault: a better one would do better."""
         failed: NDArray[np.bool_] = self.poor & ~(self.excess <= MOST_EXCESS)
         return failed
+
+    @property
+    def lost(self) -> NDArray[np.bool_]:
+        """Tell which (N,) had no gain or did not arrive, where a linear law does."""
+        return np.isinf(self.ratios)
+
+    @property
+    def tried(self) -> TriedLoops | None:
+        """The loops as a model keeps them, so that another law acts in the lost ones; or None."""
+        lost = self.lost[:MAX_TRIED_LOOPS]
+        if not lost.any():
+            return None
+        starts, setpoints = (self.states.to_deviation(x[:MAX_TRIED_LOOPS])
+                             for x in (self.starts, self.setpoints))
+        return TriedLoops(starts, setpoints, lost)
 
     @property
     def loops(self) -> int:
@@ -148,7 +165,7 @@ class LawCheck:
             rest = '' if not self.poor.any() else (
                 f', but for {np.sum(self.poor)} in which it would with a perfect model, too')
             return f'{text}, costing at most {worst:.3g} times as much as a linear one{rest}'
-        failed, lost = self.failed, ~np.isfinite(self.ratios)
+        failed, lost = self.failed, self.lost
         counts = ((int(np.sum(failed & self.no_gain)), 'without a gain'),
                   (int(np.sum(failed & lost & ~self.no_gain)), 'not arriving'),
                   (int(np.sum(failed & ~lost)),
@@ -261,7 +278,7 @@ class _Plant:
         slope = self.slope(np.zeros((1, n)), np.zeros((1, model.n_u)))[0]
         itself = NetworkObservables((), np.zeros((0, n)), identity=True)
         return replace(model, observables=itself, A=slope[:, :n], B=slope[:, n:],
-                       readout=None, input_terms=None, pre_feedback=None)
+                       readout=None, input_terms=None, pre_feedback=None, tried_loops=None)
 
 
 def _closed_loop_rates(linear: LiftedModel, weights: Weights) -> tuple[float, float]:
@@ -420,12 +437,23 @@ def _run(plant: _Plant, feedbacks: Sequence[_Feedback], starts: Array, setpoints
     n, (M, m) = starts.shape[1], inputs.shape
     y = np.tile(np.hstack([starts, np.zeros((M, 1))]), (len(feedbacks), 1, 1))
     no_gain = np.zeros(M, dtype=bool)
+
+    def arrived() -> NDArray[np.bool_]:
+        return np.all(np.abs(y[..., :n] - setpoints) < _ARRIVED, axis=-1)
+
     # a loop that runs away ends as one that failed, whatever overflows meanwhile
     with np.errstate(all='ignore'):
-        for number in range(samples):
-            if watch(number / samples):
+        for number in range(_PATIENCE * samples):
+            # the share of the usual time
+            if watch(min(number, samples - 1) / samples):
                 return None
             active = (np.abs(y[..., :n]) < _ESCAPED).all(axis=-1)
+            y[~active] = np.nan
+            if number >= samples:
+                # all laws of a loop get the same time
+                active &= (active & ~arrived()).any(axis=0)
+                if not active.any():
+                    break
             v = np.array([act(x, on) for act, x, on in zip(
                 feedbacks, y[..., :n], active, strict=True)])
             no_gain |= active[0] & ~np.isfinite(v[0]).all(axis=-1)
@@ -439,8 +467,9 @@ def _run(plant: _Plant, feedbacks: Sequence[_Feedback], starts: Array, setpoints
                 rate = plant.rate(x.reshape(-1, n), v.reshape(-1, m)).reshape(x.shape)
                 return np.concatenate([rate, cost[..., None]], axis=-1)
 
-            y[~active] = np.nan
+            ahead = y
             for _ in range(steps):
-                y = runge_kutta_step(flow, y, interval / steps)
-        there = (np.abs(y[..., :n] - setpoints) < _ARRIVED).all(axis=-1)
+                ahead = runge_kutta_step(flow, ahead, interval / steps)
+            y = np.where(active[..., None], ahead, y)
+        there = arrived()
     return np.where(there & np.isfinite(y[..., n]), y[..., n], np.inf), no_gain

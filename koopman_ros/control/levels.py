@@ -95,6 +95,10 @@ class Level:
             return None, LawResult(None, reason(Code.NO_STEADY_STATE))
         return target, self.law.compute(estimate, target, limits, memory, interval)
 
+    def lost(self, estimate: Estimate, target: Target | None) -> bool:
+        """Tell whether the law was lost between such a state and target when it was checked."""
+        return target is not None and self.model.lost_at(estimate.x, target.x)
+
 
 def levels_of(model: LiftedModel, settings: Settings) -> dict[str, Level]:
     """

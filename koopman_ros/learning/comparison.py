@@ -212,6 +212,9 @@ class _Judge:
             if law_check is not None and not law_check.accepted:
                 refusal = f'no controller: {law_check}'
         figures = evaluate(model, self._test)
-        model = replace(model, training_states=self._known, provenance=replace(
-            model.provenance, metrics=figures.metrics(model.states.names)))
+        model = replace(
+            model, training_states=self._known,
+            tried_loops=None if law_check is None else law_check.tried,
+            provenance=replace(
+                model.provenance, metrics=figures.metrics(model.states.names)))
         return Contender(name, model, self.rx(model), figures, law_check, seconds, refusal)

@@ -78,6 +78,8 @@ class Trained:
 class NoUsefulLift(ValueError):  # noqa: N818
     """Training ended without a lift that is better than a linear model; the message says why."""
 
+    law_check: LawCheck | None = None  #: the closed loops of a lift whose law failed
+
 
 @dataclass(frozen=True)
 class _Candidate:
@@ -191,15 +193,19 @@ def _conclude(plant: Plant, parts: tuple[Samples, Samples, Samples], path: list[
                                   loops=loops, watch=watch)
         interrupted = interrupted or law_check is None
         if law_check is not None and not law_check.accepted:
-            raise NoUsefulLift(
+            refusal = NoUsefulLift(
                 f'the lift with n_z = {winner.model.n_z} is no controller: {law_check}: use '
                 f'{_remedies(winner.model)}')
+            refusal.law_check = law_check
+            raise refusal
     models, figures = [], []
     for candidate in path:
         figures.append(evaluate(candidate.model, parts[2]))
         metrics = figures[-1].metrics(candidate.model.states.names)
         models.append(replace(candidate.model, provenance=replace(
             candidate.model.provenance, metrics=metrics)))
+    if law_check is not None:
+        models[-1] = replace(models[-1], tried_loops=law_check.tried)
     return Trained(models[-1], figures[-1], evaluate(linear, parts[2]), law_check,
                    _ending(winner.grown, interrupted), tuple(models), tracker.finished)
 

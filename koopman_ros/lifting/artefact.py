@@ -17,7 +17,7 @@ import numpy as np
 
 from koopman_ros.lifting import bounds
 from koopman_ros.lifting.activations import activation_named
-from koopman_ros.lifting.coordinates import Coordinates, TrainingStates
+from koopman_ros.lifting.coordinates import Coordinates, TrainingStates, TriedLoops
 from koopman_ros.lifting.input_terms import InputTerms
 from koopman_ros.lifting.model import LiftedModel, Provenance
 from koopman_ros.lifting.observables import NetworkObservables, PolynomialObservables
@@ -69,6 +69,9 @@ def save(model: LiftedModel, path: str | os.PathLike[str]) -> None:
         tensors['input_terms'] = C.reshape(len(C), -1)
     if model.pre_feedback is not None:
         tensors['pre_feedback'] = model.pre_feedback
+    tried = model.tried_loops
+    if tried is not None:
+        tensors['tried_loops'] = np.column_stack([tried.starts, tried.setpoints, tried.lost])
     description = json.dumps({
         **network,
         **({'fill_distance': known.fill_distance} if known is not None else {}),
@@ -131,7 +134,7 @@ def load_with_digest(path: str | os.PathLike[str]) -> tuple[LiftedModel, str]:
         raise ModelFileError(
             f'the model file {path} has format version {version!r}, this package reads '
             f'{FORMAT_VERSION}: retrain the model, or install the matching package')
-    if len(header) > 2 * bounds.MAX_LAYERS + 6:
+    if len(header) > 2 * bounds.MAX_LAYERS + 7:
         _refuse(path, f'it holds {len(header)} arrays, more than any lift')
     tensors = {name: _tensor(path, name, entry, data) for name, entry in header.items()}
     try:
@@ -162,8 +165,8 @@ def _build(about: dict[str, Any], tensors: dict[str, np.ndarray]) -> LiftedModel
     if 'fill_distance' in about:
         expected.add('training_states')
     # files without them are of lifts whose drift is read off the rate of z, whose B is constant,
-    # and whose A is of the plant alone
-    expected |= {'readout', 'input_terms', 'pre_feedback'} & set(tensors)
+    # whose A is of the plant alone, and whose law is lost nowhere
+    expected |= {'readout', 'input_terms', 'pre_feedback', 'tried_loops'} & set(tensors)
     if set(tensors) != expected:
         raise ValueError(f'expected the arrays {sorted(expected)}, got {sorted(tensors)}')
     if not monomials and not isinstance(about['identity'], bool):
@@ -194,7 +197,8 @@ def _build(about: dict[str, Any], tensors: dict[str, np.ndarray]) -> LiftedModel
         readout=tensors.get('readout'),
         input_terms=None if 'input_terms' not in tensors else InputTerms(
             tensors['input_terms'].reshape(len(tensors['input_terms']), *tensors['B'].shape)),
-        pre_feedback=tensors.get('pre_feedback'))
+        pre_feedback=tensors.get('pre_feedback'),
+        tried_loops=None if 'tried_loops' not in tensors else _tried(tensors['tried_loops']))
     for name, actual in (('n_x', model.n_x), ('n_u', model.n_u), ('n_z', model.n_z)):
         if _integer(about, name) != actual:
             raise ValueError(f'{name} is given as {about[name]}, the arrays say {actual}')
@@ -206,6 +210,15 @@ def _monomials(exponents: np.ndarray) -> PolynomialObservables:
     if not np.array_equal(rounded, exponents):
         raise ValueError(f'exponents must be whole numbers from 0 to {bounds.MAX_DEGREE}')
     return PolynomialObservables(rounded.astype(np.int64))
+
+
+def _tried(rows: np.ndarray) -> TriedLoops:
+    if rows.ndim != 2 or rows.shape[1] % 2 == 0:
+        raise ValueError(f'incompatible tried_loops: expected (N, 2 n_x + 1), got {rows.shape}')
+    n_x, lost = rows.shape[1] // 2, rows[:, -1]
+    if not np.isin(lost, (0.0, 1.0)).all():
+        raise ValueError('the last column of tried_loops must be 0 or 1')
+    return TriedLoops(rows[:, :n_x], rows[:, n_x:-1], lost == 1.0)
 
 
 def _checksum(description: str, arrays: dict[str, Any], data: bytes) -> str:

@@ -11,12 +11,13 @@ from functools import cached_property
 import math
 
 import numpy as np
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, NDArray
 
 from koopman_ros.arrays import Array, brief, frozen
 from koopman_ros.plant_data import Plant
 
 MAX_TRAINING_STATES = 256
+MAX_TRIED_LOOPS = 1024
 
 
 @dataclass(frozen=True)
@@ -211,6 +212,46 @@ class TrainingStates:
             return math.inf
         nearest = float(np.min(_distances(self.states, x, half_widths)))
         return max(0.0, nearest - self.fill_distance)
+
+
+@dataclass(frozen=True)
+class TriedLoops:
+    """
+    The closed loops in which a model's law was tried, and in which of them it was lost.
+
+    :raises ValueError: naming what does not fit.
+    """
+
+    starts: Array  #: (N, n_x) where they began, in scaled deviations; N from 1 to 1024
+    setpoints: Array  #: (N, n_x) where they were to go, likewise
+    lost: NDArray[np.bool_]  #: (N,) where it did not arrive, or had no gain, but a linear law did
+
+    __repr__ = brief
+
+    def __post_init__(self) -> None:
+        shape = np.shape(self.starts)
+        if len(shape) != 2 or not 1 <= shape[0] <= MAX_TRIED_LOOPS:
+            raise ValueError(f'incompatible tried_loops: expected (N, n_x) with N from 1 to '
+                             f'{MAX_TRIED_LOOPS}, got {shape}')
+        object.__setattr__(self, 'starts', frozen(self.starts, 'starts', shape))
+        object.__setattr__(self, 'setpoints', frozen(self.setpoints, 'setpoints', shape))
+        lost = np.array(self.lost, dtype=np.bool_)
+        if lost.shape != shape[:1]:
+            raise ValueError(f'incompatible lost: expected {shape[:1]}, got {lost.shape}')
+        lost.setflags(write=False)
+        object.__setattr__(self, 'lost', lost)
+
+    def lost_at(self, x: Array, x_ref: Array, half_widths: Array) -> bool:
+        """
+        Tell whether the loop that is nearest to a state and a set-point, (n_x,) each, was lost.
+
+        All are scaled; distances are in half widths of the training box, as those of
+        :class:`TrainingStates`. Between two equally near loops the law has the doubt's benefit.
+        """
+        distances = np.maximum(_distances(self.starts, x, half_widths),
+                               _distances(self.setpoints, x_ref, half_widths))
+        nearest = np.min(distances, where=self.lost, initial=math.inf)
+        return bool(nearest < np.min(distances, where=~self.lost, initial=math.inf))
 
 
 def _distances(states: Array, x: Array, half_widths: Array) -> Array:

@@ -14,7 +14,7 @@ from numpy.polynomial.legendre import leggauss
 from numpy.typing import NDArray
 
 from koopman_ros.arrays import Array, brief, frozen
-from koopman_ros.lifting.coordinates import Coordinates, TrainingStates
+from koopman_ros.lifting.coordinates import Coordinates, TrainingStates, TriedLoops
 from koopman_ros.lifting.input_terms import InputTerms
 from koopman_ros.lifting.observables import NetworkObservables, Observables
 from koopman_ros.plant_data import Plant
@@ -75,6 +75,8 @@ class LiftedModel:
     input_terms: InputTerms | None = None  #: what B(x) has beside B; None where it is constant
     #: (n_u, n_x) gain K of the pre-feedback that A holds under, in scaled coordinates, or None
     pre_feedback: Array | None = None
+    #: where the law of the model was tried; None where that is not known, or it was lost nowhere
+    tried_loops: TriedLoops | None = None
 
     __repr__ = brief
 
@@ -98,6 +100,9 @@ class LiftedModel:
         if self.training_states is not None and self.training_states.states.shape[1] != n_x:
             raise ValueError(f'incompatible training_states: expected {n_x} states, got '
                              f'{self.training_states.states.shape[1]}')
+        if self.tried_loops is not None and self.tried_loops.starts.shape[1] != n_x:
+            raise ValueError(f'incompatible tried_loops: expected {n_x} states, got '
+                             f'{self.tried_loops.starts.shape[1]}')
 
     @property
     def n_x(self) -> int:
@@ -238,7 +243,19 @@ class LiftedModel:
             slope = self.drift_jacobian(origin)
         observables = NetworkObservables((), np.zeros((0, self.n_x)), identity=True)
         return replace(self, observables=observables, A=slope, readout=None,
-                       input_terms=None, pre_feedback=None)
+                       input_terms=None, pre_feedback=None, tried_loops=None)
+
+    def lost_at(self, x: Array, x_ref: Array) -> bool:
+        """
+        Tell whether the law was lost when it was tried on a way from x to x_ref, (n_x,) each.
+
+        In scaled deviations; see :attr:`tried_loops`.
+        """
+        if self.tried_loops is None:
+            return False
+        states = self.states
+        return self.tried_loops.lost_at(x, x_ref, 0.5 * (states.upper - states.lower)
+                                        / states.scale)
 
     def distance(self, x: Array) -> float:
         """

@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 
+from koopman_ros.control.law_map import draw_loops
 from koopman_ros.identification import fitted_starts, Identified, longest_step, Segments
 from koopman_ros.identification.drift import Rate
 from koopman_ros.learning.validation import lifted_rate
@@ -95,12 +96,18 @@ def _draw(path: Path, retrained: Retrained) -> bool:
     """Draw where the data lie, what was learned, and how it predicts; False without matplotlib."""
     n_x = len(retrained.found.drift.box.states)
     try:
-        with drawing(path, n_x, 3, size=(15.0, 4.6 * n_x)) as (figure, panels):
+        decision = retrained.decision
+        columns = 3 if decision is None else 4
+        with drawing(path, n_x, columns, size=(5.0 * columns, 4.6 * n_x)) as (figure, panels):
             for i in range(n_x):
-                left, middle, right = panels[3 * i:3 * i + 3]
-                _draw_coverage(left, retrained.found, i)
-                _draw_drift(middle, retrained, i)
-                _draw_prediction(right, retrained, i)
+                row = panels[columns * i:columns * (i + 1)]
+                _draw_coverage(row[0], retrained.found, i)
+                _draw_drift(row[1], retrained, i)
+                _draw_prediction(row[2], retrained, i)
+                if decision is not None:
+                    draw_loops(row[3], decision.law_check, i)
+                    row[3].set_title('closed loops on the estimated drift')
+                    row[3].legend(fontsize=8)
             word = 'accepted' if retrained.accepted else 'refused'
             figure.suptitle(f'Retraining: the new lift is {word}')
     except ImportError:

@@ -315,7 +315,7 @@ def _with_provenance(model: LiftedModel, found: Identified, decision: Decision, 
         metrics |= dict(zip(labels, map(float, values), strict=True))
     # a refused lift may diverge
     metrics = {name: value for name, value in metrics.items() if np.isfinite(value)}
-    return replace(model, provenance=replace(
+    return replace(model, tried_loops=decision.law_check.tried, provenance=replace(
         model.provenance, data_digest=sha.hexdigest(), metrics=metrics,
         method=f'{found.method}, drift of degree {found.drift.degree}'))
 

@@ -6,11 +6,14 @@
 from dataclasses import dataclass, replace
 import math
 
+from matplotlib.figure import Figure
 import numpy as np
 import pytest
 from scipy.integrate import quad
 
+from koopman_ros.control import Controller, LevelSettings, Settings, State, SupervisorSettings
 from koopman_ros.control.law_check import check_law, LawCheck
+from koopman_ros.control.law_map import draw_loops, plot_law_check
 from koopman_ros.control.laws import LawResult, Linear, Tuning, Weights
 from koopman_ros.control.laws.base import steady_state_target
 from koopman_ros.control.limits import InputLimits
@@ -22,7 +25,10 @@ from koopman_ros.lifting import (
     PolynomialObservables,
     Provenance,
     TrainingStates,
+    TriedLoops,
 )
+from koopman_ros.reasons import Code
+from koopman_ros.units import NANOSECONDS
 
 STATE = Coordinates(('level',), ('m',), np.zeros(1), np.ones(1), -np.ones(1), np.ones(1))
 INPUT = Coordinates(('flow',), ('m/s',), np.zeros(1), np.ones(1), np.full(1, -3.0),
@@ -169,17 +175,24 @@ def test_what_no_law_can_do_is_not_held_against_it():
     assert math.isnan(lost.worst_ratio)
 
 
-def test_what_a_perfect_model_does_no_better_is_not_the_models_fault():
-    """Of dx/dt = 2 x - 2 x^3 + u the law loses some loops that a linear one does not."""
+def cubic(a, b, c, limit):
+    """Return the model of dx/dt = a x + b x^2 + c x^3 + u, and this rate."""
     A = np.zeros((3, 3))
-    A[0] = 2.0, 0.0, -2.0
-    model = LiftedModel(PolynomialObservables.total_degree(1, 3), A, np.ones((1, 1)), STATE, INPUT,
-                        's', Provenance('right'), readout=A[:1])
+    A[0] = a, b, c
+    bounds = np.full(1, limit)
+    inputs = replace(INPUT, lower=-bounds, upper=bounds)
+    return LiftedModel(PolynomialObservables.total_degree(1, 3), A, np.ones((1, 1)), STATE, inputs,
+                       's', Provenance('cubic'), readout=A[:1]), (
+        lambda x, u: a * x + b * x ** 2 + c * x ** 3 + u)
 
-    def rate(x, u):
-        return 2.0 * (x - x ** 3) + u
 
-    found = check_law(model, rate)
+def too_steady():
+    """Return a model of dx/dt = x + u that takes x for far steadier than it is, far out."""
+    return cubic(1.0, 0.0, -0.5, 3.0)[0]
+
+
+def test_what_a_perfect_model_does_no_better_is_not_the_models_fault():
+    found = check_law(*cubic(0.0, 6.0, 0.0, 8.0))
     assert np.mean(found.poor) > 0.01
     assert np.all(found.excess[found.poor] <= 1.001)
     assert np.isnan(found.excess[~found.poor]).all()
@@ -187,11 +200,94 @@ def test_what_a_perfect_model_does_no_better_is_not_the_models_fault():
     assert found.region == ''
     assert str(found).endswith(f', but for {np.sum(found.poor)} in which it would with a perfect '
                                'model, too')
-    # a model of a third of that drift is to blame for what it loses
-    blamed = check_law(replace(model, A=A / 3.0, readout=A[:1] / 3.0), rate)
+    # here it is to blame
+    blamed = check_law(too_steady(), linear_rate(1.0))
     assert not blamed.accepted
     assert np.all(blamed.excess[blamed.failed] > 1.05)
-    assert 0.5 < blamed.share_failed < np.mean(blamed.poor)
+
+
+def test_what_is_slow_and_cheap_has_not_failed():
+    """Between two stable rests the law takes longer than a linear one, and costs less."""
+    found = check_law(*cubic(2.0, 0.0, -2.0, 3.0))
+    assert (found.arrived, found.poor.sum()) == (found.loops, 0)
+    assert found.worst_ratio < 1.0
+
+
+def test_a_model_keeps_the_loops_in_which_its_law_is_lost():
+    model = too_steady()
+    found = check_law(model, linear_rate(1.0))
+    tried = found.tried
+    assert tried is not None
+    model = replace(model, tried_loops=tried)
+    for start, setpoint, lost in zip(found.starts, found.setpoints, found.lost, strict=True):
+        assert model.lost_at(start, setpoint) == lost
+    assert model.linearised.tried_loops is None
+    # and nothing of a law that is lost nowhere
+    assert check_law(two_states(), two_state_rate, loops=16).tried is None
+
+
+@pytest.mark.parametrize(('starts', 'setpoints', 'lost'), [
+    (np.zeros((3, 2)), np.zeros((3, 2)), np.zeros(2)),
+    (np.zeros((3, 2)), np.zeros((3, 1)), np.zeros(3)),
+    (np.zeros((0, 2)), np.zeros((0, 2)), np.zeros(0)),
+    (np.zeros((1025, 2)), np.zeros((1025, 2)), np.zeros(1025))])
+def test_tried_loops_that_do_not_fit_are_refused(starts, setpoints, lost):
+    with pytest.raises(ValueError, match='incompatible'):
+        TriedLoops(starts, setpoints, lost)
+
+
+def test_tried_loops_of_another_plant_are_refused():
+    tried = TriedLoops(np.zeros((1, 2)), np.zeros((1, 2)), np.zeros(1))
+    with pytest.raises(ValueError, match='incompatible tried_loops: expected 1 states, got 2'):
+        replace(scalar(), tried_loops=tried)
+
+
+def levels_on_the_way(model, levels, start, setpoint):
+    """Let a controller bring the plant dx/dt = x + u to a set-point; return (level, reason)s."""
+    loop = Controller(model, Settings.for_model(
+        model, state_weight=np.ones(1), input_weight=np.ones(1), observer_bandwidth=5.0,
+        limits=InputLimits(*(np.full(1, bound) for bound in (-3.0, 3.0, np.inf))),
+        transfer_time=0.0, supervisor=SupervisorSettings(tuple(
+            LevelSettings(law, 1.0) for law in levels), recovery_time=0.5)))
+    x, h, found = np.array([start]), 0.05, []
+    state, refused = loop.request_setpoint(State(), np.array([setpoint]))
+    assert refused is None
+    for k in range(200):
+        state, u, report = loop.step(state, x, round(k * h * NANOSECONDS))
+        x = math.exp(h) * x + (math.exp(h) - 1.0) * u
+        found.append((report.level, report.reason and report.reason.code))
+    assert x == pytest.approx(setpoint, abs=1e-3)
+    return found
+
+
+def test_where_its_law_was_lost_the_controller_takes_the_next_one():
+    found = check_law(too_steady(), linear_rate(1.0))
+    assert 0 < found.lost.sum() < found.poor.sum() < found.loops
+    model = replace(too_steady(), tried_loops=found.tried)
+    for lost, expected in ((True, ('linear', Code.LOST_HERE)), (False, ('sdre', None))):
+        for k in np.flatnonzero(found.lost == lost)[:5]:
+            first, *_ = levels_on_the_way(
+                model, ('sdre', 'linear'), found.starts[k, 0], found.setpoints[k, 0])
+            assert first == expected
+    start, setpoint = found.starts[found.lost][0, 0], found.setpoints[found.lost][0, 0]
+    # another set-point is another way
+    *_, (last, _) = levels_on_the_way(model, ('sdre', 'linear'), start, 0.5 * start)
+    assert last == 'sdre'
+    # without another law there is nothing to leave the plant to
+    assert set(levels_on_the_way(model, ('sdre',), start, setpoint)) == {('sdre', None)}
+
+
+def test_the_map_shows_each_loop_once(tmp_path):
+    found = check_law(too_steady(), linear_rate(1.0))
+    file = plot_law_check(found, tmp_path / 'map.png')
+    assert file.read_bytes().startswith(b'\x89PNG')
+    axes = Figure().subplots()
+    draw_loops(axes, found, 0)
+    drawn = np.concatenate([dots.get_offsets() for dots in axes.collections])
+    expected = np.hstack([found.starts, found.setpoints])
+    assert sorted(map(tuple, drawn)) == sorted(map(tuple, expected))
+    assert [len(dots.get_offsets()) for dots in axes.collections] == [
+        np.sum(~found.poor), np.sum(found.failed)]
 
 
 def test_ranges_are_told_to_what_tells():

@@ -26,6 +26,7 @@ from koopman_ros.lifting import (
     PolynomialObservables,
     save,
     TrainingStates,
+    TriedLoops,
 )
 from support.closed_loops import content
 from support.random_lifts import random_lift
@@ -46,6 +47,8 @@ MODELS = {
         0).normal(size=(2, 6))),
     'with a pre-feedback': replace(random_lift(n_u=2), pre_feedback=np.random.default_rng(
         0).normal(size=(2, 2))),
+    'with tried loops': replace(random_lift(), tried_loops=TriedLoops(
+        *np.random.default_rng(0).normal(size=(2, 7, 2)), np.arange(7) % 3 == 0)),
     'monomials': replace(
         random_lift(), observables=PolynomialObservables.total_degree(2, 2),
         readout=np.random.default_rng(0).normal(size=(2, 5))),
