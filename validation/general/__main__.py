@@ -10,6 +10,7 @@ import sys
 import time
 from typing import Any
 
+from validation.general import coordinates
 from validation.general.report import write_report
 from validation.general.study import EXPERIMENTS
 from validation.paper.campaign import conclude, run_campaign
@@ -36,8 +37,12 @@ def main(args: list[str] | None = None) -> int:
     # a request to end is an interrupt: what is done is reported
     signal.signal(signal.SIGTERM, signal.default_int_handler)
     start = time.monotonic()
-    campaign = run_campaign(options.seeds, {
-        name: EXPERIMENTS[name] for name in options.plants or EXPERIMENTS})
+    names = options.plants or list(EXPERIMENTS)
+    campaign = run_campaign(options.seeds, {name: EXPERIMENTS[name] for name in names})
+    if campaign.complete:
+        campaign.add(run_campaign(min(options.seeds, coordinates.SEEDS), {
+            name: coordinates.EXPERIMENTS[name] for name in (
+                f'{coordinates.PLACE}/{name}' for name in names)}))
 
     def report(summary: dict[str, Any]) -> str:
         write_report(summary, options.output)

@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 The koopman_ros Authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""Classes of models that are set beside each other; to add one, name it in LEARNERS."""
+"""Classes of models that are set beside each other; to add one, name it in LEARNERS or RECIPES."""
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
@@ -88,14 +88,17 @@ def _trained(recipe: Callable[[int], Recipe]) -> Learner:
 
 
 _STEPS = 300  # of Levenberg-Marquardt, for each size
+# What is trained, made for a number of states.
+RECIPES: dict[str, Callable[[int], Recipe]] = {
+    'identity lift': lambda n_x: Growth(n_x + 3, hidden_first=16, max_iterations=_STEPS),
+    'free lift': lambda n_x: Growth(
+        n_x, identity=False, hidden_first=16, max_iterations=_STEPS),
+    'neural drift': lambda n_x: NeuralDrift((16,), max_iterations=_STEPS),
+}
 LEARNERS: dict[str, Learner] = {
     'linear': _polynomial(1),
     'EDMD-3': _polynomial(3),
     'EDMD-5': _polynomial(5),
     'SINDy-5': _sparse(5),
-    'identity lift': _trained(
-        lambda n_x: Growth(n_x + 3, hidden_first=16, max_iterations=_STEPS)),
-    'free lift': _trained(
-        lambda n_x: Growth(n_x, identity=False, hidden_first=16, max_iterations=_STEPS)),
-    'neural drift': _trained(lambda n_x: NeuralDrift((16,), max_iterations=_STEPS)),
+    **{label: _trained(recipe) for label, recipe in RECIPES.items()},
 }

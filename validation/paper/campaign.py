@@ -55,6 +55,13 @@ class Campaign:
     #: closed loops of models, by the identity of the model
     loops: dict[int, ClosedLoop] = field(default_factory=dict)
 
+    def add(self, other: 'Campaign') -> None:
+        """Take in what other experiments found."""
+        self.metrics |= other.metrics
+        self.models |= other.models
+        self.errors = sorted(self.errors + other.errors)
+        self.complete = self.complete and other.complete
+
     def summary(self) -> dict[str, Any]:
         """Nest the figures: experiment, its parts, then one list over the seeds."""
         nested: dict[str, Any] = {}

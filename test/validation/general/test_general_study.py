@@ -13,10 +13,11 @@ import matplotlib.image
 import numpy as np
 import pytest
 
-from koopman_ros.learning import Growth, NoUsefulLift
+from koopman_ros.learning import Growth, NoUsefulLift, rollout_rmse
+from koopman_ros.lifting import Box
 from koopman_ros.plants import describe
 from koopman_ros.solvers import solve_riccati
-from validation.general import learners, loops, study
+from validation.general import coordinates, learners, loops, study
 from validation.general.__main__ import main
 from validation.general.loops import End, judged, Known
 from validation.general.systems import CASES, oscillator
@@ -139,6 +140,10 @@ def folder(tmp_path_factory):
             'hasty lift': learners._trained(lambda n_x: Growth(n_x + 1, max_iterations=5))})
         patch.setitem(study.EXPERIMENTS, 'van_der_pol', partial(
             study.run, 'van_der_pol', starts=3))
+        patch.setattr(coordinates, 'RECIPES', {
+            'identity lift': lambda n_x: Growth(n_x + 1, max_iterations=5)})
+        patch.setitem(coordinates.EXPERIMENTS, 'coordinates/van_der_pol', partial(
+            coordinates.run, 'van_der_pol', starts=3))
         assert main(['van_der_pol', '--seeds', '1', '--output', str(output)]) == 0
     return output
 
@@ -161,8 +166,39 @@ def test_figures_of_van_der_pol(folder):
     assert found[study.SDRE]['missed'] == 0
 
 
+def test_uses_of_models_of_van_der_pol(folder):
+    """Its drift is cubic: noise apart, the cubic model is exact in and beyond the box."""
+    found = json.loads((folder / 'summary.json').read_text())['coordinates']['van_der_pol']
+    cubic, lift = found['EDMD-3'], found['identity lift']
+    assert max(cubic['rx'] + cubic['rx_few'] + cubic['rx_beyond']) < 1e-20
+    # a variance of a part in 1100 for the noise, over some 70 samples to a coefficient
+    assert 1e-6 < cubic['rx_noisy'][0] < 1e-4
+    assert lift['rollout'][0] < lift['rollout_z'][0]
+    assert {'averaged', 'recentred', 'averaged_missed', 'recentred_missed'} <= lift.keys()
+
+
+def test_in_z_a_linear_model_is_predicted_as_by_its_drift():
+    case = CASES['van_der_pol']
+    samples = case.samples(0, 5)
+    model = case.truth
+    by_drift = rollout_rmse(model, samples)
+    np.testing.assert_allclose(coordinates.rolled_in_z(model, samples), by_drift, rtol=1e-3)
+    assert by_drift.max() > 0.1
+
+
+def test_in_discrete_time_a_linear_plant_is_predicted_exactly():
+    """With delays, too, which it does not need."""
+    spring = oscillator('spring', lambda x1, x2: x1 - x2, lambda x1, x2: (1.0, -1.0))
+    case = replace(CASES['duffing'], system=spring)
+    samples, held_out = case.samples(0), case.samples(1, 10)
+    box = Box.of(describe(spring), samples.x, samples.u)
+    for delays in (0, 1):
+        assert coordinates.discrete(case, box, samples, held_out, delays) < 1e-6
+
+
 def test_report_of_van_der_pol(folder):
     text = (folder / 'report.md').read_text()
+    assert '| Van der Pol | EDMD-3 | ' in text
     assert re.search(r'^\| model \| Van der Pol \|$', text, re.MULTILINE)
     assert re.search(r'^\| natural SDRE on the truth \| 1 of 1 \|$', text, re.MULTILINE)
     assert '\n## Van der Pol\n' in text
