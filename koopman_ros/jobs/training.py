@@ -152,23 +152,46 @@ def _in_words(summary: Mapping[str, Any]) -> str:
     present = summary['heldout_error_of_present_lift']
     other, name = (('heldout_error_of_linear_model', 'best linear model') if present is None else (
         'heldout_error_of_present_lift', 'present one'))
-    return (f'the new lift is accepted: error on held-out records '
-            f'{_errors(summary, "heldout_error")}, that of the {name} '
+    units = summary['units']
+    return ('the new lift is accepted: error on held-out records '
+            f'{_errors(summary["heldout_error"], units)}, that of the {name} '
             + ('infinite, as it diverges' if None in summary[other].values()
-               else _errors(summary, other))
+               else _errors(summary[other], units))
             + f'; written to {summary["model_file"]}')
 
 
-def _errors(summary: Mapping[str, Any], key: str) -> str:
-    errors, units = summary[key], summary['units']
-    return ', '.join(f'{value:.4g} {units[name]}' + (f' in {name}' if len(errors) > 1 else '')
+def _errors(errors: Mapping[str, float | None], units: Mapping[str, str]) -> str:
+    return ', '.join(('infinite' if value is None else f'{value:.4g} {units[name]}')
+                     + (f' in {name}' if len(errors) > 1 else '')
                      for name, value in errors.items())
+
+
+def class_lines(summary: Mapping[str, Any]) -> dict[str, str]:
+    """Return a line for each of several classes that were learned, by name; else nothing."""
+    classes = summary.get('classes', {})
+    return {} if len(classes) < 2 else {
+        name: _class_line(one, summary['units']) for name, one in classes.items()}
+
+
+def _class_line(one: Mapping[str, Any], units: Mapping[str, str]) -> str:
+    parts = []
+    if 'heldout_error' in one:
+        rx, failed, loops = (one[key] for key in (
+            'heldout_rx', 'closed_loops_failed', 'closed_loops'))
+        parts = [f'drift rx {"infinite" if rx is None else f"{rx:.1e}"}',
+                 f'roll-out {_errors(one["heldout_error"], units)}',
+                 f'law fails in {failed} of {loops} closed loops']
+    line = 'chosen: ' * one['chosen'] + ', '.join([*parts, f'{one["seconds"]:.1f} s'])
+    return line + (f'; refused: {one["refusal"]}' if one['refusal'] else '')
 
 
 def scalars(summary: Mapping[str, Any]) -> dict[str, bool | float | str]:
     """Return the figures of a summary one by one, those of a signal under its name."""
-    found: dict[str, bool | float | str] = {}
+    found: dict[str, bool | float | str] = {
+        f'class {name}': line for name, line in class_lines(summary).items()}
     for key, value in summary.items():
+        if key == 'classes':
+            continue
         if isinstance(value, Mapping):
             found |= {f'{key}: {name}': one for name, one in scalars(value).items()}
         elif isinstance(value, (bool, int, float, str)):

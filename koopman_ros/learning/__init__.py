@@ -4,7 +4,7 @@
 """Lifts learned from samples, their baselines and held-out figures; in torch, never in a node."""
 
 from koopman_ros.learning.baselines import Algorithm1, Edmd, Linearisation
-from koopman_ros.learning.comparison import compare, Comparison, Contender
+from koopman_ros.learning.comparison import compare, Comparison, Contender, Judge
 from koopman_ros.learning.drift import NeuralDrift
 from koopman_ros.learning.growth import Growth
 from koopman_ros.learning.training import NoUsefulLift, Progress, train, Trained
@@ -18,7 +18,7 @@ from koopman_ros.learning.validation import (
 )
 
 __all__ = [
-    'Algorithm1', 'Comparison', 'Contender', 'Edmd', 'Figures', 'Fit', 'Growth', 'Linearisation',
-    'NeuralDrift', 'NoUsefulLift', 'Progress', 'Trained', 'compare', 'evaluate', 'fit', 'roll_out',
-    'rollout_rmse', 'train',
+    'Algorithm1', 'Comparison', 'Contender', 'Edmd', 'Figures', 'Fit', 'Growth', 'Judge',
+    'Linearisation', 'NeuralDrift', 'NoUsefulLift', 'Progress', 'Trained', 'compare', 'evaluate',
+    'fit', 'roll_out', 'rollout_rmse', 'train',
 ]

@@ -5,7 +5,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
+import contextlib
 from dataclasses import dataclass, replace
 import math
 import time
@@ -14,10 +15,12 @@ import numpy as np
 
 from koopman_ros.control.law_check import check_law, LawCheck, LOOPS
 from koopman_ros.learning.baselines import Edmd
+from koopman_ros.learning.contradictions import check_nominal_point, check_rates
 from koopman_ros.learning.drift import NeuralDrift, with_readout, with_units_of
 from koopman_ros.learning.growth import Growth
 from koopman_ros.learning.training import (
     NoUsefulLift,
+    Progress,
     Recipe,
     reference_drift,
     train,
@@ -26,10 +29,10 @@ from koopman_ros.learning.training import (
 )
 from koopman_ros.learning.validation import evaluate, Figures, fit, ROUNDING
 from koopman_ros.lifting import bounds, Box, LiftedModel
+from koopman_ros.model_classes import FREE_LIFT, IDENTITY_LIFT, LINEAR, NEURAL_DRIFT, POLYNOMIAL
 from koopman_ros.plant_data import Plant, Samples, split_by_episode
 from koopman_ros.reports import table
 
-LINEAR, POLYNOMIAL = 'linear', 'polynomial'
 DEGREES = (2, 3, 4, 5)
 # A plainer model may err by this much more, in the mean square.
 _FACTOR = 2.0
@@ -46,6 +49,23 @@ class Contender:
     law_check: LawCheck | None  #: its law in closed loops, where there are any
     seconds: float  #: that it took to learn
     refusal: str = ''  #: why it should not be used; empty when it may be
+    #: mean-square error of its predictions of a record beyond the noise, relative to the states'
+    #: scale; None where no record judges
+    excess: float | None = None
+
+    @property
+    def error(self) -> float:
+        """What the rule goes by: the error on a record where there is one, else `rx`."""
+        return self.rx if self.excess is None else self.excess
+
+
+@dataclass(frozen=True)
+class Judge:
+    """By what models are judged in the place of validation episodes and their polynomials."""
+
+    #: completes a contender that has no law check, no `excess` and no refusal yet
+    judged: Callable[[Contender], Contender]
+    resolution: float  #: errors below it count as equal
 
 
 @dataclass(frozen=True)
@@ -63,9 +83,22 @@ class Comparison:
         assert self.chosen.model is not None
         return self.chosen.model
 
+    @property
+    def figures(self) -> Figures:
+        """The figures of that model."""
+        assert self.chosen.figures is not None
+        return self.chosen.figures
+
+    def with_model(self, model: LiftedModel) -> Comparison:
+        """Return the same with another model of the chosen class."""
+        chosen = replace(self.chosen, model=model)
+        return replace(self, chosen=chosen, contenders=tuple(
+            chosen if one is self.chosen else one for one in self.contenders))
+
     def __str__(self) -> str:
-        """Return a row for each class; roll-out errors are those of the test episodes."""
-        head = ['model', 'n_z', 'rx, validation', 'rx, test',
+        """Return a row for each class; roll-outs are of the test episodes, or of the record."""
+        recorded = any(one.excess is not None for one in self.contenders)
+        head = ['model', 'n_z', 'rx, validation', 'rx, test', *['beyond noise'] * recorded,
                 *(f'roll-out of {name}, {unit}' for name, unit in zip(
                     self.state_names, self.state_units, strict=True)),
                 'loops failed', 'cost beside linear', 's', 'remark']
@@ -78,7 +111,8 @@ class Comparison:
             rows.append([
                 one.name, '' if one.model is None else one.model.n_z,
                 '' if one.model is None else f'{one.rx:.1e}',
-                '' if found is None else f'{found.fit.rx:.1e}', *errors,
+                '' if found is None else f'{found.fit.rx:.1e}',
+                *['' if one.excess is None else f'{one.excess:.1e}'] * recorded, *errors,
                 *(('', '') if law is None else (f'{law.failed.sum()} of {law.loops}',
                                                 f'{law.median_ratio:.3f}')), f'{one.seconds:.1f}',
                 '; '.join(filter(None, ['chosen' * (one is self.chosen), one.refusal]))])
@@ -89,97 +123,137 @@ def usual_recipes(n_x: int) -> dict[str, Recipe]:
     """Return the networks that are tried for a plant of `n_x` states, plainest first."""
     units = 8 if n_x == 1 else 16
     return {
-        'neural drift': NeuralDrift((units,)),
-        'identity lift': Growth(n_x + 3, hidden_first=units, max_iterations=300),
-        'free lift': Growth(n_x, identity=False, hidden_first=units, max_iterations=300)}
+        NEURAL_DRIFT: NeuralDrift((units,)),
+        IDENTITY_LIFT: Growth(n_x + 3, hidden_first=units, max_iterations=300),
+        FREE_LIFT: Growth(n_x, identity=False, hidden_first=units, max_iterations=300)}
 
 
 def compare(plant: Plant, samples: Samples, recipes: Mapping[str, Recipe] | None = None, *,
-            degrees: Sequence[int] = DEGREES, choose: str | None = None, seed: int = 0,
-            starts: int = 2, split_seed: int = 0, watch: Watch | None = None,
-            loops: int = LOOPS) -> Comparison:
+            degrees: Sequence[int] = DEGREES, choose: str | None = None, alone: bool = False,
+            seed: int = 0, starts: int = 2, split_seed: int = 0, watch: Watch | None = None,
+            loops: int = LOOPS, judge: Judge | None = None) -> Comparison:
     """
     Learn a model of each class from the same episodes and choose one by a stated rule.
 
     In order of plainness: linear, polynomial, and the recipes, by default a neural drift, a lift
     with identity coordinates and a free one. Refused are networks whose `rx` on validation
-    episodes is not below the linear one's, and models whose law fails in closed loops. Of the
-    others the plainest is taken whose `rx` there is at most twice the smallest; below 1e-20 it is
-    rounding and counts as equal. Where every law fails, it is the one that does in the smallest
-    share of the loops. The degree of the polynomial is chosen by the same rule from `rx`. The
-    read-out of a lift after a neural drift may use the units of that, too.
+    episodes is not below the linear one's, models whose law fails in closed loops, and classes of
+    which no model can be learned. Of the others the plainest is taken whose `rx` there is at most
+    twice the smallest; below 1e-20 it is rounding and counts as equal. Where every law fails, it
+    is the one that does in the smallest share of the loops. The degree of the polynomial is chosen
+    by the same rule from `rx`. The read-out of a lift after a neural drift may use the units of
+    that, too.
 
     :param recipes: those of the networks by name, in the order of the choice; the usual ones by
         default. Other arguments as in :func:`train`.
     :param choose: the name of the class to take whatever the rule says.
-    :raises NoUsefulLift: when there is no model of the class that was asked for.
-    :raises ValueError: for a name that there is not; otherwise as :func:`train`.
+    :param alone: whether it is the only one to be learned.
+    :param judge: what the models are judged by in the place of validation episodes and `loops`.
+    :raises NoUsefulLift: when there is no model of the class that was asked for, or of any.
+    :raises ValueError: for a name that there is not; otherwise as :func:`train`, where the class
+        was asked for or all samples are to blame.
     """
-    recipes = usual_recipes(samples.x.shape[1]) if recipes is None else recipes
-    names = (LINEAR, POLYNOMIAL, *recipes)
-    if choose is not None and choose not in names:
+    n_x = samples.x.shape[1]
+    recipes = usual_recipes(n_x) if recipes is None else recipes
+    names: tuple[str, ...] = (LINEAR, POLYNOMIAL, *recipes)
+    if choose not in (*names, *[None] * (not alone)):
         raise ValueError(f'choose must be one of {", ".join(names)}, got {choose!r}')
-    judge = _Judge(plant, samples, split_seed, loops)
-    found = [judge.linear_contender(), judge.polynomial(degrees)]
+    if alone:
+        names = tuple(name for name in names if name == choose)
+    if starts < 1:
+        raise ValueError(f'starts must be at least 1, got {starts}')
+    learner = _Learner(plant, samples, split_seed)
+    judge = judge or learner.judge(loops)
+    counts = {name: starts * _rounds(recipes[name], n_x) for name in names if name in recipes}
+    found: list[Contender] = []
     drift: LiftedModel | None = None
-    for name, recipe in recipes.items():
+    for name in names:
         begin = time.perf_counter()
         try:
-            trained = train(plant, samples, recipe, seed=seed, starts=starts,
-                            split_seed=split_seed, watch=watch, loops=0)
-            model = trained.model if drift is None else judge.with_units_of(drift, trained.model)
-        except NoUsefulLift as refusal:
+            if name in recipes:
+                trained = train(
+                    plant, samples, recipes[name], seed=seed, starts=starts,
+                    split_seed=split_seed, loops=0, watch=_among(watch, name, counts))
+                model = trained.model if drift is None else learner.with_units_of(
+                    drift, trained.model)
+                if isinstance(recipes[name], NeuralDrift):
+                    drift = model
+            else:
+                model = learner.linear() if name == LINEAR else learner.polynomial(degrees)
+            found.append(learner.contender(name, model, time.perf_counter() - begin, judge))
+        except (ValueError, np.linalg.LinAlgError) as refusal:
+            if name == choose:
+                raise
             found.append(Contender(name, None, math.inf, None, None,
                                    time.perf_counter() - begin, str(refusal)))
-            continue
-        if isinstance(recipe, NeuralDrift):
-            drift = model
-        found.append(judge.contender(name, model, begin))
-    chosen = plainest(found)
-    if choose is not None:
-        chosen = found[names.index(choose)]
-        if chosen.model is None:
-            raise NoUsefulLift(chosen.refusal)
+    chosen = plainest(found, judge.resolution) if choose is None else found[names.index(choose)]
     return Comparison(tuple(found), chosen, plant.state_names, plant.state_units)
 
 
-def plainest(contenders: Sequence[Contender]) -> Contender:
+def plainest(contenders: Sequence[Contender], resolution: float = ROUNDING) -> Contender:
     """
     Return of those that pass the first whose error is at most twice the smallest.
 
     Where none passes, the one whose law fails in the smallest share of its closed loops.
+
+    :param resolution: errors below it count as equal.
+    :raises NoUsefulLift: when there is no model of any class.
     """
     able = [one for one in contenders if not one.refusal]
     if not able:
-        tried = [one for one in contenders if one.law_check is not None]
+        tried = [one for one in contenders if one.model is not None]
+        if not tried:
+            raise NoUsefulLift('no class has a model: ' + '; '.join(
+                f'{one.name}: {one.refusal}' for one in contenders))
         return min(tried, key=lambda one: one.law_check.share_failed if one.law_check else 1.0)
-    limit = _FACTOR * max(min(one.rx for one in able), ROUNDING)
-    return next(one for one in able if one.rx <= limit)
+    limit = _FACTOR * max(min(one.error for one in able), resolution)
+    return next(one for one in able if one.error <= limit)
 
 
-class _Judge:
-    """What all contenders are learned from and judged by."""
+def _rounds(recipe: Recipe, n_x: int) -> int:
+    """Return the number of rounds of a recipe; 0 where it does not fit, as training will say."""
+    with contextlib.suppress(ValueError):
+        return len(recipe.rounds(n_x))
+    return 0
 
-    def __init__(self, plant: Plant, samples: Samples, split_seed: int, loops: int) -> None:
-        self._plant, self._loops = plant, loops
+
+def _among(watch: Watch | None, name: str, counts: Mapping[str, int]) -> Watch | None:
+    """Return what tells `watch` of the starts of one class among those of all."""
+    if watch is None:
+        return None
+    before = sum(counts[other] for other in list(counts)[:list(counts).index(name)])
+
+    def told(now: Progress) -> bool:
+        return watch(replace(now, name=name, finished=before + now.finished,
+                             total=sum(counts.values())))
+
+    return told
+
+
+class _Learner:
+    """What all contenders are learned from, and judged by where no record does."""
+
+    def __init__(self, plant: Plant, samples: Samples, split_seed: int) -> None:
+        self._plant = plant
         self._parts = split_by_episode(samples, split_seed)
         self._training, self._validation, self._test = self._parts
         self._box = Box.of(plant, samples.x, samples.u)
+        # what is wrong with the samples is no matter of one class
+        check_rates(plant, samples)
+        check_nominal_point(plant, samples, self._box)
         self._known = training_states(self._box, samples)
-        self._begin = time.perf_counter()
-        self._linear = Edmd(degree=1).learn(plant, self._training, self._box)
 
     def rx(self, model: LiftedModel) -> float:
         """Return the error on the validation episodes."""
         return fit(model, self._validation.x, self._validation.dxdt, self._validation.u).rx
 
-    def linear_contender(self) -> Contender:
+    def linear(self) -> LiftedModel:
         """Return the linear model."""
-        return self.contender(LINEAR, self._linear, self._begin)
+        return Edmd(degree=1).learn(self._plant, self._training, self._box)
 
-    def polynomial(self, degrees: Sequence[int]) -> Contender:
+    def polynomial(self, degrees: Sequence[int]) -> LiftedModel:
         """Choose the degree; those with too many monomials to tell apart or to save fall out."""
-        begin, tried, refusal = time.perf_counter(), [], 'no degree was to be tried'
+        tried, refusal = [], 'no degree was to be tried'
         for degree in degrees:
             try:
                 model = Edmd(degree).learn(self._plant, self._training, self._box)
@@ -189,9 +263,8 @@ class _Judge:
                 refusal = str(error)
         best = plainest(tried).model if tried else None
         if best is None:
-            return Contender(POLYNOMIAL, None, math.inf, None, None,
-                             time.perf_counter() - begin, refusal)
-        return self.contender(POLYNOMIAL, best, begin)
+            raise NoUsefulLift(refusal)
+        return best
 
     def with_units_of(self, drift: LiftedModel, lift: LiftedModel) -> LiftedModel:
         """Let a lift's read-out use a drift's units as well, where that is closer."""
@@ -202,19 +275,27 @@ class _Judge:
             return lift
         return min((lift, joined), key=self.rx)
 
-    def contender(self, name: str, model: LiftedModel, begin: float) -> Contender:
+    def contender(self, name: str, model: LiftedModel, seconds: float, judge: Judge) -> Contender:
         """Judge a model, and note its figures in it."""
-        seconds = time.perf_counter() - begin
-        law_check, refusal = None, ''
-        if self._loops and model.n_u:
-            law_check = check_law(model, reference_drift(
-                self._plant, self._box, self._parts, model), loops=self._loops)
-            if law_check is not None and not law_check.accepted:
-                refusal = f'no controller: {law_check}'
-        figures = evaluate(model, self._test)
-        model = replace(
-            model, training_states=self._known,
-            tried_loops=None if law_check is None else law_check.tried,
+        model = replace(model, training_states=self._known)
+        one = judge.judged(Contender(name, model, self.rx(model), evaluate(model, self._test),
+                                     None, seconds))
+        assert one.figures is not None
+        return replace(one, model=replace(
+            model, tried_loops=None if one.law_check is None else one.law_check.tried,
             provenance=replace(
-                model.provenance, metrics=figures.metrics(model.states.names)))
-        return Contender(name, model, self.rx(model), figures, law_check, seconds, refusal)
+                model.provenance, metrics=one.figures.metrics(model.states.names))))
+
+    def judge(self, loops: int) -> Judge:
+        """Return the judge by closed loops on the drift that predicts validation episodes best."""
+        def judged(one: Contender) -> Contender:
+            model = one.model
+            if not loops or model is None or not model.n_u:
+                return one
+            law_check = check_law(model, reference_drift(
+                self._plant, self._box, self._parts, model), loops=loops)
+            refused = law_check is not None and not law_check.accepted
+            return replace(one, law_check=law_check,
+                           refusal=f'no controller: {law_check}' if refused else '')
+
+        return Judge(judged, ROUNDING)

@@ -23,7 +23,7 @@ def training_progress(label: str) -> Iterator[Watch]:
 
     def watch(now: Progress) -> bool:
         nonlocal last_line
-        text = f'n_z {now.n_z}'
+        text = f'{now.name}, ' * bool(now.name) + f'n_z {now.n_z}'
         if not math.isnan(now.rw):
             text += f', rw {now.rw:.1e}'
         if now.iteration:

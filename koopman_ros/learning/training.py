@@ -50,6 +50,7 @@ class Progress:
     residual: float  #: root mean square of the residuals there, else NaN
     rw: float  #: best validation figure so far, NaN before the first
     checked: float = 0.0  #: share that is done of the closed loops, which come last
+    name: str = ''  #: of the class that is being learned, where several are compared
 
 
 # Called after every step and start; True ends the training with the best so far.

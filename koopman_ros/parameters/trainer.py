@@ -14,6 +14,7 @@ import numpy as np
 from koopman_ros.arrays import Array
 from koopman_ros.experiment import Experiment
 from koopman_ros.lifting import LiftedModel
+from koopman_ros.model_classes import BEST, CLASSES, IDENTITY_LIFT
 from koopman_ros.parameters import wire
 from koopman_ros.parameters.table import (
     ConfigurationError,
@@ -131,7 +132,11 @@ class TrainerParameters:
     model_output: str = parameter(
         'retrained.safetensors', 'model file that an accepted lift is written to; the one before '
         'it is kept as .previous.safetensors')
-    model_coordinates: int = parameter(3, 'coordinates n_z of the new lift', '', 2, 8)
+    model_class: str = parameter(
+        IDENTITY_LIFT, 'class of the new model; best learns all of them and takes one by the rule '
+        'of the comparison of classes', choices=(*CLASSES, BEST))
+    model_coordinates: int = parameter(
+        3, 'coordinates n_z of a new identity lift', '', 2, 8)
     training_starts: int = parameter(
         3, 'starts of which each coordinate keeps the best', '', 1, 100)
     training_seed: int = parameter(
@@ -207,8 +212,8 @@ class TrainerParameters:
 
     def training(self) -> dict[str, Any]:
         """Return the fields of a :class:`koopman_ros.retraining.Task` that are settings."""
-        return {'coordinates': self.model_coordinates, 'seed': self.training_seed,
-                'starts': self.training_starts,
+        return {'model_class': self.model_class, 'coordinates': self.model_coordinates,
+                'seed': self.training_seed, 'starts': self.training_starts,
                 'input_matrix_degree': self.input_matrix_degree, 'margin': self.gate_margin,
                 'condition': self.gate_condition}
 

@@ -8,15 +8,10 @@ Imports bags, identification, learning, lifting and control; needs the `train` r
 do not import it, they start ``python -m koopman_ros.retraining``.
 """
 
-from koopman_ros.retraining.lift import (
-    decide,
-    Decision,
-    drift_samples,
-    learn_lift,
-    Thresholds,
-)
+from koopman_ros.retraining.gate import decide, Decision, Thresholds
+from koopman_ros.retraining.lift import compare_classes, drift_samples, learn_lift
 from koopman_ros.retraining.report import write_report
 from koopman_ros.retraining.task import retrain, Retrained, Task
 
-__all__ = ['Decision', 'Retrained', 'Task', 'Thresholds', 'decide', 'drift_samples',
-           'learn_lift', 'retrain', 'write_report']
+__all__ = ['Decision', 'Retrained', 'Task', 'Thresholds', 'compare_classes', 'decide',
+           'drift_samples', 'learn_lift', 'retrain', 'write_report']

@@ -1,24 +1,25 @@
 # SPDX-FileCopyrightText: 2026 The koopman_ros Authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""Training of a lift on an estimated drift, and its acceptance on data held out of both."""
+"""Training of models on an estimated drift."""
 
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Callable
+from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
 
-from koopman_ros.arrays import Array, brief
-from koopman_ros.control.law_check import check_law, LawCheck, LOOPS
-from koopman_ros.identification import DriftModel, fitted_starts, Identified, longest_step, Stopped
-from koopman_ros.identification.drift import prediction_error, Segments
-from koopman_ros.learning import Growth, train, Trained
+from koopman_ros.arrays import Array
+from koopman_ros.control.law_check import LOOPS
+from koopman_ros.identification import DriftModel, fitted_starts, Identified, longest_step
+from koopman_ros.identification.drift import Segments
+from koopman_ros.learning import compare, Comparison, Contender, Growth, Judge, train, Trained
+from koopman_ros.learning.comparison import usual_recipes
 from koopman_ros.learning.training import Watch
-from koopman_ros.learning.validation import lifted_rate
-from koopman_ros.lifting import Coordinates, LiftedModel
+from koopman_ros.learning.validation import ROUNDING
+from koopman_ros.model_classes import BEST, IDENTITY_LIFT, LINEAR
 from koopman_ros.plant_data import Episode, Plant, Samples
-from koopman_ros.units import Display, display_unit
+from koopman_ros.retraining.gate import HeldOut, Thresholds
 
 # More samples of a smooth drift tell nothing new.
 _MAX_SAMPLES = 2000
@@ -30,13 +31,6 @@ _SHARES = 10
 _SLIGHTLY_OUTSIDE = 1.1
 # A search that is so far outside does not come back.
 _LOST = 1e3
-# An error is more than noise when it is this unlikely, and this large beside the range.
-_SIGMAS = 5.0
-_NOTICEABLE = 1e-3
-# White errors have none; those of a fitted start stay far below.
-_LEAST_AUTOCORRELATION = 0.3
-# A share of the set-points' range that may be missing: noise moves the ends of a record.
-_MISSING = 0.05
 
 
 def drift_samples(drift: DriftModel, episodes: tuple[Episode, ...]) -> Samples:
@@ -137,6 +131,13 @@ def learn_lift(found: Identified, plant: Plant, n_z: int, *, seed: int, starts: 
     :raises NoUsefulLift: when no lift is better than a linear model.
     :raises ValueError: when the episodes hold no steady state.
     """
+    known, samples = _estimated(found, plant)
+    return train(known, samples, Growth(n_z), seed=seed, starts=starts, watch=watch,
+                 loops=0)
+
+
+def _estimated(found: Identified, plant: Plant) -> tuple[Plant, Samples]:
+    """Return what is known of a plant by its estimated drift, and samples of that."""
     samples = drift_samples(found.drift, found.fitted)
     lower, upper = samples.x.min(axis=0), samples.x.max(axis=0)
     within = (plant.nominal_state > lower) & (plant.nominal_state < upper)
@@ -145,155 +146,49 @@ def learn_lift(found: Identified, plant: Plant, n_z: int, *, seed: int, starts: 
                         np.where(np.isfinite(plant.nominal_input), plant.nominal_input,
                                  found.drift.box.inputs.center))
     drift = found.drift
-    known = replace(plant, nominal_state=x, nominal_input=u, input_matrix_degree=0,
-                    B=drift.input_matrix_at if drift.input_degree else drift.input_matrix)
-    return train(known, samples, Growth(n_z), seed=seed, starts=starts, watch=watch,
-                 loops=0)
+    return replace(plant, nominal_state=x, nominal_input=u, input_matrix_degree=0,
+                   B=drift.input_matrix_at if drift.input_degree else drift.input_matrix), samples
 
 
-@dataclass(frozen=True)
-class Thresholds:
-    """Thresholds that a lift has to reach."""
-
-    #: by this share its held-out error must be smaller than those of the present lift, where
-    #: there is one, and of the best linear model
-    margin: float = 0.1
-    condition: float = 1e4  #: largest condition number of E[z z']
-
-    def __post_init__(self) -> None:
-        if not 0.0 <= self.margin < 1.0:
-            raise ValueError(f'margin = {self.margin} must be in [0, 1)')
-        if not self.condition > 1.0:
-            raise ValueError(f'condition = {self.condition} must be above 1')
-
-
-@dataclass(frozen=True)
-class Decision:
-    """Acceptance or refusal of a lift, with its figures on held-out segments."""
-
-    reasons: tuple[str, ...]  #: why it is refused; empty when it is accepted
-    warnings: tuple[str, ...]  #: for the user, in either case
-    rmse: Array  #: (n_x,) error of its predictions of the measurements, in state units
-    drift_rmse: Array  #: (n_x,) the same of the drift that it was learned from
-    current_rmse: Array | None  #: (n_x,) the same of the present lift, None without one
-    linear_rmse: Array  #: (n_x,) the same of the best linear model
-    noise: Array  #: (n_x,) standard deviation of the measurements from sample to sample
-    law_check: LawCheck  #: closed loops on the estimated drift
-
-    __repr__ = brief
-
-    @property
-    def accepted(self) -> bool:
-        """Whether the lift may be used."""
-        return not self.reasons
-
-
-def decide(found: Identified, trained: Trained, current: LiftedModel | None,
-           thresholds: Thresholds, *, loops: int = LOOPS,
-           watch: Callable[[float], bool] = lambda _: False) -> Decision:
+def compare_classes(found: Identified, plant: Plant, thresholds: Thresholds, *,
+                    model_class: str = BEST, n_z: int, seed: int, starts: int, loops: int = LOOPS,
+                    watch: Watch | None = None,
+                    judging: Callable[[str, float], bool] = lambda *_: False) -> Comparison:
     """
-    Compare a new lift with the present and a linear one, held out, and close its loop.
+    Learn models of an estimated drift as :func:`learning.compare` does, judged by the record.
 
-    :param loops: see :func:`~koopman_ros.control.law_check.check_law`, as for `watch`.
-    :raises Stopped: when `watch` ended it.
+    The rule is the same, its error another: the mean square by which predictions of the
+    measurements that were held out err beyond their noise. What chance makes of the noise is the
+    same for all and counts as equal. Refused are classes that the gate would refuse for their law,
+    their coordinates or for a linear model that is as good.
+
+    :param model_class: the name of a class, which alone is learned then, or ``'best'`` for all of
+        them and the rule.
+    :param n_z: coordinates of the identity lift; other arguments as for :func:`learn_lift`.
+    :param judging: called with the class whose law is being tried and the share that is done.
+    :raises NoUsefulLift: when there is no model of the class that was asked for, or of any.
+    :raises ValueError: when the episodes hold no steady state, and for a class that there is not.
+    :raises Stopped: when `judging` ended it.
     """
-    model, scale = trained.model, found.drift.box.states.scale
-    unit = model.seconds_per_time_unit
-    held_out = Segments.of(found.held_out, longest_step(found.held_out))
-    rmse, drift_rmse, linear_rmse = (
-        prediction_error(rate, held_out, scale)
-        for rate in (lifted_rate(model, unit), found.drift.rate, found.linear.rate))
-    current_rmse = None if current is None else prediction_error(
-        lifted_rate(current, unit), held_out, scale)
-    reasons = []
-    own = _size(rmse, scale)
-    for name, other in (('the present lift', current_rmse),
-                        ('the best linear model', linear_rmse)):
-        if other is None:
-            continue
-        if not np.isfinite(own) or own > (1.0 - thresholds.margin) * _size(other, scale):
-            reasons.append(
-                f'its error on held-out records, {_text(rmse, model)}, is not '
-                f'{100.0 * thresholds.margin:.0f} % below that of {name}, {_text(other, model)}')
-    cond = trained.figures.fit.cond
-    if not cond <= thresholds.condition:
-        reasons.append(f'the condition number of its coordinates, {cond:.3g}, is above '
-                       f'{thresholds.condition:.3g}: use fewer coordinates')
-    # as it was measured, as far as that matters
-    period = float(np.median(np.concatenate([np.diff(part.time) for part in found.held_out])))
-    law_check = check_law(model, found.drift.rate, interval=period * unit, loops=loops,
-                          watch=watch)
-    if law_check is None:
-        raise Stopped
-    if not law_check.accepted:
-        reasons.append(f'it is no controller of the estimated drift: {law_check}')
-    warnings = _warnings(found, model, drift_rmse, _autocorrelation(found.drift, held_out))
-    return Decision(tuple(reasons), warnings, rmse, drift_rmse, current_rmse, linear_rmse,
-                    found.noise, law_check)
+    held_out = HeldOut(found, thresholds)
+    noise = np.minimum(found.noise, held_out.rmse(found.drift.rate)) / held_out.scale
 
+    def judged(one: Contender) -> Contender:
+        assert one.model is not None
+        assert one.figures is not None
+        rmse = held_out.rmse_of(one.model)
+        law_check = held_out.law_check(one.model, loops, lambda share: judging(one.name, share))
+        reasons = held_out.reasons(one.model, rmse, one.figures, law_check,
+                                   one.name == LINEAR)
+        return replace(one, figures=replace(one.figures, rollout_rmse=rmse), law_check=law_check,
+                       excess=float(np.mean(np.maximum(
+                           (rmse / held_out.scale) ** 2 - noise ** 2, 0.0))),
+                       refusal='; '.join(reasons))
 
-def _autocorrelation(drift: DriftModel, segments: Segments) -> Array:
-    """Return the autocorrelation (n_x,) of a drift's errors from one measurement to the next."""
-    starts = fitted_starts(drift.rate, segments, drift.box.states.scale)[0]
-    errors = segments.errors(drift.rate, starts)
-    products, squares = np.zeros((2, errors.shape[2]))
-    for j in range(errors.shape[1]):
-        own = errors[segments.measured[:, j], j]
-        products += np.sum(own[1:] * own[:-1], axis=0)
-        squares += 0.5 * np.sum(own[1:] ** 2 + own[:-1] ** 2, axis=0)
-    return products / np.where(squares > 0.0, squares, 1.0)
-
-
-def _warnings(found: Identified, model: LiftedModel, error: Array, autocorrelation: Array
-              ) -> tuple[str, ...]:
-    """Say where the best drift errs by more than white noise explains."""
-    warnings = []
-    count = sum(len(episode) for episode in found.held_out)
-    for i, (name, unit) in enumerate(zip(model.states.names, model.states.units, strict=True)):
-        noticeable, r = _NOTICEABLE * found.drift.box.states.scale[i], autocorrelation[i]
-        if error[i] > noticeable and r > max(_LEAST_AUTOCORRELATION, _SIGMAS / np.sqrt(count)):
-            warnings.append(
-                f'the noise of {name} is coloured (autocorrelation {r:.2f} from sample to sample '
-                'of what the best drift leaves): a filter before the record does that, or what '
-                f'is not measured; it tells as much as {100.0 * (1.0 - r) / (1.0 + r):.0f} % of '
-                'the samples would with white noise, so record longer, or without the filter')
-        noise = found.noise[i]
-        excess = float(np.sqrt(max(0.0, error[i] ** 2 - noise ** 2)))
-        # the mean square of `count` white errors strays by this share
-        chance = noise * (_SIGMAS * np.sqrt(2.0 / count)) ** 0.5
-        if excess > max(chance, noticeable):
-            warnings.append(
-                f'the best drift errs by {error[i]:.3g} {unit} in {name}, of which {excess:.3g} '
-                f'{unit} is not noise ({noise:.3g} {unit} from sample to sample): something that '
-                'is not measured acts too, such as another state or a disturbance, and no lift '
-                'of what is measured can know it')
-    return tuple(warnings)
-
-
-def shortfalls(states: Coordinates, wanted: Mapping[str, Sequence[float]]) -> tuple[str, ...]:
-    """
-    Say which set-points that are wanted a trained range leaves out.
-
-    :param wanted: lowest and highest set-point of some of the states by name, in their units.
-    """
-    found = []
-    for name, (low, high) in wanted.items():
-        i = states.names.index(name)
-        lower, upper = states.lower[i], states.upper[i]
-        if max(lower - low, high - upper) > _MISSING * (high - low):
-            unit = Display(states.units[i], display_unit(states.units[i]), '.4g')
-            found.append(
-                f'{name} was trained from {unit.text(lower)} to {unit.text(upper)}, set-points '
-                f'are wanted from {unit.text(low)} to {unit.text(high)}: those outside will be '
-                'refused, record what is missing or narrow setpoint_min and setpoint_max')
-    return tuple(found)
-
-
-def _size(rmse: Array, scale: Array) -> float:
-    return float(np.sqrt(np.mean((rmse / scale) ** 2)))
-
-
-def _text(rmse: Array, model: LiftedModel) -> str:
-    names, units = model.states.names, model.states.units
-    return ', '.join(f'{value:.4g} {unit}' + (f' in {name}' if len(names) > 1 else '')
-                     for value, unit, name in zip(rmse, units, names, strict=True))
+    known, samples = _estimated(found, plant)
+    # the mean square of so many white errors strays by this share
+    chance = float(np.mean(noise ** 2)) * np.sqrt(2.0 / held_out.count)
+    alone = model_class != BEST
+    return compare(known, samples, {**usual_recipes(len(noise)), IDENTITY_LIFT: Growth(n_z)},
+                   choose=model_class if alone else None, alone=alone, seed=seed, starts=starts,
+                   watch=watch, judge=Judge(judged, max(chance, ROUNDING)))

@@ -14,6 +14,7 @@ from koopman_ros.identification import fitted_starts, Identified, longest_step, 
 from koopman_ros.identification.drift import Rate
 from koopman_ros.learning.validation import lifted_rate
 from koopman_ros.lifting import Coordinates
+from koopman_ros.model_classes import BEST
 from koopman_ros.reports import bullets, drawing, table, write_figures, write_page
 from koopman_ros.retraining.task import CELLS, Retrained, visited_cells
 from koopman_ros.units import SECONDS_PER_TIME_UNIT, shown, unit_label
@@ -33,7 +34,7 @@ def write_report(retrained: Retrained) -> list[Path]:
 
 
 def _sections(retrained: Retrained) -> Iterator[str]:
-    found, decision, trained = retrained.found, retrained.decision, retrained.trained
+    found, decision, learned = retrained.found, retrained.decision, retrained.learned
     states, inputs = found.drift.box.states, found.drift.box.inputs
     errors = tuple(f'error of {name} [{unit}]'
                    for name, unit in zip(states.names, states.units, strict=True))
@@ -66,8 +67,17 @@ def _sections(retrained: Retrained) -> Iterator[str]:
     yield table(('degree', 'method', *errors),
                 ((score.degree, score.method, *(f'{error:.5g}' for error in score.rmse))
                  for score in found.scores), range(2, 2 + len(states)))
-    if decision is None or trained is None:
+    if decision is None or learned is None:
         return
+    yield '## Classes of models'
+    by_rule = retrained.task.model_class == BEST
+    yield ('Taken by the rule: the plainest of those not refused whose error beyond the noise is '
+           'at most twice the smallest, where what chance explains counts as equal.' if by_rule
+           else 'The one that was asked for.')
+    yield str(learned)
+    yield ('rx is the relative mean-square error of the drift beside the estimated one; roll-outs '
+           'are predictions of the held-out measurements, with their noise; the errors beyond the '
+           'noise are mean squares relative to the range.')
     yield '## On held-out segments'
     yield 'Root mean square errors of predictions of the measurements:'
     yield table(('prediction by', *errors),
@@ -78,14 +88,14 @@ def _sections(retrained: Retrained) -> Iterator[str]:
                     ('the best linear model', decision.linear_rmse)) if rmse is not None),
                 range(1, 1 + len(states)))
     yield 'The noise of the measurements is part of each.'
-    eigenvalues = ', '.join(f'{value:.3g}' for value in trained.model.eigenvalues)
-    own = trained.model.states
+    eigenvalues = ', '.join(f'{value:.3g}' for value in learned.model.eigenvalues)
+    own = learned.model.states
     yield 'Set-points can be given within ' + ', '.join(
         f'{low:.5g} to {high:.5g} {unit} of {name}'
         for name, unit, low, high in zip(own.names, own.units, own.lower, own.upper, strict=True))
-    yield (f'Lift: n_z = {trained.model.n_z}, rw = {trained.figures.fit.rw:.2g}, condition number '
-           f'{trained.figures.fit.cond:.3g}, eigenvalues {eigenvalues} '
-           f'1/{trained.model.time_unit}. On the estimated drift {decision.law_check}.')
+    yield (f'Lift: n_z = {learned.model.n_z}, rw = {learned.figures.fit.rw:.2g}, condition number '
+           f'{learned.figures.fit.cond:.3g}, eigenvalues {eigenvalues} '
+           f'1/{learned.model.time_unit}. On the estimated drift {decision.law_check}.')
 
 
 def _label(signals: Coordinates, k: int) -> str:
@@ -137,7 +147,7 @@ def _draw_coverage(axes: Any, found: Identified, i: int) -> None:
 
 def _lifts(retrained: Retrained) -> list[tuple[str, Rate, str]]:
     """Return label, rate and colour of the present lift and of the new one, where they are."""
-    new = None if retrained.trained is None else retrained.trained.model
+    new = None if retrained.learned is None else retrained.learned.model
     return [(name, lifted_rate(model, SECONDS_PER_TIME_UNIT[retrained.plant.time_unit]), color)
             for name, model, color in (('present lift', retrained.present, 'tab:red'),
                                        ('new lift', new, 'tab:green')) if model is not None]

@@ -22,10 +22,12 @@ from numpy.typing import NDArray
 from koopman_ros.arrays import Array, brief
 from koopman_ros.bags import Account, loop_episodes, RecordedInput, RecordedState
 from koopman_ros.identification import Identified, identify, Stopped
-from koopman_ros.learning import NoUsefulLift, Progress, Trained
+from koopman_ros.learning import Comparison, Contender, NoUsefulLift, Progress
 from koopman_ros.lifting import Box, Coordinates, LiftedModel, load, save
+from koopman_ros.model_classes import BEST, CLASSES, IDENTITY_LIFT
 from koopman_ros.plant_data import Episode, Plant
-from koopman_ros.retraining.lift import decide, Decision, learn_lift, shortfalls, Thresholds
+from koopman_ros.retraining.gate import decide, Decision, shortfalls, Thresholds
+from koopman_ros.retraining.lift import compare_classes
 from koopman_ros.units import NANOSECONDS, SECONDS_PER_TIME_UNIT
 from koopman_ros.wire import Place
 
@@ -35,6 +37,7 @@ _LEAST_JUMP = 0.1
 
 # Shares of the whole at which estimating, learning and judging begin and end.
 _STAGES = {'estimate': (0.05, 0.35), 'learn': (0.35, 0.9), 'decide': (0.9, 1.0)}
+_JUDGED = 0.98
 
 # Called with the share done in [0, 1] and what is done now; True asks to stop.
 OnProgress = Callable[[float, str], bool]
@@ -51,7 +54,9 @@ class Task:
     inputs: tuple[RecordedInput, ...]  #: likewise
     plant: str = ''  #: what a first lift calls the plant
     tolerance: float = 0.0  #: how far stamps of one sample of several states may lie apart, in s
-    coordinates: int = 3  #: n_z of the new lift
+    #: class to learn, a name of `compare`, or ``'best'`` for the one that its rule takes
+    model_class: str = IDENTITY_LIFT
+    coordinates: int = 3  #: n_z of the identity lift
     seed: int = 0  #: of the split and of the training
     starts: int = 3  #: of each round of the training
     #: B where it is known, in state unit per input unit and second, by state and input; what is
@@ -86,7 +91,8 @@ class Retrained:
     task: Task  #: the task
     account: Account  #: counts of used and dropped measurements
     found: Identified  #: the estimated drift
-    trained: Trained | None  #: the lift, None when there is none worth judging
+    #: the classes that were learned, None when there is no model worth judging
+    learned: Comparison | None
     decision: Decision | None  #: its figures, None without a lift
     reasons: tuple[str, ...]  #: why it was refused; empty when it was accepted
     #: share of the cells of two signals' ranges that the episodes visit, for all pairs of signals
@@ -109,8 +115,23 @@ class Retrained:
         gains = self.found.drift.input_matrix / SECONDS_PER_TIME_UNIT[self.plant.time_unit]
 
         def by_state(values: Array) -> dict[str, float | None]:
-            return {name: float(value) if np.isfinite(value) else None
-                    for name, value in zip(states.names, values, strict=True)}
+            return {name: _finite(value) for name, value in zip(states.names, values, strict=True)}
+
+        def of_class(one: Contender) -> dict[str, object]:
+            said: dict[str, object] = {
+                'chosen': self.learned is not None and one is self.learned.chosen,
+                'refusal': one.refusal, 'seconds': one.seconds}
+            if one.figures and one.law_check:
+                assert one.figures.rollout_rmse is not None
+                assert one.excess is not None
+                said |= {
+                    'heldout_rx': _finite(one.figures.fit.rx),
+                    'heldout_error': by_state(one.figures.rollout_rmse),
+                    'beyond_noise': _finite(one.excess),
+                    'closed_loops': one.law_check.loops,
+                    'closed_loops_failed': int(np.sum(one.law_check.failed)),
+                    'closed_loop_cost_beside_linear': _finite(one.law_check.median_ratio)}
+            return said
 
         figures: dict[str, object] = {
             'accepted': self.accepted,
@@ -128,27 +149,33 @@ class Retrained:
                            for name, row in zip(states.names, gains, strict=True)},
             'noise': by_state(self.found.noise),
         }
-        if self.decision and self.trained:
-            trained = self.trained.model.states
+        if self.decision and self.learned:
+            trained, fit = self.learned.model.states, self.learned.figures.fit
             check = self.decision.law_check
             figures |= {
+                'model_class': self.learned.chosen.name,
+                'classes': {one.name: of_class(one) for one in self.learned.contenders},
                 'trained_from': by_state(trained.lower),
                 'trained_to': by_state(trained.upper),
                 'heldout_error': by_state(self.decision.rmse),
                 'heldout_error_of_present_lift': None if self.decision.current_rmse is None else (
                     by_state(self.decision.current_rmse)),
                 'heldout_error_of_linear_model': by_state(self.decision.linear_rmse),
-                'heldout_rw': self.trained.figures.fit.rw,
-                'heldout_rx': self.trained.figures.fit.rx,
-                'condition': self.trained.figures.fit.cond,
+                'heldout_rw': fit.rw,
+                'heldout_rx': fit.rx,
+                'condition': fit.cond,
                 'closed_loops': check.loops,
                 'closed_loops_arrived': check.arrived,
                 'closed_loops_failed': int(np.sum(check.failed)),
                 'closed_loop_cost_beside_linear': check.median_ratio,
                 'worst_closed_loop_cost_beside_linear': check.worst_ratio,
             }
-        return {name: None if isinstance(value, float) and not np.isfinite(value) else value
+        return {name: _finite(value) if isinstance(value, float) else value
                 for name, value in figures.items()}
+
+
+def _finite(value: float) -> float | None:
+    return float(value) if np.isfinite(value) else None
 
 
 def retrain(task: Task, on_progress: OnProgress = lambda *_: False) -> Retrained:
@@ -164,6 +191,9 @@ def retrain(task: Task, on_progress: OnProgress = lambda *_: False) -> Retrained
     :raises Stopped: when `on_progress` asked for it; nothing is written then.
     """
     thresholds = Thresholds(task.margin, task.condition)
+    if task.model_class not in (*CLASSES, BEST):
+        raise ValueError(f'model_class = {task.model_class!r} must be one of '
+                         f'{", ".join((*CLASSES, BEST))}')
     if Path(task.output).suffix != '.safetensors':
         raise ValueError(f'output = {task.output!r} must end in .safetensors')
     current = load(task.model) if task.model else None
@@ -197,25 +227,24 @@ def retrain(task: Task, on_progress: OnProgress = lambda *_: False) -> Retrained
                         nominal_input=found.drift.box.inputs.center)
     bare = Retrained(task, account, found, None, None, (), coverage(episodes, found.drift.box),
                      plant, current)
+    course = _Course(on_progress)
     try:
-        trained = learn_lift(found, plant, task.coordinates, seed=task.seed,
-                             starts=task.starts, watch=lambda now: on_progress(
-                                 _at('learn', now.finished / now.total), _learning(now)))
+        learned = compare_classes(
+            found, plant, thresholds, model_class=task.model_class, n_z=task.coordinates,
+            seed=task.seed, starts=task.starts, watch=course.learning, judging=course.judging)
     except NoUsefulLift as error:
-        _stop_if(on_progress(_at('decide', 0.0), 'judging'))
+        _stop_if(on_progress(_JUDGED, 'judging'))
         return replace(bare, reasons=(str(error),))
-    # a training that was stopped ends with its best so far
-    _stop_if(on_progress(_at('decide', 0.0), 'judging'))
-    decision = decide(found, trained, current, thresholds, watch=lambda share: on_progress(
-        _at('decide', 0.8 * share), 'judging'))
+    _stop_if(on_progress(_JUDGED, 'judging'))
+    decision = decide(found, learned, current, thresholds)
     decision = replace(decision, warnings=(
-        *decision.warnings, *shortfalls(trained.model.states, task.setpoints)))
+        *decision.warnings, *shortfalls(learned.model.states, task.setpoints)))
     _stop_if(on_progress(_at('decide', 0.9), 'writing'))
-    model = _with_provenance(trained.model, found, decision, min(bare.coverage.values()),
+    model = _with_provenance(learned.model, found, decision, min(bare.coverage.values()),
                              episodes)
     path = _place(Path(task.output), decision.accepted)
     save(model, path)
-    return replace(bare, trained=replace(trained, model=model), decision=decision,
+    return replace(bare, learned=learned.with_model(model), decision=decision,
                    reasons=decision.reasons, model_file=str(path))
 
 
@@ -296,9 +325,26 @@ def _stop_if(stop: bool) -> None:
         raise Stopped
 
 
-def _learning(now: Progress) -> str:
-    rw = '' if np.isnan(now.rw) else f', rw {now.rw:.1e}'
-    return f'learning: n_z {now.n_z}, start {min(now.finished + 1, now.total)} of {now.total}{rw}'
+class _Course:
+    """Reports how far learning and judging the classes have come; ends them by Stopped."""
+
+    def __init__(self, on_progress: OnProgress) -> None:
+        self._on_progress, self._share = on_progress, 0.0
+
+    def learning(self, now: Progress) -> bool:
+        """Report the starts, as :func:`learning.compare` tells of them."""
+        self._share = now.finished / now.total
+        rw = '' if np.isnan(now.rw) else f', rw {now.rw:.1e}'
+        _stop_if(self._on_progress(
+            _at('learn', self._share), f'learning: {now.name}, n_z {now.n_z}, start '
+            f'{min(now.finished + 1, now.total)} of {now.total}{rw}'))
+        return False
+
+    def judging(self, name: str, share: float) -> bool:
+        """Report the share of a class's closed loops; the last ones come after all starts."""
+        at = _at('decide', 0.8 * share) if self._share == 1.0 else _at('learn', self._share)
+        _stop_if(self._on_progress(at, f'judging: {name}'))
+        return False
 
 
 def _with_provenance(model: LiftedModel, found: Identified, decision: Decision, covered: float,

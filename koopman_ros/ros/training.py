@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 from std_srvs.srv import Trigger
 
-from koopman_ros.jobs.training import JobState, RetrainingJob, scalars
+from koopman_ros.jobs.training import class_lines, JobState, RetrainingJob, scalars
 from koopman_ros.parameters.trainer import TrainerParameters
 from koopman_ros.parameters.wire import Wiring
 from koopman_ros.resources import model_path
@@ -138,7 +138,10 @@ class Training:
             log.warning(self._state.text)
         else:
             log.error(self._state.text)
-        for warning in (self._state.summary or {}).get('warnings', ()):
+        summary = self._state.summary or {}
+        for name, line in class_lines(summary).items():
+            log.info(f'{name}: {line}')
+        for warning in summary.get('warnings', ()):
             log.warning(warning)
         self._diagnostics.publish_if_changed()
         self._on_end(self._state)

@@ -60,6 +60,35 @@ def test_lift_that_is_refused_has_an_exit_code_of_its_own(
     assert line.endswith('the new lift is refused: it is too flat')
 
 
+@pytest.mark.parametrize('name', ['best', 'neural drift'])
+def test_class_is_passed_on_and_each_that_was_learned_is_shown(
+        monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str], name: str) -> None:
+    """The process refuses with the class that its task names."""
+    learned = {
+        'linear': {'chosen': True, 'refusal': '', 'seconds': 0.04, 'heldout_rx': 0.02,
+                   'heldout_error': {'temperature': 0.5}, 'closed_loops': 128,
+                   'closed_loops_failed': 1},
+        'free lift': {'chosen': False, 'refusal': 'it has lost a state', 'seconds': 2.0}}
+    end = {'accepted': False, 'model_file': '', 'units': {'temperature': 'K'}, 'classes': learned}
+    monkeypatch.setattr('koopman_ros.jobs.training._command', lambda: (
+        sys.executable, '-c', 'import json; task = json.loads(input()); print(json.dumps('
+        f'{{"summary": {{**json.loads({json.dumps(end)!r}), "reasons": [task["model_class"]]}}}}))'
+    ))
+    assert run_here(trainer, task='train', bags='[run]', model_class=name) == 2
+    said = capfd.readouterr().err
+    assert f'the new lift is refused: {name}\n' in said
+    assert ('linear: chosen: drift rx 2.0e-02, roll-out 0.5 K, law fails in 1 of 128 closed '
+            'loops, 0.0 s\n') in said
+    assert 'free lift: 2.0 s; refused: it has lost a state\n' in said
+
+
+def test_class_that_there_is_not(capfd: pytest.CaptureFixture[str]) -> None:
+    assert run_here(trainer, task='train', bags='[run]', model_class='lift') == 1
+    assert complaint(capfd).endswith(
+        "model_class = 'lift' must be one of linear, polynomial, neural drift, identity lift, "
+        'free lift, best')
+
+
 def test_task_that_cannot_start(capfd: pytest.CaptureFixture[str]) -> None:
     assert run_here(trainer, task='train') == 1
     assert complaint(capfd) == (

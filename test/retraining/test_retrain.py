@@ -73,7 +73,7 @@ def estimated(accepted, monkeypatch):
 @pytest.fixture
 def learned(accepted, estimated, monkeypatch):
     """Let it go on from what the accepted one has learned, too."""
-    monkeypatch.setattr(task_module, 'learn_lift', lambda *_, **__: accepted[0].trained)
+    monkeypatch.setattr(task_module, 'compare_classes', lambda *_, **__: accepted[0].learned)
 
 
 def test_accepted_lift_is_written_and_the_one_before_is_kept(accepted):
@@ -115,7 +115,8 @@ def test_progress_rises_to_the_end(accepted):
     assert list(shares) == sorted(shares)
     assert (shares[0], shares[-1]) == (0.0, pytest.approx(0.99))
     assert words[0] == 'reading bags'
-    assert {'estimating: drift of degree 3', 'learning: n_z 2, start 1 of 1'} < set(words)
+    assert {'estimating: drift of degree 3', 'learning: identity lift, n_z 2, start 1 of 1',
+            'judging: identity lift'} < set(words)
     assert words[-2:] == ('judging', 'writing')
 
 
@@ -186,7 +187,7 @@ def test_a_linear_plant_of_known_gain_needs_no_lift(tmp_path):
     retrained = retrain(small(bag, tmp_path / 'new.safetensors', seconds, input_gain=gain))
     (reason,) = retrained.reasons
     assert 'does not predict the motion better than a linear model' in reason
-    assert (retrained.trained, retrained.decision, retrained.model_file) == (None, None, '')
+    assert (retrained.learned, retrained.decision, retrained.model_file) == (None, None, '')
     assert list(tmp_path.glob('*.safetensors')) == [seconds]
     # dT/dt = -(T - 315) / 2 + (Tc - 288), in minutes
     assert retrained.found.drift.degree == 1
@@ -200,7 +201,8 @@ def test_a_linear_plant_of_known_gain_needs_no_lift(tmp_path):
 
 @pytest.mark.parametrize(('stage', 'done_before'), [
     ('reading bags', 'bag'), ('estimating: drift of degree 3', 'bag'),
-    ('learning: n_z 2', 'estimated'), ('judging', 'learned'), ('writing', 'learned')])
+    ('learning: identity lift, n_z 2', 'estimated'), ('judging: id', 'estimated'),
+    ('judging', 'learned'), ('writing', 'learned')])
 def test_stops_at_any_stage_and_writes_nothing(bag, tmp_path, request, stage, done_before):
     request.getfixturevalue(done_before)
     stopped = False

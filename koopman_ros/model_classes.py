@@ -1,0 +1,11 @@
+# SPDX-FileCopyrightText: 2026 The koopman_ros Authors
+# SPDX-License-Identifier: Apache-2.0
+
+"""Names of the classes of models, by which one is asked for; without torch."""
+
+LINEAR, POLYNOMIAL, NEURAL_DRIFT = 'linear', 'polynomial', 'neural drift'
+IDENTITY_LIFT, FREE_LIFT = 'identity lift', 'free lift'
+#: those that are tried, the plainest first
+CLASSES = (LINEAR, POLYNOMIAL, NEURAL_DRIFT, IDENTITY_LIFT, FREE_LIFT)
+#: stands for the one that the rule of the choice takes
+BEST = 'best'
