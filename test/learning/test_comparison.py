@@ -26,7 +26,15 @@ from koopman_ros.learning.drift import with_units_of
 from koopman_ros.lifting import Box, load, save
 from koopman_ros.plant_data import split_by_episode
 from support.random_lifts import random_lift
-from support.small_plants import BENT, bent_samples, SMALL, UNFORCED, unforced_samples
+from support.small_plants import (
+    BENT,
+    bent_samples,
+    SMALL,
+    TWO_STATE,
+    two_state_samples,
+    UNFORCED,
+    unforced_samples,
+)
 
 RECIPES = {'neural drift': NeuralDrift((3,), max_iterations=40), 'identity lift': SMALL}
 
@@ -88,6 +96,37 @@ def test_the_table_has_a_row_for_each(bent):
     assert [row.endswith('| chosen |') for row in rows] == [False, True, False, False]
 
 
+def test_progress_is_that_of_all_classes():
+    told = []
+    compare(BENT, bent_samples(), RECIPES, starts=2, loops=0,
+            watch=lambda now: bool(told.append(now)))
+    assert list(dict.fromkeys(now.name for now in told)) == ['neural drift', 'identity lift']
+    counts = [now.finished for now in told]
+    assert counts == sorted(counts)
+    assert {now.total for now in told} == {4}
+    assert counts[-1] == 4
+
+
+def test_a_class_may_be_learned_alone():
+    alone = compare(BENT, bent_samples(), RECIPES, choose='polynomial', alone=True, loops=0)
+    assert [one.name for one in alone.contenders] == ['polynomial']
+    assert alone.model is alone.chosen.model
+    with pytest.raises(ValueError, match=r'choose must be one of .*, got None'):
+        compare(BENT, bent_samples(), RECIPES, alone=True)
+    with pytest.raises(ValueError, match='starts must be at least 1, got 0'):
+        compare(BENT, bent_samples(), RECIPES, starts=0)
+
+
+def test_a_class_that_cannot_be_learned_has_its_reason():
+    found = compare(BENT, bent_samples(), {'lift': Growth(1)}, degrees=(40,), starts=1, loops=0)
+    assert found.chosen.name == 'linear'
+    assert [one.model is None for one in found.contenders] == [False, True, True]
+    assert found.contenders[2].refusal.startswith('n_z = 1 is too small for 1 states')
+    none = [contender(name, math.inf, 'is none') for name in ('a', 'b')]
+    with pytest.raises(NoUsefulLift, match='no class has a model: a: is none; b: is none'):
+        plainest(none)
+
+
 def test_a_class_may_be_asked_for():
     asked = compare(BENT, bent_samples(), RECIPES, starts=1, choose='identity lift', loops=0)
     assert asked.chosen.name == 'identity lift'
@@ -123,6 +162,21 @@ def test_a_model_whose_law_fails_is_not_taken(monkeypatch, failing, chosen):
     refusal = f'no controller: the law fails in {failing[2]} of 16'
     assert found.contenders[1].refusal.startswith(refusal)
     assert f'{"chosen; " * (chosen == "polynomial")}{refusal}' in str(found)
+
+
+def test_all_laws_are_tried_where_the_data_are(monkeypatch):
+    tried = []
+
+    def noted(model, *_, **__):
+        tried.append(model.training_states)
+
+    monkeypatch.setattr(comparison, 'check_law', noted)
+    found = compare(TWO_STATE, two_state_samples(), {'drift': NeuralDrift((3,), max_iterations=5)},
+                    degrees=(2,), starts=1)
+    assert len(tried) == 3
+    for known, one in zip(tried, found.contenders, strict=True):
+        np.testing.assert_array_equal(known.states, tried[-1].states)
+        assert one.model.training_states is known
 
 
 def test_a_plant_without_inputs_and_degrees_that_cannot_be():
