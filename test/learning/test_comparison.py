@@ -79,7 +79,7 @@ def test_a_polynomial_drift_is_found_and_taken(bent, tmp_path):
         assert one.model.provenance.metrics == one.figures.metrics(('level',))
     for one in bent.contenders:
         assert one.law_check.loops == 16
-        assert one.law_check.accepted
+        assert one.law_check.accepted or one is linear
     box = Box.of(BENT, bent_samples().x, bent_samples().u)
     np.testing.assert_array_equal(linear.model.A, Edmd(1).learn(BENT, training, box).A)
     save(bent.model, tmp_path / 'best.safetensors')
@@ -152,9 +152,9 @@ def test_a_linear_plant_gets_a_linear_model_and_no_refused_one():
 def test_a_model_whose_law_fails_is_not_taken(monkeypatch, failing, chosen):
     """However close it is; where all fail, which fails least often."""
     def fails(model, rate, loops):
-        ratios = np.ones(16)
-        ratios[:failing.get(model.n_z, 0)] = np.inf
-        return replace(check_law(model, rate, loops=loops), ratios=ratios)
+        excess = np.ones(16)
+        excess[:failing.get(model.n_z, 0)] = np.inf
+        return replace(check_law(model, rate, loops=loops), excess=excess)
 
     monkeypatch.setattr(comparison, 'check_law', fails)
     found = compare(BENT, bent_samples(), {}, loops=16)
