@@ -89,11 +89,9 @@ def feedback(model: LiftedModel, x: Array, target: Target, weights: Weights, *,
     Evaluate the law that suits the model.
 
     Re-centred with identity coordinates if the lift is closed, so that z goes as it predicts, and
-    A has no unstable modes but those of the linearised plant, which its input moves; and with as
-    many free ones as there are states if A is Hurwitz. Averaged otherwise, and when the re-centred
-    law's equation cannot be solved. A free lift with more coordinates than states has directions
-    of z that no state reaches, in which its weight C' Q C and so the gain are not determined near
-    the target; M^+ e, which its weight goes by, is a poor factorisation of an unstable drift.
+    A has no unstable modes but those of the linearised plant, which its input moves. Averaged
+    otherwise, and when the re-centred law's equation cannot be solved: M^+ e, which the weight of
+    a free lift goes by, is a poor factorisation of the drift away from its nominal point.
 
     :param x: (n_x,) scaled deviation of the measured state.
     :param interval: for which the input will be held, in the model's time unit: the gain is that
@@ -102,8 +100,7 @@ def feedback(model: LiftedModel, x: Array, target: Target, weights: Weights, *,
     :param max_residual: bound on the relative Riccati residual.
     """
     how = {'interval': interval, 'max_gain': max_gain, 'max_residual': max_residual}
-    closed = model.identity and model.mismatch <= _CLOSED and not model.adds_unstable_modes
-    if closed or (not model.identity and model.is_hurwitz and model.n_z == model.n_x):
+    if model.identity and model.mismatch <= _CLOSED and not model.adds_unstable_modes:
         result = recentred(model, x, target, weights, **how)
         if result.solved:
             return result
