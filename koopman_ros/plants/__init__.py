@@ -19,6 +19,7 @@ from koopman_ros.plants.library.reactor import (
 from koopman_ros.plants.library.scalar import scalar_example
 from koopman_ros.plants.library.two_state import two_state_example
 from koopman_ros.plants.process import Actuator, Process, sensor_noise
+from koopman_ros.plants.recovery import recoverable
 from koopman_ros.plants.simulation import (
     advance,
     IntegrationError,
@@ -38,5 +39,5 @@ __all__ = ['PLANTS', 'Actuator', 'Constant', 'Constants', 'ControlAffineSystem',
            'EquilibriumError', 'ExcitationError', 'IntegrationError', 'IntegrationFailure',
            'Process', 'RandomStepDesign', 'ReactorParameters', 'advance', 'box_episodes', 'build',
            'constant', 'constants_of', 'describe', 'equilibrium_input', 'one_state_reactor',
-           'plant_class', 'random_steps', 'sample_derivatives', 'scalar_example', 'sensor_noise',
-           'simulate', 'steady_state', 'two_state_example', 'two_state_reactor']
+           'plant_class', 'random_steps', 'recoverable', 'sample_derivatives', 'scalar_example',
+           'sensor_noise', 'simulate', 'steady_state', 'two_state_example', 'two_state_reactor']

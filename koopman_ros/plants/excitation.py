@@ -8,10 +8,11 @@ from dataclasses import dataclass
 import math
 
 import numpy as np
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, NDArray
 
 from koopman_ros.arrays import Array
 from koopman_ros.plant_data import Episode, Samples
+from koopman_ros.plants.recovery import recoverable
 from koopman_ros.plants.simulation import (
     integration_limits,
     IntegrationError,
@@ -131,7 +132,8 @@ def random_steps(system: ControlAffineSystem, design: RandomStepDesign, duration
 
 
 def box_episodes(system: ControlAffineSystem, design: RandomStepDesign, episodes: int,
-                 duration: float, seed: int, starts: tuple[Array, Array] | None = None) -> Samples:
+                 duration: float, seed: int, starts: tuple[Array, Array] | None = None, *,
+                 keep_recoverable: bool = False) -> Samples:
     """
     Simulate short episodes of random input steps from random states within a box.
 
@@ -140,28 +142,46 @@ def box_episodes(system: ControlAffineSystem, design: RandomStepDesign, episodes
     :param duration: of each, in the plant's time unit.
     :param seed: of the initial states and of the steps.
     :param starts: corners of that box, each (n_x,); by default the box that they may not leave.
+    :param keep_recoverable: whether only episodes are kept from whose end the input, within the
+        bounds of the steps, can bring the plant back; see
+        :func:`~koopman_ros.plants.recovery.recoverable`. For unstable plants, which are not to be
+        learned where they are lost.
     :raises ExcitationError: when hardly any start can be kept in the box.
-    :raises ValueError: as :func:`random_steps`.
+    :raises ValueError: as :func:`random_steps` and :func:`~koopman_ros.plants.recoverable`.
     """
     rng = np.random.default_rng(seed)
     lower, upper = (np.broadcast_to(bound, system.n_x) for bound in starts or (
         design.state_lower, design.state_upper))
     found: list[Episode] = []
-    for _ in range(_MOST_STARTS * episodes):
-        if len(found) == episodes:
-            break
-        x0, step_seed = rng.uniform(lower, upper), int(rng.integers(2 ** 31))
-        if rng.random() < _AT_CORNERS:
-            x0 = np.where(rng.random(system.n_x) < 0.5, lower, upper)
-        # no input within the bounds keeps some states inside the box
-        with contextlib.suppress(ExcitationError):
-            found.append(random_steps(system, design, duration, step_seed, x0=x0))
+    tried = 0
+    while len(found) < episodes and tried < _MOST_STARTS * episodes:
+        batch: list[Episode] = []
+        while len(batch) < episodes - len(found) and tried < _MOST_STARTS * episodes:
+            tried += 1
+            x0, step_seed = rng.uniform(lower, upper), int(rng.integers(2 ** 31))
+            if rng.random() < _AT_CORNERS:
+                x0 = np.where(rng.random(system.n_x) < 0.5, lower, upper)
+            # no input within the bounds keeps some states inside the box
+            with contextlib.suppress(ExcitationError):
+                batch.append(random_steps(system, design, duration, step_seed, x0=x0))
+        if keep_recoverable and batch:
+            # from there back, all states on the way there are recoverable as well
+            ends = np.stack([episode.x[-1] for episode in batch])
+            batch = [batch[i] for i in np.flatnonzero(_recoverable(system, design, ends))]
+        found += batch
     if len(found) < episodes:
         raise ExcitationError(
             f'{system.name}: of {_MOST_STARTS * episodes} starts {len(found)} could be kept in '
             f'the box for {duration} {system.time_unit}, {episodes} are wanted; shorten the '
             'episodes, widen the input bounds or the box')
     return sample_derivatives(system, found)
+
+
+def _recoverable(system: ControlAffineSystem, design: RandomStepDesign, x: Array
+                 ) -> NDArray[np.bool_]:
+    levels, box = _bounds(system, design)
+    return recoverable(system, x, input_lower=levels[0], input_upper=levels[1],
+                       state_lower=box[0], state_upper=box[1])
 
 
 def _bounds(system: ControlAffineSystem, design: RandomStepDesign
