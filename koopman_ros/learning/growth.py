@@ -50,6 +50,8 @@ class Growth:
     layers: int = 1  #: number of hidden layers, 1 or 2
     activation: str = 'tanh'  #: ``'tanh'``, ``'sigmoid'``, ``'sine'`` or ``'softplus'``
     whitening: float = 1.0  #: weight of the residual that keeps E[z z'] near the identity
+    #: further such weights: starts take all of them in turn, and validation episodes choose
+    other_whitenings: tuple[float, ...] = ()
     #: units of the decoder network, which holds on to the states where they are no coordinates
     #: themselves; None for 8 with two or more states in a free lift and none otherwise
     decoder: int | None = None
@@ -58,6 +60,9 @@ class Growth:
     ridge: float = 1e-6  #: ridge weight in the fit that starts a new coordinate
     max_iterations: int = 1000  #: limit of Levenberg-Marquardt steps for each coordinate
     tolerance: float = 1e-3  #: relative decrease of the cost over 20 steps taken as convergence
+    #: for unstable plants: weight of the input in the regulator of the linear fit, under whose
+    #: feedback the lift is learned, of whitened states; None to learn it of the plant as it is
+    pre_feedback: float | None = None
 
     def __post_init__(self) -> None:
         if self.n_z < 1:
@@ -68,6 +73,17 @@ class Growth:
         if self.layers not in (1, 2):
             raise ValueError(f'layers must be 1 or 2, got {self.layers}')
         check_activation(self.activation)
+        if min(self.whitening, *self.other_whitenings, math.inf) < 0.0:
+            raise ValueError('whitening weights must be at least 0, got '
+                             f'{(self.whitening, *self.other_whitenings)}')
+        if self.pre_feedback is not None and not self.pre_feedback > 0.0:
+            raise ValueError('pre_feedback, the weight of the input, must be above 0 or None, got '
+                             f'{self.pre_feedback}')
+
+    def of_start(self, number: int) -> Growth:
+        """Return the recipe of one of the starts of a round, by its number."""
+        weights = (self.whitening, *self.other_whitenings)
+        return replace(self, whitening=weights[number % len(weights)], other_whitenings=())
 
     def rounds(self, n_x: int) -> tuple[int, ...]:
         """Return the n_z after each round of starts; ValueError when the states need more."""

@@ -24,13 +24,14 @@ from koopman_ros.control.law_check import check_law, LawCheck, LOOPS, Rate
 from koopman_ros.learning.baselines import Algorithm1, Edmd
 from koopman_ros.learning.contradictions import check_nominal_point, check_rates
 from koopman_ros.learning.drift import NeuralDrift, SMALLEST, with_readout
+from koopman_ros.learning.frame import Frame
 from koopman_ros.learning.growth import Grown, Growth, Monitor
 from koopman_ros.learning.inputs import InputModel
 from koopman_ros.learning.levenberg_marquardt import MinimumStatus, PATIENCE
 from koopman_ros.learning.residuals import deviations, ScaledSamples
 from koopman_ros.learning.validation import evaluate, Figures, Fit, fit, lifted_rate, ROUNDING
 from koopman_ros.lifting import Box, LiftedModel, NetworkObservables, Provenance, TrainingStates
-from koopman_ros.plant_data import Plant, Samples, split_by_episode
+from koopman_ros.plant_data import Array, Plant, Samples, split_by_episode
 
 # Polynomials on which a law is tried.
 _HIGHEST_DEGREE = 5
@@ -132,7 +133,8 @@ def train(plant: Plant, samples: Samples, recipe: Recipe, *, seed: int = 0, star
     check_rates(plant, samples)
     check_nominal_point(plant, samples, box)
     assembly = _Assembly(plant, box, parts[0], samples.digest(), seed,
-                         training_states(box, samples))
+                         training_states(box, samples),
+                         recipe.pre_feedback if isinstance(recipe, Growth) else None)
     data = assembly.data(device)
     tracker = _Tracker(watch, starts * len(rounds))
     path: list[_Candidate] = []
@@ -308,12 +310,13 @@ class _Assembly:
     digest: str
     seed: int
     training_states: TrainingStates | None
+    pre_feedback: float | None  # weight of the input, where there is to be one
 
     @cached_property
     def pace(self) -> float:
         """Root mean square of the scaled rates, by which time is scaled, in 1/time unit."""
         # rates of order one put the residuals of the dynamics beside the others
-        _, rate, _ = deviations(self.box, self.samples)
+        rate = self.given[1] if self.frame else deviations(self.box, self.samples)[1]
         return float(np.sqrt(np.mean(rate ** 2))) or 1.0
 
     @cached_property
@@ -321,24 +324,44 @@ class _Assembly:
         """What is known of B."""
         return InputModel.of(self.plant, self.box, self.samples.x)
 
-    def data(self, device: str) -> ScaledSamples:
+    @cached_property
+    def plain(self) -> tuple[Array, Array, Array | None]:
+        """States, rates without what is known of the inputs, and the regressors of the rest."""
         x, rate, u = deviations(self.box, self.samples)
-        f, regressors = self.inputs.apart(x, rate, u)
+        return x, *self.inputs.apart(x, rate, u)
+
+    @cached_property
+    def frame(self) -> Frame | None:
+        """In which the lift is learned; None for that of the samples."""
+        return None if self.pre_feedback is None else Frame.of(
+            self.inputs, *self.plain, self.pre_feedback)
+
+    @cached_property
+    def given(self) -> tuple[Array, Array, Array | None]:
+        """The same as `plain` in the frame."""
+        return self.frame.enter(*self.plain) if self.frame else self.plain
+
+    def data(self, device: str) -> ScaledSamples:
+        x, f, regressors = self.given
         arrays = (x, f / self.pace, *([] if regressors is None else [regressors]))
         return ScaledSamples(*(torch.from_numpy(a).to(device) for a in arrays))
 
     def model(self, grown: Grown) -> LiftedModel:
         parts = grown.layout.split(grown.theta.cpu())
-        B, terms = self.inputs.matrix(None if parts.B is None else self.pace * parts.B.numpy())
+        A, B = self.pace * parts.A.numpy(), None if parts.B is None else (
+            self.pace * parts.B.numpy())
         alone = grown.drift_alone
         observables = NetworkObservables(
             tuple((W.numpy(), b.numpy()) for W, b in parts.hidden),
             parts.V.numpy()[:0 if alone else None], alone or grown.layout.identity,
             grown.layout.activation)
+        if self.frame:
+            observables, A, B = self.frame.leave(observables, A, B)
+        constant, terms = self.inputs.matrix(B)
         origin = Provenance(self.plant.name, self.seed, self.digest, {}, __version__)
-        return LiftedModel(observables, self.pace * parts.A.numpy(), B, self.box.states,
-                           self.box.inputs, self.box.time_unit, origin, self.training_states,
-                           input_terms=terms)
+        return LiftedModel(observables, A, constant, self.box.states, self.box.inputs,
+                           self.box.time_unit, origin, self.training_states, input_terms=terms,
+                           pre_feedback=self.frame.K if self.frame else None)
 
 
 def _run_starts(recipe: Recipe, data: ScaledSamples, n_z: int, parent: Grown | None, seed: int,
@@ -347,8 +370,9 @@ def _run_starts(recipe: Recipe, data: ScaledSamples, n_z: int, parent: Grown | N
     seeds = [int(n) for n in np.random.SeedSequence([seed, n_z]).generate_state(starts)]
     monitor = tracker.step if _runs_here() else None
     results = joblib.Parallel(return_as='generator')(
-        joblib.delayed(_start)(recipe, data, n_z, parent, number, threads, monitor)
-        for number in seeds)
+        joblib.delayed(_start)(recipe.of_start(i) if isinstance(recipe, Growth) else recipe, data,
+                               n_z, parent, number, threads, monitor)
+        for i, number in enumerate(seeds))
     try:
         # not `yield from`, which would close the results where their warning is not silenced
         for found in results:  # noqa: UP028

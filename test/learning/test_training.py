@@ -74,6 +74,9 @@ def test_fewer_coordinates_than_a_lift_needs(n_z, identity, n_x, hint):
     ({'hidden_first': 0}, 'hidden units must be positive, got 0 first and 3 more'),
     ({'hidden_more': -1}, 'hidden units must be positive, got 8 first and -1 more'),
     ({'layers': 3}, 'layers must be 1 or 2, got 3'),
+    ({'whitening': -1.0}, r'whitening weights must be at least 0, got \(-1.0,\)'),
+    ({'other_whitenings': (1.0, -2.0)}, r'must be at least 0, got \(1.0, 1.0, -2.0\)'),
+    ({'pre_feedback': 0.0}, 'pre_feedback, the weight of the input, must be above 0 or None, got'),
     ({'activation': 'relu'}, "must be one of tanh, sigmoid, sine, softplus, got 'relu'"),
 ])
 def test_a_recipe_without_sense(change, message):
