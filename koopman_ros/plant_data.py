@@ -16,6 +16,8 @@ from numpy.typing import ArrayLike
 from koopman_ros.arrays import Array, brief, frozen
 from koopman_ros.units import check_time_unit
 
+__all__ = ['Episode', 'Plant', 'Samples', 'cut', 'split_by_episode', 'within']
+
 
 @dataclass(frozen=True)
 class Plant:

@@ -18,6 +18,8 @@ from koopman_ros.units import shown, unit_label
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
+__all__ = ['draw_loops', 'plot_law_check']
+
 _PANEL = 5.0  # inches
 
 
