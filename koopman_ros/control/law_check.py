@@ -42,8 +42,8 @@ _ARRIVED = 0.05
 _APART = 0.25
 # It is lost when a state is further than this from the nominal point, in units of its scale.
 _ESCAPED = 10.0
-# Slowest time constants of the linear loop that a loop lasts, how many times as long one that has
-# not arrived may go on, and the slowest rate beside the fastest that is waited for.
+# Slowest time constants of the linear loop that a loop lasts, how many times as long it may go on
+# when only some laws have arrived, and the slowest rate beside the fastest that is waited for.
 _DURATION = 6.0
 _PATIENCE = 4
 _SLOWEST = 1e-3
@@ -463,8 +463,9 @@ def _run(plant: _Plant, feedbacks: Sequence[_Feedback], starts: Array, setpoints
             active = (np.abs(y[..., :n]) < _ESCAPED).all(axis=-1)
             y[~active] = np.nan
             if number >= samples:
-                # all laws of a loop get the same time
-                active &= (active & ~arrived()).any(axis=0)
+                # where one law has arrived the others may, too; all of them get the same time
+                there = arrived()
+                active &= there.any(axis=0) & (active & ~there).any(axis=0)
                 if not active.any():
                     break
             v = np.array([act(x, on) for act, x, on in zip(
