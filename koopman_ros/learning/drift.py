@@ -22,6 +22,9 @@ from koopman_ros.plant_data import Samples
 # Directions of the features smaller than this beside the largest are left out of a fit: their
 # weights would be as large as the inverse. What that loses and gains depends on the data.
 SMALLEST = (1e-9, 1e-6, 1e-3)
+# A unit that moves less on the samples is saturated: with a weight so large, its rounding would be
+# steps in the drift, on which no steady state is found.
+_STILL = 1e-6
 _CHUNK = 1 << 18  # numbers in a part of the Jacobian
 
 
@@ -38,9 +41,9 @@ def with_readout(model: LiftedModel, samples: Samples, smallest: float = SMALLES
     phi = model.observables.features.lift(x)
     f = samples.dxdt / model.states.scale - model.forcing(
         x, model.inputs.to_deviation(samples.u))
-    # each feature in units of its size; one that is 0 on all samples gets no weight
+    # each feature in units of its size; one that stands still on all samples gets no weight
     size = np.sqrt(np.mean(phi ** 2, axis=0))
-    unit = np.divide(1.0, size, out=np.zeros_like(size), where=size > 0.0)
+    unit = np.divide(1.0, size, out=np.zeros_like(size), where=size > _STILL)
     weights = np.linalg.lstsq(phi * unit, f, rcond=smallest)[0].T
     return replace(model, readout=weights * unit)
 

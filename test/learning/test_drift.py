@@ -53,6 +53,18 @@ def test_units_that_say_nothing_and_units_that_say_the_same_do_no_harm():
     np.testing.assert_array_equal(found.readout[:, 2], 0.0)
 
 
+def test_a_saturated_unit_gets_no_weight():
+    """It moves by 1e-14: what it could add to a drift that the others do not span is rounding."""
+    lift = random_lift(2, (6,))
+    W, b = (np.array(a) for a in lift.observables.hidden[0])
+    b[1] = 17.0
+    lift = replace(lift, observables=replace(lift.observables, hidden=((W, b),)))
+    truth = replace(random_lift(2, (9,), seed=4), states=lift.states, inputs=lift.inputs, B=lift.B)
+    found = with_readout(lift, samples_of(truth))
+    np.testing.assert_array_equal(found.readout[:, 3], 0.0)
+    assert np.max(np.abs(found.readout)) < 1e3
+
+
 class Given:
     """A recipe that has its result already, or keeps it."""
 
