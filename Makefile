@@ -12,7 +12,7 @@ export ROS_AUTOMATIC_DISCOVERY_RANGE ?= LOCALHOST
 # How many seeds each experiment is run from: make studies SEEDS=5
 SEEDS ?= 20
 
-.PHONY: help demo demo-retrain test test-machines lint models studies studies-sensors studies-robustness studies-general bench faults docs config lock clean
+.PHONY: help demo demo-retrain test test-machines lint models studies studies-sensors studies-robustness studies-general studies-unstable bench faults docs config lock clean
 
 help:  ## show this list
 	@grep -E '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed 's/:.*## /\t/'
@@ -86,6 +86,10 @@ studies-robustness: $(VENV)/bench.stamp  ## margins, attraction, disturbances, n
 studies-general: SEEDS = 10
 studies-general: $(VENV)/bench.stamp  ## the law on seven plants by models of each class, SEEDS=10 -> out/studies-general
 	$(BIN)/python -m validation.general --seeds $(SEEDS)
+
+studies-unstable: SEEDS = 10
+studies-unstable: $(VENV)/train.stamp  ## the reactor about its saddle, learned under a pre-feedback, SEEDS=10, six minutes
+	$(BIN)/python -m validation.unstable --seeds $(SEEDS)
 
 bench: $(VENV)/bench.stamp  ## speed beside other programs, thirteen minutes (BENCH=--quick: two) -> out/bench
 	$(BIN)/python -m validation.benchmarks $(BENCH)

@@ -1,0 +1,134 @@
+# SPDX-FileCopyrightText: 2026 The koopman_ros Authors
+# SPDX-License-Identifier: Apache-2.0
+
+"""
+The two-state reactor about its saddle, learned under a pre-feedback: figures, closed loops.
+
+Run it as ``python -m validation.unstable`` (needs the `train` requirements).
+"""
+
+import argparse
+from dataclasses import replace
+import sys
+import time
+
+import numpy as np
+
+from koopman_ros.arrays import Array
+from koopman_ros.control import (
+    at,
+    Controller,
+    InputLimits,
+    LevelSettings,
+    SetpointRequest,
+    Settings,
+    simulate,
+    SupervisorSettings,
+)
+from koopman_ros.learning import compare, fit, Growth, NeuralDrift, NoUsefulLift
+from koopman_ros.learning.training import Recipe
+from koopman_ros.lifting import LiftedModel
+from koopman_ros.plant_data import Samples
+from koopman_ros.plants import (
+    box_episodes,
+    describe,
+    Process,
+    RandomStepDesign,
+    steady_state,
+    two_state_reactor,
+)
+from koopman_ros.plants.optimum import cost_along, optimum, Task
+from koopman_ros.reports import table
+
+# the steady state with a coolant of 300 K from which the reactor cools down or ignites; the range
+# about it, in mol/L and K, holds another one with that coolant, an unstable focus
+SADDLE = (0.4999182859586588, 350.00552869021254)
+SYSTEM = two_state_reactor(nominal_state=SADDLE)
+DESIGN = RandomStepDesign(
+    input_lower=278.15, input_upper=305.15, state_lower=[0.1, 325.0], state_upper=[0.95, 375.0],
+    hold_time=(0.02, 0.05), sample_period=0.02, max_redraws=20, rtol=1e-9)
+EPISODES, DURATION = 400, 0.1  # in min
+# A feedback under which the range has one steady state makes as many free coordinates as states
+# enough.
+LIFT = Growth(2, identity=False, hidden_first=32, decoder=0, max_iterations=1000,
+              pre_feedback=0.05, other_whitenings=(10.0,))
+RECIPES: dict[str, Recipe] = {'neural drift': NeuralDrift((16,)), 'free lift': LIFT}
+STARTS = 2
+# From one temperature to another, in K.
+STEPS = ((350.0, 345.0), (350.0, 355.0), (340.0, 350.0), (365.0, 350.0))
+PERIOD, SAMPLES = 1.0, 240  # of a loop, in s
+
+
+def samples(seed: int, episodes: int) -> Samples:
+    """Simulate episodes from whose ends the coolant can bring the reactor back to the saddle."""
+    return box_episodes(SYSTEM, DESIGN, episodes, DURATION, seed, keep_recoverable=True)
+
+
+def learn(seed: int) -> LiftedModel:
+    """Learn the free lift, and units for its drift."""
+    return compare(describe(SYSTEM), samples(seed, EPISODES), RECIPES, degrees=(2,),
+                   choose='free lift', seed=seed, starts=STARTS, loops=0).model
+
+
+def cost_ratio(model: LiftedModel, begin: float, end: float) -> float:
+    """
+    Step the temperature, in K, by the law of a model on the true reactor, sampled each second.
+
+    :return: the integral of (T - T_ref)^2 + (T_c - T_c,ref)^2 over the least a held input can.
+    """
+    x0, (x_ref, u_ref) = steady(begin)[0], steady(end)
+    weights, one = np.array([0.0, 1.0]), np.ones(1)
+    task = Task(SYSTEM, x0, x_ref, u_ref, weights, one, PERIOD / SYSTEM.seconds_per_time_unit,
+                SAMPLES)
+    unlimited = InputLimits(np.array([200.0]), np.array([400.0]), np.full(1, np.inf))
+    settings = Settings.for_model(
+        model, state_weight=weights, input_weight=one, limits=unlimited,
+        controlled=('temperature',),
+        supervisor=SupervisorSettings((LevelSettings('sdre', 0.1),)))
+    loop = simulate(
+        Controller(model, settings), Process(SYSTEM, 0, x0, steady(begin)[1]),
+        [at(0.0, SetpointRequest(0, x_ref[1:]))], period=PERIOD, duration=PERIOD * SAMPLES)
+    if set(loop.levels) != {'sdre'}:
+        return float('inf')
+    return cost_along(task, loop.states, loop.commands[:-1]) / optimum(task).cost
+
+
+def steady(temperature: float) -> tuple[Array, Array]:
+    """Return the state and the coolant that hold a temperature, in K."""
+    return steady_state(SYSTEM, {'temperature': temperature})
+
+
+def main(args: list[str] | None = None) -> int:
+    """Learn from several seeds and print a row for each, judged on fresh samples."""
+    parser = argparse.ArgumentParser(
+        prog='python -m validation.unstable',
+        description='Learn the two-state reactor about its saddle under a pre-feedback.')
+    parser.add_argument('--seeds', type=int, default=10, help='number of seeds, at least 1 '
+                        '(default: %(default)s)')
+    options = parser.parse_args(args)
+    if options.seeds < 1:
+        parser.error(f'--seeds is {options.seeds}, must be at least 1')
+    rows, refused = [], False
+    for seed in range(options.seeds):
+        begin = time.process_time()
+        try:
+            model, fresh = learn(seed), samples(1000 + seed, 200)
+        except NoUsefulLift as refusal:
+            print(f'seed {seed}: {refusal}', file=sys.stderr)
+            refused = True
+            continue
+        seconds = time.process_time() - begin
+        found, by_rates = (fit(one, fresh.x, fresh.dxdt, fresh.u)
+                           for one in (model, replace(model, readout=None)))
+        costs = [f'{cost_ratio(model, *step):.4f}' for step in STEPS]
+        rows.append([seed, f'{found.rw:.0e}', f'{found.rx:.0e}', f'{found.cond:.1f}',
+                     f'{by_rates.rx:.0e}', *costs, f'{seconds:.0f}'])
+        print(*rows[-1], sep='\t', file=sys.stderr, flush=True)
+    steps = [f'{begin:.0f} to {end:.0f} K' for begin, end in STEPS]
+    head = ['seed', 'rw', 'rx', 'cond', 'rx by the rates of z', *steps, 's']
+    print(table(head, rows, range(len(head))))
+    return int(refused)
+
+
+if __name__ == '__main__':
+    sys.exit(main())
