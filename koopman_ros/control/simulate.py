@@ -308,9 +308,7 @@ def run_closed_loop(model: LiftedModel, rate: Callable[[Array, Array], Array], x
 
     target = _target(model, np.asarray(x_ref, dtype=np.float64), controlled)
     x0 = frozen(x0, 'x0', (model.n_x,))
-    for name, matrix, n in (('Q', weights.Q, model.n_x), ('R', weights.R, model.n_u)):
-        if matrix.shape != (n, n):
-            raise ValueError(f'incompatible {name}: expected {(n, n)}, got {matrix.shape}')
+    weights.check(model)
     v_ref = target.u if u_ref is None else model.inputs.to_deviation(np.asarray(u_ref))
 
     def act(x: Array) -> tuple[Array, Array]:

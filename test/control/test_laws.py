@@ -4,6 +4,7 @@
 """The laws against exact optima, and a law and an estimator added from a folder."""
 
 from dataclasses import replace
+import re
 
 import numpy as np
 import pytest
@@ -335,6 +336,17 @@ def test_a_free_lift_and_one_that_is_not_closed_take_the_averaged_law(identity, 
     found = feedback(model, np.array([0.3]), target, Weights(np.eye(1), np.eye(1)))
     assert found.solved
     assert found.form is Form.AVERAGED
+
+
+@pytest.mark.parametrize(('n_x', 'n_u', 'size', 'words'), [
+    (3, 1, 2, 'incompatible Q: expected (2, 2), got (3, 3)'),
+    (2, 2, 2, 'incompatible R: expected (1, 1), got (2, 2)'),
+    (2, 1, 3, 'incompatible state: expected one number for each of')])
+def test_what_does_not_fit_the_model_is_refused_by_name(n_x, n_u, size, words):
+    model = random_lift()
+    target = steady_state_target(model, np.zeros(2))
+    with pytest.raises(ValueError, match=re.escape(words)):
+        feedback(model, np.zeros(size), target, Weights(np.eye(n_x), np.eye(n_u)))
 
 
 # The sampled loop.

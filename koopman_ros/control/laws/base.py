@@ -79,6 +79,12 @@ class Weights:
                 raise ValueError(f'{name} must be symmetric, positive {least}, got {M.tolist()}')
             object.__setattr__(self, name, M)
 
+    def check(self, model: LiftedModel) -> None:
+        """Raise a ValueError for weights of another number of states or inputs than a model's."""
+        for name, matrix, n in (('Q', self.Q, model.n_x), ('R', self.R, model.n_u)):
+            if matrix.shape != (n, n):
+                raise ValueError(f'incompatible {name}: expected {(n, n)}, got {matrix.shape}')
+
     @classmethod
     def physical(cls, model: LiftedModel, states: ArrayLike, inputs: ArrayLike) -> Self:
         """

@@ -98,7 +98,10 @@ def feedback(model: LiftedModel, x: Array, target: Target, weights: Weights, *,
         of the sampled regulator, and with 0 that of the continuous one.
     :param max_gain: bound on the spectral norm of K.
     :param max_residual: bound on the relative Riccati residual.
+    :raises ValueError: for weights or a state of another size than the model's.
     """
+    weights.check(model)
+    x = model.states.array('state', x)
     how = {'interval': interval, 'max_gain': max_gain, 'max_residual': max_residual}
     if model.identity and model.mismatch <= _CLOSED and not model.adds_unstable_modes:
         result = recentred(model, x, target, weights, **how)
