@@ -117,7 +117,9 @@ def _draw(path: Path, retrained: Retrained) -> bool:
                 if decision is not None:
                     draw_loops(row[3], decision.law_check, i)
                     row[3].set_title('closed loops on the estimated drift')
-                    row[3].legend(fontsize=8)
+                    low, high = row[3].get_ylim()
+                    row[3].set_ylim(low, high + 0.2 * (high - low))  # room for the legend
+                    row[3].legend(fontsize=8, loc='upper left')
             word = 'accepted' if retrained.accepted else 'refused'
             figure.suptitle(f'Retraining: the new lift is {word}')
     except ImportError:
