@@ -122,8 +122,8 @@ for one in found.contenders:
 #
 # A model that predicts well may be no controller. So its law is tried from many states to many
 # set-points, on the drift that predicts the validation episodes best, beside the law that knows
-# that drift and two linear ones. A loop fails where the law that knows saves 5 %, or alone arrives;
-# at most 1 % of the loops may. Those from which no law arrives do not count.
+# that drift and two linear ones. A loop fails where the law that knows saves 5 %, or alone
+# arrives; at most 1 % of the loops may. Those from which no law arrives do not count.
 #
 # What the motor can do decides more than the model. Below, the same law on the true pendulum with
 # weaker motors: set-points are only those that the motor can hold, up to asin(u / m g l), and from

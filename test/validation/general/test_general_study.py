@@ -13,7 +13,7 @@ import matplotlib.image
 import numpy as np
 import pytest
 
-from koopman_ros.learning import Growth, NoUsefulLift, rollout_rmse
+from koopman_ros.learning import fit, Growth, NoUsefulLift, rollout_rmse
 from koopman_ros.lifting import Box
 from koopman_ros.plants import describe
 from koopman_ros.solvers import solve_riccati
@@ -175,6 +175,16 @@ def test_uses_of_models_of_van_der_pol(folder):
     assert 1e-6 < cubic['rx_noisy'][0] < 1e-4
     assert lift['rollout'][0] < lift['rollout_z'][0]
     assert {'averaged', 'recentred', 'averaged_missed', 'recentred_missed'} <= lift.keys()
+
+
+def test_the_error_of_a_drift_is_rx():
+    case = CASES['van_der_pol']
+    samples = case.samples(0, 5)
+    assert coordinates.drift_error(case.truth, samples) == pytest.approx(
+        fit(case.truth, samples.x, samples.dxdt, samples.u).rx, rel=1e-12)
+    # of one sample, too
+    assert coordinates.drift_error(case.truth, coordinates.chosen(
+        samples, np.arange(len(samples)) == 3)) > 0.0
 
 
 def test_in_z_a_linear_model_is_predicted_as_by_its_drift():
