@@ -14,6 +14,7 @@ import torch
 
 from koopman_ros.learning import fit, Growth, NoUsefulLift, train
 from koopman_ros.learning.levenberg_marquardt import MinimumStatus
+from koopman_ros.learning.validation import ROUNDING
 from koopman_ros.plant_data import split_by_episode
 from support import small_plants
 from support.small_plants import BENT, bent_samples, bits, SMALL, UNFORCED, unforced_samples
@@ -97,7 +98,8 @@ def test_a_linear_plant_needs_no_lift_and_gets_one_where_it_is_asked_for():
                                            r'range$'):
         train(BENT, linear, SMALL, starts=1)
     trained = train(BENT, linear, SMALL, starts=1, refuse=False)
-    assert trained.figures.fit.rx > trained.linear.fit.rx
+    # both are exact, to rounding: which has less of it depends on the processor
+    assert max(trained.figures.fit.rx, trained.linear.fit.rx) < ROUNDING
     assert trained.law_check is None
 
 
