@@ -80,7 +80,9 @@ class LawCheck:
     #: not arrive but that one does, and 0 where that one does not or needs the last fifth of the
     #: inputs' range
     excess: Array
-    hopeless: int  #: further loops, which do not count: from there none of the laws arrives
+    #: further loops, which do not count: none of the laws arrives there, or only the one that
+    #: knows the drift, with the last fifth of the inputs' range
+    hopeless: int
 
     @property
     def poor(self) -> NDArray[np.bool_]:
@@ -117,7 +119,7 @@ class LawCheck:
     @property
     def arrived(self) -> int:
         """Number of those that reached their set-point."""
-        return int(np.sum(np.isfinite(self.ratios)))
+        return int(np.sum(np.isfinite(self.ratios) & np.isfinite(self.excess)))
 
     @property
     def share_failed(self) -> float:
@@ -189,9 +191,9 @@ def check_law(model: LiftedModel, rate: Rate, *, tuning: Tuning | None = None,
 
     It fails where it costs more than 1.05 times as much as the averaged law that knows that drift,
     or does not arrive though that one does, with four fifths of the inputs' range, too: then a
-    better model would do better. Where it has no
-    gain, does not arrive, or costs more than 1.1 times the better of two linear laws without
-    failing so, it is poor by itself, and no model would help.
+    better model would do better. Where it has no gain, does not arrive, or costs more than 1.1
+    times the better of two linear laws without failing so, it is poor by itself, and no model
+    would help.
 
     Starts and set-points fill the data's range evenly (a scrambled Sobol sequence of fixed seed);
     the latter are steady states of that drift, which an input within its limits holds. All laws
@@ -240,7 +242,8 @@ def check_law(model: LiftedModel, rate: Rate, *, tuning: Tuning | None = None,
         if again is None:
             return None
         excess[beaten] = np.minimum(excess[beaten], _beside(own[beaten], again[0][0]))
-    counts = np.isfinite(own) | np.isfinite(informed) | np.isfinite(others).any(axis=0)
+    # a law that does not arrive counts where another one does
+    counts = np.isfinite(own) | np.isinf(ratios) | np.isinf(excess)
     x0, x_ref = (model.states.to_physical(x[counts]) for x in (starts, targets))
     return LawCheck(model.states, x0, x_ref, ratios[counts], no_gain[counts], excess[counts],
                     int(np.sum(~counts)))
