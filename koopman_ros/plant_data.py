@@ -11,7 +11,7 @@ import hashlib
 import itertools
 
 import numpy as np
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, NDArray
 
 from koopman_ros.arrays import Array, brief, frozen
 from koopman_ros.units import check_time_unit
@@ -251,7 +251,10 @@ class Samples:
 
     def take(self, episodes: np.ndarray) -> Samples:
         """Return the samples of some episodes."""
-        keep = np.isin(self.episode, episodes)
+        return self.where(np.isin(self.episode, episodes))
+
+    def where(self, keep: NDArray[np.bool_]) -> Samples:
+        """Return the samples that a mask (N,) keeps."""
         return Samples(self.x[keep], self.dxdt[keep], self.u[keep], self.episode[keep],
                        None if self.time is None else self.time[keep])
 

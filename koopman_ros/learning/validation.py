@@ -74,10 +74,7 @@ def fit(model: LiftedModel, x: Array, dxdt: Array, u: Array) -> Fit:
     :raises ValueError: when the samples do not distinguish the coordinates, or do not fit the
         model.
     """
-    x, dxdt = (model.states.array(name, a) for name, a in (('x', x), ('dxdt', dxdt)))
-    xi = model.states.to_deviation(x)
-    f = dxdt / model.states.scale - model.forcing(
-        xi, model.inputs.to_deviation(model.inputs.array('u', u)))
+    xi, f = _drifts(model, x, dxdt, u)
     z, J = model.lift_and_jacobian(xi)
     # of the plant under the pre-feedback of A
     dz = (J @ (f + model.pre_feedback_rate(xi))[..., None])[..., 0]
@@ -89,10 +86,27 @@ def fit(model: LiftedModel, x: Array, dxdt: Array, u: Array) -> Fit:
     factor = np.linalg.cholesky(S)
     residual = np.linalg.solve(factor, (dz - z @ model.A.T).T)
     reference = np.linalg.solve(factor, dz.T)
-    error = model.drift(xi) - f
     return Fit(rw=float(np.sum(residual ** 2) / np.sum(reference ** 2)),
-               rx=float(np.sum(error ** 2) / np.sum(f ** 2)),
+               rx=_relative_error(model, xi, f),
                cond=cond)
+
+
+def drift_error(model: LiftedModel, samples: Samples) -> float:
+    """Return `rx` of samples that need not tell the coordinates apart."""
+    return _relative_error(model, *_drifts(model, samples.x, samples.dxdt, samples.u))
+
+
+def _drifts(model: LiftedModel, x: Array, dxdt: Array, u: Array) -> tuple[Array, Array]:
+    """Return scaled states (N, n_x), and their rates (N, n_x) less what the inputs add."""
+    x, dxdt = (model.states.array(name, a) for name, a in (('x', x), ('dxdt', dxdt)))
+    xi = model.states.to_deviation(x)
+    return xi, dxdt / model.states.scale - model.forcing(
+        xi, model.inputs.to_deviation(model.inputs.array('u', u)))
+
+
+def _relative_error(model: LiftedModel, xi: Array, f: Array) -> float:
+    error = model.drift(xi) - f
+    return float(np.sum(error ** 2) / np.sum(f ** 2))
 
 
 def roll_out(model: LiftedModel, x0: Array, inputs: Array, sample_period: float | Array) -> Array:

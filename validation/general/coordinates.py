@@ -9,12 +9,12 @@ from functools import partial
 from itertools import pairwise
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.integrate import solve_ivp
 
 from koopman_ros.arrays import Array
 from koopman_ros.control import averaged, recentred
 from koopman_ros.learning import NoUsefulLift, rollout_rmse, train
+from koopman_ros.learning.validation import drift_error
 from koopman_ros.lifting import Box, LiftedModel, PolynomialObservables
 from koopman_ros.plant_data import Samples, split_by_episode
 from koopman_ros.plants import describe
@@ -45,25 +45,12 @@ def noisy(samples: Samples, seed: int) -> Samples:
 
 def few(samples: Samples, seed: int) -> Samples:
     """Return the first episodes alone."""
-    return chosen(samples, samples.episode < FEW * (samples.episode.max() + 1))
-
-
-def chosen(samples: Samples, rows: NDArray[np.bool_]) -> Samples:
-    """Return some of the samples, by mask (N,)."""
-    return Samples(samples.x[rows], samples.dxdt[rows], samples.u[rows], samples.episode[rows],
-                   None if samples.time is None else samples.time[rows])
+    episodes = np.unique(samples.episode)
+    return samples.take(episodes[:round(FEW * len(episodes))])
 
 
 CONDITIONS: Mapping[str, Callable[[Samples, int], Samples]] = {
     'rx': lambda samples, seed: samples, 'rx_noisy': noisy, 'rx_few': few}
-
-
-def drift_error(model: LiftedModel, samples: Samples) -> float:
-    """Return the figure `rx` of samples that need not tell the coordinates apart."""
-    x = model.states.to_deviation(samples.x)
-    f = samples.dxdt / model.states.scale - model.forcing(
-        x, model.inputs.to_deviation(samples.u))
-    return float(np.sum((model.drift(x) - f) ** 2) / np.sum(f ** 2))
 
 
 def beyond(case: Case, box: Box, seed: int) -> Samples:
@@ -74,7 +61,7 @@ def beyond(case: Case, box: Box, seed: int) -> Samples:
                         case.design, state_lower=box.states.lower,
                         state_upper=box.states.upper + 1.5 * more))
     found = wider.samples(seed, _HELD_OUT)
-    return chosen(found, np.any(found.x > box.states.upper, axis=1))
+    return found.where(np.any(found.x > box.states.upper, axis=1))
 
 
 def rolled_in_z(model: LiftedModel, samples: Samples) -> Array:

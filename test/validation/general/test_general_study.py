@@ -183,8 +183,8 @@ def test_the_error_of_a_drift_is_rx():
     assert coordinates.drift_error(case.truth, samples) == pytest.approx(
         fit(case.truth, samples.x, samples.dxdt, samples.u).rx, rel=1e-12)
     # of one sample, too
-    assert coordinates.drift_error(case.truth, coordinates.chosen(
-        samples, np.arange(len(samples)) == 3)) > 0.0
+    assert coordinates.drift_error(
+        case.truth, samples.where(np.arange(len(samples)) == 3)) > 0.0
 
 
 def test_in_z_a_linear_model_is_predicted_as_by_its_drift():
