@@ -39,10 +39,10 @@ from koopman_ros.plants import (
 )
 from koopman_ros.plants.optimum import cost_along, optimum, Task
 from koopman_ros.reports import table
+from validation.general.systems import SADDLE
 
-# the steady state with a coolant of 300 K from which the reactor cools down or ignites; the range
-# about it, in mol/L and K, holds another one with that coolant, an unstable focus
-SADDLE = (0.4999182859586588, 350.00552869021254)
+# the range about the saddle, in mol/L and K, holds another steady state with its coolant of 300 K,
+# an unstable focus
 SYSTEM = two_state_reactor(nominal_state=SADDLE)
 DESIGN = RandomStepDesign(
     input_lower=278.15, input_upper=305.15, state_lower=[0.1, 325.0], state_upper=[0.95, 375.0],

@@ -37,7 +37,7 @@ _LEAST_JUMP = 0.1
 
 # Shares of the whole at which estimating, learning and judging begin and end.
 _STAGES = {'estimate': (0.05, 0.35), 'learn': (0.35, 0.9), 'decide': (0.9, 1.0)}
-_JUDGED = 0.98
+_JUDGED = 0.8  # share of deciding in which the closed loops are run
 
 # Called with the share done in [0, 1] and what is done now; True asks to stop.
 OnProgress = Callable[[float, str], bool]
@@ -233,9 +233,9 @@ def retrain(task: Task, on_progress: OnProgress = lambda *_: False) -> Retrained
             found, plant, thresholds, model_class=task.model_class, n_z=task.coordinates,
             seed=task.seed, starts=task.starts, watch=course.learning, judging=course.judging)
     except NoUsefulLift as error:
-        _stop_if(on_progress(_JUDGED, 'judging'))
+        _stop_if(on_progress(_at('decide', _JUDGED), 'judging'))
         return replace(bare, reasons=(str(error),))
-    _stop_if(on_progress(_JUDGED, 'judging'))
+    _stop_if(on_progress(_at('decide', _JUDGED), 'judging'))
     decision = decide(found, learned, current, thresholds)
     decision = replace(decision, warnings=(
         *decision.warnings, *shortfalls(learned.model.states, task.setpoints)))
@@ -342,7 +342,7 @@ class _Course:
 
     def judging(self, name: str, share: float) -> bool:
         """Report the share of a class's closed loops; the last ones come after all starts."""
-        at = _at('decide', 0.8 * share) if self._share == 1.0 else _at('learn', self._share)
+        at = _at('decide', _JUDGED * share) if self._share == 1.0 else _at('learn', self._share)
         _stop_if(self._on_progress(at, f'judging: {name}'))
         return False
 

@@ -147,7 +147,7 @@ def _shipped(name: str) -> Case:
 
 
 # the steady state with a coolant of 300 K from which the reactor cools down or ignites
-_SADDLE = np.array([0.4999182859586588, 350.00552869021254])
+SADDLE = np.array([0.4999182859586588, 350.00552869021254])
 CASES = {
     'van_der_pol': _case(
         oscillator('Van der Pol', lambda x1, x2: (1.0 - x1 * x1) * x2 - x1,
@@ -160,7 +160,7 @@ CASES = {
     'pendulum': _case(library_system('pendulum'), [-1.8, -2.0], [1.8, 2.0], 8.0, (0.05, 0.1),
                       0.05),
     'two_state_example': _shipped('two_state_example'),
-    'reactor_saddle': _case(two_state_reactor(nominal_state=_SADDLE), [0.4, 340.0], [0.6, 360.0],
+    'reactor_saddle': _case(two_state_reactor(nominal_state=SADDLE), [0.4, 340.0], [0.6, 360.0],
                             10.0, (0.05, 0.1), 0.025),
     'two_tanks': _shipped('two_tanks'),
     'quadruple_tank': _shipped('quadruple_tank'),
