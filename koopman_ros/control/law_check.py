@@ -80,8 +80,8 @@ class LawCheck:
     #: not arrive but that one does, and 0 where that one does not or needs the last fifth of the
     #: inputs' range
     excess: Array
-    #: further loops, which do not count: none of the laws arrives there, or only the one that
-    #: knows the drift, with the last fifth of the inputs' range
+    #: loops in which no law arrives within the inputs' limits; they are judged without these, and
+    #: do not count where none arrives then
     hopeless: int
 
     @property
@@ -195,10 +195,11 @@ def check_law(model: LiftedModel, rate: Rate, *, tuning: Tuning | None = None,
     times the better of two linear laws without failing so, it is poor by itself, and no model
     would help.
 
-    Starts and set-points fill the data's range evenly (a scrambled Sobol sequence of fixed seed);
-    the latter are steady states of that drift, which an input within its limits holds. All laws
-    get the input that does: what a disturbance observer finds at rest. Inputs are held from
-    sample to sample. The loops run side by side.
+    Starts fill the box evenly, and set-points that part of it where the data are (a scrambled
+    Sobol sequence of fixed seed); the latter are steady states of that drift, which an input
+    within its limits holds. All laws get the input that does: what a disturbance observer finds at
+    rest. Inputs are held from sample to sample. The loops run side by side. Where no law arrives
+    within the limits, they run again without: what is far from the data the limits must not hide.
 
     :param rate: dx/dt (M, n_x) of states (M, n_x) and inputs (M, n_u), in state and input units
         and per time unit of the model; affine in the input.
@@ -224,18 +225,31 @@ def check_law(model: LiftedModel, rate: Rate, *, tuning: Tuning | None = None,
     loops = min(loops, max(_MOST_CALLS // samples, _FEWEST_LOOPS))
     starts, targets, inputs = _cases(plant, limits, loops)
     seconds = interval * model.seconds_per_time_unit
-    feedbacks = (_called(law(model, tuning), targets, inputs, limits, seconds),
-                 _informed(plant, targets, inputs, tuning, limits, interval),
-                 *(_constant(Linear(one, tuning), targets, inputs, limits, seconds)
-                   for one in (linear, model)))
+
+    def laws(targets: Array, inputs: Array, limits: InputLimits) -> tuple[_Feedback, ...]:
+        return (_called(law(model, tuning), targets, inputs, limits, seconds),
+                _informed(plant, targets, inputs, tuning, limits, interval),
+                *(_constant(Linear(one, tuning), targets, inputs, limits, seconds)
+                  for one in (linear, model)))
+
+    endless = np.full(model.n_u, np.inf)
     steps = math.ceil(_STEPS * interval * fastest)
-    ended = _run(plant, feedbacks, starts, targets, inputs, tuning.weights, interval, samples,
-                 steps, watch)
+    ended = _run(plant, laws(targets, inputs, limits), starts, targets, inputs, tuning.weights,
+                 interval, samples, steps, watch)
     if ended is None:
         return None
-    (own, informed, *others), no_gain = ended
+    costs, no_gain = ended
+    if (hopeless := ~np.isfinite(costs).any(axis=0)).any():
+        # what the limits hide
+        cases = starts[hopeless], targets[hopeless], inputs[hopeless]
+        ended = _run(plant, laws(*cases[1:], InputLimits(-endless, endless, endless)), *cases,
+                     tuning.weights, interval, samples, steps, watch)
+        if ended is None:
+            return None
+        costs[:, hopeless], no_gain[hopeless] = ended
+    own, informed, *others = costs
     ratios, excess = _beside(own, np.min(others, axis=0)), _beside(own, informed)
-    if (beaten := ~(excess <= MOST_EXCESS)).any():
+    if (beaten := ~(excess <= MOST_EXCESS) & ~hopeless).any():
         cases = starts[beaten], targets[beaten], inputs[beaten]
         again = _run(plant, [_informed(plant, *cases[1:], tuning, _narrowed(limits), interval)],
                      *cases, tuning.weights, interval, samples, steps, watch)
@@ -246,7 +260,7 @@ def check_law(model: LiftedModel, rate: Rate, *, tuning: Tuning | None = None,
     counts = np.isfinite(own) | np.isinf(ratios) | np.isinf(excess)
     x0, x_ref = (model.states.to_physical(x[counts]) for x in (starts, targets))
     return LawCheck(model.states, x0, x_ref, ratios[counts], no_gain[counts], excess[counts],
-                    int(np.sum(~counts)))
+                    int(np.sum(hopeless)))
 
 
 def _beside(cost: Array, other: Array) -> Array:
@@ -307,7 +321,7 @@ def _cases(plant: _Plant, limits: InputLimits, loops: int) -> tuple[Array, Array
     model = plant.model
     n, m = model.n_x, model.n_u
     points = qmc.Sobol(2 * n + m, seed=0).random_base2(math.ceil(math.log2(_ATTEMPTS * loops)))
-    starts = _within_data(model, points[:loops, :n], np.arange(loops))
+    starts = _between(model.states, points[:loops, :n])
     numbers = np.random.default_rng(0).permutation(len(points))
     anchors = _within_data(model, points[:, n:2 * n], numbers)
     # the nominal point, too, lest there be none
