@@ -14,7 +14,7 @@ from enum import Enum
 import math
 
 import numpy as np
-from scipy.linalg import blas, expm, lapack
+from scipy.linalg import blas, lapack
 
 from koopman_ros.arrays import Array
 
@@ -23,6 +23,17 @@ __all__ = ['RiccatiSolution', 'RiccatiStatus', 'runge_kutta_step', 'solve_riccat
 # A double eigenvalue of the Hamiltonian on the imaginary axis comes out split by about the square
 # root of the rounding error: modes within that of the axis cannot be told from undamped ones.
 _AXIS_MARGIN = float(np.sqrt(np.finfo(np.float64).eps))
+# Nor modes of a sampled plant within the rounding of its transition, where samples as far apart as
+# a period leave nothing else.
+_ROUNDING = 64.0 * float(np.finfo(np.float64).eps)
+
+# Of the power series of an exponential of norm 1/2: the next would be 2e-20. One more than a power
+# of 2.
+_TERMS = 17
+_FACTORS = np.array([1.0 / math.factorial(k) for k in range(_TERMS)])
+# What the products of two terms, of the powers j and k of time, contribute to an integral from 0
+# to 1.
+_SHARES = np.outer(_FACTORS, _FACTORS) / (1.0 + np.add.outer(range(_TERMS), range(_TERMS)))
 
 
 class RiccatiStatus(Enum):
@@ -135,7 +146,7 @@ def _sampled(A: Array, B: Array, Q: Array, R: Array, interval: float
     held = _over_interval(A, B, Q, R, interval)
     if held is None:
         return None
-    D, W = held
+    D, W, size = held
     step, push = D[:n, :n], D[:n, n:]
     Q_d, N, R_d = W[:n, :n], W[:n, n:], W[n:, n:]
     # what the cross term makes of input and weight
@@ -151,7 +162,8 @@ def _sampled(A: Array, B: Array, Q: Array, R: Array, interval: float
     more[:, n:] *= -1.0
     more.ravel(order='K')[::2 * n + 1] += 2.0
     H = _solution(more, less)
-    P = _stable_graph(H, scale) if H is not None and _size(Q_d) > 0.0 else None
+    P = (_stable_graph(H, scale, _ROUNDING * min(size, 1.0))
+         if H is not None and _size(Q_d) > 0.0 else None)
     if P is None:
         return None
     P_step, P_push = P.dot(step), P.dot(push)
@@ -166,40 +178,47 @@ def _sampled(A: Array, B: Array, Q: Array, R: Array, interval: float
 
 
 def _over_interval(A: Array, B: Array, Q: Array, R: Array, interval: float
-                   ) -> tuple[Array, Array] | None:
+                   ) -> tuple[Array, Array, float] | None:
     """
     Integrate state, held input and cost over an interval; None for what is not finite.
 
+    By the power series of the exponential of [A, B; 0, 0], over so short a part of the interval
+    that it ends within rounding. D is the series without its constant term, so that no digits
+    are lost where the part is short. A general function for exponentials takes twice as long.
+
     :return: with y = (x, u), the D (n + m, n + m) of y(interval) = (I + D) y(0), whose lower rows
-        are zeros, and W of the cost y(0)'W y(0).
+        are zeros, W of the cost y(0)'W y(0), and the norm of [A, B] times the interval.
     """
     n, m = B.shape
     N = n + m
     F, W = np.zeros((N, N)), np.zeros((N, N))
     F[:n, :n], F[:n, n:] = A, B
     W[:n, :n], W[n:, n:] = Q, R
-    size_W = _size(W)
-    doublings = max(0, math.frexp(_size(F) * interval)[1])
-    part = math.ldexp(interval, -doublings)
-    F *= part
-    # by blocks the exponential of F and its integral, of which D loses no digits when F is small,
-    # and of the weights
-    block = np.zeros((3 * N, 3 * N))
-    block[:N, :N], block[:N, N:2 * N] = -F.T, W / size_W
-    block[N:2 * N, N:2 * N], block[N:2 * N, 2 * N:] = F, np.eye(N)
-    if not math.isfinite(_size(block)):
+    size_F, size_W = _size(F) * interval, _size(W)
+    if not (math.isfinite(size_F) and math.isfinite(size_W) and size_W > 0.0):
         return None
-    exponential = expm(block)
-    D = F.dot(exponential[N:2 * N, 2 * N:])
-    W = exponential[N:2 * N, N:2 * N].T.dot(exponential[:N, N:2 * N])
+    doublings = max(0, math.frexp(size_F)[1] + 1)
+    part = math.ldexp(interval, -doublings)
+    # the powers of F below each other: those known times the highest give as many more
+    powers = np.empty((_TERMS * N, N))
+    powers[:N] = np.eye(N)
+    np.multiply(F, part, out=powers[N:2 * N])
+    known = 1
+    while known < _TERMS - 1:
+        highest = (known + 1) * N
+        np.dot(powers[N:highest], powers[highest - N:highest],
+               out=powers[highest:highest + known * N])
+        known *= 2
+    D = _FACTORS[1:].dot(powers[N:].reshape(_TERMS - 1, -1)).reshape(N, N)
+    weighed = np.matmul(W / size_W, powers.reshape(_TERMS, N, N)).reshape(-1, N)
+    W = weighed.T.dot(_SHARES.dot(powers.reshape(_TERMS, -1)).reshape(-1, N))
     W = (0.5 * part * size_W) * (W + W.T)
-    # twice the time, again and again: the same blocks over all of it would overflow where modes
-    # decay fast
+    # twice the time, again and again: the series over all of it would lose its digits
     for _ in range(doublings):
         DW = D.T.dot(W)
         W = 2.0 * W + DW + DW.T + DW.dot(D)
         D = 2.0 * D + D.dot(D)
-    return D, W
+    return D, W, size_F
 
 
 def _scale(Q: Array, G: Array) -> float:
@@ -208,14 +227,19 @@ def _scale(Q: Array, G: Array) -> float:
     return math.sqrt(size_Q / size_G) if size_G > 0.0 and size_Q > 0.0 else 1.0
 
 
-def _stable_graph(H: Array, scale: float) -> Array | None:
-    """Return `scale` times the P whose graph is the stable subspace of a Hamiltonian, or None."""
+def _stable_graph(H: Array, scale: float, least: float = 0.0) -> Array | None:
+    """
+    Return `scale` times the P whose graph is the stable subspace of a Hamiltonian, or None.
+
+    :param least: distance of its modes from the imaginary axis.
+    """
     n, size = len(H) // 2, _size(H)
     if not math.isfinite(size):
         return None
     _, stable, real, _, vectors, _, info = lapack.dgees(
         _in_left_half_plane, H, sort_t=1, lwork=16 * n, overwrite_a=1)
-    if info != 0 or stable != n or not (real[:n] < -_AXIS_MARGIN * size).all():
+    least = max(least, _AXIS_MARGIN * size)
+    if info != 0 or stable != n or not (real[:n] < -least).all():
         return None
     P = _solution(vectors[:n, :n].T, vectors[n:, :n].T)
     return None if P is None else (0.5 * scale) * (P + P.T)

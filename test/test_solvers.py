@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 from scipy.linalg import block_diag, expm, solve_continuous_are, solve_discrete_are
 
+from koopman_ros import solvers
 from koopman_ros.solvers import RiccatiStatus, runge_kutta_step, solve_riccati
 
 SIZES = [(n, m) for n in range(1, 9) for m in range(1, 4)]
@@ -291,10 +292,57 @@ def test_modes_that_decay_within_an_interval(rate):
     np.testing.assert_allclose(found.K, [[0.0, reduced.K[0, 0]]], rtol=1e-9, atol=1e-12)
 
 
-def test_samples_as_far_apart_as_a_period_do_not_see_an_oscillation():
-    problem = OSCILLATOR, np.array([[0.0], [1.0]]), np.eye(2), np.eye(1)
+@pytest.mark.parametrize('gain', [1e-2, 1.0, 1e2])
+@pytest.mark.parametrize('periods', [1, 2, 5])
+def test_samples_as_far_apart_as_a_period_do_not_see_an_oscillation(gain, periods):
+    problem = OSCILLATOR, np.array([[0.0], [gain]]), np.eye(2), np.eye(1)
     assert solve_riccati(*problem, interval=0.9 * np.pi).status is RiccatiStatus.SOLVED
-    assert solve_riccati(*problem, interval=np.pi).status is not RiccatiStatus.SOLVED
+    found = solve_riccati(*problem, interval=periods * np.pi)
+    assert found.status is not RiccatiStatus.SOLVED
+
+
+# The integrals over an interval, which the sampled regulator is made of.
+
+@pytest.mark.parametrize('h', [1e-9, 1e-3, 0.1, 0.3, 2.0])
+def test_the_interval_against_an_exponential_of_blocks(h):
+    """Van Loan, 1978: [-F', W; 0, F], and [F, I; 0, 0] for D, which loses no digits."""
+    for n, m in SIZES:
+        A, B, Q, R = random_problem(n, m, seed=6)
+        D, W, size = solvers._over_interval(A, B, Q, R, h)
+        N = n + m
+        F, weight = np.zeros((N, N)), block_diag(Q, R)
+        F[:n, :n], F[:n, n:] = A, B
+        block = expm(h * np.block([[-F.T, weight], [np.zeros_like(F), F]]))
+        expected = block[N:, N:].T @ block[:N, N:]
+        assert np.linalg.norm(W - expected) <= 2e-12 * np.linalg.norm(expected)
+        whole = expm(h * np.block([[F, np.eye(N)], [np.zeros((N, 2 * N))]]))
+        assert np.linalg.norm(D - F @ whole[:N, N:]) <= 1e-13 * max(
+            np.linalg.norm(D), h * np.linalg.norm(F))
+        assert size == pytest.approx(h * np.linalg.norm(F), rel=1e-14)
+
+
+@pytest.mark.parametrize('h', [1e-12, 1e-3, 0.3, 3.0])
+def test_the_interval_of_an_integrator_chain_by_hand(h):
+    """Of x1' = x2, x2' = u: polynomials of the interval."""
+    A, B = np.array([[0.0, 1.0], [0.0, 0.0]]), np.array([[0.0], [1.0]])
+    D, W, _ = solvers._over_interval(A, B, np.diag([2.0, 3.0]), np.array([[5.0]]), h)
+    np.testing.assert_allclose(D, [[0.0, h, h ** 2 / 2.0], [0.0, 0.0, h], [0.0] * 3], rtol=1e-14)
+    np.testing.assert_allclose(W, [
+        [2.0 * h, h ** 2, h ** 3 / 3.0],
+        [h ** 2, 2.0 * h ** 3 / 3.0 + 3.0 * h, h ** 4 / 4.0 + 1.5 * h ** 2],
+        [h ** 3 / 3.0, h ** 4 / 4.0 + 1.5 * h ** 2, h ** 5 / 10.0 + h ** 3 + 5.0 * h]],
+        rtol=1e-13)
+
+
+@pytest.mark.parametrize('h', [1e-12, 1e-3, 0.3, 3.0, 40.0])
+@pytest.mark.parametrize('a', [-2.0, -1e-9, 1.5])
+def test_the_interval_of_one_state_by_hand(a, h):
+    """Its input does nothing, so that e^(a t) alone is left."""
+    D, W, _ = solvers._over_interval(*(np.array([[value]]) for value in (a, 0.0, 1.0, 1.0)), h)
+    assert D[0, 0] == pytest.approx(np.expm1(a * h), rel=2e-13)
+    assert W[0, 0] == pytest.approx(np.expm1(2.0 * a * h) / (2.0 * a), rel=2e-13)
+    assert W[1, 1] == pytest.approx(h, rel=1e-14)
+    assert W[0, 1] == D[0, 1] == 0.0
 
 
 # Runge-Kutta steps.

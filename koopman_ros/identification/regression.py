@@ -7,7 +7,7 @@ from collections.abc import Sequence
 
 import numpy as np
 from numpy.polynomial.legendre import leggauss
-from scipy.linalg import solveh_banded
+from scipy.linalg import lapack
 
 from koopman_ros.identification.drift import DriftModel
 from koopman_ros.lifting import Box, InputTerms
@@ -230,16 +230,20 @@ def _filtered(y: Array, D: Array, weight: float) -> Array:
     """Solve one l1 trend filter (Kim, Koh, Boyd, Gorinevsky 2009) by iterated weights."""
     g = y
     floor = 1e-6 * float(np.std(_apply(D, y)))
+    columns = np.ascontiguousarray(D.T)
+    bands = np.empty((4, len(y)))
     for _ in range(_SWEEPS):
         w = weight / np.maximum(np.abs(_apply(D, g)), floor)
-        bands = np.zeros((4, len(y)))
-        for shift in range(4):
-            for i in range(4 - shift):
-                # (D' W D)[k + i, k + i + shift] gathers D[k, i] D[k, i + shift]
-                start = i + shift
-                bands[3 - shift, start:start + len(D)] += w * D[:, i] * D[:, i + shift]
+        bands.fill(0.0)
+        for i, weighted in enumerate(w * columns):
+            for end in range(i, 4):
+                # (D' W D)[k + i, k + end] gathers D[k, i] D[k, end]
+                bands[3 - end + i, end:end + len(D)] += weighted * columns[end]
         bands[3] += 1.0
-        g = solveh_banded(bands, y, check_finite=False)
+        # as scipy.linalg.solveh_banded does, which takes as long again to look at its arguments
+        _, g, info = lapack.dpbsv(bands, y)
+        if info:
+            raise np.linalg.LinAlgError('the weights of a trend filter are out of range')
     return g
 
 
@@ -256,4 +260,8 @@ def _third_differences(time: Array) -> Array:
 
 
 def _apply(D: Array, y: Array) -> Array:
-    return np.einsum('ki,ki->k', D, np.lib.stride_tricks.sliding_window_view(y, 4))
+    # the general view takes longer to make than the product
+    windows: Array = np.ndarray(
+        (len(y) - 3, 4), buffer=y, strides=2 * y.strides) if y.flags.c_contiguous else (
+        np.lib.stride_tricks.sliding_window_view(y, 4))
+    return np.einsum('ki,ki->k', D, windows)
