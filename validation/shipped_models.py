@@ -15,6 +15,7 @@ import sys
 
 import numpy as np
 
+from koopman_ros.control.law_check import LOOPS
 from koopman_ros.learning import Growth, roll_out, train
 from koopman_ros.learning.progress import training_progress
 from koopman_ros.learning.training import Watch
@@ -89,18 +90,19 @@ def lift_samples(name: str, seed: int) -> Samples:
     return box_episodes(library_system(name), lift.design, lift.episodes, lift.duration, seed)
 
 
-def train_lift(name: str) -> LiftedModel:
+def train_lift(name: str, loops: int = LOOPS) -> LiftedModel:
     """Train the shipped lift of a plant; its metrics are those of held-out episodes."""
     return train(describe(library_system(name)), lift_samples(name, SEED), LIFTS[name].recipe,
-                 seed=SEED, starts=1).model
+                 seed=SEED, starts=1, loops=loops).model
 
 
-def train_lifts(progress: Watch | None = None, starts: int = STARTS) -> dict[int, LiftedModel]:
+def train_lifts(progress: Watch | None = None, starts: int = STARTS, loops: int = LOOPS
+                ) -> dict[int, LiftedModel]:
     """Train the lifts of the one-state reactor, by n_z; the larger grows from the smaller."""
     # a fixed number of steps: where they end depends least on how a processor rounds
     trained = train(describe(SYSTEM), training_samples(SEED),
                     Growth(max(LIFTED_SIZES), tolerance=0.0), seed=SEED, starts=starts,
-                    watch=progress)
+                    loops=loops, watch=progress)
     return {model.n_z: _with_roll_out(model) for model in trained.path
             if model.n_z in LIFTED_SIZES}
 

@@ -82,7 +82,8 @@ def test_two_loops_side_by_side_in_their_namespaces_and_with_another_topic(ros: 
     loops = {47.0: Loop(ros, '/unit_1/'), 42.0: Loop(ros, '/unit_2/', 'reactor_temperature')}
     for celsius, loop in loops.items():
         loop.start_controller(celsius)
-        loop.start_plant(**LOCKSTEP, speed=0.0)
+        # no quicker: one works on while the other starts and settles
+        loop.start_plant(**LOCKSTEP, speed=100.0)
     for celsius, loop in loops.items():
         ros.wait_until(lambda celsius=celsius, loop=loop: len(loop.measured) > 20 and all(
             abs(message.temperature - celsius) <= 0.01 for message in loop.measured[-20:]))

@@ -20,7 +20,7 @@ from koopman_ros.lifting import load, save
 from koopman_ros.resources import model_path
 from koopman_ros.ros import topics
 from koopman_ros.testing import Harness
-from support.controller_bench import Bench, STATUS, STEADY
+from support.controller_bench import Bench, STATUS, STEADY, until_read
 from support.nodes import seconds, temperature, value
 
 
@@ -252,15 +252,16 @@ def test_a_model_that_does_not_reach_to_the_safe_coolant_says_so(
     narrow = tmp_path / 'narrow.safetensors'
     save(replace(model, states=replace(model.states, lower=lower, upper=upper)), narrow)
     # accepted nevertheless
-    (result,) = bench.ros.set_parameters('controller', model=str(narrow))
-    assert result.successful, result.reason
+    assert until_read(lambda: bench.ros.set_parameters_atomically(
+        'controller', model=str(narrow))).successful
     words = 'under coolant_temperature.safe = 5 degC'
     status = bench.ros.wait_for_status(STATUS, lambda s: words in value(s, 'safe input'))
     assert 'leaves the trained range' in value(status, 'safe input')
     bench.ros.wait_until(lambda: words in bench.process.output())
     bench.ros.set_parameters('controller', **{'coolant_temperature.safe': 27.0})
     bench.ros.wait_for_status(STATUS, lambda s: value(s, 'safe input') == 'within reach')
-    bench.ros.set_parameters('controller', model='reactor_nz4')
+    assert until_read(lambda: bench.ros.set_parameters_atomically(
+        'controller', model='reactor_nz4')).successful
 
 
 def test_second_controller_is_told_by_both_while_it_lasts(ros: Harness) -> None:

@@ -13,6 +13,7 @@ import sys
 import pytest
 
 from koopman_ros.bags import summary
+from koopman_ros.demo import first_act
 from koopman_ros.testing import reserved_output
 
 
@@ -50,23 +51,19 @@ def test_demo_of_another_plant_is_measured_by_the_optimum(tmp_path: Path) -> Non
     assert done.stdout.count('angle set-point [rad]') >= 20
 
 
-def test_demo_says_which_plants_it_knows(tmp_path: Path) -> None:
-    done = subprocess.run(
-        [sys.executable, '-m', 'koopman_ros.demo', '--plant', 'volcano', '--output', tmp_path],
-        capture_output=True, text=True, timeout=240, check=False)
-    assert done.returncode == 1
-    (line,) = done.stderr.splitlines()
+def test_demo_says_which_plants_it_knows(
+        tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert first_act.main(['--plant', 'volcano', '--output', str(tmp_path)]) == 1
+    (line,) = capsys.readouterr().err.splitlines()
     assert line.startswith("demo: there is no demo of 'volcano': choose one of ")
     assert {'fed_reactor', 'pendulum', 'two_tanks'} <= set(line.split(' of ')[-1].split(', '))
 
 
-def test_demo_says_in_one_line_why_it_cannot_run(tmp_path: Path) -> None:
+def test_demo_says_in_one_line_why_it_cannot_run(
+        tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     (tmp_path / 'taken').write_text('a file, not a folder')
-    done = subprocess.run(
-        [sys.executable, '-m', 'koopman_ros.demo', '--output', tmp_path / 'taken'],
-        capture_output=True, text=True, timeout=240, check=False)
-    assert done.returncode == 1
-    (line,) = done.stderr.splitlines()
+    assert first_act.main(['--output', str(tmp_path / 'taken')]) == 1
+    (line,) = capsys.readouterr().err.splitlines()
     assert line.startswith('demo: ')
     assert str(tmp_path / 'taken') in line
 

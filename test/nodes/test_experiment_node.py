@@ -81,7 +81,7 @@ def start_with_plant(ros: Harness, subscribers: int = 2, **trainer: object) -> l
     """Start both, and an experiment that both know of; return the measurements to come."""
     measured = ros.listen(Temperature, reactor.TEMPERATURE)
     ros.start('trainer', {**IDLE, **trainer})
-    ros.start('plant', {'lockstep': True, 'speed': 0.0, 'lockstep_subscribers': subscribers})
+    ros.start('plant', {'lockstep': True, 'speed': 150.0, 'lockstep_subscribers': subscribers})
     ros.meet('plant')
     response = ros.set_bool(SERVICE, True)
     assert response.success, response.message
@@ -257,7 +257,7 @@ def test_experiment_through_a_controller_in_manual_mode(ros: Harness) -> None:
                           'experiment_length': 60000.0, 'experiment_shortest_hold': 6.0,
                           'experiment_longest_hold': 12.0})
     ros.meet('trainer')
-    ros.start('plant', {'lockstep': True, 'speed': 200.0})
+    ros.start('plant', {'lockstep': True, 'speed': 60.0})
     ros.wait_until(lambda: commands)
     assert ros.set_bool(SERVICE, True).message == 'running on /manual_coolant_setpoint'
     first = len(commands)

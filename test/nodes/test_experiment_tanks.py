@@ -135,8 +135,8 @@ def test_setpoints_move_and_come_back_to_what_they_were(ros: Harness, tmp_path: 
         f'{name}.weight': 1e4 for name in LEVELS}})
     asked = [ros.speak(JointState, f'{name}/setpoint', to='controller') for name in LEVELS]
     ros.start('trainer', {
-        **TRAINER, 'model': model, 'experiment_on': 'setpoint', 'experiment_length': 600.0,
-        'experiment_shortest_hold': 30.0, 'experiment_longest_hold': 90.0, **{
+        **TRAINER, 'model': model, 'experiment_on': 'setpoint', 'experiment_length': 350.0,
+        'experiment_shortest_hold': 20.0, 'experiment_longest_hold': 50.0, **{
             f'{name}.setpoint_{end}': float(bound[i]) for i, name in enumerate(LEVELS)
             for end, bound in (('min', low), ('max', high))}})
     ros.meet('trainer')
@@ -146,7 +146,8 @@ def test_setpoints_move_and_come_back_to_what_they_were(ros: Harness, tmp_path: 
                     'choose', said)
     for name, publisher, level in zip(LEVELS, asked, before, strict=True):
         publisher.publish(JointState(name=[name], position=[float(level)]))
-    ros.start('plant', {**PLANT, 'lockstep_subscribers': 2})
+    # no quicker: all of them would work on while something else is waited for
+    ros.start('plant', {**PLANT, 'speed': 100.0, 'lockstep_subscribers': 2})
     ros.wait_until(lambda: all(heard and heard[-1].position[0] == level
                                for heard, level in zip(active, before, strict=True)))
     for publisher in asked:
@@ -219,7 +220,7 @@ def test_pumps_through_a_controller_that_leaves_manual_mode(ros: Harness, tmp_pa
     ros.start('trainer', {**TRAINER, 'model': model, 'experiment_on': 'manual',
                           'experiment_length': 60000.0})
     ros.meet('trainer')
-    ros.start('plant', {**PLANT, 'speed': 200.0})
+    ros.start('plant', {**PLANT, 'speed': 50.0})
     ros.wait_until(lambda: commands[0])
     said = ros.set_bool(SERVICE, True).message
     assert said == 'running on /manual_pump_1_setpoint, /manual_pump_2_setpoint'

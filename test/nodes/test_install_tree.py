@@ -79,7 +79,7 @@ def installation(request: pytest.FixtureRequest) -> Installation:
 
 
 def test_everything_is_installed(installation: Installation) -> None:
-    for name in (*NODES, *TOOLS):
+    for name in (*NODES, *TOOLS, 'panel'):
         executable = installation.executables / name
         assert executable.is_file()
         assert os.access(executable, os.X_OK)

@@ -3,7 +3,6 @@
 
 """Another model in the running controller: nothing unanswered, no jump, reasons in words."""
 
-from collections.abc import Callable
 from dataclasses import replace
 import itertools
 import math
@@ -33,7 +32,7 @@ from koopman_ros.ros import model_reload, topics
 from koopman_ros.testing import Harness
 from koopman_ros.units import NANOSECONDS, to_celsius, ZERO_CELSIUS
 from support.closed_loops import REACTOR
-from support.controller_bench import PATIENT, reproduced, STATUS, STEADY
+from support.controller_bench import PATIENT, reproduced, STATUS, STEADY, until_read
 from support.nodes import opened, temperature, value
 
 NAMES = ('reactor_nz3', 'reactor_nz4', 'reactor_linear')
@@ -76,16 +75,9 @@ class Bench:
     def set(self, model: str | Path) -> tuple[bool, str]:
         request = SetParameters.Request(
             parameters=[Parameter('model', value=str(model)).to_parameter_msg()])
-        result = self.until_read(
+        result = until_read(
             lambda: self._wait_for(self._set.call_async(request)).results[0])
         return result.successful, result.reason
-
-    @staticmethod
-    def until_read(change: Callable[[], SetParametersResult]) -> SetParametersResult:
-        """Change a model, again if the machine is too busy to read it in the moment."""
-        while 'still being read' in (result := change()).reason:
-            pass
-        return result
 
     def measure(self, celsius: float | None = None) -> None:
         k = len(self.sent) + 1
@@ -222,8 +214,8 @@ def test_model_changes_with_the_weights_that_it_needs(running: Bench) -> None:
         return running.ros.set_parameters_atomically(
             'controller', model='reactor_linear', max_gain=gain)
 
-    assert 'the gain exceeds its bound' in running.until_read(lambda: change(1e-3)).reason
-    result = running.until_read(lambda: change(500.0))
+    assert 'the gain exceeds its bound' in until_read(lambda: change(1e-3)).reason
+    result = until_read(lambda: change(500.0))
     assert result.successful, result.reason
     assert running.ros.get_parameters('controller', 'model', 'max_gain') == [
         'reactor_linear', 500.0]
@@ -277,7 +269,7 @@ def test_model_that_predicts_what_was_measured_much_worse_is_refused(
         assert present < allowed < wrong
     ros.wait_for_status(STATUS, lambda s: s.message == reason)
     track(44.0)
-    result = bench.until_read(lambda: ros.set_parameters_atomically(
+    result = until_read(lambda: ros.set_parameters_atomically(
         'controller', model=f'{file.parent}/./{file.name}', model_check_factor=0.0))
     assert result.successful, result.reason
     assert bench.reload()[0]

@@ -16,7 +16,7 @@ from koopman_ros.identification import Stopped
 from koopman_ros.lifting import load, ModelFileError, save
 from koopman_ros.plant_data import Episode
 from koopman_ros.resources import model_path
-from koopman_ros.retraining import retrain, Task, write_report
+from koopman_ros.retraining import compare_classes, decide, retrain, Task, write_report
 from koopman_ros.retraining import task as task_module
 from support.known_plants import box, methods
 from support.random_lifts import random_lift
@@ -40,11 +40,17 @@ def bag(tmp_path_factory):
 
 @pytest.fixture(scope='module', autouse=True)
 def few_methods():
-    """Estimate by a few methods alone; what all of them find is the matter of test_identify."""
+    """
+    Estimate by a few methods alone, and try laws in a few loops.
+
+    What they find is the matter of test_identify and test_law_check.
+    """
     original = task_module.identify
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(task_module, 'identify',
                       partial(original, degrees=(1, 3), methods=methods(10, 20)))
+        patch.setattr(task_module, 'compare_classes', partial(compare_classes, loops=16))
+        patch.setattr(task_module, 'decide', partial(decide, loops=16))
         yield
 
 

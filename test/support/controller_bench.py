@@ -9,6 +9,7 @@ import time as clock
 
 from diagnostic_msgs.msg import DiagnosticStatus
 import pytest
+from rcl_interfaces.msg import SetParametersResult
 from rclpy.qos import QoSProfile
 from sensor_msgs.msg import Temperature
 from std_msgs.msg import String
@@ -43,6 +44,13 @@ def reproduced(messages: Sequence[String]) -> tuple[list[Record], list[float]]:
     samples = replay_records(records).samples
     assert [sample.recorded for sample in samples] == [sample.replayed for sample in samples]
     return records, [to_celsius(float(sample.recorded[0])) for sample in samples]
+
+
+def until_read(change: Callable[[], SetParametersResult]) -> SetParametersResult:
+    """Change a model, again if the machine is too busy to read it in the moment."""
+    while 'still being read' in (result := change()).reason:
+        pass
+    return result
 
 
 class Bench:
