@@ -6,6 +6,8 @@ BIN := $(VENV)/bin
 # changed its mind about which of them governs that).
 LOCK := requirements.lock
 INSTALL := PIP_CONSTRAINT=$(LOCK) PIP_BUILD_CONSTRAINT=$(LOCK) $(BIN)/python -m pip install --quiet
+# Where the environment forbids to keep what is compiled, each process would compile the package anew.
+unexport PYTHONDONTWRITEBYTECODE
 # The loop stays on this machine.
 export ROS_AUTOMATIC_DISCOVERY_RANGE ?= LOCALHOST
 
@@ -40,6 +42,10 @@ $(VENV)/retrain.stamp: setup.py $(LOCK) $(VENV)/run.stamp
 	$(INSTALL) --editable '.[ros,demo,train]'
 	@touch $@
 
+$(VENV)/panel.stamp: setup.py $(LOCK) $(VENV)/run.stamp
+	$(INSTALL) --editable '.[ros,demo,panel]'
+	@touch $@
+
 $(VENV)/docs.stamp: setup.py $(LOCK) | $(BIN)/python
 	$(INSTALL) --editable '.[docs]'
 	@touch $@
@@ -48,8 +54,8 @@ $(VENV)/bench.stamp: setup.py $(LOCK) $(VENV)/run.stamp
 	$(INSTALL) --editable '.[ros,demo,train,bench]'
 	@touch $@
 
-demo: $(VENV)/run.stamp  ## closed loop of three processes: live table, bag, picture -> out/demo (PLANT=pendulum: out/demo-pendulum)
-	$(BIN)/python -m koopman_ros.demo $(if $(PLANT),--plant $(PLANT))
+demo: $(VENV)/$(if $(PANEL),panel,run).stamp  ## closed loop of three processes: live table, bag, picture -> out/demo (PLANT=pendulum: out/demo-pendulum; PANEL=1: until Ctrl-C, to be run from a browser)
+	$(BIN)/python -m koopman_ros.demo $(if $(PLANT),--plant $(PLANT)) $(if $(PANEL),--panel)
 
 demo-retrain: $(VENV)/retrain.stamp  ## the plant drifts, is recorded, learned and controlled anew -> out/demo-retrain
 	$(BIN)/python -m koopman_ros.demo.retrain
@@ -91,7 +97,7 @@ studies-unstable: SEEDS = 10
 studies-unstable: $(VENV)/train.stamp  ## the reactor about its saddle, learned under a pre-feedback, SEEDS=10, six minutes
 	$(BIN)/python -m validation.unstable --seeds $(SEEDS)
 
-bench: $(VENV)/bench.stamp  ## speed beside other programs, thirteen minutes (BENCH=--quick: two) -> out/bench
+bench: $(VENV)/bench.stamp  ## speed beside other programs, seventeen minutes (BENCH=--quick: three) -> out/bench
 	$(BIN)/python -m validation.benchmarks $(BENCH)
 
 faults: $(VENV)/run.stamp  ## put faults into the loops of the reactor and of two tank plants, and soak the first for a day, a quarter of an hour (FAULTS=--quick: a minute; FAULTS=two_tanks: one plant) -> out/faults

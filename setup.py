@@ -48,9 +48,12 @@ setup(
             'ros-jazzy-rmw-fastrtps-cpp==8.4.3',
         ],
         'demo': ['matplotlib', 'rich'],
+        # the operator's panel, with all that its pages load
+        'panel': ['nicegui>=3'],
         'train': ['torch==2.13.0', 'joblib', 'tqdm'],
         # what validation and benchmarks compare with
-        'bench': ['casadi==3.8.2', 'control', 'psutil', 'pysindy==2.1.0'],
+        'bench': ['casadi==3.8.2', 'control', 'nicegui>=3', 'playwright', 'psutil',
+                  'pysindy==2.1.0'],
         'docs': ['furo', 'myst-parser', 'sphinx'],
         'test': [
             'colcon-common-extensions',
@@ -58,7 +61,9 @@ setup(
             'distributed',
             'hypothesis',
             'mypy',
+            'nicegui>=3',
             'packaging',
+            'playwright',
             'pytest>=9',
             'pytest-timeout',
             'pytest-xdist',
@@ -75,6 +80,7 @@ setup(
             'trainer = koopman_ros.startup:trainer',
             'player = koopman_ros.startup:player',
             'replay = koopman_ros.startup:replay',
+            'panel = koopman_ros.startup:panel',
         ],
     },
 )

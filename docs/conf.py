@@ -23,7 +23,9 @@ myst_heading_anchors = 3
 # The reference is built without ROS and without torch.
 autodoc_mock_imports = ['builtin_interfaces', 'diagnostic_msgs', 'joblib', 'lifecycle_msgs',
                         'matplotlib', 'rcl_interfaces', 'rclpy', 'rosgraph_msgs', 'sensor_msgs',
-                        'std_msgs', 'std_srvs', 'torch', 'tqdm']
+                        'std_msgs', 'std_srvs', 'torch', 'tqdm',
+                        # of the panel
+                        'fastapi', 'nicegui', 'starlette', 'uvicorn']
 autodoc_typehints = 'description'
 autodoc_typehints_format = 'short'
 autodoc_type_aliases = {'Array': 'Array', 'FloatArray': 'Array'}

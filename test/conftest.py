@@ -23,7 +23,8 @@ from support.disturbance import disturb_training
 os.environ['ROS_PYTHON_CHECK_FIELDS'] = '1'
 
 # What takes longest, first: where each core takes the next file, none is then idle at the end.
-LONGEST = ('test_training_benchmark', 'test_examples', 'test_campaign', 'test_identify',
+LONGEST = ('test_learning', 'test_browser', 'test_panel', 'test_training_benchmark',
+           'test_examples', 'test_campaign', 'test_identify',
            'test_training', 'test_own_plant', 'test_observer', 'test_shipped_models',
            'test_install_tree', 'test_retrain', 'test_training_node', 'test_retraining_tanks',
            'test_estimates', 'test_demo', 'test_replay', 'test_parallel', 'test_parameter_ends',

@@ -34,8 +34,10 @@ ALLOWED = {
     'replay': {'bags', 'control', 'lifting'},
     'parameters': {'control', 'estimation', 'lifting', 'plants'},
     'jobs': set(),
-    'ros': {'bags', 'control', 'jobs', 'lifting', 'parameters', 'plants', 'replay'},
-    'nodes': {'bags', 'control', 'jobs', 'lifting', 'parameters', 'plants', 'replay', 'ros'},
+    'panel': {'bags', 'parameters', 'replay'},
+    'ros': {'bags', 'control', 'jobs', 'lifting', 'panel', 'parameters', 'plants', 'replay'},
+    'nodes': {'bags', 'control', 'jobs', 'lifting', 'panel', 'parameters', 'plants', 'replay',
+              'ros'},
     'testing': {'ros'},
     'demo': {'bags', 'control', 'learning', 'lifting', 'parameters', 'plants', 'ros', 'testing'},
 }

@@ -7,7 +7,9 @@ The demo: bring the reactor 10 K down with the learned lift, and with the linear
 The disturbance observer is off, so that what is seen is what each model knows.
 """
 
+from collections.abc import Callable, Mapping
 from functools import partial
+import math
 from pathlib import Path
 import time
 
@@ -15,15 +17,18 @@ from koopman_ros.bags import summary
 from koopman_ros.demo import reactor
 from koopman_ros.demo.any_plant import run_plant
 from koopman_ros.demo.console import LiveTable, read_options, run_act
-from koopman_ros.demo.loop import run_loop
+from koopman_ros.demo.loop import run_loop, running_loop, Scenario
 from koopman_ros.demo.results import plot, read_run
 from koopman_ros.lifting import load
+from koopman_ros.parameters.trainer import preset_wiring
+from koopman_ros.parameters.wire import shipped
 from koopman_ros.reports import write_figures
 from koopman_ros.resources import model_path
 from koopman_ros.testing import HarnessError
 
 STEP = -10.0  # K
 _SETTLED = 0.1  # K
+_SHOWN_SPEED = 10.0  # at most, of a loop that a person looks at
 
 
 def run_demo(output: Path, speed: float) -> dict[str, object]:
@@ -64,9 +69,27 @@ def run_demo(output: Path, speed: float) -> dict[str, object]:
     return result
 
 
+def run_beside_panel(plant: str, port: int, output: Path, speed: float) -> dict[str, object]:
+    """Run the loop of a plant until Ctrl-C, with the panel beside it."""
+    if preset_wiring(plant) is None:
+        raise ValueError(f'there is no demo of {plant!r}: choose one of {", ".join(shipped())}')
+    logs = output / 'logs'
+    logs.mkdir(parents=True, exist_ok=True)
+    scenario = Scenario({}, plant, duration=0.0, speed=min(speed or _SHOWN_SPEED, _SHOWN_SPEED))
+    with running_loop(scenario, logs, {'output': output / 'panel.mcap'},
+                      panel={'port': port}) as operator:
+        print(f'{scenario.speed:g} times as fast as the clock; Ctrl-C ends it', flush=True)
+        operator.run_until(math.inf)
+    return {}
+
+
 def main(args: list[str] | None = None) -> int:
     """Run the demo from the command line: this one, or that of another plant."""
     options = read_options(args, __doc__, 'out/demo', 60.0, plant=reactor.SYSTEM)
-    act = run_demo if options.plant == reactor.SYSTEM else partial(run_plant, options.plant)
+    if options.panel:
+        act: Callable[[Path, float], Mapping[str, object]] = partial(
+            run_beside_panel, options.plant, options.port)
+    else:
+        act = run_demo if options.plant == reactor.SYSTEM else partial(run_plant, options.plant)
     return run_act(act, options, (HarnessError, OSError, ValueError),
                    'closed_loop.png, closed_loop.mcap and summary.json')

@@ -8,6 +8,7 @@ import contextlib
 from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
+import re
 from typing import Any
 
 from diagnostic_msgs.msg import DiagnosticStatus
@@ -33,7 +34,8 @@ _TIMEOUT = 30.0  # s for the processes to find each other, and from one command 
 class Scenario:
     """What a closed loop does."""
 
-    setpoints: Mapping[str, float]  #: new set-points, by signal and in its unit
+    #: new set-points, by signal and in its unit; none where somebody else gives them
+    setpoints: Mapping[str, float]
     system: str = 'reactor'  #: plant that is shipped
     step_time: float = 60.0  #: when they take effect, in s after the first measurement
     duration: float = 600.0  #: length of the run in s of plant time, 0 for endless
@@ -105,7 +107,7 @@ class Operator:
 
     def run_until(self, seconds: float) -> None:
         """Let the loop go on until so many seconds of plant time after its first measurement."""
-        end = _FIRST_STAMP_NS + round(seconds * NANOSECONDS)
+        end = _FIRST_STAMP_NS + seconds * NANOSECONDS
         while self.last_stamp_ns < end:
             self.harness.wait_until(partial(self._answered_after, self.last_stamp_ns),
                                     'the loop stands still: no command')
@@ -132,7 +134,8 @@ class Operator:
 
 @contextlib.contextmanager
 def running_loop(scenario: Scenario, logs: Path, trainer: Mapping[str, object],
-                 on_row: Callable[[Row], None] = lambda _: None) -> Iterator[Operator]:
+                 on_row: Callable[[Row], None] = lambda _: None,
+                 panel: Mapping[str, object] | None = None) -> Iterator[Operator]:
     """
     Run plant, controller and trainer in lock-step, the set-points requested, until it is left.
 
@@ -141,6 +144,7 @@ def running_loop(scenario: Scenario, logs: Path, trainer: Mapping[str, object],
     :param logs: folder for what the processes print.
     :param trainer: parameters of the trainer, which records from its start.
     :param on_row: called with what the operator sees, at every command.
+    :param panel: parameters of a panel beside the loop, None for no panel.
     :raises HarnessError: when a process ends early or the loop stands still.
     """
     with (deferred_interrupt() as check_interrupt,
@@ -151,13 +155,20 @@ def running_loop(scenario: Scenario, logs: Path, trainer: Mapping[str, object],
         harness.start('trainer', {'system': scenario.system, **trainer})
         harness.wait_until(lambda: operator.found_loop,
                            'controller and trainer did not find each other')
-        operator.request_setpoints()
+        if panel is not None:
+            shown = harness.start('panel', {'system': scenario.system, **panel})
+            address = harness.wait_until(lambda: re.search(r'the panel is at (\S+)',
+                                                           shown.output()))
+            assert address is not None
+            print(f'the panel is at {address[1]}', flush=True)
+        if scenario.setpoints:
+            operator.request_setpoints()
         plant = harness.start('plant', {
             'system': scenario.system, **scenario.plant,
             'lockstep': True, 'speed': scenario.speed, 'duration': scenario.duration,
             'sample_period': scenario.sample_period, 'start_time': _START_TIME,
             # controller, trainer and operator: nobody misses the first measurement
-            'lockstep_subscribers': 3,
+            'lockstep_subscribers': 3 if panel is None else 4,
         })
         # the others hear its last measurement
         with plant:

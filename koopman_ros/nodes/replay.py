@@ -27,7 +27,7 @@ from koopman_ros.parameters.wire import renamed, signals_of, Wiring
 from koopman_ros.replay.loop import Alternative, Replay, replay
 from koopman_ros.replay.records import Record, RecordError
 from koopman_ros.replay.report import ReplayedBag, reproduced, verdict, write_report
-from koopman_ros.replay.sources import command_counts, Models, read_records
+from koopman_ros.replay.sources import command_counts, lately, Models, read_records
 from koopman_ros.resources import config_directory, model_path
 from koopman_ros.ros import topics
 from koopman_ros.ros.model_reload import load_suitable
@@ -101,6 +101,8 @@ def replayed_bag(path: str, names: Names, parameters: ReplayParameters,
         new = load_suitable(parameters.new_model)
         alternative = Alternative(new.model, new.digest, _tuning(new.model, given))
     records = read_records(path, names.records, recover=parameters.recover)
+    if parameters.last:
+        records = lately(records, parameters.last)
     try:
         found = replay_records(
             records, [Path(parameters.model).expanduser(), model_path(parameters.model)]
@@ -110,7 +112,9 @@ def replayed_bag(path: str, names: Names, parameters: ReplayParameters,
     places = _commands(found, names)
     return ReplayedBag(
         path, summary(path).complete, found,
-        command_counts(path, places, recover=parameters.recover), places, parameters.tolerance,
+        command_counts(path, places, recover=parameters.recover, since_ns=(
+            found.samples[0].stamp_ns if parameters.last and found.samples else 0)),
+        places, parameters.tolerance,
         None if alternative is None else alternative.model.states)
 
 

@@ -272,6 +272,9 @@ class ReplayParameters:
         'and marked', '', 0.0, 1e9)
     recover: bool = parameter(
         False, 'read bags that were not closed or are damaged as far as they are whole')
+    last: float = parameter(
+        0.0, 'how much of the end of each bag is replayed, from the snapshot before it; 0 for all '
+        'of it', 's', 0.0, 1e9)
 
 
 def _check_replay(values: ReplayParameters) -> str:

@@ -25,6 +25,7 @@ from koopman_ros.wire import Place, place, stem
 
 CONTROLLER_STATE = 'controller_state'
 CONTROLLER_EVENTS = 'controller_events'
+OPERATOR_ACTIONS = 'operator_actions'
 DIAGNOSTICS = '/diagnostics'
 CLOCK = '/clock'
 

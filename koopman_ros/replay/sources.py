@@ -3,8 +3,8 @@
 
 """What a replay reads: a controller's records and commands in a bag, and the models they name."""
 
-from collections import Counter
-from collections.abc import Iterator, Sequence
+from collections import Counter, deque
+from collections.abc import Iterable, Iterator, Sequence
 import contextlib
 import os
 from pathlib import Path
@@ -13,7 +13,7 @@ from typing import TypeAlias
 
 from koopman_ros.bags import BagMessage, BagReadError, read_messages, summary
 from koopman_ros.lifting import LiftedModel, load_with_digest, ModelFileError
-from koopman_ros.replay.records import parse, Record, RecordError
+from koopman_ros.replay.records import parse, Record, RecordError, SNAPSHOT, START
 from koopman_ros.units import NANOSECONDS
 from koopman_ros.wire import Place
 
@@ -44,6 +44,20 @@ def read_records(path: str | os.PathLike[str], topic: str, *, recover: bool = Fa
     return _parsed(path, messages)
 
 
+def lately(records: Iterable[Record], seconds: float) -> Iterator[Record]:
+    """Return those records that a replay of the last seconds needs, from a snapshot on."""
+    parts: deque[tuple[int, list[Record]]] = deque()
+    latest = 0
+    for record in records:
+        latest = max(latest, record.stamp_ns)
+        if not parts or record.event in (START, SNAPSHOT):
+            parts.append((latest, []))
+        parts[-1][1].append(record)
+        while len(parts) > 1 and parts[1][0] <= latest - seconds * NANOSECONDS:
+            parts.popleft()
+    return (record for _, part in parts for record in part)
+
+
 def _parsed(path: str | os.PathLike[str], messages: Iterator[BagMessage]) -> Iterator[Record]:
     for entry in messages:
         try:
@@ -58,8 +72,12 @@ Command: TypeAlias = tuple[int, int, bytes]
 
 
 def command_counts(path: str | os.PathLike[str], places: Sequence[Place], *,
-                   recover: bool = False) -> Counter[Command]:
-    """Count the commands of the inputs in a bag by :func:`command_key`; none where it has none."""
+                   recover: bool = False, since_ns: int = 0) -> Counter[Command]:
+    """
+    Count the commands of the inputs in a bag by :func:`command_key`; none where it has none.
+
+    :param since_ns: stamp of the first that counts.
+    """
     found: Counter[Command] = Counter()
     known = summary(path).types
     for i, place in enumerate(places):
@@ -68,8 +86,9 @@ def command_counts(path: str | os.PathLike[str], places: Sequence[Place], *,
         for entry in read_messages(path, (place.topic,), recover=recover):
             with contextlib.suppress(LookupError, AttributeError):
                 stamp = entry.message.header.stamp
-                found[command_key(i, stamp.sec * NANOSECONDS + stamp.nanosec,
-                                  place.get(entry.message))] += 1
+                stamp_ns = stamp.sec * NANOSECONDS + stamp.nanosec
+                if stamp_ns >= since_ns:
+                    found[command_key(i, stamp_ns, place.get(entry.message))] += 1
     return found
 
 

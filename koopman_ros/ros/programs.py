@@ -15,7 +15,7 @@ from typing import Any
 from xml.etree import ElementTree
 
 from koopman_ros.lifting import load
-from koopman_ros.parameters import controller, plant, trainer
+from koopman_ros.parameters import controller, panel, plant, trainer
 from koopman_ros.parameters.table import ConfigurationError, ParameterTable
 from koopman_ros.parameters.wire import DEFAULT_SYSTEM, preset
 from koopman_ros.resources import config_directory, model_path
@@ -28,6 +28,9 @@ STANDARD_TOPICS = ('/rosout', '/parameter_events')
 STANDARD_SERVICES = (
     '~/describe_parameters', '~/get_parameter_types', '~/get_parameters', '~/list_parameters',
     '~/set_parameters', '~/set_parameters_atomically', '~/get_type_description')
+# by which a node is tuned from afar
+TUNING_SERVICES = ('list_parameters', 'describe_parameters', 'get_parameters',
+                   'set_parameters_atomically')
 # `ros2 topic pub` and its like start a node with this service, named after their process
 _COMMAND_LINE_SERVICE = '/_ros2cli_*/get_type_description'
 
@@ -44,7 +47,8 @@ def tables(system: str = DEFAULT_SYSTEM) -> dict[str, ParameterTable[Any]]:
     model = load(model_path(name))
     return {'plant': plant.PlantTable(given), 'controller': controller.table_of(model, given),
             'trainer': trainer.trainer_table(model, given),
-            'player': trainer.player_table(given), 'replay': controller.REPLAY_TABLE}
+            'player': trainer.player_table(given), 'replay': controller.REPLAY_TABLE,
+            'panel': panel.panel_table(None, given)}
 
 
 @dataclass(frozen=True)
@@ -113,6 +117,20 @@ def programs(system: str = DEFAULT_SYSTEM) -> dict[str, Program]:
             'an unknown argument, 3 when there is nothing to compare in a bag, 130 when '
             'interrupted',
             publishes=('/parameter_events',), serves=('~/get_type_description',)),
+        'panel': Program(
+            'Shows the loop in a browser, and passes on what an operator asks for there.',
+            publishes=(*topics_of('setpoints', 'manual'), topics.OPERATOR_ACTIONS,
+                       topics.DIAGNOSTICS, *STANDARD_TOPICS),
+            subscribes=(*topics_of('measured', 'applied', 'commands', 'active_setpoints',
+                                   'predicted'), topics.CONTROLLER_STATE,
+                        topics.CONTROLLER_EVENTS, topics.DIAGNOSTICS, '/parameter_events',
+                        topics.CLOCK),
+            serves=STANDARD_SERVICES,
+            calls=(*(f'controller/{service}' for service in ('set_automatic', 'reload_model')),
+                   *(f'trainer/{service}' for service in (
+                       'record', 'experiment', 'train', 'cancel_training')),
+                   *(f'{node}/{service}' for node in ('controller', 'trainer')
+                     for service in TUNING_SERVICES))),
     }
 
 

@@ -162,6 +162,7 @@ class Recording:
                 Level.OK, 'not recording')
         counts = self._recorder.counts
         return Status(Level.OK, f'recording to {self._path}', {
+            'bag': os.path.abspath(self._path),
             'messages': sum(counts.values()),
             **{f'messages on {topic}': count for topic, count in counts.items()}})
 

@@ -32,14 +32,15 @@ from koopman_ros.parameters.wire import (
     CONTROLLER_EVENTS,
     CONTROLLER_STATE,
     DIAGNOSTICS,
+    OPERATOR_ACTIONS,
     Wiring,
 )
 from koopman_ros.ros.node import Owned
 
 # JointState is the one stamped type of common_interfaces that carries named float64 values.
 # Records are lines of JSON, which keep a float64 bit-identical at a third of the time.
-TYPES = {CONTROLLER_STATE: JointState, CONTROLLER_EVENTS: String, DIAGNOSTICS: DiagnosticArray,
-         CLOCK: Clock}
+TYPES = {CONTROLLER_STATE: JointState, CONTROLLER_EVENTS: String, OPERATOR_ACTIONS: String,
+         DIAGNOSTICS: DiagnosticArray, CLOCK: Clock}
 
 # Every message counts: reliable, with room for a receiver that falls behind a fast plant.
 LOOP_QOS = QoSProfile(depth=1000)

@@ -140,6 +140,13 @@ def test_the_trainer_does_what_it_is_granted(ros: Harness, tmp_path: Path) -> No
     check(ros, 'trainer', seen)
 
 
+def test_the_panel_does_what_it_is_granted(ros: Harness) -> None:
+    ros.start('panel', {'port': 0, 'use_sim_time': True})
+    # it publishes there only while it asks for something
+    check(ros, 'panel', {'publishes': {
+        f'/{reactor.SETPOINT}', f'/{reactor.MANUAL_COOLANT_SETPOINT}'}})
+
+
 def test_the_replay_does_what_it_is_granted(ros: Harness, monkeypatch: pytest.MonkeyPatch
                                             ) -> None:
     """It is gone before others have found it, so that it is asked itself, at its end."""

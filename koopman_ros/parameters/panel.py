@@ -1,0 +1,95 @@
+# SPDX-FileCopyrightText: 2026 The koopman_ros Authors
+# SPDX-License-Identifier: Apache-2.0
+
+"""Parameters of the panel, which shows a loop in a browser."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from types import MappingProxyType
+from typing import Any
+
+from koopman_ros.lifting import LiftedModel
+from koopman_ros.parameters.table import parameter, ParameterTable, per_signal
+from koopman_ros.parameters.trainer import trainer_signals
+from koopman_ros.parameters.wire import (
+    DEFAULT_SYSTEM,
+    InputPlaces,
+    preset,
+    Signals,
+    StatePlaces,
+    system_of,
+    Wiring,
+)
+
+
+@dataclass(frozen=True)
+class PanelParameters:
+    """Snapshot of the panel's parameters."""
+
+    system: str = parameter(
+        DEFAULT_SYSTEM, 'plant that is shipped, whose signals and topics are the defaults here; '
+        'any other name for none', read_only=True)
+    model: str = parameter(
+        '', 'model whose signals are shown where nothing else names them: a shipped one by name, '
+        'or the path of a .safetensors model file', read_only=True)
+    states_measured: tuple[str, ...] = parameter(
+        ('',), 'measured signals with their units, e.g. level [m]; an empty name for those of the '
+        'model', read_only=True)
+    inputs_commanded: tuple[str, ...] = parameter(
+        ('',), 'inputs with their units, likewise', read_only=True)
+    controlled: tuple[str, ...] = parameter(
+        ('',), 'measured signals that have a set-point; an empty name for all', read_only=True)
+    controller: str = parameter(
+        'controller', 'name of the controller node, whose services are called', read_only=True)
+    trainer: str = parameter(
+        'trainer', 'name of the trainer node, likewise', read_only=True)
+    title: str = parameter(
+        '', 'what is written above each page; empty for the name of the plant', read_only=True)
+    host: str = parameter(
+        '127.0.0.1', 'address that the pages are served on; any but one of this machine alone '
+        'needs users', read_only=True)
+    port: int = parameter(
+        8080, 'port that the pages are served on; 0 takes a free one', '', 0, 65535,
+        read_only=True)
+    users: str = parameter(
+        '', 'file of those who may log in, with hashed passwords and roles; empty for none: then '
+        'whoever uses this machine is the operator', read_only=True)
+    tls_certificate: str = parameter(
+        '', 'certificate, as a PEM file; empty serves without encryption', read_only=True)
+    tls_key: str = parameter(
+        '', 'private key of the certificate, as a PEM file', read_only=True)
+    span: float = parameter(
+        28800.0, 'how much of the past the trends keep', 's', 600.0, 604800.0, read_only=True)
+    states: Mapping[str, StatePlaces] = per_signal(StatePlaces)
+    inputs: Mapping[str, InputPlaces] = per_signal(InputPlaces)
+
+
+def panel_signals(present: LiftedModel | None, given: Mapping[str, Any]) -> Signals:
+    """Return the signals that parameters name, those of a plant that is shipped, or of a model."""
+    return trainer_signals(present, {**preset(system_of(given), 'panel'), **given})
+
+
+def panel_table(present: LiftedModel | None = None,
+                given: Mapping[str, Any] = MappingProxyType({})
+                ) -> ParameterTable[PanelParameters]:
+    """
+    Return the parameters of a panel.
+
+    :param present: the model that parameters name, or None where they name none.
+    :param given: what is known of the values already, of which system and signals count.
+    :raises ConfigurationError: where nothing says what the signals are.
+    """
+    system = system_of(given)
+    signals = panel_signals(present, given)
+
+    def check(values: PanelParameters) -> str:
+        if bool(values.tls_certificate) != bool(values.tls_key):
+            return 'tls_certificate and tls_key belong together: give both, or neither'
+        for name in ('controller', 'trainer', 'host'):
+            if not getattr(values, name):
+                return f"{name} = '' must not be empty"
+        return Wiring(signals, values.states, values.inputs).check()
+
+    return ParameterTable(
+        PanelParameters, check, signals={'states': signals.states, 'inputs': signals.inputs},
+        defaults={**signals.defaults(), **preset(system, 'panel'), 'system': system})

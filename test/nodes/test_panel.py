@@ -1,0 +1,282 @@
+# SPDX-FileCopyrightText: 2026 The koopman_ros Authors
+# SPDX-License-Identifier: Apache-2.0
+
+"""The panel beside a loop: whom it serves, what it passes on, and that the loop needs it not."""
+
+from collections.abc import Callable, Iterator
+from concurrent.futures import Future
+import json
+import math
+from pathlib import Path
+import re
+import signal
+import socket
+import threading
+from typing import Any
+from urllib.error import HTTPError
+from urllib.request import build_opener, HTTPRedirectHandler, Request
+
+from diagnostic_msgs.msg import DiagnosticStatus
+import pytest
+import rclpy
+from rclpy.executors import SingleThreadedExecutor
+from sensor_msgs.msg import Temperature
+from std_msgs.msg import String
+
+from koopman_ros.demo import reactor
+from koopman_ros.nodes import panel
+from koopman_ros.nodes.panel import PanelNode
+from koopman_ros.panel.access import Cost, hashed, Role, write_user
+from koopman_ros.panel.plant import CONTROLLER, TRAINER
+from koopman_ros.panel.requests import Action, Answer
+from koopman_ros.ros import topics
+from koopman_ros.testing import Harness, NodeProcess
+from support.nodes import complaint, run_here, seconds, temperature, TIMEOUT, value
+
+_ADDRESS = re.compile(r'the panel is at (http://127\.0\.0\.1:\d+)')
+
+
+def address(ros: Harness, process: NodeProcess) -> str:
+    found = ros.wait_until(lambda: _ADDRESS.search(process.output()))
+    assert found is not None
+    return found[1]
+
+
+class _Stay(HTTPRedirectHandler):
+    def redirect_request(self, *_: Any) -> None:
+        return None
+
+
+def get(url: str, data: bytes | None = None, **headers: str) -> tuple[int, str, Any]:
+    """Return status, text and headers of a page, or of what it is refused with."""
+    request = Request(url, data, {name.replace('_', '-'): text for name, text in headers.items()})
+    try:
+        with build_opener(_Stay).open(request, timeout=TIMEOUT) as answer:
+            return answer.status, answer.read().decode(), answer.headers
+    except HTTPError as error:
+        return error.code, error.read().decode(), error.headers
+
+
+# Whom it serves.
+
+
+def test_pages_are_served_to_this_machine_alone_and_a_port_only_once(ros: Harness) -> None:
+    url = address(ros, ros.start('panel', {'port': 0}))
+    for path in ('/', '/trends', '/alarms', '/model', '/tuning'):
+        status, text, headers = get(f'{url}{path}')
+        assert status == 200
+        assert not re.findall(r'(?:src|href)="?(?:https?:)?//', text)
+        assert headers['x-frame-options'] == 'DENY'
+    host = url.removeprefix('http://')
+    assert get(url, Origin=url)[0] == 200
+    for headers in ({'Origin': 'http://elsewhere'}, {'Host': 'elsewhere.example'},
+                    {'Origin': 'http://elsewhere', 'Host': 'elsewhere'},
+                    {'Origin': f'https://{host}'}, {'Origin': 'null'}):
+        status, text, _ = get(url, **headers)
+        assert status == 403
+        assert text.startswith('refused: ')
+    # browsers always say the origin
+    assert [opened(url, *origin) for origin in (
+        ('Origin: http://elsewhere',), (), (f'Origin: {url}',))] == ['403', '403', '101']
+    port = url.rpartition(':')[2]
+    second = ros.start('panel', {'port': port})
+    second.told_to_end = True
+    assert ros.wait_for_end(second) == 1
+    assert f'the pages cannot be served on 127.0.0.1, port {port} (' in second.output()
+
+
+def opened(url: str, *headers: str) -> str:
+    """Return the status with which a WebSocket is answered."""
+    host, _, port = url.removeprefix('http://').partition(':')
+    with socket.create_connection((host, int(port)), TIMEOUT) as stream:
+        stream.sendall('\r\n'.join((
+            'GET /_nicegui_ws/socket.io/?EIO=4&transport=websocket HTTP/1.1',
+            f'Host: {host}:{port}', 'Connection: Upgrade', 'Upgrade: websocket',
+            'Sec-WebSocket-Version: 13', 'Sec-WebSocket-Key: dGhlIHNhbXBsZSBub25jZQ==',
+            *headers, '', '')).encode())
+        return stream.recv(4096).split()[1].decode()
+
+
+@pytest.mark.parametrize(('parameters', 'words'), [
+    ({'host': '0.0.0.0'}, "cannot start: the panel is not served on '0.0.0.0' without passwords"),
+    ({'users': 'nowhere'}, 'cannot start: [Errno 2] No such file or directory'),
+    ({'tls_certificate': 'here.pem'}, 'cannot start: tls_certificate and tls_key belong together'),
+    ({'tls_certificate': 'a.pem', 'tls_key': 'b.pem'},
+     "cannot start: tls_certificate = 'a.pem' and tls_key = 'b.pem' cannot be used"),
+    ({'controlled': '[nothing]'}, "cannot start: controlled = ['nothing'] must name"),
+])
+def test_bad_start_is_said_in_one_line(
+        capfd: pytest.CaptureFixture[str], parameters: dict[str, object], words: str) -> None:
+    assert run_here(panel, **parameters) == 1
+    assert complaint(capfd).startswith(f'panel: {words}')
+
+
+def test_users_log_in_and_wrong_passwords_wait(ros: Harness, tmp_path: Path) -> None:
+    users = tmp_path / 'users'
+    write_user(users, 'anna', Role.OPERATOR, hashed('correct horse', Cost(2, 8, 1)))
+    url = address(ros, ros.start('panel', {'port': 0, 'users': users}))
+    status, _, headers = get(url)
+    assert (status, headers['location']) == (303, '/login')
+    assert get(f'{url}/_nicegui_ws/socket.io/?EIO=4&transport=polling')[0] == 401
+    right = b'name=anna&password=correct+horse'
+    kind = {'Content_Type': 'application/x-www-form-urlencoded', 'Origin': url}
+    assert get(f'{url}/login', right, **{**kind, 'Origin': 'http://elsewhere'})[0] == 403
+    status, text, _ = get(f'{url}/login', b'name=%3Cb%3E&password=x', **kind)
+    assert status == 401
+    assert '<b>' not in text
+    status, _, headers = get(f'{url}/login', right, **kind)
+    assert status == 303
+    cookie, *rules = headers['set-cookie'].split('; ')
+    assert {'HttpOnly', 'SameSite=strict', 'Path=/'} <= set(rules)
+    assert get(url, Cookie=cookie)[0] == 200
+    assert get(f'{url}/logout', Cookie=cookie)[0] == 303
+    assert get(url, Cookie=cookie)[0] == 303
+    # from this address
+    answers = [get(f'{url}/login', b'name=anna&password=wrong', **kind)[0] for _ in range(6)]
+    assert answers[-1] == 429
+    assert set(answers) == {401, 429}
+
+
+# What it passes on.
+
+
+class Panel:
+    """A panel in this process, without its pages, beside processes of a harness."""
+
+    def __init__(self, ros: Harness, monkeypatch: pytest.MonkeyPatch) -> None:
+        class Nothing:
+            address, pages = '', 0
+
+            def stop(self) -> None:
+                pass
+
+        monkeypatch.setattr(PanelNode, '_serve', lambda _: Nothing())
+        rclpy.init()
+        self.ros, self.node = ros, PanelNode()
+        self.executor = SingleThreadedExecutor()
+        self.executor.add_node(self.node)
+        self.thread = threading.Thread(target=self.executor.spin)
+        self.thread.start()
+
+    def wait(self, condition: Callable[[], Any]) -> Any:
+        return self.ros.wait_until(condition)
+
+    def ask(self, what: str, name: str = '', number: Any = None) -> Answer:
+        future: Future[Answer] = self.node.ask(Action('anna', what, name, number))
+        self.wait(future.done)
+        return future.result()
+
+    def close(self) -> None:
+        self.executor.shutdown()
+        self.thread.join()
+        self.node.complete()
+        self.node.destroy_node()
+        rclpy.shutdown()
+
+
+@pytest.fixture
+def desk(ros: Harness, monkeypatch: pytest.MonkeyPatch) -> Iterator[Panel]:
+    own = Panel(ros, monkeypatch)
+    try:
+        yield own
+    finally:
+        own.close()
+
+
+def test_what_is_asked_for_reaches_the_loop_and_is_written_down(
+        ros: Harness, desk: Panel, tmp_path: Path) -> None:
+    node = desk.node
+    actions: list[String] = ros.listen(String, topics.OPERATOR_ACTIONS)
+    (publisher,) = (one for one in node.publishers
+                    if one.topic_name == f'/{topics.OPERATOR_ACTIONS}')
+    desk.wait(publisher.get_subscription_count)
+    assert desk.ask('setpoint', reactor.TEMPERATURE, 45.0) == Answer(
+        False, 'the controller is not there: start it')
+    ros.start('controller')
+    ros.start('trainer', {'output': tmp_path / 'bag'})
+    ros.start('plant', {'speed': 20.0})
+    desk.wait(lambda: node.snapshot.mode == 'automatic' and not node.snapshot.silences
+              and len(node.snapshot.parameters.get(TRAINER, ())) > 20
+              and node.snapshot.states[0].training and math.isfinite(node.snapshot.time))
+    # a set-point that is accepted, and one that is not
+    assert desk.ask('setpoint', reactor.TEMPERATURE, 45.0) == Answer(True, 'accepted')
+    desk.wait(lambda: node.snapshot.states[0].setpoint == pytest.approx(45.0))
+    refused = desk.ask('setpoint', reactor.TEMPERATURE, 80.0)
+    assert re.fullmatch(r'refused: outside 31\.85 to 53\.85 degC, the trained range', str(refused))
+    # nobody is in the way of an experiment
+    desk.wait(lambda: not ros.node.count_publishers(reactor.SETPOINT))
+    # manual mode and back
+    assert not desk.ask('manual', reactor.COOLANT_TEMPERATURE, 20.0).accepted
+    assert desk.ask('automatic', CONTROLLER, False) == Answer(True, 'manual mode')
+    assert desk.ask('manual', reactor.COOLANT_TEMPERATURE, 20.0) == Answer(True, 'accepted')
+    desk.wait(lambda: node.snapshot.inputs[0].command == pytest.approx(20.0))
+    assert node.snapshot.mode == 'manual'
+    assert desk.ask('automatic', CONTROLLER, True).accepted
+    # parameters
+    assert desk.ask('parameters', CONTROLLER, {'coolant_temperature.max': 30.0}).accepted
+    desk.wait(lambda: node.snapshot.inputs[0].limits == (5.0, 30.0))
+    refused = desk.ask('parameters', CONTROLLER, {'coolant_temperature.max': 4.0})
+    assert 'coolant_temperature.min = 5.0 degC must be below' in refused.text
+    # services of the trainer
+    assert desk.ask('record', TRAINER, False).accepted
+    assert desk.ask('cancel', TRAINER) == Answer(False, 'not training')
+    ros.wait_until(lambda: len(actions) >= 11)
+    first, second = (json.loads(message.data) for message in actions[:2])
+    assert (first['who'], first['what'], first['accepted']) == (
+        'anna', 'setpoint temperature', False)
+    assert (second['new'], second['accepted'], second['answer']) == (45.0, True, 'accepted')
+    desk.wait(lambda: {'setpoint', 'mode', 'parameter'} <= {
+        mark.kind for mark in node.view.trends.marks(0.0, 1e12)})
+
+
+def test_what_was_before_is_read_from_the_bag_that_is_recorded(
+        ros: Harness, monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    ros.start('controller')
+    ros.start('trainer', {'output': tmp_path / 'bag'})
+    ask = ros.speak(Temperature, reactor.SETPOINT, to='controller', subscribers=2)
+    heard: list[Temperature] = ros.listen(Temperature, reactor.TEMPERATURE)
+    # the controller, the trainer and this test miss nothing
+    ros.start('plant', {'speed': 50.0, 'lockstep': True, 'lockstep_subscribers': 3})
+    ros.wait_until(lambda: len(heard) > 50)
+    ask.publish(temperature(45.0))
+    ros.wait_until(lambda: len(heard) > 200)
+    desk = Panel(ros, monkeypatch)
+    try:
+        trends = desk.node.view.trends
+
+        def found() -> bool:
+            times, _ = trends.window([reactor.TEMPERATURE], 50.0, 150.0)[reactor.TEMPERATURE]
+            return len(times) > 90 and times[0] < 55.0
+
+        desk.wait(found)
+        desk.wait(lambda: 'temperature 45 °C' in [mark.text for mark in trends.marks(0.0, 150.0)])
+        times, values = trends.window([reactor.TEMPERATURE], 50.0, 150.0)[reactor.TEMPERATURE]
+        sent = {seconds(message): message.temperature for message in heard}
+        assert values.tolist() == pytest.approx([sent[moment] for moment in times.tolist()])
+    finally:
+        desk.close()
+
+
+# The loop without it.
+
+
+def test_the_loop_goes_on_when_the_panel_is_killed_or_stands_still(ros: Harness) -> None:
+    process = ros.start('panel', {'port': 0})
+    ros.start('controller')
+    ros.start('plant', {'lockstep': True, 'lockstep_subscribers': 3, 'speed': 0.0})
+    commands: list[Temperature] = ros.listen(Temperature, reactor.COOLANT_SETPOINT)
+    ros.listen(Temperature, reactor.TEMPERATURE)
+    ros.wait_until(lambda: len(commands) > 100)
+    # more than a queue holds
+    process.process.send_signal(signal.SIGSTOP)
+    seen = len(commands)
+    ros.wait_until(lambda: len(commands) > seen + 600)
+    process.told_to_end = True
+    process.process.kill()
+    process.wait()
+    seen = len(commands)
+    ros.wait_until(lambda: len(commands) > seen + 100)
+    status = ros.wait_for_status('controller: control', lambda s: int(
+        value(s, 'measurements')) > 700)
+    assert status.level == DiagnosticStatus.OK
+    assert int(value(status, 'late measurements')) == 0

@@ -1,0 +1,405 @@
+# SPDX-FileCopyrightText: 2026 The koopman_ros Authors
+# SPDX-License-Identifier: Apache-2.0
+
+"""The panel in a real browser, beside a plant, a controller and a trainer."""
+
+from collections.abc import Callable, Iterator
+import contextlib
+from dataclasses import dataclass, field
+import json
+from pathlib import Path
+import re
+import shutil
+import time
+import warnings
+
+from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
+from playwright.sync_api import Browser, BrowserContext, expect, Locator, Page, sync_playwright
+import pytest
+from rclpy.serialization import serialize_message
+from sensor_msgs.msg import Temperature
+from std_msgs.msg import String
+
+from koopman_ros.demo import reactor
+from koopman_ros.panel.access import Cost, hashed, Role, write_user
+from koopman_ros.ros import topics
+from koopman_ros.testing import Harness, NodeProcess
+
+FLAGS = ('--no-sandbox', '--disable-gpu', '--disable-quic', '--no-first-run', '--mute-audio',
+         '--disable-extensions', '--disable-background-networking', '--disable-component-update',
+         '--disable-sync', '--in-process-gpu', '--renderer-process-limit=1')
+PATIENCE = 60_000.0  # ms
+DESK = (1000, 600)  # pixels
+PHONE = (390, 844)
+PASSWORDS = {'anna': ('operator', 'correct horse'), 'otto': ('viewer', 'battery staple')}
+ADDRESS = re.compile(r'the panel is at (http://127\.0\.0\.1:\d+)')
+MARKUP = '<script>document.title="caught"</script><b>bold</b>'
+
+
+@dataclass
+class Site:
+    """A loop with a panel that has users, and a browser in which one of them is logged in."""
+
+    ros: Harness
+    browser: Browser
+    url: str
+    panel: NodeProcess
+    controller: NodeProcess
+    actions: list[String]
+    desk: Page = field(init=False)  #: of the operator
+    #: what the pages complained of, and asked others for
+    complaints: list[str] = field(default_factory=list)
+    foreign: list[str] = field(default_factory=list)
+
+    def __post_init__(self) -> None:
+        self.desk = self.opened(DESK).new_page()
+
+    def opened(self, size: tuple[int, int]) -> BrowserContext:
+        """Return another browser, as far as the panel can tell."""
+        width, height = size
+        context = self.browser.new_context(
+            viewport={'width': width, 'height': height}, reduced_motion='reduce')
+        context.set_default_timeout(PATIENCE)
+        context.on('console', lambda message: self.complaints.append(message.text)
+                   if message.type == 'error' else None)
+        context.on('weberror', lambda error: self.complaints.append(str(error.error)))
+        context.on('request', lambda request: self._note(request.url))
+        context.on('page', lambda page: page.on('websocket', lambda own: self._note(own.url)))
+        return context
+
+    @contextlib.contextmanager
+    def page(self, path: str = '/') -> Iterator[Page]:
+        """Show a page to the operator, which may be open from the test before."""
+        try:
+            if self.desk.url != f'{self.url}{path}':
+                self.desk.goto(f'{self.url}{path}')
+            if self.desk.url.endswith('/login'):
+                log_in(self.desk, 'anna')
+                if path != '/':
+                    self.desk.goto(f'{self.url}{path}')
+            yield self.desk
+        except BaseException:
+            # the next test begins anew
+            self.desk.goto('about:blank')
+            raise
+
+    def _note(self, url: str) -> None:
+        if not re.match(r'(http|ws)://127\.0\.0\.1:\d+/|data:|blob:', url):
+            self.foreign.append(url)
+
+    def until(self, condition: Callable[[], object]) -> None:
+        self.ros.wait_until(condition)
+
+
+@pytest.fixture(scope='module')
+def site(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Site]:
+    """Start all of it once: each test leaves it as it found it."""
+    chromium = shutil.which('chromium')
+    if chromium is None:
+        pytest.fail('the tests in a browser need Chromium: sudo apt-get install chromium')
+    expect.set_options(timeout=PATIENCE)
+    folder = tmp_path_factory.mktemp('browser')
+    users = folder / 'users'
+    for name, (role, password) in PASSWORDS.items():
+        write_user(users, name, Role(role), hashed(password, Cost(2, 8, 1)))
+    with warnings.catch_warnings():
+        # the parser of the type support imports a module that Python deprecated
+        warnings.simplefilter('ignore', DeprecationWarning)
+        serialize_message(Temperature())
+    with Harness(folder) as ros, sync_playwright() as playwright:
+        panel = ros.start('panel', {'port': 0, 'users': users})
+        controller = ros.start('controller')
+        ros.start('trainer', {'output': folder / 'run'})
+        ros.start('plant', {'speed': 10.0})
+        actions: list[String] = ros.listen(String, topics.OPERATOR_ACTIONS)
+        browser = playwright.chromium.launch(
+            executable_path=chromium, headless=True, args=list(FLAGS))
+        try:
+            url = ros.wait_until(lambda: ADDRESS.search(panel.output()))[1]
+            yield Site(ros, browser, url, panel, controller, actions)
+        finally:
+            browser.close()
+
+
+@pytest.fixture(autouse=True)
+def quiet(site: Site) -> Iterator[None]:
+    """No page complains in its console, or asks anybody but the panel."""
+    yield
+    complaints, foreign = site.complaints[:], site.foreign[:]
+    site.complaints.clear()
+    site.foreign.clear()
+    assert (complaints, foreign) == ([], [])
+
+
+def log_in(page: Page, name: str) -> None:
+    page.get_by_label('Name').fill(name)
+    page.get_by_label('Password').fill(PASSWORDS[name][1])
+    page.keyboard.press('Enter')
+    page.wait_for_selector('#beat[data-beat]')
+
+
+def face(page: Page, signal: str) -> Locator:
+    return page.locator(f'[data-signal={signal}]')
+
+
+def asked(page: Page) -> Locator:
+    return page.get_by_label('Set-point of temperature, °C', exact=True)
+
+
+def ready(page: Page) -> None:
+    """Wait until numbers are there, and the controls."""
+    expect(face(page, 'temperature').locator('.big')).to_have_text(re.compile(r'\d+\.\d'))
+    expect(asked(page)).to_have_value(re.compile(r'\d'))
+
+
+def ask_setpoint(page: Page, celsius: str) -> Locator:
+    asked(page).fill(celsius)
+    asked(page).press('Enter')
+    return face(page, 'temperature').locator('.answer')
+
+
+def test_an_operator_logs_in_asks_for_a_set_point_and_the_reactor_arrives(site: Site) -> None:
+    with site.page() as page:
+        expect(page.locator('header')).to_contain_text('anna')
+        ready(page)
+        expect(ask_setpoint(page, '50')).to_have_text('accepted')
+        own = face(page, 'temperature')
+        expect(own.locator('.value')).to_have_text('50.0 °C')
+        expect(own.locator('.big')).to_have_text('50.0')
+    site.until(lambda: any((said['who'], said['new']) == ('anna', 50.0) for said in (
+        json.loads(message.data) for message in site.actions)))
+
+
+def test_a_refused_set_point_says_why_where_it_was_typed(site: Site) -> None:
+    with site.page() as page:
+        ready(page)
+        own = asked(page)
+        before = float(own.input_value())
+        expect(ask_setpoint(page, '80')).to_have_text(
+            re.compile(r'✖ refused: outside 31\.85 to 53\.85 degC'))
+        own.press('Escape')
+        expect(own).to_have_value(re.compile(rf'^{before:g}(\.0)?$'))
+
+
+def test_the_keyboard_does_it_all(site: Site) -> None:
+    with site.page() as page:
+        ready(page)
+        own = asked(page)
+        before = float(own.input_value())
+        # the next Tab begins there
+        page.get_by_role('heading', level=1).click()
+        page.keyboard.press('Tab')
+        for _ in range(30):
+            if own.evaluate('element => element === document.activeElement'):
+                break
+            page.keyboard.press('Tab')
+        expect(own).to_be_focused()
+        page.keyboard.press('ArrowUp')
+        expect(own).to_have_value(f'{before + 0.1:.1f}')
+        page.keyboard.press('Enter')
+        expect(face(page, 'temperature').locator('.answer')).to_have_text('accepted')
+        page.keyboard.press('Tab')
+        expect(page.get_by_role('button', name='Set', exact=True).first).to_be_focused()
+
+
+def test_manual_mode_is_asked_for_once_and_left_again(site: Site) -> None:
+    with site.page() as page:
+        ready(page)
+        switch = page.get_by_role('button', name='Switch to manual mode …')
+        switch.click()
+        dialog = page.get_by_role('dialog')
+        expect(dialog).to_contain_text('Nothing brings the plant to its set-point')
+        page.keyboard.press('Escape')
+        expect(dialog).to_have_count(0)
+        expect(page.locator('header')).to_contain_text('AUTOMATIC')
+        switch.click()
+        page.get_by_role('button', name='Switch to manual mode', exact=True).click()
+        expect(page.locator('header')).to_contain_text('MANUAL')
+        by_hand = page.get_by_label('coolant temperature by hand, °C', exact=True)
+        by_hand.fill('21.5')
+        by_hand.press('Enter')
+        own = face(page, 'coolant_temperature')
+        expect(own.locator('.answer')).to_have_text('accepted')
+        expect(own.locator('.big')).to_have_text('21.5')
+        page.get_by_role('button', name='Switch to automatic mode').click()
+        expect(page.locator('header')).to_contain_text('AUTOMATIC')
+
+
+def standing(page: Page, said: str) -> Locator:
+    return page.get_by_label('Standing alarms').get_by_role('listitem').filter(has_text=said)
+
+
+def test_an_alarm_is_raised_shelved_shown_again_acknowledged_and_gone(site: Site) -> None:
+    with site.page('/alarms') as page:
+        # somebody commands the coolant beside the controller
+        other = site.ros.node.create_publisher(
+            Temperature, reactor.COOLANT_SETPOINT, topics.LOOP_QOS)
+        try:
+            said = 'controller: control: 2 nodes command the coolant'
+            row = standing(page, said)
+            expect(row).to_contain_text('MEDIUM')
+            expect(page.get_by_role('link', name=re.compile(r'Alarms \(\d\)'))).to_be_visible()
+            row.get_by_role('button', name='Shelve 10 min').click()
+            expect(row).to_have_count(0)
+            shelved = page.get_by_label('Shelved alarms')
+            expect(shelved).to_contain_text(said)
+            shelved.get_by_role('button', name='Show again').click()
+            row.get_by_role('button', name='Acknowledge').click()
+            expect(row).to_contain_text('acknowledged by anna')
+        finally:
+            site.ros.node.destroy_publisher(other)
+        expect(row).to_have_count(0)
+        expect(page.get_by_label('Alarms of the day')).to_contain_text('acknowledged by anna')
+
+
+def test_text_of_others_is_text(site: Site) -> None:
+    """In the names and sentences of diagnostics, and in the name of who is not there."""
+    evil = site.ros.node.create_publisher(DiagnosticArray, topics.DIAGNOSTICS, 10)
+    status = DiagnosticStatus(level=DiagnosticStatus.ERROR, name=MARKUP, message=MARKUP,
+                              hardware_id=MARKUP)
+    with site.page('/alarms') as page:
+        row = page.get_by_label('Standing alarms').get_by_text(MARKUP).first
+        deadline = time.monotonic() + PATIENCE / 1e3
+        while not row.is_visible() and time.monotonic() < deadline:
+            evil.publish(DiagnosticArray(status=[status]))
+            site.ros.spin_once(0.2)
+        expect(row).to_be_visible()
+        assert 'caught' not in page.title()
+        assert page.locator('b', has_text='bold').count() == 0
+        status.level = DiagnosticStatus.OK
+        evil.publish(DiagnosticArray(status=[status]))
+        standing(page, MARKUP).get_by_role('button', name='Acknowledge').first.click()
+        expect(row).to_have_count(0)
+    site.ros.node.destroy_publisher(evil)
+
+
+def test_trends_show_the_past_to_a_page_that_is_opened_late(site: Site) -> None:
+    points = """() => {
+        const chart = document.querySelector('.nicegui-echart');
+        const vue = getElement(parseInt(chart.id.slice(1)));
+        return vue.chart.getOption().series.map(series => series.data.length);
+    }"""
+    with site.page() as page:
+        ready(page)
+        expect(ask_setpoint(page, '46')).to_have_text('accepted')
+    with site.page('/trends') as page:
+        page.wait_for_function(f'() => ({points})()[0] > 20')
+        expect(page.get_by_label('Marks')).to_contain_text('setpoint: temperature 46 °C')
+        page.reload()
+        page.wait_for_function(f'() => ({points})()[0] > 20')
+        page.get_by_role('button', name='1 h').click()
+        page.wait_for_function(f'() => ({points})().every(count => count > 20)')
+
+
+def test_parameters_are_set_checked_and_refused(site: Site) -> None:
+    with site.page('/tuning') as page:
+        own = page.get_by_label('Parameters of the controller')
+        own.get_by_text('coolant temperature', exact=True).click()
+        row = own.locator('[data-parameter="coolant_temperature.max"]')
+        expect(row).to_contain_text('highest command')
+        given = row.get_by_role('textbox')
+        expect(given).to_have_value('32')
+        for text, said in (('31', 'set'), ('x', "✖ refused: 'x' is not a number"),
+                           ('-300', '✖ refused: must be [-273.15, 1000000000] degC'),
+                           ('4', re.compile('✖ refused: coolant_temperature.min = 5.0 degC must '
+                                            'be below')),
+                           ('32', 'set')):
+            given.fill(text)
+            given.press('Enter')
+            expect(row.locator('.answer')).to_have_text(said)
+
+        def exported() -> str:
+            with page.expect_download() as download:
+                own.get_by_role('button', name='Export YAML').click()
+            return Path(download.value.path()).read_text()
+
+        # the controller tells of it a moment after it has answered
+        deadline = time.monotonic() + PATIENCE / 1e3
+        while '31.0' in (text := exported()) and time.monotonic() < deadline:
+            page.wait_for_timeout(100.0)
+        assert text.startswith('controller:\n  ros__parameters:\n')
+        assert '    coolant_temperature.max: 32.0  # [degC]\n' in text
+
+
+def test_recording_and_experiment_are_begun_and_ended(site: Site) -> None:
+    with site.page('/model') as page:
+        recording = page.get_by_label('Recording', exact=True)
+        expect(recording).to_contain_text('recording to')
+        recording.get_by_role('button', name='Stop').click()
+        expect(recording).to_contain_text('not recording')
+        recording.get_by_role('button', name='Record').click()
+        expect(recording.locator('.answer')).to_contain_text('recording to')
+        experiment = page.get_by_label('Experiment', exact=True)
+        experiment.get_by_role('button', name='Start …').click()
+        dialog = page.get_by_role('dialog')
+        expect(dialog).to_contain_text('coolant_temperature: steps within 8.5 degC to 27.5 degC')
+        dialog.get_by_role('button', name='Start the experiment').click()
+        expect(experiment.locator('.answer')).to_contain_text(
+            '/controller publishes on /coolant_setpoint')
+
+
+# What a viewer could use, had nobody disabled it.
+USABLE = """controls => controls.filter(own => own.checkVisibility() && !own.disabled
+    && own.innerText !== 'Export YAML').map(own => own.outerHTML)"""
+
+
+def test_a_viewer_on_a_phone_sees_what_the_operator_does_and_cannot_act(site: Site) -> None:
+    phone = site.opened(PHONE)
+    with contextlib.closing(phone), site.page() as desk:
+        page = phone.new_page()
+        page.goto(site.url)
+        assert page.url.endswith('/login')
+        log_in(page, 'otto')
+        expect(page.locator('header')).to_contain_text('otto (viewer)')
+        ready(page)
+        ready(desk)
+        expect(ask_setpoint(desk, '48')).to_have_text('accepted')
+        expect(face(page, 'temperature').locator('.value')).to_have_text('48.0 °C')
+        for path in ('/', '/trends', '/alarms', '/model', '/tuning'):
+            if path != '/':
+                page.goto(f'{site.url}{path}')
+                page.wait_for_selector('#beat[data-beat]')
+            page.locator('.q-expansion-item .q-item:visible').evaluate_all(
+                'groups => groups.forEach(group => group.click())')
+            expect(page.locator('.q-expansion-item--collapsed:visible')).to_have_count(0)
+            # nothing is scrolled sideways
+            assert page.evaluate('document.documentElement.scrollWidth') <= PHONE[0]
+            # of trends, a viewer may choose what to see
+            if path != '/trends':
+                controls = page.locator('.page button, .page input')
+                assert controls.evaluate_all(USABLE) == []
+        # logged out in another page
+        assert phone.request.get(f'{site.url}/logout').ok
+        page.wait_for_url('**/login')
+
+
+def test_a_controller_that_is_gone_is_said_with_the_time_and_comes_back(site: Site) -> None:
+    with site.page() as page:
+        ready(page)
+        site.controller.stop()
+        banner = page.locator('.banner:not(#lost)')
+        expect(banner).to_have_text(re.compile(
+            r'⚠ Connection lost: nothing from the controller since \d\d:\d\d:\d\d'))
+        expect(page.locator('header')).to_contain_text('MODE NOT KNOWN')
+        expect(ask_setpoint(page, '45')).to_have_text(
+            '✖ refused: the controller is not there: start it')
+        site.controller = site.ros.start('controller')
+        expect(banner).to_be_hidden()
+        expect(page.locator('header')).to_contain_text('AUTOMATIC')
+
+
+def test_a_page_finds_its_panel_again(site: Site) -> None:
+    """The one that comes back has no users: whoever reaches it is the operator."""
+    port = int(site.url.rpartition(':')[2])
+    with site.page() as page:
+        ready(page)
+        site.panel.stop()
+        lost = page.locator('#lost')
+        expect(lost).to_have_text(re.compile('Connection lost: nothing from the panel since'))
+        expect(lost).to_be_visible()
+        site.panel = site.ros.start('panel', {'port': port})
+        expect(lost).to_be_hidden()
+        expect(page.locator('header')).to_contain_text('operator')
+        ready(page)
+        # of the connection that was refused meanwhile
+        site.complaints.clear()
