@@ -129,7 +129,12 @@ class PanelNode(LoopNode):
         wall_timer(self, _PERIOD, self._on_tick)
         wall_timer(self, _LOOK, self._on_look)
         wall_timer(self, _SENDING, self._on_sending)
-        self._server = self._serve()
+        try:
+            self._server = self._serve()
+        except BaseException:
+            # nobody else has it to destroy, and it would go on listening in this process
+            self.destroy_node()
+            raise
         self.diagnostics.add('pages', self._status)
         self.get_logger().info(f'the panel is at {self._server.address}')
 

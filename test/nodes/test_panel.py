@@ -5,6 +5,7 @@
 
 from collections.abc import Callable, Iterator
 from concurrent.futures import Future
+import gc
 import json
 import math
 from pathlib import Path
@@ -20,6 +21,7 @@ from diagnostic_msgs.msg import DiagnosticStatus
 import pytest
 import rclpy
 from rclpy.executors import SingleThreadedExecutor
+from rclpy.node import Node
 from sensor_msgs.msg import Temperature
 from std_msgs.msg import String
 
@@ -107,8 +109,17 @@ def opened(url: str, *headers: str) -> str:
 ])
 def test_bad_start_is_said_in_one_line(
         capfd: pytest.CaptureFixture[str], parameters: dict[str, object], words: str) -> None:
+    before = listening()
     assert run_here(panel, **parameters) == 1
     assert complaint(capfd).startswith(f'panel: {words}')
+    assert listening() == before, 'a node that did not start goes on listening'
+
+
+def listening() -> int:
+    """Count the subscriptions of all nodes in this process."""
+    gc.collect()
+    return sum(len(list(each.subscriptions)) for each in gc.get_objects()
+               if issubclass(type(each), Node))
 
 
 def test_users_log_in_and_wrong_passwords_wait(ros: Harness, tmp_path: Path) -> None:
