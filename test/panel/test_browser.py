@@ -9,12 +9,11 @@ from dataclasses import dataclass, field
 import json
 from pathlib import Path
 import re
-import shutil
 import time
 import warnings
 
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
-from playwright.sync_api import Browser, BrowserContext, expect, Locator, Page, sync_playwright
+from playwright.sync_api import expect, Locator, Page
 import pytest
 from rclpy.serialization import serialize_message
 from sensor_msgs.msg import Temperature
@@ -24,15 +23,11 @@ from koopman_ros.demo import reactor
 from koopman_ros.panel.access import Cost, hashed, Role, write_user
 from koopman_ros.ros import topics
 from koopman_ros.testing import Harness, NodeProcess
+from support.browser import ADDRESS, opened_browser, Pages, PATIENCE
 
-FLAGS = ('--no-sandbox', '--disable-gpu', '--disable-quic', '--no-first-run', '--mute-audio',
-         '--disable-extensions', '--disable-background-networking', '--disable-component-update',
-         '--disable-sync', '--in-process-gpu', '--renderer-process-limit=1')
-PATIENCE = 60_000.0  # ms
 DESK = (1000, 600)  # pixels
 PHONE = (390, 844)
 PASSWORDS = {'anna': ('operator', 'correct horse'), 'otto': ('viewer', 'battery staple')}
-ADDRESS = re.compile(r'the panel is at (http://127\.0\.0\.1:\d+)')
 MARKUP = '<script>document.title="caught"</script><b>bold</b>'
 
 
@@ -41,31 +36,15 @@ class Site:
     """A loop with a panel that has users, and a browser in which one of them is logged in."""
 
     ros: Harness
-    browser: Browser
+    browser: Pages
     url: str
     panel: NodeProcess
     controller: NodeProcess
     actions: list[String]
     desk: Page = field(init=False)  #: of the operator
-    #: what the pages complained of, and asked others for
-    complaints: list[str] = field(default_factory=list)
-    foreign: list[str] = field(default_factory=list)
 
     def __post_init__(self) -> None:
-        self.desk = self.opened(DESK).new_page()
-
-    def opened(self, size: tuple[int, int]) -> BrowserContext:
-        """Return another browser, as far as the panel can tell."""
-        width, height = size
-        context = self.browser.new_context(
-            viewport={'width': width, 'height': height}, reduced_motion='reduce')
-        context.set_default_timeout(PATIENCE)
-        context.on('console', lambda message: self.complaints.append(message.text)
-                   if message.type == 'error' else None)
-        context.on('weberror', lambda error: self.complaints.append(str(error.error)))
-        context.on('request', lambda request: self._note(request.url))
-        context.on('page', lambda page: page.on('websocket', lambda own: self._note(own.url)))
-        return context
+        self.desk = self.browser.context(*DESK).new_page()
 
     @contextlib.contextmanager
     def page(self, path: str = '/') -> Iterator[Page]:
@@ -83,10 +62,6 @@ class Site:
             self.desk.goto('about:blank')
             raise
 
-    def _note(self, url: str) -> None:
-        if not re.match(r'(http|ws)://127\.0\.0\.1:\d+/|data:|blob:', url):
-            self.foreign.append(url)
-
     def until(self, condition: Callable[[], object]) -> None:
         self.ros.wait_until(condition)
 
@@ -94,9 +69,6 @@ class Site:
 @pytest.fixture(scope='module')
 def site(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Site]:
     """Start all of it once: each test leaves it as it found it."""
-    chromium = shutil.which('chromium')
-    if chromium is None:
-        pytest.fail('the tests in a browser need Chromium: sudo apt-get install chromium')
     expect.set_options(timeout=PATIENCE)
     folder = tmp_path_factory.mktemp('browser')
     users = folder / 'users'
@@ -106,29 +78,21 @@ def site(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Site]:
         # the parser of the type support imports a module that Python deprecated
         warnings.simplefilter('ignore', DeprecationWarning)
         serialize_message(Temperature())
-    with Harness(folder) as ros, sync_playwright() as playwright:
+    with opened_browser() as browser, Harness(folder) as ros:
         panel = ros.start('panel', {'port': 0, 'users': users})
         controller = ros.start('controller')
         ros.start('trainer', {'output': folder / 'run'})
         ros.start('plant', {'speed': 10.0})
         actions: list[String] = ros.listen(String, topics.OPERATOR_ACTIONS)
-        browser = playwright.chromium.launch(
-            executable_path=chromium, headless=True, args=list(FLAGS))
-        try:
-            url = ros.wait_until(lambda: ADDRESS.search(panel.output()))[1]
-            yield Site(ros, browser, url, panel, controller, actions)
-        finally:
-            browser.close()
+        url = ros.wait_until(lambda: ADDRESS.search(panel.output()))[1]
+        yield Site(ros, browser, url, panel, controller, actions)
 
 
 @pytest.fixture(autouse=True)
 def quiet(site: Site) -> Iterator[None]:
     """No page complains in its console, or asks anybody but the panel."""
     yield
-    complaints, foreign = site.complaints[:], site.foreign[:]
-    site.complaints.clear()
-    site.foreign.clear()
-    assert (complaints, foreign) == ([], [])
+    site.browser.check()
 
 
 def log_in(page: Page, name: str) -> None:
@@ -344,7 +308,7 @@ USABLE = """controls => controls.filter(own => own.checkVisibility() && !own.dis
 
 
 def test_a_viewer_on_a_phone_sees_what_the_operator_does_and_cannot_act(site: Site) -> None:
-    phone = site.opened(PHONE)
+    phone = site.browser.context(*PHONE)
     with contextlib.closing(phone), site.page() as desk:
         page = phone.new_page()
         page.goto(site.url)
@@ -402,4 +366,4 @@ def test_a_page_finds_its_panel_again(site: Site) -> None:
         expect(page.locator('header')).to_contain_text('operator')
         ready(page)
         # of the connection that was refused meanwhile
-        site.complaints.clear()
+        site.browser.forgive()

@@ -5,17 +5,17 @@
 
 from collections.abc import Iterator
 import contextlib
-from pathlib import Path
 import re
+import shutil
 
-from playwright.sync_api import Browser, Page, sync_playwright
+from playwright.sync_api import Browser, BrowserContext, Page, sync_playwright
 import pytest
 
-CHROMIUM = Path('/usr/bin/chromium')
-FLAGS = ('--no-sandbox', '--disable-gpu', '--disable-quic', '--no-first-run',
-         '--disable-background-networking', '--disable-component-update', '--disable-sync')
 PATIENCE = 60_000.0  # ms
 ADDRESS = re.compile(r'the panel is at (http://127\.0\.0\.1:\d+)')
+_FLAGS = ('--no-sandbox', '--disable-gpu', '--disable-quic', '--no-first-run', '--mute-audio',
+          '--disable-extensions', '--disable-background-networking', '--disable-component-update',
+          '--disable-sync', '--in-process-gpu', '--renderer-process-limit=1')
 _OWN = re.compile(r'(http|ws)://127\.0\.0\.1:\d+/|data:|blob:')
 
 
@@ -24,42 +24,59 @@ class Pages:
 
     def __init__(self, browser: Browser) -> None:
         self._browser = browser
-        self.complaints: list[str] = []  #: errors in their consoles
-        self.foreign: list[str] = []  #: addresses that are no panel's
+        self._complaints: list[str] = []  # errors in their consoles
+        self._foreign: list[str] = []  # addresses that are no panel's
+
+    def context(self, width: int = 1280, height: int = 800) -> BrowserContext:
+        """Return another browser, as far as a panel can tell."""
+        context = self._browser.new_context(
+            viewport={'width': width, 'height': height}, reduced_motion='reduce')
+        context.set_default_timeout(PATIENCE)
+        context.on('console', lambda message: self._complaints.append(message.text)
+                   if message.type == 'error' else None)
+        context.on('weberror', lambda error: self._complaints.append(str(error.error)))
+        context.on('request', lambda request: self._note(request.url))
+        context.on('page', lambda page: page.on('websocket', lambda own: self._note(own.url)))
+        return context
 
     @contextlib.contextmanager
-    def page(self, url: str, width: int = 1280, height: int = 800) -> Iterator[Page]:
+    def page(self, url: str) -> Iterator[Page]:
         """Open a page as nobody has before."""
-        context = self._browser.new_context(viewport={'width': width, 'height': height})
-        context.set_default_timeout(PATIENCE)
+        context = self.context()
         try:
             page = context.new_page()
-            page.on('console', lambda message: self.complaints.append(message.text)
-                    if message.type == 'error' else None)
-            page.on('pageerror', lambda error: self.complaints.append(str(error)))
-            page.on('request', lambda request: self._note(request.url))
-            page.on('websocket', lambda socket: self._note(socket.url))
             page.goto(url)
             yield page
         finally:
             context.close()
 
+    def check(self) -> None:
+        """Assert that no page has complained since the last time, and none has asked others."""
+        complaints, self._complaints = self._complaints, []
+        foreign, self._foreign = self._foreign, []
+        assert (complaints, foreign) == ([], [])
+
+    def forgive(self) -> None:
+        """Pass over what pages have complained of since the last time."""
+        self._complaints = []
+
     def _note(self, url: str) -> None:
         if not _OWN.match(url):
-            self.foreign.append(url)
+            self._foreign.append(url)
 
 
 @contextlib.contextmanager
 def opened_browser() -> Iterator[Pages]:
     """Start a browser; the end asserts that no page complained, and none asked others."""
-    if not CHROMIUM.exists():
+    chromium = shutil.which('chromium')
+    if chromium is None:
         pytest.fail('the tests in a browser need Chromium: sudo apt-get install chromium')
     with sync_playwright() as playwright:
         browser = playwright.chromium.launch(
-            executable_path=str(CHROMIUM), headless=True, args=list(FLAGS))
+            executable_path=chromium, headless=True, args=list(_FLAGS))
         try:
             pages = Pages(browser)
             yield pages
-            assert (pages.complaints, pages.foreign) == ([], [])
+            pages.check()
         finally:
             browser.close()
