@@ -10,13 +10,13 @@ from pathlib import Path
 import signal
 import subprocess
 
+from koopman_ros.jobs.ending import see_it_end
 from koopman_ros.startup import blocked_signals, command
 
 _MODULE = 'koopman_ros.nodes.replay'
 _NICE = 10
 _ONE_THREAD = {'OMP_NUM_THREADS': '1', 'OPENBLAS_NUM_THREADS': '1'}
 _MOST_SAID = 4000  # bytes of what it printed last
-_PATIENCE = 3.0  # s from the request to end until the process is killed
 
 
 class ReplayJob:
@@ -63,8 +63,4 @@ class ReplayJob:
     def close(self) -> None:
         """End the process, by force when it does not end in time."""
         self.cancel()
-        try:
-            self._process.wait(_PATIENCE)
-        except subprocess.TimeoutExpired:
-            self._process.kill()
-            self._process.wait()
+        see_it_end(self._process)

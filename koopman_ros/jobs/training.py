@@ -14,12 +14,12 @@ import subprocess
 import threading
 from typing import Any, IO
 
+from koopman_ros.jobs.ending import see_it_end
 from koopman_ros.startup import command
 
 _MODULE = 'koopman_ros.retraining.__main__'
 # The problems are small, and the nodes of the loop need the cores; sums keep their order, too.
 _ONE_THREAD = {'OMP_NUM_THREADS': '1', 'OPENBLAS_NUM_THREADS': '1'}
-_PATIENCE = 5.0  # s from the request to end until the process is killed
 _CANCELLED = 'cancelled, nothing was written'
 
 
@@ -86,11 +86,7 @@ class RetrainingJob:
     def close(self) -> None:
         """End the process, by force when it does not end in time."""
         self.cancel()
-        try:
-            self._process.wait(_PATIENCE)
-        except subprocess.TimeoutExpired:
-            self._process.kill()
-            self._process.wait()
+        see_it_end(self._process)
         for thread in self._threads:
             thread.join()
         for stream in (self._process.stdout, self._process.stderr):

@@ -15,7 +15,7 @@ import time
 
 import pytest
 
-from koopman_ros.jobs import training
+from koopman_ros.jobs import ending, training
 from koopman_ros.jobs.training import JobState, RetrainingJob
 from koopman_ros.resources import model_path
 from support.nodes import TIMEOUT, wait_until_ended
@@ -55,7 +55,7 @@ def test_process_that_gets_a_signal(
         task: dict[str, object], tmp_path: Path, monkeypatch: pytest.MonkeyPatch, step: str,
         number: int, code: int, words: str) -> None:
     # its libraries may take their time to end on a busy machine
-    monkeypatch.setattr(training, '_PATIENCE', TIMEOUT)
+    monkeypatch.setattr(ending, '_PATIENCE', TIMEOUT)
     job = RetrainingJob(task)
     assert any(state.text.startswith(step) for state in itertools.chain([job.state], follow(job)))
     os.kill(job._process.pid, number)
@@ -120,7 +120,7 @@ def test_process_ends_with_its_parent_that_is_killed(
 def test_process_that_does_not_end_is_killed(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(training, '_command', lambda: (
         'sh', '-c', 'echo \'{"progress": 0.5, "text": "x"}\'; exec sleep 3600'))
-    monkeypatch.setattr(training, '_PATIENCE', 0.2)
+    monkeypatch.setattr(ending, '_PATIENCE', 0.2)
     job = RetrainingJob({})
     next(follow(job))
     job.close()
