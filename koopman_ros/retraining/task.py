@@ -23,7 +23,7 @@ from koopman_ros.arrays import Array, brief
 from koopman_ros.bags import Account, loop_episodes, RecordedInput, RecordedState
 from koopman_ros.identification import Identified, identify, Stopped
 from koopman_ros.learning import Comparison, Contender, NoUsefulLift, Progress
-from koopman_ros.lifting import Box, Coordinates, LiftedModel, load, save
+from koopman_ros.lifting import Box, Coordinates, LiftedModel, load, predecessor, save
 from koopman_ros.model_classes import BEST, CLASSES, IDENTITY_LIFT
 from koopman_ros.plant_data import Episode, Plant
 from koopman_ros.retraining.gate import decide, Decision, shortfalls, Thresholds
@@ -371,7 +371,7 @@ def _place(output: Path, accepted: bool) -> Path:
     if not accepted:
         return output.with_suffix('.refused.safetensors')
     if output.exists():
-        previous = output.with_suffix('.previous.safetensors')
+        previous = predecessor(output)
         previous.unlink(missing_ok=True)
         # a second name, so that there is a model under the first one at every moment
         try:
