@@ -100,7 +100,12 @@ def display_unit(unit: str) -> str:
 
 def unit_label(unit: str) -> str:
     """Return the unit in which people read values, as it is printed."""
-    return display_unit(unit).replace('deg', '°')
+    return printed(display_unit(unit))
+
+
+def printed(unit: str) -> str:
+    """Return a unit as it is printed."""
+    return unit.replace('deg', '°')
 
 
 def shown(values: Numbers, unit: str) -> Numbers:
@@ -139,12 +144,12 @@ class Displays:
     """How all signals are written."""
 
     units: Mapping[str, str]  #: of the signals, by name
-    #: how values in a unit are written, by unit; as they are by default
+    #: how values are written, by signal or by unit; as they are by default
     shown: Mapping[str, Display] = field(default_factory=dict)
 
     def __getitem__(self, name: str) -> Display:
         unit = self.units.get(name, '')
-        return self.shown.get(unit) or Display(unit)
+        return self.shown.get(name) or self.shown.get(unit) or Display(unit)
 
 
 def to_kelvin(celsius: float) -> float:

@@ -49,7 +49,7 @@ from koopman_ros.ros.node import Level, LoopNode, Status, wall_timer, words_of
 from koopman_ros.ros.process import run
 from koopman_ros.ros.remote import RemoteNode
 from koopman_ros.ros.signals import Heard, Inlet, Outlet
-from koopman_ros.units import conversion, display_unit, NANOSECONDS, shown
+from koopman_ros.units import conversion, Display, display_unit, NANOSECONDS
 from koopman_ros.wire import Place
 
 # The loop waits for nobody who only looks on.
@@ -94,9 +94,12 @@ class PanelNode(LoopNode):
         self.settings = settings = self.declare_table(panel_table(present, given))
         self._signals = signals = panel_signals(present, given)
         self._wiring = wiring = Wiring(signals, settings.states, settings.inputs)
-        self.view = PlantView(signals, settings.span, time.time())
+        read = settings.read(signals)
+        self.view = PlantView(signals, read, settings.span, time.time())
         self.snapshot = self.view.snapshot(time.time())
-        self._words = words_of(signals)
+        self._words = words_of(signals, {
+            name: Display(unit, read[name], '.6g') for name, unit in signals.units.items()
+            if read[name] != display_unit(unit)})
         self._requests = Requests(
             {SETPOINT: signals.controlled, MANUAL: tuple(signals.inputs)}, self._refusal)
         self._asked: deque[tuple[Action, Future[Answer]]] = deque()
@@ -222,8 +225,8 @@ class PanelNode(LoopNode):
     def _read_past(self, bag: str, first: float) -> None:
         """Fill in what was before the panel; called in a thread of its own."""
         try:
-            past = read_past(bag, self._wiring, self.resolve_topic_name, self.settings.span,
-                             self._ended.is_set)
+            past = read_past(bag, self._wiring, self.view.read, self.resolve_topic_name,
+                             self.settings.span, self._ended.is_set)
         except (OSError, BagReadError) as error:
             self.get_logger().warning(f'the trends begin with the panel: {error}')
             return
@@ -280,7 +283,8 @@ class PanelNode(LoopNode):
                 reply(Answer(False, str(error) or type(error).__name__))
 
     def _reply(self, action: Action, future: Future[Answer], answer: Answer) -> None:
-        self._actions.publish(String(data=action_text(action, answer, time.time())))
+        self._actions.publish(String(data=action_text(
+            action, answer, time.time(), self.view.read.get(action.name, ''))))
         word = 'accepted' if answer.accepted else 'refused'
         self.get_logger().info(f'{action.who}: {action.what} {action.name} {action.value}: {word}')
         if not future.done():
@@ -316,7 +320,7 @@ class PanelNode(LoopNode):
         places: Mapping[str, Place] = self._wiring.setpoints if setpoint else self._wiring.manual
         units = self._signals.states if setpoint else self._signals.inputs
         place, unit = places[action.name], units[action.name]
-        value = float(conversion(display_unit(unit), unit)(float(action.value)))
+        value = float(conversion(self.view.read[action.name], unit)(float(action.value)))
         if not self.count_publishers(topics.CONTROLLER_EVENTS):
             reply(Answer(False, _GONE.format('the controller')))
             return
@@ -353,9 +357,10 @@ class PanelNode(LoopNode):
         if codes[:1] != (Code.SETPOINT_OUTSIDE.value,) or name not in self._trained:
             return ''
         low, high = self._trained[name]
-        unit = self._signals.states[name]
-        return (f'outside {shown(low, unit):.6g} to {shown(high, unit):.6g} '
-                f'{display_unit(unit)}, the trained range') if not low <= value <= high else (
+        read = self.view.read[name]
+        to_read = conversion(self._signals.states[name], read)
+        return (f'outside {to_read(low):.6g} to {to_read(high):.6g} {read}, '
+                'the trained range') if not low <= value <= high else (
             self._words(reason(Code.SETPOINT_OUTSIDE, signal=name, value=value, lower=low,
                                upper=high)))
 

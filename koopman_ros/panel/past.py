@@ -3,7 +3,7 @@
 
 """What happened before the panel was started, from the bag that is being recorded."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 import math
 import time
 from typing import Any
@@ -22,13 +22,15 @@ _BATCH = 200  # messages, after which others have their turn for
 _PAUSE = 0.001  # s
 
 
-def read_past(path: str, wiring: Wiring, resolve: Callable[[str], str], span: float,
+def read_past(path: str, wiring: Wiring, read: Mapping[str, str],
+              resolve: Callable[[str], str], span: float,
               ended: Callable[[], bool] = lambda: False) -> PlantView:
     """
     Return the view of a loop that its bag gives, as far as it is whole.
 
     It may take a minute for hours of records, and leaves room for other threads meanwhile.
 
+    :param read: units in which people read the signals, by name.
     :param resolve: makes names of topics those in the bag.
     :param span: s of the past that is kept.
     :param ended: tells that it is not wanted any more.
@@ -38,11 +40,11 @@ def read_past(path: str, wiring: Wiring, resolve: Callable[[str], str], span: fl
     places: dict[str, list[tuple[str, str, Place, Any]]] = {}
     for kind in _KINDS:
         for name, place in getattr(wiring, kind).items():
-            unit = {**signals.states, **signals.inputs}[name]
+            unit = signals.units[name]
             places.setdefault(resolve(place.topic), []).append(
                 (kind, name, place, conversion(place.unit, unit)))
     events = resolve(CONTROLLER_EVENTS)
-    past = PlantView(signals, span, 0.0)
+    past = PlantView(signals, read, span, 0.0)
     for number, entry in enumerate(read_messages(path, (*places, events), recover=True)):
         if number % _BATCH == 0:
             time.sleep(_PAUSE)

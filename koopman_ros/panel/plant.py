@@ -8,17 +8,19 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 import math
+from pathlib import Path
 import re
 from types import MappingProxyType
 from typing import Any
 
+from koopman_ros.lifting import predecessor
 from koopman_ros.panel.alarms import Alarm, Alarms, Priority
 from koopman_ros.panel.requests import REFUSED
 from koopman_ros.panel.trends import Trends
 from koopman_ros.parameters.table import UNBOUNDED
 from koopman_ros.parameters.wire import Signals
 from koopman_ros.reasons import level_words
-from koopman_ros.units import shown, unit_label
+from koopman_ros.units import conversion, display_unit, printed
 
 OK, WARN, ERROR = 0, 1, 2  #: levels of a status
 PLANT, CONTROLLER, TRAINER = 'plant', 'controller', 'trainer'
@@ -202,8 +204,12 @@ class Snapshot:
 @dataclass
 class _Signal:
     unit: str
+    read: str  # unit in which people read it, as all values here
     values: dict[str, float] = field(default_factory=dict)
     training: Range | None = None
+
+    def shown(self, value: float) -> float:
+        return float(conversion(self.unit, self.read)(float(value)))
 
 
 class PlantView:
@@ -211,17 +217,21 @@ class PlantView:
     Keeps what was heard of a loop; all is called from one thread but for trends and alarms.
 
     :param signals: of the plant.
+    :param read: units in which people read them, by name.
     :param span: of the past that the trends keep, in s.
     :param now: by the wall clock, as everywhere here.
     """
 
-    def __init__(self, signals: Signals, span: float, now: float) -> None:
-        self.signals = signals
+    def __init__(self, signals: Signals, read: Mapping[str, str], span: float, now: float
+                 ) -> None:
+        self.signals, self.read = signals, read
         self.alarms = Alarms()
         self.trends = Trends(span)
         self._span, self._start = span, now
-        self._states = {name: _Signal(unit) for name, unit in signals.states.items()}
-        self._inputs = {name: _Signal(unit) for name, unit in signals.inputs.items()}
+        self._states = {
+            name: _Signal(unit, read[name]) for name, unit in signals.states.items()}
+        self._inputs = {
+            name: _Signal(unit, read[name]) for name, unit in signals.inputs.items()}
         self.plant = ''
         self._time = math.nan
         self._mode = self._level = ''
@@ -233,7 +243,7 @@ class PlantView:
         self._watched = [CONTROLLER, PLANT]
         self._looked = now  # at the journal
         self._about: Mapping[str, str] = _NO_VALUES
-        self._previous_model = ''
+        self._previous_model = self._digest = ''
 
     # What is heard.
 
@@ -244,7 +254,7 @@ class PlantView:
         if kind == 'measured':
             self._beat(stamp, now)
         for name, value in values.items():
-            read = float(shown(value, of[name].unit))
+            read = of[name].shown(value)
             of[name].values[kind] = read
             # the latched ones carry the stamp of when they began to hold
             if math.isfinite(read) and kind != 'active_setpoints':
@@ -299,27 +309,35 @@ class PlantView:
             case 'setpoint' if fields['accepted']:
                 names = fields.get('signals') or self.signals.controlled
                 for name, value in zip(names, fields['value'], strict=True):
-                    self._states[name].values['asked'] = float(
-                        shown(float(value), self._states[name].unit))
+                    own = self._states[name]
+                    own.values['asked'] = own.shown(value)
                     self._mark('setpoint', f'{label(name)} {self._quantity(name)}')
             case 'manual_command' if fields['accepted']:
                 for own, value in zip(self._inputs.values(), fields['value'], strict=True):
-                    own.values['manual'] = float(shown(float(value), own.unit))
+                    own.values['manual'] = own.shown(value)
                 self._mark('manual', 'manual command')
             case 'mode':
                 self._mode = str(fields['mode'])
                 self._mark('mode', f'{self._mode} mode')
             case 'model':
-                self._mark('model', f'model {fields["model"]["name"]}')
+                name, before = str(fields['model']['name']), self._digest
+                self._mark('model', f'model {name}')
+                self._digest = str(fields['model']['digest'])
+                if self._digest != before and name.endswith('.safetensors'):
+                    # read anew, from a file that another training has written since
+                    self._previous_model = str(predecessor(Path(name)))
             case 'parameters':
                 self._mark('model' if 'model' in fields else 'parameter',
                            ', '.join(map(str, fields['parameters'])))
+                if 'model' in fields:
+                    self._digest = str(fields['model']['digest'])
             case 'start' | 'snapshot':
                 self._mode = str(fields['state']['mode']['name']).lower()
+                self._digest = str(fields['model']['digest'])
 
     def _quantity(self, name: str) -> str:
         own = self._states[name]
-        return f'{own.values["asked"]:.6g} {unit_label(own.unit)}'
+        return f'{own.values["asked"]:.6g} {printed(own.read)}'
 
     def _mark(self, kind: str, text: str) -> None:
         if not math.isnan(self._time):
@@ -363,7 +381,7 @@ class PlantView:
         for name, own in (*self._states.items(), *self._inputs.items()):
             bounds = ranges.get(name)
             own.training = None if bounds is None else (
-                float(shown(bounds[0], own.unit)), float(shown(bounds[1], own.unit)))
+                own.shown(bounds[0]), own.shown(bounds[1]))
 
     # What is shown.
 
@@ -419,19 +437,19 @@ class PlantView:
         found = own.values
         measured = found.get('measured', math.nan)
         setpoint = found.get('active_setpoints', math.nan)
-        span = _span([own.training, self._bounds(name, 'sensor_min', 'sensor_max')],
+        span = _span([own.training, self._bounds(name, own, 'sensor_min', 'sensor_max')],
                      [measured, setpoint])
         abnormal = 'no measurement' if silent or math.isnan(measured) else ''
         if not abnormal and own.training and not own.training[0] <= measured <= own.training[1]:
             abnormal = 'above the trained range' if (
                 measured > own.training[1]) else 'below the trained range'
         return StateFace(
-            name, unit_label(own.unit), span, _decimals(span), own.training, abnormal,
+            name, printed(own.read), span, _decimals(span), own.training, abnormal,
             name in self.signals.controlled, measured, setpoint,
             found.get('asked', setpoint), found.get('predicted', math.nan))
 
     def _input(self, name: str, own: _Signal) -> InputFace:
-        found, limits = own.values, self._bounds(name, 'min', 'max')
+        found, limits = own.values, self._bounds(name, own, 'min', 'max')
         command, applied = found.get('commands', math.nan), found.get('applied', math.nan)
         span = _span([limits, own.training], [command, applied])
         slack = 1e-6 * (span[1] - span[0])
@@ -440,15 +458,18 @@ class PlantView:
             abnormal = ('at its upper limit' if command >= limits[1] - slack else
                         'at its lower limit' if command <= limits[0] + slack else '')
         return InputFace(
-            name, unit_label(own.unit), span, _decimals(span), own.training, abnormal, command,
+            name, printed(own.read), span, _decimals(span), own.training, abnormal, command,
             applied, found.get('manual', math.nan), limits, found.get('disturbance', math.nan),
             own.unit)
 
-    def _bounds(self, name: str, low: str, high: str) -> Range | None:
-        own = self._parameters.get(CONTROLLER, {})
-        if (lower := own.get(f'{name}.{low}')) and (upper := own.get(f'{name}.{high}')):
+    def _bounds(self, name: str, own: _Signal, low: str, high: str) -> Range | None:
+        given = self._parameters.get(CONTROLLER, {})
+        if (lower := given.get(f'{name}.{low}')) and (upper := given.get(f'{name}.{high}')):
             found = float(lower.value), float(upper.value)
-            return found if -UNBOUNDED < found[0] < found[1] < UNBOUNDED else None
+            if -UNBOUNDED < found[0] < found[1] < UNBOUNDED:
+                # parameters are in the usual unit
+                to_read = conversion(display_unit(own.unit), own.read)
+                return to_read(found[0]), to_read(found[1])
         return None
 
 

@@ -52,12 +52,12 @@ class Desk(Protocol):
         """Do what an operator asks for; called from any thread."""
 
 
-def action_text(action: Action, answer: Answer, stamp: float) -> str:
-    """Return the line of JSON that says what an operator did."""
+def action_text(action: Action, answer: Answer, stamp: float, unit: str = '') -> str:
+    """Return the line of JSON that says what an operator did; `unit` is that of the values."""
     return json.dumps({'stamp': round(stamp, 3), 'who': action.who, 'what': ' '.join(
         filter(None, (action.what, action.name))), 'old': _plain(action.old),
-        'new': _plain(action.value), 'accepted': answer.accepted, 'answer': answer.text},
-        allow_nan=False)
+        'new': _plain(action.value), **({'unit': unit} if unit else {}),
+        'accepted': answer.accepted, 'answer': answer.text}, allow_nan=False)
 
 
 def _plain(value: Any) -> Any:

@@ -20,6 +20,25 @@ from koopman_ros.parameters.wire import (
     system_of,
     Wiring,
 )
+from koopman_ros.units import conversion, display_unit
+
+
+def _shown_unit() -> Any:
+    return parameter('', 'unit in which the pages show it; empty for {shown}', read_only=True)
+
+
+@dataclass(frozen=True)
+class ShownState(StatePlaces):
+    """Where a state is on the wire, and how it is shown."""
+
+    shown_unit: str = _shown_unit()
+
+
+@dataclass(frozen=True)
+class ShownInput(InputPlaces):
+    """The same of an input."""
+
+    shown_unit: str = _shown_unit()
 
 
 @dataclass(frozen=True)
@@ -60,8 +79,14 @@ class PanelParameters:
         '', 'private key of the certificate, as a PEM file', read_only=True)
     span: float = parameter(
         28800.0, 'how much of the past the trends keep', 's', 600.0, 604800.0, read_only=True)
-    states: Mapping[str, StatePlaces] = per_signal(StatePlaces)
-    inputs: Mapping[str, InputPlaces] = per_signal(InputPlaces)
+    states: Mapping[str, ShownState] = per_signal(ShownState)
+    inputs: Mapping[str, ShownInput] = per_signal(ShownInput)
+
+    def read(self, signals: Signals) -> dict[str, str]:
+        """Return the units in which people read the signals, by name."""
+        shown: dict[str, ShownState | ShownInput] = {**self.states, **self.inputs}
+        return {name: shown[name].shown_unit or display_unit(unit)
+                for name, unit in signals.units.items()}
 
 
 def panel_signals(present: LiftedModel | None, given: Mapping[str, Any]) -> Signals:
@@ -88,6 +113,13 @@ def panel_table(present: LiftedModel | None = None,
         for name in ('controller', 'trainer', 'host'):
             if not getattr(values, name):
                 return f"{name} = '' must not be empty"
+        read = values.read(signals)
+        for name, unit in signals.units.items():
+            try:
+                conversion(unit, read[name])
+            except ValueError as error:
+                return (f'{name}.shown_unit = {read[name]!r} must be a unit of the dimension of '
+                        f'{unit}: {error}')
         return Wiring(signals, values.states, values.inputs).check()
 
     return ParameterTable(

@@ -194,7 +194,7 @@ class TrainerParameters:
         what = 'setpoint' if on_setpoints else 'experiment'
         stepped = {name: self.states[name] for name in signals.controlled
                    } if on_setpoints else self.inputs
-        units = {**signals.states, **signals.inputs}
+        units = signals.units
         return [f'{name}.{row} [{display_unit(units[name])}]' for name, row in [
             *((name, f'{what}_{end}') for name, item in stepped.items() for end in ('min', 'max')
               if getattr(item, f'{what}_min') == getattr(item, f'{what}_max')),

@@ -98,6 +98,11 @@ class Signals:
     inputs: Mapping[str, str]  #: units of the inputs, by name
     controlled: tuple[str, ...] = ()  #: names of the states that have a set-point
 
+    @property
+    def units(self) -> dict[str, str]:
+        """Units of all, by name."""
+        return {**self.states, **self.inputs}
+
     def __post_init__(self) -> None:
         for name in (*self.states, *self.inputs):
             if not _NAME.fullmatch(name):

@@ -14,6 +14,7 @@ from enum import Enum
 from functools import cached_property
 import math
 import time
+from types import MappingProxyType
 from typing import Any, TypeVar
 
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
@@ -369,6 +370,6 @@ def _as_python(value: Any) -> Any:
     return tuple(value)
 
 
-def words_of(signals: Signals) -> Words:
-    """Return the words for some signals."""
-    return Words(Displays({**signals.states, **signals.inputs}, _SHOWN))
+def words_of(signals: Signals, shown: Mapping[str, Display] = MappingProxyType({})) -> Words:
+    """Return the words for some signals; `shown` are those not written as they usually are."""
+    return Words(Displays(signals.units, {**_SHOWN, **shown}))

@@ -105,6 +105,8 @@ def opened(url: str, *headers: str) -> str:
     ({'tls_certificate': 'here.pem'}, 'cannot start: tls_certificate and tls_key belong together'),
     ({'tls_certificate': 'a.pem', 'tls_key': 'b.pem'},
      "cannot start: tls_certificate = 'a.pem' and tls_key = 'b.pem' cannot be used"),
+    ({'temperature.shown_unit': 'm'},
+     "cannot start: temperature.shown_unit = 'm' must be a unit of the dimension of K"),
     ({'controlled': '[nothing]'}, "cannot start: controlled = ['nothing'] must name"),
 ])
 def test_bad_start_is_said_in_one_line(
@@ -162,7 +164,8 @@ class Panel:
                 pass
 
         monkeypatch.setattr(PanelNode, '_serve', lambda _: Nothing())
-        rclpy.init()
+        # of the two one in the usual unit
+        rclpy.init(args=['--ros-args', '-p', 'coolant_temperature.shown_unit:=degF'])
         self.ros, self.node = ros, PanelNode()
         self.executor = SingleThreadedExecutor()
         self.executor.add_node(self.node)
@@ -217,15 +220,15 @@ def test_what_is_asked_for_reaches_the_loop_and_is_written_down(
     # nobody is in the way of an experiment
     desk.wait(lambda: not ros.node.count_publishers(reactor.SETPOINT))
     # manual mode and back
-    assert not desk.ask('manual', reactor.COOLANT_TEMPERATURE, 20.0).accepted
+    assert not desk.ask('manual', reactor.COOLANT_TEMPERATURE, 68.0).accepted
     assert desk.ask('automatic', CONTROLLER, False) == Answer(True, 'manual mode')
-    assert desk.ask('manual', reactor.COOLANT_TEMPERATURE, 20.0) == Answer(True, 'accepted')
-    desk.wait(lambda: node.snapshot.inputs[0].command == pytest.approx(20.0))
+    assert desk.ask('manual', reactor.COOLANT_TEMPERATURE, 68.0) == Answer(True, 'accepted')
+    desk.wait(lambda: node.snapshot.inputs[0].command == pytest.approx(68.0))
     assert node.snapshot.mode == 'manual'
     assert desk.ask('automatic', CONTROLLER, True).accepted
     # parameters
     assert desk.ask('parameters', CONTROLLER, {'coolant_temperature.max': 30.0}).accepted
-    desk.wait(lambda: node.snapshot.inputs[0].limits == (5.0, 30.0))
+    desk.wait(lambda: node.snapshot.inputs[0].limits == pytest.approx((41.0, 86.0)))
     refused = desk.ask('parameters', CONTROLLER, {'coolant_temperature.max': 4.0})
     assert 'coolant_temperature.min = 5.0 degC must be below' in refused.text
     # services of the trainer
@@ -235,7 +238,8 @@ def test_what_is_asked_for_reaches_the_loop_and_is_written_down(
     first, second = (json.loads(message.data) for message in actions[:2])
     assert (first['who'], first['what'], first['accepted']) == (
         'anna', 'setpoint temperature', False)
-    assert (second['new'], second['accepted'], second['answer']) == (45.0, True, 'accepted')
+    assert (second['new'], second['unit'], second['accepted'], second['answer']) == (
+        45.0, 'degC', True, 'accepted')
     desk.wait(lambda: {'setpoint', 'mode', 'parameter'} <= {
         mark.kind for mark in node.view.trends.marks(0.0, 1e12)})
 

@@ -33,7 +33,7 @@ from koopman_ros.panel.requests import (
     SETPOINT,
 )
 from koopman_ros.parameters.wire import Signals
-from koopman_ros.units import to_kelvin
+from koopman_ros.units import display_unit, to_kelvin
 
 REACTOR = Signals({'temperature': 'K'}, {'coolant_temperature': 'K'}, ('temperature',))
 TANKS = Signals({'level_1': 'm', 'level_2': 'm'}, {'pump_1': 'V', 'pump_2': 'V'},
@@ -46,8 +46,9 @@ def parameter(name: str, value: Any, **details: Any) -> ParameterView:
     return replace(ParameterView(name, value, '', '', '', -math.inf, math.inf, False), **details)
 
 
-def view(signals: Signals = REACTOR) -> PlantView:
-    return PlantView(signals, 3600.0, NOW)
+def view(signals: Signals = REACTOR, **read: str) -> PlantView:
+    usual = {name: display_unit(unit) for name, unit in signals.units.items()}
+    return PlantView(signals, {**usual, **read}, 3600.0, NOW)
 
 
 def measure(own: PlantView, celsius: float, seconds: float, wall: float | None = None) -> None:
@@ -82,6 +83,44 @@ def test_numbers_are_those_that_people_read() -> None:
     assert given.text(given.applied) == '–'
     # that of the measured state is none of an unmeasured one
     assert now.estimates == (('concentration', '0.88 mol/L'),)
+
+
+def test_a_signal_is_shown_in_the_unit_that_its_operators_read() -> None:
+    own = view(temperature='degF')
+    own.trained({'temperature': (to_kelvin(40.0), to_kelvin(60.0))}, {})
+    measure(own, 50.0, 1.0)
+    own.record('setpoint', {'accepted': True, 'signals': ['temperature'],
+                            'value': [to_kelvin(45.0)], 'reason': []}, NOW)
+    face = own.snapshot(NOW).states[0]
+    assert face.unit == '°F'
+    assert [face.measured, face.asked, *face.training] == pytest.approx(
+        [122.0, 113.0, 104.0, 140.0])
+    assert face.abnormal == ''
+    bare = view(temperature='degF')
+    bare.parameters('controller', {
+        name: parameter(name, value, unit='degC') for name, value in (
+            ('temperature.sensor_min', 0.0), ('temperature.sensor_max', 100.0))})
+    low, high = bare.snapshot(NOW).states[0].span
+    assert (low, high) == pytest.approx((32.0 - 18.0, 212.0 + 18.0))
+    # of the others nothing changes
+    assert bare.snapshot(NOW).inputs[0].unit == '°C'
+
+
+def test_a_file_that_another_training_replaced_offers_its_predecessor() -> None:
+    own = view()
+    own.parameters('controller', {'model': parameter('model', 'runs/new.safetensors')})
+    state = {'mode': {'name': 'AUTOMATIC'}}
+
+    def model(event: str, name: str, digest: str) -> str:
+        own.record(event, {'model': {'name': name, 'digest': digest}, 'state': state}, NOW)
+        return own.snapshot(NOW).previous_model
+
+    assert model('snapshot', 'runs/new.safetensors', 'a') == ''
+    # the same file once more
+    assert model('model', 'runs/new.safetensors', 'a') == ''
+    assert model('model', 'runs/new.safetensors', 'b') == 'runs/new.previous.safetensors'
+    own.parameters('controller', {'model': parameter('model', 'runs/new.previous.safetensors')})
+    assert own.snapshot(NOW).previous_model == 'runs/new.safetensors'
 
 
 def test_bars_hold_ranges_and_values() -> None:
