@@ -27,6 +27,11 @@ def config_directory() -> Path:
                             'again, or source the workspace it was built in')
 
 
+def predecessor(path: Path) -> Path:
+    """Return where the model is kept that a training replaced in a file."""
+    return path.with_suffix('.previous.safetensors')
+
+
 def model_path(model: str) -> Path:
     """Return the file of a model given by name, e.g. ``reactor_nz4``, or by path."""
     if model.endswith('.safetensors') or os.sep in model:

@@ -3,13 +3,7 @@
 
 """Lifted models at run time: observables, scaling, model file; in numpy alone."""
 
-from koopman_ros.lifting.artefact import (
-    load,
-    load_with_digest,
-    ModelFileError,
-    predecessor,
-    save,
-)
+from koopman_ros.lifting.artefact import load, load_with_digest, ModelFileError, save
 from koopman_ros.lifting.coordinates import Box, Coordinates, TrainingStates, TriedLoops
 from koopman_ros.lifting.input_terms import InputTerms
 from koopman_ros.lifting.model import LiftedModel, linearised_model, Provenance
@@ -17,5 +11,4 @@ from koopman_ros.lifting.observables import NetworkObservables, Observables, Pol
 
 __all__ = ['Box', 'Coordinates', 'InputTerms', 'LiftedModel', 'ModelFileError',
            'NetworkObservables', 'Observables', 'PolynomialObservables', 'Provenance',
-           'TrainingStates', 'TriedLoops', 'linearised_model', 'load', 'load_with_digest',
-           'predecessor', 'save']
+           'TrainingStates', 'TriedLoops', 'linearised_model', 'load', 'load_with_digest', 'save']

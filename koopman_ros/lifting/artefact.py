@@ -106,11 +106,6 @@ def save(model: LiftedModel, path: str | os.PathLike[str]) -> None:
     _write_atomically(Path(path), [len(text).to_bytes(8, 'little'), text, *chunks])
 
 
-def predecessor(path: Path) -> Path:
-    """Return where the model is kept that a training replaced in a file."""
-    return path.with_suffix('.previous.safetensors')
-
-
 def load(path: str | os.PathLike[str]) -> LiftedModel:
     """Read a model and check every field; raise ModelFileError with what is wrong and to do."""
     return load_with_digest(path)[0]

@@ -13,18 +13,17 @@ import re
 from types import MappingProxyType
 from typing import Any
 
-from koopman_ros.lifting import predecessor
 from koopman_ros.panel.alarms import Alarm, Alarms, Priority
 from koopman_ros.panel.requests import REFUSED
 from koopman_ros.panel.trends import Trends
 from koopman_ros.parameters.table import UNBOUNDED
 from koopman_ros.parameters.wire import Signals
 from koopman_ros.reasons import level_words
+from koopman_ros.resources import predecessor
 from koopman_ros.units import conversion, display_unit, printed
 
 OK, WARN, ERROR = 0, 1, 2  #: levels of a status
 PLANT, CONTROLLER, TRAINER = 'plant', 'controller', 'trainer'
-LEARNED = 'sdre'  #: the best level of a controller
 
 _SILENT = 3.5  # s without a status, of which there is one a second
 _PERIODS = 5.0  # usual times between two measurements without one
@@ -421,7 +420,7 @@ class PlantView:
             plant=self.plant, wall=now, time=self._time,
             mode='' if CONTROLLER in quiet else self._mode,
             level='' if CONTROLLER in quiet else level_words(level),
-            fallback=bool(level) and level not in (LEARNED, 'manual'),
+            fallback=bool(level) and level not in (self._best_level(), 'manual'),
             reason='' if reason == 'none' else reason,
             states=tuple(self._state(name, own, PLANT in quiet)
                          for name, own in self._states.items()),
@@ -461,6 +460,11 @@ class PlantView:
             name, printed(own.read), span, _decimals(span), own.training, abnormal, command,
             applied, found.get('manual', math.nan), limits, found.get('disturbance', math.nan),
             own.unit)
+
+    def _best_level(self) -> str:
+        """Return the first of the controller's levels."""
+        levels = self._parameters.get(CONTROLLER, {}).get('levels')
+        return str(levels.value[0]) if levels else 'sdre'
 
     def _bounds(self, name: str, own: _Signal, low: str, high: str) -> Range | None:
         given = self._parameters.get(CONTROLLER, {})

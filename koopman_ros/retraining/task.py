@@ -23,9 +23,10 @@ from koopman_ros.arrays import Array, brief
 from koopman_ros.bags import Account, loop_episodes, RecordedInput, RecordedState
 from koopman_ros.identification import Identified, identify, Stopped
 from koopman_ros.learning import Comparison, Contender, NoUsefulLift, Progress
-from koopman_ros.lifting import Box, Coordinates, LiftedModel, load, predecessor, save
+from koopman_ros.lifting import Box, Coordinates, LiftedModel, load, save
 from koopman_ros.model_classes import BEST, CLASSES, IDENTITY_LIFT
 from koopman_ros.plant_data import Episode, Plant
+from koopman_ros.resources import predecessor
 from koopman_ros.retraining.gate import decide, Decision, shortfalls, Thresholds
 from koopman_ros.retraining.lift import compare_classes
 from koopman_ros.units import NANOSECONDS, SECONDS_PER_TIME_UNIT
