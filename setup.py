@@ -50,6 +50,8 @@ setup(
         'demo': ['matplotlib', 'rich'],
         # the operator's panel, with all that its pages load
         'panel': ['nicegui>=3'],
+        # the predictive law's solver of quadratic programs
+        'mpc': ['daqp'],
         'train': ['torch==2.13.0', 'joblib', 'tqdm'],
         # what validation and benchmarks compare with
         'bench': ['casadi==3.8.2', 'control', 'nicegui>=3', 'playwright', 'psutil',
@@ -58,6 +60,7 @@ setup(
         'test': [
             'colcon-common-extensions',
             'control',
+            'daqp',
             'distributed',
             'hypothesis',
             'mypy',

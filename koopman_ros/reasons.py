@@ -71,6 +71,15 @@ class Code(Enum):
     PREDICTED_UNSTABLE = 'predicted_unstable', (
         'the closed loop is predicted unstable at a sample every {interval:.3g} s: raise the '
         'input weight, or measure more often')
+    PACKAGE_MISSING = 'package_missing', (
+        "it needs {package}, which is not installed: pip install 'koopman_ros[{extra}]'")
+    PLAN_NOT_SOLVED = 'plan_not_solved', (
+        'it finds no plan within the limits of the inputs ({flag})')
+    PLAN_MOVES = 'plan_moves', 'its plan still changes after {iterations} iterations'
+    PLAN_OUTSIDE = 'plan_outside', (
+        'its plan leaves the training data by {outside:.2g} half widths, {margin:g} are allowed')
+    TOO_LATE = 'too_late', (
+        'its plan took {seconds:.3g} s, {deadline:.3g} s are allowed')
     COMMAND_NOT_FINITE = 'command_not_finite', 'its command is not finite'
     SETPOINT_NOT_FINITE = 'setpoint_not_finite', (
         '{signal} set-point {value:value} is not finite: the old one is kept')
@@ -139,8 +148,8 @@ def reason(code: Code, **values: Value) -> Reason:
     return Reason(code, values)
 
 
-LEVELS = {'sdre': 'learned law', 'linear': 'linear law', 'hold': 'hold', 'safe': 'safe input',
-          'manual': 'manual'}
+LEVELS = {'mpc': 'predictive law', 'sdre': 'learned law', 'linear': 'linear law', 'hold': 'hold',
+          'safe': 'safe input', 'manual': 'manual'}
 
 
 def level_words(name: str) -> str:

@@ -238,7 +238,7 @@ class Controller:
         if level is None or state.setpoint.active is None:
             return state
         now = level.compute(state.setpoint.active, state.estimate, self.settings.limits, None,
-                            _spacing(state), state.target)[1]
+                            _spacing(state), state.target, last=state.command)[1]
         if now.u is None:
             return state
         return amended(state, law_input=now.u, law_memory=now.memory, transfer=shifted(
@@ -382,7 +382,7 @@ class Controller:
         if verdict.fault is not None:
             requested = Requested(HOLD, verdict.fault, passing=True)
         else:
-            requested = state.supervisor.allowed(settings, outside, self._ranges)
+            requested = self._usable(state.supervisor.allowed(settings, outside, self._ranges))
         target, result = None, None
         while True:
             supervisor = state.supervisor.at(settings, requested, time_ns)
@@ -394,7 +394,7 @@ class Controller:
             memory = state.law_memory if state.law == level.name else None
             target, result = level.compute(
                 state.setpoint.active, estimate, self.settings.limits, memory, spacing,
-                state.target)
+                state.target, self.settings.deadline, state.command)
             below = settings.order[settings.depth(level.name) + 1]
             if result.failure is not None:
                 why = reason(Code.LAW_FAILED, level=level.name, cause=result.failure)
@@ -403,7 +403,15 @@ class Controller:
                 why = reason(Code.LOST_HERE, level=level.name)
             else:
                 return supervisor, target, result
-            requested = Requested(below, why)
+            requested = Requested(below, why, result.passing)
+
+    def _usable(self, requested: Requested) -> Requested:
+        """Pass over levels whose laws can never act."""
+        settings = self.settings.supervisor
+        while (level := self.levels.get(requested.level)) and (why := level.unusable) is not None:
+            requested = Requested(settings.order[settings.depth(level.name) + 1], reason(
+                Code.LAW_FAILED, level=level.name, cause=why))
+        return requested
 
     def _supervised(self, state: State, supervisor: Supervisor, verdict: Verdict,
                     outside: float, time_ns: int) -> State:

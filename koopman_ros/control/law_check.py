@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from koopman_ros.arrays import Array
-from koopman_ros.control.laws import Law, LAWS, Linear, Tuning, Weights
+from koopman_ros.control.laws import Law, Linear, StateDependentRiccati, Tuning, Weights
 from koopman_ros.control.laws.base import steady_state_target, Target
 from koopman_ros.control.limits import finite, InputLimits
 from koopman_ros.estimation import Estimate
@@ -183,7 +183,7 @@ class LawCheck:
 
 
 def check_law(model: LiftedModel, rate: Rate, *, tuning: Tuning | None = None,
-              law: Callable[[LiftedModel, Tuning], Law] = LAWS['sdre'],
+              law: Callable[[LiftedModel, Tuning], Law] = StateDependentRiccati,
               limits: InputLimits | None = None, interval: float = 0.0, loops: int = LOOPS,
               watch: Callable[[float], bool] = lambda _: False) -> LawCheck | None:
     """

@@ -5,8 +5,9 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cached_property
+import math
 
 import numpy as np
 from numpy.typing import NDArray
@@ -21,7 +22,7 @@ from koopman_ros.control.target import partial_target
 from koopman_ros.estimation import check, Estimate, Estimator, ESTIMATORS, FrozenCheck, Verdict
 from koopman_ros.lifting import Coordinates, LiftedModel
 from koopman_ros.plugs import plug
-from koopman_ros.reasons import Code, reason
+from koopman_ros.reasons import Code, Reason, reason
 from koopman_ros.signals import Outputs
 from koopman_ros.units import NANOSECONDS
 
@@ -40,6 +41,12 @@ class Level:
     def model(self) -> LiftedModel:
         """The model of law and estimator."""
         return self.law.model
+
+    @property
+    def unusable(self) -> Reason | None:
+        """Why its law can never act, which it may say itself; None where it can."""
+        found: Reason | None = getattr(self.law, 'unusable', None)
+        return found
 
     @cached_property
     def controls_all(self) -> bool:
@@ -88,12 +95,14 @@ class Level:
             inputs.to_deviation(limits.lower), inputs.to_deviation(limits.upper), y)
 
     def compute(self, setpoint: Array, estimate: Estimate, limits: InputLimits, memory: object,
-                interval: float, start: Array | None) -> tuple[Target | None, LawResult]:
+                interval: float, start: Array | None, deadline: float = math.inf,
+                last: Array | None = None) -> tuple[Target | None, LawResult]:
         """Evaluate the law towards a target, see :meth:`target`, for an estimate of its model."""
         target = self.target(setpoint, estimate.w, limits, start)
         if target is None:
             return None, LawResult(None, reason(Code.NO_STEADY_STATE))
-        return target, self.law.compute(estimate, target, limits, memory, interval)
+        return target, self.law.compute(
+            estimate, target, limits, memory, interval, deadline, last)
 
     def lost(self, estimate: Estimate, target: Target | None) -> bool:
         """Tell whether the law was lost between such a state and target when it was checked."""
@@ -107,13 +116,16 @@ def levels_of(model: LiftedModel, settings: Settings) -> dict[str, Level]:
     :raises ValueError: for a law or an estimator that there is not.
     """
     weights = Weights.physical(model, settings.state_weight, settings.input_weight)
-    tuning = Tuning(weights, settings.max_gain, settings.max_residual)
+    lower, upper = (model.states.to_deviation(bound) if len(bound) else bound
+                    for bound in (settings.state_lower, settings.state_upper))
+    tuning = Tuning(weights, settings.max_gain, settings.max_residual, lower, upper)
     estimator = plug(settings.estimator or (
         'disturbance_observer' if settings.observer_bandwidth > 0.0 else 'measured_state'),
         'estimator', ESTIMATORS)
     levels = {}
     for level in settings.supervisor.levels:
-        law = plug(level.law, 'law', LAWS)(model, tuning)
+        law = plug(level.law, 'law', LAWS)(
+            model, replace(tuning, margin=level.margin))
         levels[level.law] = Level(level.law, law, estimator(
             law.model, settings.observer_bandwidth,
             settings.max_disturbance / model.inputs.scale),

@@ -42,6 +42,12 @@ class Settings:
     #: time constant in s in which the difference between two laws or models, or from manual mode,
     #: fades
     transfer_time: float = 30.0
+    #: (n_x,) lowest states, to `state_upper` (n_x,), that a law with a horizon plans for, in state
+    #: units; infinity for none, both empty where there are none at all
+    state_lower: Array = field(default_factory=lambda: np.zeros(0))
+    state_upper: Array = field(default_factory=lambda: np.zeros(0))
+    #: seconds that a law may take for a sample before the next one acts; infinity for any
+    deadline: float = np.inf
     max_gain: float = 1e3  #: bound on the norm of the Riccati gain in scaled coordinates
     max_residual: float = 1e-8  #: bound on the relative Riccati residual
     #: which laws act, and when
@@ -51,7 +57,7 @@ class Settings:
 
     def __post_init__(self) -> None:
         as_arrays(self, 'state_weight', 'input_weight', 'setpoint_ramp', 'max_disturbance',
-                  'input_tolerance', 'safe_input')
+                  'input_tolerance', 'safe_input', 'state_lower', 'state_upper')
         weights, costs = self.state_weight, self.input_weight
         for name, fits, words in (
                 ('state_weight', np.isfinite(weights) & (weights >= 0.0) & np.any(weights > 0.0),
@@ -60,9 +66,11 @@ class Settings:
                 ('safe_input', np.isfinite(self.safe_input), 'finite'),
                 ('setpoint_ramp', self.setpoint_ramp > 0.0, 'above 0'),
                 ('max_disturbance', self.max_disturbance > 0.0, 'above 0'),
-                ('input_tolerance', self.input_tolerance >= 0.0, 'at least 0')):
+                ('input_tolerance', self.input_tolerance >= 0.0, 'at least 0'),
+                ('deadline', self.deadline > 0.0, 'above 0')):
             if not np.all(fits):
-                raise ValueError(f'{name} must be {words}, got {getattr(self, name).tolist()}')
+                raise ValueError(f'{name} must be {words}, got '
+                                 f'{np.asarray(getattr(self, name)).tolist()}')
         for name in ('setpoint_filter', 'observer_bandwidth', 'transfer_time'):
             if not 0.0 <= getattr(self, name) < np.inf:
                 raise ValueError(f'{name} must be finite and at least 0, got '
@@ -101,5 +109,11 @@ class Settings:
                 (('input_weight', 'max_disturbance', 'input_tolerance', 'safe_input'), inputs)):
             for name in names:
                 per_signal(name, getattr(self, name), signals)
+        if len(self.state_lower) or len(self.state_upper):
+            for name in ('state_lower', 'state_upper'):
+                per_signal(name, getattr(self, name), states)
+            if not np.all(self.state_lower < self.state_upper):
+                raise ValueError('state limits must be lower < upper, got '
+                                 f'{self.state_lower.tolist()} and {self.state_upper.tolist()}')
         self.limits.check(inputs)
         self.sensor.check(outputs.names)

@@ -213,6 +213,12 @@ class TrainingStates:
         nearest = float(np.min(_distances(self.states, x, half_widths)))
         return max(0.0, nearest - self.fill_distance)
 
+    def distances(self, x: Array, half_widths: Array) -> Array:
+        """Return the distances (N,), as :meth:`distance`, of finite states (N, n_x)."""
+        apart = np.abs(self.states - x[:, None]) / half_widths
+        found: Array = np.maximum(np.min(np.max(apart, axis=2), axis=1) - self.fill_distance, 0.0)
+        return found
+
 
 @dataclass(frozen=True)
 class TriedLoops:

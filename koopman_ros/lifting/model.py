@@ -272,6 +272,17 @@ class LiftedModel:
         return max(outside, self.training_states.distance(
             states.to_deviation(x), 0.5 * (states.upper - states.lower) / states.scale))
 
+    def distances(self, x: Array) -> Array:
+        """Measure, as :meth:`distance`, for states (N, n_x) in scaled deviations: (N,)."""
+        states = self.states
+        half = 0.5 * (states.upper - states.lower) / states.scale
+        lower, upper = states.to_deviation(states.lower), states.to_deviation(states.upper)
+        outside = np.max(np.maximum(np.maximum(lower - x, x - upper) / half, 0.0), axis=1)
+        if self.training_states is not None:
+            outside = np.maximum(outside, self.training_states.distances(x, half))
+        found: Array = np.where(np.isfinite(x).all(axis=1), outside, np.inf)
+        return found
+
     def lift(self, x: Array) -> Array:
         """Evaluate z = N(x): (..., n_x) -> (..., n_z); ValueError for another size."""
         return self.observables.lift(self.states.array('state', x))
@@ -323,6 +334,29 @@ class LiftedModel:
     def pre_feedback_rate(self, x: Array) -> Array:
         """Evaluate B K x, what the pre-feedback adds to the drift: (..., n_x) -> same."""
         return x @ self.pre_feedback_slope.T
+
+    def drift_and_jacobian(self, x: Array) -> tuple[Array, Array]:
+        """
+        Evaluate the drift and its Jacobian at once; see :meth:`drift_jacobian`.
+
+        Where there is no read-out they are of the normal equations, which are quicker for many
+        states and lose digits where J_N is badly conditioned.
+
+        :raises numpy.linalg.LinAlgError: where it has not full rank.
+        """
+        if self.readout is not None:
+            features, slope = self.observables.features.lift_and_jacobian(x)
+            return features @ self.readout.T, self.readout @ slope
+        n = self.n_x
+        steps = _DIFFERENCE * np.concatenate((np.zeros((1, n)), np.eye(n), -np.eye(n)))
+        points = x + steps.reshape(-1, *(1,) * (x.ndim - 1), n)
+        z, J = self.observables.lift_and_jacobian(points)
+        transposed = J.swapaxes(-1, -2)
+        rate = np.linalg.solve(
+            transposed @ J, transposed @ (z @ self.A.T)[..., None])[..., 0]
+        rate -= self.pre_feedback_rate(points)
+        ahead, behind = rate[1:n + 1], rate[n + 1:]
+        return rate[0], np.moveaxis(ahead - behind, 0, -1) / (2.0 * _DIFFERENCE)
 
     def drift_jacobian(self, x: Array) -> Array:
         """Evaluate df/dx of the drift, (..., n_x) -> (..., n_x, n_x): of a read-out exactly."""

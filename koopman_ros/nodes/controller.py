@@ -40,7 +40,7 @@ from koopman_ros.parameters.wire import (
     system_of,
     Wiring,
 )
-from koopman_ros.reasons import level_words
+from koopman_ros.reasons import Code, level_words
 from koopman_ros.replay import records
 from koopman_ros.ros import controller_messages as messages
 from koopman_ros.ros import topics
@@ -285,6 +285,9 @@ class ControllerNode(ManagedNode):
         self._counts.late += report.measurement.arrival is Arrival.LATE
         self._counts.missed += report.measurement.missed
         self._counts.refused += report.measurement.arrival is Arrival.REJECTED
+        if report.reason is not None and (cause := report.reason.cause) is not None:
+            self._counts.late_plans += cause.code is Code.TOO_LATE
+            self._counts.unsolved_plans += cause.code in (Code.PLAN_NOT_SOLVED, Code.PLAN_MOVES)
         self._tell(report, sample.stamp)
 
     def _on_watch(self) -> None:

@@ -79,7 +79,8 @@ class _Bar:
         style(self._fill, f'width: {place(value)}')
         style(self._tick, f'left: {place(mark)}' if math.isfinite(mark) else 'display: none')
         for at, limit in enumerate(self._limits):
-            style(limit, 'display: none' if limits is None else f'left: {place(limits[at])}')
+            style(limit, f'left: {place(limits[at])}' if (
+                limits is not None and math.isfinite(limits[at])) else 'display: none')
         low, high = (face.text(end) for end in face.span)
         self._low.set_text(low)
         self._high.set_text(high)
@@ -182,7 +183,7 @@ def _state_card(frame: Frame, at: int, face: StateFace) -> None:
         own = now.states[at]
         head.show(own)
         measured.set_text(own.text(own.measured))
-        bar.show(own, own.measured, own.setpoint, None)
+        bar.show(own, own.measured, own.setpoint, own.limits)
         if face.controlled:
             setpoint.set_text(f'{own.text(own.setpoint)} {own.unit}')
             ramps = math.isfinite(own.asked) and own.text(own.asked) != own.text(own.setpoint)

@@ -80,6 +80,7 @@ class StateFace(Face):
     setpoint: float  #: that is tracked
     asked: float  #: that was asked for last and accepted
     predicted: float  #: what the model expected of the measurement
+    limits: Range | None  #: that the predictive law keeps
 
 
 @dataclass(frozen=True)
@@ -436,8 +437,9 @@ class PlantView:
         found = own.values
         measured = found.get('measured', math.nan)
         setpoint = found.get('active_setpoints', math.nan)
+        limits = self._bounds(name, own, 'min', 'max')
         span = _span([own.training, self._bounds(name, own, 'sensor_min', 'sensor_max')],
-                     [measured, setpoint])
+                     [measured, setpoint, *(limits or ())])
         abnormal = 'no measurement' if silent or math.isnan(measured) else ''
         if not abnormal and own.training and not own.training[0] <= measured <= own.training[1]:
             abnormal = 'above the trained range' if (
@@ -445,7 +447,7 @@ class PlantView:
         return StateFace(
             name, printed(own.read), span, _decimals(span), own.training, abnormal,
             name in self.signals.controlled, measured, setpoint,
-            found.get('asked', setpoint), found.get('predicted', math.nan))
+            found.get('asked', setpoint), found.get('predicted', math.nan), limits)
 
     def _input(self, name: str, own: _Signal) -> InputFace:
         found, limits = own.values, self._bounds(name, own, 'min', 'max')
@@ -469,11 +471,11 @@ class PlantView:
     def _bounds(self, name: str, own: _Signal, low: str, high: str) -> Range | None:
         given = self._parameters.get(CONTROLLER, {})
         if (lower := given.get(f'{name}.{low}')) and (upper := given.get(f'{name}.{high}')):
-            found = float(lower.value), float(upper.value)
-            if -UNBOUNDED < found[0] < found[1] < UNBOUNDED:
-                # parameters are in the usual unit
-                to_read = conversion(display_unit(own.unit), own.read)
-                return to_read(found[0]), to_read(found[1])
+            # parameters are in the usual unit
+            to_read = conversion(display_unit(own.unit), own.read)
+            found = (to_read(float(lower.value)) if lower.value > -UNBOUNDED else -math.inf,
+                     to_read(float(upper.value)) if upper.value < UNBOUNDED else math.inf)
+            return found if found[0] > -math.inf or found[1] < math.inf else None
         return None
 
 
@@ -486,7 +488,7 @@ def pen(kind: str, name: str) -> str:
 
 def _span(ranges: Sequence[Range | None], values: Sequence[float]) -> Range:
     """Return the range of a bar: the first that is known, a little wider, with all values."""
-    known = next(filter(None, ranges), None)
+    known = next((one for one in ranges if one and math.isfinite(one[1] - one[0])), None)
     finite = [value for value in values if math.isfinite(value)]
     low, high = known or (min(finite, default=0.0), max(finite, default=1.0))
     margin = 0.1 * (high - low) or max(1.0, 0.1 * abs(high))

@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 
 from koopman_ros.arrays import Array
-from koopman_ros.control import InputLimits, LevelSettings, Settings, SupervisorSettings
+from koopman_ros.control import InputLimits, LAWS, LevelSettings, Settings, SupervisorSettings
 from koopman_ros.estimation import SensorLimits
 from koopman_ros.lifting import LiftedModel
 from koopman_ros.parameters.table import (
@@ -36,6 +36,7 @@ from koopman_ros.parameters.wire import (
     system_of,
     Wiring,
 )
+from koopman_ros.plugs import plug
 from koopman_ros.units import conversion, display_unit
 
 
@@ -46,6 +47,10 @@ class StateParameters(StatePlaces):
     weight: float = parameter(1.0, 'cost of its squared error', '1/({unit})^2', 0.0, 1e12)
     setpoint_ramp: float = parameter(
         0.0, 'fastest change of the tracked set-point; 0 for a step', '{unit}/s', 0.0, 1e9)
+    min: float = signal_value(
+        -UNBOUNDED, 'lowest value that the predictive law plans for, and leaves where it must')
+    max: float = signal_value(
+        UNBOUNDED, 'highest value that the predictive law plans for, likewise')
     sensor_min: float = signal_value(
         -UNBOUNDED, 'lowest value that the sensor can measure')
     sensor_max: float = signal_value(
@@ -111,9 +116,15 @@ class ControllerParameters:
     transfer_time: float = parameter(
         0.0, 'time constant in which the inputs move to what another law, model, tuning or mode '
         'asks for', 's', 0.0, 86400.0)
+    levels: tuple[str, ...] = parameter(
+        ('sdre', 'linear'), 'laws, the best first: mpc plans ahead, within limits of the states; '
+        'sdre solves the Riccati equation; linear has one gain; module:class is one of your own')
+    law_deadline: float = parameter(
+        0.0, 'how long a law may take for a sample before the next one of the levels acts in its '
+        'place; 0 for any time', 's', 0.0, 3600.0)
     validity_margin: float = parameter(
-        0.1, 'how far outside the trained range the learned law acts, in halves of its width; '
-        'beyond, the linear law does', '', 0.0, 100.0)
+        0.1, 'how far outside the trained range laws act, in halves of its width, all but the '
+        'linear one; beyond, the linear law does', '', 0.0, 100.0)
     linear_margin: float = parameter(
         0.5, 'how far outside the trained range the linear law acts, in halves of its width; '
         'beyond, the safe inputs are commanded', '', 0.0, 100.0)
@@ -156,6 +167,8 @@ class ControllerParameters:
 
         states, inputs, own = self.states, self.inputs, signals.inputs
         controlled = {name: states[name] for name in signals.controlled}
+        lower, upper = (in_own_units(states, end, signals.states) for end in ('min', 'max'))
+        limited = any(part.min > -UNBOUNDED or part.max < UNBOUNDED for part in states.values())
         return Settings(
             controlled=() if tuple(states) == signals.controlled else signals.controlled,
             state_weight=column(states, 'weight'),
@@ -169,6 +182,9 @@ class ControllerParameters:
             input_tolerance=column(inputs, 'tolerance'),
             transfer_time=self.transfer_time,
             safe_input=in_own_units(inputs, 'safe', own),
+            state_lower=lower if limited else np.zeros(0),
+            state_upper=upper if limited else np.zeros(0),
+            deadline=_or_any(self.law_deadline),
             max_gain=self.max_gain,
             max_residual=10.0 ** -self.min_riccati_digits,
             sensor=SensorLimits(
@@ -178,8 +194,8 @@ class ControllerParameters:
                 jump=column(states, 'max_jump', _or_any),
                 frozen_timeout=_or_any(self.frozen_timeout)),
             supervisor=SupervisorSettings(
-                (LevelSettings('sdre', self.validity_margin),
-                 LevelSettings('linear', self.linear_margin)),
+                tuple(LevelSettings(law, self.linear_margin if law == 'linear'
+                                    else self.validity_margin) for law in self.levels),
                 self.hold_timeout, self.recovery_time))
 
 
@@ -192,6 +208,11 @@ def _cross_check(signals: Signals, values: ControllerParameters) -> str:
     if values.validity_margin > values.linear_margin:
         return (f'validity_margin = {values.validity_margin} must be at most linear_margin = '
                 f'{values.linear_margin}: change the other one first')
+    for law in values.levels:
+        try:
+            plug(law, 'law', LAWS)
+        except ValueError as error:
+            return f'levels = {list(values.levels)}: {error}'
     return Wiring(signals, values.states, values.inputs).check()
 
 

@@ -42,6 +42,8 @@ class Counts:
     late: int = 0
     missed: int = 0
     refused: int = 0
+    late_plans: int = 0
+    unsolved_plans: int = 0
     setpoint_received: bool = False
 
 
@@ -218,6 +220,8 @@ def _figures(now: Situation) -> dict[str, object]:
         'late measurements': now.counts.late,
         'missed measurements': now.counts.missed,
         'measurements rejected': now.counts.refused,
+        **({'late plans': now.counts.late_plans, 'unsolved plans': now.counts.unsolved_plans}
+           if 'mpc' in now.parameters.levels else {}),
         **{f'{what} parts of {name}': count for what, counts in (
             ('late', now.assembler.late), ('missing', now.assembler.missing),
             ('doubled', now.assembler.doubled)) for name, count in counts.items()},

@@ -132,7 +132,7 @@ class Constant:
     model: LiftedModel
     tuning: Tuning
 
-    def compute(self, estimate, target, limits, memory, interval, deadline=math.inf):
+    def compute(self, estimate, target, limits, memory, interval, deadline=math.inf, last=None):
         return LawResult(limits.within(
             self.model.inputs.to_physical(target.u - 4.0 * (estimate.x - target.x))))
 

@@ -429,7 +429,7 @@ class Proportional:
     model: LiftedModel
     tuning: Tuning
 
-    def compute(self, estimate, target, limits, memory, interval, deadline=math.inf):
+    def compute(self, estimate, target, limits, memory, interval, deadline=math.inf, last=None):
         u = target.u - 2.0 * self.model.input_inverse() @ (estimate.x - target.x)
         calls = (memory or 0) + 1
         return LawResult(limits.within(self.model.inputs.to_physical(u)), memory=calls)

@@ -131,6 +131,8 @@ def tune_and_swap(operator: Operator) -> None:
     for change, taken in (
             ({'coolant_temperature.weight': 0.3}, True),
             ({'coolant_temperature.weight': -1.0}, False),
+            ({'levels': ['none', 'linear']}, False),
+            ({'levels': ['mpc', 'sdre', 'linear'], 'temperature.max': 46.2}, True),
             ({'setpoint_filter': 15.0, 'disturbance_bandwidth': 0.05}, True),
             ({'model': str(operator.model), 'coolant_temperature.weight': 0.5}, True),
             ({'model': 'none'}, False)):
@@ -216,7 +218,7 @@ def test_every_recorded_command_of_a_day_that_was_not_easy_is_reproduced(bag: Pa
     assert {record.fields['result'] for record in written if record.event == 'measurement'} == {
         'accepted', 'rejected', 'repeated', 'late'}
     assert {record.fields['level'] for record in written if 'level' in record.fields} >= {
-        'sdre', 'hold', 'safe'}
+        'mpc', 'sdre', 'hold', 'safe'}
     assert found.found.models == ['reactor_nz4', str(bag.parent / 'own.safetensors'),
                                   'reactor_nz3']
     steps = np.abs(np.diff(found.recorded[:, 0]))

@@ -17,7 +17,8 @@ from koopman_ros.control.laws.riccati import (
 )
 from koopman_ros.lifting import LiftedModel
 
-LAWS: dict[str, Callable[[LiftedModel, Tuning], Law]] = {
+LAWS: dict[str, Callable[[LiftedModel, Tuning], Law] | str] = {
+    'mpc': 'koopman_ros.control.laws.receding_horizon:RecedingHorizon',
     'sdre': StateDependentRiccati, 'linear': Linear}
 
 __all__ = ['LAWS', 'Feedback', 'Figures', 'Form', 'Law', 'LawResult', 'Linear',

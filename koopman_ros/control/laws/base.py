@@ -3,7 +3,7 @@
 
 """What a law is: a plug that turns an estimate and a target into an input."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 import math
 from typing import Protocol, Self
 
@@ -107,6 +107,17 @@ class Tuning:
     weights: Weights  #: the cost
     max_gain: float = 1e6  #: bound on the spectral norm of a gain in scaled coordinates
     max_residual: float = 1e-8  #: bound on the relative residual of a Riccati equation
+    #: (n_x,) lowest states, to `state_upper` (n_x,), that a law with a horizon plans for, in
+    #: scaled deviations; infinity and nothing for none
+    state_lower: Array = field(default_factory=lambda: np.zeros(0))
+    state_upper: Array = field(default_factory=lambda: np.zeros(0))
+    #: distance outside the training data, in half widths of their box, up to which it plans
+    margin: float = math.inf
+
+    @property
+    def limits_states(self) -> bool:
+        """Whether there are limits of the states."""
+        return len(self.state_lower) > 0
 
 
 @dataclass(frozen=True)
@@ -132,6 +143,8 @@ class LawResult:
     figures: Figures = NO_FIGURES  #: of the solution, as far as there is one
     memory: object = None  #: what the law wants to be given at the next sample
     clipped: bool = False  #: whether the range cut it
+    #: whether a failure is of this sample alone, so that the law acts again at the next
+    passing: bool = False
 
 
 class Law(Protocol):
@@ -148,7 +161,8 @@ class Law(Protocol):
         """The model in whose terms estimate and target are, in the units of the lift."""
 
     def compute(self, estimate: Estimate, target: Target, limits: InputLimits, memory: object,
-                interval: float, deadline: float = math.inf) -> LawResult:
+                interval: float, deadline: float = math.inf, last: Array | None = None
+                ) -> LawResult:
         """
         Find the input for an estimate.
 
@@ -157,4 +171,5 @@ class Law(Protocol):
         :param memory: of the result before, None at first and after another law.
         :param interval: seconds between samples; 0 when they are not known.
         :param deadline: seconds that it may take; a law that iterates returns its best by then.
+        :param last: (n_u,) the command before, in input units; None at first.
         """

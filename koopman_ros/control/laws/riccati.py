@@ -191,7 +191,8 @@ class StateDependentRiccati:
     tuning: Tuning  #: weights and bounds
 
     def compute(self, estimate: Estimate, target: Target, limits: InputLimits, memory: object,
-                interval: float, deadline: float = math.inf) -> LawResult:
+                interval: float, deadline: float = math.inf, last: Array | None = None
+                ) -> LawResult:
         """Solve the equation at the estimate; see :class:`~koopman_ros.control.laws.base.Law`."""
         tuning = self.tuning
         try:
@@ -247,7 +248,8 @@ class Linear:
         return held_for
 
     def compute(self, estimate: Estimate, target: Target, limits: InputLimits, memory: object,
-                interval: float, deadline: float = math.inf) -> LawResult:
+                interval: float, deadline: float = math.inf, last: Array | None = None
+                ) -> LawResult:
         """Apply the gain; see :class:`~koopman_ros.control.laws.base.Law`."""
         try:
             found = self._at_nominal(interval)

@@ -1,0 +1,414 @@
+# SPDX-FileCopyrightText: 2026 The koopman_ros Authors
+# SPDX-License-Identifier: Apache-2.0
+
+"""Model predictive control on the model's drift, by real-time iteration."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property, lru_cache
+import importlib
+import math
+import time
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from koopman_ros.arrays import Array, frozen
+from koopman_ros.control.laws.base import Figures, LawResult, Target, Tuning
+from koopman_ros.control.laws.riccati import feedback, StateDependentRiccati
+from koopman_ros.control.limits import finite, InputLimits
+from koopman_ros.estimation import Estimate
+from koopman_ros.lifting import LiftedModel
+from koopman_ros.reasons import Code, Reason, reason
+from koopman_ros.solvers import RiccatiStatus, runge_kutta_step, solve_riccati
+
+PACKAGE = 'daqp'  # the solver of quadratic programs
+
+_INTERVALS = 30  # of the horizon, at most, each with one input that is held
+_FEWEST = 3  # likewise, at least
+# The horizon is so many time constants of the closed loop, unless the plant is unstable: over more
+# than this many of its time constants the effect of an input is too large to compute with.
+_CLOSED_LOOP, _UNSTABLE = 6.0, 8.0
+# A step of the integration is no longer than this share of the drift's fastest time constant; the
+# costs need an even number of them.
+_STEP, _MOST_STEPS = 0.7, 8
+# A plan is solved again until it changes by less than this, in scaled inputs.
+_STILL, _MOST_ITERATIONS = 1e-4, 12
+# What still changes by more after the last iteration has not converged.
+_MOVING = 0.05
+_UNLIMITED = 1e30  # what the solver takes for infinite
+_SOLVED = (1, 2)  # its flags; in the second case a soft limit is violated
+_SOFT = 8  # its mark of a limit that may be violated
+# Half widths of the training box beyond which a course that is rolled out is worth nothing.
+_ASTRAY = 2.0
+
+
+@dataclass(frozen=True)
+class _Course:
+    """How the plant goes from nodes (N, n_x) under inputs (N, n_u), each held for an interval."""
+
+    #: (N, m + 1, n_x) the state from the beginning of each interval to its end
+    states: Array
+    by_state: Array  #: (N, m + 1, n_x, n_x) its derivative by the node
+    by_input: Array  #: (N, m + 1, n_x, n_u) and by the input
+
+
+@dataclass(frozen=True)
+class RecedingHorizon:
+    """
+    Plan the inputs of a while ahead at each sample, and give the first.
+
+    The least of the integral of e' Q e + v' R v over the horizon, and of what the sampled
+    regulator costs from its end on, is found on the model's drift under the estimated disturbance:
+    the course of the plan before is linearised, its deviation solves a quadratic program, and so
+    on until the plan stands still. Range and rate of the inputs are limits; those of the states
+    may be violated where they must be.
+
+    Multiple shooting by Runge-Kutta steps with their derivatives, condensed to the inputs; see
+    M. Diehl, H. G. Bock, J. P. Schloeder, "A real-time iteration scheme for nonlinear optimization
+    in optimal feedback control", SIAM J. Control Optim. 43 (2005).
+    """
+
+    model: LiftedModel  #: the lift
+    tuning: Tuning  #: weights and bounds
+
+    @cached_property
+    def _solve(self) -> Any:
+        """The solver; None where it is not installed."""
+        try:
+            return importlib.import_module(PACKAGE).solve
+        except ImportError:
+            return None
+
+    @property
+    def unusable(self) -> Reason | None:
+        """Why it never gives an input: its solver is not installed."""
+        return None if self._solve is not None else reason(
+            Code.PACKAGE_MISSING, package=PACKAGE, extra='mpc')
+
+    @cached_property
+    def _riccati(self) -> StateDependentRiccati:
+        return StateDependentRiccati(self.model, self.tuning)
+
+    def compute(self, estimate: Estimate, target: Target, limits: InputLimits, memory: object,
+                interval: float, deadline: float = math.inf, last: Array | None = None
+                ) -> LawResult:
+        """
+        Find the input for an estimate; see :class:`~koopman_ros.control.laws.base.Law`.
+
+        At the first sample, of which nobody knows for how long its input will be held, it is that
+        of the Riccati equation.
+        """
+        if self.unusable is not None:
+            return LawResult(None, self.unusable)
+        if not interval > 0.0:
+            return self._riccati.compute(estimate, target, limits, None, interval)
+        began = time.perf_counter()
+        try:
+            problem = _Problem(self, estimate, target, limits, interval, last)
+            u, x = problem.begin(memory)
+            for iteration in range(1, _MOST_ITERATIONS + 1):
+                found = problem.improve(u, x)
+                if isinstance(found, Reason):
+                    return LawResult(None, found, passing=True)
+                change, u, x = found
+                spent = time.perf_counter() - began
+                if iteration == 1 and spent > deadline:
+                    return LawResult(None, reason(
+                        Code.TOO_LATE, seconds=spent, deadline=deadline), passing=True)
+                if change <= _STILL or spent * (iteration + 1) / iteration > deadline:
+                    break
+        except np.linalg.LinAlgError as error:
+            return LawResult(None, reason(Code.SINGULAR, matrix=str(error)))
+        if not change <= _MOVING:
+            return LawResult(None, reason(Code.PLAN_MOVES, iterations=iteration), passing=True)
+        # from outside, the way back is no reason
+        outside = float(np.max(self.model.distances(x[1:])))
+        allowed = max(self.tuning.margin, float(self.model.distances(x[:1])[0]))
+        if outside > allowed:
+            return LawResult(None, reason(
+                Code.PLAN_OUTSIDE, outside=outside, margin=self.tuning.margin))
+        wanted = self.model.inputs.to_physical(u[0])
+        if not finite(wanted):
+            return LawResult(None, reason(Code.COMMAND_NOT_FINITE))
+        within = limits.within(wanted)
+        room = np.minimum(within - limits.lower, limits.upper - within)
+        return LawResult(within, None, Figures('planned'), (u, x, problem.lengths),
+                         clipped=bool((room <= _EDGE * self.model.inputs.scale).any()))
+
+    def lengths(self, interval: float) -> Array:
+        """
+        Return the intervals (N,) of the horizon, the first that of a sample, in time units.
+
+        The others grow by a factor until the horizon is reached.
+
+        :param interval: between samples, in the model's time unit.
+        """
+        return self._lengths(interval)
+
+    @cached_property
+    def _lengths(self) -> Any:
+        @lru_cache(maxsize=8)
+        def of(interval: float) -> Array:
+            A, found = self._at_nominal(interval)
+            horizon = _INTERVALS * interval
+            closed = np.linalg.eigvals(A - self.model.B @ found.K).real
+            if found.status is RiccatiStatus.SOLVED and np.all(closed < 0.0):
+                horizon = _CLOSED_LOOP / float(np.min(-closed))
+            growing = float(np.max(np.linalg.eigvals(A).real))
+            if growing > 0.0:
+                horizon = min(horizon, _UNSTABLE / growing)
+            count = int(min(max(math.ceil(horizon / interval), _FEWEST), _INTERVALS))
+            return frozen(interval * _growth(count, horizon / interval) ** np.arange(count),
+                          'intervals', (count,))
+
+        return of
+
+    def _at_nominal(self, interval: float) -> Any:
+        A = self.model.drift_jacobian(np.zeros(self.model.n_x))
+        weights = self.tuning.weights
+        return A, solve_riccati(A, self.model.B, weights.Q, weights.R, interval=interval,
+                                max_gain=self.tuning.max_gain,
+                                max_residual=self.tuning.max_residual)
+
+    @cached_property
+    def fastest(self) -> float:
+        """Rate of the fastest mode of the drift at the nominal point, in 1/time unit."""
+        return float(np.max(np.abs(np.linalg.eigvals(
+            self.model.drift_jacobian(np.zeros(self.model.n_x))))))
+
+
+_EDGE = 1e-9  # of an input's scale; so near a limit it is reached
+
+
+def _growth(count: int, total: float) -> float:
+    """Return g >= 1 with 1 + g + ... + g^(count - 1) = total; 1 where that is less than count."""
+    if total <= count or count < 2:
+        return 1.0
+    low, high = 1.0, 2.0
+    while (high ** count - 1.0) / (high - 1.0) < total:
+        high *= 2.0
+    for _ in range(60):
+        middle = 0.5 * (low + high)
+        if (middle ** count - 1.0) / (middle - 1.0) < total:
+            low = middle
+        else:
+            high = middle
+    return high
+
+
+class _Problem:
+    """The quadratic programs of one sample; all in scaled deviations and the model's time unit."""
+
+    def __init__(self, law: RecedingHorizon, estimate: Estimate, target: Target,
+                 limits: InputLimits, interval: float, last: Array | None) -> None:
+        model, tuning = law.model, law.tuning
+        self._law, self._model, self._target = law, model, target
+        self._x, self._w = estimate.x, estimate.w
+        self._sample = interval / model.seconds_per_time_unit
+        self.lengths = law.lengths(self._sample)
+        rate = max(law.fastest, *(float(np.max(np.abs(np.linalg.eigvals(
+            model.drift_jacobian(x))))) for x in (estimate.x, target.x)))
+        if not math.isfinite(rate):
+            raise np.linalg.LinAlgError('the drift has no slope here')
+        # an even number, for Simpson's rule
+        self._steps = 2 * int(min(max(math.ceil(
+            0.5 * self.lengths[-1] * rate / _STEP), 1), _MOST_STEPS // 2))
+        self._Q, self._R = tuning.weights.Q, tuning.weights.R
+        self._terminal = self._cost_to_go()
+        self._lower = np.maximum(model.inputs.to_deviation(limits.lower), -_UNLIMITED)
+        self._upper = np.minimum(model.inputs.to_deviation(limits.upper), _UNLIMITED)
+        # what an input may change from one interval to the next, (N, n_u): the first since the
+        # last command
+        reach = limits.rate * model.seconds_per_time_unit / model.inputs.scale
+        before = np.concatenate(([self._sample], self.lengths[:-1]))
+        self._change = before[:, None] * reach
+        self._last = None if last is None else model.inputs.to_deviation(last)
+
+    def _cost_to_go(self) -> Array:
+        """Return P (n_x, n_x), what is left at the end of the horizon by the sampled regulator."""
+        model, target, tuning = self._model, self._target, self._law.tuning
+        A = model.drift_jacobian(target.x) + model.forcing_jacobian(target.x, target.u)
+        found = solve_riccati(A, model.input_matrix(target.x), self._Q, self._R,
+                              interval=self._sample, max_gain=tuning.max_gain,
+                              max_residual=tuning.max_residual)
+        if found.status is RiccatiStatus.SOLVED:
+            return found.P
+        # where the regulator has none, the horizon alone counts
+        return self._Q * float(self.lengths[-1])
+
+    # Where to begin.
+
+    def begin(self, memory: object) -> tuple[Array, Array]:
+        """Return inputs (N, n_u) and nodes (N + 1, n_x): of the plan before, or of a feedback."""
+        match memory:
+            case (np.ndarray() as u, np.ndarray() as x, np.ndarray() as lengths) if (
+                    len(u) == len(lengths) == len(x) - 1):
+                return self._shifted(u, x, lengths)
+        return self._rolled_out()
+
+    def _shifted(self, u: Array, x: Array, lengths: Array) -> tuple[Array, Array]:
+        old = np.concatenate(([0.0], np.cumsum(lengths)))
+        new = self._sample + np.concatenate(([0.0], np.cumsum(self.lengths)))
+        # the input that held in the middle of each interval
+        held = np.searchsorted(old[1:], 0.5 * (new[1:] + new[:-1]))
+        inputs = u[np.minimum(held, len(u) - 1)]
+        nodes = np.stack([np.interp(new, old, x[:, i]) for i in range(x.shape[1])], axis=1)
+        nodes[0] = self._x
+        return inputs, nodes
+
+    def _rolled_out(self) -> tuple[Array, Array]:
+        """Follow the model under the law of the Riccati equation, limited."""
+        model, target, tuning = self._model, self._target, self._law.tuning
+        x, last, inputs, nodes = self._x, self._last, [], [self._x]
+        for length, change in zip(self.lengths.tolist(), self._change, strict=True):
+            found = feedback(model, x, target, tuning.weights, interval=length,
+                             max_gain=tuning.max_gain, max_residual=tuning.max_residual)
+            u = found.u if found.solved and finite(found.u) else target.u
+            u = np.minimum(np.maximum(u, self._lower), self._upper)
+            if last is not None:
+                u = np.minimum(np.maximum(u, last - change), last + change)
+            last, rate = u, model.rate_under(u, self._w)
+            for _ in range(self._steps):
+                x = runge_kutta_step(rate, x, length / self._steps)
+            inputs.append(u)
+            nodes.append(x)
+            if not (finite(x) and float(model.distances(x[None])[0]) < _ASTRAY):
+                # the straight way is as good a guess
+                share = np.linspace(0.0, 1.0, len(self.lengths) + 1)[:, None]
+                return (np.tile(target.u, (len(self.lengths), 1)),
+                        self._x + share * (target.x - self._x))
+        return np.array(inputs), np.array(nodes)
+
+    # The course, its quadratic program, and the next one.
+
+    def improve(self, u: Array, x: Array) -> tuple[float, Array, Array] | Reason:
+        """
+        Solve the program about a course of inputs (N, n_u) and nodes (N + 1, n_x).
+
+        :return: by how much an input changes at most, inputs and nodes; or why there are none.
+        """
+        course = self._course(u, x[:-1])
+        if not np.isfinite(course.by_state).all() or not np.isfinite(course.states).all():
+            return reason(Code.PLAN_NOT_SOLVED, flag='its course is not finite')
+        nodes, by_inputs = _condensed(course, x, self._x)
+        H, f = self._cost(course, x, u, nodes, by_inputs)
+        rows, lower, upper, sense = self._limits(u, nodes, by_inputs)
+        v, _, flag, _ = self._law._solve(H, f, rows, upper, lower, sense)
+        v = np.asarray(v, dtype=np.float64)
+        if flag not in _SOLVED or not np.isfinite(v).all():
+            return reason(Code.PLAN_NOT_SOLVED, flag=f'the solver says {flag}')
+        return (float(np.max(np.abs(v))), u + v.reshape(u.shape),
+                nodes + (by_inputs @ v))
+
+    def _course(self, u: Array, nodes: Array) -> _Course:
+        model, n, m = self._model, self._model.n_x, self._steps
+        h = (self.lengths / m)[:, None]
+        x, S = nodes, np.zeros((len(u), n, n + model.n_u))
+        S[:, :, :n] = np.eye(n)
+        forced = np.zeros_like(S)
+
+        def rates(x: Array, S: Array) -> tuple[Array, Array]:
+            f, J = model.drift_and_jacobian(x)
+            forced[:, :, n:] = model.input_matrix(x)
+            if model.input_terms is not None:
+                J = J + model.forcing_jacobian(x, u)
+            return f + model.forcing(x, u) + self._w, J @ S + forced
+
+        states, slopes = [x], [S]
+        H = h[..., None]
+        for _ in range(m):
+            k1, s1 = rates(x, S)
+            k2, s2 = rates(x + 0.5 * h * k1, S + 0.5 * H * s1)
+            k3, s3 = rates(x + 0.5 * h * k2, S + 0.5 * H * s2)
+            k4, s4 = rates(x + h * k3, S + H * s3)
+            x = x + h / 6.0 * (k1 + 2.0 * k2 + 2.0 * k3 + k4)
+            S = S + H / 6.0 * (s1 + 2.0 * s2 + 2.0 * s3 + s4)
+            states.append(x)
+            slopes.append(S)
+        every = np.stack(slopes, axis=1)
+        return _Course(np.stack(states, axis=1), every[..., :n], every[..., n:])
+
+    def _cost(self, course: _Course, x: Array, u: Array, nodes: Array, by_inputs: Array
+              ) -> tuple[Array, Array]:
+        """Return H and f of the cost v' H v / 2 + f' v of a change v (N n_u,) of the inputs."""
+        (N, points), n_u = course.states.shape[:2], u.shape[1]
+        # of each point, as if the inputs stayed, and how it changes with all of them
+        error = course.states + (course.by_state @ (nodes[:-1] - x[:-1])[:, None, :, None])[
+            ..., 0] - self._target.x
+        slope = course.by_state @ by_inputs[:-1, None]
+        for k in range(N):
+            slope[k, :, :, k * n_u:(k + 1) * n_u] += course.by_input[k]
+        simpson = np.full(points, 2.0)
+        simpson[1::2] = 4.0
+        simpson[[0, -1]] = 1.0
+        share = (self.lengths[:, None] * simpson / (3.0 * (points - 1)))[..., None]
+        G, weighted = slope.reshape(-1, N * n_u), (share * (error @ self._Q)).reshape(-1)
+        GQ = (share[..., None] * (self._Q @ slope)).reshape(-1, N * n_u)
+        end, last = by_inputs[-1], nodes[-1] - self._target.x
+        H = G.T @ GQ + end.T @ self._terminal @ end
+        f = G.T @ weighted + end.T @ (self._terminal @ last)
+        deviation = u - self._target.u
+        H += np.kron(np.diag(self.lengths), self._R)
+        f += (self.lengths[:, None] * (deviation @ self._R)).reshape(-1)
+        return np.ascontiguousarray(0.5 * (H + H.T)), f
+
+    def _limits(self, u: Array, nodes: Array, by_inputs: Array
+                ) -> tuple[Array, Array, Array, NDArray[np.int32]]:
+        """Return rows A with lower <= (v, A v) <= upper, and what of that is soft."""
+        N, n_u = u.shape
+        last = self._last
+        lower, upper = np.tile(self._lower, (N, 1)), np.tile(self._upper, (N, 1))
+        if last is not None:
+            # what a range that was tightened since has left outside comes back at its rate
+            reach = np.cumsum(self._change, axis=0)
+            lower = np.minimum(lower, last + reach)
+            upper = np.maximum(upper, last - reach)
+        rows, low, high = [], [(lower - u).ravel()], [(upper - u).ravel()]
+        limited = np.isfinite(self._change[0])
+        if limited.any():
+            D = np.eye(N * n_u) - np.eye(N * n_u, k=-n_u)
+            before = np.concatenate((u[:1] if last is None else last[None], u[:-1]))
+            step = (u - before).ravel()
+            chosen = np.tile(limited, N)
+            if last is None:
+                # at first nothing was commanded
+                chosen[:n_u] = False
+            change = self._change.ravel()
+            rows.append(D[chosen])
+            low.append((-change - step)[chosen])
+            high.append((change - step)[chosen])
+        sense = [np.zeros(sum(map(len, low)), dtype=np.int32)]
+        tuning = self._law.tuning
+        for i, (least, most) in enumerate(zip(
+                tuning.state_lower.tolist(), tuning.state_upper.tolist(), strict=True)
+                if tuning.limits_states else ()):
+            if math.isfinite(least) or math.isfinite(most):
+                rows.append(by_inputs[1:, i])
+                low.append(np.maximum(least - nodes[1:, i], -_UNLIMITED))
+                high.append(np.minimum(most - nodes[1:, i], _UNLIMITED))
+                sense.append(np.full(N, _SOFT, dtype=np.int32))
+        matrix = np.concatenate(rows) if rows else np.zeros((0, N * n_u))
+        return (np.ascontiguousarray(matrix), np.concatenate(low), np.concatenate(high),
+                np.concatenate(sense))
+
+
+def _condensed(course: _Course, x: Array, start: Array) -> tuple[Array, Array]:
+    """
+    Return the nodes (N + 1, n_x) of the linearised course, and their derivative by the inputs.
+
+    The latter is (N + 1, n_x, N n_u). The nodes are those from `start` on, without the gaps that
+    the course has at its own nodes x (N + 1, n_x).
+    """
+    N, _, n, n_u = course.by_input.shape
+    nodes, by_inputs = np.empty((N + 1, n)), np.zeros((N + 1, n, N * n_u))
+    nodes[0] = start
+    ends, A, B = course.states[:, -1], course.by_state[:, -1], course.by_input[:, -1]
+    for k in range(N):
+        nodes[k + 1] = ends[k] + A[k].dot(nodes[k] - x[k])
+        width = k * n_u
+        by_inputs[k + 1, :, :width] = A[k].dot(by_inputs[k, :, :width])
+        by_inputs[k + 1, :, width:width + n_u] = B[k]
+    return nodes, by_inputs
