@@ -106,6 +106,28 @@ def test_a_signal_is_shown_in_the_unit_that_its_operators_read() -> None:
     assert bare.snapshot(NOW).inputs[0].unit == '°C'
 
 
+def test_a_limit_of_a_state_is_drawn_also_where_there_is_only_one() -> None:
+    own = view(coolant_temperature='degC')
+    own.parameters('controller', {name: parameter(name, value, unit='degC') for name, value in (
+        ('temperature.min', -1e9), ('temperature.max', 60.0),
+        ('coolant_temperature.min', 5.0), ('coolant_temperature.max', 40.0))})
+    measure(own, 50.0, 1.0)
+    now = own.snapshot(NOW)
+    assert now.states[0].limits == (-math.inf, 60.0)
+    assert now.inputs[0].limits == (5.0, 40.0)
+    # and the bar is long enough for it
+    assert now.states[0].span[1] >= 60.0
+
+
+def test_the_first_of_the_levels_is_no_fallback() -> None:
+    for levels, fallback in ((('mpc', 'sdre'), True), (('sdre', 'linear'), False), (None, False)):
+        own = view()
+        if levels:
+            own.parameters('controller', {'levels': parameter('levels', levels)})
+        own.record('measurement', {'mode': 'automatic', 'level': 'sdre'}, NOW)
+        assert own.snapshot(NOW).fallback is fallback
+
+
 def test_a_file_that_another_training_replaced_offers_its_predecessor() -> None:
     own = view()
     own.parameters('controller', {'model': parameter('model', 'runs/new.safetensors')})

@@ -31,13 +31,14 @@ _FEWEST = 3  # likewise, at least
 # The horizon is so many time constants of the closed loop, unless the plant is unstable: over more
 # than this many of its time constants the effect of an input is too large to compute with.
 _CLOSED_LOOP, _UNSTABLE = 6.0, 8.0
-# A step of the integration is no longer than this share of the drift's fastest time constant; the
-# costs need an even number of them.
-_STEP, _MOST_STEPS = 0.7, 8
+# A step of the integration is no longer than this share of the drift's fastest time constant.
+# Intervals grow to so many steps at the nominal point, and are never given more than the last.
+_STEP, _STEPS, _MOST_STEPS = 0.7, 6, 32
 # A plan is solved again until it changes by less than this, in scaled inputs.
 _STILL, _MOST_ITERATIONS = 1e-4, 12
 # What still changes by more after the last iteration has not converged.
 _MOVING = 0.05
+_LOOK = 3  # every third node, and the last, is held to the training data
 _UNLIMITED = 1e30  # what the solver takes for infinite
 _SOLVED = (1, 2)  # its flags; in the second case a soft limit is violated
 _SOFT = 8  # its mark of a limit that may be violated
@@ -49,10 +50,10 @@ _ASTRAY = 2.0
 class _Course:
     """How the plant goes from nodes (N, n_x) under inputs (N, n_u), each held for an interval."""
 
-    #: (N, m + 1, n_x) the state from the beginning of each interval to its end
+    #: (N, 2 m + 1, n_x) the state from the beginning of each interval to its end, in m steps
     states: Array
-    by_state: Array  #: (N, m + 1, n_x, n_x) its derivative by the node
-    by_input: Array  #: (N, m + 1, n_x, n_u) and by the input
+    by_state: Array  #: (N, 2 m + 1, n_x, n_x) its derivative by the node
+    by_input: Array  #: (N, 2 m + 1, n_x, n_u) and by the input
 
 
 @dataclass(frozen=True)
@@ -125,9 +126,9 @@ class RecedingHorizon:
         if not change <= _MOVING:
             return LawResult(None, reason(Code.PLAN_MOVES, iterations=iteration), passing=True)
         # from outside, the way back is no reason
-        outside = float(np.max(self.model.distances(x[1:])))
-        allowed = max(self.tuning.margin, float(self.model.distances(x[:1])[0]))
-        if outside > allowed:
+        distances = self.model.distances(np.concatenate((x[:-1:_LOOK], x[-1:])))
+        outside = float(np.max(distances[1:]))
+        if outside > max(self.tuning.margin, float(distances[0])):
             return LawResult(None, reason(
                 Code.PLAN_OUTSIDE, outside=outside, margin=self.tuning.margin))
         wanted = self.model.inputs.to_physical(u[0])
@@ -161,8 +162,10 @@ class RecedingHorizon:
             if growing > 0.0:
                 horizon = min(horizon, _UNSTABLE / growing)
             count = int(min(max(math.ceil(horizon / interval), _FEWEST), _INTERVALS))
-            return frozen(interval * _growth(count, horizon / interval) ** np.arange(count),
-                          'intervals', (count,))
+            lengths = interval * _growth(count, horizon / interval) ** np.arange(count)
+            # where there are faster modes than those that make it long, it ends sooner
+            longest = max(interval, _STEPS * _STEP / self.fastest if self.fastest else math.inf)
+            return frozen(np.minimum(lengths, longest), 'intervals', (count,))
 
         return of
 
@@ -209,15 +212,13 @@ class _Problem:
         self._x, self._w = estimate.x, estimate.w
         self._sample = interval / model.seconds_per_time_unit
         self.lengths = law.lengths(self._sample)
-        rate = max(law.fastest, *(float(np.max(np.abs(np.linalg.eigvals(
-            model.drift_jacobian(x))))) for x in (estimate.x, target.x)))
-        if not math.isfinite(rate):
+        slopes = model.drift_and_jacobian(np.array((estimate.x, target.x)))[1]
+        if not np.isfinite(slopes).all():
             raise np.linalg.LinAlgError('the drift has no slope here')
-        # an even number, for Simpson's rule
-        self._steps = 2 * int(min(max(math.ceil(
-            0.5 * self.lengths[-1] * rate / _STEP), 1), _MOST_STEPS // 2))
+        rate = max(law.fastest, float(np.max(np.abs(np.linalg.eigvals(slopes)))))
+        self._steps = min(max(math.ceil(self.lengths[-1] * rate / _STEP), 1), _MOST_STEPS)
         self._Q, self._R = tuning.weights.Q, tuning.weights.R
-        self._terminal = self._cost_to_go()
+        self._terminal = self._cost_to_go(slopes[1])
         self._lower = np.maximum(model.inputs.to_deviation(limits.lower), -_UNLIMITED)
         self._upper = np.minimum(model.inputs.to_deviation(limits.upper), _UNLIMITED)
         # what an input may change from one interval to the next, (N, n_u): the first since the
@@ -227,10 +228,14 @@ class _Problem:
         self._change = before[:, None] * reach
         self._last = None if last is None else model.inputs.to_deviation(last)
 
-    def _cost_to_go(self) -> Array:
-        """Return P (n_x, n_x), what is left at the end of the horizon by the sampled regulator."""
+    def _cost_to_go(self, slope: Array) -> Array:
+        """
+        Return P (n_x, n_x), what the sampled regulator costs from the end of the horizon on.
+
+        :param slope: (n_x, n_x) of the drift at the target.
+        """
         model, target, tuning = self._model, self._target, self._law.tuning
-        A = model.drift_jacobian(target.x) + model.forcing_jacobian(target.x, target.u)
+        A = slope + model.forcing_jacobian(target.x, target.u)
         found = solve_riccati(A, model.input_matrix(target.x), self._Q, self._R,
                               interval=self._sample, max_gain=tuning.max_gain,
                               max_residual=tuning.max_residual)
@@ -324,10 +329,12 @@ class _Problem:
             k2, s2 = rates(x + 0.5 * h * k1, S + 0.5 * H * s1)
             k3, s3 = rates(x + 0.5 * h * k2, S + 0.5 * H * s2)
             k4, s4 = rates(x + h * k3, S + H * s3)
-            x = x + h / 6.0 * (k1 + 2.0 * k2 + 2.0 * k3 + k4)
-            S = S + H / 6.0 * (s1 + 2.0 * s2 + 2.0 * s3 + s4)
-            states.append(x)
-            slopes.append(S)
+            ahead = x + h / 6.0 * (k1 + 2.0 * k2 + 2.0 * k3 + k4)
+            turned = S + H / 6.0 * (s1 + 2.0 * s2 + 2.0 * s3 + s4)
+            # the middle by the rates at both ends (Hermite), for Simpson's rule
+            states += [0.5 * (x + ahead) + 0.125 * h * (k1 - k4), ahead]
+            slopes += [0.5 * (S + turned) + 0.125 * H * (s1 - s4), turned]
+            x, S = ahead, turned
         every = np.stack(slopes, axis=1)
         return _Course(np.stack(states, axis=1), every[..., :n], every[..., n:])
 
