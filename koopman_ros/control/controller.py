@@ -238,7 +238,7 @@ class Controller:
         if level is None or state.setpoint.active is None:
             return state
         now = level.compute(state.setpoint.active, state.estimate, self.settings.limits, None,
-                            _spacing(state), state.target, last=state.command)[1]
+                            _spacing(state), state.target, last=_own_share(state))[1]
         if now.u is None:
             return state
         return amended(state, law_input=now.u, law_memory=now.memory, transfer=shifted(
@@ -394,7 +394,7 @@ class Controller:
             memory = state.law_memory if state.law == level.name else None
             target, result = level.compute(
                 state.setpoint.active, estimate, self.settings.limits, memory, spacing,
-                state.target, self.settings.deadline, state.command)
+                state.target, self.settings.deadline, _own_share(state))
             below = settings.order[settings.depth(level.name) + 1]
             if result.failure is not None:
                 why = reason(Code.LAW_FAILED, level=level.name, cause=result.failure)
@@ -506,6 +506,13 @@ def _passed(state: State, time_ns: int, elapsed: float) -> tuple[State, float, i
 def _spacing(state: State) -> float:
     """Return the usual seconds between measurements; 0 before the second."""
     return 0.0 if math.isinf(state.interval) else state.interval
+
+
+def _own_share(state: State) -> Array | None:
+    """Return the last command (n_u,) without what a change of law still added; None for none."""
+    if state.command is None or state.transfer is None:
+        return state.command
+    return state.command - state.transfer.offset
 
 
 def _afresh(state: State) -> State:

@@ -171,5 +171,6 @@ class Law(Protocol):
         :param memory: of the result before, None at first and after another law.
         :param interval: seconds between samples; 0 when they are not known.
         :param deadline: seconds that it may take; a law that iterates returns its best by then.
-        :param last: (n_u,) the command before, in input units; None at first.
+        :param last: (n_u,) the command before, in input units, as far as it was the law's; None
+            at first.
         """
