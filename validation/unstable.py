@@ -18,6 +18,7 @@ from koopman_ros.arrays import Array
 from koopman_ros.control import (
     at,
     Controller,
+    Initialisation,
     InputLimits,
     LevelSettings,
     SetpointRequest,
@@ -25,6 +26,7 @@ from koopman_ros.control import (
     simulate,
     SupervisorSettings,
 )
+from koopman_ros.control.simulate import Simulation
 from koopman_ros.learning import compare, fit, Growth, NeuralDrift, NoUsefulLift
 from koopman_ros.learning.training import Recipe
 from koopman_ros.lifting import LiftedModel
@@ -54,6 +56,11 @@ LIFT = Growth(2, identity=False, hidden_first=32, decoder=0, max_iterations=1000
               pre_feedback=0.05, other_whitenings=(10.0,))
 RECIPES: dict[str, Recipe] = {'neural drift': NeuralDrift((16,)), 'free lift': LIFT}
 STARTS = 2
+UNLIMITED = InputLimits(np.array([200.0]), np.array([400.0]), np.full(1, np.inf))
+# With these the laws are compared, also from where they may lose the plant.
+LIMITS = InputLimits(np.array([278.15]), np.array([305.15]), np.ones(1))
+LIMITED_SAMPLES, LIMITED_STARTS, MARGIN = 400, 40, 0.3
+SADDLE_TEMPERATURE, REACHED = 350.0, 1.0  # K
 # From one temperature to another, in K.
 STEPS = ((350.0, 345.0), (350.0, 355.0), (340.0, 350.0), (365.0, 350.0))
 PERIOD, SAMPLES = 1.0, 240  # of a loop, in s
@@ -80,17 +87,56 @@ def cost_ratio(model: LiftedModel, begin: float, end: float) -> float:
     weights, one = np.array([0.0, 1.0]), np.ones(1)
     task = Task(SYSTEM, x0, x_ref, u_ref, weights, one, PERIOD / SYSTEM.seconds_per_time_unit,
                 SAMPLES)
-    unlimited = InputLimits(np.array([200.0]), np.array([400.0]), np.full(1, np.inf))
-    settings = Settings.for_model(
-        model, state_weight=weights, input_weight=one, limits=unlimited,
-        controlled=('temperature',),
-        supervisor=SupervisorSettings((LevelSettings('sdre', 0.1),)))
-    loop = simulate(
-        Controller(model, settings), Process(SYSTEM, 0, x0, steady(begin)[1]),
-        [at(0.0, SetpointRequest(0, x_ref[1:]))], period=PERIOD, duration=PERIOD * SAMPLES)
+    loop = run(model, ('sdre',), UNLIMITED, 0.1, begin, end, x0, SAMPLES)
     if set(loop.levels) != {'sdre'}:
         return float('inf')
     return cost_along(task, loop.states, loop.commands[:-1]) / optimum(task).cost
+
+
+def run(model: LiftedModel, laws: tuple[str, ...], limits: InputLimits, margin: float,
+        begin: float, end: float, x0: Array, samples: int) -> Simulation:
+    """
+    Run laws on the true reactor, sampled each second, from a state to a temperature.
+
+    :param laws: best first.
+    :param margin: half widths of the training box by which they may leave that.
+    :param begin: in K; its coolant is on before.
+    :param x0: (2,) in mol/L and K.
+    """
+    settings = Settings.for_model(
+        model, state_weight=np.array([0.0, 1.0]), input_weight=np.ones(1), limits=limits,
+        controlled=('temperature',), transfer_time=0.0,
+        supervisor=SupervisorSettings(tuple(LevelSettings(law, margin) for law in laws)))
+    before = steady(begin)[1]
+    return simulate(
+        Controller(model, settings), Process(SYSTEM, 0, x0, before),
+        [at(0.0, Initialisation(before)), at(0.0, SetpointRequest(0, steady(end)[0][1:]))],
+        period=PERIOD, duration=PERIOD * samples)
+
+
+def limited(model: LiftedModel, laws: tuple[str, ...]) -> list[str]:
+    """
+    Return what laws cost in each step under limits, and from how many starts they lose the plant.
+
+    The cost is in K^2 min, infinite where the set-point is not reached. Lost is what leaves their
+    margin, so that the safe input acts, or has not arrived in the end.
+    """
+    costs = []
+    for begin, end in STEPS:
+        x0, (x_ref, u_ref) = steady(begin)[0], steady(end)
+        task = Task(SYSTEM, x0, x_ref, u_ref, np.array([0.0, 1.0]), np.ones(1),
+                    PERIOD / SYSTEM.seconds_per_time_unit, LIMITED_SAMPLES)
+        loop = run(model, laws, LIMITS, MARGIN, begin, end, x0, LIMITED_SAMPLES)
+        costs.append(cost_along(task, loop.states, loop.commands[:-1])
+                     if abs(loop.states[-1, 1] - end) < REACHED else float('inf'))
+    rng, lost = np.random.default_rng(0), 0
+    for _ in range(LIMITED_STARTS):
+        begin = float(rng.uniform(335.0, 370.0))
+        x0 = np.array([steady(begin)[0][0] + rng.uniform(-0.2, 0.2), begin])
+        loop = run(model, laws, LIMITS, MARGIN, begin, SADDLE_TEMPERATURE, x0, LIMITED_SAMPLES)
+        lost += 'safe' in loop.levels or not (
+            abs(loop.states[-1, 1] - SADDLE_TEMPERATURE) < REACHED)
+    return [laws[0], *(f'{cost:.2f}' for cost in costs), f'{lost} of {LIMITED_STARTS}']
 
 
 def steady(temperature: float) -> tuple[Array, Array]:
@@ -108,7 +154,7 @@ def main(args: list[str] | None = None) -> int:
     options = parser.parse_args(args)
     if options.seeds < 1:
         parser.error(f'--seeds is {options.seeds}, must be at least 1')
-    rows, refused = [], False
+    rows, refused, first = [], False, None
     for seed in range(options.seeds):
         begin = time.process_time()
         try:
@@ -118,6 +164,7 @@ def main(args: list[str] | None = None) -> int:
             refused = True
             continue
         seconds = time.process_time() - begin
+        first = first or model
         found, by_rates = (fit(one, fresh.x, fresh.dxdt, fresh.u)
                            for one in (model, replace(model, readout=None)))
         costs = [f'{cost_ratio(model, *step):.4f}' for step in STEPS]
@@ -127,6 +174,12 @@ def main(args: list[str] | None = None) -> int:
     steps = [f'{begin:.0f} to {end:.0f} K' for begin, end in STEPS]
     head = ['seed', 'rw', 'rx', 'cond', 'rx by the rates of z', *steps, 's']
     print(table(head, rows, range(len(head))))
+    if first is not None:
+        print(f'\nThe first of them, coolant from {LIMITS.lower[0]:g} to {LIMITS.upper[0]:g} K at '
+              f'{LIMITS.rate[0]:g} K/s: cost in K^2 min, and starts that were lost\n')
+        head = ['law', *steps, 'lost']
+        print(table(head, [limited(first, laws) for laws in (('mpc', 'sdre'), ('sdre',))],
+                    range(1, len(head))))
     return int(refused)
 
 

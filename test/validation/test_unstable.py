@@ -34,8 +34,11 @@ def test_a_row_of_a_lift_that_was_learned_in_a_hurry(monkeypatch, capsys):
     monkeypatch.setattr(unstable, 'RECIPES', {
         'neural drift': NeuralDrift((12,), max_iterations=150),
         'free lift': replace(unstable.LIFT, hidden_first=24, max_iterations=250)})
+    monkeypatch.setattr(unstable, 'LIMITED_STARTS', 1)
+    monkeypatch.setattr(unstable, 'LIMITED_SAMPLES', 150)
     assert unstable.main(['--seeds', '1']) == 0
-    row = capsys.readouterr().out.splitlines()[2].strip('| ').split(' | ')
+    lines = capsys.readouterr().out.splitlines()
+    row = lines[2].strip('| ').split(' | ')
     seed, rw, rx, cond, by_rates, cost, _ = map(float, row)
     assert seed == 0
     assert rw < 1e-4
@@ -43,6 +46,10 @@ def test_a_row_of_a_lift_that_was_learned_in_a_hurry(monkeypatch, capsys):
     assert cond < 5.0
     # the law weighs the coolant itself: else it would be far from the least cost
     assert 1.0 - 1e-3 < cost < 1.01
+    laws = {law: float(cost) for law, cost, _ in (
+        line.strip('| ').split(' | ') for line in lines[-2:])}
+    # what is planned costs no more than what is cut
+    assert laws['mpc'] <= 1.005 * laws['sdre'] < 50.0
 
 
 def test_a_seed_without_a_lift_is_told(monkeypatch, capsys):
