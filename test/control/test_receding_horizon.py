@@ -298,6 +298,16 @@ def test_what_it_remembers_comes_back_from_a_record_bit_for_bit():
     assert again[0] == again[1]
 
 
+def test_what_a_model_of_another_size_remembers_is_not_gone_by():
+    law = RecedingHorizon(OSCILLATOR[1], Tuning(Weights(Q, R)))
+    other = (np.zeros((5, 1)), np.zeros((6, 3)), np.full(5, PERIOD))
+    own = nowhere(law, [0.7, -0.4]).u.tobytes()
+    for memory in (other, (1, 2), 'text', {'plan': None}):
+        target = steady_state_target(law.model, np.zeros(2))
+        estimate = Estimate(np.array([0.7, -0.4]), np.zeros(2))
+        assert law.compute(estimate, target, ANY, memory, PERIOD).u.tobytes() == own
+
+
 def test_the_horizon_grows_from_the_sample_and_ends_in_time():
     law = RecedingHorizon(UNSTABLE[1], Tuning(Weights(Q, R)))
     for interval in (0.01, 0.1, 1.0, 10.0):

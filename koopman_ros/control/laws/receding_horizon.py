@@ -39,6 +39,7 @@ _STILL, _MOST_ITERATIONS = 1e-4, 12
 # What still changes by more after the last iteration has not converged.
 _MOVING = 0.05
 _LOOK = 3  # every third node, and the last, is held to the training data
+_EDGE = 1e-9  # of an input's scale; so near a limit it is reached
 _UNLIMITED = 1e30  # what the solver takes for infinite
 _SOLVED = (1, 2)  # its flags; in the second case a soft limit is violated
 _SOFT = 8  # its mark of a limit that may be violated
@@ -153,7 +154,10 @@ class RecedingHorizon:
     def _lengths(self) -> Any:
         @lru_cache(maxsize=8)
         def of(interval: float) -> Array:
-            A, found = self._at_nominal(interval)
+            A, weights = self._slope, self.tuning.weights
+            found = solve_riccati(A, self.model.B, weights.Q, weights.R, interval=interval,
+                                  max_gain=self.tuning.max_gain,
+                                  max_residual=self.tuning.max_residual)
             horizon = _INTERVALS * interval
             closed = np.linalg.eigvals(A - self.model.B @ found.K).real
             if found.status is RiccatiStatus.SOLVED and np.all(closed < 0.0):
@@ -169,26 +173,21 @@ class RecedingHorizon:
 
         return of
 
-    def _at_nominal(self, interval: float) -> Any:
-        A = self.model.drift_jacobian(np.zeros(self.model.n_x))
-        weights = self.tuning.weights
-        return A, solve_riccati(A, self.model.B, weights.Q, weights.R, interval=interval,
-                                max_gain=self.tuning.max_gain,
-                                max_residual=self.tuning.max_residual)
+    @cached_property
+    def _slope(self) -> Array:
+        """The slope of the drift (n_x, n_x) at the nominal point."""
+        return self.model.drift_jacobian(np.zeros(self.model.n_x))
 
     @cached_property
     def fastest(self) -> float:
         """Rate of the fastest mode of the drift at the nominal point, in 1/time unit."""
-        return float(np.max(np.abs(np.linalg.eigvals(
-            self.model.drift_jacobian(np.zeros(self.model.n_x))))))
-
-
-_EDGE = 1e-9  # of an input's scale; so near a limit it is reached
+        return float(np.max(np.abs(np.linalg.eigvals(self._slope))))
 
 
 def _growth(count: int, total: float) -> float:
     """Return g >= 1 with 1 + g + ... + g^(count - 1) = total; 1 where that is less than count."""
-    if total <= count or count < 2:
+    # beside 1 nothing is left of g - 1
+    if total <= count * (1.0 + 1e-9) or count < 2:
         return 1.0
     low, high = 1.0, 2.0
     while (high ** count - 1.0) / (high - 1.0) < total:
@@ -249,8 +248,10 @@ class _Problem:
     def begin(self, memory: object) -> tuple[Array, Array]:
         """Return inputs (N, n_u) and nodes (N + 1, n_x): of the plan before, or of a feedback."""
         match memory:
+            # not of a model of another size
             case (np.ndarray() as u, np.ndarray() as x, np.ndarray() as lengths) if (
-                    len(u) == len(lengths) == len(x) - 1):
+                    u.shape == (len(lengths), self._model.n_u)
+                    and x.shape == (len(lengths) + 1, self._model.n_x)):
                 return self._shifted(u, x, lengths)
         return self._rolled_out()
 
