@@ -3,8 +3,10 @@
 
 """The panel beside a loop: whom it serves, what it passes on, and that the loop needs it not."""
 
+from collections import Counter
 from collections.abc import Callable, Iterator
 from concurrent.futures import Future
+import contextlib
 import gc
 import json
 import math
@@ -12,10 +14,17 @@ from pathlib import Path
 import re
 import signal
 import socket
+import ssl
+import subprocess
 import threading
 from typing import Any
-from urllib.error import HTTPError
-from urllib.request import build_opener, HTTPRedirectHandler, Request
+from urllib.error import HTTPError, URLError
+from urllib.request import (
+    build_opener,
+    HTTPRedirectHandler,
+    HTTPSHandler,
+    Request,
+)
 
 from diagnostic_msgs.msg import DiagnosticStatus
 import pytest
@@ -49,11 +58,13 @@ class _Stay(HTTPRedirectHandler):
         return None
 
 
-def get(url: str, data: bytes | None = None, **headers: str) -> tuple[int, str, Any]:
+def get(url: str, data: bytes | None = None, trusting: ssl.SSLContext | None = None,
+        **headers: str) -> tuple[int, str, Any]:
     """Return status, text and headers of a page, or of what it is refused with."""
     request = Request(url, data, {name.replace('_', '-'): text for name, text in headers.items()})
     try:
-        with build_opener(_Stay).open(request, timeout=TIMEOUT) as answer:
+        opener = build_opener(_Stay, HTTPSHandler(context=trusting))
+        with opener.open(request, timeout=TIMEOUT) as answer:
             return answer.status, answer.read().decode(), answer.headers
     except HTTPError as error:
         return error.code, error.read().decode(), error.headers
@@ -148,6 +159,33 @@ def test_users_log_in_and_wrong_passwords_wait(ros: Harness, tmp_path: Path) -> 
     answers = [get(f'{url}/login', b'name=anna&password=wrong', **kind)[0] for _ in range(6)]
     assert answers[-1] == 429
     assert set(answers) == {401, 429}
+
+
+def test_with_a_certificate_nothing_is_said_in_clear(ros: Harness, tmp_path: Path) -> None:
+    users, key, certificate = (tmp_path / name for name in ('users', 'key.pem', 'panel.pem'))
+    write_user(users, 'anna', Role.OPERATOR, hashed('correct horse', Cost(2, 8, 1)))
+    subprocess.run(
+        ['openssl', 'req', '-x509', '-newkey', 'rsa:2048', '-nodes', '-days', '2', '-subj',
+         '/CN=127.0.0.1', '-addext', 'subjectAltName=IP:127.0.0.1', '-keyout', str(key), '-out',
+         str(certificate)], check=True, capture_output=True)
+    process = ros.start('panel', {'port': 0, 'host': '0.0.0.0', 'users': users,
+                                  'tls_certificate': certificate, 'tls_key': key})
+    found = ros.wait_until(lambda: re.search(r'at https://0\.0\.0\.0:(\d+)', process.output()))
+    url = f'https://127.0.0.1:{found[1]}'
+    # only who knows its certificate takes it for the panel
+    trusting = ssl.create_default_context(cafile=str(certificate))
+    status, _, headers = get(
+        f'{url}/login', b'name=anna&password=correct+horse', trusting, Origin=url,
+        Content_Type='application/x-www-form-urlencoded')
+    assert (status, headers['location']) == (303, '/')
+    assert 'Secure' in headers['set-cookie'].split('; ')
+    with pytest.raises(URLError, match='certificate verify failed'):
+        get(f'{url}/login')
+    # a page of the same name without encryption is another origin
+    assert get(f'{url}/login', None, trusting, Origin=url.replace('https', 'http'))[0] == 403
+    with socket.create_connection(('127.0.0.1', int(found[1])), TIMEOUT) as stream:
+        stream.sendall(b'GET /login HTTP/1.1\r\nHost: 127.0.0.1\r\n\r\n')
+        assert b'login' not in stream.recv(4096)
 
 
 # What it passes on.
@@ -273,6 +311,40 @@ def test_what_was_before_is_read_from_the_bag_that_is_recorded(
 
 
 # The loop without it.
+
+
+def test_the_loop_goes_on_while_the_panel_is_flooded(ros: Harness) -> None:
+    process = ros.start('panel', {'port': 0})
+    ros.start('controller')
+    ros.start('plant', {'lockstep': True, 'lockstep_subscribers': 3, 'speed': 0.0})
+    commands: list[Temperature] = ros.listen(Temperature, reactor.COOLANT_SETPOINT)
+    ros.listen(Temperature, reactor.TEMPERATURE)
+    url = address(ros, process)
+    host, _, port = url.removeprefix('http://').partition(':')
+    over, answered = threading.Event(), Counter[int]()
+
+    def ask() -> None:
+        while not over.is_set():
+            answered[get(url)[0]] += 1
+
+    with contextlib.ExitStack() as stack:
+        # who never says what they want, whatever they are let in for
+        for _ in range(200):
+            idle = stack.enter_context(socket.create_connection((host, int(port)), TIMEOUT))
+            idle.sendall(b'GET / HTTP/1.1\r\nHost: ')
+        askers = [threading.Thread(target=ask) for _ in range(4)]
+        for asker in askers:
+            asker.start()
+        try:
+            ros.wait_until(lambda: len(commands) > 600 and answered.total() > 40)
+        finally:
+            over.set()
+            for asker in askers:
+                asker.join()
+    assert set(answered) == {200}
+    status = ros.wait_for_status(
+        'controller: control', lambda s: s.message.startswith('automatic'))
+    assert value(status, 'missed measurements') == '0'
 
 
 def test_the_loop_goes_on_when_the_panel_is_killed_or_stands_still(ros: Harness) -> None:
