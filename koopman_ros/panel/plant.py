@@ -16,7 +16,6 @@ from typing import Any
 from koopman_ros.panel.alarms import Alarm, Alarms, Priority
 from koopman_ros.panel.requests import REFUSED
 from koopman_ros.panel.trends import Trends
-from koopman_ros.parameters.table import UNBOUNDED
 from koopman_ros.parameters.wire import Signals
 from koopman_ros.reasons import level_words
 from koopman_ros.resources import predecessor
@@ -471,10 +470,10 @@ class PlantView:
     def _bounds(self, name: str, own: _Signal, low: str, high: str) -> Range | None:
         given = self._parameters.get(CONTROLLER, {})
         if (lower := given.get(f'{name}.{low}')) and (upper := given.get(f'{name}.{high}')):
-            # parameters are in the usual unit
+            # parameters are in the usual unit, and at the end of their range stand for none
             to_read = conversion(display_unit(own.unit), own.read)
-            found = (to_read(float(lower.value)) if lower.value > -UNBOUNDED else -math.inf,
-                     to_read(float(upper.value)) if upper.value < UNBOUNDED else math.inf)
+            found = (to_read(float(lower.value)) if lower.value > lower.lower else -math.inf,
+                     to_read(float(upper.value)) if upper.value < upper.upper else math.inf)
             return found if found[0] > -math.inf or found[1] < math.inf else None
         return None
 

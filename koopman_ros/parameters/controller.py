@@ -19,6 +19,7 @@ from koopman_ros.lifting import LiftedModel
 from koopman_ros.parameters.table import (
     ConfigurationError,
     in_own_units,
+    lowest,
     parameter,
     ParameterTable,
     per_signal,
@@ -168,7 +169,10 @@ class ControllerParameters:
         states, inputs, own = self.states, self.inputs, signals.inputs
         controlled = {name: states[name] for name in signals.controlled}
         lower, upper = (in_own_units(states, end, signals.states) for end in ('min', 'max'))
-        limited = any(part.min > -UNBOUNDED or part.max < UNBOUNDED for part in states.values())
+        for i, (name, unit) in enumerate(signals.states.items()):
+            lower[i] = lower[i] if states[name].min > lowest(display_unit(unit)) else -math.inf
+            upper[i] = upper[i] if states[name].max < UNBOUNDED else math.inf
+        limited = bool(np.any(np.isfinite([lower, upper])))
         return Settings(
             controlled=() if tuple(states) == signals.controlled else signals.controlled,
             state_weight=column(states, 'weight'),

@@ -266,9 +266,14 @@ def _row(name: str, item: Field[Any], unit: str, defaults: Mapping[str, Any]) ->
         # a file may say 1 for 1.0, and has lists
         default = type(item.default)(default)
     row = Specification(name, default, **{**item.metadata, 'unit': own})
+    return replace(row, default=max(default, lowest(own)), minimum=max(
+        row.minimum, lowest(own))) if own == 'degC' and math.isfinite(row.minimum) else row
+
+
+def lowest(unit: str) -> float:
+    """Return what a value in a unit cannot be below; as a limit it stands for none."""
     # there is nothing below absolute zero
-    return replace(row, default=max(default, -ZERO_CELSIUS), minimum=max(
-        row.minimum, -ZERO_CELSIUS)) if own == 'degC' and math.isfinite(row.minimum) else row
+    return -ZERO_CELSIUS if unit == 'degC' else -UNBOUNDED
 
 
 def as_yaml(value: Any) -> str:

@@ -207,8 +207,14 @@ class Panel:
         self.ros, self.node = ros, PanelNode()
         self.executor = SingleThreadedExecutor()
         self.executor.add_node(self.node)
-        self.thread = threading.Thread(target=self.executor.spin)
+        self.over = threading.Event()
+        self.thread = threading.Thread(target=self.spin)
         self.thread.start()
+
+    def spin(self) -> None:
+        # an executor that is shut down while it waits may fail
+        while not self.over.is_set():
+            self.executor.spin_once(0.1)
 
     def wait(self, condition: Callable[[], Any]) -> Any:
         return self.ros.wait_until(condition)
@@ -219,8 +225,9 @@ class Panel:
         return future.result()
 
     def close(self) -> None:
-        self.executor.shutdown()
+        self.over.set()
         self.thread.join()
+        self.executor.shutdown()
         self.node.complete()
         self.node.destroy_node()
         rclpy.shutdown()

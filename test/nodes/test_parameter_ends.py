@@ -58,8 +58,9 @@ TRAINING = ('model_class', 'model_coordinates', 'input_matrix_degree', 'training
 PAIRS = (('validity_margin', 'linear_margin'),
          ('experiment_shortest_hold', 'experiment_longest_hold'),
          *((f'{name}min', f'{name}max') for name in (
-             'coolant_temperature.', 'temperature.sensor_', 'coolant_temperature.experiment_',
-             'temperature.experiment_', 'temperature.setpoint_')))
+             'coolant_temperature.', 'temperature.', 'temperature.sensor_',
+             'coolant_temperature.experiment_', 'temperature.experiment_',
+             'temperature.setpoint_')))
 
 
 def ends(row: Specification) -> list[Any]:
