@@ -208,9 +208,10 @@ def _lines(first: bool, own: _Pen, now: Snapshot, happened: Sequence[Mark]) -> d
     face = _present(own.face, now)
     if own.kind in ('measured', 'commands'):
         ranges: list[tuple[str, Range | None]] = [('trained', face.training),
-                                                  ('limit', getattr(face, 'limits', None))]
+                                                  ('limit', face.limits)]
         found += [{'yAxis': end, 'name': what} for what, bounds in ranges if bounds
-                  for end in bounds]
+                  # the chart fails at one that is not finite
+                  for end in bounds if math.isfinite(end)]
     if first:
         found += [{'xAxis': 1e3 * mark.time, 'name': mark.kind, 'lineStyle': {
             'type': 'solid', 'color': _ABNORMAL if mark.kind == 'alarm' else _QUIET}}
