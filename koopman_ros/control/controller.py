@@ -395,7 +395,7 @@ class Controller:
             target, result = level.compute(
                 state.setpoint.active, estimate, self.settings.limits, memory, spacing,
                 state.target, self.settings.deadline, _own_share(state))
-            below = settings.order[settings.depth(level.name) + 1]
+            below = settings.below(level.name)
             if result.failure is not None:
                 why = reason(Code.LAW_FAILED, level=level.name, cause=result.failure)
             # a poor law is better than none
@@ -409,7 +409,7 @@ class Controller:
         """Pass over levels whose laws can never act."""
         settings = self.settings.supervisor
         while (level := self.levels.get(requested.level)) and (why := level.unusable) is not None:
-            requested = Requested(settings.order[settings.depth(level.name) + 1], reason(
+            requested = Requested(settings.below(level.name), reason(
                 Code.LAW_FAILED, level=level.name, cause=why))
         return requested
 

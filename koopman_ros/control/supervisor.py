@@ -64,6 +64,10 @@ class SupervisorSettings:
         """Return the place in the order; 0 for None, and for a level that there is no more."""
         return self._depths.get(level, 0)
 
+    def below(self, level: str) -> str:
+        """Return the next level in the order."""
+        return self.order[self.depth(level) + 1]
+
     @cached_property
     def _depths(self) -> dict[str | None, int]:
         return {level: depth for depth, level in enumerate(self.order)}

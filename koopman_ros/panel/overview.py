@@ -12,7 +12,7 @@ from typing import Any
 from nicegui import ui
 
 from koopman_ros.panel.frame import alarm_row, div, Frame, say, show_if, words
-from koopman_ros.panel.plant import Face, InputFace, number, Range, Snapshot, StateFace
+from koopman_ros.panel.plant import Face, InputFace, number, Snapshot, StateFace
 from koopman_ros.panel.requests import Answer
 from koopman_ros.panel.trend_page import TrendChart
 
@@ -67,12 +67,12 @@ class _Bar:
         with div('scale'):
             self._low, self._between, self._high = (words('span', '') for _ in range(3))
 
-    def show(self, face: Face, value: float, mark: float, limits: Range | None) -> None:
+    def show(self, face: Face, value: float, mark: float) -> None:
         def place(number: float) -> str:
             return f'{100.0 * face.share(number):.1f}%'
 
         style = self._frame.style
-        training = face.training
+        training, limits = face.training, face.limits
         style(self._training, 'display: none' if training is None else (
             f'left: {place(training[0])}; right: '
             f'{100.0 - 100.0 * face.share(training[1]):.1f}%'))
@@ -88,17 +88,28 @@ class _Bar:
             f'trained {face.text(training[0])} to {face.text(training[1])}'))
 
 
-class _Head:
-    """Name, unit and what is out of order."""
+def _card(face: Face) -> Any:
+    return div('card', tag='section').props(
+        f'aria-label="{face.label}" data-signal={face.name}')
 
-    def __init__(self, face: Face) -> None:
+
+class _Plate:
+    """Name of a signal, what is out of order, its number with unit, and its bar."""
+
+    def __init__(self, frame: Frame, face: Face, unit: str) -> None:
         with div('row1 between'):
             words('h2', face.label)
             self._abnormal = words('span', '', 'abnormal hidden')
+        with div('row1'):
+            self._number = words('span', '', 'big')
+            words('span', unit, 'unit')
+        self._bar = _Bar(frame)
 
-    def show(self, face: Face) -> None:
+    def show(self, face: Face, value: float, mark: float) -> None:
         self._abnormal.set_text(f'▲ {face.abnormal}')
         show_if(self._abnormal, bool(face.abnormal))
+        self._number.set_text(face.text(value))
+        self._bar.show(face, value, mark)
 
 
 class _Entry:
@@ -165,12 +176,8 @@ def _state_card(frame: Frame, at: int, face: StateFace) -> None:
     async def send(value: float) -> Answer:
         return await frame.act('setpoint', face.name, value, present())
 
-    with div('card', tag='section').props(f'aria-label="{face.label}" data-signal={face.name}'):
-        head = _Head(face)
-        with div('row1'):
-            measured = words('span', '', 'big')
-            words('span', face.unit, 'unit')
-        bar = _Bar(frame)
+    with _card(face):
+        plate = _Plate(frame, face, face.unit)
         if face.controlled:
             with div('row1 between'):
                 words('span', 'set-point')
@@ -181,9 +188,7 @@ def _state_card(frame: Frame, at: int, face: StateFace) -> None:
 
     def show(now: Snapshot) -> None:
         own = now.states[at]
-        head.show(own)
-        measured.set_text(own.text(own.measured))
-        bar.show(own, own.measured, own.setpoint, own.limits)
+        plate.show(own, own.measured, own.setpoint)
         if face.controlled:
             setpoint.set_text(f'{own.text(own.setpoint)} {own.unit}')
             ramps = math.isfinite(own.asked) and own.text(own.asked) != own.text(own.setpoint)
@@ -203,12 +208,8 @@ def _input_card(frame: Frame, at: int, face: InputFace) -> None:
     async def send(value: float) -> Answer:
         return await frame.act('manual', face.name, value, present())
 
-    with div('card', tag='section').props(f'aria-label="{face.label}" data-signal={face.name}'):
-        head = _Head(face)
-        with div('row1'):
-            command = words('span', '', 'big')
-            words('span', f'{face.unit} command', 'unit')
-        bar = _Bar(frame)
+    with _card(face):
+        plate = _Plate(frame, face, f'{face.unit} command')
         with div('row1 between'):
             words('span', 'acting')
             applied = words('span', '', 'value')
@@ -219,9 +220,7 @@ def _input_card(frame: Frame, at: int, face: InputFace) -> None:
 
     def show(now: Snapshot) -> None:
         own = now.inputs[at]
-        head.show(own)
-        command.set_text(own.text(own.command))
-        bar.show(own, own.command, own.applied, own.limits)
+        plate.show(own, own.command, own.applied)
         applied.set_text(f'{own.text(own.applied)} {own.unit}')
         limits = f'limits {own.text(own.limits[0])} to {own.text(own.limits[1])} {own.unit}' if (
             own.limits) else 'limits not known'

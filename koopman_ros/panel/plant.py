@@ -54,6 +54,7 @@ class Face:
     decimals: int  #: of its numbers
     training: Range | None  #: what the acting model was trained with
     abnormal: str  #: what is out of order, or empty
+    limits: Range | None  #: of the command, or what the predictive law keeps a state within
 
     @property
     def label(self) -> str:
@@ -79,7 +80,6 @@ class StateFace(Face):
     setpoint: float  #: that is tracked
     asked: float  #: that was asked for last and accepted
     predicted: float  #: what the model expected of the measurement
-    limits: Range | None  #: that the predictive law keeps
 
 
 @dataclass(frozen=True)
@@ -89,7 +89,6 @@ class InputFace(Face):
     command: float
     applied: float  #: what acts, where it is measured
     manual: float  #: what was commanded by hand last and accepted
-    limits: Range | None  #: of the command
     disturbance: float  #: as a change of the input, in its own unit
     own_unit: str  #: of a difference
 
@@ -444,9 +443,9 @@ class PlantView:
             abnormal = 'above the trained range' if (
                 measured > own.training[1]) else 'below the trained range'
         return StateFace(
-            name, printed(own.read), span, _decimals(span), own.training, abnormal,
+            name, printed(own.read), span, _decimals(span), own.training, abnormal, limits,
             name in self.signals.controlled, measured, setpoint,
-            found.get('asked', setpoint), found.get('predicted', math.nan), limits)
+            found.get('asked', setpoint), found.get('predicted', math.nan))
 
     def _input(self, name: str, own: _Signal) -> InputFace:
         found, limits = own.values, self._bounds(name, own, 'min', 'max')
@@ -458,8 +457,8 @@ class PlantView:
             abnormal = ('at its upper limit' if command >= limits[1] - slack else
                         'at its lower limit' if command <= limits[0] + slack else '')
         return InputFace(
-            name, printed(own.read), span, _decimals(span), own.training, abnormal, command,
-            applied, found.get('manual', math.nan), limits, found.get('disturbance', math.nan),
+            name, printed(own.read), span, _decimals(span), own.training, abnormal, limits,
+            command, applied, found.get('manual', math.nan), found.get('disturbance', math.nan),
             own.unit)
 
     def _best_level(self) -> str:

@@ -320,12 +320,18 @@ def test_what_was_before_is_read_from_the_bag_that_is_recorded(
 # The loop without it.
 
 
-def test_the_loop_goes_on_while_the_panel_is_flooded(ros: Harness) -> None:
+def beside_a_loop(ros: Harness) -> tuple[NodeProcess, list[Temperature]]:
+    """Start a panel, and a loop as fast as it can; return the panel and what is commanded."""
     process = ros.start('panel', {'port': 0})
     ros.start('controller')
     ros.start('plant', {'lockstep': True, 'lockstep_subscribers': 3, 'speed': 0.0})
     commands: list[Temperature] = ros.listen(Temperature, reactor.COOLANT_SETPOINT)
     ros.listen(Temperature, reactor.TEMPERATURE)
+    return process, commands
+
+
+def test_the_loop_goes_on_while_the_panel_is_flooded(ros: Harness) -> None:
+    process, commands = beside_a_loop(ros)
     url = address(ros, process)
     host, _, port = url.removeprefix('http://').partition(':')
     over, answered = threading.Event(), Counter[int]()
@@ -355,11 +361,7 @@ def test_the_loop_goes_on_while_the_panel_is_flooded(ros: Harness) -> None:
 
 
 def test_the_loop_goes_on_when_the_panel_is_killed_or_stands_still(ros: Harness) -> None:
-    process = ros.start('panel', {'port': 0})
-    ros.start('controller')
-    ros.start('plant', {'lockstep': True, 'lockstep_subscribers': 3, 'speed': 0.0})
-    commands: list[Temperature] = ros.listen(Temperature, reactor.COOLANT_SETPOINT)
-    ros.listen(Temperature, reactor.TEMPERATURE)
+    process, commands = beside_a_loop(ros)
     ros.wait_until(lambda: len(commands) > 100)
     # more than a queue holds
     process.process.send_signal(signal.SIGSTOP)

@@ -114,11 +114,6 @@ class Tuning:
     #: distance outside the training data, in half widths of their box, up to which it plans
     margin: float = math.inf
 
-    @property
-    def limits_states(self) -> bool:
-        """Whether there are limits of the states."""
-        return len(self.state_lower) > 0
-
 
 @dataclass(frozen=True)
 class Figures:

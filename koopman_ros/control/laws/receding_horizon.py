@@ -391,8 +391,7 @@ class _Problem:
         sense = [np.zeros(sum(map(len, low)), dtype=np.int32)]
         tuning = self._law.tuning
         for i, (least, most) in enumerate(zip(
-                tuning.state_lower.tolist(), tuning.state_upper.tolist(), strict=True)
-                if tuning.limits_states else ()):
+                tuning.state_lower.tolist(), tuning.state_upper.tolist(), strict=True)):
             if math.isfinite(least) or math.isfinite(most):
                 rows.append(by_inputs[1:, i])
                 low.append(np.maximum(least - nodes[1:, i], -_UNLIMITED))
