@@ -59,17 +59,29 @@ class Outputs:
         return self.C.shape[0] == self.C.shape[1] and bool((np.eye(len(self.C)) == self.C).all())
 
     @cached_property
+    def determine_state(self) -> bool:
+        """Whether they leave nothing of the state open."""
+        return self.C.shape[0] == self.C.shape[1] and (
+            np.linalg.matrix_rank(self.C) == len(self.C))
+
+    @cached_property
     def _inverse(self) -> Array:
-        if self.C.shape[0] != self.C.shape[1] or np.linalg.matrix_rank(self.C) < len(self.C):
-            raise ValueError(
-                f'the measured signals {", ".join(self.names)} do not determine all '
-                f'{self.C.shape[1]} states: measure as many, or choose an estimator')
-        return np.asarray(np.linalg.inv(self.C), dtype=np.float64)
+        inverse = np.linalg.inv if self.determine_state else np.linalg.pinv
+        return np.asarray(inverse(self.C), dtype=np.float64)
 
     def of(self, x: Array) -> Array:
         """Return the outputs (n_y,) of a state (n_x,) or of a difference of states."""
         return x if self.all_states else self.C.dot(x)
 
-    def state(self, y: Array) -> Array:
-        """Return the state (n_x,) of outputs (n_y,); a ValueError where they leave it open."""
-        return y if self.all_states else self._inverse.dot(y)
+    def state(self, y: Array, guess: Array) -> Array:
+        """
+        Return the state (n_x,) of outputs (n_y,).
+
+        :param guess: (n_x,) what they leave open is as there.
+        """
+        if self.all_states:
+            return y
+        if self.determine_state:
+            return self._inverse.dot(y)
+        found: Array = guess + self._inverse.dot(y - self.C.dot(guess))
+        return found

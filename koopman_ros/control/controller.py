@@ -53,8 +53,8 @@ class Controller:
     """
     A lifted model with its tuning; every method is pure and returns a new state.
 
-    :raises ValueError: when the settings do not fit the model's signals, or what is measured
-        does not determine the state.
+    :raises ValueError: when the settings do not fit the model's signals, or the estimator cannot
+        do with what is measured.
     """
 
     model: LiftedModel  #: the lift
@@ -65,7 +65,6 @@ class Controller:
 
     def __post_init__(self) -> None:
         self.settings.check(self.model, self.measured)
-        self.measured.state(np.zeros(len(self.measured.names)))
         # what cannot be built is refused now, and what was built is kept
         assert self.levels
 
@@ -78,7 +77,7 @@ class Controller:
     @cached_property
     def levels(self) -> dict[str, Level]:
         """The levels with a law, by name, best first."""
-        return levels_of(self.model, self.settings)
+        return levels_of(self.model, self.measured, self.settings)
 
     @cached_property
     def _best(self) -> Level:
@@ -254,6 +253,10 @@ class Controller:
         return np.full(self.model.n_x, np.nan) if target is None else (
             self.model.states.to_physical(target.x))
 
+    def position(self, y: Array) -> Array:
+        """Return the state (n_x,) that a measurement (n_y,) is taken for by itself."""
+        return self._estimating.position(None, y)
+
     def try_law(self, x: Array, setpoint: Array) -> Reason | None:
         """Return why the best law fails at a state (n_x,) towards a set-point (n_c,), or None."""
         level = self._best
@@ -283,7 +286,7 @@ class Controller:
         y = numbers('measurement', y, self.measured.names)
         if applied is not None:
             applied = numbers('applied input', applied, self.model.inputs.names)
-        outside = self._outside(y)
+        outside = self._outside(state.estimate, y)
         ahead = 1 if state.time_ns is None else time_ns - state.time_ns
         if state.command is not None and -LATE_NANOSECONDS <= ahead <= 0:
             return state, state.command, amended(
@@ -305,8 +308,10 @@ class Controller:
             u, follows = self._estimating.applied(state, applied)
             state, verdict, predicted = self._estimating.observe(state, y, time_ns, elapsed, u)
             if verdict.fault is None:
+                x = self._estimating.position(state.estimate, y)
+                outside = self.model.distance(x)
                 state = amended(state, setpoint=setpoints.advance(
-                    state.setpoint, self._best.controlled_of(self.measured.state(y)),
+                    state.setpoint, self._best.controlled_of(x),
                     self.controlled,
                     self.settings.setpoint_ramp, time_ns, seconds,
                     self.settings.setpoint_filter))
@@ -459,7 +464,8 @@ class Controller:
         if supervisor.level != SAFE or verdict.fault is not None or verdict.accepted is None:
             return None
         if outside > 0.0 and not leads_home(
-                self.model, self.measured.state(verdict.accepted.value), self.safe_input,
+                self.model, self._estimating.position(state.estimate, verdict.accepted.value),
+                self.safe_input,
                 self._nominal_input):
             return None
         if state.way_back is not None:
@@ -468,9 +474,9 @@ class Controller:
         kept_out = supervisor.bad_since_ns is None and supervisor.better_since_ns is None
         return WayBack(outside, outside, time_ns) if kept_out and outside > 0.0 else None
 
-    def _outside(self, y: Array) -> float:
+    def _outside(self, known: Estimate | None, y: Array) -> float:
         """Return how far a measurement is from the training data; NaN when it is none."""
-        return self.model.distance(self.measured.state(y)) if finite(y) else np.nan
+        return self.model.distance(self._estimating.position(known, y)) if finite(y) else np.nan
 
     def _report(self, state: State, why: Reason | None) -> Report:
         """Return what is known without a law."""
@@ -484,10 +490,12 @@ class Controller:
         if estimate is None:
             return report
         estimator = self._estimating.level(state).estimator
+        deviation = None if estimate.covariance is None else (
+            self.model.states.scale * np.sqrt(np.diag(estimate.covariance)[:self.model.n_x]))
         return amended(report, estimate=EstimateReport(
             self.model.states.to_physical(estimate.x),
             estimator.as_input(estimate.w) * self.model.inputs.scale,
-            estimator.at_bound(estimate.w)))
+            estimator.at_bound(estimate.w), deviation, estimate.innovation))
 
 
 def _passed(state: State, time_ns: int, elapsed: float) -> tuple[State, float, int]:

@@ -18,8 +18,16 @@ from koopman_ros.control.laws.base import steady_state_target, Target
 from koopman_ros.control.limits import finite, InputLimits
 from koopman_ros.control.settings import Settings
 from koopman_ros.control.state import amended, State
-from koopman_ros.control.target import partial_target
-from koopman_ros.estimation import check, Estimate, Estimator, ESTIMATORS, FrozenCheck, Verdict
+from koopman_ros.control.target import held_at, partial_target
+from koopman_ros.estimation import (
+    check,
+    Estimate,
+    Estimator,
+    ESTIMATORS,
+    EstimatorTuning,
+    FrozenCheck,
+    Verdict,
+)
 from koopman_ros.lifting import Coordinates, LiftedModel
 from koopman_ros.plugs import plug
 from koopman_ros.reasons import Code, Reason, reason
@@ -109,27 +117,31 @@ class Level:
         return target is not None and self.model.lost_at(estimate.x, target.x)
 
 
-def levels_of(model: LiftedModel, settings: Settings) -> dict[str, Level]:
+def levels_of(model: LiftedModel, outputs: Outputs, settings: Settings) -> dict[str, Level]:
     """
     Build the levels that the settings name, best first.
 
-    :raises ValueError: for a law or an estimator that there is not.
+    :raises ValueError: for a law or an estimator that there is not, or one that cannot do with
+        what is measured.
     """
     weights = Weights.physical(model, settings.state_weight, settings.input_weight)
     lower, upper = (model.states.to_deviation(bound) if len(bound) else bound
                     for bound in (settings.state_lower, settings.state_upper))
     tuning = Tuning(weights, settings.max_gain, settings.max_residual, lower, upper)
     estimator = plug(settings.estimator or (
+        'extended_kalman_filter' if not outputs.determine_state else
         'disturbance_observer' if settings.observer_bandwidth > 0.0 else 'measured_state'),
         'estimator', ESTIMATORS)
+    noise, wander, error = settings.uncertainty(model, outputs)
+    estimating = EstimatorTuning(
+        outputs, settings.observer_bandwidth, settings.max_disturbance / model.inputs.scale,
+        noise, wander / model.inputs.scale, error / model.states.scale)
     levels = {}
     for level in settings.supervisor.levels:
         law = plug(level.law, 'law', LAWS)(
             model, replace(tuning, margin=level.margin))
-        levels[level.law] = Level(level.law, law, estimator(
-            law.model, settings.observer_bandwidth,
-            settings.max_disturbance / model.inputs.scale),
-            settings.controlled or model.states.names)
+        levels[level.law] = Level(level.law, law, estimator(law.model, estimating),
+                                  settings.controlled or model.states.names)
     return levels
 
 
@@ -188,8 +200,8 @@ class Estimating:
             and what (n_y,) was expected of it, None when nothing was.
         """
         before, last = state.estimate, state.accepted
-        x = self.outputs.state(y)
         predicted = self.coast(state, elapsed, u).estimate
+        x = self.position(predicted, y)
         w = np.zeros(self.model.n_x) if before is None else before.w
 
         def travel(then: FrozenCheck) -> Array:
@@ -197,7 +209,7 @@ class Estimating:
                 # what the model says of its motion is worth little; under the safe input even a
                 # plant that it does not expect to may rest there
                 return np.zeros_like(y)
-            frozen = None if before is None else Estimate(before.x, then.w)
+            frozen = None if before is None else replace(before, w=then.w)
             moved = self.coast(amended(state, estimate=frozen), elapsed, u).estimate
             if before is None or moved is None:
                 return np.zeros_like(y)
@@ -210,9 +222,31 @@ class Estimating:
             predicted = self._corrected(state, predicted, verdict, x, time_ns, elapsed)
         elif verdict.fault.code is Code.FROZEN and predicted is not None and last is not None:
             # what the observer made of a sensor that does not move is no disturbance
-            predicted = Estimate(predicted.x, last.frozen.w)
+            predicted = replace(predicted, w=last.frozen.w)
         return (amended(state, accepted=verdict.accepted, time_ns=time_ns, estimate=predicted),
                 verdict, expected)
+
+    def position(self, known: Estimate | None, y: Array) -> Array:
+        """
+        Return the state (n_x,), in state units, that goes with a measurement (n_y,).
+
+        What the measurement leaves open is as it is known, or where it may rest.
+        """
+        outputs, states = self.outputs, self.model.states
+        if outputs.determine_state:
+            return outputs.state(y, states.center)
+        if known is not None:
+            return outputs.state(y, states.to_physical(known.x))
+        return self._resting(outputs.state(y, states.center))
+
+    def _resting(self, x: Array) -> Array:
+        """Return the steady state with the outputs of a state (n_x,), or that state."""
+        measured = np.any(self.outputs.C != 0.0, axis=0)
+        if np.count_nonzero(measured) == len(self.outputs.C) and finite(x):
+            found = held_at(self.model, self.model.states.to_deviation(x), measured)
+            if found is not None:
+                return self.model.states.to_physical(found)
+        return x
 
     def _corrected(self, state: State, predicted: Estimate | None, verdict: Verdict, x: Array,
                    time_ns: int, elapsed: float) -> Estimate:
@@ -271,13 +305,23 @@ class Estimating:
         if old is new:
             return amended(state, estimate=estimate)
         x = old.states.to_physical(estimate.x)
+        if old.states.names != new.states.names:
+            # of what is not measured the new model has a view of its own
+            x = self.position(None, predecessor.outputs.of(x))
+            return amended(state, accepted=None, way_back=None, estimate=estimator.restart(
+                None, new.states.to_deviation(x), _command(new, state)))
         # the rates that the old model estimated, per second, which all models share
         rate = estimate.w + predecessor.level(state).model.drift(estimate.x) + (
             old.forcing(estimate.x, _command(old, state)))
         factor = (old.states.scale / old.seconds_per_time_unit
                   / (new.states.scale / new.seconds_per_time_unit))
         x_new = new.states.to_deviation(x)
-        moved = Estimate(x_new, factor * rate - new.forcing(x_new, _command(new, state)))
+        covariance = estimate.covariance
+        if covariance is not None:
+            change = np.concatenate((old.states.scale / new.states.scale, factor))
+            covariance = covariance * change * change[:, None]
+        moved = Estimate(
+            x_new, factor * rate - new.forcing(x_new, _command(new, state)), covariance)
         moved = estimator.rebased(moved, np.zeros_like(moved.w))
         # what it holds of the disturbance is in the old model's units, and distances from its data
         return amended(state, estimate=moved, accepted=None, way_back=None)

@@ -4,6 +4,7 @@
 """What a controller is tuned by, one number per signal, checked against the model's signals."""
 
 from dataclasses import dataclass, field
+import math
 from typing import Any, Self
 
 import numpy as np
@@ -14,6 +15,16 @@ from koopman_ros.control.supervisor import SupervisorSettings
 from koopman_ros.estimation import SensorLimits
 from koopman_ros.lifting import LiftedModel
 from koopman_ros.signals import Outputs, per_signal
+
+# What is taken where nobody says how uncertain the plant is: noise as a share of the half width of
+# the training box, an influence as a share of the inputs', after the slowest time constant, and a
+# first guess.
+_NOISE, _WANDER, _GUESS = 1e-3, 0.1, 0.5
+_LONGEST = 86400.0  # s, of time constants
+
+
+def _none() -> Array:
+    return np.zeros(0)
 
 
 @dataclass(frozen=True)
@@ -37,15 +48,24 @@ class Settings:
     #: of the disturbance observer in 1/s; 0 for none, as in the paper
     observer_bandwidth: float = 0.0
     #: its name in :data:`koopman_ros.estimation.ESTIMATORS`, or module:class; empty for the
-    #: disturbance observer, or none of it where its bandwidth is 0
+    #: disturbance observer, or none of it where its bandwidth is 0, and for the extended Kalman
+    #: filter where not every state is measured
     estimator: str = ''
+    #: for Kalman filters, empty or 0 for what suits the model: (n_y,) standard deviation of the
+    #: noise of the measurements, in their units
+    noise: Array = field(default_factory=_none)
+    #: (n_u,) how far an unknown influence wanders in a second, as a change of each input, in input
+    #: units; over longer times with their square root
+    wander: Array = field(default_factory=_none)
+    #: (n_x,) how wrong the first guess of a state may be, in state units
+    initial_error: Array = field(default_factory=_none)
     #: time constant in s in which the difference between two laws or models, or from manual mode,
     #: fades
     transfer_time: float = 30.0
     #: (n_x,) lowest states, to `state_upper` (n_x,), that a law with a horizon plans for, in state
     #: units; infinity for none, both empty where there are none at all
-    state_lower: Array = field(default_factory=lambda: np.zeros(0))
-    state_upper: Array = field(default_factory=lambda: np.zeros(0))
+    state_lower: Array = field(default_factory=_none)
+    state_upper: Array = field(default_factory=_none)
     #: seconds that a law may take for a sample before the next one acts; infinity for any
     deadline: float = np.inf
     max_gain: float = 1e3  #: bound on the norm of the Riccati gain in scaled coordinates
@@ -57,7 +77,8 @@ class Settings:
 
     def __post_init__(self) -> None:
         as_arrays(self, 'state_weight', 'input_weight', 'setpoint_ramp', 'max_disturbance',
-                  'input_tolerance', 'safe_input', 'state_lower', 'state_upper')
+                  'input_tolerance', 'safe_input', 'state_lower', 'state_upper', 'noise',
+                  'wander', 'initial_error')
         weights, costs = self.state_weight, self.input_weight
         for name, fits, words in (
                 ('state_weight', np.isfinite(weights) & (weights >= 0.0) & np.any(weights > 0.0),
@@ -67,7 +88,9 @@ class Settings:
                 ('setpoint_ramp', self.setpoint_ramp > 0.0, 'above 0'),
                 ('max_disturbance', self.max_disturbance > 0.0, 'above 0'),
                 ('input_tolerance', self.input_tolerance >= 0.0, 'at least 0'),
-                ('deadline', self.deadline > 0.0, 'above 0')):
+                ('deadline', self.deadline > 0.0, 'above 0'),
+                *((name, getattr(self, name) >= 0.0, 'at least 0')
+                  for name in ('noise', 'wander', 'initial_error'))):
             if not np.all(fits):
                 raise ValueError(f'{name} must be {words}, got '
                                  f'{np.asarray(getattr(self, name)).tolist()}')
@@ -93,6 +116,19 @@ class Settings:
             'input_tolerance': np.full(n_u, np.inf), 'safe_input': model.inputs.center,
             'sensor': SensorLimits.none(n_x), **others})
 
+    def uncertainty(self, model: LiftedModel, outputs: Outputs) -> tuple[Array, Array, Array]:
+        """Return noise, wander and initial error, what suits the model where they are not said."""
+        half = 0.5 * (model.states.upper - model.states.lower)
+        slowest = float(np.min(np.abs(np.linalg.eigvals(
+            model.drift_jacobian(np.zeros(model.n_x)))))) / model.seconds_per_time_unit
+        defaults = (_NOISE * np.abs(outputs.C) @ half,
+                    _WANDER * 0.5 * (model.inputs.upper - model.inputs.lower)
+                    * math.sqrt(max(slowest, 1.0 / _LONGEST)), _GUESS * half)
+        noise, wander, error = (
+            np.where(own > 0.0, own, default) if len(own) else default for own, default in zip(
+                (self.noise, self.wander, self.initial_error), defaults, strict=True))
+        return noise, wander, error
+
     def check(self, model: LiftedModel, outputs: Outputs) -> None:
         """Check that there is one number for each signal; a ValueError names which not."""
         states, inputs = model.states.names, model.inputs.names
@@ -108,6 +144,10 @@ class Settings:
                 (('state_weight',), states), (('setpoint_ramp',), controlled),
                 (('input_weight', 'max_disturbance', 'input_tolerance', 'safe_input'), inputs)):
             for name in names:
+                per_signal(name, getattr(self, name), signals)
+        for name, signals in (('noise', outputs.names), ('wander', inputs),
+                              ('initial_error', states)):
+            if len(getattr(self, name)):
                 per_signal(name, getattr(self, name), signals)
         if len(self.state_lower) or len(self.state_upper):
             for name in ('state_lower', 'state_upper'):

@@ -15,7 +15,7 @@ from koopman_ros.control.laws.base import Figures, NO_FIGURES
 from koopman_ros.control.limits import Transfer
 from koopman_ros.control.setpoint import Setpoint
 from koopman_ros.control.supervisor import Supervisor, WayBack
-from koopman_ros.estimation import Accepted, Estimate
+from koopman_ros.estimation import Accepted, Estimate, Innovation
 from koopman_ros.reasons import Reason
 
 Record = TypeVar('Record')
@@ -102,6 +102,9 @@ class EstimateReport:
     state: Array  #: (n_x,) in state units
     disturbance: Array  #: (n_u,) as an input that would have the same effect, in input units
     at_bound: bool  #: whether the disturbance is as large as is allowed
+    #: (n_x,) standard deviation of the state's error, in state units; None where it is not known
+    deviation: Array | None = None
+    innovation: Innovation | None = None  #: how well the measurements were expected, or None
 
 
 @dataclass(frozen=True)

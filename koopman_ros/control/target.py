@@ -118,6 +118,14 @@ def resting_state(model: LiftedModel, u: Array, w: Array, start: Array) -> Array
     return None if found is None else found[:model.n_x]
 
 
+def held_at(model: LiftedModel, x: Array, held: NDArray[np.bool_]) -> Array | None:
+    """Return the steady state (n_x,), whatever input keeps it, with some numbers of x, or None."""
+    y = np.concatenate((x, np.zeros(model.n_u)))
+    free = np.concatenate((~held, np.ones(model.n_u, dtype=np.bool_)))
+    found = equilibrium(model, np.zeros(model.n_x), y, free, np.zeros(len(y)), np.ones(len(y)))
+    return None if found is None else found[:model.n_x]
+
+
 def _target(model: LiftedModel, y: Array, w: Array) -> Target:
     x, u = y[:model.n_x], y[model.n_x:]
     drift, forcing = model.drift(x), model.forcing(x, u) + w

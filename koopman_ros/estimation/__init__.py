@@ -1,25 +1,31 @@
 # SPDX-FileCopyrightText: 2026 The koopman_ros Authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""Estimation of state and disturbance from measured outputs; imports lifting and signals."""
+"""Estimation of state and disturbance from outputs; imports lifting, signals and solvers."""
 
 from collections.abc import Callable
 
+from koopman_ros.estimation.kalman import ExtendedKalmanFilter, UnscentedKalmanFilter
 from koopman_ros.estimation.measurement import Accepted, check, FrozenCheck, SensorLimits, Verdict
 from koopman_ros.estimation.observer import (
     DisturbanceObserver,
     equivalent_bias,
     Estimate,
     Estimator,
+    EstimatorTuning,
+    Innovation,
     MeasuredState,
 )
 
-# From a model, the observer's bandwidth in 1/s, and the largest disturbance (n_u,), as an input in
-# scaled deviations.
+# By name. The Kalman filters beside the observer: that needs every state measured, and is two
+# numbers in place of a covariance.
 ESTIMATORS: dict[str, Callable[..., Estimator]] = {
     'disturbance_observer': DisturbanceObserver,
+    'extended_kalman_filter': ExtendedKalmanFilter,
     'measured_state': MeasuredState,
+    'unscented_kalman_filter': UnscentedKalmanFilter,
 }
 
-__all__ = ['ESTIMATORS', 'Accepted', 'DisturbanceObserver', 'Estimate', 'Estimator', 'FrozenCheck',
-           'MeasuredState', 'SensorLimits', 'Verdict', 'check', 'equivalent_bias']
+__all__ = ['ESTIMATORS', 'Accepted', 'DisturbanceObserver', 'Estimate', 'Estimator',
+           'EstimatorTuning', 'ExtendedKalmanFilter', 'FrozenCheck', 'Innovation', 'MeasuredState',
+           'SensorLimits', 'UnscentedKalmanFilter', 'Verdict', 'check', 'equivalent_bias']

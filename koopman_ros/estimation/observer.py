@@ -3,19 +3,51 @@
 
 """Estimators: plugs between measured outputs and the laws; the disturbance observer."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import cached_property
 import math
-from typing import Protocol
+from typing import ClassVar, Protocol
 
 import numpy as np
 
 from koopman_ros.arrays import Array
 from koopman_ros.lifting import LiftedModel
+from koopman_ros.signals import Outputs
 
 # One step of integration spans at most this share of the model's fastest time constant.
 _STEP_SHARE = 0.1
 _MAX_STEPS = 20
+
+
+@dataclass(frozen=True)
+class Innovation:
+    """
+    By how much measurements differed from what was expected, over what was to be expected.
+
+    See Y. Bar-Shalom, X. R. Li, T. Kirubarajan, *Estimation with Applications to Tracking and
+    Navigation* (2001), section 5.4, on tests of consistency.
+    """
+
+    normalised: Array  #: (n_y,) of the last one, in its standard deviations
+    #: mean of the squares, weighed by the covariance and per output, of the last ones; 1 where the
+    #: estimator knows how wrong it is
+    mean_square: float
+    count: int  #: of measurements in it, at most :attr:`WINDOW`
+
+    #: measurements over which squares are averaged; more fade
+    WINDOW: ClassVar[int] = 100
+
+    @property
+    def expected(self) -> tuple[float, float]:
+        """The range in which the mean square is in 998 of 1,000 cases."""
+        # in here: no node needs it before its first diagnostics
+        from scipy.special import chdtri
+
+        # a fading mean is worth as many as twice its window
+        independent = self.count if self.count < self.WINDOW else 2 * self.WINDOW - 1
+        freedom = len(self.normalised) * independent
+        lower, upper = (float(chdtri(freedom, p)) / freedom for p in (0.999, 0.001))
+        return lower, upper
 
 
 @dataclass(frozen=True)
@@ -29,14 +61,39 @@ class Estimate:
 
     x: Array  #: (n_x,) state
     w: Array  #: (n_x,) disturbance of its rate, taken as constant
+    #: (2 n_x, 2 n_x) of the errors of both, or None where it is not known
+    covariance: Array | None = None
+    innovation: Innovation | None = None  #: of the last measurement, or None likewise
+
+
+def _unknown() -> Array:
+    return np.zeros(0)
+
+
+@dataclass(frozen=True)
+class EstimatorTuning:
+    """What every estimator is built from, beside its model."""
+
+    outputs: Outputs  #: what is measured of the state
+    bandwidth: float  #: of an observer, in 1/s
+    #: (n_u,) bound on each input of B(0)^+ w, in scaled deviations
+    max_disturbance: Array
+    noise: Array = field(default_factory=_unknown)  #: (n_y,) of the measurements, in their units
+    #: (n_u,) how far an unknown influence wanders in a second, as a change of each input, in
+    #: scaled deviations; over longer times with their square root
+    wander: Array = field(default_factory=_unknown)
+    #: (n_x,) how wrong the first guess may be, in scaled deviations
+    initial_error: Array = field(default_factory=_unknown)
 
 
 class Estimator(Protocol):
     """
-    From the measured state to an estimate with its disturbance; pure, without memory of its own.
+    From measured outputs to an estimate with its disturbance; pure, without memory of its own.
 
     To add one: write a class like :class:`~koopman_ros.estimation.observer.DisturbanceObserver`,
-    with the same three arguments, in any module, and name it in the settings as module:class.
+    which takes a model and an :class:`EstimatorTuning`, in any module, and name it in the settings
+    as module:class. Measurements come as a state that has the measured outputs and is otherwise
+    the predicted one.
     """
 
     @property
@@ -97,49 +154,24 @@ def simulated(model: LiftedModel, estimate: Estimate, u: Array, seconds: float) 
     return Estimate(x, estimate.w)
 
 
-@dataclass(frozen=True)
-class DisturbanceObserver:
-    """
-    Two equal poles for each state: one knob between noise and speed.
+def _check_determined(outputs: Outputs) -> None:
+    if not outputs.determine_state:
+        raise ValueError(f'{", ".join(outputs.names)}, measured, do not determine all '
+                         f'{outputs.C.shape[1]} states: measure as many, or take a Kalman filter '
+                         'as the estimator')
 
-    With p = exp(-bandwidth dt) the state takes 1 - p^2 of what a measurement differs from its
-    prediction, and the disturbance (1 - p)^2 / dt of it, which places both poles of the error at
-    p where the model's own motion within a sample is small.
-    """
+
+@dataclass(frozen=True)
+class BoundedDisturbance:
+    """What estimators of a disturbance share: how large it may be, and what it is as an input."""
 
     model: LiftedModel  #: whose drift predicts
-    bandwidth: float  #: in 1/s, above 0
-    max_disturbance: Array  #: (n_u,) bound on each input of B(0)^+ w, in scaled deviations
+    tuning: EstimatorTuning  #: its bound on the disturbance
 
     @property
     def remembers(self) -> bool:
         """It does."""
         return True
-
-    def predict(self, estimate: Estimate, u: Array, seconds: float) -> Estimate | None:
-        """Integrate the model under input and disturbance."""
-        return simulated(self.model, estimate, u, seconds)
-
-    def correct(self, predicted: Estimate, x: Array, seconds: float) -> Estimate:
-        """Divide the innovation between state and disturbance."""
-        p = math.exp(-self.bandwidth * seconds)
-        duration = seconds / self.model.seconds_per_time_unit
-        difference = x - predicted.x
-        w = predicted.w + ((1.0 - p) ** 2 / duration) * difference
-        return Estimate(predicted.x + (1.0 - p * p) * difference, self.bounded(w))
-
-    def restart(self, predicted: Estimate | None, x: Array, u: Array | None) -> Estimate:
-        """Keep a known disturbance; else take the one that makes `u` hold the plant, if given."""
-        if predicted is not None:
-            return Estimate(x, predicted.w)
-        if u is None:
-            return Estimate(x, np.zeros_like(x))
-        return Estimate(x, self.bounded(-self.model.rate_under(u)(x)))
-
-    def rebased(self, estimate: Estimate, rate: Array) -> Estimate:
-        """Let the disturbance make up for the difference between the two models."""
-        w = estimate.w + rate - self.model.drift(estimate.x)
-        return Estimate(estimate.x, self.bounded(w))
 
     def bounded(self, w: Array) -> Array:
         """Return a disturbance within its bound; none where it is not finite."""
@@ -170,16 +202,63 @@ class DisturbanceObserver:
 
     @cached_property
     def _bounds(self) -> list[float]:
-        return self.max_disturbance.tolist()
+        return self.tuning.max_disturbance.tolist()
+
+
+@dataclass(frozen=True)
+class DisturbanceObserver(BoundedDisturbance):
+    """
+    Two equal poles for each state: one knob between noise and speed; every state is measured.
+
+    With p = exp(-bandwidth dt) the state takes 1 - p^2 of what a measurement differs from its
+    prediction, and the disturbance (1 - p)^2 / dt of it, which places both poles of the error at
+    p where the model's own motion within a sample is small.
+
+    :raises ValueError: where the outputs leave the state open.
+    """
+
+    def __post_init__(self) -> None:
+        _check_determined(self.tuning.outputs)
+
+    def predict(self, estimate: Estimate, u: Array, seconds: float) -> Estimate | None:
+        """Integrate the model under input and disturbance."""
+        return simulated(self.model, estimate, u, seconds)
+
+    def correct(self, predicted: Estimate, x: Array, seconds: float) -> Estimate:
+        """Divide the innovation between state and disturbance."""
+        p = math.exp(-self.tuning.bandwidth * seconds)
+        duration = seconds / self.model.seconds_per_time_unit
+        difference = x - predicted.x
+        w = predicted.w + ((1.0 - p) ** 2 / duration) * difference
+        return Estimate(predicted.x + (1.0 - p * p) * difference, self.bounded(w))
+
+    def restart(self, predicted: Estimate | None, x: Array, u: Array | None) -> Estimate:
+        """Keep a known disturbance; else take the one that makes `u` hold the plant, if given."""
+        if predicted is not None:
+            return Estimate(x, predicted.w)
+        if u is None:
+            return Estimate(x, np.zeros_like(x))
+        return Estimate(x, self.bounded(-self.model.rate_under(u)(x)))
+
+    def rebased(self, estimate: Estimate, rate: Array) -> Estimate:
+        """Let the disturbance make up for the difference between the two models."""
+        w = estimate.w + rate - self.model.drift(estimate.x)
+        return Estimate(estimate.x, self.bounded(w))
 
 
 @dataclass(frozen=True)
 class MeasuredState:
-    """Every measurement is the state, and there is no disturbance, as in the paper."""
+    """
+    Every measurement is the state, and there is no disturbance, as in the paper.
+
+    :raises ValueError: where the outputs leave the state open.
+    """
 
     model: LiftedModel  #: whose drift predicts between measurements
-    bandwidth: float = 0.0  #: of no meaning
-    max_disturbance: Array | None = None  #: likewise
+    tuning: EstimatorTuning  #: what is measured
+
+    def __post_init__(self) -> None:
+        _check_determined(self.tuning.outputs)
 
     @property
     def remembers(self) -> bool:

@@ -30,7 +30,7 @@ from koopman_ros.control import (
     State,
 )
 from koopman_ros.control.events import Event, ModeChange, Silence
-from koopman_ros.parameters.controller import ControllerParameters, table_of
+from koopman_ros.parameters.controller import built, ControllerParameters, table_of
 from koopman_ros.parameters.table import ConfigurationError
 from koopman_ros.parameters.wire import (
     LONGEST_FRAME_ID,
@@ -99,7 +99,8 @@ class ControllerNode(ManagedNode):
         loaded = load_suitable(model)
         self._table = table = table_of(loaded.model, given)
         self._settings = self.declare_table(table)
-        self._signals = signals_of(loaded.model, self._settings.controlled)
+        self._signals = signals_of(
+            loaded.model, self._settings.controlled, self._settings.states)
         self._loaded: LoadedModel | None = loaded
 
     def configure(self) -> None:
@@ -114,12 +115,10 @@ class ControllerNode(ManagedNode):
         self._words = words_of(signals)
         self._models = ModelReload(
             self, loaded, signals, lambda: Situation(
-                self._tuning, self._state, self._measured,
-                self._recent.windows(self._settings.model_check_length),
-                self._settings.model_check_factor),
+                self._settings, self._state, self._measured,
+                self._recent.windows(self._settings.model_check_length)),
             lambda: self._exchange(records.MODEL, {'model': self._models.in_force.identity}),
             lambda: self._diagnostics.publish_if_changed())
-        self._tuning = parameters.settings(signals)
         self._controller = self._built()
         self._state = State()
         self._recent = Recent()
@@ -404,11 +403,11 @@ class ControllerNode(ManagedNode):
         return not self._refused
 
     def _built(self) -> Controller:
-        return Controller(self._models.in_force.model, self._tuning)
+        return built(self._settings, self._models.in_force.model)
 
     def _on_parameters(self, parameters: ControllerParameters) -> None:
         before = self._table.values(self._settings)
-        self._settings, self._tuning = parameters, parameters.settings(self._signals)
+        self._settings = parameters
         fields: dict[str, object] = {'parameters': {
             name: value for name, value in self._table.values(parameters).items()
             if value != before[name]}}
@@ -420,6 +419,9 @@ class ControllerNode(ManagedNode):
         """Put the parameters and the model of now in force."""
         with self._lock:
             predecessor, self._controller = self._controller, self._built()
+            # what is estimated may be something else
+            self._signals = signals_of(
+                self._controller.model, self._signals.controlled, self._signals.states)
             self._state = self._controller.hand_over(predecessor, self._state)
             self._records.publish(event, fields)
         self._warn_of_rest()

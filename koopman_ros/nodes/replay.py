@@ -14,9 +14,10 @@ from typing import Any
 import numpy as np
 
 from koopman_ros.bags import BagReadError, summary
-from koopman_ros.control import Settings
+from koopman_ros.control import Controller
 from koopman_ros.lifting import LiftedModel
 from koopman_ros.parameters.controller import (
+    built,
     REPLAY_TABLE,
     ReplayParameters,
     table_of,
@@ -141,7 +142,7 @@ def replay_records(records: Iterable[Record], models: Sequence[Path] = (),
     :param models: files or folders in which models are looked for beside the shipped ones.
     :raises RecordError: for records that cannot be replayed.
     """
-    return replay(records, Models([*models, config_directory() / 'models']).find, _settings,
+    return replay(records, Models([*models, config_directory() / 'models']).find, _controller,
                   alternative)
 
 
@@ -152,24 +153,28 @@ def _commands(found: Replay, names: Names) -> tuple[Place, ...]:
     values = found.parameters
     table = table_of(found.controller.model, values)
     snapshot = table.snapshot(values)
-    wiring = Wiring(signals_of(found.controller.model, snapshot.controlled), snapshot.states,
-                    snapshot.inputs)
+    signals = signals_of(found.controller.model, snapshot.controlled, snapshot.states)
+    wiring = Wiring(signals, snapshot.states, snapshot.inputs)
     return tuple(replace(place, topic=names.of(place.topic))
                  for place in wiring.commands.values())
 
 
-def _settings(values: Mapping[str, Any], model: LiftedModel) -> Settings:
+def _controller(values: Mapping[str, Any], model: LiftedModel) -> Controller:
     values = {name: tuple(value) if isinstance(value, list) else value
               for name, value in values.items()}
     table = table_of(model, values)
-    if unknown := ', '.join(sorted(set(values) - set(table.rows))):
+    signals = signals_of(model)
+    # those of a state that another model of the run estimates tell nothing here
+    if unknown := ', '.join(sorted(
+            name for name in set(values) - set(table.rows)
+            if '.' not in name or name.partition('.')[0] in signals.units)):
         raise RecordError(f'its controller had the parameters {unknown}, which this version has '
                           'not: take the package that recorded it')
     snapshot = table.snapshot(values)
     if reason := table.check(snapshot):
         raise RecordError(f'its controller had parameters that this version refuses ({reason}): '
                           'take the package that recorded it')
-    return snapshot.settings(signals_of(model, snapshot.controlled))
+    return built(snapshot, model)
 
 
 def _prepare() -> Callable[[], int]:

@@ -13,8 +13,15 @@ from typing import Any
 import numpy as np
 
 from koopman_ros.arrays import Array
-from koopman_ros.control import InputLimits, LAWS, LevelSettings, Settings, SupervisorSettings
-from koopman_ros.estimation import SensorLimits
+from koopman_ros.control import (
+    Controller,
+    InputLimits,
+    LAWS,
+    LevelSettings,
+    Settings,
+    SupervisorSettings,
+)
+from koopman_ros.estimation import ESTIMATORS, SensorLimits
 from koopman_ros.lifting import LiftedModel
 from koopman_ros.parameters.table import (
     ConfigurationError,
@@ -38,7 +45,8 @@ from koopman_ros.parameters.wire import (
     Wiring,
 )
 from koopman_ros.plugs import plug
-from koopman_ros.units import conversion, display_unit
+from koopman_ros.signals import Outputs
+from koopman_ros.units import conversion, display_unit, SECONDS_PER_MINUTE
 
 
 @dataclass(frozen=True)
@@ -61,6 +69,23 @@ class StateParameters(StatePlaces):
     max_jump: float = parameter(
         0.0, 'change between two measurements that is accepted beside that rate, for noise; 0 for '
         'any', '{unit}', 0.0, 1e9)
+    noise: float = parameter(
+        0.0, 'standard deviation of the noise of its sensor, for a Kalman filter; 0 for what '
+        'suits the model', '{unit}', 0.0, 1e9)
+
+
+@dataclass(frozen=True)
+class EstimatedParameters:
+    """What is tuned for a state that is not measured."""
+
+    weight: float = parameter(0.0, 'cost of its squared error', '1/({unit})^2', 0.0, 1e12)
+    min: float = signal_value(
+        -UNBOUNDED, 'lowest value that the predictive law plans for, and leaves where it must')
+    max: float = signal_value(
+        UNBOUNDED, 'highest value that the predictive law plans for, likewise')
+    initial_error: float = parameter(
+        0.0, 'how wrong the first guess of it may be, as a standard deviation; 0 for a fourth of '
+        'the trained range', '{unit}', 0.0, 1e9)
 
 
 @dataclass(frozen=True)
@@ -77,6 +102,9 @@ class InputParameters(InputPlaces):
     max_disturbance: float = parameter(
         0.0, 'largest disturbance that is accepted, as a change of the input; 0 for any', '{unit}',
         0.0, 1e9)
+    wander: float = parameter(
+        0.0, 'how far an unknown influence wanders in a minute, as a change of the input, for a '
+        'Kalman filter; 0 for what suits the model', '{unit}', 0.0, 1e9)
     tolerance: float = parameter(
         UNBOUNDED, 'how far the measured input may be from its command before the observer goes '
         'by it, as at a limit of the actuator', '{unit}', 0.0, UNBOUNDED)
@@ -95,8 +123,8 @@ class ControllerParameters:
     model: str = parameter(
         '', 'name of a shipped model, or path of a .safetensors model file')
     states_measured: tuple[str, ...] = parameter(
-        ('',), 'measured signals with their units, e.g. level [m], which the model must have; an '
-        'empty name for those that it has', read_only=True)
+        ('',), 'measured signals with their units, e.g. level [m], which the model must have; its '
+        'other states are estimated; an empty name for all that it has', read_only=True)
     inputs_commanded: tuple[str, ...] = parameter(
         ('',), 'inputs with their units, likewise', read_only=True)
     controlled: tuple[str, ...] = parameter(
@@ -114,6 +142,10 @@ class ControllerParameters:
     disturbance_bandwidth: float = parameter(
         0.0, 'how fast disturbances are estimated: more removes offsets sooner, less lets less '
         'noise through to the inputs; 0 switches the observer off', '1/s', 0.0, 1000.0)
+    estimator: str = parameter(
+        '', 'how states are estimated: extended_kalman_filter or unscented_kalman_filter, one of '
+        'which a state needs that is not measured; disturbance_observer; measured_state takes '
+        'measurements as they are; module:class is one of your own; empty for the one that suits')
     transfer_time: float = parameter(
         0.0, 'time constant in which the inputs move to what another law, model, tuning or mode '
         'asks for', 's', 0.0, 86400.0)
@@ -158,30 +190,41 @@ class ControllerParameters:
         600.0, 'how much of what was measured is kept for that', 's', 0.0, 86400.0,
         open_minimum=True)
     states: Mapping[str, StateParameters] = per_signal(StateParameters)
+    estimated: Mapping[str, EstimatedParameters] = per_signal(EstimatedParameters)
     inputs: Mapping[str, InputParameters] = per_signal(InputParameters)
 
     def settings(self, signals: Signals) -> Settings:
-        """Return the tuning of the control step, in the units of the model."""
+        """
+        Return the tuning of the control step, in the units of the model.
+
+        What a model estimates that these are not the parameters of has their defaults.
+        """
         def column(of: Mapping[str, Any], attribute: str,
                    change: Callable[[float], float] = lambda value: value) -> Array:
             return np.array([change(getattr(of[name], attribute)) for name in of])
 
         states, inputs, own = self.states, self.inputs, signals.inputs
         controlled = {name: states[name] for name in signals.controlled}
-        lower, upper = (in_own_units(states, end, signals.states) for end in ('min', 'max'))
-        for i, (name, unit) in enumerate(signals.states.items()):
-            lower[i] = lower[i] if states[name].min > lowest(display_unit(unit)) else -math.inf
-            upper[i] = upper[i] if states[name].max < UNBOUNDED else math.inf
+        every = {name: states.get(name) or self.estimated.get(name, EstimatedParameters())
+                 for name in signals.every}
+        lower, upper = (in_own_units(every, end, signals.every) for end in ('min', 'max'))
+        for i, (name, unit) in enumerate(signals.every.items()):
+            lower[i] = lower[i] if every[name].min > lowest(display_unit(unit)) else -math.inf
+            upper[i] = upper[i] if every[name].max < UNBOUNDED else math.inf
         limited = bool(np.any(np.isfinite([lower, upper])))
         return Settings(
-            controlled=() if tuple(states) == signals.controlled else signals.controlled,
-            state_weight=column(states, 'weight'),
+            controlled=() if tuple(every) == signals.controlled else signals.controlled,
+            state_weight=column(every, 'weight'),
             input_weight=column(inputs, 'weight'),
             limits=InputLimits(in_own_units(inputs, 'min', own), in_own_units(inputs, 'max', own),
                                column(inputs, 'rate_limit', _or_any)),
             setpoint_ramp=column(controlled, 'setpoint_ramp', _or_any),
             setpoint_filter=self.setpoint_filter,
             observer_bandwidth=self.disturbance_bandwidth,
+            estimator=self.estimator,
+            noise=column(states, 'noise'),
+            wander=column(inputs, 'wander') / math.sqrt(SECONDS_PER_MINUTE),
+            initial_error=np.array([getattr(of, 'initial_error', 0.0) for of in every.values()]),
             max_disturbance=column(inputs, 'max_disturbance', _or_any),
             input_tolerance=column(inputs, 'tolerance'),
             transfer_time=self.transfer_time,
@@ -203,6 +246,18 @@ class ControllerParameters:
                 self.hold_timeout, self.recovery_time))
 
 
+def built(parameters: ControllerParameters, model: LiftedModel) -> Controller:
+    """
+    Return the controller with a model, whatever that has beside the measured signals.
+
+    :raises ValueError: where the estimator cannot do with what is measured.
+    """
+    own = signals_of(model, parameters.controlled, parameters.states)
+    return Controller(model, parameters.settings(own), Outputs(
+        tuple(own.states), tuple(own.states.values()),
+        np.eye(model.n_x)[[model.states.names.index(name) for name in own.states]]))
+
+
 def _or_any(bound: float) -> float:
     """Return a bound, of which 0 stands for none."""
     return bound or math.inf
@@ -217,6 +272,10 @@ def _cross_check(signals: Signals, values: ControllerParameters) -> str:
             plug(law, 'law', LAWS)
         except ValueError as error:
             return f'levels = {list(values.levels)}: {error}'
+    try:
+        plug(values.estimator or 'measured_state', 'estimator', ESTIMATORS)
+    except ValueError as error:
+        return f'estimator = {values.estimator!r}: {error}'
     return Wiring(signals, values.states, values.inputs).check()
 
 
@@ -249,16 +308,18 @@ def table_of(model: LiftedModel, given: Mapping[str, Any] = MappingProxyType({})
     found = signals_of(model)
     named = [named_units(tuple(filter(None, given.get(kind, ()))) or own.get(kind, ()))
              for kind in ('states_measured', 'inputs_commanded')]
-    if (expected := Signals(named[0] or found.states, named[1] or found.inputs)) != Signals(
-            found.states, found.inputs):
+    expected = Signals(named[0] or found.states, named[1] or found.inputs)
+    if expected.inputs != found.inputs or not expected.states.items() <= found.states.items():
         raise ConfigurationError(
             f'the model has {found}, the system {system!r} has {expected}: choose a model of that '
             'system, correct states_measured and inputs_commanded, or name in system what the '
             'model is of (an empty name: none that is shipped)')
-    signals = signals_of(model, tuple(given.get('controlled', own.get('controlled', ()))))
+    signals = signals_of(model, tuple(given.get('controlled', own.get('controlled', ()))),
+                         expected.states)
     defaults: dict[str, Any] = {**signals.defaults(), **_times(model)}
     for name, scale in zip(model.states.names, model.states.scale.tolist(), strict=True):
-        defaults[f'{name}.weight'] = 1.0 / scale ** 2
+        if name in signals.states:
+            defaults[f'{name}.weight'] = 1.0 / scale ** 2
     box = model.inputs
     for i, (name, unit) in enumerate(zip(box.names, box.units, strict=True)):
         shown = conversion(unit, display_unit(unit))
@@ -268,8 +329,10 @@ def table_of(model: LiftedModel, given: Mapping[str, Any] = MappingProxyType({})
                      f'{name}.safe': shown(float(box.center[i]))}
     return ParameterTable(
         ControllerParameters, partial(_cross_check, signals),
-        lambda values: values.settings(signals), (('min', 'max'), ('sensor_min', 'sensor_max')),
-        signals={'states': signals.states, 'inputs': signals.inputs},
+        lambda values: built(values, model),
+        (('min', 'max'), ('sensor_min', 'sensor_max')),
+        signals={'states': signals.states, 'estimated': signals.estimated,
+                 'inputs': signals.inputs},
         defaults={**defaults, **own, 'system': system})
 
 

@@ -6,7 +6,7 @@
 from __future__ import annotations
 
 from collections.abc import Collection, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import cached_property
 import math
 import re
@@ -97,6 +97,18 @@ class Signals:
     states: Mapping[str, str]  #: units of the measured states, by name
     inputs: Mapping[str, str]  #: units of the inputs, by name
     controlled: tuple[str, ...] = ()  #: names of the states that have a set-point
+    #: units of all states of the model, in its order; empty where all are measured
+    model_states: Mapping[str, str] = field(default_factory=dict)
+
+    @property
+    def every(self) -> Mapping[str, str]:
+        """Units of all states, by name, in the order of the model."""
+        return self.model_states or self.states
+
+    @property
+    def estimated(self) -> dict[str, str]:
+        """Units of the states that are not measured, by name."""
+        return {name: unit for name, unit in self.every.items() if name not in self.states}
 
     @property
     def units(self) -> dict[str, str]:
@@ -139,14 +151,22 @@ class Signals:
         return topics
 
 
-def signals_of(model: LiftedModel, controlled: tuple[str, ...] = ()) -> Signals:
-    """Return the signals of a model, all states controlled by default."""
-    states, inputs = (dict(zip(of.names, of.units, strict=True))
-                      for of in (model.states, model.inputs))
-    named = tuple(filter(None, controlled))
+def signals_of(model: LiftedModel, controlled: tuple[str, ...] = (),
+               measured: Collection[str] = ()) -> Signals:
+    """
+    Return the signals of a model.
+
+    :param controlled: names of states; all that are measured by default.
+    :param measured: names of states, in any order; all by default.
+    """
+    every, inputs = (dict(zip(of.names, of.units, strict=True))
+                     for of in (model.states, model.inputs))
     # in the order of the states, as the control step wants them
+    states = {name: unit for name, unit in every.items() if name in (measured or every)}
+    named = tuple(filter(None, controlled))
     own = tuple(name for name in states if name in named)
-    return Signals(states, inputs, (named if len(own) < len(named) else own) or tuple(states))
+    return Signals(states, inputs, (named if len(own) < len(named) else own) or tuple(states),
+                   {} if len(states) == len(every) else every)
 
 
 @dataclass(frozen=True)

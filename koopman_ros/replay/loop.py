@@ -8,7 +8,7 @@ from dataclasses import dataclass, field, replace
 from typing import Any, TypeAlias
 
 from koopman_ros.arrays import Array
-from koopman_ros.control import Controller, Setpoint, Settings, State
+from koopman_ros.control import Controller, Setpoint, State
 from koopman_ros.control.events import apply, Measurement, SetpointRequest
 from koopman_ros.lifting import LiftedModel
 from koopman_ros.replay import records
@@ -16,7 +16,7 @@ from koopman_ros.replay import records
 # The model of a name and a digest, read anew each time; raises RecordError where there is none.
 FindModel: TypeAlias = Callable[[str, str], LiftedModel]
 # The tuning of a model that parameters by name stand for; raises ValueError where they do not fit.
-MakeSettings: TypeAlias = Callable[[Mapping[str, Any], LiftedModel], Settings]
+Build: TypeAlias = Callable[[Mapping[str, Any], LiftedModel], Controller]
 
 
 @dataclass(frozen=True)
@@ -70,7 +70,7 @@ class Replay:
     parameters: Mapping[str, Any] = field(default_factory=dict)
 
 
-def replay(recorded: Iterable[records.Record], find_model: FindModel, make_settings: MakeSettings,
+def replay(recorded: Iterable[records.Record], find_model: FindModel, build: Build,
            alternative: Alternative | None = None) -> Replay:
     """
     Apply what is recorded again.
@@ -83,7 +83,7 @@ def replay(recorded: Iterable[records.Record], find_model: FindModel, make_setti
     runs: dict[str, _Run] = {}
     for record in recorded:
         if record.run not in runs:
-            runs[record.run] = _Run(found, find_model, make_settings, alternative)
+            runs[record.run] = _Run(found, find_model, build, alternative)
             found.runs += 1
             found.begins_late += record.event != records.START
         try:
@@ -101,11 +101,11 @@ def replay(recorded: Iterable[records.Record], find_model: FindModel, make_setti
 class _Run:
     """A run of a controller on its way through the replay."""
 
-    def __init__(self, found: Replay, find_model: FindModel, make_settings: MakeSettings,
+    def __init__(self, found: Replay, find_model: FindModel, build: Build,
                  alternative: Alternative | None) -> None:
         self._found = found
         self._find_model = find_model
-        self._make_settings = make_settings
+        self._build = build
         self._other = alternative
         self._next: int | None = None  # number of the next record
         self._state: State | None = None  # None while it is not known
@@ -138,7 +138,7 @@ class _Run:
     def _begin(self, record: records.Record) -> None:
         self._parameters = dict(record.fields['parameters'])
         model = self._model(record)
-        self._controller = Controller(model, self._make_settings(self._parameters, model))
+        self._controller = self._build(self._parameters, model)
         self._found.controller, self._found.parameters = self._controller, self._parameters
         self._state = records.state_of(record)
         if self._other is not None:
@@ -152,7 +152,7 @@ class _Run:
         self._parameters.update(record.fields.get('parameters', {}))
         predecessor = self._controller
         model = self._model(record) if 'model' in record.fields else predecessor.model
-        self._controller = Controller(model, self._make_settings(self._parameters, model))
+        self._controller = self._build(self._parameters, model)
         self._found.controller, self._found.parameters = self._controller, self._parameters
         self._state = self._controller.hand_over(predecessor, state)
         if self._other is not None and 'parameters' in record.fields:
@@ -195,5 +195,4 @@ class _Run:
 
     def _tuned(self, model: LiftedModel) -> Controller:
         assert self._other is not None
-        return Controller(model, self._make_settings(
-            {**self._parameters, **self._other.parameters}, model))
+        return self._build({**self._parameters, **self._other.parameters}, model)

@@ -145,10 +145,11 @@ def _warning(now: Situation) -> str:
     if now.model_refused:
         return now.model_refused
     if report.measurement.outside > 0.0:
+        box = states.only(tuple(now.signals.states))
         outside = [f'{name} is outside the trained range [{shown(lower, unit):.6g}, '
                    f'{shown(upper, unit):.6g}] {display_unit(unit)}'
                    for name, unit, lower, upper, value in zip(
-                       states.names, states.units, states.lower.tolist(), states.upper.tolist(),
+                       box.names, box.units, box.lower.tolist(), box.upper.tolist(),
                        now.measured.tolist(), strict=True) if not lower <= value <= upper]
         return f'{", ".join(outside) or "the state is far from the training data"}: ' \
                'the model extrapolates'
@@ -190,7 +191,9 @@ def _figures(now: Situation) -> dict[str, object]:
     target, law, transfer = report.target, report.command.law, report.command.transfer
     inputs = {stem(name, unit): unit for name, unit in signals.inputs.items()}
     estimate = report.estimate
-    bias = None if estimate is None else now.controller.equivalent_bias(state)
+    # a bias of what is not measured is no sensor's
+    bias = None if estimate is None or signals.estimated else (
+        now.controller.equivalent_bias(state))
     unit = {name: signals.states[name] for name in signals.controlled}
     return {
         'mode': state.mode.value,
@@ -206,6 +209,7 @@ def _figures(now: Situation) -> dict[str, object]:
         **_each(inputs, f'disturbance [{{}} of {now.input}]' if len(inputs) == 1
                 else 'disturbance [{}]', None if estimate is None else estimate.disturbance, True),
         **_each(signals.states, 'equivalent sensor bias [{}]', bias, True),
+        **_estimated(now),
         'distance outside training box [half widths]': float(report.measurement.outside),
         'set-point outside training box [half widths]': (
             np.nan if target is None else float(target.outside)),
@@ -232,17 +236,46 @@ def _figures(now: Situation) -> dict[str, object]:
     }
 
 
+def _estimated(now: Situation) -> dict[str, object]:
+    """Return what is estimated of states that are not measured, and how well it fits."""
+    estimate, states = now.report.estimate, now.controller.model.states
+    found: dict[str, object] = {}
+    if estimate is None or estimate.deviation is None:
+        return found
+    for name, unit, value, deviation in zip(states.names, states.units, estimate.state.tolist(),
+                                            estimate.deviation.tolist(), strict=True):
+        if name in now.signals.estimated:
+            found[f'{name}, estimated [{display_unit(unit)}]'] = (
+                f'{shown(value, unit):.6g} +/- {deviation:.2g}')
+    if estimate.innovation is not None:
+        (lower, upper), square = estimate.innovation.expected, estimate.innovation.mean_square
+        fits = 'consistent' if lower <= square <= upper else (
+            'more than the noise explains' if square > upper else 'less than the noise said')
+        found['innovations, mean square over expected'] = (
+            f'{square:.3g}: {fits} ({lower:.3g} to {upper:.3g})')
+    return found
+
+
 def internals(signals: Signals, report: Report, stamp: Time, frame_id: str) -> JointState:
     """Return what a person would plot beside the signals, under names with units."""
     law, transfer, estimate = report.command.law, report.command.transfer, report.estimate
     inputs, target = signals.inputs, report.target
+    states = signals.every
+    deviation = None if estimate is None else estimate.deviation
+    innovation = None if estimate is None else estimate.innovation
     values = {
         **_each(inputs, 'disturbance [{}]',
                 None if estimate is None else estimate.disturbance, True),
         **{f'estimated_{name} [{display_unit(unit)}]': value for (name, unit), value in zip(
-            signals.states.items(),
-            _each(signals.states, '{}', None if estimate is None else estimate.state).values(),
+            states.items(),
+            _each(states, '{}', None if estimate is None else estimate.state).values(),
             strict=True)},
+        # of a filter alone
+        **({f'deviation_{name} [{unit}]': value for (name, unit), value in zip(
+            states.items(), deviation.tolist(), strict=True)} if deviation is not None else {}),
+        **({f'innovation_{name} [standard deviations]': value for name, value in zip(
+            signals.states, innovation.normalised.tolist(), strict=True)}
+           if innovation is not None else {}),
         'distance_outside [half widths]': float(report.measurement.outside),
         'level [0 learned, 1 linear, 2 hold, 3 safe, 4 manual]': float(report.depth),
         'gain': float(law.gain),

@@ -20,9 +20,9 @@ from rclpy.task import Future
 from std_srvs.srv import Trigger
 
 from koopman_ros.arrays import Array
-from koopman_ros.control import compare, Controller, Settings, State, Windows
+from koopman_ros.control import compare, Controller, State, Windows
 from koopman_ros.lifting import Coordinates, LiftedModel, load_with_digest, ModelFileError
-from koopman_ros.parameters.controller import ControllerParameters, table_of
+from koopman_ros.parameters.controller import built, ControllerParameters, table_of
 from koopman_ros.parameters.wire import Signals, signals_of
 from koopman_ros.resources import model_path
 from koopman_ros.ros.node import words_of
@@ -65,11 +65,17 @@ class LoadedModel:
 class Situation:
     """What a new model has to cope with."""
 
-    settings: Settings
+    parameters: ControllerParameters
     state: State
-    measured: Array  #: (n_x,) last measurement; NaN before the first
+    measured: Array  #: (n_y,) last measurement; NaN before the first
     recent: Windows | None  #: what was measured lately; None while that is too little
-    max_ratio: float  #: of the errors with which it and the present model predict that; 0 for any
+
+    def controller(self, model: LiftedModel) -> Controller:
+        """Return what would act with a model; ModelFileError where that cannot be."""
+        try:
+            return built(self.parameters, model)
+        except ValueError as error:
+            raise ModelFileError(f'the model does not suit the parameters: {error}') from error
 
 
 def ranges(model: LiftedModel) -> str:
@@ -91,10 +97,14 @@ def load_suitable(name: str, signals: Signals | None = None) -> LoadedModel:
     path = model_path(name)
     model, digest = load_with_digest(path)
     own = signals_of(model)
-    if signals is not None and (own.states, own.inputs) != (signals.states, signals.inputs):
+    if signals is not None and not (own.inputs == signals.inputs
+                                    and signals.states.items() <= own.states.items()):
         raise ModelFileError(
             f'{path} has {own}, this controller was started for {signals}: choose a model of '
             'the same signals, or start it anew')
+    if signals is not None and (taken := set(own.states) & set(signals.inputs)):
+        raise ModelFileError(f'{path} has a state and an input of the name {min(taken)}: train '
+                             'the model again with different names')
     for box in (model.states, model.inputs):
         for unit, low, center, high, one in zip(
                 box.units, box.lower, box.center, box.upper, box.names, strict=True):
@@ -113,8 +123,8 @@ def load_suitable(name: str, signals: Signals | None = None) -> LoadedModel:
 
 
 def _refuse_slow(path: Path, model: LiftedModel) -> None:
-    controller, state = Controller(model, table_of(model, {'system': ''}).snapshot({}).settings(
-        signals_of(model))), State()
+    controller = built(table_of(model, {'system': ''}).snapshot({}), model)
+    state = State()
     needed = []
     for k in range(1, _TRIALS + 1):
         # of this thread alone, for a busy machine says nothing of a model
@@ -136,20 +146,21 @@ def _refuse_slow(path: Path, model: LiftedModel) -> None:
 
 def refuse_setpoints(model: LiftedModel, situation: Situation) -> None:
     """Raise ModelFileError for a model that cannot track what the operator asked for."""
-    controller = Controller(model, situation.settings)
+    controller = situation.controller(model)
     if (refusal := controller.untrained(situation.state.setpoint)) is not None:
         raise ModelFileError(words_of(signals_of(model))(refusal))
 
 
 def refuse_without_law(model: LiftedModel, situation: Situation) -> None:
     """Raise ModelFileError for a model without a law where the plant is or shall go."""
-    controller, asked = Controller(model, situation.settings), situation.state.setpoint
+    controller, asked = situation.controller(model), situation.state.setpoint
+    margin = controller.settings.supervisor.levels[0].margin
     for setpoint in [value for value in (asked.active, asked.requested)
                      if value is not None and np.isfinite(value).all()] or [
                          controller.controlled.center]:
-        for place in (controller.steady_state(setpoint), situation.measured):
+        for place in (controller.steady_state(setpoint), controller.position(situation.measured)):
             # neither before the first measurement, nor where the learned law would not act
-            if not model.distance(place) <= situation.settings.supervisor.levels[0].margin:
+            if not model.distance(place) <= margin:
                 continue
             if (problem := controller.try_law(place, setpoint)) is not None:
                 raise ModelFileError(
@@ -165,6 +176,8 @@ def refuse_worse(present: LiftedModel, model: LiftedModel, situation: Situation)
 
     :return: how well it does beside the present one, in words.
     """
+    if set(model.states.names) != set(situation.parameters.states):
+        return 'not compared with the model before: not every state is measured'
     found = None if situation.recent is None else compare(present, model, situation.recent)
     if found is None:
         return 'not compared with the model before: too little was measured so far'
@@ -173,10 +186,11 @@ def refuse_worse(present: LiftedModel, model: LiftedModel, situation: Situation)
     words = (f'predicts {name} of the last {found.seconds:.3g} s with an error of '
              f'{found.candidate[i]:.2g} {unit}, the {{}} with {found.present[i]:.2g} {unit}')
     # written so that NaN is refused, too
-    if situation.max_ratio and not found.ratio[i] <= situation.max_ratio:
+    most = situation.parameters.model_check_factor
+    if most and not found.ratio[i] <= most:
         raise ModelFileError(
             f'the model {words.format("present one")}, at most '
-            f'{situation.max_ratio * found.allowance[i]:.2g} {unit} are allowed: train it again '
+            f'{most * found.allowance[i]:.2g} {unit} are allowed: train it again '
             'with more data, or set model_check_factor = 0 to load it all the same')
     return words.format('model before') + (
         '' if found.tells else '; nothing moved that would tell more')
@@ -316,8 +330,7 @@ class ModelReload:
         if 'model' not in changes:
             return ''
         trial = self._start(parameters.model, replace(
-            self._situation(), settings=parameters.settings(self._signals),
-            max_ratio=parameters.model_check_factor))
+            self._situation(), parameters=parameters))
         if not trial.outcome.done():
             trial.thread.join(_SHORT_WAIT)
         outcome = trial.outcome.result() if trial.outcome.done() else (

@@ -3,6 +3,7 @@
 
 """Any number of states and inputs: limits, levels, noise and silence, one number per signal."""
 
+import contextlib
 from dataclasses import replace
 import json
 import math
@@ -44,6 +45,12 @@ def mixed(model: LiftedModel) -> Outputs:
     return Outputs(tuple(f'y{i}' for i in range(n)), ('1',) * n, np.eye(n) + 0.5 * np.eye(n, k=1))
 
 
+def some(model: LiftedModel, n_y: int) -> Outputs:
+    """Return measurements of the first states alone."""
+    states = model.states
+    return Outputs(states.names[:n_y], states.units[:n_y], np.eye(model.n_x)[:n_y])
+
+
 WILD = [math.nan, math.inf, -math.inf, 1e300, -1e300, 1.7e308, 0.0, -0.0, 5e-324, -40.0]
 shares = st.one_of(st.floats(-3.0, 3.0), st.floats(-3.0, 3.0), st.sampled_from(WILD), st.floats())
 waits = st.one_of(st.just(1.0), st.sampled_from(
@@ -68,8 +75,14 @@ def random_controllers(n_x: int, n_u: int, seed: int, all_states: bool, n_c: int
     n_c = min(n_c, n_u, n_x)
     part = {'controlled': model.states.names[:n_c], 'setpoint_ramp': 0.1 * model.states.scale[
         :n_c]} if n_c else {}
-    return [tuned(model, outputs, **part), tuned(model, outputs),
-            tuned(model, outputs, observer_bandwidth=0.0, **part)]
+    found = [tuned(model, outputs, **part), tuned(model, outputs),
+             tuned(model, outputs, observer_bandwidth=0.0, **part)]
+    if all_states and n_x > 1 and n_c:
+        with contextlib.suppress(ValueError):
+            # what is measured may leave the disturbance open
+            found = [tuned(model, some(model, n_x - 1), estimator=filtering, **part)
+                     for filtering in ('', 'extended_kalman_filter', 'unscented_kalman_filter')]
+    return found
 
 
 controllers = st.one_of(st.sampled_from(REACTORS), st.builds(
@@ -201,11 +214,11 @@ def test_nothing_broadcasts():
             Controller(good.model, replace(good.settings, **{part: short}))
 
 
-def test_outputs_that_do_not_determine_the_state_are_refused():
+@pytest.mark.parametrize('estimator', ['disturbance_observer', 'measured_state'])
+def test_estimators_that_need_every_state_say_so(estimator):
     model = random_lift(2, n_u=1)
-    one = Outputs(('x0',), ('K',), np.array([[1.0, 0.0]]))
-    with pytest.raises(ValueError, match='x0 do not determine all 2 states'):
-        tuned(model, one, sensor=SensorLimits.none(1))
+    with pytest.raises(ValueError, match='x0, measured, do not determine all 2 states'):
+        tuned(model, some(model, 1), estimator=estimator)
 
 
 def test_a_frozen_sensor_is_found_beside_another_that_moves():

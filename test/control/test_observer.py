@@ -13,7 +13,6 @@ from scipy.integrate import solve_ivp
 from koopman_ros.control import Controller, InputLimits, perfect, Settings, Silence, State
 from koopman_ros.estimation import (
     check,
-    DisturbanceObserver,
     equivalent_bias,
     Estimate,
     SensorLimits,
@@ -26,6 +25,7 @@ from support.closed_loops import (
     EPOCH,
     largest_step,
     levels,
+    observing,
     REACTOR,
     Reactor,
     say,
@@ -41,14 +41,13 @@ from validation.robustness.disturbances import CHANGED
 from validation.robustness.loop import changed_reactor
 
 MODEL = shipped('reactor_nz4')
-NO_BOUND = np.array([np.inf])
 
 
 @pytest.mark.parametrize('bandwidth', [0.5 / 60.0, 6.0 / 60.0, 1.0])
 @pytest.mark.parametrize('seconds', [0.1, 1.0, 5.0])
 def test_both_poles_of_the_error_are_where_they_were_put(bandwidth, seconds):
     # about the nominal point, where the drift is A x within a thousandth
-    observer, size = DisturbanceObserver(MODEL.linearised, bandwidth, NO_BOUND), 1e-6
+    observer, size = observing(MODEL.linearised, bandwidth), 1e-6
     columns = []
     for dx, dw in np.eye(2) * size:
         before = Estimate(np.array([dx]), np.array([dw]))
@@ -66,7 +65,7 @@ def test_both_poles_of_the_error_are_where_they_were_put(bandwidth, seconds):
 
 def test_prediction_is_that_of_the_differential_equation():
     estimate, u = Estimate(np.array([-0.5]), np.array([0.3])), np.array([0.4])
-    observer = DisturbanceObserver(MODEL, 0.1, NO_BOUND)
+    observer = observing(MODEL, 0.1)
     exact = solve_ivp(lambda _, x: MODEL.drift(x) + MODEL.B @ u + estimate.w, (0.0, 1.0),
                       estimate.x, rtol=1e-10, atol=1e-12).y[:, -1]
     predicted = observer.predict(estimate, u, 60.0)
@@ -80,7 +79,7 @@ def test_prediction_is_that_of_the_differential_equation():
 
 
 def test_the_disturbance_is_bounded():
-    observer = DisturbanceObserver(MODEL, 0.1, np.array([0.5]))
+    observer = observing(MODEL, 0.1, 0.5)
     huge = observer.correct(Estimate(np.zeros(1), np.zeros(1)), np.array([1e6]), 1.0)
     np.testing.assert_allclose(np.abs(observer.as_input(huge.w)), 0.5, rtol=1e-12)
     np.testing.assert_array_equal(observer.bounded(np.array([np.nan])), [0.0])

@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 
 from koopman_ros import plants
-from koopman_ros.control import Controller, Mode, Settings, State
+from koopman_ros.control import Controller, Mode, State
 from koopman_ros.control.events import (
     apply,
     Event,
@@ -27,9 +27,8 @@ from koopman_ros.control.events import (
     Silence,
 )
 from koopman_ros.lifting import LiftedModel, load_with_digest
-from koopman_ros.parameters.controller import table_of
+from koopman_ros.parameters.controller import built, table_of
 from koopman_ros.parameters.plant import PlantTable
-from koopman_ros.parameters.wire import signals_of
 from koopman_ros.replay import records
 from koopman_ros.replay.loop import replay
 from koopman_ros.resources import model_path
@@ -45,9 +44,8 @@ sequences = st.lists(st.tuples(kinds, st.lists(shares, min_size=4, max_size=4), 
                      min_size=1, max_size=15)
 
 
-def tuned(values: Mapping[str, Any], model: LiftedModel) -> Settings:
-    snapshot = table_of(model, values).snapshot(values)
-    return snapshot.settings(signals_of(model, snapshot.controlled))
+def tuned(values: Mapping[str, Any], model: LiftedModel) -> Controller:
+    return built(table_of(model, values).snapshot(values), model)
 
 
 class Run:
@@ -57,7 +55,7 @@ class Run:
         self.model, digest = load_with_digest(model_path(system))
         table = table_of(self.model, {'system': system})
         self.values = table.values(table.snapshot(parameters))
-        self.controller = Controller(self.model, tuned(self.values, self.model))
+        self.controller = tuned(self.values, self.model)
         self.identity = {'name': system, 'digest': digest}
         plant = PlantTable({'system': system})
         self.equations = plant.system(plant.snapshot({}))

@@ -13,7 +13,7 @@ from koopman_ros.control import averaged, recentred, run_closed_loop, steady_sta
 from koopman_ros.control.hindsight import Windows
 from koopman_ros.control.law_check import check_law
 from koopman_ros.control.target import partial_target, resting_state
-from koopman_ros.estimation import DisturbanceObserver, Estimate
+from koopman_ros.estimation import Estimate
 from koopman_ros.estimation.observer import simulated
 from koopman_ros.identification import identify
 from koopman_ros.learning import Edmd, fit, Growth, NeuralDrift, roll_out, train
@@ -32,6 +32,7 @@ from koopman_ros.plants import (
 )
 from koopman_ros.plants.library.reactor import fed_reactor
 from koopman_ros.retraining.lift import learn_lift
+from support.closed_loops import observing
 
 PLANT = fed_reactor()
 HALF_X, HALF_U = np.array([0.08, 8.0]), np.array([50.0, 10.0])
@@ -156,7 +157,7 @@ def test_observer_and_hindsight_know_what_an_input_does_at_each_state():
     predicted = simulated(model, Estimate(model.states.to_deviation(x), np.zeros(2)), v, 12.0)
     # by Heun's method with steps of a quarter of the fastest time constant
     assert np.all(np.abs(model.states.to_physical(predicted.x) - after) < [2e-4, 0.02])
-    observer = DisturbanceObserver(model, 0.1, np.full(2, 10.0))
+    observer = observing(model, 0.1, 10.0)
     held, balance = steady_state(PLANT, {'temperature': 321.0, 'concentration': 0.88})
     found = observer.restart(None, model.states.to_deviation(held),
                              model.inputs.to_deviation(balance))

@@ -14,11 +14,13 @@ from scipy.optimize import root
 
 from koopman_ros import control, plants
 from koopman_ros.arrays import Array
+from koopman_ros.estimation import DisturbanceObserver, EstimatorTuning
 from koopman_ros.lifting import LiftedModel, load
 from koopman_ros.parameters.controller import table_of
 from koopman_ros.parameters.wire import signals_of
 from koopman_ros.reasons import Words
 from koopman_ros.replay.records import encoded
+from koopman_ros.signals import Outputs
 from koopman_ros.units import Displays
 from koopman_ros.units import NANOSECONDS as SECOND
 
@@ -34,6 +36,14 @@ UNIT = 10.0
 
 def shipped(name: str) -> LiftedModel:
     return load(Path(__file__).parents[2] / 'config' / 'models' / f'{name}.safetensors')
+
+
+def observing(model: LiftedModel, bandwidth: float, bound: float = np.inf) -> DisturbanceObserver:
+    """Return an observer of all states, its bandwidth in 1/s, one bound for all inputs."""
+    states = model.states
+    return DisturbanceObserver(model, EstimatorTuning(
+        Outputs(states.names, states.units, np.eye(model.n_x)), bandwidth,
+        np.full(model.n_u, bound)))
 
 
 def steady_state(system: plants.ControlAffineSystem, u: list[float], guess: list[float]

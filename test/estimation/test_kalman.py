@@ -1,0 +1,295 @@
+# SPDX-FileCopyrightText: 2026 The koopman_ros Authors
+# SPDX-License-Identifier: Apache-2.0
+
+"""States that are not measured: filters against Kalman's equations, and the reactor's saddle."""
+
+from dataclasses import replace
+import json
+
+import numpy as np
+import pytest
+from scipy.integrate import solve_ivp
+from scipy.linalg import expm, solve_discrete_are
+from scipy.stats import chi2
+
+from koopman_ros.arrays import Array
+from koopman_ros.control import (
+    at,
+    Controller,
+    exchange,
+    Initialisation,
+    InputLimits,
+    LevelSettings,
+    Loop,
+    SetpointRequest,
+    Settings,
+    simulate,
+    State,
+    SupervisorSettings,
+)
+from koopman_ros.estimation import (
+    Estimate,
+    EstimatorTuning,
+    ExtendedKalmanFilter,
+    Innovation,
+    SensorLimits,
+    UnscentedKalmanFilter,
+)
+from koopman_ros.lifting import Coordinates, LiftedModel, linearised_model, Provenance
+from koopman_ros.plants import Process, steady_state, two_state_reactor
+from koopman_ros.plants.library.reactor import ReactorParameters
+from koopman_ros.replay.records import decoded, encoded
+from koopman_ros.signals import Outputs
+from support.random_lifts import coordinates, random_lift
+from validation.general.systems import SADDLE
+from validation.true_model import TrueModel
+
+FILTERS = [ExtendedKalmanFilter, UnscentedKalmanFilter]
+SYSTEM = two_state_reactor(nominal_state=SADDLE)
+TRUTH = TrueModel.of(SYSTEM, np.array([0.1, 325.0]), np.array([0.95, 375.0]), np.array([278.15]),
+                     np.array([305.15]))
+TEMPERATURE = Outputs(('temperature',), ('K',), np.array([[0.0, 1.0]]))
+NOISE = 0.1  # K
+WIDE = InputLimits(np.array([253.15]), np.array([373.15]), np.ones(1))
+
+
+def linear(A: Array, B: Array) -> LiftedModel:
+    A, B = np.asarray(A), np.asarray(B)
+    return linearised_model(A, B, coordinates('x', len(A)), coordinates('u', B.shape[1]), 'min',
+                            Provenance('linear'))
+
+
+def first(model: LiftedModel, n_y: int) -> Outputs:
+    states = model.states
+    return Outputs(states.names[:n_y], states.units[:n_y], np.eye(model.n_x)[:n_y])
+
+
+def tuning(model: LiftedModel, outputs: Outputs, *, noise: float = 0.1, wander: float = 0.05,
+           error: float = 0.3) -> EstimatorTuning:
+    return EstimatorTuning(outputs, 0.0, np.full(model.n_u, np.inf),
+                           np.full(len(outputs.names), noise), np.full(model.n_u, wander),
+                           np.full(model.n_x, error))
+
+
+def oscillator() -> LiftedModel:
+    return linear([[-0.2, 1.0], [-1.5, -0.1]], [[0.0], [0.7]])
+
+
+@pytest.mark.parametrize('kind', FILTERS)
+@pytest.mark.parametrize('seconds', [2.0, 20.0])
+def test_a_linear_plant_is_filtered_as_by_the_riccati_equation(kind, seconds):
+    model = oscillator()
+    one = kind(model, tuning(model, first(model, 1)))
+    estimate = Estimate(np.zeros(2), np.zeros(2))
+    for _ in range(400):
+        estimate = one.predict(estimate, np.zeros(1), seconds)
+        predicted = estimate.covariance
+        estimate = one.correct(estimate, estimate.x, seconds)
+    # the same by scipy: x and the disturbance, which acts like the input
+    A = np.zeros((3, 3))
+    A[:2] = np.hstack((model.A, model.B))
+    F = expm(A * seconds / 60.0)
+    H = np.array([[model.states.scale[0], 0.0, 0.0]])
+    wanders = F @ np.diag([0.0, 0.0, seconds * 0.05 ** 2]) @ F.T
+    expected = solve_discrete_are(F.T, H.T, wanders, np.array([[0.1 ** 2]]))
+    spread = np.block([[np.eye(2), np.zeros((2, 1))], [np.zeros((2, 2)), model.B]])
+    expected = spread @ expected @ spread.T
+    assert predicted == pytest.approx(expected, abs=1e-4 * np.max(np.abs(expected)))
+
+
+@pytest.mark.parametrize('kind', FILTERS)
+def test_the_covariance_follows_the_nonlinear_flow(kind):
+    one = kind(TRUTH, tuning(TRUTH, TEMPERATURE, wander=1e-4))
+    x, w, u = np.array([0.2, -0.3]), np.array([0.0, 0.4]), np.array([0.5])
+    P = 1e-8 * np.eye(4)
+    found = one.predict(Estimate(x, w, P), u, 20.0)
+
+    def flow(start: Array) -> Array:
+        rate = TRUTH.rate_under(u, start[2:])
+        done = solve_ivp(lambda _, x: rate(x), (0.0, 20.0 / 60.0), start[:2], rtol=1e-11,
+                         atol=1e-12)
+        return np.concatenate((done.y[:, -1], start[2:]))
+
+    start = np.concatenate((x, w))
+    F = np.array([(flow(start + d) - flow(start - d)) / 2e-5 for d in 1e-5 * np.eye(4)]).T
+    # what wanders in the meantime acts on the temperature alone, by B
+    before = P + np.pad(20.0 * np.outer(TRUTH.B, TRUTH.B) * 1e-4 ** 2, (2, 0))
+    expected = F @ before @ F.T
+    assert found.x == pytest.approx(flow(start)[:2], abs=1e-4)
+    assert found.covariance == pytest.approx(expected, abs=2e-3 * np.max(np.abs(expected)))
+
+
+@pytest.mark.parametrize(('factor', 'consistent'), [(1.0, True), (2.0, False), (0.5, False)])
+def test_squares_of_innovations_tell_whether_the_noise_is_what_was_said(factor, consistent):
+    model, rng = oscillator(), np.random.default_rng(3)
+    said = tuning(model, first(model, 1))
+    one = ExtendedKalmanFilter(model, replace(said, noise=factor * said.noise))
+    F = expm(np.vstack((np.hstack((model.A, model.B)), np.zeros((1, 3)))) * 5.0 / 60.0)
+    truth = np.zeros(3)
+    estimate = one.restart(None, np.zeros(2), None)
+    for _ in range(400):
+        truth[2] += rng.normal(0.0, 0.05 * np.sqrt(5.0))
+        truth = F @ truth
+        estimate = one.predict(estimate, np.zeros(1), 5.0)
+        y = model.states.scale[0] * truth[0] + rng.normal(0.0, 0.1)
+        estimate = one.correct(estimate, np.array([y / model.states.scale[0], estimate.x[1]]), 5.0)
+    lower, upper = estimate.innovation.expected
+    assert (lower <= estimate.innovation.mean_square <= upper) is consistent
+
+
+def test_the_range_of_a_mean_square_is_that_of_chi_square():
+    for n_y, count in ((1, 5), (2, 40)):
+        freedom = n_y * count
+        assert Innovation(np.zeros(n_y), 1.0, count).expected == pytest.approx(
+            chi2.ppf([0.001, 0.999], freedom) / freedom)
+
+
+@pytest.mark.parametrize(('A', 'B', 'hidden'), [
+    # a hidden integrator that nothing measured depends on
+    ([[-1.0, 0.0], [0.0, 0.0]], [[1.0], [0.0]], True),
+    # one that decays may stay unseen
+    ([[-1.0, 0.0], [0.0, -0.5]], [[1.0], [0.0]], False),
+    # the input does not reach what is measured: its rate has a disturbance of its own
+    ([[-1.0, 0.0], [1.0, -0.5]], [[0.0], [1.0]], False)])
+def test_a_state_that_cannot_be_seen_is_refused(A, B, hidden):
+    model = linear(A, B)
+    if hidden:
+        with pytest.raises(ValueError, match='x0, measured, do not determine the states x0, x1'):
+            ExtendedKalmanFilter(model, tuning(model, first(model, 1)))
+    else:
+        assert ExtendedKalmanFilter(model, tuning(model, first(model, 1)))
+
+
+@pytest.mark.parametrize('wrong', ['noise', 'wander', 'initial_error'])
+def test_a_number_is_missing(wrong):
+    model = oscillator()
+    with pytest.raises(ValueError, match=rf'{wrong} must be \d finite numbers above 0, got \[\]'):
+        ExtendedKalmanFilter(model, replace(tuning(model, first(model, 1)),
+                                            **{wrong: np.zeros(0)}))
+
+
+def saddle(model: LiftedModel = TRUTH, **changes: object) -> Controller:
+    """Return the controller of the temperature that knows nothing else."""
+    return Controller(model, Settings.for_model(model, **{
+        'state_weight': np.array([0.0, 1.0]), 'input_weight': np.ones(1), 'limits': WIDE,
+        'controlled': ('temperature',), 'sensor': SensorLimits.none(1), 'transfer_time': 0.0,
+        'noise': np.array([NOISE]), 'wander': np.array([0.1]),
+        'initial_error': np.array([0.2, 2.0]),
+        'supervisor': SupervisorSettings((LevelSettings('sdre', 0.3),)), **changes}), TEMPERATURE)
+
+
+def held(temperature: float) -> tuple[Array, Array]:
+    return steady_state(SYSTEM, {'temperature': temperature})
+
+
+def changed(**constants: float):
+    plant = two_state_reactor(ReactorParameters(**constants), nominal_state=SADDLE)
+
+    def change(loop: Loop) -> Loop:
+        before = loop.plant
+        return replace(loop, plant=Process(plant, before.time_ns, before.x, before.u))
+
+    return change
+
+
+@pytest.mark.parametrize('estimator', ['extended_kalman_filter', 'unscented_kalman_filter'])
+@pytest.mark.parametrize(('constants', 'known'), [
+    ({'heat_transfer_coefficient': 0.85 * 5e4}, True),
+    ({'feed_temperature': 355.0}, True),
+    # one output has one disturbance: it is taken for one of the heat balance
+    ({'feed_concentration': 1.1}, False)])
+def test_the_saddle_is_held_by_its_temperature_alone(estimator, constants, known):
+    x0, u0 = held(350.0)
+    loop = simulate(saddle(estimator=estimator), Process(SYSTEM, 0, x0, u0), [
+        at(0.0, Initialisation(u0)), at(0.0, SetpointRequest(0, np.array([350.0]))),
+        at(60.0, changed(**constants)), at(400.0, SetpointRequest(0, np.array([345.0])))],
+        duration=1000.0, noise=np.array([NOISE]), seed=1)
+    T = loop.states[:, 1]
+    assert set(loop.levels) == {'sdre'}
+    assert np.max(np.abs(T[:400] - 350.0)) < 4.0
+    assert abs(np.mean(T[300:400]) - 350.0) < 0.05
+    assert abs(np.mean(T[700:]) - 345.0) < 0.05
+    estimates = np.array([report.estimate.state[0] for report in loop.reports])
+    error = estimates[700:] - loop.states[700:, 0]
+    assert np.max(np.abs(error)) < (2e-3 if known else 0.06)
+    # it says itself how well it knows what is not measured
+    deviation = np.array([report.estimate.deviation[0] for report in loop.reports])
+    assert deviation[0] == pytest.approx(0.2)
+    assert not known or np.all(np.abs(error) < 5.0 * deviation[700:])
+
+
+@pytest.mark.parametrize('wrong', [-0.2, 0.1])
+def test_a_wrong_first_guess_of_what_is_not_measured_is_survived(wrong):
+    x0, u0 = held(350.0)
+    x0 = np.array([x0[0] + wrong, x0[1]])
+    loop = simulate(saddle(), Process(SYSTEM, 0, x0, u0), [
+        at(0.0, Initialisation(u0)), at(0.0, SetpointRequest(0, np.array([350.0])))],
+        duration=600.0, noise=np.array([NOISE]), seed=2)
+    assert set(loop.levels) == {'sdre'}
+    assert abs(np.mean(loop.states[-100:, 1]) - 350.0) < 0.05
+
+
+def test_a_sensor_that_is_lost_for_five_seconds_is_bridged_by_the_model():
+    x0, u0 = held(350.0)
+    loop = simulate(saddle(), Process(SYSTEM, 0, x0, u0), [
+        at(0.0, Initialisation(u0)), at(0.0, SetpointRequest(0, np.array([355.0])))],
+        duration=400.0, noise=np.array([NOISE]), seed=3,
+        sensor=lambda y, seconds: None if 8.0 < seconds < 14.0 else y)
+    assert set(loop.levels) == {'sdre', 'hold'}
+    assert np.max(loop.states[:, 1]) < 358.0
+    assert abs(np.mean(loop.states[-100:, 1]) - 355.0) < 0.05
+    deviations = np.array([report.estimate.deviation[1] for report in loop.reports[1:]])
+    # it grows while nothing comes
+    assert np.all(np.diff(deviations[8:12]) > 0.0)
+    assert deviations[11] > 1.5 * deviations[6]
+
+
+def test_what_is_known_goes_over_to_a_model_in_other_units():
+    states = TRUTH.states
+    twice = replace(TRUTH, states=replace(states, scale=2.0 * states.scale),
+                    A=TRUTH.A, B=0.5 * TRUTH.B)
+    x0, u0 = held(350.0)
+    loop = simulate(saddle(), Process(SYSTEM, 0, x0, u0), [
+        at(0.0, Initialisation(u0)), at(0.0, SetpointRequest(0, np.array([350.0]))),
+        at(20.0, changed(heat_transfer_coefficient=0.9 * 5e4)),
+        at(100.0, exchange(saddle(twice)))],
+        duration=101.0, noise=np.array([NOISE]), seed=4)
+    before, after = (loop.reports[k].estimate for k in (99, 100))
+    assert after.deviation == pytest.approx(before.deviation, rel=0.05)
+    assert after.disturbance == pytest.approx(before.disturbance, abs=0.5)
+    assert abs(float(loop.commands[100, 0] - loop.commands[99, 0])) <= 1.0
+
+
+def test_a_model_with_other_hidden_states_begins_from_what_is_measured():
+    # the same plant, its concentration in other words
+    names = ('conversion', 'temperature')
+    other = replace(TRUTH, states=Coordinates(
+        names, ('1', 'K'), TRUTH.states.center, TRUTH.states.scale, TRUTH.states.lower,
+        TRUTH.states.upper))
+    x0, u0 = held(350.0)
+    loop = simulate(saddle(), Process(SYSTEM, 0, x0, u0), [
+        at(0.0, Initialisation(u0)), at(0.0, SetpointRequest(0, np.array([350.0]))),
+        at(100.0, exchange(saddle(other)))],
+        duration=300.0, noise=np.array([NOISE]), seed=5)
+    assert set(loop.levels) == {'sdre'}
+    assert abs(np.mean(loop.states[200:, 1]) - 350.0) < 0.05
+
+
+def test_a_state_with_its_covariance_is_written_down_without_loss():
+    x0, u0 = held(350.0)
+    state = simulate(saddle(), Process(SYSTEM, 0, x0, u0), [], duration=5.0,
+                     noise=np.array([NOISE])).loop.state
+    written = json.dumps(encoded(state))
+    read = decoded(json.loads(written))
+    assert isinstance(read, State)
+    assert json.dumps(encoded(read)) == written
+    assert (read.estimate.covariance == state.estimate.covariance).all()
+    assert read.estimate.innovation.mean_square == state.estimate.innovation.mean_square
+
+
+def test_more_inputs_than_outputs_and_fewer():
+    # one disturbance for each output, whatever the inputs: no offset where the plant differs
+    for n_u, n_y in ((2, 1), (1, 2), (1, 1)):
+        model = random_lift(2, n_u=n_u, seed=1)
+        one = ExtendedKalmanFilter(model, tuning(model, first(model, n_y)))
+        assert np.linalg.matrix_rank(one.initial_covariance[2:, 2:]) == n_y
