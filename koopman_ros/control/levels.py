@@ -18,7 +18,7 @@ from koopman_ros.control.laws.base import steady_state_target, Target
 from koopman_ros.control.limits import finite, InputLimits
 from koopman_ros.control.settings import Settings
 from koopman_ros.control.state import amended, State
-from koopman_ros.control.target import held_at, partial_target
+from koopman_ros.control.target import held_at, partial_target, reachable_target
 from koopman_ros.estimation import (
     check,
     Estimate,
@@ -109,8 +109,22 @@ class Level:
         target = self.target(setpoint, estimate.w, limits, start)
         if target is None:
             return None, LawResult(None, reason(Code.NO_STEADY_STATE))
+        target = self._within_reach(target, estimate.w, limits)
         return target, self.law.compute(
             estimate, target, limits, memory, interval, deadline, last)
+
+    def _within_reach(self, target: Target, w: Array, limits: InputLimits) -> Target:
+        """Return the target, or what is nearest to it where the inputs do not suffice."""
+        model = self.model
+        # a single one at its end goes there by itself
+        if model.n_u == 1 or len(self.controlled) > model.n_u:
+            return target
+        u = model.inputs.to_physical(target.u)
+        if ((u >= limits.lower) & (u <= limits.upper)).all():
+            return target
+        return reachable_target(
+            model, self._indices, target, w, model.inputs.to_deviation(limits.lower),
+            model.inputs.to_deviation(limits.upper)) or target
 
     def lost(self, estimate: Estimate, target: Target | None) -> bool:
         """Tell whether the law was lost between such a state and target when it was checked."""

@@ -22,6 +22,7 @@ _LONGEST_STEP = 0.5
 _RESOLUTION = 1e-9
 # With inputs to spare the nearest solution is found when a step is no longer than this.
 _STILL = 1e-6
+_SLACK = 1e-6  # of what rounding may add to an input, in scaled deviations
 # Weight of the states against the inputs where the nearest steady state is wanted.
 _REACH = 1e3
 
@@ -101,6 +102,39 @@ def partial_target(model: LiftedModel, controlled: NDArray[np.intp], setpoint: A
     if found is None or np.any((found[n:] < lower) | (found[n:] > upper)):
         found = unlimited
     return None if found is None else _target(model, found, w)
+
+
+def reachable_target(model: LiftedModel, controlled: NDArray[np.intp], target: Target, w: Array,
+                     lower: Array, upper: Array) -> Target | None:
+    """
+    Find the steady state nearest to a target that inputs within their range hold.
+
+    Nearest is where the states with a set-point are; the others go where they have to.
+
+    :param controlled: (n_c,) indices of the states with a set-point.
+    :param w: (n_x,) disturbance of the state's rate.
+    :param lower: (n_u,) range of the inputs, to `upper` (n_u,), in scaled deviations.
+    :return: the target itself where it is within; None where nothing was found near it.
+    """
+    n, states = model.n_x, model.states
+    # a steady state further off than the box is wide is on another branch
+    far = (states.upper - states.lower) / states.scale
+    y = anchor = np.concatenate((target.x, target.u))
+    free, reach = np.ones(len(y), dtype=np.bool_), np.full(len(y), _REACH)
+    reach[controlled] = 1.0
+    for _ in range(model.n_u + 1):
+        excess = np.maximum(lower - y[n:], y[n:] - upper)
+        worst = int(np.argmax(excess))
+        if not excess[worst] > _SLACK:
+            return target if y is anchor else _target(model, y, w)
+        y = y.copy()
+        y[n + worst] = min(max(y[n + worst], lower[worst]), upper[worst])
+        free[n + worst] = False
+        found = equilibrium(model, w, y, free, anchor, reach)
+        if found is None or not np.all(np.abs(found[:n] - target.x) <= far):
+            return None
+        y = found
+    return None
 
 
 def nearest_steady_state(model: LiftedModel, target: Target, w: Array) -> Array | None:

@@ -19,6 +19,7 @@ from std_msgs.msg import String
 from koopman_ros.arrays import Array
 from koopman_ros.assembler import Assembler
 from koopman_ros.control import Arrival, Controller, events, HOLD, Mode, Report, SAFE, State
+from koopman_ros.control.state import TargetReport
 from koopman_ros.parameters.controller import ControllerParameters
 from koopman_ros.parameters.wire import Signals
 from koopman_ros.reasons import level_words
@@ -29,6 +30,7 @@ from koopman_ros.ros.watchdog import Timing
 from koopman_ros.units import display_unit, shown
 from koopman_ros.wire import stem
 
+_REACHED = 1e-3  # of a range; so near a set-point is reached
 _SNAPSHOT_PERIOD = 10.0  # s by the wall
 _ACTIONS = {HOLD: 'the last command is held', SAFE: 'the safe {} is commanded'}
 _WAY_BACK = 'the {} leads the plant back from where the safe one keeps it'
@@ -156,6 +158,8 @@ def _warning(now: Situation) -> str:
     if oldest and abs(age) > oldest:
         return (f'measurements are {age:.1f} s old when they arrive, at most {oldest:g} s are '
                 'expected: check the connection and the clocks')
+    if report.target is not None and (short := _out_of_reach(now, report.target)):
+        return short
     if not report.measurement.follows:
         return (f'the {now.input} does not follow its command within '
                 f'{_listed(now, "tolerance")}: the observer goes by what is measured; check the '
@@ -163,6 +167,29 @@ def _warning(now: Situation) -> str:
     if report.estimate is not None and report.estimate.at_bound:
         return (f'the disturbance estimate is at its bound of {_listed(now, "max_disturbance")} '
                 f'of {now.input}: the plant is far from its model; retrain')
+    return ''
+
+
+def _out_of_reach(now: Situation, target: TargetReport) -> str:
+    """Say that the inputs do not suffice for the set-point as things are, or return ''."""
+    if target.state is None or target.input is None:
+        return ''
+    names, limits = now.controller.model.states.names, now.controller.settings.limits
+    for name, wanted in zip(now.signals.controlled, target.setpoint.tolist(), strict=True):
+        found, unit = float(target.state[names.index(name)]), now.signals.states[name]
+        box = now.controller.model.states.only((name,))
+        if abs(found - wanted) > _REACHED * float(box.upper[0] - box.lower[0]):
+            return (f'the set-point {shown(wanted, unit):.6g} {display_unit(unit)} of {name} '
+                    f'cannot be held within the range of the {now.input}: '
+                    f'{shown(found, unit):.6g} {display_unit(unit)} is the nearest')
+    for (name, unit), wanted, low, high in zip(
+            now.signals.inputs.items(), target.input.tolist(), limits.lower.tolist(),
+            limits.upper.tolist(), strict=True):
+        slack = _REACHED * (high - low)
+        if not low - slack <= wanted <= high + slack:
+            return (f'the set-point would need the {stem(name, unit)} at '
+                    f'{shown(wanted, unit):.6g} {display_unit(unit)}, its range is '
+                    f'{shown(low, unit):.6g} to {shown(high, unit):.6g}: it is not reached')
     return ''
 
 

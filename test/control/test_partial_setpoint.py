@@ -12,6 +12,7 @@ from hypothesis import strategies as st
 import numpy as np
 import pytest
 from scipy.linalg import expm
+from scipy.optimize import lsq_linear
 
 from koopman_ros.control import (
     at,
@@ -25,6 +26,7 @@ from koopman_ros.control import (
     Weights,
 )
 from koopman_ros.control.events import Outcome
+from koopman_ros.control.target import reachable_target
 from koopman_ros.estimation import Estimate
 from koopman_ros.lifting import Coordinates, LiftedModel, linearised_model, Provenance
 from koopman_ros.lifting.observables import PolynomialObservables
@@ -509,3 +511,34 @@ def test_commands_are_numbers_within_limits_and_follow_from_the_state_alone(cont
                 assert refused is None or say(refused)
         if command is not None:
             assert np.all((limits.lower <= command) & (command <= limits.upper))
+
+
+@pytest.mark.parametrize(('model', 'controlled', 'asked', 'w'), [
+    # the pump of the first tank would have to give 7 L/s
+    (SERIES, ('h2',), [5.0], [0.0, 0.0]),
+    (SERIES, ('h2',), [2.0], [-0.15, 0.0]),
+    (BOTH, ('h1', 'h2'), [2.0, 2.0], [-3.0, -4.0]),
+    (THREE, ('h2', 'h3'), [2.0, 1.8], [-0.05, 0.0, -0.2])])
+def test_where_a_pump_does_not_suffice_the_nearest_level_is_found(model, controlled, asked, w):
+    level = next(iter(loop(model, *controlled).levels.values()))
+    limits = loop(model).settings.limits
+    w = np.array(w) / model.states.scale
+    places = [model.states.names.index(name) for name in controlled]
+    found = reachable_target(
+        model, np.array(places), level.target(np.array(asked), w, limits, None), w,
+        model.inputs.to_deviation(limits.lower), model.inputs.to_deviation(limits.upper))
+    # linear: all steady states are x = -A^-1 (B u + w), so that bounded least squares has it
+    slope = -np.linalg.solve(model.A, model.B)
+    rest = -np.linalg.solve(model.A, w)
+    wanted = model.states.to_deviation(model.states.center)[places] + (
+        np.array(asked) - model.states.center[places]) / model.states.scale[places]
+    best = lsq_linear(slope[places], wanted - rest[places], (
+        model.inputs.to_deviation(limits.lower), model.inputs.to_deviation(limits.upper)))
+    assert found.u == pytest.approx(best.x, abs=1e-3)
+    assert found.x == pytest.approx(slope @ best.x + rest, abs=1e-3)
+    assert found.residual == pytest.approx(0.0, abs=1e-8)
+    if model.n_u > 1:
+        # which is where the law goes
+        estimate = Estimate(np.zeros(model.n_x), w)
+        target = level.compute(np.array(asked), estimate, limits, None, 1.0, None)[0]
+        assert target.u == pytest.approx(found.u)

@@ -7,6 +7,7 @@ from dataclasses import replace
 import itertools
 import math
 from pathlib import Path
+import re
 import sys
 import time
 
@@ -173,6 +174,20 @@ def measure_on(bench: Bench, count: int, first: float) -> float:
     for k in range(count):
         bench.measure(STEADY - 0.02 * k, first + k)
     return first + count - 1
+
+
+def test_a_setpoint_that_needs_more_than_there_is_is_said(bench: Bench) -> None:
+    bench.ros.set_parameters('controller', **{
+        'disturbance_bandwidth': 0.1, 'coolant_temperature.max_disturbance': 100.0})
+    for k in range(60):
+        # a thermometer that does not follow: the observer takes it for a plant that is cooled
+        bench.measure(STEADY - 8.0 - 0.01 * (k % 2), 2.0 + k)
+    status = bench.status(lambda s: 'would need' in s.message)
+    assert status.level == DiagnosticStatus.WARN
+    needed = re.search(r'the set-point would need the coolant at ([\d.]+) degC, its range is 5 to '
+                       r'32: it is not reached', status.message)
+    assert needed, status.message
+    assert float(needed[1]) > 32.0
 
 
 def test_status_tells_mode_law_reason_and_figures(bench: Bench) -> None:
