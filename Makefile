@@ -14,7 +14,7 @@ export ROS_AUTOMATIC_DISCOVERY_RANGE ?= LOCALHOST
 # How many seeds each experiment is run from: make studies SEEDS=5
 SEEDS ?= 20
 
-.PHONY: help demo demo-retrain test test-machines lint models studies studies-sensors studies-robustness studies-general studies-unstable bench faults docs config lock clean
+.PHONY: help demo demo-retrain test test-machines lint models studies studies-sensors studies-robustness studies-general studies-unstable studies-saddle bench faults docs config lock clean
 
 help:  ## show this list
 	@grep -E '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed 's/:.*## /\t/'
@@ -96,6 +96,10 @@ studies-general: $(VENV)/bench.stamp  ## the law on seven plants by models of ea
 studies-unstable: SEEDS = 10
 studies-unstable: $(VENV)/train.stamp  ## the reactor about its saddle, learned under a pre-feedback, SEEDS=10, six minutes
 	$(BIN)/python -m validation.unstable --seeds $(SEEDS)
+
+studies-saddle: SEEDS = 10
+studies-saddle: $(VENV)/train.stamp  ## the same reactor held at its saddle from its temperature alone, SEEDS=10, half an hour
+	$(BIN)/python -m validation.saddle --seeds $(SEEDS)
 
 bench: $(VENV)/bench.stamp  ## speed beside other programs, seventeen minutes (BENCH=--quick: three) -> out/bench
 	$(BIN)/python -m validation.benchmarks $(BENCH)

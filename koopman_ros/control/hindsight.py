@@ -13,9 +13,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from koopman_ros.arrays import Array
+from koopman_ros.control.controller import Controller
 from koopman_ros.control.events import Measurement
 from koopman_ros.control.limits import finite
 from koopman_ros.control.state import Arrival, MeasurementReport
+from koopman_ros.estimation import Estimate
+from koopman_ros.estimation.observer import simulated
 from koopman_ros.lifting import LiftedModel
 from koopman_ros.units import NANOSECONDS
 
@@ -94,7 +97,7 @@ class Recent:
 class Windows:
     """N measurements in M windows of K steps each."""
 
-    x: Array  #: (N, n_x) measured, in units
+    x: Array  #: (N, n_y) measured, in units
     u: Array  #: (N - 1, n_u) inputs held between them, in units
     steps: Array  #: (N - 1,) time between them, in s
     places: NDArray[np.intp]  #: (M, K) which steps are in a window
@@ -157,6 +160,41 @@ class Windows:
         return every
 
 
+def _predicted(controller: Controller, windows: Windows) -> Array:
+    """
+    Return the mean squared errors (., n_y) of predicting windows from what is known before them.
+
+    Those of the later half, and the last one: before that, states that are not measured are not
+    known yet. Infinite where the model is lost.
+    """
+    model, outputs = controller.model, controller.measured
+    estimator = next(iter(controller.levels.values())).estimator
+    inputs, steps = model.inputs.to_deviation(windows.u), windows.steps.tolist()
+    estimate = estimator.restart(
+        None, model.states.to_deviation(controller.position(windows.x[0])), inputs[0])
+    known = [estimate]
+    for y, u, seconds in zip(windows.x[1:], inputs, steps, strict=True):
+        predicted = estimator.predict(estimate, u, seconds) or estimate
+        x = outputs.state(y, model.states.to_physical(predicted.x))
+        estimate = estimator.correct(predicted, model.states.to_deviation(x), seconds)
+        known.append(estimate)
+    # the last one comes first
+    late = [places for k, places in enumerate(windows.places.tolist())
+            if not k or places[0] >= len(steps) // 2]
+    found = np.full((len(late), len(outputs.names)), np.inf)
+    for window, places in zip(found, late, strict=True):
+        ahead: Estimate | None = known[places[0]]
+        errors = []
+        for k in places:
+            ahead = ahead and simulated(model, ahead, inputs[k], steps[k])
+            if ahead is None or not finite(ahead.x):
+                break
+            errors.append(windows.x[k + 1] - outputs.of(model.states.to_physical(ahead.x)))
+        else:
+            window[:] = np.mean(np.square(errors), axis=0)
+    return found
+
+
 def rms(squares: Array) -> Array:
     """Return the root of the mean (n,) over windows of squares (M, n)."""
     found: Array = np.sqrt(squares.mean(axis=0))
@@ -190,13 +228,19 @@ class Comparison:
         return bool(np.any((self.motion > self.negligible) & (self.present < 0.5 * self.motion)))
 
 
-def compare(present: LiftedModel, candidate: LiftedModel, windows: Windows
-            ) -> Comparison | None:
-    """Let two models of the same states predict; None where the present one never can."""
-    box, motion = present.states, windows.motion
-    negligible = np.maximum(_SHARE_OF_MOTION * motion, _SHARE_OF_BOX * (box.upper - box.lower))
+def compare(present: Controller, candidate: Controller, windows: Windows) -> Comparison | None:
+    """
+    Let the models of two controllers predict; None where the present one never can.
+
+    Where not every state is measured they go on from what their filters know.
+    """
+    box, motion = present.model.states, windows.motion
+    negligible = np.maximum(_SHARE_OF_MOTION * motion, _SHARE_OF_BOX * (
+        np.abs(present.measured.C) @ (box.upper - box.lower)))
+    whole = present.measured.all_states and candidate.measured.all_states
     with np.errstate(all='ignore'):
-        own, new = (windows.squares(model, negligible) for model in (present, candidate))
+        own, new = (windows.squares(one.model, negligible) if whole else _predicted(one, windows)
+                    for one in (present, candidate))
     known = np.isfinite(own).all(axis=1)
     if not known.any():
         return None

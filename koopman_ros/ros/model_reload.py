@@ -176,13 +176,13 @@ def refuse_worse(present: LiftedModel, model: LiftedModel, situation: Situation)
 
     :return: how well it does beside the present one, in words.
     """
-    if set(model.states.names) != set(situation.parameters.states):
-        return 'not compared with the model before: not every state is measured'
-    found = None if situation.recent is None else compare(present, model, situation.recent)
+    found = None if situation.recent is None else compare(
+        situation.controller(present), situation.controller(model), situation.recent)
     if found is None:
         return 'not compared with the model before: too little was measured so far'
     i = int(np.argmax(found.ratio))
-    name, unit = model.states.names[i], model.states.units[i]
+    name, unit = list(situation.parameters.states)[i], list(signals_of(
+        model, measured=situation.parameters.states).states.values())[i]
     words = (f'predicts {name} of the last {found.seconds:.3g} s with an error of '
              f'{found.candidate[i]:.2g} {unit}, the {{}} with {found.present[i]:.2g} {unit}')
     # written so that NaN is refused, too

@@ -9,13 +9,21 @@ import numpy as np
 import pytest
 from scipy.signal import cont2discrete
 
-from koopman_ros.control import SetpointRequest
+from koopman_ros.control import (
+    Controller,
+    hindsight,
+    InputLimits,
+    SetpointRequest,
+    Settings,
+)
 from koopman_ros.control.events import Measurement
-from koopman_ros.control.hindsight import compare, Recent, Windows
+from koopman_ros.control.hindsight import Recent, Windows
 from koopman_ros.control.simulate import at, simulate
 from koopman_ros.control.state import Arrival, MeasurementReport
+from koopman_ros.estimation import SensorLimits
 from koopman_ros.lifting import Coordinates, LiftedModel, linearised_model, Provenance
 from koopman_ros.plants import Process
+from koopman_ros.signals import Outputs
 from support.closed_loops import controller, REACTOR, SECOND, shipped, START
 
 ACCEPTED, REJECTED = MeasurementReport(Arrival.ACCEPTED), MeasurementReport(Arrival.REJECTED)
@@ -28,6 +36,20 @@ def model(A: np.ndarray = A, B: np.ndarray = B) -> LiftedModel:
                         np.full(n, 6.0))
             for names, n in ((('x1', 'x2'), 2), (('u',), 1)))
     return linearised_model(A, B, x, u, 's', Provenance('two lags'))
+
+
+def one(model: LiftedModel, outputs: Outputs | None = None) -> Controller:
+    n_y = model.n_x if outputs is None else len(outputs.names)
+    limits = InputLimits(model.inputs.lower, model.inputs.upper, np.full(model.n_u, np.inf))
+    return Controller(model, Settings.for_model(
+        model, state_weight=np.ones(model.n_x), input_weight=np.ones(model.n_u), limits=limits,
+        sensor=SensorLimits.none(n_y), noise=np.full(n_y, 0.01), wander=np.full(model.n_u, 1e-3)),
+        outputs)
+
+
+def compare(present: LiftedModel, candidate: LiftedModel, windows: Windows,
+            outputs: Outputs | None = None) -> hindsight.Comparison | None:
+    return hindsight.compare(one(present, outputs), one(candidate, outputs), windows)
 
 
 def recent(x: np.ndarray, u: np.ndarray, length: float, seconds: float = 1.0) -> Recent:
@@ -92,6 +114,20 @@ def test_models_are_told_apart_where_something_moves(other, accepted, noise):
     found = compare(model(), other, recent(x + 3.0, u + 3.0, 200.0).windows(200.0))
     assert found.tells
     assert found.seconds == 200.0
+    assert bool(np.all(found.ratio <= 2.0)) is accepted
+
+
+@pytest.mark.parametrize(('other', 'accepted'), [
+    (model(), True), (model(B=1.1 * B), True), (model(A=1.2 * A), True),
+    (model(B=-B), False), (model(B=5.0 * B), False)])
+def test_models_are_told_apart_by_one_output_of_two(other, accepted):
+    u = random_steps(301, 1)
+    y = two_lags(u)[:, :1] + 0.01 * np.random.default_rng(2).normal(size=(301, 1))
+    # what moves the output is the state that is not measured
+    windows = recent(y + 3.0, u + 3.0, 200.0).windows(200.0)
+    found = compare(model(), other, windows, Outputs(('x1',), ('1',), np.array([[1.0, 0.0]])))
+    assert found.tells
+    assert found.ratio.shape == (1,)
     assert bool(np.all(found.ratio <= 2.0)) is accepted
 
 
