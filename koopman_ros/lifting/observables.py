@@ -265,12 +265,16 @@ class PolynomialObservables(Observables):
         return self
 
     @cached_property
-    def _first(self) -> tuple[Array, NDArray[np.int64]]:
-        return _differentiated(np.ones(self.n_z), self.exponents)
+    def _own(self) -> '_Monomials':
+        return _Monomials(np.ones(self.n_z), self.exponents)
 
     @cached_property
-    def _second(self) -> tuple[Array, NDArray[np.int64]]:
-        return _differentiated(*self._first)
+    def _first(self) -> '_Monomials':
+        return self._own.differentiated
+
+    @cached_property
+    def _second(self) -> '_Monomials':
+        return self._first.differentiated
 
     @cached_property
     def _quadrature(self) -> tuple[Array, Array]:
@@ -281,24 +285,22 @@ class PolynomialObservables(Observables):
 
     def lift(self, x: Array) -> Array:
         """Evaluate z = N(x): (..., n_x) -> (..., n_z)."""
-        return _monomials(x, self.exponents)
+        return self._own.at(x)
 
     def lift_and_jacobian(self, x: Array) -> tuple[Array, Array]:
         """Evaluate N(x) and J_N(x); shapes as in the interface."""
-        factors, exponents = self._first
-        return self.lift(x), factors * _monomials(x, exponents)
+        return self.lift(x), self._first.factors * self._first.at(x)
 
     def lift_and_secants(self, x: Array, x_ref: Array, w: Array
                          ) -> tuple[Array, Array, Array, Array]:
         """Evaluate the lift, and the secants as means along the segment, by exact quadrature."""
         nodes, weights = self._quadrature
         points = x_ref + nodes[:, None] * (x - x_ref)
-        first, exponents = self._first
-        M: Array = np.tensordot(weights, first * _monomials(points, exponents), 1)
+        first, second = self._first, self._second
+        M: Array = np.tensordot(weights, first.factors * first.at(points), 1)
         # the weights add up to 1 but for rounding
         M[:self.n_x] = np.eye(self.n_x)
-        second, exponents = self._second
-        H: Array = np.tensordot(weights, second * _monomials(points, exponents) @ w, 1)
+        H: Array = np.tensordot(weights, second.factors * second.at(points) @ w, 1)
         return *self.lift_and_jacobian(x), M, H
 
 
@@ -312,17 +314,36 @@ def _columns(array: Array) -> int:
     return np.shape(array)[1] if np.ndim(array) == 2 else -1
 
 
-def _differentiated(factors: Array, exponents: NDArray[np.int64]
-                    ) -> tuple[Array, NDArray[np.int64]]:
-    """Differentiate factors (...) times monomials (..., n_x) by each state, in an axis added."""
-    n_x = exponents.shape[-1]
-    # the factor is 0 where an exponent would turn negative, and x^-1 must not be evaluated at 0
-    lowered = np.maximum(exponents[..., None, :] - np.eye(n_x, dtype=np.int64), 0)
-    return factors[..., None] * exponents, lowered
+@dataclass(frozen=True, eq=False)
+class _Monomials:
+    """Factors (*shape) times prod_j x_j^exponents[..., j], of exponents (*shape, n_x)."""
 
+    factors: Array
+    exponents: NDArray[np.int64]
 
-def _monomials(x: Array, exponents: NDArray[np.int64]) -> Array:
-    """Evaluate prod_j x_j^exponents[..., j]: (..., n_x) and (*shape, n_x) -> (..., *shape)."""
-    axes = tuple(range(-exponents.ndim, -1))
-    powers: Array = np.expand_dims(x, axes) ** exponents
-    return powers.prod(axis=-1)
+    @cached_property
+    def differentiated(self) -> '_Monomials':
+        """Their derivatives by each state, in an axis added."""
+        E = self.exponents
+        # the factor is 0 where an exponent would turn negative; x^-1 must not be evaluated at 0
+        lowered = np.maximum(E[..., None, :] - np.eye(E.shape[-1], dtype=np.int64), 0)
+        return _Monomials(self.factors[..., None] * E, lowered)
+
+    @cached_property
+    def _columns(self) -> tuple[int, list[NDArray[np.int64]]]:
+        E = self.exponents
+        return int(np.max(E, initial=1)), [np.ascontiguousarray(E[..., j])
+                                           for j in range(E.shape[-1])]
+
+    def at(self, x: Array) -> Array:
+        """Evaluate them without their factors: (..., n_x) -> (..., *shape)."""
+        degree, columns = self._columns
+        # each power once; numpy's own power of many numbers takes twenty times as long
+        powers = np.empty((*x.shape, degree + 1))
+        powers[..., 0], powers[..., 1] = 1.0, x
+        for k in range(2, degree + 1):
+            np.multiply(powers[..., k - 1], x, out=powers[..., k])
+        found: Array = powers[..., 0, :].take(columns[0], axis=-1)
+        for j in range(1, len(columns)):
+            found *= powers[..., j, :].take(columns[j], axis=-1)
+        return found

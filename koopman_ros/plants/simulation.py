@@ -113,7 +113,9 @@ def hold(system: ControlAffineSystem, start: Array, u: Array, duration: float,
             raise failed(IntegrationFailure.NON_FINITE, 0.0, start)
         if duration == 0.0:
             return start.copy()
-        solver = DOP853(rate, 0.0, start, duration, rtol=limits.rtol, atol=limits.atol)
+        # most holds are short, so that the first step is the last one; too long, it is rejected
+        solver = DOP853(rate, 0.0, start, duration, rtol=limits.rtol, atol=limits.atol,
+                        first_step=duration)
         for _ in range(_MAX_STEPS_PER_HOLD):
             solver.step()
             x: Array = solver.y

@@ -4,10 +4,11 @@
 """A pendulum with friction and a motor in its pivot, upright."""
 
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 
-from koopman_ros.arrays import Array
+from koopman_ros.arrays import along_last, Array
 from koopman_ros.plants.constants import constant, Constants
 from koopman_ros.plants.system import ControlAffineSystem
 
@@ -41,14 +42,14 @@ class Pendulum(Constants):
             nominal_input=np.zeros(1),
         )
 
-    @property
+    @cached_property
     def _inertia(self) -> float:
         return self.mass * self.length ** 2
 
     def _drift(self, x: Array) -> Array:
         angle, rate = x[..., 0], x[..., 1]
-        return np.stack([rate, self.gravity / self.length * np.sin(angle)
-                         - self.friction / self._inertia * rate], axis=-1)
+        return along_last(rate, self.gravity / self.length * np.sin(angle)
+                          - self.friction / self._inertia * rate)
 
     def _drift_jacobian(self, x: Array) -> Array:
         jacobian = np.zeros((*x.shape, 2))

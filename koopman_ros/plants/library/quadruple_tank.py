@@ -4,6 +4,7 @@
 """The quadruple-tank process: four tanks, two pumps that each fill a lower and an upper one."""
 
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 
@@ -74,11 +75,11 @@ class QuadrupleTank(Constants):
             state_lower=np.full(4, LOWEST_LEVEL),
         )
 
-    @property
+    @cached_property
     def _areas(self) -> Array:
         return np.array([self.tank_area_1, self.tank_area_2, self.tank_area_3, self.tank_area_4])
 
-    @property
+    @cached_property
     def _orifices(self) -> Array:
         return np.array([self.orifice_1, self.orifice_2, self.orifice_3, self.orifice_4])
 

@@ -4,13 +4,13 @@
 """The continuous stirred tank reactor (CSTR) with a cooling jacket, of one state and of two."""
 
 from dataclasses import dataclass, replace
-from functools import partial
+from functools import cached_property, partial
 
 import numpy as np
 from numpy.typing import ArrayLike
 from scipy.optimize import brentq
 
-from koopman_ros.arrays import Array
+from koopman_ros.arrays import along_last, Array
 from koopman_ros.plants.constants import constant, Constants
 from koopman_ros.plants.system import ArrayFunction, ControlAffineSystem, EquilibriumError
 
@@ -64,17 +64,17 @@ class ReactorParameters(Constants):
         0.87725294608097, 'mol/L', 0.0, 100.0,
         'reactant C_A that the one-state reactor holds, its alone', si='mol/m^3', factor=1e-3)
 
-    @property
+    @cached_property
     def dilution_rate(self) -> float:
         """The flow rate over the volume, q/V, in 1/min."""
         return self.flow_rate / self.volume
 
-    @property
+    @cached_property
     def cooling_rate(self) -> float:
         """The input gain UA/(rho C_p V), in 1/min."""
         return self.heat_transfer_coefficient / (self.density * self.heat_capacity * self.volume)
 
-    @property
+    @cached_property
     def heating_per_conversion(self) -> float:
         """The temperature rise by reaction, -Delta H_R/(rho C_p), in K per mol/L."""
         return -self.reaction_enthalpy / (self.density * self.heat_capacity)
@@ -208,7 +208,7 @@ def _two_state_drift(constants: ReactorParameters, x: Array) -> Array:
     reaction = concentration * _rate_constant(constants, temperature)
     supply = constants.dilution_rate * (constants.feed_concentration - concentration)
     heating = constants.heating_per_conversion * reaction
-    return np.stack([supply - reaction, _heat_flow(constants, temperature) + heating], axis=-1)
+    return along_last(supply - reaction, _heat_flow(constants, temperature) + heating)
 
 
 def _two_state_jacobian(constants: ReactorParameters, x: Array) -> Array:
@@ -243,7 +243,7 @@ def _heat_flow(constants: ReactorParameters, temperature: Array) -> Array:
 def _with_steady_concentration(constants: ReactorParameters, temperature: Array) -> Array:
     supply = constants.dilution_rate * constants.feed_concentration
     consumption = constants.dilution_rate + _rate_constant(constants, temperature)
-    return np.stack([supply / consumption, temperature], axis=-1)
+    return along_last(supply / consumption, temperature)
 
 
 def _cold_stable_state(constants: ReactorParameters, drift: ArrayFunction,

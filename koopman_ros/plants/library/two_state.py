@@ -8,7 +8,7 @@ from functools import partial
 
 import numpy as np
 
-from koopman_ros.arrays import Array
+from koopman_ros.arrays import along_last, Array
 from koopman_ros.plants.constants import constant, Constants
 from koopman_ros.plants.system import ControlAffineSystem
 
@@ -48,7 +48,7 @@ def two_state_example(mu: float = -0.1, lambda_: float = 1.0) -> ControlAffineSy
 
 def _drift(mu: float, lambda_: float, x: Array) -> Array:
     x1, x2 = x[..., 0], x[..., 1]
-    return np.stack([mu * x1, lambda_ * (x2 - x1 * x1)], axis=-1)
+    return along_last(mu * x1, lambda_ * (x2 - x1 * x1))
 
 
 def _drift_jacobian(mu: float, lambda_: float, x: Array) -> Array:

@@ -4,10 +4,11 @@
 """Two coupled tanks, one above the other, each filled by a pump of its own."""
 
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 
-from koopman_ros.arrays import Array
+from koopman_ros.arrays import along_last, Array
 from koopman_ros.plants.constants import constant, Constants
 from koopman_ros.plants.library.outflow import (
     level_with_outflow,
@@ -55,13 +56,13 @@ class TwoTanks(Constants):
             state_lower=np.full(2, LOWEST_LEVEL),
         )
 
-    @property
+    @cached_property
     def _orifices(self) -> Array:
         return np.array([self.orifice_1, self.orifice_2])
 
     def _drift(self, x: Array) -> Array:
         flow = outflow(self._orifices, x) / self.tank_area
-        return np.stack([-flow[..., 0], flow[..., 0] - flow[..., 1]], axis=-1)
+        return along_last(-flow[..., 0], flow[..., 0] - flow[..., 1])
 
     def _drift_jacobian(self, x: Array) -> Array:
         slope = outflow_slope(self._orifices, x) / self.tank_area
