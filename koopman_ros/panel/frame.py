@@ -6,7 +6,7 @@
 from __future__ import annotations
 
 import asyncio
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from concurrent.futures import Future
 from dataclasses import dataclass
 import time
@@ -222,44 +222,101 @@ def link(text: str, target: str) -> Any:
     return _Words('a', text).props(f'href={target}')
 
 
-def alarm_row(frame: Frame, alarm: Alarm, shelving: bool = False) -> None:
-    """Show an alarm, with what can be done about it."""
-    priority = alarm.priority
-    with div('alarm').props('role=listitem'):
-        words('span', f'{_SYMBOLS[priority]} {priority.word.upper()}', priority.word)
-        words('span', alarm.text, 'what')
-        by = f' by {alarm.acknowledged_by}' if alarm.acknowledged_by else ''
-        words('span', f'{clock(alarm.since)}, {alarm.state.word}{by}', 'quiet')
+class Rows:
+    """
+    Alarms in a list, a row for each, which stays as it is while its alarm stands.
+
+    A control that was drawn anew would be gone under the finger that is on its way to it.
+
+    :param build: draws the row of an alarm, and returns what shows another state of it.
+    """
+
+    def __init__(self, name: str, build: Callable[[Alarm], Callable[[Alarm], None]],
+                 none: str = 'none') -> None:
+        self._build = build
+        self._rows: dict[str, tuple[Element, Callable[[Alarm], None]]] = {}
+        self._place = div('strip').props(f'role=list aria-label="{name}"')
+        with self._place:
+            self._none = words('div', none, 'quiet')
+
+    def show(self, alarms: Sequence[Alarm]) -> None:
+        """Show these, in this order."""
+        for gone in set(self._rows) - {alarm.key for alarm in alarms}:
+            self._rows.pop(gone)[0].delete()
+        for at, alarm in enumerate(alarms):
+            if alarm.key not in self._rows:
+                with self._place, div('alarm').props('role=listitem') as row:
+                    self._rows[alarm.key] = row, self._build(alarm)
+            row, update = self._rows[alarm.key]
+            update(alarm)
+            if self._place.default_slot.children.index(row) != at:
+                row.move(target_index=at)
+        show_if(self._none, not alarms)
+
+
+def alarm_rows(frame: Frame, name: str, *, shelving: bool = False, none: str = 'none') -> Rows:
+    """Return a list of standing alarms, with what can be done about them."""
+    def build(first: Alarm) -> Callable[[Alarm], None]:
+        key = first.key
+        priority, what, state = words('span', ''), words('span', '', 'what'), words(
+            'span', '', 'quiet')
 
         def acknowledge() -> None:
             if frame.visitor.may_act():
-                frame.source.view.alarms.acknowledge(alarm.key, frame.visitor.name, time.time())
-                _tell(frame, 'acknowledge', alarm.key)
+                frame.source.view.alarms.acknowledge(key, frame.visitor.name, time.time())
+                _tell(frame, 'acknowledge', key)
 
-        if alarm.state is not AlarmState.ACKNOWLEDGED:
-            frame.control(ui.button('Acknowledge', on_click=acknowledge).props('outline dense'))
+        button = frame.control(ui.button('Acknowledge', on_click=acknowledge).props(
+            'outline dense'))
         if shelving:
-            shelve_control(frame, alarm)
+            shelve_control(frame, key)
+
+        def update(alarm: Alarm) -> None:
+            word = alarm.priority.word
+            priority.set_text(f'{_SYMBOLS[alarm.priority]} {word.upper()}')
+            priority.classes(replace=word)
+            what.set_text(alarm.text)
+            by = f' by {alarm.acknowledged_by}' if alarm.acknowledged_by else ''
+            state.set_text(f'{clock(alarm.since)}, {alarm.state.word}{by}')
+            show_if(button, alarm.state is not AlarmState.ACKNOWLEDGED)
+
+        return update
+
+    return Rows(name, build, none)
 
 
-def shelve_control(frame: Frame, alarm: Alarm) -> None:
+def shelved_rows(frame: Frame, name: str) -> Rows:
+    """Return a list of shelved alarms, which can be shown again."""
+    def build(first: Alarm) -> Callable[[Alarm], None]:
+        what, until = words('span', '', 'what'), words('span', '', 'quiet')
+        frame.control(ui.button('Show again', on_click=lambda: _unshelve(frame, first.key)).props(
+            'outline dense'))
+
+        def update(alarm: Alarm) -> None:
+            what.set_text(alarm.text)
+            until.set_text(f'until {clock(alarm.shelved_until or 0.0)}')
+
+        return update
+
+    return Rows(name, build)
+
+
+def shelve_control(frame: Frame, key: str) -> None:
     """Show what takes an alarm out of sight for a while."""
     def shelve(seconds: float) -> None:
         if frame.visitor.may_act():
-            frame.source.view.alarms.shelve(
-                alarm.key, seconds, frame.visitor.name, time.time())
-            _tell(frame, 'shelve', alarm.key, seconds)
+            frame.source.view.alarms.shelve(key, seconds, frame.visitor.name, time.time())
+            _tell(frame, 'shelve', key, seconds)
 
     for text, seconds in (('Shelve 10 min', 600.0), ('1 h', 3600.0), ('8 h', 28800.0)):
         frame.control(ui.button(text, on_click=lambda _, s=seconds: shelve(s)).props(
             'flat dense'))
 
 
-def unshelve(frame: Frame, alarm: Alarm) -> None:
-    """Show an alarm again."""
+def _unshelve(frame: Frame, key: str) -> None:
     if frame.visitor.may_act():
-        frame.source.view.alarms.unshelve(alarm.key, frame.visitor.name, time.time())
-        _tell(frame, 'unshelve', alarm.key)
+        frame.source.view.alarms.unshelve(key, frame.visitor.name, time.time())
+        _tell(frame, 'unshelve', key)
 
 
 def _tell(frame: Frame, what: str, key: str, value: Any = None) -> None:

@@ -11,7 +11,7 @@ from typing import Any
 
 from nicegui import ui
 
-from koopman_ros.panel.frame import alarm_row, div, Frame, say, show_if, words
+from koopman_ros.panel.frame import alarm_rows, div, Frame, say, show_if, words
 from koopman_ros.panel.plant import Face, InputFace, number, Snapshot, StateFace
 from koopman_ros.panel.requests import Answer
 from koopman_ros.panel.trend_page import TrendChart
@@ -35,21 +35,13 @@ def overview(frame: Frame) -> None:
 
 
 def _strip(frame: Frame) -> None:
-    strip = div('strip').props('role=list aria-label=Alarms')
-    shown: list[Any] = [None]
+    rows = alarm_rows(frame, 'Alarms', none='No alarms')
+    others = words('div', '', 'quiet hidden')
 
     def show(now: Snapshot) -> None:
-        if shown[0] == now.standing:
-            return
-        shown[0] = now.standing
-        strip.clear()
-        with strip:
-            for alarm in now.standing[:_STRIP]:
-                alarm_row(frame, alarm)
-            if len(now.standing) > _STRIP:
-                words('div', f'and {len(now.standing) - _STRIP} more', 'quiet')
-            if not now.standing:
-                words('div', 'No alarms', 'quiet')
+        rows.show(now.standing[:_STRIP])
+        others.set_text(f'and {len(now.standing) - _STRIP} more')
+        show_if(others, len(now.standing) > _STRIP)
 
     frame.follow(show)
 

@@ -6,8 +6,11 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+import contextlib
 import os
 from pathlib import Path
+import shutil
+import stat
 import tempfile
 import threading
 import time
@@ -29,6 +32,18 @@ from koopman_ros.parameters.wire import CONTROLLER_EVENTS, Wiring
 
 LAST = 3600.0  # s of the end of a bag that are compared
 _PERIOD = 1.0  # s between two looks at the files of a report
+_PREFIX = 'koopman_ros_panel_'  # of folders for a while, followed by the process that has them
+
+
+def remove_leftovers() -> None:
+    """Remove the folders of panels of this user that were ended by force."""
+    for folder in Path(tempfile.gettempdir()).glob(f'{_PREFIX}*_*'):
+        process = folder.name.removeprefix(_PREFIX).partition('_')[0]
+        with contextlib.suppress(OSError, ValueError):
+            about = folder.lstat()
+            if stat.S_ISDIR(about.st_mode) and about.st_uid == os.getuid() and (
+                    not Path(f'/proc/{int(process)}').exists()):
+                shutil.rmtree(folder, ignore_errors=True)
 
 
 class LearningWatch:
@@ -40,6 +55,7 @@ class LearningWatch:
     """
 
     def __init__(self, node: Node, system: str, wiring: Wiring) -> None:
+        remove_leftovers()
         self.learning = Learning()
         self._node, self._system, self._wiring = node, system, wiring
         self._place: tuple[str, Mapping[str, str]] = ('', {})
@@ -74,7 +90,7 @@ class LearningWatch:
         if not self._bag:
             return Answer(False, 'nothing was recorded since the panel was started: record first')
         self._clear()
-        self._folder = tempfile.TemporaryDirectory(prefix='koopman_ros_panel_')
+        self._folder = tempfile.TemporaryDirectory(prefix=f'{_PREFIX}{os.getpid()}_')
         folder = Path(self._folder.name)
         given = {
             'system': self._system, 'bags': [self._bag], 'new_model': new, 'recover': True,

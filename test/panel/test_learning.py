@@ -99,6 +99,9 @@ def test_a_model_is_learned_read_about_compared_and_takes_over(tmp_path: Path) -
 
             comparison = card(page, 'Comparison')
             press(comparison, 'Compare on the last hour')
+            press(comparison, 'Cancel')
+            expect(comparison).to_contain_text('✖ cancelled', timeout=PATIENCE)
+            press(comparison, 'Compare on the last hour')
             expect(comparison).to_contain_text(
                 'the recorded commands are reproduced', timeout=PATIENCE)
             expect(comparison).to_contain_text('commands compared')

@@ -1,17 +1,23 @@
 # SPDX-FileCopyrightText: 2026 The koopman_ros Authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""A window of the trends that is zoomed is drawn as finely as the whole was."""
+"""Trends in a browser: an hour that was before, and a window that is zoomed."""
 
+import math
 from pathlib import Path
 import sys
 
+from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
 import pytest
+from rclpy.serialization import serialize_message
 
+from koopman_ros.bags import BagWriter, message_definition
 from koopman_ros.panel.trend_page import zoomed
+from koopman_ros.ros import topics
 from koopman_ros.testing import Harness
+from koopman_ros.units import NANOSECONDS
 from support.browser import ADDRESS, opened_browser
-from support.nodes import type_support
+from support.nodes import temperature, type_support
 
 __all__ = ['type_support']
 
@@ -24,6 +30,14 @@ SHARE = """share => {
     const { min, max } = xAxis[0], middle = (min + max) / 2, half = share * (max - min) / 2;
     return series[0].data.filter(([time]) => Math.abs(time - middle) < half).length;
 }"""
+DATA = """() => {
+    const chart = document.querySelector('.nicegui-echart');
+    if (!chart) return [];
+    const { series } = getElement(parseInt(chart.id.slice(1))).chart.getOption();
+    return series.length ? series[0].data : [];
+}"""
+SAMPLES, BEGIN = 36_000, 10_000.0  # and s
+PEAK, DIP, HIGHEST, LOWEST = 12_345, 23_456, 70.25, 30.5  # samples and degC
 ZOOM = """() => {
     const chart = document.querySelector('.nicegui-echart');
     getElement(parseInt(chart.id.slice(1))).chart.dispatchAction(
@@ -47,6 +61,59 @@ def test_a_zoomed_window_has_as_many_values_as_the_whole_had(tmp_path: Path) -> 
             page.evaluate(ZOOM)
             page.wait_for_function(f'() => {{ const of = {SHARE}; return of(0.2) > 30; }}')
         assert 'Traceback' not in panel.output()
+
+
+def an_hour(folder: Path) -> Path:
+    """Record an hour at 10 Hz as a trainer would, with a peak and a dip of one sample each."""
+    with BagWriter(folder) as writer:
+        writer.add_topic('/temperature', message_definition('sensor_msgs/msg/Temperature'))
+        for k in range(SAMPLES):
+            celsius = {PEAK: HIGHEST, DIP: LOWEST}.get(k, 48.0 + math.sin(0.01 * k))
+            stamp = BEGIN + 0.1 * k
+            writer.write('/temperature', serialize_message(temperature(celsius, stamp)),
+                         round(stamp * NANOSECONDS))
+    return folder
+
+
+def test_an_hour_at_ten_hertz_is_drawn_to_a_page_that_comes_late(tmp_path: Path) -> None:
+    bag = an_hour(tmp_path / 'hour')
+    with opened_browser() as browser, Harness(tmp_path, timeout=60.0) as ros:
+        panel = ros.start('panel', {'port': 0})
+        recording = ros.node.create_publisher(DiagnosticArray, topics.DIAGNOSTICS, 10)
+        said = DiagnosticArray(status=[DiagnosticStatus(
+            name='trainer: recording', values=[KeyValue(key='bag', value=str(bag))])])
+        ros.start('plant', {'speed': 2.0, 'start_time': BEGIN + 0.1 * SAMPLES})
+        address = ros.wait_until(lambda: ADDRESS.search(panel.output()))
+        assert address is not None
+        # it comes late, and finds a bag that is being recorded
+        clock = ros.node.create_timer(0.5, lambda: recording.publish(said))
+        with browser.page(f'{address[1]}/trends') as page:
+            page.get_by_role('button', name='1 h', exact=True).click()
+
+            def drawn() -> list[list[float]]:
+                ros.spin_once(0.2)
+                found: list[list[float]] = page.evaluate(DATA)
+                return found if found and found[-1][0] - found[0][0] > 3500e3 else []
+
+            values = [value for _, value in ros.wait_until(drawn) if value is not None]
+            # thinned out, and yet nothing of a tenth of a second is lost
+            assert len(values) < 0.2 * SAMPLES
+            assert (max(values), min(values)) == pytest.approx((HIGHEST, LOWEST))
+            # the same to whoever comes again
+            page.reload()
+            page.get_by_role('button', name='1 h', exact=True).click()
+            page.wait_for_function(f'() => {{ const of = {DATA}; const found = of(); '
+                                   'return found.length && found.at(-1)[0] - found[0][0] > 3500e3'
+                                   '; }')
+        ros.node.destroy_timer(clock)
+
+
+def test_without_chromium_it_is_said_how_to_get_it(
+        monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    monkeypatch.setenv('PATH', str(tmp_path))
+    with pytest.raises(pytest.fail.Exception, match='sudo apt-get install chromium'), (
+            opened_browser()):
+        pass
 
 
 @pytest.mark.parametrize(('told', 'found'), [
