@@ -85,6 +85,10 @@ def test_a_model_is_learned_read_about_compared_and_takes_over(tmp_path: Path) -
             press(recording, 'Stop')
             expect(recording).to_contain_text('not recording', timeout=PATIENCE)
             press(training, 'Train')
+            expect(training.locator('.answer')).to_contain_text('training', timeout=PATIENCE)
+            press(training, 'Cancel')
+            expect(training).to_contain_text('cancelled, nothing was written', timeout=PATIENCE)
+            press(training, 'Train')
             expect(training).to_contain_text(
                 'the new lift is accepted', timeout=2.0 * PATIENCE)
 

@@ -12,9 +12,8 @@ number on the faceplate changes (MutationObserver); the screen has it with the n
 delay of a message is that until its number, or that of a later message, is there. It includes
 the panel's looks at the loop, five times a second, and the pages' at the panel, four times.
 
-All pages but the first are drawn once a second at most, as browsers do with pages that are not in
-front: twenty browsers on the machine of the panel would be all that is measured. The panel sends
-to all of them alike.
+All pages but the first read what is sent and draw nothing (:mod:`light_pages`): twenty browsers on
+the machine of the panel would be all that is measured. The panel sends to all of them alike.
 
 The answer of the controller goes by the stamps that the middleware gives to measurement and
 command when they are sent: a busy browser or bench does not blur it.
@@ -27,6 +26,7 @@ from importlib.util import find_spec
 from pathlib import Path
 import re
 import shutil
+import subprocess
 import sys
 import tempfile
 import time
@@ -67,8 +67,8 @@ _LOWEST, _STEP, _NUMBERS = 32.0, 0.1, 200  # of what the panel is told, in degre
 _TOLD = 'told_temperature'
 _FRESH = 0.05  # s, of a measurement that has not waited here
 _LAST = 0.7  # s for the last message to be shown
+_END = 10.0  # s for pages to close
 _SETTLE = 1.0  # s from the last page to the figures
-_PAGES_PER_PROFILE = 5
 _PATIENCE = 60_000.0  # ms for a page
 _FLAGS = ('--no-sandbox', '--disable-gpu', '--disable-quic', '--no-first-run',
           '--disable-background-networking', '--disable-component-update', '--disable-sync')
@@ -85,7 +85,6 @@ new MutationObserver(() => {
   }
 }).observe(document, {subtree: true, childList: true, characterData: true});
 """
-_BEHIND = 'window.requestAnimationFrame = draw => setTimeout(draw, 1000, performance.now());'
 
 
 @dataclass(frozen=True)
@@ -259,10 +258,10 @@ def _first_load(figures: dict[str, Any], loop: _Loop, browser: 'Browser', addres
             f'number after {found["seconds"]:.2f} s')
 
 
-def _profile(browser: 'Browser', *, behind: bool = False) -> 'BrowserContext':
+def _profile(browser: 'Browser') -> 'BrowserContext':
     profile = browser.new_context(viewport={'width': 1280, 'height': 800})
     profile.set_default_timeout(_PATIENCE)
-    profile.add_init_script(_BEHIND + _WATCH if behind else _WATCH)
+    profile.add_init_script(_WATCH)
     return profile
 
 
@@ -278,20 +277,20 @@ def _open(loop: _Loop, page: 'Page', address: str) -> None:
 
 def _all_pages(figures: dict[str, Any], loop: _Loop, browser: 'Browser', panel: NodeProcess,
                address: str, plan: Plan) -> str:
-    """Open one page after the other, and take the figures of the first and of the last."""
-    profiles: list[BrowserContext] = []
-    pages: list[Page] = []
-    for count in range(1, plan.pages + 1):
-        # the first one has a profile of its own
-        if len(pages) % _PAGES_PER_PROFILE == min(len(pages), 1):
-            profiles.append(_profile(browser, behind=bool(pages)))
-        pages.append(profiles[-1].new_page())
-        _open(loop, pages[-1], address)
-        if count in (1, plan.pages):
+    """Open a page, and then the others beside it; take the figures of both."""
+    page = _profile(browser).new_page()
+    _open(loop, page, address)
+    with contextlib.ExitStack() as stack:
+        for name, count in (('one_page', 1), ('all_pages', plan.pages)):
+            if count > 1:
+                stack.enter_context(_light_pages(address, count - 1))
             _tell(f'{plan.seconds:g} s with {count} open')
+            # its diagnostics come once a second
+            deadline = time.monotonic() + _PATIENCE / 1e3
+            while loop.pages != count and time.monotonic() < deadline:
+                loop.run(0.1)
             loop.settle()
-            name = 'one_page' if count == 1 else 'all_pages'
-            figures[name] = {'opened': count, **_figures(loop, pages[0], panel, plan.seconds)}
+            figures[name] = {'opened': count, **_figures(loop, page, panel, plan.seconds)}
     rows = [('none', '', '', '', '', _milliseconds(figures['without_panel']['answer']))]
     for name in ('one_page', 'all_pages'):
         one = figures[name]
@@ -301,6 +300,30 @@ def _all_pages(figures: dict[str, Any], loop: _Loop, browser: 'Browser', panel: 
                      f'{one["machine_share"]:.0%}', _milliseconds(one['answer'])))
     return table(('pages', 'delay, median / p99 [ms]', 'panel, of a core', 'PSS [MB]',
                   'machine', 'answer, median / p99 [ms]'), rows)
+
+
+@contextlib.contextmanager
+def _light_pages(address: str, count: int) -> Iterator[None]:
+    """Hold pages open that draw nothing."""
+    held = subprocess.Popen(
+        [sys.executable, '-m', 'validation.benchmarks.light_pages', address, str(count)],
+        stdin=subprocess.PIPE, stdout=subprocess.PIPE)
+    assert held.stdin is not None
+    assert held.stdout is not None
+    try:
+        if held.stdout.readline() != b'connected\n':
+            raise RuntimeError(f'{count} pages could not be opened at {address}')
+        yield
+        if held.poll() is not None:
+            raise RuntimeError('the panel closed a page')
+    finally:
+        held.stdin.close()
+        try:
+            held.wait(_END)
+        except subprocess.TimeoutExpired:
+            held.kill()
+            held.wait()
+        held.stdout.close()
 
 
 def _figures(loop: _Loop, page: 'Page', panel: NodeProcess, seconds: float) -> dict[str, Any]:
