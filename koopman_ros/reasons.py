@@ -73,6 +73,7 @@ class Code(Enum):
         'input weight, or measure more often')
     PACKAGE_MISSING = 'package_missing', (
         "it needs {package}, which is not installed: pip install 'koopman_ros[{extra}]'")
+    NO_PI_GAIN = 'no_pi_gain', 'no signal has a pi_gain: set it for those that are controlled'
     PLAN_NOT_SOLVED = 'plan_not_solved', (
         'it finds no plan within the limits of the inputs ({flag})')
     PLAN_MOVES = 'plan_moves', 'its plan still changes after {iterations} iterations'
@@ -148,8 +149,8 @@ def reason(code: Code, **values: Value) -> Reason:
     return Reason(code, values)
 
 
-LEVELS = {'mpc': 'predictive law', 'sdre': 'learned law', 'linear': 'linear law', 'hold': 'hold',
-          'safe': 'safe input', 'manual': 'manual'}
+LEVELS = {'mpc': 'predictive law', 'sdre': 'learned law', 'linear': 'linear law', 'pi': 'PI law',
+          'hold': 'hold', 'safe': 'safe input', 'manual': 'manual'}
 
 
 def level_words(name: str) -> str:

@@ -56,6 +56,11 @@ class Level:
         found: Reason | None = getattr(self.law, 'unusable', None)
         return found
 
+    @property
+    def model_free(self) -> bool:
+        """Whether its law goes to the set-point, wherever the model has its steady states."""
+        return bool(getattr(self.law, 'model_free', False))
+
     @cached_property
     def controls_all(self) -> bool:
         """Whether every state has a set-point."""
@@ -89,6 +94,11 @@ class Level:
         :return: None where there is no steady state.
         """
         model = self.model
+        if self.model_free:
+            x = np.zeros(model.n_x)
+            x[self._indices] = self.controlled_states.to_deviation(setpoint)
+            none = np.zeros(model.n_x)
+            return Target(x, np.zeros(model.n_z), none, np.zeros(model.n_u), none, 0.0)
         if self.controls_all:
             # a memory of the last set-point only; what comes out does not depend on it
             target = steady_state_target(model, model.states.to_deviation(setpoint), w,
@@ -117,7 +127,7 @@ class Level:
         """Return the target, or what is nearest to it where the inputs do not suffice."""
         model = self.model
         # a single one at its end goes there by itself
-        if model.n_u == 1 or len(self.controlled) > model.n_u:
+        if self.model_free or model.n_u == 1 or len(self.controlled) > model.n_u:
             return target
         u = model.inputs.to_physical(target.u)
         if ((u >= limits.lower) & (u <= limits.upper)).all():
@@ -141,7 +151,8 @@ def levels_of(model: LiftedModel, outputs: Outputs, settings: Settings) -> dict[
     weights = Weights.physical(model, settings.state_weight, settings.input_weight)
     lower, upper = (model.states.to_deviation(bound) if len(bound) else bound
                     for bound in (settings.state_lower, settings.state_upper))
-    tuning = Tuning(weights, settings.max_gain, settings.max_residual, lower, upper)
+    tuning = Tuning(weights, settings.max_gain, settings.max_residual, lower, upper,
+                    pi_gain=settings.pi_gain, pi_time=settings.pi_time)
     estimator = plug(settings.estimator or (
         'extended_kalman_filter' if not outputs.determine_state else
         'disturbance_observer' if settings.observer_bandwidth > 0.0 else 'measured_state'),

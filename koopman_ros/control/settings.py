@@ -66,6 +66,10 @@ class Settings:
     #: units; infinity for none, both empty where there are none at all
     state_lower: Array = field(default_factory=_none)
     state_upper: Array = field(default_factory=_none)
+    #: (n_x,) of the law `pi`: change of the command per error, in units; 0 for states that it does
+    #: not control, empty for none at all
+    pi_gain: Array = field(default_factory=_none)
+    pi_time: Array = field(default_factory=_none)  #: (n_x,) and its integral times in s
     #: seconds that a law may take for a sample before the next one acts; infinity for any
     deadline: float = np.inf
     max_gain: float = 1e3  #: bound on the norm of the Riccati gain in scaled coordinates
@@ -78,7 +82,7 @@ class Settings:
     def __post_init__(self) -> None:
         as_arrays(self, 'state_weight', 'input_weight', 'setpoint_ramp', 'max_disturbance',
                   'input_tolerance', 'safe_input', 'state_lower', 'state_upper', 'noise',
-                  'wander', 'initial_error')
+                  'wander', 'initial_error', 'pi_gain', 'pi_time')
         weights, costs = self.state_weight, self.input_weight
         for name, fits, words in (
                 ('state_weight', np.isfinite(weights) & (weights >= 0.0) & np.any(weights > 0.0),
@@ -89,6 +93,8 @@ class Settings:
                 ('max_disturbance', self.max_disturbance > 0.0, 'above 0'),
                 ('input_tolerance', self.input_tolerance >= 0.0, 'at least 0'),
                 ('deadline', self.deadline > 0.0, 'above 0'),
+                ('pi_gain', np.isfinite(self.pi_gain), 'finite'),
+                ('pi_time', self.pi_time > 0.0, 'above 0'),
                 *((name, getattr(self, name) >= 0.0, 'at least 0')
                   for name in ('noise', 'wander', 'initial_error'))):
             if not np.all(fits):
@@ -146,7 +152,8 @@ class Settings:
             for name in names:
                 per_signal(name, getattr(self, name), signals)
         for name, signals in (('noise', outputs.names), ('wander', inputs),
-                              ('initial_error', states)):
+                              ('initial_error', states), ('pi_gain', states),
+                              ('pi_time', states)):
             if len(getattr(self, name)):
                 per_signal(name, getattr(self, name), signals)
         if len(self.state_lower) or len(self.state_upper):

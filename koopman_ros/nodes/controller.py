@@ -419,9 +419,11 @@ class ControllerNode(ManagedNode):
         """Put the parameters and the model of now in force."""
         with self._lock:
             predecessor, self._controller = self._controller, self._built()
-            # what is estimated may be something else
-            self._signals = signals_of(
-                self._controller.model, self._signals.controlled, self._signals.states)
+            if predecessor.model.states.names != self._controller.model.states.names:
+                # what is estimated is something else; what was last said is of another model
+                self._signals = signals_of(
+                    self._controller.model, self._signals.controlled, self._signals.states)
+                self._report = replace(self._report, estimate=None, target=None)
             self._state = self._controller.hand_over(predecessor, self._state)
             self._records.publish(event, fields)
         self._warn_of_rest()

@@ -162,8 +162,11 @@ def _commands(found: Replay, names: Names) -> tuple[Place, ...]:
 def _controller(values: Mapping[str, Any], model: LiftedModel) -> Controller:
     values = {name: tuple(value) if isinstance(value, list) else value
               for name, value in values.items()}
-    table = table_of(model, values)
     signals = signals_of(model)
+    # what was measured had a topic, whatever other states this model has
+    values['states_measured'] = tuple(
+        f'{name} [{unit}]' for name, unit in signals.states.items() if f'{name}.topic' in values)
+    table = table_of(model, values)
     # those of a state that another model of the run estimates tell nothing here
     if unknown := ', '.join(sorted(
             name for name in set(values) - set(table.rows)

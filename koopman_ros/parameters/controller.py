@@ -69,6 +69,12 @@ class StateParameters(StatePlaces):
     max_jump: float = parameter(
         0.0, 'change between two measurements that is accepted beside that rate, for noise; 0 for '
         'any', '{unit}', 0.0, 1e9)
+    pi_gain: float = parameter(
+        0.0, 'change of the command per error, of the law pi: the first signal with one moves the '
+        'first input, and so on; 0 for signals that it does not control', 'of input/({unit})',
+        -1e9, 1e9)
+    pi_time: float = parameter(
+        60.0, 'integral time of that law', 's', 0.0, 86400.0, open_minimum=True)
     noise: float = parameter(
         0.0, 'standard deviation of the noise of its sensor, for a Kalman filter; 0 for what '
         'suits the model', '{unit}', 0.0, 1e9)
@@ -151,7 +157,8 @@ class ControllerParameters:
         'asks for', 's', 0.0, 86400.0)
     levels: tuple[str, ...] = parameter(
         ('sdre', 'linear'), 'laws, the best first: mpc plans ahead, within limits of the states; '
-        'sdre solves the Riccati equation; linear has one gain; module:class is one of your own')
+        'sdre solves the Riccati equation; linear has one gain; pi asks nothing of the model; '
+        'module:class is one of your own')
     law_deadline: float = parameter(
         0.0, 'how long a law may take for a sample before the next one of the levels acts in its '
         'place; 0 for any time', 's', 0.0, 3600.0)
@@ -231,6 +238,8 @@ class ControllerParameters:
             safe_input=in_own_units(inputs, 'safe', own),
             state_lower=lower if limited else np.zeros(0),
             state_upper=upper if limited else np.zeros(0),
+            pi_gain=np.array([getattr(of, 'pi_gain', 0.0) for of in every.values()]),
+            pi_time=np.array([getattr(of, 'pi_time', np.inf) for of in every.values()]),
             deadline=_or_any(self.law_deadline),
             max_gain=self.max_gain,
             max_residual=10.0 ** -self.min_riccati_digits,
@@ -241,7 +250,7 @@ class ControllerParameters:
                 jump=column(states, 'max_jump', _or_any),
                 frozen_timeout=_or_any(self.frozen_timeout)),
             supervisor=SupervisorSettings(
-                tuple(LevelSettings(law, self.linear_margin if law == 'linear'
+                tuple(LevelSettings(law, self.linear_margin if law in ('linear', 'pi')
                                     else self.validity_margin) for law in self.levels),
                 self.hold_timeout, self.recovery_time))
 

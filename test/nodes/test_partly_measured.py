@@ -3,10 +3,15 @@
 
 """A reactor of two states whose concentration is estimated, over topics, and its replay."""
 
+import itertools
+from pathlib import Path
+
+import numpy as np
 import pytest
 from sensor_msgs.msg import JointState, Temperature
 from std_msgs.msg import String
 
+from koopman_ros.lifting import Coordinates, linearised_model, Provenance, save
 from koopman_ros.nodes.replay import replay_records
 from koopman_ros.plants import steady_state, two_state_reactor
 from koopman_ros.plants.library.reactor import ReactorParameters
@@ -54,4 +59,49 @@ def test_no_offset_is_left_and_what_is_not_measured_is_known(ros: Harness) -> No
     found = replay_records([parse(message.data) for message in recorded])
     assert len(found.samples) >= SAMPLES
     assert not found.lost
+    assert all(sample.replayed.tobytes() == sample.recorded.tobytes() for sample in found.samples)
+
+
+def test_a_lift_with_a_hidden_state_takes_over_from_a_pi_law(ros: Harness, tmp_path: Path) -> None:
+    """Nothing was learned at first: the law knows names and ranges alone."""
+    states, inputs = (Coordinates.spanning((name,), ('K',), np.array([low]), np.array([high]))
+                      for name, low, high in (('temperature', 290.0, 330.0),
+                                              ('coolant_temperature', 278.15, 305.15)))
+    file = tmp_path / 'signals.safetensors'
+    save(linearised_model(np.zeros((1, 1)), np.zeros((1, 1)), states, inputs, 'min',
+                          Provenance('signals alone')), file)
+    measured = ros.listen(Temperature, 'temperature')
+    commands = ros.listen(Temperature, 'coolant_setpoint')
+    recorded = ros.listen(String, topics.CONTROLLER_EVENTS)
+    internals = ros.listen(JointState, topics.CONTROLLER_STATE)
+    ros.start('controller', {
+        'system': 'none', 'model': file, 'levels': "['pi']", 'temperature.pi_gain': 3.0,
+        'temperature.pi_time': 60.0, 'coolant_temperature.safe': 5.0, 'transfer_time': 10.0,
+        'temperature.noise': 0.02, 'model_check_factor': 0.0})
+    ros.speak(Temperature, 'setpoint', to='controller').publish(temperature(SETPOINT))
+    ros.start('plant', {
+        'system': 'two_state', 'speed': 50.0, 'temperature.noise': 0.02, 'lockstep': True,
+        'lockstep_subscribers': 2})
+
+    def rests() -> bool:
+        late = [message.temperature for message in measured[-60:]]
+        return len(measured) > 120 and abs(sum(late) / len(late) - SETPOINT) < 0.05
+
+    ros.wait_until(rests)
+    ros.set_parameters('controller', model='two_state', levels=['sdre', 'linear'])
+    begun = len(measured)
+    status = ros.wait_for_status('controller: control', lambda status: (
+        value(status, 'active law') == 'learned law'))
+    assert value(status, 'model') == 'two_state'
+    ros.wait_until(lambda: len(measured) > begun + 200)
+    # without a bump, and without an offset
+    late = np.array([message.temperature for message in measured[begun:]])
+    assert np.max(np.abs(late - SETPOINT)) < 0.5
+    assert np.mean(late[-60:]) == pytest.approx(SETPOINT, abs=0.05)
+    assert max(abs(after.temperature - before.temperature)
+               for before, after in itertools.pairwise(commands[-begun:])) < 1.0
+    assert 'deviation_concentration [mol/L]' in internals[-1].name
+    # the replay takes over as well
+    found = replay_records([parse(message.data) for message in recorded], [file])
+    assert found.models == [str(file), 'two_state']
     assert all(sample.replayed.tobytes() == sample.recorded.tobytes() for sample in found.samples)

@@ -6,6 +6,7 @@
 from collections.abc import Callable
 
 from koopman_ros.control.laws.base import Figures, Law, LawResult, Tuning, Weights
+from koopman_ros.control.laws.pi import ProportionalIntegral
 from koopman_ros.control.laws.riccati import (
     averaged,
     Feedback,
@@ -19,7 +20,8 @@ from koopman_ros.lifting import LiftedModel
 
 LAWS: dict[str, Callable[[LiftedModel, Tuning], Law] | str] = {
     'mpc': 'koopman_ros.control.laws.receding_horizon:RecedingHorizon',
-    'sdre': StateDependentRiccati, 'linear': Linear}
+    'sdre': StateDependentRiccati, 'linear': Linear, 'pi': ProportionalIntegral}
 
 __all__ = ['LAWS', 'Feedback', 'Figures', 'Form', 'Law', 'LawResult', 'Linear',
-           'StateDependentRiccati', 'Tuning', 'Weights', 'averaged', 'feedback', 'recentred']
+           'ProportionalIntegral', 'StateDependentRiccati', 'Tuning', 'Weights', 'averaged',
+           'feedback', 'recentred']

@@ -113,6 +113,10 @@ class Tuning:
     state_upper: Array = field(default_factory=lambda: np.zeros(0))
     #: distance outside the training data, in half widths of their box, up to which it plans
     margin: float = math.inf
+    #: (n_x,) of a PI law, in units of the first input per unit of the first state with one, and so
+    #: on; 0 for states that it does not control, empty for none
+    pi_gain: Array = field(default_factory=lambda: np.zeros(0))
+    pi_time: Array = field(default_factory=lambda: np.zeros(0))  #: (n_x,) its integral times in s
 
 
 @dataclass(frozen=True)
