@@ -28,6 +28,7 @@ _SILENT = 3.5  # s without a status, of which there is one a second
 _PERIODS = 5.0  # usual times between two measurements without one
 _BACK = 1.0  # s; a stamp that is earlier by more begins time afresh
 _MOST_STATUSES = 64
+_DEVIATION = re.compile(r'deviation_(\w+) \[')
 _NAMED = re.compile(r'estimated_(\w+) \[(.+)\]')
 
 Range = tuple[float, float]
@@ -234,7 +235,7 @@ class PlantView:
         self._time = math.nan
         self._mode = self._level = ''
         self._statuses: dict[str, TaskStatus] = {}
-        self._estimates: dict[str, tuple[float, str]] = {}
+        self._estimates: dict[str, str] = {}
         self._parameters: dict[str, Mapping[str, ParameterView]] = {}
         self._heard: dict[str, float] = {}
         self._period = 0.0
@@ -284,10 +285,16 @@ class PlantView:
         for name, own in self._inputs.items():
             text = f'{name} disturbance [{own.unit}]' if several else f'disturbance [{own.unit}]'
             own.values['disturbance'] = values.get(text, math.nan)
+        deviations = {found[1]: value for key, value in values.items()
+                      if (found := _DEVIATION.match(key)) and math.isfinite(value)}
+        # another model may estimate others
+        self._estimates = {}
         for key, value in values.items():
             found = _NAMED.fullmatch(key)
             if found and found[1] not in self._states and math.isfinite(value):
-                self._estimates[found[1]] = (value, found[2].replace('deg', '°'))
+                known = deviations.get(found[1])
+                spread = '' if known is None else f' ± {known:.2g}'
+                self._estimates[found[1]] = f'{value:.4g}{spread} {found[2].replace("deg", "°")}'
 
     def record(self, event: str, fields: Mapping[str, Any], now: float) -> None:
         """Take a record of the controller; one that is not as it should be is passed over."""
@@ -424,8 +431,7 @@ class PlantView:
             states=tuple(self._state(name, own, PLANT in quiet)
                          for name, own in self._states.items()),
             inputs=tuple(self._input(name, own) for name, own in self._inputs.items()),
-            estimates=tuple((label(name), f'{value:.4g} {unit}')
-                            for name, (value, unit) in self._estimates.items()),
+            estimates=tuple((label(name), text) for name, text in self._estimates.items()),
             statuses=MappingProxyType(dict(self._statuses)),
             standing=self.alarms.standing, shelved=self.alarms.shelved,
             silences=silences, parameters=MappingProxyType(dict(self._parameters)),

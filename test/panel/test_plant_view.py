@@ -83,6 +83,9 @@ def test_numbers_are_those_that_people_read() -> None:
     assert given.text(given.applied) == '–'
     # that of the measured state is none of an unmeasured one
     assert now.estimates == (('concentration', '0.88 mol/L'),)
+    # of a filter with how well it is known, and of another model others
+    own.internals({'estimated_latent_1 [1]': 0.25, 'deviation_latent_1 [1]': 0.0123})
+    assert own.snapshot(NOW + 1.2).estimates == (('latent 1', '0.25 ± 0.012 1'),)
 
 
 def test_a_signal_is_shown_in_the_unit_that_its_operators_read() -> None:
