@@ -152,7 +152,10 @@ class Controller:
         level, estimating = self._best, self._estimating
         try:
             with np.errstate(all='ignore'):
-                estimate = estimating.rebase(state.estimate, estimating.level(state), level)
+                acting = estimating.level(state)
+                # where a law acts that needs no model, none is trusted
+                estimate = None if acting.model_free else estimating.rebase(
+                    state.estimate, acting, level)
                 holding = Holding(
                     level, self.settings.limits, self.settings.supervisor.levels[0].margin,
                     np.zeros(self.model.n_x) if estimate is None else estimate.w, state.target)

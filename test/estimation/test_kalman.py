@@ -293,3 +293,21 @@ def test_more_inputs_than_outputs_and_fewer():
         model = random_lift(2, n_u=n_u, seed=1)
         one = ExtendedKalmanFilter(model, tuning(model, first(model, n_y)))
         assert np.linalg.matrix_rank(one.initial_covariance[2:, 2:]) == n_y
+
+
+def test_a_start_up_from_far_outside_the_data_arrives():
+    # a PI law, which asks nothing of the model, until the data begin
+    limits = InputLimits(np.array([278.15]), np.array([305.15]), np.ones(1))
+    one = saddle(limits=limits, setpoint_ramp=np.array([0.1]), pi_gain=np.array([0.0, 8.0]),
+                 pi_time=np.array([1.0, 120.0]), supervisor=SupervisorSettings(
+                     (LevelSettings('sdre', 0.3), LevelSettings('pi', 3.0))))
+    u0 = np.array([300.0])
+    loop = simulate(one, Process(SYSTEM, 0, np.array([0.95, 300.0]), u0), [
+        at(0.0, Initialisation(u0)), at(5.0, SetpointRequest(0, np.array([350.0])))],
+        duration=1100.0, noise=np.array([NOISE]), seed=7)
+    levels = loop.levels
+    assert set(levels) == {'pi', 'sdre'}
+    taken_over = levels.index('sdre')
+    assert set(levels[taken_over:]) == {'sdre'}
+    assert np.max(loop.states[:, 1]) < 351.0
+    assert abs(np.mean(loop.states[-100:, 1]) - 350.0) < 0.05
