@@ -98,8 +98,9 @@ def run(case: Case, *events, law='sdre', bandwidth=0.0, samples=60, plant=None, 
         duration=samples * case.seconds, **others)
 
 
+# a PI law has no gain that would suit all of them: test_pi.py has its plants
 @each_case
-@pytest.mark.parametrize('law', LAWS)
+@pytest.mark.parametrize('law', sorted(set(LAWS) - {'pi'}))
 def test_each_law_brings_each_plant_to_its_setpoint(case, law):
     # the linear law leaves the reactor off its set-point, and the observer makes up for it
     bandwidth = 0.4 if (law, case.plant) == ('linear', REACTOR) else 0.0
