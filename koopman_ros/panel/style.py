@@ -54,6 +54,7 @@ a { color: var(--text); }
 .answer { min-height: 1.4em; }
 .answer.refused { color: var(--high); font-weight: 600; }
 .strip { display: flex; flex-direction: column; gap: 6px; }
+.alarm .q-btn { padding: 0 10px; }
 .alarm { display: flex; flex-wrap: wrap; gap: 4px 12px; align-items: center;
   background: var(--card); border: 1px solid var(--line); padding: 4px 10px; }
 .alarm .what { flex: 1 1 240px; min-width: 0; overflow-wrap: anywhere; }
