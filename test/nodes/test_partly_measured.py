@@ -99,7 +99,7 @@ def test_a_lift_with_a_hidden_state_takes_over_from_a_pi_law(ros: Harness, tmp_p
     assert np.max(np.abs(late - SETPOINT)) < 0.5
     assert np.mean(late[-60:]) == pytest.approx(SETPOINT, abs=0.05)
     assert max(abs(after.temperature - before.temperature)
-               for before, after in itertools.pairwise(commands[-begun:])) < 1.0
+               for before, after in itertools.pairwise(commands[begun:])) < 1.0
     assert 'deviation_concentration [mol/L]' in internals[-1].name
     # the replay takes over as well
     found = replay_records([parse(message.data) for message in recorded], [file])
