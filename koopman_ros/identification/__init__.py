@@ -16,6 +16,7 @@ from koopman_ros.identification.drift import (
     prediction_error,
     Segments,
 )
+from koopman_ros.identification.hidden import identify_hidden
 from koopman_ros.identification.identify import (
     Identified,
     identify,
@@ -30,6 +31,6 @@ from koopman_ros.identification.regression import noise_level, total_variation, 
 
 __all__ = [
     'METHODS', 'DriftModel', 'Identified', 'Method', 'Score', 'Segments', 'Stopped', 'box_of',
-    'fitted_starts', 'identify', 'longest_step', 'noise_level', 'output_error',
+    'fitted_starts', 'identify', 'identify_hidden', 'longest_step', 'noise_level', 'output_error',
     'prediction_error', 'total_variation', 'weak_form', 'weak_forms',
 ]

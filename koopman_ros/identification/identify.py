@@ -89,6 +89,8 @@ class Identified:
     noise: Array  #: (n_x,) standard deviation of the measurement noise, from sample to sample
     fitted: tuple[Episode, ...]  #: the segments that it was fitted to
     held_out: tuple[Episode, ...]  #: segments that neither fit nor choice has seen
+    #: states, the last ones, that were not measured: the segments hold what a filter makes of them
+    hidden: int = 0
 
     __repr__ = brief
 
@@ -117,9 +119,9 @@ def identify(plant: Plant, episodes: Sequence[Episode], *, degrees: Sequence[int
     n_x, n_u = len(plant.state_names), len(plant.input_names)
     degrees = degrees or tuple(degree for degree in DEGREES if degree == 1
                                or n_x * math.comb(n_x + degree, degree) <= _MOST_COEFFICIENTS)
-    parts = _segments(episodes, n_x + n_u)
+    parts = segments_of(episodes, n_x + n_u)
     box = box_of(plant, parts)
-    fit, choose, held_out = _split(parts, seed)
+    fit, choose, held_out = ([parts[i] for i in share] for share in split(parts, seed))
     step = longest_step(parts)
     chooser, fitter = Segments.of(choose, step), Segments.of(fit, step)
     inputs = InputModel.of(plant, box, np.concatenate([part.x for part in parts]))
@@ -172,7 +174,7 @@ def identify(plant: Plant, episodes: Sequence[Episode], *, degrees: Sequence[int
                       (*fit, *choose), tuple(held_out))
 
 
-def _segments(episodes: Sequence[Episode], signals: int) -> list[Episode]:
+def segments_of(episodes: Sequence[Episode], signals: int) -> list[Episode]:
     """Cut into segments, of which three fifths may hold the extremes of so many signals."""
     low, high = _SEGMENT_SAMPLES
     count = max(_SEGMENTS, math.ceil(2 * signals / _FITTED))
@@ -188,9 +190,9 @@ def _segments(episodes: Sequence[Episode], signals: int) -> list[Episode]:
     return kept
 
 
-def _split(parts: list[Episode], seed: int) -> tuple[list[Episode], list[Episode], list[Episode]]:
+def split(parts: Sequence[Episode], seed: int) -> tuple[list[int], list[int], list[int]]:
     """
-    Return the segments to fit to, to choose by and to hold out: three, one and one fifth.
+    Return which segments to fit to, to choose by and to hold out: three, one and one fifth.
 
     Those that reach furthest are fitted to: the range should be known, not extrapolated to.
     """
@@ -205,8 +207,7 @@ def _split(parts: list[Episode], seed: int) -> tuple[list[Episode], list[Episode
     fifth = min(max(1, len(parts) // 5), len(free) // 2)
     choose, held_out = free[:fifth], free[fifth:2 * fifth]
     fit = furthest.union(free[2 * fifth:])
-    return ([parts[i] for i in sorted(fit)], [parts[i] for i in sorted(choose)],
-            [parts[i] for i in sorted(held_out)])
+    return sorted(fit), sorted(choose), sorted(held_out)
 
 
 def _estimates(episodes: Sequence[Episode], box: Box, degree: int, B: Array | None,

@@ -147,6 +147,9 @@ class TrainerParameters:
     input_matrix_degree: int = parameter(
         0, 'degree of the polynomial in the states that a learned B is, where what an input does '
         'depends on them; 0 for a constant B', '', 0, 5)
+    hidden_states: int = parameter(
+        0, 'most states of the plant that are not measured, which a lift is learned with; 0 where '
+        'all are', '', 0, 4)
     synchronisation_tolerance: float = parameter(
         0.0, 'how far the stamps of messages may be apart that together are one measurement', 's',
         0.0, 10.0)
@@ -214,7 +217,8 @@ class TrainerParameters:
         """Return the fields of a :class:`koopman_ros.retraining.Task` that are settings."""
         return {'model_class': self.model_class, 'coordinates': self.model_coordinates,
                 'seed': self.training_seed, 'starts': self.training_starts,
-                'input_matrix_degree': self.input_matrix_degree, 'margin': self.gate_margin,
+                'input_matrix_degree': self.input_matrix_degree,
+                'hidden_states': self.hidden_states, 'margin': self.gate_margin,
                 'condition': self.gate_condition}
 
 
@@ -299,6 +303,9 @@ def _cross_check(signals: Signals, values: TrainerParameters) -> str:
     if values.input_matrix != (0.0,) and values.input_matrix_degree:
         return (f'input_matrix_degree is {values.input_matrix_degree}, must be 0 where '
                 'input_matrix is given, of which nothing is learned')
+    if values.hidden_states and values.input_matrix_degree:
+        return (f'input_matrix_degree is {values.input_matrix_degree}, must be 0 where '
+                'hidden_states are learned, on which B would depend')
     return Wiring(signals, values.states, values.inputs).check()
 
 

@@ -168,7 +168,9 @@ def _warnings(found: Identified, model: LiftedModel, error: Array, autocorrelati
     """Say where the best drift errs by more than white noise explains."""
     warnings = []
     count = sum(len(episode) for episode in found.held_out)
-    for i, (name, unit) in enumerate(zip(model.states.names, model.states.units, strict=True)):
+    measured = len(model.states) - found.hidden
+    for i, (name, unit) in enumerate(zip(model.states.names[:measured], model.states.units,
+                                         strict=False)):
         noticeable, r = _NOTICEABLE * found.drift.box.states.scale[i], autocorrelation[i]
         if error[i] > noticeable and r > max(_LEAST_AUTOCORRELATION, _SIGMAS / np.sqrt(count)):
             warnings.append(

@@ -63,9 +63,11 @@ def _sections(retrained: Retrained) -> Iterator[str]:
                     states.names, states.units,
                     found.drift.input_matrix / SECONDS_PER_TIME_UNIT[retrained.plant.time_unit],
                     strict=True)), range(1, 1 + len(inputs)))
-    yield 'Errors on the segments to choose by:'
+    yield 'Errors on the segments to choose by' + (
+        ', of the next measurement foreseen:' if found.hidden else ':')
     yield table(('degree', 'method', *errors),
-                ((score.degree, score.method, *(f'{error:.5g}' for error in score.rmse))
+                ((score.degree, score.method, *(f'{error:.5g}' for error in score.rmse),
+                  *[''] * (len(states) - len(score.rmse)))
                  for score in found.scores), range(2, 2 + len(states)))
     if decision is None or learned is None:
         return

@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 
 from koopman_ros.arrays import Array, brief
 from koopman_ros.bags import Account, loop_episodes, RecordedInput, RecordedState
-from koopman_ros.identification import Identified, identify, Stopped
+from koopman_ros.identification import Identified, identify, identify_hidden, Stopped
 from koopman_ros.learning import Comparison, Contender, NoUsefulLift, Progress
 from koopman_ros.lifting import Box, Coordinates, LiftedModel, load, save
 from koopman_ros.model_classes import BEST, CLASSES, IDENTITY_LIFT
@@ -65,6 +65,9 @@ class Task:
     input_gain: Mapping[str, Mapping[str, float]] = field(default_factory=dict)
     #: degree of the polynomial B(x) that is learned; 0 for a constant, and where B is known
     input_matrix_degree: int = 0
+    #: most states that are not in the bags, see :func:`identify_hidden`; the new lift is then not
+    #: compared with the present one
+    hidden_states: int = 0
     #: lowest and highest set-point that the lift is wanted for, of some states by name, in their
     #: units
     setpoints: Mapping[str, tuple[float, float]] = field(default_factory=dict)
@@ -218,14 +221,22 @@ def retrain(task: Task, on_progress: OnProgress = lambda *_: False) -> Retrained
     seconds = SECONDS_PER_TIME_UNIT[plant.time_unit]
     episodes = [replace(episode, time=episode.time / seconds,
                         input_time=episode.input_time / seconds) for episode in recorded]
-    found = identify(
-        plant, episodes, seed=task.seed,
-        watch=lambda done, total, text: on_progress(
-            _at('estimate', done / total), f'estimating: {text}'))
+    def estimating(done: int, total: int, text: str) -> bool:
+        return on_progress(_at('estimate', done / total), f'estimating: {text}')
+
+    if task.hidden_states:
+        found = identify_hidden(plant, episodes, task.hidden_states, seed=task.seed,
+                                watch=estimating)
+        episodes = [*found.fitted, *found.held_out]
+        # of other states
+        current = None
+    else:
+        found = identify(plant, episodes, seed=task.seed, watch=estimating)
     if current is None:
         # an input that keeps the plant somewhere in the middle is not far
-        plant = replace(plant, nominal_state=found.drift.box.states.center,
-                        nominal_input=found.drift.box.inputs.center)
+        box = found.drift.box
+        plant = replace(plant, state_names=box.states.names, state_units=box.states.units, B=None,
+                        nominal_state=box.states.center, nominal_input=box.inputs.center)
     bare = Retrained(task, account, found, None, None, (), coverage(episodes, found.drift.box),
                      plant, current)
     course = _Course(on_progress)
@@ -239,7 +250,9 @@ def retrain(task: Task, on_progress: OnProgress = lambda *_: False) -> Retrained
     _stop_if(on_progress(_at('decide', _JUDGED), 'judging'))
     decision = decide(found, learned, current, thresholds)
     decision = replace(decision, warnings=(
-        *decision.warnings, *shortfalls(learned.model.states, task.setpoints)))
+        *decision.warnings, *shortfalls(learned.model.states, task.setpoints),
+        *[f'it is not compared with the present lift {task.model}, which has no hidden states'
+          ] * bool(task.hidden_states and task.model)))
     _stop_if(on_progress(_at('decide', 0.9), 'writing'))
     model = _with_provenance(learned.model, found, decision, min(bare.coverage.values()),
                              episodes)

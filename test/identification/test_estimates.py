@@ -7,6 +7,8 @@ Total variation, the weak form and output error on plants whose drift is known.
 Exact derivatives and recovery, order of the quadrature, what noise does, and what fails.
 """
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from scipy.integrate import quad
@@ -23,10 +25,11 @@ from koopman_ros.identification import (
     total_variation,
     weak_form,
 )
-from koopman_ros.identification.output_error import _Problem
+from koopman_ros.identification.output_error import _Filter, _Problem
 from koopman_ros.identification.regression import _input_integral, smoothed
 from koopman_ros.learning.levenberg_marquardt import normal_equations
 from koopman_ros.plant_data import cut, Episode
+from koopman_ros.solvers import runge_kutta_step
 from support.known_plants import box, CUBIC, PAIR
 
 NOISE = 0.02
@@ -52,7 +55,7 @@ def test_normal_equations_against_differences(learn):
 
     def residuals(values):
         # by the path in units, which shares no line with the derivatives
-        drift, starts = problem.split(values)
+        drift, starts, _ = problem.split(values)
         middle = box.states.center
         errors = segments.errors(drift.rate, middle + starts * box.states.scale)
         return (errors / box.states.scale).ravel() / np.sqrt(count)
@@ -69,6 +72,49 @@ def test_normal_equations_against_differences(learn):
     assert found.matrix.numpy() == pytest.approx(J.T @ J, abs=1e-7)
     only = normal_equations(problem.add_residuals, theta, derivatives=False)
     assert only.cost == found.cost
+
+
+@pytest.mark.parametrize('learn', [True, False])
+def test_normal_equations_of_a_filter_against_differences(learn):
+    records = [PAIR.irregular(count, 40, (0.05, 0.15), seed=count) for count in (30, 25)]
+    model, whole = start_of(PAIR, records, 2)
+    # the second state is not measured
+    segments = replace(whole, x=whole.x[..., :1])
+    rng = np.random.default_rng(0)
+    gain, starts = rng.uniform(0.1, 0.4, (2, 1)), rng.uniform(-0.5, 0.5, (2, 2))
+    deviation, settling = np.array([0.3]), 5
+    problem = _Problem(model, segments, learn, _Filter(gain, starts, deviation, settling))
+    theta = problem.start()
+    theta = theta + 0.03 * torch.from_numpy(rng.standard_normal(len(theta)))
+    box = model.box
+
+    def residuals(values):
+        drift, _, K = problem.split(values)
+        found = []
+        for j, record in enumerate(records):
+            # sample by sample and in units, with the solver's steps over each interval
+            x, taken = box.states.to_physical(starts[j]), 0
+            for k in range(len(segments.measured)):
+                if segments.measured[k, j]:
+                    error = segments.x[k, j, 0] - x[0]
+                    if taken >= settling:
+                        found.append(error / box.states.scale[0] / deviation[0])
+                    x = x + box.states.scale * (K[:, 0] * error / box.states.scale[0])
+                    taken += 1
+                if k < len(segments.steps):
+                    x = runge_kutta_step(lambda x, u=segments.u[k, j]: drift.rate(x, u), x,
+                                         segments.steps[k, j])
+            assert taken == len(record)
+        return np.array(found) / np.sqrt(len(found))
+
+    base = residuals(theta.numpy())
+    J = np.stack([(residuals(theta.numpy() + h) - residuals(theta.numpy() - h)) / 2e-5
+                  for h in 1e-5 * np.eye(len(theta))], axis=-1)
+    found = normal_equations(problem.add_residuals, theta)
+    assert len(theta) == 12 + (4 if learn else 0) + 2
+    assert found.cost == pytest.approx(0.5 * base @ base, rel=1e-12)
+    assert found.gradient.numpy() == pytest.approx(J.T @ base, abs=1e-7)
+    assert found.matrix.numpy() == pytest.approx(J.T @ J, abs=1e-6)
 
 
 def test_a_model_that_diverges_has_infinite_cost():
