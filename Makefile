@@ -14,7 +14,7 @@ export ROS_AUTOMATIC_DISCOVERY_RANGE ?= LOCALHOST
 # How many seeds each experiment is run from: make studies SEEDS=5
 SEEDS ?= 20
 
-.PHONY: help demo demo-retrain test test-machines lint models studies studies-sensors studies-robustness studies-general studies-unstable studies-saddle bench faults docs config lock clean
+.PHONY: help demo demo-retrain demo-saddle test test-machines lint models studies studies-sensors studies-robustness studies-general studies-unstable studies-saddle bench faults docs config lock clean
 
 help:  ## show this list
 	@grep -E '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed 's/:.*## /\t/'
@@ -42,6 +42,10 @@ $(VENV)/retrain.stamp: setup.py $(LOCK) $(VENV)/run.stamp
 	$(INSTALL) --editable '.[ros,demo,train]'
 	@touch $@
 
+$(VENV)/saddle.stamp: setup.py $(LOCK) $(VENV)/run.stamp
+	$(INSTALL) --editable '.[ros,demo,train,mpc]'
+	@touch $@
+
 $(VENV)/panel.stamp: setup.py $(LOCK) $(VENV)/run.stamp
 	$(INSTALL) --editable '.[ros,demo,panel]'
 	@touch $@
@@ -59,6 +63,10 @@ demo: $(VENV)/$(if $(PANEL),panel,run).stamp  ## closed loop of three processes:
 
 demo-retrain: $(VENV)/retrain.stamp  ## the plant drifts, is recorded, learned and controlled anew -> out/demo-retrain
 	$(BIN)/python -m koopman_ros.demo.retrain
+
+demo-saddle: SEEDS = 5
+demo-saddle: $(VENV)/saddle.stamp  ## an unstable reactor is learned from its temperature alone, recorded under a PI law, and held, SEEDS=5, a quarter of an hour -> out/demo-saddle
+	$(BIN)/python -m validation.saddle_act --seeds $(SEEDS)
 
 # Types are checked beside the tests. Tests across processes wait most of their time, so that there
 # is one worker more than cores; the longest files come first (test/conftest.py). A worker that was
@@ -94,11 +102,11 @@ studies-general: $(VENV)/bench.stamp  ## the law on seven plants by models of ea
 	$(BIN)/python -m validation.general --seeds $(SEEDS)
 
 studies-unstable: SEEDS = 10
-studies-unstable: $(VENV)/train.stamp  ## the reactor about its saddle, learned under a pre-feedback, SEEDS=10, six minutes
+studies-unstable: $(VENV)/saddle.stamp  ## the reactor about its saddle, learned under a pre-feedback, SEEDS=10, six minutes
 	$(BIN)/python -m validation.unstable --seeds $(SEEDS)
 
 studies-saddle: SEEDS = 10
-studies-saddle: $(VENV)/train.stamp  ## the same reactor held at its saddle from its temperature alone, SEEDS=10, half an hour
+studies-saddle: $(VENV)/saddle.stamp  ## the same reactor held at its saddle from its temperature alone, SEEDS=10, half an hour
 	$(BIN)/python -m validation.saddle --seeds $(SEEDS)
 
 bench: $(VENV)/bench.stamp  ## speed beside other programs, seventeen minutes (BENCH=--quick: three) -> out/bench

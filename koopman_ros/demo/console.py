@@ -26,8 +26,8 @@ _IN_MINUTES = 300.0  # s; so long a run is told in minutes
 
 
 def read_options(args: list[str] | None, description: str | None, output: str, speed: float,
-                 plant: str = '') -> argparse.Namespace:
-    """Read `output`, `speed` and, where there is a choice, `plant`, with these defaults."""
+                 plant: str = '', seeds: int = 0) -> argparse.Namespace:
+    """Read `output`, `speed` and, where there is a choice, `plant` and `seeds`; the defaults."""
     parser = argparse.ArgumentParser(description=description)
     of = f', of another plant {output}-PLANT' if plant else ''
     parser.add_argument('--output', type=Path,
@@ -42,7 +42,12 @@ def read_options(args: list[str] | None, description: str | None, output: str, s
     parser.add_argument('--speed', type=float, default=speed,
                         help='simulated seconds per second, 0 for as fast as the machine can '
                         '(default: %(default)s)')
+    if seeds:
+        parser.add_argument('--seeds', type=int, default=seeds,
+                            help='runs, each with noise of its own (default: %(default)s)')
     options = parser.parse_args(args)
+    if seeds and options.seeds < 1:
+        parser.error(f'--seeds is {options.seeds}, must be at least 1')
     if options.output is None:
         other = plant and options.plant != plant
         options.output = Path(f'{output}-{options.plant}' if other else output)

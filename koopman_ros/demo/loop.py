@@ -26,7 +26,7 @@ from koopman_ros.units import NANOSECONDS
 from koopman_ros.wire import Place
 
 _START_TIME = 1.0  # s of plant time at the first measurement
-_FIRST_STAMP_NS = round(_START_TIME * NANOSECONDS)
+FIRST_STAMP_NS = round(_START_TIME * NANOSECONDS)
 _TIMEOUT = 30.0  # s for the processes to find each other, and from one command to the next
 
 
@@ -78,7 +78,7 @@ class Operator:
         self.last_stamp_ns = 0
         self._wiring = wiring = scenario.wiring
         states, inputs = wiring.signals.states, wiring.signals.inputs
-        self._setpoints = Outlet(wiring.setpoints, states, self._publisher)
+        self._setpoints: Outlet | None = Outlet(wiring.setpoints, states, self._publisher)
         self._listen(wiring.measured, states, partial(self._on_part, self._measured))
         self._listen(wiring.active_setpoints, states, lambda heard: self._active.update(
             heard.values), topics.LATCHED_QOS)
@@ -97,17 +97,17 @@ class Operator:
     @property
     def found_loop(self) -> bool:
         """Whether controller and trainer are there and hear the set-points."""
-        return self._commands.published() and all(
+        return self._commands.published() and self._setpoints is not None and all(
             publisher.get_subscription_count() >= 2 for publisher in self._setpoints.publishers)
 
     @property
     def seconds(self) -> float:
         """Plant time of the last command since the first measurement, in s; 0 before it."""
-        return max(0.0, (self.last_stamp_ns - _FIRST_STAMP_NS) / NANOSECONDS)
+        return max(0.0, (self.last_stamp_ns - FIRST_STAMP_NS) / NANOSECONDS)
 
     def run_until(self, seconds: float) -> None:
         """Let the loop go on until so many seconds of plant time after its first measurement."""
-        end = _FIRST_STAMP_NS + seconds * NANOSECONDS
+        end = FIRST_STAMP_NS + seconds * NANOSECONDS
         while self.last_stamp_ns < end:
             self.harness.wait_until(partial(self._answered_after, self.last_stamp_ns),
                                     'the loop stands still: no command')
@@ -115,11 +115,21 @@ class Operator:
     def _answered_after(self, stamp_ns: int) -> bool:
         return self.last_stamp_ns > stamp_ns
 
-    def request_setpoints(self) -> None:
-        """Publish the set-points, stamped with the plant time from which they hold."""
-        stamp = _FIRST_STAMP_NS + round(self.scenario.step_time * NANOSECONDS)
-        wanted = [self.scenario.setpoints[name] for name in self._wiring.setpoints]
+    def request_setpoints(self, setpoints: Mapping[str, float], seconds: float) -> None:
+        """Publish set-points, stamped with the plant time in s from which they hold."""
+        if self._setpoints is None:
+            self._setpoints = Outlet(
+                self._wiring.setpoints, self._wiring.signals.states, self._publisher)
+            self.harness.wait_until(lambda: self.found_loop, 'nobody hears the set-points')
+        stamp = FIRST_STAMP_NS + round(seconds * NANOSECONDS)
+        wanted = [setpoints[name] for name in self._wiring.setpoints]
         self._setpoints.send(np.array(wanted), stamp_message(stamp), 'operator')
+
+    def leave_setpoints(self) -> None:
+        """Leave the set-points to somebody else, until they are requested again."""
+        for publisher in [] if self._setpoints is None else self._setpoints.publishers:
+            self.harness.node.destroy_publisher(publisher)
+        self._setpoints = None
 
     def _on_part(self, parts: dict[int, dict[str, float]], heard: Heard) -> None:
         """Take a message, and show the row that it makes whole."""
@@ -128,7 +138,7 @@ class Operator:
         if (len(self._measured.get(stamp, ())) == len(self._wiring.measured)
                 and len(self._commanded.get(stamp, ())) == len(self._wiring.commands)):
             self.last_stamp_ns = stamp
-            self._on_row(Row((stamp - _FIRST_STAMP_NS) / NANOSECONDS, self._measured.pop(stamp),
+            self._on_row(Row((stamp - FIRST_STAMP_NS) / NANOSECONDS, self._measured.pop(stamp),
                              dict(self._active), self._commanded.pop(stamp)))
 
 
@@ -162,7 +172,7 @@ def running_loop(scenario: Scenario, logs: Path, trainer: Mapping[str, object],
             assert address is not None
             print(f'the panel is at {address[1]}', flush=True)
         if scenario.setpoints:
-            operator.request_setpoints()
+            operator.request_setpoints(scenario.setpoints, scenario.step_time)
         plant = harness.start('plant', {
             'system': scenario.system, **scenario.plant,
             'lockstep': True, 'speed': scenario.speed, 'duration': scenario.duration,

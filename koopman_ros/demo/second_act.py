@@ -8,19 +8,18 @@ Plant, controller and trainer run as three processes in lock-step; none is stopp
 The disturbance observer is off: it would make up for the drift, and for what a lift lacks.
 """
 
-from dataclasses import dataclass, field, replace
+from dataclasses import replace
 import json
 from pathlib import Path
 import shutil
 import time
 
-from diagnostic_msgs.msg import DiagnosticStatus
 import numpy as np
-from std_srvs.srv import SetBool, Trigger
 
 from koopman_ros.demo import reactor
 from koopman_ros.demo.console import LiveTable, read_options, run_act
-from koopman_ros.demo.loop import Operator, running_loop
+from koopman_ros.demo.hands import ActError, Hands
+from koopman_ros.demo.loop import running_loop
 from koopman_ros.demo.results import plot_retraining, read_run
 from koopman_ros.learning import roll_out
 from koopman_ros.lifting import LiftedModel, load
@@ -74,7 +73,7 @@ def run_retraining(output: Path, speed: float) -> dict[str, object]:
                       scenario.wiring.signals, _SHOWN)
     trainer = {'output': bags[0], 'model_output': new_model, **_EXPERIMENT}
     with table, running_loop(scenario, logs, trainer, table.show) as operator:
-        phases = _Actor(operator, table).act(bags[1], new_model)
+        phases = _act(Hands(operator, table), bags[1], new_model)
     history = read_run(scenario.wiring, *bags)
     learned = load(new_model)
     trained = json.loads(new_model.with_suffix('.json').read_text())
@@ -115,76 +114,29 @@ def rollout_rmse(model: LiftedModel) -> float:
     return float(np.sqrt(np.mean((predicted - truth.x) ** 2)))
 
 
-class ActError(RuntimeError):
-    """A step of the act was refused, or failed."""
-
-
-@dataclass
-class _Actor:
-    """The operator's hands."""
-
-    operator: Operator
-    table: LiveTable
-    phases: list[tuple[str, float]] = field(default_factory=list)  #: name and start in s
-
-    def act(self, second_bag: Path, new_model: Path) -> list[tuple[str, float]]:
-        """Do it all; return name and start, in s of plant time, of each phase."""
-        operator = self.operator
-        self._begin('shipped lift', 'set-point step of -10 K with the shipped lift')
-        operator.run_until(_DRIFT_TIME)
-        self._set('plant', **{'constants.heat_transfer_coefficient': (
-            FOULING * reactor.constant('heat_transfer_coefficient'))})
-        self._begin('fouling', 'the cooling jacket fouls: a fifth of its heat transfer is lost')
-        # a new bag, so that the plant as it was is not among the data
-        self._switch('trainer/record', False)
-        self._set('trainer', output=str(second_bag))
-        self._switch('trainer/record', True)
-        operator.run_until(_EXPERIMENT_TIME)
-        self._switch('controller/set_automatic', False)
-        self._switch('trainer/experiment', True)
-        self._begin('experiment', f'manual mode: random steps for {_EXPERIMENT_MINUTES:.0f} min')
-        self._wait_for('experiment', 'finished', _EXPERIMENT_TIMEOUT)
-        self._switch('trainer/experiment', False)
-        self._switch('controller/set_automatic', True)
-        self._begin('training', 'automatic mode again; a lift is learned from the recording')
-        _checked('trainer/train', operator.harness.trigger('trainer/train'))
-        status = self._wait_for('training', 'the new lift is', _TRAINING_TIMEOUT)
-        self.table.announce(status.message)
-        if not new_model.exists():
-            raise ActError(status.message)
-        self._set('controller', model=str(new_model.resolve()))
-        self._begin('new lift', 'the controller has taken the new lift over')
-        operator.run_until(self.phases[-1][1] + _AFTER)
-        return self.phases
-
-    def _begin(self, name: str, text: str) -> None:
-        self.phases.append((name, self.operator.seconds))
-        self.table.announce(text)
-
-    def _wait_for(self, task: str, words: str, timeout: float) -> DiagnosticStatus:
-        """Wait until a task of the trainer says so."""
-        def said() -> DiagnosticStatus | None:
-            status = self.operator.harness.last_status(f'trainer: {task}')
-            if status is not None and status.level == DiagnosticStatus.ERROR:
-                raise ActError(f'{task}: {status.message}')
-            return status if status is not None and status.message.startswith(words) else None
-
-        status = self.operator.harness.wait_until(said, f'the {task} did not end', timeout)
-        assert status is not None
-        return status
-
-    def _switch(self, service: str, on: bool) -> None:
-        _checked(service, self.operator.harness.set_bool(service, on))
-
-    def _set(self, node: str, **values: object) -> None:
-        for result in self.operator.harness.set_parameters(node, **values):
-            if not result.successful:
-                raise ActError(f'{node}: {result.reason}')
-
-
-def _checked(service: str, response: SetBool.Response | Trigger.Response) -> None:
-    if not response.success:
-        raise ActError(f'{service}: {response.message}')
+def _act(hands: Hands, second_bag: Path, new_model: Path) -> list[tuple[str, float]]:
+    """Do it all; return name and start, in s of plant time, of each phase."""
+    operator = hands.operator
+    hands.begin('shipped lift', 'set-point step of -10 K with the shipped lift')
+    operator.run_until(_DRIFT_TIME)
+    hands.set('plant', **{'constants.heat_transfer_coefficient': (
+        FOULING * reactor.constant('heat_transfer_coefficient'))})
+    hands.begin('fouling', 'the cooling jacket fouls: a fifth of its heat transfer is lost')
+    # a new bag, so that the plant as it was is not among the data
+    hands.record_anew(second_bag)
+    operator.run_until(_EXPERIMENT_TIME)
+    hands.switch('controller/set_automatic', False)
+    hands.switch('trainer/experiment', True)
+    hands.begin('experiment', f'manual mode: random steps for {_EXPERIMENT_MINUTES:.0f} min')
+    hands.wait_for('experiment', 'finished', _EXPERIMENT_TIMEOUT)
+    hands.switch('trainer/experiment', False)
+    hands.switch('controller/set_automatic', True)
+    hands.begin('training', 'automatic mode again; a lift is learned from the recording')
+    hands.train(new_model, _TRAINING_TIMEOUT)
+    hands.set('controller', model=str(new_model.resolve()))
+    hands.begin('new lift', 'the controller has taken the new lift over')
+    operator.run_until(hands.phases[-1][1] + _AFTER)
+    return hands.phases
 
 
 def main(args: list[str] | None = None) -> int:
