@@ -123,11 +123,20 @@ class Settings:
             'sensor': SensorLimits.none(n_x), **others})
 
     def uncertainty(self, model: LiftedModel, outputs: Outputs) -> tuple[Array, Array, Array]:
-        """Return noise, wander and initial error, what suits the model where they are not said."""
+        """
+        Return noise, wander and initial error, what suits the model where they are not said.
+
+        The noise of an output that is a state is that of the record that the model was learned
+        from, where there was one.
+        """
+        metrics, names = model.provenance.metrics, model.states.names
+        recorded = np.array([metrics.get(
+            f'noise_{name}' if len(names) > 1 else 'noise', 0.0) if name in names else 0.0
+            for name in outputs.names])
         half = 0.5 * (model.states.upper - model.states.lower)
         slowest = float(np.min(np.abs(np.linalg.eigvals(
             model.drift_jacobian(np.zeros(model.n_x)))))) / model.seconds_per_time_unit
-        defaults = (_NOISE * np.abs(outputs.C) @ half,
+        defaults = (np.where(recorded > 0.0, recorded, _NOISE * np.abs(outputs.C) @ half),
                     _WANDER * 0.5 * (model.inputs.upper - model.inputs.lower)
                     * math.sqrt(max(slowest, 1.0 / _LONGEST)), _GUESS * half)
         noise, wander, error = (

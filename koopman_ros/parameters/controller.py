@@ -76,8 +76,8 @@ class StateParameters(StatePlaces):
     pi_time: float = parameter(
         60.0, 'integral time of that law', 's', 0.0, 86400.0, open_minimum=True)
     noise: float = parameter(
-        0.0, 'standard deviation of the noise of its sensor, for a Kalman filter; 0 for what '
-        'suits the model', '{unit}', 0.0, 1e9)
+        0.0, 'standard deviation of the noise of its sensor, for a Kalman filter; 0 for that of '
+        'the record that the model was learned from', '{unit}', 0.0, 1e9)
 
 
 @dataclass(frozen=True)

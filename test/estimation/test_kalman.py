@@ -311,3 +311,16 @@ def test_a_start_up_from_far_outside_the_data_arrives():
     assert set(levels[taken_over:]) == {'sdre'}
     assert np.max(loop.states[:, 1]) < 351.0
     assert abs(np.mean(loop.states[-100:, 1]) - 350.0) < 0.05
+
+
+def test_noise_that_is_not_said_is_that_of_the_record():
+    model = oscillator()
+    outputs, name = first(model, 1), model.states.names[0]
+    known = replace(model, provenance=replace(
+        model.provenance, metrics={f'noise_{name}': 0.125}))
+    settings = saddle(noise=np.zeros(0)).settings
+    half = 0.5 * (model.states.upper[0] - model.states.lower[0])
+    assert settings.uncertainty(model, outputs)[0] == pytest.approx([1e-3 * half], rel=1e-12)
+    assert settings.uncertainty(known, outputs)[0].tolist() == [0.125]
+    said = replace(settings, noise=np.array([0.5]))
+    assert said.uncertainty(known, outputs)[0].tolist() == [0.5]
