@@ -288,15 +288,17 @@ def _cross_check(signals: Signals, values: ControllerParameters) -> str:
     return Wiring(signals, values.states, values.inputs).check()
 
 
-def _times(model: LiftedModel) -> dict[str, float]:
-    """Return the times that suit a model's modes; an unstable plant cannot wait."""
+def _dynamics(model: LiftedModel) -> dict[str, Any]:
+    """Return what suits a model's modes: an unstable plant cannot wait, and is planned for."""
     modes = np.linalg.eigvals(
         model.drift_jacobian(np.zeros(model.n_x))) / model.seconds_per_time_unit
     fastest, slowest = float(np.max(np.abs(modes))), float(np.min(np.abs(modes)))
     stable = bool(np.all(modes.real < 0.0)) and fastest > 0.0
+    levels = {} if np.all(modes.real <= 0.0) else {'levels': ('mpc', 'sdre', 'linear')}
     # a window, a fifth of it, is to show the slowest mode, and not to let an unstable one run off
     shown = max(slowest, 0.1 * fastest, float(np.max(modes.real)), 1e-3)
-    return {'model_check_length': min(float(f'{10.0 / shown:.2g}'), 86400.0),
+    return {**levels,
+            'model_check_length': min(float(f'{10.0 / shown:.2g}'), 86400.0),
             'transfer_time': min(float(f'{0.5 / fastest:.2g}'), 86400.0) if stable else 0.0,
             'disturbance_bandwidth': min(float(f'{fastest:.2g}'), 1000.0) if stable else 0.0}
 
@@ -325,7 +327,7 @@ def table_of(model: LiftedModel, given: Mapping[str, Any] = MappingProxyType({})
             'model is of (an empty name: none that is shipped)')
     signals = signals_of(model, tuple(given.get('controlled', own.get('controlled', ()))),
                          expected.states)
-    defaults: dict[str, Any] = {**signals.defaults(), **_times(model)}
+    defaults: dict[str, Any] = {**signals.defaults(), **_dynamics(model)}
     for name, scale in zip(model.states.names, model.states.scale.tolist(), strict=True):
         if name in signals.states:
             defaults[f'{name}.weight'] = 1.0 / scale ** 2

@@ -379,6 +379,13 @@ def test_nothing_is_below_absolute_zero() -> None:
     assert said.startswith('temperature.sensor_min = -300.0 degC must be in [-273.15, ')
 
 
+@pytest.mark.parametrize(('name', 'levels'), [
+    ('reactor_nz4', ('sdre', 'linear')), ('two_state', ('sdre', 'linear')),
+    ('pendulum', ('mpc', 'sdre', 'linear')), ('two_state_example', ('mpc', 'sdre', 'linear'))])
+def test_an_unstable_plant_is_planned_for(name: str, levels: tuple[str, ...]) -> None:
+    assert table_of(load(model_path(name)), {'system': ''}).snapshot({}).levels == levels
+
+
 @pytest.mark.parametrize('name', ['two_tanks', 'pendulum'])
 def test_times_follow_from_the_modes_of_the_plant(name: str) -> None:
     """Of the true one, whose pendulum falls by itself."""
