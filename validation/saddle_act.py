@@ -395,7 +395,7 @@ def draw(path: Path, run: _Run, phases: list[tuple[str, float]], model: LiftedMo
                    label='that which explains the heat that the lift expects')
         lower.set(ylabel='concentration [mol/L]', xlabel='plant time [min]',
                   xlim=(0.0, float(minutes[-1])))
-        lower.legend(loc='upper right', fontsize=8)
+        lower.legend(loc='upper center', fontsize=8)
 
 
 def run_saddle(output: Path, speed: float, seeds: int = SEEDS) -> dict[str, object]:
