@@ -438,7 +438,7 @@ class Controller:
         held = self.model.inputs.center if state.command is None else state.command
         level, done = state.supervisor.level, CommandReport()
         if result is not None:
-            done = CommandReport(result.figures, at_range=result.clipped)
+            done = CommandReport(result.figures, at_range=result.clipped, plan=result.plan)
         if result is None or result.u is None:
             if result is not None:
                 done = amended(done, law=amended(result.figures, form=''))

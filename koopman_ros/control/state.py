@@ -11,7 +11,7 @@ from typing import TypeVar
 import numpy as np
 
 from koopman_ros.arrays import Array, brief
-from koopman_ros.control.laws.base import Figures, NO_FIGURES
+from koopman_ros.control.laws.base import Figures, NO_FIGURES, Plan
 from koopman_ros.control.limits import Transfer
 from koopman_ros.control.setpoint import Setpoint
 from koopman_ros.control.supervisor import Supervisor, WayBack
@@ -129,6 +129,7 @@ class CommandReport:
     way_back: float = 0.0  #: share of the nominal input in it on the way back from the safe one
     at_range: bool = False  #: whether the range of an input was active
     at_rate: bool = False  #: whether the rate limit of an input was active
+    plan: Plan | None = None  #: what the law plans, where it has a horizon
     #: its distance from the training box, in half widths; NaN where not looked at
     outside: float = math.nan
 

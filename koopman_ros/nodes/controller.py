@@ -141,6 +141,8 @@ class ControllerNode(ManagedNode):
         self._active = Outlet(wiring.active_setpoints, signals.states, self._latched)
         self._predicted = Outlet(wiring.predicted, signals.states, matching.publish)
         self._internals = matching.publish(topics.CONTROLLER_STATE)
+        self._plan = matching.publish(topics.CONTROLLER_PLAN)
+        self._active_limits = matching.publish(topics.ACTIVE_LIMITS)
         self._published_setpoint: Array | None = None
         self.diagnostics.hardware_id = loaded.model.provenance.plant or parameters.system
         self._diagnostics = self.diagnostics.add('control', self._status)
@@ -357,6 +359,10 @@ class ControllerNode(ManagedNode):
         if predicted is not None:
             self._predicted.send(predicted, stamp, self._frame_id)
         self._internals.publish(messages.internals(self._signals, report, stamp, self._frame_id))
+        if (plan := report.command.plan) is not None:
+            self._plan.publish(messages.planned(self._signals, plan, stamp, self._frame_id))
+            self._active_limits.publish(
+                messages.active_limits(self._signals, plan, stamp, self._frame_id))
 
     def _on_setpoint(self, heard: Heard) -> None:
         (name, value), = heard.values.items()

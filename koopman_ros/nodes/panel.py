@@ -23,6 +23,7 @@ from rclpy.qos import QoSProfile
 from sensor_msgs.msg import JointState
 from std_msgs.msg import String
 from std_srvs.srv import SetBool, Trigger
+from trajectory_msgs.msg import JointTrajectory
 
 from koopman_ros.bags import BagReadError
 from koopman_ros.lifting import LiftedModel, load
@@ -44,6 +45,7 @@ from koopman_ros.reasons import Code, reason
 from koopman_ros.replay import records
 from koopman_ros.resources import model_path
 from koopman_ros.ros import topics
+from koopman_ros.ros.codec import stamp_nanoseconds
 from koopman_ros.ros.learning import LearningWatch
 from koopman_ros.ros.node import Level, LoopNode, Status, wall_timer, words_of
 from koopman_ros.ros.process import run
@@ -119,6 +121,8 @@ class PanelNode(LoopNode):
             topic, hear, of, topics.LATCHED_QOS), wiring.active_setpoints, signals.states,
             partial(self._on_signal, 'active_setpoints'))
         matching.subscribe(topics.CONTROLLER_STATE, self._on_internals, qos=_WATCHING)
+        matching.subscribe(topics.CONTROLLER_PLAN, self._on_plan, qos=_WATCHING)
+        matching.subscribe(topics.ACTIVE_LIMITS, self._on_limits, qos=_WATCHING)
         matching.subscribe(topics.CONTROLLER_EVENTS, self._on_record)
         matching.subscribe(topics.DIAGNOSTICS, self._on_diagnostics, qos=QoSProfile(depth=100))
         self._actions = matching.publish(topics.OPERATOR_ACTIONS)
@@ -189,6 +193,15 @@ class PanelNode(LoopNode):
 
     def _on_internals(self, message: JointState) -> None:
         self.view.internals(dict(zip(message.name, message.position, strict=False)))
+
+    def _on_plan(self, message: JointTrajectory) -> None:
+        self.view.planned(
+            message.joint_names, stamp_nanoseconds(message.header.stamp) / NANOSECONDS,
+            [stamp_nanoseconds(point.time_from_start) / NANOSECONDS for point in message.points],
+            [point.positions for point in message.points])
+
+    def _on_limits(self, message: JointState) -> None:
+        self.view.limits(dict(zip(message.name, message.position, strict=False)))
 
     def _on_record(self, message: String) -> None:
         try:

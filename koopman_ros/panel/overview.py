@@ -96,12 +96,14 @@ class _Plate:
             self._number = words('span', '', 'big')
             words('span', unit, 'unit')
         self._bar = _Bar(frame)
+        self._active = words('div', '', 'quiet')
 
     def show(self, face: Face, value: float, mark: float) -> None:
         self._abnormal.set_text(f'▲ {face.abnormal}')
         show_if(self._abnormal, bool(face.abnormal))
         self._number.set_text(face.text(value))
         self._bar.show(face, value, mark)
+        self._active.set_text(f'planned: {face.active}' if face.active else '')
 
 
 class _Entry:

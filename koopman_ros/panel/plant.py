@@ -30,6 +30,13 @@ _BACK = 1.0  # s; a stamp that is earlier by more begins time afresh
 _MOST_STATUSES = 64
 _DEVIATION = re.compile(r'deviation_(\w+) \[')
 _NAMED = re.compile(r'estimated_(\w+) \[(.+)\]')
+_SIGNAL = re.compile(r'(\w+) \[(.+)\]')
+_LIMIT = re.compile(r'at_(range|rate|limit)_(\w+) \[')
+_OF_LIMITS: Mapping[tuple[str, float], str] = {
+    ('range', -1.0): 'at its lower limit', ('range', 1.0): 'at its upper limit',
+    ('rate', -1.0): 'falling as fast as it may', ('rate', 1.0): 'rising as fast as it may',
+    ('limit', -1.0): 'kept above its lower limit', ('limit', 1.0): 'kept below its upper limit'}
+_UNPLANNED = 3  # answers without a plan, after which the last one is over: one may be lost
 
 Range = tuple[float, float]
 _NO_VALUES: Mapping[str, str] = MappingProxyType({})
@@ -56,6 +63,8 @@ class Face:
     training: Range | None  #: what the acting model was trained with
     abnormal: str  #: what is out of order, or empty
     limits: Range | None  #: of the command, or what the predictive law keeps a state within
+    active: str  #: which limits of it are active in the plan, in words, or empty
+    plan: Sequence[tuple[float, float]]  #: times and values ahead; empty without a plan
 
     @property
     def label(self) -> str:
@@ -206,6 +215,8 @@ class _Signal:
     read: str  # unit in which people read it, as all values here
     values: dict[str, float] = field(default_factory=dict)
     training: Range | None = None
+    active: str = ''
+    plan: tuple[tuple[float, float], ...] = ()
 
     def shown(self, value: float) -> float:
         return float(conversion(self.unit, self.read)(float(value)))
@@ -233,6 +244,7 @@ class PlantView:
             name: _Signal(unit, read[name]) for name, unit in signals.inputs.items()}
         self.plant = ''
         self._time = math.nan
+        self._unplanned = 0
         self._mode = self._level = ''
         self._statuses: dict[str, TaskStatus] = {}
         self._estimates: dict[str, str] = {}
@@ -296,6 +308,44 @@ class PlantView:
                 spread = '' if known is None else f' ± {known:.2g}'
                 self._estimates[found[1]] = f'{value:.4g}{spread} {found[2].replace("deg", "°")}'
 
+    def planned(self, names: Sequence[str], stamp: float, times: Sequence[float],
+                rows: Sequence[Sequence[float]]) -> None:
+        """
+        Take what the controller plans from a stamp on; what is no plan is passed over.
+
+        :param names: of signals, with units.
+        :param times: since the stamp, in s, with values of all signals in each row.
+        """
+        signals = {**self._states, **self._inputs}
+        plans = []
+        try:
+            for name, values in list(zip(names, list(zip(*rows, strict=True)), strict=True)):
+                found = _SIGNAL.fullmatch(name)
+                if found and (own := signals.get(found[1])):
+                    to_read = conversion(found[2], own.read)
+                    plans.append((own, tuple(
+                        (stamp + after, float(to_read(value)))
+                        for after, value in zip(times, values, strict=True))))
+        except ValueError:
+            return
+        for own, plan in plans:
+            own.plan = plan
+        self._unplanned = 0
+
+    def limits(self, values: Mapping[str, float]) -> None:
+        """Take which limits are active in that plan, by name."""
+        words: dict[str, list[str]] = {}
+        for key, value in values.items():
+            found = _LIMIT.match(key)
+            if found and (said := _OF_LIMITS.get((found[1], value))):
+                words.setdefault(found[2], []).append(said)
+        for name, own in (*self._states.items(), *self._inputs.items()):
+            own.active = ', '.join(words.get(name, ()))
+
+    def _without_plan(self) -> None:
+        for own in (*self._states.values(), *self._inputs.values()):
+            own.plan, own.active = (), ''
+
     def record(self, event: str, fields: Mapping[str, Any], now: float) -> None:
         """Take a record of the controller; one that is not as it should be is passed over."""
         self._heard[CONTROLLER] = now
@@ -311,6 +361,9 @@ class PlantView:
                 if self._level and level != self._level:
                     self._mark('level', f'{level_words(self._level)} → {level_words(level)}')
                 self._mode, self._level = mode, level
+                self._unplanned += 1
+                if self._unplanned == _UNPLANNED:
+                    self._without_plan()
             case 'setpoint' if fields['accepted']:
                 names = fields.get('signals') or self.signals.controlled
                 for name, value in zip(names, fields['value'], strict=True):
@@ -450,7 +503,7 @@ class PlantView:
                 measured > own.training[1]) else 'below the trained range'
         return StateFace(
             name, printed(own.read), span, _decimals(span), own.training, abnormal, limits,
-            name in self.signals.controlled, measured, setpoint,
+            own.active, own.plan, name in self.signals.controlled, measured, setpoint,
             found.get('asked', setpoint), found.get('predicted', math.nan))
 
     def _input(self, name: str, own: _Signal) -> InputFace:
@@ -464,8 +517,8 @@ class PlantView:
                         'at its lower limit' if command <= limits[0] + slack else '')
         return InputFace(
             name, printed(own.read), span, _decimals(span), own.training, abnormal, limits,
-            command, applied, found.get('manual', math.nan), found.get('disturbance', math.nan),
-            own.unit)
+            own.active, own.plan, command, applied, found.get('manual', math.nan),
+            found.get('disturbance', math.nan), own.unit)
 
     def _best_level(self) -> str:
         """Return the first of the controller's levels."""
@@ -486,8 +539,8 @@ class PlantView:
 def pen(kind: str, name: str) -> str:
     """Return the name of the pen of a signal."""
     return {'measured': f'{name}', 'active_setpoints': f'{name} set-point',
-            'predicted': f'{name} predicted', 'commands': f'{name} command',
-            'applied': f'{name}'}[kind]
+            'predicted': f'{name} predicted', 'planned': f'{name} planned',
+            'commands': f'{name} command', 'applied': f'{name}'}[kind]
 
 
 def _span(ranges: Sequence[Range | None], values: Sequence[float]) -> Range:

@@ -17,7 +17,7 @@ import numpy as np
 
 from koopman_ros.arrays import Array
 from koopman_ros.panel.frame import div, Frame, words
-from koopman_ros.panel.plant import Face, pen, Range, Snapshot
+from koopman_ros.panel.plant import Face, InputFace, pen, Range, Snapshot
 from koopman_ros.panel.trends import Mark
 
 SPANS = {'10 min': (600.0, 1.0), '1 h': (3600.0, 2.0), '8 h': (28800.0, 5.0)}  #: and the renewal
@@ -28,7 +28,7 @@ _EPOCH = 1e9  # s; what is later is a time of day, what is earlier one of a simu
 _MARKS = 40  # that are shown, the last ones
 _INKS = ('#1d1d1b', '#4b6a88', '#7a6a45', '#6b4b6b', '#3f6b54', '#8a5a44')
 _LINES = {'measured': ('solid', 2.0), 'active_setpoints': ('dashed', 1.6),
-          'predicted': ('dotted', 1.2), 'commands': ('solid', 2.0)}
+          'predicted': ('dotted', 1.2), 'planned': ('dotted', 1.6), 'commands': ('solid', 2.0)}
 _ABNORMAL = '#8a4b00'
 # in the browser
 _CLOCK = 'p => new Date(p.value).toTimeString().slice(0, 8)'
@@ -54,12 +54,12 @@ def _charts(now: Snapshot) -> list[tuple[str, list[_Pen]]]:
     """Return the unit and the pens of each chart: of the states, and of the inputs."""
     found: dict[tuple[str, str], list[_Pen]] = {}
     for state in now.states:
-        kinds = ('measured', 'active_setpoints', 'predicted') if state.controlled else (
-            'measured', 'predicted')
+        kinds = ('measured', 'active_setpoints', 'predicted', 'planned') if (
+            state.controlled) else ('measured', 'predicted')
         found.setdefault(('states', state.unit), []).extend(_Pen(kind, state) for kind in kinds)
     for own in now.inputs:
         found.setdefault(('inputs', own.unit), []).extend(
-            _Pen(kind, own) for kind in ('commands', 'applied'))
+            _Pen(kind, own) for kind in ('commands', 'applied', 'planned'))
     return [(unit, pens) for (_, unit), pens in found.items()]
 
 
@@ -111,21 +111,28 @@ class TrendChart:
         if latest < _EPOCH:
             # a simulation has no time before its own
             begin = max(begin, 0.0)
+        end = min(ahead(now, latest), latest + length)
         keys = [own.key for _, pens in charts for own in pens]
         found = trends.window(keys, begin, latest, _BUCKETS)
         if self._zoomed != _ALL:
-            first, last = (begin + share * (latest - begin) for share in self._zoomed)
+            first, last = (begin + share * (end - begin) for share in self._zoomed)
             fine = trends.window(keys, first, last, _BUCKETS)
             found = {key: _refined(found[key], fine[key]) for key in keys}
         self.happened = trends.marks(begin, latest)[-_MARKS:]
         self._chart.run_chart_method('setOption', {
             'useUTC': latest < _EPOCH,
-            'xAxis': [{'min': 1e3 * begin, 'max': 1e3 * latest} for _ in charts],
+            'xAxis': [{'min': 1e3 * begin, 'max': 1e3 * end} for _ in charts],
             'yAxis': [_ends(pens, now) if self.whole else {'min': None, 'max': None}
                       for _, pens in charts],
-            'series': [{'name': own.title, 'data': _points(*found[own.key]),
+            'series': [{'name': own.title, 'data': (
+                _planned(own, now) if own.kind == 'planned' else _points(*found[own.key])),
                         'markLine': _lines(number == 0, own, now, self.happened)}
                        for _, pens in charts for number, own in enumerate(pens)]})
+
+
+def ahead(now: Snapshot, latest: float) -> float:
+    """Return until when there is something to draw: the last value, or the end of a plan."""
+    return max([latest, *(face.plan[-1][0] for face in (*now.states, *now.inputs) if face.plan)])
 
 
 def zoomed(told: Any) -> Range | None:
@@ -190,6 +197,11 @@ def _moment(seconds: float) -> str:
 def _points(times: Array, values: Array) -> list[list[float | None]]:
     return [[1e3 * t, round(v, 6) if math.isfinite(v) else None]
             for t, v in zip(times.tolist(), values.tolist(), strict=True)]
+
+
+def _planned(own: _Pen, now: Snapshot) -> list[list[float | None]]:
+    times, values = np.reshape(_present(own.face, now).plan, (-1, 2)).T
+    return _points(times, values)
 
 
 def _present(face: Face, now: Snapshot) -> Face:
@@ -259,7 +271,8 @@ def _frame_of(charts: list[tuple[str, list[_Pen]]], height: int, zoom: bool, sim
              'filterMode': 'none', 'showDataShadow': False, 'labelFormatter': '', **grey}],
         'series': [{'type': 'line', 'name': own.title, 'showSymbol': False,
                     'xAxisIndex': at, 'yAxisIndex': at, 'data': [],
-                    'step': 'end' if own.kind in ('commands', 'active_setpoints') else False,
+                    'step': 'end' if own.kind in ('commands', 'active_setpoints') or (
+                        own.kind == 'planned' and isinstance(own.face, InputFace)) else False,
                     'color': _INKS[number % len(_INKS)],
                     'lineStyle': dict(zip(('type', 'width'), _LINES.get(
                         own.kind, ('dashed', 1.2)), strict=True))}

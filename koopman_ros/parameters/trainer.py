@@ -236,7 +236,8 @@ def trainer_table(present: LiftedModel | None, given: Mapping[str, Any] = Mappin
     signals = trainer_signals(present, {**own, **given})
     defaults: dict[str, Any] = dict(signals.defaults())
     defaults['topics'] = (*_wiring(signals, {**own, **given}).topics, wire.CONTROLLER_STATE,
-                          wire.CONTROLLER_EVENTS, wire.OPERATOR_ACTIONS, wire.DIAGNOSTICS)
+                          wire.CONTROLLER_PLAN, wire.ACTIVE_LIMITS, wire.CONTROLLER_EVENTS,
+                          wire.OPERATOR_ACTIONS, wire.DIAGNOSTICS)
     if present is not None:
         defaults['input_matrix_degree'] = present.input_matrix_degree
         for box, low, high in ((present.states, 'experiment_min', 'experiment_max'),

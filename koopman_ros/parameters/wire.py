@@ -25,6 +25,8 @@ from koopman_ros.wire import Place, place, stem
 
 CONTROLLER_STATE = 'controller_state'
 CONTROLLER_EVENTS = 'controller_events'
+CONTROLLER_PLAN = 'controller_plan'
+ACTIVE_LIMITS = 'active_limits'
 OPERATOR_ACTIONS = 'operator_actions'
 DIAGNOSTICS = '/diagnostics'
 CLOCK = '/clock'

@@ -11,14 +11,16 @@ import threading
 import time
 from typing import Any
 
-from builtin_interfaces.msg import Time
+from builtin_interfaces.msg import Duration, Time
 import numpy as np
 from sensor_msgs.msg import JointState
 from std_msgs.msg import String
+from trajectory_msgs.msg import JointTrajectory, JointTrajectoryPoint
 
-from koopman_ros.arrays import Array
+from koopman_ros.arrays import along_last, Array
 from koopman_ros.assembler import Assembler
 from koopman_ros.control import Arrival, Controller, events, HOLD, Mode, Report, SAFE, State
+from koopman_ros.control.laws import Plan
 from koopman_ros.control.state import TargetReport
 from koopman_ros.parameters.controller import ControllerParameters
 from koopman_ros.parameters.wire import Signals
@@ -27,7 +29,7 @@ from koopman_ros.replay.records import fields_of, Record, SNAPSHOT, START
 from koopman_ros.ros import topics
 from koopman_ros.ros.node import Level, Status, words_of
 from koopman_ros.ros.watchdog import Timing
-from koopman_ros.units import display_unit, shown
+from koopman_ros.units import display_unit, NANOSECONDS, shown
 from koopman_ros.wire import stem
 
 _REACHED = 1e-3  # of a range; so near a set-point is reached
@@ -297,12 +299,6 @@ def internals(signals: Signals, report: Report, stamp: Time, frame_id: str) -> J
             states.items(),
             _each(states, '{}', None if estimate is None else estimate.state).values(),
             strict=True)},
-        # of a filter alone
-        **({f'deviation_{name} [{unit}]': value for (name, unit), value in zip(
-            states.items(), deviation.tolist(), strict=True)} if deviation is not None else {}),
-        **({f'innovation_{name} [standard deviations]': value for name, value in zip(
-            signals.states, innovation.normalised.tolist(), strict=True)}
-           if innovation is not None else {}),
         'distance_outside [half widths]': float(report.measurement.outside),
         'level [0 learned, 1 linear, 2 hold, 3 safe, 4 manual]': float(report.depth),
         'gain': float(law.gain),
@@ -312,11 +308,53 @@ def internals(signals: Signals, report: Report, stamp: Time, frame_id: str) -> J
                 True),
         **_each({name: signals.states[name] for name in signals.controlled}, 'setpoint [{}]',
                 None if target is None else target.setpoint),
+        # of a filter alone; at the end, so that the places of the others stay
+        **({f'deviation_{name} [{unit}]': value for (name, unit), value in zip(
+            states.items(), deviation.tolist(), strict=True)} if deviation is not None else {}),
+        **({f'innovation_{name} [standard deviations]': value for name, value in zip(
+            signals.states, innovation.normalised.tolist(), strict=True)}
+           if innovation is not None else {}),
     }
+    return _named(values, stamp, frame_id)
+
+
+def _named(values: Mapping[str, float], stamp: Time, frame_id: str) -> JointState:
     message = JointState(name=list(values), position=list(values.values()))
     message.header.stamp = stamp
     message.header.frame_id = frame_id
     return message
+
+
+def planned(signals: Signals, plan: Plan, stamp: Time, frame_id: str) -> JointTrajectory:
+    """
+    Return the path of the controlled states in a plan, and its inputs, under names with units.
+
+    There is a point for each node; what a point says of an input holds until the next one.
+    """
+    names = list(signals.every)
+    columns = [(name, signals.states[name], plan.states[:, names.index(name)])
+               for name in signals.controlled]
+    # up to the end, the last one is held
+    held = np.concatenate((plan.inputs, plan.inputs[-1:]))
+    columns += [(*of, held[:, i]) for i, of in enumerate(signals.inputs.items())]
+    rows = along_last(*(shown(column, unit) for _, unit, column in columns))
+    message = JointTrajectory(
+        joint_names=[f'{name} [{display_unit(unit)}]' for name, unit, _ in columns],
+        points=[JointTrajectoryPoint(positions=row, time_from_start=Duration(
+            sec=int(time), nanosec=int(NANOSECONDS * (time % 1.0))))
+            for time, row in zip(plan.times.tolist(), rows, strict=True)])
+    message.header.stamp = stamp
+    message.header.frame_id = frame_id
+    return message
+
+
+def active_limits(signals: Signals, plan: Plan, stamp: Time, frame_id: str) -> JointState:
+    """Return which limits are active in a plan, under names that say what -1 and 1 stand for."""
+    return _named({what.format(name): value for what, of, values in (
+        ('at_range_{} [-1 lower, 1 upper]', signals.inputs, plan.at_range),
+        ('at_rate_{} [-1 falling, 1 rising]', signals.inputs, plan.at_rate),
+        ('at_limit_{} [-1 lower, 1 upper]', signals.every, plan.at_state))
+        for name, value in zip(of, values.tolist(), strict=True)}, stamp, frame_id)
 
 
 class RecordPublisher:

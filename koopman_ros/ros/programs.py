@@ -89,7 +89,8 @@ def programs(system: str = DEFAULT_SYSTEM) -> dict[str, Program]:
         'controller': Program(
             'Answers each measurement with a command, by a learned model.',
             publishes=(*topics_of('commands', 'active_setpoints', 'predicted'),
-                       topics.CONTROLLER_STATE, topics.CONTROLLER_EVENTS, topics.DIAGNOSTICS,
+                       topics.CONTROLLER_STATE, topics.CONTROLLER_PLAN, topics.ACTIVE_LIMITS,
+                       topics.CONTROLLER_EVENTS, topics.DIAGNOSTICS,
                        _TRANSITIONS, *STANDARD_TOPICS),
             subscribes=(*topics_of('measured', 'applied', 'setpoints', 'manual'), topics.CLOCK),
             serves=('~/set_automatic', '~/reload_model', *lifecycle, *STANDARD_SERVICES)),
@@ -123,6 +124,7 @@ def programs(system: str = DEFAULT_SYSTEM) -> dict[str, Program]:
                        topics.DIAGNOSTICS, *STANDARD_TOPICS),
             subscribes=(*topics_of('measured', 'applied', 'commands', 'active_setpoints',
                                    'predicted'), topics.CONTROLLER_STATE,
+                        topics.CONTROLLER_PLAN, topics.ACTIVE_LIMITS,
                         topics.CONTROLLER_EVENTS, topics.DIAGNOSTICS, '/parameter_events',
                         topics.CLOCK),
             serves=STANDARD_SERVICES,

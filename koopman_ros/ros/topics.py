@@ -26,10 +26,13 @@ from rclpy.validate_topic_name import validate_topic_name
 from rosgraph_msgs.msg import Clock
 from sensor_msgs.msg import JointState
 from std_msgs.msg import String
+from trajectory_msgs.msg import JointTrajectory
 
 from koopman_ros.parameters.wire import (
+    ACTIVE_LIMITS,
     CLOCK,
     CONTROLLER_EVENTS,
+    CONTROLLER_PLAN,
     CONTROLLER_STATE,
     DIAGNOSTICS,
     OPERATOR_ACTIONS,
@@ -37,9 +40,11 @@ from koopman_ros.parameters.wire import (
 )
 from koopman_ros.ros.node import Owned
 
-# JointState is the one stamped type of common_interfaces that carries named float64 values.
+# JointState is the one stamped type of common_interfaces that carries named float64 values,
+# JointTrajectory the one with their course in time.
 # Records are lines of JSON, which keep a float64 bit-identical at a third of the time.
-TYPES = {CONTROLLER_STATE: JointState, CONTROLLER_EVENTS: String, OPERATOR_ACTIONS: String,
+TYPES = {CONTROLLER_STATE: JointState, CONTROLLER_PLAN: JointTrajectory,
+         ACTIVE_LIMITS: JointState, CONTROLLER_EVENTS: String, OPERATOR_ACTIONS: String,
          DIAGNOSTICS: DiagnosticArray, CLOCK: Clock}
 
 # Every message counts: reliable, with room for a receiver that falls behind a fast plant.

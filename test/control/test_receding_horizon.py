@@ -14,7 +14,7 @@ from scipy.optimize import lsq_linear
 
 from koopman_ros.control import Controller, InputLimits, Settings
 from koopman_ros.control.events import SetpointRequest
-from koopman_ros.control.laws import receding_horizon, Tuning, Weights
+from koopman_ros.control.laws import Plan, receding_horizon, Tuning, Weights
 from koopman_ros.control.laws.base import steady_state_target
 from koopman_ros.control.laws.receding_horizon import RecedingHorizon
 from koopman_ros.control.simulate import at, simulate
@@ -217,6 +217,60 @@ def test_a_range_that_was_tightened_is_come_back_to_at_the_rate():
     # its plan begins at 3 - 0.2, of which the range leaves 1
     assert (found.failure, found.u) == (None, np.array([1.0]))
     assert float(found.memory[0][0, 0]) == pytest.approx(2.8, abs=1e-6)
+
+
+# What it says of it.
+
+
+def test_the_plan_is_what_the_plant_does_under_its_inputs():
+    """Between nodes a linear plant goes as the matrix exponential says."""
+    _, model = OSCILLATOR
+    found = RecedingHorizon(model, Tuning(Weights(Q, R))).compute(
+        Estimate(np.array([0.7, -0.4]), np.zeros(2)), steady_state_target(model, np.zeros(2)), ANY,
+        None, PERIOD)
+    plan, x = found.plan, np.array([0.7, -0.4])
+    assert plan.times[:2] == pytest.approx([0.0, PERIOD])
+    np.testing.assert_array_equal(plan.inputs[0], found.u)
+    assert len(plan.times) == len(plan.states) == len(plan.inputs) + 1
+    for k, h in enumerate(np.diff(plan.times)):
+        np.testing.assert_allclose(plan.states[k], x, atol=2e-3)
+        whole = expm(h * np.block([[model.A, model.B], [np.zeros((1, 3))]]))
+        x = whole[:2, :2] @ x + whole[:2, 2:] @ plan.inputs[k]
+    assert not any(side.any() for side in (plan.at_range, plan.at_rate, plan.at_state))
+
+
+def test_the_plan_is_in_the_units_of_the_signals():
+    model = shipped('reactor_nz4')
+    seconds = 1.0
+    x = np.array([2.0 / model.states.scale[0]])
+    found = RecedingHorizon(model, Tuning(Weights(np.eye(1), np.eye(1)))).compute(
+        Estimate(x, np.zeros(1)), steady_state_target(model, np.zeros(1)), ANY, None, seconds)
+    assert found.plan.states[0] == pytest.approx(model.states.center + 2.0)
+    assert found.plan.times[1] == pytest.approx(seconds)
+    np.testing.assert_array_equal(found.plan.inputs[0], found.u)
+
+
+@pytest.mark.parametrize('side', [-1.0, 1.0])
+def test_the_plan_says_which_limits_are_active(side):
+    _, model = OSCILLATOR
+
+    def plan(reach: float, rate: float, most: float = math.inf) -> Plan:
+        bound = np.array([most, math.inf])
+        law = RecedingHorizon(model, Tuning(
+            Weights(np.diag([1.0, 0.0]), 0.05 * R), state_lower=-bound, state_upper=bound))
+        limits = InputLimits(np.full(1, -reach), np.full(1, reach), np.full(1, rate))
+        return law.compute(Estimate(np.zeros(2), np.zeros(2)),
+                           steady_state_target(model, np.array([side, 0.0])), limits, None,
+                           PERIOD, last=np.zeros(1)).plan
+
+    def active(found: Plan) -> list[list[float]]:
+        return [found.at_range.tolist(), found.at_rate.tolist(), found.at_state.tolist()]
+
+    assert active(plan(50.0, 1e3)) == [[0.0], [0.0], [0.0, 0.0]]
+    assert active(plan(2.0, 1e3)) == [[side], [0.0], [0.0, 0.0]]
+    assert active(plan(50.0, 5.0)) == [[0.0], [side], [0.0, 0.0]]
+    # a limit that the free path would go beyond
+    assert active(plan(50.0, 1e3, 1.01)) == [[0.0], [0.0], [side, 0.0]]
 
 
 # Where it has none.

@@ -15,6 +15,7 @@ from diagnostic_msgs.msg import DiagnosticStatus
 import pytest
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 from sensor_msgs.msg import JointState, Temperature
+from trajectory_msgs.msg import JointTrajectory
 
 from koopman_ros.demo import reactor
 from koopman_ros.lifting import load, save
@@ -257,6 +258,47 @@ def test_internals_carry_the_stamp_of_the_measurement(bench: Bench) -> None:
     assert found['estimated_temperature'] == pytest.approx(STEADY - 0.18, abs=0.5)
     assert found['level'] == 0.0
     assert 0.0 < found['gain'] < 1000.0
+
+
+def test_a_plan_is_told_with_the_limits_that_are_active(bench: Bench) -> None:
+    plans = bench.ros.listen(JointTrajectory, topics.CONTROLLER_PLAN)
+    limits = bench.ros.listen(JointState, topics.ACTIVE_LIMITS)
+    bench.ros.meet('controller')
+    bench.ros.set_parameters('controller', **{
+        'levels': ['mpc', 'sdre'], 'recovery_time': 0.0, 'coolant_temperature.rate_limit': 0.1})
+    bench.measure(STEADY, 2.0)
+    before = bench.measure(STEADY, 3.0).temperature
+    # too cold, which takes a coolant that is warmer than it may get at once
+    answer = bench.measure(STEADY - 1.5, 4.0)
+    assert answer.temperature == pytest.approx(before + 0.1)
+
+    def of_last() -> bool:
+        return all(heard and seconds(heard[-1]) == 4.0 for heard in (plans, limits))
+
+    bench.ros.wait_until(of_last)
+    plan = plans[-1]
+    assert list(plan.joint_names) == ['temperature [degC]', 'coolant_temperature [degC]']
+    path = [list(point.positions) for point in plan.points]
+    times = [point.time_from_start.sec + 1e-9 * point.time_from_start.nanosec
+             for point in plan.points]
+    assert path[0] == pytest.approx([STEADY - 1.5, answer.temperature])
+    assert path[-1][0] == pytest.approx(STEADY, abs=0.1)
+    assert times[:2] == pytest.approx([0.0, 1.0])
+    assert all(after > before for before, after in itertools.pairwise(times))
+    assert dict(zip(limits[-1].name, limits[-1].position, strict=True)) == {
+        'at_range_coolant_temperature [-1 lower, 1 upper]': 0.0,
+        'at_rate_coolant_temperature [-1 falling, 1 rising]': 1.0,
+        'at_limit_temperature [-1 lower, 1 upper]': 0.0}
+    # one a sample at most, and none of another law
+    stamps = [seconds(message) for message in plans]
+    assert len(stamps) == len(set(stamps)) == len(limits)
+    bench.ros.set_parameters('controller', levels=['sdre', 'linear'])
+    internals = bench.ros.listen(JointState, topics.CONTROLLER_STATE)
+    bench.ros.meet('controller')
+    bench.measure(STEADY, 5.0)
+    bench.ros.wait_until(lambda: internals and seconds(internals[-1]) == 5.0)
+    bench.ros.meet('controller')
+    assert seconds(plans[-1]) == 4.0
 
 
 def test_a_model_that_does_not_reach_to_the_safe_coolant_says_so(

@@ -9,24 +9,37 @@ from typing import Any
 import xml.etree.ElementTree as ElementTree
 
 from builtin_interfaces.msg import Time
+import numpy as np
 import pytest
 from sensor_msgs.msg import JointState
 
 from koopman_ros.control import Mode, Report
+from koopman_ros.control.laws import Plan
+from koopman_ros.control.state import EstimateReport
 from koopman_ros.demo import reactor
+from koopman_ros.estimation import Innovation
 from koopman_ros.parameters.trainer import preset_wiring
 from koopman_ros.resources import config_directory
 from koopman_ros.ros import topics
-from koopman_ros.ros.controller_messages import internals
+from koopman_ros.ros.controller_messages import active_limits, internals
 
 # What a layout shows: topics with one value by themselves, and internals by their names.
 TEMPERATURES = {reactor.TEMPERATURE, reactor.ACTIVE_SETPOINT, reactor.PREDICTED_TEMPERATURE,
                 reactor.COOLANT_SETPOINT, reactor.COOLANT_TEMPERATURE}
-INTERNALS = {'disturbance', 'transfer', 'gain', 'growth_per_sample', 'level', 'distance_outside'}
+INTERNALS = {'disturbance', 'transfer', 'gain', 'growth_per_sample', 'level', 'distance_outside',
+             'deviation_temperature', 'innovation_temperature'}
+LIMITS = {'at_range_coolant_temperature', 'at_rate_coolant_temperature', 'at_limit_temperature'}
 WIRING = preset_wiring('reactor')
 assert WIRING is not None
 TYPES = {topic: kind for topic, (kind, _) in topics.known(WIRING).items()}
-NAMES = list(internals(WIRING.signals, Report(Mode.AUTOMATIC, 'sdre'), Time(), '').name)
+ONE, NONE = np.ones(1), np.zeros(1)
+# by a Kalman filter, which says more than the observer, and a law that plans
+ESTIMATE = EstimateReport(ONE, NONE, False, ONE, Innovation(NONE, 1.0, 1))
+PLAN = Plan(np.arange(2.0), np.ones((2, 1)), np.ones((1, 1)), NONE, NONE, NONE)
+NAMES = {
+    topics.CONTROLLER_STATE: list(internals(WIRING.signals, Report(
+        Mode.AUTOMATIC, 'mpc', estimate=ESTIMATE), Time(), '').name),
+    topics.ACTIVE_LIMITS: list(active_limits(WIRING.signals, PLAN, Time(), '').name)}
 
 
 def published(topic: str, field: str, name: str = '') -> str:
@@ -43,10 +56,10 @@ def test_plotjuggler_shows_what_is_published_and_subscribes_to_it() -> None:
     for curve in layout.iter('curve'):
         # PlotJuggler unrolls a JointState as /topic/name/position
         _, topic, *name, field = curve.attrib['name'].split('/')
-        assert all(part in NAMES for part in name)
+        assert all(part in NAMES[topic] for part in name)
         shown.append(published(topic, field, *name))
     assert len(shown) == len(set(shown))
-    assert set(shown) == TEMPERATURES | INTERNALS
+    assert set(shown) == TEMPERATURES | INTERNALS | LIMITS
 
     streamer = layout.find('previouslyLoaded_Streamer')
     plugin = layout.find('Plugins/plugin')
@@ -67,6 +80,11 @@ def test_plotjuggler_shows_what_is_published_and_subscribes_to_it() -> None:
         assert splitter.attrib['orientation'] in '|-'
 
 
+def test_a_kalman_filter_leaves_the_places_of_the_others() -> None:
+    plain = internals(WIRING.signals, Report(Mode.AUTOMATIC, 'sdre'), Time(), '').name
+    assert NAMES[topics.CONTROLLER_STATE][:len(plain)] == list(plain)
+
+
 def test_foxglove_shows_what_is_published() -> None:
     layout = json.loads((config_directory() / 'foxglove_layout.json').read_text())
     shown = []
@@ -75,12 +93,12 @@ def test_foxglove_shows_what_is_published() -> None:
             parts = re.fullmatch(r'/(\w+)\.(\w+)(?:\[(\d+)\])?', series['value'])
             assert parts is not None
             topic, field, place = parts.groups()
-            name = [] if place is None else [NAMES[int(place)]]
+            name = [] if place is None else [NAMES[topic][int(place)]]
             # nothing but its label says what the number in brackets stands for
             assert name in ([], [series['label']])
             shown.append(published(topic, field, *name))
     assert len(shown) == len(set(shown))
-    assert set(shown) == TEMPERATURES | INTERNALS
+    assert set(shown) == TEMPERATURES | INTERNALS | LIMITS
     assert sorted(_panels(layout['layout'])) == sorted(layout['configById'])
     assert layout['configById']['DiagnosticSummary!all']['topicToRender'] == topics.DIAGNOSTICS
 

@@ -109,6 +109,39 @@ def test_a_signal_is_shown_in_the_unit_that_its_operators_read() -> None:
     assert bare.snapshot(NOW).inputs[0].unit == '°C'
 
 
+def test_a_plan_lies_ahead_until_nothing_is_planned() -> None:
+    own = view(temperature='degF')
+    own.planned(['temperature [degC]', 'coolant_temperature [degC]'], 100.0, [0.0, 1.0, 3.0],
+                [[50.0, 20.0], [45.0, 21.0], [40.0, 21.0]])
+    own.limits({'at_range_coolant_temperature [-1 lower, 1 upper]': 1.0,
+                'at_rate_coolant_temperature [-1 falling, 1 rising]': 1.0,
+                'at_limit_temperature [-1 lower, 1 upper]': -1.0})
+    answered(own, 'mpc')
+    now = own.snapshot(NOW)
+    assert [time for time, _ in now.states[0].plan] == [100.0, 101.0, 103.0]
+    assert [value for _, value in now.states[0].plan] == pytest.approx([122.0, 113.0, 104.0])
+    assert now.inputs[0].plan == ((100.0, 20.0), (101.0, 21.0), (103.0, 21.0))
+    assert now.states[0].active == 'kept above its lower limit'
+    assert now.inputs[0].active == 'at its upper limit, rising as fast as it may'
+    # one that is lost on its way leaves the last; limits that are over are
+    answered(own, 'mpc')
+    own.limits({'at_rate_coolant_temperature [-1 falling, 1 rising]': 0.0})
+    assert (own.snapshot(NOW).inputs[0].active, len(own.snapshot(NOW).inputs[0].plan)) == ('', 3)
+    answered(own, 'sdre')
+    assert own.snapshot(NOW).states[0].plan == own.snapshot(NOW).inputs[0].plan == ()
+
+
+@pytest.mark.parametrize(('names', 'rows'), [
+    (['temperature [degC]'], [[1.0], [1.0, 2.0]]), (['temperature [m]'], [[1.0], [2.0]]),
+    (['temperature [degC]', 'coolant_temperature [degC]'], [[1.0], [2.0]]),
+    (['temperature'], [[1.0], [2.0]]), (['level [m]'], [[1.0], [2.0]])])
+def test_what_is_no_plan_of_these_signals_is_passed_over(
+        names: list[str], rows: list[list[float]]) -> None:
+    own = view()
+    own.planned(names, 100.0, [0.0, 1.0], rows)
+    assert own.snapshot(NOW).states[0].plan == own.snapshot(NOW).inputs[0].plan == ()
+
+
 def test_a_limit_of_a_state_is_drawn_also_where_there_is_only_one() -> None:
     own = view(coolant_temperature='degC')
     own.parameters('controller', {name: parameter(

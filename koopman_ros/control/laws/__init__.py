@@ -5,7 +5,7 @@
 
 from collections.abc import Callable
 
-from koopman_ros.control.laws.base import Figures, Law, LawResult, Tuning, Weights
+from koopman_ros.control.laws.base import Figures, Law, LawResult, Plan, Tuning, Weights
 from koopman_ros.control.laws.pi import ProportionalIntegral
 from koopman_ros.control.laws.riccati import (
     averaged,
@@ -23,5 +23,5 @@ LAWS: dict[str, Callable[[LiftedModel, Tuning], Law] | str] = {
     'sdre': StateDependentRiccati, 'linear': Linear, 'pi': ProportionalIntegral}
 
 __all__ = ['LAWS', 'Feedback', 'Figures', 'Form', 'Law', 'LawResult', 'Linear',
-           'ProportionalIntegral', 'StateDependentRiccati', 'Tuning', 'Weights', 'averaged',
-           'feedback', 'recentred']
+           'Plan', 'ProportionalIntegral', 'StateDependentRiccati', 'Tuning', 'Weights',
+           'averaged', 'feedback', 'recentred']

@@ -134,6 +134,22 @@ NO_FIGURES = Figures()
 
 
 @dataclass(frozen=True)
+class Plan:
+    """
+    What a law with a horizon expects, in units of states and inputs, and which limits it meets.
+
+    Of a limit -1 says that the lower one is active, 1 the upper one, and 0 none.
+    """
+
+    times: Array  #: (N + 1,) of the nodes in s, from 0, when the plan was made
+    states: Array  #: (N + 1, n_x) at the nodes
+    inputs: Array  #: (N, n_u) each held from a node to the next
+    at_range: Array  #: (n_u,) whether the first input is at the end of its range
+    at_rate: Array  #: (n_u,) whether it falls (-1) or rises (1) as fast as it may
+    at_state: Array  #: (n_x,) whether a node is at a limit of the state, or beyond
+
+
+@dataclass(frozen=True)
 class LawResult:
     """What a law gives, or why it gives nothing."""
 
@@ -141,6 +157,7 @@ class LawResult:
     failure: Reason | None = None  #: why it may not be used; None when it may
     figures: Figures = NO_FIGURES  #: of the solution, as far as there is one
     memory: object = None  #: what the law wants to be given at the next sample
+    plan: Plan | None = None  #: of a law with a horizon
     clipped: bool = False  #: whether the range cut it
     #: whether a failure is of this sample alone, so that the law acts again at the next
     passing: bool = False

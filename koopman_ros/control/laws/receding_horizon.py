@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from koopman_ros.arrays import Array, frozen
-from koopman_ros.control.laws.base import Figures, LawResult, Target, Tuning
+from koopman_ros.control.laws.base import Figures, LawResult, Plan, Target, Tuning
 from koopman_ros.control.laws.riccati import feedback, StateDependentRiccati
 from koopman_ros.control.limits import finite, InputLimits
 from koopman_ros.estimation import Estimate
@@ -40,6 +40,7 @@ _STILL, _MOST_ITERATIONS = 1e-4, 12
 _MOVING = 0.05
 _LOOK = 3  # every third node, and the last, is held to the training data
 _EDGE = 1e-9  # of an input's scale; so near a limit it is reached
+_TOUCH = 1e-6  # likewise of a state's, which follows from all inputs
 _UNLIMITED = 1e30  # what the solver takes for infinite
 _SOLVED = (1, 2)  # its flags; in the second case a soft limit is violated
 _SOFT = 8  # its mark of a limit that may be violated
@@ -138,6 +139,7 @@ class RecedingHorizon:
         within = limits.within(wanted)
         room = np.minimum(within - limits.lower, limits.upper - within)
         return LawResult(within, None, Figures('planned'), (u, x, problem.lengths),
+                         problem.plan(u, x),
                          clipped=bool((room <= _EDGE * self.model.inputs.scale).any()))
 
     def lengths(self, interval: float) -> Array:
@@ -309,6 +311,22 @@ class _Problem:
         return (float(np.max(np.abs(v))), u + v.reshape(u.shape),
                 nodes + (by_inputs @ v))
 
+    def plan(self, u: Array, x: Array) -> Plan:
+        """Return inputs (N, n_u) and nodes (N + 1, n_x) in their units, and what limits them."""
+        model, tuning, first = self._model, self._law.tuning, u[0]
+        step = np.zeros_like(first) if self._last is None else first - self._last
+        fastest = self._change[0] - _EDGE
+        lowest, highest = (bound if len(bound) else np.full(model.n_x, none) for bound, none in (
+            (tuning.state_lower, -math.inf), (tuning.state_upper, math.inf)))
+        seconds = np.cumsum(self.lengths) * model.seconds_per_time_unit
+        return Plan(
+            np.concatenate(([0.0], seconds)), model.states.to_physical(x),
+            model.inputs.to_physical(u),
+            _side(first <= self._lower + _EDGE, first >= self._upper - _EDGE),
+            _side(step <= -fastest, step >= fastest),
+            _side(np.min(x[1:], axis=0) <= lowest + _TOUCH,
+                  np.max(x[1:], axis=0) >= highest - _TOUCH))
+
     def _course(self, u: Array, nodes: Array) -> _Course:
         model, n, m = self._model, self._model.n_x, self._steps
         h = (self.lengths / m)[:, None]
@@ -400,6 +418,11 @@ class _Problem:
         matrix = np.concatenate(rows) if rows else np.zeros((0, N * n_u))
         return (np.ascontiguousarray(matrix), np.concatenate(low), np.concatenate(high),
                 np.concatenate(sense))
+
+
+def _side(lower: NDArray[np.bool_], upper: NDArray[np.bool_]) -> Array:
+    """Return -1 where the lower limit is active, 1 where the upper one is, else 0."""
+    return upper.astype(np.float64) - lower
 
 
 def _condensed(course: _Course, x: Array, start: Array) -> tuple[Array, Array]:
