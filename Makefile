@@ -46,6 +46,10 @@ $(VENV)/saddle.stamp: setup.py $(LOCK) $(VENV)/run.stamp
 	$(INSTALL) --editable '.[ros,demo,train,mpc]'
 	@touch $@
 
+$(VENV)/mpc.stamp: setup.py $(LOCK) $(VENV)/run.stamp
+	$(INSTALL) --editable '.[ros,demo,mpc]'
+	@touch $@
+
 $(VENV)/panel.stamp: setup.py $(LOCK) $(VENV)/run.stamp
 	$(INSTALL) --editable '.[ros,demo,panel]'
 	@touch $@
@@ -112,7 +116,7 @@ studies-saddle: $(VENV)/saddle.stamp  ## the same reactor held at its saddle fro
 bench: $(VENV)/bench.stamp  ## speed beside other programs, seventeen minutes (BENCH=--quick: three) -> out/bench
 	$(BIN)/python -m validation.benchmarks $(BENCH)
 
-faults: $(VENV)/run.stamp  ## put faults into the loops of the reactor and of two tank plants, and soak the first for a day, a quarter of an hour (FAULTS=--quick: a minute; FAULTS=two_tanks: one plant) -> out/faults
+faults: $(VENV)/mpc.stamp  ## put faults into the loops of the reactor, of two tank plants and of a reactor at its saddle, and soak both reactors for a day, three quarters of an hour (FAULTS=--quick: a minute; FAULTS=two_tanks: one plant) -> out/faults
 	$(BIN)/python -m validation.faults $(FAULTS)
 
 docs: $(VENV)/docs.stamp  ## the pages and a reference of the Python API, half a minute -> out/docs

@@ -173,8 +173,8 @@ def _controller_parameters(model: Path) -> dict[str, object]:
 def _trainer_parameters(bag: Path, learned: Path, seed: int) -> dict[str, object]:
     low, high = SADDLE_TEMPERATURE - SPREAD, SADDLE_TEMPERATURE + SPREAD
     return {
-        'system': 'none', 'states_measured': "['temperature [K]']",
-        'inputs_commanded': "['coolant_temperature [K]']", 'output': bag, 'model_output': learned,
+        'system': 'none', 'states_measured': ['temperature [K]'],
+        'inputs_commanded': ['coolant_temperature [K]'], 'output': bag, 'model_output': learned,
         'hidden_states': 1, 'model_coordinates': 5, 'training_starts': 1,
         'experiment_on': SETPOINT, 'experiment_length': SECONDS_PER_MINUTE * MINUTES,
         'experiment_shortest_hold': 30.0, 'experiment_longest_hold': 90.0,

@@ -32,6 +32,7 @@ from koopman_ros.plants import (
 from validation.paper.reactor import SYSTEM, TRAINING, training_samples
 
 SEED = 2026
+SADDLE = 'two_state_saddle'  # the reactor of two states where it runs away by itself
 STARTS = 3
 LIFTED_SIZES = (3, 4)
 
@@ -76,6 +77,7 @@ LIFTS = {
         input_lower=-12.0, input_upper=12.0, state_lower=[-1.3, -5.0], state_upper=[1.3, 5.0],
         hold_time=(0.05, 0.1), sample_period=0.05), 120, 0.5, _FREE),
 }
+NAMES = ('reactor', *LIFTS, SADDLE)
 
 
 def library_system(name: str) -> ControlAffineSystem:
@@ -132,20 +134,29 @@ def reactor_models() -> dict[str, LiftedModel]:
             'reactor_linear': linear_model(lifts[max(lifts)])}
 
 
+def saddle_model() -> LiftedModel:
+    """Learn the free lift of the reactor at its saddle."""
+    # in here: it imports the systems, and these this module
+    from validation.unstable import learn
+
+    return learn(0)
+
+
 def main(args: list[str] | None = None) -> int:
     """Train shipped models and write them."""
     parser = argparse.ArgumentParser(description='Train the models that the package ships.')
-    parser.add_argument('plants', nargs='*', metavar='plant', default=('reactor', *LIFTS),
-                        help=f'whose models: reactor, {", ".join(LIFTS)} (default: all)')
+    parser.add_argument('plants', nargs='*', metavar='plant', default=NAMES,
+                        help=f'whose models: {", ".join(NAMES)} (default: all)')
     parser.add_argument('--output', type=Path, default=Path('config/models'),
                         help='folder for the model files (default: %(default)s)')
     options = parser.parse_args(args)
-    if unknown := set(options.plants) - {'reactor', *LIFTS}:
-        parser.error(f'there is no lift of {", ".join(sorted(unknown))}: choose of reactor, '
-                     f'{", ".join(LIFTS)}')
+    if unknown := set(options.plants) - set(NAMES):
+        parser.error(f'there is no lift of {", ".join(sorted(unknown))}: choose of '
+                     f'{", ".join(NAMES)}')
     options.output.mkdir(parents=True, exist_ok=True)
     for plant in options.plants:
-        models = reactor_models() if plant == 'reactor' else {plant: train_lift(plant)}
+        models = reactor_models() if plant == 'reactor' else {
+            plant: saddle_model() if plant == SADDLE else train_lift(plant)}
         for name, model in models.items():
             save(model, options.output / f'{name}.safetensors')
             metrics = ', '.join(f'{key} {value:.2g}'

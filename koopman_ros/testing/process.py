@@ -106,7 +106,11 @@ def _as_argument(value: object) -> str:
     """Write a parameter value for the command line, keeping its type."""
     if isinstance(value, bool):
         return str(value).lower()
-    return f'[{",".join(map(str, value))}]' if isinstance(value, tuple | list) else str(value)
+    if isinstance(value, tuple | list):
+        # in quotes, or a bracket or a colon in one would be read as YAML
+        items = (repr(item) if isinstance(item, str) else str(item) for item in value)
+        return f'[{",".join(items)}]'
+    return str(value)
 
 
 @contextlib.contextmanager

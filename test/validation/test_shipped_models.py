@@ -24,6 +24,7 @@ from koopman_ros.lifting import load
 from koopman_ros.plants import Process, random_steps, RandomStepDesign, steady_state
 from koopman_ros.plants.optimum import cost_along, linear_law, optimum, Task
 from koopman_ros.resources import model_path
+from validation import saddle
 from validation.paper import reactor
 from validation.paper.reactor import SETPOINT, SYSTEM, training_samples
 from validation.shipped_models import (
@@ -31,6 +32,7 @@ from validation.shipped_models import (
     lift_samples,
     LIFTS,
     main,
+    SADDLE,
     SEED,
     train_lift,
     train_lifts,
@@ -262,6 +264,17 @@ def test_shipped_lifts_of_the_library_keep_their_promise(name):
 
 def test_a_retrained_lift_of_the_library_keeps_what_the_shipped_one_promises():
     keeps('two_state_example', train_lift('two_state_example', loops=16))
+
+
+def test_the_lift_at_the_saddle_holds_it_from_the_temperature_alone():
+    model = load(model_path(SADDLE))
+    assert (model.n_z, model.provenance.seed) == (2, 0)
+    assert max(model.provenance.metrics[figure] for figure in ('rw', 'rx')) < 1e-6
+    largest, left = saddle.disturbed(
+        saddle.controller(model, ('sdre',), saddle.WIDE), saddle.FOULING, 0)
+    # with the reactor's own equations and both states known it is 3.85 K
+    assert largest < 4.2
+    assert left < 0.05
 
 
 def test_models_that_there_are_not_are_refused(capsys):

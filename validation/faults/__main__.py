@@ -13,11 +13,10 @@ from koopman_ros.testing import deferred_interrupt
 from validation.faults import report
 from validation.faults.case import Case, Trace
 from validation.faults.cases import CASES
-from validation.faults.endurance import HOURS, run_endurance
+from validation.faults.endurance import DAYS, HOURS, run_endurance
 from validation.faults.harness import run
 from validation.faults.plants import PLANTS
 
-SOAK = 'soak'
 # One of each group, quick ones that say much.
 QUICK = ('nan-short', 'measurements-lost', 'clock-zero', 'controller-killed', 'bad-values-storm',
          'feed-warm', 'two_tanks-nan-one', 'quadruple_tank-controller-killed')
@@ -30,8 +29,8 @@ def main(args: list[str] | None = None) -> int:
         prog='python -m validation.faults',
         description='Put faults into the loop and judge what it does.')
     parser.add_argument('names', nargs='*', metavar='name',
-                        help=f'a case, a plant or group ({", ".join(groups)}), or {SOAK} '
-                             '(default: all)')
+                        help=f'a case, a plant or group ({", ".join(groups)}), or '
+                             f'{", ".join(DAYS)} (default: all)')
     parser.add_argument('--quick', action='store_true', help='eight cases, no soak: a minute')
     parser.add_argument('--list', action='store_true', help='show the cases, and run none')
     parser.add_argument('--hours', type=float, default=HOURS,
@@ -39,23 +38,23 @@ def main(args: list[str] | None = None) -> int:
     parser.add_argument('--output', type=Path, default=Path('out/faults'),
                         help='folder for the report (default: %(default)s)')
     given = parser.parse_args(args)
-    if unknown := [name for name in given.names if name not in {*CASES, *groups, SOAK}]:
+    if unknown := [name for name in given.names if name not in {*CASES, *groups, *DAYS}]:
         parser.error(f'there is no case {", ".join(unknown)}: --list shows them')
     if not given.hours > 0.0:
         parser.error(f'--hours is {given.hours} h, must be above 0 h')
-    names = given.names or (QUICK if given.quick else [*CASES, SOAK])
+    names = given.names or (QUICK if given.quick else [*CASES, *DAYS])
     cases = [case for case in CASES.values()
              if {case.name, case.group, case.on.name}.intersection(names)]
     if given.list:
         print(*(f'{case.name:49s}{case.group:14s}{case.does}' for case in cases), sep='\n')
         return 0
-    return _run(cases, given.hours if SOAK in names else 0.0, given.output)
+    return _run(cases, [name for name in DAYS if name in names], given.hours, given.output)
 
 
-def _run(cases: Sequence[Case], hours: float, folder: Path) -> int:
+def _run(cases: Sequence[Case], days: Sequence[str], hours: float, folder: Path) -> int:
     results: dict[str, dict[str, Any]] = {}
     traces: dict[str, Trace] = {}
-    endured = None
+    endured: dict[str, dict[str, Any]] = {}
     try:
         with deferred_interrupt() as check:
             for number, case in enumerate(cases, 1):
@@ -64,9 +63,9 @@ def _run(cases: Sequence[Case], hours: float, folder: Path) -> int:
                     case, folder / 'logs' / case.name, check)
                 print(report.line(results[case.name]), flush=True)
                 report.write(folder, results)
-            if hours:
-                endured = run_endurance(folder / 'logs' / SOAK, check, hours)
-                print('\n'.join(endured['reasons']) or 'survived')
+            for name in days:
+                endured[name] = run_endurance(folder / 'logs' / name, check, hours, DAYS[name])
+                print('\n'.join(endured[name]['reasons']) or 'survived')
     except KeyboardInterrupt:
         print(f'\ninterrupted; what was finished is in {folder}', file=sys.stderr)
         return 130

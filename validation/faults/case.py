@@ -37,6 +37,7 @@ class Case:
     setpoint: tuple[float, ...] = REACTOR.setpoint  #: requested at the start
     settle: float = REACTOR.settle  #: plant time from the start until it is played, s
     afterwards: float = REACTOR.afterwards  #: plant time that the loop runs on after it, s
+    missing: tuple[str, ...] = ()  #: packages that its controller goes without
 
     #: largest step between two commands; never less than the rate limit allows for the time
     #: between them, where a busy machine has missed measurements

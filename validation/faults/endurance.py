@@ -4,7 +4,8 @@
 """A day of plant time with whatever may happen in one: nothing is lost, and nothing grows."""
 
 from collections import Counter
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import dataclass
 import math
 from pathlib import Path
 import shutil
@@ -23,7 +24,7 @@ from validation.faults.case import Trace
 from validation.faults.harness import FaultHarness
 from validation.faults.interceptor import Alteration, value
 from validation.faults.judge import out_of_range, responses
-from validation.faults.plants import LOCKSTEP, REACTOR
+from validation.faults.plants import LOCKSTEP, Plant, REACTOR, SADDLE
 
 HOURS = 24.0
 _EVENT_PERIOD = 300.0  # s, mean time between two events
@@ -34,19 +35,39 @@ _GROWTH = 4.0  # MB that a process may grow from then on
 _RECORDED = ('temperature', 'coolant_setpoint')
 
 
-def _happen(event: str, loop: FaultHarness, random: Generator) -> None:
+@dataclass(frozen=True)
+class Day:
+    """What is run, and between what its set-points and constants are drawn."""
+
+    on: Plant
+    setpoints: tuple[float, float]
+    plant: Mapping[str, tuple[float, float]]  #: parameters of the plant
+    models: tuple[str, ...]  #: one of which there is not
+
+
+DAYS = {
+    'soak': Day(REACTOR, (42.0, 50.0), {
+        'constants.feed_temperature': (74.0, 80.0),
+        'constants.heat_transfer_coefficient': (750.0, 917.0), 'temperature.noise': (0.0, 0.05)},
+        ('reactor_nz3', 'reactor_nz4', '/nowhere.safetensors')),
+    # what the coolant can make up for at once
+    'soak-saddle': Day(SADDLE, (73.0, 81.0), {
+        'constants.feed_temperature': (74.0, 80.0),
+        'constants.heat_transfer_coefficient': (800.0, 870.0), 'temperature.noise': (0.02, 0.08)},
+        ('two_state_saddle', '/nowhere.safetensors'))}
+
+
+def _happen(event: str, day: Day, loop: FaultHarness, random: Generator) -> None:
     """Do what may happen in a day: each ends by itself."""
     what, _, alteration = event.partition(': ')
     match event:
         case 'set-point':
-            loop.request(float(random.uniform(42.0, 50.0)))
+            loop.request(float(random.uniform(*day.setpoints)))
         case 'disturbance':
             loop.set_parameters('plant', **{
-                'constants.feed_temperature': float(random.uniform(74.0, 80.0)),
-                'constants.heat_transfer_coefficient': float(random.uniform(750.0, 917.0)),
-                'temperature.noise': float(random.uniform(0.0, 0.05))})
+                name: float(random.uniform(*ends)) for name, ends in day.plant.items()})
         case 'impossible set-point':
-            celsius = float(random.choice([math.nan, 90.0, -1e9]))
+            celsius = float(random.choice([math.nan, 190.0, -1e9]))
             loop.ask(temperature=celsius)
         case 'weights':
             loop.set_parameters('controller', **{
@@ -57,8 +78,7 @@ def _happen(event: str, loop: FaultHarness, random: Generator) -> None:
             loop.run_for(float(random.uniform(5.0, 60.0)))
             loop.ros.set_bool('controller/set_automatic', True)
         case 'model':
-            loop.set_parameters('controller', model=str(random.choice(
-                ['reactor_nz3', 'reactor_nz4', '/nowhere.safetensors'])))
+            loop.set_parameters('controller', model=str(random.choice(day.models)))
             loop.ros.trigger('controller/reload_model')
         case 'plant reset':
             loop.ros.trigger('plant/reset')
@@ -80,8 +100,8 @@ EVENTS = (
     'impossible set-point', 'weights', 'manual mode', 'model', 'plant reset')
 
 
-def run_endurance(folder: Path, check: Callable[[], None], hours: float = HOURS
-                  ) -> dict[str, Any]:
+def run_endurance(folder: Path, check: Callable[[], None], hours: float = HOURS,
+                  day: Day = DAYS['soak']) -> dict[str, Any]:
     """
     Run plant, controller and trainer for some hours of plant time, and account for everything.
 
@@ -94,12 +114,12 @@ def run_endurance(folder: Path, check: Callable[[], None], hours: float = HOURS
     folder.mkdir(parents=True)
     happened: Counter[str] = Counter()
     looks: dict[str, list[tuple[float, float]]] = {}
-    with FaultHarness(folder, 60.0 + _WALL_PER_HOUR * hours, check, between=True) as loop:
+    with FaultHarness(folder, 60.0 + _WALL_PER_HOUR * hours, check, True, day.on) as loop:
         try:
             loop.start('trainer', {'output': folder / 'bag', 'min_free_disk': 0.0,
                                    'topics': _RECORDED})
-            loop.start_loop(REACTOR.setpoint, LOCKSTEP, {})
-            _let_happen(loop, hours, happened, looks)
+            loop.start_loop(day.on.setpoint, LOCKSTEP, {})
+            _let_happen(loop, day, hours, happened, looks)
             # what is on its way arrives, so that the counts can agree
             loop.kill('plant', signal.SIGINT)
             loop.wait(lambda: len(loop.trace.commands) >= len(loop.trace.delivered),
@@ -128,7 +148,7 @@ def run_endurance(folder: Path, check: Callable[[], None], hours: float = HOURS
             'mean_error_K': round(mean_error, 6), 'memory_MB': memory}
 
 
-def _let_happen(loop: FaultHarness, hours: float, happened: Counter[str],
+def _let_happen(loop: FaultHarness, day: Day, hours: float, happened: Counter[str],
                 looks: dict[str, list[tuple[float, float]]]) -> None:
     """Run for so long; count the events, and note each process's memory by plant time."""
     random = default_rng(0)
@@ -139,7 +159,7 @@ def _let_happen(loop: FaultHarness, hours: float, happened: Counter[str],
             loop.run_until(due)
             event = EVENTS[random.integers(len(EVENTS))]
             happened[event] += 1
-            _happen(event, loop, random)
+            _happen(event, day, loop, random)
             due = loop.now + random.exponential(_EVENT_PERIOD)
         loop.run_until(number * look)
         for name, process in loop.processes.items():

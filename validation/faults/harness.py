@@ -12,6 +12,7 @@ import math
 from pathlib import Path
 import re
 import signal
+import sys
 import time
 from types import TracebackType
 from typing import Any, TypeVar
@@ -53,7 +54,7 @@ def run(case: Case, folder: Path, check: Callable[[], None] = lambda: None
     skipped = ''
     with FaultHarness(folder, LIMIT, check, case.between, case.on) as loop:
         try:
-            loop.start_loop(case.setpoint, case.plant, case.controller)
+            loop.start_loop(case.setpoint, case.plant, case.controller, case.missing)
             loop.run_until(case.settle)
             case.play(loop)
             loop.run_for(case.afterwards)
@@ -67,6 +68,13 @@ def run(case: Case, folder: Path, check: Callable[[], None] = lambda: None
     return {'plant': case.on.name, 'group': case.group, 'does': case.does,
             'notes': loop.trace.notes, **figures,
             'wall_seconds': round(time.monotonic() - started, 2)}, loop.trace
+
+
+def _without(missing: Sequence[str]) -> tuple[str, ...] | None:
+    """Return how a controller is started that cannot import some packages; None for as usual."""
+    return (sys.executable, '-c', (
+        f'import sys; sys.modules |= dict.fromkeys({list(missing)}); '
+        'from koopman_ros.nodes.controller import main; sys.exit(main())')) if missing else None
 
 
 class FaultHarness:
@@ -121,8 +129,9 @@ class FaultHarness:
         """Start a process as :class:`Harness` does; it is `called` as the node by default."""
         called = called or name
         if name in ('plant', 'controller'):
-            parameters = {'system': self.on.name, **self.on.wired,
-                          **(self.on.tuned if name == 'controller' else {}), **(parameters or {})}
+            parameters = {'system': self.on.system, **self.on.wired,
+                          **(self.on.tuned if name == 'controller' else self.on.simulated),
+                          **(parameters or {})}
         if self._between and called == 'plant':
             arguments += remapped(self.on)
         process = self.ros.start(name, parameters, arguments, command, called)
@@ -130,12 +139,12 @@ class FaultHarness:
         return process
 
     def start_loop(self, setpoint: Sequence[float], plant: Mapping[str, object],
-                   controller: Mapping[str, object]) -> None:
+                   controller: Mapping[str, object], missing: Sequence[str] = ()) -> None:
         """Start plant and controller, and ask for a set-point before the first measurement."""
         lockstep = bool(plant.get('lockstep'))
         # the plant is traced once the controller is known: a lock-step waits for it
         subscribers = {'lockstep_subscribers': 1 if self._between else 2} if lockstep else {}
-        self.start('controller', controller)
+        self.start('controller', controller, command=_without(missing))
         if lockstep:
             self.start('plant', {**plant, **subscribers})
         self._meet_controller()

@@ -29,7 +29,7 @@ PATIENT = {**LOCKSTEP, 'lockstep_timeout': 0.05}
 class Plant:
     """A plant that is shipped; controlled states share a unit, and so do inputs."""
 
-    name: str  #: by which plant and controller are told what they are
+    name: str  #: by which it is called on the command line
     setpoint: tuple[float, ...]  #: of the controlled states, that it is held at
     other: tuple[float, ...]  #: that can be held, too, at each other's values as well
     by_hand: tuple[float, ...]  #: inputs that hold it somewhere
@@ -39,15 +39,22 @@ class Plant:
     recovery: float = 300.0  #: of this, within which the plant must be back, s
     #: parameters of both nodes, and of every controller, beside those of its file
     wired: Mapping[str, str] = field(default_factory=dict)
-    tuned: Mapping[str, float] = field(default_factory=dict)
+    tuned: Mapping[str, Any] = field(default_factory=dict)
+    simulated: Mapping[str, float] = field(default_factory=dict)  #: and of every plant
     #: a set-point that no input can hold beside the others
     never: Mapping[str, float] = field(default_factory=dict)
     highest: float = math.inf  #: of the controlled states, from which on it is lost
+    kind: str = ''  #: what plant and controller are told that they are; its name by default
+
+    @property
+    def system(self) -> str:
+        """What plant and controller are told that they are."""
+        return self.kind or self.name
 
     @cached_property
     def table(self) -> ParameterTable[ControllerParameters]:
         """Parameters of its controllers."""
-        return table_of(load(model_path(self._model)), {'system': self.name})
+        return table_of(load(model_path(self._model)), {**self.tuned, 'system': self.system})
 
     @cached_property
     def parameters(self) -> ControllerParameters:
@@ -56,12 +63,13 @@ class Plant:
 
     @property
     def _model(self) -> str:
-        return str(preset(self.name, 'controller')['model'])
+        return str({**preset(self.system, 'controller'), **self.tuned}['model'])
 
     @cached_property
     def wiring(self) -> Wiring:
         """Where its signals are."""
-        signals = signals_of(load(model_path(self._model)), self.parameters.controlled)
+        signals = signals_of(load(model_path(self._model)), self.parameters.controlled,
+                             self.parameters.states)
         return Wiring(signals, self.parameters.states, self.parameters.inputs)
 
     @property
@@ -97,7 +105,7 @@ class Plant:
     @cached_property
     def period(self) -> float:
         """Time between measurements, s."""
-        return PlantTable({'system': self.name}).snapshot({}).sample_period
+        return PlantTable({'system': self.system}).snapshot({}).sample_period
 
     @cached_property
     def rate(self) -> float:
@@ -130,4 +138,15 @@ QUADRUPLE_TANK = Plant(
     wired={f'{name}.topic': 'levels' for name in _LEVELS}, tuned={
         **_each(_LEVELS, max_rate=0.01, max_jump=0.01),
         **_each(('pump_1', 'pump_2'), rate_limit=1.0), 'transfer_time': 10.0})
-PLANTS = {plant.name: plant for plant in (REACTOR, TWO_TANKS, QUADRUPLE_TANK)}
+# The reactor of two states where no coolant that is held holds it, its concentration estimated.
+SADDLE = Plant(
+    'saddle', kind='two_state', setpoint=(76.85,), other=(73.85,), by_hand=(26.85,), band=0.5,
+    settle=120.0, afterwards=420.0, recovery=300.0, highest=110.0,
+    simulated={'concentration.initial_offset': -0.37733466,
+               'temperature.initial_offset': 25.53008526, 'temperature.noise': 0.05}, tuned={
+        'model': 'two_state_saddle', 'states_measured': ('temperature [K]',),
+        'levels': ('mpc', 'sdre', 'pi'), 'temperature.noise': 0.05,
+        'concentration.initial_error': 0.2, 'temperature.max_rate': 2.0,
+        'temperature.max_jump': 2.0, 'temperature.pi_gain': 6.0, 'temperature.pi_time': 60.0,
+        **_each(('coolant_temperature',), wander=0.775, min=-20.0, max=100.0, rate_limit=1.0)})
+PLANTS = {plant.name: plant for plant in (REACTOR, TWO_TANKS, QUADRUPLE_TANK, SADDLE)}

@@ -25,23 +25,24 @@ TELLING = ('nan-long', 'bias', 'feed-warm', 'controller-killed-in-a-step', 'plan
 _BEFORE, _AFTER = 30.0, 300.0  # s around the fault
 
 
-def write(folder: Path, results: Mapping[str, dict[str, Any]], run: dict[str, Any] | None = None,
+def write(folder: Path, results: Mapping[str, dict[str, Any]],
+          runs: Mapping[str, dict[str, Any]] | None = None,
           traces: Mapping[str, Trace] | None = None) -> bool:
     """
     Write a page, figures and, where traces are given, a picture of what has been run so far.
 
-    :return: whether nothing is held against any case that could be tried, nor the endurance run.
+    :return: whether nothing is held against any case that could be tried, nor an endurance run.
     """
     figures: dict[str, Any] = {
         'machine': reports.machine(), 'cases': len(results),
         'survived': sum(result['survived'] for result in results.values()),
         'skipped': sum('skipped' in result for result in results.values()),
-        'results': results, **({} if run is None else {'soak': run})}
+        'results': results, **(runs or {})}
     reports.write_figures(folder / 'summary.json', figures)
     picture = FIGURE if _draw(traces or {}, folder / FIGURE) else ''
     reports.write_page(folder / 'report.md', 'Fault campaign', _sections(figures, picture))
-    return figures['survived'] + figures['skipped'] == len(results) and (
-        run is None or run['survived'])
+    return figures['survived'] + figures['skipped'] == len(results) and all(
+        run['survived'] for run in (runs or {}).values())
 
 
 def line(result: dict[str, Any]) -> str:
@@ -95,8 +96,9 @@ def _sections(figures: dict[str, Any], picture: str) -> Iterator[str]:
     if failed:
         yield '## What failed'
         yield reports.bullets(failed)
-    if 'soak' in figures:
-        yield from _endurance_sections(figures['soak'])
+    for name, run in figures.items():
+        if name.startswith('soak'):
+            yield from _endurance_sections(name, run)
 
 
 def _row(name: str, result: dict[str, Any]) -> tuple[str, ...]:
@@ -110,8 +112,8 @@ def _row(name: str, result: dict[str, Any]) -> tuple[str, ...]:
             'survived' if result['survived'] else '**failed**')
 
 
-def _endurance_sections(run: dict[str, Any]) -> Iterator[str]:
-    yield '## Endurance'
+def _endurance_sections(name: str, run: dict[str, Any]) -> Iterator[str]:
+    yield f'## Endurance: {name}'
     yield (f'{"Survived" if run["survived"] else "**Failed**"}: {run["hours"]:g} h of plant time '
            f'in {run["wall_seconds"]:.0f} s with {sum(run["events"].values())} events. The '
            f'reactor was {run["mean_error_K"]:.2f} K from its set-point on average and never '

@@ -275,6 +275,22 @@ def test_a_bad_signal_of_two_and_a_second_controller_are_survived(tmp_path):
     assert {len(command.values) for command in found.commands} == {2}
 
 
+def test_a_plant_that_runs_away_is_held_without_a_solver_and_without_its_sensor(tmp_path):
+    """From the temperature alone; what was commanded is replayed without the solver, too."""
+    def play(loop):
+        loop.request(*loop.on.other)
+        CASES['saddle-lost'].play(loop)
+
+    case = replace(CASES['saddle-solver-missing'], play=play, between=True, settle=30.0,
+                   afterwards=90.0, recovery=80.0, largest_step=2.0)
+    result, found = run(case, tmp_path)
+    assert result['reasons'] == []
+    assert result['plant'] == 'saddle'
+    assert {len(states) for _, states in found.samples} == {1}
+    # with the solver the law would have planned
+    assert judge(found, replace(case, missing=()))['reasons'] != []
+
+
 def test_what_goes_wrong_is_held_against_the_case(tmp_path):
     """A process that dies, words that nobody reports, and a reactor that stays away."""
     def play(loop):
@@ -326,7 +342,8 @@ ENDURED = {
 
 
 def test_report_says_what_failed_and_why(tmp_path):
-    assert not write(tmp_path, {'nan-short': GOOD, 'bias': BAD, 'disk-full': SKIPPED}, ENDURED)
+    assert not write(tmp_path, {'nan-short': GOOD, 'bias': BAD, 'disk-full': SKIPPED}, {
+        'soak': ENDURED})
     text = (tmp_path / 'report.md').read_text()
     assert '1 of 3 cases survived, 1 skipped: reactor 1 of 2, two_tanks 0 of 1.' in text
     assert '## two_tanks: processes' in text
@@ -340,13 +357,14 @@ def test_report_says_what_failed_and_why(tmp_path):
     assert summary['results']['bias']['time_to_recover_s'] is None
     assert summary['results']['nan-short']['worst_error'] == 1.0
     assert summary['soak']['survived']
-    assert write(tmp_path, {'good': GOOD, 'skipped': SKIPPED}, ENDURED)
-    assert not write(tmp_path, {'good': GOOD}, {**ENDURED, 'survived': False})
+    assert write(tmp_path, {'good': GOOD, 'skipped': SKIPPED}, {'soak': ENDURED})
+    assert not write(tmp_path, {'good': GOOD}, {
+        'soak': ENDURED, 'soak-saddle': {**ENDURED, 'survived': False}})
 
 
 def test_command_line(capsys):
     counts = Counter(case.on.name for case in CASES.values())
-    assert counts['reactor'] == 80
+    assert (counts['reactor'], counts['saddle']) == (80, 15)
     assert min(counts['two_tanks'], counts['quadruple_tank']) >= 15
     assert all(name.startswith(case.on.name) for name, case in CASES.items()
                if case.on.name != 'reactor')

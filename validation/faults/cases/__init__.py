@@ -3,7 +3,7 @@
 
 """The cases of the campaign, by group."""
 
-from validation.faults.cases import any_plant, messages, operators, processes
+from validation.faults.cases import any_plant, messages, operators, processes, saddle
 
 CASES = {case.name: case for case in (*messages.CASES, *processes.CASES, *operators.CASES,
-                                    *any_plant.CASES)}
+                                    *any_plant.CASES, *saddle.CASES)}

@@ -58,13 +58,13 @@ def _messages(on: Plant) -> Iterable[Case]:
 
     def one(name: str, does: str, make: Maker, seconds: float = short, code: Code | None = None,
             group: str = 'sensor', **details: Any) -> Case:
-        return _case(on, group, name, f'{last}: {does}, {seconds:g} s', partial(
+        return case_on(on, group, name, f'{last}: {does}, {seconds:g} s', partial(
             altered, make=lambda: _of_one(on, make()), seconds=seconds, setpoint=on.other),
             between=True, code=code, **{**step, **details})
 
     def every(name: str, does: str, make: Maker, seconds: float = short, group: str = 'clocks',
               what: str = 'measurements', **details: Any) -> Case:
-        return _case(on, group, name, f'all: {does}, {seconds:g} s', partial(
+        return case_on(on, group, name, f'all: {does}, {seconds:g} s', partial(
             altered, make=make, seconds=seconds, setpoint=on.other, what=what), between=True,
             **{**step, **details})
 
@@ -99,7 +99,8 @@ def _messages(on: Plant) -> Iterable[Case]:
         lambda stamp_ns: stamp_ns - round(half * second)), group='clocks')
 
 
-def _case(on: Plant, group: str, name: str, does: str, play: Any, **details: Any) -> Case:
+def case_on(on: Plant, group: str, name: str, does: str, play: Any, **details: Any) -> Case:
+    """Return a case on a plant, at its set-points and times."""
     return Case(group, f'{on.name}-{name}', does, play, **{
         'on': on, 'setpoint': on.setpoint, 'settle': on.settle, 'afterwards': on.afterwards,
         'recovery': on.recovery, 'band': on.band, **details})
@@ -123,7 +124,7 @@ def _not_held(loop: FaultHarness) -> None:
 
 
 def _operators(on: Plant) -> Iterable[Case]:
-    case = partial(_case, on, 'operators')
+    case = partial(case_on, on, 'operators')
 
     def storm(name: str, does: str, *asked: Mapping[str, float], code: Code | None = None) -> Case:
         return case(f'setpoints-{name}', f'set-points at 1 kHz: {does}',
@@ -154,7 +155,7 @@ def _operators(on: Plant) -> Iterable[Case]:
 
 
 def _processes(on: Plant) -> Iterable[Case]:
-    case = partial(_case, on, 'processes')
+    case = partial(case_on, on, 'processes')
     yield case('controller-killed', 'the controller is killed at rest and started again',
                controller_again, plant=PATIENT, bump=_BUMP)
     yield case('controller-killed-in-manual-mode', 'killed in manual mode, and started again',
@@ -164,7 +165,7 @@ def _processes(on: Plant) -> Iterable[Case]:
     yield case('plant-reset', 'the plant is reset', plant_reset)
     says = tuple(f'^{node}: 2 nodes command the {on.inputs[0]}'
                  for node in ('controller: control', 'plant: simulation'))
-    case = partial(_case, on, 'neighbours', largest_step=math.inf)
+    case = partial(case_on, on, 'neighbours', largest_step=math.inf)
     yield case('two-controllers', 'a second controller, tuned otherwise, commands the same plant',
                partial(second_controller, says=says))
     if len({place.topic for place in on.wiring.measured.values()}) > 1:

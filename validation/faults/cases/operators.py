@@ -132,8 +132,8 @@ def mode_once(loop: FaultHarness, seconds: float = 60.0) -> None:
         loop.ros.set_bool('controller/set_automatic', True)
 
 
-def _changed(loop: FaultHarness, parameters: Mapping[str, float],
-             setpoint: tuple[float, ...] = ()) -> None:
+def changed_for_good(loop: FaultHarness, parameters: Mapping[str, float],
+                     setpoint: tuple[float, ...] = ()) -> None:
     """Change the plant for good, after a step of the set-point if asked to."""
     if setpoint:
         loop.request(*setpoint)
@@ -150,7 +150,7 @@ def _without_the_cold(loop: FaultHarness, node: str, usual: float) -> None:
         loop.set_parameters(node, **{f'{_COOLANT}.min': usual})
 
 
-def _scaled(name: str, factor: float) -> dict[str, float]:
+def scaled(name: str, factor: float) -> dict[str, float]:
     """Return a constant of the plant by a factor of its usual value."""
     return {f'constants.{name}': factor * reactor.constant(name)}
 
@@ -191,19 +191,19 @@ CASES = (
          mode_once, bump=0.01),
     Case('operators', 'mode-storm', f'{REQUESTS} changes between automatic and manual mode',
          storm_of_modes),
-    *(_constant(name, f'{does}, for good', partial(_changed, parameters=changes))
+    *(_constant(name, f'{does}, for good', partial(changed_for_good, parameters=changes))
       for name, does, changes in (
-          ('heat-transfer-low', 'UA -20 %', _scaled('heat_transfer_coefficient', 0.8)),
-          ('heat-transfer-high', 'UA +20 %', _scaled('heat_transfer_coefficient', 1.2)),
+          ('heat-transfer-low', 'UA -20 %', scaled('heat_transfer_coefficient', 0.8)),
+          ('heat-transfer-high', 'UA +20 %', scaled('heat_transfer_coefficient', 1.2)),
           ('feed-warm', 'T_i +5 K', {'constants.feed_temperature': 81.85}),
           ('feed-cold', 'T_i -5 K', {'constants.feed_temperature': 71.85}),
-          ('concentration-high', 'C_A +10 %', _scaled('concentration', 1.1)),
-          ('concentration-low', 'C_A -10 %', _scaled('concentration', 0.9)))),
+          ('concentration-high', 'C_A +10 %', scaled('concentration', 1.1)),
+          ('concentration-low', 'C_A -10 %', scaled('concentration', 0.9)))),
     _constant('actuator-lag', 'the coolant follows its command with 5 s, for good, and the '
               'set-point steps',
-              partial(_changed, parameters={f'{_COOLANT}.lag': 5.0}, setpoint=(42.0,))),
+              partial(changed_for_good, parameters={f'{_COOLANT}.lag': 5.0}, setpoint=(42.0,))),
     _constant('actuator-late', 'commands act one sample late, for good, and the set-point steps',
-              partial(_changed, parameters={f'{_COOLANT}.delay': 1.0}, setpoint=(42.0,))),
+              partial(changed_for_good, parameters={f'{_COOLANT}.delay': 1.0}, setpoint=(42.0,))),
     _constant('actuator-saturated', f'the coolant does not get below {STUCK_AT:g} degC, 15 min',
               partial(_without_the_cold, node='plant', usual=-20.0), worst=WINDUP),
     _constant('coolant-limited', f'the controller may not command less than {STUCK_AT:g} degC, '
@@ -211,8 +211,9 @@ CASES = (
                                 usual=reactor.coolant_parameters().min),
               worst=WINDUP),
     _constant('noise', 'noise of 0.1 K, for good',
-              partial(_changed, parameters={'temperature.noise': 0.1}), band=0.5, offset=0.5),
+              partial(changed_for_good, parameters={'temperature.noise': 0.1}), band=0.5,
+              offset=0.5),
     _constant('two-state', 'the concentration moves, which the model does not know, and the feed '
               'gets 1 K warmer; near the stable point',
-              partial(_changed, parameters={'constants.feed_temperature': 77.85}),
+              partial(changed_for_good, parameters={'constants.feed_temperature': 77.85}),
               setpoint=(50.5,), plant={**LOCKSTEP, 'system': 'two_state'}))
