@@ -121,6 +121,9 @@ class TrendChart:
         self.happened = trends.marks(begin, latest)[-_MARKS:]
         self._chart.run_chart_method('setOption', {
             'useUTC': latest < _EPOCH,
+            # of a law that does not plan there is no line
+            'legend': {'data': [own.title for _, pens in charts for own in pens
+                                if own.kind != 'planned' or _present(own.face, now).plan]},
             'xAxis': [{'min': 1e3 * begin, 'max': 1e3 * end} for _ in charts],
             'yAxis': [_ends(pens, now) if self.whole else {'min': None, 'max': None}
                       for _, pens in charts],
@@ -252,7 +255,7 @@ def _frame_of(charts: list[tuple[str, list[_Pen]]], height: int, zoom: bool, sim
                     ':valueFormatter': "v => v == null ? '–' : (+v).toPrecision(6)",
                     'axisPointer': {'type': 'cross', 'label': {'backgroundColor': '#4d4d4a'}}},
         'legend': {'type': 'scroll', 'top': 4, 'pageIconColor': '#4d4d4a',
-                   'data': [own.title for _, own in pens],
+                   'data': [own.title for _, own in pens if own.kind != 'planned'],
                    'textStyle': {'color': '#1d1d1b', 'fontSize': 13}, 'icon': 'roundRect',
                    'itemHeight': 4},
         'grid': [{'left': 56, 'right': 16, 'top': 45 + height * at, 'height': height - 60}

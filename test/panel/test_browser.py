@@ -241,7 +241,8 @@ def test_trends_show_the_past_to_a_page_that_is_opened_late(site: Site) -> None:
     points = """() => {
         const chart = document.querySelector('.nicegui-echart');
         const vue = getElement(parseInt(chart.id.slice(1)));
-        return vue.chart.getOption().series.map(series => series.data.length);
+        return vue.chart.getOption().series.filter(series => !series.name.includes('planned'))
+            .map(series => series.data.length);
     }"""
     with site.page() as page:
         ready(page)
@@ -253,6 +254,25 @@ def test_trends_show_the_past_to_a_page_that_is_opened_late(site: Site) -> None:
         page.wait_for_function(f'() => ({points})()[0] > 20')
         page.get_by_role('button', name='1 h').click()
         page.wait_for_function(f'() => ({points})().every(count => count > 20)')
+
+
+def test_a_plan_is_drawn_ahead_of_now_while_there_is_one(site: Site) -> None:
+    planned = """() => {
+        const chart = document.querySelector('.nicegui-echart');
+        const vue = getElement(parseInt(chart.id.slice(1)));
+        const { series, legend, xAxis } = vue.chart.getOption();
+        const last = name => series.find(one => one.name.startsWith(name)).data.at(-1)?.[0];
+        return [last('temperature planned') > last('temperature [') + 10_000
+                    && xAxis[0].max >= last('coolant temperature planned'),
+                legend[0].data.filter(name => name.includes('planned')).length];
+    }"""
+    with site.page('/trends') as page:
+        site.ros.set_parameters('controller', levels=['mpc', 'sdre'])
+        page.wait_for_function(
+            f'() => {{ const [ahead, drawn] = ({planned})(); return ahead && drawn === 2; }}')
+        site.ros.set_parameters('controller', levels=['sdre', 'linear'])
+        page.wait_for_function(
+            f'() => {{ const [ahead, drawn] = ({planned})(); return !ahead && drawn === 0; }}')
 
 
 def test_parameters_are_set_checked_and_refused(site: Site) -> None:
