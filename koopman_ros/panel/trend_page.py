@@ -257,7 +257,8 @@ def _frame_of(charts: list[tuple[str, list[_Pen]]], height: int, zoom: bool, sim
         'legend': {'type': 'scroll', 'top': 4, 'pageIconColor': '#4d4d4a',
                    'data': [own.title for _, own in pens if own.kind != 'planned'],
                    'textStyle': {'color': '#1d1d1b', 'fontSize': 13}, 'icon': 'roundRect',
-                   'itemHeight': 4},
+                   # less than that of the text cuts it where there are several pages of pens
+                   'itemHeight': 14, 'itemWidth': 14},
         'grid': [{'left': 56, 'right': 16, 'top': 45 + height * at, 'height': height - 60}
                  for at in several],
         'xAxis': [{'type': 'time', 'gridIndex': at, 'axisPointer': {'label': {
