@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 from koopman_ros.bags import BagWriter, message_definition, RecordedInput, RecordedState
-from koopman_ros.identification import identify
+from koopman_ros.identification import identify, identify_hidden
 from koopman_ros.lifting import Coordinates, linearised_model, load, Provenance, save
 from koopman_ros.plant_data import Episode, Plant
 from koopman_ros.plants import Actuator, Process, random_steps, RandomStepDesign
@@ -57,7 +57,12 @@ def write_tanks(path):
 
 
 @pytest.fixture(scope='module')
-def retrained(tmp_path_factory):
+def bag(tmp_path_factory):
+    return write_tanks(tmp_path_factory.mktemp('bags') / 'run.mcap')
+
+
+@pytest.fixture(scope='module')
+def retrained(bag, tmp_path_factory):
     """Return what became of a linear model whose pumps are half as strong again."""
     folder = tmp_path_factory.mktemp('tanks')
     names = TANKS.state_names, TANKS.input_names
@@ -67,7 +72,6 @@ def retrained(tmp_path_factory):
     present = linearised_model(TANKS.drift_jacobian(TANKS.nominal_state), 1.5 * TANKS.B, *boxes,
                                's', Provenance('two tanks'))
     save(present, folder / 'present.safetensors')
-    bag = write_tanks(folder / 'run.mcap')
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(task_module, 'identify',
                       partial(identify, degrees=(1, 3), methods=methods(20, 40)))
@@ -163,3 +167,23 @@ def test_measured_input_tells_what_the_command_hides(lagging):
     gain, drift = learned_errors(lagging, measured=False)
     assert -0.4 < gain < -0.2
     assert drift > 3.0
+
+
+def test_a_level_that_is_in_no_bag_is_learned_with_the_other(bag, tmp_path, monkeypatch):
+    """Tank 1 flows into tank 2, so that what it holds shows there."""
+    monkeypatch.setattr(task_module, 'identify_hidden',
+                        partial(identify_hidden, highest_degree=2))
+    found = retrain(Task((str(bag),), str(tmp_path / 'new.safetensors'), '', STATES[:1], INPUTS,
+                         model_class='polynomial', hidden_states=1))
+    assert found.reasons == ()
+    assert not any('hidden_1' in warning for warning in found.decision.warnings)
+    model = load(found.model_file)
+    assert model.states.names == ('level_2', 'hidden_1')
+    assert model.states.units == ('m', '1')
+    modes = np.linalg.eigvals(model.drift_jacobian(np.zeros(2))).real
+    truth = np.linalg.eigvals(TANKS.drift_jacobian(TANKS.nominal_state)).real
+    assert np.sort(modes) == pytest.approx(np.sort(truth), rel=0.25)
+    assert found.decision.rmse[0] < 2.0 * LEVEL_NOISE
+    page = next(path for path in write_report(found) if path.suffix == '.md').read_text()
+    assert 'of the next measurement foreseen' in page
+    assert 'innovations form, 1 state not measured' in page
