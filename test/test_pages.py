@@ -11,11 +11,15 @@ from functools import cache
 from pathlib import Path
 import re
 
+from builtin_interfaces.msg import Time
+import numpy as np
 import pytest
 import yaml
 
+from koopman_ros.control.laws import Plan
 from koopman_ros.parameters.trainer import preset_wiring
 from koopman_ros.ros import programs, topics
+from koopman_ros.ros.controller_messages import active_limits
 from koopman_ros.wire import CARRIERS, place
 
 ROOT = Path(__file__).parent.parent
@@ -87,6 +91,15 @@ def test_interfaces_list_the_topics_with_their_types_and_the_services() -> None:
         assert not serves - own or managed <= {*node.serves, *node.publishes}, name
         services -= {service.replace('~', f'/{name}') for service in own}
     assert not services
+
+
+def test_interfaces_list_the_limits_of_a_plan() -> None:
+    wiring, none = preset_wiring('reactor'), np.zeros(1)
+    assert wiring is not None
+    (state,), (given,) = wiring.signals.states, wiring.signals.inputs
+    names = active_limits(wiring.signals, Plan(*3 * (none,), none, none, none), Time(), '').name
+    assert [row[0].strip('`') for row in _rows('interfaces.md') if row[0].startswith('`at_')] == [
+        name.replace(given, '<input>').replace(f'_{state} ', '_<state> ') for name in names]
 
 
 @pytest.mark.parametrize(('system', 'column'), [('reactor', 2), ('two_tanks', 3)])

@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 The koopman_ros Authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""Parts of nodes: what they create goes with them; what a recorder writes; models refused."""
+"""Parts of nodes: what goes with them; what a recorder and a plan write; models refused."""
 
 from collections.abc import Callable
 from dataclasses import replace
@@ -10,6 +10,7 @@ import threading
 import time
 from typing import Any
 
+from builtin_interfaces.msg import Time
 import numpy as np
 import pytest
 from rclpy.duration import Duration
@@ -17,12 +18,14 @@ from sensor_msgs.msg import Temperature
 
 from koopman_ros.bags import BagWriter, read_messages
 from koopman_ros.control import Controller
+from koopman_ros.control.laws import Plan
 from koopman_ros.demo import reactor
 from koopman_ros.lifting import load, ModelFileError, save
 from koopman_ros.parameters.trainer import trainer_table
-from koopman_ros.parameters.wire import signals_of, Wiring
+from koopman_ros.parameters.wire import Signals, signals_of, Wiring
 from koopman_ros.resources import model_path
 from koopman_ros.ros import model_reload, recorder, topics
+from koopman_ros.ros.controller_messages import active_limits, planned
 from koopman_ros.ros.experiment import PlantExperiment
 from koopman_ros.ros.model_reload import load_suitable
 from koopman_ros.ros.node import Level, LoopNode, Status
@@ -196,3 +199,26 @@ def test_name_that_is_no_path_is_not_repeated_at_length(name: str) -> None:
     with pytest.raises(ModelFileError, match='is no path of a file, which has at most 4096') as e:
         load_suitable(name)
     assert len(str(e.value)) < 200
+
+
+def test_a_plan_has_the_controlled_states_and_all_inputs_and_limits_of_every_state() -> None:
+    """Of three states the second is not measured and the third is controlled."""
+    every = {'level': 'm', 'latent': '1', 'warmth': 'K'}
+    signals = Signals({'level': 'm', 'warmth': 'K'}, {'pump': 'V', 'heater': 'K'}, ('warmth',),
+                      every)
+    plan = Plan(np.array([0.0, 0.5, 2.25]), np.arange(9.0).reshape(3, 3) + 273.15,
+                np.array([[1.0, 300.0], [2.0, 310.0]]), np.array([0.0, 1.0]),
+                np.array([-1.0, 0.0]), np.array([0.0, 0.0, -1.0]))
+    message = planned(signals, plan, Time(sec=7), 'plant')
+    assert list(message.joint_names) == ['warmth [degC]', 'pump [V]', 'heater [degC]']
+    np.testing.assert_allclose([point.positions for point in message.points], [
+        [2.0, 1.0, 26.85], [5.0, 2.0, 36.85], [8.0, 2.0, 36.85]])
+    assert [(point.time_from_start.sec, point.time_from_start.nanosec)
+            for point in message.points] == [(0, 0), (0, 500_000_000), (2, 250_000_000)]
+    assert (message.header.stamp.sec, message.header.frame_id) == (7, 'plant')
+    limits = active_limits(signals, plan, Time(sec=7), 'plant')
+    assert dict(zip(limits.name, limits.position, strict=True)) == {
+        'at_range_pump [-1 lower, 1 upper]': 0.0, 'at_range_heater [-1 lower, 1 upper]': 1.0,
+        'at_rate_pump [-1 falling, 1 rising]': -1.0, 'at_rate_heater [-1 falling, 1 rising]': 0.0,
+        'at_limit_level [-1 lower, 1 upper]': 0.0, 'at_limit_latent [-1 lower, 1 upper]': 0.0,
+        'at_limit_warmth [-1 lower, 1 upper]': -1.0}
