@@ -266,7 +266,8 @@ def test_a_retrained_lift_of_the_library_keeps_what_the_shipped_one_promises():
     keeps('two_state_example', train_lift('two_state_example', loops=16))
 
 
-def test_the_lift_at_the_saddle_holds_it_from_the_temperature_alone():
+def test_the_lift_at_the_saddle_holds_it_from_the_temperature_alone(monkeypatch):
+    monkeypatch.setattr(saddle, 'ARRIVAL', 400.0)
     model = load(model_path(SADDLE))
     assert (model.n_z, model.provenance.seed) == (2, 0)
     assert max(model.provenance.metrics[figure] for figure in ('rw', 'rx')) < 1e-6

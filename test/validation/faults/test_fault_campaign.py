@@ -277,12 +277,8 @@ def test_a_bad_signal_of_two_and_a_second_controller_are_survived(tmp_path):
 
 def test_a_plant_that_runs_away_is_held_without_a_solver_and_without_its_sensor(tmp_path):
     """From the temperature alone; what was commanded is replayed without the solver, too."""
-    def play(loop):
-        loop.request(*loop.on.other)
-        CASES['saddle-lost'].play(loop)
-
-    case = replace(CASES['saddle-solver-missing'], play=play, between=True, settle=30.0,
-                   afterwards=90.0, recovery=80.0, largest_step=2.0)
+    case = replace(CASES['saddle-solver-missing'], play=CASES['saddle-lost'].play, between=True,
+                   settle=15.0, afterwards=30.0, recovery=0.0, largest_step=2.0)
     result, found = run(case, tmp_path)
     assert result['reasons'] == []
     assert result['plant'] == 'saddle'
