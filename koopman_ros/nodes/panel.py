@@ -9,6 +9,7 @@ from concurrent.futures import Future
 from dataclasses import dataclass
 from functools import partial
 import math
+from pathlib import Path
 import sys
 import threading
 import time
@@ -27,6 +28,7 @@ from trajectory_msgs.msg import JointTrajectory
 
 from koopman_ros.bags import BagReadError
 from koopman_ros.lifting import LiftedModel, load
+from koopman_ros.panel.alarm_memory import AlarmMemory
 from koopman_ros.panel.learning import Learning
 from koopman_ros.panel.past import fill_in, read_past
 from koopman_ros.panel.plant import CONTROLLER, ParameterView, PlantView, Range, TRAINER
@@ -98,6 +100,7 @@ class PanelNode(LoopNode):
         self._wiring = wiring = Wiring(signals, settings.states, settings.inputs)
         read = settings.read(signals)
         self.view = PlantView(signals, read, settings.span, time.time())
+        self._memory = self._recalled(settings.alarm_file)
         self.snapshot = self.view.snapshot(time.time())
         self._words = words_of(signals, {
             name: Display(unit, read[name], '.6g') for name, unit in signals.units.items()
@@ -145,6 +148,19 @@ class PanelNode(LoopNode):
         self.diagnostics.add('pages', self._status)
         self.get_logger().info(f'the panel is at {self._server.address}')
 
+    def _recalled(self, path: str) -> AlarmMemory | None:
+        if not path:
+            return None
+        try:
+            memory = AlarmMemory(self.view.alarms, Path(path), time.time())
+        except OSError as error:
+            raise ConfigurationError(
+                f'alarm_file = {path!r} cannot be used ({error}): name a file in a folder that '
+                'can be written') from error
+        if memory.complaint:
+            self.get_logger().warning(memory.complaint)
+        return memory
+
     def _serve(self) -> Any:
         try:
             # other programs do without
@@ -164,6 +180,8 @@ class PanelNode(LoopNode):
         self._ended.set()
         self._watch.complete()
         self._server.stop()
+        if self._memory is not None:
+            self._memory.close()
         if self._past is not None:
             self._past.join(_LOOK)
 
@@ -275,6 +293,13 @@ class PanelNode(LoopNode):
     def _on_tick(self) -> None:
         now = time.time()
         self.view.advance(now)
+        if self._memory is not None:
+            try:
+                self._memory.keep(now)
+            except OSError as error:
+                self.get_logger().error(
+                    f'alarms are not written to {self.settings.alarm_file}: {error}',
+                    throttle_duration_sec=60.0)
         self.diagnostics.hardware_id = self.view.plant or self.settings.system
         self._requests.advance(time.monotonic())
         self._watch.advance()

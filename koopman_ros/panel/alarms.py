@@ -4,7 +4,7 @@
 """Alarms in the sense of ISA-18.2: delays, acknowledgement, shelving, and a journal of the day."""
 
 from collections import deque
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from enum import Enum
 import hashlib
@@ -20,6 +20,7 @@ MAX_KEY = 200  # characters
 MAX_TEXT = 500
 MAX_WHO = 64
 OVERFLOW = 'alarms'  #: key of the alarm that says that there are too many
+_FOUND_AGAIN = 10.0  # s in which what reported an alarm before a restart is heard again
 
 
 class Priority(Enum):
@@ -146,6 +147,7 @@ class Alarms:
         self._journal: deque[Entry] = deque(maxlen=kept)
         self._last = -math.inf
         self._lock = threading.Lock()
+        self.noted = 0  #: entries that were ever made in the journal
 
     def report(self, key: str, active: bool, priority: Priority, text: str, now: float) -> None:
         """
@@ -231,6 +233,38 @@ class Alarms:
             found = [record.alarm() for record in self._records.values()
                      if record.shelved_until is not None]
         return tuple(sorted(found, key=lambda alarm: (alarm.shelved_until or 0.0, alarm.key)))
+
+    @property
+    def all(self) -> tuple[Alarm, ...]:
+        """What is not normal, or is shelved."""
+        with self._lock:
+            return tuple(record.alarm() for record in self._records.values() if (
+                record.state is not AlarmState.NORMAL or record.shelved_until is not None))
+
+    def recall(self, alarms: Iterable[Alarm], journal: Iterable[Entry], now: float) -> None:
+        """
+        Go on from what there was before a restart, in place of what there is.
+
+        What stood then stands until it is clear that it does not any more.
+
+        :param alarms: as :attr:`all` gave them.
+        :param journal: the oldest entry first.
+        """
+        with self._lock:
+            self._records.clear()
+            self._running.clear()
+            self._journal.clear()
+            self._journal.extend(journal)
+            for alarm in alarms:
+                record = self._records[alarm.key] = _Record(alarm.key, alarm.priority)
+                record.text, record.state, record.since = alarm.text, alarm.state, alarm.since
+                record.shelved_until = alarm.shelved_until
+                record.acknowledged_by = alarm.acknowledged_by
+                if alarm.state in (AlarmState.UNACKNOWLEDGED, AlarmState.ACKNOWLEDGED):
+                    record.shown = record.reported = alarm.priority.value
+                    record.report(0, now + _FOUND_AGAIN)
+                self._tidy(record)
+            self._advance(now)
 
     def journal(self, since: float) -> tuple[Entry, ...]:
         """Return what happened from then on, the newest first."""
@@ -331,6 +365,7 @@ class Alarms:
         return True
 
     def _note(self, time: float, record: _Record, what: str, who: str = '') -> None:
+        self.noted += 1
         self._journal.append(Entry(time, record.key, record.priority, record.text, what,
                                    plain(who, MAX_WHO)))
 

@@ -77,6 +77,9 @@ class PanelParameters:
         '', 'certificate, as a PEM file; empty serves without encryption', read_only=True)
     tls_key: str = parameter(
         '', 'private key of the certificate, as a PEM file', read_only=True)
+    alarm_file: str = parameter(
+        '', 'file in which alarms, their shelving and the list of the day outlast the panel; '
+        'empty for none', read_only=True)
     span: float = parameter(
         28800.0, 'how much of the past the trends keep', 's', 600.0, 604800.0, read_only=True)
     states: Mapping[str, ShownState] = per_signal(ShownState)

@@ -113,6 +113,7 @@ def opened(url: str, *headers: str) -> str:
 @pytest.mark.parametrize(('parameters', 'words'), [
     ({'host': '0.0.0.0'}, "cannot start: the panel is not served on '0.0.0.0' without passwords"),
     ({'users': 'nowhere'}, 'cannot start: [Errno 2] No such file or directory'),
+    ({'alarm_file': '/proc/alarms'}, "cannot start: alarm_file = '/proc/alarms' cannot be used ("),
     ({'tls_certificate': 'here.pem'}, 'cannot start: tls_certificate and tls_key belong together'),
     ({'tls_certificate': 'a.pem', 'tls_key': 'b.pem'},
      "cannot start: tls_certificate = 'a.pem' and tls_key = 'b.pem' cannot be used"),

@@ -1,0 +1,117 @@
+# SPDX-FileCopyrightText: 2026 The koopman_ros Authors
+# SPDX-License-Identifier: Apache-2.0
+
+"""Alarms that outlast the panel: what is recalled of them, and from which files."""
+
+import json
+import math
+import os
+from pathlib import Path
+
+import pytest
+
+from koopman_ros.panel.alarm_memory import AlarmMemory
+from koopman_ros.panel.alarms import Alarms, AlarmState, Priority
+
+NOW = 1_700_000_000.0
+AGAIN = NOW + 100.0
+
+
+@pytest.fixture
+def file(tmp_path: Path) -> Path:
+    """Return a file of one alarm of each kind: acknowledged, not, returned, shelved."""
+    path, alarms = tmp_path / 'alarms.json', Alarms()
+    memory = AlarmMemory(alarms, path, NOW)
+    for key in ('seen', 'new', 'over', 'shelved'):
+        alarms.report(key, True, Priority.HIGH, f'text of {key}', NOW)
+    alarms.advance(NOW + 1.0)
+    alarms.acknowledge('seen', 'anna', NOW + 2.0)
+    alarms.shelve('shelved', 600.0, 'anna', NOW + 3.0)
+    alarms.report('over', False, Priority.HIGH, '', NOW + 4.0)
+    alarms.advance(NOW + 9.0)
+    memory.close()
+    return path
+
+
+def recalled(path: Path) -> Alarms:
+    alarms = Alarms()
+    assert not AlarmMemory(alarms, path, AGAIN).complaint
+    return alarms
+
+
+def test_states_shelving_and_the_list_of_the_day_are_recalled(file: Path) -> None:
+    alarms = recalled(file)
+    assert {alarm.key: (alarm.state, alarm.text, alarm.acknowledged_by)
+            for alarm in alarms.standing} == {
+        'seen': (AlarmState.ACKNOWLEDGED, 'text of seen', 'anna'),
+        'new': (AlarmState.UNACKNOWLEDGED, 'text of new', ''),
+        'over': (AlarmState.RETURNED, 'text of over', '')}
+    assert [(alarm.key, alarm.shelved_until) for alarm in alarms.shelved] == [
+        ('shelved', NOW + 603.0)]
+    happened = [(entry.key, entry.what, entry.who) for entry in alarms.journal(-math.inf)]
+    assert happened[:3] == [
+        ('over', 'returned', ''), ('shelved', 'shelved', 'anna'), ('seen', 'acknowledged', 'anna')]
+    assert len(happened) == 7
+
+
+def test_what_is_there_again_is_no_news_and_what_is_not_returns(file: Path) -> None:
+    alarms = recalled(file)
+    # nodes take a while until they are heard
+    alarms.advance(AGAIN + 8.0)
+    for key in ('seen', 'shelved'):
+        alarms.report(key, True, Priority.HIGH, 'the same', AGAIN + 9.0)
+    alarms.advance(AGAIN + 60.0)
+    assert {alarm.key: alarm.state for alarm in alarms.standing} == {
+        'seen': AlarmState.ACKNOWLEDGED, 'new': AlarmState.RETURNED, 'over': AlarmState.RETURNED}
+    assert [entry.what for entry in alarms.journal(AGAIN)] == ['returned']
+    # a day later there is nothing to list
+    alarms.advance(AGAIN + 86_401.0 + 60.0)
+    assert [entry.what for entry in alarms.journal(-math.inf)] == ['unshelved']
+
+
+def test_it_is_written_every_few_seconds_where_something_changed(tmp_path: Path) -> None:
+    path, alarms = tmp_path / 'alarms.json', Alarms(delay_on=0.0)
+    memory = AlarmMemory(alarms, path, NOW)
+    assert json.loads(path.read_text())['alarms'] == []
+    for second, keys, kept in ((0.0, 'a', 1), (1.0, 'ab', 1), (5.0, 'ab', 2)):
+        for key in keys:
+            alarms.report(key, True, Priority.LOW, '', NOW + second)
+        memory.keep(NOW + second)
+        assert len(json.loads(path.read_text())['alarms']) == kept
+    path.unlink()
+    memory.keep(NOW + 60.0)
+    memory.close()
+    assert not path.exists(), 'nothing had changed'
+
+
+@pytest.mark.parametrize(('change', 'words'), [
+    (lambda text: text[:-20], ' line '),
+    (lambda text: text.replace('"version": 1', '"version": 2'), 'version is 2, must be 1'),
+    (lambda text: text.replace('"HIGH"', '"HIGHEST"'), 'HIGHEST'),
+    (lambda text: text.replace('"raised"', '"praised"'), "'praised' must be one of raised"),
+    (lambda text: text.replace(f'"time": {NOW + 1.0}', '"time": NaN'), 'times must be finite'),
+    (lambda text: '[]', 'get'), (lambda text: '\udcff', 'utf-8'),
+    (lambda text: text.replace('"key"', '"lock"'), 'key'),
+])
+def test_a_damaged_file_is_moved_aside_and_said(file: Path, change, words: str) -> None:
+    text = change(file.read_text())
+    file.write_bytes(text.encode(errors='surrogateescape'))
+    alarms = Alarms()
+    memory = AlarmMemory(alarms, file, AGAIN)
+    assert memory.complaint.endswith(f'it is kept as {file}.damaged')
+    assert words in memory.complaint
+    assert Path(f'{file}.damaged').read_bytes() == text.encode(errors='surrogateescape')
+    assert not alarms.all
+    assert json.loads(file.read_text())['journal'] == []
+
+
+def test_a_pipe_is_not_waited_for(tmp_path: Path) -> None:
+    os.mkfifo(tmp_path / 'pipe')
+    assert 'is no regular file' in AlarmMemory(Alarms(), tmp_path / 'pipe', NOW).complaint
+
+
+def test_markup_and_control_characters_are_shown_as_text(file: Path) -> None:
+    file.write_text(file.read_text().replace('text of new', 'a\\u0000b' + 'c' * 10_000))
+    (alarm,) = (alarm for alarm in recalled(file).standing if alarm.key == 'new')
+    assert alarm.text.startswith('a�bc')
+    assert len(alarm.text) == 500
