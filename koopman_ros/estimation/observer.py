@@ -11,6 +11,7 @@ from typing import ClassVar, Protocol
 import numpy as np
 
 from koopman_ros.arrays import Array
+from koopman_ros.kernels import compilable
 from koopman_ros.lifting import LiftedModel
 from koopman_ros.signals import Outputs
 
@@ -145,13 +146,17 @@ def simulated(model: LiftedModel, estimate: Estimate, u: Array, seconds: float) 
     steps = max(1, math.ceil(duration / longest))
     if steps > _MAX_STEPS:
         return None
-    h = duration / steps
-    x, rate = estimate.x, model.rate_under(u, estimate.w)
+    return Estimate(moved(model, estimate.x, estimate.w, u, duration / steps, steps), estimate.w)
+
+
+@compilable
+def moved(model: LiftedModel, x: Array, w: Array, u: Array, h: float, steps: int) -> Array:
+    """Return where a state (n_x,) goes in so many of Heun's steps of h, in time units."""
+    rate = model.rate_under(u, w)
     for _ in range(steps):
-        # Heun's method
         slope = rate(x)
         x = x + (0.5 * h) * (slope + rate(x + h * slope))
-    return Estimate(x, estimate.w)
+    return x
 
 
 def _check_determined(outputs: Outputs) -> None:

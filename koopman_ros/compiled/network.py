@@ -1,0 +1,174 @@
+# SPDX-FileCopyrightText: 2026 The koopman_ros Authors
+# SPDX-License-Identifier: Apache-2.0
+
+"""A model out of its layout, its lift and secants, and its drift with the Jacobian."""
+
+import math
+
+import numpy as np
+from numpy.typing import NDArray
+
+from koopman_ros.arrays import Array
+from koopman_ros.compiled.jit import inner
+from koopman_ros.compiled.matrices import applied, identity, least_squares, product
+
+# Places in the sizes of a layout; widths of the hidden layers follow.
+N_X, N_U, N_Z, IDENTITY, READOUT, WIDTHS = range(6)
+_TINY = 1e-300  # beside which no difference of a ratio is seen
+
+
+@inner
+def _matrix(numbers: Array, start: int, rows: int, columns: int) -> Array:
+    found = np.empty((rows, columns))
+    for i in range(rows):
+        for j in range(columns):
+            found[i, j] = numbers[start + i * columns + j]
+    return found
+
+
+@inner
+def _widths(sizes: NDArray[np.int64]) -> tuple[int, int]:
+    """Return the width of the last hidden layer, and where what follows the layers begins."""
+    width, start, before = 0, 0, sizes[N_X]
+    for layer in range(WIDTHS, len(sizes)):
+        width = sizes[layer]
+        start += width * (before + 1)
+        before = width
+    return width, start
+
+
+@inner
+def matrices(sizes: NDArray[np.int64], numbers: Array) -> tuple[Array, Array, Array, Array]:
+    """Return A, B, the slope of the pre-feedback and the read-out of a layout."""
+    n, m, n_z = sizes[N_X], sizes[N_U], sizes[N_Z]
+    width, start = _widths(sizes)
+    start += width * (1 + n_z)
+    A = _matrix(numbers, start, n_z, n_z)
+    start += n_z * n_z
+    B = _matrix(numbers, start, n, m)
+    start += n * m
+    slope = _matrix(numbers, start, n, n)
+    return A, B, slope, _matrix(numbers, start + n * n, n, n + width)
+
+
+@inner
+def hidden(sizes: NDArray[np.int64], numbers: Array, x: Array) -> tuple[Array, Array]:
+    """Return the last hidden layer (h,) less its value at the origin, and its derivative."""
+    n = sizes[N_X]
+    h, T, start, last = x.copy(), identity(n), 0, n
+    for layer in range(WIDTHS, len(sizes)):
+        width = sizes[layer]
+        after, turn = np.empty(width), np.zeros((width, n))
+        bias = start + width * last
+        for i in range(width):
+            a = numbers[bias + i]
+            row = start + i * last
+            for j in range(last):
+                weight = numbers[row + j]
+                a += weight * h[j]
+                for k in range(n):
+                    turn[i, k] += weight * T[j, k]
+            t = math.tanh(a)
+            after[i] = t
+            for k in range(n):
+                turn[i, k] *= 1.0 - t * t
+        h, T, start, last = after, turn, bias + width, width
+    if len(sizes) == WIDTHS:
+        return np.empty(0), np.empty((0, n))
+    for i in range(last):
+        h[i] -= numbers[start + i]
+    return h, T
+
+
+@inner
+def secants(sizes: NDArray[np.int64], numbers: Array, x: Array, x_ref: Array, w: Array
+            ) -> tuple[Array, Array, Array, Array]:
+    """Return the hidden layer as :func:`hidden`, and the secants of it and of its derivative."""
+    n = sizes[N_X]
+    h, g, p, start, last = x.copy(), x_ref.copy(), w.copy(), 0, n
+    T, S, G = identity(n), identity(n), np.zeros((n, n))
+    for layer in range(WIDTHS, len(sizes)):
+        width = sizes[layer]
+        h_1, g_1, p_1 = np.empty(width), np.empty(width), np.empty(width)
+        T_1, S_1, G_1 = np.zeros((width, n)), np.zeros((width, n)), np.zeros((width, n))
+        bias = start + width * last
+        for i in range(width):
+            a = b = numbers[bias + i]
+            q, row = 0.0, start + i * last
+            for j in range(last):
+                weight = numbers[row + j]
+                a += weight * h[j]
+                b += weight * g[j]
+                q += weight * p[j]
+                for k in range(n):
+                    T_1[i, k] += weight * T[j, k]
+                    S_1[i, k] += weight * S[j, k]
+                    G_1[i, k] += weight * G[j, k]
+            t, r = math.tanh(a), math.tanh(b)
+            apart = (a - b) + math.copysign(_TINY, a - b)
+            slope = math.tanh(apart) / apart * (1.0 - t * r)
+            bend, at_x, at_ref = -(t + r) * slope, 1.0 - t * t, 1.0 - r * r
+            h_1[i], g_1[i], p_1[i] = t, r, at_x * q
+            for k in range(n):
+                G_1[i, k] = bend * q * S_1[i, k] + at_ref * G_1[i, k]
+                S_1[i, k] *= slope
+                T_1[i, k] *= at_x
+        h, g, p, T, S, G = h_1, g_1, p_1, T_1, S_1, G_1
+        start, last = bias + width, width
+    if len(sizes) == WIDTHS:
+        empty = np.empty((0, n))
+        return np.empty(0), empty, empty, empty
+    for i in range(last):
+        h[i] -= numbers[start + i]
+    return h, T, S, G
+
+
+@inner
+def lifted(sizes: NDArray[np.int64], numbers: Array, rows: Array, states: float) -> Array:
+    """
+    Return coordinates (n_z, k) of rows (h, k) of the hidden layer, as far as they are of it.
+
+    Where z starts with the state, those are `states` times the identity matrix.
+    """
+    n, n_z = sizes[N_X], sizes[N_Z]
+    width, start = _widths(sizes)
+    output = _matrix(numbers, start + width, n_z, width)
+    found = product(output, rows)
+    if sizes[IDENTITY] and states != 0.0:
+        for i in range(n):
+            found[i, i] = states
+    return found
+
+
+@inner
+def drift(sizes: NDArray[np.int64], numbers: Array, A: Array, slope: Array, readout: Array,
+          x: Array) -> Array:
+    """Return the drift (n_x,) at a state."""
+    n = sizes[N_X]
+    h, T = hidden(sizes, numbers, x)
+    if sizes[READOUT]:
+        return applied(readout, np.concatenate((x, h)))
+    z = lifted(sizes, numbers, h.reshape((len(h), 1)), 0.0)
+    if sizes[IDENTITY]:
+        z[:n, 0] = x
+    rate = least_squares(lifted(sizes, numbers, T, 1.0), product(A, z))
+    return rate[:, 0] - applied(slope, x)
+
+
+@inner
+def drift_and_jacobian(sizes: NDArray[np.int64], numbers: Array, readout: Array, x: Array
+                       ) -> tuple[Array, Array]:
+    """Return the drift of a read-out and its Jacobian (n_x, n_x)."""
+    n = sizes[N_X]
+    h, T = hidden(sizes, numbers, x)
+    f, J = np.zeros(n), np.zeros((n, n))
+    for i in range(n):
+        for j in range(n):
+            f[i] += readout[i, j] * x[j]
+            J[i, j] = readout[i, j]
+        for k in range(len(h)):
+            weight = readout[i, n + k]
+            f[i] += weight * h[k]
+            for j in range(n):
+                J[i, j] += weight * T[k, j]
+    return f, J
