@@ -37,8 +37,9 @@ def _folder() -> Path:
 
 config.CACHE_DIR = str(_folder())
 
-# divisions by 0 give infinity as in numpy: what is not finite is refused by its results
-_HOW = {'error_model': 'numpy'}
+# Divisions by 0 give infinity as in numpy: what is not finite is refused by its results. Sums may
+# be taken in another order, several numbers at once.
+_HOW = {'error_model': 'numpy', 'fastmath': {'reassoc', 'contract'}}
 
 
 def compiled(*arguments: Any) -> Callable[[Callable[..., Any]], Callable[..., Any]]:

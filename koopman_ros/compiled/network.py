@@ -10,11 +10,16 @@ from numpy.typing import NDArray
 
 from koopman_ros.arrays import Array
 from koopman_ros.compiled.jit import inner
-from koopman_ros.compiled.matrices import applied, identity, least_squares, product
+from koopman_ros.compiled.matrices import applied, identity, least_squares, product, turned
 
 # Places in the sizes of a layout; widths of the hidden layers follow.
 N_X, N_U, N_Z, IDENTITY, READOUT, WIDTHS = range(6)
 _TINY = 1e-300  # beside which no difference of a ratio is seen
+_FLAT = 40.0  # of 2 |a|, from which on tanh is 1
+_LOG2_E = 1.0 / math.log(2.0)
+# ln 2 = 0x1.62e42fefa39efp-1, its first digits, of which products with small integers are exact,
+# and the rest
+_LN2_HIGH, _LN2_LOW = float.fromhex('0x1.62e42fee00000p-1'), float.fromhex('0x1.a39ef35793c76p-33')
 
 
 @inner
@@ -52,29 +57,65 @@ def matrices(sizes: NDArray[np.int64], numbers: Array) -> tuple[Array, Array, Ar
 
 
 @inner
+def _squash(a: Array, scale: NDArray[np.int64]) -> None:
+    """
+    Turn numbers into their tanh = (e - 1) / (e + 1) with e = exp(2 |a|) = 2^k exp(r).
+
+    A loop without calls, of which several turns are taken at once; `scale` is room for 2^k.
+    """
+    for i in range(len(a)):
+        scale[i] = (np.int64(math.floor(min(_FLAT, 2.0 * abs(a[i])) * _LOG2_E + 0.5)) + 1023) << 52
+    powers = scale.view(np.float64)
+    for i in range(len(a)):
+        y = 2.0 * abs(a[i])
+        if y > _FLAT:
+            y = _FLAT
+        k = math.floor(y * _LOG2_E + 0.5)
+        r = (y - k * _LN2_HIGH) - k * _LN2_LOW
+        # of exp(r) - 1, whose digits are all needed where a is small
+        q = 1.0 / 6227020800.0
+        q = q * r + 1.0 / 479001600.0
+        q = q * r + 1.0 / 39916800.0
+        q = q * r + 1.0 / 3628800.0
+        q = q * r + 1.0 / 362880.0
+        q = q * r + 1.0 / 40320.0
+        q = q * r + 1.0 / 5040.0
+        q = q * r + 1.0 / 720.0
+        q = q * r + 1.0 / 120.0
+        q = q * r + 1.0 / 24.0
+        q = q * r + 1.0 / 6.0
+        q = q * r + 0.5
+        q = (q * r + 1.0) * r
+        less = powers[i] * q + (powers[i] - 1.0)
+        t = less / (less + 2.0)
+        a[i] = t if a[i] > 0.0 else -t
+
+
+@inner
 def hidden(sizes: NDArray[np.int64], numbers: Array, x: Array) -> tuple[Array, Array]:
-    """Return the last hidden layer (h,) less its value at the origin, and its derivative."""
+    """Return the last hidden layer (h,) less its value at the origin, and dh/dx (n_x, h)."""
     n = sizes[N_X]
     h, T, start, last = x.copy(), identity(n), 0, n
     for layer in range(WIDTHS, len(sizes)):
         width = sizes[layer]
-        after, turn = np.empty(width), np.zeros((width, n))
         bias = start + width * last
+        after, turn = np.empty(width), np.zeros((n, width))
         for i in range(width):
-            a = numbers[bias + i]
-            row = start + i * last
-            for j in range(last):
-                weight = numbers[row + j]
-                a += weight * h[j]
-                for k in range(n):
-                    turn[i, k] += weight * T[j, k]
-            t = math.tanh(a)
-            after[i] = t
+            after[i] = numbers[bias + i]
+        for j in range(last):
+            row = start + j * width
+            for i in range(width):
+                after[i] += numbers[row + i] * h[j]
             for k in range(n):
-                turn[i, k] *= 1.0 - t * t
+                for i in range(width):
+                    turn[k, i] += numbers[row + i] * T[k, j]
+        _squash(after, np.empty(width, np.int64))
+        for k in range(n):
+            for i in range(width):
+                turn[k, i] *= 1.0 - after[i] * after[i]
         h, T, start, last = after, turn, bias + width, width
     if len(sizes) == WIDTHS:
-        return np.empty(0), np.empty((0, n))
+        return np.empty(0), np.empty((n, 0))
     for i in range(last):
         h[i] -= numbers[start + i]
     return h, T
@@ -83,7 +124,7 @@ def hidden(sizes: NDArray[np.int64], numbers: Array, x: Array) -> tuple[Array, A
 @inner
 def secants(sizes: NDArray[np.int64], numbers: Array, x: Array, x_ref: Array, w: Array
             ) -> tuple[Array, Array, Array, Array]:
-    """Return the hidden layer as :func:`hidden`, and the secants of it and of its derivative."""
+    """Return the hidden layer as :func:`hidden`, and secants of it and its derivative (h, n_x)."""
     n = sizes[N_X]
     h, g, p, start, last = x.copy(), x_ref.copy(), w.copy(), 0, n
     T, S, G = identity(n), identity(n), np.zeros((n, n))
@@ -94,9 +135,9 @@ def secants(sizes: NDArray[np.int64], numbers: Array, x: Array, x_ref: Array, w:
         bias = start + width * last
         for i in range(width):
             a = b = numbers[bias + i]
-            q, row = 0.0, start + i * last
+            q = 0.0
             for j in range(last):
-                weight = numbers[row + j]
+                weight = numbers[start + j * width + i]
                 a += weight * h[j]
                 b += weight * g[j]
                 q += weight * p[j]
@@ -151,7 +192,7 @@ def drift(sizes: NDArray[np.int64], numbers: Array, A: Array, slope: Array, read
     z = lifted(sizes, numbers, h.reshape((len(h), 1)), 0.0)
     if sizes[IDENTITY]:
         z[:n, 0] = x
-    rate = least_squares(lifted(sizes, numbers, T, 1.0), product(A, z))
+    rate = least_squares(lifted(sizes, numbers, turned(T), 1.0), product(A, z))
     return rate[:, 0] - applied(slope, x)
 
 
@@ -167,8 +208,8 @@ def drift_and_jacobian(sizes: NDArray[np.int64], numbers: Array, readout: Array,
             f[i] += readout[i, j] * x[j]
             J[i, j] = readout[i, j]
         for k in range(len(h)):
-            weight = readout[i, n + k]
-            f[i] += weight * h[k]
-            for j in range(n):
-                J[i, j] += weight * T[k, j]
+            f[i] += readout[i, n + k] * h[k]
+        for j in range(n):
+            for k in range(len(h)):
+                J[i, j] += readout[i, n + k] * T[j, k]
     return f, J

@@ -50,13 +50,13 @@ class Level:
         """The model of law and estimator."""
         return self.law.model
 
-    @property
+    @cached_property
     def unusable(self) -> Reason | None:
         """Why its law can never act, which it may say itself; None where it can."""
         found: Reason | None = getattr(self.law, 'unusable', None)
         return found
 
-    @property
+    @cached_property
     def model_free(self) -> bool:
         """Whether its law goes to the set-point, wherever the model has its steady states."""
         return bool(getattr(self.law, 'model_free', False))

@@ -151,6 +151,9 @@ def check(limits: SensorLimits, outputs: Outputs, last: Accepted | None, y: Arra
     still = list(map(eq, y.tolist(), last.value.tolist()))
     frozen = last.frozen.after(still, time_ns, w, travel)
     remembered = Accepted(y, time_ns, frozen)
+    if not any(still):
+        return Verdict(remembered, moved=last.jumped and _unreachable(
+            limits, last.value, y, 0.0) is not None)
     i, stood = frozen.longest(time_ns, still, 0.5 * limits.jump)
     if stood > limits.frozen_timeout:
         return Verdict(remembered, reason(

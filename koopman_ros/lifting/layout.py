@@ -25,7 +25,7 @@ class Layout:
     #: n_x, n_u, n_z, whether z starts with the state, whether there is a read-out, and the width
     #: of each hidden layer
     sizes: NDArray[np.int64]
-    #: weight and bias of each hidden layer, the last one's values at the origin, (n_z, h) output
+    #: transposed weight and bias of each hidden layer, its last one at the origin, (n_z, h) output
     #: with rows of zeros for the state, A, B, the slope of the pre-feedback, and (n_x, n_x + h)
     #: read-out, of zeros where there is none
     numbers: Array
@@ -40,7 +40,7 @@ def layout_of(model: LiftedModel) -> Layout | None:
     widths = [len(bias) for _, bias in network.hidden]
     width = widths[-1] if widths else 0
     readout = np.zeros((model.n_x, model.n_x + width)) if model.readout is None else model.readout
-    parts = [part for layer in network.hidden for part in layer]
+    parts = [part for weight, bias in network.hidden for part in (weight.T, bias)]
     if widths:
         parts += [network.value_at_zero, network.rows]
     parts += [model.A, model.B, model.pre_feedback_slope, readout]

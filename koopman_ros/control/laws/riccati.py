@@ -236,7 +236,7 @@ def checked(model: LiftedModel, found: Feedback, limits: InputLimits, interval: 
     if not finite(u):
         return LawResult(None, reason(Code.COMMAND_NOT_FINITE), figures)
     within = limits.within(u)
-    return LawResult(within, None, figures, clipped=bool((within != u).any()))
+    return LawResult(within, None, figures, clipped=within.tolist() != u.tolist())
 
 
 @dataclass(frozen=True)
