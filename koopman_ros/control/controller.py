@@ -379,8 +379,10 @@ class Controller:
             changes, wanted, done = self._act(state, result, transfer)
             why = state.supervisor.reason
             aim = None if target is None else self._aim(state, target)
-            if aim is not None and not self._best.controls_all:
-                changes = {**changes, 'target': _kept(np.concatenate((aim.state, aim.input)))}
+            if target is not None and not self._best.controls_all:
+                changes = {**changes, 'target': _kept(np.concatenate((
+                    self.model.states.to_physical(target.x),
+                    self.model.inputs.to_physical(target.u))))}
         limited = limit(self.settings.limits, wanted, state.command, seconds)
         done = amended(
             done, at_range=done.at_range or limited.at_range, at_rate=limited.at_rate,
