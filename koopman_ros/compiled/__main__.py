@@ -15,9 +15,9 @@ def main() -> int:
     if named(COMPILED) is None:
         print(f"{PACKAGE} is not installed: pip install 'koopman_ros[fast]'", file=sys.stderr)
         return 1
-    from numba import config
+    from koopman_ros.compiled.jit import FOLDER
 
-    print(f'compiled code is in {config.CACHE_DIR}, after {time.monotonic() - begun:.1f} s')
+    print(f'compiled code is in {FOLDER}, after {time.monotonic() - begun:.1f} s')
     return 0
 
 

@@ -12,12 +12,12 @@ from typing import Any
 import numba
 from numba import config, types
 
-__all__ = ['CUBE', 'FLAG', 'INTEGERS', 'MATRIX', 'NUMBER', 'SIZE', 'VECTOR', 'compiled', 'inner']
+__all__ = ['FOLDER', 'INTEGERS', 'MATRIX', 'NUMBER', 'SIZE', 'VECTOR', 'compiled', 'inner']
 
-VECTOR, MATRIX, CUBE = (
-    types.Array(types.float64, dimensions, 'C', readonly=True) for dimensions in (1, 2, 3))
+VECTOR, MATRIX = (
+    types.Array(types.float64, dimensions, 'C', readonly=True) for dimensions in (1, 2))
 INTEGERS = types.Array(types.int64, 1, 'C', readonly=True)
-NUMBER, SIZE, FLAG = types.float64, types.int64, types.boolean
+NUMBER, SIZE = types.float64, types.int64
 
 
 def _folder() -> Path:
@@ -35,11 +35,12 @@ def _folder() -> Path:
     return Path(base) / digest.hexdigest()[:16]
 
 
-config.CACHE_DIR = str(_folder())
+FOLDER = _folder()
+config.CACHE_DIR = str(FOLDER)  # type: ignore[attr-defined]
 
 # Divisions by 0 give infinity as in numpy: what is not finite is refused by its results. Sums may
 # be taken in another order, several numbers at once.
-_HOW = {'error_model': 'numpy', 'fastmath': {'reassoc', 'contract'}}
+_HOW: dict[str, Any] = {'error_model': 'numpy', 'fastmath': {'reassoc', 'contract'}}
 
 
 def compiled(*arguments: Any) -> Callable[[Callable[..., Any]], Callable[..., Any]]:
