@@ -127,7 +127,8 @@ def _stable_solution(A: Array, G: Array, Q: Array) -> tuple[bool, Array]:
                 amount += X[i, j] * X[i, j]
         if not math.isfinite(amount):
             return False, X
-        if math.sqrt(change) <= _STILL * math.sqrt(amount):
+        # what is left of E tells that no mode stays, weighted or not
+        if math.sqrt(change) <= _STILL * math.sqrt(amount) and size(E) ** 2 <= _STILL:
             return True, X
         multiply(E, by_G, EG)
         multiply(EG, turned(E), step)
