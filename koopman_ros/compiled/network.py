@@ -10,7 +10,14 @@ from numpy.typing import NDArray
 
 from koopman_ros.arrays import Array
 from koopman_ros.compiled.jit import inner
-from koopman_ros.compiled.matrices import applied, identity, least_squares, product, turned
+from koopman_ros.compiled.matrices import (
+    applied,
+    block,
+    identity,
+    least_squares,
+    product,
+    turned,
+)
 
 # Places in the sizes of a layout; widths of the hidden layers follow.
 N_X, N_U, N_Z, IDENTITY, READOUT, WIDTHS = range(6)
@@ -57,16 +64,16 @@ def matrices(sizes: NDArray[np.int64], numbers: Array) -> tuple[Array, Array, Ar
 
 
 @inner
-def _squash(a: Array, scale: NDArray[np.int64]) -> None:
+def _squash(a: Array, width: int, scale: NDArray[np.int64]) -> None:
     """
-    Turn numbers into their tanh = (e - 1) / (e + 1) with e = exp(2 |a|) = 2^k exp(r).
+    Turn so many numbers into their tanh = (e - 1) / (e + 1) with e = exp(2 |a|) = 2^k exp(r).
 
     A loop without calls, of which several turns are taken at once; `scale` is room for 2^k.
     """
-    for i in range(len(a)):
+    for i in range(width):
         scale[i] = (np.int64(math.floor(min(_FLAT, 2.0 * abs(a[i])) * _LOG2_E + 0.5)) + 1023) << 52
     powers = scale.view(np.float64)
-    for i in range(len(a)):
+    for i in range(width):
         y = 2.0 * abs(a[i])
         if y > _FLAT:
             y = _FLAT
@@ -92,33 +99,60 @@ def _squash(a: Array, scale: NDArray[np.int64]) -> None:
 
 
 @inner
-def hidden(sizes: NDArray[np.int64], numbers: Array, x: Array) -> tuple[Array, Array]:
-    """Return the last hidden layer (h,) less its value at the origin, and dh/dx (n_x, h)."""
-    n = sizes[N_X]
-    h, T, start, last = x.copy(), identity(n), 0, n
+def room(sizes: NDArray[np.int64]) -> tuple[Array, Array, Array, Array, NDArray[np.int64]]:
+    """Return room for :func:`hidden_into`: two layers in turns, their derivatives, and 2^k."""
+    n, width = sizes[N_X], 0
+    for layer in range(WIDTHS, len(sizes)):
+        width = max(width, sizes[layer])
+    return (np.empty(width), np.empty(width), np.empty((n, width)), np.empty((n, width)),
+            np.empty(width, np.int64))
+
+
+@inner
+def hidden_into(sizes: NDArray[np.int64], numbers: Array, x: Array, h: Array, before: Array,
+                T: Array, T_before: Array, scale: NDArray[np.int64]) -> None:
+    """Write the last hidden layer, less its value at the origin, to h, and dh/dx (n_x, h) to T."""
+    n, start, last = sizes[N_X], 0, sizes[N_X]
     for layer in range(WIDTHS, len(sizes)):
         width = sizes[layer]
-        bias = start + width * last
-        after, turn = np.empty(width), np.zeros((n, width))
-        for i in range(width):
-            after[i] = numbers[bias + i]
-        for j in range(last):
-            row = start + j * width
-            for i in range(width):
-                after[i] += numbers[row + i] * h[j]
+        bias, first = start + width * last, layer == WIDTHS
+        if not first:
+            for i in range(last):
+                before[i] = h[i]
             for k in range(n):
-                for i in range(width):
-                    turn[k, i] += numbers[row + i] * T[k, j]
-        _squash(after, np.empty(width, np.int64))
+                for i in range(last):
+                    T_before[k, i] = T[k, i]
+        for i in range(width):
+            h[i] = numbers[bias + i]
         for k in range(n):
             for i in range(width):
-                turn[k, i] *= 1.0 - after[i] * after[i]
-        h, T, start, last = after, turn, bias + width, width
-    if len(sizes) == WIDTHS:
-        return np.empty(0), np.empty((n, 0))
-    for i in range(last):
-        h[i] -= numbers[start + i]
-    return h, T
+                T[k, i] = 0.0
+        for j in range(last):
+            row = start + j * width
+            value = x[j] if first else before[j]
+            for i in range(width):
+                h[i] += numbers[row + i] * value
+            for k in range(n):
+                slope = (1.0 if j == k else 0.0) if first else T_before[k, j]
+                for i in range(width):
+                    T[k, i] += numbers[row + i] * slope
+        _squash(h, width, scale)
+        for k in range(n):
+            for i in range(width):
+                T[k, i] *= 1.0 - h[i] * h[i]
+        start, last = bias + width, width
+    if len(sizes) > WIDTHS:
+        for i in range(last):
+            h[i] -= numbers[start + i]
+
+
+@inner
+def hidden(sizes: NDArray[np.int64], numbers: Array, x: Array) -> tuple[Array, Array]:
+    """Return the last hidden layer (h,) less its value at the origin, and dh/dx (n_x, h)."""
+    h, before, T, T_before, scale = room(sizes)
+    hidden_into(sizes, numbers, x, h, before, T, T_before, scale)
+    width = sizes[len(sizes) - 1] if len(sizes) > WIDTHS else 0
+    return h[:width].copy(), block(T, 0, 0, sizes[N_X], width)
 
 
 @inner
@@ -197,19 +231,29 @@ def drift(sizes: NDArray[np.int64], numbers: Array, A: Array, slope: Array, read
 
 
 @inner
+def read_out(readout: Array, x: Array, h: Array, T: Array, f: Array, J: Array) -> None:
+    """Write the drift of a read-out to f, and its Jacobian to J, of what `hidden_into` gave."""
+    n = len(f)
+    width = readout.shape[1] - n
+    for i in range(n):
+        total = 0.0
+        for k in range(width):
+            total += readout[i, n + k] * h[k]
+        for j in range(n):
+            total += readout[i, j] * x[j]
+        f[i] = total
+        for j in range(n):
+            total = readout[i, j]
+            for k in range(width):
+                total += readout[i, n + k] * T[j, k]
+            J[i, j] = total
+
+
+@inner
 def drift_and_jacobian(sizes: NDArray[np.int64], numbers: Array, readout: Array, x: Array
                        ) -> tuple[Array, Array]:
     """Return the drift of a read-out and its Jacobian (n_x, n_x)."""
-    n = sizes[N_X]
     h, T = hidden(sizes, numbers, x)
-    f, J = np.zeros(n), np.zeros((n, n))
-    for i in range(n):
-        for j in range(n):
-            f[i] += readout[i, j] * x[j]
-            J[i, j] = readout[i, j]
-        for k in range(len(h)):
-            f[i] += readout[i, n + k] * h[k]
-        for j in range(n):
-            for k in range(len(h)):
-                J[i, j] += readout[i, n + k] * T[j, k]
+    f, J = np.empty(len(x)), np.empty((len(x), len(x)))
+    read_out(readout, x, h, T, f, J)
     return f, J

@@ -8,30 +8,7 @@ from numpy.typing import NDArray
 
 from koopman_ros.arrays import Array
 from koopman_ros.compiled.jit import inner
-from koopman_ros.compiled.network import drift_and_jacobian, N_X
-
-
-@inner
-def _rates(sizes: NDArray[np.int64], numbers: Array, readout: Array, push: Array, forced: Array,
-           x: Array, S: Array) -> tuple[Array, Array]:
-    f, J = drift_and_jacobian(sizes, numbers, readout, x)
-    T = forced.copy()
-    for i in range(len(f)):
-        f[i] += push[i]
-        for j in range(len(f)):
-            for c in range(S.shape[1]):
-                T[i, c] += J[i, j] * S[j, c]
-    return f, T
-
-
-@inner
-def _ahead(x: Array, S: Array, h: float, k: Array, s: Array) -> tuple[Array, Array]:
-    y, T = np.empty(len(x)), np.empty(S.shape)
-    for i in range(len(x)):
-        y[i] = x[i] + h * k[i]
-        for j in range(S.shape[1]):
-            T[i, j] = S[i, j] + h * s[i, j]
-    return y, T
+from koopman_ros.compiled.network import hidden_into, read_out, room
 
 
 @inner
@@ -43,15 +20,32 @@ def runge_kutta(sizes: NDArray[np.int64], numbers: Array, readout: Array, push: 
 
     :return: both then, and the rates of both at the beginning and in the last stage.
     """
-    k1, s1 = _rates(sizes, numbers, readout, push, forced, x, S)
-    y, T = _ahead(x, S, 0.5 * h, k1, s1)
-    k2, s2 = _rates(sizes, numbers, readout, push, forced, y, T)
-    y, T = _ahead(x, S, 0.5 * h, k2, s2)
-    k3, s3 = _rates(sizes, numbers, readout, push, forced, y, T)
-    y, T = _ahead(x, S, h, k3, s3)
-    k4, s4 = _rates(sizes, numbers, readout, push, forced, y, T)
-    for i in range(sizes[N_X]):
-        y[i] = x[i] + h / 6.0 * (k1[i] + 2.0 * k2[i] + 2.0 * k3[i] + k4[i])
-        for j in range(S.shape[1]):
-            T[i, j] = S[i, j] + h / 6.0 * (s1[i, j] + 2.0 * s2[i, j] + 2.0 * s3[i, j] + s4[i, j])
-    return y, T, k1, s1, k4, s4
+    n, c = S.shape
+    layer, before, T, T_before, scale = room(sizes)
+    y, V, f, J = x.copy(), S.copy(), np.empty(n), np.empty((n, n))
+    first, first_S, rate, rate_S = np.empty(n), np.empty((n, c)), np.empty(n), np.empty((n, c))
+    total, total_S = np.zeros(n), np.zeros((n, c))
+    for stage in range(4):
+        hidden_into(sizes, numbers, y, layer, before, T, T_before, scale)
+        read_out(readout, y, layer, T, f, J)
+        weight = 1.0 if stage in (0, 3) else 2.0
+        for i in range(n):
+            rate[i] = f[i] + push[i]
+            total[i] += weight * rate[i]
+            for a in range(c):
+                moved = forced[i, a]
+                for j in range(n):
+                    moved += J[i, j] * V[j, a]
+                rate_S[i, a] = moved
+                total_S[i, a] += weight * moved
+        part = 0.5 * h if stage < 2 else h
+        for i in range(n):
+            if stage == 0:
+                first[i] = rate[i]
+            y[i] = x[i] + (part * rate[i] if stage < 3 else h / 6.0 * total[i])
+            for a in range(c):
+                if stage == 0:
+                    first_S[i, a] = rate_S[i, a]
+                V[i, a] = S[i, a] + (part * rate_S[i, a] if stage < 3
+                                     else h / 6.0 * total_S[i, a])
+    return y, V, first, first_S, rate, rate_S

@@ -227,8 +227,10 @@ class TrainingStates:
 
     def distances(self, x: Array, half_widths: Array) -> Array:
         """Return the distances (N,), as :meth:`distance`, of finite states (N, n_x)."""
-        apart = np.abs(self.states - x[:, None]) / half_widths
-        found: Array = np.maximum(np.min(np.max(apart, axis=2), axis=1) - self.fill_distance, 0.0)
+        apart = np.zeros((len(x), len(self.states)))
+        for column, values, half in zip(self._columns, x.T, half_widths.tolist(), strict=True):
+            np.maximum(apart, np.abs(column - values[:, None]) / half, out=apart)
+        found: Array = np.maximum(apart.min(axis=1) - self.fill_distance, 0.0)
         return found
 
 
