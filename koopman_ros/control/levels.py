@@ -8,6 +8,7 @@ from __future__ import annotations
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 import math
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -43,7 +44,8 @@ class Level:
     law: Law  #: with its model
     estimator: Estimator  #: on the same model
     controlled: tuple[str, ...]  #: (n_c,) names of the states with a set-point
-    _last: list[Target | None] = field(default_factory=lambda: [None], init=False, compare=False)
+    #: the last set-point, and where it led
+    _last: list[Any] = field(default_factory=lambda: [None, None], init=False, compare=False)
 
     @property
     def model(self) -> LiftedModel:
@@ -101,9 +103,11 @@ class Level:
             return Target(x, np.zeros(model.n_z), none, np.zeros(model.n_u), none, 0.0)
         if self.controls_all:
             # a memory of the last set-point only; what comes out does not depend on it
-            target = steady_state_target(model, model.states.to_deviation(setpoint), w,
-                                         known=self._last[0])
-            self._last[0] = target
+            asked, known = self._last
+            x = known.x if known is not None and asked is setpoint else (
+                model.states.to_deviation(setpoint))
+            target = steady_state_target(model, x, w, known=known)
+            self._last[:] = setpoint, target
             return target
         n, inputs = model.n_x, model.inputs
         y = np.zeros(n + model.n_u) if start is None else np.concatenate(

@@ -197,6 +197,9 @@ class BoundedDisturbance:
     def _largest(self, w: Array) -> tuple[float, float]:
         """Return size and bound of the input that is nearest to its bound, or beyond."""
         worst, share = (0.0, math.inf), -1.0
+        if len(self._bounds) == 1:
+            size = abs(float(self.as_input(w)[0]))
+            return (size if math.isfinite(size) else math.inf), self._bounds[0]
         for size, bound in zip(map(abs, self.as_input(w).tolist()), self._bounds, strict=True):
             if not math.isfinite(size):
                 return math.inf, bound

@@ -5,6 +5,7 @@
 
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
+import gc
 import math
 import sys
 import threading
@@ -175,6 +176,8 @@ class ControllerNode(ManagedNode):
         self.follow_table(table, parameters, self._on_parameters, self._models.accept)
         self.get_logger().info(self._models.in_force.about)
         self._warn_of_rest()
+        # what is there by now stays: nobody is to look through it for garbage between two samples
+        gc.freeze()
         self._watchdog = Watchdog(self._on_busy)
         self._watchdog.start()
 

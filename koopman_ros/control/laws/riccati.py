@@ -31,6 +31,7 @@ from koopman_ros.solvers import RiccatiSolution, RiccatiStatus, solve_riccati
 # Largest mismatch of a closed lift: those of plants that have one come to 2e-7 or less, others to
 # 1e-4 or more, and from there on the averaged Jacobian costs less.
 _CLOSED = 1e-5
+_OVERFLOW = 709.0  # of an exponent, near what a float64 holds
 
 
 class Form(Enum):
@@ -69,9 +70,11 @@ class Feedback:
             a, action = float(self.drift[0, 0]), float(self.action[0, 0])
             if not interval > 0.0:
                 return float(np.exp(a + action))
+            if not a * interval < _OVERFLOW:
+                return math.nan if math.isnan(a) else math.inf
             # expm1(a t) / a is the integral of exp(a s), also for a small a
-            held = interval if a == 0.0 else float(np.expm1(a * interval)) / a
-            return abs(float(np.exp(a * interval)) + held * action)
+            held = interval if a == 0.0 else math.expm1(a * interval) / a
+            return abs(math.exp(a * interval) + held * action)
         if not (np.all(np.isfinite(self.drift)) and np.all(np.isfinite(self.action))):
             return np.nan
         if not interval > 0.0:
