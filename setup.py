@@ -52,6 +52,8 @@ setup(
         'panel': ['nicegui>=3'],
         # the predictive law's solver of quadratic programs
         'mpc': ['daqp'],
+        # compiles the numerics of a control step
+        'fast': ['numba'],
         'train': ['torch==2.13.0', 'joblib', 'tqdm'],
         # what validation and benchmarks compare with
         'bench': ['casadi==3.8.2', 'control', 'nicegui>=3', 'playwright', 'psutil',
@@ -65,6 +67,7 @@ setup(
             'hypothesis',
             'mypy',
             'nicegui>=3',
+            'numba',
             'packaging',
             'playwright',
             'pytest>=9',

@@ -5,6 +5,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cached_property
 import math
@@ -26,6 +27,8 @@ from koopman_ros.control.state import (
     EstimateReport,
     MeasurementReport,
     Mode,
+    NO_COMMAND,
+    NOTHING_MEASURED,
     Report,
     State,
     TargetReport,
@@ -46,6 +49,10 @@ from koopman_ros.lifting import Coordinates, LiftedModel
 from koopman_ros.reasons import Code, Reason, reason
 from koopman_ros.signals import numbers, Outputs
 from koopman_ros.units import LATE_NANOSECONDS, NANOSECONDS
+
+# What changes of the state when no law acts any more, and when none is on its way back.
+_LAW_ENDS: Mapping[str, object] = {'law': None, 'law_input': None, 'law_memory': None}
+_WITHOUT_LAW: Mapping[str, object] = {**_LAW_ENDS, 'transfer': None}
 
 
 @dataclass(frozen=True)
@@ -289,12 +296,12 @@ class Controller:
         y = numbers('measurement', y, self.measured.names)
         if applied is not None:
             applied = numbers('applied input', applied, self.model.inputs.names)
-        outside = self._outside(state.estimate, y)
         ahead = 1 if state.time_ns is None else time_ns - state.time_ns
         if state.command is not None and -LATE_NANOSECONDS <= ahead <= 0:
-            return state, state.command, amended(
-                self._report(state, state.supervisor.reason), measurement=MeasurementReport(
-                    Arrival.LATE if ahead < 0 else Arrival.REPEATED, outside))
+            return state, state.command, self._report(
+                state, state.supervisor.reason, MeasurementReport(
+                    Arrival.LATE if ahead < 0 else Arrival.REPEATED,
+                    self._outside(state.estimate, y)))
         back = ahead < 0
         if back:
             state = _afresh(state)
@@ -309,22 +316,22 @@ class Controller:
         # a measurement of 1e300 may overflow on its way; the result is checked and limited
         with np.errstate(all='ignore'):
             u, follows = self._estimating.applied(state, applied)
-            state, verdict, predicted = self._estimating.observe(state, y, time_ns, elapsed, u)
-            if verdict.fault is None:
-                x = self._estimating.position(state.estimate, y)
-                outside = self.model.distance(x)
-                state = amended(state, setpoint=setpoints.advance(
-                    state.setpoint, self._best.controlled_of(x),
-                    self.controlled,
-                    self.settings.setpoint_ramp, time_ns, seconds,
-                    self.settings.setpoint_filter))
+            before = state.estimate
+            state, seen = self._estimating.observe(state, y, time_ns, elapsed, u)
+            accepted = seen.verdict.fault is None
+            if accepted:
+                setpoint = setpoints.advance(
+                    state.setpoint, self._best.controlled_of(seen.x), self.controlled,
+                    self.settings.setpoint_ramp, time_ns, seconds, self.settings.setpoint_filter)
+                if setpoint is not state.setpoint:
+                    state = amended(state, setpoint=setpoint)
+            measured = MeasurementReport(
+                Arrival.ACCEPTED if accepted else Arrival.REJECTED,
+                seen.outside if accepted else self._outside(before, y), seen.expected, missed,
+                back, follows)
             # without elapsed time the rate limit holds the last command
-            state, command, report = self._command(
-                state, verdict, outside, time_ns, elapsed, seconds, spacing)
-        return amended(state, commanded_ns=time_ns), command, amended(
-            report, measurement=MeasurementReport(
-                Arrival.ACCEPTED if verdict.fault is None else Arrival.REJECTED, outside,
-                predicted, missed, back, follows))
+            return self._command(
+                state, seen.verdict, measured, time_ns, time_ns, elapsed, seconds, spacing)
 
     def hold(self, state: State, time_ns: int) -> tuple[State, Array | None, Report]:
         """
@@ -338,11 +345,11 @@ class Controller:
             return state, None, self._report(state, None)
         elapsed = max(0.0, (time_ns - since_ns) / NANOSECONDS)
         with np.errstate(all='ignore'):
-            state = self._estimating.coast(state, elapsed, self._estimating.applied(state)[0])
-            state, command, report = self._command(
-                state, Verdict(state.accepted, reason(Code.NO_MEASUREMENT)), np.nan, time_ns,
-                elapsed, elapsed)
-        return amended(state, commanded_ns=max(time_ns, since_ns)), command, report
+            state = amended(state, estimate=self._estimating.coast(
+                state, elapsed, self._estimating.applied(state)[0]))
+            return self._command(
+                state, Verdict(state.accepted, reason(Code.NO_MEASUREMENT)), NOTHING_MEASURED,
+                time_ns, max(time_ns, since_ns), elapsed, elapsed)
 
     def equivalent_bias(self, state: State) -> Array:
         """Return the sensor's error (n_x,) that would explain the disturbance; NaN for none."""
@@ -351,8 +358,8 @@ class Controller:
         model = self._estimating.level(state).model
         return equivalent_bias(model, state.estimate) * self.model.states.scale
 
-    def _command(self, state: State, verdict: Verdict, outside: float, time_ns: int,
-                 elapsed: float, seconds: float, spacing: float = 0.0
+    def _command(self, state: State, verdict: Verdict, measured: MeasurementReport, time_ns: int,
+                 commanded_ns: int, elapsed: float, seconds: float, spacing: float = 0.0
                  ) -> tuple[State, Array, Report]:
         """
         Return the command within its limits, with what is known of it.
@@ -360,28 +367,38 @@ class Controller:
         Of the `elapsed` seconds since the last one, `seconds` count for the rate limit.
         """
         transfer = state.transfer and state.transfer.after(elapsed, self.settings.transfer_time)
+        aim = None
         if state.mode is Mode.MANUAL:
             held = self.model.inputs.center if state.command is None else state.command
             wanted = held if state.manual_input is None else state.manual_input
-            state = _without_law(state)
-            report, done = self._report(state, verdict.fault), CommandReport()
+            changes, done, why = _WITHOUT_LAW, NO_COMMAND, verdict.fault
         else:
-            supervisor, target, result = self._choose(state, verdict, outside, time_ns, spacing)
-            state = self._supervised(state, supervisor, verdict, outside, time_ns)
-            state, wanted, done = self._act(state, result, transfer)
-            report = self._report(state, state.supervisor.reason)
-            if target is not None and report.target is not None:
-                u, every = self.model.inputs.to_physical(target.u), self._best.controls_all
-                x = report.target.setpoint if every else self.model.states.to_physical(target.x)
-                report = amended(report, target=amended(
-                    report.target, residual=target.residual, state=x, input=u))
-                if not every:
-                    state = amended(state, target=_kept(np.concatenate((x, u))))
+            supervisor, target, result = self._choose(
+                state, verdict, measured.outside, time_ns, spacing)
+            state = self._supervised(state, supervisor, verdict, measured.outside, time_ns)
+            changes, wanted, done = self._act(state, result, transfer)
+            why = state.supervisor.reason
+            aim = None if target is None else self._aim(state, target)
+            if target is not None and not self._best.controls_all:
+                changes = {**changes, 'target': _kept(np.concatenate((
+                    self.model.states.to_physical(target.x),
+                    self.model.inputs.to_physical(target.u))))}
         limited = limit(self.settings.limits, wanted, state.command, seconds)
-        return amended(state, command=limited.u), limited.u, amended(
-            report, command=amended(
-                done, at_range=done.at_range or limited.at_range, at_rate=limited.at_rate,
-                outside=self.model.inputs.violation(limited.u)))
+        done = amended(
+            done, at_range=done.at_range or limited.at_range, at_rate=limited.at_rate,
+            outside=self.model.inputs.violation(limited.u))
+        return amended(state, **changes, command=limited.u, commanded_ns=commanded_ns), (
+            limited.u), self._report(state, why, measured, aim, done)
+
+    def _aim(self, state: State, target: Target) -> TargetReport | None:
+        """Return what is reported of the target of a law."""
+        active = state.setpoint.active
+        if active is None:
+            return None
+        return TargetReport(
+            active, self.controlled.violation(active), target.residual,
+            active if self._best.controls_all else self.model.states.to_physical(target.x),
+            self.model.inputs.to_physical(target.u))
 
     def _choose(self, state: State, verdict: Verdict, outside: float, time_ns: int,
                 spacing: float) -> tuple[Supervisor, Target | None, LawResult | None]:
@@ -425,41 +442,39 @@ class Controller:
                     outside: float, time_ns: int) -> State:
         """Take over the supervisor's new state."""
         estimating, before = self._estimating, self._estimating.level(state)
-        state = amended(state, supervisor=supervisor, way_back=self._way_back(
-            state, supervisor, verdict, outside, time_ns))
+        way_back = self._way_back(state, supervisor, verdict, outside, time_ns)
+        if supervisor == state.supervisor and way_back is state.way_back:
+            return state
+        state = amended(state, supervisor=supervisor, way_back=way_back)
         now = estimating.level(state)
         if now is not before:
             state = amended(state, estimate=estimating.rebase(state.estimate, before, now))
         return state
 
     def _act(self, state: State, result: LawResult | None, transfer: Transfer | None
-             ) -> tuple[State, Array, CommandReport]:
-        """Return the command before limits of the level that acts."""
-        held = self.model.inputs.center if state.command is None else state.command
-        level, done = state.supervisor.level, CommandReport()
-        if result is not None:
-            done = CommandReport(result.figures, at_range=result.clipped, plan=result.plan)
+             ) -> tuple[Mapping[str, object], Array, CommandReport]:
+        """Return what changes of the state, and the command before limits with its report."""
+        level, command = state.supervisor.level, state.command
+        held = self.model.inputs.center if command is None else command
         if result is None or result.u is None:
-            if result is not None:
-                done = amended(done, law=amended(result.figures, form=''))
+            done = NO_COMMAND if result is None else CommandReport(
+                amended(result.figures, form=''), at_range=result.clipped, plan=result.plan)
             if level == SAFE:
-                state = _without_law(state)
                 share = 0.0 if state.way_back is None else state.way_back.share
                 if not share:
-                    return state, self.safe_input, done
+                    return _WITHOUT_LAW, self.safe_input, done
                 wanted = self.safe_input + share * (self._nominal_input - self.safe_input)
-                return state, wanted, amended(done, way_back=share)
+                return _WITHOUT_LAW, wanted, amended(done, way_back=share)
             passing = state.supervisor.resumes is not None
-            return (state if passing else amended(state, law=None, law_input=None,
-                                                  law_memory=None), held, done)
-        if state.law != level and state.command is not None and self.settings.transfer_time:
+            return {} if passing else _LAW_ENDS, held, done
+        if state.law != level and command is not None and self.settings.transfer_time:
             # somebody else has commanded so far
             transfer = shifted(None, held - result.u)
-        state = amended(state, law=level, law_input=result.u, law_memory=result.memory,
-                        transfer=transfer)
-        if transfer is None:
-            return state, result.u, done
-        return state, result.u + transfer.offset, amended(done, transfer=transfer.offset)
+        offset = None if transfer is None else transfer.offset
+        done = CommandReport(result.figures, offset, at_range=result.clipped, plan=result.plan)
+        changes = {'law': level, 'law_input': result.u, 'law_memory': result.memory,
+                   'transfer': transfer}
+        return changes, result.u if offset is None else result.u + offset, done
 
     def _way_back(self, state: State, supervisor: Supervisor, verdict: Verdict, outside: float,
                   time_ns: int) -> WayBack | None:
@@ -481,24 +496,29 @@ class Controller:
         """Return how far a measurement is from the training data; NaN when it is none."""
         return self.model.distance(self._estimating.position(known, y)) if finite(y) else np.nan
 
-    def _report(self, state: State, why: Reason | None) -> Report:
-        """Return what is known without a law."""
-        estimate, active = state.estimate, state.setpoint.active
+    def _report(self, state: State, why: Reason | None,
+                measured: MeasurementReport = NOTHING_MEASURED, target: TargetReport | None = None,
+                command: CommandReport = NO_COMMAND) -> Report:
+        """Return what is known; of the target where it is, if there is no law."""
+        active = state.setpoint.active
+        if target is None and active is not None:
+            target = TargetReport(active, self.controlled.violation(active))
         levels, manual = self.settings.supervisor, state.mode is Mode.MANUAL
         depth = len(levels.order) if manual else levels.depth(state.supervisor.level)
-        report = Report(
-            state.mode, MANUAL if manual else levels.order[depth], depth, why,
-            target=None if active is None else (
-                TargetReport(active, self.controlled.violation(active))))
+        return Report(state.mode, MANUAL if manual else levels.order[depth], depth, why, measured,
+                      self._estimated(state), target, command)
+
+    def _estimated(self, state: State) -> EstimateReport | None:
+        estimate, states = state.estimate, self.model.states
         if estimate is None:
-            return report
+            return None
         estimator = self._estimating.level(state).estimator
         deviation = None if estimate.covariance is None else (
-            self.model.states.scale * np.sqrt(np.diag(estimate.covariance)[:self.model.n_x]))
-        return amended(report, estimate=EstimateReport(
-            self.model.states.to_physical(estimate.x),
-            estimator.as_input(estimate.w) * self.model.inputs.scale,
-            estimator.at_bound(estimate.w), deviation, estimate.innovation))
+            states.scale * np.sqrt(estimate.covariance.diagonal()[:len(states)]))
+        return EstimateReport(
+            states.to_physical(estimate.x), estimator.as_input(estimate.w) * (
+                self.model.inputs.scale), estimator.at_bound(estimate.w), deviation,
+            estimate.innovation)
 
 
 def _passed(state: State, time_ns: int, elapsed: float) -> tuple[State, float, int]:
@@ -531,10 +551,6 @@ def _afresh(state: State) -> State:
     supervisor = amended(state.supervisor, bad_since_ns=None, better_since_ns=None)
     return amended(state, time_ns=None, commanded_ns=None, accepted=None, supervisor=supervisor,
                    way_back=None, setpoint=amended(state.setpoint, scheduled=()))
-
-
-def _without_law(state: State) -> State:
-    return amended(state, law=None, law_input=None, law_memory=None, transfer=None)
 
 
 def _kept(value: Array) -> Array:

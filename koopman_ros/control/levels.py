@@ -8,6 +8,7 @@ from __future__ import annotations
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 import math
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -43,20 +44,21 @@ class Level:
     law: Law  #: with its model
     estimator: Estimator  #: on the same model
     controlled: tuple[str, ...]  #: (n_c,) names of the states with a set-point
-    _last: list[Target | None] = field(default_factory=lambda: [None], init=False, compare=False)
+    #: the last set-point, and where it led
+    _last: list[Any] = field(default_factory=lambda: [None, None], init=False, compare=False)
 
     @property
     def model(self) -> LiftedModel:
         """The model of law and estimator."""
         return self.law.model
 
-    @property
+    @cached_property
     def unusable(self) -> Reason | None:
         """Why its law can never act, which it may say itself; None where it can."""
         found: Reason | None = getattr(self.law, 'unusable', None)
         return found
 
-    @property
+    @cached_property
     def model_free(self) -> bool:
         """Whether its law goes to the set-point, wherever the model has its steady states."""
         return bool(getattr(self.law, 'model_free', False))
@@ -101,9 +103,11 @@ class Level:
             return Target(x, np.zeros(model.n_z), none, np.zeros(model.n_u), none, 0.0)
         if self.controls_all:
             # a memory of the last set-point only; what comes out does not depend on it
-            target = steady_state_target(model, model.states.to_deviation(setpoint), w,
-                                         known=self._last[0])
-            self._last[0] = target
+            asked, known = self._last
+            x = known.x if known is not None and asked is setpoint else (
+                model.states.to_deviation(setpoint))
+            target = steady_state_target(model, x, w, known=known)
+            self._last[:] = setpoint, target
             return target
         n, inputs = model.n_x, model.inputs
         y = np.zeros(n + model.n_u) if start is None else np.concatenate(
@@ -170,6 +174,16 @@ def levels_of(model: LiftedModel, outputs: Outputs, settings: Settings) -> dict[
     return levels
 
 
+@dataclass(frozen=True)
+class Observation:
+    """What became of a measurement."""
+
+    verdict: Verdict  #: whether it is accepted
+    expected: Array | None  #: (n_y,) what was expected of it; None when nothing was
+    x: Array  #: (n_x,) state that it is taken for, in state units
+    outside: float  #: its distance from the training data, in half widths
+
+
 # After so many time constants without an accepted measurement the state is not known.
 _LOST = 2.0
 # So many intervals between measurements are a gap.
@@ -210,32 +224,33 @@ class Estimating:
         if state.command is None:
             return np.zeros(self.model.n_u), True
         u, tolerance = state.command, self.settings.input_tolerance
-        if measured is not None and finite(measured):
-            u = np.minimum(np.maximum(u, measured - tolerance), measured + tolerance)
+        if measured is None or not finite(measured):
+            return self.model.inputs.to_deviation(u), True
+        u = np.minimum(np.maximum(u, measured - tolerance), measured + tolerance)
         return self.model.inputs.to_deviation(u), bool((u == state.command).all())
 
     def observe(self, state: State, y: Array, time_ns: int, elapsed: float, u: Array
-                ) -> tuple[State, Verdict, Array | None]:
+                ) -> tuple[State, Observation]:
         """
         Check a measurement (n_y,) and take it into account.
 
         :param elapsed: seconds since the last command.
         :param u: (n_u,) what has acted since then, in scaled deviations.
-        :return: the state with measurement, time and estimate, what became of the measurement,
-            and what (n_y,) was expected of it, None when nothing was.
+        :return: the state with measurement, time and estimate, and what became of the measurement.
         """
         before, last = state.estimate, state.accepted
-        predicted = self.coast(state, elapsed, u).estimate
+        predicted = self.coast(state, elapsed, u)
         x = self.position(predicted, y)
+        outside = self.model.distance(x)
         w = np.zeros(self.model.n_x) if before is None else before.w
 
         def travel(then: FrozenCheck) -> Array:
-            if self.model.distance(x) > 0.0 or state.way_back is not None:
+            if outside > 0.0 or state.way_back is not None:
                 # what the model says of its motion is worth little; under the safe input even a
                 # plant that it does not expect to may rest there
                 return np.zeros_like(y)
             frozen = None if before is None else replace(before, w=then.w)
-            moved = self.coast(amended(state, estimate=frozen), elapsed, u).estimate
+            moved = self.coast(amended(state, estimate=frozen), elapsed, u)
             if before is None or moved is None:
                 return np.zeros_like(y)
             return self.outputs.of((moved.x - before.x) * self.model.states.scale)
@@ -244,12 +259,19 @@ class Estimating:
         expected = None if predicted is None else self.outputs.of(
             self.model.states.to_physical(predicted.x))
         if verdict.fault is None:
-            predicted = self._corrected(state, predicted, verdict, x, time_ns, elapsed)
+            far = outside > self.settings.supervisor.largest_margin
+            predicted = self._corrected(
+                state, predicted, verdict, x, elapsed, far or self._lost(state, time_ns))
+            if not self.outputs.determine_state:
+                # the measurement has changed what it leaves open, too
+                x = self.position(predicted, y)
+                outside = self.model.distance(x)
         elif verdict.fault.code is Code.FROZEN and predicted is not None and last is not None:
             # what the observer made of a sensor that does not move is no disturbance
             predicted = replace(predicted, w=last.frozen.w)
-        return (amended(state, accepted=verdict.accepted, time_ns=time_ns, estimate=predicted),
-                verdict, expected)
+        return amended(
+            state, accepted=verdict.accepted, time_ns=time_ns, estimate=predicted
+        ), Observation(verdict, expected, x, outside)
 
     def position(self, known: Estimate | None, y: Array) -> Array:
         """
@@ -274,21 +296,20 @@ class Estimating:
         return x
 
     def _corrected(self, state: State, predicted: Estimate | None, verdict: Verdict, x: Array,
-                   time_ns: int, elapsed: float) -> Estimate:
-        """Return the estimate with a measurement that is accepted."""
+                   elapsed: float, lost: bool) -> Estimate:
+        """
+        Return the estimate with a measurement that is accepted.
+
+        :param lost: whether the model's prediction is worth nothing, after so long or so far out.
+        """
         xi, estimator = self.model.states.to_deviation(x), self.level(state).estimator
         if predicted is None:
             # taken over from somebody who, it is supposed, held the plant where it is
             return estimator.restart(None, xi, None if state.command is None else (
                 self.model.inputs.to_deviation(state.command)))
-        # far out the model's prediction is worth nothing
-        if verdict.moved or not elapsed > 0.0 or self._lost(state, time_ns) or self._far_out(x):
+        if verdict.moved or not elapsed > 0.0 or lost:
             return estimator.restart(predicted, xi, None)
         return estimator.correct(predicted, xi, elapsed)
-
-    def _far_out(self, x: Array) -> bool:
-        """Tell whether no law is to act at a state (n_x,) in state units."""
-        return self.model.distance(x) > self.settings.supervisor.largest_margin
 
     def _lost(self, state: State, time_ns: int) -> bool:
         """Tell whether no measurement was accepted for so long that the state is not known."""
@@ -299,19 +320,19 @@ class Estimating:
         return seconds * self.settings.observer_bandwidth > _LOST and (
             seconds > _GAP * state.interval)
 
-    def coast(self, state: State, elapsed: float, u: Array) -> State:
+    def coast(self, state: State, elapsed: float, u: Array) -> Estimate | None:
         """
         Carry the estimate forward without a measurement.
 
         Arguments as in :meth:`observe`.
         """
         if state.estimate is None or state.command is None or not elapsed > 0.0:
-            return state
+            return state.estimate
         predicted = self.level(state).estimator.predict(state.estimate, u, elapsed)
         if predicted is None or not finite(predicted.x):
             # after so long, or from so far out, nothing is known; the disturbance is kept
-            return state
-        return amended(state, estimate=predicted)
+            return state.estimate
+        return predicted
 
     def rebase(self, estimate: Estimate | None, before: Level, now: Level) -> Estimate | None:
         """Carry an estimate over from the model of one level to that of another."""

@@ -95,6 +95,9 @@ class MeasurementReport:
     follows: bool = True  #: whether the measured input, where there is one, is what was commanded
 
 
+NOTHING_MEASURED = MeasurementReport()
+
+
 @dataclass(frozen=True)
 class EstimateReport:
     """The estimate."""
@@ -134,6 +137,9 @@ class CommandReport:
     outside: float = math.nan
 
 
+NO_COMMAND = CommandReport()
+
+
 @dataclass(frozen=True)
 class Report:
     """What a step did."""
@@ -144,9 +150,9 @@ class Report:
     depth: int = 0
     #: why not a better one, or why a measurement is rejected; None without
     reason: Reason | None = None
-    measurement: MeasurementReport = field(default_factory=MeasurementReport)  #: the measurement
+    measurement: MeasurementReport = NOTHING_MEASURED  #: the measurement
     estimate: EstimateReport | None = None  #: the estimate, or None
     target: TargetReport | None = None  #: where the law goes, or None before the first measurement
-    command: CommandReport = field(default_factory=CommandReport)  #: the command
+    command: CommandReport = NO_COMMAND  #: the command
 
     __repr__ = brief

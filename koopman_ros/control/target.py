@@ -13,13 +13,14 @@ from numpy.typing import NDArray
 from koopman_ros.arrays import Array
 from koopman_ros.control.laws.base import Target
 from koopman_ros.control.limits import finite
+from koopman_ros.kernels import compilable
 from koopman_ros.lifting import LiftedModel
 
-_MOST_STEPS = 30
+MOST_STEPS = 30
 # A step is no longer than this, in scaled deviations: Newton's method far out overshoots.
-_LONGEST_STEP = 0.5
+LONGEST_STEP = 0.5
 # Solved is what is left of the rate when it is worth so little of a deviation.
-_RESOLUTION = 1e-9
+RESOLUTION = 1e-9
 # With inputs to spare the nearest solution is found when a step is no longer than this.
 _STILL = 1e-6
 _SLACK = 1e-6  # of what rounding may add to an input, in scaled deviations
@@ -27,6 +28,7 @@ _SLACK = 1e-6  # of what rounding may add to an input, in scaled deviations
 _REACH = 1e3
 
 
+@compilable
 def equilibrium(model: LiftedModel, w: Array, start: Array, free: NDArray[np.bool_],
                 anchor: Array, reach: Array) -> Array | None:
     """
@@ -47,7 +49,7 @@ def equilibrium(model: LiftedModel, w: Array, start: Array, free: NDArray[np.boo
     anchor, reach = anchor[free], reach[free]
     try:
         rate = model.drift(y[:n]) + model.forcing(y[:n], y[n:]) + w
-        for _ in range(_MOST_STEPS):
+        for _ in range(MOST_STEPS):
             J = np.concatenate((model.drift_jacobian(y[:n]) + model.forcing_jacobian(y[:n], y[n:]),
                                 model.input_matrix(y[:n])), axis=1)[:, free]
             if not (finite(J.ravel()) and finite(rate)):
@@ -56,9 +58,9 @@ def equilibrium(model: LiftedModel, w: Array, start: Array, free: NDArray[np.boo
             step = anchor + reach * np.linalg.lstsq(J * reach, wanted, rcond=None)[0] - y[free]
             length = max(map(abs, step.tolist()), default=0.0)
             y = y.copy()
-            y[free] += step * min(1.0, _LONGEST_STEP / length) if length > 0.0 else step
+            y[free] += step * min(1.0, LONGEST_STEP / length) if length > 0.0 else step
             rate = model.drift(y[:n]) + model.forcing(y[:n], y[n:]) + w
-            if math.sqrt(rate.dot(rate)) <= _RESOLUTION * math.sqrt(float((J * J).sum())) and (
+            if math.sqrt(rate.dot(rate)) <= RESOLUTION * math.sqrt(float((J * J).sum())) and (
                     length <= _STILL or not settles):
                 return y
     except np.linalg.LinAlgError:

@@ -11,6 +11,8 @@ import numpy as np
 
 from koopman_ros.arrays import Array
 from koopman_ros.estimation.observer import BoundedDisturbance, Estimate, Innovation
+from koopman_ros.kernels import compilable
+from koopman_ros.lifting import LiftedModel
 from koopman_ros.solvers import runge_kutta_step
 
 # One step of integration spans at most this share of the drift's fastest time constant.
@@ -144,39 +146,16 @@ class ExtendedKalmanFilter(BoundedDisturbance):
     def _propagated(self, x: Array, w: Array, P: Array, u: Array, h: float, steps: int
                     ) -> tuple[Array, Array]:
         """Return state and covariance after so many steps of h, in time units."""
-        model, n = self.model, self.model.n_x
-        forced = np.concatenate((np.zeros((n, n)), np.eye(n)), axis=1)
-        # x and its derivatives by what x and w were
-        whole = np.concatenate((x[:, None], np.eye(n), np.zeros((n, n))), axis=1)
-
-        def rate(whole: Array) -> Array:
-            x = whole[:, 0]
-            f, J = model.drift_and_jacobian(x)
-            if model.input_terms is not None:
-                J = J + model.forcing_jacobian(x, u)
-            return np.concatenate(((f + model.forcing(x, u) + w)[:, None],
-                                   J @ whole[:, 1:] + forced), axis=1)
-
-        for _ in range(steps):
-            whole = runge_kutta_step(rate, whole, h)
-        F = np.eye(2 * n)
-        F[:n] = whole[:, 1:]
-        return whole[:, 0].copy(), F @ P @ F.T
+        return propagated(self.model, x, w, P, u, h, steps)
 
     def correct(self, predicted: Estimate, x: Array, seconds: float) -> Estimate:
         """Take the outputs of a state (n_x,) into account, in the form of Joseph."""
         n, H = self.model.n_x, self._H
         P = self.initial_covariance if predicted.covariance is None else predicted.covariance
-        innovation = H.dot(x - predicted.x)
-        PH = P[:, :n] @ H.T
-        S = H @ PH[:n] + self._R
-        gain = np.linalg.solve(S, PH.T).T
-        keep = np.eye(2 * n)
-        keep[:, :n] -= gain @ H
-        P = keep @ P @ keep.T + gain @ self._R @ gain.T
-        step = gain.dot(innovation)
-        return Estimate(predicted.x + step[:n], self.bounded(predicted.w + step[n:]),
-                        0.5 * (P + P.T), _averaged(predicted.innovation, innovation, S))
+        found = corrected(self.model, H, self._R, P, x - predicted.x)
+        return Estimate(
+            predicted.x + found.step[:n], self.bounded(predicted.w + found.step[n:]),
+            found.covariance, _averaged(predicted.innovation, found))
 
     def restart(self, predicted: Estimate | None, x: Array, u: Array | None) -> Estimate:
         """Start from a state (n_x,) with the measured outputs; see the observer's."""
@@ -226,9 +205,69 @@ class UnscentedKalmanFilter(ExtendedKalmanFilter):
         return mean[:n], (weights[:, None] * deviation).T @ deviation
 
 
-def _averaged(before: Innovation | None, innovation: Array, S: Array) -> Innovation:
-    square = float(innovation.dot(np.linalg.solve(S, innovation))) / len(innovation)
-    normalised = innovation / np.sqrt(np.diag(S))
+@compilable
+def propagated(model: LiftedModel, x: Array, w: Array, P: Array, u: Array, h: float, steps: int
+               ) -> tuple[Array, Array]:
+    """
+    Return state and covariance after so many steps of h, in time units.
+
+    :param x: (n_x,) and w (n_x,), of which P (2 n_x, 2 n_x) is the covariance.
+    :param u: (n_u,) input.
+    """
+    n = model.n_x
+    forced = np.concatenate((np.zeros((n, n)), np.eye(n)), axis=1)
+    # x and its derivatives by what x and w were
+    whole = np.concatenate((x[:, None], np.eye(n), np.zeros((n, n))), axis=1)
+
+    def rate(whole: Array) -> Array:
+        x = whole[:, 0]
+        f, J = model.drift_and_jacobian(x)
+        if model.input_terms is not None:
+            J = J + model.forcing_jacobian(x, u)
+        return np.concatenate(((f + model.forcing(x, u) + w)[:, None],
+                               J @ whole[:, 1:] + forced), axis=1)
+
+    for _ in range(steps):
+        whole = runge_kutta_step(rate, whole, h)
+    F = np.eye(2 * n)
+    F[:n] = whole[:, 1:]
+    return whole[:, 0].copy(), F @ P @ F.T
+
+
+@dataclass(frozen=True)
+class Correction:
+    """What outputs (n_y,) add to a prediction."""
+
+    step: Array  #: (2 n_x,) of state and disturbance
+    covariance: Array  #: (2 n_x, 2 n_x) of both afterwards
+    innovation: Array  #: (n_y,) what was measured less what was expected
+    deviation: Array  #: (n_y,) its standard deviations
+    square: float  #: its square, weighed by its covariance
+
+
+@compilable
+def corrected(model: LiftedModel, H: Array, R: Array, P: Array, difference: Array) -> Correction:
+    """
+    Take a measured difference (n_x,) from a prediction into account, in the form of Joseph.
+
+    :param H: (n_y, n_x) outputs, of noise with covariance R (n_y, n_y).
+    :param P: (2 n_x, 2 n_x) covariance of state and disturbance.
+    """
+    n = len(difference)
+    innovation = H.dot(difference)
+    PH = P[:, :n] @ H.T
+    S = H @ PH[:n] + R
+    gain = np.linalg.solve(S, PH.T).T
+    keep = np.eye(2 * n)
+    keep[:, :n] -= gain @ H
+    P = keep @ P @ keep.T + gain @ R @ gain.T
+    return Correction(gain.dot(innovation), 0.5 * (P + P.T), innovation, np.sqrt(np.diag(S)),
+                      float(innovation.dot(np.linalg.solve(S, innovation))))
+
+
+def _averaged(before: Innovation | None, found: Correction) -> Innovation:
+    square = found.square / len(found.innovation)
+    normalised = found.innovation / found.deviation
     if before is None:
         return Innovation(normalised, square, 1)
     count = min(before.count + 1, Innovation.WINDOW)

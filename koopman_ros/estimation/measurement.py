@@ -7,10 +7,11 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import cached_property
 import math
+from operator import eq
 
 import numpy as np
-from numpy.typing import NDArray
 
 from koopman_ros.arrays import Array, as_arrays
 from koopman_ros.reasons import Code, Reason, reason
@@ -29,7 +30,7 @@ class FrozenCheck:
     #: of a sensor that does not move is no disturbance
     w: Array
 
-    def after(self, still: NDArray[np.bool_], time_ns: int, w: Array,
+    def after(self, still: Sequence[bool], time_ns: int, w: Array,
               travel: Callable[[FrozenCheck], Array]) -> FrozenCheck:
         """
         Take a measurement into account, of which the signals `still` (n_y,) have not changed.
@@ -37,14 +38,14 @@ class FrozenCheck:
         :param w: (n_x,) disturbance that is estimated now.
         :param travel: predicts how far (n_y,) the signals have moved since the last measurement.
         """
-        if not still.any():
-            return FrozenCheck((time_ns,) * len(still), np.zeros_like(self.travel), w)
+        if not any(still):
+            return FrozenCheck((time_ns,) * len(still), np.zeros(len(still)), w)
         return FrozenCheck(
             tuple(since if same else time_ns
-                  for since, same in zip(self.since_ns, still.tolist(), strict=True)),
+                  for since, same in zip(self.since_ns, still, strict=True)),
             np.where(still, self.travel + travel(self), 0.0), self.w)
 
-    def longest(self, time_ns: int, still: NDArray[np.bool_], significant: Array
+    def longest(self, time_ns: int, still: Sequence[bool], significant: Array
                 ) -> tuple[int, float]:
         """
         Return which signal has stood still for longest although it should have moved.
@@ -53,10 +54,11 @@ class FrozenCheck:
         :return: its place, and for how many seconds; 0 when there is none.
         """
         place, stood = 0, 0.0
-        for i in np.flatnonzero(still & (np.abs(self.travel) > significant)).tolist():
-            seconds = (time_ns - self.since_ns[i]) / NANOSECONDS
-            if seconds > stood:
-                place, stood = i, seconds
+        for i, same in enumerate(still):
+            if same and abs(self.travel[i]) > significant[i]:
+                seconds = (time_ns - self.since_ns[i]) / NANOSECONDS
+                if seconds > stood:
+                    place, stood = i, seconds
         return place, stood
 
 
@@ -96,6 +98,12 @@ class SensorLimits:
         """Check that there is one number for each signal (n_y,); a ValueError names which not."""
         for name in ('lower', 'upper', 'rate', 'jump'):
             per_signal(f'sensor {name}', getattr(self, name), names)
+
+    @cached_property
+    def each(self) -> list[tuple[float, float, float, float]]:
+        """Lower, upper, rate and jump of each signal, as plain numbers."""
+        return list(zip(self.lower.tolist(), self.upper.tolist(), self.rate.tolist(),
+                        self.jump.tolist(), strict=True))
 
 
 @dataclass(frozen=True)
@@ -140,23 +148,26 @@ def check(limits: SensorLimits, outputs: Outputs, last: Accepted | None, y: Arra
         return Verdict(Accepted(last.value, last.time_ns, last.frozen, True), reason(
             Code.JUMPED, signal=outputs.names[i], before=float(last.value[i]), value=float(y[i]),
             seconds=seconds, jump=float(limits.jump[i]), rate=float(limits.rate[i])))
-    still = y == last.value
+    still = list(map(eq, y.tolist(), last.value.tolist()))
     frozen = last.frozen.after(still, time_ns, w, travel)
     remembered = Accepted(y, time_ns, frozen)
+    if not any(still):
+        return Verdict(remembered, moved=last.jumped and _unreachable(
+            limits, last.value, y, 0.0) is not None)
     i, stood = frozen.longest(time_ns, still, 0.5 * limits.jump)
     if stood > limits.frozen_timeout:
         return Verdict(remembered, reason(
             Code.FROZEN, signal=outputs.names[i], value=float(y[i]),
             timeout=limits.frozen_timeout, change=0.5 * float(limits.jump[i])))
-    return Verdict(remembered, moved=last.jumped and not still.all() and _unreachable(
+    return Verdict(remembered, moved=last.jumped and not all(still) and _unreachable(
         limits, last.value, y, 0.0) is not None)
 
 
 def _impossible(limits: SensorLimits, outputs: Outputs, y: Array) -> Reason | None:
-    for i, (value, name) in enumerate(zip(y.tolist(), outputs.names, strict=True)):
+    for value, name, (lower, upper, _, _) in zip(y.tolist(), outputs.names, limits.each,
+                                                 strict=True):
         if not math.isfinite(value):
             return reason(Code.NOT_FINITE, signal=name, value=value)
-        lower, upper = float(limits.lower[i]), float(limits.upper[i])
         if not lower <= value <= upper:
             return reason(Code.OUTSIDE_SENSOR, signal=name, value=value, lower=lower, upper=upper)
     return None
@@ -165,9 +176,9 @@ def _impossible(limits: SensorLimits, outputs: Outputs, y: Array) -> Reason | No
 def _unreachable(limits: SensorLimits, before: Array, y: Array, seconds: float) -> int | None:
     """Return the place of the signal that is farthest beyond what it could have reached."""
     worst, excess = None, 0.0
-    for i, (a, b) in enumerate(zip(y.tolist(), before.tolist(), strict=True)):
-        possible = float(limits.jump[i]) + (
-            float(limits.rate[i]) * seconds if seconds > 0.0 else 0.0)
+    for i, (a, b, (_, _, rate, jump)) in enumerate(zip(
+            y.tolist(), before.tolist(), limits.each, strict=True)):
+        possible = jump + (rate * seconds if seconds > 0.0 else 0.0)
         if abs(a - b) > possible and abs(a - b) / possible > excess:
             worst, excess = i, abs(a - b) / possible
     return worst

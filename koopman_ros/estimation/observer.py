@@ -11,6 +11,7 @@ from typing import ClassVar, Protocol
 import numpy as np
 
 from koopman_ros.arrays import Array
+from koopman_ros.kernels import compilable
 from koopman_ros.lifting import LiftedModel
 from koopman_ros.signals import Outputs
 
@@ -145,13 +146,17 @@ def simulated(model: LiftedModel, estimate: Estimate, u: Array, seconds: float) 
     steps = max(1, math.ceil(duration / longest))
     if steps > _MAX_STEPS:
         return None
-    h = duration / steps
-    x, rate = estimate.x, model.rate_under(u, estimate.w)
+    return Estimate(moved(model, estimate.x, estimate.w, u, duration / steps, steps), estimate.w)
+
+
+@compilable
+def moved(model: LiftedModel, x: Array, w: Array, u: Array, h: float, steps: int) -> Array:
+    """Return where a state (n_x,) goes in so many of Heun's steps of h, in time units."""
+    rate = model.rate_under(u, w)
     for _ in range(steps):
-        # Heun's method
         slope = rate(x)
         x = x + (0.5 * h) * (slope + rate(x + h * slope))
-    return Estimate(x, estimate.w)
+    return x
 
 
 def _check_determined(outputs: Outputs) -> None:
@@ -192,6 +197,9 @@ class BoundedDisturbance:
     def _largest(self, w: Array) -> tuple[float, float]:
         """Return size and bound of the input that is nearest to its bound, or beyond."""
         worst, share = (0.0, math.inf), -1.0
+        if len(self._bounds) == 1:
+            size = abs(float(self.as_input(w)[0]))
+            return (size if math.isfinite(size) else math.inf), self._bounds[0]
         for size, bound in zip(map(abs, self.as_input(w).tolist()), self._bounds, strict=True):
             if not math.isfinite(size):
                 return math.inf, bound

@@ -14,8 +14,10 @@ from numpy.polynomial.legendre import leggauss
 from numpy.typing import NDArray
 
 from koopman_ros.arrays import Array, brief, frozen
+from koopman_ros.kernels import Kernels, NUMPY
 from koopman_ros.lifting.coordinates import Coordinates, TrainingStates, TriedLoops
 from koopman_ros.lifting.input_terms import InputTerms
+from koopman_ros.lifting.layout import Layout, layout_of
 from koopman_ros.lifting.observables import NetworkObservables, Observables
 from koopman_ros.plant_data import Plant
 from koopman_ros.units import check_time_unit, SECONDS_PER_TIME_UNIT
@@ -77,6 +79,8 @@ class LiftedModel:
     pre_feedback: Array | None = None
     #: where the law of the model was tried; None where that is not known, or it was lost nowhere
     tried_loops: TriedLoops | None = None
+    #: compiled functions that take the place of those in numpy; see :mod:`koopman_ros.kernels`
+    kernels: Kernels = field(default_factory=lambda: NUMPY, repr=False, compare=False)
 
     __repr__ = brief
 
@@ -103,6 +107,11 @@ class LiftedModel:
         if self.tried_loops is not None and self.tried_loops.starts.shape[1] != n_x:
             raise ValueError(f'incompatible tried_loops: expected {n_x} states, got '
                              f'{self.tried_loops.starts.shape[1]}')
+
+    @cached_property
+    def layout(self) -> Layout | None:
+        """Its numbers as compiled code takes them; None for a kind that it does not know."""
+        return layout_of(self)
 
     @property
     def n_x(self) -> int:
@@ -251,11 +260,8 @@ class LiftedModel:
 
         In scaled deviations; see :attr:`tried_loops`.
         """
-        if self.tried_loops is None:
-            return False
-        states = self.states
-        return self.tried_loops.lost_at(x, x_ref, 0.5 * (states.upper - states.lower)
-                                        / states.scale)
+        return self.tried_loops is not None and self.tried_loops.lost_at(
+            x, x_ref, self.states.half_widths)
 
     def distance(self, x: Array) -> float:
         """
@@ -268,14 +274,13 @@ class LiftedModel:
         outside = self.states.violation(x)
         if self.training_states is None:
             return outside
-        states = self.states
         return max(outside, self.training_states.distance(
-            states.to_deviation(x), 0.5 * (states.upper - states.lower) / states.scale))
+            self.states.to_deviation(x), self.states.half_widths))
 
     def distances(self, x: Array) -> Array:
         """Measure, as :meth:`distance`, for states (N, n_x) in scaled deviations: (N,)."""
         states = self.states
-        half = 0.5 * (states.upper - states.lower) / states.scale
+        half = states.half_widths
         lower, upper = states.to_deviation(states.lower), states.to_deviation(states.upper)
         outside = np.max(np.maximum(np.maximum(lower - x, x - upper) / half, 0.0), axis=1)
         if self.training_states is not None:

@@ -124,14 +124,15 @@ class NetworkObservables(Observables):
         return activation_named(self.activation)
 
     @cached_property
-    def _value_at_zero(self) -> Array:
+    def value_at_zero(self) -> Array:
+        """The last hidden layer (h,) at the origin."""
         h = np.zeros(self.n_x)
         for weight, bias in self.hidden:
             h = self._activation.value(weight @ h + bias)
         return h
 
     @cached_property
-    def _rows(self) -> Array:
+    def rows(self) -> Array:
         """The output (n_z, h) with rows of zeros where the state goes."""
         states = self.n_z - self.output.shape[0]
         return np.concatenate((np.zeros((states, self.output.shape[1])), self.output))
@@ -151,7 +152,7 @@ class NetworkObservables(Observables):
         h, value = x, self._activation.value
         for weight, bias in self.hidden:
             h = value(_product(h, weight.T) + bias)
-        return self._with_states(x, _product(h - self._value_at_zero, self._rows.T))
+        return self._with_states(x, _product(h - self.value_at_zero, self.rows.T))
 
     def lift_and_jacobian(self, x: Array) -> tuple[Array, Array]:
         """Evaluate N(x) and J_N(x) in one forward pass; shapes as in the interface."""
@@ -166,8 +167,8 @@ class NetworkObservables(Observables):
             a = _product(h, weight.T) + bias
             h = f.value(a)
             T = f.slope(a, h)[..., None, :] * _product(T, weight.T)
-        z = _product(h - self._value_at_zero, self._rows.T)
-        J = _product(T, self._rows.T)
+        z = _product(h - self.value_at_zero, self.rows.T)
+        J = _product(T, self.rows.T)
         return self._with_states(x, z), self._with_states(eye, J).swapaxes(-1, -2)
 
     def lift_and_secants(self, x: Array, x_ref: Array, w: Array
@@ -189,8 +190,8 @@ class NetworkObservables(Observables):
             S = slope * S
             T = at_x * T.dot(W)
             p = at_x * q
-        rows = self._rows.T
-        return (self._with_states(x, (h[0] - self._value_at_zero).dot(rows)),
+        rows = self.rows.T
+        return (self._with_states(x, (h[0] - self.value_at_zero).dot(rows)),
                 self._with_states(eye, T.dot(rows)).T, self._with_states(eye, S.dot(rows)).T,
                 G.dot(rows).T)
 

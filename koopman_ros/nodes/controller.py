@@ -5,6 +5,7 @@
 
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
+import gc
 import math
 import sys
 import threading
@@ -30,6 +31,7 @@ from koopman_ros.control import (
     State,
 )
 from koopman_ros.control.events import Event, ModeChange, Silence
+from koopman_ros.kernels import COMPILED, IN_NUMPY, Kernels, NUMPY
 from koopman_ros.parameters.controller import built, ControllerParameters, table_of
 from koopman_ros.parameters.table import ConfigurationError
 from koopman_ros.parameters.wire import (
@@ -45,6 +47,7 @@ from koopman_ros.replay import records
 from koopman_ros.ros import controller_messages as messages
 from koopman_ros.ros import topics
 from koopman_ros.ros.codec import stamp_message
+from koopman_ros.ros.compiling import Compiling
 from koopman_ros.ros.managed import ManagedNode
 from koopman_ros.ros.model_reload import (
     load_suitable,
@@ -119,6 +122,8 @@ class ControllerNode(ManagedNode):
                 self._recent.windows(self._settings.model_check_length)),
             lambda: self._exchange(records.MODEL, {'model': self._models.in_force.identity}),
             lambda: self._diagnostics.publish_if_changed())
+        self._compiling = Compiling(self) if parameters.compiled else None
+        self._kernels, self._carried = NUMPY, (loaded.model, loaded.model)
         self._controller = self._built()
         self._state = State()
         self._recent = Recent()
@@ -166,11 +171,13 @@ class ControllerNode(ManagedNode):
         wall_timer(self, PERIOD, self._on_watch)
         self._records = messages.RecordPublisher(
             self._matching, lambda: records.snapshot(
-                self._state, table.values(self._settings), self._models.in_force.identity),
-            self._lock)
+                self._state, table.values(self._settings), self._models.in_force.identity,
+                COMPILED if self._kernels else IN_NUMPY), self._lock)
         self.follow_table(table, parameters, self._on_parameters, self._models.accept)
         self.get_logger().info(self._models.in_force.about)
         self._warn_of_rest()
+        # what is there by now stays: nobody is to look through it for garbage between two samples
+        gc.freeze()
         self._watchdog = Watchdog(self._on_busy)
         self._watchdog.start()
 
@@ -193,6 +200,8 @@ class ControllerNode(ManagedNode):
         if self._watchdog is not None:
             self._watchdog.end()
             self._models.end()
+            if self._compiling is not None:
+                self._compiling.end()
 
     def _single(self, wiring: Wiring) -> dict[str, str]:
         """Return what is done on topics on which only one node may publish."""
@@ -278,6 +287,8 @@ class ControllerNode(ManagedNode):
                 'a measurement is not answered, as a control step takes longer than the watchdog '
                 'waits: choose a smaller model', throttle_duration_sec=1.0)
             return
+        if self._compiling is not None:
+            self._compiling.begin()
         report = outcome.report
         self._recent.add(
             asked, report.measurement, before.command, self._settings.model_check_length)
@@ -295,6 +306,8 @@ class ControllerNode(ManagedNode):
         self._timing.busy = False
         assert self._watchdog is not None
         self._watchdog.beat()
+        if self._compiling is not None and (kernels := self._compiling.take()) is not None:
+            self._switch(kernels)
         watched = self._watch(self._timing.silence)
         if watched is not None:
             self._tell(*watched)
@@ -409,7 +422,20 @@ class ControllerNode(ManagedNode):
         return not self._refused
 
     def _built(self) -> Controller:
-        return built(self._settings, self._models.in_force.model)
+        given, carrier = self._models.in_force.model, self._carried[1]
+        if given is not self._carried[0] or carrier.kernels is not self._kernels:
+            # the same one as long as nothing changes: what is estimated goes by it
+            carrier = replace(given, kernels=self._kernels) if self._kernels else given
+            self._carried = given, carrier
+        return built(self._settings, carrier)
+
+    def _switch(self, kernels: Kernels) -> None:
+        """Let compiled functions answer from now on; the state stays as it is."""
+        with self._lock:
+            self._kernels = kernels
+            self._controller = self._built()
+            self._records.publish(records.NUMERICS, {records.NUMERICS: COMPILED})
+        self.get_logger().info('the control step is compiled')
 
     def _on_parameters(self, parameters: ControllerParameters) -> None:
         before = self._table.values(self._settings)

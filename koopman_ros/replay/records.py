@@ -22,6 +22,7 @@ from numpy.typing import NDArray
 
 from koopman_ros import __version__
 from koopman_ros.control import events, Mode, State
+from koopman_ros.kernels import IN_NUMPY
 from koopman_ros.reasons import Reason
 
 VERSION = 1
@@ -38,6 +39,8 @@ _ENCODER = json.JSONEncoder(separators=(',', ':'), allow_nan=False)
 START, SNAPSHOT = 'start', 'snapshot'
 # Names of those by which it is exchanged for one with other parameters or another model.
 PARAMETERS, MODEL = 'parameters', 'model'
+# Name of those by which compiled functions take the place of those in numpy, and their field.
+NUMERICS = 'numerics'
 _TAG = '@'
 
 
@@ -116,11 +119,11 @@ def event_of(record: Record) -> events.Event:
     return kind(**read)
 
 
-def snapshot(state: State, parameters: Mapping[str, Any], model: Mapping[str, str]
-             ) -> dict[str, Any]:
+def snapshot(state: State, parameters: Mapping[str, Any], model: Mapping[str, str],
+             numerics: str = IN_NUMPY) -> dict[str, Any]:
     """Return the fields of a snapshot; a model is its `name` and the SHA-256 of its file."""
     return {'package': __version__, 'model': dict(model), 'parameters': dict(parameters),
-            'state': encoded(state)}
+            NUMERICS: numerics, 'state': encoded(state)}
 
 
 def state_of(record: Record) -> State:

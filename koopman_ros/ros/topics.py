@@ -54,6 +54,7 @@ LATCHED_QOS = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
 CLOCK_QOS = QoSProfile(depth=1, reliability=ReliabilityPolicy.BEST_EFFORT)
 
 _LOOK_PERIOD = 0.5  # s
+_POLICIES = ('reliability', 'durability', 'deadline', 'liveliness', 'liveliness_lease_duration')
 # What does not pass: policy, offered, asked for.
 _CONFLICTS = (('reliability', ReliabilityPolicy.BEST_EFFORT, ReliabilityPolicy.RELIABLE),
               ('durability', DurabilityPolicy.VOLATILE, DurabilityPolicy.TRANSIENT_LOCAL))
@@ -109,6 +110,9 @@ class Matching:
     """
     Make a node's publishers and subscriptions, and say which others conflict or do not match.
 
+    That is looked for twice a second. The middleware has events for it, and the executor asks for
+    each of them, two a topic, before and after each message, which takes longer than its answer.
+
     :param on_change: called when the complaint is another.
     :param single: what is done on topics on which only one node may publish, in words.
     """
@@ -118,7 +122,6 @@ class Matching:
         self._node, self._on_change, self._single = node, on_change, single or {}
         self._owned = Owned(node)
         self._own: list[Publisher | Subscription] = []
-        self._policies: dict[str, str] = {}  # last reported by the middleware, by topic
         self._said: tuple[str, ...] = ('', '')
         self._owned.timer(_LOOK_PERIOD, self._look)
         self.destroy = self._owned.destroy  #: with what was made here
@@ -134,8 +137,7 @@ class Matching:
         # overriding parameters change the profile itself
         made = self._owned.keep(self._node.create_subscription(
             kind or TYPES[topic], topic, callback, copy.copy(qos),
-            event_callbacks=SubscriptionEventCallbacks(
-                incompatible_qos=self._found(topic), incompatible_type=lambda _: self._look()),
+            event_callbacks=SubscriptionEventCallbacks(use_default_callbacks=False),
             qos_overriding_options=overridable()))
         self._own.append(made)
         return made
@@ -146,20 +148,10 @@ class Matching:
         made = self._owned.keep(self._node.create_publisher(
             kind or TYPES[topic], topic, copy.copy(qos),
             event_callbacks=PublisherEventCallbacks(
-                incompatible_qos=self._found(topic), incompatible_type=lambda _: self._look(),
-                matched=matched), qos_overriding_options=overridable()))
+                matched=matched, use_default_callbacks=False),
+            qos_overriding_options=overridable()))
         self._own.append(made)
         return made
-
-    def _found(self, topic: str) -> Callable[[Any], None]:
-        name = self._node.resolve_topic_name(topic)
-
-        def note(event: Any) -> None:
-            policy = rclpy_qos.qos_policy_name_from_kind(event.last_policy_kind)
-            self._policies[name] = policy.lower()
-            self._look()
-
-        return note
 
     def _look(self) -> None:
         said = ('; '.join(filter(None, map(self._conflict, self._single))),
@@ -198,7 +190,7 @@ class Matching:
     def _qos_complaint(self, own: Publisher | Subscription, other: TopicEndpointInfo) -> str:
         topic, subscribes = own.topic_name, isinstance(own, Subscription)
         offered, asked = _in_order(own, other)
-        policy, wanted = self._policies.get(topic, 'quality of service'), 'the default'
+        policy, wanted = _incompatible(offered, asked), 'the default'
         does = 'publishes' if subscribes else 'subscribes'
         for name, too_little, too_much in _CONFLICTS:
             if (getattr(offered, name), getattr(asked, name)) == (too_little, too_much):
@@ -217,6 +209,17 @@ def _in_order(own: Publisher | Subscription, other: TopicEndpointInfo
               ) -> tuple[QoSProfile, QoSProfile]:
     ours, theirs = _explicit(own.qos_profile), _explicit(other.qos_profile)
     return (theirs, ours) if isinstance(own, Subscription) else (ours, theirs)
+
+
+def _incompatible(offered: QoSProfile, asked: QoSProfile) -> str:
+    """Return the policy in which less is offered than asked for."""
+    for name in _POLICIES:
+        as_asked = copy.copy(offered)
+        setattr(as_asked, name, getattr(asked, name))
+        if rclpy_qos.qos_check_compatible(offered, as_asked)[0] == (
+                rclpy_qos.QoSCompatibility.ERROR):
+            return name
+    return 'quality of service'
 
 
 def _explicit(profile: QoSProfile) -> QoSProfile:

@@ -41,7 +41,7 @@ def steady_state_target(model: LiftedModel, x_ref: Array, w: Array | None = None
     :param w: (n_x,) disturbance of the state's rate, none by default.
     :param known: a target of the same model, which saves lift and drift where x_ref is the same.
     """
-    if known is not None and (known.x == x_ref).all():
+    if known is not None and (known.x is x_ref or known.x.tolist() == x_ref.tolist()):
         x_ref, z, drift = known.x, known.z, known.drift
     else:
         z, drift = model.lift(x_ref), model.drift(x_ref)

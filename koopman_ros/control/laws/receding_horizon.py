@@ -17,12 +17,13 @@ from numpy.typing import NDArray
 
 from koopman_ros.arrays import Array, frozen
 from koopman_ros.control.laws.base import Figures, LawResult, Plan, Target, Tuning
-from koopman_ros.control.laws.riccati import feedback, StateDependentRiccati
+from koopman_ros.control.laws.riccati import feedback, regulator, StateDependentRiccati
+from koopman_ros.control.laws.shooting import Horizon, program
 from koopman_ros.control.limits import finite, InputLimits
 from koopman_ros.estimation import Estimate
 from koopman_ros.lifting import LiftedModel
 from koopman_ros.reasons import Code, Reason, reason
-from koopman_ros.solvers import RiccatiStatus, runge_kutta_step, solve_riccati
+from koopman_ros.solvers import RiccatiStatus, runge_kutta_step
 
 PACKAGE = 'daqp'  # the solver of quadratic programs
 
@@ -46,16 +47,6 @@ _SOLVED = (1, 2)  # its flags; in the second case a soft limit is violated
 _SOFT = 8  # its mark of a limit that may be violated
 # Half widths of the training box beyond which a course that is rolled out is worth nothing.
 _ASTRAY = 2.0
-
-
-@dataclass(frozen=True)
-class _Course:
-    """How the plant goes from nodes (N, n_x) under inputs (N, n_u), each held for an interval."""
-
-    #: (N, 2 m + 1, n_x) the state from the beginning of each interval to its end, in m steps
-    states: Array
-    by_state: Array  #: (N, 2 m + 1, n_x, n_x) its derivative by the node
-    by_input: Array  #: (N, 2 m + 1, n_x, n_u) and by the input
 
 
 @dataclass(frozen=True)
@@ -157,9 +148,9 @@ class RecedingHorizon:
         @lru_cache(maxsize=8)
         def of(interval: float) -> Array:
             A, weights = self._slope, self.tuning.weights
-            found = solve_riccati(A, self.model.B, weights.Q, weights.R, interval=interval,
-                                  max_gain=self.tuning.max_gain,
-                                  max_residual=self.tuning.max_residual)
+            found = regulator(self.model, A, self.model.B, weights.Q, weights.R,
+                              interval=interval, max_gain=self.tuning.max_gain,
+                              max_residual=self.tuning.max_residual)
             horizon = _INTERVALS * interval
             closed = np.linalg.eigvals(A - self.model.B @ found.K).real
             if found.status is RiccatiStatus.SOLVED and np.all(closed < 0.0):
@@ -218,8 +209,9 @@ class _Problem:
             raise np.linalg.LinAlgError('the drift has no slope here')
         rate = max(law.fastest, float(np.max(np.abs(np.linalg.eigvals(slopes)))))
         self._steps = min(max(math.ceil(self.lengths[-1] * rate / _STEP), 1), _MOST_STEPS)
-        self._Q, self._R = tuning.weights.Q, tuning.weights.R
-        self._terminal = self._cost_to_go(slopes[1])
+        weights = tuning.weights
+        self._horizon = Horizon(estimate.x, estimate.w, target.x, target.u, self.lengths,
+                                self._steps, weights.Q, weights.R, self._cost_to_go(slopes[1]))
         self._lower = np.maximum(model.inputs.to_deviation(limits.lower), -_UNLIMITED)
         self._upper = np.minimum(model.inputs.to_deviation(limits.upper), _UNLIMITED)
         # what an input may change from one interval to the next, (N, n_u): the first since the
@@ -237,13 +229,13 @@ class _Problem:
         """
         model, target, tuning = self._model, self._target, self._law.tuning
         A = slope + model.forcing_jacobian(target.x, target.u)
-        found = solve_riccati(A, model.input_matrix(target.x), self._Q, self._R,
-                              interval=self._sample, max_gain=tuning.max_gain,
-                              max_residual=tuning.max_residual)
+        found = regulator(model, A, model.input_matrix(target.x), tuning.weights.Q,
+                          tuning.weights.R, interval=self._sample, max_gain=tuning.max_gain,
+                          max_residual=tuning.max_residual)
         if found.status is RiccatiStatus.SOLVED:
             return found.P
         # where the regulator has none, the horizon alone counts
-        return self._Q * float(self.lengths[-1])
+        return tuning.weights.Q * float(self.lengths[-1])
 
     # Where to begin.
 
@@ -298,13 +290,12 @@ class _Problem:
 
         :return: by how much an input changes at most, inputs and nodes; or why there are none.
         """
-        course = self._course(u, x[:-1])
-        if not np.isfinite(course.by_state).all() or not np.isfinite(course.states).all():
+        found = program(self._model, self._horizon, u, x)
+        if found is None:
             return reason(Code.PLAN_NOT_SOLVED, flag='its course is not finite')
-        nodes, by_inputs = _condensed(course, x, self._x)
-        H, f = self._cost(course, x, u, nodes, by_inputs)
+        nodes, by_inputs = found.nodes, found.by_inputs
         rows, lower, upper, sense = self._limits(u, nodes, by_inputs)
-        v, _, flag, _ = self._law._solve(H, f, rows, upper, lower, sense)
+        v, _, flag, _ = self._law._solve(found.H, found.f, rows, upper, lower, sense)
         v = np.asarray(v, dtype=np.float64)
         if flag not in _SOLVED or not np.isfinite(v).all():
             return reason(Code.PLAN_NOT_SOLVED, flag=f'the solver says {flag}')
@@ -326,60 +317,6 @@ class _Problem:
             _side(step <= -fastest, step >= fastest),
             _side(np.min(x[1:], axis=0) <= lowest + _TOUCH,
                   np.max(x[1:], axis=0) >= highest - _TOUCH))
-
-    def _course(self, u: Array, nodes: Array) -> _Course:
-        model, n, m = self._model, self._model.n_x, self._steps
-        h = (self.lengths / m)[:, None]
-        x, S = nodes, np.zeros((len(u), n, n + model.n_u))
-        S[:, :, :n] = np.eye(n)
-        forced = np.zeros_like(S)
-
-        def rates(x: Array, S: Array) -> tuple[Array, Array]:
-            f, J = model.drift_and_jacobian(x)
-            forced[:, :, n:] = model.input_matrix(x)
-            if model.input_terms is not None:
-                J = J + model.forcing_jacobian(x, u)
-            return f + model.forcing(x, u) + self._w, J @ S + forced
-
-        states, slopes = [x], [S]
-        H = h[..., None]
-        for _ in range(m):
-            k1, s1 = rates(x, S)
-            k2, s2 = rates(x + 0.5 * h * k1, S + 0.5 * H * s1)
-            k3, s3 = rates(x + 0.5 * h * k2, S + 0.5 * H * s2)
-            k4, s4 = rates(x + h * k3, S + H * s3)
-            ahead = x + h / 6.0 * (k1 + 2.0 * k2 + 2.0 * k3 + k4)
-            turned = S + H / 6.0 * (s1 + 2.0 * s2 + 2.0 * s3 + s4)
-            # the middle by the rates at both ends (Hermite), for Simpson's rule
-            states += [0.5 * (x + ahead) + 0.125 * h * (k1 - k4), ahead]
-            slopes += [0.5 * (S + turned) + 0.125 * H * (s1 - s4), turned]
-            x, S = ahead, turned
-        every = np.stack(slopes, axis=1)
-        return _Course(np.stack(states, axis=1), every[..., :n], every[..., n:])
-
-    def _cost(self, course: _Course, x: Array, u: Array, nodes: Array, by_inputs: Array
-              ) -> tuple[Array, Array]:
-        """Return H and f of the cost v' H v / 2 + f' v of a change v (N n_u,) of the inputs."""
-        (N, points), n_u = course.states.shape[:2], u.shape[1]
-        # of each point, as if the inputs stayed, and how it changes with all of them
-        error = course.states + (course.by_state @ (nodes[:-1] - x[:-1])[:, None, :, None])[
-            ..., 0] - self._target.x
-        slope = course.by_state @ by_inputs[:-1, None]
-        for k in range(N):
-            slope[k, :, :, k * n_u:(k + 1) * n_u] += course.by_input[k]
-        simpson = np.full(points, 2.0)
-        simpson[1::2] = 4.0
-        simpson[[0, -1]] = 1.0
-        share = (self.lengths[:, None] * simpson / (3.0 * (points - 1)))[..., None]
-        G, weighted = slope.reshape(-1, N * n_u), (share * (error @ self._Q)).reshape(-1)
-        GQ = (share[..., None] * (self._Q @ slope)).reshape(-1, N * n_u)
-        end, last = by_inputs[-1], nodes[-1] - self._target.x
-        H = G.T @ GQ + end.T @ self._terminal @ end
-        f = G.T @ weighted + end.T @ (self._terminal @ last)
-        deviation = u - self._target.u
-        H += np.kron(np.diag(self.lengths), self._R)
-        f += (self.lengths[:, None] * (deviation @ self._R)).reshape(-1)
-        return np.ascontiguousarray(0.5 * (H + H.T)), f
 
     def _limits(self, u: Array, nodes: Array, by_inputs: Array
                 ) -> tuple[Array, Array, Array, NDArray[np.int32]]:
@@ -423,22 +360,3 @@ class _Problem:
 def _side(lower: NDArray[np.bool_], upper: NDArray[np.bool_]) -> Array:
     """Return -1 where the lower limit is active, 1 where the upper one is, else 0."""
     return upper.astype(np.float64) - lower
-
-
-def _condensed(course: _Course, x: Array, start: Array) -> tuple[Array, Array]:
-    """
-    Return the nodes (N + 1, n_x) of the linearised course, and their derivative by the inputs.
-
-    The latter is (N + 1, n_x, N n_u). The nodes are those from `start` on, without the gaps that
-    the course has at its own nodes x (N + 1, n_x).
-    """
-    N, _, n, n_u = course.by_input.shape
-    nodes, by_inputs = np.empty((N + 1, n)), np.zeros((N + 1, n, N * n_u))
-    nodes[0] = start
-    ends, A, B = course.states[:, -1], course.by_state[:, -1], course.by_input[:, -1]
-    for k in range(N):
-        nodes[k + 1] = ends[k] + A[k].dot(nodes[k] - x[k])
-        width = k * n_u
-        by_inputs[k + 1, :, :width] = A[k].dot(by_inputs[k, :, :width])
-        by_inputs[k + 1, :, width:width + n_u] = B[k]
-    return nodes, by_inputs

@@ -23,6 +23,7 @@ from koopman_ros.control.laws.base import (
 )
 from koopman_ros.control.limits import finite, InputLimits
 from koopman_ros.estimation import Estimate
+from koopman_ros.kernels import compilable
 from koopman_ros.lifting import LiftedModel
 from koopman_ros.reasons import Code, reason
 from koopman_ros.solvers import RiccatiSolution, RiccatiStatus, solve_riccati
@@ -30,6 +31,7 @@ from koopman_ros.solvers import RiccatiSolution, RiccatiStatus, solve_riccati
 # Largest mismatch of a closed lift: those of plants that have one come to 2e-7 or less, others to
 # 1e-4 or more, and from there on the averaged Jacobian costs less.
 _CLOSED = 1e-5
+_OVERFLOW = 709.0  # of an exponent, near what a float64 holds
 
 
 class Form(Enum):
@@ -68,9 +70,11 @@ class Feedback:
             a, action = float(self.drift[0, 0]), float(self.action[0, 0])
             if not interval > 0.0:
                 return float(np.exp(a + action))
+            if not a * interval < _OVERFLOW:
+                return math.nan if math.isnan(a) else math.inf
             # expm1(a t) / a is the integral of exp(a s), also for a small a
-            held = interval if a == 0.0 else float(np.expm1(a * interval)) / a
-            return abs(float(np.exp(a * interval)) + held * action)
+            held = interval if a == 0.0 else math.expm1(a * interval) / a
+            return abs(math.exp(a * interval) + held * action)
         if not (np.all(np.isfinite(self.drift)) and np.all(np.isfinite(self.action))):
             return np.nan
         if not interval > 0.0:
@@ -81,6 +85,20 @@ class Feedback:
         # Van Loan, 1978: the exponential of the block matrix holds that of A and its integral
         exponential = expm(interval * block)
         return float(np.max(np.abs(np.linalg.eigvals(exponential[:n, :n] + exponential[:n, n:]))))
+
+
+@compilable
+def regulator(model: LiftedModel, A: Array, B: Array, Q: Array, R: Array, *, interval: float,
+              max_residual: float, max_gain: float) -> RiccatiSolution:
+    """Solve the Riccati equation of (A, B); see :func:`koopman_ros.solvers.solve_riccati`."""
+    return solve_riccati(A, B, Q, R, interval=interval, max_residual=max_residual,
+                         max_gain=max_gain)
+
+
+@compilable
+def growth(model: LiftedModel, found: Feedback, interval: float) -> float:
+    """Predict how the error changes from sample to sample; see :meth:`Feedback.growth`."""
+    return found.growth(interval)
 
 
 def feedback(model: LiftedModel, x: Array, target: Target, weights: Weights, *,
@@ -110,6 +128,7 @@ def feedback(model: LiftedModel, x: Array, target: Target, weights: Weights, *,
     return averaged(model, x, target, weights, **how)
 
 
+@compilable
 def recentred(model: LiftedModel, x: Array, target: Target, weights: Weights, *,
               interval: float = 0.0, max_gain: float = 1e6, max_residual: float = 1e-8
               ) -> Feedback:
@@ -144,14 +163,15 @@ def recentred(model: LiftedModel, x: Array, target: Target, weights: Weights, *,
         C = np.linalg.pinv(M)
         A, Q = model.A + H @ C, C.T @ weights.Q @ C
     # dot takes a third of the time of @ here
-    riccati = solve_riccati(A, J.dot(B), Q, weights.R, interval=interval,
-                            max_gain=max_gain, max_residual=max_residual)
+    riccati = regulator(model, A, J.dot(B), Q, weights.R, interval=interval,
+                        max_gain=max_gain, max_residual=max_residual)
     drift = (model.onto_states(J, model.A.dot(M) + H) if model.readout is None
              else _averaged_jacobian(model, x, target, D))
     return Feedback(target.u - riccati.K.dot(z - target.z), Form.RECENTRED, riccati,
                     drift, -B.dot(riccati.K.dot(M)))
 
 
+@compilable
 def averaged(model: LiftedModel, x: Array, target: Target, weights: Weights, *,
              interval: float = 0.0, max_gain: float = 1e6, max_residual: float = 1e-8) -> Feedback:
     """
@@ -166,8 +186,8 @@ def averaged(model: LiftedModel, x: Array, target: Target, weights: Weights, *,
     """
     A = _averaged_jacobian(model, x, target, _input_secant(model, x, target))
     B = model.input_matrix(x)
-    riccati = solve_riccati(A, B, weights.Q, weights.R, interval=interval,
-                            max_gain=max_gain, max_residual=max_residual)
+    riccati = regulator(model, A, B, weights.Q, weights.R, interval=interval,
+                        max_gain=max_gain, max_residual=max_residual)
     return Feedback(target.u - riccati.K @ (x - target.x), Form.AVERAGED, riccati,
                     A, -B @ riccati.K)
 
@@ -208,17 +228,18 @@ def checked(model: LiftedModel, found: Feedback, limits: InputLimits, interval: 
             ) -> LawResult:
     """Return the command of a feedback, unless it must not be used; see :meth:`Law.compute`."""
     riccati = found.riccati
-    growth = found.growth(interval / model.seconds_per_time_unit) if found.solved else math.nan
-    figures = Figures(found.form.value, riccati.residual, riccati.gain, growth)
+    predicted = growth(model, found, interval / model.seconds_per_time_unit) if (
+        found.solved) else math.nan
+    figures = Figures(found.form.value, riccati.residual, riccati.gain, predicted)
     if not found.solved:
         return LawResult(None, reason(Code(riccati.status.value)), figures)
-    if not growth < 1.0:
+    if not predicted < 1.0:
         return LawResult(None, reason(Code.PREDICTED_UNSTABLE, interval=interval), figures)
     u = model.inputs.to_physical(found.u)
     if not finite(u):
         return LawResult(None, reason(Code.COMMAND_NOT_FINITE), figures)
     within = limits.within(u)
-    return LawResult(within, None, figures, clipped=bool((within != u).any()))
+    return LawResult(within, None, figures, clipped=within.tolist() != u.tolist())
 
 
 @dataclass(frozen=True)

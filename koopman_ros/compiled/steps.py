@@ -1,0 +1,51 @@
+# SPDX-FileCopyrightText: 2026 The koopman_ros Authors
+# SPDX-License-Identifier: Apache-2.0
+
+"""A Runge-Kutta step of the state of a read-out together with its derivatives."""
+
+import numpy as np
+from numpy.typing import NDArray
+
+from koopman_ros.arrays import Array
+from koopman_ros.compiled.jit import inner
+from koopman_ros.compiled.network import hidden_into, read_out, room
+
+
+@inner
+def runge_kutta(sizes: NDArray[np.int64], numbers: Array, readout: Array, push: Array,
+                forced: Array, x: Array, S: Array, h: float
+                ) -> tuple[Array, Array, Array, Array, Array, Array]:
+    """
+    Step x' = f(x) + push and S' = f'(x) S + forced by h.
+
+    :return: both then, and the rates of both at the beginning and in the last stage.
+    """
+    n, c = S.shape
+    layer, before, T, T_before, scale = room(sizes)
+    y, V, f, J = x.copy(), S.copy(), np.empty(n), np.empty((n, n))
+    first, first_S, rate, rate_S = np.empty(n), np.empty((n, c)), np.empty(n), np.empty((n, c))
+    total, total_S = np.zeros(n), np.zeros((n, c))
+    for stage in range(4):
+        hidden_into(sizes, numbers, y, layer, before, T, T_before, scale)
+        read_out(readout, y, layer, T, f, J)
+        weight = 1.0 if stage in (0, 3) else 2.0
+        for i in range(n):
+            rate[i] = f[i] + push[i]
+            total[i] += weight * rate[i]
+            for a in range(c):
+                moved = forced[i, a]
+                for j in range(n):
+                    moved += J[i, j] * V[j, a]
+                rate_S[i, a] = moved
+                total_S[i, a] += weight * moved
+        part = 0.5 * h if stage < 2 else h
+        for i in range(n):
+            if stage == 0:
+                first[i] = rate[i]
+            y[i] = x[i] + (part * rate[i] if stage < 3 else h / 6.0 * total[i])
+            for a in range(c):
+                if stage == 0:
+                    first_S[i, a] = rate_S[i, a]
+                V[i, a] = S[i, a] + (part * rate_S[i, a] if stage < 3
+                                     else h / 6.0 * total_S[i, a])
+    return y, V, first, first_S, rate, rate_S

@@ -1,0 +1,141 @@
+# SPDX-FileCopyrightText: 2026 The koopman_ros Authors
+# SPDX-License-Identifier: Apache-2.0
+
+"""Compiled functions give what numpy gives, and leave to it what is near to a border."""
+
+from dataclasses import replace
+import sys
+
+import numpy as np
+import pytest
+
+from koopman_ros.control import State
+from koopman_ros.control.laws.base import steady_state_target, Weights
+from koopman_ros.control.laws.riccati import recentred, regulator
+from koopman_ros.estimation.observer import moved
+from koopman_ros.kernels import COMPILED, IN_NUMPY, named, NUMPY
+from koopman_ros.lifting import LiftedModel, load
+from koopman_ros.parameters.controller import built, table_of
+from koopman_ros.resources import model_path
+from koopman_ros.solvers import RiccatiStatus, solve_riccati
+from koopman_ros.units import NANOSECONDS
+from support.random_lifts import random_lift
+
+KERNELS = named(COMPILED)
+STEPS = 40
+# model, parameters, seconds between samples, and how far apart commands may be, scaled. A plan is
+# a quadratic program, solved until it stands still: what rounding makes of it is larger.
+LOOPS = {
+    'reactor_nz3': ({}, 1.0, 1e-12),
+    'reactor_nz4': ({}, 1.0, 1e-12),
+    'reactor_linear': ({}, 1.0, 1e-12),
+    'two_state': ({'system': 'two_state'}, 1.0, 1e-12),
+    'two_state_example': ({'system': 'two_state_example', 'levels': ('sdre',)}, 0.05, 1e-12),
+    'two_tanks': ({'system': 'two_tanks'}, 0.5, 1e-12),
+    'quadruple_tank': ({'system': 'quadruple_tank'}, 1.0, 3e-12),
+    'pendulum': ({'system': 'pendulum', 'levels': ('sdre',)}, 0.02, 1e-12),
+    'fed_reactor': ({'system': 'fed_reactor'}, 1.0, 1e-12),
+    'two_state_saddle': ({'levels': ('sdre', 'linear')}, 1.0, 1e-12),
+    'two_state_saddle planned': ({'levels': ('mpc', 'sdre')}, 1.0, 1e-11),
+}
+
+
+def compiled(model: LiftedModel) -> LiftedModel:
+    assert KERNELS
+    return replace(model, kernels=KERNELS)
+
+
+@pytest.mark.parametrize('name', LOOPS)
+def test_a_loop_with_a_shipped_model_is_commanded_the_same(name: str) -> None:
+    given, seconds, apart = LOOPS[name]
+    model = load(model_path(name.split()[0]))
+    if 'saddle' in name:
+        given = {'states_measured': ('temperature [K]',), **given}
+    parameters = table_of(model, given).snapshot(given)
+    ours, theirs = built(parameters, compiled(model)), built(parameters, model)
+    rng, state = np.random.default_rng(0), State()
+    x = np.zeros(model.n_x)
+    for k in range(STEPS):
+        if k == 3:
+            state, _ = theirs.request_setpoint(
+                state, theirs.controlled.center + 0.1 * theirs.controlled.scale)
+        y = theirs.measured.of(model.states.to_physical(x + 1e-3 * rng.normal(size=len(x))))
+        one, two = (controller.step(state, y, round((k + 1) * seconds * NANOSECONDS))
+                    for controller in (ours, theirs))
+        assert one[2].level == two[2].level
+        np.testing.assert_allclose((one[1] - two[1]) / model.inputs.scale, 0.0, atol=apart)
+        for part in ('x', 'w'):
+            np.testing.assert_allclose(getattr(one[0].estimate, part),
+                                       getattr(two[0].estimate, part), rtol=1e-12, atol=1e-12)
+        state, u = two[0], model.inputs.to_deviation(two[1])
+        h = seconds / model.seconds_per_time_unit
+        x = x + h * (model.drift(x) + model.forcing(x, u))
+
+
+@pytest.mark.parametrize('widths', [(5,), (7, 3)])
+@pytest.mark.parametrize(('n_x', 'n_u'), [(1, 1), (2, 1), (3, 2)])
+def test_random_lifts_of_any_depth_move_and_are_fed_back_the_same(
+        n_x: int, n_u: int, widths: tuple[int, ...]) -> None:
+    for seed in range(10):
+        model = random_lift(n_x, widths, n_u=n_u, seed=seed)
+        fast, rng = compiled(model), np.random.default_rng(seed)
+        x, x_ref, w = (0.3 * rng.normal(size=n_x) for _ in range(3))
+        u = rng.normal(size=n_u)
+        np.testing.assert_allclose(moved(fast, x, w, u, 0.01, 3), moved(model, x, w, u, 0.01, 3),
+                                   rtol=1e-12, atol=1e-13)
+        weights = Weights(np.eye(n_x), np.eye(n_u))
+        target = steady_state_target(model, x_ref, w)
+        one, two = (recentred(lift, x, target, weights, interval=0.05) for lift in (fast, model))
+        assert one.riccati.status is two.riccati.status
+        if two.solved:
+            for part in ('u', 'drift', 'action'):
+                exact = getattr(two, part)
+                np.testing.assert_allclose(getattr(one, part), exact, rtol=0.0,
+                                           atol=1e-11 * max(1.0, np.max(np.abs(exact))))
+
+
+def test_what_is_no_number_stays_none() -> None:
+    model = compiled(random_lift(1, (5,)))
+    assert np.isnan(moved(model, np.array([np.nan]), np.zeros(1), np.zeros(1), 0.01, 1)).all()
+
+
+@pytest.mark.parametrize(('A', 'B', 'Q', 'status'), [
+    # a growing mode that no input moves
+    (np.diag([1.0, -1.0]), np.array([[0.0], [1.0]]), np.eye(2), RiccatiStatus.NOT_STABILISABLE),
+    # a mode on the imaginary axis that is not weighted
+    (np.zeros((2, 2)), np.eye(2), np.diag([1.0, 0.0]), RiccatiStatus.NOT_STABILISABLE),
+    (np.array([[np.nan]]), np.eye(1), np.eye(1), RiccatiStatus.NOT_STABILISABLE),
+])
+def test_what_has_no_gain_in_numpy_has_none(A, B, Q, status) -> None:
+    model, R = compiled(random_lift()), np.eye(B.shape[1])
+    for carrier in (model, replace(model, kernels=NUMPY)):
+        found = regulator(carrier, A, B, Q, R, interval=0.1, max_residual=1e-8, max_gain=1e6)
+        assert found.status is status
+
+
+def test_gain_of_the_sampled_regulator_of_random_plants() -> None:
+    rng, model, compared = np.random.default_rng(0), compiled(random_lift()), 0
+    for _ in range(300):
+        n, m = rng.integers(1, 6), rng.integers(1, 3)
+        A, B = rng.normal(size=(n, n)), rng.normal(size=(n, m))
+        Q, R, interval = np.eye(n), np.diag(10.0 ** rng.uniform(-1.0, 1.0, m)), rng.uniform(0, 0.5)
+        found = KERNELS['regulator'](model, A, B, Q, R, interval=interval)
+        if found is not None:
+            exact = solve_riccati(A, B, Q, R, interval=interval)
+            np.testing.assert_allclose(found.K, exact.K, rtol=0.0,
+                                       atol=1e-11 * np.max(np.abs(exact.K)))
+            compared += 1
+    assert compared > 280
+
+
+def test_a_model_is_in_numpy_unless_it_is_asked_otherwise() -> None:
+    model = random_lift()
+    assert model.kernels is NUMPY is named(IN_NUMPY)
+    assert compiled(model).linearised.kernels is KERNELS
+
+
+def test_without_the_compiler_there_is_none(monkeypatch: pytest.MonkeyPatch) -> None:
+    for name in [name for name in sys.modules if name.startswith('koopman_ros.compiled')]:
+        monkeypatch.delitem(sys.modules, name)
+    monkeypatch.setitem(sys.modules, 'numba', None)
+    assert named(COMPILED) is None
