@@ -1,0 +1,85 @@
+# SPDX-FileCopyrightText: 2026 The koopman_ros Authors
+# SPDX-License-Identifier: Apache-2.0
+
+"""The loop that every controller is run in, and what it is judged by."""
+
+from dataclasses import dataclass
+from time import process_time_ns
+
+import numpy as np
+
+from koopman_ros.arrays import Array
+from koopman_ros.plants import Process
+from koopman_ros.plants.optimum import cost_along
+from koopman_ros.units import NANOSECONDS
+from validation.partly_measured.cases import Case
+from validation.partly_measured.contenders import Contender
+
+_LATE = 1.0 / 3.0  # of a part, over which its offset is the mean
+
+
+@dataclass(frozen=True, eq=False)
+class Run:
+    """What a controller did."""
+
+    times: Array  #: (N,) in s
+    states: Array  #: (N, n_x)
+    commands: Array  #: (N, n_u)
+    step_us: Array  #: (N,) processor time of each step, in microseconds
+    failure: str  #: why it ended early, or empty
+
+
+def run(case: Case, contender: Contender, seed: int) -> Run:
+    """Run a controller on the true plant, sampled; the noise follows from seed and sample."""
+    plant = Process(case.system, 0, *case.start)
+    rows: list[tuple[float, Array, Array, float]] = []
+    failure = ''
+    for number in range(round(case.duration / case.period)):
+        seconds = number * case.period
+        try:
+            plant = plant.until(round(seconds * NANOSECONDS))
+            if plant.system is case.system and seconds >= case.loaded_at:
+                plant = Process(case.loaded, plant.time_ns, plant.x, plant.u)
+            draw = np.random.default_rng((seed, number)).standard_normal(len(case.noise))
+            y = case.outputs.of(plant.x) + case.noise * draw
+            begun = process_time_ns()
+            command = contender.step(y)
+            spent = 1e-3 * (process_time_ns() - begun)
+        except RuntimeError as error:
+            failure = str(error)
+            break
+        rows.append((seconds, plant.x, command, spent))
+        plant = plant.commanded(command, plant.time_ns)
+    times, states, commands, step_us = map(np.array, zip(*rows, strict=True))
+    return Run(times, states, commands, step_us, failure)
+
+
+@dataclass(frozen=True)
+class Figures:
+    """What a run was worth."""
+
+    cost: float  #: of the step of the set-point, over the least cost of all-knowing control
+    #: mean distances from the set-point late after the step, and late after the load, largest
+    #: over the controlled states, in the state's unit
+    offsets: tuple[float, float]
+    violation: float  #: largest excess over a limit of a state, in its unit
+    lost: bool  #: whether one of them was further than what counts as reached
+
+
+def judge(case: Case, found: Run, least: float) -> Figures:
+    """Judge a run by the least cost of its step."""
+    count = case.task.samples
+    if found.failure or len(found.times) <= count:
+        return Figures(float('inf'), (float('inf'),) * 2, float('inf'), True)
+    cost = cost_along(case.task, found.states[:count], found.commands[:count])
+    names = case.system.state_names
+    away = np.stack([found.states[:, names.index(name)] - value
+                     for name, value in case.setpoint.items()], axis=1)
+    begin, end = found.times[0], found.times[-1]
+    offsets = []
+    for first, last in ((begin, case.loaded_at), (case.loaded_at, end)):
+        late = (found.times >= last - _LATE * (last - first)) & (found.times < last)
+        offsets.append(float(np.max(np.abs(np.mean(away[late], axis=0)))))
+    excess = found.states - case.state_upper if len(case.state_upper) else np.zeros(1)
+    return Figures(cost / least, (offsets[0], offsets[1]), float(max(np.max(excess), 0.0)),
+                   not max(offsets) <= case.reached)
