@@ -19,7 +19,7 @@ _AFFINE = 1e-9  # relative, of what an input matrix may miss of a straight line
 
 @dataclass(frozen=True)
 class TrueModel(LiftedModel):
-    """The drift of a plant, its B constant or affine in the state; the lift is the state itself."""
+    """The drift of a plant whose B is constant or affine in x; the lift is the state itself."""
 
     system: ControlAffineSystem | None = None  #: the plant
 

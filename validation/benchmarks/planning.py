@@ -27,10 +27,9 @@ from koopman_ros.control.laws.receding_horizon import RecedingHorizon
 from koopman_ros.control.simulate import after_a_second
 from koopman_ros.estimation import Estimate, SensorLimits
 from koopman_ros.plants import Process
-from koopman_ros.solvers import solve_riccati
 from koopman_ros.units import NANOSECONDS
 from validation.benchmarks.process import Tell
-from validation.benchmarks.sqp import Problem, Sqp
+from validation.benchmarks.sqp import Problem, solver_of, Sqp
 from validation.equations import EQUATIONS
 from validation.partly_measured.cases import Case, CASES
 from validation.partly_measured.dompc import Planner
@@ -45,6 +44,8 @@ SETPOINTS = {'pendulum': ((0.0,), (0.5,), (-0.3,), (0.8,)),
              'quadruple_tank': ((0.15, 0.12), (0.12, 0.14), (0.14, 0.10), (0.11, 0.13))}
 _NOISE = {'pendulum': (2e-3, 1e-2), 'quadruple_tank': (1e-3, 1e-3, 5e-4, 5e-4)}
 _HELD, _BLOCK = 40, 20
+# Until then a controller does not know the time between samples, and plans nothing.
+_UNTIMED = 2
 _MARGIN = 0.3  # half widths of the training box by which the law may leave that
 _UNIFORM = 0.02  # of a sample, by which intervals of the horizon may differ from one
 #: of the range of an input, between the commands of each and those of the law. The lift's drift is
@@ -72,13 +73,14 @@ def compare(plant: str, samples: int, compiler: str | None) -> dict[str, Any]:
     case = CASES[plant]
     controller = _controller(case)
     calls, commanded, requested = _course(case, controller, samples)
+    # each twice: what one run remembers would help the next
+    problem = _problem(case, controller)
     with tempfile.TemporaryDirectory() as name:
-        # each twice: what one run remembers would help the next
-        sides, again = (_sides(case, controller, Path(name) / folder, compiler)
-                        for folder in ('checked', 'timed'))
+        solver = solver_of(problem, Path(name), compiler)
+        sides, again = (_sides(case, controller, Sqp(problem, solver)) for _ in range(2))
     commands = {'step': commanded, **{side: np.array([answer(*call) for call in calls])
                                       for side, answer in sides.items()}}
-    apart = {side: float(np.max(np.abs(commands[side] - commands['law'])[1:]
+    apart = {side: float(np.max(np.abs(commands[side] - commands['law'])[_UNTIMED:]
                                 / (case.upper - case.lower))) for side in TOLERANCE}
     for side, most in TOLERANCE.items():
         if not apart[side] <= most:
@@ -104,8 +106,7 @@ def compare(plant: str, samples: int, compiler: str | None) -> dict[str, Any]:
     found: dict[str, Any] = {'steps': samples, 'states': case.system.n_x,
                              'compiled': compiler is not None, 'agreement': apart}
     for side, pairs in taken.items():
-        # the first plan has none to begin with
-        wall, cpu = 1e-3 * np.array(pairs[1:]).T
+        wall, cpu = 1e-3 * np.array(pairs[_UNTIMED:]).T
         for clock, values in (('', wall), ('cpu_', cpu)):
             for label, percent in (('median', 50), ('p99', 99)):
                 found[f'{side}_{clock}{label}_us'] = float(np.percentile(values, percent))
@@ -143,13 +144,24 @@ def _course(case: Case, controller: Controller, samples: int
     return calls, loop.commands, requested
 
 
-def _sides(case: Case, controller: Controller, folder: Path, compiler: str | None
-           ) -> dict[str, Answer]:
-    """Return what answers a state with its target: the law alone, SQP, and do-mpc."""
-    folder.mkdir()
-    model, level = controller.model, controller.levels['mpc']
-    law, memory = level.law, None
+def _problem(case: Case, controller: Controller) -> Problem:
+    """Return what the law plans, with the plant's own equations."""
+    model, law = controller.model, controller.levels['mpc'].law
     assert isinstance(law, RecedingHorizon)
+    interval = case.period / case.system.seconds_per_time_unit
+    lengths = law.lengths(interval)
+    if len(lengths) != INTERVALS or not np.ptp(lengths) <= _UNIFORM * interval:
+        raise ValueError(f'{case.plant}: the horizon has {len(lengths)} intervals of '
+                         f'{lengths.min():g} to {lengths.max():g}, must be {INTERVALS} samples')
+    return Problem(EQUATIONS[case.plant], lengths, case.Q, case.R, case.cost_to_go, case.lower,
+                   case.upper, (model.states.scale, model.inputs.scale))
+
+
+def _sides(case: Case, controller: Controller, sqp: Sqp) -> dict[str, Answer]:
+    """Return what answers a state with its target: the law alone, SQP, and do-mpc."""
+    model, law = controller.model, controller.levels['mpc'].law
+    planner, none = Planner(case), np.zeros(case.directions.shape[1])
+    memory: object = None
 
     def own(y: Array, target: Target) -> Array:
         nonlocal memory
@@ -159,25 +171,9 @@ def _sides(case: Case, controller: Controller, folder: Path, compiler: str | Non
         assert result.u is not None
         return result.u
 
-    interval = case.period / case.system.seconds_per_time_unit
-    lengths = law.lengths(interval)
-    if len(lengths) != INTERVALS or not np.ptp(lengths) <= _UNIFORM * interval:
-        raise ValueError(f'{case.plant}: the horizon has {len(lengths)} intervals of '
-                         f'{lengths.min():g} to {lengths.max():g}, must be {INTERVALS} samples')
-    x_ref, u_ref = case.goal(case.system)
-    P = solve_riccati(case.system.slope(x_ref, u_ref), case.system.input_matrix(x_ref),
-                      np.diag(case.Q), np.diag(case.R), interval=interval, max_gain=1e9).P
-    sqp = Sqp(Problem(EQUATIONS[case.plant], lengths, case.Q, case.R, P, case.lower, case.upper,
-                      (model.states.scale, model.inputs.scale)), folder, compiler)
-    planner = Planner(case)
-    if compiler is not None:
-        planner.compile(folder, compiler)
-
     def other(y: Array, target: Target) -> Array:
-        planner.aim(model.states.to_physical(target.x), model.inputs.to_physical(target.u),
-                    np.zeros(case.directions.shape[1]))
+        planner.aim(model.states.to_physical(target.x), model.inputs.to_physical(target.u), none)
         return planner.step(y)
 
-    return {'law': own, 'sqp': lambda y, target: sqp.step(
-        y, model.states.to_physical(target.x), model.inputs.to_physical(target.u)),
-        'do_mpc': other}
+    return {'law': own, 'do_mpc': other, 'sqp': lambda y, target: sqp.step(
+        y, model.states.to_physical(target.x), model.inputs.to_physical(target.u))}

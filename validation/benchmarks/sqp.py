@@ -5,6 +5,7 @@
 
 from __future__ import annotations
 
+import contextlib
 from dataclasses import dataclass
 from pathlib import Path
 import subprocess
@@ -17,11 +18,12 @@ from koopman_ros.arrays import Array
 from validation.equations import Rates
 
 # Its own solver of quadratic programs can be generated as C together with the rest.
-_OPTIONS = {'qpsol': 'qrqp', 'max_iter': 10, 'tol_du': 1e-4, 'tol_pr': 1e-5,
-            'convexify_strategy': 'regularize', 'error_on_fail': False, 'print_header': False,
-            'print_iteration': False, 'print_status': False, 'print_time': False,
-            'qpsol_options': {'error_on_fail': False, 'print_iter': False, 'print_header': False,
-                              'print_info': False}}
+_OPTIONS: dict[str, Any] = {
+    'qpsol': 'qrqp', 'max_iter': 10, 'tol_du': 1e-4, 'tol_pr': 1e-5,
+    'convexify_strategy': 'regularize', 'error_on_fail': False, 'print_header': False,
+    'print_iteration': False, 'print_status': False, 'print_time': False,
+    'qpsol_options': {'error_on_fail': False, 'print_iter': False, 'print_header': False,
+                      'print_info': False}}
 
 
 @dataclass(frozen=True, eq=False)
@@ -41,21 +43,12 @@ class Problem:
 class Sqp:
     """Multiple shooting, a Runge-Kutta step an interval; each plan begins with the one before."""
 
-    def __init__(self, problem: Problem, folder: Path | None, compiler: str | None) -> None:
-        """
-        Build the solver.
-
-        :param folder: for what is generated.
-        :param compiler: command of a C compiler; None for casadi's virtual machine.
-        """
-        self._problem = problem
+    def __init__(self, problem: Problem, solver: Any) -> None:
+        """Plan by what :func:`solver_of` returns, from nothing."""
+        self._problem, self._solver = problem, solver
         n, n_u = (len(scale) for scale in problem.scale)
         self._n, self._size = n, n + n_u
-        solver = casadi.nlpsol('sqp', 'sqpmethod', _program(problem), _OPTIONS)
-        self._solver: Any = solver if compiler is None or folder is None else _compiled(
-            solver, folder, compiler)
-        free = np.full(n, np.inf)
-        count = len(problem.lengths)
+        free, count = np.full(n, np.inf), len(problem.lengths)
         self._bounds = [np.concatenate([*([side * free, bound / problem.scale[1]] * count),
                                         side * free])
                         for side, bound in ((-1.0, problem.lower), (1.0, problem.upper))]
@@ -78,6 +71,25 @@ class Sqp:
         # an interval later: the first ones are a sample long
         self._plan = np.concatenate((plan[self._size:], plan[-self._size:]))
         return np.asarray(plan[self._n:self._size] * unit_u)
+
+
+def solver_of(problem: Problem, folder: Path | None = None, compiler: str | None = None) -> Any:
+    """
+    Return the solver of a problem: generated C, its quadratic programs in it, if compiled.
+
+    :param folder: for what is generated.
+    :param compiler: command of a C compiler; None for casadi's virtual machine.
+    """
+    solver = casadi.nlpsol('sqp', 'sqpmethod', _program(problem), _OPTIONS)
+    if compiler is None or folder is None:
+        return solver
+    with contextlib.chdir(folder):
+        solver.generate('sqp.c')
+    library = folder / 'sqp.so'
+    # more is not quicker here, and takes minutes
+    subprocess.run([compiler, '-O1', '-fPIC', '-shared', folder / 'sqp.c', '-o', library, '-lm'],
+                   check=True)
+    return casadi.external('sqp', str(library))
 
 
 def _program(problem: Problem) -> dict[str, Any]:
@@ -106,14 +118,3 @@ def _program(problem: Problem) -> dict[str, Any]:
     e = unit * nodes[:, -1] - x_ref
     return {'x': casadi.vertcat(*variables, nodes[:, -1]), 'p': given,
             'f': cost + e.T @ problem.P @ e, 'g': casadi.vertcat(*rest)}
-
-
-def _compiled(solver: Any, folder: Path, compiler: str) -> Any:
-    """Return a solver from C that casadi generates, its quadratic programs in it."""
-    source = folder / 'sqp.c'
-    solver.generate(source.name, {'with_header': False})
-    Path(source.name).rename(source)
-    library = source.with_suffix('.so')
-    subprocess.run([compiler, '-O2', '-fPIC', '-shared', source, '-o', library, '-lm'],
-                   check=True)
-    return casadi.external('sqp', str(library))

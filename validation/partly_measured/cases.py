@@ -19,8 +19,11 @@ from koopman_ros.plants import ControlAffineSystem, steady_state
 from koopman_ros.plants.optimum import Task
 from koopman_ros.resources import model_path
 from koopman_ros.signals import Outputs
+from koopman_ros.solvers import solve_riccati
 from validation.shipped_models import library_system
 from validation.true_model import TrueModel
+
+_ENDLESS = 1e9  # bound on a gain in physical units, whatever these are
 
 
 @dataclass(frozen=True, eq=False)
@@ -39,7 +42,7 @@ class Case:
     period: float  #: between samples, in s
     begin: dict[str, float]  #: the states at rest before the step, by name
     setpoint: dict[str, float]  #: where some states are to go, in the model's order
-    reached: float  #: distance from the set-point at which a run is lost, in state units
+    reached: float  #: offset from which a run counts as lost, in the unit of the last set-point
     load: Array  #: (n_u,) what is added to the inputs in the end, which nobody is told
     loaded_at: float  #: when, in s
     duration: float  #: of it all, in s
@@ -92,6 +95,16 @@ class Case:
             return self.system.input_matrix(self.system.nominal_state)
         return np.eye(self.system.n_x)[:, self.rows]
 
+    @property
+    def shown(self) -> str:
+        """The last state with a set-point, in whose unit offsets are."""
+        return list(self.setpoint)[-1]
+
+    @cached_property
+    def unit(self) -> str:
+        """Its unit."""
+        return dict(zip(self.system.state_names, self.system.state_units, strict=True))[self.shown]
+
     @cached_property
     def start(self) -> tuple[Array, Array]:
         """State and input before the step."""
@@ -100,6 +113,15 @@ class Case:
     def goal(self, system: ControlAffineSystem) -> tuple[Array, Array]:
         """Return state and input that hold the set-point."""
         return steady_state(system, self.setpoint)
+
+    @cached_property
+    def cost_to_go(self) -> Array:
+        """What (n_x, n_x) the sampled regulator costs from a deviation about the set-point on."""
+        x, u = self.goal(self.system)
+        return solve_riccati(
+            self.system.slope(x, u), self.system.input_matrix(x), np.diag(self.Q),
+            np.diag(self.R), interval=self.period / self.system.seconds_per_time_unit,
+            max_gain=_ENDLESS).P
 
     @cached_property
     def task(self) -> Task:

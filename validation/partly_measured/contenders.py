@@ -6,9 +6,9 @@
 from collections.abc import Callable
 from typing import Protocol
 
-import control
 import numpy as np
 
+import control
 from koopman_ros.arrays import Array
 from koopman_ros.control import Controller, LevelSettings, State, SupervisorSettings
 from koopman_ros.control.simulate import after_a_second

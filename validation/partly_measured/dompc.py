@@ -8,9 +8,6 @@ See F. Fiedler et al., "do-mpc: Towards FAIR nonlinear and robust model predicti
 Control Engineering Practice 140 (2023).
 """
 
-import contextlib
-from pathlib import Path
-import subprocess
 from typing import Any
 import warnings
 
@@ -21,7 +18,6 @@ from koopman_ros.arrays import Array
 from koopman_ros.control.laws.base import Tuning, Weights
 from koopman_ros.control.laws.receding_horizon import RecedingHorizon
 from koopman_ros.estimation import Estimate, EstimatorTuning, ExtendedKalmanFilter
-from koopman_ros.solvers import solve_riccati
 from validation.equations import EQUATIONS
 from validation.partly_measured.cases import Case
 
@@ -33,10 +29,11 @@ with warnings.catch_warnings():
 # It calls functions of numpy on values of casadi, which would warn of what is to come.
 casadi.GlobalOptions.setNumpyMode(-1)
 # of those tried among the quickest on every plant
-_IPOPT = {'ipopt.print_level': 0, 'ipopt.sb': 'yes', 'print_time': 0, 'ipopt.tol': 1e-4,
-          'ipopt.warm_start_init_point': 'yes', 'ipopt.mu_init': 1e-3}
+_IPOPT: dict[str, Any] = {
+    'ipopt.print_level': 0, 'ipopt.sb': 'yes', 'print_time': 0, 'ipopt.tol': 1e-4,
+    'ipopt.warm_start_init_point': 'yes', 'ipopt.mu_init': 1e-3}
 _PENALTY = 1e3  # of a violated limit of a state, in its scale
-_WINDOW = 30  # samples that the estimator looks back
+_WINDOW = 20  # samples that the estimator looks back
 _SETTLING = 400  # samples after which a filter's covariance stands still
 
 
@@ -58,12 +55,9 @@ class Planner:
         planner.settings.nlpsol_opts = dict(_IPOPT)
         x, u, to = (self._model.x['x'], self._model.u['u'], self._model.tvp['to'])
         e, v = x - to[:n], u - to[n:]
-        x_ref, u_ref = case.goal(case.system)
-        P = solve_riccati(case.system.slope(x_ref, u_ref), case.system.input_matrix(x_ref),
-                          np.diag(case.Q), np.diag(case.R), interval=interval, max_gain=1e9).P
         planner.set_objective(
             lterm=interval * (casadi.dot(case.Q * e, e) + casadi.dot(case.R * v, v)),
-            mterm=e.T @ P @ e)
+            mterm=e.T @ case.cost_to_go @ e)
         planner.set_rterm(u=np.zeros(n_u))
         planner.bounds['lower', '_u', 'u'] = case.lower
         planner.bounds['upper', '_u', 'u'] = case.upper
@@ -83,20 +77,6 @@ class Planner:
         """Take another target and the disturbances (n_d,) that it is held under."""
         self._ahead['_tvp', :, 'to'] = np.concatenate((x_ref, u_ref))
         self._known['_p', 0, 'd'] = d
-
-    def compile(self, folder: Path, compiler: str) -> None:
-        """
-        Compile its expressions as its own `compile_nlp` does, which fails in version 5.1.2.
-
-        :param folder: for the sources and the library.
-        :param compiler: command of a C compiler.
-        """
-        source, library = 'nlp.c', folder / 'nlp.so'
-        with contextlib.chdir(folder):
-            self._planner.S.generate_dependencies(source)
-        subprocess.run([compiler, '-fPIC', '-shared', '-O2', folder / source, '-o', library],
-                       check=True)
-        self._planner.S = casadi.nlpsol('compiled', 'ipopt', str(library), _IPOPT)
 
     def step(self, x: Array) -> Array:
         """Return the first input (n_u,) of its plan from a state (n_x,)."""

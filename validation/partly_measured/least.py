@@ -29,8 +29,8 @@ def least_course(case: Case) -> Course:
     opti.subject_to(x[:, 0] == task.x0 / unit)
     for i in range(len(case.lower)):
         opti.subject_to(opti.bounded(float(case.lower[i]), u[i, :], float(case.upper[i])))
-    for i in np.flatnonzero(np.isfinite(case.state_upper)):
-        opti.subject_to(x[int(i), 1:] <= case.state_upper[i] / unit[i])
+    for i in np.flatnonzero(np.isfinite(case.state_upper)).tolist():
+        opti.subject_to(x[i, 1:] <= case.state_upper[i] / unit[i])
     opti.minimize(casadi.sum2(moved[n, :]))
     share = np.linspace(0.0, 1.0, task.samples + 1)
     opti.set_initial(x, (task.x0[:, None] + (task.x_ref - task.x0)[:, None] * share)
@@ -38,7 +38,7 @@ def least_course(case: Case) -> Course:
     opti.set_initial(u, np.tile(task.u_ref[:, None], (1, task.samples)))
     opti.solver('ipopt', {'print_time': False}, {'print_level': 0, 'sb': 'yes', 'tol': 1e-10})
     found = opti.solve()
-    return Course(unit * found.value(x).T, np.reshape(found.value(u), u.shape).T,
+    return Course(unit * np.asarray(found.value(x)).T, np.reshape(found.value(u), u.shape).T,
                   float(found.value(opti.f)))
 
 

@@ -41,15 +41,13 @@ def table_of(summary: Mapping[str, Mapping[str, Mapping[str, Any]]], cases: Mapp
     rows = []
     for plant, contenders in summary.items():
         case = cases[plant]
-        units = dict(zip(case.system.state_names, case.system.state_units, strict=True))
-        unit = units[next(iter(reversed(case.setpoint)))]
-        factor, shown = (1e3, 'mm') if unit == 'm' else (1.0, unit)
+        factor, shown = (1e3, 'mm') if case.unit == 'm' else (1.0, case.unit)
         for name, found in contenders.items():
             rows.append([
                 plant, name, f'{found["cost_mean"]:.3f}', f'{found["cost_worst"]:.3f}',
                 *(f'{factor * found[figure]:.2g} {shown}'
                   for figure in ('offset', 'offset_under_load')),
-                f'{found["violation"]:.2g} {unit}' if len(case.state_upper) else '',
+                f'{found["violation"]:.2g} {case.unit}' if len(case.state_upper) else '',
                 f'{found["lost"]} of {found["runs"]}',
                 f'{found["step_median_ms"]:.2f}', f'{found["step_p99_ms"]:.2f}'])
     return table(_HEAD, rows, range(2, len(_HEAD)))
@@ -61,12 +59,13 @@ def draw(found: Found, cases: Mapping[str, Case], path: Path) -> Picture:
             figure, axes):
         for column, (plant, contenders) in enumerate(found.items()):
             case, (above, below) = cases[plant], (axes[column], axes[column + len(found)])
-            system, name = case.system, next(iter(reversed(case.setpoint)))
+            system, name = case.system, case.shown
             i, j = system.state_names.index(name), int(np.argmax(np.abs(case.load)))
             for number, (label, runs) in enumerate(contenders.items()):
-                run, style = runs[0][0], {'color': f'C{number}', 'linewidth': 1.1}
-                above.plot(run.times, run.states[:, i], label=label, **style)
-                below.step(run.times, run.commands[:, j], where='post', label=label, **style)
+                run, color = runs[0][0], f'C{number}'
+                above.plot(run.times, run.states[:, i], label=label, color=color, linewidth=1.1)
+                below.step(run.times, run.commands[:, j], where='post', label=label, color=color,
+                           linewidth=1.1)
             above.plot([0.0, case.duration], [case.setpoint[name]] * 2, '--', color='0.3',
                        linewidth=0.8, label='set-point')
             if len(case.state_upper) and np.isfinite(case.state_upper[i]):

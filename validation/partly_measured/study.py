@@ -60,7 +60,7 @@ class Figures:
 
     cost: float  #: of the step of the set-point, over the least cost of all-knowing control
     #: mean distances from the set-point late after the step, and late after the load, largest
-    #: over the controlled states, in the state's unit
+    #: over the states with a set-point in the unit of the last
     offsets: tuple[float, float]
     violation: float  #: largest excess over a limit of a state, in its unit
     lost: bool  #: whether one of them was further than what counts as reached
@@ -72,9 +72,9 @@ def judge(case: Case, found: Run, least: float) -> Figures:
     if found.failure or len(found.times) <= count:
         return Figures(float('inf'), (float('inf'),) * 2, float('inf'), True)
     cost = cost_along(case.task, found.states[:count], found.commands[:count])
-    names = case.system.state_names
-    away = np.stack([found.states[:, names.index(name)] - value
-                     for name, value in case.setpoint.items()], axis=1)
+    units = dict(zip(case.system.state_names, case.system.state_units, strict=True))
+    away = np.stack([found.states[:, case.system.state_names.index(name)] - value
+                     for name, value in case.setpoint.items() if units[name] == case.unit], axis=1)
     begin, end = found.times[0], found.times[-1]
     offsets = []
     for first, last in ((begin, case.loaded_at), (case.loaded_at, end)):
