@@ -66,9 +66,12 @@ class LinearQuadraticGaussian:
         self._A, self._B, self._C = plant.A, plant.B, plant.C
         self._K = solve_riccati(A, B, np.diag(case.Q), np.diag(case.R), interval=interval,
                                 max_gain=_ENDLESS).K
-        # an input that wanders, as for the others, from one sample to the next
-        self._L = control.dlqe(self._A, self._B, self._C, case.period * np.diag(case.wander ** 2),
-                               np.diag(case.noise ** 2))[0]
+        # an input that wanders, as for the others, from one sample to the next; what is returned
+        # beside the covariance is the gain of a predictor, which lags by a sample
+        noise = np.diag(case.noise ** 2)
+        P = control.dlqe(self._A, self._B, self._C, case.period * np.diag(case.wander ** 2),
+                         noise)[1]
+        self._L = np.linalg.solve(self._C @ P @ self._C.T + noise, self._C @ P).T
         # what holds the set-point, as far as the linear model tells
         rows = np.eye(system.n_x)[[system.state_names.index(name) for name in case.setpoint]]
         away = np.array(list(case.setpoint.values())) - rows @ x
