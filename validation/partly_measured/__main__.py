@@ -12,7 +12,6 @@ from koopman_ros.reports import machine, write_figures, write_page
 from validation.partly_measured.cases import CASES
 from validation.partly_measured.contenders import Contender, LINEAR, OWN
 from validation.partly_measured.dompc import WithFilter, WithWindow
-from validation.partly_measured.least import least_course
 from validation.partly_measured.report import draw, figures_of, table_of
 from validation.partly_measured.study import judge, run
 
@@ -41,9 +40,8 @@ def main(args: list[str] | None = None) -> int:
     found = {}
     for plant in options.plants or CASES:
         case = CASES[plant]
-        least = least_course(case).cost
         found[plant] = {name: [
-            (made, judge(case, made, least)) for made in (
+            (made, judge(case, made)) for made in (
                 run(case, make(case), seed) for seed in range(options.seeds))]
             for name, make in CONTENDERS.items()}
         print(f'{plant} is done', file=sys.stderr, flush=True)

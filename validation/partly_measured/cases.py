@@ -28,7 +28,7 @@ _ENDLESS = 1e9  # bound on a gain in physical units, whatever these are
 
 @dataclass(frozen=True, eq=False)
 class Case:
-    """A step of the set-point from rest on a plant of the library, and a load in the end."""
+    """Rest at a set-point, a step of it, and a load in the end, on a plant of the library."""
 
     plant: str  #: its name in the catalogue, and that of its shipped lift
     measured: tuple[str, ...]  #: (n_y,) names of the states that are
@@ -40,11 +40,12 @@ class Case:
     lower: Array  #: (n_u,) range of the inputs, to `upper` (n_u,)
     upper: Array
     period: float  #: between samples, in s
-    begin: dict[str, float]  #: the states at rest before the step, by name
-    setpoint: dict[str, float]  #: where some states are to go, in the model's order
+    begin: dict[str, float]  #: where some states rest, and are to rest, before the step
+    setpoint: dict[str, float]  #: where they are to go, in the model's order
     reached: float  #: offset from which a run counts as lost, in the unit of the last set-point
     load: Array  #: (n_u,) what is added to the inputs in the end, which nobody is told
-    loaded_at: float  #: when, in s
+    stepped_at: float  #: when the set-point steps, in s
+    loaded_at: float  #: when the load begins, in s
     duration: float  #: of it all, in s
     state_upper: Array = field(default_factory=lambda: np.zeros(0))  #: (n_x,), empty for none
 
@@ -110,6 +111,11 @@ class Case:
         """State and input before the step."""
         return steady_state(self.system, self.begin)
 
+    def wanted(self, seconds: float) -> Array:
+        """Return the set-point (n_c,) at a time."""
+        return np.array(list((self.begin if seconds < self.stepped_at else self.setpoint
+                              ).values()))
+
     def goal(self, system: ControlAffineSystem) -> tuple[Array, Array]:
         """Return state and input that hold the set-point."""
         return steady_state(system, self.setpoint)
@@ -123,13 +129,12 @@ class Case:
             np.diag(self.R), interval=self.period / self.system.seconds_per_time_unit,
             max_gain=_ENDLESS).P
 
-    @cached_property
-    def task(self) -> Task:
-        """The step alone, all known."""
+    def task(self, x0: Array) -> Task:
+        """Return the step alone from a state (n_x,), all known."""
         x_ref, u_ref = self.goal(self.system)
-        return Task(self.system, self.start[0], x_ref, u_ref, self.Q, self.R,
+        return Task(self.system, x0, x_ref, u_ref, self.Q, self.R,
                     self.period / self.system.seconds_per_time_unit,
-                    round(self.loaded_at / self.period), 10)
+                    round((self.loaded_at - self.stepped_at) / self.period), 10)
 
     def settings(self, model: LiftedModel, **others: Any) -> Settings:
         """Return what a controller of this package is tuned by; `others` replace that by name."""
@@ -141,13 +146,13 @@ class Case:
             'initial_error': self.initial_error, 'state_upper': self.state_upper,
             'state_lower': np.full(len(self.state_upper), -np.inf), **others})
 
-    def target(self, w: Array) -> tuple[Array, Array]:
-        """Return the state and the input that hold the set-point under rates w (n_x,)."""
+    def target(self, setpoint: Array, w: Array) -> tuple[Array, Array]:
+        """Return the state and the input that hold a set-point (n_c,) under rates w (n_x,)."""
         model = self.truth
         states, inputs, names = model.states, model.inputs, tuple(self.setpoint)
         found: Target | None = partial_target(
             model, np.array([states.names.index(name) for name in names], dtype=np.intp),
-            states.only(names).to_deviation(np.array(list(self.setpoint.values()))),
+            states.only(names).to_deviation(setpoint),
             w / states.scale, inputs.to_deviation(self.lower), inputs.to_deviation(self.upper),
             np.zeros(model.n_x + model.n_u))
         if found is None:
@@ -160,16 +165,16 @@ CASES = {case.plant: case for case in (
     Case('quadruple_tank', ('level_1', 'level_2'), np.full(2, 1e-3), np.full(2, 0.01),
          np.array([1e-3, 1e-3, 1e-2, 1e-2]), np.array([1e4, 1e4, 0.0, 0.0]), np.ones(2),
          np.zeros(2), np.full(2, 10.0), 12.0, {'level_1': 0.10, 'level_2': 0.15},
-         {'level_1': 0.15, 'level_2': 0.12}, 0.01, np.array([-0.3, 0.0]), 600.0, 1500.0),
+         {'level_1': 0.15, 'level_2': 0.12}, 0.01, np.array([-0.3, 0.0]), 300.0, 900.0, 1800.0),
     # the motor holds it 57 degrees from upright
     Case('pendulum', ('angle',), np.array([2e-3]), np.array([0.1]), np.array([2e-3, 0.5]),
          np.array([1.0, 0.1]), np.ones(1), np.array([-15.0]), np.array([15.0]), 0.0625,
-         {'angle': 1.0}, {'angle': 0.0}, 0.1, np.array([0.5]), 3.75, 9.0),
+         {'angle': 1.0}, {'angle': 0.0}, 0.1, np.array([0.5]), 1.5625, 5.3125, 10.5),
     # the hotter, the quicker it converts: without its limit it goes to 326.6 K
     Case('fed_reactor', ('concentration', 'temperature'), np.array([2e-3, 0.1]),
          np.array([0.5, 0.05]), np.array([2e-3, 0.1]), np.array([1e5, 0.1]), np.full(2, 0.1),
          np.array([60.0, 278.15]), np.array([150.0, 305.15]), 9.0,
          {'concentration': 0.95, 'temperature': 315.0},
-         {'concentration': 0.88, 'temperature': 322.0}, 1.0, np.array([0.0, 1.0]), 450.0, 1200.0,
-         np.array([np.inf, 322.5])),
+         {'concentration': 0.88, 'temperature': 322.0}, 1.0, np.array([0.0, 1.0]), 225.0, 675.0,
+         1440.0, np.array([np.inf, 322.5])),
 )}

@@ -24,8 +24,8 @@ _ENDLESS = 1e9  # bound on a gain in physical units, whatever these are
 class Contender(Protocol):
     """What answers a measurement of a case."""
 
-    def step(self, y: Array) -> Array:
-        """Return the input (n_u,) for the outputs (n_y,) of the next sample."""
+    def step(self, y: Array, setpoint: Array) -> Array:
+        """Return the input (n_u,) for outputs (n_y,) of the next sample, and a set-point."""
 
 
 class Own:
@@ -36,14 +36,16 @@ class Own:
         self._controller = Controller(
             model, case.settings(model, supervisor=supervisor), case.outputs)
         self._state = self._controller.initialise(State(), case.start[1])
-        self._state, refused = self._controller.request_setpoint(
-            self._state, np.array(list(case.setpoint.values())))
-        if refused is not None:
-            raise ValueError(f'{case.plant}: the set-point is refused: {refused}')
         self._period_ns, self._number = round(case.period * NANOSECONDS), 0
+        self._setpoint: Array | None = None
 
-    def step(self, y: Array) -> Array:
-        """Return the input (n_u,) for the outputs (n_y,) of the next sample."""
+    def step(self, y: Array, setpoint: Array) -> Array:
+        """Return the input (n_u,) for outputs (n_y,) of the next sample, and a set-point."""
+        if self._setpoint is None or (setpoint != self._setpoint).any():
+            self._setpoint = setpoint
+            self._state, refused = self._controller.request_setpoint(self._state, setpoint)
+            if refused is not None:
+                raise ValueError(f'the set-point {setpoint.tolist()} is refused: {refused}')
         self._state, command, _ = self._controller.step(
             self._state, y, after_a_second(self._number * self._period_ns))
         self._number += 1
@@ -72,24 +74,25 @@ class LinearQuadraticGaussian:
         P = control.dlqe(self._A, self._B, self._C, case.period * np.diag(case.wander ** 2),
                          noise)[1]
         self._L = np.linalg.solve(self._C @ P @ self._C.T + noise, self._C @ P).T
-        # what holds the set-point, as far as the linear model tells
-        rows = np.eye(system.n_x)[[system.state_names.index(name) for name in case.setpoint]]
-        away = np.array(list(case.setpoint.values())) - rows @ x
-        held = np.block([[A, B], [rows, np.zeros((len(rows), system.n_u))]])
-        found = np.linalg.lstsq(held, np.concatenate((np.zeros(system.n_x), away)), rcond=None)[0]
-        self._x_ref, self._u_ref = np.split(found, [system.n_x])
+        # what holds a set-point, as far as the linear model tells
+        self._rows = np.eye(system.n_x)[[system.state_names.index(name)
+                                         for name in case.setpoint]]
+        self._held = np.linalg.pinv(np.block(
+            [[A, B], [self._rows, np.zeros((len(self._rows), system.n_u))]]))
         self._about, self._limits = (x, u), case.limits
         self._x: Array = system.nominal_state - x
         self._first = True
 
-    def step(self, y: Array) -> Array:
-        """Return the input (n_u,) for the outputs (n_y,) of the next sample."""
+    def step(self, y: Array, setpoint: Array) -> Array:
+        """Return the input (n_u,) for outputs (n_y,) of the next sample, and a set-point."""
         x, u = self._about
         error = y - self._C @ (x + self._x)
         # nothing is known before the first but what it says itself
         gain = np.linalg.pinv(self._C) if self._first else self._L
         self._x, self._first = self._x + gain @ error, False
-        command = self._limits.within(u + self._u_ref - self._K @ (self._x - self._x_ref))
+        x_ref, u_ref = np.split(self._held @ np.concatenate(
+            (np.zeros(len(x)), setpoint - self._rows @ x)), [len(x)])
+        command = self._limits.within(u + u_ref - self._K @ (self._x - x_ref))
         self._x = self._A @ self._x + self._B @ (command - u)
         return command
 

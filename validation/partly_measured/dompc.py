@@ -95,8 +95,8 @@ class WithFilter:
         self._estimate: Estimate | None = None
         self._u = case.start[1]
 
-    def step(self, y: Array) -> Array:
-        """Return the input (n_u,) for the outputs (n_y,) of the next sample."""
+    def step(self, y: Array, setpoint: Array) -> Array:
+        """Return the input (n_u,) for outputs (n_y,) of the next sample, and a set-point."""
         case, model, known = self._case, self._case.truth, self._estimate
         u = model.inputs.to_deviation(self._u)
         if known is None:
@@ -109,7 +109,7 @@ class WithFilter:
                 y, model.states.to_physical(predicted.x)))
             self._estimate = found = self._filter.correct(predicted, x, case.period)
         w = found.w * model.states.scale
-        self._planner.aim(*case.target(w), np.linalg.pinv(case.directions) @ w)
+        self._planner.aim(*case.target(setpoint, w), np.linalg.pinv(case.directions) @ w)
         self._u = self._planner.step(model.states.to_physical(found.x))
         return self._u
 
@@ -136,8 +136,8 @@ class WithWindow:
         window.setup()
         self._u, self._started = case.start[1], False
 
-    def step(self, y: Array) -> Array:
-        """Return the input (n_u,) for the outputs (n_y,) of the next sample."""
+    def step(self, y: Array, setpoint: Array) -> Array:
+        """Return the input (n_u,) for outputs (n_y,) of the next sample, and a set-point."""
         case = self._case
         if not self._started:
             self._window.x0, self._window.u0 = _guess(case, y), self._u
@@ -146,7 +146,7 @@ class WithWindow:
             self._started = True
         x = np.asarray(self._window.make_step(np.concatenate((y, self._u)))).ravel()
         d = np.asarray(self._window.p_est0.cat).ravel()
-        self._planner.aim(*case.target(case.directions @ d), d)
+        self._planner.aim(*case.target(setpoint, case.directions @ d), d)
         self._u = self._planner.step(x)
         return self._u
 

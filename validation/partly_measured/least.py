@@ -6,20 +6,21 @@
 import casadi
 import numpy as np
 
+from koopman_ros.arrays import Array
 from koopman_ros.plants.optimum import Course, Task
 from validation.equations import EQUATIONS
 from validation.partly_measured.cases import Case
 
 
-def least_course(case: Case) -> Course:
+def least_course(case: Case, x0: Array) -> Course:
     """
-    Find the course of least cost of the step of the set-point, without noise.
+    Find the course of least cost of the step of the set-point from a state (n_x,), without noise.
 
     Limits of the states hold at the samples.
 
     :raises RuntimeError: where IPOPT finds none.
     """
-    task, n = case.task, case.system.n_x
+    task, n = case.task(x0), case.system.n_x
     opti = casadi.Opti()
     u, x = opti.variable(case.system.n_u, task.samples), opti.variable(n, task.samples + 1)
     unit = case.system.state_scale

@@ -66,7 +66,8 @@ def draw(found: Found, cases: Mapping[str, Case], path: Path) -> Picture:
                 above.plot(run.times, run.states[:, i], label=label, color=color, linewidth=1.1)
                 below.step(run.times, run.commands[:, j], where='post', label=label, color=color,
                            linewidth=1.1)
-            above.plot([0.0, case.duration], [case.setpoint[name]] * 2, '--', color='0.3',
+            above.plot([0.0, case.stepped_at, case.stepped_at, case.duration],
+                       [case.begin[name]] * 2 + [case.setpoint[name]] * 2, '--', color='0.3',
                        linewidth=0.8, label='set-point')
             if len(case.state_upper) and np.isfinite(case.state_upper[i]):
                 draw_limits(above, [case.state_upper[i]], 'limit')

@@ -4,6 +4,7 @@
 """The loop that every controller is run in, and what it is judged by."""
 
 from dataclasses import dataclass
+import itertools
 from time import process_time_ns
 
 import numpy as np
@@ -14,6 +15,7 @@ from koopman_ros.plants.optimum import cost_along
 from koopman_ros.units import NANOSECONDS
 from validation.partly_measured.cases import Case
 from validation.partly_measured.contenders import Contender
+from validation.partly_measured.least import least_course
 
 _LATE = 1.0 / 3.0  # of a part, over which its offset is the mean
 
@@ -43,7 +45,7 @@ def run(case: Case, contender: Contender, seed: int) -> Run:
             draw = np.random.default_rng((seed, number)).standard_normal(len(case.noise))
             y = case.outputs.of(plant.x) + case.noise * draw
             begun = process_time_ns()
-            command = contender.step(y)
+            command = contender.step(y, case.wanted(seconds))
             spent = 1e-3 * (process_time_ns() - begun)
         except RuntimeError as error:
             failure = str(error)
@@ -58,28 +60,32 @@ def run(case: Case, contender: Contender, seed: int) -> Run:
 class Figures:
     """What a run was worth."""
 
-    cost: float  #: of the step of the set-point, over the least cost of all-knowing control
-    #: mean distances from the set-point late after the step, and late after the load, largest
-    #: over the states with a set-point in the unit of the last
+    #: of the step of the set-point, over the least of all-knowing control from the same state
+    cost: float
+    #: mean distances from the set-point late before and after the step, the larger, and late under
+    #: the load, largest over the states with a set-point in the unit of the last
     offsets: tuple[float, float]
     violation: float  #: largest excess over a limit of a state, in its unit
     lost: bool  #: whether one of them was further than what counts as reached
 
 
-def judge(case: Case, found: Run, least: float) -> Figures:
-    """Judge a run by the least cost of its step."""
-    count = case.task.samples
-    if found.failure or len(found.times) <= count:
+def judge(case: Case, found: Run) -> Figures:
+    """Judge a run."""
+    first = round(case.stepped_at / case.period)
+    end = first + round((case.loaded_at - case.stepped_at) / case.period)
+    if found.failure or len(found.times) <= end:
         return Figures(float('inf'), (float('inf'),) * 2, float('inf'), True)
-    cost = cost_along(case.task, found.states[:count], found.commands[:count])
+    begin = found.states[first]
+    cost = cost_along(case.task(begin), found.states[first:end], found.commands[first:end])
     units = dict(zip(case.system.state_names, case.system.state_units, strict=True))
-    away = np.stack([found.states[:, case.system.state_names.index(name)] - value
-                     for name, value in case.setpoint.items() if units[name] == case.unit], axis=1)
-    begin, end = found.times[0], found.times[-1]
     offsets = []
-    for first, last in ((begin, case.loaded_at), (case.loaded_at, end)):
-        late = (found.times >= last - _LATE * (last - first)) & (found.times < last)
-        offsets.append(float(np.max(np.abs(np.mean(away[late], axis=0)))))
+    for since, until in itertools.pairwise(
+            [0.0, case.stepped_at, case.loaded_at, case.duration]):
+        late = (found.times >= until - _LATE * (until - since)) & (found.times < until)
+        offsets.append(max((abs(float(np.mean(
+            found.states[late, case.system.state_names.index(name)])) - value)
+            for name, value in zip(case.setpoint, case.wanted(since), strict=True)
+            if units[name] == case.unit), default=0.0) if late.any() else 0.0)
     excess = found.states - case.state_upper if len(case.state_upper) else np.zeros(1)
-    return Figures(cost / least, (offsets[0], offsets[1]), float(max(np.max(excess), 0.0)),
-                   not max(offsets) <= case.reached)
+    return Figures(cost / least_course(case, begin).cost, (max(offsets[:2]), offsets[2]),
+                   float(max(np.max(excess), 0.0)), not max(offsets) <= case.reached)

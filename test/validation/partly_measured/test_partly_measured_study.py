@@ -36,7 +36,7 @@ def test_a_load_is_an_input_that_nobody_commands(case):
     x, u = case.goal(case.loaded)
     np.testing.assert_allclose(x, case.goal(case.system)[0], rtol=1e-9, atol=1e-12)
     np.testing.assert_allclose(u + case.load, case.goal(case.system)[1], rtol=1e-9, atol=1e-9)
-    held, by = case.target(case.system.input_matrix(x) @ case.load)
+    held, by = case.target(case.wanted(case.duration), case.system.input_matrix(x) @ case.load)
     np.testing.assert_allclose(held, x, rtol=1e-7, atol=1e-9)
     np.testing.assert_allclose(by, u, rtol=1e-7, atol=1e-9)
 
@@ -44,14 +44,15 @@ def test_a_load_is_an_input_that_nobody_commands(case):
 @pytest.mark.parametrize('plant', ['quadruple_tank', 'pendulum'])
 def test_the_least_cost_is_that_of_the_other_method_where_no_limit_is_active(plant):
     case = CASES[plant]
-    course = least_course(case)
-    assert course.cost == pytest.approx(optimum(case.task).cost, rel=1e-7)
+    course = least_course(case, case.start[0])
+    assert course.cost == pytest.approx(optimum(case.task(case.start[0])).cost, rel=1e-7)
     assert np.all((course.inputs > case.lower) & (course.inputs < case.upper))
 
 
 def test_the_limit_of_the_reactor_is_active_on_the_best_way():
     case = CASES['fed_reactor']
-    best, free = (least_course(one) for one in (case, replace(case, state_upper=np.zeros(0))))
+    best, free = (least_course(one, case.start[0]) for one in (
+        case, replace(case, state_upper=np.zeros(0))))
     hottest = case.state_upper[1]
     assert best.states[:, 1].max() == pytest.approx(hottest, abs=1e-5)
     assert free.states[:, 1].max() > hottest + 3.0
@@ -59,9 +60,8 @@ def test_the_limit_of_the_reactor_is_active_on_the_best_way():
 
 
 def test_plans_keep_the_limit_and_a_law_without_a_plan_does_not():
-    case = replace(CASES['fed_reactor'], loaded_at=270.0, duration=306.0)
-    least = least_course(case).cost
-    planned, not_planned = (judge(case, run(case, OWN[name](case), 0), least) for name in (
+    case = replace(CASES['fed_reactor'], stepped_at=90.0, loaded_at=360.0, duration=396.0)
+    planned, not_planned = (judge(case, run(case, OWN[name](case), 0)) for name in (
         '`mpc`, true model', '`sdre`, true model'))
     assert planned.violation < 0.2
     assert planned.cost < 1.05
@@ -72,9 +72,10 @@ def test_plans_keep_the_limit_and_a_law_without_a_plan_does_not():
 
 def test_the_linear_controller_is_the_best_one_for_a_small_step():
     case = replace(CASES['pendulum'], begin={'angle': 0.05}, noise=np.array([1e-4]),
+                   stepped_at=0.0,
                    loaded_at=2.5, duration=3.0)
     one = LinearQuadraticGaussian(case, *case.goal(case.system))
-    found = judge(case, run(case, one, 0), least_course(case).cost)
+    found = judge(case, run(case, one, 0))
     assert found.cost == pytest.approx(1.0, abs=0.01)
 
 
@@ -83,22 +84,23 @@ def test_offsets_are_means_late_in_each_part_and_limits_are_of_all_of_it():
     (x_ref, u_ref), times = case.goal(case.system), np.arange(0.0, case.duration, case.period)
     states = np.tile(x_ref, (len(times), 1))
     states[:, 1] += np.where(times < case.loaded_at, 0.1, -0.2)
+    states[times < case.stepped_at] = case.start[0]
     states[::2, 1] += 0.3
     states[1::2, 1] -= 0.3
-    states[3, 1] = case.state_upper[1] + 0.7
-    found = judge(case, Run(times, states, np.tile(u_ref, (len(times), 1)), times, ''), 10.0)
+    states[40, 1] = case.state_upper[1] + 0.7
+    found = judge(case, Run(times, states, np.tile(u_ref, (len(times), 1)), times, ''))
     assert found.offsets == pytest.approx((0.1, 0.2), abs=0.03)
     assert found.violation == pytest.approx(0.7)
     assert not found.lost
     assert judge(replace(case, reached=0.15), Run(
-        times, states, np.tile(u_ref, (len(times), 1)), times, ''), 10.0).lost
+        times, states, np.tile(u_ref, (len(times), 1)), times, '')).lost
     cut = Run(times[:9], states[:9], np.tile(u_ref, (9, 1)), times[:9], 'out of bounds')
-    assert judge(case, cut, 10.0).lost
+    assert judge(case, cut).lost
 
 
 def test_a_short_study_has_all_controllers_in_one_table(tmp_path, monkeypatch, capsys):
     monkeypatch.setitem(CASES, 'pendulum', replace(
-        CASES['pendulum'], loaded_at=1.875, duration=4.0))
+        CASES['pendulum'], stepped_at=0.3125, loaded_at=2.1875, duration=4.0))
     assert command.main(['pendulum', '--seeds', '1', '--output', str(tmp_path)]) == 0
     text = capsys.readouterr().out
     figures = json.loads((tmp_path / 'summary.json').read_text())['plants']['pendulum']
