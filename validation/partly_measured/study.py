@@ -65,6 +65,7 @@ class Figures:
     #: mean distances from the set-point late before and after the step, the larger, and late under
     #: the load, largest over the states with a set-point in the unit of the last
     offsets: tuple[float, float]
+    farthest: float  #: largest distance under the load, likewise
     violation: float  #: largest excess over a limit of a state, in its unit
     lost: bool  #: whether one of them was further than what counts as reached
 
@@ -74,18 +75,20 @@ def judge(case: Case, found: Run) -> Figures:
     first = round(case.stepped_at / case.period)
     end = first + round((case.loaded_at - case.stepped_at) / case.period)
     if found.failure or len(found.times) <= end:
-        return Figures(float('inf'), (float('inf'),) * 2, float('inf'), True)
+        return Figures(float('inf'), (float('inf'),) * 2, float('inf'), float('inf'), True)
     begin = found.states[first]
     cost = cost_along(case.task(begin), found.states[first:end], found.commands[first:end])
     units = dict(zip(case.system.state_names, case.system.state_units, strict=True))
-    offsets = []
+    shown = [i for i, name in enumerate(case.setpoint) if units[name] == case.unit]
+    states = [case.system.state_names.index(list(case.setpoint)[i]) for i in shown]
+    offsets, farthest = [], 0.0
     for since, until in itertools.pairwise(
             [0.0, case.stepped_at, case.loaded_at, case.duration]):
-        late = (found.times >= until - _LATE * (until - since)) & (found.times < until)
-        offsets.append(max((abs(float(np.mean(
-            found.states[late, case.system.state_names.index(name)])) - value)
-            for name, value in zip(case.setpoint, case.wanted(since), strict=True)
-            if units[name] == case.unit), default=0.0) if late.any() else 0.0)
+        within = (found.times >= since) & (found.times < until)
+        late = within & (found.times >= until - _LATE * (until - since))
+        away = found.states[:, states] - case.wanted(since)[shown]
+        offsets.append(float(np.max(np.abs(np.mean(away[late], axis=0)))))
+        farthest = float(np.max(np.abs(away[within])))
     excess = found.states - case.state_upper if len(case.state_upper) else np.zeros(1)
     return Figures(cost / least_course(case, begin).cost, (max(offsets[:2]), offsets[2]),
-                   float(max(np.max(excess), 0.0)), not max(offsets) <= case.reached)
+                   farthest, float(max(np.max(excess), 0.0)), not max(offsets) <= case.reached)

@@ -72,8 +72,7 @@ def test_plans_keep_the_limit_and_a_law_without_a_plan_does_not():
 
 def test_the_linear_controller_is_the_best_one_for_a_small_step():
     case = replace(CASES['pendulum'], begin={'angle': 0.05}, noise=np.array([1e-4]),
-                   stepped_at=0.0,
-                   loaded_at=2.5, duration=3.0)
+                   duration=6.0)
     one = LinearQuadraticGaussian(case, *case.goal(case.system))
     found = judge(case, run(case, one, 0))
     assert found.cost == pytest.approx(1.0, abs=0.01)
@@ -90,6 +89,7 @@ def test_offsets_are_means_late_in_each_part_and_limits_are_of_all_of_it():
     states[40, 1] = case.state_upper[1] + 0.7
     found = judge(case, Run(times, states, np.tile(u_ref, (len(times), 1)), times, ''))
     assert found.offsets == pytest.approx((0.1, 0.2), abs=0.03)
+    assert found.farthest == pytest.approx(0.5)
     assert found.violation == pytest.approx(0.7)
     assert not found.lost
     assert judge(replace(case, reached=0.15), Run(
@@ -100,7 +100,7 @@ def test_offsets_are_means_late_in_each_part_and_limits_are_of_all_of_it():
 
 def test_a_short_study_has_all_controllers_in_one_table(tmp_path, monkeypatch, capsys):
     monkeypatch.setitem(CASES, 'pendulum', replace(
-        CASES['pendulum'], stepped_at=0.3125, loaded_at=2.1875, duration=4.0))
+        CASES['pendulum'], stepped_at=0.3125, loaded_at=2.1875, duration=4.375))
     assert command.main(['pendulum', '--seeds', '1', '--output', str(tmp_path)]) == 0
     text = capsys.readouterr().out
     figures = json.loads((tmp_path / 'summary.json').read_text())['plants']['pendulum']
@@ -108,10 +108,11 @@ def test_a_short_study_has_all_controllers_in_one_table(tmp_path, monkeypatch, c
     for name, found in figures.items():
         assert f'| pendulum | {name} |' in text
         linear = name.startswith('LQG')
-        assert 0.99 < found['cost_worst'] < (1.1 if linear else 1.03)
-        assert found['offset'] < 0.02
-        # it knows no disturbance
-        assert (found['offset_under_load'] > 0.1) == (found['lost'] == 1) == linear
+        assert 0.99 < found['cost_worst'] < (1.2 if linear else 1.03)
+        assert linear or found['offset'] < 0.02
+        # it knows no disturbance; a window has not yet found all of that one
+        assert (found['offset_under_load'] > 0.2) == linear
+        assert found['farthest_under_load'] >= found['offset_under_load']
         assert 0.0 < found['step_median_ms'] <= found['step_p99_ms']
     assert (tmp_path / 'partly_measured.png').stat().st_size > 10_000
     assert '# Plants measured in part' in (tmp_path / 'report.md').read_text()
