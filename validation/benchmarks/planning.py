@@ -54,11 +54,11 @@ TOLERANCE = {'step': 1e-3, 'sqp': 2e-3, 'do_mpc': 0.03}
 INTERVALS = 30
 
 
-def compare_all(tell: Tell, plants: tuple[str, ...], samples: int, compile_it: bool) -> None:
+def compare_all(tell: Tell, plants: tuple[str, ...], samples: int, compiled: bool) -> None:
     """Compare on several plants, in a process with nothing else."""
     compiler = next(filter(None, map(shutil.which, ('cc', 'gcc', 'clang'))), None)
     for plant in plants:
-        tell({plant: compare(plant, samples, compiler if compile_it else None)})
+        tell({plant: compare(plant, samples, compiler if compiled else None)})
 
 
 def compare(plant: str, samples: int, compiler: str | None) -> dict[str, Any]:
