@@ -17,7 +17,7 @@ from validation.partly_measured.study import Figures, Run
 Found = Mapping[str, Mapping[str, Sequence[tuple[Run, Figures]]]]
 _HEAD = ('plant', 'controller', 'cost / least', 'worst', 'offset', 'offset under load',
          'farthest under load', 'above the limit', 'not held', 'step, median [ms]', '99 % [ms]')
-# The others lie upon these.
+# The others lie upon one of these.
 _DRAWN = ('do-mpc with its MHE', 'LQG at the set-point', '`sdre`, lift', '`mpc`, lift')
 
 
@@ -83,5 +83,5 @@ def draw(found: Found, cases: Mapping[str, Case], path: Path) -> Picture:
                       ylabel=f'{system.input_names[j]} [{system.input_units[j]}]')
         legend(figure, axes, 5)
     return Picture(path.name, 'Controllers on plants measured in part. The first seed; the load '
-                   'is added to the input that is shown. Controllers with the true model lie upon '
-                   'those with the lift.')
+                   'is added to the input that is shown. Controllers that differ from these by less '
+                   'than a line are left out.')
