@@ -83,5 +83,5 @@ def draw(found: Found, cases: Mapping[str, Case], path: Path) -> Picture:
                       ylabel=f'{system.input_names[j]} [{system.input_units[j]}]')
         legend(figure, axes, 5)
     return Picture(path.name, 'Controllers on plants measured in part. The first seed; the load '
-                   'is added to the input that is shown. Controllers that differ from these by less '
-                   'than a line are left out.')
+                   'is added to the input that is shown. The others lie upon one of these, '
+                   'or near it, and are left out.')
