@@ -14,7 +14,7 @@ export ROS_AUTOMATIC_DISCOVERY_RANGE ?= LOCALHOST
 # How many seeds each experiment is run from: make studies SEEDS=5
 SEEDS ?= 20
 
-.PHONY: help demo demo-retrain demo-saddle test test-machines lint models studies studies-sensors studies-robustness studies-general studies-unstable studies-saddle bench faults docs config lock clean
+.PHONY: help demo demo-retrain demo-saddle test test-machines lint models studies studies-sensors studies-robustness studies-general studies-unstable studies-saddle studies-partial bench faults docs config lock clean
 
 help:  ## show this list
 	@grep -E '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed 's/:.*## /\t/'
@@ -113,7 +113,11 @@ studies-saddle: SEEDS = 10
 studies-saddle: $(VENV)/saddle.stamp  ## the same reactor held at its saddle from its temperature alone, SEEDS=10, half an hour
 	$(BIN)/python -m validation.saddle --seeds $(SEEDS)
 
-bench: $(VENV)/bench.stamp  ## speed beside other programs, seventeen minutes (BENCH=--quick: three) -> out/bench
+studies-partial: SEEDS = 10
+studies-partial: $(VENV)/bench.stamp  ## three plants beside do-mpc and a plain LQG, two of them measured in part, SEEDS=10, five minutes -> out/studies-partial
+	$(BIN)/python -m validation.partly_measured --seeds $(SEEDS)
+
+bench: $(VENV)/bench.stamp  ## speed beside other programs, twenty minutes (BENCH=--quick: three) -> out/bench
 	$(BIN)/python -m validation.benchmarks $(BENCH)
 
 faults: $(VENV)/mpc.stamp  ## put faults into the loops of the reactor, of two tank plants and of a reactor at its saddle, and soak both reactors for a day, three quarters of an hour (FAULTS=--quick: a minute; FAULTS=two_tanks: one plant) -> out/faults

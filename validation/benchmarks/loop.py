@@ -23,14 +23,20 @@ from koopman_ros.ros import topics
 from koopman_ros.ros.codec import stamp_message, stamp_nanoseconds
 from koopman_ros.testing import Harness, NodeProcess
 from koopman_ros.units import NANOSECONDS
-from validation.benchmarks import process, step
+from validation.benchmarks import planning, process, step
 
-PACKAGES = ('numpy', 'scipy', 'torch', 'control')
+PACKAGES = ('numpy', 'scipy', 'torch', 'control', 'daqp', 'casadi', 'do-mpc')
 MEANING = {
     'step_us': 'median time of a control step, by n_z; step has the 99th percentiles, too',
     'step_ratio_to_naive': 'how many times as long the same law takes by torch jacrev and '
                            'control.dlqr, by n_z; medians of processor time, since a busy machine '
                            'interrupts the longer one more often',
+    'plan_us': 'median and 99th percentile of processor time of the law mpc with 30 intervals, '
+               'targets given, by lift; plan has those of the whole control step, too',
+    'plan_ratio_to_do_mpc': 'how many times as long do-mpc takes (IPOPT, targets given, the '
+                            'true equations), by lift; medians and 99th percentiles of '
+                            'processor time',
+    'plan_ratio_to_sqp': "the same of casadi's SQP, as generated C where there is a compiler",
     'latency_ratio_median': 'measurement published to command received, over that of a bare echo',
     'latency_ratio_p99': 'the same for 99th percentiles',
     'max_rate_hz': 'highest rate of measurements at which every one was answered and the median '
@@ -63,10 +69,12 @@ class Plan:
     lowest_rate: float  #: of measurements, Hz
     starts: int  #: of the controller
     plant_seconds: float  #: length of the lock-step loop
+    plans: int  #: timed plans with each lift
+    compiled: bool  #: whether those who are compared with are compiled
 
 
-PLANS = {'quick': Plan((2, 3, 4, 5, 6), 200, 4, 0.4, 500.0, 2, 600.0),
-         'default': Plan((2, 3, 4, 5, 6), 1500, 30, 2.0, 500.0, 5, 3600.0)}
+PLANS = {'quick': Plan((2, 3, 4, 5, 6), 200, 4, 0.4, 500.0, 2, 600.0, 80, False),
+         'default': Plan((2, 3, 4, 5, 6), 1500, 30, 2.0, 500.0, 5, 3600.0, 800, True)}
 
 
 def measure(plan: Plan, figures: dict[str, Any], folder: Path) -> Iterator[str]:
@@ -74,6 +82,7 @@ def measure(plan: Plan, figures: dict[str, Any], folder: Path) -> Iterator[str]:
     figures['meaning'] = MEANING
     with tempfile.TemporaryDirectory() as name:
         yield _steps(figures, plan, Path(name))
+        yield _plans(figures, plan, Path(name))
         with Harness(Path(name), name='probe') as harness:
             yield _latency(figures, harness, plan.rounds)
             yield _highest_rate(figures, harness, plan.rate_seconds, plan.lowest_rate)
@@ -99,6 +108,32 @@ def _steps(figures: dict[str, Any], plan: Plan, folder: Path) -> str:
     return table(('control step', 'ratio', *columns), [
         (f'n_z = {n_z}', f'{ratio[n_z]:.1f}', *(f'{one[column]:.0f}' for column in columns))
         for n_z, one in found.items()])
+
+
+def _plans(figures: dict[str, Any], plan: Plan, folder: Path) -> str:
+    _tell(f'{plan.plans} plans with each lift')
+    outcome = process.run(planning.compare_all, tuple(planning.SETPOINTS), plan.plans,
+                          plan.compiled, folder=folder, megabytes=8e3)
+    if outcome.failure:
+        raise RuntimeError(f'the plans could not be timed: {outcome.failure}')
+    found = {plant: one for event in outcome.events for plant, one in event.items()}
+    figures.update(plan=found, plan_us={
+        plant: {quantile: one[f'law_cpu_{quantile}_us'] for quantile in ('median', 'p99')}
+        for plant, one in found.items()})
+    rows = []
+    for side in ('do_mpc', 'sqp'):
+        figures[f'plan_ratio_to_{side}'] = {plant: {
+            quantile: one[f'{side}_cpu_{quantile}_us'] / one[f'law_cpu_{quantile}_us']
+            for quantile in ('median', 'p99')} for plant, one in found.items()}
+    for plant, one in found.items():
+        for side, label in (('step', 'control step with `mpc`'), ('law', 'the law alone'),
+                            ('do_mpc', 'do-mpc'), ('sqp', 'SQP of casadi')):
+            rows.append((f'{plant}, {one["states"]} states', label, *(
+                f'{1e-3 * one[f"{side}_cpu_{quantile}_us"]:.2f}' for quantile in ('median', 'p99')
+            ), f'{one[f"{side}_cpu_median_us"] / one["law_cpu_median_us"]:.2g}',
+                f'{one["agreement"].get(side, 0.0):.1e}'))
+    return table(('plan of 30 intervals', 'by', 'median [ms]', 'p99 [ms]', 'median / law',
+                  'commands apart [range]'), rows)
 
 
 class _Probe:

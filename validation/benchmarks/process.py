@@ -18,7 +18,8 @@ from typing import Any, TypeAlias
 Tell: TypeAlias = Callable[[dict[str, Any]], None]
 
 # Imported once; every process is forked from the one that has them.
-_PRELOAD = [f'validation.benchmarks.{name}' for name in ('training', 'ipopt', 'step')]
+_PRELOAD = [f'validation.benchmarks.{name}' for name in (
+    'training', 'ipopt', 'step', 'planning')]
 
 
 @dataclass(frozen=True)

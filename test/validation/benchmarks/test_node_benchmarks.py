@@ -10,7 +10,7 @@ import pytest
 from rclpy.serialization import serialize_message
 from sensor_msgs.msg import Temperature
 
-from validation.benchmarks import loop, recording, step
+from validation.benchmarks import loop, planning, recording, step
 from validation.benchmarks.__main__ import main
 
 
@@ -24,7 +24,9 @@ def figures(tmp_path_factory):
         warnings.simplefilter('ignore', DeprecationWarning)
         serialize_message(Temperature())
         warnings.simplefilter('error')
-        patch.setitem(loop.PLANS, 'quick', loop.Plan((2, 4), 60, 1, 0.1, 400.0, 1, 50.0))
+        patch.setitem(loop.PLANS, 'quick', loop.Plan(
+            (2, 4), 60, 1, 0.1, 400.0, 1, 50.0, 12, False))
+        patch.setattr(planning, 'SETPOINTS', {'pendulum': planning.SETPOINTS['pendulum']})
         patch.setitem(recording.PLANS, 'quick', recording.Plan(1.0, (500.0, 2000.0), 0.5, 3000, 1))
         assert main(['recording', 'loop', '--quick', '--output', str(folder)]) == 0
     return json.loads((folder / 'summary.json').read_text())
@@ -45,6 +47,18 @@ def test_both_laws_give_the_same_commands(figures):
         assert 0.0 < one['naive_median_us'] <= one['naive_p99_us']
         assert found['step_ratio_to_naive'][n_z] == pytest.approx(
             one['naive_cpu_median_us'] / one['cpu_median_us'])
+
+
+def test_plans_stand_beside_those_of_other_programs(figures):
+    found = figures['loop']
+    (plant, one), = found['plan'].items()
+    assert plant == 'pendulum'
+    assert found['plan_us'][plant]['median'] == one['law_cpu_median_us']
+    for side in ('do_mpc', 'sqp'):
+        assert one['agreement'][side] < planning.TOLERANCE[side]
+        for quantile in ('median', 'p99'):
+            assert found[f'plan_ratio_to_{side}'][plant][quantile] == pytest.approx(
+                one[f'{side}_cpu_{quantile}_us'] / one[f'law_cpu_{quantile}_us'])
 
 
 def test_laws_that_differ_are_not_compared(monkeypatch):

@@ -1,0 +1,54 @@
+# SPDX-FileCopyrightText: 2026 The koopman_ros Authors
+# SPDX-License-Identifier: Apache-2.0
+
+"""Plants of the library as expressions of casadi, for the programs that are compared with."""
+
+from collections.abc import Callable
+from typing import Any, TypeAlias
+
+import casadi
+
+from koopman_ros.plants.library.outflow import GRAVITY
+from koopman_ros.plants.library.pendulum import Pendulum
+from koopman_ros.plants.library.quadruple_tank import QuadrupleTank
+from koopman_ros.plants.library.reactor import FedReactor
+
+# Rates of the state (n_x,) from state and input (n_u,), expressions all.
+Rates: TypeAlias = Callable[[Any, Any], Any]
+_NO_LESS = 1e-6  # m, so that the outflow has a slope
+
+
+def pendulum(x: Any, u: Any) -> Any:
+    """Return the rates of the pendulum."""
+    p = Pendulum()
+    inertia = p.mass * p.length ** 2
+    return casadi.vertcat(x[1], p.gravity / p.length * casadi.sin(x[0]) + (
+        u[0] - p.friction * x[1]) / inertia)
+
+
+def quadruple_tank(x: Any, u: Any) -> Any:
+    """Return the rates of the four levels, in m/s."""
+    p = QuadrupleTank()
+    q = [orifice * casadi.sqrt(2.0 * GRAVITY * casadi.fmax(x[i], _NO_LESS))
+         for i, orifice in enumerate((p.orifice_1, p.orifice_2, p.orifice_3, p.orifice_4))]
+    flow_1, flow_2 = p.pump_gain_1 * u[0], p.pump_gain_2 * u[1]
+    return casadi.vertcat(
+        (q[2] - q[0] + p.split_1 * flow_1) / p.tank_area_1,
+        (q[3] - q[1] + p.split_2 * flow_2) / p.tank_area_2,
+        ((1.0 - p.split_2) * flow_2 - q[2]) / p.tank_area_3,
+        ((1.0 - p.split_1) * flow_1 - q[3]) / p.tank_area_4)
+
+
+def fed_reactor(x: Any, u: Any) -> Any:
+    """Return the rates of concentration and temperature, per minute."""
+    p = FedReactor()
+    reaction = p.pre_exponential_factor * casadi.exp(-p.activation_temperature / x[1]) * x[0]
+    fed = u[0] / p.volume
+    return casadi.vertcat(
+        fed * (p.feed_concentration - x[0]) - reaction,
+        fed * (p.feed_temperature - x[1]) + p.heating_per_conversion * reaction
+        + p.cooling_rate * (u[1] - x[1]))
+
+
+EQUATIONS: dict[str, Rates] = {
+    'fed_reactor': fed_reactor, 'pendulum': pendulum, 'quadruple_tank': quadruple_tank}
