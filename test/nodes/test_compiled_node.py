@@ -7,6 +7,7 @@ import itertools
 
 from std_msgs.msg import String
 
+from koopman_ros.kernels import COMPILED, named
 from koopman_ros.replay.records import NUMERICS, START
 from koopman_ros.ros import topics
 from koopman_ros.testing import Harness
@@ -14,6 +15,8 @@ from support.controller_bench import Bench, reproduced, STEADY
 
 
 def test_compiled_step_takes_over_after_the_first_command_and_is_replayed(ros: Harness) -> None:
+    # what is kept now, the controller need not wait for
+    assert named(COMPILED)
     records = ros.listen(String, topics.CONTROLLER_EVENTS)
     bench = Bench(ros, {'compiled': True, 'disturbance_bandwidth': 0.0})
     later = itertools.count(2)
