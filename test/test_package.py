@@ -26,6 +26,7 @@ ALLOWED = {
     'plants': set(),
     'lifting': set(),
     'bags': set(),
+    'compiled': {'control', 'estimation', 'lifting'},
     'estimation': {'lifting'},
     'control': {'estimation', 'lifting'},
     'learning': {'control', 'lifting'},

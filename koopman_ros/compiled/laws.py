@@ -33,19 +33,21 @@ from koopman_ros.compiled.riccati import over_interval, regulator
 
 @compiled(MATRIX, MATRIX, MATRIX, MATRIX, NUMBER)
 def solve(A: Array, B: Array, Q: Array, R: Array, interval: float
-          ) -> tuple[bool, Array, Array, float]:
+          ) -> tuple[bool, Array, Array, float, float]:
     """Solve the equation of :func:`koopman_ros.solvers.solve_riccati`; False where not sure."""
-    return regulator(A.copy(), B.copy(), Q.copy(), R.copy(), interval)
+    fine, P, K, residual = regulator(A.copy(), B.copy(), Q.copy(), R.copy(), interval)
+    return fine, P, K, residual, size(K)
 
 
 @compiled(INTEGERS, VECTOR, VECTOR, VECTOR, VECTOR, VECTOR, VECTOR, MATRIX, MATRIX, NUMBER)
 def recentred(sizes: NDArray[np.int64], numbers: Array, x: Array, x_ref: Array, z_ref: Array,
               u_ref: Array, forcing: Array, Q: Array, R: Array, interval: float
-              ) -> tuple[bool, Array, Array, Array, float, Array, Array]:
+              ) -> tuple[bool, Array, Array, Array, float, float, Array, Array]:
     """
     Evaluate the re-centred law of a lift that starts with the state.
 
-    :return: whether it is sure, u, P, K, the residual, and drift and action of the error.
+    :return: whether it is sure, u, P, K, the residual, the norm of K, and drift and action of the
+        error.
     """
     n, n_z = sizes[N_X], sizes[N_Z]
     A, B, slope, readout = matrices(sizes, numbers)
@@ -63,7 +65,7 @@ def recentred(sizes: NDArray[np.int64], numbers: Array, x: Array, x_ref: Array, 
     place(weights, 0, 0, Q, 1.0)
     fine, P, K, residual = regulator(whole, product(J, B), weights, R.copy(), interval)
     if not fine:
-        return False, p, P, K, residual, P, P
+        return False, p, P, K, residual, math.inf, P, P
     if sizes[READOUT]:
         motion = combined(1.0, block(readout, 0, 0, n, n), 1.0, product(
             block(readout, 0, n, n, len(h)), S))
@@ -73,13 +75,13 @@ def recentred(sizes: NDArray[np.int64], numbers: Array, x: Array, x_ref: Array, 
     for i in range(len(u)):
         u[i] = u_ref[i] - u[i]
     action = product(B, product(K, M))
-    return fine, u, P, K, residual, motion, combined(-1.0, action, 0.0, action)
+    return fine, u, P, K, residual, size(K), motion, combined(-1.0, action, 0.0, action)
 
 
 @compiled(INTEGERS, VECTOR, VECTOR, VECTOR, VECTOR, MATRIX, MATRIX, NUMBER)
 def averaged(sizes: NDArray[np.int64], numbers: Array, x: Array, x_ref: Array, u_ref: Array,
              Q: Array, R: Array, interval: float
-             ) -> tuple[bool, Array, Array, Array, float, Array, Array]:
+             ) -> tuple[bool, Array, Array, Array, float, float, Array, Array]:
     """Evaluate the averaged law of a read-out; returns as :func:`recentred`."""
     n = sizes[N_X]
     _, B, _, readout = matrices(sizes, numbers)
@@ -91,12 +93,12 @@ def averaged(sizes: NDArray[np.int64], numbers: Array, x: Array, x_ref: Array, u
     for i in range(n):
         e[i] = x[i] - x_ref[i]
     if not fine:
-        return False, e, P, K, residual, P, P
+        return False, e, P, K, residual, math.inf, P, P
     u = applied(K, e)
     for i in range(len(u)):
         u[i] = u_ref[i] - u[i]
     action = product(B, K)
-    return fine, u, P, K, residual, motion, combined(-1.0, action, 0.0, action)
+    return fine, u, P, K, residual, size(K), motion, combined(-1.0, action, 0.0, action)
 
 
 @compiled(MATRIX, MATRIX, NUMBER)

@@ -31,6 +31,7 @@ _TERMS = 24  # of a power series, at most
 _NOTHING = 1e-18  # relative size of the first term that is left out
 _MOST_DOUBLINGS = 20  # until then the slowest mode would be near the border
 _STILL = 1e-14  # relative change after which the next one is below rounding, as they are squared
+_SHIFT = 0.4  # of the mean size of the modes: so the slow ones take fewer doublings
 _SURE = 1e-12  # of a residual; what is larger the reference looks at
 _LONGEST = 8.0  # norm of A and B times the interval, beyond which digits are lost
 
@@ -88,7 +89,7 @@ def _stable_solution(A: Array, G: Array, Q: Array) -> tuple[bool, Array]:
     """
     n = len(A)
     eye = identity(n)
-    gamma = math.sqrt((size(A) ** 2 + size(G) * size(Q)) / n)
+    gamma = _SHIFT * math.sqrt((size(A) ** 2 + size(G) * size(Q)) / n)
     inverse, W_inverse = identity(n), identity(n)
     if not (gamma > 0.0 and solve_into(combined(1.0, A, -gamma, eye), inverse)):
         return False, Q

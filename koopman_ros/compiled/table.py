@@ -3,7 +3,6 @@
 
 """What takes the place of which function in numpy; see :mod:`koopman_ros.kernels`."""
 
-import math
 from typing import Any
 
 import numpy as np
@@ -19,10 +18,10 @@ from koopman_ros.lifting import LiftedModel
 from koopman_ros.solvers import RiccatiSolution, RiccatiStatus
 
 
-def _solution(P: Array, K: Array, residual: float, max_residual: float, max_gain: float
-              ) -> RiccatiSolution | None:
-    """Return a solution that is good beyond doubt."""
-    gain = math.sqrt(float((K * K).sum())) if min(K.shape) == 1 else float(np.linalg.norm(K, 2))
+def _solution(P: Array, K: Array, residual: float, size: float, max_residual: float,
+              max_gain: float) -> RiccatiSolution | None:
+    """Return a solution that is good beyond doubt, of a K with this Frobenius norm."""
+    gain = size if min(K.shape) == 1 else float(np.linalg.norm(K, 2))
     if not (residual <= max_residual and gain <= max_gain):
         return None
     return RiccatiSolution(P, K, residual, gain, RiccatiStatus.SOLVED)
@@ -32,15 +31,14 @@ def _regulator(model: LiftedModel, A: Array, B: Array, Q: Array, R: Array, *, in
                max_residual: float = 1e-8, max_gain: float = 1e6) -> RiccatiSolution | None:
     if not interval > 0.0:
         return None
-    sure, P, K, residual = laws.solve(np.ascontiguousarray(A), np.ascontiguousarray(B), Q, R,
-                                      interval)
-    return _solution(P, K, residual, max_residual, max_gain) if sure else None
+    sure, *found = laws.solve(np.ascontiguousarray(A), np.ascontiguousarray(B), Q, R, interval)
+    return _solution(*found, max_residual, max_gain) if sure else None
 
 
 def _feedback(found: tuple[Any, ...], form: riccati.Form, max_residual: float, max_gain: float
               ) -> riccati.Feedback | None:
-    sure, u, P, K, residual, drift, action = found
-    solution = _solution(P, K, residual, max_residual, max_gain) if sure else None
+    sure, u, P, K, residual, size, drift, action = found
+    solution = _solution(P, K, residual, size, max_residual, max_gain) if sure else None
     return None if solution is None else riccati.Feedback(u, form, solution, drift, action)
 
 

@@ -4,6 +4,7 @@
 """Compiled functions give what numpy gives, and leave to it what is near to a border."""
 
 from dataclasses import replace
+from functools import cache
 import sys
 
 import numpy as np
@@ -13,7 +14,7 @@ from koopman_ros.control import State
 from koopman_ros.control.laws.base import steady_state_target, Weights
 from koopman_ros.control.laws.riccati import recentred, regulator
 from koopman_ros.estimation.observer import moved
-from koopman_ros.kernels import COMPILED, IN_NUMPY, named, NUMPY
+from koopman_ros.kernels import COMPILED, IN_NUMPY, Kernels, named, NUMPY
 from koopman_ros.lifting import LiftedModel, load
 from koopman_ros.parameters.controller import built, table_of
 from koopman_ros.resources import model_path
@@ -21,7 +22,6 @@ from koopman_ros.solvers import RiccatiStatus, solve_riccati
 from koopman_ros.units import NANOSECONDS
 from support.random_lifts import random_lift
 
-KERNELS = named(COMPILED)
 STEPS = 40
 # model, parameters, seconds between samples, and how far apart commands may be, scaled. A plan is
 # a quadratic program, solved until it stands still: what rounding makes of it is larger.
@@ -40,9 +40,16 @@ LOOPS = {
 }
 
 
+@cache
+def kernels() -> Kernels:
+    """Return what is compiled, which takes half a minute where nothing is kept yet."""
+    found = named(COMPILED)
+    assert found
+    return found
+
+
 def compiled(model: LiftedModel) -> LiftedModel:
-    assert KERNELS
-    return replace(model, kernels=KERNELS)
+    return replace(model, kernels=kernels())
 
 
 @pytest.mark.parametrize('name', LOOPS)
@@ -119,7 +126,7 @@ def test_gain_of_the_sampled_regulator_of_random_plants() -> None:
         n, m = rng.integers(1, 6), rng.integers(1, 3)
         A, B = rng.normal(size=(n, n)), rng.normal(size=(n, m))
         Q, R, interval = np.eye(n), np.diag(10.0 ** rng.uniform(-1.0, 1.0, m)), rng.uniform(0, 0.5)
-        found = KERNELS['regulator'](model, A, B, Q, R, interval=interval)
+        found = kernels()['regulator'](model, A, B, Q, R, interval=interval)
         if found is not None:
             exact = solve_riccati(A, B, Q, R, interval=interval)
             np.testing.assert_allclose(found.K, exact.K, rtol=0.0,
@@ -131,7 +138,7 @@ def test_gain_of_the_sampled_regulator_of_random_plants() -> None:
 def test_a_model_is_in_numpy_unless_it_is_asked_otherwise() -> None:
     model = random_lift()
     assert model.kernels is NUMPY is named(IN_NUMPY)
-    assert compiled(model).linearised.kernels is KERNELS
+    assert compiled(model).linearised.kernels is kernels()
 
 
 def test_without_the_compiler_there_is_none(monkeypatch: pytest.MonkeyPatch) -> None:

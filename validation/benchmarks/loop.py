@@ -15,9 +15,12 @@ from typing import Any
 import numpy as np
 import psutil
 from sensor_msgs.msg import Temperature
+from std_msgs.msg import String
 from std_srvs.srv import Trigger
 
 from koopman_ros.demo import reactor
+from koopman_ros.kernels import COMPILED, named
+from koopman_ros.replay.records import NUMERICS
 from koopman_ros.reports import table
 from koopman_ros.ros import topics
 from koopman_ros.ros.codec import stamp_message, stamp_nanoseconds
@@ -39,6 +42,8 @@ MEANING = {
     'plan_ratio_to_sqp': "the same of casadi's SQP, as generated C where there is a compiler",
     'latency_ratio_median': 'measurement published to command received, over that of a bare echo',
     'latency_ratio_p99': 'the same for 99th percentiles',
+    'compiled_latency_ratio_median': 'the same with a compiled control step (extra fast)',
+    'compiled_latency_ratio_p99': 'the same for 99th percentiles',
     'max_rate_hz': 'highest rate of measurements at which every one was answered and the median '
                    'answer in the last tenth of the run took less than 20 ms',
     'startup_seconds': "from the start of the controller's process to its first command, median",
@@ -104,9 +109,11 @@ def _steps(figures: dict[str, Any], plan: Plan, folder: Path) -> str:
     ratio = {n_z: one['naive_cpu_median_us'] / one['cpu_median_us'] for n_z, one in found.items()}
     figures.update(step=found, step_ratio_to_naive=ratio,
                    step_us={n_z: one['median_us'] for n_z, one in found.items()})
-    columns = ('median_us', 'p99_us', 'naive_median_us', 'naive_p99_us')
+    columns = ('median_us', 'p99_us', 'compiled_median_us', 'compiled_p99_us', 'naive_median_us',
+               'naive_p99_us')
     return table(('control step', 'ratio', *columns), [
-        (f'n_z = {n_z}', f'{ratio[n_z]:.1f}', *(f'{one[column]:.0f}' for column in columns))
+        (f'n_z = {n_z}', f'{ratio[n_z]:.1f}', *(
+            f'{one[column]:.0f}' if column in one else '-' for column in columns))
         for n_z, one in found.items()])
 
 
@@ -219,25 +226,36 @@ def _latency(figures: dict[str, Any], harness: Harness, rounds: int) -> str:
     """Time measurement to command of the controller and of the echo, round by round in turns."""
     _tell('latency beside an echo')
     echo = (sys.executable, '-m', 'validation.benchmarks.echo')
-    taken: dict[str, list[float]] = {'controller': [], 'echo': []}
+    # without what compiles, the last one is the first one again
+    sides = ('controller', 'echo', 'compiled')
+    taken: dict[str, list[float]] = {name: [] for name in sides}
+    records = harness.listen(String, f'/latency/compiled/{topics.CONTROLLER_EVENTS}')
     with _start(harness, 'controller', '/latency/controller'), \
+            _start(harness, 'controller', '/latency/compiled', compiled=True), \
             _start(harness, 'echo', '/latency/echo', echo) as echoing:
-        probes = {name: _Probe(harness, f'/latency/{name}') for name in taken}
+        probes = {name: _Probe(harness, f'/latency/{name}') for name in sides}
         for probe in probes.values():
             probe.first_answer()
             probe.paced()
+        if named(COMPILED) is not None:
+            harness.wait_until(lambda: any(f'"event":"{NUMERICS}"' in one.data for one in records),
+                               'the compiled step')
         for _ in range(rounds):
             for name, probe in probes.items():
                 taken[name] += probe.paced()
         figures['latency'] = {'measurements': rounds * _ROUND, 'echo_rss_megabytes': _rss(echoing)}
     rows = []
     for quantile, percent in (('median', 50), ('p99', 99)):
-        ours, other = (1e6 * float(np.percentile(seconds, percent)) for seconds in taken.values())
-        for name, microseconds in zip(taken, (ours, other), strict=True):
+        ours, other, compiled = (
+            1e6 * float(np.percentile(seconds, percent)) for seconds in taken.values())
+        for name, microseconds in zip(sides, (ours, other, compiled), strict=True):
             figures['latency'].setdefault(name, {})[f'{quantile}_us'] = microseconds
         figures[f'latency_ratio_{quantile}'] = ours / other
-        rows.append((quantile, f'{ours / other:.2f}', f'{ours:.0f}', f'{other:.0f}'))
-    return table(('latency', 'ratio', 'controller [us]', 'echo [us]'), rows)
+        figures[f'compiled_latency_ratio_{quantile}'] = compiled / other
+        rows.append((quantile, f'{ours / other:.2f}', f'{compiled / other:.2f}', f'{ours:.0f}',
+                     f'{compiled:.0f}', f'{other:.0f}'))
+    return table(('latency', 'ratio', 'ratio, compiled', 'controller [us]', 'compiled [us]',
+                  'echo [us]'), rows)
 
 
 def _highest_rate(figures: dict[str, Any], harness: Harness, seconds: float, lowest: float) -> str:
