@@ -152,7 +152,8 @@ class ManagedNode(LifecycleNodeMixin, LoopNode):
     def _entities(self) -> tuple[list[Any], ...]:
         # rclpy subscribes to the time whenever `use_sim_time` is set
         heard = [one for one in self.subscriptions if one.msg_type is not Clock]
-        return list(self.timers), list(self.services), heard, list(self.publishers)
+        return ([*self.timers, *self.hosted_timers], list(self.services), heard,
+                list(self.publishers))
 
 
 def one_line(error: Exception) -> str:
