@@ -5,7 +5,6 @@
 
 from collections.abc import Callable, MutableMapping, Sequence
 from functools import partial
-import gc
 import os
 from pathlib import Path
 import signal
@@ -22,11 +21,20 @@ from koopman_ros.resources import config_directory, LEAN_PROFILE
 from koopman_ros.ros.hosted import HostableNode, Hosting, Schedule
 from koopman_ros.ros.managed import ManagedNode, one_line, START_ERRORS
 from koopman_ros.ros.node import Diagnostics, Level, LoopNode, Status, wall_timer
-from koopman_ros.ros.process import init, LONGEST_WAIT, open_to_the_network, PROFILES, take_down
+from koopman_ros.ros.process import (
+    init,
+    LONGEST_WAIT,
+    open_to_the_network,
+    PROFILES,
+    take_down,
+    TAKE_DOWN_PATIENCE,
+)
 from koopman_ros.ros.watchdog import end_in_time
 from koopman_ros.startup import handle_signals
 
 _PERIOD = 0.1  # s between two looks at what has ended
+_GOODBYE = 0.1  # s that taking down a node may take
+_LATE = 0.5  # s; a timer that comes so late tells of more work than the process can do
 _SHOWN = 10  # loops that failed, in diagnostics; the log has them all
 
 # Collecting nodes takes down what they have one by one, each time with word to all others; with
@@ -101,7 +109,7 @@ class Host:
         while not arrived:
             if self._waiting:
                 self._begin(self._waiting.pop())
-                self._catch_up()
+                self._catch_up(arrived)
             elif self._nodes:
                 self._turn()
             else:
@@ -120,30 +128,26 @@ class Host:
         while self._leaving:
             self._part(self._leaving.pop())
 
-    def _catch_up(self) -> None:
-        """Do all that waits now, before another loop is started."""
+    def _catch_up(self, arrived: Sequence[int]) -> None:
+        """Do all that waits now, before another loop is started, but for a signal."""
         done: list[bool] = []
         self._executor.create_task(lambda: done.append(True))
-        while not done:
+        while not done and not arrived:
             self._turn()
 
     def _begin(self, namespace: str) -> None:
-        node = None
+        hosting = Hosting(self._schedule, len(self._loops), partial(self._fail, namespace))
         try:
-            node = self._create(namespace=namespace, hosting=Hosting(
-                self._schedule, len(self._loops), partial(self._fail, namespace)))
+            node = self._create(namespace=namespace, hosting=hosting)
             if isinstance(node, ManagedNode) and node.get_parameter('autostart').value:
                 node.start()
         except Exception as error:
             self._note(namespace, error, 'cannot start: ')
-            if node is not None:
-                self._destroy(node)
-        else:
-            self._nodes[namespace] = node
-            self._executor.add_node(node)
+            for made in hosting.made:
+                _destroy(made)
             return
-        # what was made of it goes with the traceback
-        gc.collect()
+        self._nodes[namespace] = node
+        self._executor.add_node(node)
 
     def _fail(self, namespace: str, error: Exception) -> None:
         """Note what a callback of a node has raised; it gets no further ones."""
@@ -171,13 +175,7 @@ class Host:
             # its watchdog takes it for busy: it holds the command, then goes to the safe one
             self._set_aside.append(node)
         else:
-            self._destroy(node)
-
-    def _destroy(self, node: LoopNode) -> None:
-        node.complete()
-        for timer in node.hosted_timers:
-            timer.cancel()
-        node.destroy_node()
+            _destroy(node)
 
     def _look(self) -> None:
         now = time.monotonic()
@@ -197,11 +195,23 @@ class Host:
                 f'{namespace}: {why}' for namespace, why in failed[:_SHOWN]) + (
                 '; and more, see the log' if len(failed) > _SHOWN else '')
         delay, self._delay = self._delay, 0.0
+        if level is Level.OK and delay > _LATE and not self._waiting:
+            level, message = Level.WARN, (
+                f'{message}, {delay:.2g} s late: that is more than one process can do; spread the '
+                'loops over several, or measure less often')
         return Status(level, message, {
             'loops': len(self._loops), 'running': running, 'failed': len(failed),
             'to be started': len(self._waiting),
             'processor share [%]': 100.0 * self._share,
             'longest delay of a timer [ms]': 1e3 * delay})
+
+
+def _destroy(node: HostableNode) -> None:
+    if isinstance(node, LoopNode):
+        node.complete()
+    for timer in node.hosted_timers:
+        timer.cancel()
+    node.destroy_node()
 
 
 def run_loops(name: str, create: Callable[..., LoopNode], args: list[str] | None, file: str,
@@ -214,6 +224,7 @@ def run_loops(name: str, create: Callable[..., LoopNode], args: list[str] | None
     """
     leave = end_in_time(name)
     host = None
+    loops: tuple[str, ...] = ()
     try:
         try:
             loops = read_loops(Path(file))
@@ -230,7 +241,8 @@ def run_loops(name: str, create: Callable[..., LoopNode], args: list[str] | None
             if host is not None:
                 host.complete()
         finally:
-            take_down(name, None)
+            # the middleware says good-bye for each node
+            take_down(name, None, TAKE_DOWN_PATIENCE + _GOODBYE * len(loops))
             handle_signals(signal.SIG_IGN)
 
 

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Coroutine
 import contextlib
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 import functools
 import heapq
 import inspect
@@ -98,6 +98,7 @@ class Hosting:
     schedule: Schedule
     loops: int  #: that share the process
     failed: Callable[[Exception], None]  #: is told what a callback of the node has raised
+    made: list[HostableNode] = field(default_factory=list)  #: the node, also a half-made one
 
     def guarded(self, callback: Callable[..., Any]) -> Callable[..., Any]:
         """Return a callback whose errors end the node and not the process."""
@@ -126,11 +127,12 @@ class Hosting:
         def step() -> None:
             try:
                 work.send(None)
-                return
             except StopIteration as end:
-                found = end.value
-            timer.cancel()
-            done(found)
+                timer.cancel()
+                done(end.value)
+            except Exception:
+                timer.cancel()
+                raise
 
         timer = self.schedule.timer(_POLL, self.guarded(step))
 
@@ -147,6 +149,8 @@ class HostableNode(Node):
         self.hosting = hosting
         self.hosted_timers: list[HostedTimer] = []
         super().__init__(name, **options)
+        if hosting is not None:
+            hosting.made.append(self)
 
     def create_service(self, srv_type: Any, srv_name: str, callback: Callable[..., Any],
                        **options: Any) -> Service:

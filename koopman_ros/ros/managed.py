@@ -46,6 +46,11 @@ class ManagedNode(LifecycleNodeMixin, LoopNode):
         self._service_change_state.callback = lambda request, response: self._on_change(
             change, request, response)
 
+    def destroy_node(self) -> None:
+        """Take the node down with its lifecycle, which would keep its name on the network."""
+        super().destroy_node()
+        self._state_machine.destroy_when_not_in_use()
+
     def start(self) -> None:
         """Configure and activate, as without a manager; raises what went wrong."""
         self._alone = True

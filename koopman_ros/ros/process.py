@@ -24,7 +24,7 @@ from koopman_ros.startup import end_by_force, handle_signals
 PROFILES = ('FASTDDS_DEFAULT_PROFILES_FILE', 'FASTRTPS_DEFAULT_PROFILES_FILE')
 _LOOPS = '--loops'
 LONGEST_WAIT = 0.1  # s from a signal to the end
-_TAKE_DOWN_PATIENCE = 5.0  # s; taking down a participant needs some ten milliseconds
+TAKE_DOWN_PATIENCE = 5.0  # s; taking down a participant needs some ten milliseconds
 
 
 def run(name: str, create: Callable[..., LoopNode], args: list[str] | None = None,
@@ -100,10 +100,10 @@ def run_task(name: str, prepare: Callable[[], Callable[[], int]],
         return 128 + signal.SIGINT
 
 
-def take_down(name: str, node: LoopNode | None) -> None:
-    """Take a node down, and the middleware, by force where it hangs."""
+def take_down(name: str, node: LoopNode | None, patience: float = TAKE_DOWN_PATIENCE) -> None:
+    """Take a node down, and the middleware, by force where that takes longer than so many s."""
     # Fast DDS can hang in that, in rclpy with the interpreter's lock held: see docs/middleware.md
-    disarm = end_by_force(_TAKE_DOWN_PATIENCE, 0, (
+    disarm = end_by_force(patience, 0, (
         f'{name}: the middleware does not shut down: left to the operating system'))
     if node is not None:
         node.destroy_node()

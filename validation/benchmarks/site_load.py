@@ -9,6 +9,7 @@ then measures for a while and writes what it found as JSON.
 """
 
 import argparse
+from functools import partial
 import json
 import struct
 import sys
@@ -47,7 +48,7 @@ class Load:
         for k, namespace in enumerate(namespaces):
             self._node.create_subscription(
                 Temperature, f'{namespace}/{reactor.COOLANT_SETPOINT}',
-                lambda message, loop=k: self._on_command(loop, message), topics.LOOP_QOS, raw=True)
+                partial(self._on_command, k), topics.LOOP_QOS, raw=True)
         self._executor.add_node(self._node)
         self._turn, self._begun = 0, time.monotonic_ns()
 
