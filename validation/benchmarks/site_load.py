@@ -4,18 +4,21 @@
 """
 Sensors and actuators of many loops in one light process, for the part `site`.
 
-Messages are passed on as bytes. It says `ready` on standard output when every loop has answered,
-then measures for a while and writes what it found as JSON.
+Messages are passed on as bytes. When every loop has answered it measures for some windows, and
+prints what it found in each as JSON, with the processor time that the loops' processes took.
 """
 
 import argparse
 from functools import partial
 import json
+import math
+from pathlib import Path
 import struct
 import sys
 import time
 
 import numpy as np
+import psutil
 import rclpy
 from rclpy.experimental import EventsExecutor
 from rclpy.node import Node
@@ -60,11 +63,6 @@ class Load:
             self.answered.add(loop)
             self.latencies.append((now - sent) / NANOSECONDS)
 
-    @property
-    def open(self) -> int:
-        """How many measurements have no answer."""
-        return len(self._sent)
-
     def forget(self) -> None:
         """Count what is answered from now on."""
         self._sent.clear()
@@ -90,33 +88,52 @@ class Load:
         self._publishers[loop].publish(bytes(self._message))
 
 
+def _processor(processes: list[psutil.Process]) -> float:
+    """Return the processor time that some processes have taken, in s."""
+    times = [process.cpu_times() for process in processes]
+    return sum(one.user + one.system for one in times)
+
+
+def _window(load: Load, seconds: float, processes: list[psutil.Process]) -> dict[str, float]:
+    load.forget()
+    begun, before, own = time.monotonic(), _processor(processes), time.process_time()
+    sent = load.run(seconds)
+    took = time.monotonic() - begun
+    share = (_processor(processes) - before) / took
+    latencies = 1e3 * np.array(load.latencies or [math.inf])
+    p50, p99 = np.percentile(latencies, (50, 99), method='lower')
+    return {'sent': sent, 'answered': len(load.latencies), 'cores': share,
+            'load_cores': (time.process_time() - own) / took,
+            'p50_ms': float(p50), 'p99_ms': float(p99), 'worst_ms': float(latencies.max())}
+
+
 def main() -> int:
     """Load the loops of a file, and print what was found."""
-    parser = argparse.ArgumentParser()
-    parser.add_argument('loops')
-    parser.add_argument('--period', type=float, default=1.0)
-    parser.add_argument('--settle', type=float, default=5.0)
-    parser.add_argument('--seconds', type=float, default=20.0)
-    parser.add_argument('--patience', type=float, default=300.0)
+    parser = argparse.ArgumentParser(description=main.__doc__)
+    parser.add_argument('loops', type=Path, help='a namespace a line')
+    parser.add_argument('--pids', type=int, nargs='+', help='of their processes')
+    parser.add_argument('--period', type=float, default=1.0, help='of the measurements, in s')
+    parser.add_argument('--settle', type=float, help='s before the first window')
+    parser.add_argument('--seconds', type=float, help='length of a window')
+    parser.add_argument('--windows', type=int)
+    parser.add_argument('--patience', type=float, help='s until every loop has to have answered')
     given = parser.parse_args()
-    with open(given.loops) as file:
-        namespaces = [f'/{line.strip()}' for line in file]
+    namespaces = [f'/{line}' for line in given.loops.read_text().splitlines()]
+    processes = [psutil.Process(pid) for pid in given.pids]
     rclpy.init()
     load = Load(namespaces, given.period)
     begun = time.monotonic()
     while len(load.answered) < len(namespaces) and time.monotonic() - begun < given.patience:
         load.run(0.1)
-    found = {'answering': len(load.answered), 'discovery_seconds': time.monotonic() - begun}
+    started = time.time()
+    found = {'answering': len(load.answered), 'start_cpu_seconds': _processor(processes),
+             'discovery_seconds': started - min(one.create_time() for one in processes)}
     load.run(given.settle)
-    load.forget()
-    print('ready', flush=True)
-    sent = load.run(given.seconds)
-    latencies = np.array(load.latencies or [np.inf])
+    windows = [_window(load, given.seconds, processes) for _ in range(given.windows)]
+    memory = [one.memory_full_info() for one in processes]
     print(json.dumps(found | {
-        'sent': sent, 'received': len(load.latencies), 'open': load.open,
-        'p50_ms': 1e3 * float(np.percentile(latencies, 50)),
-        'p99_ms': 1e3 * float(np.percentile(latencies, 99)),
-        'worst_ms': 1e3 * float(latencies.max())}), flush=True)
+        'windows': windows, 'pss_megabytes': sum(one.pss for one in memory) / 1e6,
+        'rss_megabytes': sum(one.rss for one in memory) / 1e6}), flush=True)
     rclpy.try_shutdown()
     return 0
 
