@@ -3,16 +3,19 @@
 
 """What nodes share in a process of many: timers, failures, the file that names the loops."""
 
+import itertools
 from pathlib import Path
 from typing import Any
 
 import pytest
+import rclpy
 
 from koopman_ros.parameters.table import ConfigurationError
-from koopman_ros.ros import hosted
+from koopman_ros.ros import hosted, topics
 from koopman_ros.ros.host import read_loops
-from koopman_ros.ros.hosted import Hosting, Schedule
+from koopman_ros.ros.hosted import HostableNode, Hosting, Schedule
 from koopman_ros.ros.process import answer
+from koopman_ros.testing import isolated_domain
 
 
 class Steady:
@@ -140,3 +143,30 @@ def test_loops_are_taken_by_the_nodes_that_can_be_many(capsys: pytest.CaptureFix
     assert answer('trainer', given) == 2
     assert answer('controller', ['program', '--loops'], hosts=True) == 2
     assert capsys.readouterr().err.count("unknown argument '--loops'") == 2
+
+
+@pytest.mark.parametrize(('loops', 'rest'), [(1, 0.2), (100, 20.0)])
+def test_looks_of_all_loops_take_a_twentieth_of_a_core(
+        monkeypatch: pytest.MonkeyPatch, loops: int, rest: float) -> None:
+    clock, schedule = Steady(monkeypatch), Schedule()
+    taken = itertools.count(0.0, 0.01)
+    monkeypatch.setattr(topics.time, 'thread_time', lambda: next(taken))
+    looked: list[float] = []
+    monkeypatch.setattr(topics.Matching, '_look', lambda _: looked.append(clock.now))
+    with isolated_domain():
+        rclpy.init()
+        try:
+            node = HostableNode('one', Hosting(schedule, loops, _raised))
+            topics.Matching(node, lambda: None)
+            while len(looked) < 2:
+                clock.now += 0.5
+                schedule.turn()
+            node.destroy_node()
+        finally:
+            rclpy.shutdown()
+    # one look took 0.01 s of the thread
+    assert looked[1] - looked[0] == pytest.approx(max(0.5, rest))
+
+
+def _raised(error: Exception) -> None:
+    raise error
