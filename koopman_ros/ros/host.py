@@ -167,7 +167,9 @@ class Host:
 
     def _part(self, namespace: str) -> None:
         """Go on without a node, which has failed or was shut down."""
-        node = self._nodes.pop(namespace)
+        # it may have failed while it was shut down
+        if (node := self._nodes.pop(namespace, None)) is None:
+            return
         self._executor.remove_node(node)
         for timer in node.hosted_timers:
             timer.cancel()

@@ -196,8 +196,8 @@ def help_text(name: str) -> str:
         if (own := [item for item in names if item not in STANDARD_TOPICS + STANDARD_SERVICES]))
     file = config_directory() / f'{name}.yaml'
     called = f'{name} [--loops file]' if program.hosts else name
-    many = (f'\nWith --loops, a file with one namespace a line, it runs a {name} in each; parameters'
-            f'\nare given by the full name of a node, e.g. /line_1/reactor_3/{name}.\n'
+    many = ('\nWith --loops, a file of namespaces, one a line, it runs such a node in each. '
+            f'Parameters are\ngiven by the full name of a node, e.g. /line_1/reactor_3/{name}.\n'
             ) if program.hosts else ''
     return f"""\
 usage: ros2 run koopman_ros {called} [--ros-args [-p name:=value ...] [--params-file file] ...]
