@@ -8,6 +8,7 @@ from pathlib import Path
 import sys
 
 LOOPBACK_PROFILE = 'loopback_discovery.xml'
+LEAN_PROFILE = 'many_loops.xml'
 
 _PACKAGE = 'koopman_ros'
 

@@ -8,7 +8,9 @@ from koopman_ros.lifting.coordinates import Box, Coordinates, TrainingStates, Tr
 from koopman_ros.lifting.input_terms import InputTerms
 from koopman_ros.lifting.model import LiftedModel, linearised_model, Provenance
 from koopman_ros.lifting.observables import NetworkObservables, Observables, PolynomialObservables
+from koopman_ros.lifting.shared import load_shared
 
 __all__ = ['Box', 'Coordinates', 'InputTerms', 'LiftedModel', 'ModelFileError',
            'NetworkObservables', 'Observables', 'PolynomialObservables', 'Provenance',
-           'TrainingStates', 'TriedLoops', 'linearised_model', 'load', 'load_with_digest', 'save']
+           'TrainingStates', 'TriedLoops', 'linearised_model', 'load', 'load_shared',
+           'load_with_digest', 'save']

@@ -14,7 +14,6 @@ from typing import Any
 from builtin_interfaces.msg import Time
 import numpy as np
 from rclpy.callback_groups import MutuallyExclusiveCallbackGroup
-from rclpy.timer import Timer
 from std_srvs.srv import SetBool, Trigger
 
 from koopman_ros.arrays import Array
@@ -89,8 +88,8 @@ class ControllerNode(ManagedNode):
     answered, so that the watchdog goes by the last state that commanded.
     """
 
-    def __init__(self) -> None:
-        super().__init__('controller')
+    def __init__(self, **options: Any) -> None:
+        super().__init__('controller', **options)
         self._watchdog: Watchdog | None = None
         given = self.given()
         system = system_of(given)
@@ -136,7 +135,7 @@ class ControllerNode(ManagedNode):
             tuple(signals.states), round(parameters.synchronisation_tolerance * NANOSECONDS))
         self._applied: dict[str, tuple[int, float]] = {}  # stamp and value by name of the input
         self._waiting: list[_Sample] = []  # measurements that came before the measured inputs
-        self._patience: Timer | None = None
+        self._patience: Any = None  # a timer
         self._frame_id, self._frame_length = '', 0  # the length where it is too long
 
         wiring = Wiring(signals, parameters.states, parameters.inputs)
@@ -484,7 +483,7 @@ class ControllerNode(ManagedNode):
 
 def main(args: list[str] | None = None) -> int:
     """Run the controller node."""
-    return run('controller', ControllerNode, args)
+    return run('controller', ControllerNode, args, hosts=True)
 
 
 if __name__ == '__main__':

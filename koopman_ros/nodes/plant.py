@@ -46,8 +46,8 @@ class Phase(Enum):
 class PlantNode(ManagedNode):
     """Run a plant in time; docs/interfaces.md has its topics and services."""
 
-    def __init__(self) -> None:
-        super().__init__('plant')
+    def __init__(self, **options: Any) -> None:
+        super().__init__('plant', **options)
         self._table = table = PlantTable(self.given())
         # in the file of a whole loop; a plant has its own
         self._settings = self.declare_table(table, (*SIGNALS, 'model'))
@@ -367,7 +367,7 @@ class PlantNode(ManagedNode):
 
 def main(args: list[str] | None = None) -> int:
     """Run the plant node."""
-    return run('plant', PlantNode, args)
+    return run('plant', PlantNode, args, hosts=True)
 
 
 if __name__ == '__main__':

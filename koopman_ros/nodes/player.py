@@ -86,7 +86,7 @@ class PlayerNode(LoopNode):
         self._began, self._sent = False, 0
         self._received: set[str] = set()  # topics of which subscribers have received a message
         self._due = self._wall_start = self._said = self._asked = time.monotonic()
-        self._timer = wall_timer(self, _POLL_PERIOD_NS / NANOSECONDS, self._on_timer)
+        self._timer: Any = wall_timer(self, _POLL_PERIOD_NS / NANOSECONDS, self._on_timer)
 
     def _on_timer(self) -> None:
         try:

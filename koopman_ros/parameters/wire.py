@@ -7,8 +7,10 @@ from __future__ import annotations
 
 from collections.abc import Collection, Mapping
 from dataclasses import dataclass, field
+import functools
 from functools import cached_property
 import math
+from pathlib import Path
 import re
 from typing import Any
 
@@ -307,25 +309,28 @@ def preset(system: str, node: str) -> dict[str, Any]:
     path = config_directory() / _PRESETS / f'{system}.yaml'
     if not system.isidentifier() or not path.is_file():
         return {}
-    # in here: only at the start
-    import yaml
-
-    content = yaml.safe_load(path.read_text())
+    content = _content(path)
     values: dict[str, Any] = {}
     for section in ('/**', node):
         _flatten('', content.get(section, {}).get('ros__parameters', {}), values)
     return values
 
 
-def renamed(node: str, given: Mapping[str, Any], table: ParameterTable[Any]) -> str:
-    """Say what former parameters among those given are called now, or return an empty string."""
+@functools.cache
+def _content(path: Path) -> dict[str, Any]:
+    # in here: only at the start
     import yaml
 
+    return dict(yaml.safe_load(path.read_text()))
+
+
+def renamed(node: str, given: Mapping[str, Any], table: ParameterTable[Any]) -> str:
+    """Say what former parameters among those given are called now, or return an empty string."""
     path = config_directory() / 'renamed.yaml'
     if not (unknown := set(given) - set(table.rows)) or not path.is_file():
         return ''
     said = []
-    for name, (now, factor) in yaml.safe_load(path.read_text()).get(node, {}).items():
+    for name, (now, factor) in _content(path).get(node, {}).items():
         if name in unknown and now in table.rows:
             value, row = given[name], table.rows[now]
             if isinstance(factor, Mapping):

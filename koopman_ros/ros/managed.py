@@ -46,6 +46,11 @@ class ManagedNode(LifecycleNodeMixin, LoopNode):
         self._service_change_state.callback = lambda request, response: self._on_change(
             change, request, response)
 
+    def destroy_node(self) -> None:
+        """Take the node down with its lifecycle, which would keep its name on the network."""
+        super().destroy_node()
+        self._state_machine.destroy_when_not_in_use()
+
     def start(self) -> None:
         """Configure and activate, as without a manager; raises what went wrong."""
         self._alone = True
@@ -152,7 +157,8 @@ class ManagedNode(LifecycleNodeMixin, LoopNode):
     def _entities(self) -> tuple[list[Any], ...]:
         # rclpy subscribes to the time whenever `use_sim_time` is set
         heard = [one for one in self.subscriptions if one.msg_type is not Clock]
-        return list(self.timers), list(self.services), heard, list(self.publishers)
+        return ([*self.timers, *self.hosted_timers], list(self.services), heard,
+                list(self.publishers))
 
 
 def one_line(error: Exception) -> str:

@@ -21,7 +21,7 @@ from std_srvs.srv import Trigger
 
 from koopman_ros.arrays import Array
 from koopman_ros.control import compare, Controller, State, Windows
-from koopman_ros.lifting import Coordinates, LiftedModel, load_with_digest, ModelFileError
+from koopman_ros.lifting import Coordinates, LiftedModel, load_shared, ModelFileError
 from koopman_ros.parameters.controller import built, ControllerParameters, table_of
 from koopman_ros.parameters.wire import Signals, signals_of
 from koopman_ros.resources import model_path
@@ -95,7 +95,7 @@ def load_suitable(name: str, signals: Signals | None = None) -> LoadedModel:
         raise ModelFileError(f'model = {name[:50]!r}... is no path of a file, which has at most '
                              f'{_LONGEST_PATH} bytes: check it')
     path = model_path(name)
-    model, digest = load_with_digest(path)
+    model, digest = load_shared(path)
     own = signals_of(model)
     if signals is not None and not (own.inputs == signals.inputs
                                     and signals.states.items() <= own.states.items()):

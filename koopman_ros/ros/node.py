@@ -6,7 +6,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Collection, Mapping, Sequence
-import contextlib
 import copy
 from dataclasses import dataclass, field
 import difflib
@@ -20,7 +19,7 @@ from typing import Any, TypeVar
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
 from rcl_interfaces import msg
 from rclpy.clock import Clock, ClockType
-from rclpy.exceptions import InvalidHandle, InvalidParameterTypeException
+from rclpy.exceptions import InvalidParameterTypeException
 from rclpy.node import Node
 from rclpy.parameter import Parameter
 from rclpy.publisher import Publisher
@@ -35,23 +34,28 @@ from koopman_ros.parameters.table import ConfigurationError, ParameterTable, Spe
 from koopman_ros.parameters.wire import DIAGNOSTICS, renamed, Signals
 from koopman_ros.reasons import Words
 from koopman_ros.ros.codec import stamp_message
+from koopman_ros.ros.hosted import HostableNode, HostedTimer, Hosting
 from koopman_ros.units import Display, Displays, NANOSECONDS
 
 T = TypeVar('T')
-Entity = TypeVar('Entity', Publisher, Service, Subscription, Timer)
+Entity = TypeVar('Entity', Publisher, Service, Subscription, Timer | HostedTimer)
 
 # Parameters that rclpy itself declares or reads.
 _RCLPY_PARAMETERS = ('use_sim_time', 'start_type_description_service')
 
 _DESTROY: dict[type, Callable[[Node, Any], object]] = {
     Publisher: Node.destroy_publisher, Subscription: Node.destroy_subscription,
-    Service: Node.destroy_service, Timer: Node.destroy_timer}
+    Service: Node.destroy_service, Timer: Node.destroy_timer,
+    HostedTimer: lambda node, timer: node.destroy_timer(timer)}
 
 _SHOWN = {'K': Display('K', 'degC', '.2f')}
 
 
-def wall_timer(node: Node, seconds: float, callback: Callable[[], Any], **options: Any) -> Timer:
+def wall_timer(node: Node, seconds: float, callback: Callable[[], Any], **options: Any
+               ) -> Timer | HostedTimer:
     """Create a timer by the steady clock, which runs while simulated time stands still."""
+    if isinstance(node, HostableNode) and node.hosting is not None:
+        return node.hosted_timer(seconds, callback)
     return node.create_timer(
         seconds, callback, clock=Clock(clock_type=ClockType.STEADY_TIME), **options)
 
@@ -68,7 +72,8 @@ class Owned:
         self._entities.append(entity)
         return entity
 
-    def timer(self, seconds: float, callback: Callable[[], Any], **options: Any) -> Timer:
+    def timer(self, seconds: float, callback: Callable[[], Any], **options: Any
+              ) -> Timer | HostedTimer:
         """Create a :func:`wall_timer`."""
         return self.keep(wall_timer(self._node, seconds, callback, **options))
 
@@ -173,24 +178,27 @@ class DiagnosticTask:
         self._diagnostics.remove(self)
 
 
-class LoopNode(Node):
+class LoopNode(HostableNode):
     """
     A node whose parameters are those of a table, and which may complete work before its end.
 
     Every value that it was given is declared, so that the table finds names it does not know, and
     the table answers what rclpy would answer less clearly itself.
 
-    :ivar exit_code: ends the process when a node whose work is done sets it.
+    :param hosting: in a process that it shares with others; alone by default.
+    :ivar exit_code: ends the process, or the node in a process of many, when a node whose work is
+        done sets it.
     """
 
     exit_code: int | None = None
     _clocks_refused = 0
 
-    def __init__(self, name: str, **options: Any) -> None:
+    def __init__(self, name: str, hosting: Hosting | None = None, **options: Any) -> None:
         self._table_of = name
         self._followers: list[Any] = []  # callbacks by which tables are followed
         self._ranges: dict[str, msg.FloatingPointRange | msg.IntegerRange] = {}
-        super().__init__(name, automatically_declare_parameters_from_overrides=True, **options)
+        super().__init__(
+            name, hosting, automatically_declare_parameters_from_overrides=True, **options)
 
     @cached_property
     def diagnostics(self) -> Diagnostics:
@@ -222,21 +230,8 @@ class LoopNode(Node):
 
         # rclpy subscribes through here for `use_sim_time`, and a negative time ends it in spin
         return super().create_subscription(
-            msg_type, topic, hear if msg_type is ClockMessage else callback, *args, **options)
-
-    def create_service(self, srv_type: Any, srv_name: str, callback: Callable[..., Any],
-                       **options: Any) -> Service:
-        """Serve as any node does; an answer that comes after the service's end is dropped."""
-        made = super().create_service(srv_type, srv_name, callback, **options)
-        send = made.send_response
-
-        def answer(response: Any, header: Any) -> None:
-            # rclpy ends spin where a service went while its answer was awaited
-            with contextlib.suppress(InvalidHandle):
-                send(response, header)
-
-        made.send_response = answer  # type: ignore[method-assign]
-        return made
+            msg_type, topic, self.guarded(hear if msg_type is ClockMessage else callback), *args,
+            **options)
 
     def declare_parameters(self, namespace: str, parameters: list[Any],
                            ignore_override: bool = False) -> list[Parameter]:

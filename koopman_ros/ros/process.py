@@ -21,28 +21,37 @@ from koopman_ros.ros.node import LoopNode
 from koopman_ros.ros.watchdog import end_in_time
 from koopman_ros.startup import end_by_force, handle_signals
 
-_PROFILES = ('FASTDDS_DEFAULT_PROFILES_FILE', 'FASTRTPS_DEFAULT_PROFILES_FILE')
-_LONGEST_WAIT = 0.1  # s from a signal to the end
-_TAKE_DOWN_PATIENCE = 5.0  # s; taking down a participant needs some ten milliseconds
+PROFILES = ('FASTDDS_DEFAULT_PROFILES_FILE', 'FASTRTPS_DEFAULT_PROFILES_FILE')
+_LOOPS = '--loops'
+LONGEST_WAIT = 0.1  # s from a signal to the end
+TAKE_DOWN_PATIENCE = 5.0  # s; taking down a participant needs some ten milliseconds
 
 
-def run(name: str, create: Callable[[], LoopNode], args: list[str] | None = None) -> int:
+def run(name: str, create: Callable[..., LoopNode], args: list[str] | None = None,
+        hosts: bool = False) -> int:
     """
     Run a node until SIGINT, SIGTERM or SIGHUP, which end it between two callbacks, or by force.
 
+    :param hosts: whether ``--loops`` makes it a process of many such nodes; see
+        :func:`koopman_ros.ros.host.run_loops`.
     :return: exit code, 0 after a signal and for `--help`, 1 when the node could not start, 2 for
         an unknown argument, or the node's own.
     """
     # a list, because a second signal may come while the first is handled, where a lock would hang
     arrived: list[int] = []
     handle_signals(lambda number, _: arrived.append(number))
-    if (said := answer(name, args)) is not None:
+    if (said := answer(name, args, hosts)) is not None:
         return said
+    if hosts and (file := _loops_file(args)) is not None:
+        # most processes have one node
+        from koopman_ros.ros.host import run_loops
+
+        return run_loops(name, create, args, file, arrived)
     leave = end_in_time(name)
     node = None
     try:
         try:
-            _init(args)
+            init(args)
             node = create()
             if isinstance(node, ManagedNode) and node.get_parameter('autostart').value:
                 node.start()
@@ -55,14 +64,14 @@ def run(name: str, create: Callable[[], LoopNode], args: list[str] | None = None
         executor.add_node(node)
         while not arrived and node.exit_code is None:
             # Python handles a signal when the wait returns, so the wait is bounded
-            executor.spin_once(timeout_sec=_LONGEST_WAIT)
+            executor.spin_once(timeout_sec=LONGEST_WAIT)
     finally:
         leave()
         try:
             if node is not None:
                 node.complete()
         finally:
-            _take_down(name, node)
+            take_down(name, node)
             handle_signals(signal.SIG_IGN)
     return node.exit_code or 0
 
@@ -79,7 +88,7 @@ def run_task(name: str, prepare: Callable[[], Callable[[], int]],
         return said
     try:
         try:
-            _init(args)
+            init(args)
             task = prepare()
         finally:
             rclpy.try_shutdown()
@@ -91,9 +100,10 @@ def run_task(name: str, prepare: Callable[[], Callable[[], int]],
         return 128 + signal.SIGINT
 
 
-def _take_down(name: str, node: LoopNode | None) -> None:
+def take_down(name: str, node: LoopNode | None, patience: float = TAKE_DOWN_PATIENCE) -> None:
+    """Take a node down, and the middleware, by force where that takes longer than so many s."""
     # Fast DDS can hang in that, in rclpy with the interpreter's lock held: see docs/middleware.md
-    disarm = end_by_force(_TAKE_DOWN_PATIENCE, 0, (
+    disarm = end_by_force(patience, 0, (
         f'{name}: the middleware does not shut down: left to the operating system'))
     if node is not None:
         node.destroy_node()
@@ -102,7 +112,8 @@ def _take_down(name: str, node: LoopNode | None) -> None:
     disarm()
 
 
-def _init(args: list[str] | None) -> None:
+def init(args: list[str] | None) -> None:
+    """Begin with ROS; signals stay with us."""
     # rcl logs what it also raises, which would say it twice
     set_logger_level('rcl', LoggingSeverity.FATAL)
     # rclpy's own handlers end the context in the middle of a callback: what the callback then
@@ -111,14 +122,23 @@ def _init(args: list[str] | None) -> None:
     set_logger_level('rcl', LoggingSeverity.UNSET)
 
 
-def answer(name: str, args: list[str] | None) -> int | None:
+def _loops_file(args: list[str] | None) -> str | None:
+    """Return the file of loops that is given alone beside ROS's arguments, or None."""
+    try:
+        rest = remove_ros_args(args)[1:]
+    except RuntimeError:
+        return None
+    return rest[1] if rest[:1] == [_LOOPS] and len(rest) == 2 else None
+
+
+def answer(name: str, args: list[str] | None, hosts: bool = False) -> int | None:
     """Print the help, or refuse what is not ROS's; return an exit code, or None to go on."""
     try:
         rest = remove_ros_args(args)[1:]
     except RuntimeError:
         # the start says what is wrong with them
         return None
-    if not rest:
+    if not rest or (hosts and _loops_file(args) is not None):
         return None
     if '--help' in rest or '-h' in rest:
         # it imports the tables of all nodes
@@ -140,7 +160,7 @@ def open_to_the_network(environment: Mapping[str, str]) -> str:
     closed = (
         environment.get('ROS_AUTOMATIC_DISCOVERY_RANGE', '').upper() in ('LOCALHOST', 'OFF')
         or environment.get('ROS_LOCALHOST_ONLY') == '1'
-        or any(Path(environment.get(name, '')).name == LOOPBACK_PROFILE for name in _PROFILES)
+        or any(Path(environment.get(name, '')).name == LOOPBACK_PROFILE for name in PROFILES)
         # with keys, or not at all
         or (environment.get('ROS_SECURITY_ENABLE', '').lower() == 'true'
             and environment.get('ROS_SECURITY_STRATEGY', '') == 'Enforce'))

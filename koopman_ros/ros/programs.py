@@ -61,6 +61,7 @@ class Program:
     subscribes: tuple[str, ...] = ()  #: topics; /clock where it follows simulated time
     serves: tuple[str, ...] = ()  #: services
     calls: tuple[str, ...] = ()  #: services of others
+    hosts: bool = False  #: whether ``--loops`` makes it a process of many such nodes
 
 
 def programs(system: str = DEFAULT_SYSTEM) -> dict[str, Program]:
@@ -85,7 +86,7 @@ def programs(system: str = DEFAULT_SYSTEM) -> dict[str, Program]:
             publishes=(*topics_of('measured', 'applied'), *unmeasured, topics.CLOCK,
                        topics.DIAGNOSTICS, _TRANSITIONS, *STANDARD_TOPICS),
             subscribes=topics_of('commands'),
-            serves=('~/reset', *lifecycle, *STANDARD_SERVICES)),
+            serves=('~/reset', *lifecycle, *STANDARD_SERVICES), hosts=True),
         'controller': Program(
             'Answers each measurement with a command, by a learned model.',
             publishes=(*topics_of('commands', 'active_setpoints', 'predicted'),
@@ -93,7 +94,8 @@ def programs(system: str = DEFAULT_SYSTEM) -> dict[str, Program]:
                        topics.CONTROLLER_EVENTS, topics.DIAGNOSTICS,
                        _TRANSITIONS, *STANDARD_TOPICS),
             subscribes=(*topics_of('measured', 'applied', 'setpoints', 'manual'), topics.CLOCK),
-            serves=('~/set_automatic', '~/reload_model', *lifecycle, *STANDARD_SERVICES)),
+            serves=('~/set_automatic', '~/reload_model', *lifecycle, *STANDARD_SERVICES),
+            hosts=True),
         'trainer': Program(
             'Records the loop to MCAP bags, excites the plant, and learns models from bags.',
             f'{Program.codes}; with task:=train 0 for an accepted model, 2 for a refused one, 1 '
@@ -193,11 +195,15 @@ def help_text(name: str) -> str:
             ('serves', program.serves))
         if (own := [item for item in names if item not in STANDARD_TOPICS + STANDARD_SERVICES]))
     file = config_directory() / f'{name}.yaml'
+    called = f'{name} [--loops file]' if program.hosts else name
+    many = ('\nWith --loops, a file of namespaces, one a line, it runs such a node in each. '
+            f'Parameters are\ngiven by the full name of a node, e.g. /line_1/reactor_3/{name}.\n'
+            ) if program.hosts else ''
     return f"""\
-usage: ros2 run koopman_ros {name} [--ros-args [-p name:=value ...] [--params-file file] ...]
+usage: ros2 run koopman_ros {called} [--ros-args [-p name:=value ...] [--params-file file] ...]
 
 {program.does}
-
+{many}
 {lists}exit codes: {program.codes}
 
 Parameters for the system {DEFAULT_SYSTEM}, with defaults and ranges in {file}:

@@ -8,7 +8,9 @@ from __future__ import annotations
 from collections.abc import Callable, Collection, Mapping
 import copy
 import importlib
+import math
 import reprlib
+import time
 from typing import Any
 
 from diagnostic_msgs.msg import DiagnosticArray
@@ -38,6 +40,7 @@ from koopman_ros.parameters.wire import (
     OPERATOR_ACTIONS,
     Wiring,
 )
+from koopman_ros.ros.hosted import HostableNode
 from koopman_ros.ros.node import Owned
 
 # JointState is the one stamped type of common_interfaces that carries named float64 values,
@@ -55,6 +58,9 @@ CLOCK_QOS = QoSProfile(depth=1, reliability=ReliabilityPolicy.BEST_EFFORT)
 
 _LOOK_PERIOD = 0.5  # s
 _POLICIES = ('reliability', 'durability', 'deadline', 'liveliness', 'liveliness_lease_duration')
+# Of a processor, that the looks of all loops of a process take: each asks the whole graph, which
+# grows with the loops.
+_LOOK_SHARE = 0.05
 # What does not pass: policy, offered, asked for.
 _CONFLICTS = (('reliability', ReliabilityPolicy.BEST_EFFORT, ReliabilityPolicy.RELIABLE),
               ('durability', DurabilityPolicy.VOLATILE, DurabilityPolicy.TRANSIENT_LOCAL))
@@ -123,7 +129,10 @@ class Matching:
         self._owned = Owned(node)
         self._own: list[Publisher | Subscription] = []
         self._said: tuple[str, ...] = ('', '')
-        self._owned.timer(_LOOK_PERIOD, self._look)
+        self._rests_until = -math.inf  # by the steady clock
+        hosting = node.hosting if isinstance(node, HostableNode) else None
+        self._loops = 1 if hosting is None else hosting.loops
+        self._owned.timer(_LOOK_PERIOD, self._look_in_turn)
         self.destroy = self._owned.destroy  #: with what was made here
 
     @property
@@ -152,6 +161,13 @@ class Matching:
             qos_overriding_options=overridable()))
         self._own.append(made)
         return made
+
+    def _look_in_turn(self) -> None:
+        if (now := time.monotonic()) < self._rests_until:
+            return
+        begun = time.thread_time()
+        self._look()
+        self._rests_until = now + (time.thread_time() - begun) * self._loops / _LOOK_SHARE
 
     def _look(self) -> None:
         said = ('; '.join(filter(None, map(self._conflict, self._single))),

@@ -82,9 +82,11 @@ class Timing:
 
 class Watchdog:
     """
-    A thread that does what the executor's timer would, whenever the executor does not come to it.
+    Does what the executor's timer would, whenever the executor does not come to it.
 
-    It counts its own looks: time in which the whole process stood still does not count.
+    It counts its own looks: time in which the whole process stood still does not count. One
+    thread looks for all watchdogs of a process; each acts in a thread of its own, as one may be
+    kept by what keeps the executor.
 
     :param act: called from that thread with the seconds for which the executor has been busy;
         what it raises is raised again in the executor, by :meth:`beat`.
@@ -92,14 +94,14 @@ class Watchdog:
 
     def __init__(self, act: Callable[[float], None]) -> None:
         self._act = act
-        self._beats = 0
+        self._beats = self._seen = self._missed = 0
         self._failure: Exception | None = None
-        self._over = threading.Event()
-        self._thread = threading.Thread(target=self._run, daemon=True)
+        self._over = False
+        self._acting: threading.Thread | None = None
 
     def start(self) -> None:
         """Begin to look."""
-        self._thread.start()
+        _LOOKS.add(self)
 
     def beat(self) -> None:
         """Note that the executor has come by; called from it, every `PERIOD`."""
@@ -109,22 +111,72 @@ class Watchdog:
 
     def end(self) -> None:
         """Look no more, and act no more once this has returned, but for what takes longer."""
-        self._over.set()
-        if self._thread.is_alive():
-            self._thread.join(1.0)
+        self._over = True
+        _LOOKS.remove(self)
+        if self._acting is not None:
+            self._acting.join(1.0)
 
-    def _run(self) -> None:
-        seen, missed = self._beats, 0
-        while not self._over.wait(PERIOD):
-            missed = missed + 1 if self._beats == seen else 0
-            seen = self._beats
-            if missed < _MISSED:
-                continue
-            try:
-                self._act(missed * PERIOD)
-            except Exception as error:
-                # the next look may succeed, which a dead thread would never have
-                self._failure = error
+    def look(self) -> None:
+        """Act if the executor has been busy for too long, and no act is under way."""
+        self._missed = self._missed + 1 if self._beats == self._seen else 0
+        self._seen = self._beats
+        if self._missed < _MISSED or (self._acting is not None and self._acting.is_alive()):
+            return
+        self._acting = threading.Thread(
+            target=self._stand_in, args=[self._missed * PERIOD], daemon=True)
+        self._acting.start()
+
+    def _stand_in(self, seconds: float) -> None:
+        if self._over:
+            return
+        try:
+            self._act(seconds)
+        except Exception as error:
+            # the next look may succeed
+            self._failure = error
+
+
+class _Looks:
+    """The thread that looks, while there are watchdogs."""
+
+    def __init__(self) -> None:
+        self._lock = threading.Lock()
+        self._watchdogs: list[Watchdog] = []
+        self._over = threading.Event()
+        self._thread = threading.Thread()
+
+    def add(self, watchdog: Watchdog) -> None:
+        """Look for one more."""
+        with self._lock:
+            self._watchdogs.append(watchdog)
+            if len(self._watchdogs) > 1:
+                return
+            self._over = threading.Event()
+            self._thread = threading.Thread(
+                target=self._run, args=[self._over], name='watchdogs', daemon=True)
+            self._thread.start()
+
+    def remove(self, watchdog: Watchdog) -> None:
+        """Look for one less; it need not be among them."""
+        with self._lock:
+            if watchdog not in self._watchdogs:
+                return
+            self._watchdogs.remove(watchdog)
+            if self._watchdogs:
+                return
+            self._over.set()
+            thread = self._thread
+        thread.join(1.0)
+
+    def _run(self, over: threading.Event) -> None:
+        while not over.wait(PERIOD):
+            with self._lock:
+                watchdogs = list(self._watchdogs)
+            for watchdog in watchdogs:
+                watchdog.look()
+
+
+_LOOKS = _Looks()
 
 
 def end_in_time(name: str) -> Callable[[], None]:

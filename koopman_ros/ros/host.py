@@ -1,0 +1,254 @@
+# SPDX-FileCopyrightText: 2026 The koopman_ros Authors
+# SPDX-License-Identifier: Apache-2.0
+
+"""Many loops in one process: a node each, one executor, one failing without the others."""
+
+from collections.abc import Callable, MutableMapping, Sequence
+from functools import partial
+import os
+from pathlib import Path
+import signal
+import sys
+import time
+import traceback
+
+from rclpy.exceptions import InvalidNamespaceException
+from rclpy.experimental import EventsExecutor
+from rclpy.validate_namespace import validate_namespace
+
+from koopman_ros.parameters.table import ConfigurationError
+from koopman_ros.resources import config_directory, LEAN_PROFILE
+from koopman_ros.ros.hosted import HostableNode, Hosting, Schedule
+from koopman_ros.ros.managed import ManagedNode, one_line, START_ERRORS
+from koopman_ros.ros.node import Diagnostics, Level, LoopNode, Status, wall_timer
+from koopman_ros.ros.process import (
+    init,
+    LONGEST_WAIT,
+    open_to_the_network,
+    PROFILES,
+    take_down,
+    TAKE_DOWN_PATIENCE,
+)
+from koopman_ros.ros.watchdog import end_in_time
+from koopman_ros.startup import handle_signals
+
+_PERIOD = 0.1  # s between two looks at what has ended
+_GOODBYE = 0.1  # s that taking down a node may take
+_LATE = 0.5  # s; a timer that comes so late tells of more work than the process can do
+_SHOWN = 10  # loops that failed, in diagnostics; the log has them all
+
+# Collecting nodes takes down what they have one by one, each time with word to all others; with
+# the process goes all at once.
+_LEFT: list[object] = []
+
+
+def read_loops(path: Path) -> tuple[str, ...]:
+    """
+    Read the namespaces of loops, one a line; blank lines and what follows a # do not count.
+
+    :raises ConfigurationError: naming the line and what is wrong with it.
+    :raises OSError: when the file cannot be read.
+    """
+    lines: dict[str, int] = {}
+    for number, line in enumerate(path.read_text(errors='replace').splitlines(), 1):
+        if not (word := line.partition('#')[0].strip()):
+            continue
+        namespace = f'/{word.lstrip("/")}'
+        try:
+            validate_namespace(namespace)
+        except InvalidNamespaceException as error:
+            raise ConfigurationError(f'{path}, line {number}: {word[:100]!r} is no namespace '
+                                     f'({one_line(error)}): e.g. line_1/reactor_3') from None
+        if namespace in lines:
+            raise ConfigurationError(f'{path}, line {number}: {namespace} is in line '
+                                     f'{lines[namespace]}, too: each loop has its own')
+        lines[namespace] = number
+    if not lines:
+        raise ConfigurationError(f'{path} names no loop: write one namespace a line')
+    return tuple(lines)
+
+
+class Host:
+    """
+    The nodes of many loops, and one that says how they are.
+
+    :param create: makes the node of one loop, given its namespace and the hosting.
+    """
+
+    def __init__(self, name: str, create: Callable[..., LoopNode], loops: Sequence[str]) -> None:
+        self._create, self._loops = create, loops
+        self._waiting = list(reversed(loops))
+        self._nodes: dict[str, LoopNode] = {}  # that run, by namespace
+        self._failed: dict[str, str] = {}  # why, by namespace
+        self._set_aside: list[LoopNode] = []  # whose watchdogs stand in for them
+        self._leaving: list[str] = []
+        self._schedule = Schedule()
+        self._node = HostableNode(f'{name}_host', Hosting(
+            self._schedule, len(loops), self._on_own_failure))
+        if self._node.get_namespace() != '/':
+            raise ConfigurationError(
+                f'-r __ns:={self._node.get_namespace()} would put all loops there: write '
+                'the namespaces into the file of loops')
+        self._executor = EventsExecutor()
+        self._executor.add_node(self._node)
+        diagnostics = Diagnostics(self._node)
+        self._diagnostics = diagnostics.add('loops', self._status)
+        self._delay = self._share = 0.0
+        self._looked = self._measured = time.monotonic()
+        self._processor = time.process_time()
+        wall_timer(self._node, _PERIOD, self._look)
+        if note := open_to_the_network(os.environ):
+            self._node.get_logger().warning(note)
+
+    def run(self, arrived: Sequence[int]) -> int:
+        """
+        Start the loops one after the other, and run them until a signal arrives or none is left.
+
+        :return: 0 after a signal, or when all were shut down; 1 when none is left and one failed.
+        """
+        while not arrived:
+            if self._waiting:
+                self._begin(self._waiting.pop())
+                self._catch_up(arrived)
+            elif self._nodes:
+                self._turn()
+            else:
+                return int(bool(self._failed))
+        return 0
+
+    def complete(self) -> None:
+        """Let no node command while the middleware is taken down."""
+        _LEFT.append(self)
+        for node in (*self._nodes.values(), *self._set_aside):
+            node.complete()
+
+    def _turn(self) -> None:
+        """Call one timer that is due and one message that has come, or wait for the next."""
+        self._executor.spin_once(timeout_sec=min(LONGEST_WAIT, self._schedule.turn()))
+        while self._leaving:
+            self._part(self._leaving.pop())
+
+    def _catch_up(self, arrived: Sequence[int]) -> None:
+        """Do all that waits now, before another loop is started, but for a signal."""
+        done: list[bool] = []
+        self._executor.create_task(lambda: done.append(True))
+        while not done and not arrived:
+            self._turn()
+
+    def _begin(self, namespace: str) -> None:
+        hosting = Hosting(self._schedule, len(self._loops), partial(self._fail, namespace))
+        try:
+            node = self._create(namespace=namespace, hosting=hosting)
+            if isinstance(node, ManagedNode) and node.get_parameter('autostart').value:
+                node.start()
+        except Exception as error:
+            self._note(namespace, error, 'cannot start: ')
+            for made in hosting.made:
+                _destroy(made)
+            return
+        self._nodes[namespace] = node
+        self._executor.add_node(node)
+
+    def _fail(self, namespace: str, error: Exception) -> None:
+        """Note what a callback of a node has raised; it gets no further ones."""
+        if namespace not in self._failed:
+            self._note(namespace, error, 'stopped: ')
+            self._leaving.append(namespace)
+
+    def _note(self, namespace: str, error: Exception, what: str) -> None:
+        self._failed[namespace] = f'{what}{one_line(error)}'
+        expected = isinstance(error, START_ERRORS) and namespace not in self._nodes
+        self._node.get_logger().error(f'{namespace}: {what}' + (
+            one_line(error) if expected else ''.join(traceback.format_exception(error))))
+        self._diagnostics.publish_if_changed()
+
+    def _on_own_failure(self, error: Exception) -> None:
+        raise error
+
+    def _part(self, namespace: str) -> None:
+        """Go on without a node, which has failed or was shut down."""
+        # it may have failed while it was shut down
+        if (node := self._nodes.pop(namespace, None)) is None:
+            return
+        self._executor.remove_node(node)
+        for timer in node.hosted_timers:
+            timer.cancel()
+        if namespace in self._failed:
+            # its watchdog takes it for busy: it holds the command, then goes to the safe one
+            self._set_aside.append(node)
+        else:
+            _destroy(node)
+
+    def _look(self) -> None:
+        now = time.monotonic()
+        self._delay, self._looked = max(self._delay, now - self._looked - _PERIOD), now
+        if now - self._measured > 1.0:
+            processor = time.process_time()
+            self._share = (processor - self._processor) / (now - self._measured)
+            self._measured, self._processor = now, processor
+        self._leaving += [namespace for namespace, node in self._nodes.items()
+                          if node.exit_code is not None and namespace not in self._leaving]
+
+    def _status(self) -> Status:
+        running, failed = len(self._nodes), list(self._failed.items())
+        level, message = Level.OK, f'{running} of {len(self._loops)} loops run'
+        if failed:
+            level, message = Level.ERROR, f'{message}, {len(failed)} failed: ' + '; '.join(
+                f'{namespace}: {why}' for namespace, why in failed[:_SHOWN]) + (
+                '; and more, see the log' if len(failed) > _SHOWN else '')
+        delay, self._delay = self._delay, 0.0
+        if level is Level.OK and delay > _LATE and not self._waiting:
+            level, message = Level.WARN, (
+                f'{message}, {delay:.2g} s late: that is more than one process can do; spread the '
+                'loops over several, or measure less often')
+        return Status(level, message, {
+            'loops': len(self._loops), 'running': running, 'failed': len(failed),
+            'to be started': len(self._waiting),
+            'processor share [%]': 100.0 * self._share,
+            'longest delay of a timer [ms]': 1e3 * delay})
+
+
+def _destroy(node: HostableNode) -> None:
+    if isinstance(node, LoopNode):
+        node.complete()
+    for timer in node.hosted_timers:
+        timer.cancel()
+    node.destroy_node()
+
+
+def run_loops(name: str, create: Callable[..., LoopNode], args: list[str] | None, file: str,
+              arrived: Sequence[int]) -> int:
+    """
+    Run a node for each loop of a file until a signal; see :func:`koopman_ros.ros.process.run`.
+
+    :param arrived: signals, as they come.
+    :return: exit code, 1 when no loop could start, or all have failed since then.
+    """
+    leave = end_in_time(name)
+    host = None
+    loops: tuple[str, ...] = ()
+    try:
+        try:
+            loops = read_loops(Path(file))
+            _be_lean(os.environ)
+            init(args)
+            host = Host(name, create, loops)
+        except START_ERRORS as error:
+            print(f'{name}: cannot start: {one_line(error)}', file=sys.stderr)
+            return 1
+        return host.run(arrived)
+    finally:
+        leave()
+        try:
+            if host is not None:
+                host.complete()
+        finally:
+            # the middleware says good-bye for each node
+            take_down(name, None, TAKE_DOWN_PATIENCE + _GOODBYE * len(loops))
+            handle_signals(signal.SIG_IGN)
+
+
+def _be_lean(environment: MutableMapping[str, str]) -> None:
+    """Let Fast DDS keep little memory ready, unless it is told otherwise."""
+    if not any(environment.get(name) for name in PROFILES):
+        environment.update(dict.fromkeys(PROFILES, str(config_directory() / LEAN_PROFILE)))

@@ -1,0 +1,188 @@
+# SPDX-FileCopyrightText: 2026 The koopman_ros Authors
+# SPDX-License-Identifier: Apache-2.0
+
+"""Many loops in one process: each with what is its own, one failing without the others."""
+
+from collections.abc import Sequence
+from pathlib import Path
+import shutil
+import sys
+
+from diagnostic_msgs.msg import DiagnosticStatus
+from lifecycle_msgs.msg import Transition
+from lifecycle_msgs.srv import ChangeState
+import pytest
+from sensor_msgs.msg import Temperature
+
+from koopman_ros.demo import reactor
+from koopman_ros.resources import model_path
+from koopman_ros.ros import topics
+from koopman_ros.testing import Harness, NodeProcess
+from support.controller_bench import STEADY
+from support.nodes import seconds, temperature, value
+
+SAFE = 10.0  # degC
+STRIKES = STEADY + 1.0  # degC at which a callback raises, in the controller below
+STRUCK_AT = STRIKES + 273.15  # K
+
+# A watchdog that is five times as quick as it is, and a control step with an error in it.
+STRUCK = f"""
+import sys
+from koopman_ros.ros import watchdog
+watchdog.PERIOD = 0.02
+from koopman_ros.nodes import controller
+from koopman_ros.control import events
+apply = events.apply
+def struck(*args):
+    event = args[2]
+    if isinstance(event, events.Measurement) and abs(event.measured[0] - {STRUCK_AT}) < 0.1:
+        raise KeyError('struck')
+    return apply(*args)
+events.apply = struck
+sys.exit(controller.main())
+"""
+
+PARAMETERS = """
+/line/r1/controller:
+  ros__parameters:
+    hold_timeout: 30.0
+/line/r2/controller:
+  ros__parameters:
+    model: {model}
+    hold_timeout: 40.0
+/line/bad/controller:
+  ros__parameters:
+    model: nowhere.safetensors
+/line/struck/controller:
+  ros__parameters:
+    measurement_timeout: 0.3
+    hold_timeout: 0.2
+    coolant_temperature.safe: {safe}
+    coolant_temperature.rate_limit: 1000.0
+"""
+
+
+def start(ros: Harness, node: str, loops: Sequence[str], *arguments: str,
+          command: tuple[str, ...] | None = None) -> NodeProcess:
+    file = ros.folder / f'{node}_loops.txt'
+    file.write_text('\n'.join(loops))
+    return ros.start(node, arguments=(*arguments, '--', '--loops', str(file)), command=command)
+
+
+def change(ros: Harness, node: str, label: str) -> None:
+    assert ros.call(ChangeState, f'{node}/change_state', ChangeState.Request(
+        transition=Transition(label=label))).success
+
+
+class Loop:
+    """The sensor of a hosted loop, and what is commanded there."""
+
+    def __init__(self, ros: Harness, namespace: str) -> None:
+        self._ros, self.node, self._time = ros, f'{namespace}/controller', 0.0
+        self.commands = ros.listen(Temperature, f'{namespace}/{reactor.COOLANT_SETPOINT}')
+        self.active = ros.listen(Temperature, f'{namespace}/{reactor.ACTIVE_SETPOINT}')
+        self.setpoint = ros.node.create_publisher(
+            Temperature, f'{namespace}/{reactor.SETPOINT}', topics.LOOP_QOS)
+        self.thermometer = ros.speak(
+            Temperature, f'{namespace}/{reactor.TEMPERATURE}', to=self.node)
+
+    def measure(self, celsius: float = STEADY) -> None:
+        self._time += 1.0
+        self.thermometer.publish(temperature(celsius, self._time))
+
+    def answered(self) -> bool:
+        return any(seconds(command) == self._time for command in self.commands)
+
+    def measure_and_wait(self) -> None:
+        self.measure()
+        self._ros.wait_until(self.answered)
+
+
+def test_loops_of_a_process(ros: Harness, tmp_path: Path) -> None:
+    model = tmp_path / 'own.safetensors'
+    shutil.copy(model_path('reactor_nz3'), model)
+    parameters = tmp_path / 'site.yaml'
+    parameters.write_text(PARAMETERS.format(model=model, safe=SAFE))
+    process = start(ros, 'controller', ('line/r1', 'line/bad', '/line/r2', 'line/struck'),
+                    '--params-file', str(parameters), command=(sys.executable, '-c', STRUCK))
+    r1, r2, struck = (Loop(ros, f'/line/{name}') for name in ('r1', 'r2', 'struck'))
+
+    # its own parameters and model
+    assert ros.get_parameters(r1.node, 'model', 'hold_timeout') == [reactor.MODEL, 30.0]
+    assert ros.get_parameters(r2.node, 'model', 'hold_timeout') == [str(model), 40.0]
+    (result,) = ros.set_parameters(r2.node, hold_timeout=50.0)
+    assert result.successful
+    assert ros.get_parameters(r1.node, 'hold_timeout') == [30.0]
+
+    # the one that cannot start keeps no other from it
+    ros.wait_for_status('controller_host: loops', lambda s: s.level == DiagnosticStatus.ERROR and (
+        s.message.startswith('3 of 4 loops run, 1 failed: /line/bad: cannot start: no model file')
+        and value(s, 'to be started') == '0'))
+    assert ('controller', '/line/bad') not in ros.node.get_node_names_and_namespaces()
+    for loop in (r1, r2, struck):
+        loop.measure_and_wait()
+
+    # set-points are independent
+    r1.setpoint.publish(temperature(STEADY + 2.0))
+    r1.measure_and_wait()
+    ros.wait_until(lambda: r1.active[-1].temperature > STEADY + 0.1)
+    r2.measure_and_wait()
+    ros.wait_until(lambda: r2.active)
+    assert [message.temperature for message in r2.active] == pytest.approx([STEADY])
+
+    # an asynchronous service
+    response = ros.trigger(f'{r2.node}/reload_model')
+    assert response.success, response.message
+    model.write_bytes(b'no model')
+    assert not ros.trigger(f'{r2.node}/reload_model').success
+
+    # an error in a callback ends the loop, whose watchdog goes to the safe input
+    struck.measure(STRIKES)
+    ros.wait_for_status('controller_host: loops', lambda s: (
+        "/line/struck: stopped: 'struck'" in s.message and value(s, 'running') == '2'))
+    before = len(struck.commands)
+    ros.wait_until(lambda: len(struck.commands) > before
+                   and struck.commands[-1].temperature == pytest.approx(SAFE))
+    r1.measure_and_wait()
+    r2.measure_and_wait()
+    assert 'KeyError' in process.output()
+
+    # the lifecycle is one's own
+    change(ros, r2.node, 'deactivate')
+    count = len(r2.commands)
+    r2.measure()
+    r1.measure_and_wait()
+    ros.meet(r2.node)
+    assert len(r2.commands) == count
+    change(ros, r2.node, 'activate')
+    r2.measure_and_wait()
+    change(ros, r2.node, 'shutdown')
+    ros.wait_until(lambda: ('controller', '/line/r2') not in (
+        ros.node.get_node_names_and_namespaces()))
+    r1.measure_and_wait()
+    # who was shut down has not failed
+    ros.wait_for_status('controller_host: loops', lambda s: (
+        value(s, 'running'), value(s, 'failed')) == ('1', '2'))
+    assert process.stop() == 0
+    # all at once, and known to the others without a lease that has to end
+    ros.wait_until(lambda: not {'controller', 'controller_host'} & set(ros.node.get_node_names()))
+
+
+def test_plants_and_controllers_of_a_site(ros: Harness) -> None:
+    loops = ('hall_1/a', 'hall_2/a')
+    commands = [ros.listen(Temperature, f'/{loop}/{reactor.COOLANT_SETPOINT}') for loop in loops]
+    start(ros, 'plant', loops, '-p', 'sample_period:=0.1')
+    start(ros, 'controller', loops)
+    ros.wait_until(lambda: all(len(own) > 3 for own in commands))
+    assert ros.trigger('/hall_2/a/plant/reset').success
+
+
+def test_process_of_which_no_loop_is_left_ends(ros: Harness, tmp_path: Path) -> None:
+    process = start(ros, 'controller', ('a', 'b'), '-p', 'model:=nowhere.safetensors')
+    process.told_to_end = True
+    assert ros.wait_for_end(process) == 1
+    assert process.output().count('cannot start: no model file at nowhere.safetensors') == 2
+    process = start(ros, 'controller', ('a', 'b'), '-r', '__ns:=/elsewhere')
+    assert ros.wait_for_end(process) == 1
+    assert 'controller: cannot start: -r __ns:=/elsewhere would put all loops there' in (
+        process.output())
