@@ -52,8 +52,8 @@ class AlarmMemory:
             except (ValueError, KeyError, TypeError, AttributeError) as error:
                 aside = path.with_name(path.name + '.damaged')
                 os.replace(path, aside)
-                self.complaint = (f'the alarms of {path} are not recalled, as it is not what a panel '
-                                  f'writes ({error}): it is kept as {aside}')
+                self.complaint = (f'the alarms of {path} are not recalled, as it is not what a '
+                                  f'panel writes ({error}): it is kept as {aside}')
         self._write()
 
     def keep(self, now: float) -> None:
