@@ -10,19 +10,23 @@ dx/dt = f(x) + B u is found from the measurements first; the lift is then learne
 
 from koopman_ros.identification.drift import (
     box_of,
+    Drift,
     DriftModel,
     fitted_starts,
     longest_step,
     prediction_error,
     Segments,
 )
+from koopman_ros.identification.grey import identify_grey
 from koopman_ros.identification.hidden import identify_hidden
 from koopman_ros.identification.identify import (
+    EstimatedConstant,
     Identified,
     identify,
     Method,
     METHODS,
     Score,
+    Standing,
     Stopped,
     weak_forms,
 )
@@ -30,7 +34,8 @@ from koopman_ros.identification.output_error import output_error
 from koopman_ros.identification.regression import noise_level, total_variation, weak_form
 
 __all__ = [
-    'METHODS', 'DriftModel', 'Identified', 'Method', 'Score', 'Segments', 'Stopped', 'box_of',
-    'fitted_starts', 'identify', 'identify_hidden', 'longest_step', 'noise_level', 'output_error',
-    'prediction_error', 'total_variation', 'weak_form', 'weak_forms',
+    'METHODS', 'Drift', 'DriftModel', 'EstimatedConstant', 'Identified', 'Method', 'Score',
+    'Segments', 'Standing', 'Stopped', 'box_of', 'fitted_starts', 'identify', 'identify_grey',
+    'identify_hidden', 'longest_step', 'noise_level', 'output_error', 'prediction_error',
+    'total_variation', 'weak_form', 'weak_forms',
 ]

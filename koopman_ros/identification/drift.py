@@ -1,10 +1,11 @@
 # SPDX-FileCopyrightText: 2026 The koopman_ros Authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""A polynomial model of a drift, and segments of episodes on which models are rolled out."""
+"""Models of a drift, and segments of episodes on which they are rolled out."""
 
 from __future__ import annotations
 
+from abc import ABC, abstractmethod
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import cached_property, partial
@@ -32,10 +33,62 @@ def box_of(plant: Plant, episodes: Sequence[Episode]) -> Box:
 
 
 @dataclass(frozen=True)
-class DriftModel:
-    """dx/dt = f(x) + B(x) u with f and B polynomials, in deviations within a box."""
+class Drift(ABC):
+    """A model of dx/dt = f(x) + B(x) u, in deviations within a box and in units."""
 
     box: Box  #: the deviations' origin and scale
+
+    @property
+    @abstractmethod
+    def form(self) -> str:
+        """What kind of model it is, in words."""
+
+    @property
+    @abstractmethod
+    def varying_input_matrix(self) -> bool:
+        """Whether B depends on the state."""
+
+    @abstractmethod
+    def scaled_rate(self, xi: Array, v: Array) -> Array:
+        """Evaluate the rate in deviations: (..., n_x) and (..., n_u) -> (..., n_x)."""
+
+    @abstractmethod
+    def scaled_slope(self, xi: Array, v: Array | None = None) -> Array:
+        """
+        Evaluate the Jacobian of the scaled rate: (..., n_x) -> (..., n_x, n_x).
+
+        :param v: (..., n_u) inputs in deviations; those of the box's middle by default.
+        """
+
+    @abstractmethod
+    def scaled_input_matrix(self, xi: Array) -> Array:
+        """Evaluate B(x) in deviations: (..., n_x) -> (..., n_x, n_u), one for all if constant."""
+
+    def rate(self, x: Array, u: Array) -> Array:
+        """Evaluate dx/dt in units: (..., n_x) and (..., n_u) -> (..., n_x)."""
+        return self.box.states.scale * self.scaled_rate(
+            self.box.states.to_deviation(x), self.box.inputs.to_deviation(u))
+
+    def slope(self, x: Array) -> Array:
+        """Evaluate df/dx (n_x, n_x) at a state (n_x,), in 1/time unit for equal units."""
+        scale = self.box.states.scale
+        return scale[:, None] * self.scaled_slope(self.box.states.to_deviation(x)) / scale
+
+    @property
+    def input_matrix(self) -> Array:
+        """B (n_x, n_u) in state units per input and time unit, in the middle of the box."""
+        return self.input_matrix_at(self.box.states.center)
+
+    def input_matrix_at(self, x: Array) -> Array:
+        """Evaluate B(x) in units: (..., n_x) -> (..., n_x, n_u), one for all if constant."""
+        B = self.scaled_input_matrix(self.box.states.to_deviation(x))
+        return self.box.states.scale[:, None] * B / self.box.inputs.scale
+
+
+@dataclass(frozen=True)
+class DriftModel(Drift):
+    """dx/dt = f(x) + B(x) u with f and B polynomials, in deviations within a box."""
+
     degree: int  #: highest total degree of the monomials
     coefficients: Array  #: (1 + m, n_x) of 1 and of the m monomials, in scale units a time unit
     #: (n_x, n_u (1 + n_phi)) likewise, of the inputs and, where B depends on the state, of their
@@ -58,6 +111,17 @@ class DriftModel:
         return InputTerms.split(self.B, len(self.box.inputs))
 
     @property
+    def form(self) -> str:
+        """Its degree, and that of B(x)."""
+        return f'drift of degree {self.degree}' + (
+            f', B of degree {self.input_degree}' if self.input_degree else '')
+
+    @property
+    def varying_input_matrix(self) -> bool:
+        """Whether B depends on the state."""
+        return self.input_degree > 0
+
+    @property
     def input_degree(self) -> int:
         """Degree of the polynomial B(x)."""
         terms = self._split[1]
@@ -76,36 +140,12 @@ class DriftModel:
         """Return what `B` holds the weights of: (..., n_x), (..., n_u) -> (..., columns of B)."""
         return InputTerms.regressors(xi, v, self.input_degree)
 
-    def rate(self, x: Array, u: Array) -> Array:
-        """Evaluate dx/dt in units: (..., n_x) and (..., n_u) -> (..., n_x)."""
-        return self.box.states.scale * self.scaled_rate(
-            self.box.states.to_deviation(x), self.box.inputs.to_deviation(u))
-
-    def slope(self, x: Array) -> Array:
-        """Evaluate df/dx (n_x, n_x) at a state (n_x,), in 1/time unit for equal units."""
-        scale = self.box.states.scale
-        return scale[:, None] * self.scaled_slope(self.box.states.to_deviation(x)) / scale
-
     def scaled_slope(self, xi: Array, v: Array | None = None) -> Array:
-        """
-        Evaluate the Jacobian of the scaled rate: (..., n_x) -> (..., n_x, n_x).
-
-        :param v: (..., n_u) inputs in deviations; those of the box's middle by default.
-        """
+        """Evaluate the Jacobian of the scaled rate as :class:`Drift` has it."""
         J = self.monomials.lift_and_jacobian(xi)[1]
         slope: Array = np.einsum('ji,...jl->...il', self.coefficients[1:], J)
         terms = self._split[1]
         return slope if terms is None or v is None else slope + terms.jacobian(xi, v)
-
-    @property
-    def input_matrix(self) -> Array:
-        """B (n_x, n_u) in state units per input and time unit, in the middle of the box."""
-        return self.input_matrix_at(self.box.states.center)
-
-    def input_matrix_at(self, x: Array) -> Array:
-        """Evaluate B(x) in units: (..., n_x) -> (..., n_x, n_u), one for all if constant."""
-        B = self.scaled_input_matrix(self.box.states.to_deviation(x))
-        return self.box.states.scale[:, None] * B / self.box.inputs.scale
 
 
 @dataclass(frozen=True)

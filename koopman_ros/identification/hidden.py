@@ -11,22 +11,20 @@ import itertools
 
 import numpy as np
 
-from koopman_ros.identification.drift import DriftModel, longest_step, Segments
+from koopman_ros.identification.drift import DriftModel
 from koopman_ros.identification.identify import (
     Identified,
+    INNOVATIONS_FORM,
     Score,
-    segments_of,
-    split,
     Stopped,
     Watch,
 )
 from koopman_ros.identification.innovations import Predictor, raised, SETTLING, standardised
-from koopman_ros.identification.output_error import innovations_form, output_error
-from koopman_ros.identification.regression import noise_level, regress
+from koopman_ros.identification.output_error import innovations_form, Weights
+from koopman_ros.identification.record import Record
 from koopman_ros.lifting import Box
-from koopman_ros.plant_data import Array, cut, Episode, Plant
+from koopman_ros.plant_data import Array, Episode, Plant
 
-METHOD = 'innovations form'
 HIGHEST_DEGREE = 3
 UNIT = '1'  # of a state that is not measured: any other scale would do as well
 # Gains of filters to begin with, of outputs, of their rates and of what moves these, over powers
@@ -35,15 +33,15 @@ _GAINS = ((0.5, 0.1, 0.01), (0.2, 0.02, 0.001), (0.8, 0.4, 0.1))
 _SAMPLES = 20  # between samples, in which rates are counted at first
 # A larger model must err less by so many standard errors of the difference.
 _SIGMAS = 2.0
-# Roll-outs of an unstable plant grow by at most this exponent.
-_GROWTH, _SHORTEST = 2.0, 20
+
+_Polynomial = Predictor[DriftModel]
 
 
 @dataclass(frozen=True)
 class _Candidate:
     """A predictor, and how it foresees the segments to choose by."""
 
-    predictor: Predictor
+    predictor: _Polynomial
     hidden: int
     innovations: Array  #: (N, n_y) there, in deviations
 
@@ -54,7 +52,7 @@ class _Candidate:
     @property
     def method(self) -> str:
         count = self.hidden
-        return f'{METHOD}, {count} {"state" if count == 1 else "states"} not measured'
+        return f'{INNOVATIONS_FORM}, {count} {"state" if count == 1 else "states"} not measured'
 
 
 def identify_hidden(plant: Plant, episodes: Sequence[Episode], hidden: int, *,
@@ -79,7 +77,11 @@ def identify_hidden(plant: Plant, episodes: Sequence[Episode], hidden: int, *,
     :raises ValueError: when the episodes are too short, or nothing fits.
     :raises Stopped: when `watch` asked for it.
     """
-    record = _Record(plant, episodes, seed)
+    if callable(plant.B) or plant.input_matrix_degree:
+        raise ValueError('where states are not measured, B must not depend on them: set '
+                         'input_matrix_degree to 0')
+    record = Record(plant, episodes, seed, hidden=True)
+    search = _Search(record)
     total = hidden * highest_degree + 2
     steps = itertools.count()
     candidates = []
@@ -96,23 +98,27 @@ def identify_hidden(plant: Plant, episodes: Sequence[Episode], hidden: int, *,
         return monitor
 
     for count in range(1, hidden + 1):
-        found: Predictor | None = None
+        found: _Polynomial | None = None
         for degree in range(1, highest_degree + 1):
             monitor = progress(f'drift of degree {degree} with {count} '
                                f'{"state" if count == 1 else "states"} not measured')
             try:
-                found = record.linear(count, monitor) if found is None else record.refined(
+                found = search.linear(count, monitor) if found is None else search.refined(
                     record.fit, raised(found), monitor)
-                candidates.append(_Candidate(found, count, record.foreseen(found)))
+                candidates.append(_Candidate(
+                    found, count, record.innovations(found, record.choose)))
             except (ValueError, np.linalg.LinAlgError):
                 break
     if not candidates:
         raise ValueError('no drift fits the episodes: record longer, with steps of the input')
     best = _plainest(candidates)
     monitor = progress(f'drift of degree {best.degree} on all episodes')
-    everything = sorted([*record.fit, *record.choose])
-    predictor = record.refined(everything, best.predictor, monitor)
-    return record.identified(predictor, best, candidates, everything, progress('linear model'))
+    predictor = search.refined(sorted([*record.fit, *record.choose]), best.predictor, monitor)
+    scale = predictor.drift.box.states.scale[:len(plant.state_names)]
+    return record.identified(predictor, best.method, [
+        Score(one.method, one.degree, scale * np.sqrt(np.mean(one.innovations ** 2, axis=0)),
+              float(np.mean(one.innovations ** 2))) for one in candidates],
+        progress('linear model'))
 
 
 def _plainest(candidates: Sequence[_Candidate]) -> _Candidate:
@@ -129,103 +135,51 @@ def _plainest(candidates: Sequence[_Candidate]) -> _Candidate:
     return min(able, key=lambda one: one.predictor.drift.coefficients.size)
 
 
-class _Record:
-    """Measurements, cut into segments, and predictors that are fitted to some of them."""
+class _Search:
+    """Predictors of polynomial drifts that are fitted to segments of a record."""
 
-    def __init__(self, plant: Plant, episodes: Sequence[Episode], seed: int) -> None:
-        if callable(plant.B) or plant.input_matrix_degree:
-            raise ValueError('where states are not measured, B must not depend on them: set '
-                             'input_matrix_degree to 0')
-        self._plant, self._episodes = plant, episodes
-        n_y, n_u = len(plant.state_names), len(plant.input_names)
-        self._parts = segments_of(episodes, n_y + n_u)
-        # which samples of all episodes each of them holds
-        edges = np.cumsum([0, *map(len, episodes)]).tolist()
-        numbered = [replace(episode, x=np.arange(*ends, dtype=np.float64)[:, None])
-                    for episode, ends in zip(episodes, itertools.pairwise(edges), strict=True)]
-        self._rows = [part.x[:, 0].astype(int) for part in segments_of(numbered, n_y + n_u)]
-        # a filter that knows nothing at first knows more when an episode has lasted a while
-        begins = {episode.time[0] for episode in episodes}
-        self._settled = [i for i, part in enumerate(self._parts) if part.time[0] not in begins]
-        fit, choose, held_out = split(self._parts, seed)
-        self.fit = fit
-        self.choose, self.held_out = (
-            [i for i in share if i in self._settled] for share in (choose, held_out))
-        if not (self.choose and self.held_out):
-            raise ValueError('the episodes are too short for a filter to find what is not '
-                             'measured: record longer without gaps')
-        self._step = longest_step(self._parts)
-        self._period = float(np.median(np.concatenate([np.diff(p.time) for p in self._parts])))
-        self._deviation = np.ones(n_y)
+    def __init__(self, record: Record) -> None:
+        self.record, self._plant = record, record.plant
+        self._deviation = np.ones(len(self._plant.state_names))
 
-    def linear(self, hidden: int, monitor: Callable[..., bool]) -> Predictor:
+    def linear(self, hidden: int, monitor: Callable[..., bool]) -> _Polynomial:
         """Return the best linear predictor."""
         tried = []
         for gains in _GAINS:
-            found, cost = self._refined(self.fit, self._start(hidden, gains), monitor)
+            found, cost = self._refined(self.record.fit, self._start(hidden, gains), monitor)
             tried.append((cost, found))
-        return self.refined(self.fit, min(tried, key=lambda pair: pair[0])[1], monitor)
+        return self.refined(self.record.fit, min(tried, key=lambda pair: pair[0])[1], monitor)
 
-    def refined(self, parts: Sequence[int], start: Predictor, monitor: Callable[..., bool]
-                ) -> Predictor:
+    def refined(self, parts: Sequence[int], start: _Polynomial, monitor: Callable[..., bool]
+                ) -> _Polynomial:
         """Return a predictor that fits some segments better, its hidden states standardised."""
         found, _ = self._refined(parts, start, monitor)
-        run = found.run(self._episodes, self._step)
-        settled = np.concatenate([self._rows[i] for i in self._settled])
-        self._deviation = np.std(run.innovations[settled], axis=0)
-        return standardised(found, run.estimates[settled])
+        self._deviation = np.std(self.record.innovations(found), axis=0)
+        return standardised(found, self.record.estimates(found))
 
-    def foreseen(self, predictor: Predictor) -> Array:
-        """Return the innovations (N, n_y) over the segments to choose by."""
-        found = predictor.run(self._episodes, self._step).innovations
-        return found[np.concatenate([self._rows[i] for i in self.choose])]
+    def _refined(self, parts: Sequence[int], start: _Polynomial, monitor: Callable[..., bool]
+                 ) -> tuple[_Polynomial, float]:
+        record = self.record
+        shortest = min(len(record.parts[i]) for i in parts)
+        found = innovations_form(
+            Weights(start.drift, self._plant.B is None), start.gain, record.segments(parts),
+            record.foreseen(start, parts), self._deviation,
+            settling=min(SETTLING, shortest // 3), monitor=monitor)
+        return Predictor(found.model.drift, found.gain), found.cost
 
-    def identified(self, predictor: Predictor, best: _Candidate,
-                   candidates: Sequence[_Candidate], fitted: Sequence[int],
-                   monitor: Callable[..., bool]) -> Identified:
-        """Return what was found in the form that a record of all states leads to."""
-        drift, n_y = predictor.drift, predictor.gain.shape[1]
-        hidden = drift.box.states.to_physical(
-            predictor.run(self._episodes, self._step).estimates)[:, n_y:]
-        known, held_out = (
-            cut([replace(part, x=np.hstack([part.x, hidden[self._rows[i]]]))
-                 for i, part in enumerate(self._parts) if i in share and i in self._settled],
-                self._length(drift))
-            for share in (fitted, self.held_out))
-        linear = output_error(
-            _linear(drift, known), Segments.of(known, self._step), monitor=monitor,
-            learn_input_matrix=self._plant.B is None)
-        scale = drift.box.states.scale[:n_y]
-        scores = tuple(Score(
-            one.method, one.degree, scale * np.sqrt(np.mean(one.innovations ** 2, axis=0)),
-            float(np.mean(one.innovations ** 2))) for one in candidates)
-        return Identified(drift, best.method, linear, scores, noise_level(known, drift),
-                          tuple(known), tuple(held_out), len(drift.B) - n_y)
-
-    def _refined(self, parts: Sequence[int], start: Predictor, monitor: Callable[..., bool]
-                 ) -> tuple[Predictor, float]:
-        segments = Segments.of([self._parts[i] for i in parts], self._step)
-        foreseen = start.run(self._episodes, self._step).foreseen
-        shortest = min(len(self._parts[i]) for i in parts)
-        drift, gain, cost = innovations_form(
-            start.drift, start.gain, segments, foreseen[[self._rows[i][0] for i in parts]],
-            self._deviation, settling=min(SETTLING, shortest // 3),
-            learn_input_matrix=self._plant.B is None, monitor=monitor)
-        return Predictor(drift, gain), cost
-
-    def _start(self, hidden: int, gains: Sequence[float]) -> Predictor:
+    def _start(self, hidden: int, gains: Sequence[float]) -> _Polynomial:
         """Return a filter of outputs that move by themselves, each at a rate of its own."""
-        plant = self._plant
+        plant, parts = self._plant, self.record.parts
         n_y, n_x = len(plant.state_names), len(plant.state_names) + hidden
         names = tuple(f'hidden_{i + 1}' for i in range(hidden))
-        y = np.concatenate([part.x for part in self._parts])
+        y = np.concatenate([part.x for part in parts])
         rows = np.linspace(-1.0, 1.0, len(y))[:, None] * np.ones(hidden)
         B = None if plant.B is None else np.vstack([np.asarray(plant.B), np.zeros((hidden, len(
             plant.input_names)))])
         whole = replace(plant, state_names=(*plant.state_names, *names),
                         state_units=(*plant.state_units, *[UNIT] * hidden),
                         nominal_state=np.concatenate((plant.nominal_state, np.zeros(hidden))), B=B)
-        box = Box.of(whole, np.hstack([y, rows]), np.concatenate([p.u for p in self._parts]),
+        box = Box.of(whole, np.hstack([y, rows]), np.concatenate([p.u for p in parts]),
                      nominal=False)
         shape = DriftModel(box, 1, np.zeros((1 + n_x, n_x)), np.zeros((n_x, len(box.inputs))) if (
             B is None) else box.input_matrix(B))
@@ -234,21 +188,5 @@ class _Record:
             layer = min(i // n_y, len(gains) - 1)
             gain[i, i % n_y] = gains[layer] * _SAMPLES ** layer
             if i >= n_y:
-                shape.coefficients[1 + i, i - n_y] = 1.0 / (_SAMPLES * self._period)
+                shape.coefficients[1 + i, i - n_y] = 1.0 / (_SAMPLES * self.record.period)
         return Predictor(shape, gain)
-
-    def _length(self, drift: DriftModel) -> int:
-        """Return samples over which roll-outs of a plant, be it unstable, stay where it is."""
-        fastest = float(np.max(np.linalg.eigvals(drift.slope(drift.box.states.center)).real))
-        longest = max(len(part) for part in self._parts)
-        if fastest * self._period * longest <= _GROWTH:
-            return longest
-        return max(_SHORTEST, int(_GROWTH / (fastest * self._period)))
-
-
-def _linear(drift: DriftModel, episodes: Sequence[Episode]) -> DriftModel:
-    """Return the linear drift closest to another one over the states of episodes."""
-    xi = drift.box.states.to_deviation(np.concatenate([episode.x for episode in episodes]))
-    first = DriftModel(drift.box, 1, np.empty(0), drift.B)
-    return regress(drift.box, 1, first.features(xi), np.zeros((len(xi), len(drift.box.inputs))),
-                   drift.features(xi) @ drift.coefficients, drift.B)

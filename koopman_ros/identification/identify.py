@@ -6,6 +6,7 @@
 from collections.abc import Callable, Mapping, Sequence
 import contextlib
 from dataclasses import dataclass
+from enum import Enum
 import math
 
 import numpy as np
@@ -13,6 +14,7 @@ import numpy as np
 from koopman_ros.arrays import brief
 from koopman_ros.identification.drift import (
     box_of,
+    Drift,
     DriftModel,
     longest_step,
     prediction_error,
@@ -50,6 +52,7 @@ DEGREES = (1, 2, 3, 4, 5, 6)
 # minutes for more, and an hour does not determine them.
 _MOST_COEFFICIENTS = 150
 OUTPUT_ERROR = 'output error'
+INNOVATIONS_FORM = 'innovations form'
 
 _SEGMENT_SAMPLES = (20, 240)
 _SEGMENTS = 15
@@ -73,16 +76,49 @@ class Score:
     """Prediction error of one estimate on the segments held out for the choice."""
 
     method: str  #: its name, e.g. ``'weak form, 40 samples'``
-    degree: int  #: of the drift
+    degree: int | None  #: of the drift, None where it is no polynomial
     rmse: Array  #: (n_x,) root mean square error, in state units; infinite when it diverges
     cost: float  #: mean squared error in units of the states' scale, by which estimates compare
+
+
+class Standing(Enum):
+    """How the estimate of a constant is to be taken; the value is what to tell the user."""
+
+    ESTIMATED = ''
+    AT_LOWER_END = ('it ends at the lower end of its range: widen the range, or look for what '
+                    'else is not as the equations say')
+    AT_UPPER_END = ('it ends at the upper end of its range: widen the range, or look for what '
+                    'else is not as the equations say')
+    NOT_IDENTIFIABLE = ('the record tells no more of it than its range does: give its value in '
+                        'place of a range, or that of another constant that acts as it does, or '
+                        'record more')
+
+
+@dataclass(frozen=True)
+class EstimatedConstant:
+    """A constant of a plant's equations, as a record tells it."""
+
+    name: str  #: of the field of the plant's class
+    unit: str  #: of SI, as the plant node has it
+    value: float  #: the estimate, in `unit`
+    #: standard deviation of the estimate, in `unit` (K for a temperature); NaN at an end of the
+    #: range, infinite where the record tells nothing of it
+    standard_error: float
+    lower: float  #: lowest value that was looked at
+    upper: float  #: highest likewise
+    standing: Standing
+
+    def __str__(self) -> str:
+        error = f' +- {self.standard_error:.2g}' if self.standing is Standing.ESTIMATED else ''
+        said = f' ({self.standing.value})' if self.standing.value else ''
+        return f'{self.value:.6g}{error} {self.unit}{said}'
 
 
 @dataclass(frozen=True)
 class Identified:
     """An estimated drift with the scores of all candidates."""
 
-    drift: DriftModel  #: the estimate
+    drift: Drift  #: the estimate
     method: str  #: how it was found
     linear: DriftModel  #: the best linear model of the same episodes, by output error
     scores: tuple[Score, ...]  #: of all estimates, in the order of their making
@@ -91,6 +127,8 @@ class Identified:
     held_out: tuple[Episode, ...]  #: segments that neither fit nor choice has seen
     #: states, the last ones, that were not measured: the segments hold what a filter makes of them
     hidden: int = 0
+    #: those that were estimated, where it is the equations of a plant's class
+    constants: tuple[EstimatedConstant, ...] = ()
 
     __repr__ = brief
 

@@ -7,11 +7,12 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from typing import Generic, TypeVar
 
 import numpy as np
 
 from koopman_ros.arrays import Array
-from koopman_ros.identification.drift import DriftModel, Segments
+from koopman_ros.identification.drift import Drift, DriftModel, Segments
 from koopman_ros.identification.regression import regress
 from koopman_ros.plant_data import Episode
 from koopman_ros.solvers import runge_kutta_step
@@ -21,11 +22,14 @@ SETTLING = 40  # samples after which a filter has found the state
 _APART, _SEARCHES, _STEP = 0.5, 3, 1e-4
 
 
+_Drift = TypeVar('_Drift', bound=Drift, covariant=True)
+
+
 @dataclass(frozen=True)
-class Predictor:
+class Predictor(Generic[_Drift]):
     """A drift whose first states are measured, with the gain of its filter."""
 
-    drift: DriftModel
+    drift: _Drift
     gain: Array  #: (n_x, n_y) in deviations
 
     def run(self, episodes: Sequence[Episode], step: float) -> Run:
@@ -34,14 +38,17 @@ class Predictor:
         run = self._filter(data, self._starts(data))
         if not np.all(np.isfinite(run[1])):
             raise ValueError('the estimate of what is not measured diverges')
-        # episode by episode, each in the order of its times
-        return Run(*(np.swapaxes(values, 0, 1)[data.measured.T] for values in run))
+        return _run(data, run)
+
+    def along(self, segments: Segments, starts: Array) -> Run:
+        """Filter segments from starts (M, n_x), in deviations."""
+        return _run(segments, self._filter(segments, starts))
 
     def _filter(self, data: Segments, x: Array) -> tuple[Array, Array, Array]:
         """Return from starts (M, n_x) what a :class:`Run` has, on the grid (K + 1, M, ...)."""
         drift, n_y = self.drift, self.gain.shape[1]
         v, target = drift.box.inputs.to_deviation(data.u), self._target(data)
-        foreseen = np.empty((*target.shape[:2], len(drift.B)))
+        foreseen = np.empty((*target.shape[:2], len(self.gain)))
         estimates, errors = np.empty(foreseen.shape), np.empty(target.shape)
         with np.errstate(all='ignore'):
             for k in range(len(target)):
@@ -70,7 +77,8 @@ class Predictor:
             return self._filter(first, x)[2]
 
         def size(found: Array) -> Array:
-            squares = np.sum(found ** 2, axis=(0, 2))
+            with np.errstate(over='ignore'):
+                squares = np.sum(found ** 2, axis=(0, 2))
             return np.where(np.isfinite(squares), squares, np.inf)
 
         best, least = home, size(errors(home))
@@ -105,7 +113,12 @@ class Run:
     innovations: Array  #: (N, n_y)
 
 
-def raised(predictor: Predictor) -> Predictor:
+def _run(data: Segments, values: Sequence[Array]) -> Run:
+    # episode by episode, each in the order of its times
+    return Run(*(np.swapaxes(one, 0, 1)[data.measured.T] for one in values))
+
+
+def raised(predictor: Predictor[DriftModel]) -> Predictor[DriftModel]:
     """Return the same with monomials of the next degree, which have no weight yet."""
     drift = predictor.drift
     higher = DriftModel(drift.box, drift.degree + 1, np.empty(0), drift.B)
@@ -116,7 +129,7 @@ def raised(predictor: Predictor) -> Predictor:
     return replace(predictor, drift=replace(higher, coefficients=coefficients))
 
 
-def standardised(predictor: Predictor, xi: Array) -> Predictor:
+def standardised(predictor: Predictor[DriftModel], xi: Array) -> Predictor[DriftModel]:
     """
     Take of the hidden states what measurements do not tell, from -1 to 1, for coordinates.
 
@@ -151,5 +164,5 @@ def standardised(predictor: Predictor, xi: Array) -> Predictor:
                      S @ predictor.gain)
 
 
-def _held(drift: DriftModel, v: Array) -> Callable[[Array], Array]:
+def _held(drift: Drift, v: Array) -> Callable[[Array], Array]:
     return lambda x: drift.scaled_rate(x, v)

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.polynomial.legendre import leggauss
 from scipy.linalg import lapack
 
-from koopman_ros.identification.drift import DriftModel
+from koopman_ros.identification.drift import Drift, DriftModel
 from koopman_ros.lifting import Box, InputTerms
 from koopman_ros.plant_data import Array, Episode
 
@@ -166,7 +166,7 @@ def total_variation(episodes: Sequence[Episode], box: Box, degree: int, B: Array
                    np.concatenate(rates), B)
 
 
-def noise_level(episodes: Sequence[Episode], model: DriftModel) -> Array:
+def noise_level(episodes: Sequence[Episode], model: Drift) -> Array:
     """
     Return the standard deviation (n_x,) of the measurement noise, in state units.
 
@@ -175,7 +175,7 @@ def noise_level(episodes: Sequence[Episode], model: DriftModel) -> Array:
     """
     found = []
     # in the middle: kinks of the few steps of an input do not move the median
-    B = model.scaled_input_matrix(np.zeros(len(model.B)))
+    B = model.scaled_input_matrix(np.zeros(len(model.box.states)))
     for episode in episodes:
         if len(episode) >= _SHORTEST:
             rest = model.box.states.to_deviation(episode.x) - _moved(episode, model.box, B)

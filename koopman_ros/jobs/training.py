@@ -169,6 +169,11 @@ def class_lines(summary: Mapping[str, Any]) -> dict[str, str]:
         name: _class_line(one, summary['units']) for name, one in classes.items()}
 
 
+def constant_lines(summary: Mapping[str, Any]) -> dict[str, str]:
+    """Return a line for each constant that was estimated, by name."""
+    return {name: one['text'] for name, one in summary.get('constants', {}).items()}
+
+
 def _class_line(one: Mapping[str, Any], units: Mapping[str, str]) -> str:
     parts = []
     if 'heldout_error' in one:
@@ -184,9 +189,10 @@ def _class_line(one: Mapping[str, Any], units: Mapping[str, str]) -> str:
 def scalars(summary: Mapping[str, Any]) -> dict[str, bool | float | str]:
     """Return the figures of a summary one by one, those of a signal under its name."""
     found: dict[str, bool | float | str] = {
-        f'class {name}': line for name, line in class_lines(summary).items()}
+        **{f'class {name}': line for name, line in class_lines(summary).items()},
+        **{f'constant {name}': line for name, line in constant_lines(summary).items()}}
     for key, value in summary.items():
-        if key == 'classes':
+        if key in ('classes', 'constants'):
             continue
         if isinstance(value, Mapping):
             found |= {f'{key}: {name}': one for name, one in scalars(value).items()}

@@ -16,6 +16,7 @@ from koopman_ros.experiment import Experiment
 from koopman_ros.lifting import LiftedModel
 from koopman_ros.model_classes import BEST, CLASSES, IDENTITY_LIFT
 from koopman_ros.parameters import wire
+from koopman_ros.parameters.equations import named_ranges, refused
 from koopman_ros.parameters.table import (
     ConfigurationError,
     in_own_units,
@@ -150,6 +151,14 @@ class TrainerParameters:
     hidden_states: int = parameter(
         0, 'most states of the plant that are not measured, which a lift is learned with; 0 where '
         'all are', '', 0, 4)
+    equations: str = parameter(
+        '', 'plant whose equations are fitted in place of a polynomial: one of the library, the '
+        'name of an entry point of the group koopman_ros.plants, or package.module:Class; empty '
+        'for none')
+    constants_estimated: tuple[str, ...] = parameter(
+        ('',), 'constants of the equations that are estimated, in SI as the plant node has them, '
+        'with their ranges, e.g. friction [0.01, 0.5]; a name alone for the range that the class '
+        'gives, an empty name for those of which the class says that they are')
     synchronisation_tolerance: float = parameter(
         0.0, 'how far the stamps of messages may be apart that together are one measurement', 's',
         0.0, 10.0)
@@ -218,8 +227,9 @@ class TrainerParameters:
         return {'model_class': self.model_class, 'coordinates': self.model_coordinates,
                 'seed': self.training_seed, 'starts': self.training_starts,
                 'input_matrix_degree': self.input_matrix_degree,
-                'hidden_states': self.hidden_states, 'margin': self.gate_margin,
-                'condition': self.gate_condition}
+                'hidden_states': self.hidden_states, 'equations': self.equations,
+                'constants': named_ranges(self.constants_estimated),
+                'margin': self.gate_margin, 'condition': self.gate_condition}
 
 
 def trainer_table(present: LiftedModel | None, given: Mapping[str, Any] = MappingProxyType({})
@@ -307,7 +317,13 @@ def _cross_check(signals: Signals, values: TrainerParameters) -> str:
     if values.hidden_states and values.input_matrix_degree:
         return (f'input_matrix_degree is {values.input_matrix_degree}, must be 0 where '
                 'hidden_states are learned, on which B would depend')
-    return Wiring(signals, values.states, values.inputs).check()
+    if values.equations and values.hidden_states:
+        return (f'hidden_states is {values.hidden_states}, must be 0 where equations say which '
+                'states there are')
+    if values.equations and values.input_matrix != (0.0,):
+        return 'input_matrix must be a single 0 where equations say what the inputs do'
+    return (refused(values.equations, values.constants_estimated)
+            or Wiring(signals, values.states, values.inputs).check())
 
 
 @dataclass(frozen=True)

@@ -27,6 +27,7 @@ from koopman_ros.plants.simulation import (
     sample_derivatives,
     simulate,
 )
+from koopman_ros.plants.sought import Sought, sought_of
 from koopman_ros.plants.system import (
     ControlAffineSystem,
     describe,
@@ -37,7 +38,8 @@ from koopman_ros.plants.system import (
 
 __all__ = ['PLANTS', 'Actuator', 'Constant', 'Constants', 'ControlAffineSystem',
            'EquilibriumError', 'ExcitationError', 'IntegrationError', 'IntegrationFailure',
-           'Process', 'RandomStepDesign', 'ReactorParameters', 'advance', 'box_episodes', 'build',
-           'constant', 'constants_of', 'describe', 'equilibrium_input', 'one_state_reactor',
-           'plant_class', 'random_steps', 'recoverable', 'sample_derivatives', 'scalar_example',
-           'sensor_noise', 'simulate', 'steady_state', 'two_state_example', 'two_state_reactor']
+           'Process', 'RandomStepDesign', 'ReactorParameters', 'Sought', 'advance',
+           'box_episodes', 'build', 'constant', 'constants_of', 'describe', 'equilibrium_input',
+           'one_state_reactor', 'plant_class', 'random_steps', 'recoverable',
+           'sample_derivatives', 'scalar_example', 'sensor_noise', 'simulate', 'sought_of',
+           'steady_state', 'two_state_example', 'two_state_reactor']

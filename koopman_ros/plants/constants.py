@@ -11,7 +11,8 @@ from koopman_ros.units import to_celsius, to_kelvin
 
 
 def constant(default: float, unit: str, lower: float, upper: float, description: str, *,
-             si: str | None = None, factor: float = 1.0) -> Any:
+             si: str | None = None, factor: float = 1.0,
+             estimated: tuple[float, float] | None = None) -> Any:
     """
     Declare a physical constant of a plant.
 
@@ -19,10 +20,12 @@ def constant(default: float, unit: str, lower: float, upper: float, description:
     :param si: the unit in which a parameter shows it; the plant's by default. A temperature in K
         with ``'degC'`` is shown as REP 103 has it.
     :param factor: the value in the plant's unit is that in `si` times this factor.
+    :param estimated: the range, in the plant's unit, in which it is looked for where the plant's
+        equations are fitted to a record; None for one that is taken as known then.
     """
     return field(default=default, metadata={
         'unit': unit, 'lower': lower, 'upper': upper, 'description': description,
-        'si': unit if si is None else si, 'factor': factor})
+        'si': unit if si is None else si, 'factor': factor, 'estimated': estimated})
 
 
 @dataclass(frozen=True)
@@ -53,13 +56,18 @@ class Constant:
     lower: float  #: lowest value
     upper: float  #: highest value
     description: str  #: what it is
+    #: the range in which it is estimated from a record, None where it is taken as known
+    estimated: tuple[float, float] | None = None
 
 
 def constants_of(plant: Any) -> tuple[Constant, ...]:
     """Return the constants of a plant's class in SI; none where it declares none."""
-    return tuple(Constant(row.name, _shown(row, row.default), row.metadata['si'],
-                          _shown(row, row.metadata['lower']), _shown(row, row.metadata['upper']),
-                          row.metadata['description']) for row in _rows(plant))
+    return tuple(Constant(
+        row.name, _shown(row, row.default), row.metadata['si'],
+        _shown(row, row.metadata['lower']), _shown(row, row.metadata['upper']),
+        row.metadata['description'],
+        None if (ends := row.metadata['estimated']) is None else (
+            _shown(row, ends[0]), _shown(row, ends[1]))) for row in _rows(plant))
 
 
 def in_plant_units(plant: Any, values: Mapping[str, float]) -> dict[str, float]:

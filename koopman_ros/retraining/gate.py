@@ -10,7 +10,7 @@ import numpy as np
 
 from koopman_ros.arrays import Array, brief
 from koopman_ros.control.law_check import check_law, LawCheck, LOOPS, Rate
-from koopman_ros.identification import DriftModel, fitted_starts, Identified, longest_step, Stopped
+from koopman_ros.identification import Drift, fitted_starts, Identified, longest_step, Stopped
 from koopman_ros.identification.drift import prediction_error, Segments
 from koopman_ros.learning import Comparison, Figures, Trained
 from koopman_ros.learning.validation import lifted_rate
@@ -151,7 +151,7 @@ def decide(found: Identified, learned: Trained | Comparison, current: LiftedMode
                     found.noise, law_check)
 
 
-def _autocorrelation(drift: DriftModel, segments: Segments) -> Array:
+def _autocorrelation(drift: Drift, segments: Segments) -> Array:
     """Return the autocorrelation (n_x,) of a drift's errors from one measurement to the next."""
     starts = fitted_starts(drift.rate, segments, drift.box.states.scale)[0]
     errors = segments.errors(drift.rate, starts)

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from koopman_ros.arrays import Array
 from koopman_ros.control.law_check import LOOPS
-from koopman_ros.identification import DriftModel, fitted_starts, Identified, longest_step
+from koopman_ros.identification import Drift, fitted_starts, Identified, longest_step
 from koopman_ros.identification.drift import Segments
 from koopman_ros.learning import compare, Comparison, Contender, Growth, Judge, train, Trained
 from koopman_ros.learning.comparison import usual_recipes
@@ -33,7 +33,7 @@ _SLIGHTLY_OUTSIDE = 1.1
 _LOST = 1e3
 
 
-def drift_samples(drift: DriftModel, episodes: tuple[Episode, ...]) -> Samples:
+def drift_samples(drift: Drift, episodes: tuple[Episode, ...]) -> Samples:
     """
     Sample a drift along the paths that it predicts for some episodes, free of their noise.
 
@@ -92,7 +92,7 @@ def _quota(sizes: NDArray[np.int64], total: int) -> int:
     return low
 
 
-def steady_point(drift: DriftModel, x: Array, u: Array) -> tuple[Array, Array]:
+def steady_point(drift: Drift, x: Array, u: Array) -> tuple[Array, Array]:
     """
     Find a state and an input near given ones under which the drift stands still.
 
@@ -147,7 +147,8 @@ def _estimated(found: Identified, plant: Plant) -> tuple[Plant, Samples]:
                                  found.drift.box.inputs.center))
     drift = found.drift
     return replace(plant, nominal_state=x, nominal_input=u, input_matrix_degree=0,
-                   B=drift.input_matrix_at if drift.input_degree else drift.input_matrix), samples
+                   B=drift.input_matrix_at if drift.varying_input_matrix else (
+                       drift.input_matrix)), samples
 
 
 def compare_classes(found: Identified, plant: Plant, thresholds: Thresholds, *,

@@ -54,19 +54,26 @@ def _sections(retrained: Retrained) -> Iterator[str]:
         f'{len(found.fitted)} segments to estimate and learn from, '
         f'{len(found.held_out)} held out to judge by'])
     yield '## Estimates of the drift'
-    degree = found.drift.input_degree
-    yield (f'Taken: {found.method}, degree {found.drift.degree}, with the input matrix B'
-           + f', of degree {degree} in the states, in the middle of the range' * bool(degree))
+    yield (f'Taken: {found.method}, {found.drift.form}, with the input matrix B'
+           + ', which depends on the states, in the middle of the range'
+           * found.drift.varying_input_matrix)
     yield table(('per second by', *(f'{name} [1/({unit})]' for name, unit in
                                      zip(inputs.names, inputs.units, strict=True))),
                 ((f'{name} [{unit}]', *(f'{gain:.5g}' for gain in row)) for name, unit, row in zip(
                     states.names, states.units,
                     found.drift.input_matrix / SECONDS_PER_TIME_UNIT[retrained.plant.time_unit],
                     strict=True)), range(1, 1 + len(inputs)))
+    if found.constants:
+        yield 'Constants, with the standard errors of their estimates:'
+        yield table(('constant', 'unit', 'estimate', 'standard error', 'looked for in', ''),
+                    ((one.name, one.unit, f'{one.value:.6g}', f'{one.standard_error:.2g}',
+                      f'{one.lower:.6g} to {one.upper:.6g}', one.standing.value)
+                     for one in found.constants), (2, 3))
     yield 'Errors on the segments to choose by' + (
-        ', of the next measurement foreseen:' if found.hidden else ':')
+        ', of the next measurement foreseen:' if found.hidden or found.constants else ':')
     yield table(('degree', 'method', *errors),
-                ((score.degree, score.method, *(f'{error:.5g}' for error in score.rmse),
+                (('' if score.degree is None else score.degree, score.method,
+                  *(f'{error:.5g}' for error in score.rmse),
                   *[''] * (len(states) - len(score.rmse)))
                  for score in found.scores), range(2, 2 + len(states)))
     if decision is None or learned is None:

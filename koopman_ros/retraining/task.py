@@ -6,31 +6,35 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 import hashlib
 import itertools
-import json
-import math
 import os
 from pathlib import Path
 import shutil
-from typing import TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
 
 from koopman_ros.arrays import Array, brief
-from koopman_ros.bags import Account, loop_episodes, RecordedInput, RecordedState
-from koopman_ros.identification import Identified, identify, identify_hidden, Stopped
+from koopman_ros.bags import Account, loop_episodes
+from koopman_ros.identification import (
+    Identified,
+    identify,
+    identify_grey,
+    identify_hidden,
+    Stopped,
+)
 from koopman_ros.learning import Comparison, Contender, NoUsefulLift, Progress
-from koopman_ros.lifting import Box, Coordinates, LiftedModel, load, save
-from koopman_ros.model_classes import BEST, CLASSES, IDENTITY_LIFT
+from koopman_ros.lifting import Box, LiftedModel, load, save
+from koopman_ros.model_classes import BEST, CLASSES
 from koopman_ros.plant_data import Episode, Plant
+from koopman_ros.plants import plant_class
 from koopman_ros.resources import predecessor
 from koopman_ros.retraining.gate import decide, Decision, shortfalls, Thresholds
+from koopman_ros.retraining.known import known, Task
 from koopman_ros.retraining.lift import compare_classes
 from koopman_ros.units import NANOSECONDS, SECONDS_PER_TIME_UNIT
-from koopman_ros.wire import Place
 
 CELLS = 10  # along each of two signals, by which the visited share of their ranges is told
 # A smaller change, in half widths of the present lift's box, is neither a spike nor a jump.
@@ -42,50 +46,6 @@ _JUDGED = 0.8  # share of deciding in which the closed loops are run
 
 # Called with the share done in [0, 1] and what is done now; True asks to stop.
 OnProgress = Callable[[float, str], bool]
-
-
-@dataclass(frozen=True)
-class Task:
-    """Input files, output file and settings of a retraining."""
-
-    bags: tuple[str, ...]  #: files or folders
-    output: str  #: model file to write, ending in ``.safetensors``
-    model: str  #: file of the present lift, empty to learn the first one
-    states: tuple[RecordedState, ...]  #: those of the present lift, in any order
-    inputs: tuple[RecordedInput, ...]  #: likewise
-    plant: str = ''  #: what a first lift calls the plant
-    tolerance: float = 0.0  #: how far stamps of one sample of several states may lie apart, in s
-    #: class to learn, a name of `compare`, or ``'best'`` for the one that its rule takes
-    model_class: str = IDENTITY_LIFT
-    coordinates: int = 3  #: n_z of the identity lift
-    seed: int = 0  #: of the split and of the training
-    starts: int = 3  #: of each round of the training
-    #: B where it is known, in state unit per input unit and second, by state and input; what is
-    #: not named is 0; empty to learn B
-    input_gain: Mapping[str, Mapping[str, float]] = field(default_factory=dict)
-    #: degree of the polynomial B(x) that is learned; 0 for a constant, and where B is known
-    input_matrix_degree: int = 0
-    #: most states that are not in the bags, see :func:`identify_hidden`; the new lift is then not
-    #: compared with the present one
-    hidden_states: int = 0
-    #: lowest and highest set-point that the lift is wanted for, of some states by name, in their
-    #: units
-    setpoints: Mapping[str, tuple[float, float]] = field(default_factory=dict)
-    margin: float = 0.1  #: see :class:`Thresholds`
-    condition: float = 1e4  #: likewise
-
-    @classmethod
-    def from_json(cls, text: str) -> Task:
-        """Read a task; unknown or missing fields are a TypeError."""
-        values = json.loads(text)
-        states = tuple(RecordedState(**{**signal, 'place': Place(**signal['place'])})
-                       for signal in values['states'])
-        inputs = tuple(RecordedInput(**{
-            **signal, 'command': Place(**signal['command']),
-            'measured': Place(**signal['measured']) if signal.get('measured') else None})
-            for signal in values['inputs'])
-        return cls(**{**values, 'bags': tuple(values['bags']), 'states': states,
-                      'inputs': inputs})
 
 
 @dataclass(frozen=True)
@@ -148,10 +108,15 @@ class Retrained:
             'measurements_used': self.account.used,
             'coverage': {', '.join(pair): share for pair, share in self.coverage.items()},
             'derivative_method': self.found.method,
-            'drift_degree': self.found.drift.degree,
+            'drift': self.found.drift.form,
             'input_gain': {name: dict(zip(inputs.names, map(float, row), strict=True))
                            for name, row in zip(states.names, gains, strict=True)},
             'noise': by_state(self.found.noise),
+            'constants': {one.name: {
+                'value': one.value, 'standard_error': _finite(one.standard_error),
+                'unit': one.unit, 'lower': one.lower, 'upper': one.upper,
+                'standing': one.standing.name.lower(), 'text': str(one)}
+                for one in self.found.constants},
         }
         if self.decision and self.learned:
             trained, fit = self.learned.model.states, self.learned.figures.fit
@@ -201,14 +166,7 @@ def retrain(task: Task, on_progress: OnProgress = lambda *_: False) -> Retrained
     if Path(task.output).suffix != '.safetensors':
         raise ValueError(f'output = {task.output!r} must end in .safetensors')
     current = load(task.model) if task.model else None
-    states: Sequence[RecordedState] = task.states
-    inputs: Sequence[RecordedInput] = task.inputs
-    if current is not None:
-        states = _in_order(states, current.states, 'state', task.model)
-        inputs = _in_order(inputs, current.inputs, 'input', task.model)
-    plant = _unknown(task) if current is None else current.plant
-    plant = replace(plant, B=_known_gain(task, plant),
-                    input_matrix_degree=task.input_matrix_degree)
+    plant, states, inputs = known(task, current)
     # a folder that cannot be written should fail now, not after the training
     Path(task.output).parent.mkdir(parents=True, exist_ok=True)
     _stop_if(on_progress(0.0, 'reading bags'))
@@ -224,19 +182,28 @@ def retrain(task: Task, on_progress: OnProgress = lambda *_: False) -> Retrained
     def estimating(done: int, total: int, text: str) -> bool:
         return on_progress(_at('estimate', done / total), f'estimating: {text}')
 
-    if task.hidden_states:
+    if task.equations:
+        found = identify_grey(plant, episodes, plant_class(task.equations), task.constants,
+                              seed=task.seed, watch=estimating)
+    elif task.hidden_states:
         found = identify_hidden(plant, episodes, task.hidden_states, seed=task.seed,
                                 watch=estimating)
-        episodes = [*found.fitted, *found.held_out]
-        # of other states
-        current = None
     else:
         found = identify(plant, episodes, seed=task.seed, watch=estimating)
+    if found.hidden:
+        episodes = [*found.fitted, *found.held_out]
+    states_found = found.drift.box.states
+    if current is not None and (states_found.names, states_found.units) != (
+            current.states.names, current.states.units):
+        # of other states
+        current = None
     if current is None:
         # an input that keeps the plant somewhere in the middle is not far
         box = found.drift.box
         plant = replace(plant, state_names=box.states.names, state_units=box.states.units, B=None,
                         nominal_state=box.states.center, nominal_input=box.inputs.center)
+    elif found.hidden:
+        plant = replace(current.plant, B=None)
     bare = Retrained(task, account, found, None, None, (), coverage(episodes, found.drift.box),
                      plant, current)
     course = _Course(on_progress)
@@ -251,8 +218,9 @@ def retrain(task: Task, on_progress: OnProgress = lambda *_: False) -> Retrained
     decision = decide(found, learned, current, thresholds)
     decision = replace(decision, warnings=(
         *decision.warnings, *shortfalls(learned.model.states, task.setpoints),
-        *[f'it is not compared with the present lift {task.model}, which has no hidden states'
-          ] * bool(task.hidden_states and task.model)))
+        *(f'{one.name} = {one}' for one in found.constants if one.standing.value),
+        *[f'it is not compared with the present lift {task.model}, which has other states'
+          ] * bool(task.model and current is None)))
     _stop_if(on_progress(_at('decide', 0.9), 'writing'))
     model = _with_provenance(learned.model, found, decision, min(bare.coverage.values()),
                              episodes)
@@ -282,51 +250,6 @@ def coverage(episodes: Sequence[Episode], box: Box) -> dict[tuple[str, str], flo
     names = enumerate((*box.states.names, *box.inputs.names))
     return {(first, second): len(np.unique(cells[:, [i, j]], axis=0)) / CELLS ** 2
             for (i, first), (j, second) in itertools.combinations(names, 2)}
-
-
-_Signal = TypeVar('_Signal', RecordedState, RecordedInput)
-
-
-def _in_order(given: Sequence[_Signal], wanted: Coordinates, kind: str, path: str
-              ) -> list[_Signal]:
-    """Return signals in the order of a lift; ValueError where they are not the same."""
-    by_name = {signal.name: signal for signal in given}
-    found = {(signal.name, signal.unit) for signal in given}
-    if len(by_name) != len(given) or found != set(zip(wanted.names, wanted.units, strict=True)):
-        said, needed = (
-            ', '.join(f'{name} [{unit}]' for name, unit in pairs) or 'none'
-            for pairs in (((s.name, s.unit) for s in given),
-                          zip(wanted.names, wanted.units, strict=True)))
-        raise ValueError(f'the present lift {path} has the {kind}s {needed}, the task has {said}: '
-                         'give the same names and units, each once')
-    return [by_name[name] for name in wanted.names]
-
-
-def _unknown(task: Task) -> Plant:
-    """Return what is known of a plant without a lift, but for its nominal point."""
-    states, inputs = task.states, task.inputs
-    return Plant(task.plant, tuple(signal.name for signal in states),
-                 tuple(signal.unit for signal in states), tuple(signal.name for signal in inputs),
-                 tuple(signal.unit for signal in inputs), 's', np.full(len(states), np.nan),
-                 np.full(len(inputs), np.nan), None)
-
-
-def _known_gain(task: Task, plant: Plant) -> Array | None:
-    """Return B (n_x, n_u) of a task per time unit of a plant, None to learn it."""
-    if not task.input_gain:
-        return None
-    B = np.zeros((len(plant.state_names), len(plant.input_names)))
-    for state, row in task.input_gain.items():
-        for name, gain in row.items():
-            if state not in plant.state_names or name not in plant.input_names:
-                raise ValueError(
-                    f'input_gain names {name} acting on {state}: the lift has the states '
-                    f'{", ".join(plant.state_names)} and the inputs '
-                    f'{", ".join(plant.input_names)}')
-            if not math.isfinite(gain):
-                raise ValueError(f'input_gain of {name} on {state} is {gain}, must be finite')
-            B[plant.state_names.index(state), plant.input_names.index(name)] = gain
-    return B * SECONDS_PER_TIME_UNIT[plant.time_unit]
 
 
 def _at(stage: str, share: float) -> float:
@@ -377,7 +300,7 @@ def _with_provenance(model: LiftedModel, found: Identified, decision: Decision, 
     metrics = {name: value for name, value in metrics.items() if np.isfinite(value)}
     return replace(model, tried_loops=decision.law_check.tried, provenance=replace(
         model.provenance, data_digest=sha.hexdigest(), metrics=metrics,
-        method=f'{found.method}, drift of degree {found.drift.degree}'))
+        method=f'{found.method}, {found.drift.form}'))
 
 
 def _place(output: Path, accepted: bool) -> Path:

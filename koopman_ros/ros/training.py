@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 from std_srvs.srv import Trigger
 
-from koopman_ros.jobs.training import class_lines, JobState, RetrainingJob, scalars
+from koopman_ros.jobs.training import class_lines, constant_lines, JobState, RetrainingJob, scalars
 from koopman_ros.parameters.trainer import TrainerParameters
 from koopman_ros.parameters.wire import Wiring
 from koopman_ros.resources import model_path
@@ -139,7 +139,7 @@ class Training:
         else:
             log.error(self._state.text)
         summary = self._state.summary or {}
-        for name, line in class_lines(summary).items():
+        for name, line in {**class_lines(summary), **constant_lines(summary)}.items():
             log.info(f'{name}: {line}')
         for warning in summary.get('warnings', ()):
             log.warning(warning)

@@ -25,7 +25,7 @@ from koopman_ros.identification import (
     total_variation,
     weak_form,
 )
-from koopman_ros.identification.output_error import _Filter, _Problem
+from koopman_ros.identification.output_error import _Filter, _Problem, Weights
 from koopman_ros.identification.regression import _input_integral, smoothed
 from koopman_ros.learning.levenberg_marquardt import normal_equations
 from koopman_ros.plant_data import cut, Episode
@@ -47,7 +47,7 @@ def start_of(plant, records, degree, B=None):
 def test_normal_equations_against_differences(learn):
     records = [PAIR.irregular(count, 40, (0.05, 0.15), seed=count) for count in (60, 45)]
     model, segments = start_of(PAIR, records, 2)
-    problem = _Problem(model, segments, learn)
+    problem = _Problem(Weights(model, learn), segments)
     theta = problem.start()
     theta = theta + 0.03 * torch.from_numpy(np.random.default_rng(0).standard_normal(len(theta)))
     box, count = model.box, np.sum(segments.measured)
@@ -55,9 +55,9 @@ def test_normal_equations_against_differences(learn):
 
     def residuals(values):
         # by the path in units, which shares no line with the derivatives
-        drift, starts, _ = problem.split(values)
+        model, _, starts = problem.split(values)
         middle = box.states.center
-        errors = segments.errors(drift.rate, middle + starts * box.states.scale)
+        errors = segments.errors(model.drift.rate, middle + starts * box.states.scale)
         return (errors / box.states.scale).ravel() / np.sqrt(count)
 
     base = residuals(theta.numpy())
@@ -74,8 +74,8 @@ def test_normal_equations_against_differences(learn):
     assert only.cost == found.cost
 
 
-@pytest.mark.parametrize('learn', [True, False])
-def test_normal_equations_of_a_filter_against_differences(learn):
+@pytest.mark.parametrize(('learn', 'smooth'), [(True, False), (False, False), (True, True)])
+def test_normal_equations_of_a_filter_against_differences(learn, smooth):
     records = [PAIR.irregular(count, 40, (0.05, 0.15), seed=count) for count in (30, 25)]
     model, whole = start_of(PAIR, records, 2)
     # the second state is not measured
@@ -83,14 +83,15 @@ def test_normal_equations_of_a_filter_against_differences(learn):
     rng = np.random.default_rng(0)
     gain, starts = rng.uniform(0.1, 0.4, (2, 1)), rng.uniform(-0.5, 0.5, (2, 2))
     deviation, settling = np.array([0.3]), 5
-    problem = _Problem(model, segments, learn, _Filter(gain, starts, deviation, settling))
+    problem = _Problem(Weights(model, learn), segments, _Filter(
+        gain, starts, deviation, settling, smooth, 1e-4))
     theta = problem.start()
     theta = theta + 0.03 * torch.from_numpy(rng.standard_normal(len(theta)))
     box = model.box
 
     def residuals(values):
-        drift, _, K = problem.split(values)
-        found = []
+        model, K, starts = problem.split(values)
+        drift, found = model.drift, []
         for j, record in enumerate(records):
             # sample by sample and in units, with the solver's steps over each interval
             x, taken = box.states.to_physical(starts[j]), 0
@@ -111,7 +112,7 @@ def test_normal_equations_of_a_filter_against_differences(learn):
     J = np.stack([(residuals(theta.numpy() + h) - residuals(theta.numpy() - h)) / 2e-5
                   for h in 1e-5 * np.eye(len(theta))], axis=-1)
     found = normal_equations(problem.add_residuals, theta)
-    assert len(theta) == 12 + (4 if learn else 0) + 2
+    assert len(theta) == 12 + (4 if learn else 0) + (4 if smooth else 2)
     assert found.cost == pytest.approx(0.5 * base @ base, rel=1e-12)
     assert found.gradient.numpy() == pytest.approx(J.T @ base, abs=1e-7)
     assert found.matrix.numpy() == pytest.approx(J.T @ J, abs=1e-6)
@@ -119,7 +120,7 @@ def test_normal_equations_of_a_filter_against_differences(learn):
 
 def test_a_model_that_diverges_has_infinite_cost():
     model, segments = start_of(CUBIC, [CUBIC.excited(100, 0.1)], 3)
-    problem = _Problem(model, segments, True)
+    problem = _Problem(Weights(model, True), segments)
     theta = problem.start() + 1e8
     assert normal_equations(problem.add_residuals, theta).cost == np.inf
     assert normal_equations(problem.add_residuals, theta, derivatives=False).cost == np.inf

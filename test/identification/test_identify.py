@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 from koopman_ros.identification import box_of, identify, longest_step, Segments, Stopped, weak_form
-from koopman_ros.identification.output_error import _Problem
+from koopman_ros.identification.output_error import _Problem, Weights
 from koopman_ros.learning.levenberg_marquardt import normal_equations
 from koopman_ros.plant_data import cut, Episode
 from support.known_plants import CUBIC, methods, PAIR
@@ -208,7 +208,7 @@ def test_memory_of_a_long_record():
     model = weak_form(parts, box_of(CUBIC.plant, parts), 6, None, 80)
     tracemalloc.start()
     segments = Segments.of(parts, longest_step(parts))
-    problem = _Problem(model, segments, True)
+    problem = _Problem(Weights(model, True), segments)
     normal_equations(problem.add_residuals, 0.0 * problem.start())
     peak = tracemalloc.get_traced_memory()[1]
     tracemalloc.stop()

@@ -53,7 +53,8 @@ RECORDING = ('max_bag', 'min_free', 'compression')
 EXPERIMENT = ('experiment', 'coolant_temperature.experiment', 'coolant_temperature.safe',
               'temperature.experiment', 'temperature.setpoint')
 TRAINING = ('model_class', 'model_coordinates', 'input_matrix_degree', 'hidden_states',
-            'training', 'gate', 'synchronisation', 'coolant_temperature.delay')
+            'equations', 'constants_estimated', 'training', 'gate', 'synchronisation',
+            'coolant_temperature.delay')
 # A lower limit and its upper one, which must change together to reach the ends.
 PAIRS = (('validity_margin', 'linear_margin'),
          ('experiment_shortest_hold', 'experiment_longest_hold'),

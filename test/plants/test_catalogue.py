@@ -66,6 +66,8 @@ def test_each_plant_of_the_library_is_built_from_its_defaults_in_si_to_the_bit(n
     x = 1.01 * usual.nominal_state + 0.01
     np.testing.assert_array_equal(from_si.drift(x), usual.drift(x))
     np.testing.assert_array_equal(from_si.input_matrix(x), usual.input_matrix(x))
+    assert all(row.lower <= row.estimated[0] < row.default < row.estimated[1] <= row.upper
+               for row in rows if row.estimated)
     # the ends of the ranges, converted there and back, lie within them
     for row in rows:
         for end in (row.lower, row.upper):
@@ -78,7 +80,7 @@ def test_constants_are_shown_in_si_and_temperatures_in_degrees_celsius():
     assert (rate.name, rate.unit, rate.description) == ('rate', '1/s', 'of cooling')
     assert (rate.lower, rate.default, rate.upper) == pytest.approx((0.0, 0.7 / 60.0, 1.0 / 6.0))
     assert astuple(surroundings) == (
-        'surroundings', 76.85, 'degC', -23.15, 226.85, 'around it')
+        'surroundings', 76.85, 'degC', -23.15, 226.85, 'around it', None)
     warmer = build(Heater, {'rate': 0.05, 'surroundings': 20.0})
     # 3 / min times 10 K
     np.testing.assert_allclose(warmer.drift(np.array([283.15])), [30.0], rtol=1e-12)

@@ -3,6 +3,7 @@
 
 """Retraining with two states and two inputs from a bag; the input as measured or as commanded."""
 
+from dataclasses import asdict, replace
 from functools import partial
 import importlib
 import json
@@ -13,12 +14,14 @@ import pytest
 
 from koopman_ros.bags import BagWriter, message_definition, RecordedInput, RecordedState
 from koopman_ros.identification import identify, identify_hidden
+from koopman_ros.jobs.training import constant_lines, scalars
 from koopman_ros.lifting import Coordinates, linearised_model, load, Provenance, save
 from koopman_ros.plant_data import Episode, Plant
 from koopman_ros.plants import Actuator, Process, random_steps, RandomStepDesign
 from koopman_ros.plants.library.two_tanks import TwoTanks
 from koopman_ros.retraining import retrain, Task, write_report
 from koopman_ros.retraining import task as task_module
+from koopman_ros.retraining.known import known
 from koopman_ros.units import NANOSECONDS as SECOND
 from koopman_ros.wire import Place
 from support.known_plants import methods
@@ -35,13 +38,13 @@ INPUTS = tuple(RecordedInput(name, 'V', Place('/pumps', ARRAY, f'data[{k}]', 'mV
                for k, name in ((1, 'pump_2'), (0, 'pump_1')))
 
 
-def write_tanks(path):
+def write_tanks(path, seconds=1500.0):
     """Write 25 minutes of the tanks under random steps of both pumps, a sample a second."""
     serialize = importlib.import_module('rclpy.serialization').serialize_message
     joints = importlib.import_module('sensor_msgs.msg').JointState(name=list(TANKS.state_names))
     pumps = importlib.import_module('std_msgs.msg').Float64MultiArray()
     design = RandomStepDesign([3.0, 0.0], [9.0, 4.0], *RANGE, (15.0, 45.0), 1.0, rtol=1e-9)
-    run = random_steps(TANKS, design, 1500.0, 0)
+    run = random_steps(TANKS, design, seconds, 0)
     x = run.x + LEVEL_NOISE * np.random.default_rng(0).standard_normal(run.x.shape)
     with BagWriter(path) as writer, warnings.catch_warnings():
         # The type support imports its generator, whose parser imports a deprecated module.
@@ -187,3 +190,63 @@ def test_a_level_that_is_in_no_bag_is_learned_with_the_other(bag, tmp_path, monk
     page = next(path for path in write_report(found) if path.suffix == '.md').read_text()
     assert 'of the next measurement foreseen' in page
     assert 'innovations form, 1 state not measured' in page
+
+
+@pytest.fixture(scope='module')
+def by_equations(tmp_path_factory):
+    """Return what eight minutes of the lower level give by equations with another orifice."""
+    folder = tmp_path_factory.mktemp('equations')
+    task = Task((str(write_tanks(folder / 'run.mcap', 500.0)),), str(folder / 'new.safetensors'),
+                '', STATES[:1], INPUTS, model_class='polynomial', equations='two_tanks',
+                constants={'orifice_1': (1e-6, 5e-5), 'pump_gain': None})
+    # as the process that retrains is given it
+    return retrain(Task.from_json(json.dumps(asdict(task))))
+
+
+def test_a_level_that_is_in_no_bag_has_its_own_name_by_equations(by_equations):
+    found = by_equations.found
+    assert found.hidden == 1
+    model = load(by_equations.model_file)
+    assert (model.states.names, model.states.units) == (('level_2', 'level_1'), ('m', 'm'))
+    assert model.provenance.method == 'output error, equations of TwoTanks'
+    x, u = TANKS.nominal_state, TANKS.nominal_input
+    assert found.drift.rate(x[::-1], u) == pytest.approx([0.0, 0.0], abs=2e-5)
+
+
+def test_constants_are_in_summary_report_and_diagnostics(by_equations):
+    figures = by_equations.summary()
+    assert figures['drift'] == 'equations of TwoTanks'
+    assert set(figures['constants']) == {'orifice_1', 'pump_gain'}
+    own = TwoTanks()
+    for name, one in figures['constants'].items():
+        assert one['standing'] == 'estimated'
+        assert abs(one['value'] - getattr(own, name)) < 3.5 * one['standard_error']
+        assert scalars(figures)[f'constant {name}'] == one['text']
+    assert constant_lines(figures)['orifice_1'].endswith('m^2')
+    page = next(path for path in write_report(by_equations) if path.suffix == '.md').read_text()
+    for words in ('| constant | unit | estimate | standard error |', '| pump_gain | m^3/(s V) |',
+                  'of the next measurement foreseen'):
+        assert words in page
+
+
+@pytest.mark.parametrize(('given', 'words'), [
+    ({'equations': 'two_tanks', 'hidden_states': 1}, 'set hidden_states to 0'),
+    ({'equations': 'two_tanks', 'input_gain': {'level_2': {'pump_2': 1.0}}}, 'no input_gain'),
+    ({'constants': {'orifice_1': None}}, 'constants name orifice_1, but there are no equations')])
+def test_a_task_whose_equations_do_not_fit_is_refused(given, words):
+    with pytest.raises(ValueError, match=words):
+        known(replace(Task((), '', '', STATES, INPUTS), **given), None)
+
+
+def test_of_a_present_lift_of_all_states_equations_need_some_in_the_bags():
+    boxes = (Coordinates.spanning(TANKS.state_names, ('m', 'm'), *RANGE, TANKS.nominal_state),
+             Coordinates.spanning(TANKS.input_names, ('V', 'V'), np.array([3.0, 0.0]),
+                                  np.array([9.0, 4.0]), TANKS.nominal_input))
+    present = linearised_model(TANKS.drift_jacobian(TANKS.nominal_state), TANKS.B, *boxes, 's',
+                               Provenance('two tanks'))
+    task = Task((), '', 'present', STATES[:1], INPUTS)
+    plant, states, inputs = known(replace(task, equations='two_tanks'), present)
+    assert plant.state_names == tuple(state.name for state in states) == ('level_2',)
+    assert plant.input_names == tuple(one.name for one in inputs) == TANKS.input_names
+    with pytest.raises(ValueError, match=r'has the states level_1 \[m\], level_2 \[m\]'):
+        known(task, present)

@@ -16,6 +16,7 @@ from rclpy.node import Node
 from rclpy.parameter import parameter_dict_from_yaml_file, parameter_value_to_python
 import yaml
 
+from koopman_ros.demo import reactor
 from koopman_ros.lifting import load
 from koopman_ros.parameters.controller import table_of
 from koopman_ros.parameters.plant import PlantTable
@@ -27,6 +28,7 @@ from koopman_ros.parameters.table import (
     per_signal,
     Specification,
 )
+from koopman_ros.parameters.trainer import trainer_table
 from koopman_ros.plants import build, plant_class
 from koopman_ros.resources import config_directory, model_path
 from koopman_ros.ros.node import LoopNode, range_of
@@ -371,6 +373,34 @@ def test_a_topic_is_not_commanded_and_measured_at_once() -> None:
     said = table.check(table.snapshot({'coolant_temperature.command_topic': 'temperature'}))
     assert said == ("coolant_temperature is commanded on 'temperature', where temperature is "
                     'measured: name another topic for one of them')
+
+
+@pytest.mark.parametrize(('given', 'words'), [
+    ({'equations': 'two_thanks'}, "there is no plant 'two_thanks'"),
+    ({'equations': 'two_state', 'constants_estimated': ['volumes']},
+     'volumes is no constant of TwoStateReactor: it has flow_rate, volume'),
+    ({'equations': 'two_state', 'constants_estimated': ['volume [2, 1]']},
+     r'the range of volume is \[2, 1\] m\^3, must rise and lie in \[0.001, 100\] m\^3'),
+    ({'equations': 'two_state', 'constants_estimated': ['volume 2 1']}, 'must be a name, or one'),
+    ({'equations': 'two_state', 'constants_estimated': ['volume', 'volume']}, 'each name once'),
+    ({'equations': 'quadruple_tank'}, 'does not say which of its constants are to be estimated'),
+    ({'constants_estimated': ['volume']}, 'constants_estimated names volume, must be empty'),
+    ({'equations': 'two_state', 'hidden_states': 1}, 'hidden_states is 1, must be 0'),
+    ({'equations': 'two_state', 'input_matrix': [2.0]}, 'input_matrix must be a single 0')])
+def test_equations_that_a_trainer_cannot_fit_are_refused(given: dict[str, Any], words: str
+                                                         ) -> None:
+    table = trainer_table(load(model_path(reactor.MODEL)))
+    with pytest.raises(ConfigurationError, match=words):
+        table.snapshot(given)
+
+
+def test_equations_of_a_trainer_are_those_of_its_task() -> None:
+    table = trainer_table(load(model_path(reactor.MODEL)))
+    fields = table.snapshot({'equations': 'two_state', 'constants_estimated': [
+        'heat_transfer_coefficient [500, 1e3]', 'reaction_enthalpy']}).training()
+    assert fields['equations'] == 'two_state'
+    assert fields['constants'] == {'heat_transfer_coefficient': (500.0, 1000.0),
+                                   'reaction_enthalpy': None}
 
 
 def test_nothing_is_below_absolute_zero() -> None:

@@ -45,15 +45,17 @@ class ReactorParameters(Constants):
         0.239, 'J/(g K)', 0.01, 100.0, 'heat capacity C_p of the liquid', si='J/(kg K)',
         factor=1e-3)
     reaction_enthalpy: float = constant(
-        -5e4, 'J/mol', -1e6, -1.0, 'enthalpy of reaction Delta H_R, negative as heat is released')
+        -5e4, 'J/mol', -1e6, -1.0, 'enthalpy of reaction Delta H_R, negative as heat is released',
+        estimated=(-2e5, -1e4))
     activation_temperature: float = constant(
-        8750.0, 'K', 2e3, 1e5, 'activation energy over the gas constant, E_A/R')
+        8750.0, 'K', 2e3, 1e5, 'activation energy over the gas constant, E_A/R',
+        estimated=(7e3, 1.1e4))
     pre_exponential_factor: float = constant(
         7.2e10, '1/min', 0.0, 1e30, 'rate constant k at infinite temperature', si='1/s',
-        factor=60.0)
+        factor=60.0, estimated=(7.2e8, 7.2e12))
     heat_transfer_coefficient: float = constant(
         5e4, 'J/(min K)', 0.0, 1e7, 'coefficient times area of the cooling jacket, UA', si='W/K',
-        factor=60.0)
+        factor=60.0, estimated=(1e4, 2e5))
     feed_temperature: float = constant(
         350.0, 'K', 250.0, 500.0, 'temperature T_i of the feed', si='degC')
     feed_concentration: float = constant(

@@ -33,10 +33,13 @@ class TwoTanks(Constants):
 
     tank_area: float = constant(15.52e-4, 'm^2', 1e-5, 100.0, 'cross-section A of both tanks')
     orifice_1: float = constant(
-        0.1781e-4, 'm^2', 1e-8, 1.0, 'cross-section a1 of the outlet of tank 1')
+        0.1781e-4, 'm^2', 1e-8, 1.0, 'cross-section a1 of the outlet of tank 1',
+        estimated=(0.05e-4, 0.5e-4))
     orifice_2: float = constant(
-        0.1781e-4, 'm^2', 1e-8, 1.0, 'cross-section a2 of the outlet of tank 2')
-    pump_gain: float = constant(3.3e-6, 'm^3/(s V)', 1e-9, 1.0, 'flow k of each pump per volt')
+        0.1781e-4, 'm^2', 1e-8, 1.0, 'cross-section a2 of the outlet of tank 2',
+        estimated=(0.05e-4, 0.5e-4))
+    pump_gain: float = constant(
+        3.3e-6, 'm^3/(s V)', 1e-9, 1.0, 'flow k of each pump per volt', estimated=(1e-6, 1e-5))
 
     def system(self) -> ControlAffineSystem:
         """Build it, nominal where 6 V and 2 V hold it; levels in m, pumps in V."""

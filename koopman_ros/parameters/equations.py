@@ -1,0 +1,49 @@
+# SPDX-FileCopyrightText: 2026 The koopman_ros Authors
+# SPDX-License-Identifier: Apache-2.0
+
+"""Equations that a trainer fits, and their constants with ranges, as parameters give them."""
+
+from collections.abc import Sequence
+import re
+
+from koopman_ros.plants import plant_class, sought_of
+
+_RANGE = re.compile(r'(?P<name>\w+)(\s*\[(?P<low>[^,\]]+),(?P<high>[^,\]]+)\])?')
+
+
+def named_ranges(texts: Sequence[str]) -> dict[str, tuple[float, float] | None]:
+    """
+    Read names with ranges, as in ``friction [0.01, 0.5]``; None for a name without one.
+
+    :raises ValueError: for a text that is none, and a name that is given twice.
+    """
+    found: dict[str, tuple[float, float] | None] = {}
+    for text in filter(None, texts):
+        match = _RANGE.fullmatch(text.strip())
+        try:
+            if match is None or match['name'] in found:
+                raise ValueError(text)
+            found[match['name']] = None if match['low'] is None else (
+                float(match['low']), float(match['high']))
+        except ValueError as error:
+            raise ValueError(f'{text!r} must be a name, or one with a range as friction [0.01, '
+                             '0.5], each name once') from error
+    return found
+
+
+def refused(equations: str, texts: Sequence[str]) -> str:
+    """
+    Say why equations cannot be fitted, or nothing.
+
+    :param equations: name of a plant, empty for none.
+    :param texts: their constants, see :func:`named_ranges`.
+    """
+    try:
+        ranges = named_ranges(texts)
+        if equations:
+            sought_of(plant_class(equations), ranges)
+    except ValueError as error:
+        return f'equations = {equations!r} with constants_estimated = {list(texts)}: {error}'
+    return '' if equations or not ranges else (
+        f'constants_estimated names {", ".join(ranges)}, must be empty without equations: give '
+        'the plant whose constants they are')
