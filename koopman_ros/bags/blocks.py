@@ -45,7 +45,7 @@ class Block:
     channels: dict[int, Channel]  #: by identifier
     schemas: dict[int, Schema]  #: likewise
 
-    def part(self, rows: NDArray[np.bool_] | slice) -> 'Block':
+    def part(self, rows: Rows | slice) -> 'Block':
         """Return some of the messages."""
         return replace(self, starts=self.starts[rows], ends=self.ends[rows],
                        channel=self.channel[rows], log_ns=self.log_ns[rows])

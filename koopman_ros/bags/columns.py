@@ -105,9 +105,9 @@ class _Reader:
             row = int(np.argmax(left))
             entry = self._decoders.decode(part.stored(row))
             found = [stamped_number(self._bag, entry, place) for place in self._places]
-            if (layout := self._learned(part, row, found)) is not None:
-                self._layouts.append(layout)
-                _take(layout, part, left, stamps, values, present)
+            if (learned := self._learned(part, row, found)) is not None:
+                self._layouts.append(learned)
+                _take(learned, part, left, stamps, values, present)
                 continue
             left[row] = False
             stamps[row] = NO_STAMP if found[0][0] is None else found[0][0]

@@ -71,12 +71,7 @@ def stream_episodes(bags: Sequence[str | os.PathLike[str]], states: Sequence[Rec
         by default the record alone tells.
     :raises BagReadError: for a bag that cannot be read, lacks a topic, or has another type there.
     """
-    read: set[str] = set()
-    for bag in bags:
-        if (path := os.path.realpath(bag)) in read:
-            account.notes.append(f'{os.fspath(bag)} is named twice: read once')
-            continue
-        read.add(path)
+    for bag in distinct(bags, account):
         cuts = Cuts()
         content = summary(bag)
         loop = _Loop(bag, states, _recorded(bag, content, inputs, account), account, cuts,
@@ -88,6 +83,18 @@ def stream_episodes(bags: Sequence[str | os.PathLike[str]], states: Sequence[Rec
                 yield episode
         account.notes += [*cuts.notes(os.fspath(bag)), *loop.notes]
     account.dropped = +account.dropped
+
+
+def distinct(bags: Sequence[str | os.PathLike[str]], account: Account
+             ) -> Iterator[str | os.PathLike[str]]:
+    """Yield each bag once, however it is named."""
+    read: set[str] = set()
+    for bag in bags:
+        if (path := os.path.realpath(bag)) in read:
+            account.notes.append(f'{os.fspath(bag)} is named twice: read once')
+            continue
+        read.add(path)
+        yield bag
 
 
 def _recorded(bag: str | os.PathLike[str], content: BagSummary, inputs: Sequence[RecordedInput],

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import partial
 import struct
 from typing import Any
 
@@ -82,7 +83,7 @@ def layout_of(data: bytes, decode: Callable[[bytes], Any], numbers: Numbers) -> 
                     span.append(at)
     places = []
     for k, (span, value) in enumerate(zip(spans, wanted, strict=True)):
-        kind = None if value is None else _kind(data, span, decode, lambda m, k=k: numbers(m)[k])
+        kind = None if value is None else _kind(data, span, decode, partial(_number, numbers, k))
         if value is not None and (kind is None or set(span) & set(fixed)):
             return None
         places.append(None if kind is None else (span[0], kind))
@@ -105,6 +106,10 @@ def _kind(data: bytes, span: list[int], decode: Callable[[bytes], Any],
                       np.frombuffer(probe, dtype=kind)[0].item()) for probe in probes):
             return kind
     return None
+
+
+def _number(numbers: Numbers, k: int, message: Any) -> float | int | None:
+    return numbers(message)[k]
 
 
 def _changed(data: bytes, at: int, by: bytes) -> bytes:

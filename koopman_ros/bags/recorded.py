@@ -44,6 +44,13 @@ class Account:
     dropped: Counter[str] = field(default_factory=Counter)  #: messages left out, by reason
     notes: list[str] = field(default_factory=list)  #: what else is worth knowing, in words
 
+    def add(self, other: 'Account') -> None:
+        """Take in that of other bags."""
+        self.measurements += other.measurements
+        self.used += other.used
+        self.dropped += other.dropped
+        self.notes += other.notes
+
     def lines(self) -> list[str]:
         """Return the account in words."""
         return [f'{self.used} of {self.measurements} measurements used',

@@ -6,7 +6,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import asdict, dataclass, field, replace
 import hashlib
 import itertools
 import json
@@ -20,7 +20,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from koopman_ros.arrays import Array, brief
-from koopman_ros.bags import Account, loop_episodes, RecordedInput, RecordedState
+from koopman_ros.bags import Account, RecordedInput, RecordedState
 from koopman_ros.identification import Identified, identify, identify_hidden, Stopped
 from koopman_ros.learning import Comparison, Contender, NoUsefulLift, Progress
 from koopman_ros.lifting import Box, Coordinates, LiftedModel, load, save
@@ -29,15 +29,18 @@ from koopman_ros.plant_data import Episode, Plant
 from koopman_ros.resources import predecessor
 from koopman_ros.retraining.gate import decide, Decision, shortfalls, Thresholds
 from koopman_ros.retraining.lift import compare_classes
+from koopman_ros.retraining.record import Each, read_record, Reduction, Source
+from koopman_ros.retraining.selection import CELLS, cells_of
 from koopman_ros.units import NANOSECONDS, SECONDS_PER_TIME_UNIT
 from koopman_ros.wire import Place
 
-CELLS = 10  # along each of two signals, by which the visited share of their ranges is told
 # A smaller change, in half widths of the present lift's box, is neither a spike nor a jump.
 _LEAST_JUMP = 0.1
 
-# Shares of the whole at which estimating, learning and judging begin and end.
-_STAGES = {'estimate': (0.05, 0.35), 'learn': (0.35, 0.9), 'decide': (0.9, 1.0)}
+# Shares of the whole at which reading, estimating, learning and judging begin and end.
+_STAGES = {'read': (0.0, 0.05), 'estimate': (0.05, 0.35), 'learn': (0.35, 0.9),
+           'decide': (0.9, 1.0)}
+MOST_SAMPLES = 20_000  # more cost more time, and tell less and less
 _JUDGED = 0.8  # share of deciding in which the closed loops are run
 
 # Called with the share done in [0, 1] and what is done now; True asks to stop.
@@ -58,7 +61,10 @@ class Task:
     #: class to learn, a name of `compare`, or ``'best'`` for the one that its rule takes
     model_class: str = IDENTITY_LIFT
     coordinates: int = 3  #: n_z of the identity lift
-    seed: int = 0  #: of the split and of the training
+    seed: int = 0  #: of the split and of the training, and of what is taken of a long record
+    #: samples that are learned from and judged by; a longer record is reduced to them, see
+    #: :func:`read_record`
+    most_samples: int = MOST_SAMPLES
     starts: int = 3  #: of each round of the training
     #: B where it is known, in state unit per input unit and second, by state and input; what is
     #: not named is 0; empty to learn B
@@ -104,6 +110,7 @@ class Retrained:
     plant: Plant  #: names, units and nominal point; its time unit is that of the drift
     present: LiftedModel | None  #: the lift that was in use, where there was one
     model_file: str = ''  #: where the lift was written, or an empty string
+    reduction: Reduction | None = None  #: what was taken of a long record
 
     __repr__ = brief
 
@@ -146,6 +153,7 @@ class Retrained:
                               strict=True)),
             'measurements_read': self.account.measurements,
             'measurements_used': self.account.used,
+            'reduction': None if self.reduction is None else asdict(self.reduction),
             'coverage': {', '.join(pair): share for pair, share in self.coverage.items()},
             'derivative_method': self.found.method,
             'drift_degree': self.found.drift.degree,
@@ -182,13 +190,15 @@ def _finite(value: float) -> float | None:
     return float(value) if np.isfinite(value) else None
 
 
-def retrain(task: Task, on_progress: OnProgress = lambda *_: False) -> Retrained:
+def retrain(task: Task, on_progress: OnProgress = lambda *_: False, *, each: Each = map
+            ) -> Retrained:
     """
     Read the bags, estimate the drift, learn a lift of it, judge it, and write it.
 
     An accepted lift goes to the output file, and what was there before is kept beside it as
     ``.previous.safetensors``; a refused one goes to ``.refused.safetensors``.
 
+    :param each: reads the bags of a long record, see :func:`read_record`.
     :raises BagReadError: for bags that cannot be used.
     :raises ModelFileError: when the present lift cannot be read.
     :raises ValueError: for episodes that do not determine a model, or a task that does not fit.
@@ -212,15 +222,19 @@ def retrain(task: Task, on_progress: OnProgress = lambda *_: False) -> Retrained
     # a folder that cannot be written should fail now, not after the training
     Path(task.output).parent.mkdir(parents=True, exist_ok=True)
     _stop_if(on_progress(0.0, 'reading bags'))
-    recorded, account = loop_episodes(
+    source = Source(
         task.bags, states, inputs, tolerance_ns=round(task.tolerance * NANOSECONDS),
         least_jumps=None if current is None else (_LEAST_JUMP * current.states.scale).tolist())
-    if not recorded:
+    record = read_record(source, task.most_samples, task.seed, hidden=task.hidden_states > 0,
+                         tick=_reading(on_progress, source), each=each)
+    account = record.account
+    if not record.episodes:
         raise ValueError('the bags hold no usable segment of measurements: '
                          + '; '.join(account.lines()))
     seconds = SECONDS_PER_TIME_UNIT[plant.time_unit]
     episodes = [replace(episode, time=episode.time / seconds,
-                        input_time=episode.input_time / seconds) for episode in recorded]
+                        input_time=episode.input_time / seconds)
+                for episode in record.episodes]
     def estimating(done: int, total: int, text: str) -> bool:
         return on_progress(_at('estimate', done / total), f'estimating: {text}')
 
@@ -238,7 +252,7 @@ def retrain(task: Task, on_progress: OnProgress = lambda *_: False) -> Retrained
         plant = replace(plant, state_names=box.states.names, state_units=box.states.units, B=None,
                         nominal_state=box.states.center, nominal_input=box.inputs.center)
     bare = Retrained(task, account, found, None, None, (), coverage(episodes, found.drift.box),
-                     plant, current)
+                     plant, current, reduction=record.reduction)
     course = _Course(on_progress)
     try:
         learned = compare_classes(
@@ -267,8 +281,7 @@ def visited_cells(episodes: Sequence[Episode], box: Box) -> NDArray[np.int64]:
     found = []
     for episode in episodes:
         u = box.inputs.to_deviation(episode.inputs_at(episode.time))
-        scaled = np.hstack([box.states.to_deviation(episode.x), u])
-        found.append(np.clip((0.5 * (scaled + 1.0) * CELLS).astype(np.int64), 0, CELLS - 1))
+        found.append(cells_of(np.hstack([box.states.to_deviation(episode.x), u]), -1.0, 1.0))
     return np.unique(np.concatenate(found), axis=0)
 
 
@@ -337,6 +350,18 @@ def _at(stage: str, share: float) -> float:
 def _stop_if(stop: bool) -> None:
     if stop:
         raise Stopped
+
+
+def _reading(on_progress: OnProgress, source: Source) -> Callable[[int], None]:
+    """Return what reports how much of a record was read, twice; it ends the reading by Stopped."""
+    total, read = 2 * source.size(), 0
+
+    def tick(samples: int) -> None:
+        nonlocal read
+        read += samples
+        _stop_if(on_progress(_at('read', min(1.0, read / total)), 'reading bags'))
+
+    return tick
 
 
 class _Course:
