@@ -62,7 +62,7 @@ def stream_episodes(bags: Sequence[str | os.PathLike[str]], states: Sequence[Rec
     input, since nobody knows what acted on them. A bag that was not closed or is damaged is read
     as far as it goes. The account tells all that.
 
-    Memory does not grow with the bags: of a long record some hundred thousand measurements are
+    Memory does not grow with the bags: of a long record some ten thousand measurements are
     put together at a time, at whose ends an episode ends, too.
 
     :param account: is added to as the episodes come.

@@ -19,7 +19,7 @@ from koopman_ros.wire import Place
 
 # Measurements of a state that are put together at a time: what is usual among them is told from
 # so many, and memory is bounded by them. A bag with fewer is one portion.
-MOST = 2**17
+MOST = 2**16
 # By as many measurements, and by as much of the recorder's time, a portion lies back: what belongs
 # to it has arrived by then.
 _MARGIN = 1000

@@ -102,9 +102,9 @@ def write(path: Path, topics: Sequence[str], values: NDArray[np.float64], period
         stream.write(_encoded(DataEnd(0)))
         summary = stream.tell()
         stream.write(_encoded(schema, *channels, Statistics(
-            0, len(channels), {number: count for number in range(n)}, -(-count // per_chunk),
+            0, len(channels), dict.fromkeys(range(n), count), -(-count // per_chunk),
             count * n, int(stamps[-1]), int(stamps[0]), 0, 1)))
-        stream.write(_encoded(Footer(0, 0, summary)) + MAGIC)
+        stream.write(_encoded(Footer(summary, 0, 0)) + MAGIC)
     return path
 
 
