@@ -102,7 +102,7 @@ def write(path: Path, topics: Sequence[str], values: NDArray[np.float64], period
         stream.write(_encoded(DataEnd(0)))
         summary = stream.tell()
         stream.write(_encoded(schema, *channels, Statistics(
-            0, len(channels), dict.fromkeys(range(n), count), -(-count // per_chunk),
+            0, len(channels), dict.fromkeys(range(n), int(count)), -(-count // per_chunk),
             count * n, int(stamps[-1]), int(stamps[0]), 0, 1)))
         stream.write(_encoded(Footer(summary, 0, 0)) + MAGIC)
     return path

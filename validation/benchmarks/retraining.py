@@ -93,10 +93,10 @@ def measure(plan: Plan, figures: dict[str, Any], folder: Path) -> Iterator[str]:
                 _remove(bags)
         yield _table(figures['by_samples'])
         _tell(f'{plan.days} days at 1 Hz, two processes')
-        case = known['reactor at 1 Hz']
-        bags = write_bags(case, plan.days * _DAY, Path(name))
+        slow = known['reactor at 1 Hz']
+        bags = write_bags(slow, plan.days * _DAY, Path(name))
         days = figures['days'] = {'days': plan.days, 'samples': plan.days * _DAY,
-                                  **_measured(case, bags, Path(name), 2)}
+                                  **_measured(slow, bags, Path(name), 2)}
         yield (f'{plan.days} days at 1 Hz, {days["samples"]} samples: '
                f'{days["wall_seconds"]:.0f} s, {days["cpu_seconds"]:.0f} s of processor time, '
                f'{days["peak_megabytes"]:.0f} MB and {days["peak_megabytes_of_workers"]:.0f} MB '
@@ -240,7 +240,8 @@ def _draw(path: Path, figures: dict[str, Any]) -> None:
         first = next(iter(found.values()))[0]
         axes.axhline(first['start_megabytes'], color='0.5', ls='--', lw=1.0,
                      label='before it begins: Python with torch')
-        axes.set(xscale='log', ylim=(0.0, None), xlabel='samples of the record',
+        highest = max(one['peak_megabytes'] for rows in found.values() for one in rows)
+        axes.set(xscale='log', ylim=(0.0, 1.2 * highest), xlabel='samples of the record',
                  ylabel='peak memory [MB]')
         axes.set_title('memory', fontsize=10)
         axes.legend(fontsize=8, loc='lower right')
