@@ -16,7 +16,7 @@ from numpy.typing import ArrayLike, NDArray
 from koopman_ros.arrays import Array, brief, frozen
 from koopman_ros.units import check_time_unit
 
-__all__ = ['Episode', 'Plant', 'Samples', 'cut', 'split_by_episode', 'within']
+__all__ = ['Episode', 'Plant', 'Samples', 'averaged', 'cut', 'split_by_episode', 'within']
 
 
 @dataclass(frozen=True)
@@ -175,6 +175,27 @@ def cut(episodes: Sequence[Episode], samples: int) -> list[Episode]:
         edges = np.round(np.linspace(0, len(episode) - 1, count + 1)).astype(int)
         parts += [episode.part(a, b + 1) for a, b in itertools.pairwise(edges) if b > a]
     return parts
+
+
+def averaged(episode: Episode, count: int) -> Episode:
+    """
+    Return the means of `count` measurements in a row each, at the means of their times.
+
+    What the input came to from one to the next is kept: its changes, or where there are more of
+    them than means, as in a loop that answers each measurement, its own mean between two times.
+
+    :raises ValueError: for an episode without two such groups.
+    """
+    n = len(episode) // count
+    if n < 2:
+        raise ValueError(f'an episode of {len(episode)} measurements has no two groups of {count}')
+    time = episode.time[:n * count].reshape(n, count).mean(axis=1)
+    x = episode.x[:n * count].reshape(n, count, -1).mean(axis=1)
+    changes = np.sum((episode.input_time > time[0]) & (episode.input_time < time[-1]))
+    if not any(episode.linear) and changes <= n:
+        return Episode(time, x, episode.input_time, episode.u).part(0, n)
+    u = np.diff(episode.input_integral(time), axis=0) / np.diff(time)[:, None]
+    return Episode(time, x, time[:-1], u)
 
 
 def within(episodes: Sequence[Episode], lower: ArrayLike, upper: ArrayLike, samples: int = 2

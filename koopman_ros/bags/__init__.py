@@ -3,10 +3,12 @@
 
 """Bags in the layout of rosbag2 (MCAP), written and read on any machine with Python, no ROS."""
 
-from koopman_ros.bags.episodes import Account, loop_episodes, RecordedInput, RecordedState
+from koopman_ros.bags.decoding import BagMessage
+from koopman_ros.bags.episodes import loop_episodes, stream_episodes
 from koopman_ros.bags.limits import BagReadError
 from koopman_ros.bags.metadata import INFINITE_NS, QosProfile
-from koopman_ros.bags.reader import BagMessage, BagSummary, in_log_order, read_messages, summary
+from koopman_ros.bags.reader import BagSummary, in_log_order, read_messages, summary
+from koopman_ros.bags.recorded import Account, RecordedInput, RecordedState
 from koopman_ros.bags.schemas import message_definition, MessageDefinition, MessageDefinitionError
 from koopman_ros.bags.series import read_series, Series
 from koopman_ros.bags.writer import BagWriter
@@ -15,5 +17,5 @@ __all__ = [
     'INFINITE_NS', 'Account', 'BagMessage', 'BagReadError', 'BagSummary', 'BagWriter',
     'MessageDefinition', 'MessageDefinitionError', 'QosProfile', 'RecordedInput',
     'RecordedState', 'Series', 'in_log_order', 'loop_episodes', 'message_definition',
-    'read_messages', 'read_series', 'summary',
+    'read_messages', 'read_series', 'stream_episodes', 'summary',
 ]

@@ -3,86 +3,49 @@
 
 """A loop's measurements with the input that acted on them, cut from bags into episodes."""
 
-from collections import Counter, defaultdict
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-import math
 import os
 
 import numpy as np
 from numpy.typing import NDArray
 
 from koopman_ros.arrays import Array
+from koopman_ros.bags import acting, runs
+from koopman_ros.bags.columns import Column, columns, NO_STAMP, Times
 from koopman_ros.bags.limits import BagReadError
-from koopman_ros.bags.reader import BagSummary, read_messages, summary
-from koopman_ros.bags.series import check_places, spikes_and_jumps, stamped_number
+from koopman_ros.bags.reader import BagSummary, summary
+from koopman_ros.bags.recorded import Account, Cuts, places_of, RecordedInput, RecordedState
+from koopman_ros.bags.runs import Clock, Entries, Run
+from koopman_ros.bags.samples import named, put_together, Samples
+from koopman_ros.bags.series import check_places, spikes_and_jumps
 from koopman_ros.plant_data import Episode
-from koopman_ros.units import Conversion, conversion, LATE_NANOSECONDS, NANOSECONDS
+from koopman_ros.units import Conversion, conversion, NANOSECONDS
 from koopman_ros.wire import Place
 
 # A gap is longer than this many usual periods.
 _GAP_PERIODS = 3.5
-# A clock that differs from the recorder's by more is not the wall clock.
-_SAME_CLOCK_NS = 5 * NANOSECONDS
-# Delays below this share of the sample period are taken as none.
-_NO_DELAY = 0.01
 _SHORTEST = 10
-# An input that differs from its command by no more than this share of its own motion follows at
-# once: the command tells better when it changed.
-_AT_ONCE = 0.02
-# What happened where an episode ends, for the first and for the largest of several.
-_ENDS = {'set back': ('time was set back by {}', 'at most by {}'),
-         'gap': ('gap of {}', 'the longest of {}'),
-         'jump': ('jump to {}', 'the highest to {}')}
-
-Times = NDArray[np.int64]
-
-# Stamp [ns], None for a type without one and 0 where it was left open; receipt [ns]; number.
-_Entry = tuple[int | None, int, float]
-_Stamped = tuple[int, int, float]
-
-
-@dataclass(frozen=True)
-class RecordedState:
-    """A measured state in bags."""
-
-    name: str  #: of the signal
-    unit: str  #: in the episodes
-    place: Place  #: where its measurements are
-
-
-@dataclass(frozen=True)
-class RecordedInput:
-    """An input in bags."""
-
-    name: str  #: of the signal
-    unit: str  #: in the episodes
-    command: Place  #: where it is commanded
-    measured: Place | None = None  #: where it is measured behind its actuator, if it is
-    delay: float = 0.0  #: dead time of the actuator, after which a command begins to act, in s
-
-
-@dataclass
-class Account:
-    """What was made of some bags."""
-
-    measurements: int = 0  #: number of measurements read, of all states
-    used: int = 0  #: number of those in an episode
-    dropped: Counter[str] = field(default_factory=Counter)  #: messages left out, by reason
-    notes: list[str] = field(default_factory=list)  #: what else is worth knowing, in words
-
-    def lines(self) -> list[str]:
-        """Return the account in words."""
-        return [f'{self.used} of {self.measurements} measurements used',
-                *(f'{count} dropped: {why}' for why, count in sorted(self.dropped.items())),
-                *self.notes]
 
 
 def loop_episodes(bags: Sequence[str | os.PathLike[str]], states: Sequence[RecordedState],
                   inputs: Sequence[RecordedInput], *, tolerance_ns: int = 0,
                   least_jumps: Sequence[float] | None = None) -> tuple[list[Episode], Account]:
     """
-    Read the episodes of some bags: times in s since the first measurement of each.
+    Return all episodes of some bags, see :func:`stream_episodes`, and what was made of the bags.
+
+    :raises BagReadError: as it does.
+    """
+    account = Account()
+    return list(stream_episodes(bags, states, inputs, account, tolerance_ns=tolerance_ns,
+                                least_jumps=least_jumps)), account
+
+
+def stream_episodes(bags: Sequence[str | os.PathLike[str]], states: Sequence[RecordedState],
+                    inputs: Sequence[RecordedInput], account: Account, *, tolerance_ns: int = 0,
+                    least_jumps: Sequence[float] | None = None) -> Iterator[Episode]:
+    """
+    Yield the episodes of some bags: times in s since the first measurement of each.
 
     Nothing is resampled: measurements keep their stamps. Where there are several states, the
     nearest stamps of the others are put to each stamp of the one that is measured least; types
@@ -99,30 +62,39 @@ def loop_episodes(bags: Sequence[str | os.PathLike[str]], states: Sequence[Recor
     input, since nobody knows what acted on them. A bag that was not closed or is damaged is read
     as far as it goes. The account tells all that.
 
+    Memory does not grow with the bags: of a long record some ten thousand measurements are
+    put together at a time, at whose ends an episode ends, too.
+
+    :param account: is added to as the episodes come.
     :param tolerance_ns: how far stamps of one sample of several states may lie apart.
     :param least_jumps: smallest change of each state, in its unit, that may be a spike or a jump;
         by default the record alone tells.
     :raises BagReadError: for a bag that cannot be read, lacks a topic, or has another type there.
     """
-    episodes: list[Episode] = []
-    account = Account()
+    for bag in distinct(bags, account):
+        cuts = Cuts()
+        content = summary(bag)
+        loop = _Loop(bag, states, _recorded(bag, content, inputs, account), account, cuts,
+                     tolerance_ns, least_jumps or [0.0] * len(states))
+        check_places(bag, content, loop.scales)
+        for run in loop.runs(content):
+            for episode in loop.episodes(run):
+                account.used += len(states) * len(episode)
+                yield episode
+        account.notes += [*cuts.notes(os.fspath(bag)), *loop.notes]
+    account.dropped = +account.dropped
+
+
+def distinct(bags: Sequence[str | os.PathLike[str]], account: Account
+             ) -> Iterator[str | os.PathLike[str]]:
+    """Yield each bag once, however it is named."""
     read: set[str] = set()
     for bag in bags:
         if (path := os.path.realpath(bag)) in read:
             account.notes.append(f'{os.fspath(bag)} is named twice: read once')
             continue
         read.add(path)
-        cuts = _Cuts()
-        content = summary(bag)
-        loop = _Loop(bag, states, _recorded(bag, content, inputs, account), account, cuts,
-                     tolerance_ns, least_jumps or [0.0] * len(states))
-        check_places(bag, content, loop.scales)
-        for run in loop.runs(content):
-            episodes += loop.episodes(run)
-        account.notes += [*cuts.notes(os.fspath(bag)), *dict.fromkeys(loop.notes)]
-    account.used = len(states) * sum(map(len, episodes))
-    account.dropped = +account.dropped
-    return episodes, account
+        yield bag
 
 
 def _recorded(bag: str | os.PathLike[str], content: BagSummary, inputs: Sequence[RecordedInput],
@@ -139,70 +111,6 @@ def _recorded(bag: str | os.PathLike[str], content: BagSummary, inputs: Sequence
 
 
 @dataclass
-class _Cuts:
-    """Where episodes of a bag end: (amount in words, amount), by what happened there."""
-
-    found: dict[str, list[tuple[str, float]]] = field(
-        default_factory=lambda: {kind: [] for kind in _ENDS})
-
-    def notes(self, bag: str) -> Iterator[str]:
-        """Yield one sentence for each kind, however often it happened."""
-        for kind, (first, most) in _ENDS.items():
-            if not (cuts := self.found[kind]):
-                continue
-            happened = f'{bag}: {first.format(cuts[0][0])}'
-            if len(cuts) == 1:
-                yield f'{happened}, a new episode begins'
-            else:
-                largest = max(cuts, key=lambda cut: cut[1])[0]
-                yield (f'{happened}, the first of {len(cuts)}, {most.format(largest)}; a new '
-                       'episode begins at each')
-
-
-@dataclass
-class _Run:
-    """The messages between two resets of time."""
-
-    #: of each place, in the order of receipt
-    entries: dict[Place, list[_Entry]] = field(default_factory=lambda: defaultdict(list))
-
-
-@dataclass
-class _Clock:
-    """How the time of receipt tells that of the stamps."""
-
-    wall: bool  #: whether stamps are those of the recorder's clock
-    logs: Times  #: (n,) times of receipt, rising
-    stamps: Times  #: (n,) stamps, rising
-
-    @classmethod
-    def of(cls, entries: Sequence[_Stamped]) -> '_Clock':
-        """Compare stamps with their receipts; without any, receipts are stamps."""
-        apart = [abs(log - stamp) for stamp, log, _ in entries]
-        return cls(not apart or float(np.median(apart)) < _SAME_CLOCK_NS,
-                   np.array(sorted(log for _, log, _ in entries)),
-                   np.array(sorted(stamp for stamp, _, _ in entries)))
-
-    def at(self, log: int) -> int:
-        """Return the stamp [ns] of a receipt."""
-        return log if self.wall else int(np.interp(log, self.logs, self.stamps))
-
-
-@dataclass(frozen=True)
-class _Samples:
-    """Measurements that were put together."""
-
-    stamps: Times  #: (N,) rising, in ns
-    x: Array  #: (N, n_x) as they were sent
-    received: dict[int, int]  #: receipt of the last part [ns], by the stamps of all parts
-    clock: _Clock
-
-
-# (M,) times in ns, (M,) values in the input's unit, whether it is linear between them
-_Acting = tuple[Times, Array, bool]
-
-
-@dataclass
 class _Loop:
     """One bag with the signals of a loop."""
 
@@ -210,17 +118,17 @@ class _Loop:
     states: Sequence[RecordedState]
     inputs: Sequence[RecordedInput]
     account: Account
-    cuts: _Cuts
+    cuts: Cuts
     tolerance_ns: int
     least_jumps: Sequence[float]
-    notes: list[str] = field(default_factory=list)
+    notes: dict[str, None] = field(default_factory=dict)  #: each once, in their order
 
     def __post_init__(self) -> None:
         signals: list[RecordedState | RecordedInput] = [*self.states, *self.inputs]
         self.scales: dict[Place, Conversion] = {}
         self._ranges: dict[Place, tuple[float, float]] = {}
         for signal in signals:
-            for place in _places(signal):
+            for place in places_of(signal):
                 try:
                     self._ranges[place] = place.range
                     self.scales[place] = conversion(place.unit, signal.unit)
@@ -228,54 +136,71 @@ class _Loop:
                     raise BagReadError(f'topic {place.topic!r} of bag {os.fspath(self.bag)!r}: '
                                        f'{error}; name another topic') from error
 
-    def runs(self, content: BagSummary) -> Iterator[_Run]:
-        """Yield what lies between resets of time."""
+    def runs(self, content: BagSummary) -> Iterator[Run]:
+        """Yield what lies between resets of time, long ones in portions."""
         bag, account = os.fspath(self.bag), self.account
         if not content.complete:
             account.notes.append(f'{bag} was not closed or is damaged: read up to its last whole '
                                  'record')
-        by_topic: dict[str, list[Place]] = defaultdict(list)
-        for place in self.scales:
-            by_topic[place.topic].append(place)
-        names = {signal.place: signal.name for signal in self.states}
-        run = _Run()
-        latest: dict[Place, int] = {}
-        left = sum(content.counts[topic] for topic in by_topic)
-        for entry in read_messages(self.bag, by_topic, recover=True):
-            left -= 1
-            for place in by_topic[entry.topic]:
-                stamp_ns, value = stamped_number(self.bag, entry, place)
-                account.measurements += place in names
-                if value is None:
-                    account.dropped[f'without {place.field}'] += 1
-                    continue
-                lowest, highest = self._ranges[place]
-                if not (lowest <= value <= highest and math.isfinite(value)):
-                    account.dropped[f'outside {lowest:g} to {highest:g} {place.unit}'] += 1
-                    continue
-                if stamp_ns is None:
-                    self.notes.append(f'{bag}: messages of {place.topic} ({place.type}) have no '
-                                      'stamp: their receipt counts')
-                elif place in names:
-                    if stamp_ns < latest.get(place, -1) - LATE_NANOSECONDS:
-                        back = (latest[place] - stamp_ns) / NANOSECONDS
-                        self.cuts.found['set back'].append((f'{back:.3f} s', back))
-                        yield run
-                        run, latest = _Run(), {}
-                    latest[place] = max(latest.get(place, -1), stamp_ns)
-                run.entries[place].append((stamp_ns, entry.log_time_ns, value))
+        states = [signal.place for signal in self.states]
+        left = sum(content.counts[topic] for topic in {place.topic for place in self.scales})
+        size = runs.portion(max(content.counts[place.topic] for place in states))
+        run = Run(states)
+        for block in columns(self.bag, list(self.scales)):
+            left -= len(np.unique(np.concatenate([column.row for column in block.values()])))
+            heard = {place: self._accepted(place, column) for place, column in block.items()}
+            while (found := self._set_back(run, heard)) is not None:
+                at, back_ns = found
+                run.add({place: entries for place, (_, entries) in runs.by_place(heard, 0, at)})
+                back = back_ns / NANOSECONDS
+                self.cuts.add('set back', f'{back:.3f} s', back)
+                yield run
+                run = Run(states)
+                heard = dict(runs.by_place(heard, at, np.iinfo(np.int64).max))
+            run.add({place: entries for place, (_, entries) in heard.items()})
+            while run.is_ready(size):
+                yield run
+                run = run.rest()
         if left:
             account.notes.append(f'{bag} is damaged: {left} messages that it counts could not be '
                                  'read')
         yield run
 
+    def _accepted(self, place: Place, column: Column) -> tuple[NDArray[np.int64], Entries]:
+        """Return the rows of a block with a number that can be, and these; count the others."""
+        is_state = any(signal.place == place for signal in self.states)
+        self.account.measurements += is_state * len(column.row)
+        lowest, highest = self._ranges[place]
+        good = runs.accepted(column, (lowest, highest))
+        dropped = self.account.dropped
+        dropped[f'without {place.field}'] += int(np.sum(~column.present))
+        dropped[f'outside {lowest:g} to {highest:g} {place.unit}'] += int(
+            np.sum(column.present & ~good))
+        if np.any(column.stamp_ns[good] == NO_STAMP):
+            self.notes[f'{os.fspath(self.bag)}: messages of {place.topic} ({place.type}) have no '
+                       'stamp: their receipt counts'] = None
+        return column.row[good], Entries(column.stamp_ns[good], column.log_ns[good],
+                                         column.values[good])
 
-    def episodes(self, run: _Run) -> Iterator[Episode]:
+    def _set_back(self, run: Run, heard: Mapping[Place, tuple[NDArray[np.int64], Entries]]
+                  ) -> tuple[int, int] | None:
+        """Return the row of a block at which time was first set back, and by how many ns."""
+        found = []
+        for signal in self.states:
+            rows, entries = heard.get(signal.place, (None, None))
+            if rows is not None and entries is not None and (
+                    back := run.set_back(signal.place, entries.stamp_ns)) is not None:
+                found.append((int(rows[back[0]]), back[1]))
+        return min(found, default=None)
+
+    def episodes(self, run: Run) -> Iterator[Episode]:
         """Put one run together and cut it at its gaps and jumps."""
         dropped, n_x = self.account.dropped, len(self.states)
-        samples = self._samples(run)
+        clock = run.clock()
+        samples = put_together(run, clock, self.states, self.tolerance_ns, dropped)
         stamps, x = samples.stamps, samples.x
-        heard = all(any(run.entries[place] for place in _places(signal)) for signal in self.inputs)
+        heard = all(any(len(run.of(place)) or place in run.acted for place in places_of(signal))
+                    for signal in self.inputs)
         if len(stamps) < _SHORTEST or not heard:
             dropped['too short, or without any input'] += x.size
             return
@@ -285,53 +210,57 @@ class _Loop:
             dropped[self._named(j, 'spike of a single sample')] += int(np.sum(spike[:, j]))
         dropped['beside a spike'] += n_x * int(np.sum(odd)) - int(np.sum(spike))
         stamps, x = stamps[~odd], x[~odd]
-        jump = self._leaps(x)[1]
         period = float(np.median(np.diff(stamps)))
-        gap = np.diff(stamps, prepend=stamps[0]) > _GAP_PERIODS * period
-        ends = np.flatnonzero(gap | jump.any(axis=1))
-        for end in ends.tolist():
-            at = f'at {stamps[end - 1] / NANOSECONDS:.3f} s'
-            if gap[end]:
-                seconds = (stamps[end] - stamps[end - 1]) / NANOSECONDS
-                self.cuts.found['gap'].append((f'{seconds:.3f} s {at}', seconds))
-            else:
-                j = int(np.argmax(jump[end]))
-                level = self._named(j, f'{x[end, j]:.6g} {self.states[j].place.unit}')
-                self.cuts.found['jump'].append((f'{level} {at}', x[end, j]))
-        recorded = [(self._commands(run, signal, samples, period), self._measured(
-            run, signal, samples.clock)) for signal in self.inputs]
+        ends = self._ends(stamps, x, period)
+        recorded = [(self._commands(run, signal, samples, clock, period),
+                     self._measured(run, signal, clock)) for signal in self.inputs]
         for rows in np.split(np.arange(len(stamps)), ends):
             times = stamps[rows]
-            acting = [self._acting(signal.name, *both, times, period)
-                      for signal, both in zip(self.inputs, recorded, strict=True)]
-            known = times >= max(start for start, _ in map(_span, acting))
-            within = times <= min(end for _, end in map(_span, acting))
+            acted = [self._acting(signal.name, *both, times, period)
+                     for signal, both in zip(self.inputs, recorded, strict=True)]
+            known = times >= max(start for start, _ in map(acting.span, acted))
+            within = times <= min(end for _, end in map(acting.span, acted))
             dropped['before the first input'] += n_x * int(np.sum(~known))
             dropped['after the last input'] += n_x * int(np.sum(~within))
             rows = rows[known & within]
             if len(rows) < _SHORTEST:
                 dropped[f'in a segment of fewer than {_SHORTEST}'] += n_x * len(rows)
                 continue
-            yield self._episode(stamps[rows], x[rows], acting)
+            yield self._episode(stamps[rows], x[rows], acted)
 
-    def _episode(self, stamps: Times, x: Array, acting: Sequence[_Acting]) -> Episode:
+    def _ends(self, stamps: Times, x: Array, period: float) -> NDArray[np.int64]:
+        """Return where episodes end, at gaps and jumps, and note these."""
+        jump = self._leaps(x)[1]
+        gap = np.diff(stamps, prepend=stamps[0]) > _GAP_PERIODS * period
+        ends = np.flatnonzero(gap | jump.any(axis=1))
+        for end in ends.tolist():
+            at = f'at {stamps[end - 1] / NANOSECONDS:.3f} s'
+            if gap[end]:
+                seconds = (stamps[end] - stamps[end - 1]) / NANOSECONDS
+                self.cuts.add('gap', f'{seconds:.3f} s {at}', seconds)
+            else:
+                j = int(np.argmax(jump[end]))
+                level = self._named(j, f'{x[end, j]:.6g} {self.states[j].place.unit}')
+                self.cuts.add('jump', f'{level} {at}', float(x[end, j]))
+        return ends
+
+    def _episode(self, stamps: Times, x: Array, acted: Sequence[acting.Acting]) -> Episode:
         """Put measurements and what acted on them together, in the signals' units."""
         origin = stamps[0]
-        changes = np.unique(np.concatenate([times for times, _, _ in acting]))
-        changes = changes[changes >= max(times[0] for times, _, _ in acting)]
+        changes = np.unique(np.concatenate([times for times, _, _ in acted]))
+        changes = changes[changes >= max(times[0] for times, _, _ in acted)]
         u = np.column_stack([
             np.interp(changes - origin, times - origin, values) if linear
             else values[np.searchsorted(times, changes, side='right') - 1]
-            for times, values, linear in acting])
+            for times, values, linear in acted])
         scaled = [self.scales[signal.place](x[:, j]) for j, signal in enumerate(self.states)]
-        linear = tuple(linear for _, _, linear in acting)
+        linear = tuple(linear for _, _, linear in acted)
         return Episode((stamps - origin) / NANOSECONDS, np.column_stack(scaled),
                        (changes - origin) / NANOSECONDS, u,
                        linear if any(linear) else ()).part(0, len(stamps))
 
     def _named(self, j: int, what: str) -> str:
-        """Say of which state something is, where there are several."""
-        return what if len(self.states) == 1 else f'{what} ({self.states[j].name})'
+        return named(self.states, self.states[j], what)
 
     def _leaps(self, x: Array) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
         """Return where each state (N, n_x) has a spike, and where it jumps."""
@@ -341,82 +270,31 @@ class _Loop:
         spikes, jumps = zip(*found, strict=True)
         return np.column_stack(spikes), np.column_stack(jumps)
 
-    def _samples(self, run: _Run) -> _Samples:
-        """Put measurements together by stamp; say of the others what they lack."""
-        dropped, tolerance_ns = self.account.dropped, self.tolerance_ns
-        heard = [run.entries[signal.place] for signal in self.states]
-        stamped: list[list[_Stamped]] = [
-            _first_of_each((stamp, log, value) for stamp, log, value in entries
-                           if stamp is not None) for entries in heard]
-        clock = _Clock.of(next(filter(None, stamped), []))
-        parts = [_on(clock, entries) for entries in heard]
-        for j, (entries, part) in enumerate(zip(heard, parts, strict=True)):
-            dropped[self._named(j, 'measurement with a repeated stamp')] += (
-                len(entries) - len(part))
-        times = [np.array([stamp for stamp, _, _ in part], dtype=np.int64) for part in parts]
-        base = min(times, key=len)
-        rows = [_nearest(own, base) for own in times]
-        whole = np.ones(len(base), dtype=bool)
-        for own, row in zip(times, rows, strict=True):
-            # each the nearest of the other, so that none is taken twice
-            whole &= ((np.abs(own[row] - base) <= tolerance_ns)
-                      & (_nearest(base, own)[row] == np.arange(len(base))))
-        rows = [row[whole] for row in rows]
-        usual = min((float(np.median(np.diff(own))) for own in times if len(own) > 1),
-                    default=0.0)
-        seconds = f'{tolerance_ns / NANOSECONDS:g} s'
-        for j, own in enumerate(times):
-            left = np.delete(own, rows[j])
-            for other, signal in zip(times, self.states, strict=True):
-                if other is own:
-                    continue
-                apart = (np.abs(other[_nearest(other, left)] - left).astype(np.float64)
-                         if len(other) else np.full(len(left), np.inf))
-                late = (apart > tolerance_ns) & (apart <= 0.5 * usual)
-                dropped[f'measurement without {signal.name}'] += int(
-                    np.sum((apart > tolerance_ns) & ~late))
-                dropped[f'measurement with {signal.name} more than {seconds} apart'] += int(
-                    np.sum(late))
-                left = left[apart <= tolerance_ns]
-            dropped[self._named(j, f'one of several within {seconds}')] += len(left)
-        received: dict[int, int] = {}
-        for at in zip(*(row.tolist() for row in rows), strict=True):
-            found = [part[k] for part, k in zip(parts, at, strict=True)]
-            latest = max(log for _, log, _ in found)
-            received.update((stamp, latest) for stamp, _, _ in found)
-        x = np.column_stack([np.array([value for _, _, value in part])[row]
-                             if len(row) else np.empty(0)
-                             for part, row in zip(parts, rows, strict=True)])
-        return _Samples(base[whole], x, received, clock)
-
-    def _commands(self, run: _Run, signal: RecordedInput, samples: _Samples, period: float
-                  ) -> tuple[Times, Array]:
+    def _commands(self, run: Run, signal: RecordedInput, samples: Samples, clock: Clock,
+                  period: float) -> tuple[Times, Array]:
         """Return when which command began to act, in the signal's unit."""
-        clock, received = samples.clock, samples.received
-        times: dict[int, float] = {}
-        for given, log, value in sorted(run.entries[signal.command], key=lambda entry: entry[1]):
-            # without a stamp it acts on receipt, which plant time may have to be asked for
-            stamp = given or clock.at(log)
-            late = log - received[stamp] if clock.wall and stamp in received else 0
-            # the last word counts
-            times[stamp + (late if late > _NO_DELAY * period else 0)] = value
-        order = sorted(times)
-        changes = [t for i, t in enumerate(order) if i == 0 or times[t] != times[order[i - 1]]]
-        values = np.array([times[t] for t in changes], dtype=np.float64)
-        return (np.array(changes, dtype=np.int64) + round(signal.delay * NANOSECONDS),
-                self.scales[signal.command](values))
+        times, values = acting.commanded(run.of(signal.command), clock, samples.received, period)
+        if signal.command in run.acted:
+            # the last word counts, of this portion
+            earlier = run.acted[signal.command]
+            times, values = acting.last_words(np.concatenate((earlier[0], times)),
+                                              np.concatenate((earlier[1], values)))
+        delay_ns = round(signal.delay * NANOSECONDS)
+        if run.until_ns is not None:
+            first = max(0, int(np.searchsorted(times, run.until_ns - delay_ns, side='right')) - 1)
+            run.acted[signal.command] = times[first:], values[first:]
+        times, values = acting.changes(times, values)
+        return times + delay_ns, self.scales[signal.command](values)
 
-    def _measured(self, run: _Run, signal: RecordedInput, clock: _Clock) -> tuple[Times, Array]:
+    def _measured(self, run: Run, signal: RecordedInput, clock: Clock) -> tuple[Times, Array]:
         """Return when an input was measured, in the signal's unit."""
         if signal.measured is None:
             return np.empty(0, dtype=np.int64), np.empty(0)
-        found = _on(clock, [(stamp or None, log, value)
-                            for stamp, log, value in run.entries[signal.measured]])
-        return (np.array([stamp for stamp, _, _ in found], dtype=np.int64),
-                self.scales[signal.measured](np.array([value for _, _, value in found])))
+        found = clock.on(run.of(signal.measured), 0).first_of_each()
+        return found.stamp_ns, self.scales[signal.measured](found.values)
 
     def _acting(self, name: str, commands: tuple[Times, Array], measured: tuple[Times, Array],
-                stamps: Times, period: float) -> _Acting:
+                stamps: Times, period: float) -> acting.Acting:
         """Return what acted while some measurements were taken."""
         usual = float(np.median(np.diff(measured[0]))) if len(measured[0]) > 1 else 0.0
         reach = _GAP_PERIODS * max(period, usual)
@@ -425,59 +303,14 @@ class _Loop:
         if (len(times) < 2 or times[0] > stamps[0] + reach or times[-1] < stamps[-1] - reach
                 or np.max(np.diff(times)) > reach):
             if len(measured[0]):
-                self.notes.append(f'{os.fspath(self.bag)}: {name} was not measured throughout, '
-                                  'and is taken from its command there')
-            return *commands, False
+                self._note(f'{name} was not measured throughout, and is taken from its command '
+                           'there')
+            return *acting.around(*commands, stamps), False
         for held in (commands[1], np.clip(commands[1], values.min(), values.max())):
-            if _at_once(commands[0], held, times, values):
-                return commands[0], held, False
-        self.notes.append(f'{os.fspath(self.bag)}: {name} is taken as it was measured')
+            if acting.at_once(commands[0], held, times, values):
+                return *acting.around(commands[0], held, stamps), False
+        self._note(f'{name} is taken as it was measured')
         return times, values, True
 
-
-def _places(signal: RecordedState | RecordedInput) -> list[Place]:
-    """Return where a signal is."""
-    if isinstance(signal, RecordedState):
-        return [signal.place]
-    return [signal.command] if signal.measured is None else [signal.command, signal.measured]
-
-
-def _first_of_each(entries: Iterable[_Stamped]) -> list[_Stamped]:
-    """Sort by stamp; of repeated stamps the first one received stays."""
-    first: dict[int, _Stamped] = {}
-    for entry in entries:
-        first.setdefault(entry[0], entry)
-    return [first[stamp] for stamp in sorted(first)]
-
-
-def _on(clock: _Clock, entries: Iterable[_Entry]) -> list[_Stamped]:
-    """Return the entries on a clock, sorted, each stamp once."""
-    return _first_of_each((clock.at(log) if stamp is None else stamp, log, value)
-                          for stamp, log, value in entries)
-
-
-def _nearest(times: Times, wanted: Times) -> NDArray[np.int64]:
-    """Return which of some rising times is nearest to each wanted one; -1 where there is none."""
-    after = np.searchsorted(times, wanted)
-    before, after = np.maximum(after - 1, 0), np.minimum(after, len(times) - 1)
-    if not len(times):
-        return np.full(len(wanted), -1)
-    return np.where(wanted - times[before] <= times[after] - wanted, before, after)
-
-
-def _span(acting: _Acting) -> tuple[float, float]:
-    """Return from when to when it is known what acted."""
-    times, _, linear = acting
-    if not len(times):
-        return math.inf, math.inf
-    return times[0], times[-1] if linear else math.inf
-
-
-def _at_once(times: Times, held: Array, stamps: Times, measured: Array) -> bool:
-    """Tell whether an input is its command wherever it was measured, before or after a change."""
-    known = stamps > times[0] if len(times) else np.zeros(len(stamps), dtype=bool)
-    if not np.any(known):
-        return False
-    apart = np.min([np.abs(held[np.searchsorted(times, stamps[known], side=side) - 1]
-                           - measured[known]) for side in ('left', 'right')], axis=0)
-    return bool(np.sqrt(np.mean(apart ** 2)) <= _AT_ONCE * np.std(measured[known]))
+    def _note(self, words: str) -> None:
+        self.notes[f'{os.fspath(self.bag)}: {words}'] = None

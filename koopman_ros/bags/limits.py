@@ -44,7 +44,7 @@ _BYTES_LIKE_A_RECORD = 16
 _LARGEST_DEFINITION = _MIB
 _MOST_LINES = 5000
 # What each zstd frame begins with; no CDR message does, its first byte is 0.
-_ZSTD_MAGIC = b'\x28\xb5\x2f\xfd'
+ZSTD_MAGIC = b'\x28\xb5\x2f\xfd'
 _DELIMITER = re.compile(r'={3,}|MSG:\s')
 # type, name, and what follows it
 _FIELD = re.compile(r'(\S+)\s+([^\s=]+)\s*(=?)')
@@ -128,9 +128,9 @@ def opened(file: Path) -> Iterator[BinaryIO]:
     BagReadError for one that grows beyond reason.
     """
     with file.open('rb') as stream:
-        head = stream.read(len(_ZSTD_MAGIC))
+        head = stream.read(len(ZSTD_MAGIC))
         stream.seek(0)
-        if head != _ZSTD_MAGIC:
+        if head != ZSTD_MAGIC:
             yield stream
             return
         with tempfile.TemporaryFile() as plain:
@@ -174,7 +174,7 @@ def chunk_content(chunk: Chunk, budget: Budget) -> bytes:
 
 def message_content(data: bytes) -> bytes:
     """Return a message that rosbag2 compressed by itself as it was sent, any other as it is."""
-    return (_zstd_content(data, _block_limit(len(data))) if data.startswith(_ZSTD_MAGIC)
+    return (_zstd_content(data, _block_limit(len(data))) if data.startswith(ZSTD_MAGIC)
             else data)
 
 

@@ -4,45 +4,24 @@
 """Reading bags back: decoded messages and a summary, from rosbag2's bags as from our own."""
 
 from collections import Counter
-from collections.abc import Callable, Collection, Iterable, Iterator
-import contextlib
-from dataclasses import dataclass, replace
+from collections.abc import Collection, Iterable, Iterator
+from dataclasses import dataclass
 import heapq
-import io
 import os
 from pathlib import Path
-from typing import Any
 
-from mcap.exceptions import EndOfFile
 from mcap.records import Channel
-from mcap.well_known import SchemaEncoding
-from mcap_ros2.decoder import DecoderFactory
 
 from koopman_ros.bags import limits
+from koopman_ros.bags.decoding import BagMessage, Decoders
 from koopman_ros.bags.metadata import parse_offered_qos, QosProfile
-from koopman_ros.bags.records import stored_messages, StoredMessage, summary_section
+from koopman_ros.bags.records import stored_messages, summary_section
 from koopman_ros.bags.storage import locate
 
 # Of the different offers in a file, which take seconds to read; seven hundred publishers' worth.
 _MAX_OFFERS_BYTES = 2**18
 # A recorder that falls behind writes what waits topic by topic; longer than this it never waits.
 _BEHIND_NS = 5_000_000_000
-
-
-@dataclass(frozen=True, slots=True)
-class BagMessage:
-    """
-    One message of a bag: times of receipt and of sending [ns], decoded fields, original bytes.
-
-    `message` has the fields of the ROS message as attributes (`message.header.stamp.sec`).
-    """
-
-    topic: str
-    type_name: str
-    log_time_ns: int
-    publish_time_ns: int
-    message: Any
-    data: bytes
 
 
 @dataclass(frozen=True)
@@ -136,76 +115,11 @@ def _decoded(files: tuple[Path, ...], topics: frozenset[str] | None, recover: bo
              ) -> Iterator[BagMessage]:
     for file in files:
         # One set of decoders for each file: they are kept by schema id, and ids are a file's own.
-        decoders = _Decoders(file)
+        decoders = Decoders(file)
         for stored in stored_messages(file, recover=recover, topics=topics):
             with limits.enough_memory(file):
                 message = decoders.decode(stored)
             yield message
-
-
-class _WholeSlices(bytes):
-    """
-    Bytes whose slices are complete or fail.
-
-    The decoder takes whatever a slice returns for a string or a field of bytes: one cut short
-    would pass for a shorter one, and a damaged length for that many empty ones.
-    """
-
-    def __getitem__(self, key: Any) -> Any:
-        if isinstance(key, slice) and key.stop > len(self):
-            raise EndOfFile
-        return super().__getitem__(key)
-
-
-class _Decoders:
-    """The decoders of one file's message types."""
-
-    def __init__(self, file: Path) -> None:
-        self._file = file
-        self._factory = DecoderFactory()
-        self._known: dict[tuple[str, int], Callable[[bytes], Any]] = {}
-
-    def decode(self, stored: StoredMessage) -> BagMessage:
-        """Return a message with its fields; raise BagReadError where that cannot be."""
-        channel, message = stored.channel, stored.message
-        key = channel.message_encoding, channel.schema_id
-        if key not in self._known:
-            self._known[key] = self._decoder(stored)
-        try:
-            fields = self._known[key](_WholeSlices(message.data))
-        except MemoryError:
-            raise
-        except Exception as error:
-            # The decoder walks over foreign bytes and fails in as many ways as they can be wrong.
-            raise limits.BagReadError(
-                f'{str(self._file)!r}: the message on {channel.topic!r} at {message.log_time} ns '
-                f'does not decode ({limits.reason(error)}): read the other topics by name'
-            ) from error
-        return BagMessage(channel.topic, stored.schema.name if stored.schema else '',
-                          message.log_time, message.publish_time, fields, message.data)
-
-    def _decoder(self, stored: StoredMessage) -> Callable[[bytes], Any]:
-        schema, encoding = stored.schema, stored.channel.message_encoding
-        try:
-            if schema is not None and schema.encoding == SchemaEncoding.ROS2:
-                schema = replace(schema, data=limits.fields_only(schema.data))
-            # the definition parser prints what it also raises
-            with contextlib.redirect_stderr(io.StringIO()):
-                decoder = self._factory.decoder_for(encoding, schema)
-        except MemoryError:
-            raise
-        except Exception as error:
-            # Another recorder's schema text meets the definition parser here.
-            raise limits.BagReadError(
-                f'{str(self._file)!r}: the definition stored for {stored.channel.topic!r} does '
-                f'not parse ({limits.reason(error)}): read the other topics by name') from error
-        if decoder is None:
-            schema_encoding = schema.encoding if schema else 'no schema'
-            raise limits.BagReadError(
-                f'{str(self._file)!r}: topic {stored.channel.topic!r} is encoded as {encoding!r} '
-                f'with {schema_encoding!r}, only cdr with ros2msg is decoded here: read the other '
-                'topics by name')
-        return decoder
 
 
 def _indexed_summary(file: Path) -> BagSummary | None:

@@ -3,7 +3,9 @@
 
 """The records of one MCAP file, whole or of a killed recorder, in the order of the file."""
 
+from array import array
 from collections.abc import Callable, Collection, Iterator
+import contextlib
 from dataclasses import dataclass, replace
 import io
 import os
@@ -17,6 +19,8 @@ from mcap.exceptions import EndOfFile
 from mcap.opcode import Opcode
 from mcap.records import Channel, Chunk, DataEnd, McapRecord, Message, Schema, Statistics
 from mcap.summary import Summary
+import numpy as np
+from numpy.typing import NDArray
 import zstandard
 
 from koopman_ros.bags import limits
@@ -29,7 +33,7 @@ _FOOTER_HEAD = _HEAD.pack(Opcode.FOOTER, 20)
 _FOOTER = struct.Struct('<QQI')
 _TAIL_SIZE = len(_FOOTER_HEAD) + _FOOTER.size + len(MAGIC)
 # Message: channel, sequence, log time, publish time; its data is the rest of the record.
-_MESSAGE_HEAD = struct.Struct('<HIQQ')
+MESSAGE_HEAD = struct.Struct('<HIQQ')
 _READ_BY: dict[int, Callable[[ReadDataStream], McapRecord]] = {
     Opcode.SCHEMA: Schema.read, Opcode.CHANNEL: Channel.read, Opcode.CHUNK: Chunk.read,
     Opcode.STATISTICS: Statistics.read}
@@ -47,6 +51,20 @@ class StoredMessage:
     schema: Schema | None
     channel: Channel
     message: Message
+
+
+@dataclass(frozen=True)
+class ChunkRecords:
+    """The n records of a chunk, one after the other."""
+
+    content: bytes  #: with the head of each before its body
+    opcodes: bytes  #: (n,)
+    starts: NDArray[np.int64]  #: (n,) where the bodies begin
+
+    @property
+    def ends(self) -> NDArray[np.int64]:
+        """Where the bodies end (n,)."""
+        return np.append(self.starts[1:] - _HEAD.size, len(self.content))[:len(self.starts)]
 
 
 def stored_messages(file: Path, *, recover: bool, topics: Collection[str] | None = None,
@@ -67,7 +85,7 @@ def stored_messages(file: Path, *, recover: bool, topics: Collection[str] | None
                 count += 1
                 if topics is not None and stored.channel.topic not in topics:
                     continue
-                yield _as_sent(stored, budget) if with_data else stored
+                yield as_sent(stored, budget) if with_data else stored
             if not recover:
                 _check_count(count, summary_section(stream, budget))
         except limits.DamageError as damage:
@@ -150,12 +168,22 @@ def _messages(stream: BinaryIO, budget: limits.Budget) -> Iterator[StoredMessage
 
 def _records(stream: BinaryIO, budget: limits.Budget) -> Iterator[McapRecord]:
     """Yield the records of the data section; raise DamageError where they stop making sense."""
-    try:
-        for record in _data_section(stream, budget):
+    with failures_are_damage():
+        for record in data_section(stream, budget):
             if isinstance(record, Chunk):
-                yield from _chunk_records(record, budget)
+                held = chunk_records(record, budget)
+                for opcode, start, end in zip(held.opcodes, held.starts, held.ends, strict=True):
+                    if opcode in _READ:
+                        yield parsed(opcode, held.content[start:end])
             else:
                 yield record
+
+
+@contextlib.contextmanager
+def failures_are_damage() -> Iterator[None]:
+    """Raise DamageError for whatever foreign bytes do to a parser."""
+    try:
+        yield
     except (OSError, MemoryError, limits.DamageError, limits.BagTooLargeError):
         raise
     except Exception as error:
@@ -164,7 +192,7 @@ def _records(stream: BinaryIO, budget: limits.Budget) -> Iterator[McapRecord]:
         raise limits.DamageError(limits.reason(error)) from error
 
 
-def _data_section(stream: BinaryIO, budget: limits.Budget) -> Iterator[McapRecord]:
+def data_section(stream: BinaryIO, budget: limits.Budget) -> Iterator[McapRecord]:
     """Yield the records between the two ends of a file, chunks whole."""
     data = ReadDataStream(cast('BinaryIO', _WholeReads(stream)), calculate_crc=True)
     if data.read(len(MAGIC)) != MAGIC:
@@ -181,31 +209,30 @@ def _data_section(stream: BinaryIO, budget: limits.Budget) -> Iterator[McapRecor
             return
         _count(opcode, length, budget)
         if opcode in _READ or opcode == Opcode.CHUNK:
-            yield _parsed(opcode, data.read(length))
+            yield parsed(opcode, data.read(length))
         else:
             while length:
                 length -= len(data.read(min(length, _PIECE_BYTES)))
 
 
-def _chunk_records(chunk: Chunk, budget: limits.Budget) -> Iterator[McapRecord]:
-    """Yield the schemas, channels and messages of a chunk, once it is whole."""
+def chunk_records(chunk: Chunk, budget: limits.Budget) -> ChunkRecords:
+    """Return the records of a chunk, once it is whole."""
     content = limits.chunk_content(chunk, budget)
-    for opcode, start, end in _spans(content):
-        _count(opcode, end - start, budget)
-    for opcode, start, end in _spans(content):
-        if opcode in _READ:
-            yield _parsed(opcode, content[start:end])
-
-
-def _spans(content: bytes) -> Iterator[tuple[int, int, int]]:
-    """Yield the opcode of each record of a chunk with its begin and end, within the chunk."""
-    end = 0
+    opcodes, starts = bytearray(), array('q')
+    end, head = 0, _HEAD.unpack_from
     while end < len(content):
-        opcode, length = _HEAD.unpack_from(content, end)
-        start, end = end + _HEAD.size, end + _HEAD.size + length
+        opcode, length = head(content, end)
+        start = end + _HEAD.size
+        end = start + length
         if end > len(content):
             raise EndOfFile
-        yield opcode, start, end
+        if opcode == Opcode.MESSAGE:
+            budget.take_record()
+        else:
+            _count(opcode, length, budget)
+        opcodes.append(opcode)
+        starts.append(start)
+    return ChunkRecords(content, bytes(opcodes), np.array(starts, dtype=np.int64))
 
 
 def _count(opcode: int, length: int, budget: limits.Budget) -> None:
@@ -215,16 +242,16 @@ def _count(opcode: int, length: int, budget: limits.Budget) -> None:
     budget.take_record(length if opcode in (Opcode.SCHEMA, Opcode.CHANNEL) else 0)
 
 
-def _parsed(opcode: int, body: bytes) -> McapRecord:
+def parsed(opcode: int, body: bytes) -> McapRecord:
     """Return a record from its own bytes."""
     if opcode == Opcode.MESSAGE:
-        channel, sequence, log_time, publish_time = _MESSAGE_HEAD.unpack_from(body)
+        channel, sequence, log_time, publish_time = MESSAGE_HEAD.unpack_from(body)
         return Message(channel_id=channel, sequence=sequence, log_time=log_time,
-                       publish_time=publish_time, data=body[_MESSAGE_HEAD.size:])
+                       publish_time=publish_time, data=body[MESSAGE_HEAD.size:])
     return _READ_BY[opcode](ReadDataStream(cast('BinaryIO', _WholeReads(io.BytesIO(body)))))
 
 
-def _as_sent(stored: StoredMessage, budget: limits.Budget) -> StoredMessage:
+def as_sent(stored: StoredMessage, budget: limits.Budget) -> StoredMessage:
     """Return a message as it was sent, also where rosbag2 compressed it by itself."""
     try:
         data = limits.message_content(stored.message.data)
@@ -268,7 +295,7 @@ def _summary(stream: BinaryIO, start: int, budget: limits.Budget) -> Summary | N
         if opcode not in (Opcode.SCHEMA, Opcode.CHANNEL, Opcode.STATISTICS):
             whole.skip(length)
             continue
-        record = _parsed(opcode, whole.read(length))
+        record = parsed(opcode, whole.read(length))
         if isinstance(record, Schema):
             found.schemas[record.id] = record
         elif isinstance(record, Channel):

@@ -141,7 +141,11 @@ class TrainerParameters:
     training_starts: int = parameter(
         3, 'starts of which each coordinate keeps the best', '', 1, 100)
     training_seed: int = parameter(
-        0, 'seed of the training and of what is held out', '', 0, 2 ** 31)
+        0, 'seed of the training, of what is held out, and of what is taken of a long record', '',
+        0, 2 ** 31)
+    training_samples: int = parameter(
+        20_000, 'samples that are learned from and judged by; a longer record is averaged, where '
+        'that loses nothing, and segments from all over its range are taken', '', 1000, 1_000_000)
     input_matrix: tuple[float, ...] = parameter(
         (0.0,), 'B where it is known, row by row: change of the rate of each state, in its unit '
         'per second, with each input; a single 0 to learn it')
@@ -226,6 +230,7 @@ class TrainerParameters:
         """Return the fields of a :class:`koopman_ros.retraining.Task` that are settings."""
         return {'model_class': self.model_class, 'coordinates': self.model_coordinates,
                 'seed': self.training_seed, 'starts': self.training_starts,
+                'most_samples': self.training_samples,
                 'input_matrix_degree': self.input_matrix_degree,
                 'hidden_states': self.hidden_states, 'equations': self.equations,
                 'constants': named_ranges(self.constants_estimated),

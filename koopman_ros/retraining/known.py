@@ -21,6 +21,8 @@ from koopman_ros.plant_data import Plant
 from koopman_ros.units import SECONDS_PER_TIME_UNIT
 from koopman_ros.wire import Place
 
+MOST_SAMPLES = 20_000  # more cost more time, and tell less and less
+
 
 @dataclass(frozen=True)
 class Task:
@@ -36,7 +38,10 @@ class Task:
     #: class to learn, a name of `compare`, or ``'best'`` for the one that its rule takes
     model_class: str = IDENTITY_LIFT
     coordinates: int = 3  #: n_z of the identity lift
-    seed: int = 0  #: of the split and of the training
+    seed: int = 0  #: of the split and of the training, and of what is taken of a long record
+    #: samples that are learned from and judged by; a longer record is reduced to them, see
+    #: :func:`read_record`
+    most_samples: int = MOST_SAMPLES
     starts: int = 3  #: of each round of the training
     #: B where it is known, in state unit per input unit and second, by state and input; what is
     #: not named is 0; empty to learn B

@@ -16,7 +16,8 @@ from koopman_ros.learning.validation import lifted_rate
 from koopman_ros.lifting import Coordinates
 from koopman_ros.model_classes import BEST
 from koopman_ros.reports import bullets, drawing, table, write_figures, write_page
-from koopman_ros.retraining.task import CELLS, Retrained, visited_cells
+from koopman_ros.retraining.selection import CELLS
+from koopman_ros.retraining.task import Retrained, visited_cells
 from koopman_ros.units import SECONDS_PER_TIME_UNIT, shown, unit_label
 
 
@@ -47,6 +48,7 @@ def _sections(retrained: Retrained) -> Iterator[str]:
     yield bullets(map(str, retrained.task.bags))
     yield bullets([
         *retrained.account.lines(),
+        *([] if retrained.reduction is None else [retrained.reduction.text()]),
         *(f'{100.0 * share:.0f} % of the cells of {first} and {second} visited ({CELLS} along '
           'each)' for (first, second), share in retrained.coverage.items()),
         *(f'noise of {name} from sample to sample: {noise:.3g} {unit}' for name, noise, unit in

@@ -6,7 +6,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import asdict, dataclass, replace
 import hashlib
 import itertools
 import os
@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from koopman_ros.arrays import Array, brief
-from koopman_ros.bags import Account, loop_episodes
+from koopman_ros.bags import Account
 from koopman_ros.identification import (
     Identified,
     identify,
@@ -34,14 +34,16 @@ from koopman_ros.resources import predecessor
 from koopman_ros.retraining.gate import decide, Decision, shortfalls, Thresholds
 from koopman_ros.retraining.known import known, Task
 from koopman_ros.retraining.lift import compare_classes
+from koopman_ros.retraining.record import Each, read_record, Reduction, Source
+from koopman_ros.retraining.selection import CELLS, cells_of
 from koopman_ros.units import NANOSECONDS, SECONDS_PER_TIME_UNIT
 
-CELLS = 10  # along each of two signals, by which the visited share of their ranges is told
 # A smaller change, in half widths of the present lift's box, is neither a spike nor a jump.
 _LEAST_JUMP = 0.1
 
-# Shares of the whole at which estimating, learning and judging begin and end.
-_STAGES = {'estimate': (0.05, 0.35), 'learn': (0.35, 0.9), 'decide': (0.9, 1.0)}
+# Shares of the whole at which reading, estimating, learning and judging begin and end.
+_STAGES = {'read': (0.0, 0.05), 'estimate': (0.05, 0.35), 'learn': (0.35, 0.9),
+           'decide': (0.9, 1.0)}
 _JUDGED = 0.8  # share of deciding in which the closed loops are run
 
 # Called with the share done in [0, 1] and what is done now; True asks to stop.
@@ -64,6 +66,7 @@ class Retrained:
     plant: Plant  #: names, units and nominal point; its time unit is that of the drift
     present: LiftedModel | None  #: the lift that was in use, where there was one
     model_file: str = ''  #: where the lift was written, or an empty string
+    reduction: Reduction | None = None  #: what was taken of a long record
 
     __repr__ = brief
 
@@ -106,6 +109,7 @@ class Retrained:
                               strict=True)),
             'measurements_read': self.account.measurements,
             'measurements_used': self.account.used,
+            'reduction': None if self.reduction is None else asdict(self.reduction),
             'coverage': {', '.join(pair): share for pair, share in self.coverage.items()},
             'derivative_method': self.found.method,
             'drift': self.found.drift.form,
@@ -147,13 +151,15 @@ def _finite(value: float) -> float | None:
     return float(value) if np.isfinite(value) else None
 
 
-def retrain(task: Task, on_progress: OnProgress = lambda *_: False) -> Retrained:
+def retrain(task: Task, on_progress: OnProgress = lambda *_: False, *, each: Each = map
+            ) -> Retrained:
     """
     Read the bags, estimate the drift, learn a lift of it, judge it, and write it.
 
     An accepted lift goes to the output file, and what was there before is kept beside it as
     ``.previous.safetensors``; a refused one goes to ``.refused.safetensors``.
 
+    :param each: reads the bags of a long record, see :func:`read_record`.
     :raises BagReadError: for bags that cannot be used.
     :raises ModelFileError: when the present lift cannot be read.
     :raises ValueError: for episodes that do not determine a model, or a task that does not fit.
@@ -170,15 +176,19 @@ def retrain(task: Task, on_progress: OnProgress = lambda *_: False) -> Retrained
     # a folder that cannot be written should fail now, not after the training
     Path(task.output).parent.mkdir(parents=True, exist_ok=True)
     _stop_if(on_progress(0.0, 'reading bags'))
-    recorded, account = loop_episodes(
+    source = Source(
         task.bags, states, inputs, tolerance_ns=round(task.tolerance * NANOSECONDS),
         least_jumps=None if current is None else (_LEAST_JUMP * current.states.scale).tolist())
-    if not recorded:
+    record = read_record(source, task.most_samples, task.seed, hidden=task.hidden_states > 0,
+                         tick=_reading(on_progress, source), each=each)
+    account = record.account
+    if not record.episodes:
         raise ValueError('the bags hold no usable segment of measurements: '
                          + '; '.join(account.lines()))
     seconds = SECONDS_PER_TIME_UNIT[plant.time_unit]
     episodes = [replace(episode, time=episode.time / seconds,
-                        input_time=episode.input_time / seconds) for episode in recorded]
+                        input_time=episode.input_time / seconds)
+                for episode in record.episodes]
     def estimating(done: int, total: int, text: str) -> bool:
         return on_progress(_at('estimate', done / total), f'estimating: {text}')
 
@@ -205,7 +215,7 @@ def retrain(task: Task, on_progress: OnProgress = lambda *_: False) -> Retrained
     elif found.hidden:
         plant = replace(current.plant, B=None)
     bare = Retrained(task, account, found, None, None, (), coverage(episodes, found.drift.box),
-                     plant, current)
+                     plant, current, reduction=record.reduction)
     course = _Course(on_progress)
     try:
         learned = compare_classes(
@@ -235,8 +245,7 @@ def visited_cells(episodes: Sequence[Episode], box: Box) -> NDArray[np.int64]:
     found = []
     for episode in episodes:
         u = box.inputs.to_deviation(episode.inputs_at(episode.time))
-        scaled = np.hstack([box.states.to_deviation(episode.x), u])
-        found.append(np.clip((0.5 * (scaled + 1.0) * CELLS).astype(np.int64), 0, CELLS - 1))
+        found.append(cells_of(np.hstack([box.states.to_deviation(episode.x), u]), -1.0, 1.0))
     return np.unique(np.concatenate(found), axis=0)
 
 
@@ -260,6 +269,18 @@ def _at(stage: str, share: float) -> float:
 def _stop_if(stop: bool) -> None:
     if stop:
         raise Stopped
+
+
+def _reading(on_progress: OnProgress, source: Source) -> Callable[[int], None]:
+    """Return what reports how much of a record was read, twice; it ends the reading by Stopped."""
+    total, read = 2 * source.size(), 0
+
+    def tick(samples: int) -> None:
+        nonlocal read
+        read += samples
+        _stop_if(on_progress(_at('read', min(1.0, read / total)), 'reading bags'))
+
+    return tick
 
 
 class _Course:

@@ -34,19 +34,21 @@ class Outcome:
         return next((event[key] for event in reversed(self.events) if key in event), None)
 
 
-def run(job: Callable[..., None], *arguments: Any, folder: Path, megabytes: float) -> Outcome:
+def run(job: Callable[..., None], *arguments: Any, folder: Path, megabytes: float,
+        children: bool = False) -> Outcome:
     """
     Run a job in a process; what it had told stays when it is ended.
 
     :param job: takes a function that is told what it finds, and the arguments.
     :param folder: where it runs, as compilers leave files there.
     :param megabytes: the memory that it may take.
+    :param children: whether it may start processes itself.
     """
     context = multiprocessing.get_context('forkserver')
     context.set_forkserver_preload(_PRELOAD)
     receiving, sending = context.Pipe(duplex=False)
     process = context.Process(target=_enter, args=(sending, folder, megabytes, job, arguments),
-                              daemon=True)
+                              daemon=not children)
     process.start()
     sending.close()
     events: list[dict[str, Any]] = []

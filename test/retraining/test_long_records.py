@@ -1,0 +1,108 @@
+# SPDX-FileCopyrightText: 2026 The koopman_ros Authors
+# SPDX-License-Identifier: Apache-2.0
+
+"""Retraining from a record that is longer than what is learned from."""
+
+from collections.abc import Iterator
+from dataclasses import replace
+from functools import partial
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from koopman_ros.identification import Stopped
+from koopman_ros.retraining import compare_classes, decide, retrain, Task, write_report
+from koopman_ros.retraining import task as task_module
+from koopman_ros.retraining.record import read_record, Source
+from support.known_plants import methods
+from validation.benchmarks.retraining import Case, cases, drift_error, task_of, write_bags
+
+SLOW = cases()['reactor at 1 Hz']
+# ten bags of 10000 samples
+CASE = replace(SLOW, bag=10_000)
+SAMPLES = 100_000
+
+
+@pytest.fixture(scope='module', autouse=True)
+def few_methods() -> Iterator[None]:
+    """Estimate by a few methods alone, and try laws in a few loops."""
+    original = task_module.identify
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(task_module, 'identify',
+                      partial(original, degrees=(1, 3), methods=methods(20)))
+        patch.setattr(task_module, 'compare_classes', partial(compare_classes, loops=16))
+        patch.setattr(task_module, 'decide', partial(decide, loops=16))
+        yield
+
+
+@pytest.fixture(scope='module')
+def bags(tmp_path_factory: pytest.TempPathFactory) -> list[Path]:
+    return write_bags(CASE, SAMPLES, tmp_path_factory.mktemp('bags'))
+
+
+def small(bags: list[Path], output: Path, case: Case = CASE) -> Task:
+    return replace(task_of(case, bags, output), coordinates=2, starts=1, most_samples=3000)
+
+
+def test_it_is_as_good_as_a_record_of_that_length(bags: list[Path], tmp_path: Path) -> None:
+    told: list[tuple[float, str]] = []
+    found = retrain(small(bags, tmp_path / 'long.safetensors'),
+                    lambda share, text: told.append((share, text)) or False)
+    assert found.accepted
+    assert found.reduction is not None
+    assert found.reduction.samples == found.account.measurements == SAMPLES
+    assert found.reduction.used <= 3000
+    # of rates up to 15 K/min
+    assert drift_error(CASE, found.found.drift)[0] < 0.02
+    # a dozen segments of four minutes reach most of the range
+    assert min(found.coverage.values()) > 0.6
+    shares = [share for share, _ in told]
+    assert shares == sorted(shares)
+    # it is read twice, bag by bag
+    assert sum(text == 'reading bags' for _, text in told) == 1 + 2 * 10
+    files = write_report(found)
+    assert json.loads(files[0].read_text())['reduction'] == {
+        'samples': SAMPLES, 'group': 1, 'segments': found.reduction.segments,
+        'chosen': found.reduction.chosen, 'used': found.reduction.used}
+    assert found.reduction.text() in files[1].read_text()
+
+
+def source(bags: list[Path]) -> Source:
+    task = task_of(CASE, bags, Path('none.safetensors'))
+    return Source(task.bags, task.states, task.inputs, 0, None)
+
+
+def test_the_same_is_read_whoever_reads(bags: list[Path]) -> None:
+    def backwards(function, items):
+        items = list(items)
+        return reversed([function(one) for one in reversed(items)])
+
+    few = source(bags[:4])
+    one, other = (read_record(few, 3000, 7, each=each) for each in (map, backwards))
+    assert one.reduction == other.reduction
+    assert one.account == other.account
+    for a, b in zip(one.episodes, other.episodes, strict=True):
+        np.testing.assert_array_equal(a.x, b.x)
+    another = read_record(few, 3000, 8).episodes
+    assert [part.x[0, 0] for part in another] != [part.x[0, 0] for part in one.episodes]
+
+
+def test_a_short_record_is_taken_whole(bags: list[Path]) -> None:
+    found = read_record(source([*bags[:2], bags[0]]), 20_000, 0)
+    assert found.reduction is None
+    assert [len(one) for one in found.episodes] == [10_000, 10_000]
+    # a bag that is named twice is read once, here and there
+    twice = read_record(source([*bags[:2], bags[0]]), 15_000, 0)
+    assert twice.account.notes[0] == f'{bags[0]} is named twice: read once'
+    assert twice.account.used == 20_000
+
+
+def test_reading_can_be_stopped(bags: list[Path], tmp_path: Path) -> None:
+    told: list[float] = []
+    with pytest.raises(Stopped):
+        retrain(small(bags, tmp_path / 'x.safetensors'),
+                lambda share, _: told.append(share) or len(told) == 4)
+    assert 0.0 < told[-1] < 0.05
+    assert list(tmp_path.iterdir()) == []
