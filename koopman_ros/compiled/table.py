@@ -31,8 +31,9 @@ def _regulator(model: LiftedModel, A: Array, B: Array, Q: Array, R: Array, *, in
                max_residual: float = 1e-8, max_gain: float = 1e6) -> RiccatiSolution | None:
     if not interval > 0.0:
         return None
-    sure, *found = laws.solve(np.ascontiguousarray(A), np.ascontiguousarray(B), Q, R, interval)
-    return _solution(*found, max_residual, max_gain) if sure else None
+    sure, P, K, residual, size = laws.solve(
+        np.ascontiguousarray(A), np.ascontiguousarray(B), Q, R, interval)
+    return _solution(P, K, residual, size, max_residual, max_gain) if sure else None
 
 
 def _feedback(found: tuple[Any, ...], form: riccati.Form, max_residual: float, max_gain: float
