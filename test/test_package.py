@@ -28,7 +28,7 @@ ALLOWED = {
     'bags': set(),
     'estimation': {'lifting'},
     'control': {'estimation', 'lifting'},
-    'learning': {'control', 'lifting'},
+    'learning': {'control', 'jobs', 'lifting'},
     'identification': {'learning', 'lifting'},
     'retraining': {'bags', 'control', 'identification', 'learning', 'lifting'},
     'replay': {'bags', 'control', 'lifting'},

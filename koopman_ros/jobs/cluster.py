@@ -125,11 +125,21 @@ class Cluster:
             warnings.simplefilter('ignore', UserWarning)
             return self._client.submit(function, *arguments, key=key, pure=False)
 
-    def results(self, futures: Mapping[str, Future]) -> list[Any]:
-        """Wait for all, and return what they have found, in their order."""
-        while missing := [future for future in futures.values() if not future.done()]:
-            self._wait(missing)
-        return [self._result(name, future) for name, future in futures.items()]
+    def each(self, function: Callable[..., Any], given: Mapping[str, Future], key: str,
+             **arguments: Any) -> list[Any]:
+        """Send a task for each of some futures, and return what they find, in their order."""
+        # all of them in one message there and one back
+        with self._failing():
+            futures = self._client.map(function, given.values(), pure=False, **arguments,
+                                       key=[f'{name}-{key}' for name in given])
+        while missing := [future for future in futures if not future.done()]:
+            self._wait(missing, 'ALL_COMPLETED')
+        for name, future in zip(given, futures, strict=True):
+            if future.status == 'error':
+                self._result(name, future)
+        with self._failing():
+            found: list[Any] = self._client.gather(futures)
+        return found
 
     def _leave(self, token: str, futures: Sequence[Future]) -> None:
         """Ask for nothing any longer, and let those that are under way end."""
@@ -160,11 +170,11 @@ class Cluster:
         noted(error, name)
         raise error
 
-    def _wait(self, futures: Sequence[Future]) -> None:
+    def _wait(self, futures: Sequence[Future], until: str = 'FIRST_COMPLETED') -> None:
         """Wait a little, and look after the workers now and then."""
         with self._failing():
             with contextlib.suppress(TimeoutError), self._client.as_current():
-                distributed.wait(futures, timeout=PERIOD, return_when='FIRST_COMPLETED')
+                distributed.wait(futures, timeout=PERIOD, return_when=until)
             if self._client.status != 'running':
                 raise self._gone()
             if time.monotonic() - self._looked > self._silence / 4.0:
@@ -283,10 +293,8 @@ class _KeptOnCluster:
 
     def run(self, function: Callable[[Any, Any], Found], argument: Any) -> list[Found]:
         self._count += 1
-        call = _packed((function, argument))
-        return self._cluster.results({name: self._cluster.submit(
-            _on_resident, loaded, call, key=f'{name}-{self._token}-{self._count}')
-            for name, loaded in self._loaded.items()})
+        return self._cluster.each(_on_resident, self._loaded, f'{self._token}-{self._count}',
+                                  call=_packed((function, argument)))
 
     def close(self) -> None:
         # Dask lets go of what nobody asks for

@@ -18,15 +18,8 @@ from koopman_ros.learning.baselines import Edmd
 from koopman_ros.learning.contradictions import check_nominal_point, check_rates
 from koopman_ros.learning.drift import NeuralDrift, with_readout, with_units_of
 from koopman_ros.learning.growth import Growth
-from koopman_ros.learning.training import (
-    NoUsefulLift,
-    Progress,
-    Recipe,
-    reference_drift,
-    train,
-    training_states,
-    Watch,
-)
+from koopman_ros.learning.starts import Progress, Recipe, Watch
+from koopman_ros.learning.training import NoUsefulLift, reference_drift, train, training_states
 from koopman_ros.learning.validation import evaluate, Figures, fit, ROUNDING
 from koopman_ros.lifting import bounds, Box, LiftedModel
 from koopman_ros.model_classes import FREE_LIFT, IDENTITY_LIFT, LINEAR, NEURAL_DRIFT, POLYNOMIAL

@@ -15,7 +15,7 @@ from koopman_ros.identification import DriftModel, fitted_starts, Identified, lo
 from koopman_ros.identification.drift import Segments
 from koopman_ros.learning import compare, Comparison, Contender, Growth, Judge, train, Trained
 from koopman_ros.learning.comparison import usual_recipes
-from koopman_ros.learning.training import Watch
+from koopman_ros.learning.starts import Watch
 from koopman_ros.learning.validation import ROUNDING
 from koopman_ros.model_classes import BEST, IDENTITY_LIFT, LINEAR
 from koopman_ros.plant_data import Episode, Plant, Samples

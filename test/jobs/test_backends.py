@@ -4,35 +4,23 @@
 """One protocol wherever work runs: order, progress, cancel, failure and what is kept."""
 
 import contextlib
-import logging
 import os
 import signal
-import threading
-import warnings
 
 import numpy as np
 import pytest
 
 from koopman_ros.jobs.backends import backend_of, Here, SchedulerLost, WorkerLost
 from koopman_ros.jobs.processes import Processes
+from support.places import KINDS, places
 
-KINDS = ('', 'process', 'joblib:2', 'dask')
 ELSEWHERE = KINDS[1:]
 
 
-@pytest.fixture(scope='module')
-def places():
-    """Open each backend once; the Dask cluster has two threads in this process."""
-    with contextlib.ExitStack() as stack:
-        with warnings.catch_warnings():
-            # its own imports
-            warnings.simplefilter('ignore')
-            import distributed
-        cluster = stack.enter_context(distributed.LocalCluster(
-            n_workers=1, threads_per_worker=2, processes=False, host='127.0.0.1',
-            protocol='tcp://', dashboard_address='127.0.0.1:0', silence_logs=logging.CRITICAL))
-        yield {kind: stack.enter_context(backend_of(
-            cluster.scheduler_address if kind == 'dask' else kind)) for kind in KINDS}
+@pytest.fixture(scope='module', name='places')
+def every_place():
+    with places() as opened:
+        yield opened
 
 
 @pytest.fixture(params=KINDS)
@@ -169,7 +157,6 @@ def test_a_process_has_one_thread_and_leaves_an_interrupt_alone(places):
         patch.delenv('OMP_NUM_THREADS', raising=False)
         with Processes(1) as own:
             assert list(own.run(probe, {'probe': None})) == [('probe', ('1', True))]
-    assert threading.main_thread().is_alive()
 
 
 @pytest.mark.parametrize('text', ['joblib:0', 'joblib:-1', 'joblib:x', 'dask', 'tcp:', 'udp://a:1'])
