@@ -41,7 +41,8 @@ from koopman_ros.jobs.backends import (
 #: s without a sign of life after which a worker counts as lost, and without any worker after
 #: which a work does.
 SILENCE = 30.0
-_CONNECT = 10.0  # s for the first answer of a scheduler, and of its first worker
+_CONNECT = 10.0  # s for the first answer of a scheduler
+_JOIN = 30.0  # s for its first worker, which may just be starting
 _LOST = (distributed.client.FutureCancelledError, distributed.CancelledError,
          distributed.comm.CommClosedError)
 
@@ -67,12 +68,19 @@ class Cluster:
             raise SchedulerLost(
                 f'no scheduler answers at {address} within {_CONNECT:g} s: start `dask scheduler` '
                 'there, and `dask worker` with its address') from error
-        try:
-            self._client.wait_for_workers(1, timeout=_CONNECT)
-        except TimeoutError:
-            self.close()
-            raise self._deserted(_CONNECT) from None
         self._looked, self._seen = time.monotonic(), time.monotonic()
+        try:
+            self.wait_for_workers(1)
+        except WorkerLost:
+            self.close()
+            raise
+
+    def wait_for_workers(self, count: int) -> None:
+        """Wait until so many have joined; WorkerLost when they do not."""
+        try:
+            self._client.wait_for_workers(count, timeout=_JOIN)
+        except TimeoutError:
+            raise self._deserted(_JOIN) from None
 
     def run(self, function: Task[Item, Found], items: Mapping[str, Item], *, shared: Any = None,
             watch: Watch = never) -> Generator[tuple[str, Found]]:

@@ -98,12 +98,14 @@ class _Worker:
 
     def __init__(self) -> None:
         self._executor: ProcessPoolExecutor | None = None
+        self._pid: Future[int]
 
     def submit(self, function: Callable[..., Any], *arguments: Any) -> Future[Any]:
         if self._executor is None:
             # its workers would end when they are idle
             self._executor = ProcessPoolExecutor(
                 1, timeout=None, initializer=_begin, env={**_ONE_THREAD, **os.environ})
+            self._pid = self._executor.submit(os.getpid)
         future: Future[Any] = self._executor.submit(function, *arguments)
         return future
 
@@ -113,7 +115,11 @@ class _Worker:
 
     def end(self) -> None:
         if self._executor is not None:
-            self._executor.shutdown(kill_workers=True)
+            # not `shutdown(kill_workers=True)`: a task that was given to it just before makes
+            # that fail in a thread of its own; so, it finds its process lost
+            with contextlib.suppress(BrokenProcessPool, ProcessLookupError):
+                os.kill(self._pid.result(), signal.SIGKILL)
+            self._executor.shutdown()
             self._executor = None
 
 

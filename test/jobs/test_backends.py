@@ -4,13 +4,16 @@
 """One protocol wherever work runs: order, progress, cancel, failure and what is kept."""
 
 import contextlib
+import logging
 import os
+import re
 import signal
 
 import numpy as np
 import pytest
 
 from koopman_ros.jobs.backends import backend_of, Here, SchedulerLost, WorkerLost
+from koopman_ros.jobs.cluster import Cluster
 from koopman_ros.jobs.processes import Processes
 from support.places import KINDS, places
 
@@ -163,6 +166,21 @@ def test_a_process_has_one_thread_and_leaves_an_interrupt_alone(places):
 def test_other_names_are_refused(text):
     with pytest.raises(ValueError, match=f'scheduler is {text!r}, must be empty for this process'):
         backend_of(text)
+
+
+def test_a_scheduler_without_workers(places, monkeypatch):
+    monkeypatch.setattr('koopman_ros.jobs.cluster._JOIN', 0.1)
+    import distributed
+    with distributed.LocalCluster(
+            n_workers=0, processes=False, host='127.0.0.1', protocol='tcp://',
+            dashboard_address='127.0.0.1:0', silence_logs=logging.CRITICAL) as empty:
+        text = f'the scheduler at {empty.scheduler_address} has had no worker for {{:g}} s: start'
+        with pytest.raises(WorkerLost, match=re.escape(text.format(0.1))):
+            Cluster(empty.scheduler_address)
+        monkeypatch.setattr(Cluster, 'wait_for_workers', lambda *_: None)
+        with Cluster(empty.scheduler_address, silence=0.2) as deserted, pytest.raises(
+                WorkerLost, match=re.escape(text.format(0.2))):
+            list(deserted.run(lambda *_: None, {'a task': 0}))
 
 
 def test_an_address_without_a_scheduler(monkeypatch):
