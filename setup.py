@@ -53,8 +53,10 @@ setup(
         # the predictive law's solver of quadratic programs
         'mpc': ['daqp'],
         'train': ['torch==2.13.0', 'joblib', 'tqdm'],
+        # training on the workers of a Dask scheduler
+        'cluster': ['distributed'],
         # what validation and benchmarks compare with
-        'bench': ['casadi==3.8.2', 'control', 'nicegui>=3', 'playwright', 'psutil',
+        'bench': ['casadi==3.8.2', 'control', 'distributed', 'nicegui>=3', 'playwright', 'psutil',
                   'pysindy==2.1.0'],
         'docs': ['furo', 'myst-parser', 'sphinx'],
         'test': [

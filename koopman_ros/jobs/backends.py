@@ -27,6 +27,7 @@ PERIOD = 0.1
 PATIENCE = 5.0
 #: Times that a task is begun anew whose worker was lost.
 ATTEMPTS = 3
+_ADDRESSES = ('tcp://', 'tls://')
 
 
 class WorkerLost(RuntimeError):  # noqa: N818
@@ -187,20 +188,25 @@ def backend_of(text: str) -> Backend:
     :raises ValueError: for anything else.
     :raises SchedulerLost: when nothing answers at the address, or there is no worker.
     """
-    kind, _, rest = text.partition(':')
-    if not text:
-        return Here()
+    if reason := scheduler_refusal(text):
+        raise ValueError(reason)
     # in here: what is not asked for need not be installed
-    if text == 'process':
-        from koopman_ros.jobs.processes import Processes
-        return Processes(1)
-    if kind == 'joblib' and (
-            not rest or (rest.isascii() and rest.isdigit() and int(rest))):
-        from koopman_ros.jobs.processes import cores, Processes
-        return Processes(int(rest or cores()))
-    if kind in ('tcp', 'tls') and rest.startswith('//'):
+    if text.startswith(_ADDRESSES):
         from koopman_ros.jobs.cluster import Cluster
         return Cluster(text)
-    raise ValueError(
-        f'scheduler is {text!r}, must be empty for this process, process, joblib, joblib:N with N '
-        'processes of at least 1, or the address of a Dask scheduler, like tcp://127.0.0.1:8786')
+    if text:
+        from koopman_ros.jobs.processes import cores, Processes
+        return Processes(1 if text == 'process' else int(text.partition(':')[2] or cores()))
+    return Here()
+
+
+def scheduler_refusal(text: str) -> str:
+    """Return why a text names no backend, or an empty text."""
+    if text in ('', 'process', 'joblib') or text.startswith(_ADDRESSES):
+        return ''
+    kind, _, count = text.partition(':')
+    if kind == 'joblib' and count.isascii() and count.isdigit() and int(count):
+        return ''
+    return (f'scheduler is {text!r}, must be empty for this process, process, joblib, joblib:N '
+            'with N processes of at least 1, or the address of a Dask scheduler, like '
+            'tcp://127.0.0.1:8786')

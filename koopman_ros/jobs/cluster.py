@@ -7,6 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Generator, Mapping, Sequence
 import contextlib
+import logging
 import pickle
 import queue
 import sys
@@ -62,6 +63,8 @@ class Cluster:
 
     def __init__(self, address: str, silence: float = SILENCE) -> None:
         self._address, self._silence = address, silence
+        # what it says of a lost scheduler, with all that led to it, is raised here in a sentence
+        logging.getLogger('distributed.client').setLevel(logging.CRITICAL)
         try:
             self._client = Client(address, timeout=_CONNECT, set_as_default=False)
         except (OSError, TimeoutError) as error:

@@ -118,7 +118,7 @@ def train(plant: Plant, samples: Samples, recipe: Recipe, *, seed: int = 0, star
         :func:`~koopman_ros.control.law_check.check_law`; 0 for none.
     :param device: where the residuals are evaluated, as torch names it, on every worker.
     :param threads: torch's threads for each start, for a number of which the bits are the same.
-    :param backend: where starts run and shards are, see
+    :param backend: where starts and closed loops run and shards are, see
         :func:`~koopman_ros.jobs.backends.backend_of`; this process by default.
     :param shards: how workers read what the model is fitted to.
     :raises NoUsefulLift: when no start gives a lift that can be judged, or none that beats the
@@ -154,7 +154,8 @@ def train(plant: Plant, samples: Samples, recipe: Recipe, *, seed: int = 0, star
             assembly, parts[1], rounds, tracker, lambda n_z, parent: run_starts(
                 Here() if kept else backend, recipe, data, n_z, parent, seed, starts, threads,
                 tracker))
-    return _conclude(plant, parts, path, interrupted, tracker, loops if refuse else 0, refuse)
+    return _conclude(plant, parts, path, interrupted, tracker, loops if refuse else 0, refuse,
+                     backend)
 
 
 def _extent(plant: Plant, samples: Samples, kept: KeptShards | None) -> tuple[Box, str]:
@@ -208,7 +209,8 @@ def _run_rounds(assembly: _Assembly, validation: Samples, rounds: Sequence[int],
 
 
 def _conclude(plant: Plant, parts: tuple[Samples, Samples, Samples], path: list[_Candidate],
-              interrupted: bool, tracker: Tracker, loops: int, refuse: bool) -> Trained:
+              interrupted: bool, tracker: Tracker, loops: int, refuse: bool,
+              backend: Backend) -> Trained:
     """Compare the winner with the linear model and report on the untouched episodes."""
     winner = path[-1]
     box = Box(winner.model.states, winner.model.inputs, plant.time_unit)
@@ -226,7 +228,7 @@ def _conclude(plant: Plant, parts: tuple[Samples, Samples, Samples], path: list[
         watch = (lambda _: False) if tracker.stop else tracker.check
         with contextlib.suppress(KeyboardInterrupt):
             law_check = check_law(winner.model, reference_drift(plant, box, parts, winner.model),
-                                  loops=loops, watch=watch)
+                                  loops=loops, watch=watch, backend=backend)
         interrupted = interrupted or law_check is None
         if law_check is not None and not law_check.accepted:
             refusal = NoUsefulLift(

@@ -13,6 +13,7 @@ import numpy as np
 
 from koopman_ros.arrays import Array
 from koopman_ros.experiment import Experiment
+from koopman_ros.jobs.backends import scheduler_refusal
 from koopman_ros.lifting import LiftedModel
 from koopman_ros.model_classes import BEST, CLASSES, IDENTITY_LIFT
 from koopman_ros.parameters import wire
@@ -141,6 +142,13 @@ class TrainerParameters:
         3, 'starts of which each coordinate keeps the best', '', 1, 100)
     training_seed: int = parameter(
         0, 'seed of the training and of what is held out', '', 0, 2 ** 31)
+    scheduler: str = parameter(
+        '', 'where a training works: empty for a process of its own beside this node; joblib for '
+        'one on each core, joblib:N for N of them; tcp://host:port for the workers of a Dask '
+        'scheduler')
+    device: str = parameter(
+        'cpu', 'what evaluates the residuals, on every worker: cpu, or a GPU as torch names it, '
+        'like cuda')
     input_matrix: tuple[float, ...] = parameter(
         (0.0,), 'B where it is known, row by row: change of the rate of each state, in its unit '
         'per second, with each input; a single 0 to learn it')
@@ -219,7 +227,8 @@ class TrainerParameters:
                 'seed': self.training_seed, 'starts': self.training_starts,
                 'input_matrix_degree': self.input_matrix_degree,
                 'hidden_states': self.hidden_states, 'margin': self.gate_margin,
-                'condition': self.gate_condition}
+                'condition': self.gate_condition, 'scheduler': self.scheduler,
+                'device': self.device}
 
 
 def trainer_table(present: LiftedModel | None, given: Mapping[str, Any] = MappingProxyType({})
@@ -295,6 +304,8 @@ def _cross_check(signals: Signals, values: TrainerParameters) -> str:
     if values.output.endswith('.mcap') and (values.max_bag_size or values.max_bag_duration):
         return (f'output = {values.output!r} is one file, which max_bag_size and '
                 'max_bag_duration cannot split: give the name of a folder, without .mcap')
+    if reason := scheduler_refusal(values.scheduler):
+        return reason
     if not values.model_output.endswith('.safetensors'):
         return f'model_output = {values.model_output!r} must end in .safetensors'
     n_x, n_u = len(signals.states), len(signals.inputs)

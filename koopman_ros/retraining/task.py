@@ -22,7 +22,9 @@ from numpy.typing import NDArray
 from koopman_ros.arrays import Array, brief
 from koopman_ros.bags import Account, loop_episodes, RecordedInput, RecordedState
 from koopman_ros.identification import Identified, identify, identify_hidden, Stopped
+from koopman_ros.jobs.backends import Backend, backend_of
 from koopman_ros.learning import Comparison, Contender, NoUsefulLift, Progress
+from koopman_ros.learning.scaling import checked_device
 from koopman_ros.lifting import Box, Coordinates, LiftedModel, load, save
 from koopman_ros.model_classes import BEST, CLASSES, IDENTITY_LIFT
 from koopman_ros.plant_data import Episode, Plant
@@ -73,6 +75,9 @@ class Task:
     setpoints: Mapping[str, tuple[float, float]] = field(default_factory=dict)
     margin: float = 0.1  #: see :class:`Thresholds`
     condition: float = 1e4  #: likewise
+    #: where it is worked, see :func:`~koopman_ros.jobs.backends.backend_of`
+    scheduler: str = ''
+    device: str = 'cpu'  #: where residuals are evaluated, as torch names it
 
     @classmethod
     def from_json(cls, text: str) -> Task:
@@ -186,6 +191,22 @@ def retrain(task: Task, on_progress: OnProgress = lambda *_: False) -> Retrained
     """
     Read the bags, estimate the drift, learn a lift of it, judge it, and write it.
 
+    It is worked where the task says, and gives the same lift wherever that is; arguments, what it
+    writes and raises as for :func:`retrain_by`.
+
+    :raises WorkerLost: when workers are lost and none takes over; nothing is written then.
+    :raises SchedulerLost: when a scheduler is not reached, or is lost; likewise.
+    """
+    checked_device(task.device)
+    with backend_of(task.scheduler) as backend:
+        return retrain_by(backend, task, on_progress)
+
+
+def retrain_by(backend: Backend, task: Task, on_progress: OnProgress = lambda *_: False
+               ) -> Retrained:
+    """
+    Read the bags, estimate the drift, learn a lift of it, judge it, and write it.
+
     An accepted lift goes to the output file, and what was there before is kept beside it as
     ``.previous.safetensors``; a refused one goes to ``.refused.safetensors``.
 
@@ -231,7 +252,7 @@ def retrain(task: Task, on_progress: OnProgress = lambda *_: False) -> Retrained
         # of other states
         current = None
     else:
-        found = identify(plant, episodes, seed=task.seed, watch=estimating)
+        found = identify(plant, episodes, seed=task.seed, watch=estimating, backend=backend)
     if current is None:
         # an input that keeps the plant somewhere in the middle is not far
         box = found.drift.box
@@ -243,7 +264,8 @@ def retrain(task: Task, on_progress: OnProgress = lambda *_: False) -> Retrained
     try:
         learned = compare_classes(
             found, plant, thresholds, model_class=task.model_class, n_z=task.coordinates,
-            seed=task.seed, starts=task.starts, watch=course.learning, judging=course.judging)
+            seed=task.seed, starts=task.starts, watch=course.learning, judging=course.judging,
+            device=task.device, backend=backend)
     except NoUsefulLift as error:
         _stop_if(on_progress(_at('decide', _JUDGED), 'judging'))
         return replace(bare, reasons=(str(error),))
