@@ -6,8 +6,10 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+import contextlib
 from dataclasses import dataclass, replace
 import math
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,6 +19,7 @@ from koopman_ros.control.laws import Law, Linear, StateDependentRiccati, Tuning,
 from koopman_ros.control.laws.base import steady_state_target, Target
 from koopman_ros.control.limits import finite, InputLimits
 from koopman_ros.estimation import Estimate
+from koopman_ros.jobs.backends import Backend, Here, Tell
 from koopman_ros.lifting import Coordinates, LiftedModel, NetworkObservables, TriedLoops
 from koopman_ros.lifting.coordinates import MAX_TRIED_LOOPS
 from koopman_ros.lifting.model import NODES, WEIGHTS
@@ -52,6 +55,8 @@ _SAMPLES, _STEPS = 2, 8
 # A slow plant takes many samples: fewer loops then, so that the law is called so often in all.
 _MOST_CALLS = 150 * LOOPS
 _FEWEST_LOOPS = 16
+# Loops that are run side by side, the same ones wherever that is: sums depend on how many.
+_PART = 32
 # Attempts for each set-point.
 _ATTEMPTS = 4
 _NEWTON_STEPS = 30
@@ -185,7 +190,8 @@ class LawCheck:
 def check_law(model: LiftedModel, rate: Rate, *, tuning: Tuning | None = None,
               law: Callable[[LiftedModel, Tuning], Law] = StateDependentRiccati,
               limits: InputLimits | None = None, interval: float = 0.0, loops: int = LOOPS,
-              watch: Callable[[float], bool] = lambda _: False) -> LawCheck | None:
+              watch: Callable[[float], bool] = lambda _: False,
+              backend: Backend | None = None) -> LawCheck | None:
     """
     Let a model's law control a drift that the model was not learned from, all over its box.
 
@@ -198,7 +204,7 @@ def check_law(model: LiftedModel, rate: Rate, *, tuning: Tuning | None = None,
     Starts fill the box evenly, and set-points that part of it where the data are (a scrambled
     Sobol sequence of fixed seed); the latter are steady states of that drift, which an input
     within its limits holds. All laws get the input that does: what a disturbance observer finds at
-    rest. Inputs are held from sample to sample. The loops run side by side. Where no law arrives
+    rest. Inputs are held from sample to sample. Where no law arrives
     within the limits, they run again without: what is far from the data the limits must not hide.
 
     :param rate: dx/dt (M, n_x) of states (M, n_x) and inputs (M, n_u), in state and input units
@@ -209,6 +215,7 @@ def check_law(model: LiftedModel, rate: Rate, *, tuning: Tuning | None = None,
         time constant of the linear loop.
     :param loops: closed loops to run; fewer where these take many samples.
     :param watch: called with the share that is done; True ends the check.
+    :param backend: where the loops run, 32 of them side by side; this process by default.
     :return: None where `watch` ended it.
     :raises ValueError: for a model without inputs.
     """
@@ -224,43 +231,95 @@ def check_law(model: LiftedModel, rate: Rate, *, tuning: Tuning | None = None,
     samples = math.ceil(_DURATION / (slowest * interval))
     loops = min(loops, max(_MOST_CALLS // samples, _FEWEST_LOOPS))
     starts, targets, inputs = _cases(plant, limits, loops)
-    seconds = interval * model.seconds_per_time_unit
+    given = _Given(plant, tuning, law, limits, interval, samples,
+                   math.ceil(_STEPS * interval * fastest))
+    parts = {f'loops from {first + 1} on': (
+        starts[first:first + _PART], targets[first:first + _PART], inputs[first:first + _PART])
+        for first in range(0, max(1, len(starts)), _PART)}
+    shares = dict.fromkeys(parts, 0.0)
 
-    def laws(targets: Array, inputs: Array, limits: InputLimits) -> tuple[_Feedback, ...]:
-        return (_called(law(model, tuning), targets, inputs, limits, seconds),
-                _informed(plant, targets, inputs, tuning, limits, interval),
-                *(_constant(Linear(one, tuning), targets, inputs, limits, seconds)
-                  for one in (linear, model)))
+    def watching(name: str, share: float | None) -> bool:
+        if share is not None:
+            shares[name] = share
+        return watch(sum(shares.values()) / len(parts))
 
-    endless = np.full(model.n_u, np.inf)
-    steps = math.ceil(_STEPS * interval * fastest)
-    ended = _run(plant, laws(targets, inputs, limits), starts, targets, inputs, tuning.weights,
-                 interval, samples, steps, watch)
+    found = []
+    with contextlib.closing((backend or Here()).run(
+            _judged, parts, shared=given, watch=watching)) as judged:
+        for name, part in judged:
+            shares[name] = 1.0
+            found.append(part)
+    if len(found) < len(parts) or None in found:
+        return None
+    own, ratios, no_gain, excess, hopeless = (
+        np.concatenate(of_parts) for of_parts in zip(*filter(None, found), strict=True))
+    # a law that does not arrive counts where another one does
+    counts = np.isfinite(own) | np.isinf(ratios) | np.isinf(excess)
+    x0, x_ref = (model.states.to_physical(x[counts]) for x in (starts, targets))
+    return LawCheck(model.states, x0, x_ref, ratios[counts], no_gain[counts], excess[counts],
+                    int(np.sum(hopeless)))
+
+
+@dataclass(frozen=True)
+class _Given:
+    """What all loops have in common."""
+
+    plant: _Plant
+    tuning: Tuning
+    law: Callable[[LiftedModel, Tuning], Law]
+    limits: InputLimits
+    interval: float  #: between samples, in time units of the model
+    samples: int
+    steps: int  #: of integration, in an interval
+
+    def laws(self, targets: Array, inputs: Array, limits: InputLimits) -> tuple[_Feedback, ...]:
+        """Return the law, the averaged one that knows the plant, and two linear ones."""
+        model, seconds = self.plant.model, self.interval * self.plant.model.seconds_per_time_unit
+        return (_called(self.law(model, self.tuning), targets, inputs, limits, seconds),
+                _informed(self.plant, targets, inputs, self.tuning, limits, self.interval),
+                *(_constant(Linear(one, self.tuning), targets, inputs, limits, seconds)
+                  for one in (self.plant.linearised, model)))
+
+    def run(self, feedbacks: Sequence[_Feedback], cases: tuple[Array, Array, Array], tell: Tell
+            ) -> tuple[Array, NDArray[np.bool_]] | None:
+        """Run loops under each of some laws, as :func:`_run`."""
+        return _run(self.plant, feedbacks, *cases, self.tuning.weights, self.interval,
+                    self.samples, self.steps, tell)
+
+
+def _judged(given: _Given, cases: tuple[Array, Array, Array], tell: Tell
+            ) -> tuple[Any, ...] | None:
+    """
+    Run some of the loops; None where `tell` ended them.
+
+    :return: of each the cost of the law, that beside the better of two linear laws, whether it had
+        no gain, its cost beside that of a perfect model, and whether no law arrives.
+    """
+    starts, targets, inputs = cases
+    limits, m = given.limits, given.plant.model.n_u
+    ended = given.run(given.laws(targets, inputs, limits), cases, tell)
     if ended is None:
         return None
     costs, no_gain = ended
     if (hopeless := ~np.isfinite(costs).any(axis=0)).any():
         # what the limits hide
-        cases = starts[hopeless], targets[hopeless], inputs[hopeless]
-        ended = _run(plant, laws(*cases[1:], InputLimits(-endless, endless, endless)), *cases,
-                     tuning.weights, interval, samples, steps, watch)
+        endless = np.full(m, np.inf)
+        some = starts[hopeless], targets[hopeless], inputs[hopeless]
+        ended = given.run(given.laws(*some[1:], InputLimits(-endless, endless, endless)), some,
+                          tell)
         if ended is None:
             return None
         costs[:, hopeless], no_gain[hopeless] = ended
     own, informed, *others = costs
     ratios, excess = _beside(own, np.min(others, axis=0)), _beside(own, informed)
     if (beaten := ~(excess <= MOST_EXCESS) & ~hopeless).any():
-        cases = starts[beaten], targets[beaten], inputs[beaten]
-        again = _run(plant, [_informed(plant, *cases[1:], tuning, _narrowed(limits), interval)],
-                     *cases, tuning.weights, interval, samples, steps, watch)
+        some = starts[beaten], targets[beaten], inputs[beaten]
+        again = given.run([_informed(given.plant, *some[1:], given.tuning, _narrowed(limits),
+                                     given.interval)], some, tell)
         if again is None:
             return None
         excess[beaten] = np.minimum(excess[beaten], _beside(own[beaten], again[0][0]))
-    # a law that does not arrive counts where another one does
-    counts = np.isfinite(own) | np.isinf(ratios) | np.isinf(excess)
-    x0, x_ref = (model.states.to_physical(x[counts]) for x in (starts, targets))
-    return LawCheck(model.states, x0, x_ref, ratios[counts], no_gain[counts], excess[counts],
-                    int(np.sum(hopeless)))
+    return own, ratios, no_gain, excess, hopeless
 
 
 def _beside(cost: Array, other: Array) -> Array:

@@ -22,6 +22,7 @@ from koopman_ros.identification.drift import (
 )
 from koopman_ros.identification.output_error import output_error
 from koopman_ros.identification.regression import noise_level, total_variation, weak_form
+from koopman_ros.jobs.backends import Backend, Here, Tell
 from koopman_ros.learning.inputs import InputModel
 from koopman_ros.lifting import Box
 from koopman_ros.plant_data import Array, cut, Episode, Plant
@@ -135,7 +136,7 @@ class Identified:
 
 def identify(plant: Plant, episodes: Sequence[Episode], *, degrees: Sequence[int] | None = None,
              methods: Mapping[str, Method] | None = None, seed: int = 0,
-             watch: Watch = lambda *_: False) -> Identified:
+             watch: Watch = lambda *_: False, backend: Backend | None = None) -> Identified:
     """
     Estimate dx/dt = f(x) + B(x) u from sampled, noisy measurements.
 
@@ -151,6 +152,7 @@ def identify(plant: Plant, episodes: Sequence[Episode], *, degrees: Sequence[int
     :param methods: by name; those that go by a rough B come after one that learns it. By default
         ``METHODS``, or the weak forms where B depends on the state.
     :param seed: of the split.
+    :param backend: where the degrees are estimated, each by itself; this process by default.
     :raises ValueError: when the episodes are too short, or nothing fits.
     :raises Stopped: when `watch` asked for it.
     """
@@ -168,38 +170,30 @@ def identify(plant: Plant, episodes: Sequence[Episode], *, degrees: Sequence[int
                           else METHODS)
     scores: list[Score] = []
     best: dict[int, tuple[DriftModel, Score]] = {}
+    done, words = 0, {f'drift of degree {degree}': degree for degree in degrees}
 
-    def progress(step: int, text: str) -> Callable[..., bool]:
-        def monitor(*_: object) -> bool:
-            if watch(step, len(degrees) + 1, text):
-                raise Stopped
-            return False
+    def progress(name: str, _: object) -> bool:
+        if watch(done, len(degrees) + 1, name or [*words, ''][done]):
+            raise Stopped
+        return False
 
-        return monitor
-
-    for number, degree in enumerate(degrees):
-        monitor = progress(number, f'drift of degree {degree}')
-        monitor()
-        rated = [(model, _score(model, chooser, method))
-                 for method, model in _estimates(fit, box, degree, known, methods)]
-        model, score = min(rated, key=lambda pair: pair[1].cost, default=(None, None))
-        if model is None or score is None:
-            continue
-        best[degree] = model, score
-        if not math.isfinite(score.cost):
-            continue
-        refined = output_error(model, fitter, learn_input_matrix=known is None, monitor=monitor)
-        polished = _score(refined, chooser, f'{OUTPUT_ERROR} from {score.method}')
-        scores += [*(score for _, score in rated), polished]
-        # the better estimate in theory needs no proof, only that it does no harm
-        if polished.cost <= _NEARLY * score.cost:
-            best[degree] = refined, polished
+    with contextlib.closing((backend or Here()).run(
+            _candidate, words, shared=_Given(fit, fitter, chooser, box, known, methods),
+            watch=progress)) as candidates:
+        for name, candidate in candidates:
+            done += 1
+            if candidate is not None:
+                scores += candidate.scores
+                best[words[name]] = candidate.best
     least = min((score.cost for _, score in best.values()), default=math.inf)
     if not math.isfinite(least):
         raise ValueError('no drift fits the episodes: record longer, with steps of the input')
     good = [d for d, (_, score) in best.items() if score.cost <= _NEARLY * least]
     degree = min(good, key=lambda d: _information(best[d][0], fitter, known is None))
-    monitor = progress(len(degrees), f'drift of degree {degree} on all episodes')
+
+    def monitor(*_: object) -> bool:
+        return progress(f'drift of degree {degree} on all episodes', None)
+
     monitor()
     everything = Segments.of([*fit, *choose], step)
     finished = {}
@@ -210,6 +204,47 @@ def identify(plant: Plant, episodes: Sequence[Episode], *, degrees: Sequence[int
     return Identified(finished[degree], best[degree][1].method, finished[min(finished)],
                       tuple(scores), noise_level(parts, finished[degree]),
                       (*fit, *choose), tuple(held_out))
+
+
+@dataclass(frozen=True)
+class _Given:
+    """What the estimates of all degrees go by."""
+
+    fit: Sequence[Episode]
+    fitter: Segments  # the same
+    chooser: Segments
+    box: Box
+    known: Array | None  # B as DriftModel has it
+    methods: Mapping[str, Method]
+
+
+@dataclass(frozen=True)
+class _Candidate:
+    """The best estimate of a degree, with the scores of all of them that were refined."""
+
+    best: tuple[DriftModel, Score]
+    scores: tuple[Score, ...]
+
+
+def _candidate(given: _Given, degree: int, tell: Tell) -> _Candidate | None:
+    """Estimate a drift of a degree by every method, and refine the best; None without any."""
+    def monitor(*_: object) -> bool:
+        return tell(None)
+
+    monitor()
+    rated = [(model, _score(model, given.chooser, method)) for method, model in _estimates(
+        given.fit, given.box, degree, given.known, given.methods)]
+    model, score = min(rated, key=lambda pair: pair[1].cost, default=(None, None))
+    if model is None or score is None:
+        return None
+    if not math.isfinite(score.cost):
+        return _Candidate((model, score), ())
+    refined = output_error(model, given.fitter, learn_input_matrix=given.known is None,
+                           monitor=monitor)
+    polished = _score(refined, given.chooser, f'{OUTPUT_ERROR} from {score.method}')
+    # the better estimate in theory needs no proof, only that it does no harm
+    best = (refined, polished) if polished.cost <= _NEARLY * score.cost else (model, score)
+    return _Candidate(best, (*(score for _, score in rated), polished))
 
 
 def segments_of(episodes: Sequence[Episode], signals: int) -> list[Episode]:

@@ -7,7 +7,9 @@ from koopman_ros.learning.baselines import Algorithm1, Edmd, Linearisation
 from koopman_ros.learning.comparison import compare, Comparison, Contender, Judge
 from koopman_ros.learning.drift import NeuralDrift
 from koopman_ros.learning.growth import Growth
-from koopman_ros.learning.training import NoUsefulLift, Progress, train, Trained
+from koopman_ros.learning.shards import read_samples, Shard, write_samples
+from koopman_ros.learning.starts import Progress
+from koopman_ros.learning.training import NoUsefulLift, train, Trained
 from koopman_ros.learning.validation import (
     evaluate,
     Figures,
@@ -19,6 +21,6 @@ from koopman_ros.learning.validation import (
 
 __all__ = [
     'Algorithm1', 'Comparison', 'Contender', 'Edmd', 'Figures', 'Fit', 'Growth', 'Judge',
-    'Linearisation', 'NeuralDrift', 'NoUsefulLift', 'Progress', 'Trained', 'compare', 'evaluate',
-    'fit', 'roll_out', 'rollout_rmse', 'train',
+    'Linearisation', 'NeuralDrift', 'NoUsefulLift', 'Progress', 'Shard', 'Trained', 'compare',
+    'evaluate', 'fit', 'read_samples', 'roll_out', 'rollout_rmse', 'train', 'write_samples',
 ]

@@ -13,7 +13,12 @@ from koopman_ros.learning.growth import Grown, Monitor
 from koopman_ros.learning.inputs import InputModel
 from koopman_ros.learning.levenberg_marquardt import minimise, MinimumStatus
 from koopman_ros.learning.network import check_activation, Layout
-from koopman_ros.learning.residuals import deviations, Problem, ResidualWeights, ScaledSamples
+from koopman_ros.learning.residuals import (
+    deviations,
+    LiftProblem,
+    ResidualWeights,
+    ScaledSamples,
+)
 from koopman_ros.lifting import (
     Box,
     LiftedModel,
@@ -76,7 +81,7 @@ class Algorithm1:
                         0 if data.u is None else data.u.shape[1], self.decoder)
         generator = torch.Generator().manual_seed(seed)
         theta = torch.randn(layout.size, generator=generator, dtype=torch.float64).to(data.x)
-        problem = Problem(layout, data, ResidualWeights())
+        problem = LiftProblem(layout, data, ResidualWeights())
         status = MinimumStatus.MAX_ITERATIONS
         for number in range(self.max_rounds):
             weight = self.lambda_initial / self.gamma ** number

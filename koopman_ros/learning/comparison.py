@@ -14,19 +14,13 @@ import time
 import numpy as np
 
 from koopman_ros.control.law_check import check_law, LawCheck, LOOPS
+from koopman_ros.jobs.backends import Backend
 from koopman_ros.learning.baselines import Edmd
 from koopman_ros.learning.contradictions import check_nominal_point, check_rates
 from koopman_ros.learning.drift import NeuralDrift, with_readout, with_units_of
 from koopman_ros.learning.growth import Growth
-from koopman_ros.learning.training import (
-    NoUsefulLift,
-    Progress,
-    Recipe,
-    reference_drift,
-    train,
-    training_states,
-    Watch,
-)
+from koopman_ros.learning.starts import Progress, Recipe, Watch
+from koopman_ros.learning.training import NoUsefulLift, reference_drift, train, training_states
 from koopman_ros.learning.validation import evaluate, Figures, fit, ROUNDING
 from koopman_ros.lifting import bounds, Box, LiftedModel
 from koopman_ros.model_classes import FREE_LIFT, IDENTITY_LIFT, LINEAR, NEURAL_DRIFT, POLYNOMIAL
@@ -131,7 +125,8 @@ def usual_recipes(n_x: int) -> dict[str, Recipe]:
 def compare(plant: Plant, samples: Samples, recipes: Mapping[str, Recipe] | None = None, *,
             degrees: Sequence[int] = DEGREES, choose: str | None = None, alone: bool = False,
             seed: int = 0, starts: int = 2, split_seed: int = 0, watch: Watch | None = None,
-            loops: int = LOOPS, judge: Judge | None = None) -> Comparison:
+            loops: int = LOOPS, judge: Judge | None = None, device: str = 'cpu',
+            backend: Backend | None = None) -> Comparison:
     """
     Learn a model of each class from the same episodes and choose one by a stated rule.
 
@@ -163,7 +158,7 @@ def compare(plant: Plant, samples: Samples, recipes: Mapping[str, Recipe] | None
     if starts < 1:
         raise ValueError(f'starts must be at least 1, got {starts}')
     learner = _Learner(plant, samples, split_seed)
-    judge = judge or learner.judge(loops)
+    judge = judge or learner.judge(loops, backend)
     counts = {name: starts * _rounds(recipes[name], n_x) for name in names if name in recipes}
     found: list[Contender] = []
     drift: LiftedModel | None = None
@@ -173,7 +168,8 @@ def compare(plant: Plant, samples: Samples, recipes: Mapping[str, Recipe] | None
             if name in recipes:
                 trained = train(
                     plant, samples, recipes[name], seed=seed, starts=starts,
-                    split_seed=split_seed, loops=0, watch=_among(watch, name, counts))
+                    split_seed=split_seed, loops=0, watch=_among(watch, name, counts),
+                    device=device, backend=backend)
                 model = trained.model if drift is None else learner.with_units_of(
                     drift, trained.model)
                 if isinstance(recipes[name], NeuralDrift):
@@ -286,14 +282,14 @@ class _Learner:
             provenance=replace(
                 model.provenance, metrics=one.figures.metrics(model.states.names))))
 
-    def judge(self, loops: int) -> Judge:
+    def judge(self, loops: int, backend: Backend | None) -> Judge:
         """Return the judge by closed loops on the drift that predicts validation episodes best."""
         def judged(one: Contender) -> Contender:
             model = one.model
             if not loops or model is None or not model.n_u:
                 return one
             law_check = check_law(model, reference_drift(
-                self._plant, self._box, self._parts, model), loops=loops)
+                self._plant, self._box, self._parts, model), loops=loops, backend=backend)
             refused = law_check is not None and not law_check.accepted
             return replace(one, law_check=law_check,
                            refusal=f'no controller: {law_check}' if refused else '')

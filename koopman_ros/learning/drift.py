@@ -15,9 +15,9 @@ from torch import Tensor
 from koopman_ros.learning.growth import Grown, linear_drift, Monitor, xavier
 from koopman_ros.learning.levenberg_marquardt import minimise, NormalEquations
 from koopman_ros.learning.network import check_activation, Layout, Parameters, Pass
-from koopman_ros.learning.residuals import ScaledSamples
+from koopman_ros.learning.residuals import ScaledSamples, Sums
 from koopman_ros.lifting import LiftedModel, NetworkObservables
-from koopman_ros.plant_data import Samples
+from koopman_ros.plant_data import Array, Samples
 
 # Directions of the features smaller than this beside the largest are left out of a fit: their
 # weights would be as large as the inverse. What that loses and gains depends on the data.
@@ -37,12 +37,26 @@ def with_readout(model: LiftedModel, samples: Samples, smallest: float = SMALLES
 
     :param smallest: share of the largest singular value below which a direction is left out.
     """
+    return fitted_readout(model, readout_rows(model, samples), len(samples), smallest)
+
+
+def readout_rows(model: LiftedModel, samples: Samples) -> Array:
+    """Return features and what they should give, [phi, f] (N, h + n_x), at samples."""
     x = model.states.to_deviation(samples.x)
-    phi = model.observables.features.lift(x)
     f = samples.dxdt / model.states.scale - model.forcing(
         x, model.inputs.to_deviation(samples.u))
+    return np.hstack([model.observables.features.lift(x), f])
+
+
+def fitted_readout(model: LiftedModel, rows: Array, N: int, smallest: float) -> LiftedModel:
+    """
+    Fit the read-out to rows of N samples, or to a triangle with the same products of columns.
+
+    :param rows: (M, h + n_x) as :func:`readout_rows`, or R of their QR decomposition.
+    """
+    phi, f = rows[:, :-model.n_x], rows[:, -model.n_x:]
     # each feature in units of its size; one that stands still on all samples gets no weight
-    size = np.sqrt(np.mean(phi ** 2, axis=0))
+    size = np.sqrt(np.sum(phi ** 2, axis=0) / N)
     unit = np.divide(1.0, size, out=np.zeros_like(size), where=size > _STILL)
     weights = np.linalg.lstsq(phi * unit, f, rcond=smallest)[0].T
     return replace(model, readout=weights * unit)
@@ -121,17 +135,27 @@ class DriftProblem:
     layout: Layout  #: of a free lift with as many coordinates as states
     data: ScaledSamples  #: the samples
 
+    def on(self, data: ScaledSamples) -> DriftProblem:
+        """Return the same problem on other samples."""
+        return replace(self, data=data)
+
     def add_residuals(self, theta: Tensor, equations: NormalEquations) -> None:
-        """Add the residuals at parameters (p,) over chunks of the data."""
-        layout, N = self.layout, len(self.data)
+        """Add the residuals at parameters (p,) over all samples."""
+        equations.add_sums(*self.data.sums(self, theta, equations.derivatives))
+
+    def sums(self, theta: Tensor, derivatives: bool, N: int) -> Sums:
+        """Sum over its samples, which are some of N: cost, gradient (p,) and matrix (p, p)."""
+        layout = self.layout
         parameters = layout.split(theta)
+        equations = NormalEquations(theta, derivatives=derivatives)
         chunk = max(64, _CHUNK // (layout.n_x * layout.size))
-        for start in range(0, N, chunk):
+        for start in range(0, len(self.data), chunk):
             data = self.data.part(start, chunk)
             lifted = Pass(layout, parameters, data.x, data.f)
             r = data.drift(parameters.B) - data.x @ parameters.A.T - lifted.z
-            J = self._jacobian(data, parameters, lifted) if equations.derivatives else None
+            J = self._jacobian(data, parameters, lifted) if derivatives else None
             equations.add(r, J, count=N)
+        return equations.sums
 
     def _jacobian(self, data: ScaledSamples, parameters: Parameters, lifted: Pass) -> Tensor:
         """Differentiate the residual in the parameters: (N, n_x, p)."""

@@ -16,7 +16,7 @@ from torch import Tensor
 
 from koopman_ros.learning.levenberg_marquardt import minimise, Minimum, MinimumStatus
 from koopman_ros.learning.network import check_activation, Layout, Parameters, Pass
-from koopman_ros.learning.residuals import Problem, ResidualWeights, ScaledSamples
+from koopman_ros.learning.residuals import LiftProblem, ResidualWeights, ScaledSamples
 
 # Called after every step with (iteration, cost); True ends the minimisation.
 Monitor = Callable[[int, float], bool]
@@ -99,7 +99,7 @@ class Growth:
         layout, theta = self._extended(data, n_z, parent or self._root(data), seed)
         run = partial(minimise, max_iterations=self.max_iterations, tolerance=self.tolerance,
                       monitor=monitor)
-        problem = Problem(layout, data, ResidualWeights(self.whitening,
+        problem = LiftProblem(layout, data, ResidualWeights(self.whitening,
                                                 self.decoder_weight * bool(layout.decoder)))
         minimum: Minimum = run(problem.add_residuals, theta)
         if layout.decoder and minimum.status is not MinimumStatus.INTERRUPTED:

@@ -62,6 +62,11 @@ class NormalEquations:
         """Half the sum of squares."""
         return float(self._cost)
 
+    @property
+    def sums(self) -> tuple[Tensor, ...]:
+        """The cost and, where wanted, gradient and matrix, as :meth:`add_sums` takes them."""
+        return (self._cost, self.gradient, self.matrix) if self.derivatives else (self._cost,)
+
     def add(self, r: Tensor, J: Tensor | None = None, count: int = 1) -> None:
         """Add residuals (...) with their J (..., p) where wanted, squares divided by a count."""
         self._cost += 0.5 * torch.sum(r * r) / count

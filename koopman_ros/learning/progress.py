@@ -11,7 +11,7 @@ import time
 
 from tqdm import tqdm
 
-from koopman_ros.learning.training import Progress, Watch
+from koopman_ros.learning.starts import Progress, Watch
 
 _LINE_PERIOD = 5.0  # s between plain lines
 

@@ -6,6 +6,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from typing import Protocol, Self
 
 import torch
 from torch import Tensor
@@ -23,6 +24,30 @@ def deviations(box: Box, samples: Samples) -> tuple[Array, Array, Array]:
             box.inputs.to_deviation(samples.u))
 
 
+# What samples add to the cost and its derivatives at some parameters, as far as it simply adds up.
+Sums = tuple[Tensor, ...]
+
+
+class Problem(Protocol):
+    """A least-squares problem on samples."""
+
+    def on(self, data: ScaledSamples) -> Self:
+        """Return the same problem on other samples."""
+        ...
+
+    def sums(self, theta: Tensor, derivatives: bool, N: int) -> Sums:
+        """Sum over its samples, which are some of N, at parameters (p,)."""
+        ...
+
+
+class SamplesElsewhere(Protocol):
+    """Samples that stay where they are: sums over them come from there."""
+
+    def sums(self, problem: Problem, theta: Tensor, derivatives: bool) -> Sums:
+        """Sum over all of them at parameters (p,), in an order of their own that never changes."""
+        ...
+
+
 @dataclass(frozen=True)
 class ScaledSamples:
     """Samples in the scaled deviations from the nominal point that a lift is learned from."""
@@ -32,6 +57,8 @@ class ScaledSamples:
     #: (N, n_u) inputs whose B is to be learned, and their products with monomials of the state
     #: where it depends on that; None where B is known
     u: Tensor | None = None
+    #: over which residuals are summed in the place of these, which then only start a lift
+    elsewhere: SamplesElsewhere | None = None
 
     def drift(self, B: Tensor | None) -> Tensor:
         """Return the rates without what the inputs do, (N, n_x)."""
@@ -41,6 +68,18 @@ class ScaledSamples:
         """Return some consecutive samples."""
         rows = slice(start, start + length)
         return ScaledSamples(self.x[rows], self.f[rows], None if self.u is None else self.u[rows])
+
+    def none(self) -> ScaledSamples:
+        """Return no samples of the same kind."""
+        # not a view, which would be pickled with all samples
+        return ScaledSamples(*(None if a is None else a.new_empty((0, a.shape[1]))
+                               for a in (self.x, self.f, self.u)))
+
+    def sums(self, problem: Problem, theta: Tensor, derivatives: bool) -> Sums:
+        """Sum over these or those elsewhere, for a problem on these."""
+        if self.elsewhere is None:
+            return problem.sums(theta, derivatives, len(self))
+        return self.elsewhere.sums(problem.on(self.none()), theta, derivatives)
 
     def __len__(self) -> int:
         return len(self.x)
@@ -55,7 +94,7 @@ class ResidualWeights:
 
 
 @dataclass(frozen=True)
-class Problem:
+class LiftProblem:
     """
     Least-squares problem of a lift on data: 0.5 times the sum of three squared residuals.
 
@@ -89,39 +128,62 @@ class Problem:
                          FeatureMap.size(self.layout) if shallow else 0)
             object.__setattr__(self, 'chunk', max(64, (1 << 18) // floats))
 
-    def with_weights(self, weights: ResidualWeights) -> Problem:
+    def with_weights(self, weights: ResidualWeights) -> LiftProblem:
         """Return the same problem with other weights."""
         return replace(self, weights=weights)
 
+    def on(self, data: ScaledSamples) -> LiftProblem:
+        """Return the same problem on other samples."""
+        return replace(self, data=data)
+
     def add_residuals(self, theta: Tensor, equations: NormalEquations) -> None:
-        """Add the residuals at parameters (p,) over chunks of the data."""
-        layout, N = self.layout, len(self.data)
+        """Add the residuals at parameters (p,) over all samples."""
+        layout, derivatives = self.layout, equations.derivatives
+        cost, moment, *others = self.data.sums(self, theta, derivatives)
+        decoder = others[-2:] if derivatives and self.weights.decoder else []
+        equations.add_sums(cost, *decoder)
+        i, j, scale, r = _whitening(layout, moment, self.weights.whitening)
+        J = None
+        if derivatives:
+            gradient, matrix, moment_rate = self._kind.result(
+                layout, layout.split(theta), self.weights.whitening > 0.0,
+                others[:len(others) - len(decoder)])
+            equations.add_sums(0.0, gradient, matrix)
+            J = scale[:, None] * (moment_rate[i, j] + moment_rate[j, i])
+        equations.add(r, J)
+
+    def sums(self, theta: Tensor, derivatives: bool, N: int) -> Sums:
+        """
+        Sum over its samples, which are some of N, at parameters (p,).
+
+        :return: the cost, E[z z'] (n_z, n_z), what the residuals of the dynamics add to the normal
+            equations, and gradient (p,) and matrix (p, p) of the decoder's, where there is one.
+        """
+        layout = self.layout
         parameters = layout.split(theta)
-        sums: MomentSums | ProductSums | None = None
-        if equations.derivatives:
-            kind = MomentSums if len(layout.hidden) == 1 else ProductSums
-            sums = kind(layout, parameters, N, self.weights.whitening > 0.0)
+        decoding = bool(self.weights.decoder)
+        equations = NormalEquations(theta, derivatives=derivatives and decoding)
+        dynamics = self._kind(layout, parameters, N, self.weights.whitening > 0.0) if (
+            derivatives) else None
         moment = theta.new_zeros((layout.n_z, layout.n_z))
-        for start in range(0, N, self.chunk):
+        for start in range(0, len(self.data), self.chunk):
             data = self.data.part(start, self.chunk)
             f = data.drift(parameters.B)
             lifted = Pass(layout, parameters, data.x, f)
             r = lifted.z_rate - lifted.z @ parameters.A.T
             equations.add(r, count=N)
             moment += lifted.z.T @ lifted.z / N
-            if sums is not None:
-                sums.add(data.x, f, data.u, lifted, r)
-            if self.weights.decoder:
+            if dynamics is not None:
+                dynamics.add(data.x, f, data.u, lifted, r)
+            if decoding:
                 equations.add(*_decoder_block(layout, parameters, data.x, lifted,
-                                              self.weights.decoder ** 0.5,
-                                              equations.derivatives), count=N)
-        i, j, scale, r = _whitening(layout, moment, self.weights.whitening)
-        J = None
-        if sums is not None:
-            gradient, matrix, moment_rate = sums.result()
-            equations.add_sums(0.0, gradient, matrix)
-            J = scale[:, None] * (moment_rate[i, j] + moment_rate[j, i])
-        equations.add(r, J)
+                                              self.weights.decoder ** 0.5, derivatives), count=N)
+        cost, *others = equations.sums
+        return cost, moment, *(dynamics.sums if dynamics else ()), *others
+
+    @property
+    def _kind(self) -> type[MomentSums | ProductSums]:
+        return MomentSums if len(self.layout.hidden) == 1 else ProductSums
 
 
 def _decoder_block(layout: Layout, parameters: Parameters, x: Tensor, lifted: Pass,

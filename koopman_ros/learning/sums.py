@@ -13,6 +13,7 @@ coordinate.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
 import itertools
@@ -46,9 +47,17 @@ class ProductSums:
         if self._whitening and self._layout.hidden:
             self._add_moment_rate(lifted)
 
-    def result(self) -> tuple[Tensor, Tensor, Tensor]:
-        """Return J^T r (p,), J^T J (p, p) and E[z_a dz_b/dtheta] (n_z, n_z, p)."""
+    @property
+    def sums(self) -> tuple[Tensor, ...]:
+        """What was summed so far, which adds up over parts of the samples."""
         return self._gradient, self._matrix, self._moment_rate
+
+    @staticmethod
+    def result(layout: Layout, parameters: Parameters, whitening: bool, sums: Sequence[Tensor]
+               ) -> tuple[Tensor, Tensor, Tensor]:
+        """Return of sums J^T r (p,), J^T J (p, p) and E[z_a dz_b/dtheta] (n_z, n_z, p)."""
+        gradient, matrix, moment_rate = sums
+        return gradient, matrix, moment_rate
 
     def _jacobian(self, u: Tensor | None, lifted: Pass) -> Tensor:
         """Differentiate J_N (dx/dt - B u) - A N in the parameters: (N, n_z, p)."""
@@ -89,8 +98,8 @@ class MomentSums:
     """The sums of a lift with one hidden layer, from the second moments of its features."""
 
     def __init__(self, layout: Layout, parameters: Parameters, N: int, whitening: bool) -> None:
+        # whether there is whitening matters to what follows from the sums alone
         self._map, self._N = FeatureMap(layout, parameters), N
-        self._whitening = whitening
         K, like = FeatureMap.size(layout), parameters.A
         self._moments, self._by_residual = like.new_zeros((K, K)), like.new_zeros((K, layout.n_z))
 
@@ -101,17 +110,26 @@ class MomentSums:
         # the residuals themselves, since from the moments they would come out with their rounding
         self._by_residual.addmm_(phi.T, r, alpha=1.0 / self._N)
 
-    def result(self) -> tuple[Tensor, Tensor, Tensor]:
-        """Return the sums, as :meth:`ProductSums.result`."""
-        T = self._map.residual_rates
+    @property
+    def sums(self) -> tuple[Tensor, ...]:
+        """Moments of the features (K, K), and these by the residuals (K, n_z), so far."""
+        return self._moments, self._by_residual
+
+    @staticmethod
+    def result(layout: Layout, parameters: Parameters, whitening: bool, sums: Sequence[Tensor]
+               ) -> tuple[Tensor, Tensor, Tensor]:
+        """Return what follows from sums, as :meth:`ProductSums.result`."""
+        moments, by_residual = sums
+        of = FeatureMap(layout, parameters)
+        T = of.residual_rates
         n_z, p, K = T.shape
-        gradient = torch.einsum('ipk,ki->p', T, self._by_residual)
-        left = (T.reshape(-1, K) @ self._moments).view(T.shape).transpose(0, 1).reshape(p, -1)
+        gradient = torch.einsum('ipk,ki->p', T, by_residual)
+        left = (T.reshape(-1, K) @ moments).view(T.shape).transpose(0, 1).reshape(p, -1)
         matrix = left @ T.transpose(0, 1).reshape(p, -1).T
-        if not self._whitening:
+        if not whitening:
             return gradient, matrix, T.new_zeros((n_z, n_z, p))
-        Z, U = self._map.coordinates, self._map.coordinate_rates
-        moment_rate = (U.reshape(-1, K) @ (self._moments @ Z.T)).view(n_z, p, n_z)
+        Z, U = of.coordinates, of.coordinate_rates
+        moment_rate = (U.reshape(-1, K) @ (moments @ Z.T)).view(n_z, p, n_z)
         return gradient, matrix, moment_rate.permute(2, 0, 1)
 
 

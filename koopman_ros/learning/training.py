@@ -5,58 +5,32 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Generator
+from collections.abc import Callable, Generator, Sequence
 import contextlib
 from dataclasses import dataclass, replace
-from functools import cached_property
 import math
-import multiprocessing
-import signal
-import warnings
 
-import joblib
 import numpy as np
-import torch
 
 from koopman_ros import __version__
 from koopman_ros.arrays import brief
 from koopman_ros.control.law_check import check_law, LawCheck, LOOPS, Rate
-from koopman_ros.learning.baselines import Algorithm1, Edmd
+from koopman_ros.jobs.backends import Backend, Here
+from koopman_ros.learning.baselines import Edmd
 from koopman_ros.learning.contradictions import check_nominal_point, check_rates
-from koopman_ros.learning.drift import NeuralDrift, SMALLEST, with_readout
-from koopman_ros.learning.frame import Frame
-from koopman_ros.learning.growth import Grown, Growth, Monitor
-from koopman_ros.learning.inputs import InputModel
+from koopman_ros.learning.drift import fitted_readout, readout_rows, SMALLEST
+from koopman_ros.learning.growth import Grown, Growth
 from koopman_ros.learning.levenberg_marquardt import MinimumStatus, PATIENCE
-from koopman_ros.learning.residuals import deviations, ScaledSamples
+from koopman_ros.learning.scaling import Scaling
+from koopman_ros.learning.shards import KeptShards, Shard
+from koopman_ros.learning.starts import Recipe, run_starts, Tracker, Watch
 from koopman_ros.learning.validation import evaluate, Figures, Fit, fit, lifted_rate, ROUNDING
-from koopman_ros.lifting import Box, LiftedModel, NetworkObservables, Provenance, TrainingStates
-from koopman_ros.plant_data import Array, Plant, Samples, split_by_episode
+from koopman_ros.lifting import Box, LiftedModel, Provenance, TrainingStates
+from koopman_ros.plant_data import Plant, Samples, split_by_episode
 
 # Polynomials on which a law is tried.
 _HIGHEST_DEGREE = 5
 _SAMPLES_OF_MONOMIAL = 5
-
-Recipe = Growth | Algorithm1 | NeuralDrift
-
-
-@dataclass(frozen=True)
-class Progress:
-    """Progress of a training."""
-
-    n_z: int  #: coordinates being learned
-    finished: int  #: starts that finished, over all rounds
-    total: int  #: starts in all
-    iteration: int  #: step within a start that is under way in this process, else 0
-    residual: float  #: root mean square of the residuals there, else NaN
-    rw: float  #: best validation figure so far, NaN before the first
-    checked: float = 0.0  #: share that is done of the closed loops, which come last
-    name: str = ''  #: of the class that is being learned, where several are compared
-
-
-# Called after every step and start; True ends the training with the best so far.
-Watch = Callable[[Progress], bool]
-
 
 @dataclass(frozen=True)
 class Trained:
@@ -84,6 +58,27 @@ class NoUsefulLift(ValueError):  # noqa: N818
 
 
 @dataclass(frozen=True)
+class _Assembly:
+    """What turns the solution of a start into a model."""
+
+    scaling: Scaling
+    samples: Samples  # for its training, where there are no shards
+    shards: KeptShards | None
+    training_states: TrainingStates | None
+    provenance: Provenance
+
+    def model(self, grown: Grown) -> LiftedModel:
+        return self.scaling.model(grown, training_states=self.training_states,
+                                  provenance=self.provenance)
+
+    def readouts(self, model: LiftedModel) -> list[LiftedModel]:
+        """Return the model with each read-out that is tried."""
+        rows, N = (readout_rows(model, self.samples), len(self.samples)) if (
+            self.shards is None) else (self.shards.readout_rows(model), len(self.shards))
+        return [fitted_readout(model, rows, N, smallest) for smallest in SMALLEST]
+
+
+@dataclass(frozen=True)
 class _Candidate:
     grown: Grown
     model: LiftedModel  # its drift read off the rate of z or out of its features
@@ -98,15 +93,20 @@ class _Candidate:
 
 def train(plant: Plant, samples: Samples, recipe: Recipe, *, seed: int = 0, starts: int = 4,
           split_seed: int = 0, watch: Watch | None = None, refuse: bool = True,
-          loops: int = LOOPS, device: str = 'cpu', threads: int = 1) -> Trained:
+          loops: int = LOOPS, device: str = 'cpu', threads: int = 1,
+          backend: Backend | None = None, shards: Sequence[Shard] = ()) -> Trained:
     """
     Learn a lifted model in rounds of starts, of which validation episodes choose the best.
 
     A fifth of the episodes chooses the winner of each round and another fifth, touched by nothing
-    else, gives the figures reported. The starts of a round run through joblib: within
-    ``joblib.parallel_config(...)`` they run in processes, or on a Dask cluster, and give the same
-    model as one after the other. An interrupt from the keyboard ends the training and keeps the
+    else, gives the figures reported. The starts of a round run where `backend` says, and give the
+    same model wherever that is. An interrupt from the keyboard ends the training and keeps the
     best so far.
+
+    With `shards` the model is fitted to those alone, wherever workers have them: sums over them
+    come back, no samples. The starts then run here, one after the other, and `samples` are some of
+    the plant's, from which the starts begin, of which two fifths choose and judge as ever, and
+    which the checks of data are made on.
 
     :param plant: names, units, nominal point, and B where it is known.
     :param samples: at least three episodes.
@@ -116,27 +116,60 @@ def train(plant: Plant, samples: Samples, recipe: Recipe, *, seed: int = 0, star
         refused.
     :param loops: closed loops in which the law is tried before, see
         :func:`~koopman_ros.control.law_check.check_law`; 0 for none.
-    :param device: where the residuals are evaluated, as torch names it.
+    :param device: where the residuals are evaluated, as torch names it, on every worker.
     :param threads: torch's threads for each start, for a number of which the bits are the same.
+    :param backend: where starts and closed loops run and shards are, see
+        :func:`~koopman_ros.jobs.backends.backend_of`; this process by default.
+    :param shards: how workers read what the model is fitted to.
     :raises NoUsefulLift: when no start gives a lift that can be judged, or none that beats the
         linear model on validation episodes, or when its law fails in closed loop.
     :raises ValueError: on too few episodes, held-out episodes that hardly move, a recipe that
-        does not fit, times that contradict the derivatives, or a nominal point where the plant
-        moves.
+        does not fit, times that contradict the derivatives, a nominal point where the plant
+        moves, or a device that there is not.
     :raises KeyboardInterrupt: when interrupted before the first start finished.
+    :raises WorkerLost: when workers of the backend are lost and none takes over.
+    :raises SchedulerLost: when its scheduler is.
     """
     if starts < 1:
         raise ValueError(f'starts must be at least 1, got {starts}')
     rounds = recipe.rounds(samples.x.shape[1])
     parts = split_by_episode(samples, split_seed)
-    box = Box.of(plant, samples.x, samples.u)
-    check_rates(plant, samples)
-    check_nominal_point(plant, samples, box)
-    assembly = _Assembly(plant, box, parts[0], samples.digest(), seed,
-                         training_states(box, samples),
-                         recipe.pre_feedback if isinstance(recipe, Growth) else None)
-    data = assembly.data(device)
-    tracker = _Tracker(watch, starts * len(rounds))
+    tracker = Tracker(watch, starts * len(rounds))
+    backend = backend or Here()
+    with contextlib.ExitStack() as stack:
+        kept = stack.enter_context(contextlib.closing(KeptShards(backend, shards))) if (
+            shards) else None
+        box, digest = _extent(plant, samples, kept)
+        check_rates(plant, samples)
+        check_nominal_point(plant, samples, box)
+        scaling = Scaling.of(plant, box, parts[0],
+                             recipe.pre_feedback if isinstance(recipe, Growth) else None)
+        data = scaling.data(parts[0], device)
+        if kept is not None:
+            kept.scaled(scaling, device, threads)
+            data = replace(data, elsewhere=kept)
+        assembly = _Assembly(scaling, parts[0], kept, training_states(box, samples),
+                             Provenance(plant.name, seed, digest, {}, __version__))
+        path, interrupted = _run_rounds(
+            assembly, parts[1], rounds, tracker, lambda n_z, parent: run_starts(
+                Here() if kept else backend, recipe, data, n_z, parent, seed, starts, threads,
+                tracker))
+    return _conclude(plant, parts, path, interrupted, tracker, loops if refuse else 0, refuse,
+                     backend)
+
+
+def _extent(plant: Plant, samples: Samples, kept: KeptShards | None) -> tuple[Box, str]:
+    """Return the range of all samples, and their digest."""
+    if kept is None:
+        return Box.of(plant, samples.x, samples.u), samples.digest()
+    x, u = kept.corners
+    return Box.of(plant, np.vstack([samples.x, x]), np.vstack([samples.u, u])), kept.digest
+
+
+def _run_rounds(assembly: _Assembly, validation: Samples, rounds: Sequence[int],
+                tracker: Tracker, run: Callable[[int, Grown | None], Generator[
+                    tuple[str, Grown | str]]]) -> tuple[list[_Candidate], bool]:
+    """Return the winners of the rounds, and whether they were interrupted."""
     path: list[_Candidate] = []
     reasons: list[str] = []
     for n_z in rounds:
@@ -145,10 +178,9 @@ def train(plant: Plant, samples: Samples, recipe: Recipe, *, seed: int = 0, star
         best: _Candidate | None = None
         interrupted = False
         try:
-            with contextlib.closing(_run_starts(recipe, data, n_z, parent, seed, starts,
-                                                threads, tracker)) as finds:
-                for grown in finds:
-                    candidate = _judged(assembly, grown, parts[1])
+            with contextlib.closing(run(n_z, parent)) as finds:
+                for _, grown in finds:
+                    candidate = _judged(assembly, grown, validation)
                     if isinstance(candidate, str):
                         reasons.append(candidate)
                     elif best is None or candidate.score < best.score:
@@ -158,6 +190,8 @@ def train(plant: Plant, samples: Samples, recipe: Recipe, *, seed: int = 0, star
                                         and grown.status is MinimumStatus.INTERRUPTED):
                         interrupted = True
                         break
+            # elsewhere none may have come
+            interrupted = interrupted or tracker.stop
         except KeyboardInterrupt:
             if best is None and not path:
                 raise
@@ -171,11 +205,12 @@ def train(plant: Plant, samples: Samples, recipe: Recipe, *, seed: int = 0, star
             break
     if not path:
         raise NoUsefulLift(reasons[-1] if reasons else 'stopped before a start finished')
-    return _conclude(plant, parts, path, interrupted, tracker, loops if refuse else 0, refuse)
+    return path, interrupted
 
 
 def _conclude(plant: Plant, parts: tuple[Samples, Samples, Samples], path: list[_Candidate],
-              interrupted: bool, tracker: _Tracker, loops: int, refuse: bool) -> Trained:
+              interrupted: bool, tracker: Tracker, loops: int, refuse: bool,
+              backend: Backend) -> Trained:
     """Compare the winner with the linear model and report on the untouched episodes."""
     winner = path[-1]
     box = Box(winner.model.states, winner.model.inputs, plant.time_unit)
@@ -193,7 +228,7 @@ def _conclude(plant: Plant, parts: tuple[Samples, Samples, Samples], path: list[
         watch = (lambda _: False) if tracker.stop else tracker.check
         with contextlib.suppress(KeyboardInterrupt):
             law_check = check_law(winner.model, reference_drift(plant, box, parts, winner.model),
-                                  loops=loops, watch=watch)
+                                  loops=loops, watch=watch, backend=backend)
         interrupted = interrupted or law_check is None
         if law_check is not None and not law_check.accepted:
             refusal = NoUsefulLift(
@@ -263,8 +298,7 @@ def _judged(assembly: _Assembly, grown: Grown | str, validation: Samples) -> _Ca
         return grown.status.value
     try:
         model = assembly.model(grown)
-        readings = [model, *(with_readout(model, assembly.samples, smallest)
-                             for smallest in SMALLEST)]
+        readings = [model, *assembly.readouts(model)]
         fits = [fit(reading, validation.x, validation.dxdt, validation.u) for reading in readings]
         best = int(np.nanargmin([found.rx for found in fits]))
     except (ValueError, np.linalg.LinAlgError) as error:
@@ -273,135 +307,3 @@ def _judged(assembly: _Assembly, grown: Grown | str, validation: Samples) -> _Ca
     if not math.isfinite(found.rw + found.rx):
         return 'its figures are not finite: check the data and try another seed'
     return _Candidate(grown, readings[best], found)
-
-
-class _Tracker:
-    """Reports progress to `watch`, and remembers whether it asked to stop."""
-
-    def __init__(self, watch: Watch | None, total: int) -> None:
-        self._watch, self._total = watch, total
-        self.n_z, self.finished, self.stop = 0, 0, False
-        self._rw = math.nan
-
-    def step(self, iteration: int, cost: float) -> bool:
-        return self._report(iteration, math.sqrt(2.0 * cost))
-
-    def finish(self, rw: float) -> None:
-        self.finished, self._rw = self.finished + 1, rw
-        self._report(0, math.nan)
-
-    def check(self, share: float) -> bool:
-        return self._report(0, math.nan, share)
-
-    def _report(self, iteration: int, residual: float, checked: float = 0.0) -> bool:
-        if self._watch is not None and not self.stop:
-            self.stop = self._watch(Progress(self.n_z, self.finished, self._total, iteration,
-                                             residual, self._rw, checked))
-        return self.stop
-
-
-@dataclass(frozen=True)
-class _Assembly:
-    """Conversion of samples to the scaled problem, and of its solution to a model."""
-
-    plant: Plant
-    box: Box
-    samples: Samples
-    digest: str
-    seed: int
-    training_states: TrainingStates | None
-    pre_feedback: float | None  # weight of the input, where there is to be one
-
-    @cached_property
-    def pace(self) -> float:
-        """Root mean square of the scaled rates, by which time is scaled, in 1/time unit."""
-        # rates of order one put the residuals of the dynamics beside the others
-        rate = self.given[1] if self.frame else deviations(self.box, self.samples)[1]
-        return float(np.sqrt(np.mean(rate ** 2))) or 1.0
-
-    @cached_property
-    def inputs(self) -> InputModel:
-        """What is known of B."""
-        return InputModel.of(self.plant, self.box, self.samples.x)
-
-    @cached_property
-    def plain(self) -> tuple[Array, Array, Array | None]:
-        """States, rates without what is known of the inputs, and the regressors of the rest."""
-        x, rate, u = deviations(self.box, self.samples)
-        return x, *self.inputs.apart(x, rate, u)
-
-    @cached_property
-    def frame(self) -> Frame | None:
-        """In which the lift is learned; None for that of the samples."""
-        return None if self.pre_feedback is None else Frame.of(
-            self.inputs, *self.plain, self.pre_feedback)
-
-    @cached_property
-    def given(self) -> tuple[Array, Array, Array | None]:
-        """The same as `plain` in the frame."""
-        return self.frame.enter(*self.plain) if self.frame else self.plain
-
-    def data(self, device: str) -> ScaledSamples:
-        x, f, regressors = self.given
-        arrays = (x, f / self.pace, *([] if regressors is None else [regressors]))
-        return ScaledSamples(*(torch.from_numpy(a).to(device) for a in arrays))
-
-    def model(self, grown: Grown) -> LiftedModel:
-        parts = grown.layout.split(grown.theta.cpu())
-        A, B = self.pace * parts.A.numpy(), None if parts.B is None else (
-            self.pace * parts.B.numpy())
-        alone = grown.drift_alone
-        observables = NetworkObservables(
-            tuple((W.numpy(), b.numpy()) for W, b in parts.hidden),
-            parts.V.numpy()[:0 if alone else None], alone or grown.layout.identity,
-            grown.layout.activation)
-        if self.frame:
-            observables, A, B = self.frame.leave(observables, A, B)
-        constant, terms = self.inputs.matrix(B)
-        origin = Provenance(self.plant.name, self.seed, self.digest, {}, __version__)
-        return LiftedModel(observables, A, constant, self.box.states, self.box.inputs,
-                           self.box.time_unit, origin, self.training_states, input_terms=terms,
-                           pre_feedback=self.frame.K if self.frame else None)
-
-
-def _run_starts(recipe: Recipe, data: ScaledSamples, n_z: int, parent: Grown | None, seed: int,
-                starts: int, threads: int, tracker: _Tracker) -> Generator[Grown | str]:
-    """Run one round; yield what each start has found, in their order."""
-    seeds = [int(n) for n in np.random.SeedSequence([seed, n_z]).generate_state(starts)]
-    monitor = tracker.step if _runs_here() else None
-    results = joblib.Parallel(return_as='generator')(
-        joblib.delayed(_start)(recipe.of_start(i) if isinstance(recipe, Growth) else recipe, data,
-                               n_z, parent, number, threads, monitor)
-        for i, number in enumerate(seeds))
-    try:
-        # not `yield from`, which would close the results where their warning is not silenced
-        for found in results:  # noqa: UP028
-            yield found
-    finally:
-        with warnings.catch_warnings():
-            # that what is under way gets cancelled is meant
-            warnings.filterwarnings('ignore', '.* tasks (have been|which were)', UserWarning)
-            results.close()
-
-
-def _runs_here() -> bool:
-    """Return whether joblib runs the starts in this process, where their steps are reported."""
-    backend, jobs = joblib.parallel.get_active_backend()
-    return jobs in (None, 1) and isinstance(
-        backend, joblib.parallel.LokyBackend | joblib.parallel.SequentialBackend)
-
-
-def _start(recipe: Recipe, data: ScaledSamples, n_z: int, parent: Grown | None, seed: int,
-           threads: int, monitor: Monitor | None) -> Grown | str:
-    if multiprocessing.current_process().name.startswith('LokyProcess'):
-        # an interrupt of the terminal reaches the whole group: the process that waits answers it
-        # and ends its workers, which between two starts would only print where they were
-        signal.signal(signal.SIGINT, signal.SIG_IGN)
-    before = torch.get_num_threads()
-    torch.set_num_threads(threads)
-    try:
-        return recipe.start(data, n_z, parent, seed, monitor)
-    except torch.linalg.LinAlgError as error:
-        return f'a start is degenerate ({error}): check that all states move on their own'
-    finally:
-        torch.set_num_threads(before)

@@ -13,6 +13,7 @@ import numpy as np
 
 from koopman_ros.arrays import Array
 from koopman_ros.experiment import Experiment
+from koopman_ros.jobs.backends import scheduler_refusal
 from koopman_ros.lifting import LiftedModel
 from koopman_ros.model_classes import BEST, CLASSES, IDENTITY_LIFT
 from koopman_ros.parameters import wire
@@ -146,6 +147,13 @@ class TrainerParameters:
     training_samples: int = parameter(
         20_000, 'samples that are learned from and judged by; a longer record is averaged, where '
         'that loses nothing, and segments from all over its range are taken', '', 1000, 1_000_000)
+    scheduler: str = parameter(
+        '', 'where a training works: empty for a process of its own beside this node; joblib for '
+        'one on each core, joblib:N for N of them; tcp://host:port for the workers of a Dask '
+        'scheduler')
+    device: str = parameter(
+        'cpu', 'what evaluates the residuals, on every worker: cpu, or a GPU as torch names it, '
+        'like cuda')
     input_matrix: tuple[float, ...] = parameter(
         (0.0,), 'B where it is known, row by row: change of the rate of each state, in its unit '
         'per second, with each input; a single 0 to learn it')
@@ -234,7 +242,8 @@ class TrainerParameters:
                 'input_matrix_degree': self.input_matrix_degree,
                 'hidden_states': self.hidden_states, 'equations': self.equations,
                 'constants': named_ranges(self.constants_estimated),
-                'margin': self.gate_margin, 'condition': self.gate_condition}
+                'margin': self.gate_margin, 'condition': self.gate_condition,
+                'scheduler': self.scheduler, 'device': self.device}
 
 
 def trainer_table(present: LiftedModel | None, given: Mapping[str, Any] = MappingProxyType({})
@@ -310,6 +319,8 @@ def _cross_check(signals: Signals, values: TrainerParameters) -> str:
     if values.output.endswith('.mcap') and (values.max_bag_size or values.max_bag_duration):
         return (f'output = {values.output!r} is one file, which max_bag_size and '
                 'max_bag_duration cannot split: give the name of a folder, without .mcap')
+    if reason := scheduler_refusal(values.scheduler):
+        return reason
     if not values.model_output.endswith('.safetensors'):
         return f'model_output = {values.model_output!r} must end in .safetensors'
     n_x, n_u = len(signals.states), len(signals.inputs)

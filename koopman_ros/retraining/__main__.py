@@ -17,6 +17,7 @@ import threading
 import time
 
 from koopman_ros.identification import Stopped
+from koopman_ros.jobs.backends import SchedulerLost, WorkerLost
 from koopman_ros.retraining import retrain, Task, write_report
 
 _PERIOD = 0.2  # s between two lines of progress
@@ -49,7 +50,8 @@ def main() -> int:
     except Stopped:
         _print(stopped=True)
         return 1
-    except (ValueError, TypeError, KeyError, OSError, MemoryError) as error:
+    except (ValueError, TypeError, KeyError, OSError, MemoryError, WorkerLost,
+            SchedulerLost, ImportError) as error:
         _print(error=' '.join(str(error).split()) or type(error).__name__)
         return 1
     warnings = list(retrained.decision.warnings) if retrained.decision else []

@@ -12,6 +12,7 @@ from koopman_ros.arrays import Array, brief
 from koopman_ros.control.law_check import check_law, LawCheck, LOOPS, Rate
 from koopman_ros.identification import Drift, fitted_starts, Identified, longest_step, Stopped
 from koopman_ros.identification.drift import prediction_error, Segments
+from koopman_ros.jobs.backends import Backend
 from koopman_ros.learning import Comparison, Figures, Trained
 from koopman_ros.learning.validation import lifted_rate
 from koopman_ros.lifting import Coordinates, LiftedModel
@@ -62,14 +63,14 @@ class HeldOut:
         """Return that of a model's drift."""
         return self.rmse(lifted_rate(model, self._seconds))
 
-    def law_check(self, model: LiftedModel, loops: int, watch: Callable[[float], bool]
-                  ) -> LawCheck:
+    def law_check(self, model: LiftedModel, loops: int, watch: Callable[[float], bool],
+                  backend: Backend | None = None) -> LawCheck:
         """Close a model's loop on the estimated drift; Stopped where `watch` ended it."""
         # as it was measured, as far as that matters
         period = float(np.median(np.concatenate(
             [np.diff(part.time) for part in self._found.held_out])))
         found = check_law(model, self._found.drift.rate, loops=loops, watch=watch,
-                          interval=period * self._seconds)
+                          interval=period * self._seconds, backend=backend)
         if found is None:
             raise Stopped
         return found

@@ -61,6 +61,9 @@ class Task:
     setpoints: Mapping[str, tuple[float, float]] = field(default_factory=dict)
     margin: float = 0.1  #: see :class:`Thresholds`
     condition: float = 1e4  #: likewise
+    #: where it is worked, see :func:`~koopman_ros.jobs.backends.backend_of`
+    scheduler: str = ''
+    device: str = 'cpu'  #: where residuals are evaluated, as torch names it
 
     @classmethod
     def from_json(cls, text: str) -> Task:

@@ -13,9 +13,10 @@ from koopman_ros.arrays import Array
 from koopman_ros.control.law_check import LOOPS
 from koopman_ros.identification import Drift, fitted_starts, Identified, longest_step
 from koopman_ros.identification.drift import Segments
+from koopman_ros.jobs.backends import Backend
 from koopman_ros.learning import compare, Comparison, Contender, Growth, Judge, train, Trained
 from koopman_ros.learning.comparison import usual_recipes
-from koopman_ros.learning.training import Watch
+from koopman_ros.learning.starts import Watch
 from koopman_ros.learning.validation import ROUNDING
 from koopman_ros.model_classes import BEST, IDENTITY_LIFT, LINEAR
 from koopman_ros.plant_data import Episode, Plant, Samples
@@ -154,7 +155,8 @@ def _estimated(found: Identified, plant: Plant) -> tuple[Plant, Samples]:
 def compare_classes(found: Identified, plant: Plant, thresholds: Thresholds, *,
                     model_class: str = BEST, n_z: int, seed: int, starts: int, loops: int = LOOPS,
                     watch: Watch | None = None,
-                    judging: Callable[[str, float], bool] = lambda *_: False) -> Comparison:
+                    judging: Callable[[str, float], bool] = lambda *_: False,
+                    device: str = 'cpu', backend: Backend | None = None) -> Comparison:
     """
     Learn models of an estimated drift as :func:`learning.compare` does, judged by the record.
 
@@ -167,6 +169,7 @@ def compare_classes(found: Identified, plant: Plant, thresholds: Thresholds, *,
         them and the rule.
     :param n_z: coordinates of the identity lift; other arguments as for :func:`learn_lift`.
     :param judging: called with the class whose law is being tried and the share that is done.
+    :param device: as for :func:`learning.train`, as `backend`, where closed loops run, too.
     :raises NoUsefulLift: when there is no model of the class that was asked for, or of any.
     :raises ValueError: when the episodes hold no steady state, and for a class that there is not.
     :raises Stopped: when `judging` ended it.
@@ -178,7 +181,8 @@ def compare_classes(found: Identified, plant: Plant, thresholds: Thresholds, *,
         assert one.model is not None
         assert one.figures is not None
         rmse = held_out.rmse_of(one.model)
-        law_check = held_out.law_check(one.model, loops, lambda share: judging(one.name, share))
+        law_check = held_out.law_check(one.model, loops, lambda share: judging(one.name, share),
+                                       backend)
         reasons = held_out.reasons(one.model, rmse, one.figures, law_check,
                                    one.name == LINEAR)
         return replace(one, figures=replace(one.figures, rollout_rmse=rmse), law_check=law_check,
@@ -192,4 +196,5 @@ def compare_classes(found: Identified, plant: Plant, thresholds: Thresholds, *,
     alone = model_class != BEST
     return compare(known, samples, {**usual_recipes(len(noise)), IDENTITY_LIFT: Growth(n_z)},
                    choose=model_class if alone else None, alone=alone, seed=seed, starts=starts,
-                   watch=watch, judge=Judge(judged, max(chance, ROUNDING)))
+                   watch=watch, judge=Judge(judged, max(chance, ROUNDING)), device=device,
+                   backend=backend)

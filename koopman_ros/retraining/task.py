@@ -19,13 +19,16 @@ from numpy.typing import NDArray
 from koopman_ros.arrays import Array, brief
 from koopman_ros.bags import Account
 from koopman_ros.identification import (
+    DriftModel,
     Identified,
     identify,
     identify_grey,
     identify_hidden,
     Stopped,
 )
+from koopman_ros.jobs.backends import Backend, backend_of
 from koopman_ros.learning import Comparison, Contender, NoUsefulLift, Progress
+from koopman_ros.learning.scaling import checked_device
 from koopman_ros.lifting import Box, LiftedModel, load, save
 from koopman_ros.model_classes import BEST, CLASSES
 from koopman_ros.plant_data import Episode, Plant
@@ -113,6 +116,8 @@ class Retrained:
             'coverage': {', '.join(pair): share for pair, share in self.coverage.items()},
             'derivative_method': self.found.method,
             'drift': self.found.drift.form,
+            'drift_degree': (
+                self.found.drift.degree if isinstance(self.found.drift, DriftModel) else None),
             'input_gain': {name: dict(zip(inputs.names, map(float, row), strict=True))
                            for name, row in zip(states.names, gains, strict=True)},
             'noise': by_state(self.found.noise),
@@ -156,6 +161,22 @@ def retrain(task: Task, on_progress: OnProgress = lambda *_: False, *, each: Eac
     """
     Read the bags, estimate the drift, learn a lift of it, judge it, and write it.
 
+    It is worked where the task says, and gives the same lift wherever that is; arguments, what it
+    writes and raises as for :func:`retrain_by`.
+
+    :raises WorkerLost: when workers are lost and none takes over; nothing is written then.
+    :raises SchedulerLost: when a scheduler is not reached, or is lost; likewise.
+    """
+    checked_device(task.device)
+    with backend_of(task.scheduler) as backend:
+        return retrain_by(backend, task, on_progress, each=each)
+
+
+def retrain_by(backend: Backend, task: Task, on_progress: OnProgress = lambda *_: False, *,
+               each: Each = map) -> Retrained:
+    """
+    Read the bags, estimate the drift, learn a lift of it, judge it, and write it.
+
     An accepted lift goes to the output file, and what was there before is kept beside it as
     ``.previous.safetensors``; a refused one goes to ``.refused.safetensors``.
 
@@ -179,8 +200,8 @@ def retrain(task: Task, on_progress: OnProgress = lambda *_: False, *, each: Eac
     source = Source(
         task.bags, states, inputs, tolerance_ns=round(task.tolerance * NANOSECONDS),
         least_jumps=None if current is None else (_LEAST_JUMP * current.states.scale).tolist())
-    record = read_record(source, task.most_samples, task.seed, hidden=task.hidden_states > 0,
-                         tick=_reading(on_progress, source), each=each)
+    record = read_record(source, task.most_samples, task.seed,
+                         hidden=bool(task.hidden_states or task.equations), tick=_reading(on_progress, source), each=each)
     account = record.account
     if not record.episodes:
         raise ValueError('the bags hold no usable segment of measurements: '
@@ -199,7 +220,7 @@ def retrain(task: Task, on_progress: OnProgress = lambda *_: False, *, each: Eac
         found = identify_hidden(plant, episodes, task.hidden_states, seed=task.seed,
                                 watch=estimating)
     else:
-        found = identify(plant, episodes, seed=task.seed, watch=estimating)
+        found = identify(plant, episodes, seed=task.seed, watch=estimating, backend=backend)
     if found.hidden:
         episodes = [*found.fitted, *found.held_out]
     states_found = found.drift.box.states
@@ -220,7 +241,8 @@ def retrain(task: Task, on_progress: OnProgress = lambda *_: False, *, each: Eac
     try:
         learned = compare_classes(
             found, plant, thresholds, model_class=task.model_class, n_z=task.coordinates,
-            seed=task.seed, starts=task.starts, watch=course.learning, judging=course.judging)
+            seed=task.seed, starts=task.starts, watch=course.learning, judging=course.judging,
+            device=task.device, backend=backend)
     except NoUsefulLift as error:
         _stop_if(on_progress(_at('decide', _JUDGED), 'judging'))
         return replace(bare, reasons=(str(error),))

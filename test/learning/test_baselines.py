@@ -14,7 +14,7 @@ from koopman_ros.control import averaged, run_closed_loop, steady_state_target, 
 from koopman_ros.learning import Algorithm1, Edmd, evaluate, fit, Linearisation
 from koopman_ros.learning.levenberg_marquardt import MinimumStatus, normal_equations
 from koopman_ros.learning.network import Layout
-from koopman_ros.learning.residuals import Problem, ResidualWeights, ScaledSamples
+from koopman_ros.learning.residuals import LiftProblem, ResidualWeights, ScaledSamples
 from koopman_ros.lifting import Box
 from koopman_ros.plant_data import Plant, Samples
 from support.small_plants import BENT, bent_samples, TWO_STATE, two_state_samples
@@ -196,8 +196,8 @@ def test_lambda_falls_by_gamma_from_one_minimisation_to_the_next(data, initial, 
         grown = recipe.start(data, 2, None, 0, monitor)
         assert grown.status is MinimumStatus.INTERRUPTED
         weights = ResidualWeights(decoder=initial / gamma ** number)
-        there = normal_equations(Problem(grown.layout, data, weights).add_residuals, grown.theta,
-                                 derivatives=False)
+        there = normal_equations(LiftProblem(grown.layout, data, weights).add_residuals,
+                                 grown.theta, derivatives=False)
         assert there.cost == pytest.approx(seen[-1][1], rel=1e-13)
 
 
@@ -215,6 +215,6 @@ def test_it_ends_when_parameters_hardly_move_or_after_max_rounds(
 def test_it_lowers_the_residual_of_the_dynamics(data):
     recipe = Algorithm1(2, identity=True, hidden=(4,), decoder=4, max_iterations=60)
     grown = recipe.start(data, 2, None, 0)
-    problem = Problem(grown.layout, data, ResidualWeights())
+    problem = LiftProblem(grown.layout, data, ResidualWeights())
     found = normal_equations(problem.add_residuals, grown.theta, derivatives=False)
     assert found.cost < 0.02 * 0.5 * float(np.mean(data.f.numpy() ** 2))

@@ -151,7 +151,7 @@ def test_a_linear_plant_gets_a_linear_model_and_no_refused_one():
     ({2: 16}, 'linear'), ({1: 8, 2: 5}, 'polynomial'), ({1: 5, 2: 5}, 'linear')])
 def test_a_model_whose_law_fails_is_not_taken(monkeypatch, failing, chosen):
     """However close it is; where all fail, which fails least often."""
-    def fails(model, rate, loops):
+    def fails(model, rate, loops, **_):
         excess = np.ones(16)
         excess[:failing.get(model.n_z, 0)] = np.inf
         return replace(check_law(model, rate, loops=loops), excess=excess)

@@ -17,7 +17,7 @@ import torch
 import koopman_ros
 from koopman_ros.learning.levenberg_marquardt import minimise, MinimumStatus, normal_equations
 from koopman_ros.learning.network import ACTIVATIONS, Layout, Pass
-from koopman_ros.learning.residuals import Problem, ResidualWeights, ScaledSamples
+from koopman_ros.learning.residuals import LiftProblem, ResidualWeights, ScaledSamples
 from koopman_ros.lifting import NetworkObservables
 
 FUNCTIONS = {'tanh': torch.tanh, 'sigmoid': torch.sigmoid, 'sine': torch.sin,
@@ -66,7 +66,7 @@ def random_problem(layout, weights, chunk=4, seed=1):
     normal = normals(seed)
     data = ScaledSamples(normal(COUNT, layout.n_x), normal(COUNT, layout.n_x),
                          normal(COUNT, layout.n_u) if layout.n_u else None)
-    return Problem(layout, data, weights, chunk), normal(layout.size)
+    return LiftProblem(layout, data, weights, chunk), normal(layout.size)
 
 
 def residuals(theta, of):
@@ -152,13 +152,13 @@ def test_any_chunks_and_the_cost_alone(chunk):
     (Layout(2, 4, (3,), True), ALL_TERMS, 'a decoder weight needs a decoder network')])
 def test_what_a_problem_needs(layout, weights, words):
     with pytest.raises(ValueError, match=words):
-        Problem(layout, ScaledSamples(torch.zeros(3, 2), torch.zeros(3, 2)), weights)
+        LiftProblem(layout, ScaledSamples(torch.zeros(3, 2), torch.zeros(3, 2)), weights)
 
 
 MEMORY = """
 import resource
 from koopman_ros.learning.network import Layout
-from koopman_ros.learning.residuals import Problem, ResidualWeights
+from koopman_ros.learning.residuals import LiftProblem, ResidualWeights
 from koopman_ros.learning.residuals import ScaledSamples
 from koopman_ros.learning.levenberg_marquardt import normal_equations
 import torch
@@ -168,7 +168,7 @@ theta = 0.1 * torch.ones(layout.size, dtype=torch.float64)
 peaks = []
 for count in (6_000, 60_000):
     x = torch.linspace(-1.0, 1.0, 2 * count, dtype=torch.float64).view(count, 2)
-    problem = Problem(layout, ScaledSamples(x, x), ResidualWeights(1.0))
+    problem = LiftProblem(layout, ScaledSamples(x, x), ResidualWeights(1.0))
     normal_equations(problem.add_residuals, theta)
     peaks.append(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss)
 print(peaks[1] - peaks[0])

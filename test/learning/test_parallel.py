@@ -5,128 +5,107 @@
 
 import contextlib
 from dataclasses import replace
-import logging
 import os
 from pathlib import Path
 import signal
 import subprocess
 import sys
-import warnings
 
-import joblib
 import numpy as np
 import pytest
 import torch
 
 import koopman_ros
-from koopman_ros.learning import train, training
+from koopman_ros.jobs.backends import Here
+from koopman_ros.learning import train
+from support.places import KINDS, places
 from support.small_plants import BENT, bent_samples, bits, SMALL
 
 RECIPE = replace(SMALL, n_z=3)
 
 
-def trained():
-    return train(BENT, bent_samples(), RECIPE, starts=3, seed=5, loops=16)
+def trained(backend, watch=None):
+    return train(BENT, bent_samples(), RECIPE, starts=3, seed=5, loops=16, backend=backend,
+                 watch=watch)
 
 
 @pytest.fixture(scope='module')
 def expected():
-    return bits(trained().model)
+    return bits(trained(None).model)
 
 
-@contextlib.contextmanager
-def dask():
-    """Start a Dask cluster of two threads in this process."""
-    with warnings.catch_warnings():
-        # its own imports
-        warnings.simplefilter('ignore')
-        distributed = pytest.importorskip('distributed')
-    # its ports are free ones of the loopback interface
-    with (distributed.LocalCluster(
-            n_workers=1, threads_per_worker=2, processes=False, host='127.0.0.1',
-            protocol='tcp://', dashboard_address='127.0.0.1:0',
-            silence_logs=logging.CRITICAL) as cluster,
-          distributed.Client(cluster), joblib.parallel_config('dask')):
-        yield
+@pytest.fixture(scope='module', name='places')
+def every_place():
+    with places() as opened:
+        yield opened
 
 
-@pytest.mark.parametrize('backend', [
-    lambda: joblib.parallel_config('loky', n_jobs=2),
-    lambda: joblib.parallel_config('threading', n_jobs=2),
-    lambda: joblib.parallel_config('loky', n_jobs=1),
-    dask], ids=['loky', 'threading', 'one job', 'dask'])
-def test_the_bits_do_not_depend_on_where_starts_run(backend, expected):
+@pytest.mark.parametrize('kind', KINDS)
+def test_the_bits_do_not_depend_on_where_starts_run(kind, expected, places):
     threads = torch.get_num_threads()
-    with backend():
-        assert bits(trained().model) == expected
+    assert bits(trained(places[kind]).model) == expected
     assert torch.get_num_threads() == threads
 
 
-@pytest.mark.parametrize(('backend', 'leaves'), [('loky', True), ('threading', False)])
-def test_workers_leave_an_interrupt_to_the_process_that_waits(backend, leaves):
-    """Between two starts they would print where they were."""
-    class Probe:
-        """A recipe whose start says how its process answers an interrupt."""
-
-        def start(self, *_):
-            return signal.getsignal(signal.SIGINT) is signal.SIG_IGN
-
-    # in the background of a shell all of them would ignore it
-    before = signal.signal(signal.SIGINT, signal.default_int_handler)
-    try:
-        with joblib.parallel_config(backend, n_jobs=2):
-            answers = joblib.Parallel()(joblib.delayed(training._start)(
-                Probe(), None, 2, None, 0, 1, None) for _ in range(2))
-    finally:
-        signal.signal(signal.SIGINT, before)
-    assert answers == [leaves, leaves]
-
-
-def test_many_samples_go_to_processes():
-    """Arrays beyond a megabyte come to them mapped to memory, read-only."""
-    some = bent_samples(length=40_000)
-    assert some.x.nbytes > 1 << 20
-    recipe = replace(SMALL, max_iterations=2, tolerance=0.0)
-    one = train(BENT, some, recipe, starts=1, loops=16)
-    with joblib.parallel_config('loky', n_jobs=2):
-        assert bits(train(BENT, some, recipe, starts=1, loops=16).model) == bits(one.model)
-    assert np.isfinite(one.figures.fit.rw)
-
-
-def test_the_watch_can_end_starts_in_processes():
+@pytest.mark.parametrize('kind', KINDS)
+def test_the_watch_follows_and_can_end_starts_anywhere(kind, places):
     seen = []
 
     def watch(now):
         seen.append(now)
         return now.finished == 4
 
-    with joblib.parallel_config('loky', n_jobs=2):
-        kept = train(BENT, bent_samples(), RECIPE, starts=3, seed=5, loops=16,
-                     watch=watch)
-    # processes tell of whole starts only
-    assert [(now.n_z, now.finished, now.iteration) for now in seen] == [
-        (2, 1, 0), (2, 2, 0), (2, 3, 0), (3, 4, 0)]
+    kept = trained(places[kind], watch)
+    # whole starts come in their order wherever they run, and steps of them before
+    finished = [(now.n_z, now.finished) for now in seen]
+    assert finished == sorted(finished)
+    assert {(2, 1), (2, 2), (2, 3), (3, 4)} <= set(finished) <= {
+        (2, 0), (2, 1), (2, 2), (2, 3), (3, 3), (3, 4)}
+    assert any(now.iteration and np.isfinite(now.residual) for now in seen)
     assert kept.status.startswith('interrupted')
     assert (kept.model.n_z, kept.starts) == (3, 4)
 
 
+def test_many_samples_go_to_processes(places):
+    some = bent_samples(length=40_000)
+    assert some.x.nbytes > 1 << 20
+    recipe = replace(SMALL, max_iterations=2, tolerance=0.0)
+    one, other = (train(BENT, some, recipe, starts=1, loops=16, backend=backend)
+                  for backend in (Here(), places['process']))
+    assert bits(other.model) == bits(one.model)
+    assert np.isfinite(one.figures.fit.rw)
+
+
+def test_a_start_that_fails_is_named(places):
+    """Not all of the samples span another coordinate."""
+    class Failing(type(RECIPE)):
+        def start(self, *_):
+            raise ValueError('no new coordinate can be started')
+
+    for backend in places.values():
+        with pytest.raises(ValueError, match='no new coordinate') as caught:
+            train(BENT, bent_samples(), Failing(2), starts=2, backend=backend)
+        assert caught.value.__notes__ == ['in start 1 with n_z = 2']
+
+
 PROGRAM = """
 import signal
-import joblib
+from koopman_ros.jobs.backends import backend_of
 from koopman_ros.learning import Growth, train
 from support.small_plants import BENT, bent_samples
 
 def watch(now):
-    print(now.n_z, now.finished, now.iteration, flush=True)
+    print(now.n_z, now.finished, flush=True)
     return False
 
 # started in the background of a shell, it would ignore it
 signal.signal(signal.SIGINT, signal.default_int_handler)
 if __name__ == '__main__':
-    with joblib.parallel_config('loky', n_jobs=2):
+    with backend_of('joblib:2') as backend:
         # endless, or it could be over before a busy machine interrupts it
         recipe = Growth(200, max_iterations=60, tolerance=0.0)
-        found = train(BENT, bent_samples(length=300), recipe, starts=2, watch=watch)
+        found = train(BENT, bent_samples(length=300), recipe, starts=2, watch=watch,
+                      backend=backend)
     print('model', found.model.n_z, found.status)
 """
 

@@ -35,6 +35,6 @@ def disturb_training() -> None:
     """Disturb what `train` hands to its starts; figures and digests are of the data as given."""
     if not SIZE:
         return
-    from koopman_ros.learning import training
-    original = training.ScaledSamples
-    training.ScaledSamples = lambda *arrays: disturbed_data(original(*arrays))
+    from koopman_ros.learning import scaling
+    original = scaling.ScaledSamples
+    scaling.ScaledSamples = lambda *arrays: disturbed_data(original(*arrays))

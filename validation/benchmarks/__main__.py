@@ -10,12 +10,12 @@ from pathlib import Path
 import sys
 
 from koopman_ros.reports import machine, write_figures
-from validation.benchmarks import loop, panel, recording, retraining, site, training
+from validation.benchmarks import cluster, loop, panel, recording, retraining, site, training
 
 # A part has its PLANS by extent, the PACKAGES whose versions matter, and `measure`, which fills
 # in the figures of one plan and yields them piece by piece as text.
 PARTS = {'training': training, 'retraining': retraining, 'recording': recording, 'loop': loop,
-         'panel': panel, 'site': site}
+         'panel': panel, 'site': site, 'cluster': cluster}
 
 
 def main(args: list[str] | None = None) -> int:

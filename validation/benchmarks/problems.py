@@ -12,7 +12,7 @@ from torch import Tensor
 from koopman_ros.arrays import Array
 from koopman_ros.learning.growth import Growth
 from koopman_ros.learning.network import Layout, Pass
-from koopman_ros.learning.residuals import Problem, ResidualWeights, ScaledSamples
+from koopman_ros.learning.residuals import LiftProblem, ResidualWeights, ScaledSamples
 from koopman_ros.plants import one_state_reactor, two_state_example
 
 WHITENING = 1.0
@@ -47,9 +47,9 @@ class Case:
         return torch.from_numpy(self.start)
 
     @property
-    def problem(self) -> Problem:
+    def problem(self) -> LiftProblem:
         """The objective, as our learner takes it."""
-        return Problem(self.layout, self.data, ResidualWeights(WHITENING))
+        return LiftProblem(self.layout, self.data, ResidualWeights(WHITENING))
 
     def rw(self, theta: Tensor) -> float:
         """Return rw, the residual relative to the motion in the metric of E[z z'], or infinity."""

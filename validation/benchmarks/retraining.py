@@ -18,7 +18,7 @@ from matplotlib.axes import Axes
 import numpy as np
 
 from koopman_ros.bags import RecordedInput, RecordedState
-from koopman_ros.identification import DriftModel
+from koopman_ros.identification import Drift
 from koopman_ros.plants.library.reactor import OneStateReactor
 from koopman_ros.plants.library.two_tanks import TwoTanks
 from koopman_ros.reports import drawing, legend, table
@@ -129,7 +129,7 @@ def task_of(case: Case, bags: Sequence[Path], output: Path) -> Task:
             system.input_names, system.input_units, strict=True)), plant=case.name)
 
 
-def drift_error(case: Case, drift: DriftModel) -> list[float]:
+def drift_error(case: Case, drift: Drift) -> list[float]:
     """Return the error of each state's drift along fresh runs, relative to the drift's size."""
     system, states = case.design.system, drift.box.states
     x, u = (values.reshape(-1, values.shape[2])[::7][:_TESTED] for values in simulated(

@@ -13,7 +13,7 @@ from typing import Any
 from validation.general import coordinates
 from validation.general.report import write_report
 from validation.general.study import EXPERIMENTS
-from validation.paper.campaign import conclude, run_campaign
+from validation.paper.campaign import add_scheduler, conclude, run_campaign
 
 
 def main(args: list[str] | None = None) -> int:
@@ -28,6 +28,7 @@ def main(args: list[str] | None = None) -> int:
                         '(default: %(default)s)')
     parser.add_argument('--output', type=Path, default=Path('out/studies-general'),
                         help='folder for figure and report (default: %(default)s)')
+    add_scheduler(parser)
     options = parser.parse_args(args)
     if options.seeds < 1:
         parser.error(f'--seeds is {options.seeds}, must be at least 1')
@@ -38,11 +39,12 @@ def main(args: list[str] | None = None) -> int:
     signal.signal(signal.SIGTERM, signal.default_int_handler)
     start = time.monotonic()
     names = options.plants or list(EXPERIMENTS)
-    campaign = run_campaign(options.seeds, {name: EXPERIMENTS[name] for name in names})
+    campaign = run_campaign(options.seeds, {name: EXPERIMENTS[name] for name in names},
+                            options.scheduler)
     if campaign.complete:
         campaign.add(run_campaign(min(options.seeds, coordinates.SEEDS), {
             name: coordinates.EXPERIMENTS[name] for name in (
-                f'{coordinates.PLACE}/{name}' for name in names)}))
+                f'{coordinates.PLACE}/{name}' for name in names)}, options.scheduler))
 
     def report(summary: dict[str, Any]) -> str:
         write_report(summary, options.output)

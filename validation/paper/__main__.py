@@ -14,7 +14,12 @@ import sys
 import time
 from typing import Any
 
-from validation.paper.campaign import conclude, run_campaign, SENSOR_EXPERIMENTS
+from validation.paper.campaign import (
+    add_scheduler,
+    conclude,
+    run_campaign,
+    SENSOR_EXPERIMENTS,
+)
 from validation.paper.figures import draw_figures
 from validation.paper.report import write_report
 
@@ -31,6 +36,7 @@ def main(args: list[str] | None = None) -> int:
                         "instead of the paper's experiments")
     parser.add_argument('--output', type=Path, help='folder for figures and report (default: '
                         'out/studies, or out/studies-sensors)')
+    add_scheduler(parser)
     options = parser.parse_args(args)
     options.output = options.output or Path(
         'out/studies-sensors' if options.sensors else 'out/studies')
@@ -39,7 +45,8 @@ def main(args: list[str] | None = None) -> int:
     # a request to end is an interrupt: what is done is reported
     signal.signal(signal.SIGTERM, signal.default_int_handler)
     start = time.monotonic()
-    campaign = run_campaign(options.seeds, SENSOR_EXPERIMENTS if options.sensors else None)
+    campaign = run_campaign(options.seeds, SENSOR_EXPERIMENTS if options.sensors else None,
+                            options.scheduler)
 
     def report(summary: dict[str, Any]) -> str:
         figures = draw_figures(campaign, options.output)

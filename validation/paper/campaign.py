@@ -3,20 +3,21 @@
 
 """All experiments over a number of seeds, side by side on the cores of the machine."""
 
+import argparse
 from collections.abc import Callable, Iterator, Mapping
+import contextlib
 from dataclasses import dataclass, field
 import math
-import os
 from pathlib import Path
 import sys
 import time
 from typing import Any, TypeAlias
 
-import joblib
 from tqdm import tqdm
 
 from koopman_ros import __version__
 from koopman_ros.control import ClosedLoop
+from koopman_ros.jobs.backends import backend_of, SchedulerLost, Tell, WorkerLost
 from koopman_ros.lifting import LiftedModel
 from koopman_ros.reports import write_figures
 from validation.paper import reactor, scalar, sensors, two_state
@@ -78,44 +79,43 @@ class Campaign:
         return nested
 
 
-def run_campaign(seeds: int, experiments: Mapping[str, Experiment] | None = None) -> Campaign:
+def add_scheduler(parser: argparse.ArgumentParser) -> None:
+    """Add the option that says where runs go."""
+    parser.add_argument(
+        '--scheduler', default='joblib', metavar='PLACE', help='where the runs go: joblib for a '
+        'process on each core, joblib:N for N of them, tcp://... for the workers of a Dask '
+        'scheduler, an empty text for this process (default: %(default)s)')
+
+
+def run_campaign(seeds: int, experiments: Mapping[str, Experiment] | None = None,
+                 scheduler: str = 'joblib') -> Campaign:
     """
     Run every experiment for the seeds 0 ... `seeds` - 1; an interrupt keeps what is done.
 
-    joblib spreads the runs over the cores; within ``joblib.parallel_config(...)`` they go where
-    that says.
-
     :param experiments: by the place of their figures in the summary; the paper's by default.
+    :param scheduler: where the runs go, see :func:`~koopman_ros.jobs.backends.backend_of`.
     """
     experiments = EXPERIMENTS if experiments is None else experiments
     campaign = Campaign()
     # seed by seed, so that an interrupted campaign is whole for the first ones
-    runs = [(name, seed) for seed in range(seeds) for name in experiments]
-    jobs = joblib.parallel.get_active_backend()[1] or len(os.sched_getaffinity(0))
-    finished = joblib.Parallel(n_jobs=jobs, return_as='generator_unordered')(
-        joblib.delayed(_run)(name, seed, experiments[name]) for name, seed in runs)
+    runs = {f'{name}, seed {seed}': (name, seed, experiments[name])
+            for seed in range(seeds) for name in experiments}
     bar = tqdm(total=len(runs), unit='run', disable=not sys.stderr.isatty())
     try:
-        for number, (name, seed, outcome) in enumerate(finished, 1):
-            if isinstance(outcome, str):
-                campaign.errors.append(f'{name}, seed {seed}: {outcome}')
-                text = ' failed'
-            else:
-                campaign.metrics.setdefault(name, {})[seed], campaign.models.setdefault(
-                    name, {})[seed] = outcome
-                rw = [value for figure, value in outcome[0].items()
-                      if figure.split('/')[-1] in ('rw', 'rw_in') and isinstance(value, float)]
-                text = f', rw {min(rw):.1e}' if rw else ''
-            bar.set_postfix_str(f'{name}, seed {seed}{text}', refresh=False)
-            bar.update()
-            if bar.disable:
-                print(f'{number}/{len(runs)}: {name}, seed {seed}{text}', file=sys.stderr,
-                      flush=True)
+        with backend_of(scheduler) as backend, contextlib.closing(
+                backend.run(_run, runs)) as finished:
+            for number, (run, outcome) in enumerate(finished, 1):
+                text = _noted(campaign, *runs[run][:2], outcome)
+                bar.set_postfix_str(run + text, refresh=False)
+                bar.update()
+                if bar.disable:
+                    print(f'{number}/{len(runs)}: {run}{text}', file=sys.stderr, flush=True)
         campaign.complete = True
     except KeyboardInterrupt:
         print('interrupted: reporting on what is done', file=sys.stderr)
+    except (WorkerLost, SchedulerLost) as error:
+        campaign.errors.append(str(error))
     finally:
-        finished.close()
         bar.close()
     campaign.errors.sort()
     return campaign
@@ -142,13 +142,27 @@ def conclude(campaign: Campaign, seeds: int, begin: float, folder: Path,
     return 0 if campaign.complete and not campaign.errors else 1
 
 
-def _run(name: str, seed: int, experiment: Experiment
-         ) -> tuple[str, int, tuple[Metrics, Models] | str]:
+def _noted(campaign: Campaign, name: str, seed: int, outcome: tuple[Metrics, Models] | str
+           ) -> str:
+    """Note what a run has found, and return what is told of it."""
+    if isinstance(outcome, str):
+        campaign.errors.append(f'{name}, seed {seed}: {outcome}')
+        return ' failed'
+    metrics, models = outcome
+    campaign.metrics.setdefault(name, {})[seed] = metrics
+    campaign.models.setdefault(name, {})[seed] = models
+    rw = [value for figure, value in metrics.items()
+          if figure.split('/')[-1] in ('rw', 'rw_in') and isinstance(value, float)]
+    return f', rw {min(rw):.1e}' if rw else ''
+
+
+def _run(_: None, item: tuple[str, int, Experiment], __: Tell) -> tuple[Metrics, Models] | str:
+    _name, seed, experiment = item
     try:
-        return name, seed, experiment(seed)
+        return experiment(seed)
     except (ValueError, RuntimeError, ArithmeticError) as error:
         # one run that fails must not take the others with it
-        return name, seed, f'{type(error).__name__}: {error}'
+        return f'{type(error).__name__}: {error}'
 
 
 def _flattened(metrics: Metrics) -> Iterator[tuple[str, float | bool | None]]:

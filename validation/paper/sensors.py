@@ -11,7 +11,7 @@ from koopman_ros import experiment as experiments
 from koopman_ros import plants
 from koopman_ros.arrays import Array
 from koopman_ros.control import at, Controller, InputLimits, SetpointRequest, Settings, simulate
-from koopman_ros.identification import Identified, identify
+from koopman_ros.identification import DriftModel, Identified, identify
 from koopman_ros.learning import NoUsefulLift, roll_out, Trained
 from koopman_ros.lifting import Box, LiftedModel, linearised_model, Provenance
 from koopman_ros.plant_data import Episode
@@ -49,6 +49,7 @@ def run_noisy(seed: int, noise: float = NOISE) -> tuple[Metrics, Models]:
     """
     found, learned = _learn(_measured(_drive(SYSTEM, DESIGN, seed), noise, seed), _like(), seed)
     fitted = learned.figures.fit
+    assert isinstance(found.drift, DriftModel)
     return {
         'rollout_kelvin': _roll_out_error(learned.model, SYSTEM, DESIGN, seed),
         'input_gain_error': _gain_error(found, SYSTEM),

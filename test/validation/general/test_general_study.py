@@ -8,7 +8,6 @@ from functools import partial
 import json
 import re
 
-import joblib
 import matplotlib.image
 import numpy as np
 import pytest
@@ -134,7 +133,7 @@ def test_sindy_leaves_out_what_van_der_pol_does_not_have():
 def folder(tmp_path_factory):
     """Run one plant and one seed, few starts, linear and cubic models and a hasty lift."""
     output = tmp_path_factory.mktemp('general')
-    with pytest.MonkeyPatch.context() as patch, joblib.parallel_config('threading', n_jobs=1):
+    with pytest.MonkeyPatch.context() as patch:
         patch.setattr(study, 'LEARNERS', {
             'linear': learners.LEARNERS['linear'], 'EDMD-3': learners.LEARNERS['EDMD-3'],
             'hasty lift': learners._trained(lambda n_x: Growth(n_x + 1, max_iterations=5))})
@@ -144,7 +143,8 @@ def folder(tmp_path_factory):
             'identity lift': lambda n_x: Growth(n_x + 1, max_iterations=5)})
         patch.setitem(coordinates.EXPERIMENTS, 'coordinates/van_der_pol', partial(
             coordinates.run, 'van_der_pol', starts=3))
-        assert main(['van_der_pol', '--seeds', '1', '--output', str(output)]) == 0
+        assert main(['van_der_pol', '--seeds', '1', '--scheduler', '',
+                     '--output', str(output)]) == 0
     return output
 
 

@@ -4,9 +4,10 @@
 """The campaign over seeds, its summary, figures and report."""
 
 import json
+import os
 import re
+import signal
 
-import joblib
 import matplotlib.image
 import numpy as np
 import pytest
@@ -22,12 +23,6 @@ from validation.paper.datasets import random_step_episodes
 from validation.paper.optimal_control import exact_two_state_model
 
 
-@pytest.fixture
-def one_process():
-    with joblib.parallel_config('threading', n_jobs=1):
-        yield
-
-
 def quick(seed):
     return {'rw': 0.5 ** seed, 'part/cond': None if seed == 1 else 2.0,
             'ratio': {'R=1': np.inf}}, {}
@@ -39,10 +34,9 @@ def failing(seed):
     return {'rw': 1.0}, {}
 
 
-@pytest.mark.usefixtures('one_process')
 def test_summary_has_one_entry_for_each_seed(monkeypatch, capsys):
     monkeypatch.setattr(campaigns, 'EXPERIMENTS', {'a': quick, 'b/c': failing})
-    campaign = run_campaign(3)
+    campaign = run_campaign(3, scheduler='')
     assert campaign.complete
     assert campaign.errors == ['b/c, seed 1: ValueError: no such lift']
     assert campaign.summary() == {
@@ -54,7 +48,18 @@ def test_summary_has_one_entry_for_each_seed(monkeypatch, capsys):
     assert '4/6: b/c, seed 1 failed' in lines
 
 
-@pytest.mark.usefixtures('one_process')
+def test_lost_workers_keep_what_is_done():
+    def deadly(seed):
+        if seed == 1:
+            os.kill(os.getpid(), signal.SIGKILL)
+        return {'rw': 1.0}, {}
+
+    campaign = run_campaign(3, {'a': deadly}, 'process')
+    assert not campaign.complete
+    assert campaign.summary() == {'a': {'rw': [1.0]}}
+    assert campaign.errors[0].startswith('a, seed 1: 3 workers that ran it were killed')
+
+
 def test_an_interrupt_keeps_what_is_done(monkeypatch):
     def interrupted(seed):
         if seed == 2:
@@ -62,7 +67,7 @@ def test_an_interrupt_keeps_what_is_done(monkeypatch):
         return {'rw': 1.0}, {}
 
     monkeypatch.setattr(campaigns, 'EXPERIMENTS', {'a': interrupted})
-    campaign = run_campaign(4)
+    campaign = run_campaign(4, scheduler='')
     assert not campaign.complete
     assert campaign.summary() == {'a': {'rw': [1.0, 1.0]}}
 

@@ -1,0 +1,93 @@
+# SPDX-FileCopyrightText: 2026 The koopman_ros Authors
+# SPDX-License-Identifier: Apache-2.0
+
+"""From samples to the scaled problem that a lift is learned from, and from its solution back."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import torch
+
+from koopman_ros.learning.frame import Frame
+from koopman_ros.learning.growth import Grown
+from koopman_ros.learning.inputs import InputModel
+from koopman_ros.learning.residuals import deviations, ScaledSamples
+from koopman_ros.lifting import Box, LiftedModel, NetworkObservables
+from koopman_ros.plant_data import Array, Plant, Samples
+
+
+@dataclass(frozen=True)
+class Scaling:
+    """How samples are scaled; small, so that it can be sent to where they are."""
+
+    box: Box  #: names and scaling of states and inputs
+    inputs: InputModel  #: what is known of B
+    frame: Frame | None  #: in which the lift is learned; None for that of the samples
+    #: root mean square of the scaled rates, by which time is scaled, in 1/time unit
+    pace: float
+
+    @staticmethod
+    def of(plant: Plant, box: Box, samples: Samples, pre_feedback: float | None) -> Scaling:
+        """
+        Choose it by some samples.
+
+        :param pre_feedback: weight of the input, where there is to be one, see :class:`Growth`.
+        """
+        inputs = InputModel.of(plant, box, samples.x)
+        plain = _plain(box, inputs, samples)
+        frame = None if pre_feedback is None else Frame.of(inputs, *plain, pre_feedback)
+        # rates of order one put the residuals of the dynamics beside the others
+        rate = frame.enter(*plain)[1] if frame else deviations(box, samples)[1]
+        return Scaling(box, inputs, frame, float(np.sqrt(np.mean(rate ** 2))) or 1.0)
+
+    def data(self, samples: Samples, device: str) -> ScaledSamples:
+        """
+        Scale samples, onto a device as torch names it.
+
+        :raises ValueError: for a device that there is not.
+        """
+        plain = _plain(self.box, self.inputs, samples)
+        x, f, regressors = self.frame.enter(*plain) if self.frame else plain
+        arrays = (x, f / self.pace, *([] if regressors is None else [regressors]))
+        place = checked_device(device)
+        return ScaledSamples(*(torch.from_numpy(a).to(place) for a in arrays))
+
+    def model(self, grown: Grown, **about: Any) -> LiftedModel:
+        """Return what was learned in units; `about` are further fields of the model."""
+        parts = grown.layout.split(grown.theta.cpu())
+        A, B = self.pace * parts.A.numpy(), None if parts.B is None else (
+            self.pace * parts.B.numpy())
+        alone = grown.drift_alone
+        observables = NetworkObservables(
+            tuple((W.numpy(), b.numpy()) for W, b in parts.hidden),
+            parts.V.numpy()[:0 if alone else None], alone or grown.layout.identity,
+            grown.layout.activation)
+        if self.frame:
+            observables, A, B = self.frame.leave(observables, A, B)
+        constant, terms = self.inputs.matrix(B)
+        return LiftedModel(observables, A, constant, self.box.states, self.box.inputs,
+                           self.box.time_unit, input_terms=terms,
+                           pre_feedback=self.frame.K if self.frame else None, **about)
+
+
+def _plain(box: Box, inputs: InputModel, samples: Samples) -> tuple[Array, Array, Array | None]:
+    """Return states, rates without what is known of the inputs, and regressors of the rest."""
+    x, rate, u = deviations(box, samples)
+    return x, *inputs.apart(x, rate, u)
+
+
+def checked_device(name: str) -> torch.device:
+    """Return a device of torch's; ValueError, saying why, for one that there is not."""
+    try:
+        device = torch.device(name)
+        torch.empty(0, device=device)
+    except (RuntimeError, AssertionError) as error:
+        found = f'{torch.cuda.device_count()} GPU(s)' if torch.cuda.is_available() else 'no GPU'
+        raise ValueError(
+            f'device is {name!r}, but torch {torch.__version__} finds {found} on this machine '
+            f'({str(error).splitlines()[0]}): use cpu, or install a driver and a torch that '
+            'support it') from error
+    return device
