@@ -201,7 +201,8 @@ def retrain_by(backend: Backend, task: Task, on_progress: OnProgress = lambda *_
         task.bags, states, inputs, tolerance_ns=round(task.tolerance * NANOSECONDS),
         least_jumps=None if current is None else (_LEAST_JUMP * current.states.scale).tolist())
     record = read_record(source, task.most_samples, task.seed,
-                         hidden=bool(task.hidden_states or task.equations), tick=_reading(on_progress, source), each=each)
+                         hidden=bool(task.hidden_states or task.equations),
+                         tick=_reading(on_progress, source), each=each)
     account = record.account
     if not record.episodes:
         raise ValueError('the bags hold no usable segment of measurements: '
