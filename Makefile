@@ -106,7 +106,7 @@ studies-general: $(VENV)/bench.stamp  ## the law on seven plants by models of ea
 	$(BIN)/python -m validation.general --seeds $(SEEDS)
 
 studies-unstable: SEEDS = 10
-studies-unstable: $(VENV)/saddle.stamp  ## the reactor about its saddle, learned under a pre-feedback, SEEDS=10, six minutes
+studies-unstable: $(VENV)/bench.stamp  ## the reactor about its saddle, learned under a pre-feedback, SEEDS=10, six minutes
 	$(BIN)/python -m validation.unstable --seeds $(SEEDS)
 
 studies-saddle: SEEDS = 10

@@ -11,7 +11,7 @@ import casadi
 from koopman_ros.plants.library.outflow import GRAVITY
 from koopman_ros.plants.library.pendulum import Pendulum
 from koopman_ros.plants.library.quadruple_tank import QuadrupleTank
-from koopman_ros.plants.library.reactor import FedReactor
+from koopman_ros.plants.library.reactor import FedReactor, ReactorParameters, TwoStateReactor
 
 # Rates of the state (n_x,) from state and input (n_u,), expressions all.
 Rates: TypeAlias = Callable[[Any, Any], Any]
@@ -40,15 +40,26 @@ def quadruple_tank(x: Any, u: Any) -> Any:
 
 
 def fed_reactor(x: Any, u: Any) -> Any:
-    """Return the rates of concentration and temperature, per minute."""
+    """Return the rates of concentration and temperature, per minute, from feed and coolant."""
     p = FedReactor()
+    return _reactor(p, x, u[0], u[1])
+
+
+def two_state(x: Any, u: Any) -> Any:
+    """Return the rates of the two-state reactor, per minute."""
+    p = TwoStateReactor()
+    return _reactor(p, x, p.flow_rate, u[0])
+
+
+def _reactor(p: ReactorParameters, x: Any, flow: Any, coolant: Any) -> Any:
     reaction = p.pre_exponential_factor * casadi.exp(-p.activation_temperature / x[1]) * x[0]
-    fed = u[0] / p.volume
+    fed = flow / p.volume
     return casadi.vertcat(
         fed * (p.feed_concentration - x[0]) - reaction,
         fed * (p.feed_temperature - x[1]) + p.heating_per_conversion * reaction
-        + p.cooling_rate * (u[1] - x[1]))
+        + p.cooling_rate * (coolant - x[1]))
 
 
 EQUATIONS: dict[str, Rates] = {
-    'fed_reactor': fed_reactor, 'pendulum': pendulum, 'quadruple_tank': quadruple_tank}
+    'fed_reactor': fed_reactor, 'pendulum': pendulum, 'quadruple_tank': quadruple_tank,
+    'two_state': two_state}

@@ -4,7 +4,7 @@
 """
 The two-state reactor about its saddle, learned under a pre-feedback: figures, closed loops.
 
-Run it as ``python -m validation.unstable`` (needs the `train` requirements).
+Run it as ``python -m validation.unstable`` (needs the `train` and `bench` requirements).
 """
 
 import argparse
@@ -39,9 +39,11 @@ from koopman_ros.plants import (
     steady_state,
     two_state_reactor,
 )
-from koopman_ros.plants.optimum import cost_along, optimum, Task
+from koopman_ros.plants.optimum import cost_along, Course, optimum, Task
 from koopman_ros.reports import table
+from validation.equations import EQUATIONS
 from validation.general.systems import SADDLE
+from validation.least import least_course
 
 # the range about the saddle, in mol/L and K, holds another steady state with its coolant of 300 K,
 # an unstable focus
@@ -123,9 +125,8 @@ def limited(model: LiftedModel, laws: tuple[str, ...]) -> list[str]:
     """
     costs = []
     for begin, end in STEPS:
-        x0, (x_ref, u_ref) = steady(begin)[0], steady(end)
-        task = Task(SYSTEM, x0, x_ref, u_ref, np.array([0.0, 1.0]), np.ones(1),
-                    PERIOD / SYSTEM.seconds_per_time_unit, LIMITED_SAMPLES)
+        task = _limited_task(begin, end)
+        x0 = task.x0
         loop = run(model, laws, LIMITS, MARGIN, begin, end, x0, LIMITED_SAMPLES)
         costs.append(cost_along(task, loop.states, loop.commands[:-1])
                      if abs(loop.states[-1, 1] - end) < REACHED else float('inf'))
@@ -137,6 +138,23 @@ def limited(model: LiftedModel, laws: tuple[str, ...]) -> list[str]:
         lost += 'safe' in loop.levels or not (
             abs(loop.states[-1, 1] - SADDLE_TEMPERATURE) < REACHED)
     return [laws[0], *(f'{cost:.2f}' for cost in costs), f'{lost} of {LIMITED_STARTS}']
+
+
+def least_costs(model: LiftedModel) -> list[str]:
+    """Return the least cost of each step under limits, found from what the law `mpc` did."""
+    costs = []
+    for begin, end in STEPS:
+        task = _limited_task(begin, end)
+        loop = run(model, ('mpc', 'sdre'), LIMITS, MARGIN, begin, end, task.x0, LIMITED_SAMPLES)
+        costs.append(least_course(
+            task, EQUATIONS['two_state'], LIMITS.lower, LIMITS.upper, step=PERIOD * LIMITS.rate,
+            guess=Course(loop.states, loop.commands[:LIMITED_SAMPLES], 0.0)).cost)
+    return ['the least', *(f'{cost:.2f}' for cost in costs), '']
+
+
+def _limited_task(begin: float, end: float) -> Task:
+    return Task(SYSTEM, steady(begin)[0], *steady(end), np.array([0.0, 1.0]), np.ones(1),
+                PERIOD / SYSTEM.seconds_per_time_unit, LIMITED_SAMPLES)
 
 
 def steady(temperature: float) -> tuple[Array, Array]:
@@ -178,8 +196,8 @@ def main(args: list[str] | None = None) -> int:
         print(f'\nThe first of them, coolant from {LIMITS.lower[0]:g} to {LIMITS.upper[0]:g} K at '
               f'{LIMITS.rate[0]:g} K/s: cost in K^2 min, and starts that were lost\n')
         head = ['law', *steps, 'lost']
-        print(table(head, [limited(first, laws) for laws in (('mpc', 'sdre'), ('sdre',))],
-                    range(1, len(head))))
+        print(table(head, [least_costs(first), *(
+            limited(first, laws) for laws in (('mpc', 'sdre'), ('sdre',)))], range(1, len(head))))
     return int(refused)
 
 

@@ -11,11 +11,12 @@ import numpy as np
 
 from koopman_ros.arrays import Array
 from koopman_ros.plants import Process
-from koopman_ros.plants.optimum import cost_along
+from koopman_ros.plants.optimum import cost_along, Course
 from koopman_ros.units import NANOSECONDS
+from validation.equations import EQUATIONS
+from validation.least import least_course
 from validation.partly_measured.cases import Case
 from validation.partly_measured.contenders import Contender
-from validation.partly_measured.least import least_course
 
 _LATE = 1.0 / 3.0  # of a part, over which its offset is the mean
 
@@ -70,6 +71,12 @@ class Figures:
     lost: bool  #: whether one of them was further than what counts as reached
 
 
+def least(case: Case, x0: Array) -> Course:
+    """Return the course of least cost of the step of the set-point from a state (n_x,)."""
+    return least_course(case.task(x0), EQUATIONS[case.plant], case.lower, case.upper,
+                        state_upper=case.state_upper)
+
+
 def judge(case: Case, found: Run) -> Figures:
     """Judge a run."""
     first = round(case.stepped_at / case.period)
@@ -90,5 +97,5 @@ def judge(case: Case, found: Run) -> Figures:
         offsets.append(float(np.max(np.abs(np.mean(away[late], axis=0)))))
         farthest = float(np.max(np.abs(away[within])))
     excess = found.states - case.state_upper if len(case.state_upper) else np.zeros(1)
-    return Figures(cost / least_course(case, begin).cost, (max(offsets[:2]), offsets[2]),
+    return Figures(cost / least(case, begin).cost, (max(offsets[:2]), offsets[2]),
                    farthest, float(max(np.max(excess), 0.0)), not max(offsets) <= case.reached)

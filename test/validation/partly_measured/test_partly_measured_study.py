@@ -14,8 +14,7 @@ from validation.equations import EQUATIONS
 from validation.partly_measured import __main__ as command
 from validation.partly_measured.cases import CASES
 from validation.partly_measured.contenders import LinearQuadraticGaussian, OWN
-from validation.partly_measured.least import least_course
-from validation.partly_measured.study import judge, Run, run
+from validation.partly_measured.study import judge, least, Run, run
 
 each_plant = pytest.mark.parametrize('case', CASES.values(), ids=CASES)
 
@@ -44,14 +43,14 @@ def test_a_load_is_an_input_that_nobody_commands(case):
 @pytest.mark.parametrize('plant', ['quadruple_tank', 'pendulum'])
 def test_the_least_cost_is_that_of_the_other_method_where_no_limit_is_active(plant):
     case = CASES[plant]
-    course = least_course(case, case.start[0])
+    course = least(case, case.start[0])
     assert course.cost == pytest.approx(optimum(case.task(case.start[0])).cost, rel=1e-7)
     assert np.all((course.inputs > case.lower) & (course.inputs < case.upper))
 
 
 def test_the_limit_of_the_reactor_is_active_on_the_best_way():
     case = CASES['fed_reactor']
-    best, free = (least_course(one, case.start[0]) for one in (
+    best, free = (least(one, case.start[0]) for one in (
         case, replace(case, state_upper=np.zeros(0))))
     hottest = case.state_upper[1]
     assert best.states[:, 1].max() == pytest.approx(hottest, abs=1e-5)
