@@ -52,7 +52,7 @@ setup(
         'panel': ['nicegui>=3'],
         # the predictive law's solver of quadratic programs
         'mpc': ['daqp'],
-        'train': ['torch==2.13.0', 'joblib', 'tqdm'],
+        'train': ['torch==2.13.0', 'cloudpickle', 'joblib', 'tqdm'],
         # training on the workers of a Dask scheduler
         'cluster': ['distributed'],
         # what validation and benchmarks compare with
