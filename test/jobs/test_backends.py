@@ -185,7 +185,8 @@ def test_a_scheduler_without_workers(places, monkeypatch):
 
 
 def test_the_trainer_refuses_other_names():
-    table = trainer_table(None, {'states_measured': ['x [m]'], 'inputs_commanded': ['u [V]']})
+    table = trainer_table(None, {
+        'system': 'own', 'states_measured': ['x [m]'], 'inputs_commanded': ['u [V]']})
     for text in KINDS[:3]:
         assert 'scheduler' not in table.check(table.snapshot({'scheduler': text}))
     assert table.check(table.snapshot({'scheduler': 'dask'})).startswith("scheduler is 'dask', ")

@@ -55,7 +55,7 @@ class Plan:
     rounds: int  #: of a task that does nothing, by which messages are measured
 
 
-PLANS = {'quick': Plan(40_000, 6, 1, 10), 'default': Plan(200_000, 8, 3, 40)}
+PLANS = {'quick': Plan(40_000, 6, 1, 10), 'default': Plan(1_000_000, 8, 2, 40)}
 
 
 def measure(plan: Plan, figures: dict[str, Any], _: Path) -> Iterator[str]:
@@ -136,8 +136,10 @@ def _made(folder: Path) -> Path:
 
 def _train_in(place: str, backend: Backend, work: _Work, runs: int, figures: dict[str, Any]
               ) -> None:
-    # the first one imports what workers need, and reads the shards' files into the cache
-    digests = {work.done(backend)}
+    # one step first: workers import what they need, and the files come into the cache
+    train(work.plant, work.some, Growth(3, max_iterations=1), starts=1, refuse=False,
+          backend=backend, shards=work.shards)
+    digests: set[str] = set()
     walls, own, theirs, most = [], [], [], []
     for _ in range(runs):
         begin, mine, before = time.perf_counter(), time.process_time(), _processor_times()
