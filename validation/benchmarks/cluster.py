@@ -55,7 +55,7 @@ class Plan:
     rounds: int  #: of a task that does nothing, by which messages are measured
 
 
-PLANS = {'quick': Plan(40_000, 6, 1, 10), 'default': Plan(1_000_000, 8, 2, 40)}
+PLANS = {'quick': Plan(40_000, 6, 1, 10), 'default': Plan(200_000, 8, 3, 40)}
 
 
 def measure(plan: Plan, figures: dict[str, Any], _: Path) -> Iterator[str]:
