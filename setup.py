@@ -54,7 +54,7 @@ setup(
         'mpc': ['daqp'],
         # compiles the numerics of a control step
         'fast': ['numba'],
-        'train': ['torch==2.13.0', 'joblib', 'tqdm'],
+        'train': ['torch==2.13.0', 'cloudpickle', 'joblib', 'tqdm'],
         # training on the workers of a Dask scheduler
         'cluster': ['distributed'],
         # what validation and benchmarks compare with

@@ -21,9 +21,9 @@ myst_fence_as_directive = ['math']
 myst_heading_anchors = 3
 
 # The reference is built without ROS and without torch.
-autodoc_mock_imports = ['builtin_interfaces', 'diagnostic_msgs', 'joblib', 'lifecycle_msgs',
-                        'matplotlib', 'rcl_interfaces', 'rclpy', 'rosgraph_msgs', 'sensor_msgs',
-                        'std_msgs', 'std_srvs', 'torch', 'tqdm',
+autodoc_mock_imports = ['builtin_interfaces', 'cloudpickle', 'diagnostic_msgs', 'distributed',
+                        'joblib', 'lifecycle_msgs', 'matplotlib', 'rcl_interfaces', 'rclpy',
+                        'rosgraph_msgs', 'sensor_msgs', 'std_msgs', 'std_srvs', 'torch', 'tqdm',
                         # of the panel
                         'fastapi', 'nicegui', 'starlette', 'uvicorn']
 autodoc_typehints = 'description'

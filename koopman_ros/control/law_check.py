@@ -5,50 +5,41 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 import contextlib
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 import math
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from koopman_ros.arrays import Array
-from koopman_ros.control.laws import Law, Linear, StateDependentRiccati, Tuning, Weights
-from koopman_ros.control.laws.base import steady_state_target, Target
-from koopman_ros.control.limits import finite, InputLimits
-from koopman_ros.estimation import Estimate
-from koopman_ros.jobs.backends import Backend, Here, Tell
-from koopman_ros.lifting import Coordinates, LiftedModel, NetworkObservables, TriedLoops
+from koopman_ros.control.law_loops import (
+    DriftPlant,
+    judge_loops,
+    Loops,
+    MOST_EXCESS,
+    Rate,
+)
+from koopman_ros.control.laws import Law, StateDependentRiccati, Tuning, Weights
+from koopman_ros.control.limits import InputLimits
+from koopman_ros.jobs.backends import Backend, Here
+from koopman_ros.lifting import Coordinates, LiftedModel, TriedLoops
 from koopman_ros.lifting.coordinates import MAX_TRIED_LOOPS
-from koopman_ros.lifting.model import NODES, WEIGHTS
-from koopman_ros.solvers import RiccatiStatus, runge_kutta_step, solve_riccati
-
-# dx/dt (M, n_x) of states (M, n_x) and inputs (M, n_u), in units a time unit of the model
-Rate = Callable[[Array, Array], Array]
-# inputs (M, n_u) of states (M, n_x), as far as these are active; NaN where there is none
-_Feedback = Callable[[Array, NDArray[np.bool_]], Array]
+from koopman_ros.solvers import solve_riccati
 
 #: Closed loops that a law is judged by.
 LOOPS = 128
 #: A law is poor that costs more than so many times as much as a linear one.
 MOST_COST = 1.1
-#: It fails where it costs more than so many times as much as with a perfect model.
-MOST_EXCESS = 1.05
 #: Share of the closed loops that may fail.
 MOST_FAILURES = 0.01
 
-# A loop has arrived when it ends this close to the set-point, in units of the scale; it starts
-# several times as far away.
-_ARRIVED = 0.05
+# A loop starts at least so far from its set-point, in units of the scale.
 _APART = 0.25
-# It is lost when a state is further than this from the nominal point, in units of its scale.
-_ESCAPED = 10.0
-# Slowest time constants of the linear loop that a loop lasts, how many times as long it may go on
-# when only some laws have arrived, and the slowest rate beside the fastest that is waited for.
+# Slowest time constants of the linear loop that a loop lasts, and the slowest rate beside the
+# fastest that is waited for.
 _DURATION = 6.0
-_PATIENCE = 4
 _SLOWEST = 1e-3
 # Samples in the fastest time constant of the linear loop, and steps of integration.
 _SAMPLES, _STEPS = 2, 8
@@ -61,13 +52,9 @@ _PART = 32
 _ATTEMPTS = 4
 _NEWTON_STEPS = 30
 _LONGEST_STEP = 0.5
-# Share of the inputs' range, at either end, that a perfect model is not given.
-_KEPT = 0.1
 # Share of the box to which ranges are told.
 _ROUNDED = 1e-3
-# What is left of a step, and a difference quotient's step, in scaled deviations.
-_RESOLUTION = 1e-9
-_DIFFERENCE = 1e-5
+_RESOLUTION = 1e-9  # what is left of a step, in scaled deviations
 
 
 @dataclass(frozen=True, eq=False)
@@ -224,14 +211,14 @@ def check_law(model: LiftedModel, rate: Rate, *, tuning: Tuning | None = None,
     tuning = tuning or Tuning(Weights(np.eye(model.n_x), np.eye(model.n_u)))
     limits = limits or InputLimits(model.inputs.lower, model.inputs.upper,
                                    np.full(model.n_u, np.inf))
-    plant = _Plant(model, rate)
+    plant = DriftPlant(model, rate)
     linear = plant.linearised
     slowest, fastest = _closed_loop_rates(linear, tuning.weights)
     interval = max(interval / model.seconds_per_time_unit, 1.0 / (_SAMPLES * fastest))
     samples = math.ceil(_DURATION / (slowest * interval))
     loops = min(loops, max(_MOST_CALLS // samples, _FEWEST_LOOPS))
     starts, targets, inputs = _cases(plant, limits, loops)
-    given = _Given(plant, tuning, law, limits, interval, samples,
+    given = Loops(plant, tuning, law, limits, interval, samples,
                    math.ceil(_STEPS * interval * fastest))
     parts = {f'loops from {first + 1} on': (
         starts[first:first + _PART], targets[first:first + _PART], inputs[first:first + _PART])
@@ -245,7 +232,7 @@ def check_law(model: LiftedModel, rate: Rate, *, tuning: Tuning | None = None,
 
     found = []
     with contextlib.closing((backend or Here()).run(
-            _judged, parts, shared=given, watch=watching)) as judged:
+            judge_loops, parts, shared=given, watch=watching)) as judged:
         for name, part in judged:
             shares[name] = 1.0
             found.append(part)
@@ -260,108 +247,6 @@ def check_law(model: LiftedModel, rate: Rate, *, tuning: Tuning | None = None,
                     int(np.sum(hopeless)))
 
 
-@dataclass(frozen=True)
-class _Given:
-    """What all loops have in common."""
-
-    plant: _Plant
-    tuning: Tuning
-    law: Callable[[LiftedModel, Tuning], Law]
-    limits: InputLimits
-    interval: float  #: between samples, in time units of the model
-    samples: int
-    steps: int  #: of integration, in an interval
-
-    def laws(self, targets: Array, inputs: Array, limits: InputLimits) -> tuple[_Feedback, ...]:
-        """Return the law, the averaged one that knows the plant, and two linear ones."""
-        model, seconds = self.plant.model, self.interval * self.plant.model.seconds_per_time_unit
-        return (_called(self.law(model, self.tuning), targets, inputs, limits, seconds),
-                _informed(self.plant, targets, inputs, self.tuning, limits, self.interval),
-                *(_constant(Linear(one, self.tuning), targets, inputs, limits, seconds)
-                  for one in (self.plant.linearised, model)))
-
-    def run(self, feedbacks: Sequence[_Feedback], cases: tuple[Array, Array, Array], tell: Tell
-            ) -> tuple[Array, NDArray[np.bool_]] | None:
-        """Run loops under each of some laws, as :func:`_run`."""
-        return _run(self.plant, feedbacks, *cases, self.tuning.weights, self.interval,
-                    self.samples, self.steps, tell)
-
-
-def _judged(given: _Given, cases: tuple[Array, Array, Array], tell: Tell
-            ) -> tuple[Any, ...] | None:
-    """
-    Run some of the loops; None where `tell` ended them.
-
-    :return: of each the cost of the law, that beside the better of two linear laws, whether it had
-        no gain, its cost beside that of a perfect model, and whether no law arrives.
-    """
-    starts, targets, inputs = cases
-    limits, m = given.limits, given.plant.model.n_u
-    ended = given.run(given.laws(targets, inputs, limits), cases, tell)
-    if ended is None:
-        return None
-    costs, no_gain = ended
-    if (hopeless := ~np.isfinite(costs).any(axis=0)).any():
-        # what the limits hide
-        endless = np.full(m, np.inf)
-        some = starts[hopeless], targets[hopeless], inputs[hopeless]
-        ended = given.run(given.laws(*some[1:], InputLimits(-endless, endless, endless)), some,
-                          tell)
-        if ended is None:
-            return None
-        costs[:, hopeless], no_gain[hopeless] = ended
-    own, informed, *others = costs
-    ratios, excess = _beside(own, np.min(others, axis=0)), _beside(own, informed)
-    if (beaten := ~(excess <= MOST_EXCESS) & ~hopeless).any():
-        some = starts[beaten], targets[beaten], inputs[beaten]
-        again = given.run([_informed(given.plant, *some[1:], given.tuning, _narrowed(limits),
-                                     given.interval)], some, tell)
-        if again is None:
-            return None
-        excess[beaten] = np.minimum(excess[beaten], _beside(own[beaten], again[0][0]))
-    return own, ratios, no_gain, excess, hopeless
-
-
-def _beside(cost: Array, other: Array) -> Array:
-    """Return ratios (M,) of costs; 0 where the other is infinite."""
-    finite = np.isfinite(other)
-    return np.where(finite, cost / np.where(finite, other, 1.0), 0.0)
-
-
-@dataclass(frozen=True)
-class _Plant:
-    """A drift in the scaled deviations of a model; rows are states or inputs side by side."""
-
-    model: LiftedModel  #: whose names and scaling
-    physical: Rate  #: in units
-
-    def rate(self, x: Array, v: Array) -> Array:
-        states = self.model.states
-        scaled: Array = self.physical(states.to_physical(x), self.model.inputs.to_physical(v)
-                                      ) / states.scale
-        return scaled
-
-    def slope(self, x: Array, v: Array) -> Array:
-        """Return the derivatives (M, n_x, n_x + n_u) of the rate by state and input."""
-        n = x.shape[1]
-        both = np.hstack([x, v])
-        columns = []
-        for step in _DIFFERENCE * np.eye(both.shape[1]):
-            ahead, behind = both + step, both - step
-            columns.append(self.rate(ahead[:, :n], ahead[:, n:])
-                           - self.rate(behind[:, :n], behind[:, n:]))
-        return np.stack(columns, axis=-1) / (2.0 * _DIFFERENCE)
-
-    @property
-    def linearised(self) -> LiftedModel:
-        """The linear model of the plant at the model's nominal point."""
-        model, n = self.model, self.model.n_x
-        slope = self.slope(np.zeros((1, n)), np.zeros((1, model.n_u)))[0]
-        itself = NetworkObservables((), np.zeros((0, n)), identity=True)
-        return replace(model, observables=itself, A=slope[:, :n], B=slope[:, n:],
-                       readout=None, input_terms=None, pre_feedback=None, tried_loops=None)
-
-
 def _closed_loop_rates(linear: LiftedModel, weights: Weights) -> tuple[float, float]:
     """Return the slowest and the fastest rate of a linear model under its own law."""
     # not of the open loop: an integrator never settles by itself
@@ -372,7 +257,7 @@ def _closed_loop_rates(linear: LiftedModel, weights: Weights) -> tuple[float, fl
     return max(float(rates.min()), _SLOWEST * fastest), fastest
 
 
-def _cases(plant: _Plant, limits: InputLimits, loops: int) -> tuple[Array, Array, Array]:
+def _cases(plant: DriftPlant, limits: InputLimits, loops: int) -> tuple[Array, Array, Array]:
     """Return starts (M, n_x), set-points (M, n_x) and the inputs (M, n_u) that hold these."""
     # in here: no node needs it, and it takes long to import
     from scipy.stats import qmc
@@ -417,7 +302,7 @@ def _within_data(model: LiftedModel, shares: Array, numbers: NDArray[np.int64]) 
     return np.clip(known.states[numbers % len(known.states)] + around, lower, upper)
 
 
-def _steady(plant: _Plant, x: Array, v: Array) -> tuple[Array, Array]:
+def _steady(plant: DriftPlant, x: Array, v: Array) -> tuple[Array, Array]:
     """Move states and inputs as little as it takes to rest; those that do not are left out."""
     n = x.shape[1]
     with np.errstate(all='ignore'):
@@ -433,133 +318,3 @@ def _steady(plant: _Plant, x: Array, v: Array) -> tuple[Array, Array]:
                 break
         still = np.max(np.abs(change), axis=1, initial=0.0) < _RESOLUTION
     return x[still], v[still]
-
-
-def _target(model: LiftedModel, x_ref: Array, v: Array) -> Target | None:
-    """Return a target of a model with the disturbance under which this input holds it."""
-    try:
-        w = -model.rate_under(v)(x_ref)
-        return steady_state_target(model, x_ref, w) if finite(w) else None
-    except np.linalg.LinAlgError:
-        return None
-
-
-def _called(law: Law, setpoints: Array, inputs: Array, limits: InputLimits, seconds: float
-            ) -> _Feedback:
-    """Return a law's inputs, found for one state after another."""
-    model = law.model
-    targets = [_target(model, *pair) for pair in zip(setpoints, inputs, strict=True)]
-    memory: list[object] = [None] * len(targets)
-
-    def act(x: Array, active: NDArray[np.bool_]) -> Array:
-        v = np.full(inputs.shape, np.nan)
-        for k in np.flatnonzero(active):
-            target = targets[k]
-            if target is None:
-                continue
-            w = -(target.drift + model.forcing(target.x, target.u))
-            found = law.compute(Estimate(x[k], w), target, limits, memory[k], seconds)
-            memory[k] = found.memory
-            if found.u is not None:
-                v[k] = model.inputs.to_deviation(found.u)
-        return v
-
-    return act
-
-
-def _constant(law: Law, setpoints: Array, inputs: Array, limits: InputLimits, seconds: float
-              ) -> _Feedback:
-    """Return the inputs of a law with one gain, which is read off what it does without limits."""
-    model, n = law.model, setpoints.shape[1]
-    endless = np.full(model.n_u, np.inf)
-    at_nominal = _called(law, np.zeros((n, n)), np.zeros((n, model.n_u)),
-                         InputLimits(-endless, endless, endless), seconds)
-    gain = at_nominal(np.eye(n), np.full(n, True)).T
-
-    def act(x: Array, active: NDArray[np.bool_]) -> Array:
-        u = model.inputs.to_physical(inputs + (x - setpoints) @ gain.T)
-        return model.inputs.to_deviation(limits.within(u))
-
-    return act
-
-
-def _narrowed(limits: InputLimits) -> InputLimits:
-    """Leave out what a perfect model makes of the last of the range: others cannot be as sure."""
-    bounded = np.isfinite(limits.lower) & np.isfinite(limits.upper)
-    margin = np.zeros(len(bounded))
-    margin[bounded] = _KEPT * (limits.upper - limits.lower)[bounded]
-    return replace(limits, lower=limits.lower + margin, upper=limits.upper - margin)
-
-
-def _informed(plant: _Plant, setpoints: Array, inputs: Array, tuning: Tuning, limits: InputLimits,
-              interval: float) -> _Feedback:
-    """Return the averaged law that knows the plant: no better model of it has a better one."""
-    def act(x: Array, active: NDArray[np.bool_]) -> Array:
-        v = np.full(inputs.shape, np.nan)
-        rows = np.flatnonzero(active)
-        e, n = x[rows] - setpoints[rows], x.shape[1]
-        points = setpoints[rows] + NODES[:, None, None] * e
-        along = plant.slope(points.reshape(-1, n), np.tile(inputs[rows], (len(NODES), 1)))
-        A = np.tensordot(WEIGHTS, along[..., :n].reshape(len(NODES), -1, n, n), 1)
-        B = plant.slope(x[rows], inputs[rows])[..., n:]
-        for i, k in enumerate(rows):
-            found = solve_riccati(A[i], B[i], tuning.weights.Q, tuning.weights.R,
-                                  interval=interval, max_gain=tuning.max_gain,
-                                  max_residual=tuning.max_residual)
-            if found.status is RiccatiStatus.SOLVED:
-                u = plant.model.inputs.to_physical(inputs[k] - found.K @ e[i])
-                v[k] = plant.model.inputs.to_deviation(limits.within(u))
-        return v
-
-    return act
-
-
-def _run(plant: _Plant, feedbacks: Sequence[_Feedback], starts: Array, setpoints: Array,
-         inputs: Array, weights: Weights, interval: float, samples: int, steps: int,
-         watch: Callable[[float], bool]) -> tuple[Array, NDArray[np.bool_]] | None:
-    """
-    Run M loops under each of F laws; None where `watch` ended it.
-
-    :return: costs (F, M), infinite where a loop does not arrive, and whether (M,) the first law
-        had no gain on the way.
-    """
-    n, (M, m) = starts.shape[1], inputs.shape
-    y = np.tile(np.hstack([starts, np.zeros((M, 1))]), (len(feedbacks), 1, 1))
-    no_gain = np.zeros(M, dtype=bool)
-
-    def arrived() -> NDArray[np.bool_]:
-        return np.all(np.abs(y[..., :n] - setpoints) < _ARRIVED, axis=-1)
-
-    # a loop that runs away ends as one that failed, whatever overflows meanwhile
-    with np.errstate(all='ignore'):
-        for number in range(_PATIENCE * samples):
-            # the share of the usual time
-            if watch(min(number, samples - 1) / samples):
-                return None
-            active = (np.abs(y[..., :n]) < _ESCAPED).all(axis=-1)
-            y[~active] = np.nan
-            if number >= samples:
-                # where one law has arrived the others may, too; all of them get the same time
-                there = arrived()
-                active &= there.any(axis=0) & (active & ~there).any(axis=0)
-                if not active.any():
-                    break
-            v = np.array([act(x, on) for act, x, on in zip(
-                feedbacks, y[..., :n], active, strict=True)])
-            no_gain |= active[0] & ~np.isfinite(v[0]).all(axis=-1)
-            u = v - inputs
-            held = np.einsum('...i,ij,...j->...', u, weights.R, u)
-
-            def flow(y: Array, v: Array = v, held: Array = held) -> Array:
-                x = y[..., :n]
-                e = x - setpoints
-                cost = np.einsum('...i,ij,...j->...', e, weights.Q, e) + held
-                rate = plant.rate(x.reshape(-1, n), v.reshape(-1, m)).reshape(x.shape)
-                return np.concatenate([rate, cost[..., None]], axis=-1)
-
-            ahead = y
-            for _ in range(steps):
-                ahead = runge_kutta_step(flow, ahead, interval / steps)
-            y = np.where(active[..., None], ahead, y)
-        there = arrived()
-    return np.where(there & np.isfinite(y[..., n]), y[..., n], np.inf), no_gain

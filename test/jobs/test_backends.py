@@ -15,6 +15,7 @@ import pytest
 from koopman_ros.jobs.backends import backend_of, Here, SchedulerLost, WorkerLost
 from koopman_ros.jobs.cluster import Cluster
 from koopman_ros.jobs.processes import Processes
+from koopman_ros.parameters.trainer import trainer_table
 from support.places import KINDS, places
 
 ELSEWHERE = KINDS[1:]
@@ -181,6 +182,15 @@ def test_a_scheduler_without_workers(places, monkeypatch):
         with Cluster(empty.scheduler_address, silence=0.2) as deserted, pytest.raises(
                 WorkerLost, match=re.escape(text.format(0.2))):
             list(deserted.run(lambda *_: None, {'a task': 0}))
+
+
+def test_the_trainer_refuses_other_names():
+    table = trainer_table(None, {
+        'system': 'own', 'states_measured': ['x [m]'], 'inputs_commanded': ['u [V]']})
+    for text in KINDS[:3]:
+        assert 'scheduler' not in table.check(table.snapshot({'scheduler': text}))
+    assert table.check(table.snapshot({'scheduler': 'dask'})).startswith("scheduler is 'dask', ")
+    assert table.snapshot({'device': 'cuda'}).training()['device'] == 'cuda'
 
 
 def test_an_address_without_a_scheduler(monkeypatch):

@@ -259,6 +259,24 @@ def test_one_class_has_no_lines_beside_others(bag, tmp_path):
     assert figures['model_class'] == 'polynomial'
 
 
+@pytest.mark.usefixtures('quick')
+def test_it_is_retrained_where_the_task_says(bag, tmp_path):
+    """The same lift comes of it, and what fails writes nothing."""
+    models = []
+    for scheduler in ('', 'joblib:2'):
+        done = retrain(replace(task(bag, tmp_path, 'linear'), scheduler=scheduler))
+        models.append(load(done.model_file))
+        (tmp_path / 'new.safetensors').unlink()
+    assert models[0].A.tobytes() == models[1].A.tobytes()
+    assert models[0].tried_loops == models[1].tried_loops
+    for change, error, text in (
+            ({'scheduler': 'joblib:0'}, ValueError, "scheduler is 'joblib:0', must be"),
+            ({'device': 'abacus'}, ValueError, "device is 'abacus', but torch")):
+        with pytest.raises(error, match=text):
+            retrain(replace(task(bag, tmp_path, 'linear'), **change))
+    assert list(tmp_path.glob('*.safetensors')) == []
+
+
 def test_a_class_that_there_is_not(bag, tmp_path):
     with pytest.raises(ValueError, match="model_class = 'lift' must be one of linear, polynomial, "
                                          'neural drift, identity lift, free lift, best'):

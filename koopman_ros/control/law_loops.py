@@ -1,0 +1,274 @@
+# SPDX-FileCopyrightText: 2026 The koopman_ros Authors
+# SPDX-License-Identifier: Apache-2.0
+
+"""Closed loops of several laws side by side on a drift, and what each of them costs."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from koopman_ros.arrays import Array
+from koopman_ros.control.laws import Law, Linear, Tuning, Weights
+from koopman_ros.control.laws.base import steady_state_target, Target
+from koopman_ros.control.limits import finite, InputLimits
+from koopman_ros.estimation import Estimate
+from koopman_ros.jobs.backends import Tell
+from koopman_ros.lifting import LiftedModel, NetworkObservables
+from koopman_ros.lifting.model import NODES, WEIGHTS
+from koopman_ros.solvers import RiccatiStatus, runge_kutta_step, solve_riccati
+
+# dx/dt (M, n_x) of states (M, n_x) and inputs (M, n_u), in units a time unit of the model
+Rate = Callable[[Array, Array], Array]
+# inputs (M, n_u) of states (M, n_x), as far as these are active; NaN where there is none
+_Feedback = Callable[[Array, NDArray[np.bool_]], Array]
+
+#: A law fails where it costs more than so many times as much as with a perfect model.
+MOST_EXCESS = 1.05
+
+# A loop has arrived when it ends this close to the set-point, in units of the scale.
+_ARRIVED = 0.05
+# It is lost when a state is further than this from the nominal point, in units of its scale.
+_ESCAPED = 10.0
+# How many times as long a loop may go on when only some laws have arrived.
+_PATIENCE = 4
+# Share of the inputs' range, at either end, that a perfect model is not given.
+_KEPT = 0.1
+_DIFFERENCE = 1e-5  # step of a difference quotient, in scaled deviations
+
+
+@dataclass(frozen=True)
+class Loops:
+    """What all loops have in common."""
+
+    plant: DriftPlant
+    tuning: Tuning
+    law: Callable[[LiftedModel, Tuning], Law]
+    limits: InputLimits
+    interval: float  #: between samples, in time units of the model
+    samples: int
+    steps: int  #: of integration, in an interval
+
+    def laws(self, targets: Array, inputs: Array, limits: InputLimits) -> tuple[_Feedback, ...]:
+        """Return the law, the averaged one that knows the plant, and two linear ones."""
+        model, seconds = self.plant.model, self.interval * self.plant.model.seconds_per_time_unit
+        return (_called(self.law(model, self.tuning), targets, inputs, limits, seconds),
+                _informed(self.plant, targets, inputs, self.tuning, limits, self.interval),
+                *(_constant(Linear(one, self.tuning), targets, inputs, limits, seconds)
+                  for one in (self.plant.linearised, model)))
+
+    def run(self, feedbacks: Sequence[_Feedback], cases: tuple[Array, Array, Array], tell: Tell
+            ) -> tuple[Array, NDArray[np.bool_]] | None:
+        """Run loops under each of some laws, as :func:`_run`."""
+        return _run(self.plant, feedbacks, *cases, self.tuning.weights, self.interval,
+                    self.samples, self.steps, tell)
+
+
+def judge_loops(given: Loops, cases: tuple[Array, Array, Array], tell: Tell
+                ) -> tuple[Any, ...] | None:
+    """
+    Run some of the loops; None where `tell` ended them.
+
+    :return: of each the cost of the law, that beside the better of two linear laws, whether it had
+        no gain, its cost beside that of a perfect model, and whether no law arrives.
+    """
+    starts, targets, inputs = cases
+    limits, m = given.limits, given.plant.model.n_u
+    ended = given.run(given.laws(targets, inputs, limits), cases, tell)
+    if ended is None:
+        return None
+    costs, no_gain = ended
+    if (hopeless := ~np.isfinite(costs).any(axis=0)).any():
+        # what the limits hide
+        endless = np.full(m, np.inf)
+        some = starts[hopeless], targets[hopeless], inputs[hopeless]
+        ended = given.run(given.laws(*some[1:], InputLimits(-endless, endless, endless)), some,
+                          tell)
+        if ended is None:
+            return None
+        costs[:, hopeless], no_gain[hopeless] = ended
+    own, informed, *others = costs
+    ratios, excess = _beside(own, np.min(others, axis=0)), _beside(own, informed)
+    if (beaten := ~(excess <= MOST_EXCESS) & ~hopeless).any():
+        some = starts[beaten], targets[beaten], inputs[beaten]
+        again = given.run([_informed(given.plant, *some[1:], given.tuning, _narrowed(limits),
+                                     given.interval)], some, tell)
+        if again is None:
+            return None
+        excess[beaten] = np.minimum(excess[beaten], _beside(own[beaten], again[0][0]))
+    return own, ratios, no_gain, excess, hopeless
+
+
+def _beside(cost: Array, other: Array) -> Array:
+    """Return ratios (M,) of costs; 0 where the other is infinite."""
+    finite = np.isfinite(other)
+    return np.where(finite, cost / np.where(finite, other, 1.0), 0.0)
+
+
+@dataclass(frozen=True)
+class DriftPlant:
+    """A drift in the scaled deviations of a model; rows are states or inputs side by side."""
+
+    model: LiftedModel  #: whose names and scaling
+    physical: Rate  #: in units
+
+    def rate(self, x: Array, v: Array) -> Array:
+        """Return the scaled rates (M, n_x)."""
+        states = self.model.states
+        scaled: Array = self.physical(states.to_physical(x), self.model.inputs.to_physical(v)
+                                      ) / states.scale
+        return scaled
+
+    def slope(self, x: Array, v: Array) -> Array:
+        """Return the derivatives (M, n_x, n_x + n_u) of the rate by state and input."""
+        n = x.shape[1]
+        both = np.hstack([x, v])
+        columns = []
+        for step in _DIFFERENCE * np.eye(both.shape[1]):
+            ahead, behind = both + step, both - step
+            columns.append(self.rate(ahead[:, :n], ahead[:, n:])
+                           - self.rate(behind[:, :n], behind[:, n:]))
+        return np.stack(columns, axis=-1) / (2.0 * _DIFFERENCE)
+
+    @property
+    def linearised(self) -> LiftedModel:
+        """The linear model of the plant at the model's nominal point."""
+        model, n = self.model, self.model.n_x
+        slope = self.slope(np.zeros((1, n)), np.zeros((1, model.n_u)))[0]
+        itself = NetworkObservables((), np.zeros((0, n)), identity=True)
+        return replace(model, observables=itself, A=slope[:, :n], B=slope[:, n:],
+                       readout=None, input_terms=None, pre_feedback=None, tried_loops=None)
+
+
+def target_of(model: LiftedModel, x_ref: Array, v: Array) -> Target | None:
+    """Return a target of a model with the disturbance under which this input holds it."""
+    try:
+        w = -model.rate_under(v)(x_ref)
+        return steady_state_target(model, x_ref, w) if finite(w) else None
+    except np.linalg.LinAlgError:
+        return None
+
+
+def _called(law: Law, setpoints: Array, inputs: Array, limits: InputLimits, seconds: float
+            ) -> _Feedback:
+    """Return a law's inputs, found for one state after another."""
+    model = law.model
+    targets = [target_of(model, *pair) for pair in zip(setpoints, inputs, strict=True)]
+    memory: list[object] = [None] * len(targets)
+
+    def act(x: Array, active: NDArray[np.bool_]) -> Array:
+        v = np.full(inputs.shape, np.nan)
+        for k in np.flatnonzero(active):
+            target = targets[k]
+            if target is None:
+                continue
+            w = -(target.drift + model.forcing(target.x, target.u))
+            found = law.compute(Estimate(x[k], w), target, limits, memory[k], seconds)
+            memory[k] = found.memory
+            if found.u is not None:
+                v[k] = model.inputs.to_deviation(found.u)
+        return v
+
+    return act
+
+
+def _constant(law: Law, setpoints: Array, inputs: Array, limits: InputLimits, seconds: float
+              ) -> _Feedback:
+    """Return the inputs of a law with one gain, which is read off what it does without limits."""
+    model, n = law.model, setpoints.shape[1]
+    endless = np.full(model.n_u, np.inf)
+    at_nominal = _called(law, np.zeros((n, n)), np.zeros((n, model.n_u)),
+                         InputLimits(-endless, endless, endless), seconds)
+    gain = at_nominal(np.eye(n), np.full(n, True)).T
+
+    def act(x: Array, active: NDArray[np.bool_]) -> Array:
+        u = model.inputs.to_physical(inputs + (x - setpoints) @ gain.T)
+        return model.inputs.to_deviation(limits.within(u))
+
+    return act
+
+
+def _narrowed(limits: InputLimits) -> InputLimits:
+    """Leave out what a perfect model makes of the last of the range: others cannot be as sure."""
+    bounded = np.isfinite(limits.lower) & np.isfinite(limits.upper)
+    margin = np.zeros(len(bounded))
+    margin[bounded] = _KEPT * (limits.upper - limits.lower)[bounded]
+    return replace(limits, lower=limits.lower + margin, upper=limits.upper - margin)
+
+
+def _informed(plant: DriftPlant, setpoints: Array, inputs: Array, tuning: Tuning,
+              limits: InputLimits, interval: float) -> _Feedback:
+    """Return the averaged law that knows the plant: no better model of it has a better one."""
+    def act(x: Array, active: NDArray[np.bool_]) -> Array:
+        v = np.full(inputs.shape, np.nan)
+        rows = np.flatnonzero(active)
+        e, n = x[rows] - setpoints[rows], x.shape[1]
+        points = setpoints[rows] + NODES[:, None, None] * e
+        along = plant.slope(points.reshape(-1, n), np.tile(inputs[rows], (len(NODES), 1)))
+        A = np.tensordot(WEIGHTS, along[..., :n].reshape(len(NODES), -1, n, n), 1)
+        B = plant.slope(x[rows], inputs[rows])[..., n:]
+        for i, k in enumerate(rows):
+            found = solve_riccati(A[i], B[i], tuning.weights.Q, tuning.weights.R,
+                                  interval=interval, max_gain=tuning.max_gain,
+                                  max_residual=tuning.max_residual)
+            if found.status is RiccatiStatus.SOLVED:
+                u = plant.model.inputs.to_physical(inputs[k] - found.K @ e[i])
+                v[k] = plant.model.inputs.to_deviation(limits.within(u))
+        return v
+
+    return act
+
+
+def _run(plant: DriftPlant, feedbacks: Sequence[_Feedback], starts: Array, setpoints: Array,
+         inputs: Array, weights: Weights, interval: float, samples: int, steps: int,
+         watch: Callable[[float], bool]) -> tuple[Array, NDArray[np.bool_]] | None:
+    """
+    Run M loops under each of F laws; None where `watch` ended it.
+
+    :return: costs (F, M), infinite where a loop does not arrive, and whether (M,) the first law
+        had no gain on the way.
+    """
+    n, (M, m) = starts.shape[1], inputs.shape
+    y = np.tile(np.hstack([starts, np.zeros((M, 1))]), (len(feedbacks), 1, 1))
+    no_gain = np.zeros(M, dtype=bool)
+
+    def arrived() -> NDArray[np.bool_]:
+        return np.all(np.abs(y[..., :n] - setpoints) < _ARRIVED, axis=-1)
+
+    # a loop that runs away ends as one that failed, whatever overflows meanwhile
+    with np.errstate(all='ignore'):
+        for number in range(_PATIENCE * samples):
+            # the share of the usual time
+            if watch(min(number, samples - 1) / samples):
+                return None
+            active = (np.abs(y[..., :n]) < _ESCAPED).all(axis=-1)
+            y[~active] = np.nan
+            if number >= samples:
+                # where one law has arrived the others may, too; all of them get the same time
+                there = arrived()
+                active &= there.any(axis=0) & (active & ~there).any(axis=0)
+                if not active.any():
+                    break
+            v = np.array([act(x, on) for act, x, on in zip(
+                feedbacks, y[..., :n], active, strict=True)])
+            no_gain |= active[0] & ~np.isfinite(v[0]).all(axis=-1)
+            u = v - inputs
+            held = np.einsum('...i,ij,...j->...', u, weights.R, u)
+
+            def flow(y: Array, v: Array = v, held: Array = held) -> Array:
+                x = y[..., :n]
+                e = x - setpoints
+                cost = np.einsum('...i,ij,...j->...', e, weights.Q, e) + held
+                rate = plant.rate(x.reshape(-1, n), v.reshape(-1, m)).reshape(x.shape)
+                return np.concatenate([rate, cost[..., None]], axis=-1)
+
+            ahead = y
+            for _ in range(steps):
+                ahead = runge_kutta_step(flow, ahead, interval / steps)
+            y = np.where(active[..., None], ahead, y)
+        there = arrived()
+    return np.where(there & np.isfinite(y[..., n]), y[..., n], np.inf), no_gain
