@@ -194,7 +194,7 @@ def test_a_level_that_is_in_no_bag_is_learned_with_the_other(bag, tmp_path, monk
 
 @pytest.fixture(scope='module')
 def by_equations(tmp_path_factory):
-    """Return what eight minutes of the lower level give by equations with another orifice."""
+    """Return what the equations make of eight minutes of the lower level alone."""
     folder = tmp_path_factory.mktemp('equations')
     task = Task((str(write_tanks(folder / 'run.mcap', 500.0)),), str(folder / 'new.safetensors'),
                 '', STATES[:1], INPUTS, model_class='polynomial', equations='two_tanks',
@@ -210,7 +210,7 @@ def test_a_level_that_is_in_no_bag_has_its_own_name_by_equations(by_equations):
     assert (model.states.names, model.states.units) == (('level_2', 'level_1'), ('m', 'm'))
     assert model.provenance.method == 'output error, equations of TwoTanks'
     x, u = TANKS.nominal_state, TANKS.nominal_input
-    assert found.drift.rate(x[::-1], u) == pytest.approx([0.0, 0.0], abs=2e-5)
+    assert found.drift.rate(x[::-1], u[::-1]) == pytest.approx([0.0, 0.0], abs=2e-5)
 
 
 def test_constants_are_in_summary_report_and_diagnostics(by_equations):
