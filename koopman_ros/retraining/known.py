@@ -95,19 +95,19 @@ def known(task: Task, current: LiftedModel | None
                          'that have them: give the plant in equations')
     states: Sequence[RecordedState] = task.states
     inputs: Sequence[RecordedInput] = task.inputs
-    plant = _unknown(task)
-    if current is not None:
-        inputs = _in_order(inputs, current.inputs, 'input', task.model)
+    if current is None:
+        plant = _unknown(task)
+    else:
         some = [name for name in current.states.names
                 if name in {state.name for state in states}]
-        if task.equations and 0 < len(some) < len(current.states):
-            # the others are estimated
-            states = _in_order(states, current.states.only(some), 'state', task.model)
-            plant = replace(_unknown(replace(task, states=tuple(states), inputs=tuple(inputs))),
-                            name=current.plant.name, time_unit=current.plant.time_unit)
-        else:
-            states = _in_order(states, current.states, 'state', task.model)
-            plant = current.plant
+        # the others are estimated
+        partly = bool(task.equations) and 0 < len(some) < len(current.states)
+        states = _in_order(states, current.states.only(some) if partly else current.states,
+                           'state', task.model)
+        inputs = _in_order(inputs, current.inputs, 'input', task.model)
+        plant = current.plant if not partly else replace(
+            _unknown(replace(task, states=tuple(states), inputs=tuple(inputs))),
+            name=current.plant.name, time_unit=current.plant.time_unit)
     return replace(plant, B=_known_gain(task, plant),
                    input_matrix_degree=task.input_matrix_degree), states, inputs
 
