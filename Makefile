@@ -113,7 +113,7 @@ studies-saddle: SEEDS = 10
 studies-saddle: $(VENV)/saddle.stamp  ## the same reactor held at its saddle from its temperature alone, SEEDS=10, half an hour
 	$(BIN)/python -m validation.saddle --seeds $(SEEDS)
 
-bench: $(VENV)/bench.stamp  ## speed beside other programs, seventeen minutes (BENCH=--quick: three) -> out/bench
+bench: $(VENV)/bench.stamp  ## speed beside other programs, half an hour (BENCH=--quick: four) -> out/bench
 	$(BIN)/python -m validation.benchmarks $(BENCH)
 
 faults: $(VENV)/mpc.stamp  ## put faults into the loops of the reactor, of two tank plants and of a reactor at its saddle, and soak both reactors for a day, three quarters of an hour (FAULTS=--quick: a minute; FAULTS=two_tanks: one plant) -> out/faults

@@ -135,7 +135,8 @@ class Selection:
             extreme = bool(np.any(low <= self.lower) or np.any(high >= self.upper))
             if self.group > 1:
                 part = averaged(part, self.group)
-            self._held.append(_Segment((bag, self.offered), key, self._cells(part), extreme, part))
+            self._held.append(_Segment((bag, self.offered), key, self._cells(part), extreme,
+                                       _copied(part)))
             self.offered += 1
         if sum(len(one.episode) for one in self._held) > 2 * self.most:
             self._held = self._best()
@@ -170,6 +171,12 @@ class Selection:
         return np.unique(np.concatenate([
             CELLS ** 2 * number + CELLS * cells[:, i] + cells[:, j]
             for number, (i, j) in enumerate(pairs)]))
+
+
+def _copied(part: Episode) -> Episode:
+    """Return a part of an episode that does not keep all of it in memory."""
+    return replace(part, time=part.time.copy(), x=part.x.copy(),
+                   input_time=part.input_time.copy(), u=part.u.copy())
 
 
 def cells_of(values: Array, lower: Array | float, upper: Array | float) -> NDArray[np.int64]:
