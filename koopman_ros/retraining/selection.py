@@ -5,6 +5,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 import itertools
 import math
@@ -13,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from koopman_ros.arrays import Array
+from koopman_ros.lifting import Box
 from koopman_ros.plant_data import averaged, cut, Episode
 
 CELLS = 10  # along each of two signals, by which the visited share of their ranges is told
@@ -183,3 +185,24 @@ def cells_of(values: Array, lower: Array | float, upper: Array | float) -> NDArr
     """Return in which of the cells of each signal's range values (N, n) lie: (N, n)."""
     width = np.where(np.greater(upper, lower), np.subtract(upper, lower), 1.0)
     return np.clip((CELLS * ((values - lower) / width)).astype(np.int64), 0, CELLS - 1)
+
+
+def visited_cells(episodes: Sequence[Episode], box: Box) -> NDArray[np.int64]:
+    """Return the cells (K, n_x + n_u) of the box that measurements and their inputs lie in."""
+    found = []
+    for episode in episodes:
+        u = box.inputs.to_deviation(episode.inputs_at(episode.time))
+        found.append(cells_of(np.hstack([box.states.to_deviation(episode.x), u]), -1.0, 1.0))
+    return np.unique(np.concatenate(found), axis=0)
+
+
+def coverage(episodes: Sequence[Episode], box: Box) -> dict[tuple[str, str], float]:
+    """
+    Return the share of the cells of two signals' ranges that are visited, for all pairs.
+
+    Not of all signals at once: an hour of samples cannot fill the cells of six.
+    """
+    cells = visited_cells(episodes, box)
+    names = enumerate((*box.states.names, *box.inputs.names))
+    return {(first, second): len(np.unique(cells[:, [i, j]], axis=0)) / CELLS ** 2
+            for (i, first), (j, second) in itertools.combinations(names, 2)}

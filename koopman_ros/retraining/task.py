@@ -8,7 +8,6 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass, field, replace
 import hashlib
-import itertools
 import json
 import math
 import os
@@ -17,20 +16,19 @@ import shutil
 from typing import TypeVar
 
 import numpy as np
-from numpy.typing import NDArray
 
 from koopman_ros.arrays import Array, brief
 from koopman_ros.bags import Account, RecordedInput, RecordedState
 from koopman_ros.identification import Identified, identify, identify_hidden, Stopped
 from koopman_ros.learning import Comparison, Contender, NoUsefulLift, Progress
-from koopman_ros.lifting import Box, Coordinates, LiftedModel, load, save
+from koopman_ros.lifting import Coordinates, LiftedModel, load, save
 from koopman_ros.model_classes import BEST, CLASSES, IDENTITY_LIFT
 from koopman_ros.plant_data import Episode, Plant
 from koopman_ros.resources import predecessor
 from koopman_ros.retraining.gate import decide, Decision, shortfalls, Thresholds
 from koopman_ros.retraining.lift import compare_classes
 from koopman_ros.retraining.record import Each, read_record, Reduction, Source
-from koopman_ros.retraining.selection import CELLS, cells_of
+from koopman_ros.retraining.selection import coverage
 from koopman_ros.units import NANOSECONDS, SECONDS_PER_TIME_UNIT
 from koopman_ros.wire import Place
 
@@ -274,27 +272,6 @@ def retrain(task: Task, on_progress: OnProgress = lambda *_: False, *, each: Eac
     save(model, path)
     return replace(bare, learned=learned.with_model(model), decision=decision,
                    reasons=decision.reasons, model_file=str(path))
-
-
-def visited_cells(episodes: Sequence[Episode], box: Box) -> NDArray[np.int64]:
-    """Return the cells (K, n_x + n_u) of the box that measurements and their inputs lie in."""
-    found = []
-    for episode in episodes:
-        u = box.inputs.to_deviation(episode.inputs_at(episode.time))
-        found.append(cells_of(np.hstack([box.states.to_deviation(episode.x), u]), -1.0, 1.0))
-    return np.unique(np.concatenate(found), axis=0)
-
-
-def coverage(episodes: Sequence[Episode], box: Box) -> dict[tuple[str, str], float]:
-    """
-    Return the share of the cells of two signals' ranges that are visited, for all pairs.
-
-    Not of all signals at once: an hour of samples cannot fill the cells of six.
-    """
-    cells = visited_cells(episodes, box)
-    names = enumerate((*box.states.names, *box.inputs.names))
-    return {(first, second): len(np.unique(cells[:, [i, j]], axis=0)) / CELLS ** 2
-            for (i, first), (j, second) in itertools.combinations(names, 2)}
 
 
 _Signal = TypeVar('_Signal', RecordedState, RecordedInput)
