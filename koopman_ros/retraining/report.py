@@ -16,8 +16,8 @@ from koopman_ros.learning.validation import lifted_rate
 from koopman_ros.lifting import Coordinates
 from koopman_ros.model_classes import BEST
 from koopman_ros.reports import bullets, drawing, table, write_figures, write_page
-from koopman_ros.retraining.selection import CELLS
-from koopman_ros.retraining.task import Retrained, visited_cells
+from koopman_ros.retraining.selection import CELLS, visited_cells
+from koopman_ros.retraining.task import Retrained
 from koopman_ros.units import SECONDS_PER_TIME_UNIT, shown, unit_label
 
 

@@ -5,6 +5,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 import itertools
 import math
@@ -13,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from koopman_ros.arrays import Array
+from koopman_ros.lifting import Box
 from koopman_ros.plant_data import averaged, cut, Episode
 
 CELLS = 10  # along each of two signals, by which the visited share of their ranges is told
@@ -135,7 +137,8 @@ class Selection:
             extreme = bool(np.any(low <= self.lower) or np.any(high >= self.upper))
             if self.group > 1:
                 part = averaged(part, self.group)
-            self._held.append(_Segment((bag, self.offered), key, self._cells(part), extreme, part))
+            self._held.append(_Segment((bag, self.offered), key, self._cells(part), extreme,
+                                       _copied(part)))
             self.offered += 1
         if sum(len(one.episode) for one in self._held) > 2 * self.most:
             self._held = self._best()
@@ -172,7 +175,34 @@ class Selection:
             for number, (i, j) in enumerate(pairs)]))
 
 
+def _copied(part: Episode) -> Episode:
+    """Return a part of an episode that does not keep all of it in memory."""
+    return replace(part, time=part.time.copy(), x=part.x.copy(),
+                   input_time=part.input_time.copy(), u=part.u.copy())
+
+
 def cells_of(values: Array, lower: Array | float, upper: Array | float) -> NDArray[np.int64]:
     """Return in which of the cells of each signal's range values (N, n) lie: (N, n)."""
     width = np.where(np.greater(upper, lower), np.subtract(upper, lower), 1.0)
     return np.clip((CELLS * ((values - lower) / width)).astype(np.int64), 0, CELLS - 1)
+
+
+def visited_cells(episodes: Sequence[Episode], box: Box) -> NDArray[np.int64]:
+    """Return the cells (K, n_x + n_u) of the box that measurements and their inputs lie in."""
+    found = []
+    for episode in episodes:
+        u = box.inputs.to_deviation(episode.inputs_at(episode.time))
+        found.append(cells_of(np.hstack([box.states.to_deviation(episode.x), u]), -1.0, 1.0))
+    return np.unique(np.concatenate(found), axis=0)
+
+
+def coverage(episodes: Sequence[Episode], box: Box) -> dict[tuple[str, str], float]:
+    """
+    Return the share of the cells of two signals' ranges that are visited, for all pairs.
+
+    Not of all signals at once: an hour of samples cannot fill the cells of six.
+    """
+    cells = visited_cells(episodes, box)
+    names = enumerate((*box.states.names, *box.inputs.names))
+    return {(first, second): len(np.unique(cells[:, [i, j]], axis=0)) / CELLS ** 2
+            for (i, first), (j, second) in itertools.combinations(names, 2)}

@@ -5,16 +5,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from dataclasses import asdict, dataclass, replace
 import hashlib
-import itertools
 import os
 from pathlib import Path
 import shutil
 
 import numpy as np
-from numpy.typing import NDArray
 
 from koopman_ros.arrays import Array, brief
 from koopman_ros.bags import Account
@@ -29,7 +27,7 @@ from koopman_ros.identification import (
 from koopman_ros.jobs.backends import Backend, backend_of
 from koopman_ros.learning import Comparison, Contender, NoUsefulLift, Progress
 from koopman_ros.learning.scaling import checked_device
-from koopman_ros.lifting import Box, LiftedModel, load, save
+from koopman_ros.lifting import LiftedModel, load, save
 from koopman_ros.model_classes import BEST, CLASSES
 from koopman_ros.plant_data import Episode, Plant
 from koopman_ros.plants import plant_class
@@ -38,7 +36,7 @@ from koopman_ros.retraining.gate import decide, Decision, shortfalls, Thresholds
 from koopman_ros.retraining.known import known, Task
 from koopman_ros.retraining.lift import compare_classes
 from koopman_ros.retraining.record import Each, read_record, Reduction, Source
-from koopman_ros.retraining.selection import CELLS, cells_of
+from koopman_ros.retraining.selection import coverage
 from koopman_ros.units import NANOSECONDS, SECONDS_PER_TIME_UNIT
 
 # A smaller change, in half widths of the present lift's box, is neither a spike nor a jump.
@@ -263,25 +261,6 @@ def retrain_by(backend: Backend, task: Task, on_progress: OnProgress = lambda *_
                    reasons=decision.reasons, model_file=str(path))
 
 
-def visited_cells(episodes: Sequence[Episode], box: Box) -> NDArray[np.int64]:
-    """Return the cells (K, n_x + n_u) of the box that measurements and their inputs lie in."""
-    found = []
-    for episode in episodes:
-        u = box.inputs.to_deviation(episode.inputs_at(episode.time))
-        found.append(cells_of(np.hstack([box.states.to_deviation(episode.x), u]), -1.0, 1.0))
-    return np.unique(np.concatenate(found), axis=0)
-
-
-def coverage(episodes: Sequence[Episode], box: Box) -> dict[tuple[str, str], float]:
-    """
-    Return the share of the cells of two signals' ranges that are visited, for all pairs.
-
-    Not of all signals at once: an hour of samples cannot fill the cells of six.
-    """
-    cells = visited_cells(episodes, box)
-    names = enumerate((*box.states.names, *box.inputs.names))
-    return {(first, second): len(np.unique(cells[:, [i, j]], axis=0)) / CELLS ** 2
-            for (i, first), (j, second) in itertools.combinations(names, 2)}
 
 
 def _at(stage: str, share: float) -> float:

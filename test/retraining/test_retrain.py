@@ -18,6 +18,7 @@ from koopman_ros.plant_data import Episode
 from koopman_ros.resources import model_path
 from koopman_ros.retraining import compare_classes, decide, retrain, Task, write_report
 from koopman_ros.retraining import task as task_module
+from koopman_ros.retraining.selection import coverage, visited_cells
 from support.known_plants import box, methods
 from support.random_lifts import random_lift
 from support.recorded_runs import (
@@ -290,8 +291,8 @@ TWO_STATES = Episode(np.arange(2.0), np.array([[0.05, 0.95], [0.55, 0.45]]), np.
     ([HELD], BOX, [[0, 0], [0, 9]]),
     ([TWO_STATES], box([0.0, 0.0], [1.0, 1.0], [0.0], [1.0]), [[0, 9, 3], [5, 4, 3]])])
 def test_visited_cells_and_their_share_of_all(episodes, within, cells):
-    assert task_module.visited_cells(episodes, within).tolist() == cells
-    shares = task_module.coverage(episodes, within)
+    assert visited_cells(episodes, within).tolist() == cells
+    shares = coverage(episodes, within)
     if len(cells[0]) == 2:
         assert shares == {('x1', 'u1'): pytest.approx(len(cells) / 100.0)}
     else:

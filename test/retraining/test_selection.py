@@ -164,6 +164,8 @@ def test_what_is_held_is_bounded() -> None:
         # half of it is thrown away now and then
         assert sum(len(one.episode) for one in found._held) <= 2000 + 5000
     assert sum(map(len, found.episodes())) <= 1000
+    # a segment does not keep the episode that it was cut from
+    assert all(one.x.base is None and one.u.base is None for one in found.episodes())
 
 
 def test_short_parts_are_left_out() -> None:

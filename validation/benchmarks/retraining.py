@@ -3,12 +3,11 @@
 
 """What retraining from long records costs: processor time and memory by their samples."""
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor
 from dataclasses import asdict, dataclass, replace
 from functools import partial
 from pathlib import Path
-import resource
 import sys
 import tempfile
 import time
@@ -81,7 +80,7 @@ def cases() -> dict[str, Case]:
 def measure(plan: Plan, figures: dict[str, Any], folder: Path) -> Iterator[str]:
     """Retrain from records of growing length, and from many days by two processes."""
     figures['machine']['threads'] = 1
-    figures['clock'] = 'processor time; of the children, too, where there are several processes'
+    figures['clock'] = 'processor time, in all processes'
     known = cases()
     with tempfile.TemporaryDirectory() as name:
         for case, sizes in plan.samples.items():
@@ -159,7 +158,7 @@ def _retrain(tell: process.Tell, name: str, bags: Sequence[Path], output: Path, 
 
     torch.set_num_threads(1)
     case, before = cases()[name], _peak()
-    spent = {'reading': 0.0}
+    spent, by_workers, of_workers = {'reading': 0.0}, 0.0, 0.0
     stage, since = 'reading', time.process_time()
 
     def on_progress(_: float, text: str) -> bool:
@@ -172,16 +171,21 @@ def _retrain(tell: process.Tell, name: str, bags: Sequence[Path], output: Path, 
 
     task = task_of(case, bags, output)
     if workers > 1:
+        def each(function: Callable[[Any], Any], bags: Iterable[Any]) -> Iterator[Any]:
+            nonlocal by_workers, of_workers
+            for result, seconds, peak in pool.map(partial(_watched, function), bags, chunksize=8):
+                by_workers, of_workers = by_workers + seconds, max(of_workers, peak)
+                yield result
+
         with ProcessPoolExecutor(workers) as pool:
-            found = retrain(task, on_progress, each=partial(pool.map, chunksize=8))
-            of_workers = max(pool.map(_peak, range(workers)))
+            found = retrain(task, on_progress, each=each)
     else:
-        found, of_workers = retrain(task, on_progress), 0.0
+        found = retrain(task, on_progress)
     spent[stage] = spent.get(stage, 0.0) + time.process_time() - since
     reduction = found.reduction
     tell({'figures': {
         'stages': spent,
-        'cpu_seconds': sum(map(_seconds, (resource.RUSAGE_SELF, resource.RUSAGE_CHILDREN))),
+        'cpu_seconds': time.process_time() + by_workers, 'cpu_seconds_of_workers': by_workers,
         'start_megabytes': before, 'peak_megabytes': _peak(),
         'peak_megabytes_of_workers': of_workers,
         'accepted': found.accepted, 'reasons': list(found.reasons),
@@ -191,15 +195,17 @@ def _retrain(tell: process.Tell, name: str, bags: Sequence[Path], output: Path, 
         'drift_error': drift_error(case, found.found.drift)}})
 
 
-def _peak(_: object = None) -> float:
+def _peak() -> float:
     """Return the most memory that this process has had, in MB."""
     status = Path('/proc/self/status').read_text()
     return int(status.partition('VmHWM:')[2].split()[0]) * 1024 / 1e6
 
 
-def _seconds(who: int) -> float:
-    used = resource.getrusage(who)
-    return used.ru_utime + used.ru_stime
+def _watched(function: Callable[[Any], Any], item: Any) -> tuple[Any, float, float]:
+    """Return what a function returns, its processor time, and the most memory until its end."""
+    begun = time.process_time()
+    found = function(item)
+    return found, time.process_time() - begun, _peak()
 
 
 def _remove(bags: Sequence[Path]) -> None:
