@@ -324,3 +324,40 @@ def test_noise_that_is_not_said_is_that_of_the_record():
     assert settings.uncertainty(known, outputs)[0].tolist() == [0.125]
     said = replace(settings, noise=np.array([0.5]))
     assert said.uncertainty(known, outputs)[0].tolist() == [0.5]
+
+
+def test_measurements_count_at_their_own_times_and_those_that_are_no_use_not_at_all():
+    model, rng = oscillator(), np.random.default_rng(0)
+    outputs = first(model, 1)
+    one = Controller(model, Settings.for_model(
+        model, state_weight=np.ones(2), input_weight=np.ones(1), controlled=(outputs.names[0],),
+        limits=InputLimits(model.inputs.lower, model.inputs.upper, np.ones(1)),
+        sensor=SensorLimits.none(1), noise=np.array([0.1]), wander=0.05 * model.inputs.scale,
+        initial_error=0.3 * model.states.scale, estimator='extended_kalman_filter'), outputs)
+    kalman = ExtendedKalmanFilter(model, tuning(model, outputs))
+    state, now, expected, before = State(), 10 ** 12, None, None
+    for k in range(60):
+        seconds = float(rng.choice([0.4, 1.0, 2.5]))
+        elapsed = round(seconds * 1e9)
+        now += elapsed
+        y = model.states.center[:1] + rng.normal(0.0, 0.3, 1)
+        lost = k % 7 == 3
+        state, command, _ = one.step(state, np.full(1, np.nan) if lost else y, now)
+        deviation = (y - model.states.center[:1]) / model.states.scale[:1]
+        if expected is None:
+            expected = kalman.restart(None, np.append(deviation, 0.0), None)
+        else:
+            expected = kalman.predict(expected, before, elapsed / 1e9)
+            if not lost:
+                expected = kalman.correct(expected, np.append(deviation, expected.x[1]), 0.0)
+        if k:
+            # first guesses differ
+            assert state.estimate.x == pytest.approx(expected.x, abs=1e-9)
+        else:
+            expected = state.estimate
+        assert state.estimate.covariance == pytest.approx(expected.covariance, rel=1e-9, abs=1e-12)
+        before = model.inputs.to_deviation(command)
+        # the same again, and one that was overtaken
+        for late in (0, 10 ** 8):
+            state, repeated, _ = one.step(state, y + 5.0, now - late)
+            assert repeated == command
