@@ -22,7 +22,7 @@ from koopman_ros.plants import (
     RandomStepDesign,
     sought_of,
 )
-from koopman_ros.plants.library.reactor import TwoStateReactor
+from koopman_ros.plants.library.reactor import FedReactor, TwoStateReactor
 from koopman_ros.plants.library.two_tanks import TwoTanks
 from koopman_ros.solvers import runge_kutta_step
 
@@ -212,6 +212,29 @@ def test_derivatives_by_constants_and_states_against_those_by_hand():
     assert not slopes[:, :, 2].any()
     assert at.scaled_slope(xi, v) == pytest.approx(np.full((2, 1, 1), -leak), rel=1e-12)
     assert not at.varying_input_matrix
+
+
+@pytest.mark.parametrize('turned', [False, True])
+def test_where_inputs_act_by_the_state_and_signals_have_another_order_and_time(turned):
+    system = FedReactor().system()
+    order = slice(None, None, -1 if turned else None)
+    plant = Plant('fed', system.state_names[order], system.state_units[order],
+                  system.input_names[order], system.input_units[order], 's', np.full(2, np.nan),
+                  np.full(2, np.nan), None)
+    rng = np.random.default_rng(0)
+    x, u = ((nominal * rng.uniform(0.9, 1.1, (20, 2)))[:, order]
+            for nominal in (system.nominal_state, system.nominal_input))
+    model = Equations.of(FedReactor, sought_of(FedReactor, {}), plant, x, u)
+    # a minute has 60 s
+    assert 60.0 * model.rate(x, u) == pytest.approx(
+        system.derivative(x[:, order], u[:, order])[:, order], rel=1e-9)
+    xi, v = model.box.states.to_deviation(x), model.box.inputs.to_deviation(u)
+    assert model.varying_input_matrix
+    forced = (model.scaled_input_matrix(xi) @ v[..., None])[..., 0]
+    assert model.scaled_rate(xi, 0.0 * v) + forced == pytest.approx(model.scaled_rate(xi, v))
+    slope = np.stack([(model.scaled_rate(xi + h, v) - model.scaled_rate(xi - h, v)) / 2e-5
+                      for h in 1e-5 * np.eye(2)], axis=-1)
+    assert model.scaled_slope(xi, v) == pytest.approx(slope, abs=1e-8)
 
 
 @dataclass(frozen=True)
