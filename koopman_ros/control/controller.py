@@ -513,11 +513,12 @@ class Controller:
         if estimate is None:
             return None
         estimator = self._estimating.level(state).estimator
-        deviation = None if estimate.covariance is None else (
-            states.scale * np.sqrt(estimate.covariance.diagonal()[:len(states)]))
+        n = len(states)
+        covariance = None if estimate.covariance is None else (
+            states.scale[:, None] * estimate.covariance[:n, :n] * states.scale)
         return EstimateReport(
             states.to_physical(estimate.x), estimator.as_input(estimate.w) * (
-                self.model.inputs.scale), estimator.at_bound(estimate.w), deviation,
+                self.model.inputs.scale), estimator.at_bound(estimate.w), covariance,
             estimate.innovation)
 
 

@@ -105,9 +105,15 @@ class EstimateReport:
     state: Array  #: (n_x,) in state units
     disturbance: Array  #: (n_u,) as an input that would have the same effect, in input units
     at_bound: bool  #: whether the disturbance is as large as is allowed
-    #: (n_x,) standard deviation of the state's error, in state units; None where it is not known
-    deviation: Array | None = None
+    #: (n_x, n_x) covariance of the state's error, in products of state units; None where it is not
+    #: known
+    covariance: Array | None = None
     innovation: Innovation | None = None  #: how well the measurements were expected, or None
+
+    @property
+    def deviation(self) -> Array | None:
+        """Standard deviation (n_x,) of the state's error, in state units; or None."""
+        return None if self.covariance is None else np.sqrt(self.covariance.diagonal())
 
 
 @dataclass(frozen=True)

@@ -5,6 +5,7 @@
 
 from collections.abc import Callable, Collection, Mapping
 from dataclasses import dataclass
+import itertools
 import math
 import secrets
 import threading
@@ -290,7 +291,7 @@ def internals(signals: Signals, report: Report, stamp: Time, frame_id: str) -> J
     law, transfer, estimate = report.command.law, report.command.transfer, report.estimate
     inputs, target = signals.inputs, report.target
     states = signals.every
-    deviation = None if estimate is None else estimate.deviation
+    covariance = None if estimate is None else estimate.covariance
     innovation = None if estimate is None else estimate.innovation
     values = {
         **_each(inputs, 'disturbance [{}]',
@@ -309,13 +310,22 @@ def internals(signals: Signals, report: Report, stamp: Time, frame_id: str) -> J
         **_each({name: signals.states[name] for name in signals.controlled}, 'setpoint [{}]',
                 None if target is None else target.setpoint),
         # of a filter alone; at the end, so that the places of the others stay
-        **({f'deviation_{name} [{unit}]': value for (name, unit), value in zip(
-            states.items(), deviation.tolist(), strict=True)} if deviation is not None else {}),
+        **({} if covariance is None else _spread(states, covariance)),
         **({f'innovation_{name} [standard deviations]': value for name, value in zip(
             signals.states, innovation.normalised.tolist(), strict=True)}
            if innovation is not None else {}),
     }
     return _named(values, stamp, frame_id)
+
+
+def _spread(states: Mapping[str, str], covariance: Array) -> dict[str, float]:
+    """Return the standard deviation of each state, and the covariance of each pair."""
+    several = list(enumerate(states.items()))
+    return {
+        **{f'deviation_{name} [{unit}]': math.sqrt(covariance[i, i])
+           for i, (name, unit) in several},
+        **{f'covariance_{name}_{other} [{unit} {by}]': float(covariance[i, j])
+           for (i, (name, unit)), (j, (other, by)) in itertools.combinations(several, 2)}}
 
 
 def _named(values: Mapping[str, float], stamp: Time, frame_id: str) -> JointState:

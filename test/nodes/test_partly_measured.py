@@ -50,6 +50,8 @@ def test_no_offset_is_left_and_what_is_not_measured_is_known(ros: Harness) -> No
                          {'temperature': to_kelvin(SETPOINT)})[0][0]
     assert said['estimated_concentration [mol/L]'] == pytest.approx(truth, abs=5e-3)
     assert 0.0 < said['deviation_concentration [mol/L]'] < 0.02
+    spread = said['deviation_concentration [mol/L]'] * said['deviation_temperature [K]']
+    assert 0.0 < abs(said['covariance_concentration_temperature [mol/L K]']) < spread
     # a warmer feed, q/V = 1/min, is like a warmer coolant, UA/(rho C_p V) = 2.09/min
     assert said['disturbance [K]'] == pytest.approx((FEED - 350.0) / 2.0921, abs=0.3)
     assert 'consistent' in value(status, 'innovations, mean square over expected')
