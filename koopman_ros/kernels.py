@@ -13,13 +13,12 @@ not do, for a kind of model or near to a border, the reference does.
 from collections.abc import Callable, Mapping
 from functools import wraps
 import importlib
-from types import MappingProxyType
 from typing import Any, Protocol, TypeVar
 
 Kernels = Mapping[str, Callable[..., Any]]
 Function = TypeVar('Function', bound=Callable[..., Any])
 
-NUMPY: Kernels = MappingProxyType({})
+NUMPY: Kernels = {}
 # Names of both in records.
 IN_NUMPY, COMPILED = 'numpy', 'compiled'
 PACKAGE = 'numba'  # which compiles

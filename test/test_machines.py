@@ -7,7 +7,7 @@ import os
 import subprocess
 import sys
 
-from koopman_ros.learning import train, training
+from koopman_ros.learning import scaling, train
 import machines
 from support import disturbance
 from support.small_plants import BENT, bent_samples, bits, SMALL
@@ -41,7 +41,7 @@ def test_all_that_is_to_run_is_there_and_one_machine_that_fails_is_a_failure(mon
 
 def test_a_disturbed_training_is_another_one(monkeypatch):
     # set so that it is put back
-    monkeypatch.setattr(training, 'ScaledSamples', training.ScaledSamples)
+    monkeypatch.setattr(scaling, 'ScaledSamples', scaling.ScaledSamples)
     monkeypatch.setattr(disturbance, 'SIZE', 0.0)
     disturbance.disturb_training()
     as_given = train(BENT, bent_samples(), SMALL, starts=1, loops=16).model

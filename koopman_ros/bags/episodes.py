@@ -147,7 +147,8 @@ class _Loop:
         size = runs.portion(max(content.counts[place.topic] for place in states))
         run = Run(states)
         for block in columns(self.bag, list(self.scales)):
-            left -= len(np.unique(np.concatenate([column.row for column in block.values()])))
+            rows = [column.row for column in block.values()]
+            left -= len(np.unique(np.concatenate(rows))) if rows else 0
             heard = {place: self._accepted(place, column) for place, column in block.items()}
             while (found := self._set_back(run, heard)) is not None:
                 at, back_ns = found
