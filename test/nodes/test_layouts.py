@@ -34,7 +34,7 @@ assert WIRING is not None
 TYPES = {topic: kind for topic, (kind, _) in topics.known(WIRING).items()}
 ONE, NONE = np.ones(1), np.zeros(1)
 # by a Kalman filter, which says more than the observer, and a law that plans
-ESTIMATE = EstimateReport(ONE, NONE, False, ONE, Innovation(NONE, 1.0, 1))
+ESTIMATE = EstimateReport(ONE, NONE, False, np.eye(1), Innovation(NONE, 1.0, 1))
 PLAN = Plan(np.arange(2.0), np.ones((2, 1)), np.ones((1, 1)), NONE, NONE, NONE)
 NAMES = {
     topics.CONTROLLER_STATE: list(internals(WIRING.signals, Report(
