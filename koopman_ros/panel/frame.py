@@ -23,7 +23,7 @@ from koopman_ros.panel.style import CSS, WATCH
 
 PERIOD = 0.25  # s between two looks at the snapshot
 _PATIENCE = 40.0  # s for an answer
-_SYMBOLS = {Priority.HIGH: '⬛', Priority.MEDIUM: '▲', Priority.LOW: '●'}
+_SYMBOLS = {Priority.HIGH: '■', Priority.MEDIUM: '▲', Priority.LOW: '●'}
 _TABS = {'/': 'Overview', '/trends': 'Trends', '/alarms': 'Alarms', '/model': 'Model',
          '/tuning': 'Tuning'}
 NOT_ALLOWED = Answer(False, 'you may look, not act: log in as an operator')

@@ -24,7 +24,7 @@ from koopman_ros.panel.plant import (
     TRAINER,
 )
 
-_WORDS = {OK: '', ERROR: '⬛ ERROR'}
+_WORDS = {OK: '', ERROR: '■ ERROR'}
 _DONE = 'done [%]'
 _CONTROL, _TRAINING = 'controller: control', 'trainer: training'
 

@@ -38,7 +38,7 @@ from koopman_ros.ros.hosted import HostableNode, HostedTimer, Hosting
 from koopman_ros.units import Display, Displays, NANOSECONDS
 
 T = TypeVar('T')
-Entity = TypeVar('Entity', Publisher, Service, Subscription, Timer | HostedTimer)
+Entity = TypeVar('Entity', Publisher, Service, Subscription, 'Timer | HostedTimer')
 
 # Parameters that rclpy itself declares or reads.
 _RCLPY_PARAMETERS = ('use_sim_time', 'start_type_description_service')
