@@ -299,10 +299,11 @@ def test_parameters_are_set_checked_and_refused(site: Site) -> None:
 
         # the controller tells of it a moment after it has answered
         deadline = time.monotonic() + PATIENCE / 1e3
-        while '31.0' in (text := exported()) and time.monotonic() < deadline:
+        line = '    coolant_temperature.max: 32.0  # [degC]\n'
+        while line not in (text := exported()) and time.monotonic() < deadline:
             page.wait_for_timeout(100.0)
+        assert line in text
         assert text.startswith('controller:\n  ros__parameters:\n')
-        assert '    coolant_temperature.max: 32.0  # [degC]\n' in text
 
 
 def test_recording_and_experiment_are_begun_and_ended(site: Site) -> None:
