@@ -8,7 +8,6 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping, Sequence
 import contextlib
 from dataclasses import replace
-import itertools
 from typing import Any
 
 import numpy as np
@@ -20,8 +19,8 @@ from koopman_ros.identification.identify import (
     INNOVATIONS_FORM,
     OUTPUT_ERROR,
     Score,
+    stage_by_stage,
     Standing,
-    Stopped,
     Watch,
 )
 from koopman_ros.identification.innovations import Predictor
@@ -72,19 +71,7 @@ def identify_grey(plant: Plant, episodes: Sequence[Episode], equations: Any,
     """
     plant = replace(plant, B=None, input_matrix_degree=0)
     sought = sought_of(equations, ranges or {})
-    steps, total = itertools.count(), 3
-
-    def progress(text: str) -> Callable[..., bool]:
-        number = next(steps)
-
-        def monitor(*_: object) -> bool:
-            if watch(number, total, text):
-                raise Stopped
-            return False
-
-        monitor()
-        return monitor
-
+    progress = stage_by_stage(watch, 3)
     start = Equations.of(equations, sought, plant, np.concatenate([e.x for e in episodes]),
                          np.concatenate([e.u for e in episodes]))
     n_y = len(plant.state_names)

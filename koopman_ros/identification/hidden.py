@@ -7,7 +7,6 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-import itertools
 
 import numpy as np
 
@@ -16,7 +15,7 @@ from koopman_ros.identification.identify import (
     Identified,
     INNOVATIONS_FORM,
     Score,
-    Stopped,
+    stage_by_stage,
     Watch,
 )
 from koopman_ros.identification.innovations import Predictor, raised, SETTLING, standardised
@@ -82,21 +81,8 @@ def identify_hidden(plant: Plant, episodes: Sequence[Episode], hidden: int, *,
                          'input_matrix_degree to 0')
     record = Record(plant, episodes, seed, hidden=True)
     search = _Search(record)
-    total = hidden * highest_degree + 2
-    steps = itertools.count()
+    progress = stage_by_stage(watch, hidden * highest_degree + 2)
     candidates = []
-
-    def progress(text: str) -> Callable[..., bool]:
-        number = next(steps)
-
-        def monitor(*_: object) -> bool:
-            if watch(number, total, text):
-                raise Stopped
-            return False
-
-        monitor()
-        return monitor
-
     for count in range(1, hidden + 1):
         found: _Polynomial | None = None
         for degree in range(1, highest_degree + 1):

@@ -7,6 +7,7 @@ from collections.abc import Callable, Mapping, Sequence
 import contextlib
 from dataclasses import dataclass
 from enum import Enum
+import itertools
 import math
 
 import numpy as np
@@ -70,6 +71,29 @@ Watch = Callable[[int, int, str], bool]
 
 class Stopped(Exception):  # noqa: N818
     """The `watch` callback asked to stop."""
+
+
+def stage_by_stage(watch: Watch, total: int) -> Callable[[str], Callable[..., bool]]:
+    """
+    Return what begins the next of `total` stages by its name, and returns the stage's monitor.
+
+    A stage reports when it begins and whenever its monitor is called, which raises
+    :class:`Stopped` when `watch` asked to stop.
+    """
+    numbers = itertools.count()
+
+    def begin(text: str) -> Callable[..., bool]:
+        number = next(numbers)
+
+        def monitor(*_: object) -> bool:
+            if watch(number, total, text):
+                raise Stopped
+            return False
+
+        monitor()
+        return monitor
+
+    return begin
 
 
 @dataclass(frozen=True)
