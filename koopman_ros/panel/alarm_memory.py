@@ -49,7 +49,8 @@ class AlarmMemory:
         if path.exists():
             try:
                 alarms.recall(*_parsed(read_bounded(path, _MOST_BYTES).decode()), now)
-            except (ValueError, KeyError, TypeError, AttributeError) as error:
+            except (ValueError, KeyError, TypeError, AttributeError, ArithmeticError,
+                    RecursionError) as error:
                 aside = path.with_name(path.name + '.damaged')
                 os.replace(path, aside)
                 self.complaint = (f'the alarms of {path} are not recalled, as it is not what a '

@@ -92,6 +92,8 @@ def test_it_is_written_every_few_seconds_where_something_changed(tmp_path: Path)
     (lambda text: text.replace(f'"time": {NOW + 1.0}', '"time": NaN'), 'times must be finite'),
     (lambda text: '[]', 'get'), (lambda text: '\udcff', 'utf-8'),
     (lambda text: text.replace('"key"', '"lock"'), 'key'),
+    (lambda text: '[' * 100_000, 'recursion'),
+    (lambda text: text.replace(f'"time": {NOW + 1.0}', '"time": ' + '9' * 400), 'too large'),
 ])
 def test_a_damaged_file_is_moved_aside_and_said(file: Path, change, words: str) -> None:
     text = change(file.read_text())
