@@ -8,19 +8,24 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from functools import cached_property, partial
+from functools import cached_property, lru_cache, partial
 import itertools
 import math
 
 import numpy as np
+from numpy.typing import NDArray
 
 from koopman_ros.arrays import brief
 from koopman_ros.lifting import Box, InputTerms, PolynomialObservables
+from koopman_ros.lifting.observables import Monomials
 from koopman_ros.plant_data import Array, Episode, Plant
 from koopman_ros.solvers import runge_kutta_step
 
 # dx/dt (M, n_x) of states (M, n_x) and inputs (M, n_u), all in units
 Rate = Callable[[Array, Array], Array]
+
+# A state; features that depend on it, what they turn into, and their factors.
+_Derivative = tuple[int, NDArray[np.int64], NDArray[np.int64], NDArray[np.int64]]
 
 # Difference of two starts that tells the slope, in units of the states' scale.
 _STEP = 1e-4
@@ -97,14 +102,23 @@ class DriftModel(Drift):
 
     __repr__ = brief
 
-    @cached_property
+    @property
     def monomials(self) -> PolynomialObservables:
         """The monomials from degree 1 on."""
         return PolynomialObservables.total_degree(len(self.box.states), self.degree)
 
     def features(self, xi: Array) -> Array:
         """Evaluate 1 and the monomials: (..., n_x) -> (..., 1 + m)."""
-        return np.concatenate((np.ones((*xi.shape[:-1], 1)), self.monomials.lift(xi)), axis=-1)
+        return _features(len(self.box.states), self.degree).at(xi)
+
+    @cached_property
+    def _slope_coefficients(self) -> Array:
+        """(1 + m, n_x n_x) of the features, for the slope."""
+        n_x = len(self.box.states)
+        found = np.zeros((len(self.coefficients), n_x, n_x))
+        for by, rows, lowered, factors in _derivatives(n_x, self.degree):
+            found[lowered, :, by] = factors[:, None] * self.coefficients[rows]
+        return found.reshape(len(found), -1)
 
     @cached_property
     def _split(self) -> tuple[Array, InputTerms | None]:
@@ -134,7 +148,11 @@ class DriftModel(Drift):
 
     def scaled_rate(self, xi: Array, v: Array) -> Array:
         """Evaluate the rate in deviations: (..., n_x) and (..., n_u) -> (..., n_x)."""
-        return self.features(xi) @ self.coefficients + self.regressors(xi, v) @ self.B.T
+        return self.rate_of(self.features(xi), self.regressors(xi, v))
+
+    def rate_of(self, features: Array, regressors: Array) -> Array:
+        """Return the scaled rate (..., n_x) where its features and regressors are these."""
+        return features @ self.coefficients + regressors @ self.B.T
 
     def regressors(self, xi: Array, v: Array) -> Array:
         """Return what `B` holds the weights of: (..., n_x), (..., n_u) -> (..., columns of B)."""
@@ -142,10 +160,36 @@ class DriftModel(Drift):
 
     def scaled_slope(self, xi: Array, v: Array | None = None) -> Array:
         """Evaluate the Jacobian of the scaled rate as :class:`Drift` has it."""
-        J = self.monomials.lift_and_jacobian(xi)[1]
-        slope: Array = np.einsum('ji,...jl->...il', self.coefficients[1:], J)
+        return self.slope_of(self.features(xi), xi, v)
+
+    def slope_of(self, features: Array, xi: Array, v: Array | None) -> Array:
+        """Return the scaled slope (..., n_x, n_x) where the features are these."""
+        # derivatives of monomials are monomials: the same features with other coefficients
+        slope = (features @ self._slope_coefficients).reshape(*xi.shape, xi.shape[-1])
         terms = self._split[1]
         return slope if terms is None or v is None else slope + terms.jacobian(xi, v)
+
+
+@lru_cache(maxsize=64)
+def _features(n_x: int, degree: int) -> Monomials:
+    """Return 1 and the monomials up to a degree."""
+    E = PolynomialObservables.total_degree(n_x, degree).exponents
+    E = np.vstack([np.zeros((1, n_x), dtype=np.int64), E])
+    return Monomials(np.ones(len(E)), E)
+
+
+@lru_cache(maxsize=64)
+def _derivatives(n_x: int, degree: int) -> tuple[_Derivative, ...]:
+    """Return by each state: it, features that depend on it, what they turn into, factors."""
+    E = _features(n_x, degree).exponents
+    place = {tuple(row): k for k, row in enumerate(E.tolist())}
+    found = []
+    for by in range(n_x):
+        rows = np.flatnonzero(E[:, by])
+        lowered = E[rows] - np.eye(n_x, dtype=np.int64)[by]
+        found.append((by, rows, np.array([place[tuple(row)] for row in lowered.tolist()]),
+                      E[rows, by]))
+    return tuple(found)
 
 
 @dataclass(frozen=True)

@@ -95,22 +95,20 @@ class Equations(Drift):
 
     def scaled_rate(self, xi: Array, v: Array) -> Array:
         """Evaluate the rate in deviations as :class:`Drift` has it."""
-        return self.rate_with_slopes(xi, v, None)
-
-    def rate_with_slopes(self, xi: Array, v: Array, slopes: Array | None) -> Array:
-        """
-        Evaluate the scaled rate, and its derivatives by the angles by central differences.
-
-        :param slopes: (M, n_x, p or more), to which the derivatives are added.
-        """
-        x, u = self._own(xi, v)
-        pace = self._speed / self.box.states.scale
-        if slopes is not None:
-            for j, (ahead, behind) in enumerate(self._beside):
-                change = _rate(ahead, x, u) - _rate(behind, x, u)
-                slopes[..., j] += change[..., self._back] * (pace / (2.0 * _DIFFERENCE))
-        rate: Array = _rate(self._system, x, u)[..., self._back] * pace
+        rate: Array = _rate(self._system, *self._own(xi, v))[..., self._back] * self._pace
         return rate
+
+    def rates(self, xi: Array, v: Array, S: Array) -> tuple[Array, Array]:
+        """Evaluate rates of states and, by central differences in the angles, of sensitivities."""
+        rate = self.scaled_rate(xi, v)
+        if not S.shape[-1]:
+            return rate, S
+        x, u = self._own(xi, v)
+        dS = self.scaled_slope(xi, v) @ S
+        for j, (ahead, behind) in enumerate(self._beside):
+            change = _rate(ahead, x, u) - _rate(behind, x, u)
+            dS[..., j] += change[..., self._back] * (self._pace / (2.0 * _DIFFERENCE))
+        return rate, dS
 
     def scaled_slope(self, xi: Array, v: Array | None = None) -> Array:
         """Evaluate the Jacobian of the scaled rate as :class:`Drift` has it."""
@@ -164,6 +162,11 @@ class Equations(Drift):
     def _speed(self) -> float:
         """Time units of the class in one of the box."""
         return SECONDS_PER_TIME_UNIT[self.box.time_unit] / self._system.seconds_per_time_unit
+
+    @cached_property
+    def _pace(self) -> Array:
+        """Deviations a time unit of the box in rates of the class (n_x,)."""
+        return self._speed / self.box.states.scale
 
     def _own(self, xi: Array, v: Array) -> tuple[Array, Array]:
         """Return states and inputs as the class has them."""

@@ -37,11 +37,11 @@ class Refinable(Protocol):
     def at(self, theta: Array) -> Self:
         """Return the same with other parameters."""
 
-    def rate_with_slopes(self, xi: Array, v: Array, slopes: Array | None) -> Array:
+    def rates(self, xi: Array, v: Array, S: Array) -> tuple[Array, Array]:
         """
-        Evaluate the scaled rate: (M, n_x) and (M, n_u) -> (M, n_x).
+        Evaluate the scaled rate, (M, n_x) and (M, n_u) -> (M, n_x), and those of sensitivities.
 
-        :param slopes: (M, n_x, p or more), to which its derivatives by the parameters are added.
+        :param S: (M, n_x, p or more) of the states, by the parameters first, or (M, n_x, 0).
         """
 
 
@@ -65,18 +65,21 @@ class Weights:
         return replace(self, drift=replace(
             drift, B=B, coefficients=theta[:n].reshape(drift.coefficients.shape)))
 
-    def rate_with_slopes(self, xi: Array, v: Array, slopes: Array | None) -> Array:
-        """Evaluate the scaled rate as :class:`Refinable` has it."""
+    def rates(self, xi: Array, v: Array, S: Array) -> tuple[Array, Array]:
+        """Evaluate rates of states and sensitivities as :class:`Refinable` has it."""
         drift, n_x = self.drift, xi.shape[1]
         features, inputs = drift.features(xi), drift.regressors(xi, v)
-        if slopes is not None:
-            m, n_B = features.shape[1], inputs.shape[1]
-            for i in range(n_x):
-                slopes[:, i, i:m * n_x:n_x] += features
-                if self.learn_input_matrix:
-                    first = m * n_x + i * n_B
-                    slopes[:, i, first:first + n_B] += inputs
-        return features @ drift.coefficients + inputs @ drift.B.T
+        rate = drift.rate_of(features, inputs)
+        if not S.shape[-1]:
+            return rate, S
+        dS = drift.slope_of(features, xi, v) @ S
+        m, n_B = features.shape[1], inputs.shape[1]
+        for i in range(n_x):
+            dS[:, i, i:m * n_x:n_x] += features
+            if self.learn_input_matrix:
+                first = m * n_x + i * n_B
+                dS[:, i, first:first + n_B] += inputs
+        return rate, dS
 
     @property
     def _n_B(self) -> int:
@@ -306,8 +309,5 @@ class _Sums:
 
 def _rates(model: Refinable, v: Array, y: Array) -> Array:
     """Evaluate the rates of states and, beside them, of their sensitivities: (M, n_x, 1 + ...)."""
-    x, S = y[..., 0], y[..., 1:]
-    if not S.shape[-1]:
-        return model.rate_with_slopes(x, v, None)[..., None]
-    dS = model.drift.scaled_slope(x, v) @ S
-    return np.concatenate((model.rate_with_slopes(x, v, dS)[..., None], dS), axis=-1)
+    rate, dS = model.rates(y[..., 0], v, y[..., 1:])
+    return np.concatenate((rate[..., None], dS), axis=-1)

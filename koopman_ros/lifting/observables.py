@@ -5,7 +5,7 @@
 
 from abc import ABC, abstractmethod
 from dataclasses import dataclass, field
-from functools import cached_property
+from functools import cached_property, lru_cache
 from itertools import combinations_with_replacement
 from typing import final, Self
 
@@ -242,6 +242,7 @@ class PolynomialObservables(Observables):
         object.__setattr__(self, 'exponents', E)
 
     @classmethod
+    @lru_cache(maxsize=64)
     def total_degree(cls, n_x: int, degree: int) -> Self:
         """Return the monomials of n_x states from degree 1 on; raise ValueError below 1."""
         if n_x < 1 or degree < 1:
@@ -266,15 +267,15 @@ class PolynomialObservables(Observables):
         return self
 
     @cached_property
-    def _own(self) -> '_Monomials':
-        return _Monomials(np.ones(self.n_z), self.exponents)
+    def _own(self) -> 'Monomials':
+        return Monomials(np.ones(self.n_z), self.exponents)
 
     @cached_property
-    def _first(self) -> '_Monomials':
+    def _first(self) -> 'Monomials':
         return self._own.differentiated
 
     @cached_property
-    def _second(self) -> '_Monomials':
+    def _second(self) -> 'Monomials':
         return self._first.differentiated
 
     @cached_property
@@ -316,19 +317,19 @@ def _columns(array: Array) -> int:
 
 
 @dataclass(frozen=True, eq=False)
-class _Monomials:
+class Monomials:
     """Factors (*shape) times prod_j x_j^exponents[..., j], of exponents (*shape, n_x)."""
 
     factors: Array
     exponents: NDArray[np.int64]
 
     @cached_property
-    def differentiated(self) -> '_Monomials':
+    def differentiated(self) -> 'Monomials':
         """Their derivatives by each state, in an axis added."""
         E = self.exponents
         # the factor is 0 where an exponent would turn negative; x^-1 must not be evaluated at 0
         lowered = np.maximum(E[..., None, :] - np.eye(E.shape[-1], dtype=np.int64), 0)
-        return _Monomials(self.factors[..., None] * E, lowered)
+        return Monomials(self.factors[..., None] * E, lowered)
 
     @cached_property
     def _columns(self) -> tuple[int, list[NDArray[np.int64]]]:

@@ -198,8 +198,7 @@ def test_derivatives_by_constants_and_states_against_those_by_hand():
     at = model.at(theta)
     box = at.box
     xi, v = np.array([[0.4], [-0.2]]), np.array([[0.5], [0.1]])
-    slopes = np.zeros((2, 1, 3))
-    rate = at.rate_with_slopes(xi, v, slopes)
+    rate, slopes = at.rates(xi, v, np.zeros((2, 1, 3)))
     gain = 1.25 + 0.75 * np.sin(0.3)
     # from 0.05 to 5 it goes in powers
     leak = 0.5 * 10.0 ** np.sin(-0.4)
