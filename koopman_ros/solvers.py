@@ -2,7 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 
 """
-Riccati equations and Runge-Kutta steps, in numpy and scipy; imports nothing of ours but arrays.
+Riccati equations, transitions and Runge-Kutta steps, in numpy and LAPACK; imports little of ours.
 
 The algebraic Riccati equations of the continuous and of the sampled regulator are solved by an
 ordered Schur form, and checked.
@@ -12,13 +12,14 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from enum import Enum
 import math
+from typing import NamedTuple
 
 import numpy as np
-from scipy.linalg import blas, lapack
 
 from koopman_ros.arrays import Array
+from koopman_ros.lapack import blas, lapack
 
-__all__ = ['RiccatiSolution', 'RiccatiStatus', 'runge_kutta_step', 'solve_riccati']
+__all__ = ['RiccatiSolution', 'RiccatiStatus', 'runge_kutta_step', 'solve_riccati', 'transition']
 
 # A double eigenvalue of the Hamiltonian on the imaginary axis comes out split by about the square
 # root of the rounding error: modes within that of the axis cannot be told from undamped ones.
@@ -191,34 +192,73 @@ def _over_interval(A: Array, B: Array, Q: Array, R: Array, interval: float
     """
     n, m = B.shape
     N = n + m
-    F, W = np.zeros((N, N)), np.zeros((N, N))
-    F[:n, :n], F[:n, n:] = A, B
+    W = np.zeros((N, N))
     W[:n, :n], W[n:, n:] = Q, R
-    size_F, size_W = _size(F) * interval, _size(W)
-    if not (math.isfinite(size_F) and math.isfinite(size_W) and size_W > 0.0):
+    series, size_W = _Series.over(A, B, interval), _size(W)
+    if series is None or not (math.isfinite(size_W) and size_W > 0.0):
         return None
-    doublings = max(0, math.frexp(size_F)[1] + 1)
-    part = math.ldexp(interval, -doublings)
-    # the powers of F below each other: those known times the highest give as many more
-    powers = np.empty((_TERMS * N, N))
-    powers[:N] = np.eye(N)
-    np.multiply(F, part, out=powers[N:2 * N])
-    known = 1
-    while known < _TERMS - 1:
-        highest = (known + 1) * N
-        np.dot(powers[N:highest], powers[highest - N:highest],
-               out=powers[highest:highest + known * N])
-        known *= 2
-    D = _FACTORS[1:].dot(powers[N:].reshape(_TERMS - 1, -1)).reshape(N, N)
+    powers, D = series.powers, series.D
     weighed = np.matmul(W / size_W, powers.reshape(_TERMS, N, N)).reshape(-1, N)
     W = weighed.T.dot(_SHARES.dot(powers.reshape(_TERMS, -1)).reshape(-1, N))
-    W = (0.5 * part * size_W) * (W + W.T)
+    W = (0.5 * series.part * size_W) * (W + W.T)
     # twice the time, again and again: the series over all of it would lose its digits
-    for _ in range(doublings):
+    for _ in range(series.doublings):
         DW = D.T.dot(W)
         W = 2.0 * W + DW + DW.T + DW.dot(D)
         D = 2.0 * D + D.dot(D)
-    return D, W, size_F
+    return D, W, series.size
+
+
+@np.errstate(all='ignore')
+def transition(A: Array, B: Array, interval: float) -> Array:
+    """
+    Integrate dx/dt = A x + B u over an interval, with the input held.
+
+    :param A: (n, n), and B (n, m).
+    :return: [Phi - I, Gamma] (n, n + m) of x+ = Phi x + Gamma u; not finite where it overflows.
+    """
+    series = _Series.over(A, B, interval)
+    if series is None:
+        return np.full((len(A), len(A) + B.shape[1]), np.nan)
+    D = series.D
+    for _ in range(series.doublings):
+        D = 2.0 * D + D.dot(D)
+    return D[:len(A)]
+
+
+class _Series(NamedTuple):
+    """Power series of the exponential of F = [A, B; 0, 0] over a part of an interval."""
+
+    powers: Array  #: (terms (n + m), n + m) of F times the part, below each other
+    D: Array  #: (n + m, n + m) its sum without the constant term
+    part: float  #: in units of time
+    doublings: int  #: from the part to the interval
+    size: float  #: norm of F times the interval
+
+    @classmethod
+    def over(cls, A: Array, B: Array, interval: float) -> '_Series | None':
+        """Sum it up over so short a part that it ends within rounding; None if not finite."""
+        n, m = B.shape
+        N = n + m
+        F = np.zeros((N, N))
+        F[:n, :n], F[:n, n:] = A, B
+        size = _size(F) * interval
+        if not math.isfinite(size):
+            return None
+        doublings = max(0, math.frexp(size)[1] + 1)
+        part = math.ldexp(interval, -doublings)
+        # those known times the highest give as many more
+        powers = np.empty((_TERMS * N, N))
+        powers[:N] = np.eye(N)
+        np.multiply(F, part, out=powers[N:2 * N])
+        known = 1
+        while known < _TERMS - 1:
+            highest = (known + 1) * N
+            np.dot(powers[N:highest], powers[highest - N:highest],
+                   out=powers[highest:highest + known * N])
+            known *= 2
+        D = _FACTORS[1:].dot(powers[N:].reshape(_TERMS - 1, -1)).reshape(N, N)
+        return cls(powers, D, part, doublings, size)
 
 
 def _scale(Q: Array, G: Array) -> float:

@@ -8,11 +8,13 @@ What is imported here is imported before signals are handled, so it is little. O
 is started by :func:`command` and :func:`blocked_signals` handles them from its very start.
 """
 
+import atexit
 from collections.abc import Callable, Iterator
 import contextlib
 import ctypes
 import faulthandler
 from functools import partial
+import gc
 import importlib
 import os
 import signal
@@ -39,22 +41,47 @@ _AFTER = 0.5  # s from the stack that is printed to the end
 def run_program(module: str, interrupted: int) -> int:
     """Run a module's `main`, whatever signals come; return its exit code, or `interrupted`."""
     open_standard_streams()
-    # numpy, scipy and rclpy take half a second, in which there is nothing to complete
+    ended: list[int] = []
+    # the last of those that are called, as the first one that is registered
+    atexit.register(_end_at_once, ended)
+    # numpy and rclpy take a quarter of a second, in which there is nothing to complete
     handle_signals(lambda *_: os._exit(interrupted))
     if module in _IN_THE_LOOP:
         os.environ.setdefault('OPENBLAS_NUM_THREADS', '1')
+    # what is imported stays: nobody is to look through it for garbage again and again, now or at
+    # the end
+    gc.disable()
     main = importlib.import_module(module).main
+    gc.freeze()
+    gc.enable()
     _raise_interrupts()
     code = 1
     try:
         code = main()
+        ended.append(code)
     except KeyboardInterrupt:
         code = interrupted
+        ended.append(code)
     finally:
         handle_signals(signal.SIG_IGN)
         # what libraries do at the interpreter's own end may hang, too
         end_by_force(_END, code)
     return code
+
+
+def _end_at_once(ended: list[int]) -> None:
+    """End the process with its code, where its program has ended; all else is done by now."""
+    if not ended:
+        return
+    try:
+        sys.stdout.flush()
+        sys.stderr.flush()
+    except (OSError, ValueError):
+        # the interpreter's own end says so
+        return
+    # What is left is to take down objects and libraries one by one, for which the operating system
+    # needs a fraction of a millisecond: Fast DDS waits a tenth of a second in there.
+    os._exit(ended[0])
 
 
 def open_standard_streams() -> None:

@@ -8,7 +8,7 @@ import pytest
 from scipy.linalg import block_diag, expm, solve_continuous_are, solve_discrete_are
 
 from koopman_ros import solvers
-from koopman_ros.solvers import RiccatiStatus, runge_kutta_step, solve_riccati
+from koopman_ros.solvers import RiccatiStatus, runge_kutta_step, solve_riccati, transition
 
 SIZES = [(n, m) for n in range(1, 9) for m in range(1, 4)]
 
@@ -371,3 +371,21 @@ def test_a_step_of_no_length_stays():
     moved = runge_kutta_step(lambda x: -x, x, h)
     np.testing.assert_array_equal(moved[0], x[0])
     assert np.all(moved[1] < x[1])
+
+
+@pytest.mark.parametrize('interval', [1e-6, 0.3, 40.0])
+def test_transition_is_that_of_the_exponential(interval: float) -> None:
+    A, B = np.array([[-1.0, 0.5], [-2.0, -0.3]]), np.array([[0.4], [1.0]])
+    block = np.zeros((3, 3))
+    block[:2, :2], block[:2, 2:] = A, B
+    expected = expm(interval * block)[:2] - np.eye(2, 3)
+    found = transition(A, B, interval)
+    np.testing.assert_allclose(found, expected, rtol=1e-9, atol=1e-14)
+    if interval < 1e-3:
+        # without the constant term no digits are lost
+        short = A * interval + A @ A * interval**2 / 2.0
+        np.testing.assert_allclose(found[:, :2], short, rtol=1e-11)
+
+
+def test_transition_that_overflows_is_not_finite() -> None:
+    assert not np.isfinite(transition(np.eye(2), np.ones((2, 1)), 1e4)).all()

@@ -263,11 +263,12 @@ class LoopNode(HostableNode):
             a former one is called now.
         """
         given: dict[str, Any] = dict(self.get_parameters_by_prefix(''))
-        if former := renamed(self._table_of, self.given(), table):
-            raise ConfigurationError(former)
-        # as if they had not been given, like in any node
         unknown = [name for name in given if name not in table.rows and name not in beside
                    and name not in _RCLPY_PARAMETERS and not name.startswith('qos_overrides')]
+        if former := renamed(self._table_of, {name: value for name, value in self.given().items()
+                                              if name in unknown}, table):
+            raise ConfigurationError(former)
+        # as if they had not been given, like in any node
         for name in [*unknown, *set(given).intersection(table.rows)]:
             self.undeclare_parameter(name)
         if unknown:

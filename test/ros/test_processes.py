@@ -104,6 +104,27 @@ def test_signal_before_the_interpreter_is_up_and_arguments_are_answered_before_t
     assert 'started' not in process.output()
 
 
+def test_a_program_that_has_ended_leaves_without_taking_down_what_it_holds(tmp_path: Path
+                                                                           ) -> None:
+    (tmp_path / 'ended.py').write_text(
+        'import atexit\n'
+        'class Held:\n'
+        '    def __del__(self, print=print):\n'
+        '        print("taken down")\n'
+        'held = Held()\n'
+        'def main():\n'
+        '    atexit.register(print, "last words", end="")\n'
+        '    return 3\n')
+    result = subprocess.run(
+        [sys.executable, '-c', 'import sys; from koopman_ros.startup import run_program\n'
+                               'sys.exit(run_program("ended", 0))'],
+        # what is printed is kept back until the end
+        env={**os.environ, 'PYTHONUNBUFFERED': '', 'PYTHONPATH': os.pathsep.join(
+            (str(tmp_path), str(Path(__file__).parents[2])))},
+        capture_output=True, text=True, timeout=240, check=False, cwd=tmp_path)
+    assert (result.returncode, result.stdout, result.stderr) == (3, 'last words', '')
+
+
 # What happens at the end of a plant that gets a signal as it starts, and its last words.
 ENDS = {
     'nothing': ('', r'.*'),
