@@ -1,14 +1,20 @@
 # SPDX-FileCopyrightText: 2026 The koopman_ros Authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""Compiled functions give what numpy gives, and leave to it what is near to a border."""
+"""
+Compiled functions give what numpy gives, and leave to it what is near to a border.
+
+One file, so that they are compiled once where nothing is kept yet.
+"""
 
 from dataclasses import replace
 from functools import cache
+import itertools
 import sys
 
 import numpy as np
 import pytest
+from std_msgs.msg import String
 
 from koopman_ros.control import State
 from koopman_ros.control.laws.base import steady_state_target, Weights
@@ -17,9 +23,13 @@ from koopman_ros.estimation.observer import moved
 from koopman_ros.kernels import COMPILED, IN_NUMPY, Kernels, named, NUMPY
 from koopman_ros.lifting import LiftedModel, load
 from koopman_ros.parameters.controller import built, table_of
+from koopman_ros.replay.records import NUMERICS
 from koopman_ros.resources import model_path
+from koopman_ros.ros import topics
 from koopman_ros.solvers import RiccatiStatus, solve_riccati
+from koopman_ros.testing import Harness
 from koopman_ros.units import NANOSECONDS
+from support.controller_bench import Bench, reproduced, STEADY
 from support.random_lifts import random_lift
 
 STEPS = 40
@@ -146,3 +156,27 @@ def test_without_the_compiler_there_is_none(monkeypatch: pytest.MonkeyPatch) -> 
         monkeypatch.delitem(sys.modules, name)
     monkeypatch.setitem(sys.modules, 'numba', None)
     assert named(COMPILED) is None
+
+
+def test_compiled_step_takes_over_after_the_first_command_and_is_replayed(ros: Harness) -> None:
+    # what is kept now, the controller need not wait for
+    assert named(COMPILED)
+    records = ros.listen(String, topics.CONTROLLER_EVENTS)
+    bench = Bench(ros, {'compiled': True, 'disturbance_bandwidth': 0.0})
+    later = itertools.count(2)
+
+    def measure() -> bool:
+        """Measure once more; tell whether the last answers were compiled."""
+        bench.measure(STEADY - 0.1 * (next(later) % 7), float(next(later)))
+        switched = [k for k, record in enumerate(records)
+                    if f'"event":"{NUMERICS}"' in record.data]
+        return bool(switched) and len(records) > switched[0] + 20
+
+    ros.wait_until(measure)
+    ros.wait_until(lambda: sum('"event":"measurement"' in record.data for record in records)
+                   == bench.sent)
+    written, commands = reproduced(records)
+    assert [record.event for record in written].count(NUMERICS) == 1
+    # the one that a new listener gets, or that of the start
+    assert written[0].fields[NUMERICS] == 'numpy'
+    assert commands == [message.temperature for message in bench.commands]
