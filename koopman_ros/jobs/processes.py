@@ -59,12 +59,12 @@ class Processes:
         self._workers = [_Worker() for _ in range(count)]
 
     def run(self, function: Task[Item, Found], items: Mapping[str, Item], *, shared: Any = None,
-            watch: Watch = never) -> Generator[tuple[str, Found]]:
+            watch: Watch = never, apart: bool = False) -> Generator[tuple[str, Found]]:
         """Run tasks, as :meth:`~koopman_ros.jobs.backends.Backend.run`."""
         with tempfile.TemporaryDirectory(prefix='koopman_ros_') as name:
             folder = Path(name)
             (folder / _SHARED).write_bytes(cloudpickle.dumps((function, shared)))
-            course = _Course(self._workers, items, folder, watch)
+            course = _Course(self._workers, items, folder, watch, apart)
             try:
                 for name in items:
                     while course.awaits(name):
@@ -127,8 +127,8 @@ class _Course:
     """Tasks on their way: what waits, what runs where, and what was found."""
 
     def __init__(self, workers: list[_Worker], items: Mapping[str, Any], folder: Path,
-                 watch: Watch) -> None:
-        self._items, self._folder, self._watch = items, folder, watch
+                 watch: Watch, apart: bool) -> None:
+        self._items, self._folder, self._watch, self._apart = items, folder, watch, apart
         self._numbers = {name: number for number, name in enumerate(items)}
         self._waiting = deque(items)
         self._idle = list(workers)
@@ -176,12 +176,16 @@ class _Course:
             worker.end()
             self._lost[name] = self._lost.get(name, 0) + 1
             if self._lost[name] == ATTEMPTS:
-                raise lost(name) from None
-            if self._left_behind == float('inf'):
+                if not self._apart:
+                    raise lost(name) from None
+                self.found[name] = lost(name)
+            elif self._left_behind == float('inf'):
                 self._waiting.appendleft(name)
         except Exception as error:
             noted(error, name)
-            raise
+            if not self._apart:
+                raise
+            self.found[name] = error
 
     def _news(self) -> list[tuple[str, Any]]:
         """Return what tasks have told since."""

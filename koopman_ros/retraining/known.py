@@ -63,6 +63,9 @@ class Task:
     condition: float = 1e4  #: likewise
     #: where it is worked, see :func:`~koopman_ros.jobs.backends.backend_of`
     scheduler: str = ''
+    #: file of a lift of a plant of the same kind, which training begins from; empty for nothing.
+    #: In a fleet also ``'first'``, see :func:`~koopman_ros.retraining.fleet.retrain_fleet`.
+    sibling: str = ''
     device: str = 'cpu'  #: where residuals are evaluated, as torch names it
 
     @classmethod
