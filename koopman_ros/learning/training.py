@@ -129,8 +129,8 @@ def train(plant: Plant, samples: Samples, recipe: Recipe, *, seed: int = 0, star
     :raises NoUsefulLift: when no start gives a lift that can be judged, or none that beats the
         linear model on validation episodes, or when its law fails in closed loop.
     :raises ValueError: on too few episodes, held-out episodes that hardly move, a recipe that
-        does not fit, a lift to begin from that does not, times that contradict the derivatives, a nominal point where the plant
-        moves, or a device that there is not.
+        does not fit, a lift to begin from that does not, times that contradict the derivatives,
+        a nominal point where the plant moves, or a device that there is not.
     :raises KeyboardInterrupt: when interrupted before the first start finished.
     :raises WorkerLost: when workers of the backend are lost and none takes over.
     :raises SchedulerLost: when its scheduler is.

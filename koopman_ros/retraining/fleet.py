@@ -7,19 +7,27 @@ from __future__ import annotations
 
 from collections.abc import Callable, Generator, Mapping
 import contextlib
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
 from koopman_ros.identification import Stopped
-from koopman_ros.jobs.backends import Backend, backend_of, Here, Tell
+from koopman_ros.jobs.backends import (
+    Backend,
+    backend_of,
+    Here,
+    SchedulerLost,
+    Tell,
+    WorkerLost,
+)
 from koopman_ros.learning.scaling import checked_device
-from koopman_ros.retraining.known import Task
-from koopman_ros.retraining.report import write_report
+from koopman_ros.retraining.known import FIRST, Task
+from koopman_ros.retraining.report import reported
 from koopman_ros.retraining.task import retrain_by
 
-#: As a task's sibling: the first plant of its kind whose lift is accepted.
-FIRST = 'first'
+#: What a retraining raises where the task, the bags or the machine are to blame.
+EXPECTED = (ValueError, TypeError, KeyError, OSError, MemoryError, WorkerLost, SchedulerLost,
+            ImportError)
 
 # Called with the plant, the share of its retraining that is done in [0, 1] and what is done now,
 # and with empty texts now and then while others work; True asks all to stop.
@@ -33,7 +41,7 @@ class Outcome:
     summary: Mapping[str, Any] | None  #: as :meth:`Retrained.summary`, None where it failed
     files: tuple[str, ...] = ()  #: the report
     error: str = ''  #: why it failed, or empty
-    stopped: bool = field(default=False)  #: whether it was asked to end before it had ended
+    stopped: bool = False  #: whether it was asked to end before it had ended
 
     @property
     def accepted(self) -> bool:
@@ -110,20 +118,20 @@ def _retrained(_: None, task: Task, tell: Tell) -> Outcome:
     """Retrain one plant, wherever that is."""
     checked_device(task.device)
     retrained = retrain_by(Here(), task, lambda share, text: tell((share, text)))
-    warnings = list(retrained.decision.warnings) if retrained.decision else []
-    files: tuple[str, ...] = ()
-    try:
-        files = tuple(map(str, write_report(retrained)))
-    except OSError as error:
-        # the lift is written already
-        warnings.append(f'the report could not be written: {error}')
-    return Outcome({**retrained.summary(), 'warnings': warnings}, files)
+    return Outcome(*reported(retrained))
 
 
 def _failed(error: BaseException) -> Outcome:
     if isinstance(error, Stopped):
         return Outcome(None, stopped=True)
-    return Outcome(None, error=' '.join(str(error).split()) or type(error).__name__)
+    return Outcome(None, error=one_line(error))
+
+
+def one_line(error: BaseException) -> str:
+    """Return what an error says, in a line; an unexpected one by its kind, too."""
+    said = ' '.join(str(error).split())
+    expected = isinstance(error, EXPECTED)
+    return said if said and expected else ': '.join(filter(None, [type(error).__name__, said]))
 
 
 def _check(tasks: Mapping[str, Task]) -> None:

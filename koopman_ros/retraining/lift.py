@@ -171,7 +171,8 @@ def compare_classes(found: Identified, plant: Plant, thresholds: Thresholds, *,
         them and the rule.
     :param n_z: coordinates of the identity lift; other arguments as for :func:`learn_lift`.
     :param judging: called with the class whose law is being tried and the share that is done.
-    :param device: as for :func:`learning.train`, as `backend`, where closed loops run, too, and `begin`.
+    :param device: as for :func:`learning.train`, like `begin`, and `backend`, where closed loops
+        run, too.
     :raises NoUsefulLift: when there is no model of the class that was asked for, or of any.
     :raises ValueError: when the episodes hold no steady state, and for a class that there is not.
     :raises Stopped: when `judging` ended it.

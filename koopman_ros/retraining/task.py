@@ -33,7 +33,7 @@ from koopman_ros.plant_data import Episode, Plant
 from koopman_ros.plants import plant_class
 from koopman_ros.resources import predecessor
 from koopman_ros.retraining.gate import decide, Decision, shortfalls, Thresholds
-from koopman_ros.retraining.known import known, Task
+from koopman_ros.retraining.known import FIRST, known, Task
 from koopman_ros.retraining.lift import compare_classes
 from koopman_ros.retraining.record import Each, read_record, Reduction, Source
 from koopman_ros.retraining.selection import coverage
@@ -191,6 +191,9 @@ def retrain_by(backend: Backend, task: Task, on_progress: OnProgress = lambda *_
                          f'{", ".join((*CLASSES, BEST))}')
     if Path(task.output).suffix != '.safetensors':
         raise ValueError(f'output = {task.output!r} must end in .safetensors')
+    if task.sibling == FIRST:
+        raise ValueError(f'sibling = {FIRST!r} is the first of a fleet: retrain several plants in '
+                         'one call, or name a model file')
     current, sibling = (load(path) if path else None for path in (task.model, task.sibling))
     plant, states, inputs = known(task, current)
     # a folder that cannot be written should fail now, not after the training
