@@ -35,7 +35,7 @@ from koopman_ros.resources import predecessor
 from koopman_ros.retraining.gate import decide, Decision, shortfalls, Thresholds
 from koopman_ros.retraining.known import FIRST, known, Task
 from koopman_ros.retraining.lift import compare_classes
-from koopman_ros.retraining.record import Each, read_record, Reduction, Source
+from koopman_ros.retraining.record import read_record, Reduction, Source
 from koopman_ros.retraining.selection import coverage
 from koopman_ros.units import NANOSECONDS, SECONDS_PER_TIME_UNIT
 
@@ -154,8 +154,7 @@ def _finite(value: float) -> float | None:
     return float(value) if np.isfinite(value) else None
 
 
-def retrain(task: Task, on_progress: OnProgress = lambda *_: False, *, each: Each = map
-            ) -> Retrained:
+def retrain(task: Task, on_progress: OnProgress = lambda *_: False) -> Retrained:
     """
     Read the bags, estimate the drift, learn a lift of it, judge it, and write it.
 
@@ -167,11 +166,11 @@ def retrain(task: Task, on_progress: OnProgress = lambda *_: False, *, each: Eac
     """
     checked_device(task.device)
     with backend_of(task.scheduler) as backend:
-        return retrain_by(backend, task, on_progress, each=each)
+        return retrain_by(backend, task, on_progress)
 
 
-def retrain_by(backend: Backend, task: Task, on_progress: OnProgress = lambda *_: False, *,
-               each: Each = map) -> Retrained:
+def retrain_by(backend: Backend, task: Task, on_progress: OnProgress = lambda *_: False
+               ) -> Retrained:
     """
     Read the bags, estimate the drift, learn a lift of it, judge it, and write it.
 
@@ -179,7 +178,6 @@ def retrain_by(backend: Backend, task: Task, on_progress: OnProgress = lambda *_
     ``.previous.safetensors``; a refused one goes to ``.refused.safetensors``. Where what a
     sibling's lift has become would be refused, the lift is learned from nothing after all.
 
-    :param each: reads the bags of a long record, see :func:`read_record`.
     :raises BagReadError: for bags that cannot be used.
     :raises ModelFileError: when the present lift, or that to begin from, cannot be read.
     :raises ValueError: for episodes that do not determine a model, or a task that does not fit.
@@ -204,7 +202,7 @@ def retrain_by(backend: Backend, task: Task, on_progress: OnProgress = lambda *_
         least_jumps=None if current is None else (_LEAST_JUMP * current.states.scale).tolist())
     record = read_record(source, task.most_samples, task.seed,
                          hidden=bool(task.hidden_states or task.equations),
-                         tick=_reading(on_progress, source), each=each)
+                         tick=_reading(on_progress, source), backend=backend)
     account = record.account
     if not record.episodes:
         raise ValueError('the bags hold no usable segment of measurements: '

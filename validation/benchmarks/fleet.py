@@ -41,7 +41,7 @@ class Plan:
 
 PLANS = {
     'quick': Plan({'reactors': (0.0, -0.1)}, 1800),
-    'default': Plan(dict.fromkeys(('reactors', 'tanks'), (0.0, -0.1, 0.1, -0.2, 0.2, -0.15)),
+    'default': Plan(dict.fromkeys(('reactors', 'tanks'), (0.0, -0.1, 0.1, -0.2, 0.2, 0.15)),
                     3600),
 }
 
@@ -51,8 +51,8 @@ def plant(kind: str, share: float) -> Case:
     if kind == 'reactors':
         clean = OneStateReactor()
         system = replace(clean, heat_transfer_coefficient=(
-            1.0 + share) * clean.heat_transfer_coefficient).system()
-        design = Design(system, np.array([281.3]), np.array([300.5]), (30.0, 120.0), 1.0,
+            1.0 + share) * clean.heat_transfer_coefficient).system([314.475])
+        design = Design(system, np.array([276.0]), np.array([292.0]), (30.0, 120.0), 1.0,
                         np.array([0.1]))
     else:
         tanks = TwoTanks()
