@@ -25,6 +25,8 @@ Task = Callable[[Any, Item, Tell], Found]
 PERIOD = 0.1
 #: s from the request to end until a task is left behind.
 PATIENCE = 5.0
+#: s without a sign of life after which a worker counts as lost.
+SILENCE = 30.0
 #: Times that a task is begun anew whose worker was lost.
 ATTEMPTS = 3
 _ADDRESSES = ('tcp://', 'tls://')

@@ -33,15 +33,13 @@ from koopman_ros.jobs.backends import (
     PATIENCE,
     PERIOD,
     SchedulerLost,
+    SILENCE,
     Task,
     Tell,
     Watch,
     WorkerLost,
 )
 
-#: s without a sign of life after which a worker counts as lost, and without any worker after
-#: which a work does.
-SILENCE = 30.0
 _CONNECT = 10.0  # s for the first answer of a scheduler
 _JOIN = 30.0  # s for its first worker, which may just be starting
 _LOST = (distributed.client.FutureCancelledError, distributed.CancelledError,
@@ -56,7 +54,7 @@ class Cluster:
     anew on another one. Where the scheduler is lost, so are the workers, and the work with them.
 
     :param address: of the scheduler, like ``'tcp://127.0.0.1:8786'``.
-    :param silence: seconds; longer than a task may hold a worker's interpreter.
+    :param silence: seconds, also without any worker after which the work is lost; longer than a task may hold a worker's interpreter.
     :raises SchedulerLost: when nothing answers there.
     :raises WorkerLost: when no worker has joined.
     """

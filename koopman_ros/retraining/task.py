@@ -219,7 +219,7 @@ def retrain_by(backend: Backend, task: Task, on_progress: OnProgress = lambda *_
                               seed=task.seed, watch=estimating)
     elif task.hidden_states:
         found = identify_hidden(plant, episodes, task.hidden_states, seed=task.seed,
-                                watch=estimating)
+                                watch=estimating, backend=backend)
     else:
         found = identify(plant, episodes, seed=task.seed, watch=estimating, backend=backend)
     if found.hidden:
