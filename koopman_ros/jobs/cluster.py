@@ -54,7 +54,8 @@ class Cluster:
     anew on another one. Where the scheduler is lost, so are the workers, and the work with them.
 
     :param address: of the scheduler, like ``'tcp://127.0.0.1:8786'``.
-    :param silence: seconds, also without any worker after which the work is lost; longer than a task may hold a worker's interpreter.
+    :param silence: seconds, also without any worker after which the work is lost; longer than a
+        task may hold a worker's interpreter.
     :raises SchedulerLost: when nothing answers there.
     :raises WorkerLost: when no worker has joined.
     """

@@ -10,9 +10,9 @@ import pytest
 from scipy.optimize import fsolve
 
 from koopman_ros.identification import identify_hidden, Stopped
+from koopman_ros.jobs.backends import backend_of
 from koopman_ros.plant_data import Episode, Plant
 from koopman_ros.solvers import runge_kutta_step
-from support.places import places
 
 PLANT = Plant('one output', ('level',), ('m',), ('flow',), ('l/s',), 's', np.zeros(1),
               np.zeros(1), None)
@@ -125,10 +125,9 @@ def test_episodes_in_which_no_filter_finds_the_state_are_refused():
 
 def test_the_bits_do_not_depend_on_where_it_is_estimated():
     episodes = [record(oscillator, samples=200)]
-    with places() as opened:
-        here, *elsewhere = [identify_hidden(PLANT, episodes, 1, highest_degree=1, backend=one)
-                            for one in opened.values()]
-    for found in elsewhere:
-        assert found.drift.coefficients.tobytes() == here.drift.coefficients.tobytes()
-        assert [score.rmse.tobytes() for score in found.scores] == [
-            score.rmse.tobytes() for score in here.scores]
+    with backend_of('process') as backend:
+        found, here = (identify_hidden(PLANT, episodes, 1, highest_degree=1, backend=one)
+                       for one in (backend, None))
+    assert found.drift.coefficients.tobytes() == here.drift.coefficients.tobytes()
+    assert [score.rmse.tobytes() for score in found.scores] == [
+        score.rmse.tobytes() for score in here.scores]

@@ -7,22 +7,18 @@ import argparse
 
 import pytest
 
-from support.places import KINDS, places
+from koopman_ros.jobs.backends import backend_of
 from validation import options, saddle, unstable
 from validation.robustness import __main__ as robustness
-from validation.robustness.loop import reactor_controller, START
-from validation.robustness.stability import margins_at
+from validation.robustness import stability
 
 
 def test_figures_are_the_same_wherever_they_are_computed():
-    def margins(bandwidth):
-        return margins_at(reactor_controller(bandwidth=bandwidth), START)
-
-    keys = (0.0, 6.0)
-    expected = {key: margins(key) for key in keys}
-    with places() as opened:
-        for kind in KINDS:
-            assert options.over(opened[kind], margins, keys) == expected
+    with backend_of('process') as backend:
+        found, here = (options.over(one, stability.hottest_saved, stability.COOLANTS)
+                       for one in (backend, None))
+    assert found == here
+    assert list(here) == list(stability.COOLANTS)
 
 
 def test_a_plant_or_seeds_that_there_cannot_be(capsys):

@@ -15,7 +15,7 @@ import numpy as np
 
 from koopman_ros.learning.validation import lifted_rate
 from koopman_ros.lifting import load
-from koopman_ros.plants import ControlAffineSystem
+from koopman_ros.plants import ControlAffineSystem, equilibrium_input
 from koopman_ros.plants.library.reactor import OneStateReactor
 from koopman_ros.plants.library.two_tanks import TwoTanks
 from koopman_ros.reports import table
@@ -27,6 +27,7 @@ from validation.benchmarks.retraining import Case, task_of, write_bags
 
 PACKAGES = ('torch', 'numpy', 'scipy')
 _OUTLETS = ('orifice_1', 'orifice_2')
+_MIDDLE = 318.0  # K
 _TESTED = 2000  # states at which a lift is held against the plant
 
 
@@ -52,8 +53,9 @@ def plant(kind: str, share: float) -> Case:
         clean = OneStateReactor()
         system = replace(clean, heat_transfer_coefficient=(
             1.0 + share) * clean.heat_transfer_coefficient).system([314.475])
-        design = Design(system, np.array([276.0]), np.array([292.0]), (30.0, 120.0), 1.0,
-                        np.array([0.1]))
+        # about what holds the middle of the range, which the plants have in common
+        held = equilibrium_input(system, [_MIDDLE])
+        design = Design(system, held - 20.0, held + 4.0, (30.0, 120.0), 1.0, np.array([0.1]))
     else:
         tanks = TwoTanks()
         system = replace(tanks, **{name: (1.0 + share) * getattr(tanks, name)
@@ -122,15 +124,19 @@ def _table(rows: Mapping[str, Mapping[str, Mapping[str, Any]]]) -> str:
     for name in rows['nothing']:
         both = [rows[begin][name] for begin in ('nothing', FIRST)]
         found.append((name, *(f'{one["seconds"]:.1f}' for one in both),
+                      *(f'{one["learning_seconds"]:.1f}' for one in both),
                       *(one['steps'] for one in both),
                       *('' if one['rx'] is None else f'{one["rx"]:.1e}' for one in both),
                       *('accepted' if one['accepted'] else 'refused' for one in both)))
     total = [sum(one['seconds'] for one in rows[begin].values()) for begin in ('nothing', FIRST)]
     found.append(('all', *(f'{seconds:.1f}' for seconds in total),
+                  *(f'{sum(one["learning_seconds"] for one in rows[begin].values()):.1f}'
+                    for begin in ('nothing', FIRST)),
                   *(sum(one['steps'] or 0 for one in rows[begin].values())
                     for begin in ('nothing', FIRST)), *[''] * 4))
-    return table(('plant', 'from nothing [s]', 'from a sibling [s]', 'steps', 'steps',
-                  'error beside the plant', 'error', '', ''), found, range(1, 7))
+    return table(('plant', *(f'{what}, from {begin}' for what in (
+        'all [s]', 'learning [s]', 'steps', 'error', 'lift') for begin in (
+            'nothing', 'a sibling'))), found, range(1, 9))
 
 
 def _tell(label: str) -> None:
