@@ -78,7 +78,8 @@ def retrain_fleet(tasks: Mapping[str, Task], scheduler: str = '',
 def kind_of(task: Task) -> tuple[object, ...]:
     """Return what the lifts of siblings have in common."""
     return (task.model_class, task.coordinates, task.equations, task.hidden_states,
-            *((signal.name, signal.unit) for signal in (*task.states, *task.inputs)))
+            *((state.name, state.unit) for state in task.states),
+            *((one.name, one.unit) for one in task.inputs))
 
 
 def _rounds(backend: Backend, waiting: dict[str, Task], on_progress: OnPlant

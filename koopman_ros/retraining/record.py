@@ -99,7 +99,8 @@ def read_record(source: Source, most: int, seed: int, *, hidden: bool = False,
                                      tolerance_ns=source.tolerance_ns,
                                      least_jumps=source.least_jumps))
     account = Account()
-    bags = {bag: (number, bag) for number, bag in enumerate(distinct(source.bags, account))}
+    bags = {str(bag): (number, str(bag))
+            for number, bag in enumerate(distinct(source.bags, account))}
     n_x, n_u = len(source.states), len(source.inputs)
 
     def each(function: Callable[[_Numbered, Tick], Found]) -> Iterator[Found]:
