@@ -97,7 +97,7 @@ def _learned(cases: Mapping[str, Case], tasks: Mapping[str, Task]) -> dict[str, 
             raise RuntimeError(f'{name}: {outcome.error}')
         own = summary['classes'].get(summary.get('model_class', ''), {})
         rows[name] = {
-            'seconds': now - since, 'learning_seconds': own.get('seconds'),
+            'seconds': now - since,
             'steps': own.get('steps'), 'accepted': outcome.accepted,
             'reasons': summary['reasons'], 'warnings': summary['warnings'],
             'heldout_error': summary.get('heldout_error'),
@@ -124,19 +124,16 @@ def _table(rows: Mapping[str, Mapping[str, Mapping[str, Any]]]) -> str:
     for name in rows['nothing']:
         both = [rows[begin][name] for begin in ('nothing', FIRST)]
         found.append((name, *(f'{one["seconds"]:.1f}' for one in both),
-                      *(f'{one["learning_seconds"]:.1f}' for one in both),
                       *(one['steps'] for one in both),
                       *('' if one['rx'] is None else f'{one["rx"]:.1e}' for one in both),
                       *('accepted' if one['accepted'] else 'refused' for one in both)))
     total = [sum(one['seconds'] for one in rows[begin].values()) for begin in ('nothing', FIRST)]
     found.append(('all', *(f'{seconds:.1f}' for seconds in total),
-                  *(f'{sum(one["learning_seconds"] for one in rows[begin].values()):.1f}'
-                    for begin in ('nothing', FIRST)),
                   *(sum(one['steps'] or 0 for one in rows[begin].values())
                     for begin in ('nothing', FIRST)), *[''] * 4))
     return table(('plant', *(f'{what}, from {begin}' for what in (
-        'all [s]', 'learning [s]', 'steps', 'error', 'lift') for begin in (
-            'nothing', 'a sibling'))), found, range(1, 9))
+        'processor [s]', 'steps', 'error', 'lift') for begin in (
+            'nothing', 'a sibling'))), found, range(1, 7))
 
 
 def _tell(label: str) -> None:
