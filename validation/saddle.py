@@ -30,12 +30,14 @@ from koopman_ros.control import (
 )
 from koopman_ros.control.simulate import Change, Simulation
 from koopman_ros.estimation import SensorLimits
+from koopman_ros.jobs.backends import Backend, backend_of
 from koopman_ros.lifting import LiftedModel
 from koopman_ros.plants import ControlAffineSystem, Process, steady_state, two_state_reactor
 from koopman_ros.plants.library.reactor import ReactorParameters
 from koopman_ros.reports import table
 from koopman_ros.signals import Outputs
 from validation.general.systems import SADDLE
+from validation.options import add_scheduler, add_seeds, over, read
 from validation.true_model import TrueModel
 from validation.unstable import LIMITS, MARGIN, REACHED, SADDLE_TEMPERATURE, steady, SYSTEM
 
@@ -179,14 +181,21 @@ def lost(one: Controller, seed: int) -> set[int]:
     return found
 
 
-def course_rows(models: list[LiftedModel], periods: Iterable[float] = PERIODS) -> list[list[str]]:
+def course_rows(models: list[LiftedModel], periods: Iterable[float] = PERIODS,
+                backend: Backend | None = None) -> list[list[str]]:
     """Return a row for each law and time between samples, over all models."""
+    periods = tuple(periods)
+
+    def three(key: tuple[str, float, int]) -> list[Figures]:
+        name, period, seed = key
+        return [run(controller(model, LAWS[name], informed=informed), seed, period)
+                for model, informed in ((models[seed], False), (truth(), False), (truth(), True))]
+
+    found_by = over(backend, three, itertools.product(LAWS, periods, range(len(models))))
     rows = []
-    for name, laws in LAWS.items():
+    for name in LAWS:
         for period in periods:
-            runs = [[run(controller(model, laws, informed=informed), seed, period)
-                     for model, informed in ((lift, False), (truth(), False), (truth(), True))]
-                    for seed, lift in enumerate(models)]
+            runs = [found_by[name, period, seed] for seed in range(len(models))]
             own = [found[0] for found in runs]
             over_true, over_full = ([found[0].costs[0] / found[k].costs[0] for found in runs]
                                     for k in (1, 2))
@@ -204,13 +213,17 @@ def course_rows(models: list[LiftedModel], periods: Iterable[float] = PERIODS) -
     return rows
 
 
-def disturbance_rows(models: list[LiftedModel]) -> list[list[str]]:
+def disturbance_rows(models: list[LiftedModel], backend: Backend | None = None
+                     ) -> list[list[str]]:
     """Return a row for each disturbance: of the lifts, and of the true model fully informed."""
+    def all_of(name: str) -> tuple[list[tuple[float, float]], tuple[float, float]]:
+        constants, limits = DISTURBANCES[name]
+        return [disturbed(controller(model, LAWS['mpc'], limits), constants, seed)
+                for seed, model in enumerate(models)], disturbed(
+            controller(truth(), LAWS['mpc'], limits, informed=True), constants, 0)
+
     rows = []
-    for name, (constants, limits) in DISTURBANCES.items():
-        own = [disturbed(controller(model, LAWS['mpc'], limits), constants, seed)
-               for seed, model in enumerate(models)]
-        best = disturbed(controller(truth(), LAWS['mpc'], limits, informed=True), constants, 0)
+    for name, (own, best) in over(backend, all_of, DISTURBANCES).items():
         rows.append([name, f'{max(peak for peak, _ in own):.2f}',
                      f'{max(offset for _, offset in own):.3f}', f'{best[0]:.2f}',
                      f'{best[1]:.3f}'])
@@ -223,37 +236,40 @@ def main(args: list[str] | None = None) -> int:
     parser = argparse.ArgumentParser(
         prog='python -m validation.saddle',
         description='Hold the two-state reactor at its saddle from its temperature alone.')
-    parser.add_argument('--seeds', type=int, default=10, help='number of seeds, at least 1 '
-                        '(default: %(default)s)')
-    options = parser.parse_args(args)
-    if options.seeds < 1:
-        parser.error(f'--seeds is {options.seeds}, must be at least 1')
+    add_seeds(parser)
+    add_scheduler(parser, '')
+    options = read(parser, args)
+    with backend_of(options.scheduler) as backend:
+        _report(options.seeds, backend)
+    return 0
+
+
+def _report(seeds: int, backend: Backend) -> None:
     # torch is needed to learn alone
     from validation.unstable import learn
 
     begin = time.monotonic()
-    models: list[LiftedModel] = []
-    for seed in range(options.seeds):
-        models.append(learn(seed))
-        print(f'learned {seed + 1} of {options.seeds}, {time.monotonic() - begin:.0f} s',
-              file=sys.stderr, flush=True)
+    models = list(over(backend, learn, range(seeds)).values())
+    print(f'learned {seeds} lifts, {time.monotonic() - begin:.0f} s', file=sys.stderr, flush=True)
     head = ['law', 'sample [s]', 'cost / true model', 'worst', 'cost / full information', 'worst',
             'offset [K]', 'error of C_A [mol/L]', 'lost', 'fouling: cost / true model', 'lost',
             'lost with full information']
-    print(f'{options.seeds} lifts, 0.1 K of noise, 350 -> 355 -> 345 K, then UA -15 %; coolant '
+    print(f'{seeds} lifts, 0.1 K of noise, 350 -> 355 -> 345 K, then UA -15 %; coolant '
           f'from {LIMITS.lower[0]:g} to {LIMITS.upper[0]:g} K at 1 K/s\n')
-    print(table(head, course_rows(models), range(1, len(head))))
+    print(table(head, course_rows(models, backend=backend), range(1, len(head))))
     print('\nDisturbances at 350 K, `mpc`, coolant from 253 to 373 K at 1 K/s: largest distance, '
           'and mean in the end, in K\n')
     head = ['disturbance', 'from T alone', 'end', 'true model, full information', 'end']
-    print(table(head, disturbance_rows(models), range(1, len(head))))
+    print(table(head, disturbance_rows(models, backend), range(1, len(head))))
+
     print(f'\nOf {STARTS} starts from 335 to 370 K, C_A up to 0.2 mol/L from steady, do not come '
           'to 350 K (coolant from 253 to 373 K):\n')
-    rows = [[name, len(lost(controller(models[0], laws, WIDE), 0)),
-             len(lost(controller(truth(), laws, WIDE, informed=True), 0))]
-            for name, laws in LAWS.items()]
+    def losses(law: str) -> list[int]:
+        return [len(lost(controller(model, LAWS[law], WIDE, informed=informed), 0))
+                for model, informed in ((models[0], False), (truth(), True))]
+
+    rows = [[name, *found] for name, found in over(backend, losses, LAWS).items()]
     print(table(['law', 'from T alone', 'true model, full information'], rows, (1, 2)))
-    return 0
 
 
 if __name__ == '__main__':

@@ -27,6 +27,7 @@ from koopman_ros.control import (
     SupervisorSettings,
 )
 from koopman_ros.control.simulate import Simulation
+from koopman_ros.jobs.backends import Backend, backend_of, Tell
 from koopman_ros.learning import compare, fit, Growth, NeuralDrift, NoUsefulLift
 from koopman_ros.learning.starts import Recipe
 from koopman_ros.lifting import LiftedModel
@@ -44,6 +45,7 @@ from koopman_ros.reports import table
 from validation.equations import EQUATIONS
 from validation.general.systems import SADDLE
 from validation.least import least_course
+from validation.options import add_scheduler, add_seeds, read
 
 # the range about the saddle, in mol/L and K, holds another steady state with its coolant of 300 K,
 # an unstable focus
@@ -167,28 +169,40 @@ def main(args: list[str] | None = None) -> int:
     parser = argparse.ArgumentParser(
         prog='python -m validation.unstable',
         description='Learn the two-state reactor about its saddle under a pre-feedback.')
-    parser.add_argument('--seeds', type=int, default=10, help='number of seeds, at least 1 '
-                        '(default: %(default)s)')
-    options = parser.parse_args(args)
-    if options.seeds < 1:
-        parser.error(f'--seeds is {options.seeds}, must be at least 1')
+    add_seeds(parser)
+    add_scheduler(parser, '')
+    options = read(parser, args)
+    with backend_of(options.scheduler) as backend:
+        return _report(options.seeds, backend)
+
+
+def judged(_: None, seed: int, __: Tell) -> tuple[LiftedModel, list[str]] | str:
+    """Learn from a seed; return the lift and its row, or why there is none."""
+    begin = time.process_time()
+    try:
+        model, fresh = learn(seed), samples(1000 + seed, 200)
+    except NoUsefulLift as refusal:
+        return f'seed {seed}: {refusal}'
+    seconds = time.process_time() - begin
+    found, by_rates = (fit(one, fresh.x, fresh.dxdt, fresh.u)
+                       for one in (model, replace(model, readout=None)))
+    return model, [str(seed), f'{found.rw:.0e}', f'{found.rx:.0e}', f'{found.cond:.1f}',
+                   f'{by_rates.rx:.0e}', *(f'{cost_ratio(model, *step):.4f}' for step in STEPS),
+                   f'{seconds:.0f}']
+
+
+def _report(seeds: int, backend: Backend) -> int:
+    """Print the tables; return the exit status, 1 where a seed gave no lift."""
     rows, refused, first = [], False, None
-    for seed in range(options.seeds):
-        begin = time.process_time()
-        try:
-            model, fresh = learn(seed), samples(1000 + seed, 200)
-        except NoUsefulLift as refusal:
-            print(f'seed {seed}: {refusal}', file=sys.stderr)
+    for _, outcome in backend.run(judged, {f'seed {seed}': seed for seed in range(seeds)}):
+        if isinstance(outcome, str):
+            print(outcome, file=sys.stderr)
             refused = True
             continue
-        seconds = time.process_time() - begin
+        model, row = outcome
         first = first or model
-        found, by_rates = (fit(one, fresh.x, fresh.dxdt, fresh.u)
-                           for one in (model, replace(model, readout=None)))
-        costs = [f'{cost_ratio(model, *step):.4f}' for step in STEPS]
-        rows.append([seed, f'{found.rw:.0e}', f'{found.rx:.0e}', f'{found.cond:.1f}',
-                     f'{by_rates.rx:.0e}', *costs, f'{seconds:.0f}'])
-        print(*rows[-1], sep='\t', file=sys.stderr, flush=True)
+        rows.append(row)
+        print(*row, sep='\t', file=sys.stderr, flush=True)
     steps = [f'{begin:.0f} to {end:.0f} K' for begin, end in STEPS]
     head = ['seed', 'rw', 'rx', 'cond', 'rx by the rates of z', *steps, 's']
     print(table(head, rows, range(len(head))))

@@ -6,6 +6,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+import contextlib
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -16,11 +17,13 @@ from koopman_ros.identification.identify import (
     INNOVATIONS_FORM,
     Score,
     stage_by_stage,
+    Stopped,
     Watch,
 )
 from koopman_ros.identification.innovations import Predictor, raised, SETTLING, standardised
 from koopman_ros.identification.output_error import innovations_form, Weights
 from koopman_ros.identification.record import Record
+from koopman_ros.jobs.backends import Backend, Here, Tell
 from koopman_ros.lifting import Box
 from koopman_ros.plant_data import Array, Episode, Plant
 
@@ -43,6 +46,7 @@ class _Candidate:
     predictor: _Polynomial
     hidden: int
     innovations: Array  #: (N, n_y) there, in deviations
+    deviation: Array  #: (n_y,) standard deviations of the innovations over all segments
 
     @property
     def degree(self) -> int:
@@ -56,7 +60,8 @@ class _Candidate:
 
 def identify_hidden(plant: Plant, episodes: Sequence[Episode], hidden: int, *,
                     highest_degree: int = HIGHEST_DEGREE, seed: int = 0,
-                    watch: Watch = lambda *_: False) -> Identified:
+                    watch: Watch = lambda *_: False, backend: Backend | None = None
+                    ) -> Identified:
     """
     Estimate dx/dt = f(x) + B u where only the first n_y states are in the record.
 
@@ -72,6 +77,7 @@ def identify_hidden(plant: Plant, episodes: Sequence[Episode], hidden: int, *,
     :param hidden: most states that are not measured, at least 1.
     :param highest_degree: of f.
     :param seed: of the split.
+    :param backend: where each number of states is tried; this process by default.
     :return: an estimate of the plant with these states, in the episodes as they were estimated.
     :raises ValueError: when the episodes are too short, or nothing fits.
     :raises Stopped: when `watch` asked for it.
@@ -80,26 +86,32 @@ def identify_hidden(plant: Plant, episodes: Sequence[Episode], hidden: int, *,
         raise ValueError('where states are not measured, B must not depend on them: set '
                          'input_matrix_degree to 0')
     record = Record(plant, episodes, seed, hidden=True)
-    search = _Search(record)
-    progress = stage_by_stage(watch, hidden * highest_degree + 2)
-    candidates = []
-    for count in range(1, hidden + 1):
-        found: _Polynomial | None = None
-        for degree in range(1, highest_degree + 1):
-            monitor = progress(f'drift of degree {degree} with {count} '
-                               f'{"state" if count == 1 else "states"} not measured')
-            try:
-                found = search.linear(count, monitor) if found is None else search.refined(
-                    record.fit, raised(found), monitor)
-                candidates.append(_Candidate(
-                    found, count, record.innovations(found, record.choose)))
-            except (ValueError, np.linalg.LinAlgError):
-                break
+    total = hidden * highest_degree + 2
+    words = {f'{count} {"state" if count == 1 else "states"} not measured': count
+             for count in range(1, hidden + 1)}
+    candidates: list[_Candidate] = []
+    under_way = dict.fromkeys(words, 0)  # degrees that were tried
+
+    def told(name: str, degree: int | None) -> bool:
+        if degree is not None:
+            under_way[name] = degree - 1
+        text = f'drift of degree {degree} with {name}' if degree else 'drift'
+        if watch(sum(under_way.values()), total, text):
+            raise Stopped
+        return False
+
+    with contextlib.closing((backend or Here()).run(
+            _tried, words, shared=(record, highest_degree), watch=told)) as results:
+        for name, found in results:
+            under_way[name] = highest_degree
+            candidates += found
+    progress = stage_by_stage(watch, total, hidden * highest_degree)
     if not candidates:
         raise ValueError('no drift fits the episodes: record longer, with steps of the input')
     best = _plainest(candidates)
     monitor = progress(f'drift of degree {best.degree} on all episodes')
-    predictor = search.refined(sorted([*record.fit, *record.choose]), best.predictor, monitor)
+    predictor = _Search(record, best.deviation).refined(
+        sorted([*record.fit, *record.choose]), best.predictor, monitor)
     scale = predictor.drift.box.states.scale[:len(plant.state_names)]
     return record.identified(predictor, best.method, [
         Score(one.method, one.degree, scale * np.sqrt(np.mean(one.innovations ** 2, axis=0)),
@@ -121,12 +133,35 @@ def _plainest(candidates: Sequence[_Candidate]) -> _Candidate:
     return min(able, key=lambda one: one.predictor.drift.coefficients.size)
 
 
-class _Search:
-    """Predictors of polynomial drifts that are fitted to segments of a record."""
+def _tried(shared: tuple[Record, int], count: int, tell: Tell) -> list[_Candidate]:
+    """Return predictors with so many hidden states, of rising degree, until none is found."""
+    record, highest_degree = shared
+    search, candidates = _Search(record), list[_Candidate]()
+    for degree in range(1, highest_degree + 1):
+        def monitor(*_: object, degree: int = degree) -> bool:
+            return tell(degree)
 
-    def __init__(self, record: Record) -> None:
+        monitor()
+        try:
+            found = search.refined(record.fit, raised(candidates[-1].predictor), monitor) if (
+                candidates) else search.linear(count, monitor)
+            candidates.append(_Candidate(
+                found, count, record.innovations(found, record.choose), search.deviation))
+        except (ValueError, np.linalg.LinAlgError):
+            break
+    return candidates
+
+
+class _Search:
+    """
+    Predictors of polynomial drifts that are fitted to segments of a record.
+
+    :ivar deviation: (n_y,) standard deviations of the innovations of the last one.
+    """
+
+    def __init__(self, record: Record, deviation: Array | None = None) -> None:
         self.record, self._plant = record, record.plant
-        self._deviation = np.ones(len(self._plant.state_names))
+        self.deviation = np.ones(len(self._plant.state_names)) if deviation is None else deviation
 
     def linear(self, hidden: int, monitor: Callable[..., bool]) -> _Polynomial:
         """Return the best linear predictor."""
@@ -140,7 +175,7 @@ class _Search:
                 ) -> _Polynomial:
         """Return a predictor that fits some segments better, its hidden states standardised."""
         found, _ = self._refined(parts, start, monitor)
-        self._deviation = np.std(self.record.innovations(found), axis=0)
+        self.deviation = np.std(self.record.innovations(found), axis=0)
         return standardised(found, self.record.estimates(found))
 
     def _refined(self, parts: Sequence[int], start: _Polynomial, monitor: Callable[..., bool]
@@ -149,7 +184,7 @@ class _Search:
         shortest = min(len(record.parts[i]) for i in parts)
         found = innovations_form(
             Weights(start.drift, self._plant.B is None), start.gain, record.segments(parts),
-            record.foreseen(start, parts), self._deviation,
+            record.foreseen(start, parts), self.deviation,
             settling=min(SETTLING, shortest // 3), monitor=monitor)
         return Predictor(found.model.drift, found.gain), found.cost
 

@@ -73,14 +73,17 @@ class Stopped(Exception):  # noqa: N818
     """The `watch` callback asked to stop."""
 
 
-def stage_by_stage(watch: Watch, total: int) -> Callable[[str], Callable[..., bool]]:
+def stage_by_stage(watch: Watch, total: int, done: int = 0
+                   ) -> Callable[[str], Callable[..., bool]]:
     """
     Return what begins the next of `total` stages by its name, and returns the stage's monitor.
+
+    Of the stages so many are `done` already.
 
     A stage reports when it begins and whenever its monitor is called, which raises
     :class:`Stopped` when `watch` asked to stop.
     """
-    numbers = itertools.count()
+    numbers = itertools.count(done)
 
     def begin(text: str) -> Callable[..., bool]:
         number = next(numbers)

@@ -63,6 +63,12 @@ def weak_form(episodes: Sequence[Episode], box: Box, degree: int, B: Array | Non
     :param input_degree: of the polynomial B(x) that is learned.
     :raises ValueError: when the window or the episodes are too short.
     """
+    return regress(box, degree, *weak_rows(episodes, box, degree, B, window, input_degree), B)
+
+
+def weak_rows(episodes: Sequence[Episode], box: Box, degree: int, B: Array | None, window: int,
+              input_degree: int = 0) -> tuple[Array, Array, Array]:
+    """Return features, inputs and rates of :func:`weak_form`, as :func:`regress` takes them."""
     if window < _NARROWEST:
         raise ValueError(f'a window of {window} samples is too short, at least {_NARROWEST} are '
                          'needed')
@@ -87,7 +93,7 @@ def weak_form(episodes: Sequence[Episode], box: Box, degree: int, B: Array | Non
                           if input_degree else _input_integral(episode, box, middle, half))
     if not features:
         raise ValueError(f'no episode has {window} samples: record longer')
-    return regress(box, degree, np.array(features), np.array(inputs), np.array(rates), B)
+    return np.array(features), np.array(inputs), np.array(rates)
 
 
 def _trapezoid(t: Array) -> Array:

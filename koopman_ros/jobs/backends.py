@@ -25,6 +25,8 @@ Task = Callable[[Any, Item, Tell], Found]
 PERIOD = 0.1
 #: s from the request to end until a task is left behind.
 PATIENCE = 5.0
+#: s without a sign of life after which a worker counts as lost.
+SILENCE = 30.0
 #: Times that a task is begun anew whose worker was lost.
 ATTEMPTS = 3
 _ADDRESSES = ('tcp://', 'tls://')
@@ -67,7 +69,7 @@ class Backend(Protocol):
     """
 
     def run(self, function: Task[Item, Found], items: Mapping[str, Item], *, shared: Any = None,
-            watch: Watch = never) -> Generator[tuple[str, Found]]:
+            watch: Watch = never, apart: bool = False) -> Generator[tuple[str, Found]]:
         """
         Yield the name of each task and what it found, in the order of the items.
 
@@ -78,6 +80,8 @@ class Backend(Protocol):
         :param function: of what is shared, an item, and what the task tells its progress with.
         :param items: by the names of their tasks.
         :param shared: goes to each worker once.
+        :param apart: whether a task that fails leaves the others alone: its exception is then
+            what it found, also where its workers died time and again.
         :raises WorkerLost: when the workers of a task died time and again.
         :raises SchedulerLost: when a scheduler is not reached any longer.
         """
@@ -109,7 +113,7 @@ class Here:
     """One task after the other, in this process."""
 
     def run(self, function: Task[Item, Found], items: Mapping[str, Item], *, shared: Any = None,
-            watch: Watch = never) -> Generator[tuple[str, Found]]:
+            watch: Watch = never, apart: bool = False) -> Generator[tuple[str, Found]]:
         """Run tasks, as :meth:`Backend.run`."""
         ended = False
 
@@ -122,11 +126,14 @@ class Here:
             return tell
 
         for name, item in items.items():
+            found: Any
             try:
                 found = function(shared, item, telling(name))
             except Exception as error:
                 noted(error, name)
-                raise
+                if not apart:
+                    raise
+                found = error
             yield name, found
             if ended:
                 return

@@ -33,15 +33,13 @@ from koopman_ros.jobs.backends import (
     PATIENCE,
     PERIOD,
     SchedulerLost,
+    SILENCE,
     Task,
     Tell,
     Watch,
     WorkerLost,
 )
 
-#: s without a sign of life after which a worker counts as lost, and without any worker after
-#: which a work does.
-SILENCE = 30.0
 _CONNECT = 10.0  # s for the first answer of a scheduler
 _JOIN = 30.0  # s for its first worker, which may just be starting
 _LOST = (distributed.client.FutureCancelledError, distributed.CancelledError,
@@ -56,7 +54,8 @@ class Cluster:
     anew on another one. Where the scheduler is lost, so are the workers, and the work with them.
 
     :param address: of the scheduler, like ``'tcp://127.0.0.1:8786'``.
-    :param silence: seconds; longer than a task may hold a worker's interpreter.
+    :param silence: seconds, also without any worker after which the work is lost; longer than a
+        task may hold a worker's interpreter.
     :raises SchedulerLost: when nothing answers there.
     :raises WorkerLost: when no worker has joined.
     """
@@ -86,7 +85,7 @@ class Cluster:
             raise self._deserted(_JOIN) from None
 
     def run(self, function: Task[Item, Found], items: Mapping[str, Item], *, shared: Any = None,
-            watch: Watch = never) -> Generator[tuple[str, Found]]:
+            watch: Watch = never, apart: bool = False) -> Generator[tuple[str, Found]]:
         """Run tasks, as :meth:`~koopman_ros.jobs.backends.Backend.run`."""
         token = uuid.uuid4().hex
         news: queue.SimpleQueue[tuple[str, Any]] = queue.SimpleQueue()
@@ -107,7 +106,7 @@ class Cluster:
                         left_behind = time.monotonic() + PATIENCE
                         self._ask_to_end(token)
                 if future.done() and not isinstance(
-                        found := self._result(name, future), _NotBegun):
+                        found := self._result(name, future, apart), _NotBegun):
                     yield name, found
         finally:
             self._leave(token, list(futures.values()))
@@ -168,18 +167,21 @@ class Cluster:
 
         threading.Thread(target=tell, daemon=True).start()
 
-    def _result(self, name: str, future: Future) -> Any:
-        """Return what a task that is done has found, or raise what it has raised."""
+    def _result(self, name: str, future: Future, apart: bool = False) -> Any:
+        """Return what a task that is done has found; raise, or return, what it has raised."""
         with self._failing():
             error = future.exception() if future.status == 'error' else None
             if error is None:
                 return self._client.gather(future)
         if isinstance(error, KilledWorker):
-            raise WorkerLost(
+            error = WorkerLost(
                 f'{name}: {ATTEMPTS} workers that ran it were killed or fell silent, one after '
-                'the other: see whether the memory suffices for it, and run it again') from None
-        noted(error, name)
-        raise error
+                'the other: see whether the memory suffices for it, and run it again')
+        else:
+            noted(error, name)
+        if apart:
+            return error
+        raise error from None
 
     def _wait(self, futures: Sequence[Future], until: str = 'FIRST_COMPLETED') -> None:
         """Wait a little, and look after the workers now and then."""

@@ -10,6 +10,7 @@ from collections.abc import Callable, Generator, Mapping
 from concurrent.futures import FIRST_COMPLETED, Future, wait
 from concurrent.futures.process import BrokenProcessPool
 import contextlib
+import math
 import os
 from pathlib import Path
 import pickle
@@ -32,6 +33,7 @@ from koopman_ros.jobs.backends import (
     noted,
     PATIENCE,
     PERIOD,
+    SILENCE,
     Task,
     Tell,
     Watch,
@@ -52,19 +54,23 @@ class Processes:
     """
     So many processes, started when they are needed first, each with one thread.
 
+    One that is stopped (by SIGSTOP, a debugger, or a container that is paused) for `silence` is
+    ended, and what it did begun anew in another one.
+
     :param count: at least 1.
+    :param silence: seconds.
     """
 
-    def __init__(self, count: int) -> None:
-        self._workers = [_Worker() for _ in range(count)]
+    def __init__(self, count: int, silence: float = SILENCE) -> None:
+        self._workers = [_Worker(silence) for _ in range(count)]
 
     def run(self, function: Task[Item, Found], items: Mapping[str, Item], *, shared: Any = None,
-            watch: Watch = never) -> Generator[tuple[str, Found]]:
+            watch: Watch = never, apart: bool = False) -> Generator[tuple[str, Found]]:
         """Run tasks, as :meth:`~koopman_ros.jobs.backends.Backend.run`."""
         with tempfile.TemporaryDirectory(prefix='koopman_ros_') as name:
             folder = Path(name)
             (folder / _SHARED).write_bytes(cloudpickle.dumps((function, shared)))
-            course = _Course(self._workers, items, folder, watch)
+            course = _Course(self._workers, items, folder, watch, apart)
             try:
                 for name in items:
                     while course.awaits(name):
@@ -96,9 +102,10 @@ class Processes:
 class _Worker:
     """One process, begun anew after it was lost."""
 
-    def __init__(self) -> None:
+    def __init__(self, silence: float) -> None:
         self._executor: ProcessPoolExecutor | None = None
         self._pid: Future[int]
+        self._silence, self._stopped_since = silence, math.inf
 
     def submit(self, function: Callable[..., Any], *arguments: Any) -> Future[Any]:
         if self._executor is None:
@@ -108,6 +115,21 @@ class _Worker:
             self._pid = self._executor.submit(os.getpid)
         future: Future[Any] = self._executor.submit(function, *arguments)
         return future
+
+    def look(self) -> None:
+        """End the process when it has been stopped for too long."""
+        if self._executor is None or not self._pid.done() or self._pid.exception():
+            return
+        pid, now = self._pid.result(), time.monotonic()
+        if not _is_stopped(pid):
+            self._stopped_since = math.inf
+            return
+        self._stopped_since = min(now, self._stopped_since)
+        if now - self._stopped_since >= self._silence:
+            self._stopped_since = math.inf
+            # whoever waits for it finds it lost
+            with contextlib.suppress(ProcessLookupError):
+                os.kill(pid, signal.SIGKILL)
 
     @property
     def started(self) -> bool:
@@ -123,12 +145,22 @@ class _Worker:
             self._executor = None
 
 
+def _is_stopped(pid: int) -> bool:
+    """Return whether a process is stopped, by a signal or a debugger."""
+    try:
+        # its name, in brackets, may hold anything
+        state = Path(f'/proc/{pid}/stat').read_text().rpartition(')')[2].split()[0]
+    except OSError:
+        return False
+    return state in 'Tt'
+
+
 class _Course:
     """Tasks on their way: what waits, what runs where, and what was found."""
 
     def __init__(self, workers: list[_Worker], items: Mapping[str, Any], folder: Path,
-                 watch: Watch) -> None:
-        self._items, self._folder, self._watch = items, folder, watch
+                 watch: Watch, apart: bool) -> None:
+        self._items, self._folder, self._watch, self._apart = items, folder, watch, apart
         self._numbers = {name: number for number, name in enumerate(items)}
         self._waiting = deque(items)
         self._idle = list(workers)
@@ -148,6 +180,8 @@ class _Course:
             name, worker = self._waiting.popleft(), self._idle.pop()
             future = worker.submit(_do, self._folder, self._numbers[name], self._items[name])
             self._running[future] = name, worker
+        for _, worker in self._running.values():
+            worker.look()
         for future in wait(self._running, PERIOD, FIRST_COMPLETED).done:
             name, worker = self._running.pop(future)
             self._idle.append(worker)
@@ -176,12 +210,16 @@ class _Course:
             worker.end()
             self._lost[name] = self._lost.get(name, 0) + 1
             if self._lost[name] == ATTEMPTS:
-                raise lost(name) from None
-            if self._left_behind == float('inf'):
+                if not self._apart:
+                    raise lost(name) from None
+                self.found[name] = lost(name)
+            elif self._left_behind == float('inf'):
                 self._waiting.appendleft(name)
         except Exception as error:
             noted(error, name)
-            raise
+            if not self._apart:
+                raise
+            self.found[name] = error
 
     def _news(self) -> list[tuple[str, Any]]:
         """Return what tasks have told since."""
@@ -259,6 +297,9 @@ class _KeptInProcesses:
                 _on_kept, self._token, name, self._load, self._items[name], function, argument)
                 for name in missing}
             for name, future in futures.items():
+                while not wait([future], PERIOD).done:
+                    for worker in dict.fromkeys(self._places.values()):
+                        worker.look()
                 try:
                     found[name] = future.result()
                 except BrokenProcessPool:

@@ -3,9 +3,11 @@
 
 """A retraining in a process of its own: start, progress, outcome, cancel; without ROS."""
 
+from __future__ import annotations
+
 from collections.abc import Mapping
 import contextlib
-from dataclasses import dataclass
+from dataclasses import dataclass, field, replace
 import json
 import os
 import queue
@@ -31,20 +33,31 @@ class JobState:
     text: str = 'starting'  #: what is done now, or how it ended
     ended: bool = False  #: whether it has ended
     summary: Mapping[str, Any] | None = None
+    #: those of a fleet that have ended, by name
+    plants: Mapping[str, JobState] = field(default_factory=dict)
 
     @property
     def accepted(self) -> bool:
-        """Whether there is a new lift that may be used."""
+        """Whether there is a new lift that may be used, or one of each plant."""
+        if self.plants:
+            return all(one.accepted for one in self.plants.values())
         return bool(self.summary and self.summary['accepted'])
 
     @property
     def refused(self) -> bool:
-        """Whether a lift was learned or tried and does not suffice."""
+        """Whether a lift was learned or tried and does not suffice, of a fleet the worst one."""
+        if self.plants:
+            return not self.accepted and all(
+                one.accepted or one.refused for one in self.plants.values())
         return bool(self.summary and not self.summary['accepted'])
 
 
 class RetrainingJob:
-    """A retraining in a process of its own, of fields of :class:`koopman_ros.retraining.Task`."""
+    """
+    A retraining in a process of its own, of fields of :class:`koopman_ros.retraining.Task`.
+
+    Of a fleet with ``plants``, such fields by name, and ``scheduler``.
+    """
 
     def __init__(self, task: Mapping[str, object]) -> None:
         self.state = JobState()
@@ -99,8 +112,20 @@ class RetrainingJob:
         except ValueError:
             # cut off when the process was killed, or printed by a library
             return self.state
+        if 'plant' in said:
+            plants = {**self.state.plants, said['plant']: self._conclusion(said)}
+            return replace(self.state, plants=plants)
         if 'progress' in said:
-            return JobState(said['progress'], said['text'])
+            return replace(self.state, share=said['progress'],
+                           text=said['text'] or self.state.text)
+        if 'ended' in said:
+            accepted = sum(one.accepted for one in self.state.plants.values())
+            return replace(self.state, share=1.0, ended=True, text=(
+                f'{accepted} of {len(self.state.plants)} new lifts are accepted'))
+        return self._conclusion(said)
+
+    def _conclusion(self, said: Mapping[str, Any]) -> JobState:
+        """Return how a retraining ended, by its last words."""
         if 'summary' in said:
             return JobState(1.0, _in_words(said['summary']), True, said['summary'])
         if 'stopped' in said:
@@ -123,7 +148,7 @@ class RetrainingJob:
             if last.startswith(('ModuleNotFoundError', 'ImportError')):
                 text = (f'training needs a package that is not installed ({last}): pip install '
                         "'koopman_ros[train]'")
-        return JobState(self.state.share, text, True)
+        return replace(self.state, text=text, ended=True)
 
     def _read_lines(self, stream: IO[str]) -> None:
         for line in stream:

@@ -82,12 +82,13 @@ class Algorithm1:
         generator = torch.Generator().manual_seed(seed)
         theta = torch.randn(layout.size, generator=generator, dtype=torch.float64).to(data.x)
         problem = LiftProblem(layout, data, ResidualWeights())
-        status = MinimumStatus.MAX_ITERATIONS
+        status, iterations = MinimumStatus.MAX_ITERATIONS, 0
         for number in range(self.max_rounds):
             weight = self.lambda_initial / self.gamma ** number
             weighted = problem.with_weights(ResidualWeights(decoder=weight))
             minimum = minimise(weighted.add_residuals, theta, max_iterations=self.max_iterations,
                                monitor=monitor)
+            iterations += minimum.iterations
             moved = float(torch.linalg.norm(minimum.theta - theta))
             theta, status = minimum.theta, minimum.status
             # where the start itself cannot move it has not converged, but is of no use
@@ -97,7 +98,7 @@ class Algorithm1:
             if moved <= self.tolerance:
                 status = MinimumStatus.CONVERGED
                 break
-        return Grown(layout, theta, status)
+        return Grown(layout, theta, status, iterations=iterations)
 
 
 @dataclass(frozen=True)

@@ -46,6 +46,7 @@ class Contender:
     #: mean-square error of its predictions of a record beyond the noise, relative to the states'
     #: scale; None where no record judges
     excess: float | None = None
+    steps: int = 0  #: of minimisations, where it is a network
 
     @property
     def error(self) -> float:
@@ -126,7 +127,7 @@ def compare(plant: Plant, samples: Samples, recipes: Mapping[str, Recipe] | None
             degrees: Sequence[int] = DEGREES, choose: str | None = None, alone: bool = False,
             seed: int = 0, starts: int = 2, split_seed: int = 0, watch: Watch | None = None,
             loops: int = LOOPS, judge: Judge | None = None, device: str = 'cpu',
-            backend: Backend | None = None) -> Comparison:
+            backend: Backend | None = None, begin: LiftedModel | None = None) -> Comparison:
     """
     Learn a model of each class from the same episodes and choose one by a stated rule.
 
@@ -144,6 +145,7 @@ def compare(plant: Plant, samples: Samples, recipes: Mapping[str, Recipe] | None
     :param choose: the name of the class to take whatever the rule says.
     :param alone: whether it is the only one to be learned.
     :param judge: what the models are judged by in the place of validation episodes and `loops`.
+    :param begin: as in :func:`train`, for the lifts of its kind, of which one has to be learned.
     :raises NoUsefulLift: when there is no model of the class that was asked for, or of any.
     :raises ValueError: for a name that there is not; otherwise as :func:`train`, where the class
         was asked for or all samples are to blame.
@@ -157,31 +159,39 @@ def compare(plant: Plant, samples: Samples, recipes: Mapping[str, Recipe] | None
         names = tuple(name for name in names if name == choose)
     if starts < 1:
         raise ValueError(f'starts must be at least 1, got {starts}')
+    continuing = [name for name in names if begin is not None and _of_kind(recipes, name, begin)]
+    if begin is not None and not continuing:
+        raise ValueError(f'no class of {", ".join(names)} begins from a lift '
+                         f'{"with" if begin.identity else "without"} identity coordinates: learn '
+                         'a lift of its kind, or begin from nothing')
     learner = _Learner(plant, samples, split_seed)
     judge = judge or learner.judge(loops, backend)
     counts = {name: starts * _rounds(recipes[name], n_x) for name in names if name in recipes}
     found: list[Contender] = []
     drift: LiftedModel | None = None
     for name in names:
-        begin = time.perf_counter()
+        since, steps = time.perf_counter(), 0
         try:
             if name in recipes:
                 trained = train(
                     plant, samples, recipes[name], seed=seed, starts=starts,
                     split_seed=split_seed, loops=0, watch=_among(watch, name, counts),
-                    device=device, backend=backend)
+                    device=device, backend=backend,
+                    begin=begin if name in continuing else None)
+                steps = trained.steps
                 model = trained.model if drift is None else learner.with_units_of(
                     drift, trained.model)
                 if isinstance(recipes[name], NeuralDrift):
                     drift = model
             else:
                 model = learner.linear() if name == LINEAR else learner.polynomial(degrees)
-            found.append(learner.contender(name, model, time.perf_counter() - begin, judge))
+            found.append(replace(learner.contender(
+                name, model, time.perf_counter() - since, judge), steps=steps))
         except (ValueError, np.linalg.LinAlgError) as refusal:
             if name == choose:
                 raise
             found.append(Contender(name, None, math.inf, None, None,
-                                   time.perf_counter() - begin, str(refusal)))
+                                   time.perf_counter() - since, str(refusal)))
     chosen = plainest(found, judge.resolution) if choose is None else found[names.index(choose)]
     return Comparison(tuple(found), chosen, plant.state_names, plant.state_units)
 
@@ -204,6 +214,12 @@ def plainest(contenders: Sequence[Contender], resolution: float = ROUNDING) -> C
         return min(tried, key=lambda one: one.law_check.share_failed if one.law_check else 1.0)
     limit = _FACTOR * max(min(one.error for one in able), resolution)
     return next(one for one in able if one.error <= limit)
+
+
+def _of_kind(recipes: Mapping[str, Recipe], name: str, lift: LiftedModel) -> bool:
+    """Return whether a class is that of a lift, as far as its coordinates tell."""
+    recipe = recipes.get(name)
+    return isinstance(recipe, Growth) and recipe.identity == lift.identity
 
 
 def _rounds(recipe: Recipe, n_x: int) -> int:

@@ -125,7 +125,8 @@ class NeuralDrift:
                            monitor=monitor)
         # the read-out is fitted by itself; the A of the lift z = x is that of the linear fit
         found = layout.join(replace(layout.split(minimum.theta), A=A))
-        return Grown(layout, found, minimum.status, drift_alone=True)
+        return Grown(layout, found, minimum.status, drift_alone=True,
+                     iterations=minimum.iterations)
 
 
 @dataclass(frozen=True)

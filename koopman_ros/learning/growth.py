@@ -5,7 +5,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 import itertools
@@ -17,6 +17,8 @@ from torch import Tensor
 from koopman_ros.learning.levenberg_marquardt import minimise, Minimum, MinimumStatus
 from koopman_ros.learning.network import check_activation, Layout, Parameters, Pass
 from koopman_ros.learning.residuals import LiftProblem, ResidualWeights, ScaledSamples
+
+_STILL = 1e-6  # root mean square, in the scale of the states, of a coordinate that stands still
 
 # Called after every step with (iteration, cost); True ends the minimisation.
 Monitor = Callable[[int, float], bool]
@@ -31,6 +33,7 @@ class Grown:
     status: MinimumStatus  #: how the last minimisation ended
     decrease: float = math.nan  #: see :class:`Minimum`
     drift_alone: bool = False  #: whether it is the lift z = x, for a read-out of hidden units
+    iterations: int = 0  #: steps of the minimisations together
 
 
 @dataclass(frozen=True)
@@ -95,20 +98,30 @@ class Growth:
 
     def start(self, data: ScaledSamples, n_z: int, parent: Grown | None, seed: int,
               monitor: Monitor | None = None) -> Grown:
-        """Extend the lift of the round before, None in the first one, to `n_z` coordinates."""
-        layout, theta = self._extended(data, n_z, parent or self._root(data), seed)
+        """
+        Extend the lift of the round before, None in the first one, to `n_z` coordinates.
+
+        One that has so many already is only fitted to the samples.
+        """
+        if parent is not None and parent.layout.n_z == n_z:
+            layout, theta = parent.layout, parent.theta
+        else:
+            layout, theta = self._extended(data, n_z, parent or self.root(data), seed)
         run = partial(minimise, max_iterations=self.max_iterations, tolerance=self.tolerance,
                       monitor=monitor)
         problem = LiftProblem(layout, data, ResidualWeights(self.whitening,
                                                 self.decoder_weight * bool(layout.decoder)))
         minimum: Minimum = run(problem.add_residuals, theta)
+        iterations = minimum.iterations
         if layout.decoder and minimum.status is not MinimumStatus.INTERRUPTED:
             last = problem.with_weights(replace(problem.weights,
                                                 decoder=1e-3 * self.decoder_weight))
             minimum = run(last.add_residuals, minimum.theta)
-        return Grown(layout, minimum.theta, minimum.status, minimum.decrease)
+            iterations += minimum.iterations
+        return Grown(layout, minimum.theta, minimum.status, minimum.decrease,
+                     iterations=iterations)
 
-    def _root(self, data: ScaledSamples) -> Grown:
+    def root(self, data: ScaledSamples) -> Grown:
         """Return the lift without a network that growth starts from."""
         n_x = data.x.shape[1]
         n_z = n_x if self.identity else 0
@@ -123,6 +136,35 @@ class Growth:
         return Grown(layout, layout.join(Parameters(
             (), empty((layout.n_free, 0)), drift if self.identity else empty((0, 0)), B,
             network)), MinimumStatus.CONVERGED)
+
+    def planted(self, data: ScaledSamples, hidden: Sequence[tuple[Tensor, Tensor]], V: Tensor
+                ) -> Grown:
+        """
+        Return the lift of a network that was learned elsewhere, its A fitted to the samples.
+
+        :param hidden: (W, b) of each hidden layer, of the states as the samples have them.
+        :param V: (n_free, h) output weights; each coordinate is scaled to variance 1 here.
+        :raises ValueError: for a coordinate that stands still on the samples.
+        """
+        root = self.root(data)
+        n_z = root.layout.n_z + len(V)
+        layout = replace(root.layout, n_z=n_z, hidden=tuple(len(b) for _, b in hidden))
+        given, zero = root.layout.split(root.theta), data.x.new_zeros
+        drift = data.drift(given.B)
+        begun = Parameters(tuple(hidden), V, zero((n_z, n_z)), given.B)
+        plain = replace(layout, decoder=0, n_u=0)
+        size = Pass(plain, begun, data.x, drift).z[:, n_z - len(V):].square().mean(0).sqrt()
+        if not bool((size > _STILL).all()):
+            raise ValueError('a coordinate of the lift that is begun from stands still on the '
+                             'samples: begin from that of a plant in the same range, or from '
+                             'nothing')
+        begun = replace(begun, V=V / size[:, None])
+        lifted = Pass(plain, begun, data.x, drift)
+        A = least_squares(lifted.z, lifted.z_rate).T
+        decoder = None if not layout.decoder else _decoder_start(
+            lifted.z, data.x, layout.decoder, torch.Generator().manual_seed(0))
+        return Grown(layout, layout.join(replace(begun, A=A, decoder=decoder)),
+                     MinimumStatus.CONVERGED)
 
     def _extended(self, data: ScaledSamples, n_z: int, parent: Grown, seed: int
                   ) -> tuple[Layout, Tensor]:

@@ -12,10 +12,10 @@ import numpy as np
 import torch
 
 from koopman_ros.learning.frame import Frame
-from koopman_ros.learning.growth import Grown
+from koopman_ros.learning.growth import Grown, Growth
 from koopman_ros.learning.inputs import InputModel
 from koopman_ros.learning.residuals import deviations, ScaledSamples
-from koopman_ros.lifting import Box, LiftedModel, NetworkObservables
+from koopman_ros.lifting import Box, Coordinates, LiftedModel, NetworkObservables
 from koopman_ros.plant_data import Array, Plant, Samples
 
 
@@ -55,6 +55,49 @@ class Scaling:
         place = checked_device(device)
         return ScaledSamples(*(torch.from_numpy(a).to(place) for a in arrays))
 
+    def planted(self, recipe: Growth, begin: LiftedModel, data: ScaledSamples) -> Grown:
+        """
+        Return the lift of another plant of the same signals as one of these samples.
+
+        Its hidden units are the same functions of the states in their units.
+
+        :param data: the samples, scaled.
+        :raises ValueError: for a lift that the recipe would not make, of other signals, or with a
+            coordinate that stands still on the samples.
+        """
+        own, network = self.box.states, begin.observables
+        for kind, its, ours in (('states', begin.states, own),
+                                ('inputs', begin.inputs, self.box.inputs)):
+            if (its.names, its.units) != (ours.names, ours.units):
+                raise ValueError(f'the lift that is begun from has the {kind} {_listed(its)}, the '
+                                 f'plant has {_listed(ours)}: begin from that of a plant of the '
+                                 'same kind')
+        wanted = recipe.identity, recipe.layers, recipe.activation
+        if not isinstance(network, NetworkObservables) or not len(network.output) or (
+                network.identity, len(network.hidden), network.activation) != wanted:
+            raise ValueError(
+                'the lift that is begun from is of another class: begin from one with '
+                f'{"" if recipe.identity else "no "}identity coordinates and others by a network '
+                f'of {recipe.layers} hidden layer(s) of {recipe.activation}')
+        # deviations there are `stretch` times those here and `shift`
+        stretch = own.scale / begin.states.scale
+        shift = (own.center - begin.states.center) / begin.states.scale
+        (W, b), *further = network.hidden
+        W, b = W * stretch, b + W @ shift
+        if self.frame:
+            W = W @ np.linalg.inv(self.frame.T)
+        layers = [(W, b), *further]
+        if len(layers) == 1:
+            # units of the read-out alone have no part in z
+            used = np.any(network.output != 0.0, axis=0)
+            layers, output = [(W[used], b[used])], network.output[:, used]
+        else:
+            output = network.output
+        like = data.x
+        return recipe.planted(data, [
+            (like.new_tensor(np.ascontiguousarray(W)), like.new_tensor(b)) for W, b in layers],
+            like.new_tensor(np.ascontiguousarray(output)))
+
     def model(self, grown: Grown, **about: Any) -> LiftedModel:
         """Return what was learned in units; `about` are further fields of the model."""
         parts = grown.layout.split(grown.theta.cpu())
@@ -71,6 +114,11 @@ class Scaling:
         return LiftedModel(observables, A, constant, self.box.states, self.box.inputs,
                            self.box.time_unit, input_terms=terms,
                            pre_feedback=self.frame.K if self.frame else None, **about)
+
+
+def _listed(signals: Coordinates) -> str:
+    return ', '.join(f'{name} [{unit}]' for name, unit in zip(
+        signals.names, signals.units, strict=True)) or 'none'
 
 
 def _plain(box: Box, inputs: InputModel, samples: Samples) -> tuple[Array, Array, Array | None]:

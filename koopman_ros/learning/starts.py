@@ -46,7 +46,7 @@ class Tracker:
 
     def __init__(self, watch: Watch | None, total: int) -> None:
         self._watch, self._total = watch, total
-        self.n_z, self.finished, self.stop = 0, 0, False
+        self.n_z, self.finished, self.steps, self.stop = 0, 0, 0, False
         self._rw = math.nan
         self._step = 0, math.nan
 

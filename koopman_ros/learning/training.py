@@ -47,6 +47,7 @@ class Trained:
     #: the winner of every round, smallest n_z first, each with its figures
     path: tuple[LiftedModel, ...]
     starts: int  #: number of starts that finished
+    steps: int  #: of the minimisations of all these together
 
     __repr__ = brief
 
@@ -94,7 +95,8 @@ class _Candidate:
 def train(plant: Plant, samples: Samples, recipe: Recipe, *, seed: int = 0, starts: int = 4,
           split_seed: int = 0, watch: Watch | None = None, refuse: bool = True,
           loops: int = LOOPS, device: str = 'cpu', threads: int = 1,
-          backend: Backend | None = None, shards: Sequence[Shard] = ()) -> Trained:
+          backend: Backend | None = None, shards: Sequence[Shard] = (),
+          begin: LiftedModel | None = None) -> Trained:
     """
     Learn a lifted model in rounds of starts, of which validation episodes choose the best.
 
@@ -121,11 +123,14 @@ def train(plant: Plant, samples: Samples, recipe: Recipe, *, seed: int = 0, star
     :param backend: where starts and closed loops run and shards are, see
         :func:`~koopman_ros.jobs.backends.backend_of`; this process by default.
     :param shards: how workers read what the model is fitted to.
+    :param begin: a lift of a plant of the same kind, which the training goes on from: what it has
+        of coordinates is fitted to the samples in one start, further ones are added as ever.
+        None to begin from nothing.
     :raises NoUsefulLift: when no start gives a lift that can be judged, or none that beats the
         linear model on validation episodes, or when its law fails in closed loop.
     :raises ValueError: on too few episodes, held-out episodes that hardly move, a recipe that
-        does not fit, times that contradict the derivatives, a nominal point where the plant
-        moves, or a device that there is not.
+        does not fit, a lift to begin from that does not, times that contradict the derivatives,
+        a nominal point where the plant moves, or a device that there is not.
     :raises KeyboardInterrupt: when interrupted before the first start finished.
     :raises WorkerLost: when workers of the backend are lost and none takes over.
     :raises SchedulerLost: when its scheduler is.
@@ -133,8 +138,10 @@ def train(plant: Plant, samples: Samples, recipe: Recipe, *, seed: int = 0, star
     if starts < 1:
         raise ValueError(f'starts must be at least 1, got {starts}')
     rounds = recipe.rounds(samples.x.shape[1])
+    if begin is not None:
+        rounds = _further(recipe, rounds, begin)
     parts = split_by_episode(samples, split_seed)
-    tracker = Tracker(watch, starts * len(rounds))
+    tracker = Tracker(watch, starts * len(rounds) - (starts - 1) * (begin is not None))
     backend = backend or Here()
     with contextlib.ExitStack() as stack:
         kept = stack.enter_context(contextlib.closing(KeptShards(backend, shards))) if (
@@ -150,12 +157,25 @@ def train(plant: Plant, samples: Samples, recipe: Recipe, *, seed: int = 0, star
             data = replace(data, elsewhere=kept)
         assembly = _Assembly(scaling, parts[0], kept, training_states(box, samples),
                              Provenance(plant.name, seed, digest, {}, __version__))
+        first = None if begin is None or not isinstance(recipe, Growth) else scaling.planted(
+            recipe, begin, data)
         path, interrupted = _run_rounds(
             assembly, parts[1], rounds, tracker, lambda n_z, parent: run_starts(
-                Here() if kept else backend, recipe, data, n_z, parent, seed, starts, threads,
-                tracker))
+                Here() if kept else backend, recipe, data, n_z, parent or first, seed,
+                1 if parent is None and first is not None else starts, threads, tracker))
     return _conclude(plant, parts, path, interrupted, tracker, loops if refuse else 0, refuse,
                      backend)
+
+
+def _further(recipe: Recipe, rounds: Sequence[int], begin: LiftedModel) -> tuple[int, ...]:
+    """Return the rounds from those of a lift to begin from on."""
+    if not isinstance(recipe, Growth):
+        raise ValueError('only a lift by growth begins from another one: choose its class, or '
+                         'begin from nothing')
+    if begin.n_z not in rounds:
+        raise ValueError(f'the lift that is begun from has {begin.n_z} coordinates, must have '
+                         f'{rounds[0]} to {rounds[-1]} for one of {rounds[-1]}')
+    return tuple(n_z for n_z in rounds if n_z >= begin.n_z)
 
 
 def _extent(plant: Plant, samples: Samples, kept: KeptShards | None) -> tuple[Box, str]:
@@ -180,6 +200,8 @@ def _run_rounds(assembly: _Assembly, validation: Samples, rounds: Sequence[int],
         try:
             with contextlib.closing(run(n_z, parent)) as finds:
                 for _, grown in finds:
+                    if not isinstance(grown, str):
+                        tracker.steps += grown.iterations
                     candidate = _judged(assembly, grown, validation)
                     if isinstance(candidate, str):
                         reasons.append(candidate)
@@ -245,7 +267,8 @@ def _conclude(plant: Plant, parts: tuple[Samples, Samples, Samples], path: list[
     if law_check is not None:
         models[-1] = replace(models[-1], tried_loops=law_check.tried)
     return Trained(models[-1], figures[-1], evaluate(linear, parts[2]), law_check,
-                   _ending(winner.grown, interrupted), tuple(models), tracker.finished)
+                   _ending(winner.grown, interrupted), tuple(models), tracker.finished,
+                   tracker.steps)
 
 
 def _remedies(model: LiftedModel) -> str:

@@ -4,25 +4,23 @@
 """The trainer node: records the loop, drives the plant through experiments, trains from bags."""
 
 import sys
-from typing import Any
 
 from koopman_ros.jobs.training import JobState
-from koopman_ros.lifting import LiftedModel, load
 from koopman_ros.parameters.table import ConfigurationError
 from koopman_ros.parameters.trainer import (
     trainer_signals,
     trainer_table,
     TrainerParameters,
 )
-from koopman_ros.parameters.wire import preset, SIGNALS, system_of, Wiring
-from koopman_ros.resources import model_path
+from koopman_ros.parameters.wire import SIGNALS, Wiring
 from koopman_ros.ros import topics
 from koopman_ros.ros.experiment import PlantExperiment
+from koopman_ros.ros.fleet import run_fleet
 from koopman_ros.ros.managed import ManagedNode
 from koopman_ros.ros.process import run
 from koopman_ros.ros.recording import Recording
 from koopman_ros.ros.signals import by_topic
-from koopman_ros.ros.training import Training
+from koopman_ros.ros.training import present_lift, Training
 
 
 class TrainerNode(ManagedNode):
@@ -31,7 +29,7 @@ class TrainerNode(ManagedNode):
     def __init__(self) -> None:
         super().__init__('trainer')
         given = self.given()
-        present = _present(given)
+        present = present_lift(given)
         table = trainer_table(present, given)
         self._table, self._present = table, present
         self._recording: Recording | None = None
@@ -99,16 +97,9 @@ class TrainerNode(ManagedNode):
         self._training.settings = parameters
 
 
-def _present(given: dict[str, Any]) -> LiftedModel | None:
-    """Return the present lift, None where there is none yet."""
-    own = preset(system_of(given), 'trainer')
-    name = str(given.get('model', own.get('model', '')))
-    return load(model_path(name)) if name else None
-
-
 def main(args: list[str] | None = None) -> int:
-    """Run the trainer node."""
-    return run('trainer', TrainerNode, args)
+    """Run the trainer node, or with ``--loops`` the retraining of many plants."""
+    return run('trainer', TrainerNode, args, hosts=run_fleet)
 
 
 if __name__ == '__main__':

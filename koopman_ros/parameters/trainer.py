@@ -39,6 +39,7 @@ from koopman_ros.parameters.wire import (
 from koopman_ros.units import conversion, display_unit
 
 COMMAND, MANUAL, SETPOINT = 'command', 'manual', 'setpoint'
+FIRST = 'first'  # as `sibling`, the first plant of a fleet whose lift is accepted
 
 
 @dataclass(frozen=True)
@@ -147,6 +148,10 @@ class TrainerParameters:
     training_samples: int = parameter(
         20_000, 'samples that are learned from and judged by; a longer record is averaged, where '
         'that loses nothing, and segments from all over its range are taken', '', 1000, 1_000_000)
+    sibling: str = parameter(
+        '', 'lift of a plant of the same kind that training begins from, instead of from nothing: '
+        'name of a shipped model, or path of a model file; first, with --loops, for the first '
+        'plant whose lift is accepted; empty for none')
     scheduler: str = parameter(
         '', 'where a training works: empty for a process of its own beside this node; joblib for '
         'one on each core, joblib:N for N of them; tcp://host:port for the workers of a Dask '

@@ -5,21 +5,28 @@
 The process that retrains: a task in JSON on the first line of its input, JSON lines on its output.
 
 Each line holds either ``progress`` (share done) with ``text``, or at last ``summary`` and
-``files``, or ``error``, or ``stopped``. It ends early on SIGINT, on SIGTERM, and when its input is
-closed, so that it does not outlive the process that started it.
+``files``, or ``error``, or ``stopped``. The task of a fleet has ``plants``, a task each by name,
+and ``scheduler``; then these last lines come for each ``plant``, and after all ``ended``. It ends
+early on SIGINT, on SIGTERM, and when its input is closed, so that it does not outlive the process
+that started it.
 """
 
+from collections.abc import Mapping
 import json
 import os
 import signal
 import sys
 import threading
 import time
+from typing import Any
 
 from koopman_ros.identification import Stopped
-from koopman_ros.jobs.backends import SchedulerLost, WorkerLost
-from koopman_ros.retraining import retrain, Task, write_report
+from koopman_ros.retraining import retrain, retrain_fleet, Task
+from koopman_ros.retraining.fleet import EXPECTED, one_line
+from koopman_ros.retraining.report import reported
+from koopman_ros.retraining.task import OnProgress
 
+_CODES = {True: 0, False: 2}  # by whether a lift is accepted
 _PERIOD = 0.2  # s between two lines of progress
 
 
@@ -34,7 +41,7 @@ def main() -> int:
     threading.Thread(target=_wait_for_end_of_input, args=(stop,), daemon=True).start()
     last = -_PERIOD
 
-    def on_progress(share: float, text: str) -> bool:
+    def now_and_then(share: float, text: str) -> bool:
         nonlocal last
         if time.monotonic() - last >= _PERIOD:
             last = time.monotonic()
@@ -42,27 +49,46 @@ def main() -> int:
         return stop.is_set()
 
     try:
-        task = Task.from_json(line)
-        retrained = retrain(task, on_progress)
+        values = json.loads(line)
+        if 'plants' in values:
+            return _fleet(values, now_and_then)
+        retrained = retrain(Task.of(values), now_and_then)
     except BrokenPipeError:
         # the process that started it is gone
         return 1
     except Stopped:
         _print(stopped=True)
         return 1
-    except (ValueError, TypeError, KeyError, OSError, MemoryError, WorkerLost,
-            SchedulerLost, ImportError) as error:
-        _print(error=' '.join(str(error).split()) or type(error).__name__)
+    except EXPECTED as error:
+        _print(error=one_line(error))
         return 1
-    warnings = list(retrained.decision.warnings) if retrained.decision else []
-    try:
-        files = [str(path) for path in write_report(retrained)]
-    except OSError as error:
-        # the lift is written already
-        files = []
-        warnings.append(f'the report could not be written: {error}')
-    _print(summary={**retrained.summary(), 'warnings': warnings}, files=files)
-    return 0 if retrained.accepted else 2
+    summary, files = reported(retrained)
+    _print(summary=summary, files=files)
+    return _CODES[bool(summary['accepted'])]
+
+
+def _fleet(values: Mapping[str, Any], now_and_then: OnProgress) -> int:
+    """Retrain many plants; the exit code is that of the worst of them."""
+    tasks = {name: Task.of(fields) for name, fields in values['plants'].items()}
+    shares = dict.fromkeys(tasks, 0.0)
+
+    def on_progress(name: str, share: float, text: str) -> bool:
+        if name:
+            shares[name] = share
+        return now_and_then(sum(shares.values()) / len(shares), f'{name}: {text}' if name else '')
+
+    codes = []
+    for name, outcome in retrain_fleet(tasks, values.get('scheduler', ''), on_progress):
+        shares[name] = 1.0
+        if outcome.summary is not None:
+            _print(plant=name, summary=outcome.summary, files=outcome.files)
+        else:
+            _print(plant=name, **({'stopped': True} if outcome.stopped else {
+                'error': outcome.error}))
+        codes.append(1 if outcome.summary is None else _CODES[outcome.accepted])
+    _print(ended=True)
+    # a failure says more than a refusal
+    return 1 if 1 in codes else max(codes)
 
 
 def _wait_for_end_of_input(stop: threading.Event) -> None:

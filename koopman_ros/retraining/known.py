@@ -9,7 +9,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 import json
 import math
-from typing import TypeVar
+from typing import Any, TypeVar
 
 import numpy as np
 
@@ -21,6 +21,8 @@ from koopman_ros.plant_data import Plant
 from koopman_ros.units import SECONDS_PER_TIME_UNIT
 from koopman_ros.wire import Place
 
+#: As a task's sibling, in a fleet: the first plant of its kind whose lift is accepted.
+FIRST = 'first'
 MOST_SAMPLES = 20_000  # more cost more time, and tell less and less
 
 
@@ -63,12 +65,19 @@ class Task:
     condition: float = 1e4  #: likewise
     #: where it is worked, see :func:`~koopman_ros.jobs.backends.backend_of`
     scheduler: str = ''
+    #: file of a lift of a plant of the same kind, which training begins from; empty for nothing.
+    #: In a fleet also ``'first'``, see :func:`~koopman_ros.retraining.fleet.retrain_fleet`.
+    sibling: str = ''
     device: str = 'cpu'  #: where residuals are evaluated, as torch names it
 
     @classmethod
     def from_json(cls, text: str) -> Task:
         """Read a task; unknown or missing fields are a TypeError."""
-        values = json.loads(text)
+        return cls.of(json.loads(text))
+
+    @classmethod
+    def of(cls, values: Mapping[str, Any]) -> Task:
+        """Return the task of its fields as JSON has them; as :meth:`from_json`."""
         states = tuple(RecordedState(**{**signal, 'place': Place(**signal['place'])})
                        for signal in values['states'])
         inputs = tuple(RecordedInput(**{

@@ -18,6 +18,7 @@ from koopman_ros.learning import compare, Comparison, Contender, Growth, Judge, 
 from koopman_ros.learning.comparison import usual_recipes
 from koopman_ros.learning.starts import Watch
 from koopman_ros.learning.validation import ROUNDING
+from koopman_ros.lifting import LiftedModel
 from koopman_ros.model_classes import BEST, IDENTITY_LIFT, LINEAR
 from koopman_ros.plant_data import Episode, Plant, Samples
 from koopman_ros.retraining.gate import HeldOut, Thresholds
@@ -156,7 +157,8 @@ def compare_classes(found: Identified, plant: Plant, thresholds: Thresholds, *,
                     model_class: str = BEST, n_z: int, seed: int, starts: int, loops: int = LOOPS,
                     watch: Watch | None = None,
                     judging: Callable[[str, float], bool] = lambda *_: False,
-                    device: str = 'cpu', backend: Backend | None = None) -> Comparison:
+                    device: str = 'cpu', backend: Backend | None = None,
+                    begin: LiftedModel | None = None) -> Comparison:
     """
     Learn models of an estimated drift as :func:`learning.compare` does, judged by the record.
 
@@ -169,7 +171,8 @@ def compare_classes(found: Identified, plant: Plant, thresholds: Thresholds, *,
         them and the rule.
     :param n_z: coordinates of the identity lift; other arguments as for :func:`learn_lift`.
     :param judging: called with the class whose law is being tried and the share that is done.
-    :param device: as for :func:`learning.train`, as `backend`, where closed loops run, too.
+    :param device: as for :func:`learning.train`, like `begin`, and `backend`, where closed loops
+        run, too.
     :raises NoUsefulLift: when there is no model of the class that was asked for, or of any.
     :raises ValueError: when the episodes hold no steady state, and for a class that there is not.
     :raises Stopped: when `judging` ended it.
@@ -197,4 +200,4 @@ def compare_classes(found: Identified, plant: Plant, thresholds: Thresholds, *,
     return compare(known, samples, {**usual_recipes(len(noise)), IDENTITY_LIFT: Growth(n_z)},
                    choose=model_class if alone else None, alone=alone, seed=seed, starts=starts,
                    watch=watch, judge=Judge(judged, max(chance, ROUNDING)), device=device,
-                   backend=backend)
+                   backend=backend, begin=begin)

@@ -5,10 +5,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
+import contextlib
 from dataclasses import dataclass
 from functools import partial, reduce
-from typing import Any, Protocol
+from typing import TypeAlias
 
 import numpy as np
 
@@ -21,6 +22,7 @@ from koopman_ros.bags import (
     summary,
 )
 from koopman_ros.bags.episodes import distinct
+from koopman_ros.jobs.backends import Backend, Found, Here, Tell
 from koopman_ros.plant_data import Episode
 from koopman_ros.retraining.selection import SEGMENT, Selection, Survey
 
@@ -28,15 +30,9 @@ from koopman_ros.retraining.selection import SEGMENT, Selection, Survey
 # these first.
 _LONGER = 4
 
+_Numbered: TypeAlias = tuple[int, str]  # a bag, with its number in the record
 # Called with the samples that were read; it may raise to end the reading.
 Tick = Callable[[int], None]
-
-
-class Each(Protocol):
-    """Calls a function for each of some bags, as `map` does, here or in other processes."""
-
-    def __call__(self, function: Callable[[Any], Any], bags: Iterable[Any], /) -> Iterable[Any]:
-        """Return the results in the order of the bags."""
 
 
 @dataclass(frozen=True)
@@ -85,7 +81,7 @@ class Record:
 
 
 def read_record(source: Source, most: int, seed: int, *, hidden: bool = False,
-                tick: Tick | None = None, each: Each = map) -> Record:
+                tick: Tick = lambda _: None, backend: Backend | None = None) -> Record:
     """
     Read the episodes of some bags: all of them, or what stands for them where they are many.
 
@@ -94,7 +90,8 @@ def read_record(source: Source, most: int, seed: int, *, hidden: bool = False,
     which loses nothing. The second one chooses segments, see :class:`Selection`.
 
     :param hidden: whether states are to be found that are not measured.
-    :param each: calls a function for each bag; other processes may do that.
+    :param tick: told of the samples of a long record as they are read.
+    :param backend: where long records are read, a bag a task; this process by default.
     :raises BagReadError: for bags that cannot be used.
     """
     if source.size() <= most:
@@ -102,26 +99,53 @@ def read_record(source: Source, most: int, seed: int, *, hidden: bool = False,
                                      tolerance_ns=source.tolerance_ns,
                                      least_jumps=source.least_jumps))
     account = Account()
-    bags = list(enumerate(distinct(source.bags, account)))
+    bags = {str(bag): (number, str(bag))
+            for number, bag in enumerate(distinct(source.bags, account))}
     n_x, n_u = len(source.states), len(source.inputs)
-    call: dict[str, Any] = {} if tick is None or each is not map else {'tick': tick}
+
+    def each(function: Callable[[_Numbered, Tick], Found]) -> Iterator[Found]:
+        done, under_way = 0, dict.fromkeys(bags.values(), 0)
+
+        def watch(name: str, read: int | None) -> bool:
+            nonlocal done
+            if read is not None:
+                under_way[bags[name]] = read
+            # a bag that is begun anew counts again from where it was
+            now = max(done, sum(under_way.values()))
+            tick(now - done)
+            done = now
+            return False
+
+        with contextlib.closing((backend or Here()).run(
+                _told, bags, shared=function, watch=watch)) as results:
+            for _, result in results:
+                yield result
+
     survey = Survey.empty(n_x, n_u)
-    for part, own in each(partial(_surveyed, source, **call), bags):
+    for part, own in each(partial(_surveyed, source)):
         survey = survey.merged(part)
         account.add(own)
     if not survey.count:
         return Record([], account)
     start = Selection(survey.lower, survey.upper, survey.group(most), most,
                       SEGMENT * (_LONGER if hidden else 1))
-    found = reduce(Selection.merged, each(partial(_selected, source, start, seed, **call), bags))
+    found = reduce(Selection.merged, each(partial(_selected, source, start, seed)))
     episodes = found.episodes()
     return Record(episodes, account, Reduction(
         survey.count, start.group, found.offered, len(episodes),
         start.group * sum(map(len, episodes))))
 
 
-def _untold(_: int) -> None:
-    """Tell nobody."""
+def _told(function: Callable[[_Numbered, Tick], Found], bag: _Numbered, tell: Tell) -> Found:
+    """Do what is to be done with a bag, wherever that is, and tell of the samples so far."""
+    read = 0
+
+    def tick(samples: int) -> None:
+        nonlocal read
+        read += samples
+        tell(read)
+
+    return function(bag, tick)
 
 
 def _streamed(source: Source, bag: str, account: Account, tick: Tick) -> Iterable[Episode]:
@@ -132,8 +156,7 @@ def _streamed(source: Source, bag: str, account: Account, tick: Tick) -> Iterabl
         yield episode
 
 
-def _surveyed(source: Source, numbered: tuple[int, str], tick: Tick = _untold
-              ) -> tuple[Survey, Account]:
+def _surveyed(source: Source, numbered: _Numbered, tick: Tick) -> tuple[Survey, Account]:
     """Look through one bag."""
     account, survey = Account(), Survey.empty(len(source.states), len(source.inputs))
     for episode in _streamed(source, numbered[1], account, tick):
@@ -141,8 +164,8 @@ def _surveyed(source: Source, numbered: tuple[int, str], tick: Tick = _untold
     return survey, account
 
 
-def _selected(source: Source, start: Selection, seed: int, numbered: tuple[int, str],
-              tick: Tick = _untold) -> Selection:
+def _selected(source: Source, start: Selection, seed: int, numbered: _Numbered,
+              tick: Tick) -> Selection:
     """Choose segments of one bag."""
     number, bag = numbered
     rng = np.random.default_rng([seed, number])

@@ -34,6 +34,18 @@ def write_report(retrained: Retrained) -> list[Path]:
     return [*written, *([picture] if drawn else [])]
 
 
+def reported(retrained: Retrained) -> tuple[dict[str, Any], tuple[str, ...]]:
+    """Write the report; return the summary, with a warning where that failed, and the files."""
+    warnings = list(retrained.decision.warnings) if retrained.decision else []
+    files: tuple[str, ...] = ()
+    try:
+        files = tuple(map(str, write_report(retrained)))
+    except OSError as error:
+        # the lift is written already
+        warnings.append(f'the report could not be written: {error}')
+    return {**retrained.summary(), 'warnings': warnings}, files
+
+
 def _sections(retrained: Retrained) -> Iterator[str]:
     found, decision, learned = retrained.found, retrained.decision, retrained.learned
     states, inputs = found.drift.box.states, found.drift.box.inputs

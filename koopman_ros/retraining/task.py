@@ -33,9 +33,9 @@ from koopman_ros.plant_data import Episode, Plant
 from koopman_ros.plants import plant_class
 from koopman_ros.resources import predecessor
 from koopman_ros.retraining.gate import decide, Decision, shortfalls, Thresholds
-from koopman_ros.retraining.known import known, Task
+from koopman_ros.retraining.known import FIRST, known, Task
 from koopman_ros.retraining.lift import compare_classes
-from koopman_ros.retraining.record import Each, read_record, Reduction, Source
+from koopman_ros.retraining.record import read_record, Reduction, Source
 from koopman_ros.retraining.selection import coverage
 from koopman_ros.units import NANOSECONDS, SECONDS_PER_TIME_UNIT
 
@@ -88,7 +88,7 @@ class Retrained:
         def of_class(one: Contender) -> dict[str, object]:
             said: dict[str, object] = {
                 'chosen': self.learned is not None and one is self.learned.chosen,
-                'refusal': one.refusal, 'seconds': one.seconds}
+                'refusal': one.refusal, 'seconds': one.seconds, 'steps': one.steps}
             if one.figures and one.law_check:
                 assert one.figures.rollout_rmse is not None
                 assert one.excess is not None
@@ -154,8 +154,7 @@ def _finite(value: float) -> float | None:
     return float(value) if np.isfinite(value) else None
 
 
-def retrain(task: Task, on_progress: OnProgress = lambda *_: False, *, each: Each = map
-            ) -> Retrained:
+def retrain(task: Task, on_progress: OnProgress = lambda *_: False) -> Retrained:
     """
     Read the bags, estimate the drift, learn a lift of it, judge it, and write it.
 
@@ -167,20 +166,20 @@ def retrain(task: Task, on_progress: OnProgress = lambda *_: False, *, each: Eac
     """
     checked_device(task.device)
     with backend_of(task.scheduler) as backend:
-        return retrain_by(backend, task, on_progress, each=each)
+        return retrain_by(backend, task, on_progress)
 
 
-def retrain_by(backend: Backend, task: Task, on_progress: OnProgress = lambda *_: False, *,
-               each: Each = map) -> Retrained:
+def retrain_by(backend: Backend, task: Task, on_progress: OnProgress = lambda *_: False
+               ) -> Retrained:
     """
     Read the bags, estimate the drift, learn a lift of it, judge it, and write it.
 
     An accepted lift goes to the output file, and what was there before is kept beside it as
-    ``.previous.safetensors``; a refused one goes to ``.refused.safetensors``.
+    ``.previous.safetensors``; a refused one goes to ``.refused.safetensors``. Where what a
+    sibling's lift has become would be refused, the lift is learned from nothing after all.
 
-    :param each: reads the bags of a long record, see :func:`read_record`.
     :raises BagReadError: for bags that cannot be used.
-    :raises ModelFileError: when the present lift cannot be read.
+    :raises ModelFileError: when the present lift, or that to begin from, cannot be read.
     :raises ValueError: for episodes that do not determine a model, or a task that does not fit.
     :raises Stopped: when `on_progress` asked for it; nothing is written then.
     """
@@ -190,7 +189,10 @@ def retrain_by(backend: Backend, task: Task, on_progress: OnProgress = lambda *_
                          f'{", ".join((*CLASSES, BEST))}')
     if Path(task.output).suffix != '.safetensors':
         raise ValueError(f'output = {task.output!r} must end in .safetensors')
-    current = load(task.model) if task.model else None
+    if task.sibling == FIRST:
+        raise ValueError(f'sibling = {FIRST!r} is the first of a fleet: retrain several plants in '
+                         'one call, or name a model file')
+    current, sibling = (load(path) if path else None for path in (task.model, task.sibling))
     plant, states, inputs = known(task, current)
     # a folder that cannot be written should fail now, not after the training
     Path(task.output).parent.mkdir(parents=True, exist_ok=True)
@@ -200,7 +202,7 @@ def retrain_by(backend: Backend, task: Task, on_progress: OnProgress = lambda *_
         least_jumps=None if current is None else (_LEAST_JUMP * current.states.scale).tolist())
     record = read_record(source, task.most_samples, task.seed,
                          hidden=bool(task.hidden_states or task.equations),
-                         tick=_reading(on_progress, source), each=each)
+                         tick=_reading(on_progress, source), backend=backend)
     account = record.account
     if not record.episodes:
         raise ValueError('the bags hold no usable segment of measurements: '
@@ -217,7 +219,7 @@ def retrain_by(backend: Backend, task: Task, on_progress: OnProgress = lambda *_
                               seed=task.seed, watch=estimating)
     elif task.hidden_states:
         found = identify_hidden(plant, episodes, task.hidden_states, seed=task.seed,
-                                watch=estimating)
+                                watch=estimating, backend=backend)
     else:
         found = identify(plant, episodes, seed=task.seed, watch=estimating, backend=backend)
     if found.hidden:
@@ -236,19 +238,29 @@ def retrain_by(backend: Backend, task: Task, on_progress: OnProgress = lambda *_
         plant = replace(current.plant, B=None)
     bare = Retrained(task, account, found, None, None, (), coverage(episodes, found.drift.box),
                      plant, current, reduction=record.reduction)
-    course = _Course(on_progress)
-    try:
-        learned = compare_classes(
-            found, plant, thresholds, model_class=task.model_class, n_z=task.coordinates,
-            seed=task.seed, starts=task.starts, watch=course.learning, judging=course.judging,
-            device=task.device, backend=backend)
-    except NoUsefulLift as error:
+    warnings: list[str] = []
+    for begin in (*[sibling] * (sibling is not None), None):
+        course = _Course(on_progress)
+        learned = decision = None
+        try:
+            learned = compare_classes(
+                found, plant, thresholds, model_class=task.model_class, n_z=task.coordinates,
+                seed=task.seed, starts=task.starts, watch=course.learning,
+                judging=course.judging, device=task.device, backend=backend, begin=begin)
+        except NoUsefulLift as error:
+            reasons: tuple[str, ...] = (str(error),)
         _stop_if(on_progress(_at('decide', _JUDGED), 'judging'))
-        return replace(bare, reasons=(str(error),))
-    _stop_if(on_progress(_at('decide', _JUDGED), 'judging'))
-    decision = decide(found, learned, current, thresholds)
+        if learned is not None:
+            decision = decide(found, learned, current, thresholds)
+            reasons = decision.reasons
+        if begin is None or not reasons:
+            break
+        warnings.append(f'it was learned from nothing, as what training made of {task.sibling} '
+                        f'would be refused: {"; ".join(reasons)}')
+    if learned is None or decision is None:
+        return replace(bare, reasons=reasons)
     decision = replace(decision, warnings=(
-        *decision.warnings, *shortfalls(learned.model.states, task.setpoints),
+        *decision.warnings, *warnings, *shortfalls(learned.model.states, task.setpoints),
         *(f'{one.name} = {one}' for one in found.constants if one.standing.value),
         *[f'it is not compared with the present lift {task.model}, which has other states'
           ] * bool(task.model and current is None)))

@@ -23,26 +23,30 @@ from koopman_ros.startup import end_by_force, handle_signals
 
 PROFILES = ('FASTDDS_DEFAULT_PROFILES_FILE', 'FASTRTPS_DEFAULT_PROFILES_FILE')
 _LOOPS = '--loops'
+# (arguments, file of loops, signals as they come) to the exit code
+Loops = Callable[[list[str] | None, str, list[int]], int]
 LONGEST_WAIT = 0.1  # s from a signal to the end
 TAKE_DOWN_PATIENCE = 5.0  # s; taking down a participant needs some ten milliseconds
 
 
 def run(name: str, create: Callable[..., LoopNode], args: list[str] | None = None,
-        hosts: bool = False) -> int:
+        hosts: bool | Loops = False) -> int:
     """
     Run a node until SIGINT, SIGTERM or SIGHUP, which end it between two callbacks, or by force.
 
     :param hosts: whether ``--loops`` makes it a process of many such nodes; see
-        :func:`koopman_ros.ros.host.run_loops`.
+        :func:`koopman_ros.ros.host.run_loops`; or what is done with that file instead.
     :return: exit code, 0 after a signal and for `--help`, 1 when the node could not start, 2 for
         an unknown argument, or the node's own.
     """
     # a list, because a second signal may come while the first is handled, where a lock would hang
     arrived: list[int] = []
     handle_signals(lambda number, _: arrived.append(number))
-    if (said := answer(name, args, hosts)) is not None:
+    if (said := answer(name, args, bool(hosts))) is not None:
         return said
     if hosts and (file := _loops_file(args)) is not None:
+        if callable(hosts):
+            return hosts(args, file, arrived)
         # most processes have one node
         from koopman_ros.ros.host import run_loops
 

@@ -51,6 +51,9 @@ def tables(system: str = DEFAULT_SYSTEM) -> dict[str, ParameterTable[Any]]:
             'panel': panel.panel_table(None, given)}
 
 
+_HOSTS = 'it runs such a node in each'
+
+
 @dataclass(frozen=True)
 class Program:
     """What a program does, and on the network by names as in the node."""
@@ -61,7 +64,7 @@ class Program:
     subscribes: tuple[str, ...] = ()  #: topics; /clock where it follows simulated time
     serves: tuple[str, ...] = ()  #: services
     calls: tuple[str, ...] = ()  #: services of others
-    hosts: bool = False  #: whether ``--loops`` makes it a process of many such nodes
+    many: str = ''  #: what it does with ``--loops``, a file of namespaces
 
 
 def programs(system: str = DEFAULT_SYSTEM) -> dict[str, Program]:
@@ -86,7 +89,7 @@ def programs(system: str = DEFAULT_SYSTEM) -> dict[str, Program]:
             publishes=(*topics_of('measured', 'applied'), *unmeasured, topics.CLOCK,
                        topics.DIAGNOSTICS, _TRANSITIONS, *STANDARD_TOPICS),
             subscribes=topics_of('commands'),
-            serves=('~/reset', *lifecycle, *STANDARD_SERVICES), hosts=True),
+            serves=('~/reset', *lifecycle, *STANDARD_SERVICES), many=_HOSTS),
         'controller': Program(
             'Answers each measurement with a command, by a learned model.',
             publishes=(*topics_of('commands', 'active_setpoints', 'predicted'),
@@ -95,16 +98,17 @@ def programs(system: str = DEFAULT_SYSTEM) -> dict[str, Program]:
                        _TRANSITIONS, *STANDARD_TOPICS),
             subscribes=(*topics_of('measured', 'applied', 'setpoints', 'manual'), topics.CLOCK),
             serves=('~/set_automatic', '~/reload_model', *lifecycle, *STANDARD_SERVICES),
-            hosts=True),
+            many=_HOSTS),
         'trainer': Program(
             'Records the loop to MCAP bags, excites the plant, and learns models from bags.',
-            f'{Program.codes}; with task:=train 0 for an accepted model, 2 for a refused one, 1 '
-            'for a failure',
+            f'{Program.codes}; with task:=train or --loops 0 for an accepted model, 2 for a '
+            'refused one, 1 for a failure, of many the worst',
             publishes=(*topics_of('commands', 'manual', 'setpoints'), topics.DIAGNOSTICS,
                        _TRANSITIONS, *STANDARD_TOPICS),
             subscribes=(*dict.fromkeys((*wiring.topics, *recorded)), topics.CLOCK),
             serves=('~/record', '~/experiment', '~/train', '~/cancel_training', *lifecycle,
-                    *STANDARD_SERVICES)),
+                    *STANDARD_SERVICES),
+            many='it trains the plant of each from its bags, and ends'),
         'player': Program(
             'Publishes the measurements and set-points of a bag again, by the clock or in '
             'lock-step.',
@@ -195,10 +199,10 @@ def help_text(name: str) -> str:
             ('serves', program.serves))
         if (own := [item for item in names if item not in STANDARD_TOPICS + STANDARD_SERVICES]))
     file = config_directory() / f'{name}.yaml'
-    called = f'{name} [--loops file]' if program.hosts else name
-    many = ('\nWith --loops, a file of namespaces, one a line, it runs such a node in each. '
-            f'Parameters are\ngiven by the full name of a node, e.g. /line_1/reactor_3/{name}.\n'
-            ) if program.hosts else ''
+    called = f'{name} [--loops file]' if program.many else name
+    many = (f'\nWith --loops, a file of namespaces, one a line, {program.many}. Parameters are\n'
+            f'given by the full name of a node, e.g. /line_1/reactor_3/{name}.\n'
+            ) if program.many else ''
     return f"""\
 usage: ros2 run koopman_ros {called} [--ros-args [-p name:=value ...] [--params-file file] ...]
 

@@ -3,7 +3,7 @@
 
 """Training as the trainer offers it: on request, or as the one task of the process."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import asdict
 import os
 import sys
@@ -14,16 +14,53 @@ import numpy as np
 from std_srvs.srv import Trigger
 
 from koopman_ros.jobs.training import class_lines, constant_lines, JobState, RetrainingJob, scalars
-from koopman_ros.parameters.trainer import TrainerParameters
-from koopman_ros.parameters.wire import Wiring
+from koopman_ros.lifting import LiftedModel, load
+from koopman_ros.parameters.trainer import FIRST, TrainerParameters
+from koopman_ros.parameters.wire import preset, system_of, Wiring
 from koopman_ros.resources import model_path
 from koopman_ros.ros.managed import ManagedNode
-from koopman_ros.ros.node import Level, Owned, Status
+from koopman_ros.ros.node import Level, LoopNode, Owned, Status
 from koopman_ros.wire import Place
 
 _POLL_PERIOD = 0.1  # s
 _LINE_PERIOD = 5.0  # s between plain lines of progress
 _BAR_WIDTH = 30
+
+
+def present_lift(given: Mapping[str, Any]) -> LiftedModel | None:
+    """Return the lift in use by parameters that were given, None where there is none yet."""
+    own = preset(system_of(given), 'trainer')
+    name = str(given.get('model', own.get('model', '')))
+    return load(model_path(name)) if name else None
+
+
+def task_fields(node: LoopNode, settings: TrainerParameters, wiring: Wiring,
+                bags: Iterable[str]) -> dict[str, Any]:
+    """Return the fields of a :class:`koopman_ros.retraining.Task` of a trainer's parameters."""
+    def found(place: Place) -> dict[str, str]:
+        return {**asdict(place), 'topic': node.resolve_topic_name(place.topic)}
+
+    def file(model: str) -> str:
+        return os.path.abspath(model_path(model)) if model else ''
+
+    states, inputs = wiring.signals.states, wiring.signals.inputs
+    gains = np.reshape(settings.input_matrix, (-1, len(inputs))).tolist() if (
+        settings.input_matrix != (0.0,)) else []
+    return {
+        'bags': [os.path.abspath(bag) for bag in bags],
+        'output': os.path.abspath(settings.model_output),
+        'model': file(settings.model), 'plant': settings.system,
+        'sibling': FIRST if settings.sibling == FIRST else file(settings.sibling),
+        'states': [{'name': name, 'unit': unit, 'place': found(wiring.measured[name])}
+                   for name, unit in states.items()],
+        'inputs': [{'name': name, 'unit': unit, 'command': found(wiring.commands[name]),
+                    'measured': found(wiring.applied[name]),
+                    'delay': settings.inputs[name].delay} for name, unit in inputs.items()],
+        'setpoints': settings.setpoint_ranges(wiring.signals),
+        'tolerance': settings.synchronisation_tolerance,
+        'input_gain': {state: dict(zip(inputs, row, strict=True))
+                       for state, row in zip(states, gains, strict=False)},
+        **settings.training()}
 
 
 class Training:
@@ -51,39 +88,13 @@ class Training:
                 if bag]
         if not bags:
             raise ValueError('there is no bag to train from: record one, or name it in bags')
-        self._job = RetrainingJob({
-            'bags': [os.path.abspath(bag) for bag in bags],
-            'output': os.path.abspath(settings.model_output),
-            'model': os.path.abspath(model_path(settings.model)) if settings.model else '',
-            'plant': settings.system,
-            **self._signals(), **settings.training()})
+        self._job = RetrainingJob(task_fields(self._node, settings, self._wiring, bags))
         self._state = self._job.state
         self._last_line = time.monotonic()
         self._timer.reset()
         said = f'training from {", ".join(bags)}'
         self._node.get_logger().info(said)
         return said
-
-    def _signals(self) -> dict[str, Any]:
-        """Return where the signals are in the bags."""
-        wiring, settings = self._wiring, self.settings
-
-        def found(place: Place) -> dict[str, str]:
-            return {**asdict(place), 'topic': self._node.resolve_topic_name(place.topic)}
-
-        states, inputs = wiring.signals.states, wiring.signals.inputs
-        gains = np.reshape(settings.input_matrix, (-1, len(inputs))).tolist() if (
-            settings.input_matrix != (0.0,)) else []
-        return {
-            'states': [{'name': name, 'unit': unit, 'place': found(wiring.measured[name])}
-                       for name, unit in states.items()],
-            'inputs': [{'name': name, 'unit': unit, 'command': found(wiring.commands[name]),
-                        'measured': found(wiring.applied[name]),
-                        'delay': settings.inputs[name].delay} for name, unit in inputs.items()],
-            'setpoints': settings.setpoint_ranges(wiring.signals),
-            'tolerance': settings.synchronisation_tolerance,
-            'input_gain': {state: dict(zip(inputs, row, strict=True))
-                           for state, row in zip(states, gains, strict=False)}}
 
     def complete(self) -> None:
         """End a training that is under way; nothing is written then."""

@@ -147,6 +147,40 @@ def test_a_process_that_is_killed_is_replaced(places, tmp_path):
         assert kept.run(lambda n, _: dies_once(tmp_path, n, None), None) == [0, 1]
 
 
+def test_a_process_that_is_stopped_is_replaced(tmp_path):
+    def freezes_once(folder, n, _):
+        if not (folder / 'frozen').exists():
+            (folder / 'frozen').touch()
+            os.kill(os.getpid(), signal.SIGSTOP)
+        return n
+
+    with Processes(1, silence=0.2) as own:
+        assert list(own.run(freezes_once, {'a': 1, 'b': 2}, shared=tmp_path)) == [
+            ('a', 1), ('b', 2)]
+        (tmp_path / 'frozen').unlink()
+        with contextlib.closing(own.keep(lambda n: n, {'a': 1, 'b': 2})) as kept:
+            assert kept.run(lambda n, _: freezes_once(tmp_path, n, None), None) == [1, 2]
+
+
+def test_a_task_that_fails_leaves_the_others_alone(place):
+    def work(_, n, __):
+        return 6 // n
+
+    found = dict(place.run(work, {'a': 1, 'zero': 0, 'b': 2}, apart=True))
+    assert (found['a'], found['b']) == (6, 3)
+    assert isinstance(found['zero'], ZeroDivisionError)
+    assert found['zero'].__notes__ == ['in zero']
+
+
+def test_a_task_that_kills_its_processes_leaves_the_others_alone(places):
+    def work(_, n, __):
+        return n or os.kill(os.getpid(), signal.SIGKILL)
+
+    found = dict(places['process'].run(work, {'a': 1, 'deadly': 0, 'b': 2}, apart=True))
+    assert (found['a'], found['b']) == (1, 2)
+    assert isinstance(found['deadly'], WorkerLost)
+
+
 def test_a_task_that_kills_its_processes_is_given_up(places):
     with pytest.raises(WorkerLost, match='deadly: 3 workers that ran it were killed'):
         list(places['process'].run(lambda *_: os.kill(os.getpid(), signal.SIGKILL),

@@ -8,14 +8,21 @@ from dataclasses import replace
 from functools import partial
 import json
 from pathlib import Path
+import pickle
 
 import numpy as np
 import pytest
 
+from koopman_ros.bags import loop_episodes
 from koopman_ros.identification import Stopped
+from koopman_ros.identification.regression import weak_form
+from koopman_ros.jobs.backends import backend_of, Here
+from koopman_ros.plant_data import cut
 from koopman_ros.retraining import compare_classes, decide, retrain, Task, write_report
 from koopman_ros.retraining import task as task_module
+from koopman_ros.retraining.known import known
 from koopman_ros.retraining.record import read_record, Source
+from koopman_ros.retraining.shards import identify_bags
 from support.known_plants import methods
 from validation.benchmarks.retraining import Case, cases, drift_error, task_of, write_bags
 
@@ -75,12 +82,11 @@ def source(bags: list[Path]) -> Source:
 
 
 def test_the_same_is_read_whoever_reads(bags: list[Path]) -> None:
-    def backwards(function, items):
-        items = list(items)
-        return reversed([function(one) for one in reversed(items)])
-
-    few = source(bags[:4])
-    one, other = (read_record(few, 3000, 7, each=each) for each in (map, backwards))
+    few, told = source(bags[:4]), []
+    one = read_record(few, 3000, 7)
+    with backend_of('process') as elsewhere:
+        other = read_record(few, 3000, 7, tick=told.append, backend=elsewhere)
+    assert min(told) == 0
     assert one.reduction == other.reduction
     assert one.account == other.account
     for a, b in zip(one.episodes, other.episodes, strict=True):
@@ -106,3 +112,39 @@ def test_reading_can_be_stopped(bags: list[Path], tmp_path: Path) -> None:
                 lambda share, _: told.append(share) or len(told) == 4)
     assert 0.0 < told[-1] < 0.05
     assert list(tmp_path.iterdir()) == []
+
+
+def test_a_drift_of_bags_that_stay_with_their_workers(bags: list[Path]) -> None:
+    """Fitted to triangles of each bag as to all equations, and no samples come back."""
+    few = source(bags[:3])
+    plant = known(task_of(CASE, bags, Path('none.safetensors')), None)[0]
+    sizes: list[int] = []
+
+    class Weighed(Here):
+        def keep(self, load, items):
+            kept = super().keep(load, items)
+            original = kept.run
+
+            def run(function, argument):
+                found = original(function, argument)
+                sizes.append(max(len(pickle.dumps(one)) for one in found))
+                return found
+
+            kept.run = run
+            return kept
+
+    here = identify_bags(plant, few, Weighed(), degrees=(1, 2, 3))
+    with backend_of('process') as elsewhere:
+        there = identify_bags(plant, few, elsewhere, degrees=(1, 2, 3))
+    assert there.drift.coefficients.tobytes() == here.drift.coefficients.tobytes()
+    assert there.drift.B.tobytes() == here.drift.B.tobytes()
+    assert here.samples == 3 * 10_000
+    assert [shard.name for shard in here.shards] == list(map(str, bags[:3]))
+    assert max(sizes) < 2000
+    episodes = cut(loop_episodes(few.bags, few.states, few.inputs)[0], 240)
+    whole = weak_form(episodes, here.drift.box, here.drift.degree, None, 40)
+    assert here.drift.coefficients == pytest.approx(whole.coefficients, rel=1e-8)
+    assert pytest.approx(whole.B, rel=1e-8) == here.drift.B
+    assert max(drift_error(CASE, here.drift)) < 0.05
+    part = here.shards[0].read(*here.shards[0].arguments)
+    assert part.dxdt == pytest.approx(here.drift.rate(part.x, part.u))

@@ -10,12 +10,21 @@ from pathlib import Path
 import sys
 
 from koopman_ros.reports import machine, write_figures
-from validation.benchmarks import cluster, loop, panel, recording, retraining, site, training
+from validation.benchmarks import (
+    cluster,
+    fleet,
+    loop,
+    panel,
+    recording,
+    retraining,
+    site,
+    training,
+)
 
 # A part has its PLANS by extent, the PACKAGES whose versions matter, and `measure`, which fills
 # in the figures of one plan and yields them piece by piece as text.
 PARTS = {'training': training, 'retraining': retraining, 'recording': recording, 'loop': loop,
-         'panel': panel, 'site': site, 'cluster': cluster}
+         'panel': panel, 'site': site, 'cluster': cluster, 'fleet': fleet}
 
 
 def main(args: list[str] | None = None) -> int:

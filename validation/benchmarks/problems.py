@@ -76,7 +76,7 @@ def build(system: str, samples: int, hidden: int) -> Case:
     *before, _ = range(plant.n_x + 1, N_Z + 1)
     growth = Growth(N_Z, hidden_first=hidden - _HIDDEN_MORE * len(before),
                     hidden_more=_HIDDEN_MORE, whitening=WHITENING)
-    parent = growth._root(data)
+    parent = growth.root(data)
     for n_z in before:
         parent = growth.start(data, n_z, parent, _SEED)
     layout, theta = growth._extended(data, N_Z, parent, _SEED)

@@ -3,10 +3,9 @@
 
 """What retraining from long records costs: processor time and memory by their samples."""
 
-from collections.abc import Callable, Iterable, Iterator, Sequence
-from concurrent.futures import ProcessPoolExecutor
+from collections.abc import Iterator, Sequence
 from dataclasses import asdict, dataclass, replace
-from functools import partial
+import os
 from pathlib import Path
 import sys
 import tempfile
@@ -18,10 +17,12 @@ import numpy as np
 
 from koopman_ros.bags import RecordedInput, RecordedState
 from koopman_ros.identification import Drift
+from koopman_ros.jobs.backends import backend_of
 from koopman_ros.plants.library.reactor import OneStateReactor
 from koopman_ros.plants.library.two_tanks import TwoTanks
 from koopman_ros.reports import drawing, legend, table
-from koopman_ros.retraining import retrain, Task
+from koopman_ros.retraining import Task
+from koopman_ros.retraining.task import retrain_by
 from koopman_ros.units import SECONDS_PER_TIME_UNIT
 from koopman_ros.wire import Place
 from validation.benchmarks import process
@@ -170,17 +171,14 @@ def _retrain(tell: process.Tell, name: str, bags: Sequence[Path], output: Path, 
         return False
 
     task = task_of(case, bags, output)
-    if workers > 1:
-        def each(function: Callable[[Any], Any], bags: Iterable[Any]) -> Iterator[Any]:
-            nonlocal by_workers, of_workers
-            for result, seconds, peak in pool.map(partial(_watched, function), bags, chunksize=8):
-                by_workers, of_workers = by_workers + seconds, max(of_workers, peak)
-                yield result
-
-        with ProcessPoolExecutor(workers) as pool:
-            found = retrain(task, on_progress, each=each)
-    else:
-        found = retrain(task, on_progress)
+    with backend_of(f'joblib:{workers}' if workers > 1 else '') as backend:
+        found = retrain_by(backend, task, on_progress)
+        if workers > 1:
+            # each of them has ended what it does, and tells of itself
+            used = {pid: figures for _, figures in backend.run(
+                _used, {str(number): None for number in range(workers)}) for pid in [figures[0]]}
+            by_workers = sum(seconds for _, seconds, _ in used.values())
+            of_workers = max(peak for *_, peak in used.values())
     spent[stage] = spent.get(stage, 0.0) + time.process_time() - since
     reduction = found.reduction
     tell({'figures': {
@@ -201,11 +199,11 @@ def _peak() -> float:
     return int(status.partition('VmHWM:')[2].split()[0]) * 1024 / 1e6
 
 
-def _watched(function: Callable[[Any], Any], item: Any) -> tuple[Any, float, float]:
-    """Return what a function returns, its processor time, and the most memory until its end."""
-    begun = time.process_time()
-    found = function(item)
-    return found, time.process_time() - begun, _peak()
+def _used(*_: object) -> tuple[int, float, float]:
+    """Return the number of a worker, its processor time, and the most memory it has had."""
+    # the other one is to be asked, too
+    time.sleep(0.2)
+    return os.getpid(), time.process_time(), _peak()
 
 
 def _remove(bags: Sequence[Path]) -> None:

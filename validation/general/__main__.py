@@ -4,7 +4,6 @@
 """Run the study (needs the `train`, `demo` and `bench` requirements): report and figure."""
 
 import argparse
-from pathlib import Path
 import signal
 import sys
 import time
@@ -13,7 +12,8 @@ from typing import Any
 from validation.general import coordinates
 from validation.general.report import write_report
 from validation.general.study import EXPERIMENTS
-from validation.paper.campaign import add_scheduler, conclude, run_campaign
+from validation.options import add_output, add_plants, add_scheduler, add_seeds, read
+from validation.paper.campaign import conclude, run_campaign
 
 
 def main(args: list[str] | None = None) -> int:
@@ -22,19 +22,11 @@ def main(args: list[str] | None = None) -> int:
         prog='python -m validation.general',
         description='Hold the law on models of several classes to plants that it was not made '
         'for.')
-    parser.add_argument('plants', nargs='*', metavar='plant', help='which: '
-                        f'{", ".join(EXPERIMENTS)} (default: all)')
-    parser.add_argument('--seeds', type=int, default=10, help='number of seeds, at least 1 '
-                        '(default: %(default)s)')
-    parser.add_argument('--output', type=Path, default=Path('out/studies-general'),
-                        help='folder for figure and report (default: %(default)s)')
+    add_plants(parser, EXPERIMENTS)
+    add_seeds(parser)
+    add_output(parser, 'out/studies-general')
     add_scheduler(parser)
-    options = parser.parse_args(args)
-    if options.seeds < 1:
-        parser.error(f'--seeds is {options.seeds}, must be at least 1')
-    if unknown := set(options.plants) - EXPERIMENTS.keys():
-        parser.error(f'there is no plant {", ".join(sorted(unknown))}: choose of '
-                     f'{", ".join(EXPERIMENTS)}')
+    options = read(parser, args, EXPERIMENTS)
     # a request to end is an interrupt: what is done is reported
     signal.signal(signal.SIGTERM, signal.default_int_handler)
     start = time.monotonic()

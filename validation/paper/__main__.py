@@ -14,8 +14,8 @@ import sys
 import time
 from typing import Any
 
+from validation.options import add_scheduler, add_seeds, read
 from validation.paper.campaign import (
-    add_scheduler,
     conclude,
     run_campaign,
     SENSOR_EXPERIMENTS,
@@ -30,18 +30,15 @@ def main(args: list[str] | None = None) -> int:
         prog='python -m validation.paper',
         description="Reproduce the paper's experiments, or learn from sensor data, each from "
         'several seeds.')
-    parser.add_argument('--seeds', type=int, default=20, help='number of seeds, at least 1 '
-                        '(default: %(default)s)')
+    add_seeds(parser, 20)
     parser.add_argument('--sensors', action='store_true', help='learn from noisy, sampled data '
                         "instead of the paper's experiments")
     parser.add_argument('--output', type=Path, help='folder for figures and report (default: '
                         'out/studies, or out/studies-sensors)')
     add_scheduler(parser)
-    options = parser.parse_args(args)
+    options = read(parser, args)
     options.output = options.output or Path(
         'out/studies-sensors' if options.sensors else 'out/studies')
-    if options.seeds < 1:
-        parser.error(f'--seeds is {options.seeds}, must be at least 1')
     # a request to end is an interrupt: what is done is reported
     signal.signal(signal.SIGTERM, signal.default_int_handler)
     start = time.monotonic()

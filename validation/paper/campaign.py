@@ -3,7 +3,6 @@
 
 """All experiments over a number of seeds, side by side on the cores of the machine."""
 
-import argparse
 from collections.abc import Callable, Iterator, Mapping
 import contextlib
 from dataclasses import dataclass, field
@@ -77,14 +76,6 @@ class Campaign:
                     place = place.setdefault(part, {})
                 place[last] = [flat[seed].get(name) for seed in seeds]
         return nested
-
-
-def add_scheduler(parser: argparse.ArgumentParser) -> None:
-    """Add the option that says where runs go."""
-    parser.add_argument(
-        '--scheduler', default='joblib', metavar='PLACE', help='where the runs go: joblib for a '
-        'process on each core, joblib:N for N of them, tcp://... for the workers of a Dask '
-        'scheduler, an empty text for this process (default: %(default)s)')
 
 
 def run_campaign(seeds: int, experiments: Mapping[str, Experiment] | None = None,

@@ -5,10 +5,10 @@
 
 import argparse
 from collections.abc import Callable
-from pathlib import Path
 import sys
 
 from koopman_ros.reports import machine, write_figures, write_page
+from validation.options import add_output, add_plants, add_seeds, read
 from validation.partly_measured.cases import CASES
 from validation.partly_measured.contenders import Contender, LINEAR, OWN
 from validation.partly_measured.dompc import WithFilter, WithWindow
@@ -25,18 +25,10 @@ def main(args: list[str] | None = None) -> int:
     parser = argparse.ArgumentParser(
         prog='python -m validation.partly_measured',
         description='Control plants that are measured in part, beside do-mpc and an LQG.')
-    parser.add_argument('plants', nargs='*', metavar='plant',
-                        help=f'which: {", ".join(CASES)} (default: all)')
-    parser.add_argument('--seeds', type=int, default=10, help='number of seeds of the noise, at '
-                        'least 1 (default: %(default)s)')
-    parser.add_argument('--output', type=Path, default=Path('out/studies-partial'),
-                        help='folder for figures and picture (default: %(default)s)')
-    options = parser.parse_args(args)
-    if options.seeds < 1:
-        parser.error(f'--seeds is {options.seeds}, must be at least 1')
-    if unknown := set(options.plants) - CASES.keys():
-        parser.error(f'there is no plant {", ".join(sorted(unknown))}: choose of '
-                     f'{", ".join(CASES)}')
+    add_plants(parser, CASES)
+    add_seeds(parser)
+    add_output(parser, 'out/studies-partial')
+    options = read(parser, args, CASES)
     found = {}
     for plant in options.plants or CASES:
         case = CASES[plant]

@@ -9,7 +9,9 @@ import sys
 import time
 
 from koopman_ros import __version__
+from koopman_ros.jobs.backends import backend_of
 from koopman_ros.reports import write_figures
+from validation.options import add_output, add_scheduler, read
 from validation.robustness.report import write_report
 from validation.robustness.study import study
 
@@ -20,11 +22,13 @@ def main(args: list[str] | None = None) -> int:
         prog='python -m validation.robustness',
         description='Compute margins, region of attraction, disturbances, noise and the guard '
         'against narrow data.')
-    parser.add_argument('--output', type=Path, default=Path('out/studies-robustness'),
-                        help='folder for figures and report (default: %(default)s)')
-    output = parser.parse_args(args).output
+    add_output(parser, 'out/studies-robustness')
+    add_scheduler(parser, '')
+    options = read(parser, args)
+    output: Path = options.output
     start = time.monotonic()
-    found = study(lambda line: print(line, file=sys.stderr, flush=True))
+    with backend_of(options.scheduler) as backend:
+        found = study(lambda line: print(line, file=sys.stderr, flush=True), backend)
     seconds = round(time.monotonic() - start, 1)
     summary = {'package_version': __version__, 'wall_seconds': seconds, **found.figures}
     write_figures(output / 'summary.json', summary)

@@ -209,14 +209,19 @@ def hottest_saved(coolant: float) -> float:
     return float(state[0])
 
 
-def two_state_grid() -> dict[tuple[float, float], End]:
-    """Return the ends on the two-state reactor, by starting temperature and concentration."""
+def two_state_starts() -> list[tuple[float, float]]:
+    """Return temperatures in K and concentrations in mol/L to start the two-state reactor at."""
+    usual = float(two_state_reactor().nominal_state[0])
+    return [(T, concentration)
+            for T in (300.0, 310.0, 320.0, 330.0, 340.0, 350.0, 360.0, 380.0, 400.0)
+            for concentration in (0.6, 0.75, usual, 0.95)]
+
+
+def two_state_end(start: tuple[float, float]) -> End:
+    """Return the end on the two-state reactor from one of them."""
     system = two_state_reactor()
-    usual, rest = map(float, system.nominal_state)
-    return {(T, concentration): end_of(
-        T, round(rest, 3), fallback=True, system=system, concentration=concentration)
-        for T in (300.0, 310.0, 320.0, 330.0, 340.0, 350.0, 360.0, 380.0, 400.0)
-        for concentration in (0.6, 0.75, usual, 0.95)}
+    return end_of(start[0], round(float(system.nominal_state[1]), 3), fallback=True,
+                  system=system, concentration=start[1])
 
 
 def back_from_safe(system: ControlAffineSystem, linear_margin: float) -> Metrics:

@@ -3,17 +3,24 @@
 
 """The study of robustness: everything that is computed for it, by name."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from itertools import product
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 
 from koopman_ros.control import Simulation
+from koopman_ros.jobs.backends import Backend
+from koopman_ros.plants import ControlAffineSystem
+from validation.options import over
+from validation.paper.datasets import Metrics
 from validation.robustness import disturbances, narrow, stability
 from validation.robustness.loop import REACTOR, reactor_controller, START
 from validation.robustness.stability import End, grows, Margins, margins_at
+
+Key = TypeVar('Key')
+Result = TypeVar('Result')
 
 BANDWIDTHS = (0.0, 2.0, 4.0, 6.0, 10.0)  # 1/min
 COOLANT_WEIGHTS = (1.0, 0.1)  # 1/K^2
@@ -39,45 +46,42 @@ class Found:
     two_state: dict[tuple[str, str], Simulation]  #: courses of the two-state example
 
 
-def study(tell: Callable[[str], None]) -> Found:
+def study(tell: Callable[[str], None], backend: Backend | None = None) -> Found:
     """Compute everything in some minutes; `tell` takes a line of progress."""
-    tell('margins')
-    margins = {(weight, bandwidth, kelvin): margins_at(
-        reactor_controller(bandwidth=bandwidth, coolant_weight=weight), kelvin)
-        for weight, bandwidth, kelvin in product(COOLANT_WEIGHTS, BANDWIDTHS, TEMPERATURES)}
-    tell('margins in simulation')
-    controller = reactor_controller()
-    at = margins_at(controller, START)
+    def spread(function: Callable[[Key], Result], keys: Iterable[Key], line: str
+               ) -> dict[Key, Result]:
+        tell(line)
+        return over(backend, function, keys)
+
+    margins = spread(_margins, product(COOLANT_WEIGHTS, BANDWIDTHS, TEMPERATURES), 'margins')
+    at = margins_at(reactor_controller(), START)
     near = {'grows_below': 1.0 - _NEAR, 'grows_above': 1.0 + _NEAR}
+    grown = spread(_grows, [(share * factor, share * delay) for factor, delay in (
+        (at.gain, 0.0), (0.0, at.delay)) for share in near.values()], 'margins in simulation')
     verified = {
-        f'gain times {at.gain:.0f}': {name: grows(
-            controller, START, factor=share * at.gain, seconds=600.0)
-            for name, share in near.items()},
-        f'{at.delay:.1f} s of delay': {name: grows(controller, START, delay=share * at.delay)
-                                       for name, share in near.items()}}
-    tell('disturbances')
-    cases = {case.name: disturbances.judge(case) for case in disturbances.cases()}
-    tell('noise')
-    noise = {bandwidth: disturbances.noise_against_speed(bandwidth)
-             for bandwidth in disturbances.BANDWIDTHS}
-    tell('region of attraction')
+        f'gain times {at.gain:.0f}': {
+            name: grown[share * at.gain, 0.0] for name, share in near.items()},
+        f'{at.delay:.1f} s of delay': {
+            name: grown[0.0, share * at.delay] for name, share in near.items()}}
+    cases = spread(_disturbed, [case.name for case in disturbances.cases()], 'disturbances')
+    noise = spread(disturbances.noise_against_speed, disturbances.BANDWIDTHS, 'noise')
+    ends = spread(_end, product((True, False), stability.SETPOINTS, stability.STARTS),
+                  'region of attraction')
     grids = {fallback: {
-        (start, setpoint): stability.end_of(start, setpoint, fallback=fallback)
+        (start, setpoint): ends[fallback, setpoint, start]
         for setpoint, start in product(stability.SETPOINTS, stability.STARTS)}
         for fallback in (True, False)}
-    two_state_grid = stability.two_state_grid()
-    tell('hottest starts')
-    boundaries = {coolant: {
-        'physics_kelvin': stability.hottest_saved(coolant),
-        'ladder_kelvin': stability.hottest_start(coolant, fallback=True),
-        'no_ladder_kelvin': stability.hottest_start(coolant, fallback=False)}
-        for coolant in stability.COOLANTS}
-    tell('back from the safe coolant')
-    reactors = {'unchanged': REACTOR, **disturbances.CHANGED}
-    returns = {f'{name}/linear_margin={margin:g}': stability.back_from_safe(system, margin)
-               for (name, system), margin in product(reactors.items(), narrow.LINEAR_MARGINS)}
-    tell('lifts of narrow data')
-    reactor, two_state = narrow.reactor_courses(), narrow.two_state_courses()
+    two_state_grid = spread(stability.two_state_end, stability.two_state_starts(),
+                            'region of attraction of the two-state reactor')
+    boundaries = spread(_boundary, stability.COOLANTS, 'hottest starts')
+    found_back = spread(_back, product(_reactors(), narrow.LINEAR_MARGINS),
+                        'back from the safe coolant')
+    returns = {f'{name}/linear_margin={margin:g}': found
+               for (name, margin), found in found_back.items()}
+    courses = spread(_narrow, ('reactor', 'two_state'), 'lifts of narrow data')
+    reactor, two_state = courses['reactor'], courses['two_state']
+    far = spread(_far, product(narrow.LINEAR_MARGINS, narrow.MARGIN_BANDWIDTHS),
+                 'far from the model')
     figures = {
         'margins': {
             f'coolant_weight={weight:g}/bandwidth={bandwidth:g}/{kelvin:g}K': {
@@ -99,9 +103,53 @@ def study(tell: Callable[[str], None]) -> Found:
             'reactor': {'/'.join(key): narrow.judge_reactor(course)
                         for key, course in reactor.items()},
             'heat_transfer_-40%': {
-                f'linear_margin={margin:g}/bandwidth={bandwidth:g}':
-                narrow.far_from_the_model(margin, bandwidth) for margin, bandwidth in product(
-                    narrow.LINEAR_MARGINS, narrow.MARGIN_BANDWIDTHS)},
+                f'linear_margin={margin:g}/bandwidth={bandwidth:g}': judged
+                for (margin, bandwidth), judged in far.items()},
             'two_state': {'/'.join(key): narrow.judge_two_state(course)
                           for key, course in two_state.items()}}}
     return Found(figures, margins, noise, grids, two_state_grid, boundaries, reactor, two_state)
+
+
+def _margins(key: tuple[float, float, float]) -> Margins:
+    weight, bandwidth, kelvin = key
+    return margins_at(reactor_controller(bandwidth=bandwidth, coolant_weight=weight), kelvin)
+
+
+def _grows(key: tuple[float, float]) -> bool:
+    """Simulate a gain times so much, or so many s of delay."""
+    factor, delay = key
+    return grows(reactor_controller(), START, **(
+        {'delay': delay} if delay else {'factor': factor, 'seconds': 600.0}))
+
+
+def _disturbed(name: str) -> Metrics:
+    return disturbances.judge(next(
+        case for case in disturbances.cases() if case.name == name))
+
+
+def _end(key: tuple[bool, float, float]) -> End:
+    fallback, setpoint, start = key
+    return stability.end_of(start, setpoint, fallback=fallback)
+
+
+def _boundary(coolant: float) -> dict[str, float]:
+    return {'physics_kelvin': stability.hottest_saved(coolant),
+            'ladder_kelvin': stability.hottest_start(coolant, fallback=True),
+            'no_ladder_kelvin': stability.hottest_start(coolant, fallback=False)}
+
+
+def _reactors() -> dict[str, ControlAffineSystem]:
+    return {'unchanged': REACTOR, **disturbances.CHANGED}
+
+
+def _back(key: tuple[str, float]) -> Metrics:
+    name, margin = key
+    return stability.back_from_safe(_reactors()[name], margin)
+
+
+def _narrow(name: str) -> dict[tuple[str, str], Simulation]:
+    return {'reactor': narrow.reactor_courses, 'two_state': narrow.two_state_courses}[name]()
+
+
+def _far(key: tuple[float, float]) -> Metrics:
+    return narrow.far_from_the_model(*key)

@@ -1,0 +1,119 @@
+# SPDX-FileCopyrightText: 2026 The koopman_ros Authors
+# SPDX-License-Identifier: Apache-2.0
+
+"""Retraining of the plants of many loops in one call, by the parameters of each loop's trainer."""
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+import sys
+import time
+from typing import Any
+
+import rclpy
+
+from koopman_ros.jobs.training import JobState, RetrainingJob
+from koopman_ros.parameters.table import ConfigurationError
+from koopman_ros.parameters.trainer import trainer_signals, trainer_table
+from koopman_ros.parameters.wire import SIGNALS, Wiring
+from koopman_ros.ros.managed import one_line, START_ERRORS
+from koopman_ros.ros.node import LoopNode
+from koopman_ros.ros.process import init
+from koopman_ros.ros.training import present_lift, task_fields
+
+_POLL = 0.1  # s
+_LINE = 5.0  # s between two lines of progress
+
+
+def run_fleet(args: list[str] | None, file: str, arrived: Sequence[int]) -> int:
+    """
+    Retrain the plants of a file of loops, each by its trainer's parameters, until a signal.
+
+    A line on the standard output says how each ended. Nothing is written of those that have not
+    ended at a signal.
+
+    :param arrived: signals, as they come.
+    :return: exit code: 0 when all new lifts are accepted, 2 when one is refused, 1 when a plant
+        could not be retrained, or none could be tried.
+    """
+    # processes of many loops alone need it
+    from koopman_ros.ros.host import read_loops
+
+    tasks: dict[str, dict[str, Any]] = {}
+    schedulers: dict[str, str] = {}
+    failed = False
+    try:
+        loops = read_loops(Path(file))
+        try:
+            init(args)
+            for namespace in loops:
+                try:
+                    tasks[namespace], schedulers[namespace] = _of_loop(namespace)
+                except START_ERRORS as error:
+                    failed = True
+                    _say(namespace, f'cannot be retrained: {one_line(error)}')
+        finally:
+            rclpy.try_shutdown()
+        scheduler = _one_scheduler(schedulers)
+    except START_ERRORS as error:
+        print(f'trainer: cannot start: {one_line(error)}', file=sys.stderr)
+        return 1
+    if not tasks:
+        return 1
+    end = _retrain({'plants': tasks, 'scheduler': scheduler}, arrived)
+    return 1 if failed or not (end.accepted or end.refused) else 0 if end.accepted else 2
+
+
+def _of_loop(namespace: str) -> tuple[dict[str, Any], str]:
+    """Return the fields of a plant's task, and where it is to be worked."""
+    node = LoopNode('trainer', namespace=namespace, start_parameter_services=False,
+                    enable_rosout=False)
+    try:
+        given = node.given()
+        present = present_lift(given)
+        settings = node.declare_table(trainer_table(present, given))
+        bags = list(filter(None, settings.bags))
+        if not bags:
+            raise ConfigurationError('there is no bag to train from: name it in bags')
+        signals = trainer_signals(present, {name: getattr(settings, name) for name in SIGNALS})
+        wiring = Wiring(signals, settings.states, settings.inputs)
+        return task_fields(node, settings, wiring, bags), settings.scheduler
+    finally:
+        node.destroy_node()
+
+
+def _one_scheduler(schedulers: Mapping[str, str]) -> str:
+    found = sorted(set(schedulers.values()))
+    if len(found) > 1:
+        raise ConfigurationError(
+            f'scheduler is {" and ".join(map(repr, found))} in different loops: give all plants '
+            'of one call the same, e.g. under /**')
+    return found[0] if found else ''
+
+
+def _retrain(task: Mapping[str, object], arrived: Sequence[int]) -> JobState:
+    """Retrain in a process of its own; tell of the plants as they end."""
+    job = RetrainingJob(task)
+    told: set[str] = set()
+    line = time.monotonic()
+    try:
+        while True:
+            state = job.poll()
+            for name in state.plants:
+                if name not in told:
+                    told.add(name)
+                    _say(name, state.plants[name].text)
+            if state.ended:
+                print(f'trainer: {state.text}', flush=True)
+                return state if not arrived else JobState(ended=True)
+            if arrived:
+                job.cancel()
+            elif time.monotonic() - line > _LINE:
+                line = time.monotonic()
+                print(f'{100.0 * state.share:.0f} %: {state.text}', file=sys.stderr, flush=True)
+            time.sleep(_POLL)
+    finally:
+        job.close()
+
+
+def _say(namespace: str, text: str) -> None:
+    print(f'{namespace}: {text}', flush=True)
