@@ -54,7 +54,7 @@ class Way:
     """How loops are spread over processes."""
 
     label: str
-    style: Mapping[str, str]  #: of its line
+    style: Mapping[str, Any]  #: of its line
     hosted: bool
     plants: bool = False  #: simulated plants in processes likewise; a sensor of ours otherwise
     several: bool = False  #: hosts, of `Plan.loops_of_a_host` each
