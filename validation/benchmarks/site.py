@@ -126,6 +126,8 @@ def _measured(way: Way, count: int, plan: Plan) -> dict[str, Any]:
             load.stdin.write('all\n')
             load.stdin.flush()
         ended = [_told(load) for load in loads]
+        for load in loads:
+            load.wait()
     return _together(begun, ended)
 
 
