@@ -18,6 +18,7 @@ from koopman_ros.signals import Outputs
 # One step of integration spans at most this share of the model's fastest time constant.
 _STEP_SHARE = 0.1
 _MAX_STEPS = 20
+_CONVERGED = 1e-9  # of scaled deviations; the figure is shown with nine digits
 
 
 @dataclass(frozen=True)
@@ -313,10 +314,12 @@ def equivalent_bias(model: LiftedModel, estimate: Estimate) -> Array:
         for _ in range(20):
             x = estimate.x - bias
             try:
-                bias = bias + np.linalg.solve(model.drift_jacobian(x), model.drift(x) - wanted)
+                step = np.linalg.solve(model.drift_jacobian(x), model.drift(x) - wanted)
             except np.linalg.LinAlgError:
                 break
-            if not np.all(np.abs(bias) < 1e3):
+            bias = bias + step
+            # steps shrink by their square: the next one would be below rounding
+            if not np.all(np.abs(bias) < 1e3) or np.all(np.abs(step) < _CONVERGED):
                 break
         solved = np.all(np.abs(bias) < 1e3) and np.allclose(
             model.drift(estimate.x - bias), wanted, rtol=0.0, atol=1e-6)

@@ -5,7 +5,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection, Mapping
+from collections.abc import Callable, Collection, Iterator, Mapping
 import copy
 import importlib
 import math
@@ -61,6 +61,7 @@ _POLICIES = ('reliability', 'durability', 'deadline', 'liveliness', 'liveliness_
 # Of a processor, that the looks of all loops of a process take: each asks the whole graph, which
 # grows with the loops.
 _LOOK_SHARE = 0.05
+_LOOK_AT_ONCE = 0.002  # s, after which a look goes on in a later turn, as other loops wait
 # What does not pass: policy, offered, asked for.
 _CONFLICTS = (('reliability', ReliabilityPolicy.BEST_EFFORT, ReliabilityPolicy.RELIABLE),
               ('durability', DurabilityPolicy.VOLATILE, DurabilityPolicy.TRANSIENT_LOCAL))
@@ -132,6 +133,7 @@ class Matching:
         self._rests_until = -math.inf  # by the steady clock
         hosting = node.hosting if isinstance(node, HostableNode) else None
         self._loops = 1 if hosting is None else hosting.loops
+        self._looking = self._look()
         self._owned.timer(_LOOK_PERIOD, self._look_in_turn)
         self.destroy = self._owned.destroy  #: with what was made here
 
@@ -166,13 +168,23 @@ class Matching:
         if (now := time.monotonic()) < self._rests_until:
             return
         begun = time.thread_time()
-        self._look()
+        for _ in self._looking:
+            if self._loops > 1 and time.thread_time() - begun > _LOOK_AT_ONCE:
+                break
+        else:
+            self._looking = self._look()
         self._rests_until = now + (time.thread_time() - begun) * self._loops / _LOOK_SHARE
 
-    def _look(self) -> None:
-        said = ('; '.join(filter(None, map(self._conflict, self._single))),
-                '; '.join(dict.fromkeys(
-                    complaint for own in self._own for complaint in self._complaints(own))))
+    def _look(self) -> Iterator[None]:
+        """Look at one topic after the other, and say at the end what was found."""
+        conflicts, complaints = [], []
+        for topic in self._single:
+            conflicts.append(self._conflict(topic))
+            yield
+        for own in self._own:
+            complaints += self._complaints(own)
+            yield
+        said = ('; '.join(filter(None, conflicts)), '; '.join(dict.fromkeys(complaints)))
         before, self._said = self._said, said
         for complaint in said:
             if complaint and complaint not in before:

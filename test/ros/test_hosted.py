@@ -3,7 +3,7 @@
 
 """What nodes share in a process of many: timers, failures, the file that names the loops."""
 
-import itertools
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -145,27 +145,43 @@ def test_loops_are_taken_by_the_nodes_that_can_be_many(capsys: pytest.CaptureFix
     assert capsys.readouterr().err.count("unknown argument '--loops'") == 2
 
 
-@pytest.mark.parametrize(('loops', 'rest'), [(1, 0.2), (100, 20.0)])
-def test_looks_of_all_loops_take_a_twentieth_of_a_core(
-        monkeypatch: pytest.MonkeyPatch, loops: int, rest: float) -> None:
+@pytest.mark.parametrize(('loops', 'turns'), [
+    # the whole look of 0.04 s in one turn
+    (1, [[0, 1, 2], [0, 1, 2]]),
+    # one topic of 0.02 s in each, and 40 s between them
+    (100, [[0], [1], [2], [], [0]]),
+])
+def test_looks_of_all_loops_take_a_twentieth_of_a_core_a_topic_at_a_time(
+        monkeypatch: pytest.MonkeyPatch, loops: int, turns: list[list[int]]) -> None:
     clock, schedule = Steady(monkeypatch), Schedule()
-    taken = itertools.count(0.0, 0.01)
-    monkeypatch.setattr(topics.time, 'thread_time', lambda: next(taken))
-    looked: list[float] = []
-    monkeypatch.setattr(topics.Matching, '_look', lambda _: looked.append(clock.now))
+    spent = 0.0
+    monkeypatch.setattr(topics.time, 'thread_time', lambda: spent)
+    looked: dict[float, list[int]] = {}  # topics by the time of a turn
+
+    def look(_: topics.Matching) -> Iterator[None]:
+        nonlocal spent
+        for topic in range(3):
+            spent += 0.02
+            looked.setdefault(clock.now, []).append(topic)
+            yield
+        looked.setdefault(clock.now, [])
+        spent += 0.02
+
+    monkeypatch.setattr(topics.Matching, '_look', look)
     with isolated_domain():
         rclpy.init()
         try:
             node = HostableNode('one', Hosting(schedule, loops, _raised))
             topics.Matching(node, lambda: None)
-            while len(looked) < 2:
+            while len(looked) < len(turns):
                 clock.now += 0.5
                 schedule.turn()
             node.destroy_node()
         finally:
             rclpy.shutdown()
-    # one look took 0.01 s of the thread
-    assert looked[1] - looked[0] == pytest.approx(max(0.5, rest))
+    assert list(looked.values())[:len(turns)] == turns
+    first, second = list(looked)[:2]
+    assert second - first == pytest.approx(1.6 if loops == 1 else 40.0, abs=0.5)
 
 
 def _raised(error: Exception) -> None:

@@ -4,8 +4,8 @@
 """
 Sensors and actuators of many loops in one light process, for the part `site`.
 
-Messages are passed on as bytes. When every loop has answered it measures for some windows, and
-prints what it found in each as JSON, with the processor time that the loops' processes took.
+Messages are passed on as bytes. When every loop has answered it says so in a line of JSON; after
+a line on its standard input it measures for some windows, and prints what it found in another.
 """
 
 import argparse
@@ -13,6 +13,7 @@ from functools import partial
 import json
 import math
 from pathlib import Path
+import select
 import struct
 import sys
 import time
@@ -35,14 +36,18 @@ _AT = 4  # where the stamp stands in a serialized message, after four bytes abou
 
 
 class Load:
-    """Measurements of each loop once a period, all loops spread over it, and their answers."""
+    """
+    Measurements of each loop once a period, all loops spread over it, and their answers.
 
-    def __init__(self, namespaces: list[str], period: float) -> None:
+    :param plants: whether plants measure instead, and answers alone are heard.
+    """
+
+    def __init__(self, namespaces: list[str], period: float, plants: bool) -> None:
         self._node = Node('site_load', enable_rosout=False, start_parameter_services=False)
         self._executor = EventsExecutor()
         self._count, self._period_ns = len(namespaces), round(period * NANOSECONDS)
         self._message = bytearray(serialize_message(Temperature(temperature=_CELSIUS)))
-        self._publishers = [self._node.create_publisher(
+        self._publishers = [] if plants else [self._node.create_publisher(
             Temperature, f'{namespace}/{reactor.TEMPERATURE}', topics.LOOP_QOS)
             for namespace in namespaces]
         self._sent: dict[tuple[int, int], int] = {}  # by loop and stamp: when, by the steady clock
@@ -58,7 +63,9 @@ class Load:
     def _on_command(self, loop: int, message: bytes) -> None:
         now = time.monotonic_ns()
         sec, nanosec = _STAMP.unpack_from(message, _AT)
-        sent = self._sent.pop((loop, sec * NANOSECONDS + nanosec), None)
+        stamp = sec * NANOSECONDS + nanosec
+        sent = self._sent.pop((loop, stamp), None) if self._publishers else (
+            now - time.time_ns() + stamp)
         if sent is not None:
             self.answered.add(loop)
             self.latencies.append((now - sent) / NANOSECONDS)
@@ -69,12 +76,13 @@ class Load:
         self.latencies.clear()
 
     def run(self, seconds: float) -> int:
-        """Measure on schedule for a while; return how many measurements were sent."""
+        """Measure on schedule for a while; return how many measurements were due."""
         end, before = time.monotonic_ns() + round(seconds * NANOSECONDS), self._turn
         while (now := time.monotonic_ns()) < end:
             due = self._begun + self._turn * self._period_ns // self._count
             if now >= due:
-                self._publish(self._turn % self._count)
+                if self._publishers:
+                    self._publish(self._turn % self._count)
                 # what could not be sent in time is left out
                 late = (now - due) * self._count // self._period_ns
                 self._turn += 1 + late // self._count * self._count
@@ -112,26 +120,28 @@ def main() -> int:
     parser = argparse.ArgumentParser(description=main.__doc__)
     parser.add_argument('loops', type=Path, help='a namespace a line')
     parser.add_argument('--pids', type=int, nargs='+', help='of their processes')
-    parser.add_argument('--period', type=float, default=1.0, help='of the measurements, in s')
-    parser.add_argument('--settle', type=float, help='s before the first window')
-    parser.add_argument('--seconds', type=float, help='length of a window')
+    parser.add_argument('--plants', action='store_true', help='that measure are there')
+    for name in ('period', 'settle', 'seconds', 'patience'):
+        parser.add_argument(f'--{name}', type=float, help='in s')
     parser.add_argument('--windows', type=int)
-    parser.add_argument('--patience', type=float, help='s until every loop has to have answered')
     given = parser.parse_args()
     namespaces = [f'/{line}' for line in given.loops.read_text().splitlines()]
     processes = [psutil.Process(pid) for pid in given.pids]
     rclpy.init()
-    load = Load(namespaces, given.period)
+    load = Load(namespaces, given.period, given.plants)
     begun = time.monotonic()
     while len(load.answered) < len(namespaces) and time.monotonic() - begun < given.patience:
         load.run(0.1)
-    started = time.time()
-    found = {'answering': len(load.answered), 'start_cpu_seconds': _processor(processes),
-             'discovery_seconds': started - min(one.create_time() for one in processes)}
+    print(json.dumps({
+        'answering': len(load.answered), 'start_cpu_seconds': _processor(processes),
+        'discovery_seconds': time.time() - min(one.create_time() for one in processes)}),
+        flush=True)
+    while not select.select([sys.stdin], [], [], 0.0)[0]:
+        load.run(0.1)
     load.run(given.settle)
     windows = [_window(load, given.seconds, processes) for _ in range(given.windows)]
     memory = [one.memory_full_info() for one in processes]
-    print(json.dumps(found | {
+    print(json.dumps({
         'windows': windows, 'pss_megabytes': sum(one.pss for one in memory) / 1e6,
         'rss_megabytes': sum(one.rss for one in memory) / 1e6}), flush=True)
     rclpy.try_shutdown()

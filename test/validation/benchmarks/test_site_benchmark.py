@@ -12,15 +12,15 @@ from validation.benchmarks.__main__ import main
 
 
 def test_loops_of_a_process_and_processes_are_measured(tmp_path, monkeypatch, capsys):
-    monkeypatch.setitem(site.PLANS, 'quick', site.Plan((2,), (1,), 1.0, 1, 60.0))
+    monkeypatch.setitem(site.PLANS, 'quick', site.Plan(
+        {'processes': (1,), 'hosted_with_plants': (2,), 'domains': (2,)}, 1, 1.0, 1, 60.0))
     monkeypatch.setattr(site, '_SETTLE', 0.5)
     assert main(['site', '--quick', '--output', str(tmp_path)]) == 0
-    assert '| hosted |' in capsys.readouterr().out
+    assert '| hosted_with_plants |' in capsys.readouterr().out
     assert (tmp_path / 'site.png').stat().st_size > 10_000
     found = json.loads((tmp_path / 'summary.json').read_text())['site']
-    assert set(site.MEANING) - {'answering', 'discovery_seconds', 'start_cpu_seconds', 'cores',
-                                'p99_ms', 'pss_megabytes'} <= set(found)
-    for way, count in (('hosted', '2'), ('processes', '1')):
+    assert set(found['gives_way']) == {'processes', 'hosted_with_plants', 'domains'}
+    for way, count in (('processes', '1'), ('hosted_with_plants', '2'), ('domains', '2')):
         one = found[way][count]
         assert one['answering'] == int(count)
         assert one['answered_share'] > 0.0
@@ -29,6 +29,11 @@ def test_loops_of_a_process_and_processes_are_measured(tmp_path, monkeypatch, ca
         assert 0.0 < one['p50_ms'] <= one['p99_ms']
         assert one['start_cpu_seconds'] > 0.0
         assert 0.0 < one['discovery_seconds'] < 60.0
+
+
+def test_every_way_that_is_measured_has_a_meaning():
+    for plan in site.PLANS.values():
+        assert set(plan.loops) <= set(site.WAYS) <= set(site.MEANING)
 
 
 def figures(answering=100, pss_megabytes=200.0, cores=0.4, p99_ms=20.0):
