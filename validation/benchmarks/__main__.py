@@ -13,6 +13,7 @@ from koopman_ros.reports import machine, write_figures
 from validation.benchmarks import (
     cluster,
     fleet,
+    growth,
     loop,
     panel,
     recording,
@@ -57,6 +58,7 @@ def main(args: list[str] | None = None) -> int:
             return 130
         figures['machine']['load_at_end'] = os.getloadavg()[0]
         write_figures(path, summary)
+        growth.draw(given.output / growth.FILE, summary)
     print(f'{path} holds all figures')
     return 0
 

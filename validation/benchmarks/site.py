@@ -220,22 +220,23 @@ def _table(way: str, found: dict[int, dict[str, Any]]) -> str:
 def picture(path: Path, figures: dict[str, Any]) -> None:
     """Draw how memory, processor, latency and start grow with the loops."""
     with drawing(path, 2, 2, size=(9.0, 7.0), sharex=True) as (figure, axes):
-        for ax, (name, label) in zip(axes, _SIGNAL.items(), strict=True):
-            _draw(ax, name, figures)
-            ax.set(xscale='log', yscale='log', ylabel=label)
-            if name in HELD_TO:
-                draw_limits(ax, (HELD_TO[name],), 'held to with 100 hosted loops')
+        for ax, name in zip(axes, _SIGNAL, strict=True):
+            draw_growth(ax, name, figures)
         for ax in axes[2:]:
             ax.set_xlabel('loops at 1 Hz')
         _finish(figure, axes)
 
 
-def _draw(ax: Axes, name: str, figures: dict[str, Any]) -> None:
+def draw_growth(ax: Axes, name: str, figures: Mapping[str, Any]) -> None:
+    """Draw one of the figures of each way over the number of loops."""
     for key, way in WAYS.items():
         whole = {int(count): one[name] for count, one in figures.get(key, {}).items()
                  if one['answering'] == int(count)}
         if whole:
             ax.plot(list(whole), list(whole.values()), label=way.label, **way.style)
+    if name in HELD_TO:
+        draw_limits(ax, (HELD_TO[name],), 'held to with 100 hosted loops')
+    ax.set(xscale='log', yscale='log', ylabel=_SIGNAL[name])
 
 
 def _finish(figure: Figure, axes: list[Axes]) -> None:
