@@ -14,6 +14,7 @@ from koopman_ros.arrays import Array
 from koopman_ros.lifting import LiftedModel
 from koopman_ros.reasons import Code, Reason, reason
 from koopman_ros.units import NANOSECONDS
+from koopman_ros.values import record
 
 # What follows when no law can act, in this order.
 HOLD = 'hold'
@@ -83,7 +84,7 @@ class SupervisorSettings:
         return _HYSTERESIS * self.largest_margin
 
 
-@dataclass(frozen=True)
+@record
 class Requested:
     """The best level that is possible now."""
 
@@ -94,7 +95,7 @@ class Requested:
     passing: bool = False
 
 
-@dataclass(frozen=True)
+@record
 class Supervisor:
     """The state of the supervisor."""
 
@@ -173,7 +174,7 @@ _STEP, _STEP_SHARE, _AT_REST = 0.02, 0.2, 1e-5
 _MAX_STEPS = 500
 
 
-@dataclass(frozen=True)
+@record
 class WayBack:
     """
     How far a plant under the safe input has come back, by its distance from the training data.

@@ -14,13 +14,14 @@ from koopman_ros.arrays import Array
 from koopman_ros.kernels import compilable
 from koopman_ros.lifting import LiftedModel
 from koopman_ros.signals import Outputs
+from koopman_ros.values import record
 
 # One step of integration spans at most this share of the model's fastest time constant.
 _STEP_SHARE = 0.1
 _MAX_STEPS = 20
 
 
-@dataclass(frozen=True)
+@record
 class Innovation:
     """
     By how much measurements differed from what was expected, over what was to be expected.
@@ -51,7 +52,7 @@ class Innovation:
         return lower, upper
 
 
-@dataclass(frozen=True)
+@record
 class Estimate:
     """
     What is known of the plant, in scaled deviations and the model's time unit.

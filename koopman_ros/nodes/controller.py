@@ -4,7 +4,7 @@
 """The controller node: answers each measurement with a command."""
 
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import replace
 import gc
 import math
 import sys
@@ -60,6 +60,7 @@ from koopman_ros.ros.process import run
 from koopman_ros.ros.signals import Heard, Inlet, Outlet
 from koopman_ros.ros.watchdog import PERIOD, Timing, Watchdog
 from koopman_ros.units import display_unit, NANOSECONDS, shown
+from koopman_ros.values import record
 from koopman_ros.wire import stem
 
 # A measurement and the inputs that acted on it are stamped no further apart.
@@ -70,7 +71,7 @@ _PATIENCE = 0.5  # s that the first answer waits for the measured inputs
 _ATTEMPTS = 2
 
 
-@dataclass(frozen=True)
+@record
 class _Sample:
     """A measurement that is to be answered."""
 

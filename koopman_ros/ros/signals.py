@@ -4,7 +4,6 @@
 """Messages to the numbers of signals and back, once, at the boundary."""
 
 from collections.abc import Callable, Iterator, Mapping
-from dataclasses import dataclass
 from functools import partial
 import math
 from typing import Any
@@ -19,10 +18,11 @@ from koopman_ros.parameters.table import ConfigurationError
 from koopman_ros.ros import topics
 from koopman_ros.ros.codec import stamp_nanoseconds
 from koopman_ros.units import Conversion, conversion, in_steps
+from koopman_ros.values import record
 from koopman_ros.wire import Place
 
 
-@dataclass(frozen=True)
+@record
 class Heard:
     """What a message says of some signals."""
 

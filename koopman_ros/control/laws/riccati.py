@@ -27,6 +27,7 @@ from koopman_ros.kernels import compilable
 from koopman_ros.lifting import LiftedModel
 from koopman_ros.reasons import Code, reason
 from koopman_ros.solvers import RiccatiSolution, RiccatiStatus, solve_riccati
+from koopman_ros.values import record
 
 # Largest mismatch of a closed lift: those of plants that have one come to 2e-7 or less, others to
 # 1e-4 or more, and from there on the averaged Jacobian costs less.
@@ -41,7 +42,7 @@ class Form(Enum):
     AVERAGED = 'averaged'
 
 
-@dataclass(frozen=True)
+@record
 class Feedback:
     """The outcome of one state-dependent Riccati solution."""
 
