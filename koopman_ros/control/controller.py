@@ -441,10 +441,11 @@ class Controller:
     def _supervised(self, state: State, supervisor: Supervisor, verdict: Verdict,
                     outside: float, time_ns: int) -> State:
         """Take over the supervisor's new state."""
-        estimating, before = self._estimating, self._estimating.level(state)
         way_back = self._way_back(state, supervisor, verdict, outside, time_ns)
-        if supervisor == state.supervisor and way_back is state.way_back:
+        if way_back is state.way_back and (
+                supervisor is state.supervisor or supervisor == state.supervisor):
             return state
+        estimating, before = self._estimating, self._estimating.level(state)
         state = amended(state, supervisor=supervisor, way_back=way_back)
         now = estimating.level(state)
         if now is not before:

@@ -210,7 +210,8 @@ class Estimating:
         name = state.supervisor.settled
         if name is None:
             return next(iter(self.levels.values()))
-        return self.levels.get(name) or self.levels[next(reversed(self.levels))]
+        found = self.levels.get(name)
+        return self.levels[next(reversed(self.levels))] if found is None else found
 
     def applied(self, state: State, measured: Array | None = None) -> tuple[Array, bool]:
         """

@@ -33,6 +33,17 @@ class LevelSettings:
     margin: float
 
 
+@record
+class Requested:
+    """The best level that is possible now."""
+
+    level: str  #: which
+    reason: Reason | None = None  #: why none above it; None for the best
+    #: whether it is left as soon as the reason is gone, as when a measurement was missing: nothing
+    #: was lost then
+    passing: bool = False
+
+
 @dataclass(frozen=True)
 class SupervisorSettings:
     """When to fall back and when to recover."""
@@ -61,6 +72,11 @@ class SupervisorSettings:
         """The names of all levels, best first."""
         return (*(level.law for level in self.levels), HOLD, SAFE)
 
+    @cached_property
+    def best(self) -> Requested:
+        """What is asked for where nothing is against the best level."""
+        return Requested(self.order[0])
+
     def depth(self, level: str | None) -> int:
         """Return the place in the order; 0 for None, and for a level that there is no more."""
         return self._depths.get(level, 0)
@@ -85,17 +101,6 @@ class SupervisorSettings:
 
 
 @record
-class Requested:
-    """The best level that is possible now."""
-
-    level: str  #: which
-    reason: Reason | None = None  #: why none above it; None for the best
-    #: whether it is left as soon as the reason is gone, as when a measurement was missing: nothing
-    #: was lost then
-    passing: bool = False
-
-
-@record
 class Supervisor:
     """The state of the supervisor."""
 
@@ -117,6 +122,8 @@ class Supervisor:
 
         :param ranges: (name, lower, upper) of the box, for the reason.
         """
+        if not outside > 0.0:
+            return settings.best
         levels = settings.levels
         for i in reversed(range(len(levels))):
             below = levels[i + 1].law if i + 1 < len(levels) else SAFE
@@ -125,7 +132,7 @@ class Supervisor:
             if outside > (_HYSTERESIS * margin if entered else margin):
                 return Requested(below, reason(Code.OUTSIDE_TRAINING, ranges=ranges,
                                                margin=margin, level=levels[i].law))
-        return Requested(levels[0].law)
+        return settings.best
 
     def at(self, settings: SupervisorSettings, requested: Requested, time_ns: int) -> Supervisor:
         """
@@ -134,6 +141,9 @@ class Supervisor:
         A hold becomes the safe input after its timeout.
         """
         depth, bad_since, why = settings.depth, None, requested.reason
+        if (why is self.reason is self.resumes is self.bad_since_ns is self.better_since_ns is None
+                and self.level == requested.level):
+            return self
         if requested.level == HOLD:
             bad_since = time_ns if self.bad_since_ns is None else self.bad_since_ns
             held = (time_ns - bad_since) / NANOSECONDS

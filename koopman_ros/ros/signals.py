@@ -133,6 +133,10 @@ class Outlet:
         """All publishers."""
         return [publisher for publisher, *_ in self._parts]
 
+    def heard(self) -> bool:
+        """Tell whether anybody subscribes to one of the topics."""
+        return any(map(topics.heard, self.publishers))
+
     def send(self, values: Array, stamp: Time, frame_id: str, variances: Array | None = None,
              resolutions: Array | None = None) -> None:
         """
