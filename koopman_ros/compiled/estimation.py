@@ -17,7 +17,14 @@ from koopman_ros.compiled.matrices import (
     solve_into,
     turned,
 )
-from koopman_ros.compiled.network import drift, drift_and_jacobian, matrices, N_U, N_X
+from koopman_ros.compiled.network import (
+    drift,
+    drift_and_jacobian,
+    matrices,
+    N_U,
+    N_X,
+    output_of,
+)
 from koopman_ros.compiled.steps import runge_kutta
 
 
@@ -44,8 +51,8 @@ def propagated(sizes: NDArray[np.int64], numbers: Array, x: Array, w: Array, P: 
                h: float, steps: int) -> tuple[Array, Array]:
     """Return state and covariance of an extended Kalman filter after so many steps of h."""
     n = sizes[N_X]
-    _, B, _, readout = matrices(sizes, numbers)
-    push = applied(B, u)
+    A, B, slope, readout = matrices(sizes, numbers)
+    parts, push = (A, slope, readout, output_of(sizes, numbers)), applied(B, u)
     for i in range(n):
         push[i] += w[i]
     # the state's derivatives by what state and disturbance were
@@ -54,7 +61,7 @@ def propagated(sizes: NDArray[np.int64], numbers: Array, x: Array, w: Array, P: 
         S[i, i], forced[i, n + i] = 1.0, 1.0
     x = x.copy()
     for _ in range(steps):
-        x, S, _, _, _, _ = runge_kutta(sizes, numbers, readout, push, forced, x, S, h)
+        x, S, _, _, _, _ = runge_kutta(sizes, numbers, parts, push, forced, x, S, h)
     F = np.zeros((2 * n, 2 * n))
     for i in range(n):
         F[n + i, n + i] = 1.0

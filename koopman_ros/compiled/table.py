@@ -103,11 +103,11 @@ def _moved(model: LiftedModel, x: Array, w: Array, u: Array, h: float, steps: in
 def _propagated(model: LiftedModel, x: Array, w: Array, P: Array, u: Array, h: float, steps: int
                 ) -> tuple[Array, Array] | None:
     layout = model.layout
-    if layout is None or model.readout is None:
+    if layout is None:
         return None
     found: tuple[Array, Array] = estimation.propagated(
         layout.sizes, layout.numbers, x, w, P, u, h, steps)
-    return found
+    return found if math.isfinite(found[0][0]) else None
 
 
 def _corrected(model: LiftedModel, H: Array, R: Array, P: Array, difference: Array
@@ -130,7 +130,7 @@ def _equilibrium(model: LiftedModel, w: Array, start: Array, free: NDArray[np.bo
 def _program(model: LiftedModel, plan: shooting.Horizon, u: Array, x: Array
              ) -> shooting.Program | None:
     layout = model.layout
-    if layout is None or model.readout is None:
+    if layout is None:
         return None
     finite, *found = horizon.program(
         layout.sizes, layout.numbers, u, x, plan.start, plan.w, plan.x_ref, plan.u_ref,
