@@ -25,7 +25,7 @@ from koopman_ros.compiled.network import (
     N_X,
     output_of,
 )
-from koopman_ros.compiled.steps import runge_kutta
+from koopman_ros.compiled.steps import runge_kutta, space_of
 
 
 @compiled(INTEGERS, VECTOR, VECTOR, VECTOR, VECTOR, NUMBER, SIZE)
@@ -55,13 +55,15 @@ def propagated(sizes: NDArray[np.int64], numbers: Array, x: Array, w: Array, P: 
     parts, push = (A, slope, readout, output_of(sizes, numbers)), applied(B, u)
     for i in range(n):
         push[i] += w[i]
+    space = space_of(sizes)
     # the state's derivatives by what state and disturbance were
     S, forced = np.zeros((n, 2 * n)), np.zeros((n, 2 * n))
     for i in range(n):
         S[i, i], forced[i, n + i] = 1.0, 1.0
     x = x.copy()
     for _ in range(steps):
-        x, S, _, _, _, _ = runge_kutta(sizes, numbers, parts, push, forced, x, S, h)
+        x, S, _, _, _, _ = runge_kutta(
+            sizes, numbers, parts, space, push, forced, x, S, h)
     F = np.zeros((2 * n, 2 * n))
     for i in range(n):
         F[n + i, n + i] = 1.0

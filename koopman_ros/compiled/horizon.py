@@ -4,6 +4,7 @@
 """The quadratic program of a plan: its course, condensed to the inputs, and its cost."""
 
 import math
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -12,7 +13,7 @@ from koopman_ros.arrays import Array
 from koopman_ros.compiled.jit import compiled, inner, INTEGERS, MATRIX, SIZE, VECTOR
 from koopman_ros.compiled.matrices import applied
 from koopman_ros.compiled.network import matrices, N_U, N_X, output_of
-from koopman_ros.compiled.steps import runge_kutta
+from koopman_ros.compiled.steps import runge_kutta, space_of
 
 
 @inner
@@ -31,8 +32,8 @@ def _weigh(M: Array, g: Array, share: float, Q: Array, S: Array, error: Array) -
 
 @inner
 def _interval(sizes: NDArray[np.int64], numbers: Array,
-              parts: tuple[Array, Array, Array, Array], push: Array, forced: Array, x: Array,
-              x_ref: Array, Q: Array, length: float, steps: int
+              parts: tuple[Array, Array, Array, Array], space: Any, push: Array, forced: Array,
+              x: Array, x_ref: Array, Q: Array, length: float, steps: int
               ) -> tuple[Array, Array, Array, Array]:
     """
     Follow one interval.
@@ -51,7 +52,7 @@ def _interval(sizes: NDArray[np.int64], numbers: Array,
     _weigh(M, g, points, Q, S, error)
     for step in range(steps):
         y, T, k1, s1, k4, s4 = runge_kutta(
-            sizes, numbers, parts, push, forced, x, S, h)
+            sizes, numbers, parts, space, push, forced, x, S, h)
         # the middle by the rates at both ends (Hermite), for Simpson's rule
         for i in range(n):
             error[i] = 0.5 * (x[i] + y[i]) + 0.125 * h * (k1[i] - k4[i]) - x_ref[i]
@@ -107,7 +108,7 @@ def program(sizes: NDArray[np.int64], numbers: Array, u: Array, x: Array, start:
     """
     n, m, N = sizes[N_X], sizes[N_U], len(u)
     A, B, slope, readout = matrices(sizes, numbers)
-    parts = A, slope, readout, output_of(sizes, numbers)
+    parts, space = (A, slope, readout, output_of(sizes, numbers)), space_of(sizes)
     Q, terminal = Q.copy(), terminal.copy()
     nodes, by_inputs = np.empty((N + 1, n)), np.zeros((N + 1, n, N * m))
     H, f = np.zeros((N * m, N * m)), np.zeros(N * m)
@@ -121,8 +122,8 @@ def program(sizes: NDArray[np.int64], numbers: Array, u: Array, x: Array, start:
         for i in range(n):
             push[i] += w[i]
             gap[i] = nodes[k, i] - x[k, i]
-        end, S, M, g = _interval(sizes, numbers, parts, push, forced, x[k].copy(), x_ref, Q,
-                                 lengths[k], steps)
+        end, S, M, g = _interval(sizes, numbers, parts, space, push, forced, x[k].copy(), x_ref,
+                                 Q, lengths[k], steps)
         width = k * m
         for i in range(n):
             nodes[k + 1, i] = end[i]

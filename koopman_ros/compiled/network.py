@@ -116,6 +116,14 @@ def room(sizes: NDArray[np.int64], curved: bool
 
 
 @inner
+def free_room(sizes: NDArray[np.int64]) -> tuple[Array, Array, Array, Array]:
+    """Return room for :func:`free`: rows of z, rows of states, two rows of the layer, J_N."""
+    n, n_z = sizes[N_X], sizes[N_Z]
+    width, _ = _widths(sizes)
+    return np.empty((3, n_z)), np.empty((2 * n + 1, n)), np.empty((2, width)), np.empty((n_z, n))
+
+
+@inner
 def hidden_into(sizes: NDArray[np.int64], numbers: Array, x: Array, h: Array, before: Array,
                 T: Array, T_before: Array, U: Array, U_before: Array, scale: NDArray[np.int64]
                 ) -> None:
@@ -286,16 +294,18 @@ def read_out(readout: Array, x: Array, h: Array, T: Array, f: Array, J: Array) -
 
 @inner
 def free(A: Array, slope: Array, output: Array, identity: int, x: Array, h: Array, T: Array,
-         U: Array, f: Array, J: Array) -> bool:
+         U: Array, space: tuple[Array, Array, Array, Array], f: Array, J: Array) -> bool:
     """
     Write the drift without a read-out to f, and its Jacobian to J; False where it has none.
 
     By the normal equations J_N'J_N f = J_N'A z and their derivatives by each state.
 
-    :param identity: whether z starts with the state; the others are of `hidden_into`.
+    :param identity: whether z starts with the state; h, T and U are of `hidden_into`.
     """
     n, n_z, width = len(f), len(A), output.shape[1]
-    z, L, rest, bent = np.empty(n_z), np.zeros((n_z, n)), np.empty(n_z), np.empty(n_z)
+    of_z, of_x, of_layer, L = space
+    z, rest, bent, turn, bend = of_z[0], of_z[1], of_z[2], of_layer[0], of_layer[1]
+    square, copy, rate = of_x[:n], of_x[n:2 * n], of_x[2 * n].reshape((n, 1))
     for a in range(n_z):
         total = 0.0
         for i in range(width):
@@ -310,7 +320,10 @@ def free(A: Array, slope: Array, output: Array, identity: int, x: Array, h: Arra
         for a in range(n):
             for k in range(n):
                 L[a, k] = 1.0 if a == k else 0.0
-    square, copy, rate = np.zeros((n, n)), np.empty((n, n)), np.zeros((n, 1))
+    for k in range(n):
+        rate[k, 0] = 0.0
+        for j in range(n):
+            square[k, j] = 0.0
     for a in range(n_z):
         total = 0.0
         for b in range(n_z):
@@ -327,7 +340,8 @@ def free(A: Array, slope: Array, output: Array, identity: int, x: Array, h: Arra
     for a in range(n_z):
         for k in range(n):
             rest[a] -= L[a, k] * rate[k, 0]
-    turn, bend = np.zeros(width), np.empty(width)
+    for i in range(width):
+        turn[i] = 0.0
     for a in range(n_z):
         for i in range(width):
             turn[i] += output[a, i] * rest[a]
@@ -363,16 +377,18 @@ def free(A: Array, slope: Array, output: Array, identity: int, x: Array, h: Arra
 
 @inner
 def rate_into(sizes: NDArray[np.int64], parts: tuple[Array, Array, Array, Array], x: Array,
-              h: Array, T: Array, U: Array, f: Array, J: Array) -> None:
+              h: Array, T: Array, U: Array, space: tuple[Array, Array, Array, Array], f: Array,
+              J: Array) -> None:
     """
     Write the drift to f, and its Jacobian to J, of what `hidden_into` gave; NaN for none.
 
     :param parts: A, slope of the pre-feedback, read-out and output.
+    :param space: of :func:`free_room`.
     """
     A, slope, readout, output = parts
     if sizes[READOUT]:
         read_out(readout, x, h, T, f, J)
-    elif not free(A, slope, output, sizes[IDENTITY], x, h, T, U, f, J):
+    elif not free(A, slope, output, sizes[IDENTITY], x, h, T, U, space, f, J):
         f[0] = math.nan
 
 
