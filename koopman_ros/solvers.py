@@ -9,6 +9,7 @@ ordered Schur form, and checked.
 """
 
 from collections.abc import Callable
+from dataclasses import dataclass
 from enum import Enum
 import math
 
@@ -16,7 +17,6 @@ import numpy as np
 from scipy.linalg import blas, lapack
 
 from koopman_ros.arrays import Array
-from koopman_ros.values import record
 
 __all__ = ['RiccatiSolution', 'RiccatiStatus', 'runge_kutta_step', 'solve_riccati']
 
@@ -49,7 +49,7 @@ class RiccatiStatus(Enum):
     GAIN_TOO_LARGE = 'riccati_gain_too_large'
 
 
-@record
+@dataclass(frozen=True)
 class RiccatiSolution:
     """
     Solution of a Riccati equation with its gain.

@@ -23,7 +23,7 @@ from koopman_ros.compiled.network import (
     matrices,
     N_U,
     N_X,
-    output_of,
+    parts_of,
 )
 from koopman_ros.compiled.steps import runge_kutta, space_of
 
@@ -51,8 +51,8 @@ def propagated(sizes: NDArray[np.int64], numbers: Array, x: Array, w: Array, P: 
                h: float, steps: int) -> tuple[Array, Array]:
     """Return state and covariance of an extended Kalman filter after so many steps of h."""
     n = sizes[N_X]
-    A, B, slope, readout = matrices(sizes, numbers)
-    parts, push = (A, slope, readout, output_of(sizes, numbers)), applied(B, u)
+    _, B, _, _ = matrices(sizes, numbers)
+    parts, push = parts_of(sizes, numbers), applied(B, u)
     for i in range(n):
         push[i] += w[i]
     space = space_of(sizes)
@@ -127,11 +127,12 @@ def equilibrium(sizes: NDArray[np.int64], numbers: Array, w: Array, start: Array
     :param most: steps; see :mod:`koopman_ros.control.target` for what the others are.
     """
     n, m = sizes[N_X], sizes[N_U]
-    _, B, _, readout = matrices(sizes, numbers)
+    _, B, _, _ = matrices(sizes, numbers)
+    parts = parts_of(sizes, numbers)
     y, u, slope, rate = start.copy(), np.empty(m), np.empty((n, n)), np.empty((n, 1))
     size_of_slope = 0.0
     for step in range(most + 1):
-        f, J = drift_and_jacobian(sizes, numbers, readout, y[:n].copy())
+        f, J = drift_and_jacobian(sizes, numbers, parts, y[:n].copy())
         for i in range(m):
             u[i] = y[n + i]
         push, left = applied(B, u), 0.0

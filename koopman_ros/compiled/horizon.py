@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from koopman_ros.arrays import Array
 from koopman_ros.compiled.jit import compiled, inner, INTEGERS, MATRIX, SIZE, VECTOR
 from koopman_ros.compiled.matrices import applied
-from koopman_ros.compiled.network import matrices, N_U, N_X, output_of
+from koopman_ros.compiled.network import drift_and_jacobian, matrices, N_U, N_X, parts_of
 from koopman_ros.compiled.steps import runge_kutta, space_of
 
 
@@ -95,6 +95,12 @@ def _add(H: Array, f: Array, M: Array, g: Array, by_node: Array, gap: Array, wid
             H[width + i, width + j] += M[n + i, n + j]
 
 
+@compiled(INTEGERS, VECTOR, VECTOR)
+def slope(sizes: NDArray[np.int64], numbers: Array, x: Array) -> Array:
+    """Return the Jacobian of the drift at a state, (n_x, n_x)."""
+    return drift_and_jacobian(sizes, numbers, parts_of(sizes, numbers), x.copy())[1]
+
+
 @compiled(INTEGERS, VECTOR, MATRIX, MATRIX, VECTOR, VECTOR, VECTOR, VECTOR, VECTOR, SIZE, MATRIX,
           MATRIX, MATRIX)
 def program(sizes: NDArray[np.int64], numbers: Array, u: Array, x: Array, start: Array, w: Array,
@@ -107,8 +113,8 @@ def program(sizes: NDArray[np.int64], numbers: Array, u: Array, x: Array, start:
         :class:`koopman_ros.control.laws.shooting.Program`.
     """
     n, m, N = sizes[N_X], sizes[N_U], len(u)
-    A, B, slope, readout = matrices(sizes, numbers)
-    parts, space = (A, slope, readout, output_of(sizes, numbers)), space_of(sizes)
+    _, B, _, _ = matrices(sizes, numbers)
+    parts, space = parts_of(sizes, numbers), space_of(sizes)
     Q, terminal = Q.copy(), terminal.copy()
     nodes, by_inputs = np.empty((N + 1, n)), np.zeros((N + 1, n, N * m))
     H, f = np.zeros((N * m, N * m)), np.zeros(N * m)

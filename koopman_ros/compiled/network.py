@@ -13,10 +13,11 @@ from koopman_ros.compiled.jit import inner
 from koopman_ros.compiled.matrices import (
     applied,
     block,
+    factor_into,
     identity,
     least_squares,
     product,
-    solve_into,
+    solve_factored,
     turned,
 )
 
@@ -120,7 +121,7 @@ def free_room(sizes: NDArray[np.int64]) -> tuple[Array, Array, Array, Array]:
     """Return room for :func:`free`: rows of z, rows of states, two rows of the layer, J_N."""
     n, n_z = sizes[N_X], sizes[N_Z]
     width, _ = _widths(sizes)
-    return np.empty((3, n_z)), np.empty((2 * n + 1, n)), np.empty((2, width)), np.empty((n_z, n))
+    return np.empty((3, n_z)), np.empty((n + 1, n)), np.empty((2, width)), np.empty((n_z, n))
 
 
 @inner
@@ -244,6 +245,13 @@ def output_of(sizes: NDArray[np.int64], numbers: Array) -> Array:
 
 
 @inner
+def parts_of(sizes: NDArray[np.int64], numbers: Array) -> tuple[Array, Array, Array, Array]:
+    """Return A, slope of the pre-feedback, read-out and output of a layout."""
+    A, _, slope, readout = matrices(sizes, numbers)
+    return A, slope, readout, output_of(sizes, numbers)
+
+
+@inner
 def lifted(sizes: NDArray[np.int64], numbers: Array, rows: Array, states: float) -> Array:
     """
     Return coordinates (n_z, k) of rows (h, k) of the hidden layer, as far as they are of it.
@@ -305,7 +313,7 @@ def free(A: Array, slope: Array, output: Array, identity: int, x: Array, h: Arra
     n, n_z, width = len(f), len(A), output.shape[1]
     of_z, of_x, of_layer, L = space
     z, rest, bent, turn, bend = of_z[0], of_z[1], of_z[2], of_layer[0], of_layer[1]
-    square, copy, rate = of_x[:n], of_x[n:2 * n], of_x[2 * n].reshape((n, 1))
+    square, rate = of_x[:n], of_x[n].reshape((n, 1))
     for a in range(n_z):
         total = 0.0
         for i in range(width):
@@ -333,10 +341,8 @@ def free(A: Array, slope: Array, output: Array, identity: int, x: Array, h: Arra
             rate[k, 0] += L[a, k] * total
             for j in range(n):
                 square[k, j] += L[a, k] * L[a, j]
-    for k in range(n):
-        for j in range(n):
-            copy[k, j] = square[k, j]
-    fine = solve_into(copy, rate)
+    fine = factor_into(square)
+    solve_factored(square, rate)
     for a in range(n_z):
         for k in range(n):
             rest[a] -= L[a, k] * rate[k, 0]
@@ -366,7 +372,7 @@ def free(A: Array, slope: Array, output: Array, identity: int, x: Array, h: Arra
             for i in range(width):
                 total += turn[i] * U[k * n + j, i]
             J[j, k] = total
-    fine = solve_into(square, J) and fine
+    solve_factored(square, J)
     for j in range(n):
         f[j] = rate[j, 0]
         for k in range(n):
@@ -382,21 +388,22 @@ def rate_into(sizes: NDArray[np.int64], parts: tuple[Array, Array, Array, Array]
     """
     Write the drift to f, and its Jacobian to J, of what `hidden_into` gave; NaN for none.
 
-    :param parts: A, slope of the pre-feedback, read-out and output.
+    :param parts: of :func:`parts_of`.
     :param space: of :func:`free_room`.
     """
     A, slope, readout, output = parts
     if sizes[READOUT]:
         read_out(readout, x, h, T, f, J)
     elif not free(A, slope, output, sizes[IDENTITY], x, h, T, U, space, f, J):
-        f[0] = math.nan
+        f[0] = J[0, 0] = math.nan
 
 
 @inner
-def drift_and_jacobian(sizes: NDArray[np.int64], numbers: Array, readout: Array, x: Array
-                       ) -> tuple[Array, Array]:
-    """Return the drift of a read-out and its Jacobian (n_x, n_x)."""
-    h, T = hidden(sizes, numbers, x)
+def drift_and_jacobian(sizes: NDArray[np.int64], numbers: Array,
+                       parts: tuple[Array, Array, Array, Array], x: Array) -> tuple[Array, Array]:
+    """Return the drift and its Jacobian (n_x, n_x); see :func:`rate_into`."""
+    h, before, T, T_before, U, U_before, scale = room(sizes, not sizes[READOUT])
+    hidden_into(sizes, numbers, x, h, before, T, T_before, U, U_before, scale)
     f, J = np.empty(len(x)), np.empty((len(x), len(x)))
-    read_out(readout, x, h, T, f, J)
+    rate_into(sizes, parts, x, h, T, U, free_room(sizes), f, J)
     return f, J

@@ -32,7 +32,7 @@ def runge_kutta(sizes: NDArray[np.int64], numbers: Array,
     """
     Step x' = f(x) + push and S' = f'(x) S + forced by h.
 
-    :param parts: of the model, as in :func:`koopman_ros.compiled.network.rate_into`.
+    :param parts: of :func:`koopman_ros.compiled.network.parts_of`.
     :param space: of :func:`space_of`.
     :return: both then, and the rates of both at the beginning and in the last stage.
     """

@@ -138,8 +138,17 @@ def _program(model: LiftedModel, plan: shooting.Horizon, u: Array, x: Array
     return shooting.Program(*found) if finite else None
 
 
+def _slope_at(model: LiftedModel, x: Array) -> Array | None:
+    layout = model.layout
+    if layout is None:
+        return None
+    found: Array = horizon.slope(layout.sizes, layout.numbers, x)
+    return found
+
+
 KERNELS: Kernels = {
     'answer': _answer, 'averaged': partial(_feedback, riccati.Form.AVERAGED),
     'corrected': _corrected, 'equilibrium': _equilibrium,
     'growth': _growth, 'moved': _moved, 'program': _program, 'propagated': _propagated,
-    'recentred': partial(_feedback, riccati.Form.RECENTRED), 'regulator': _regulator}
+    'recentred': partial(_feedback, riccati.Form.RECENTRED), 'regulator': _regulator,
+    'slope_at': _slope_at}

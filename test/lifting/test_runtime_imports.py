@@ -43,4 +43,4 @@ def test_packages_that_stand_alone():
         result = run(name)
         assert (result.returncode, result.stderr) == (0, '')
         assert set(result.stdout.split()) <= {
-            name, *beside, 'arrays', 'kernels', 'plant_data', 'plugs', 'units'}
+            name, *beside, 'arrays', 'kernels', 'plant_data', 'plugs', 'units', 'values'}

@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from koopman_ros.arrays import Array, frozen
 from koopman_ros.control.laws.base import Figures, LawResult, Plan, Target, Tuning
 from koopman_ros.control.laws.riccati import feedback, regulator, StateDependentRiccati
-from koopman_ros.control.laws.shooting import Horizon, program
+from koopman_ros.control.laws.shooting import Horizon, program, slope_at
 from koopman_ros.control.limits import finite, InputLimits
 from koopman_ros.estimation import Estimate
 from koopman_ros.lifting import LiftedModel
@@ -185,7 +185,7 @@ class RecedingHorizon:
         def of(state: bytes, interval: float, inputs: bytes) -> tuple[float, Array]:
             model, tuning = self.model, self.tuning
             x = np.frombuffer(state)
-            A = model.drift_and_jacobian(x)[1]
+            A = slope_at(model, x)
             fastest = _fastest(A)
             if inputs:
                 A = A + model.forcing_jacobian(x, np.frombuffer(inputs))
@@ -244,7 +244,7 @@ class _Problem:
         self._sample = interval / model.seconds_per_time_unit
         self.lengths = law.lengths(self._sample)
         at_target, terminal = law.at_target(target, self._sample)
-        rate = max(law.fastest, at_target, _fastest(model.drift_and_jacobian(estimate.x)[1]))
+        rate = max(law.fastest, at_target, _fastest(slope_at(model, estimate.x)))
         self._steps = min(max(math.ceil(self.lengths[-1] * rate / _STEP), 1), _MOST_STEPS)
         weights = tuning.weights
         self._horizon = Horizon(estimate.x, estimate.w, target.x, target.u, self.lengths,

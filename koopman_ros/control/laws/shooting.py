@@ -41,6 +41,12 @@ class Program:
 
 
 @compilable
+def slope_at(model: LiftedModel, x: Array) -> Array:
+    """Return the Jacobian (n_x, n_x) of the drift at a state (n_x,)."""
+    return model.drift_and_jacobian(x)[1]
+
+
+@compilable
 def program(model: LiftedModel, horizon: Horizon, u: Array, x: Array) -> Program | None:
     """
     Set up the program about a course of inputs (N, n_u) and nodes (N + 1, n_x).
