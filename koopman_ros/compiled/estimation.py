@@ -17,8 +17,15 @@ from koopman_ros.compiled.matrices import (
     solve_into,
     turned,
 )
-from koopman_ros.compiled.network import drift, drift_and_jacobian, matrices, N_U, N_X
-from koopman_ros.compiled.steps import runge_kutta
+from koopman_ros.compiled.network import (
+    drift,
+    drift_and_jacobian,
+    matrices,
+    N_U,
+    N_X,
+    parts_of,
+)
+from koopman_ros.compiled.steps import runge_kutta, space_of
 
 
 @compiled(INTEGERS, VECTOR, VECTOR, VECTOR, VECTOR, NUMBER, SIZE)
@@ -44,17 +51,19 @@ def propagated(sizes: NDArray[np.int64], numbers: Array, x: Array, w: Array, P: 
                h: float, steps: int) -> tuple[Array, Array]:
     """Return state and covariance of an extended Kalman filter after so many steps of h."""
     n = sizes[N_X]
-    _, B, _, readout = matrices(sizes, numbers)
-    push = applied(B, u)
+    _, B, _, _ = matrices(sizes, numbers)
+    parts, push = parts_of(sizes, numbers), applied(B, u)
     for i in range(n):
         push[i] += w[i]
+    space = space_of(sizes)
     # the state's derivatives by what state and disturbance were
     S, forced = np.zeros((n, 2 * n)), np.zeros((n, 2 * n))
     for i in range(n):
         S[i, i], forced[i, n + i] = 1.0, 1.0
     x = x.copy()
     for _ in range(steps):
-        x, S, _, _, _, _ = runge_kutta(sizes, numbers, readout, push, forced, x, S, h)
+        x, S, _, _, _, _ = runge_kutta(
+            sizes, numbers, parts, space, push, forced, x, S, h)
     F = np.zeros((2 * n, 2 * n))
     for i in range(n):
         F[n + i, n + i] = 1.0
@@ -118,11 +127,12 @@ def equilibrium(sizes: NDArray[np.int64], numbers: Array, w: Array, start: Array
     :param most: steps; see :mod:`koopman_ros.control.target` for what the others are.
     """
     n, m = sizes[N_X], sizes[N_U]
-    _, B, _, readout = matrices(sizes, numbers)
+    _, B, _, _ = matrices(sizes, numbers)
+    parts = parts_of(sizes, numbers)
     y, u, slope, rate = start.copy(), np.empty(m), np.empty((n, n)), np.empty((n, 1))
     size_of_slope = 0.0
     for step in range(most + 1):
-        f, J = drift_and_jacobian(sizes, numbers, readout, y[:n].copy())
+        f, J = drift_and_jacobian(sizes, numbers, parts, y[:n].copy())
         for i in range(m):
             u[i] = y[n + i]
         push, left = applied(B, u), 0.0

@@ -4,6 +4,7 @@
 """The quadratic program of a plan: its course, condensed to the inputs, and its cost."""
 
 import math
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -11,8 +12,8 @@ from numpy.typing import NDArray
 from koopman_ros.arrays import Array
 from koopman_ros.compiled.jit import compiled, inner, INTEGERS, MATRIX, SIZE, VECTOR
 from koopman_ros.compiled.matrices import applied
-from koopman_ros.compiled.network import matrices, N_U, N_X
-from koopman_ros.compiled.steps import runge_kutta
+from koopman_ros.compiled.network import drift_and_jacobian, matrices, N_U, N_X, parts_of
+from koopman_ros.compiled.steps import runge_kutta, space_of
 
 
 @inner
@@ -30,8 +31,9 @@ def _weigh(M: Array, g: Array, share: float, Q: Array, S: Array, error: Array) -
 
 
 @inner
-def _interval(sizes: NDArray[np.int64], numbers: Array, readout: Array, push: Array,
-              forced: Array, x: Array, x_ref: Array, Q: Array, length: float, steps: int
+def _interval(sizes: NDArray[np.int64], numbers: Array,
+              parts: tuple[Array, Array, Array, Array], space: Any, push: Array, forced: Array,
+              x: Array, x_ref: Array, Q: Array, length: float, steps: int
               ) -> tuple[Array, Array, Array, Array]:
     """
     Follow one interval.
@@ -49,7 +51,8 @@ def _interval(sizes: NDArray[np.int64], numbers: Array, readout: Array, push: Ar
         error[i] = x[i] - x_ref[i]
     _weigh(M, g, points, Q, S, error)
     for step in range(steps):
-        y, T, k1, s1, k4, s4 = runge_kutta(sizes, numbers, readout, push, forced, x, S, h)
+        y, T, k1, s1, k4, s4 = runge_kutta(
+            sizes, numbers, parts, space, push, forced, x, S, h)
         # the middle by the rates at both ends (Hermite), for Simpson's rule
         for i in range(n):
             error[i] = 0.5 * (x[i] + y[i]) + 0.125 * h * (k1[i] - k4[i]) - x_ref[i]
@@ -92,6 +95,12 @@ def _add(H: Array, f: Array, M: Array, g: Array, by_node: Array, gap: Array, wid
             H[width + i, width + j] += M[n + i, n + j]
 
 
+@compiled(INTEGERS, VECTOR, VECTOR)
+def slope(sizes: NDArray[np.int64], numbers: Array, x: Array) -> Array:
+    """Return the Jacobian of the drift at a state, (n_x, n_x)."""
+    return drift_and_jacobian(sizes, numbers, parts_of(sizes, numbers), x.copy())[1]
+
+
 @compiled(INTEGERS, VECTOR, MATRIX, MATRIX, VECTOR, VECTOR, VECTOR, VECTOR, VECTOR, SIZE, MATRIX,
           MATRIX, MATRIX)
 def program(sizes: NDArray[np.int64], numbers: Array, u: Array, x: Array, start: Array, w: Array,
@@ -104,7 +113,8 @@ def program(sizes: NDArray[np.int64], numbers: Array, u: Array, x: Array, start:
         :class:`koopman_ros.control.laws.shooting.Program`.
     """
     n, m, N = sizes[N_X], sizes[N_U], len(u)
-    _, B, _, readout = matrices(sizes, numbers)
+    _, B, _, _ = matrices(sizes, numbers)
+    parts, space = parts_of(sizes, numbers), space_of(sizes)
     Q, terminal = Q.copy(), terminal.copy()
     nodes, by_inputs = np.empty((N + 1, n)), np.zeros((N + 1, n, N * m))
     H, f = np.zeros((N * m, N * m)), np.zeros(N * m)
@@ -118,8 +128,8 @@ def program(sizes: NDArray[np.int64], numbers: Array, u: Array, x: Array, start:
         for i in range(n):
             push[i] += w[i]
             gap[i] = nodes[k, i] - x[k, i]
-        end, S, M, g = _interval(sizes, numbers, readout, push, forced, x[k].copy(), x_ref, Q,
-                                 lengths[k], steps)
+        end, S, M, g = _interval(sizes, numbers, parts, space, push, forced, x[k].copy(), x_ref,
+                                 Q, lengths[k], steps)
         width = k * m
         for i in range(n):
             nodes[k + 1, i] = end[i]

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from koopman_ros.arrays import Array
-from koopman_ros.compiled.jit import compiled, INTEGERS, MATRIX, NUMBER, VECTOR
+from koopman_ros.compiled.jit import compiled, inner, INTEGERS, MATRIX, NUMBER, SIZE, VECTOR
 from koopman_ros.compiled.matrices import (
     applied,
     block,
@@ -30,6 +30,9 @@ from koopman_ros.compiled.network import (
 )
 from koopman_ros.compiled.riccati import over_interval, regulator
 
+LAW = 3  # figures before the input in what `law` returns
+OVERFLOW = 709.0  # of an exponent, near what a float64 holds
+
 
 @compiled(MATRIX, MATRIX, MATRIX, MATRIX, NUMBER)
 def solve(A: Array, B: Array, Q: Array, R: Array, interval: float
@@ -39,77 +42,22 @@ def solve(A: Array, B: Array, Q: Array, R: Array, interval: float
     return fine, P, K, residual, size(K)
 
 
-@compiled(INTEGERS, VECTOR, VECTOR, VECTOR, VECTOR, VECTOR, VECTOR, MATRIX, MATRIX, NUMBER)
-def recentred(sizes: NDArray[np.int64], numbers: Array, x: Array, x_ref: Array, z_ref: Array,
-              u_ref: Array, forcing: Array, Q: Array, R: Array, interval: float
-              ) -> tuple[bool, Array, Array, Array, float, float, Array, Array]:
-    """
-    Evaluate the re-centred law of a lift that starts with the state.
-
-    :return: whether it is sure, u, P, K, the residual, the norm of K, and drift and action of the
-        error.
-    """
-    n, n_z = sizes[N_X], sizes[N_Z]
-    A, B, slope, readout = matrices(sizes, numbers)
-    p = applied(slope, x_ref)
-    for i in range(n):
-        p[i] = forcing[i] - p[i]
-    h, T, S, G = secants(sizes, numbers, x.copy(), x_ref.copy(), p)
-    z = lifted(sizes, numbers, h.reshape((len(h), 1)), 0.0)
-    for i in range(n_z):
-        z[i, 0] = (x[i] if i < n else z[i, 0]) - z_ref[i]
-    J, M = lifted(sizes, numbers, T, 1.0), lifted(sizes, numbers, S, 1.0)
-    H = combined(1.0, lifted(sizes, numbers, G, 0.0), -1.0, product(J, slope))
-    whole, weights = A.copy(), np.zeros((n_z, n_z))
-    place(whole, 0, 0, combined(1.0, block(A, 0, 0, n_z, n), 1.0, H), 1.0)
-    place(weights, 0, 0, Q, 1.0)
-    fine, P, K, residual = regulator(whole, product(J, B), weights, R.copy(), interval)
-    if not fine:
-        return False, p, P, K, residual, math.inf, P, P
-    if sizes[READOUT]:
-        motion = combined(1.0, block(readout, 0, 0, n, n), 1.0, product(
-            block(readout, 0, n, n, len(h)), S))
-    else:
-        motion = least_squares(J, combined(1.0, product(A, M), 1.0, H))
-    u = applied(K, z[:, 0].copy())
-    for i in range(len(u)):
-        u[i] = u_ref[i] - u[i]
-    action = product(B, product(K, M))
-    return fine, u, P, K, residual, size(K), motion, combined(-1.0, action, 0.0, action)
-
-
-@compiled(INTEGERS, VECTOR, VECTOR, VECTOR, VECTOR, MATRIX, MATRIX, NUMBER)
-def averaged(sizes: NDArray[np.int64], numbers: Array, x: Array, x_ref: Array, u_ref: Array,
-             Q: Array, R: Array, interval: float
-             ) -> tuple[bool, Array, Array, Array, float, float, Array, Array]:
-    """Evaluate the averaged law of a read-out; returns as :func:`recentred`."""
-    n = sizes[N_X]
-    _, B, _, readout = matrices(sizes, numbers)
-    h, _, S, _ = secants(sizes, numbers, x.copy(), x_ref.copy(), x.copy())
-    motion = combined(1.0, block(readout, 0, 0, n, n), 1.0, product(
-        block(readout, 0, n, n, len(h)), S))
-    fine, P, K, residual = regulator(motion, B, Q.copy(), R.copy(), interval)
-    e = np.empty(n)
-    for i in range(n):
-        e[i] = x[i] - x_ref[i]
-    if not fine:
-        return False, e, P, K, residual, math.inf, P, P
-    u = applied(K, e)
-    for i in range(len(u)):
-        u[i] = u_ref[i] - u[i]
-    action = product(B, K)
-    return fine, u, P, K, residual, size(K), motion, combined(-1.0, action, 0.0, action)
-
-
-@compiled(MATRIX, MATRIX, NUMBER)
-def growth(drift: Array, action: Array, interval: float) -> float:
-    """Return the growth of two states' error, of which the larger mode counts; NaN for others."""
+@inner
+def _growth(drift: Array, action: Array, interval: float) -> float:
+    """Return the growth of the error of one state or two; NaN for others."""
     n = len(drift)
+    if n == 1:
+        a, held = drift[0, 0], interval
+        if not a * interval < OVERFLOW:
+            return math.nan if math.isnan(a) else math.inf
+        if a != 0.0:
+            held = math.expm1(a * interval) / a
+        return abs(math.exp(a * interval) + held * action[0, 0])
     # of the state and of an action that is held
     F = np.zeros((2 * n, 2 * n))
     place(F, 0, 0, drift, 1.0)
     place(F, 0, n, action, 1.0)
-    if n != 2 or not (interval > 0.0 and math.isfinite(size(F))):
+    if n != 2 or not math.isfinite(size(F)):
         return math.nan
     D, _ = over_interval(F, identity(2 * n), interval)
     a, b, c, d = D[0, 0] + D[0, 2], D[0, 1] + D[0, 3], D[1, 0] + D[1, 2], D[1, 1] + D[1, 3]
@@ -117,3 +65,75 @@ def growth(drift: Array, action: Array, interval: float) -> float:
     if apart < 0.0:
         return math.hypot(1.0 + half, math.sqrt(-apart))
     return max(abs(1.0 + half + math.sqrt(apart)), abs(1.0 + half - math.sqrt(apart)))
+
+
+@compiled(MATRIX, MATRIX, NUMBER)
+def growth(drift: Array, action: Array, interval: float) -> float:
+    """Return the growth of the error of one state or two in an interval; NaN for others."""
+    return _growth(drift.copy(), action.copy(), interval)
+
+
+@inner
+def _pack(found: Array, start: int, M: Array) -> int:
+    """Write a matrix to a row of numbers; return where it ends."""
+    columns = M.shape[1]
+    for i in range(M.shape[0]):
+        for j in range(columns):
+            found[start + i * columns + j] = M[i, j]
+    return start + M.shape[0] * columns
+
+
+@compiled(INTEGERS, VECTOR, VECTOR, VECTOR, VECTOR, VECTOR, VECTOR, MATRIX, MATRIX, NUMBER, SIZE)
+def law(sizes: NDArray[np.int64], numbers: Array, x: Array, x_ref: Array, z_ref: Array,
+        u_ref: Array, forcing: Array, Q: Array, R: Array, interval: float, recentred: int
+        ) -> Array:
+    """
+    Evaluate the re-centred law of a lift that starts with the state, or the averaged one.
+
+    The latter is that of a read-out.
+
+    :return: in one row, since each array that is returned takes as long as some products: the
+        residual of the Riccati equation, infinite where it is not sure, the norm of K, the growth
+        of the error, u, P, K, and drift and action of the error.
+    """
+    n = sizes[N_X]
+    A, B, slope, readout = matrices(sizes, numbers)
+    p = applied(slope, x_ref)
+    for i in range(n):
+        p[i] = forcing[i] - p[i]
+    h, T, S, G = secants(sizes, numbers, x.copy(), x_ref.copy(), p)
+    motion = combined(1.0, block(readout, 0, 0, n, n), 0.0, block(readout, 0, 0, n, n))
+    if sizes[READOUT]:
+        motion = combined(1.0, motion, 1.0, product(block(readout, 0, n, n, len(h)), S))
+    if recentred:
+        k = sizes[N_Z]
+        z = lifted(sizes, numbers, h.reshape((len(h), 1)), 0.0)
+        J, M = lifted(sizes, numbers, T, 1.0), lifted(sizes, numbers, S, 1.0)
+        H = combined(1.0, lifted(sizes, numbers, G, 0.0), -1.0, product(J, slope))
+        if not sizes[READOUT]:
+            motion = least_squares(J, combined(1.0, product(A, M), 1.0, H))
+        whole, push = A, product(J, B)
+        place(whole, 0, 0, combined(1.0, block(A, 0, 0, k, n), 1.0, H), 1.0)
+        e = np.empty(k)
+        for i in range(k):
+            e[i] = (x[i] if i < n else z[i, 0]) - z_ref[i]
+    else:
+        k, whole, push, M, e = n, motion, B, identity(n), np.empty(n)
+        for i in range(n):
+            e[i] = x[i] - x_ref[i]
+    weights = np.zeros((k, k))
+    place(weights, 0, 0, Q, 1.0)
+    fine, P, K, residual = regulator(whole, push, weights, R.copy(), interval)
+    m = B.shape[1]
+    found = np.empty(LAW + m + k * k + m * k + 2 * n * n)
+    found[0] = residual if fine else math.inf
+    if not fine:
+        return found
+    action = product(B, product(K, M))
+    action = combined(-1.0, action, 0.0, action)
+    found[1], found[2] = size(K), _growth(motion, action, interval)
+    u = applied(K, e)
+    for i in range(m):
+        found[LAW + i] = u_ref[i] - u[i]
+    _pack(found, _pack(found, _pack(found, _pack(found, LAW + m, P), K), motion), action)
+    return found

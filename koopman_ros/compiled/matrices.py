@@ -152,6 +152,38 @@ def solve_into(U: Array, X: Array) -> bool:
 
 
 @inner
+def factor_into(S: Array) -> bool:
+    """Turn a symmetric, definite S into the L D L' of itself; False for one that is not."""
+    n = S.shape[0]
+    fine = True
+    for k in range(n):
+        for j in range(k):
+            S[k, k] -= S[k, j] * S[k, j] * S[j, j]
+        fine = fine and S[k, k] > 0.0 and math.isfinite(S[k, k])
+        for i in range(k + 1, n):
+            for j in range(k):
+                S[i, k] -= S[i, j] * S[k, j] * S[j, j]
+            S[i, k] /= S[k, k]
+    return fine
+
+
+@inner
+def solve_factored(S: Array, X: Array) -> None:
+    """Solve L D L' X = X of what :func:`factor_into` gave."""
+    n, m = X.shape
+    for k in range(n):
+        for i in range(k):
+            for j in range(m):
+                X[k, j] -= S[k, i] * X[i, j]
+    for k in range(n - 1, -1, -1):
+        for j in range(m):
+            X[k, j] /= S[k, k]
+        for i in range(k + 1, n):
+            for j in range(m):
+                X[k, j] -= S[i, k] * X[i, j]
+
+
+@inner
 def least_squares(J: Array, B: Array) -> Array:
     """Minimise the norm of J X - B, J (n, k) of full rank, by modified Gram-Schmidt."""
     n, k, m = J.shape[0], J.shape[1], B.shape[1]

@@ -1,33 +1,49 @@
 # SPDX-FileCopyrightText: 2026 The koopman_ros Authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""A Runge-Kutta step of the state of a read-out together with its derivatives."""
+"""A Runge-Kutta step of the state together with its derivatives."""
+
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from koopman_ros.arrays import Array
 from koopman_ros.compiled.jit import inner
-from koopman_ros.compiled.network import hidden_into, read_out, room
+from koopman_ros.compiled.network import (
+    free_room,
+    hidden_into,
+    rate_into,
+    READOUT,
+    room,
+)
 
 
 @inner
-def runge_kutta(sizes: NDArray[np.int64], numbers: Array, readout: Array, push: Array,
-                forced: Array, x: Array, S: Array, h: float
-                ) -> tuple[Array, Array, Array, Array, Array, Array]:
+def space_of(sizes: NDArray[np.int64]) -> tuple[Any, Any]:
+    """Return room for the steps of a model, which each of them takes anew."""
+    return room(sizes, not sizes[READOUT]), free_room(sizes)
+
+
+@inner
+def runge_kutta(sizes: NDArray[np.int64], numbers: Array,
+                parts: tuple[Array, Array, Array, Array], space: Any, push: Array, forced: Array,
+                x: Array, S: Array, h: float) -> tuple[Array, Array, Array, Array, Array, Array]:
     """
     Step x' = f(x) + push and S' = f'(x) S + forced by h.
 
+    :param parts: of :func:`koopman_ros.compiled.network.parts_of`.
+    :param space: of :func:`space_of`.
     :return: both then, and the rates of both at the beginning and in the last stage.
     """
     n, c = S.shape
-    layer, before, T, T_before, scale = room(sizes)
+    (layer, before, T, T_before, U, U_before, scale), free_space = space
     y, V, f, J = x.copy(), S.copy(), np.empty(n), np.empty((n, n))
     first, first_S, rate, rate_S = np.empty(n), np.empty((n, c)), np.empty(n), np.empty((n, c))
     total, total_S = np.zeros(n), np.zeros((n, c))
     for stage in range(4):
-        hidden_into(sizes, numbers, y, layer, before, T, T_before, scale)
-        read_out(readout, y, layer, T, f, J)
+        hidden_into(sizes, numbers, y, layer, before, T, T_before, U, U_before, scale)
+        rate_into(sizes, parts, y, layer, T, U, free_space, f, J)
         weight = 1.0 if stage in (0, 3) else 2.0
         for i in range(n):
             rate[i] = f[i] + push[i]

@@ -3,7 +3,8 @@
 
 """What takes the place of which function in numpy; see :mod:`koopman_ros.kernels`."""
 
-from typing import Any
+from functools import partial
+import math
 
 import numpy as np
 from numpy.typing import NDArray
@@ -36,33 +37,51 @@ def _regulator(model: LiftedModel, A: Array, B: Array, Q: Array, R: Array, *, in
     return _solution(P, K, residual, size, max_residual, max_gain) if sure else None
 
 
-def _feedback(found: tuple[Any, ...], form: riccati.Form, max_residual: float, max_gain: float
-              ) -> riccati.Feedback | None:
-    sure, u, P, K, residual, size, drift, action = found
-    solution = _solution(P, K, residual, size, max_residual, max_gain) if sure else None
-    return None if solution is None else riccati.Feedback(u, form, solution, drift, action)
-
-
-def _recentred(model: LiftedModel, x: Array, target: base.Target, weights: base.Weights, *,
-               interval: float = 0.0, max_gain: float = 1e6, max_residual: float = 1e-8
-               ) -> riccati.Feedback | None:
-    layout = model.layout
-    if layout is None or not model.identity or not interval > 0.0:
+def _law(model: LiftedModel, x: Array, target: base.Target, weights: base.Weights,
+         form: riccati.Form, interval: float) -> tuple[Array, int] | None:
+    """Return what the compiled law gives, and its number of coordinates; None where not sure."""
+    layout, recentred = model.layout, form is riccati.Form.RECENTRED
+    if layout is None or not (model.identity if recentred else model.readout is not None) or not (
+            interval > 0.0):
         return None
-    return _feedback(laws.recentred(
+    found = laws.law(
         layout.sizes, layout.numbers, x, target.x, target.z, target.u, target.forcing, weights.Q,
-        weights.R, interval), riccati.Form.RECENTRED, max_residual, max_gain)
+        weights.R, interval, recentred)
+    return (found, model.n_z if recentred else model.n_x) if found[0] < math.inf else None
 
 
-def _averaged(model: LiftedModel, x: Array, target: base.Target, weights: base.Weights, *,
-              interval: float = 0.0, max_gain: float = 1e6, max_residual: float = 1e-8
-              ) -> riccati.Feedback | None:
-    layout = model.layout
-    if layout is None or model.readout is None or not interval > 0.0:
+def _feedback(form: riccati.Form, model: LiftedModel, x: Array, target: base.Target,
+              weights: base.Weights, *, interval: float = 0.0, max_gain: float = 1e6,
+              max_residual: float = 1e-8) -> riccati.Feedback | None:
+    whole = _law(model, x, target, weights, form, interval)
+    if whole is None:
         return None
-    return _feedback(laws.averaged(
-        layout.sizes, layout.numbers, x, target.x, target.u, weights.Q, weights.R, interval),
-        riccati.Form.AVERAGED, max_residual, max_gain)
+    (found, k), n, m = whole, model.n_x, model.n_u
+    residual, size = found[:2].tolist()
+    u, P, K, drift, action, _ = np.split(
+        found[laws.LAW:], np.cumsum((m, k * k, m * k, n * n, n * n)))
+    solution = _solution(P.reshape(k, k), K.reshape(m, k), residual, size, max_residual, max_gain)
+    return None if solution is None else riccati.Feedback(
+        u, form, solution, drift.reshape(n, n), action.reshape(n, n))
+
+
+def _answer(model: LiftedModel, x: Array, target: base.Target, tuning: base.Tuning,
+            interval: float) -> riccati.Answer | None:
+    form = riccati.Form.RECENTRED if riccati.closed(model) else riccati.Form.AVERAGED
+    whole = _law(model, x, target, tuning.weights, form, interval)
+    if whole is None:
+        return None
+    (found, k), m = whole, model.n_u
+    residual, gain, growth = found[:laws.LAW].tolist()
+    if min(m, k) > 1:
+        start = laws.LAW + m + k * k
+        gain = float(np.linalg.norm(found[start:start + m * k].reshape(m, k), 2))
+    # of more than two states the reference tells how their error grows
+    if not (residual <= tuning.max_residual and gain <= tuning.max_gain
+            and growth == growth):
+        return None
+    return riccati.Answer(found[laws.LAW:laws.LAW + m],
+                          base.Figures(form.value, residual, gain, growth), RiccatiStatus.SOLVED)
 
 
 def _growth(model: LiftedModel, found: riccati.Feedback, interval: float) -> float | None:
@@ -84,11 +103,11 @@ def _moved(model: LiftedModel, x: Array, w: Array, u: Array, h: float, steps: in
 def _propagated(model: LiftedModel, x: Array, w: Array, P: Array, u: Array, h: float, steps: int
                 ) -> tuple[Array, Array] | None:
     layout = model.layout
-    if layout is None or model.readout is None:
+    if layout is None:
         return None
     found: tuple[Array, Array] = estimation.propagated(
         layout.sizes, layout.numbers, x, w, P, u, h, steps)
-    return found
+    return found if math.isfinite(found[0][0]) else None
 
 
 def _corrected(model: LiftedModel, H: Array, R: Array, P: Array, difference: Array
@@ -111,7 +130,7 @@ def _equilibrium(model: LiftedModel, w: Array, start: Array, free: NDArray[np.bo
 def _program(model: LiftedModel, plan: shooting.Horizon, u: Array, x: Array
              ) -> shooting.Program | None:
     layout = model.layout
-    if layout is None or model.readout is None:
+    if layout is None:
         return None
     finite, *found = horizon.program(
         layout.sizes, layout.numbers, u, x, plan.start, plan.w, plan.x_ref, plan.u_ref,
@@ -119,7 +138,17 @@ def _program(model: LiftedModel, plan: shooting.Horizon, u: Array, x: Array
     return shooting.Program(*found) if finite else None
 
 
+def _slope_at(model: LiftedModel, x: Array) -> Array | None:
+    layout = model.layout
+    if layout is None:
+        return None
+    found: Array = horizon.slope(layout.sizes, layout.numbers, x)
+    return found
+
+
 KERNELS: Kernels = {
-    'averaged': _averaged, 'corrected': _corrected, 'equilibrium': _equilibrium,
+    'answer': _answer, 'averaged': partial(_feedback, riccati.Form.AVERAGED),
+    'corrected': _corrected, 'equilibrium': _equilibrium,
     'growth': _growth, 'moved': _moved, 'program': _program, 'propagated': _propagated,
-    'recentred': _recentred, 'regulator': _regulator}
+    'recentred': partial(_feedback, riccati.Form.RECENTRED), 'regulator': _regulator,
+    'slope_at': _slope_at}

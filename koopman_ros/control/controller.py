@@ -21,7 +21,6 @@ from koopman_ros.control.levels import Estimating, Level, levels_of
 from koopman_ros.control.limits import finite, limit, shifted, Transfer
 from koopman_ros.control.settings import Settings
 from koopman_ros.control.state import (
-    amended,
     Arrival,
     CommandReport,
     EstimateReport,
@@ -49,6 +48,7 @@ from koopman_ros.lifting import Coordinates, LiftedModel
 from koopman_ros.reasons import Code, Reason, reason
 from koopman_ros.signals import numbers, Outputs
 from koopman_ros.units import LATE_NANOSECONDS, NANOSECONDS
+from koopman_ros.values import amended
 
 # What changes of the state when no law acts any more, and when none is on its way back.
 _LAW_ENDS: Mapping[str, object] = {'law': None, 'law_input': None, 'law_memory': None}
@@ -441,10 +441,11 @@ class Controller:
     def _supervised(self, state: State, supervisor: Supervisor, verdict: Verdict,
                     outside: float, time_ns: int) -> State:
         """Take over the supervisor's new state."""
-        estimating, before = self._estimating, self._estimating.level(state)
         way_back = self._way_back(state, supervisor, verdict, outside, time_ns)
-        if supervisor == state.supervisor and way_back is state.way_back:
+        if way_back is state.way_back and (
+                supervisor is state.supervisor or supervisor == state.supervisor):
             return state
+        estimating, before = self._estimating, self._estimating.level(state)
         state = amended(state, supervisor=supervisor, way_back=way_back)
         now = estimating.level(state)
         if now is not before:

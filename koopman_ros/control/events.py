@@ -15,9 +15,10 @@ from koopman_ros.arrays import Array
 from koopman_ros.control.controller import Controller
 from koopman_ros.control.state import Mode, Report, State
 from koopman_ros.reasons import Reason
+from koopman_ros.values import record
 
 
-@dataclass(frozen=True)
+@record
 class Measurement:
     """A measurement that is answered."""
 
@@ -68,7 +69,7 @@ Event: TypeAlias = (
     Measurement | Silence | SetpointRequest | ManualCommand | ModeChange | Initialisation)
 
 
-@dataclass(frozen=True)
+@record
 class Outcome:
     """What an event led to."""
 

@@ -18,7 +18,7 @@ from koopman_ros.control.laws import Law, LawResult, LAWS, Tuning, Weights
 from koopman_ros.control.laws.base import steady_state_target, Target
 from koopman_ros.control.limits import finite, InputLimits
 from koopman_ros.control.settings import Settings
-from koopman_ros.control.state import amended, State
+from koopman_ros.control.state import State
 from koopman_ros.control.target import held_at, partial_target, reachable_target
 from koopman_ros.estimation import (
     check,
@@ -34,6 +34,7 @@ from koopman_ros.plugs import plug
 from koopman_ros.reasons import Code, Reason, reason
 from koopman_ros.signals import Outputs
 from koopman_ros.units import NANOSECONDS
+from koopman_ros.values import amended, record
 
 
 @dataclass(frozen=True)
@@ -174,7 +175,7 @@ def levels_of(model: LiftedModel, outputs: Outputs, settings: Settings) -> dict[
     return levels
 
 
-@dataclass(frozen=True)
+@record
 class Observation:
     """What became of a measurement."""
 
@@ -209,7 +210,8 @@ class Estimating:
         name = state.supervisor.settled
         if name is None:
             return next(iter(self.levels.values()))
-        return self.levels.get(name) or self.levels[next(reversed(self.levels))]
+        found = self.levels.get(name)
+        return self.levels[next(reversed(self.levels))] if found is None else found
 
     def applied(self, state: State, measured: Array | None = None) -> tuple[Array, bool]:
         """

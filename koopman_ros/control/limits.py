@@ -14,6 +14,7 @@ import numpy as np
 
 from koopman_ros.arrays import Array, as_arrays
 from koopman_ros.signals import per_signal
+from koopman_ros.values import record
 
 
 @dataclass(frozen=True)
@@ -54,7 +55,7 @@ def finite(value: Array) -> bool:
     return all(map(math.isfinite, value.tolist()))
 
 
-@dataclass(frozen=True)
+@record
 class LimitedInput:
     """A command within its limits."""
 
@@ -97,7 +98,7 @@ def _between(u: float, lower: float, upper: float) -> float:
 _NEGLIGIBLE = 1e-9
 
 
-@dataclass(frozen=True)
+@record
 class Transfer:
     """
     An offset to the command that fades with d (1 + t/T) exp(-t/T), flat at first.

@@ -3,7 +3,7 @@
 
 """The set-point: requested by the operator, at once or for a later time, checked and ramped."""
 
-from dataclasses import dataclass, replace
+from dataclasses import replace
 import math
 
 import numpy as np
@@ -12,13 +12,14 @@ from koopman_ros.arrays import Array
 from koopman_ros.lifting import Coordinates
 from koopman_ros.reasons import Code, Reason, reason
 from koopman_ros.units import NANOSECONDS
+from koopman_ros.values import record
 
 # A stamp further ahead than this comes from another clock and is no schedule.
 HORIZON_NANOSECONDS = 3600 * NANOSECONDS
 MAX_SCHEDULED = 1000
 
 
-@dataclass(frozen=True)
+@record
 class Setpoint:
     """The state of the set-point."""
 

@@ -3,10 +3,9 @@
 
 """What a controller remembers between two measurements, and what it reports of a step."""
 
-from dataclasses import dataclass, field
+from dataclasses import field
 from enum import Enum
 import math
-from typing import TypeVar
 
 import numpy as np
 
@@ -17,21 +16,7 @@ from koopman_ros.control.setpoint import Setpoint
 from koopman_ros.control.supervisor import Supervisor, WayBack
 from koopman_ros.estimation import Accepted, Estimate, Innovation
 from koopman_ros.reasons import Reason
-
-Record = TypeVar('Record')
-
-
-def amended(record: Record, **changes: object) -> Record:
-    """
-    Return a copy of a frozen dataclass with other values, as :func:`dataclasses.replace` does.
-
-    It is a fifth of a control step faster, since it neither asks for the fields nor checks
-    values: for records without checks of their own.
-    """
-    copy: Record = object.__new__(type(record))
-    copy.__dict__.update(record.__dict__)
-    copy.__dict__.update(changes)
-    return copy
+from koopman_ros.values import record
 
 
 class Mode(Enum):
@@ -41,7 +26,7 @@ class Mode(Enum):
     MANUAL = 'manual'
 
 
-@dataclass(frozen=True)
+@record
 class State:
     """All that a controller remembers between two measurements."""
 
@@ -81,7 +66,7 @@ class Arrival(Enum):
     MISSING = 'missing'
 
 
-@dataclass(frozen=True)
+@record
 class MeasurementReport:
     """The measurement that was answered."""
 
@@ -98,7 +83,7 @@ class MeasurementReport:
 NOTHING_MEASURED = MeasurementReport()
 
 
-@dataclass(frozen=True)
+@record
 class EstimateReport:
     """The estimate."""
 
@@ -116,7 +101,7 @@ class EstimateReport:
         return None if self.covariance is None else np.sqrt(self.covariance.diagonal())
 
 
-@dataclass(frozen=True)
+@record
 class TargetReport:
     """Where the law goes."""
 
@@ -129,7 +114,7 @@ class TargetReport:
     input: Array | None = None  #: (n_u,) that holds it, in input units; None likewise
 
 
-@dataclass(frozen=True)
+@record
 class CommandReport:
     """How the command came about."""
 
@@ -146,7 +131,7 @@ class CommandReport:
 NO_COMMAND = CommandReport()
 
 
-@dataclass(frozen=True)
+@record
 class Report:
     """What a step did."""
 

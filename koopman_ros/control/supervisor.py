@@ -14,6 +14,7 @@ from koopman_ros.arrays import Array
 from koopman_ros.lifting import LiftedModel
 from koopman_ros.reasons import Code, Reason, reason
 from koopman_ros.units import NANOSECONDS
+from koopman_ros.values import record
 
 # What follows when no law can act, in this order.
 HOLD = 'hold'
@@ -30,6 +31,17 @@ class LevelSettings:
     law: str  #: its name in :data:`koopman_ros.control.laws.LAWS`, or module:class
     #: distance outside the training data, in half widths of their box, up to which it acts
     margin: float
+
+
+@record
+class Requested:
+    """The best level that is possible now."""
+
+    level: str  #: which
+    reason: Reason | None = None  #: why none above it; None for the best
+    #: whether it is left as soon as the reason is gone, as when a measurement was missing: nothing
+    #: was lost then
+    passing: bool = False
 
 
 @dataclass(frozen=True)
@@ -60,6 +72,11 @@ class SupervisorSettings:
         """The names of all levels, best first."""
         return (*(level.law for level in self.levels), HOLD, SAFE)
 
+    @cached_property
+    def best(self) -> Requested:
+        """What is asked for where nothing is against the best level."""
+        return Requested(self.order[0])
+
     def depth(self, level: str | None) -> int:
         """Return the place in the order; 0 for None, and for a level that there is no more."""
         return self._depths.get(level, 0)
@@ -83,18 +100,7 @@ class SupervisorSettings:
         return _HYSTERESIS * self.largest_margin
 
 
-@dataclass(frozen=True)
-class Requested:
-    """The best level that is possible now."""
-
-    level: str  #: which
-    reason: Reason | None = None  #: why none above it; None for the best
-    #: whether it is left as soon as the reason is gone, as when a measurement was missing: nothing
-    #: was lost then
-    passing: bool = False
-
-
-@dataclass(frozen=True)
+@record
 class Supervisor:
     """The state of the supervisor."""
 
@@ -116,6 +122,8 @@ class Supervisor:
 
         :param ranges: (name, lower, upper) of the box, for the reason.
         """
+        if not outside > 0.0:
+            return settings.best
         levels = settings.levels
         for i in reversed(range(len(levels))):
             below = levels[i + 1].law if i + 1 < len(levels) else SAFE
@@ -124,7 +132,7 @@ class Supervisor:
             if outside > (_HYSTERESIS * margin if entered else margin):
                 return Requested(below, reason(Code.OUTSIDE_TRAINING, ranges=ranges,
                                                margin=margin, level=levels[i].law))
-        return Requested(levels[0].law)
+        return settings.best
 
     def at(self, settings: SupervisorSettings, requested: Requested, time_ns: int) -> Supervisor:
         """
@@ -133,6 +141,9 @@ class Supervisor:
         A hold becomes the safe input after its timeout.
         """
         depth, bad_since, why = settings.depth, None, requested.reason
+        if (why is self.reason is self.resumes is self.bad_since_ns is self.better_since_ns is None
+                and self.level == requested.level):
+            return self
         if requested.level == HOLD:
             bad_since = time_ns if self.bad_since_ns is None else self.bad_since_ns
             held = (time_ns - bad_since) / NANOSECONDS
@@ -173,7 +184,7 @@ _STEP, _STEP_SHARE, _AT_REST = 0.02, 0.2, 1e-5
 _MAX_STEPS = 500
 
 
-@dataclass(frozen=True)
+@record
 class WayBack:
     """
     How far a plant under the safe input has come back, by its distance from the training data.

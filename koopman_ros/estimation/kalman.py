@@ -14,6 +14,7 @@ from koopman_ros.estimation.observer import BoundedDisturbance, Estimate, Innova
 from koopman_ros.kernels import compilable
 from koopman_ros.lifting import LiftedModel
 from koopman_ros.solvers import runge_kutta_step
+from koopman_ros.values import record
 
 # One step of integration spans at most this share of the drift's fastest time constant.
 _STEP_SHARE = 0.5
@@ -234,7 +235,7 @@ def propagated(model: LiftedModel, x: Array, w: Array, P: Array, u: Array, h: fl
     return whole[:, 0].copy(), F @ P @ F.T
 
 
-@dataclass(frozen=True)
+@record
 class Correction:
     """What outputs (n_y,) add to a prediction."""
 

@@ -17,9 +17,10 @@ from koopman_ros.arrays import Array, as_arrays
 from koopman_ros.reasons import Code, Reason, reason
 from koopman_ros.signals import Outputs, per_signal
 from koopman_ros.units import NANOSECONDS
+from koopman_ros.values import record
 
 
-@dataclass(frozen=True)
+@record
 class FrozenCheck:
     """Since when each signal has stood still, and how far the model says that it has moved."""
 
@@ -106,7 +107,7 @@ class SensorLimits:
                         self.jump.tolist(), strict=True))
 
 
-@dataclass(frozen=True)
+@record
 class Accepted:
     """What is remembered of the measurements."""
 
@@ -116,7 +117,7 @@ class Accepted:
     jumped: bool = False  #: whether a later one was taken for a jump
 
 
-@dataclass(frozen=True)
+@record
 class Verdict:
     """What became of a measurement."""
 

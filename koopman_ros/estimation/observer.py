@@ -14,6 +14,7 @@ from koopman_ros.arrays import Array
 from koopman_ros.kernels import compilable
 from koopman_ros.lifting import LiftedModel
 from koopman_ros.signals import Outputs
+from koopman_ros.values import record
 
 # One step of integration spans at most this share of the model's fastest time constant.
 _STEP_SHARE = 0.1
@@ -21,7 +22,7 @@ _MAX_STEPS = 20
 _CONVERGED = 1e-9  # of scaled deviations; the figure is shown with nine digits
 
 
-@dataclass(frozen=True)
+@record
 class Innovation:
     """
     By how much measurements differed from what was expected, over what was to be expected.
@@ -52,7 +53,7 @@ class Innovation:
         return lower, upper
 
 
-@dataclass(frozen=True)
+@record
 class Estimate:
     """
     What is known of the plant, in scaled deviations and the model's time unit.

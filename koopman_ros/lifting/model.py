@@ -342,7 +342,7 @@ class LiftedModel:
 
     def drift_and_jacobian(self, x: Array) -> tuple[Array, Array]:
         """
-        Evaluate the drift and its Jacobian at once; see :meth:`drift_jacobian`.
+        Evaluate the drift and its Jacobian at once, both exactly: (..., n_x), (..., n_x, n_x).
 
         Where there is no read-out they are of the normal equations, which are quicker for many
         states and lose digits where J_N is badly conditioned.
@@ -352,16 +352,16 @@ class LiftedModel:
         if self.readout is not None:
             features, slope = self.observables.features.lift_and_jacobian(x)
             return features @ self.readout.T, self.readout @ slope
-        n = self.n_x
-        steps = _DIFFERENCE * np.concatenate((np.zeros((1, n)), np.eye(n), -np.eye(n)))
-        points = x + steps.reshape(-1, *(1,) * (x.ndim - 1), n)
-        z, J = self.observables.lift_and_jacobian(points)
-        transposed = J.swapaxes(-1, -2)
-        rate = np.linalg.solve(
-            transposed @ J, transposed @ (z @ self.A.T)[..., None])[..., 0]
-        rate -= self.pre_feedback_rate(points)
-        ahead, behind = rate[1:n + 1], rate[n + 1:]
-        return rate[0], np.moveaxis(ahead - behind, 0, -1) / (2.0 * _DIFFERENCE)
+        z, J, bend = self.observables.lift_and_derivatives(x)
+        rate, transposed = z @ self.A.T, J.swapaxes(-1, -2)
+        square = transposed @ J
+        f = np.linalg.solve(square, transposed @ rate[..., None])
+        rest = rate[..., None] - J @ f
+        # of J'J f = J'A z, by each state; the derivatives of J are symmetric in the states
+        slope = np.linalg.solve(
+            square, transposed @ (self.A @ J - (bend @ f[..., None, :, :])[..., 0])
+            + (bend * rest[..., None]).sum(axis=-3))
+        return (f[..., 0] - self.pre_feedback_rate(x), slope - self.pre_feedback_slope)
 
     def drift_jacobian(self, x: Array) -> Array:
         """Evaluate df/dx of the drift, (..., n_x) -> (..., n_x, n_x): of a read-out exactly."""

@@ -45,6 +45,10 @@ class Observables(ABC):
         """Evaluate N(x) and J_N(x) = dN/dx: (..., n_x) -> (..., n_z), (..., n_z, n_x)."""
 
     @abstractmethod
+    def lift_and_derivatives(self, x: Array) -> tuple[Array, Array, Array]:
+        """Evaluate N(x), J_N(x) and the derivatives of J_N: the last (..., n_z, n_x, n_x)."""
+
+    @abstractmethod
     def lift_and_secants(self, x: Array, x_ref: Array, w: Array
                          ) -> tuple[Array, Array, Array, Array]:
         """
@@ -171,6 +175,28 @@ class NetworkObservables(Observables):
         J = _product(T, self.rows.T)
         return self._with_states(x, z), self._with_states(eye, J).swapaxes(-1, -2)
 
+    def lift_and_derivatives(self, x: Array) -> tuple[Array, Array, Array]:
+        """Evaluate N(x), J_N(x) and the derivatives of J_N in one forward pass."""
+        n, eye = self.n_x, np.broadcast_to(self._identity_rows, (*x.shape, self.n_x))
+        if not self.hidden:
+            return x, eye, np.zeros((*x.shape, n, n))
+        # T is the transpose of dh/dx, and U holds that of d2h/dx2 in its last axis but two and one
+        h, T, f = x, eye, self._activation
+        U = np.zeros((*x.shape[:-1], n, n, n))
+        for weight, bias in self.hidden:
+            a = _product(h, weight.T) + bias
+            h = f.value(a)
+            # the difference of a slope between a and itself is its derivative
+            bend = f.divided_differences(a, a, h, h)[1][..., None, None, :]
+            T, slope = T @ weight.T, f.slope(a, h)[..., None, :]
+            U = bend * T[..., :, None, :] * T[..., None, :, :] + slope[..., None, :] * (
+                U @ weight.T)
+            T = slope * T
+        rows = self.rows.T
+        z, J = _product(h - self.value_at_zero, rows), T @ rows
+        return (self._with_states(x, z), self._with_states(eye, J).swapaxes(-1, -2),
+                np.moveaxis(U @ rows, -1, -3))
+
     def lift_and_secants(self, x: Array, x_ref: Array, w: Array
                          ) -> tuple[Array, Array, Array, Array]:
         """Evaluate the lift and, by the chain rule of divided differences, the secants."""
@@ -292,6 +318,10 @@ class PolynomialObservables(Observables):
     def lift_and_jacobian(self, x: Array) -> tuple[Array, Array]:
         """Evaluate N(x) and J_N(x); shapes as in the interface."""
         return self.lift(x), self._first.factors * self._first.at(x)
+
+    def lift_and_derivatives(self, x: Array) -> tuple[Array, Array, Array]:
+        """Evaluate N(x), J_N(x) and the derivatives of J_N; shapes as in the interface."""
+        return *self.lift_and_jacobian(x), self._second.factors * self._second.at(x)
 
     def lift_and_secants(self, x: Array, x_ref: Array, w: Array
                          ) -> tuple[Array, Array, Array, Array]:

@@ -4,7 +4,7 @@
 """The controller node: answers each measurement with a command."""
 
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import replace
 import gc
 import math
 import sys
@@ -60,6 +60,7 @@ from koopman_ros.ros.process import run
 from koopman_ros.ros.signals import Heard, Inlet, Outlet
 from koopman_ros.ros.watchdog import PERIOD, Timing, Watchdog
 from koopman_ros.units import display_unit, NANOSECONDS, shown
+from koopman_ros.values import record
 from koopman_ros.wire import stem
 
 # A measurement and the inputs that acted on it are stamped no further apart.
@@ -70,7 +71,7 @@ _PATIENCE = 0.5  # s that the first answer waits for the measured inputs
 _ATTEMPTS = 2
 
 
-@dataclass(frozen=True)
+@record
 class _Sample:
     """A measurement that is to be answered."""
 
@@ -368,13 +369,18 @@ class ControllerNode(ManagedNode):
                 or (target.setpoint != self._published_setpoint).any()):
             self._published_setpoint = target.setpoint
             self._active.send(target.setpoint, stamp, self._frame_id)
-        if predicted is not None:
+        if predicted is not None and self._predicted.heard():
             self._predicted.send(predicted, stamp, self._frame_id)
-        self._internals.publish(messages.internals(self._signals, report, stamp, self._frame_id))
+        if topics.heard(self._internals):
+            self._internals.publish(messages.internals(
+                self._signals, report, stamp, self._frame_id))
         if (plan := report.command.plan) is not None:
-            self._plan.publish(messages.planned(self._signals, plan, stamp, self._frame_id))
-            self._active_limits.publish(
-                messages.active_limits(self._signals, plan, stamp, self._frame_id))
+            if topics.heard(self._plan):
+                self._plan.publish(messages.planned(
+                    self._signals, plan, stamp, self._frame_id))
+            if topics.heard(self._active_limits):
+                self._active_limits.publish(messages.active_limits(
+                    self._signals, plan, stamp, self._frame_id))
 
     def _on_setpoint(self, heard: Heard) -> None:
         (name, value), = heard.values.items()
@@ -475,7 +481,8 @@ class ControllerNode(ManagedNode):
             self._controller, self._settings, self._signals, self._state, self._report,
             self._counts, self._timing, self._matching.complaint or frame, self._refused,
             self._models.refused,
-            {**self._models.figures(), 'safe input': self._rests_outside or 'within reach'},
+            lambda: {**self._models.figures(),
+                     'safe input': self._rests_outside or 'within reach'},
             self._measured, self._assembler))
         # without measurements answered there is nothing to complain of
         return status if self.active else replace(status, level=Level.OK, message='inactive')

@@ -5,6 +5,7 @@
 
 from collections.abc import Callable, Collection, Mapping
 from dataclasses import dataclass
+from functools import lru_cache
 import itertools
 import math
 import secrets
@@ -31,6 +32,7 @@ from koopman_ros.ros import topics
 from koopman_ros.ros.node import Level, Status, words_of
 from koopman_ros.ros.watchdog import Timing
 from koopman_ros.units import display_unit, NANOSECONDS, shown
+from koopman_ros.values import record
 from koopman_ros.wire import stem
 
 _REACHED = 1e-3  # of a range; so near a set-point is reached
@@ -52,7 +54,7 @@ class Counts:
     setpoint_received: bool = False
 
 
-@dataclass(frozen=True)
+@record
 class Situation:
     """All that a status tells of."""
 
@@ -66,7 +68,7 @@ class Situation:
     complaint: str  #: what is wrong around the node, e.g. a second controller; or empty
     request_refused: str  #: why the operator's last request was refused, or empty
     model_refused: str  #: why the last model was refused, or empty
-    model: Mapping[str, object]  #: figures of the model in force
+    model: Callable[[], Mapping[str, object]]  #: gives figures of the model in force
     measured: Array  #: (n_y,) last measured, in the units of the signals
     assembler: Assembler  #: what waits to be put together
 
@@ -177,17 +179,16 @@ def _out_of_reach(now: Situation, target: TargetReport) -> str:
     """Say that the inputs do not suffice for the set-point as things are, or return ''."""
     if target.state is None or target.input is None:
         return ''
-    names, limits = now.controller.model.states.names, now.controller.settings.limits
+    states, limits = now.controller.model.states, now.controller.settings.limits
+    names, half = states.names, (states.half_widths * states.scale).tolist()
     for name, wanted in zip(now.signals.controlled, target.setpoint.tolist(), strict=True):
         found, unit = float(target.state[names.index(name)]), now.signals.states[name]
-        box = now.controller.model.states.only((name,))
-        if abs(found - wanted) > _REACHED * float(box.upper[0] - box.lower[0]):
+        if abs(found - wanted) > _REACHED * 2.0 * half[names.index(name)]:
             return (f'the set-point {shown(wanted, unit):.6g} {display_unit(unit)} of {name} '
                     f'cannot be held within the range of the {now.input}: '
                     f'{shown(found, unit):.6g} {display_unit(unit)} is the nearest')
-    for (name, unit), wanted, low, high in zip(
-            now.signals.inputs.items(), target.input.tolist(), limits.lower.tolist(),
-            limits.upper.tolist(), strict=True):
+    for (name, unit), wanted, (low, high, _) in zip(
+            now.signals.inputs.items(), target.input.tolist(), limits.each, strict=True):
         slack = _REACHED * (high - low)
         if not low - slack <= wanted <= high + slack:
             return (f'the set-point would need the {stem(name, unit)} at '
@@ -210,10 +211,17 @@ def _each(signals: Mapping[str, str], text: str, values: Array | None, differenc
           ) -> dict[str, float]:
     """Return values by label with the unit of each; `{}` in the text stands for that."""
     numbers = [math.nan] * len(signals) if values is None else values.tolist()
-    return {label.replace('{}', unit if difference else display_unit(unit)):
-            value if difference else shown(value, unit)
-            for label, unit, value in zip(labelled(signals, text), signals.values(), numbers,
-                                          strict=True)}
+    labels = _labels(tuple(signals.items()), text, difference)
+    if difference:
+        return dict(zip(labels, numbers, strict=True))
+    return {label: shown(value, unit) for label, unit, value in zip(
+        labels, signals.values(), numbers, strict=True)}
+
+
+@lru_cache(maxsize=256)
+def _labels(signals: tuple[tuple[str, str], ...], text: str, difference: bool) -> tuple[str, ...]:
+    return tuple(label.replace('{}', unit if difference else display_unit(unit))
+                 for label, (_, unit) in zip(labelled(dict(signals), text), signals, strict=True))
 
 
 def _figures(now: Situation) -> dict[str, object]:
@@ -230,7 +238,7 @@ def _figures(now: Situation) -> dict[str, object]:
         'active law': level_words(report.level),
         'law': law.form or 'none',
         'reason': now.reason or 'none',
-        **now.model,
+        **now.model(),
         **{f'{name} [{display_unit(own)}]': shown(value, own) for (name, own), value in zip(
             signals.states.items(), now.measured.tolist(), strict=True)},
         **_each(unit, 'set-point [{}]', None if target is None else target.setpoint),
@@ -399,7 +407,10 @@ class RecordPublisher:
 
     def publish_event(self, event: events.Event, outcome: events.Outcome) -> None:
         """Publish an event and what it led to."""
-        self.publish(*fields_of(event, outcome))
+        if topics.heard(self._publisher):
+            self.publish(*fields_of(event, outcome))
+        elif self._started:
+            self._number += 1
 
     def publish(self, event: str, fields: Mapping[str, Any]) -> None:
         """Publish an event by its name."""
@@ -410,6 +421,7 @@ class RecordPublisher:
     def _publish(self, event: str, fields: Mapping[str, Any]) -> None:
         if not self._started:
             return
-        record = Record(self._run, self._number, event, fields)
-        self._number += 1
-        self._publisher.publish(String(data=record.text()))
+        number, self._number = self._number, self._number + 1
+        # who comes later begins at a snapshot
+        if topics.heard(self._publisher):
+            self._publisher.publish(String(data=Record(self._run, number, event, fields).text()))

@@ -11,11 +11,13 @@ import sys
 
 import rclpy
 from rclpy.executors import SingleThreadedExecutor
+from rclpy.experimental import EventsExecutor
 from rclpy.logging import LoggingSeverity, set_logger_level
 from rclpy.signals import SignalHandlerOptions
 from rclpy.utilities import remove_ros_args
 
 from koopman_ros.resources import LOOPBACK_PROFILE
+from koopman_ros.ros.hosted import Hosting, Schedule
 from koopman_ros.ros.managed import ManagedNode, one_line, START_ERRORS
 from koopman_ros.ros.node import LoopNode
 from koopman_ros.ros.watchdog import end_in_time
@@ -56,7 +58,7 @@ def run(name: str, create: Callable[..., LoopNode], args: list[str] | None = Non
     try:
         try:
             init(args)
-            node = create()
+            spin, node = _hosted(create) if hosts else _alone(create)
             if isinstance(node, ManagedNode) and node.get_parameter('autostart').value:
                 node.start()
         except START_ERRORS as error:
@@ -64,11 +66,9 @@ def run(name: str, create: Callable[..., LoopNode], args: list[str] | None = Non
             return 1
         if note := open_to_the_network(os.environ):
             node.get_logger().warning(note)
-        executor = SingleThreadedExecutor()
-        executor.add_node(node)
         while not arrived and node.exit_code is None:
             # Python handles a signal when the wait returns, so the wait is bounded
-            executor.spin_once(timeout_sec=LONGEST_WAIT)
+            spin()
     finally:
         leave()
         try:
@@ -78,6 +78,34 @@ def run(name: str, create: Callable[..., LoopNode], args: list[str] | None = Non
             take_down(name, node)
             handle_signals(signal.SIG_IGN)
     return node.exit_code or 0
+
+
+def _hosted(create: Callable[..., LoopNode]) -> tuple[Callable[[], None], LoopNode]:
+    """
+    Return the node of a loop, and what does one thing that is due, and waits for it if need be.
+
+    rclpy's EventsExecutor is told what comes; the others set up what they wait for anew with each
+    message, which takes longer than a control step.
+    """
+    schedule, failures = Schedule(), list[Exception]()
+    node = create(hosting=Hosting(schedule, 1, failures.append))
+    executor = EventsExecutor()
+    executor.add_node(node)
+
+    def spin() -> None:
+        executor.spin_once(timeout_sec=min(LONGEST_WAIT, schedule.turn()))
+        if failures:
+            raise failures[0]
+
+    return spin, node
+
+
+def _alone(create: Callable[..., LoopNode]) -> tuple[Callable[[], None], LoopNode]:
+    """Return the same of a node with clients, which the EventsExecutor does not await."""
+    node = create()
+    executor = SingleThreadedExecutor()
+    executor.add_node(node)
+    return lambda: executor.spin_once(timeout_sec=LONGEST_WAIT), node
 
 
 def run_task(name: str, prepare: Callable[[], Callable[[], int]],

@@ -4,7 +4,6 @@
 """Messages to the numbers of signals and back, once, at the boundary."""
 
 from collections.abc import Callable, Iterator, Mapping
-from dataclasses import dataclass
 from functools import partial
 import math
 from typing import Any
@@ -19,10 +18,11 @@ from koopman_ros.parameters.table import ConfigurationError
 from koopman_ros.ros import topics
 from koopman_ros.ros.codec import stamp_nanoseconds
 from koopman_ros.units import Conversion, conversion, in_steps
+from koopman_ros.values import record
 from koopman_ros.wire import Place
 
 
-@dataclass(frozen=True)
+@record
 class Heard:
     """What a message says of some signals."""
 
@@ -132,6 +132,10 @@ class Outlet:
     def publishers(self) -> list[Publisher]:
         """All publishers."""
         return [publisher for publisher, *_ in self._parts]
+
+    def heard(self) -> bool:
+        """Tell whether anybody subscribes to one of the topics."""
+        return any(map(topics.heard, self.publishers))
 
     def send(self, values: Array, stamp: Time, frame_id: str, variances: Array | None = None,
              resolutions: Array | None = None) -> None:

@@ -19,6 +19,8 @@ from std_msgs.msg import String
 from koopman_ros.control import State
 from koopman_ros.control.laws.base import steady_state_target, Weights
 from koopman_ros.control.laws.riccati import recentred, regulator
+from koopman_ros.control.laws.shooting import Horizon, program, slope_at
+from koopman_ros.estimation.kalman import propagated
 from koopman_ros.estimation.observer import moved
 from koopman_ros.kernels import COMPILED, IN_NUMPY, Kernels, named, NUMPY
 from koopman_ros.lifting import LiftedModel, load
@@ -109,6 +111,25 @@ def test_random_lifts_of_any_depth_move_and_are_fed_back_the_same(
                 exact = getattr(two, part)
                 np.testing.assert_allclose(getattr(one, part), exact, rtol=0.0,
                                            atol=1e-11 * max(1.0, np.max(np.abs(exact))))
+
+
+@pytest.mark.parametrize('name', ['reactor_nz3', 'pendulum', 'quadruple_tank', 'two_tanks',
+                                  'two_state_saddle'])
+def test_plans_and_predictions_are_set_up_the_same_with_a_read_out_and_without(name: str) -> None:
+    model, rng = load(model_path(name)), np.random.default_rng(0)
+    fast, n, m = compiled(model), model.n_x, model.n_u
+    x, w, u = rng.uniform(-0.4, 0.4, n), 0.1 * rng.normal(size=n), rng.normal(size=m)
+    inputs, nodes = 0.1 * rng.normal(size=(6, m)), np.tile(x, (7, 1))
+    horizon = Horizon(x, w, np.zeros(n), np.zeros(m), np.full(6, 0.02), 2, np.eye(n), np.eye(m),
+                      np.eye(n))
+    for function, arguments in ((propagated, (x, w, np.eye(2 * n), u, 0.01, 3)),
+                                (program, (horizon, inputs, nodes)), (slope_at, (x,))):
+        assert kernels()[function.__name__](fast, *arguments) is not None
+        ours, theirs = ((found if isinstance(found, tuple) else [found] if isinstance(
+            found, np.ndarray) else [found.nodes, found.by_inputs, found.H, found.f])
+            for found in (function(fast, *arguments), function(model, *arguments)))
+        for one, two in zip(ours, theirs, strict=True):
+            np.testing.assert_allclose(one, two, rtol=1e-12, atol=1e-13)
 
 
 def test_what_is_no_number_stays_none() -> None:

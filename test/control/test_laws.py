@@ -22,7 +22,7 @@ from koopman_ros.control.laws import (
     Weights,
 )
 from koopman_ros.control.laws.base import steady_state_target
-from koopman_ros.control.laws.riccati import checked
+from koopman_ros.control.laws.riccati import Answer, checked
 from koopman_ros.estimation import Estimate
 from koopman_ros.lifting import Coordinates, linearised_model, NetworkObservables, Provenance
 from koopman_ros.plants import two_state_example, two_state_reactor
@@ -391,8 +391,9 @@ def test_an_interval_makes_gains_smaller_and_predictions_stable():
     assert aware.growth(1.0 / 60.0) < 1.0 < unaware.growth(1.0 / 60.0)
     # nor is a gain used that came from elsewhere
     limits = controller().settings.limits
-    assert checked(model, aware, limits, 1.0).failure is None
-    refused = checked(model, unaware, limits, 1.0)
+    within, beyond = (Answer.of(model, found, 1.0 / 60.0) for found in (aware, unaware))
+    assert checked(model, within, limits, 1.0).failure is None
+    refused = checked(model, beyond, limits, 1.0)
     assert refused.failure.code is Code.PREDICTED_UNSTABLE
     assert refused.failure.values['interval'] == 1.0
 

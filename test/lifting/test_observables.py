@@ -101,6 +101,20 @@ def test_shapes_origin_and_the_state_among_the_coordinates(lift):
 
 
 @each(LIFTS)
+def test_second_derivatives_are_those_of_the_jacobian(lift):
+    batch = states(lift.n_x, 6).reshape(2, 3, lift.n_x)
+    z, J, bend = lift.lift_and_derivatives(batch)
+    np.testing.assert_allclose(z, lift.lift(batch), rtol=1e-13, atol=1e-13)
+    np.testing.assert_allclose(J, jacobian(lift, batch), rtol=1e-13, atol=1e-13)
+    expected = derivative(lambda x: jacobian(lift, x).reshape(*x.shape[:-1], -1), batch)
+    np.testing.assert_allclose(bend, expected.reshape(bend.shape), rtol=1e-8, atol=1e-9)
+    np.testing.assert_allclose(bend, bend.swapaxes(-1, -2), rtol=0.0, atol=1e-13 * size(bend))
+    one = lift.lift_and_derivatives(batch[0, 1])
+    for found, of_batch in zip(one, (z, J, bend), strict=True):
+        np.testing.assert_allclose(found, of_batch[0, 1], rtol=1e-13, atol=1e-13)
+
+
+@each(LIFTS)
 def test_a_batch_is_lifted_like_its_members_and_at_once_as_by_the_single_methods(lift):
     batch = states(lift.n_x, 12)
     z, J = lift.lift_and_jacobian(batch.reshape(3, 4, lift.n_x))

@@ -15,9 +15,10 @@ from koopman_ros.control.limits import InputLimits
 from koopman_ros.estimation import Estimate
 from koopman_ros.lifting import LiftedModel
 from koopman_ros.reasons import Reason
+from koopman_ros.values import record
 
 
-@dataclass(frozen=True)
+@record
 class Target:
     """A set-point with the input that holds it, in scaled deviations."""
 
@@ -119,7 +120,7 @@ class Tuning:
     pi_time: Array = field(default_factory=lambda: np.zeros(0))  #: (n_x,) its integral times in s
 
 
-@dataclass(frozen=True)
+@record
 class Figures:
     """What a law says of its solution; NaN and '' for what it does not have."""
 
@@ -133,7 +134,7 @@ class Figures:
 NO_FIGURES = Figures()
 
 
-@dataclass(frozen=True)
+@record
 class Plan:
     """
     What a law with a horizon expects, in units of states and inputs, and which limits it meets.
@@ -149,7 +150,7 @@ class Plan:
     at_state: Array  #: (n_x,) whether a node is at a limit of the state, or beyond
 
 
-@dataclass(frozen=True)
+@record
 class LawResult:
     """What a law gives, or why it gives nothing."""
 

@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from koopman_ros.arrays import Array, frozen
 from koopman_ros.control.laws.base import Figures, LawResult, Plan, Target, Tuning
 from koopman_ros.control.laws.riccati import feedback, regulator, StateDependentRiccati
-from koopman_ros.control.laws.shooting import Horizon, program
+from koopman_ros.control.laws.shooting import Horizon, program, slope_at
 from koopman_ros.control.limits import finite, InputLimits
 from koopman_ros.estimation import Estimate
 from koopman_ros.lifting import LiftedModel
@@ -166,6 +166,38 @@ class RecedingHorizon:
 
         return of
 
+    def at_target(self, target: Target, interval: float) -> tuple[float, Array]:
+        """
+        Return the rate of the fastest mode at a target, and what is to be paid from there on.
+
+        The latter is P (n_x, n_x), what the sampled regulator costs from the end of the horizon.
+
+        :param interval: between samples, in the model's time unit.
+        :raises numpy.linalg.LinAlgError: where the drift has no slope.
+        """
+        # the input counts where it changes the slope
+        return self._at_target(target.x.tobytes(), interval, b'' if (
+            self.model.input_terms is None) else target.u.tobytes())
+
+    @cached_property
+    def _at_target(self) -> Any:
+        @lru_cache(maxsize=8)
+        def of(state: bytes, interval: float, inputs: bytes) -> tuple[float, Array]:
+            model, tuning = self.model, self.tuning
+            x = np.frombuffer(state)
+            A = slope_at(model, x)
+            fastest = _fastest(A)
+            if inputs:
+                A = A + model.forcing_jacobian(x, np.frombuffer(inputs))
+            found = regulator(model, A, model.input_matrix(x), tuning.weights.Q,
+                              tuning.weights.R, interval=interval, max_gain=tuning.max_gain,
+                              max_residual=tuning.max_residual)
+            # where the regulator has none, the horizon alone counts
+            return fastest, found.P if found.status is RiccatiStatus.SOLVED else (
+                tuning.weights.Q * float(self.lengths(interval)[-1]))
+
+        return of
+
     @cached_property
     def _slope(self) -> Array:
         """The slope of the drift (n_x, n_x) at the nominal point."""
@@ -174,7 +206,14 @@ class RecedingHorizon:
     @cached_property
     def fastest(self) -> float:
         """Rate of the fastest mode of the drift at the nominal point, in 1/time unit."""
-        return float(np.max(np.abs(np.linalg.eigvals(self._slope))))
+        return _fastest(self._slope)
+
+
+def _fastest(slope: Array) -> float:
+    """Return the rate of the fastest mode of a slope (n_x, n_x) of the drift."""
+    if not np.isfinite(slope).all():
+        raise np.linalg.LinAlgError('the drift has no slope here')
+    return float(np.max(np.abs(np.linalg.eigvals(slope))))
 
 
 def _growth(count: int, total: float) -> float:
@@ -204,14 +243,12 @@ class _Problem:
         self._x, self._w = estimate.x, estimate.w
         self._sample = interval / model.seconds_per_time_unit
         self.lengths = law.lengths(self._sample)
-        slopes = model.drift_and_jacobian(np.array((estimate.x, target.x)))[1]
-        if not np.isfinite(slopes).all():
-            raise np.linalg.LinAlgError('the drift has no slope here')
-        rate = max(law.fastest, float(np.max(np.abs(np.linalg.eigvals(slopes)))))
+        at_target, terminal = law.at_target(target, self._sample)
+        rate = max(law.fastest, at_target, _fastest(slope_at(model, estimate.x)))
         self._steps = min(max(math.ceil(self.lengths[-1] * rate / _STEP), 1), _MOST_STEPS)
         weights = tuning.weights
         self._horizon = Horizon(estimate.x, estimate.w, target.x, target.u, self.lengths,
-                                self._steps, weights.Q, weights.R, self._cost_to_go(slopes[1]))
+                                self._steps, weights.Q, weights.R, terminal)
         self._lower = np.maximum(model.inputs.to_deviation(limits.lower), -_UNLIMITED)
         self._upper = np.minimum(model.inputs.to_deviation(limits.upper), _UNLIMITED)
         # what an input may change from one interval to the next, (N, n_u): the first since the
@@ -220,22 +257,6 @@ class _Problem:
         before = np.concatenate(([self._sample], self.lengths[:-1]))
         self._change = before[:, None] * reach
         self._last = None if last is None else model.inputs.to_deviation(last)
-
-    def _cost_to_go(self, slope: Array) -> Array:
-        """
-        Return P (n_x, n_x), what the sampled regulator costs from the end of the horizon on.
-
-        :param slope: (n_x, n_x) of the drift at the target.
-        """
-        model, target, tuning = self._model, self._target, self._law.tuning
-        A = slope + model.forcing_jacobian(target.x, target.u)
-        found = regulator(model, A, model.input_matrix(target.x), tuning.weights.Q,
-                          tuning.weights.R, interval=self._sample, max_gain=tuning.max_gain,
-                          max_residual=tuning.max_residual)
-        if found.status is RiccatiStatus.SOLVED:
-            return found.P
-        # where the regulator has none, the horizon alone counts
-        return tuning.weights.Q * float(self.lengths[-1])
 
     # Where to begin.
 
@@ -332,7 +353,7 @@ class _Problem:
         rows, low, high = [], [(lower - u).ravel()], [(upper - u).ravel()]
         limited = np.isfinite(self._change[0])
         if limited.any():
-            D = np.eye(N * n_u) - np.eye(N * n_u, k=-n_u)
+            D = _differences(N, n_u)
             before = np.concatenate((u[:1] if last is None else last[None], u[:-1]))
             step = (u - before).ravel()
             chosen = np.tile(limited, N)
@@ -355,6 +376,14 @@ class _Problem:
         matrix = np.concatenate(rows) if rows else np.zeros((0, N * n_u))
         return (np.ascontiguousarray(matrix), np.concatenate(low), np.concatenate(high),
                 np.concatenate(sense))
+
+
+@lru_cache(maxsize=8)
+def _differences(N: int, n_u: int) -> Array:
+    """Return (N n_u, N n_u) of the change of each input from the interval before."""
+    found = np.eye(N * n_u) - np.eye(N * n_u, k=-n_u)
+    found.setflags(write=False)
+    return found
 
 
 def _side(lower: NDArray[np.bool_], upper: NDArray[np.bool_]) -> Array:

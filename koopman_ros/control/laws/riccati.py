@@ -4,7 +4,7 @@
 """Laws by Riccati equations: state-dependent, re-centred and averaged, and the linear one."""
 
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from enum import Enum
 from functools import cached_property, lru_cache
 import math
@@ -26,6 +26,7 @@ from koopman_ros.kernels import compilable
 from koopman_ros.lifting import LiftedModel
 from koopman_ros.reasons import Code, reason
 from koopman_ros.solvers import RiccatiSolution, RiccatiStatus, solve_riccati, transition
+from koopman_ros.values import amended, record
 
 # Largest mismatch of a closed lift: those of plants that have one come to 2e-7 or less, others to
 # 1e-4 or more, and from there on the averaged Jacobian costs less.
@@ -40,7 +41,7 @@ class Form(Enum):
     AVERAGED = 'averaged'
 
 
-@dataclass(frozen=True)
+@record
 class Feedback:
     """The outcome of one state-dependent Riccati solution."""
 
@@ -100,6 +101,41 @@ def growth(model: LiftedModel, found: Feedback, interval: float) -> float:
     return found.growth(interval)
 
 
+@record
+class Answer:
+    """What a command is made of."""
+
+    u: Array  #: (n_u,) in scaled deviations; not to be used unless solved
+    figures: Figures  #: of the solution; its growth NaN unless solved
+    status: RiccatiStatus  #: whether `u` may be used
+
+    @staticmethod
+    def of(model: LiftedModel, found: Feedback, interval: float) -> 'Answer':
+        """Return that of a feedback for an interval in the model's time unit."""
+        riccati = found.riccati
+        return Answer(found.u, Figures(
+            found.form.value, riccati.residual, riccati.gain,
+            growth(model, found, interval) if found.solved else math.nan), riccati.status)
+
+
+@compilable
+def answer(model: LiftedModel, x: Array, target: Target, tuning: Tuning, interval: float
+           ) -> Answer:
+    """
+    Evaluate the law that suits the model, and how the error grows; see :func:`feedback`.
+
+    :param interval: for which the input will be held, in the model's time unit.
+    """
+    return Answer.of(model, feedback(
+        model, x, target, tuning.weights, interval=interval, max_gain=tuning.max_gain,
+        max_residual=tuning.max_residual), interval)
+
+
+def closed(model: LiftedModel) -> bool:
+    """Tell whether the re-centred law suits a model."""
+    return model.identity and model.mismatch <= _CLOSED and not model.adds_unstable_modes
+
+
 def feedback(model: LiftedModel, x: Array, target: Target, weights: Weights, *,
              interval: float = 0.0, max_gain: float = 1e6, max_residual: float = 1e-8) -> Feedback:
     """
@@ -120,7 +156,7 @@ def feedback(model: LiftedModel, x: Array, target: Target, weights: Weights, *,
     weights.check(model)
     x = model.states.array('state', x)
     how = {'interval': interval, 'max_gain': max_gain, 'max_residual': max_residual}
-    if model.identity and model.mismatch <= _CLOSED and not model.adds_unstable_modes:
+    if closed(model):
         result = recentred(model, x, target, weights, **how)
         if result.solved:
             return result
@@ -213,26 +249,22 @@ class StateDependentRiccati:
                 interval: float, deadline: float = math.inf, last: Array | None = None
                 ) -> LawResult:
         """Solve the equation at the estimate; see :class:`~koopman_ros.control.laws.base.Law`."""
-        tuning = self.tuning
+        model = self.model
         try:
-            found = feedback(self.model, estimate.x, target, tuning.weights,
-                             interval=interval / self.model.seconds_per_time_unit,
-                             max_gain=tuning.max_gain, max_residual=tuning.max_residual)
-            return checked(self.model, found, limits, interval)
+            return checked(model, answer(
+                model, estimate.x, target, self.tuning, interval / model.seconds_per_time_unit),
+                limits, interval)
         except np.linalg.LinAlgError as error:
             return LawResult(None, reason(Code.SINGULAR, matrix=str(error)))
 
 
-def checked(model: LiftedModel, found: Feedback, limits: InputLimits, interval: float
+def checked(model: LiftedModel, found: Answer, limits: InputLimits, interval: float
             ) -> LawResult:
-    """Return the command of a feedback, unless it must not be used; see :meth:`Law.compute`."""
-    riccati = found.riccati
-    predicted = growth(model, found, interval / model.seconds_per_time_unit) if (
-        found.solved) else math.nan
-    figures = Figures(found.form.value, riccati.residual, riccati.gain, predicted)
-    if not found.solved:
-        return LawResult(None, reason(Code(riccati.status.value)), figures)
-    if not predicted < 1.0:
+    """Return the command of a law, unless it must not be used; see :meth:`Law.compute`."""
+    figures = found.figures
+    if found.status is not RiccatiStatus.SOLVED:
+        return LawResult(None, reason(Code(found.status.value)), figures)
+    if not figures.growth < 1.0:
         return LawResult(None, reason(Code.PREDICTED_UNSTABLE, interval=interval), figures)
     u = model.inputs.to_physical(found.u)
     if not finite(u):
@@ -254,16 +286,17 @@ class Linear:
         return self.lift.linearised
 
     @cached_property
-    def _at_nominal(self) -> Callable[[float], Feedback]:
+    def _at_nominal(self) -> Callable[[float], tuple[Array, Answer]]:
         origin = np.zeros(self.model.n_x)
         target = steady_state_target(self.model, origin)
 
         # where samples are equally far apart, one solution does for all of them
         @lru_cache(maxsize=4)
-        def held_for(interval: float) -> Feedback:
-            return feedback(self.model, origin, target, self.tuning.weights,
-                            interval=interval / self.model.seconds_per_time_unit,
-                            max_gain=self.tuning.max_gain, max_residual=self.tuning.max_residual)
+        def held_for(interval: float) -> tuple[Array, Answer]:
+            within = interval / self.model.seconds_per_time_unit
+            found = feedback(self.model, origin, target, self.tuning.weights, interval=within,
+                             max_gain=self.tuning.max_gain, max_residual=self.tuning.max_residual)
+            return found.riccati.K, Answer.of(self.model, found, within)
 
         return held_for
 
@@ -272,8 +305,8 @@ class Linear:
                 ) -> LawResult:
         """Apply the gain; see :class:`~koopman_ros.control.laws.base.Law`."""
         try:
-            found = self._at_nominal(interval)
-            return checked(self.model, replace(
-                found, u=target.u - found.riccati.K.dot(estimate.x - target.x)), limits, interval)
+            K, found = self._at_nominal(interval)
+            return checked(self.model, amended(
+                found, u=target.u - K.dot(estimate.x - target.x)), limits, interval)
         except np.linalg.LinAlgError as error:
             return LawResult(None, reason(Code.SINGULAR, matrix=str(error)))

@@ -12,9 +12,10 @@ import numpy as np
 from koopman_ros.arrays import Array
 from koopman_ros.kernels import compilable
 from koopman_ros.lifting import LiftedModel
+from koopman_ros.values import record
 
 
-@dataclass(frozen=True)
+@record
 class Horizon:
     """What a plan of one sample goes by; all in scaled deviations and the model's time unit."""
 
@@ -29,7 +30,7 @@ class Horizon:
     terminal: Array  #: (n_x, n_x) cost of the error at the end
 
 
-@dataclass(frozen=True)
+@record
 class Program:
     """The cost of a change v (N n_u,) of a plan's inputs, v' H v / 2 + f' v, and what moves."""
 
@@ -37,6 +38,12 @@ class Program:
     by_inputs: Array  #: (N + 1, n_x, N n_u) their derivative by the inputs
     H: Array  #: (N n_u, N n_u) symmetric
     f: Array  #: (N n_u,)
+
+
+@compilable
+def slope_at(model: LiftedModel, x: Array) -> Array:
+    """Return the Jacobian (n_x, n_x) of the drift at a state (n_x,)."""
+    return model.drift_and_jacobian(x)[1]
 
 
 @compilable
