@@ -31,12 +31,12 @@ from koopman_ros.nodes.player import PlayerNode
 from koopman_ros.nodes.replay import Names, replayed_bag
 from koopman_ros.nodes.trainer import TrainerNode
 from koopman_ros.parameters.table import ConfigurationError, Specification
-from koopman_ros.resources import model_path
 from koopman_ros.retraining import retrain, Task
 from koopman_ros.ros import topics
 from koopman_ros.ros.managed import ManagedNode
 from koopman_ros.ros.node import LoopNode
 from koopman_ros.ros.programs import tables
+from koopman_ros.ros.training import task_fields
 from koopman_ros.testing import isolated_domain
 from koopman_ros.units import to_kelvin
 from support.nodes import seconds, temperature, TIMEOUT
@@ -352,9 +352,8 @@ def test_training_is_told_every_parameter_at_its_ends(tmp_path: Path) -> None:
             assert TABLES['trainer'].check(parameters) == ''
             training.settings = parameters
             task = Task.from_json(json.dumps({
-                'bags': ['/nowhere/run.mcap'], 'output': str(tmp_path / 'new.safetensors'),
-                'model': str(model_path(parameters.model)), **training._signals(),
-                **parameters.training()}))
+                **task_fields(place.node, parameters, training._wiring, ['/nowhere/run.mcap']),
+                'output': str(tmp_path / 'new.safetensors')}))
             # all else was looked at before
             with pytest.raises(BagReadError, match='does not exist'):
                 retrain(task)
