@@ -4,6 +4,8 @@
 """Life of a node's process: start, one-line reason on a bad start, clean end on a signal."""
 
 from collections.abc import Callable, Mapping
+import importlib
+from importlib.util import find_spec
 import os
 from pathlib import Path
 import signal
@@ -11,7 +13,6 @@ import sys
 
 import rclpy
 from rclpy.executors import SingleThreadedExecutor
-from rclpy.experimental import EventsExecutor
 from rclpy.logging import LoggingSeverity, set_logger_level
 from rclpy.signals import SignalHandlerOptions
 from rclpy.utilities import remove_ros_args
@@ -25,6 +26,7 @@ from koopman_ros.startup import end_by_force, handle_signals
 
 PROFILES = ('FASTDDS_DEFAULT_PROFILES_FILE', 'FASTRTPS_DEFAULT_PROFILES_FILE')
 _LOOPS = '--loops'
+_EVENTS = 'rclpy.experimental'  # which the first releases of rclpy for Jazzy lack
 # (arguments, file of loops, signals as they come) to the exit code
 Loops = Callable[[list[str] | None, str, list[int]], int]
 LONGEST_WAIT = 0.1  # s from a signal to the end
@@ -58,7 +60,8 @@ def run(name: str, create: Callable[..., LoopNode], args: list[str] | None = Non
     try:
         try:
             init(args)
-            spin, node = _hosted(create) if hosts else _alone(create)
+            spin, node = (_hosted(create) if hosts is True and find_spec(_EVENTS)
+                          else _alone(create))
             if isinstance(node, ManagedNode) and node.get_parameter('autostart').value:
                 node.start()
         except START_ERRORS as error:
@@ -87,6 +90,7 @@ def _hosted(create: Callable[..., LoopNode]) -> tuple[Callable[[], None], LoopNo
     rclpy's EventsExecutor is told what comes; the others set up what they wait for anew with each
     message, which takes longer than a control step.
     """
+    EventsExecutor = importlib.import_module(_EVENTS).EventsExecutor
     schedule, failures = Schedule(), list[Exception]()
     node = create(hosting=Hosting(schedule, 1, failures.append))
     executor = EventsExecutor()
