@@ -21,7 +21,8 @@ _WAYS = ('processes', 'hosted', 'domains')
 
 def draw(path: Path, summary: Mapping[str, Any]) -> None:
     """Draw what grows, of the parts that are in a summary; no file where there are none."""
-    found = [(title, panel) for part, title, panel in _PANELS if _drawable(part, summary)]
+    drawn = [part for part, *_ in _PANELS if _drawable(part, summary)]
+    found = [(title, panel) for part, title, panel in _PANELS if part in drawn]
     if not found:
         return
     columns = min(3, len(found))
@@ -33,8 +34,8 @@ def draw(path: Path, summary: Mapping[str, Any]) -> None:
             axes.legend(fontsize=7)
         for axes in panels[len(found):]:
             axes.set_axis_off()
-        machine = next(summary[part]['machine'] for part, *_ in _PANELS if part in summary)
-        figure.suptitle(f'How costs grow ({machine["processor"]})', fontsize=11)
+        processor = summary[drawn[0]]['machine']['processor']
+        figure.suptitle(f'How costs grow ({processor})', fontsize=11)
 
 
 def _drawable(part: str, summary: Mapping[str, Any]) -> bool:

@@ -10,7 +10,7 @@ import pytest
 from rclpy.serialization import serialize_message
 from sensor_msgs.msg import Temperature
 
-from validation.benchmarks import loop, planning, recording, step
+from validation.benchmarks import growth, loop, planning, recording, step
 from validation.benchmarks.__main__ import main
 
 
@@ -29,6 +29,8 @@ def figures(tmp_path_factory):
         patch.setattr(planning, 'SETPOINTS', {'pendulum': planning.SETPOINTS['pendulum']})
         patch.setitem(recording.PLANS, 'quick', recording.Plan(1.0, (500.0, 2000.0), 0.5, 3000, 1))
         assert main(['recording', 'loop', '--quick', '--output', str(folder)]) == 0
+    # of the loop alone
+    assert (folder / growth.FILE).read_bytes().startswith(b'\x89PNG')
     return json.loads((folder / 'summary.json').read_text())
 
 
