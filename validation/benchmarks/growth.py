@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from matplotlib.axes import Axes
+from matplotlib.ticker import MaxNLocator
 
 from koopman_ros.reports import draw_limits, drawing
 from validation.benchmarks import site
@@ -65,7 +66,7 @@ def _sizes(axes: Axes, summary: Mapping[str, Any]) -> None:
         axes.plot([int(count) for count in found], list(found.values()), f'{marker}-', label=label)
     axes.set(yscale='log', xlabel='coordinates or states',
              ylabel='processor time of an iteration [s]')
-    axes.xaxis.get_major_locator().set_params(integer=True)
+    axes.xaxis.set_major_locator(MaxNLocator(integer=True))
 
 
 def _records(axes: Axes, summary: Mapping[str, Any]) -> None:
@@ -95,7 +96,7 @@ def _steps(axes: Axes, summary: Mapping[str, Any]) -> None:
             axes.plot(list(by_size), list(by_size.values()), 'o-', label=label)
     draw_limits(axes, _STEP_US, 'held to: 120 in numpy, 60 compiled')
     axes.set(yscale='log', xlabel='coordinates', ylabel='control step, median [µs]')
-    axes.xaxis.get_major_locator().set_params(integer=True)
+    axes.xaxis.set_major_locator(MaxNLocator(integer=True))
 
 
 def _loops(name: str) -> Callable[[Axes, Mapping[str, Any]], None]:
