@@ -4,14 +4,12 @@
 """Retraining of many plants in one call, some of them from a sibling's lift."""
 
 from dataclasses import replace
-from functools import partial
 
 import pytest
 
 from koopman_ros.lifting import load
-from koopman_ros.retraining import compare_classes, decide, retrain, retrain_fleet, Task
-from koopman_ros.retraining import task as task_module
-from support.known_plants import methods
+from koopman_ros.retraining import retrain, retrain_fleet, Task
+from support.quick_retraining import quick_retraining
 from support.recorded_runs import driven, INPUTS, reactor, STATES, write_bag
 
 
@@ -29,12 +27,7 @@ def tasks_of_reactors(tmp_path_factory):
 @pytest.fixture(scope='module', autouse=True)
 def few_methods():
     """Estimate by a few methods alone, and try laws in a few loops."""
-    original = task_module.identify
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(task_module, 'identify',
-                      partial(original, degrees=(1, 3), methods=methods(20)))
-        patch.setattr(task_module, 'compare_classes', partial(compare_classes, loops=4))
-        patch.setattr(task_module, 'decide', partial(decide, loops=4))
+    with quick_retraining(4):
         yield
 
 

@@ -5,7 +5,6 @@
 
 from collections.abc import Iterator
 from dataclasses import replace
-from functools import partial
 import json
 from pathlib import Path
 import pickle
@@ -18,12 +17,11 @@ from koopman_ros.identification import Stopped
 from koopman_ros.identification.regression import weak_form
 from koopman_ros.jobs.backends import backend_of, Here
 from koopman_ros.plant_data import cut
-from koopman_ros.retraining import compare_classes, decide, retrain, Task, write_report
-from koopman_ros.retraining import task as task_module
+from koopman_ros.retraining import retrain, Task, write_report
 from koopman_ros.retraining.known import known
 from koopman_ros.retraining.record import read_record, Source
 from koopman_ros.retraining.shards import identify_bags
-from support.known_plants import methods
+from support.quick_retraining import quick_retraining
 from validation.benchmarks.retraining import Case, cases, drift_error, task_of, write_bags
 
 SLOW = cases()['reactor at 1 Hz']
@@ -35,12 +33,7 @@ SAMPLES = 100_000
 @pytest.fixture(scope='module', autouse=True)
 def few_methods() -> Iterator[None]:
     """Estimate by a few methods alone, and try laws in a few loops."""
-    original = task_module.identify
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(task_module, 'identify',
-                      partial(original, degrees=(1, 3), methods=methods(20)))
-        patch.setattr(task_module, 'compare_classes', partial(compare_classes, loops=16))
-        patch.setattr(task_module, 'decide', partial(decide, loops=16))
+    with quick_retraining(16):
         yield
 
 
