@@ -9,7 +9,7 @@ is started by :func:`command` and :func:`blocked_signals` handles them from its 
 """
 
 import atexit
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 import contextlib
 import ctypes
 import faulthandler
@@ -192,19 +192,30 @@ def blocked_signals() -> Iterator[None]:
         signal.pthread_sigmask(signal.SIG_SETMASK, before)
 
 
-def main() -> int:
-    """Run a child; see :func:`command`."""
-    parent, number, interrupted, module, *arguments = sys.argv[1:]
+def run_child(parent: int, number: int, interrupted: int, module: str,
+              arguments: Sequence[str]) -> int:
+    """
+    Run a module's `main` in a child whose signals are blocked; return its exit code.
+
+    :param parent: at whose end the child gets the signal `number`; 0 for none.
+    :param interrupted: exit code after a signal.
+    """
     libc = ctypes.CDLL(None)
-    if int(parent) and hasattr(libc, 'prctl'):
-        libc.prctl(_PR_SET_PDEATHSIG, int(number), 0, 0, 0)
-        if os.getppid() != int(parent):
+    if parent and hasattr(libc, 'prctl'):
+        libc.prctl(_PR_SET_PDEATHSIG, number, 0, 0, 0)
+        if os.getppid() != parent:
             # it has ended before
             os._exit(0)
     sys.argv = [module, *arguments]
-    handle_signals(lambda *_: os._exit(int(interrupted)))
+    handle_signals(lambda *_: os._exit(interrupted))
     signal.pthread_sigmask(signal.SIG_UNBLOCK, SIGNALS)
-    return run_program(module, int(interrupted))
+    return run_program(module, interrupted)
+
+
+def main() -> int:
+    """Run a child; see :func:`command`."""
+    parent, number, interrupted, module, *arguments = sys.argv[1:]
+    return run_child(int(parent), int(number), int(interrupted), module, arguments)
 
 
 # The programs on the path. A node that is ended by a signal has done its work: 0. A replay has

@@ -41,7 +41,7 @@ _READ_BY: dict[int, Callable[[ReadDataStream], McapRecord]] = {
 _READ = (Opcode.MESSAGE, Opcode.SCHEMA, Opcode.CHANNEL)
 _PIECE_BYTES = 2**20
 
-RECOVER = 'pass recover=True to read what is whole'
+RECOVER = 'set recover to true to read what is whole'
 
 
 @dataclass(frozen=True)

@@ -72,8 +72,8 @@ def _listed_files(folder: Path) -> tuple[Path, ...]:
     except (yaml.YAMLError, ValueError, KeyError, TypeError, AttributeError, RecursionError
             ) as error:
         raise BagReadError(
-            f'{str(source)!r} is not the metadata of a bag ({reason(error)}): delete it and pass '
-            'recover=True to read the files beside it') from error
+            f'{str(source)!r} is not the metadata of a bag ({reason(error)}): delete it and set '
+            'recover to true to read the files beside it') from error
     if storage != 'mcap' or compression not in ('', 'zstd'):
         kind = f'{storage} files' + (f' compressed with {compression}' if compression else '')
         raise BagReadError(

@@ -18,10 +18,7 @@ from koopman_ros.parameters.wire import SIGNALS, Wiring
 from koopman_ros.ros.managed import one_line, START_ERRORS
 from koopman_ros.ros.node import LoopNode
 from koopman_ros.ros.process import init
-from koopman_ros.ros.training import present_lift, task_fields
-
-_POLL = 0.1  # s
-_LINE = 5.0  # s between two lines of progress
+from koopman_ros.ros.training import POLL_PERIOD, present_lift, Progress, task_fields
 
 
 def run_fleet(args: list[str] | None, file: str, arrived: Sequence[int]) -> int:
@@ -94,23 +91,23 @@ def _retrain(task: Mapping[str, object], arrived: Sequence[int]) -> JobState:
     """Retrain in a process of its own; tell of the plants as they end."""
     job = RetrainingJob(task)
     told: set[str] = set()
-    line = time.monotonic()
+    progress = Progress(lambda text: print(text, file=sys.stderr, flush=True))
     try:
         while True:
             state = job.poll()
             for name in state.plants:
                 if name not in told:
                     told.add(name)
-                    _say(name, state.plants[name].text)
+                    # in the place of a bar
+                    _say(f'\r\x1b[K{name}' if sys.stdout.isatty() else name,
+                         state.plants[name].text)
+            progress.show(state)
             if state.ended:
                 print(f'trainer: {state.text}', flush=True)
                 return state if not arrived else JobState(ended=True)
             if arrived:
                 job.cancel()
-            elif time.monotonic() - line > _LINE:
-                line = time.monotonic()
-                print(f'{100.0 * state.share:.0f} %: {state.text}', file=sys.stderr, flush=True)
-            time.sleep(_POLL)
+            time.sleep(POLL_PERIOD)
     finally:
         job.close()
 

@@ -13,7 +13,6 @@ import time
 import traceback
 
 from rclpy.exceptions import InvalidNamespaceException
-from rclpy.experimental import EventsExecutor
 from rclpy.validate_namespace import validate_namespace
 
 from koopman_ros.parameters.table import ConfigurationError
@@ -28,6 +27,7 @@ from koopman_ros.ros.process import (
     PROFILES,
     take_down,
     TAKE_DOWN_PATIENCE,
+    told_executor,
 )
 from koopman_ros.ros.watchdog import end_in_time
 from koopman_ros.startup import handle_signals
@@ -89,7 +89,7 @@ class Host:
             raise ConfigurationError(
                 f'-r __ns:={self._node.get_namespace()} would put all loops there: write '
                 'the namespaces into the file of loops')
-        self._executor = EventsExecutor()
+        self._executor = told_executor()
         self._executor.add_node(self._node)
         diagnostics = Diagnostics(self._node)
         self._diagnostics = diagnostics.add('loops', self._status)

@@ -4,15 +4,13 @@
 """Life of a node's process: start, one-line reason on a bad start, clean end on a signal."""
 
 from collections.abc import Callable, Mapping
-import importlib
-from importlib.util import find_spec
 import os
 from pathlib import Path
 import signal
 import sys
 
 import rclpy
-from rclpy.executors import SingleThreadedExecutor
+from rclpy.executors import Executor, SingleThreadedExecutor
 from rclpy.logging import LoggingSeverity, set_logger_level
 from rclpy.signals import SignalHandlerOptions
 from rclpy.utilities import remove_ros_args
@@ -26,7 +24,6 @@ from koopman_ros.startup import end_by_force, handle_signals
 
 PROFILES = ('FASTDDS_DEFAULT_PROFILES_FILE', 'FASTRTPS_DEFAULT_PROFILES_FILE')
 _LOOPS = '--loops'
-_EVENTS = 'rclpy.experimental'  # which the first releases of rclpy for Jazzy lack
 # (arguments, file of loops, signals as they come) to the exit code
 Loops = Callable[[list[str] | None, str, list[int]], int]
 LONGEST_WAIT = 0.1  # s from a signal to the end
@@ -60,8 +57,7 @@ def run(name: str, create: Callable[..., LoopNode], args: list[str] | None = Non
     try:
         try:
             init(args)
-            spin, node = (_hosted(create) if hosts is True and find_spec(_EVENTS)
-                          else _alone(create))
+            spin, node = _hosted(create) if hosts is True else _alone(create)
             if isinstance(node, ManagedNode) and node.get_parameter('autostart').value:
                 node.start()
         except START_ERRORS as error:
@@ -83,17 +79,25 @@ def run(name: str, create: Callable[..., LoopNode], args: list[str] | None = Non
     return node.exit_code or 0
 
 
-def _hosted(create: Callable[..., LoopNode]) -> tuple[Callable[[], None], LoopNode]:
+def told_executor() -> Executor:
     """
-    Return the node of a loop, and what does one thing that is due, and waits for it if need be.
+    Return an executor that is told what comes, for nodes whose timers a schedule turns.
 
-    rclpy's EventsExecutor is told what comes; the others set up what they wait for anew with each
-    message, which takes longer than a control step.
+    rclpy's others set up what they wait for anew with each message, which takes longer than a
+    control step; the first releases for Jazzy have no other.
     """
-    EventsExecutor = importlib.import_module(_EVENTS).EventsExecutor
+    try:
+        from rclpy.experimental import EventsExecutor
+    except ImportError:
+        return SingleThreadedExecutor()
+    return EventsExecutor()
+
+
+def _hosted(create: Callable[..., LoopNode]) -> tuple[Callable[[], None], LoopNode]:
+    """Return the node of a loop, and what does one thing that is due, or waits for the next."""
     schedule, failures = Schedule(), list[Exception]()
     node = create(hosting=Hosting(schedule, 1, failures.append))
-    executor = EventsExecutor()
+    executor = told_executor()
     executor.add_node(node)
 
     def spin() -> None:
@@ -105,7 +109,7 @@ def _hosted(create: Callable[..., LoopNode]) -> tuple[Callable[[], None], LoopNo
 
 
 def _alone(create: Callable[..., LoopNode]) -> tuple[Callable[[], None], LoopNode]:
-    """Return the same of a node with clients, which the EventsExecutor does not await."""
+    """Return the same of a node with clients, which rclpy's EventsExecutor does not await."""
     node = create()
     executor = SingleThreadedExecutor()
     executor.add_node(node)

@@ -22,7 +22,7 @@ from koopman_ros.ros.managed import ManagedNode
 from koopman_ros.ros.node import Level, LoopNode, Owned, Status
 from koopman_ros.wire import Place
 
-_POLL_PERIOD = 0.1  # s
+POLL_PERIOD = 0.1  # s between two looks at a training
 _LINE_PERIOD = 5.0  # s between plain lines of progress
 _BAR_WIDTH = 30
 
@@ -63,6 +63,30 @@ def task_fields(node: LoopNode, settings: TrainerParameters, wiring: Wiring,
         **settings.training()}
 
 
+class Progress:
+    """
+    How far a training is: a bar on a terminal, else a line every five seconds.
+
+    :param say: prints such a line.
+    """
+
+    def __init__(self, say: Callable[[str], object]) -> None:
+        self._say = say
+        self._last_line = time.monotonic()
+
+    def show(self, state: JobState) -> None:
+        """Show a state of the training."""
+        if sys.stderr.isatty():
+            full = round(_BAR_WIDTH * state.share)
+            bar = '#' * full + '-' * (_BAR_WIDTH - full)
+            text, end = ('', '\n') if state.ended else (state.text, '')
+            print(f'\r\x1b[K|{bar}| {100.0 * state.share:3.0f} % {text}', end=end,
+                  file=sys.stderr, flush=True)
+        elif not state.ended and time.monotonic() - self._last_line > _LINE_PERIOD:
+            self._last_line = time.monotonic()
+            self._say(f'{100.0 * state.share:.0f} %: {state.text}')
+
+
 class Training:
     """Retrain in a process of its own, on ``~/train``; ``~/cancel_training`` ends it."""
 
@@ -74,12 +98,12 @@ class Training:
         self._recorded, self._on_end = recorded, on_end
         self._job: RetrainingJob | None = None
         self._state: JobState | None = None
-        self._last_line = 0.0
+        self._progress = Progress(node.get_logger().info)
         self._diagnostics = node.diagnostics.add('training', self._status)
         self._owned = owned = Owned(node)
         owned.keep(node.create_service(Trigger, '~/train', self._on_train))
         owned.keep(node.create_service(Trigger, '~/cancel_training', self._on_cancel))
-        self._timer = owned.timer(_POLL_PERIOD, self._on_poll, autostart=False)
+        self._timer = owned.timer(POLL_PERIOD, self._on_poll, autostart=False)
 
     def start(self) -> str:
         """Start a training and say from what; ValueError without a bag, OSError of the system."""
@@ -90,7 +114,7 @@ class Training:
             raise ValueError('there is no bag to train from: record one, or name it in bags')
         self._job = RetrainingJob(task_fields(self._node, settings, self._wiring, bags))
         self._state = self._job.state
-        self._last_line = time.monotonic()
+        self._progress = Progress(self._node.get_logger().info)
         self._timer.reset()
         said = f'training from {", ".join(bags)}'
         self._node.get_logger().info(said)
@@ -135,7 +159,7 @@ class Training:
         if self._job is None:
             return
         self._state = self._job.poll()
-        self._show(self._state)
+        self._progress.show(self._state)
         if not self._state.ended:
             return
         self._timer.cancel()
@@ -156,17 +180,6 @@ class Training:
             log.warning(warning)
         self._diagnostics.publish_if_changed()
         self._on_end(self._state)
-
-    def _show(self, state: JobState) -> None:
-        if sys.stderr.isatty():
-            full = round(_BAR_WIDTH * state.share)
-            bar = '#' * full + '-' * (_BAR_WIDTH - full)
-            text, end = ('', '\n') if state.ended else (state.text, '')
-            print(f'\r\x1b[K|{bar}| {100.0 * state.share:3.0f} % {text}', end=end,
-                  file=sys.stderr, flush=True)
-        elif not state.ended and time.monotonic() - self._last_line > _LINE_PERIOD:
-            self._last_line = time.monotonic()
-            self._node.get_logger().info(f'{100.0 * state.share:.0f} %: {state.text}')
 
     def _status(self) -> Status:
         state = self._state

@@ -58,6 +58,8 @@ class Harness:
     :param name: of the node in here.
     :param timeout: in s, after which what is waited for has failed.
     :param lasting: whether no process may end by itself, not even with code 0.
+    :param imported: whether nodes of this package share their imports, which makes many starts
+        cheap; see :class:`~koopman_ros.testing.forked.Forked`.
     :param each_turn: called again and again while something is waited for; may raise.
 
     :ivar node: the node in here, for whatever has no method of its own.
@@ -68,12 +70,14 @@ class Harness:
 
     def __init__(self, folder: Path, environment: Mapping[str, str] | None = None, *,
                  name: str = 'bench', timeout: float = 120.0, lasting: bool = False,
+                 imported: bool = False,
                  each_turn: Callable[[], object] = lambda: None) -> None:
         self.folder = folder
         self.processes: list[NodeProcess] = []
         self.statuses: list[DiagnosticStatus] = []
         self._timeout = timeout
         self._lasting = lasting
+        self._imported = imported
         self._each_turn = each_turn
         with contextlib.ExitStack() as stack:
             self.environment = {**stack.enter_context(isolated_domain()), **(environment or {})}
@@ -119,7 +123,8 @@ class Harness:
               called: str = '') -> NodeProcess:
         """Start a process as :class:`NodeProcess`, its log `called` as the node by default."""
         log = self.folder / f'{called or name}_{len(self.processes)}.log'
-        process = NodeProcess(name, parameters or {}, log, self.environment, arguments, command)
+        process = NodeProcess(name, parameters or {}, log, self.environment, arguments, command,
+                              self._imported)
         self.processes.append(process)
         return process
 
@@ -160,7 +165,7 @@ class Harness:
         for process in self.processes:
             if process.running or process.told_to_end:
                 continue
-            if (code := process.process.returncode) or self._lasting:
+            if (code := process.process.poll()) or self._lasting:
                 raise self._error(f'{process.name} ended early, with code {code}: '
                                   f'{process.output()[-1000:].rstrip()}')
 

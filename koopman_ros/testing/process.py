@@ -17,6 +17,7 @@ from types import TracebackType
 
 from koopman_ros import startup
 from koopman_ros.resources import config_directory, LOOPBACK_PROFILE
+from koopman_ros.testing.forked import Forked
 from koopman_ros.testing.guard import guard
 
 STOP_TIMEOUT = 10.0  # s from a signal to the end of a process
@@ -34,27 +35,34 @@ class NodeProcess:
     :param environment: variables on top of the present ones.
     :param arguments: further ROS arguments, e.g. ``('-r', '__ns:=/unit_1')``.
     :param command: what to run instead of a node of this package.
+    :param imported: whether to begin after the imports, which others have shared; see
+        :class:`~koopman_ros.testing.forked.Forked`.
     :ivar told_to_end: whether its end is expected, e.g. after :meth:`stop`.
     """
 
     def __init__(self, name: str, parameters: Mapping[str, object], log: Path,
                  environment: Mapping[str, str], arguments: tuple[str, ...] = (),
-                 command: tuple[str, ...] | None = None) -> None:
+                 command: tuple[str, ...] | None = None, imported: bool = False) -> None:
         self.name = name
         self.log = log
         self.told_to_end = False
         given = [part for key, value in parameters.items()
                  for part in ('-p', f'{key}:={_as_argument(value)}')]
-        program = command or startup.command(
-            f'koopman_ros.nodes.{name}', signal.SIGINT, interrupted=0)
+        module = f'koopman_ros.nodes.{name}'
+        ros_arguments = ('--ros-args', *given, *arguments) if given or arguments else ()
+        variables = {**os.environ, 'PYTHONFAULTHANDLER': '1', **environment}
+        self.process: subprocess.Popen[bytes] | Forked
+        if imported and not command:
+            self.process = Forked(module, ros_arguments, log, variables)
+            guard(self.process.pid)
+            return
+        program = command or startup.command(module, signal.SIGINT, interrupted=0)
         waiting = contextlib.nullcontext() if command else startup.blocked_signals()
-        ros_arguments = ['--ros-args', *given, *arguments] if given or arguments else []
         with open(log, 'wb') as output, waiting:
             # a session of its own: an interrupt of the terminal is passed on by us, in order
             self.process = subprocess.Popen(
                 [*program, *ros_arguments], stdout=output, stderr=subprocess.STDOUT,
-                stdin=subprocess.DEVNULL, start_new_session=True,
-                env={**os.environ, 'PYTHONFAULTHANDLER': '1', **environment})
+                stdin=subprocess.DEVNULL, start_new_session=True, env=variables)
             guard(self.process.pid)
 
     @property

@@ -145,7 +145,7 @@ def test_file_that_is_no_bag(tmp_path: Path, content: bytes | None, words: str) 
 
 
 def test_directory_that_is_no_bag_and_broken_metadata(tmp_path: Path) -> None:
-    with pytest.raises(bags.BagReadError, match=r'has no metadata\.yaml.*: pass recover=True'):
+    with pytest.raises(bags.BagReadError, match=r'has no metadata\.yaml.*: set recover to true'):
         bags.read_messages(tmp_path)
     with pytest.raises(bags.BagReadError, match=r'has neither metadata\.yaml nor MCAP files'):
         bags.read_messages(tmp_path, recover=True)

@@ -95,7 +95,7 @@ def test_cut_file_reads_up_to_its_last_whole_chunk(
     for cut in sorted(cut for cut in cuts if 0 < cut < len(content)):
         cut_file.write_bytes(content[:cut])
         expected = max((total for end, total in chunks if end <= cut), default=0)
-        with pytest.raises(BagReadError, match=r'is cut short.*: pass recover=True'):
+        with pytest.raises(BagReadError, match=r'is cut short.*: set recover to true'):
             read_messages(cut_file)
         found = [m.data for m in read_messages(cut_file, recover=True)]
         assert found == [s.data for s in samples[:expected]], cut
@@ -115,7 +115,7 @@ def test_flipped_byte_is_noticed_and_survived(
     for place in range(MAGIC_SIZE, data_end, 97):
         damaged.write_bytes(
             content[:place] + bytes([content[place] ^ 0x40]) + content[place + 1:])
-        with pytest.raises(BagReadError, match=r'is damaged .*: pass recover=True'):
+        with pytest.raises(BagReadError, match=r'is damaged .*: set recover to true'):
             list(read_messages(damaged))
         found = [m.data for m in read_messages(damaged, recover=True)]
         remaining = iter([s.data for s in samples])
@@ -172,7 +172,7 @@ def test_directory_of_a_killed_recorder(path: Path, samples: list[Sample]) -> No
     shutil.copy(path, folder / 'run_10.mcap')
     (folder / 'run_2.mcap').write_bytes(path.read_bytes()[:end])
     (folder / 'run_11.mcap').touch()
-    with pytest.raises(BagReadError, match=r'has no metadata\.yaml.*pass recover=True'):
+    with pytest.raises(BagReadError, match=r'has no metadata\.yaml.*set recover to true'):
         read_messages(folder)
     sent = [s.data for s in samples]
     assert [m.data for m in read_messages(folder, recover=True)] == sent + sent[:count] + sent
@@ -197,7 +197,7 @@ def test_killed_at_any_message_it_loses_the_open_chunk_only(
             assert found == list(range(len(found)))
             assert len(found) > k - 6
             assert not summary(left).complete
-            with pytest.raises(BagReadError, match=r'pass recover=True'):
+            with pytest.raises(BagReadError, match=r'set recover to true'):
                 numbers(left)
             shutil.rmtree(left)
     assert numbers(path) == list(range(60))
@@ -215,7 +215,7 @@ def test_files_that_metadata_does_not_list(tmp_path: Path) -> None:
     for name in ('other.mcap', 'other_1.mcap'):
         shutil.copy(path / 'run_0.mcap', path / name)
     with pytest.raises(BagReadError, match=(
-            r"run_1\.mcap' is not listed in metadata\.yaml, .*: pass recover=True")):
+            r"run_1\.mcap' is not listed in metadata\.yaml, .*: set recover to true")):
         read_messages(path)
     assert not summary(path).complete
     assert numbers(path, recover=True) == list(range(120))

@@ -95,7 +95,8 @@ from pathlib import Path
 from koopman_ros.testing import guard, NodeProcess
 guard.PATIENCE = {patience}
 def start():
-    child = NodeProcess({name!r}, {parameters!r}, Path({log!r}), {{}}, command={command!r})
+    child = NodeProcess({name!r}, {parameters!r}, Path({log!r}), {{}}, command={command!r},
+                        imported={imported})
     print(child.process.pid, flush=True)
 # a signal at the death of the parent would come with the end of this thread
 thread = threading.Thread(target=start)
@@ -113,14 +114,18 @@ HALTED = 'import signal\nprint("ready", flush=True)\nsignal.raise_signal(signal.
 def orphan(ros: Harness, log: Path, patience: float = TIMEOUT, **child: object) -> int:
     """Start a process that starts another one; return the number of that one."""
     parent = ros.start('parent', command=(sys.executable, '-c', PARENT.format(
-        log=str(log), patience=patience, **{'parameters': {}, 'command': None, **child})))
+        log=str(log), patience=patience,
+        **{'parameters': {}, 'command': None, 'imported': False, **child})))
     ros.wait_until(lambda: parent.output().endswith('\n'))
     return int(parent.output())
 
 
-def test_node_of_a_process_that_is_killed_completes_its_work(ros: Harness, tmp_path: Path) -> None:
+@pytest.mark.parametrize('imported', [False, True])
+def test_node_of_a_process_that_is_killed_completes_its_work(
+        ros: Harness, tmp_path: Path, imported: bool) -> None:
     bag = tmp_path / 'bag.mcap'
-    child = orphan(ros, tmp_path / 'child.log', name='trainer', parameters={'output': str(bag)})
+    child = orphan(ros, tmp_path / 'child.log', name='trainer', parameters={'output': str(bag)},
+                   imported=imported)
     ros.meet('trainer')
     ros.processes[0].stop(signal.SIGKILL)
     wait_until_ended(child)

@@ -24,7 +24,7 @@ from koopman_ros.ros import topics
 from koopman_ros.ros.codec import stamp_message
 from koopman_ros.ros.process import answer, open_to_the_network
 from koopman_ros.ros.programs import tables
-from koopman_ros.testing import Harness
+from koopman_ros.testing import Harness, NodeProcess
 from koopman_ros.units import NANOSECONDS
 from support.nodes import run_here, TIMEOUT
 
@@ -37,7 +37,7 @@ def importing(names: tuple[str, ...], act: str, main: str) -> tuple[str, ...]:
         'import os, sys\n'
         'class Finder:\n'
         '    def find_spec(self, name, path=None, target=None):\n'
-        f'        if name.split(".")[0] in {names}:\n'
+        f'        if name.split(".")[0] in {names} or name in {names}:\n'
         f'            {act}\n'
         'sys.meta_path.insert(0, Finder())\n'
         f'from koopman_ros.{main}\n'
@@ -45,7 +45,9 @@ def importing(names: tuple[str, ...], act: str, main: str) -> tuple[str, ...]:
 
 
 @pytest.mark.parametrize(('name', 'number', 'unneeded'), [
-    ('plant', signal.SIGINT, ('torch',)), ('controller', signal.SIGTERM, ('torch',)),
+    ('plant', signal.SIGINT, ('torch',)),
+    # which an early rclpy lacks
+    ('controller', signal.SIGTERM, ('torch', 'rclpy.experimental')),
     ('trainer', signal.SIGINT, ('torch', 'scipy'))])
 def test_signal_ends_a_node_on_loopback_cleanly_that_loads_only_what_it_needs(
         ros: Harness, tmp_path: Path, name: str, number: int, unneeded: tuple[str, ...]) -> None:
@@ -53,7 +55,8 @@ def test_signal_ends_a_node_on_loopback_cleanly_that_loads_only_what_it_needs(
     parameters = {'plant': {'speed': 0.0}, 'controller': {},
                   'trainer': {'output': tmp_path / 'bag'}}[name]
     process = ros.start(name, parameters, command=importing(
-        unneeded, 'raise AssertionError(f"{name} is imported")', f'nodes.{name} import main'))
+        unneeded, 'raise (ImportError if "." in name else AssertionError)(f"{name} is imported")',
+        f'nodes.{name} import main'))
     ros.meet(name)
     # the profile is one for Fast DDS
     if 'fastrtps' in get_rmw_implementation_identifier():
@@ -94,10 +97,12 @@ def test_signal_while_a_program_loads_ends_it_without_a_word(
 
 
 def test_signal_before_the_interpreter_is_up_and_arguments_are_answered_before_the_start(
-        ros: Harness) -> None:
-    process = ros.start('plant')
-    assert process.stop(signal.SIGTERM) == 0
-    assert process.output() == ''
+        ros: Harness, tmp_path: Path) -> None:
+    for imported in (False, True):
+        with NodeProcess('plant', {}, tmp_path / 'log', ros.environment,
+                         imported=imported) as process:
+            assert process.stop(signal.SIGTERM) == 0
+        assert process.output() == ''
     process = ros.start('plant', command=(
         *importing((), 'pass', 'startup import plant as main'), '--speed=2.0'))
     assert process.wait() == 2
