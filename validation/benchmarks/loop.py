@@ -42,6 +42,8 @@ MEANING = {
     'plan_ratio_to_sqp': "the same of casadi's SQP, as generated C where there is a compiler",
     'latency_ratio_median': 'measurement published to command received, over that of a bare echo',
     'latency_ratio_p99': 'the same for 99th percentiles',
+    'pid_latency_ratio_median': 'the same of a PID controller, a plain node of rclpy',
+    'pid_latency_ratio_p99': 'the same for 99th percentiles',
     'compiled_latency_ratio_median': 'the same with a compiled control step (extra fast)',
     'compiled_latency_ratio_p99': 'the same for 99th percentiles',
     'max_rate_hz': 'highest rate of measurements at which every one was answered and the median '
@@ -223,15 +225,17 @@ def _start(harness: Harness, name: str, namespace: str, command: tuple[str, ...]
 
 
 def _latency(figures: dict[str, Any], harness: Harness, rounds: int) -> str:
-    """Time measurement to command of the controller and of the echo, round by round in turns."""
-    _tell('latency beside an echo')
-    echo = (sys.executable, '-m', 'validation.benchmarks.echo')
-    # without what compiles, the last one is the first one again
-    sides = ('controller', 'echo', 'compiled')
+    """Time measurement to command of the controller and of others, round by round in turns."""
+    _tell('latency beside an echo and a PID controller')
+    echo, pid = ((sys.executable, '-m', f'validation.benchmarks.{name}')
+                 for name in ('echo', 'pid'))
+    # without what compiles, `compiled` is the first one again
+    sides = ('controller', 'compiled', 'pid', 'echo')
     taken: dict[str, list[float]] = {name: [] for name in sides}
     records = harness.listen(String, f'/latency/compiled/{topics.CONTROLLER_EVENTS}')
     with _start(harness, 'controller', '/latency/controller'), \
             _start(harness, 'controller', '/latency/compiled', compiled=True), \
+            _start(harness, 'pid', '/latency/pid', pid), \
             _start(harness, 'echo', '/latency/echo', echo) as echoing:
         probes = {name: _Probe(harness, f'/latency/{name}') for name in sides}
         for probe in probes.values():
@@ -246,16 +250,17 @@ def _latency(figures: dict[str, Any], harness: Harness, rounds: int) -> str:
         figures['latency'] = {'measurements': rounds * _ROUND, 'echo_rss_megabytes': _rss(echoing)}
     rows = []
     for quantile, percent in (('median', 50), ('p99', 99)):
-        ours, other, compiled = (
-            1e6 * float(np.percentile(seconds, percent)) for seconds in taken.values())
-        for name, microseconds in zip(sides, (ours, other, compiled), strict=True):
+        found = {name: 1e6 * float(np.percentile(seconds, percent))
+                 for name, seconds in taken.items()}
+        for name, microseconds in found.items():
             figures['latency'].setdefault(name, {})[f'{quantile}_us'] = microseconds
-        figures[f'latency_ratio_{quantile}'] = ours / other
-        figures[f'compiled_latency_ratio_{quantile}'] = compiled / other
-        rows.append((quantile, f'{ours / other:.2f}', f'{compiled / other:.2f}', f'{ours:.0f}',
-                     f'{compiled:.0f}', f'{other:.0f}'))
-    return table(('latency', 'ratio', 'ratio, compiled', 'controller [us]', 'compiled [us]',
-                  'echo [us]'), rows)
+            if name != 'echo':
+                prefix = '' if name == 'controller' else f'{name}_'
+                figures[f'{prefix}latency_ratio_{quantile}'] = microseconds / found['echo']
+        rows.append((quantile, *(
+            f'{us:.0f}' if name == 'echo' else f'{us:.0f} ({us / found["echo"]:.2f})'
+            for name, us in found.items())))
+    return table(('latency [us] (times echo)', *sides), rows)
 
 
 def _highest_rate(figures: dict[str, Any], harness: Harness, seconds: float, lowest: float) -> str:

@@ -16,11 +16,15 @@ from typing import Any
 from matplotlib.axes import Axes
 import numpy as np
 
+from koopman_ros.plants import describe
 from koopman_ros.reports import drawing, legend, table
 from validation.benchmarks import process, solvers
 from validation.benchmarks.problems import build, Case, SYSTEMS
+from validation.general.learners import LEARNERS
+from validation.general.study import predicted
+from validation.general.systems import CASES
 
-PACKAGES = ('torch', 'casadi', 'numpy')
+PACKAGES = ('torch', 'casadi', 'numpy', 'pysindy')
 TARGETS = {'1e-4': 1e-4, '1e-6': 1e-6, '1e-8': 1e-8}
 # Three coordinates, the first of them the state, do not represent the reactor below 1e-8 or so.
 NOT_ASKED = {'two-state example': (), 'one-state reactor': ('1e-8',)}
@@ -37,6 +41,8 @@ _DRAWN = (2000, 16)  # the case that is drawn
 _FIRST = 1e-3  # s, the left end of the time axis
 _REPEATED = 4.0  # s
 _COST_LIMIT = 240.0  # s
+_SEED = 0
+_HELD_OUT = 40  # episodes that no training has seen
 
 
 @dataclass(frozen=True)
@@ -54,12 +60,16 @@ class Plan:
     n_z: tuple[int, ...]  #: likewise
     n_x: tuple[int, ...]  #: likewise
     systems: tuple[str, ...] = tuple(SYSTEMS)
+    #: by their names in the study of other plants: those that whole models are learned of
+    learned: tuple[str, ...] = ()
 
 
 PLANS = {
-    'quick': Plan(((300, 8),), 1.0, 10.0, 4e3, 1, (1000, 10_000), (2, 3), (1, 2)),
+    'quick': Plan(((300, 8),), 1.0, 10.0, 4e3, 1, (1000, 10_000), (2, 3), (1, 2),
+                  learned=('two_tanks',)),
     'default': Plan(((300, 8), (2000, 8), (2000, 16), (2000, 32)), 20.0, 60.0, 8e3, 3,
-                    (1000, 10_000, 100_000, 1_000_000), (2, 3, 4, 5, 6, 7, 8), (1, 2, 3, 4)),
+                    (1000, 10_000, 100_000, 1_000_000), (2, 3, 4, 5, 6, 7, 8), (1, 2, 3, 4),
+                    learned=('two_tanks', 'van_der_pol', 'pendulum', 'reactor_saddle')),
 }
 
 
@@ -98,6 +108,8 @@ def measure(plan: Plan, figures: dict[str, Any], folder: Path) -> Iterator[str]:
             _add_cost(figures, 'n_z', {n: (2000, 1, n, 17) for n in plan.n_z}, within)
             _add_cost(figures, 'n_x', {n: (2000, n, n + 2, 16) for n in plan.n_x}, within)
             yield '\n\n'.join(_tables_of_cost(figures))
+            for name in plan.learned:
+                yield _models(figures, name, within)
         finally:
             _draw(folder / 'training.png', outcomes, figures)
 
@@ -172,6 +184,31 @@ def _add_cost(figures: dict[str, Any], name: str, sizes: dict[int, tuple[int, in
         figures.setdefault(f'seconds_per_iteration_by_{name}', {})[str(n)] = event['seconds']
         if name == 'samples':
             figures.setdefault('peak_memory_by_samples', {})[str(n)] = event['megabytes']
+
+
+def _models(figures: dict[str, Any], name: str, within: Callable[..., process.Outcome]) -> str:
+    """Learn whole models of a plant by each class, SINDy of pysindy among them."""
+    _tell(f'{name}: models of {len(LEARNERS)} classes')
+    outcome = within(_learn, name)
+    if outcome.failure:
+        raise RuntimeError(f'the models of {name} could not be learned: {outcome.failure}')
+    found = {label: one for event in outcome.events for label, one in event.items()}
+    figures.setdefault('models', {})[name] = found
+    return table((f'{name}: models', 'learned in [s]', 'relative error of the drift',
+                  'roll-out, worst state [half ranges]'), [
+        (label, f'{one["seconds"]:.3g}', f'{one["rx"]:.1e}',
+         '-' if one['rollout'] is None else f'{one["rollout"]:.1e}')
+        for label, one in found.items()])
+
+
+def _learn(tell: process.Tell, name: str) -> None:
+    case = CASES[name]
+    plant, samples = describe(case.system), case.samples(_SEED)
+    held_out = case.samples(_SEED + 1000, _HELD_OUT)
+    # what is imported at the first use is not learning
+    LEARNERS['SINDy-5'](plant, samples, _SEED)
+    for label, learn in LEARNERS.items():
+        tell({label: predicted(case, learn(plant, samples, _SEED), held_out)})
 
 
 def _table_of(case: dict[str, Any]) -> str:

@@ -77,6 +77,8 @@ def test_the_loop_across_processes(figures):
     for quantile in ('median', 'p99'):
         ours, echo = (latency[side][f'{quantile}_us'] for side in ('controller', 'echo'))
         assert found[f'latency_ratio_{quantile}'] == pytest.approx(ours / echo)
+        assert found[f'pid_latency_ratio_{quantile}'] == pytest.approx(
+            latency['pid'][f'{quantile}_us'] / echo)
         assert min(ours, echo) > 0.0
     kept_up = [one['sent_hz'] for one in steps if one['kept_up']]
     assert found['max_rate_hz'] == (kept_up[-1] if kept_up else None)

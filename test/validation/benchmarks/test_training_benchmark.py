@@ -14,9 +14,11 @@ from koopman_ros.learning import fit
 from koopman_ros.learning.levenberg_marquardt import normal_equations
 from koopman_ros.lifting import Coordinates, LiftedModel, NetworkObservables, Provenance
 from validation.benchmarks import ipopt, process, solvers
+from validation.benchmarks import training as training_part
 from validation.benchmarks.__main__ import main
 from validation.benchmarks.problems import artificial, build
 from validation.benchmarks.training import Plan, PLANS, SOLVERS
+from validation.general.learners import LEARNERS
 
 # Few samples: casadi's graphs take most of the time, and grow with them.
 PLAN = Plan(((200, 8),), 2.0, 10.0, 4e3, 1, (500, 1000), (2, 3), (1, 2), ('one-state reactor',))
@@ -62,6 +64,17 @@ def test_cost_of_an_iteration(training):
         assert set(figures) == sizes
         assert min(figures.values()) > 0.0
     assert set(training['peak_memory_by_samples']) == {'500', '1000'}
+
+
+def test_models_of_other_classes_are_learned_beside_ours(monkeypatch):
+    monkeypatch.setattr(training_part, 'LEARNERS', {
+        label: LEARNERS[label] for label in ('linear', 'EDMD-5', 'SINDy-5')})
+    told = {}
+    training_part._learn(told.update, 'two_tanks')
+    # the polynomials have the tanks' roots to some digits; no line has them
+    assert told['SINDy-5']['rx'] < 1e-4 < told['linear']['rx']
+    assert told['EDMD-5']['rx'] < 1e-4
+    assert min(one['seconds'] for one in told.values()) > 0.0
 
 
 def test_objective_of_the_first_order_solvers_is_ours():
