@@ -63,6 +63,7 @@ STARTS = 2
 UNLIMITED = InputLimits(np.array([200.0]), np.array([400.0]), np.full(1, np.inf))
 # With these the laws are compared, also from where they may lose the plant.
 LIMITS = InputLimits(np.array([278.15]), np.array([305.15]), np.ones(1))
+FRESH_EPISODES = 200  # that a lift is judged on
 LIMITED_SAMPLES, LIMITED_STARTS, MARGIN = 400, 40, 0.3
 SADDLE_TEMPERATURE, REACHED = 350.0, 1.0  # K
 # From one temperature to another, in K.
@@ -180,7 +181,7 @@ def judged(_: None, seed: int, __: Tell) -> tuple[LiftedModel, list[str]] | str:
     """Learn from a seed; return the lift and its row, or why there is none."""
     begin = time.process_time()
     try:
-        model, fresh = learn(seed), samples(1000 + seed, 200)
+        model, fresh = learn(seed), samples(1000 + seed, FRESH_EPISODES)
     except NoUsefulLift as refusal:
         return f'seed {seed}: {refusal}'
     seconds = time.process_time() - begin

@@ -9,8 +9,8 @@ from validation import saddle
 def test_without_the_concentration_the_same_law_costs_hardly_more(monkeypatch):
     monkeypatch.setattr(saddle, 'LAWS', {'sdre': ('sdre',)})
     monkeypatch.setattr(saddle, 'COURSE', {0.0: 350.0, 30.0: 345.0})
-    monkeypatch.setattr(saddle, 'FOULED', 330.0)
-    monkeypatch.setattr(saddle, 'END', 630.0)
+    monkeypatch.setattr(saddle, 'FOULED', 200.0)
+    monkeypatch.setattr(saddle, 'END', 400.0)
     (row,) = saddle.course_rows([saddle.truth()], periods=(1.0,))
     law, period, over_true, worst, over_full, _, offset, concentration, *lost = row
     assert (law, period, over_true, worst) == ('sdre', '1', '1.0000', '1.0000')
@@ -35,7 +35,7 @@ def test_what_physics_allows_is_told_from_what_it_does_not(monkeypatch):
 
 def test_starts_that_are_lost_are_lost_by_full_information_too(monkeypatch):
     monkeypatch.setattr(saddle, 'STARTS', 4)
-    monkeypatch.setattr(saddle, 'ARRIVAL', 240.0)
+    monkeypatch.setattr(saddle, 'ARRIVAL', 120.0)
     informed, own = (saddle.lost(saddle.controller(
         saddle.truth(), ('sdre',), saddle.WIDE, informed=full), 0) for full in (True, False))
     # two of these four are beyond any coolant

@@ -14,7 +14,7 @@ from validation import unstable
 
 
 def test_samples_fill_the_range_and_stay_where_the_coolant_can_go():
-    x = unstable.samples(0, 100).x
+    x = unstable.samples(0, 60).x
     design = unstable.DESIGN
     assert np.all((x >= design.state_lower) & (x <= design.state_upper))
     assert np.ptp(x[:, 1]) > 48.0
@@ -28,14 +28,15 @@ def test_samples_fill_the_range_and_stay_where_the_coolant_can_go():
 
 
 def test_a_row_of_a_lift_that_was_learned_in_a_hurry(monkeypatch, capsys):
-    monkeypatch.setattr(unstable, 'EPISODES', 250)
+    monkeypatch.setattr(unstable, 'EPISODES', 150)
+    monkeypatch.setattr(unstable, 'FRESH_EPISODES', 50)
     monkeypatch.setattr(unstable, 'STEPS', unstable.STEPS[:1])
     monkeypatch.setattr(unstable, 'STARTS', 1)
     monkeypatch.setattr(unstable, 'RECIPES', {
         'neural drift': NeuralDrift((12,), max_iterations=150),
         'free lift': replace(unstable.LIFT, hidden_first=24, max_iterations=250)})
     monkeypatch.setattr(unstable, 'LIMITED_STARTS', 1)
-    monkeypatch.setattr(unstable, 'LIMITED_SAMPLES', 150)
+    monkeypatch.setattr(unstable, 'LIMITED_SAMPLES', 120)
     assert unstable.main(['--seeds', '1']) == 0
     lines = capsys.readouterr().out.splitlines()
     row = lines[2].strip('| ').split(' | ')

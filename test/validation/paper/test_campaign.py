@@ -12,6 +12,7 @@ import matplotlib.image
 import numpy as np
 import pytest
 
+from koopman_ros.jobs import processes
 from koopman_ros.learning import Edmd, fit, Linearisation
 from koopman_ros.lifting import load
 from koopman_ros.plants import box_episodes, describe
@@ -48,16 +49,19 @@ def test_summary_has_one_entry_for_each_seed(monkeypatch, capsys):
     assert '4/6: b/c, seed 1 failed' in lines
 
 
-def test_lost_workers_keep_what_is_done():
+def test_a_lost_worker_keeps_what_is_done(monkeypatch):
+    # what is begun anew, and how often, is the place's own affair
+    monkeypatch.setattr(processes, 'ATTEMPTS', 1)
+
     def deadly(seed):
         if seed == 1:
             os.kill(os.getpid(), signal.SIGKILL)
         return {'rw': 1.0}, {}
 
-    campaign = run_campaign(3, {'a': deadly}, 'process')
+    campaign = run_campaign(3, {'a': deadly}, 'joblib:1')
     assert not campaign.complete
     assert campaign.summary() == {'a': {'rw': [1.0]}}
-    assert campaign.errors[0].startswith('a, seed 1: 3 workers that ran it were killed')
+    assert campaign.errors[0].startswith('a, seed 1: 1 workers that ran it were killed')
 
 
 def test_an_interrupt_keeps_what_is_done(monkeypatch):
@@ -75,19 +79,28 @@ def test_an_interrupt_keeps_what_is_done(monkeypatch):
 @pytest.fixture(scope='module')
 def campaign():
     """Return a campaign of one seed on few data, exact and shipped lifts in place of learned."""
+    with pytest.MonkeyPatch.context() as patch:
+        # of the seed below the first start finds it
+        patch.setattr(scalar, 'STARTS', 1)
+        # the least of them takes longest
+        patch.setattr(two_state, 'INPUT_WEIGHTS', (1.0, 0.1))
+        yield quick_campaign()
+
+
+def quick_campaign():
     found = Campaign(complete=True)
 
     def add(name, outcome):
         found.metrics[name], found.models[name] = {0: outcome[0]}, {0: outcome[1]}
 
-    add('scalar', scalar.run(0))
+    add('scalar', scalar.run(2))
     plant, exact, narrow = (
         describe(two_state.SYSTEM), exact_two_state_model(), figures.FIGURE_NARROW_BOX)
     lifts = {'wide': exact, narrow: exact, 'linear': Linearisation(
         two_state.SYSTEM.drift_jacobian(np.zeros(2))).learn(
             plant, two_state.samples(two_state.WIDE, 0, episodes=5))}
     add('two_state', ({**two_state.judged(exact, 0), 'edmd_cost_ratio': {'R=1': None},
-                       'linear_cost_ratio': {'R=1': 4.5, 'R=0.1': 1.9, 'R=0.001': 1.0}}, lifts))
+                       'linear_cost_ratio': {'R=1': 4.5, 'R=0.1': 1.9}}, lifts))
     add('narrow', ({f'{narrow}/{name}': value for name, value in (
         ('rw_in', 1e-7), ('cost_ratio_to_exact', None), ('left_box', True),
         ('final_distance', None))}, lifts))
@@ -95,7 +108,7 @@ def campaign():
     models['linear'] = load(model_path('reactor_linear'))
     few = box_episodes(reactor.SYSTEM, reactor.TRAINING, 30, 1.0, 0)
     models['edmd'] = Edmd(reactor.EDMD_DEGREE).learn(describe(reactor.SYSTEM), few)
-    fresh = [random_step_episodes(reactor.SYSTEM, design, 2, 30.0, 5_000)
+    fresh = [random_step_episodes(reactor.SYSTEM, design, 1, 30.0, 5_000)
              for design in (reactor.IN_RANGE, reactor.OUT_OF_RANGE)]
     add('reactor', ({f'{name}/{figure}': value for name, model in models.items()
                      for figure, value in reactor.judged(model, few, *fresh).items()}, models))
@@ -123,6 +136,7 @@ def test_exact_control_of_the_two_state_example(campaign):
     assert metrics['rw'] <= 1e-20
     assert metrics['eigenvalue_error'] <= 1e-12
     assert metrics['left_box'] is False
+    assert len(metrics['cost_ratio_to_exact']) == 2
     for ratio in metrics['cost_ratio_to_exact'].values():
         assert abs(ratio - 1.0) <= 1e-6
 
@@ -163,9 +177,9 @@ def test_report_names_every_experiment_and_its_eleven_figures(campaign, tmp_path
     summary = {'package_version': '1', 'seeds': 1, 'complete': True, 'errors': [],
                'wall_seconds': 1.0, **campaign.summary()}
     json.dumps(summary, allow_nan=False)
-    # the quick campaign has no lifts of 2 and 5 coordinates
+    # the quick campaign has no lifts of 2 and 5 coordinates, and two weights
     monkeypatch.setattr(report, 'TARGETS', [
-        target for target in report.TARGETS if not re.search('nz=[25]', target.path)])
+        target for target in report.TARGETS if not re.search('nz=[25]|R=0.001$', target.path)])
     report.write_report(summary, drawn, tmp_path / 'report.md')
     text = (tmp_path / 'report.md').read_text()
     for heading in ('Motivating example', 'Two-state example', 'One-state reactor',
