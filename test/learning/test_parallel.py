@@ -106,7 +106,7 @@ if __name__ == '__main__':
         # endless, or it could be over before a busy machine interrupts it
         recipe = Growth(200, max_iterations=60, tolerance=0.0)
         found = train(BENT, bent_samples(length=300), recipe, starts=2, watch=watch,
-                      backend=backend)
+                      loops=16, backend=backend)
     print('model', found.model.n_z, found.status)
 """
 
