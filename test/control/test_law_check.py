@@ -18,7 +18,6 @@ from koopman_ros.control.laws import LawResult, Linear, Tuning, Weights
 from koopman_ros.control.laws.base import steady_state_target
 from koopman_ros.control.limits import InputLimits
 from koopman_ros.estimation import Estimate
-from koopman_ros.jobs.backends import backend_of
 from koopman_ros.lifting import (
     Coordinates,
     LiftedModel,
@@ -355,25 +354,6 @@ def test_the_watch_sees_it_and_can_end_it():
     assert 0.9 < seen[-1] < 1.0
     assert seen == sorted(seen)
     assert check_law(scalar(), linear_rate(1.0), watch=lambda share: share > 0.3) is None
-
-
-def test_loops_run_elsewhere_side_by_side():
-    """In two parts, each of which tells of its share."""
-    def rate(x, u):
-        # by its value, as workers do not know this module
-        return TWO.scale * (TWO.to_deviation(x) @ A.T + INPUTS.to_deviation(u) @ B.T)
-
-    seen = []
-    one = check_law(two_states(), rate, loops=64)
-    with backend_of('process') as backend:
-        other = check_law(two_states(), rate, loops=64, backend=backend,
-                          watch=seen.append)
-        assert check_law(two_states(), rate, loops=64, backend=backend,
-                         watch=lambda _: True) is None
-    for name in ('starts', 'setpoints', 'ratios', 'no_gain', 'excess'):
-        assert getattr(other, name).tobytes() == getattr(one, name).tobytes()
-    assert one.loops > 32
-    assert seen == sorted(seen)
 
 
 def test_a_plant_without_inputs_has_no_closed_loop():

@@ -10,7 +10,6 @@ import pytest
 from scipy.optimize import fsolve
 
 from koopman_ros.identification import identify_hidden, Stopped
-from koopman_ros.jobs.backends import backend_of
 from koopman_ros.plant_data import Episode, Plant
 from koopman_ros.solvers import runge_kutta_step
 
@@ -122,13 +121,3 @@ def test_episodes_in_which_no_filter_finds_the_state_are_refused():
     parts = [whole.part(k, k + 40) for k in range(0, 600, 40)]
     with pytest.raises(ValueError, match='too short for a filter'):
         identify_hidden(PLANT, parts, 1)
-
-
-def test_the_bits_do_not_depend_on_where_it_is_estimated():
-    episodes = [record(oscillator, samples=200)]
-    with backend_of('process') as backend:
-        found, here = (identify_hidden(PLANT, episodes, 1, highest_degree=1, backend=one)
-                       for one in (backend, None))
-    assert found.drift.coefficients.tobytes() == here.drift.coefficients.tobytes()
-    assert [score.rmse.tobytes() for score in found.scores] == [
-        score.rmse.tobytes() for score in here.scores]
