@@ -4,6 +4,7 @@
 """Closed loops over a box: which laws pass, which fail, where, and beside what."""
 
 from dataclasses import dataclass, replace
+from functools import cache
 import math
 
 from matplotlib.figure import Figure
@@ -198,8 +199,13 @@ def too_steady():
     return cubic(1.0, 0.0, -0.5, 3.0)[0]
 
 
+@cache
+def too_steady_on_its_plant():
+    return check_law(too_steady(), linear_rate(1.0))
+
+
 def test_what_a_perfect_model_does_no_better_is_not_the_models_fault():
-    found = check_law(*cubic(0.0, 6.0, 0.0, 8.0))
+    found = check_law(*cubic(0.0, 6.0, 0.0, 8.0), loops=64)
     assert np.mean(found.poor) > 0.01
     assert np.all(found.excess[found.poor] <= 1.001)
     assert found.accepted
@@ -207,7 +213,7 @@ def test_what_a_perfect_model_does_no_better_is_not_the_models_fault():
     assert str(found).endswith(f', but for {np.sum(found.poor)} in which it would with a perfect '
                                'model, too')
     # here it is to blame
-    blamed = check_law(too_steady(), linear_rate(1.0))
+    blamed = too_steady_on_its_plant()
     assert not blamed.accepted
     assert np.all(blamed.excess[blamed.failed] > 1.05)
 
@@ -215,8 +221,8 @@ def test_what_a_perfect_model_does_no_better_is_not_the_models_fault():
 def test_what_a_better_model_would_save_is_held_against_a_model():
     """A linear model passes beside linear laws, but another would save much."""
     model, rate = cubic(0.5, 0.5, 0.0, 8.0)
-    assert check_law(model, rate).failed.sum() == 0
-    found = check_law(model.linearised, rate)
+    assert check_law(model, rate, loops=64).failed.sum() == 0
+    found = check_law(model.linearised, rate, loops=64)
     assert found.poor.sum() == 0
     assert found.ratios.max() == pytest.approx(1.0)
     assert not found.accepted
@@ -230,7 +236,7 @@ def test_what_a_better_model_would_save_is_held_against_a_model():
 
 def test_what_is_slow_and_cheap_has_not_failed():
     """Between two stable rests the law takes longer than a linear one, and costs less."""
-    found = check_law(*cubic(2.0, 0.0, -2.0, 3.0))
+    found = check_law(*cubic(2.0, 0.0, -2.0, 3.0), loops=64)
     assert (found.arrived, found.poor.sum()) == (found.loops, 0)
     assert found.worst_ratio < 1.0
 
@@ -283,11 +289,11 @@ def levels_on_the_way(model, levels, start, setpoint):
 
 
 def test_where_its_law_was_lost_the_controller_takes_the_next_one():
-    found = check_law(too_steady(), linear_rate(1.0))
+    found = too_steady_on_its_plant()
     assert 0 < found.lost.sum() < found.poor.sum() < found.loops
     model = replace(too_steady(), tried_loops=found.tried)
     for lost, expected in ((True, ('linear', Code.LOST_HERE)), (False, ('sdre', None))):
-        for k in np.flatnonzero(found.lost == lost)[:5]:
+        for k in np.flatnonzero(found.lost == lost)[:3]:
             first, *_ = levels_on_the_way(
                 model, ('sdre', 'linear'), found.starts[k, 0], found.setpoints[k, 0])
             assert first == expected
@@ -300,7 +306,7 @@ def test_where_its_law_was_lost_the_controller_takes_the_next_one():
 
 
 def test_the_map_shows_each_loop_once(tmp_path):
-    found = check_law(too_steady(), linear_rate(1.0))
+    found = too_steady_on_its_plant()
     file = plot_law_check(found, tmp_path / 'map.png')
     assert file.read_bytes().startswith(b'\x89PNG')
     axes = Figure().subplots()

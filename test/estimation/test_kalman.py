@@ -192,12 +192,11 @@ def changed(**constants: float):
     return change
 
 
-@pytest.mark.parametrize('estimator', ['extended_kalman_filter', 'unscented_kalman_filter'])
-@pytest.mark.parametrize(('constants', 'known'), [
-    ({'heat_transfer_coefficient': 0.85 * 5e4}, True),
-    ({'feed_temperature': 355.0}, True),
+@pytest.mark.parametrize(('estimator', 'constants', 'known'), [
+    ('unscented_kalman_filter', {'heat_transfer_coefficient': 0.85 * 5e4}, True),
+    ('extended_kalman_filter', {'feed_temperature': 355.0}, True),
     # one output has one disturbance: it is taken for one of the heat balance
-    ({'feed_concentration': 1.1}, False)])
+    ('extended_kalman_filter', {'feed_concentration': 1.1}, False)])
 def test_the_saddle_is_held_by_its_temperature_alone(estimator, constants, known):
     x0, u0 = held(350.0)
     loop = simulate(saddle(estimator=estimator), Process(SYSTEM, 0, x0, u0), [
