@@ -220,6 +220,11 @@ class Segments:
             x[rows, j], measured[rows, j] = episode.x, True
         return cls(steps, u, x, measured)
 
+    def repeated(self, count: int) -> Segments:
+        """Return all of them so many times, one round of them after the other."""
+        return Segments(*(np.tile(one, (1, count, *[1] * (one.ndim - 2)))
+                          for one in (self.steps, self.u, self.x, self.measured)))
+
     def path(self, rate: Rate, x0: Array) -> Array:
         """Return the states (K + 1, M, n_x) from starts (M, n_x), not finite after divergence."""
         path = np.empty(self.x.shape)
@@ -258,9 +263,15 @@ def fitted_starts(rate: Rate, segments: Segments, scale: Array) -> tuple[Array, 
     n_x = x0.shape[1]
     count = np.sum(segments.measured, axis=0)[:, None]
     best, least = x0, np.full_like(x0, np.inf)
-    # errors in units of the scale: states of different units weigh alike
+    # beside each segment the same from starts that differ in one state
+    beside = segments.repeated(1 + n_x)
+    shifts = _STEP * np.concatenate((np.zeros((1, n_x)), np.eye(n_x)))
     for last in (False, False, True):
-        errors = segments.errors(rate, x0) / scale
+        tried = x0 + scale * (shifts[:1] if last else shifts)[:, None]
+        # errors in units of the scale: states of different units weigh alike
+        found = (segments if last else beside).errors(rate, tried.reshape(-1, n_x)) / scale
+        found = found.reshape(len(found), *tried.shape)
+        errors = found[:, 0]
         # a model may diverge from any of the starts
         with np.errstate(all='ignore'):
             squares = np.sum(errors ** 2, axis=0) / count
@@ -270,9 +281,7 @@ def fitted_starts(rate: Rate, segments: Segments, scale: Array) -> tuple[Array, 
             if last or not np.all(np.isfinite(errors)):
                 break
             # (K + 1, M, n_x, n_x): change of every state with each start
-            slopes = np.stack([
-                (segments.errors(rate, x0 + _STEP * scale * unit) / scale - errors) / _STEP
-                for unit in np.eye(n_x)], axis=-1)
+            slopes = np.moveaxis(found[:, 1:] - found[:, :1], 1, -1) / _STEP
             normal = np.einsum('kmij,kmil->mjl', slopes, slopes)
             right = np.einsum('kmij,kmi->mj', slopes, errors)
             if not (np.all(np.isfinite(normal)) and np.all(np.isfinite(right))):

@@ -72,35 +72,36 @@ class Predictor(Generic[_Drift]):
         n_x, n_y = self.gain.shape
         home = np.zeros((first.x.shape[1], n_x))
         home[:, :n_y] = self._target(first)[0]
+        hidden = _APART * np.eye(n_x)[n_y:]
 
-        def errors(x: Array) -> Array:
-            return self._filter(first, x)[2]
+        def errors(starts: Array) -> Array:
+            """Evaluate the errors (S, k, M, n_y) from starts (S, M, n_x), side by side."""
+            found = self._filter(first.repeated(len(starts)), starts.reshape(-1, n_x))[2]
+            return np.moveaxis(found.reshape(len(found), *starts.shape[:2], n_y), 1, 0)
 
-        def size(found: Array) -> Array:
+        def best_of(starts: Array) -> tuple[Array, Array]:
+            """Return the best of starts (S, M, n_x) for each segment, and its size."""
             with np.errstate(over='ignore'):
-                squares = np.sum(found ** 2, axis=(0, 2))
-            return np.where(np.isfinite(squares), squares, np.inf)
+                squares = np.sum(errors(starts) ** 2, axis=(1, 3))
+            squares = np.where(np.isfinite(squares), squares, np.inf)
+            chosen = np.argmin(squares, axis=0)[None]
+            return (np.take_along_axis(starts, chosen[..., None], axis=0)[0],
+                    np.take_along_axis(squares, chosen, axis=0)[0])
 
-        best, least = home, size(errors(home))
-
-        def offer(x: Array) -> None:
-            nonlocal best, least
-            own = size(errors(x))
-            best, least = (np.where((own < least)[:, None], x, best), np.minimum(own, least))
-
-        for shift in np.vstack([np.eye(n_x), -np.eye(n_x)])[:, None] * _APART:
-            if np.any(shift[:, n_y:]):
-                offer(home + shift)
+        shifts = np.concatenate((np.zeros((1, n_x)), hidden, -hidden))
+        best, least = best_of(home + shifts[:, None])
+        steps = _STEP * np.concatenate((np.zeros((1, n_x)), np.eye(n_x)))
         for _ in range(_SEARCHES):
-            here = errors(best)
-            slopes = np.stack([(errors(best + _STEP * unit) - here) / _STEP
-                               for unit in np.eye(n_x)], axis=-1)
+            here, *beside = errors(best + steps[:, None])
+            slopes = np.stack([other - here for other in beside], axis=-1) / _STEP
             normal = np.einsum('kmyi,kmyj->mij', slopes, slopes)
             right = np.einsum('kmyi,kmy->mi', slopes, here)
             if not (np.all(np.isfinite(normal)) and np.all(np.isfinite(right))):
                 break
-            offer(best - (np.linalg.pinv(normal, rcond=1e-9, hermitian=True)
-                          @ right[..., None])[..., 0])
+            offered = best - (np.linalg.pinv(normal, rcond=1e-9, hermitian=True)
+                              @ right[..., None])[..., 0]
+            offer, own = best_of(offered[None])
+            best, least = (np.where((own < least)[:, None], offer, best), np.minimum(own, least))
         return best
 
 

@@ -154,12 +154,12 @@ def total_variation(episodes: Sequence[Episode], box: Box, degree: int, B: Array
         raise ValueError('total variation needs a constant B: take the weak form')
     shape = DriftModel(box, degree, np.empty(0), assumed)
     features, inputs, rates = [], [], []
-    for episode in episodes:
-        if len(episode) < _SHORTEST:
-            continue
+    episodes = [episode for episode in episodes if len(episode) >= _SHORTEST]
+    shifts = [_moved(episode, box, assumed) for episode in episodes]
+    curves = _smoothed([(episode.time, box.states.to_deviation(episode.x) - moved)
+                        for episode, moved in zip(episodes, shifts, strict=True)])
+    for episode, moved, smooth in zip(episodes, shifts, curves, strict=True):
         v = box.inputs.to_deviation(episode.inputs_at(episode.time))
-        moved = _moved(episode, box, assumed)
-        smooth = smoothed(episode.time, box.states.to_deviation(episode.x) - moved)
         rate = np.gradient(smooth, episode.time, axis=0, edge_order=2)
         # one-sided differences at the ends are poor
         inner = slice(2, -2)
@@ -213,44 +213,78 @@ def smoothed(time: Array, values: Array) -> Array:
     min 0.5 ||g - y||^2 + a ||D^3 g||_1 by iterated weights; `a` is such that what is taken away
     has the size of the noise, which third differences tell (discrepancy principle).
     """
-    return np.column_stack([_smoothed(time, values[:, j]) for j in range(values.shape[1])])
+    return _smoothed([(time, values)])[0]
 
 
-def _smoothed(time: Array, y: Array) -> Array:
-    D = _third_differences(time)
-    noise = _noise(D, y)
-    if noise <= 1e-9 * float(np.ptp(y) or 1.0):
-        return y
-    low, high = -6.0, 8.0
-    for _ in range(_BISECTIONS):
-        middle = 0.5 * (low + high)
-        g = _filtered(y, D, noise * 10.0 ** middle)
-        if np.sqrt(np.mean((g - y) ** 2)) < noise:
-            low = middle
-        else:
-            high = middle
-    return _filtered(y, D, noise * 10.0 ** low)
+def _smoothed(records: Sequence[tuple[Array, Array]]) -> list[Array]:
+    """Return what :func:`smoothed` does for each of many times and signals, all at once."""
+    found = [values.copy() for _, values in records]
+    noisy, noises, pieces = [], [], []
+    for values, (time, _) in zip(found, records, strict=True):
+        D = _third_differences(time)
+        for y in values.T:
+            noise = _noise(D, y)
+            if noise > 1e-9 * float(np.ptp(y) or 1.0):
+                noisy.append(y)
+                noises.append(noise)
+                pieces.append((D, y))
+    if noisy:
+        filters, noise = _TrendFilters(pieces), np.array(noises)
+        low, high = np.full(len(noise), -6.0), np.full(len(noise), 8.0)
+        for _ in range(_BISECTIONS):
+            middle = 0.5 * (low + high)
+            more = filters.taken_away(filters.filtered(noise * 10.0 ** middle)) < noise
+            low, high = np.where(more, middle, low), np.where(more, high, middle)
+        for y, g in zip(noisy, filters.split(filters.filtered(noise * 10.0 ** low)), strict=True):
+            y[:] = g
+    return found
 
 
-def _filtered(y: Array, D: Array, weight: float) -> Array:
-    """Solve one l1 trend filter (Kim, Koh, Boyd, Gorinevsky 2009) by iterated weights."""
-    g = y
-    floor = 1e-6 * float(np.std(_apply(D, y)))
-    columns = np.ascontiguousarray(D.T)
-    bands = np.empty((4, len(y)))
-    for _ in range(_SWEEPS):
-        w = weight / np.maximum(np.abs(_apply(D, g)), floor)
-        bands.fill(0.0)
-        for i, weighted in enumerate(w * columns):
-            for end in range(i, 4):
-                # (D' W D)[k + i, k + end] gathers D[k, i] D[k, end]
-                bands[3 - end + i, end:end + len(D)] += weighted * columns[end]
-        bands[3] += 1.0
-        # as scipy.linalg.solveh_banded does, which takes as long again to look at its arguments
-        _, g, info = lapack.dpbsv(bands, y)
-        if info:
-            raise np.linalg.LinAlgError('the weights of a trend filter are out of range')
-    return g
+class _TrendFilters:
+    """
+    The l1 trend filters (Kim, Koh, Boyd, Gorinevsky 2009) of pieces, by iterated weights.
+
+    :param pieces: rows (N - 3, 4) of third differences, and the signal (N,), of each.
+    """
+
+    def __init__(self, pieces: Sequence[tuple[Array, Array]]) -> None:
+        self._y = np.concatenate([y for _, y in pieces])
+        self._lengths = np.array([len(y) for _, y in pieces])
+        self._starts = np.cumsum(self._lengths) - self._lengths
+        # as one signal, whose differences across the ends of pieces count for nothing
+        D, self._floor = np.zeros((len(self._y) - 3, 4)), np.ones(len(self._y) - 3)
+        for start, (rows, y) in zip(self._starts, pieces, strict=True):
+            inside = slice(start, start + len(rows))
+            D[inside], self._floor[inside] = rows, 1e-6 * float(np.std(_apply(rows, y)))
+        self._D, self._columns = D, np.ascontiguousarray(D.T)
+
+    def filtered(self, weights: Array) -> Array:
+        """Solve the filters of weights, one a piece; the solutions one after the other."""
+        D, columns, weight = self._D, self._columns, np.repeat(weights, self._lengths)[:-3]
+        g, bands = self._y, np.empty((4, len(self._y)))
+        for _ in range(_SWEEPS):
+            w = weight / np.maximum(np.abs(_apply(D, g)), self._floor)
+            bands.fill(0.0)
+            for i, weighted in enumerate(w * columns):
+                for end in range(i, 4):
+                    # (D' W D)[k + i, k + end] gathers D[k, i] D[k, end]
+                    bands[3 - end + i, end:end + len(D)] += weighted * columns[end]
+            bands[3] += 1.0
+            # as scipy.linalg.solveh_banded does, which takes as long again to look at its
+            # arguments
+            _, g, info = lapack.dpbsv(bands, self._y)
+            if info:
+                raise np.linalg.LinAlgError('the weights of a trend filter are out of range')
+        return g
+
+    def taken_away(self, g: Array) -> Array:
+        """Return the root mean square of each piece less its solution."""
+        rms: Array = np.sqrt(np.add.reduceat((g - self._y) ** 2, self._starts) / self._lengths)
+        return rms
+
+    def split(self, g: Array) -> list[Array]:
+        """Return the solution of each piece."""
+        return np.split(g, self._starts[1:])
 
 
 def _third_differences(time: Array) -> Array:

@@ -170,11 +170,13 @@ def _step(residuals: Residuals, state: _State) -> _State:
     if int(info) == 0:
         step = -torch.cholesky_solve(now.gradient[:, None], factor)[:, 0]
         predicted = 0.5 * float(step @ (damping * scaling * step - now.gradient))
-        trial = normal_equations(residuals, state.theta + step, derivatives=False)
+        # after a step that was taken the next one mostly is, too: its derivatives at once
+        trial = normal_equations(residuals, state.theta + step,
+                                 derivatives=state.factor == _FACTOR)
         gain = (now.cost - trial.cost) / predicted if predicted > 0.0 else -1.0
         if math.isfinite(trial.cost) and gain > 0.0:
             theta = state.theta + step
-            now = normal_equations(residuals, theta)
+            now = trial if trial.derivatives else normal_equations(residuals, theta)
             damping *= max(1.0 / 3.0, 1.0 - (2.0 * gain - 1.0) ** 3)
             return _State(theta, now, torch.maximum(scaling, now.matrix.diagonal()),
                           max(damping, 1e-15))

@@ -4,6 +4,7 @@
 """Closed loops over a box: which laws pass, which fail, where, and beside what."""
 
 from dataclasses import dataclass, replace
+from functools import cache
 import math
 
 from matplotlib.figure import Figure
@@ -18,7 +19,6 @@ from koopman_ros.control.laws import LawResult, Linear, Tuning, Weights
 from koopman_ros.control.laws.base import steady_state_target
 from koopman_ros.control.limits import InputLimits
 from koopman_ros.estimation import Estimate
-from koopman_ros.jobs.backends import backend_of
 from koopman_ros.lifting import (
     Coordinates,
     LiftedModel,
@@ -199,8 +199,13 @@ def too_steady():
     return cubic(1.0, 0.0, -0.5, 3.0)[0]
 
 
+@cache
+def too_steady_on_its_plant():
+    return check_law(too_steady(), linear_rate(1.0))
+
+
 def test_what_a_perfect_model_does_no_better_is_not_the_models_fault():
-    found = check_law(*cubic(0.0, 6.0, 0.0, 8.0))
+    found = check_law(*cubic(0.0, 6.0, 0.0, 8.0), loops=64)
     assert np.mean(found.poor) > 0.01
     assert np.all(found.excess[found.poor] <= 1.001)
     assert found.accepted
@@ -208,7 +213,7 @@ def test_what_a_perfect_model_does_no_better_is_not_the_models_fault():
     assert str(found).endswith(f', but for {np.sum(found.poor)} in which it would with a perfect '
                                'model, too')
     # here it is to blame
-    blamed = check_law(too_steady(), linear_rate(1.0))
+    blamed = too_steady_on_its_plant()
     assert not blamed.accepted
     assert np.all(blamed.excess[blamed.failed] > 1.05)
 
@@ -216,8 +221,8 @@ def test_what_a_perfect_model_does_no_better_is_not_the_models_fault():
 def test_what_a_better_model_would_save_is_held_against_a_model():
     """A linear model passes beside linear laws, but another would save much."""
     model, rate = cubic(0.5, 0.5, 0.0, 8.0)
-    assert check_law(model, rate).failed.sum() == 0
-    found = check_law(model.linearised, rate)
+    assert check_law(model, rate, loops=64).failed.sum() == 0
+    found = check_law(model.linearised, rate, loops=64)
     assert found.poor.sum() == 0
     assert found.ratios.max() == pytest.approx(1.0)
     assert not found.accepted
@@ -231,7 +236,7 @@ def test_what_a_better_model_would_save_is_held_against_a_model():
 
 def test_what_is_slow_and_cheap_has_not_failed():
     """Between two stable rests the law takes longer than a linear one, and costs less."""
-    found = check_law(*cubic(2.0, 0.0, -2.0, 3.0))
+    found = check_law(*cubic(2.0, 0.0, -2.0, 3.0), loops=64)
     assert (found.arrived, found.poor.sum()) == (found.loops, 0)
     assert found.worst_ratio < 1.0
 
@@ -284,11 +289,11 @@ def levels_on_the_way(model, levels, start, setpoint):
 
 
 def test_where_its_law_was_lost_the_controller_takes_the_next_one():
-    found = check_law(too_steady(), linear_rate(1.0))
+    found = too_steady_on_its_plant()
     assert 0 < found.lost.sum() < found.poor.sum() < found.loops
     model = replace(too_steady(), tried_loops=found.tried)
     for lost, expected in ((True, ('linear', Code.LOST_HERE)), (False, ('sdre', None))):
-        for k in np.flatnonzero(found.lost == lost)[:5]:
+        for k in np.flatnonzero(found.lost == lost)[:3]:
             first, *_ = levels_on_the_way(
                 model, ('sdre', 'linear'), found.starts[k, 0], found.setpoints[k, 0])
             assert first == expected
@@ -301,7 +306,7 @@ def test_where_its_law_was_lost_the_controller_takes_the_next_one():
 
 
 def test_the_map_shows_each_loop_once(tmp_path):
-    found = check_law(too_steady(), linear_rate(1.0))
+    found = too_steady_on_its_plant()
     file = plot_law_check(found, tmp_path / 'map.png')
     assert file.read_bytes().startswith(b'\x89PNG')
     axes = Figure().subplots()
@@ -355,25 +360,6 @@ def test_the_watch_sees_it_and_can_end_it():
     assert 0.9 < seen[-1] < 1.0
     assert seen == sorted(seen)
     assert check_law(scalar(), linear_rate(1.0), watch=lambda share: share > 0.3) is None
-
-
-def test_loops_run_elsewhere_side_by_side():
-    """In two parts, each of which tells of its share."""
-    def rate(x, u):
-        # by its value, as workers do not know this module
-        return TWO.scale * (TWO.to_deviation(x) @ A.T + INPUTS.to_deviation(u) @ B.T)
-
-    seen = []
-    one = check_law(two_states(), rate, loops=64)
-    with backend_of('process') as backend:
-        other = check_law(two_states(), rate, loops=64, backend=backend,
-                          watch=seen.append)
-        assert check_law(two_states(), rate, loops=64, backend=backend,
-                         watch=lambda _: True) is None
-    for name in ('starts', 'setpoints', 'ratios', 'no_gain', 'excess'):
-        assert getattr(other, name).tobytes() == getattr(one, name).tobytes()
-    assert one.loops > 32
-    assert seen == sorted(seen)
 
 
 def test_a_plant_without_inputs_has_no_closed_loop():

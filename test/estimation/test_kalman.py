@@ -192,30 +192,29 @@ def changed(**constants: float):
     return change
 
 
-@pytest.mark.parametrize('estimator', ['extended_kalman_filter', 'unscented_kalman_filter'])
-@pytest.mark.parametrize(('constants', 'known'), [
-    ({'heat_transfer_coefficient': 0.85 * 5e4}, True),
-    ({'feed_temperature': 355.0}, True),
+@pytest.mark.parametrize(('estimator', 'constants', 'known'), [
+    ('unscented_kalman_filter', {'heat_transfer_coefficient': 0.85 * 5e4}, True),
+    ('extended_kalman_filter', {'feed_temperature': 355.0}, True),
     # one output has one disturbance: it is taken for one of the heat balance
-    ({'feed_concentration': 1.1}, False)])
+    ('extended_kalman_filter', {'feed_concentration': 1.1}, False)])
 def test_the_saddle_is_held_by_its_temperature_alone(estimator, constants, known):
     x0, u0 = held(350.0)
     loop = simulate(saddle(estimator=estimator), Process(SYSTEM, 0, x0, u0), [
         at(0.0, Initialisation(u0)), at(0.0, SetpointRequest(0, np.array([350.0]))),
-        at(60.0, changed(**constants)), at(400.0, SetpointRequest(0, np.array([345.0])))],
-        duration=1000.0, noise=np.array([NOISE]), seed=1)
+        at(60.0, changed(**constants)), at(300.0, SetpointRequest(0, np.array([345.0])))],
+        duration=700.0, noise=np.array([NOISE]), seed=1)
     T = loop.states[:, 1]
     assert set(loop.levels) == {'sdre'}
-    assert np.max(np.abs(T[:400] - 350.0)) < 4.0
-    assert abs(np.mean(T[300:400]) - 350.0) < 0.05
-    assert abs(np.mean(T[700:]) - 345.0) < 0.05
+    assert np.max(np.abs(T[:300] - 350.0)) < 4.0
+    assert abs(np.mean(T[200:300]) - 350.0) < 0.05
+    assert abs(np.mean(T[500:]) - 345.0) < 0.05
     estimates = np.array([report.estimate.state[0] for report in loop.reports])
-    error = estimates[700:] - loop.states[700:, 0]
+    error = estimates[500:] - loop.states[500:, 0]
     assert np.max(np.abs(error)) < (2e-3 if known else 0.06)
     # it says itself how well it knows what is not measured
     deviation = np.array([report.estimate.deviation[0] for report in loop.reports])
     assert deviation[0] == pytest.approx(0.2)
-    assert not known or np.all(np.abs(error) < 5.0 * deviation[700:])
+    assert not known or np.all(np.abs(error) < 5.0 * deviation[500:])
 
 
 @pytest.mark.parametrize('wrong', [-0.2, 0.1])
@@ -224,7 +223,7 @@ def test_a_wrong_first_guess_of_what_is_not_measured_is_survived(wrong):
     x0 = np.array([x0[0] + wrong, x0[1]])
     loop = simulate(saddle(), Process(SYSTEM, 0, x0, u0), [
         at(0.0, Initialisation(u0)), at(0.0, SetpointRequest(0, np.array([350.0])))],
-        duration=600.0, noise=np.array([NOISE]), seed=2)
+        duration=400.0, noise=np.array([NOISE]), seed=2)
     assert set(loop.levels) == {'sdre'}
     assert abs(np.mean(loop.states[-100:, 1]) - 350.0) < 0.05
 
@@ -233,7 +232,7 @@ def test_a_sensor_that_is_lost_for_five_seconds_is_bridged_by_the_model():
     x0, u0 = held(350.0)
     loop = simulate(saddle(), Process(SYSTEM, 0, x0, u0), [
         at(0.0, Initialisation(u0)), at(0.0, SetpointRequest(0, np.array([355.0])))],
-        duration=400.0, noise=np.array([NOISE]), seed=3,
+        duration=250.0, noise=np.array([NOISE]), seed=3,
         sensor=lambda y, seconds: None if 8.0 < seconds < 14.0 else y)
     assert set(loop.levels) == {'sdre', 'hold'}
     assert np.max(loop.states[:, 1]) < 358.0
@@ -270,7 +269,7 @@ def test_a_model_with_other_hidden_states_begins_from_what_is_measured():
     loop = simulate(saddle(), Process(SYSTEM, 0, x0, u0), [
         at(0.0, Initialisation(u0)), at(0.0, SetpointRequest(0, np.array([350.0]))),
         at(100.0, exchange(saddle(other)))],
-        duration=300.0, noise=np.array([NOISE]), seed=5)
+        duration=250.0, noise=np.array([NOISE]), seed=5)
     assert set(loop.levels) == {'sdre'}
     assert abs(np.mean(loop.states[200:, 1]) - 350.0) < 0.05
 

@@ -10,7 +10,6 @@ import pytest
 from scipy.optimize import fsolve
 
 from koopman_ros.identification import identify_hidden, Stopped
-from koopman_ros.jobs.backends import backend_of
 from koopman_ros.plant_data import Episode, Plant
 from koopman_ros.solvers import runge_kutta_step
 
@@ -49,7 +48,7 @@ def record(rate, *, samples=1200, gain=0.0, size=1.0, seed=0):
 
 
 def test_modes_and_gain_of_a_linear_plant():
-    found = identify_hidden(PLANT, [record(oscillator, samples=900)], 2, highest_degree=1)
+    found = identify_hidden(PLANT, [record(oscillator, samples=600)], 2, highest_degree=1)
     drift = found.drift
     # as few as suffice
     assert len({score.method for score in found.scores}) == 2
@@ -68,7 +67,8 @@ def test_modes_and_gain_of_a_linear_plant():
 
 
 def test_steady_states_of_an_unstable_plant_from_closed_loop():
-    found = identify_hidden(PLANT, [record(saddle, samples=1800, gain=2.0, size=1.5)], 1)
+    found = identify_hidden(PLANT, [record(saddle, samples=1500, gain=2.0, size=1.5)], 1,
+                            highest_degree=2)
     drift = found.drift
     assert drift.degree >= 2
     for y in (-0.3, 0.0, 0.3):
@@ -90,7 +90,7 @@ def test_steady_states_of_an_unstable_plant_from_closed_loop():
 def test_a_known_input_matrix_is_kept():
     gain = 1.0
     found = identify_hidden(replace(PLANT, B=np.array([[gain]])),
-                            [record(saddle, samples=600, gain=2.0, size=0.1)], 1,
+                            [record(saddle, samples=200, gain=2.0, size=0.1)], 1,
                             highest_degree=1)
     assert found.drift.input_matrix[0, 0] == pytest.approx(gain, rel=1e-12)
 
@@ -121,13 +121,3 @@ def test_episodes_in_which_no_filter_finds_the_state_are_refused():
     parts = [whole.part(k, k + 40) for k in range(0, 600, 40)]
     with pytest.raises(ValueError, match='too short for a filter'):
         identify_hidden(PLANT, parts, 1)
-
-
-def test_the_bits_do_not_depend_on_where_it_is_estimated():
-    episodes = [record(oscillator, samples=200)]
-    with backend_of('process') as backend:
-        found, here = (identify_hidden(PLANT, episodes, 1, highest_degree=1, backend=one)
-                       for one in (backend, None))
-    assert found.drift.coefficients.tobytes() == here.drift.coefficients.tobytes()
-    assert [score.rmse.tobytes() for score in found.scores] == [
-        score.rmse.tobytes() for score in here.scores]

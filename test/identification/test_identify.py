@@ -13,7 +13,6 @@ import pytest
 
 from koopman_ros.identification import box_of, identify, longest_step, Segments, Stopped, weak_form
 from koopman_ros.identification.output_error import _Problem, Weights
-from koopman_ros.jobs.backends import backend_of
 from koopman_ros.learning.levenberg_marquardt import normal_equations
 from koopman_ros.plant_data import cut, Episode
 from support.known_plants import CUBIC, methods, PAIR
@@ -39,15 +38,6 @@ def test_takes_output_error_and_the_right_degree(found):
     assert CUBIC.misfit(found.drift) < 5.0 * np.sqrt(5.0) * NOISE / np.sqrt(480.0)
     assert found.drift.input_matrix == pytest.approx(CUBIC.B, rel=5e-3)
     assert found.noise == pytest.approx([NOISE], rel=0.1)
-
-
-def test_degrees_are_estimated_side_by_side_elsewhere(noisy, found):
-    with backend_of('joblib:2') as backend:
-        again = identify(CUBIC.plant, [noisy], degrees=(1, 3, 4), methods=methods(10, 20),
-                         backend=backend)
-    assert again.drift.coefficients.tobytes() == found.drift.coefficients.tobytes()
-    assert [(score.method, score.degree, score.cost) for score in again.scores] == [
-        (score.method, score.degree, score.cost) for score in found.scores]
 
 
 def test_scores_say_what_was_tried(found):

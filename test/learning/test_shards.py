@@ -11,7 +11,8 @@ import numpy as np
 import pytest
 import torch
 
-from koopman_ros.learning import Growth, NeuralDrift, read_samples, Shard, train, write_samples
+from koopman_ros.jobs.backends import Here
+from koopman_ros.learning import Growth, read_samples, train, write_samples
 from koopman_ros.learning.drift import DriftProblem
 from koopman_ros.learning.levenberg_marquardt import normal_equations
 from koopman_ros.learning.network import Layout
@@ -19,25 +20,15 @@ from koopman_ros.learning.residuals import LiftProblem, ResidualWeights
 from koopman_ros.learning.scaling import Scaling
 from koopman_ros.learning.shards import KeptShards
 from koopman_ros.lifting import Box
-from support.places import places
-from support.small_plants import BENT, bent_samples, bits, SMALL, TWO_STATE, two_state_samples
-
-
-@pytest.fixture(scope='module', name='places')
-def every_place():
-    with places() as opened:
-        yield opened
-
-
-def shards_of(samples, folder):
-    """Write samples to files, unequal shares of them, and return how to read these."""
-    share = np.arange(len(samples)) / len(samples)
-    found = []
-    for number, (begin, end) in enumerate(((0.0, 0.2), (0.2, 0.5), (0.5, 1.0))):
-        path = folder / f'{number}.npz'
-        write_samples(path, samples.where((share >= begin) & (share < end)))
-        found.append(Shard(f'shard {number}', read_samples, (path,)))
-    return found
+from support.small_plants import (
+    BENT,
+    bent_samples,
+    bits,
+    shards_of,
+    SMALL,
+    TWO_STATE,
+    two_state_samples,
+)
 
 
 def problems(plant, samples):
@@ -59,11 +50,11 @@ def problems(plant, samples):
 
 
 @pytest.mark.parametrize('learned', [False, True], ids=['B known', 'B learned'])
-def test_sums_of_parts_are_the_sum(tmp_path, learned, places):
+def test_sums_of_parts_are_the_sum(tmp_path, learned):
     """Whatever the problem, up to rounding; only its order differs."""
     samples = two_state_samples(400)
     scaling, given = problems(replace(TWO_STATE, B=None) if learned else TWO_STATE, samples)
-    with contextlib.closing(KeptShards(places[''], shards_of(samples, tmp_path))) as kept:
+    with contextlib.closing(KeptShards(Here(), shards_of(samples, tmp_path))) as kept:
         kept.scaled(scaling, 'cpu', 1)
         assert len(kept) == len(samples)
         for problem, theta in given:
@@ -97,12 +88,12 @@ class Counting:
         self.kept.close()
 
 
-def test_what_goes_and_comes_does_not_grow_with_the_samples(tmp_path, places):
+def test_what_goes_and_comes_does_not_grow_with_the_samples(tmp_path):
     """Neither the samples nor a view of them is in what is pickled."""
     sizes = {}
     for count in (300, 3000):
         samples = two_state_samples(count)
-        counting = Counting(places[''])
+        counting = Counting(Here())
         train(TWO_STATE, two_state_samples(300), Growth(3, max_iterations=3), starts=1, loops=0,
               refuse=False, backend=counting, shards=shards_of(samples, tmp_path))
         sizes[count] = max(counting.sent), max(counting.received)
@@ -112,24 +103,13 @@ def test_what_goes_and_comes_does_not_grow_with_the_samples(tmp_path, places):
     assert sizes[3000][1] < 3 * 8 * 75 ** 2 + 5000
 
 
-@pytest.mark.parametrize('recipe', [replace(SMALL, max_iterations=8),
-                                    NeuralDrift((4,), max_iterations=5)],
-                         ids=['lift', 'drift'])
-def test_the_bits_do_not_depend_on_where_shards_are(recipe, places, tmp_path):
-    shards = shards_of(bent_samples(length=200, seed=3), tmp_path)
-    found = {kind: bits(train(BENT, bent_samples(), recipe, starts=2, loops=0,
-                              backend=places[kind], shards=shards).model)
-             for kind in ('', 'joblib:2', 'dask')}
-    assert len(set(found.values())) == 1
-
-
-def test_it_learns_from_the_shards(places, tmp_path):
+def test_it_learns_from_the_shards(tmp_path):
     """The samples here reach less far and their drift is another one: it is that of the shards."""
     wide = bent_samples(length=200, seed=3)
     some = bent_samples()
     drift = some.dxdt - 2.0 * (some.u - 0.5)
     wrong = replace(some, dxdt=some.dxdt + 0.2 * drift).where(np.abs(some.x[:, 0] - 3.0) < 0.8)
-    found = train(BENT, wrong, SMALL, starts=1, refuse=False, backend=places['process'],
+    found = train(BENT, wrong, SMALL, starts=1, refuse=False, backend=Here(),
                   shards=shards_of(wide, tmp_path))
     assert found.model.states.upper == wide.x.max()
     x = np.linspace(2.2, 4.2, 9)[:, None]
@@ -137,20 +117,6 @@ def test_it_learns_from_the_shards(places, tmp_path):
     np.testing.assert_allclose(rate, (3.0 - x) - 0.3 * (x - 3.0) ** 2, rtol=0.1, atol=0.02)
     assert found.model.provenance.data_digest != train(
         BENT, wrong, SMALL, starts=1, refuse=False).model.provenance.data_digest
-
-
-def test_shards_that_do_not_fit(places, tmp_path):
-    one, *_ = shards_of(bent_samples(), tmp_path)
-    other = Shard('other', two_state_samples)
-    for shards, text in (([one, one], 'a name of its own'),
-                         ([one, other], 'other has 2 states and 1 in')):
-        with pytest.raises(ValueError, match=text):
-            train(BENT, bent_samples(), SMALL, shards=shards, backend=places[''])
-    np.savez(tmp_path / 'odd.npz', x=np.zeros(3))
-    with pytest.raises(ValueError, match=r'odd\.npz has no dxdt, episode, u') as caught:
-        train(BENT, bent_samples(), SMALL, backend=places['process'],
-              shards=[Shard('odd', read_samples, (tmp_path / 'odd.npz',))])
-    assert caught.value.__notes__ == ['in odd']
 
 
 def test_a_file_keeps_samples(tmp_path):

@@ -135,7 +135,7 @@ def test_setpoints_move_and_come_back_to_what_they_were(ros: Harness, tmp_path: 
         f'{name}.weight': 1e4 for name in LEVELS}})
     asked = [ros.speak(JointState, f'{name}/setpoint', to='controller') for name in LEVELS]
     ros.start('trainer', {
-        **TRAINER, 'model': model, 'experiment_on': 'setpoint', 'experiment_length': 350.0,
+        **TRAINER, 'model': model, 'experiment_on': 'setpoint', 'experiment_length': 250.0,
         'experiment_shortest_hold': 20.0, 'experiment_longest_hold': 50.0, **{
             f'{name}.setpoint_{end}': float(bound[i]) for i, name in enumerate(LEVELS)
             for end, bound in (('min', low), ('max', high))}})
@@ -171,7 +171,7 @@ def test_setpoints_move_and_come_back_to_what_they_were(ros: Harness, tmp_path: 
         assert least <= steps.min() < steps.max() <= most
         # the plant went there
         assert np.ptp(numbers(true[first:last])) > 0.5 * np.ptp(steps)
-    ros.wait_until(lambda: len(measured[0]) > last + 200)
+    ros.wait_until(lambda: len(measured[0]) > last + 100)
     assert [heard[-1].position[0] for heard in measured] == pytest.approx(before, rel=0.02)
 
     # one that the controller refuses

@@ -23,7 +23,7 @@ from support.nodes import temperature, value
 
 FEED = 355.0  # K, 5 K more than the model knows
 SETPOINT = 39.0  # degC
-SAMPLES = 900
+SAMPLES = 600
 
 
 def test_no_offset_is_left_and_what_is_not_measured_is_known(ros: Harness) -> None:

@@ -19,7 +19,7 @@ from support.tanks import LEVELS, linear, PUMPS, TANKS
 LAG = 10.0  # s
 NOISE = 2e-4  # m
 TRAINER = {
-    'system': 'two_tanks', 'experiment_length': 700.0, 'experiment_shortest_hold': 15.0,
+    'system': 'two_tanks', 'experiment_length': 500.0, 'experiment_shortest_hold': 15.0,
     'experiment_longest_hold': 45.0, 'model_coordinates': 3, 'training_starts': 1, **{
         f'{name}.{key}': numbers[i] for i, name in enumerate(PUMPS) for key, numbers in (
             ('experiment_min', (4.0, 0.5)), ('experiment_max', (8.5, 3.5)), ('safe', (6.0, 2.0)))},
@@ -39,7 +39,7 @@ def test_lift_is_learned_from_a_record_and_controls(ros: Harness, tmp_path: Path
     assert ros.set_bool('trainer/experiment', True).success
     ros.wait_for_status('trainer: experiment', lambda s: s.message.startswith('finished'))
     assert recorder.stop() == plant.stop() == 0
-    assert summary(bag).counts['/pump_1'] > 700
+    assert summary(bag).counts['/pump_1'] > 500
 
     trainer = ros.start('trainer', {**given, 'task': 'train', 'bags': [bag]})
     assert trainer.wait(400.0) == 0, trainer.output()
