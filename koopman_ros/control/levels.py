@@ -240,8 +240,8 @@ class Estimating:
         :param u: (n_u,) what has acted since then, in scaled deviations.
         :return: the state with measurement, time and estimate, and what became of the measurement.
         """
-        before, last = state.estimate, state.accepted
-        predicted = self.coast(state, elapsed, u)
+        before, last, estimator = state.estimate, state.accepted, self.level(state).estimator
+        predicted = self._coasted(estimator, state, elapsed, u)
         x = self.position(predicted, y)
         outside = self.model.distance(x)
         w = np.zeros(self.model.n_x) if before is None else before.w
@@ -252,7 +252,8 @@ class Estimating:
                 # plant that it does not expect to may rest there
                 return np.zeros_like(y)
             frozen = None if before is None else replace(before, w=then.w)
-            moved = self.coast(amended(state, estimate=frozen), elapsed, u)
+            moved = self._coasted(
+                estimator, amended(state, estimate=frozen), elapsed, u)
             if before is None or moved is None:
                 return np.zeros_like(y)
             return self.outputs.of((moved.x - before.x) * self.model.states.scale)
@@ -263,7 +264,8 @@ class Estimating:
         if verdict.fault is None:
             far = outside > self.settings.supervisor.largest_margin
             predicted = self._corrected(
-                state, predicted, verdict, x, elapsed, far or self._lost(state, time_ns))
+                estimator, state, predicted, verdict, x, elapsed,
+                far or self._lost(state, time_ns))
             if not self.outputs.determine_state:
                 # the measurement has changed what it leaves open, too
                 x = self.position(predicted, y)
@@ -297,14 +299,14 @@ class Estimating:
                 return self.model.states.to_physical(found)
         return x
 
-    def _corrected(self, state: State, predicted: Estimate | None, verdict: Verdict, x: Array,
-                   elapsed: float, lost: bool) -> Estimate:
+    def _corrected(self, estimator: Estimator, state: State, predicted: Estimate | None,
+                   verdict: Verdict, x: Array, elapsed: float, lost: bool) -> Estimate:
         """
         Return the estimate with a measurement that is accepted.
 
         :param lost: whether the model's prediction is worth nothing, after so long or so far out.
         """
-        xi, estimator = self.model.states.to_deviation(x), self.level(state).estimator
+        xi = self.model.states.to_deviation(x)
         if predicted is None:
             # taken over from somebody who, it is supposed, held the plant where it is
             return estimator.restart(None, xi, None if state.command is None else (
@@ -328,9 +330,13 @@ class Estimating:
 
         Arguments as in :meth:`observe`.
         """
+        return self._coasted(self.level(state).estimator, state, elapsed, u)
+
+    def _coasted(self, estimator: Estimator, state: State, elapsed: float, u: Array
+                 ) -> Estimate | None:
         if state.estimate is None or state.command is None or not elapsed > 0.0:
             return state.estimate
-        predicted = self.level(state).estimator.predict(state.estimate, u, elapsed)
+        predicted = estimator.predict(state.estimate, u, elapsed)
         if predicted is None or not finite(predicted.x):
             # after so long, or from so far out, nothing is known; the disturbance is kept
             return state.estimate
