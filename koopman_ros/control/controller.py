@@ -19,6 +19,7 @@ from koopman_ros.control.laws import LawResult
 from koopman_ros.control.laws.base import Target
 from koopman_ros.control.levels import Estimating, Level, levels_of
 from koopman_ros.control.limits import finite, limit, shifted, Transfer
+from koopman_ros.control.regular import Regular
 from koopman_ros.control.settings import Settings
 from koopman_ros.control.state import (
     Arrival,
@@ -98,6 +99,10 @@ class Controller:
     @cached_property
     def _estimating(self) -> Estimating:
         return Estimating(self.model, self.measured, self.settings, self.levels)
+
+    @cached_property
+    def _regular(self) -> Regular | None:
+        return Regular.of(self.model, self.measured, self.settings, self._best)
 
     @cached_property
     def safe_input(self) -> Array:
@@ -317,6 +322,11 @@ class Controller:
         with np.errstate(all='ignore'):
             u, follows = self._estimating.applied(state, applied)
             before = state.estimate
+            if self._regular is not None and not self._estimating.lost(state, time_ns):
+                regular = self._regular.step(
+                    state, y, time_ns, u, elapsed, seconds, spacing, missed, follows)
+                if regular is not None:
+                    return regular
             state, seen = self._estimating.observe(state, y, time_ns, elapsed, u)
             accepted = seen.verdict.fault is None
             if accepted:

@@ -45,7 +45,7 @@ class Level:
     law: Law  #: with its model
     estimator: Estimator  #: on the same model
     controlled: tuple[str, ...]  #: (n_c,) names of the states with a set-point
-    #: the last set-point, and where it led
+    #: the last set-point, and where it leads undisturbed
     _last: list[Any] = field(default_factory=lambda: [None, None], init=False, compare=False)
 
     @property
@@ -103,19 +103,27 @@ class Level:
             none = np.zeros(model.n_x)
             return Target(x, np.zeros(model.n_z), none, np.zeros(model.n_u), none, 0.0)
         if self.controls_all:
-            # a memory of the last set-point only; what comes out does not depend on it
-            asked, known = self._last
-            x = known.x if known is not None and asked is setpoint else (
-                model.states.to_deviation(setpoint))
-            target = steady_state_target(model, x, w, known=known)
-            self._last[:] = setpoint, target
-            return target
+            known = self.reference(setpoint)
+            return steady_state_target(model, known.x, w, known=known)
         n, inputs = model.n_x, model.inputs
         y = np.zeros(n + model.n_u) if start is None else np.concatenate(
             (model.states.to_deviation(start[:n]), inputs.to_deviation(start[n:])))
         return partial_target(
             model, self._indices, self.controlled_states.to_deviation(setpoint), w,
             inputs.to_deviation(limits.lower), inputs.to_deviation(limits.upper), y)
+
+    def reference(self, setpoint: Array) -> Target:
+        """
+        Return the target of a set-point (n_x,) for all states, without a disturbance.
+
+        The last one is kept; what comes out does not depend on it.
+        """
+        asked, known = self._last
+        if known is None or asked is not setpoint:
+            known = steady_state_target(
+                self.model, self.model.states.to_deviation(setpoint), known=known)
+            self._last[:] = setpoint, known
+        return known
 
     def compute(self, setpoint: Array, estimate: Estimate, limits: InputLimits, memory: object,
                 interval: float, start: Array | None, deadline: float = math.inf,
@@ -265,7 +273,7 @@ class Estimating:
             far = outside > self.settings.supervisor.largest_margin
             predicted = self._corrected(
                 estimator, state, predicted, verdict, x, elapsed,
-                far or self._lost(state, time_ns))
+                far or self.lost(state, time_ns))
             if not self.outputs.determine_state:
                 # the measurement has changed what it leaves open, too
                 x = self.position(predicted, y)
@@ -315,7 +323,7 @@ class Estimating:
             return estimator.restart(predicted, xi, None)
         return estimator.correct(predicted, xi, elapsed)
 
-    def _lost(self, state: State, time_ns: int) -> bool:
+    def lost(self, state: State, time_ns: int) -> bool:
         """Tell whether no measurement was accepted for so long that the state is not known."""
         if state.accepted is None:
             return False
