@@ -30,7 +30,8 @@ from koopman_ros.compiled.matrices import (
 _TERMS = 24  # of a power series, at most
 _NOTHING = 1e-18  # relative size of the first term that is left out
 _MOST_DOUBLINGS = 20  # until then the slowest mode would be near the border
-_STILL = 1e-14  # relative change after which the next one is below rounding, as they are squared
+_STILL = 1e-9  # relative change after which the next one is below rounding, as they are squared
+_DECAYED = 1e-4  # of what is left of all modes, likewise: one that stays would never come to it
 _SHIFT = 0.4  # of the mean size of the modes: so the slow ones take fewer doublings
 _SURE = 1e-12  # of a residual; what is larger the reference looks at
 _LONGEST = 8.0  # norm of A and B times the interval, beyond which digits are lost
@@ -129,7 +130,7 @@ def _stable_solution(A: Array, G: Array, Q: Array) -> tuple[bool, Array]:
         if not math.isfinite(amount):
             return False, X
         # what is left of E tells that no mode stays, weighted or not
-        if math.sqrt(change) <= _STILL * math.sqrt(amount) and size(E) ** 2 <= _STILL:
+        if math.sqrt(change) <= _STILL * math.sqrt(amount) and size(E) ** 2 <= _DECAYED:
             return True, X
         multiply(E, by_G, EG)
         multiply(EG, turned(E), step)

@@ -64,7 +64,8 @@ class Regular:
     weights: Weights  #: of the law
     inverse: Array  #: (n_u, n_x) of the input matrix
     settings: Settings  #: the tuning
-    form: Form  #: of the law
+    recentred: bool  #: whether the law is, or goes by the averaged Jacobian
+    form: str  #: the same in a word
 
     @staticmethod
     def of(model: LiftedModel, outputs: Outputs, settings: Settings, level: Level
@@ -82,6 +83,7 @@ class Regular:
         known, tuning = model.training_states, law.tuning
         bandwidth = estimator.tuning.bandwidth if isinstance(estimator, DisturbanceObserver) else (
             0.0)
+        recentred = closed(model)
         return Regular(
             function, model, level,
             np.array([bandwidth, model.seconds_per_time_unit, longest_step(model),
@@ -93,7 +95,7 @@ class Regular:
                       inputs.lower, inputs.upper, estimator.tuning.max_disturbance]),
             np.zeros((0, model.n_x)) if known is None else np.ascontiguousarray(known.states),
             tuning.weights, np.ascontiguousarray(model.input_inverse()), settings,
-            Form.RECENTRED if closed(model) else Form.AVERAGED)
+            recentred, (Form.RECENTRED if recentred else Form.AVERAGED).value)
 
     def step(self, state: State, y: Array, time_ns: int, u: Array, elapsed: float,
              seconds: float, spacing: float, missed: int, follows: bool
@@ -126,8 +128,7 @@ class Regular:
             layout.sizes, layout.numbers, self.numbers, self.states, self.inputs, self.training,
             self.weights.Q, self.weights.R, self.inverse, y, last.value, before.x, before.w, u,
             state.command, target.x, target.z, target.drift, elapsed,
-            (time_ns - last.time_ns) / NANOSECONDS, seconds, spacing,
-            self.form is Form.RECENTRED)
+            (time_ns - last.time_ns) / NANOSECONDS, seconds, spacing, self.recentred)
         if found is None:
             return None
         found.setflags(write=False)
@@ -148,5 +149,5 @@ class Regular:
             EstimateReport(estimate, level.estimator),
             TargetReport(active, level.controlled_states, model, Target(
                 target.x, target.z, target.drift, u_ref, forcing, rest)),
-            CommandReport(Figures(self.form.value, residual, gain, growth), None, 0.0,
+            CommandReport(Figures(self.form, residual, gain, growth), None, 0.0,
                           at_range > 0.0, at_rate > 0.0, None, outside))

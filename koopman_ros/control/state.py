@@ -5,7 +5,6 @@
 
 from dataclasses import field
 from enum import Enum
-from functools import cached_property
 import math
 
 import numpy as np
@@ -92,23 +91,23 @@ class EstimateReport:
     estimate: Estimate  #: in scaled deviations
     estimator: Estimator  #: of the level that acts
 
-    @cached_property
+    @property
     def state(self) -> Array:
         """(n_x,) in state units."""
         return self.estimator.model.states.to_physical(self.estimate.x)
 
-    @cached_property
+    @property
     def disturbance(self) -> Array:
         """(n_u,) as an input that would have the same effect, in input units."""
         as_input: Array = self.estimator.as_input(self.estimate.w)
         return as_input * self.estimator.model.inputs.scale
 
-    @cached_property
+    @property
     def at_bound(self) -> bool:
         """Whether the disturbance is as large as is allowed."""
         return self.estimator.at_bound(self.estimate.w)
 
-    @cached_property
+    @property
     def covariance(self) -> Array | None:
         """(n_x, n_x) of the state's error, in products of state units; None where not known."""
         whole, scale = self.estimate.covariance, self.estimator.model.states.scale
@@ -135,7 +134,7 @@ class TargetReport:
     model: LiftedModel  #: of the steady state that goes with it
     target: Target | None = None  #: that state, in scaled deviations; None without a law
 
-    @cached_property
+    @property
     def outside(self) -> float:
         """Its distance from the training box, in half widths."""
         return self.controlled.violation(self.setpoint)
@@ -145,7 +144,7 @@ class TargetReport:
         """Rate of the state there that no input balances, scaled; NaN without a law."""
         return math.nan if self.target is None else self.target.residual
 
-    @cached_property
+    @property
     def state(self) -> Array | None:
         """(n_x,) steady state that goes with it, in state units; None without a law."""
         if self.target is None:
@@ -153,7 +152,7 @@ class TargetReport:
         every = len(self.controlled) == self.model.n_x
         return self.setpoint if every else self.model.states.to_physical(self.target.x)
 
-    @cached_property
+    @property
     def input(self) -> Array | None:
         """(n_u,) that holds it, in input units; None without a law."""
         return None if self.target is None else self.model.inputs.to_physical(self.target.u)

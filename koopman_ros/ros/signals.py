@@ -4,7 +4,7 @@
 """Messages to the numbers of signals and back, once, at the boundary."""
 
 from collections.abc import Callable, Iterator, Mapping
-from functools import cached_property, partial
+from functools import partial
 import math
 from typing import Any
 
@@ -31,7 +31,7 @@ class Heard:
     values: Mapping[str, float]  #: of the signals that it carries, in their own units
     stamped: bool  #: whether the message has a stamp
 
-    @cached_property
+    @property
     def stamp_ns(self) -> int:
         """The stamp in integer nanoseconds."""
         return stamp_nanoseconds(self.stamp)
