@@ -9,7 +9,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from koopman_ros.arrays import Array
-from koopman_ros.compiled.jit import compiled, INTEGERS, MATRIX, NUMBER, SIZE, VECTOR
+from koopman_ros.compiled.jit import (
+    compiled,
+    inner,
+    INTEGERS,
+    MATRIX,
+    NUMBER,
+    SIZE,
+    VECTOR,
+)
 from koopman_ros.compiled.matrices import (
     applied,
     combined,
@@ -28,9 +36,9 @@ from koopman_ros.compiled.network import (
 from koopman_ros.compiled.steps import runge_kutta, space_of
 
 
-@compiled(INTEGERS, VECTOR, VECTOR, VECTOR, VECTOR, NUMBER, SIZE)
-def moved(sizes: NDArray[np.int64], numbers: Array, x: Array, w: Array, u: Array, h: float,
-          steps: int) -> Array:
+@inner
+def move(sizes: NDArray[np.int64], numbers: Array, x: Array, w: Array, u: Array, h: float,
+         steps: int) -> Array:
     """Integrate the model under a held input by so many of Heun's steps."""
     n = sizes[N_X]
     A, B, slope, readout = matrices(sizes, numbers)
@@ -44,6 +52,13 @@ def moved(sizes: NDArray[np.int64], numbers: Array, x: Array, w: Array, u: Array
         for i in range(n):
             x[i] += 0.5 * h * (first[i] + second[i] + push[i] + w[i])
     return x
+
+
+@compiled(INTEGERS, VECTOR, VECTOR, VECTOR, VECTOR, NUMBER, SIZE)
+def moved(sizes: NDArray[np.int64], numbers: Array, x: Array, w: Array, u: Array, h: float,
+          steps: int) -> Array:
+    """Integrate as :func:`move`."""
+    return move(sizes, numbers, x, w, u, h, steps)
 
 
 @compiled(INTEGERS, VECTOR, VECTOR, VECTOR, MATRIX, VECTOR, NUMBER, SIZE)

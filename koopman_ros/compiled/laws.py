@@ -43,7 +43,7 @@ def solve(A: Array, B: Array, Q: Array, R: Array, interval: float
 
 
 @inner
-def _growth(drift: Array, action: Array, interval: float) -> float:
+def growth_of(drift: Array, action: Array, interval: float) -> float:
     """Return the growth of the error of one state or two; NaN for others."""
     n = len(drift)
     if n == 1:
@@ -70,7 +70,7 @@ def _growth(drift: Array, action: Array, interval: float) -> float:
 @compiled(MATRIX, MATRIX, NUMBER)
 def growth(drift: Array, action: Array, interval: float) -> float:
     """Return the growth of the error of one state or two in an interval; NaN for others."""
-    return _growth(drift.copy(), action.copy(), interval)
+    return growth_of(drift.copy(), action.copy(), interval)
 
 
 @inner
@@ -83,18 +83,17 @@ def _pack(found: Array, start: int, M: Array) -> int:
     return start + M.shape[0] * columns
 
 
-@compiled(INTEGERS, VECTOR, VECTOR, VECTOR, VECTOR, VECTOR, VECTOR, MATRIX, MATRIX, NUMBER, SIZE)
-def law(sizes: NDArray[np.int64], numbers: Array, x: Array, x_ref: Array, z_ref: Array,
-        u_ref: Array, forcing: Array, Q: Array, R: Array, interval: float, recentred: int
-        ) -> Array:
+@inner
+def evaluated(sizes: NDArray[np.int64], numbers: Array, x: Array, x_ref: Array, z_ref: Array,
+              u_ref: Array, forcing: Array, Q: Array, R: Array, interval: float, recentred: int
+              ) -> tuple[bool, float, Array, Array, Array, Array, Array]:
     """
     Evaluate the re-centred law of a lift that starts with the state, or the averaged one.
 
     The latter is that of a read-out.
 
-    :return: in one row, since each array that is returned takes as long as some products: the
-        residual of the Riccati equation, infinite where it is not sure, the norm of K, the growth
-        of the error, u, P, K, and drift and action of the error.
+    :return: whether the solution of the Riccati equation is sure, its residual, P, K, drift and
+        action of the error, and u.
     """
     n = sizes[N_X]
     A, B, slope, readout = matrices(sizes, numbers)
@@ -124,16 +123,34 @@ def law(sizes: NDArray[np.int64], numbers: Array, x: Array, x_ref: Array, z_ref:
     weights = np.zeros((k, k))
     place(weights, 0, 0, Q, 1.0)
     fine, P, K, residual = regulator(whole, push, weights, R.copy(), interval)
-    m = B.shape[1]
+    action = product(B, product(K, M))
+    action = combined(-1.0, action, 0.0, action)
+    u = applied(K, e)
+    for i in range(len(u)):
+        u[i] = u_ref[i] - u[i]
+    return fine, residual, P, K, motion, action, u
+
+
+@compiled(INTEGERS, VECTOR, VECTOR, VECTOR, VECTOR, VECTOR, VECTOR, MATRIX, MATRIX, NUMBER, SIZE)
+def law(sizes: NDArray[np.int64], numbers: Array, x: Array, x_ref: Array, z_ref: Array,
+        u_ref: Array, forcing: Array, Q: Array, R: Array, interval: float, recentred: int
+        ) -> Array:
+    """
+    Evaluate a law, as :func:`evaluated`, and how the error grows.
+
+    :return: in one row, since each array that is returned takes as long as some products: the
+        residual of the Riccati equation, infinite where it is not sure, the norm of K, the growth
+        of the error, u, P, K, and drift and action of the error.
+    """
+    fine, residual, P, K, motion, action, u = evaluated(
+        sizes, numbers, x, x_ref, z_ref, u_ref, forcing, Q, R, interval, recentred)
+    n, m, k = len(motion), K.shape[0], K.shape[1]
     found = np.empty(LAW + m + k * k + m * k + 2 * n * n)
     found[0] = residual if fine else math.inf
     if not fine:
         return found
-    action = product(B, product(K, M))
-    action = combined(-1.0, action, 0.0, action)
-    found[1], found[2] = size(K), _growth(motion, action, interval)
-    u = applied(K, e)
+    found[1], found[2] = size(K), growth_of(motion, action, interval)
     for i in range(m):
-        found[LAW + i] = u_ref[i] - u[i]
+        found[LAW + i] = u[i]
     _pack(found, _pack(found, _pack(found, _pack(found, LAW + m, P), K), motion), action)
     return found

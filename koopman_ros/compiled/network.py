@@ -18,7 +18,6 @@ from koopman_ros.compiled.matrices import (
     least_squares,
     product,
     solve_factored,
-    turned,
 )
 
 # Places in the sizes of a layout; widths of the hidden layers follow.
@@ -274,11 +273,24 @@ def drift(sizes: NDArray[np.int64], numbers: Array, A: Array, slope: Array, read
     h, T = hidden(sizes, numbers, x)
     if sizes[READOUT]:
         return applied(readout, np.concatenate((x, h)))
-    z = lifted(sizes, numbers, h.reshape((len(h), 1)), 0.0)
-    if sizes[IDENTITY]:
-        z[:n, 0] = x
-    rate = least_squares(lifted(sizes, numbers, turned(T), 1.0), product(A, z))
-    return rate[:, 0] - applied(slope, x)
+    n_z = len(A)
+    width, start = _widths(sizes)
+    z, J = np.empty(n_z), np.empty((n_z, n))
+    for a in range(n_z):
+        row, states = start + width * (1 + a), sizes[IDENTITY] and a < n
+        total = 0.0
+        for i in range(width):
+            total += numbers[row + i] * h[i]
+        z[a] = x[a] if states else total
+        for k in range(n):
+            total = 0.0
+            for i in range(width):
+                total += numbers[row + i] * T[k, i]
+            J[a, k] = (1.0 if a == k else 0.0) if states else total
+    rate, by_slope = least_squares(J, applied(A, z).reshape((n_z, 1))), applied(slope, x)
+    for i in range(n):
+        by_slope[i] = rate[i, 0] - by_slope[i]
+    return by_slope
 
 
 @inner

@@ -30,7 +30,8 @@ from koopman_ros.compiled.matrices import (
 _TERMS = 24  # of a power series, at most
 _NOTHING = 1e-18  # relative size of the first term that is left out
 _MOST_DOUBLINGS = 20  # until then the slowest mode would be near the border
-_STILL = 1e-14  # relative change after which the next one is below rounding, as they are squared
+_STILL = 1e-9  # relative change after which the next one is below rounding, as they are squared
+_DECAYED = 1e-4  # of what is left of all modes, likewise: one that stays would never come to it
 _SHIFT = 0.4  # of the mean size of the modes: so the slow ones take fewer doublings
 _SURE = 1e-12  # of a residual; what is larger the reference looks at
 _LONGEST = 8.0  # norm of A and B times the interval, beyond which digits are lost
@@ -129,7 +130,7 @@ def _stable_solution(A: Array, G: Array, Q: Array) -> tuple[bool, Array]:
         if not math.isfinite(amount):
             return False, X
         # what is left of E tells that no mode stays, weighted or not
-        if math.sqrt(change) <= _STILL * math.sqrt(amount) and size(E) ** 2 <= _STILL:
+        if math.sqrt(change) <= _STILL * math.sqrt(amount) and size(E) ** 2 <= _DECAYED:
             return True, X
         multiply(E, by_G, EG)
         multiply(EG, turned(E), step)
@@ -152,7 +153,7 @@ def regulator(A: Array, B: Array, Q: Array, R: Array, interval: float
     place(weight, 0, 0, Q, 1.0)
     place(weight, n, n, R, 1.0)
     if not (size(F) * interval <= _LONGEST and math.isfinite(size(weight))):
-        return False, Q, B, math.inf
+        return False, Q, turned(B), math.inf
     D, W = over_interval(F, weight, interval)
     step, push = block(D, 0, 0, n, n), block(D, 0, n, n, m)
     Q_d, N, R_d = block(W, 0, 0, n, n), block(W, 0, n, n, m), block(W, n, n, m, m)
@@ -161,13 +162,13 @@ def regulator(A: Array, B: Array, Q: Array, R: Array, interval: float
     place(by_R, 0, 0, push_t, 1.0)
     place(by_R, 0, n, N_t, 1.0)
     if not solve_into(R_d.copy(), by_R):
-        return False, Q, B, math.inf
+        return False, Q, turned(B), math.inf
     G, across = product(push, block(by_R, 0, 0, m, n)), block(by_R, 0, n, m, n)
     rest = combined(1.0, step, -1.0, product(push, across))
     Q_rest = combined(1.0, Q_d, -1.0, product(N, across))
     size_Q, size_G = size(Q_rest), size(G)
     if not (size_Q > 0.0 and size_G > 0.0):
-        return False, Q, B, math.inf
+        return False, Q, turned(B), math.inf
     scale = math.sqrt(size_Q / size_G)
     # (S + I)^-1 (S - I) of the symplectic pencil, which is a Hamiltonian matrix
     less, more = np.empty((2 * n, 2 * n)), np.empty((2 * n, 2 * n))
@@ -180,7 +181,7 @@ def regulator(A: Array, B: Array, Q: Array, R: Array, interval: float
             more[i, j] = less[i, j] if j < n else -less[i, j]
         more[i, i] += 2.0
     if not solve_into(more, less):
-        return False, Q, B, math.inf
+        return False, Q, turned(B), math.inf
     fine, P = _stable_solution(
         block(less, 0, 0, n, n), combined(-1.0, block(less, 0, n, n, n), 0.0, rest),
         combined(-1.0, block(less, n, 0, n, n), 0.0, rest))

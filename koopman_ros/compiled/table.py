@@ -5,12 +5,15 @@
 
 from functools import partial
 import math
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from koopman_ros.arrays import Array
 from koopman_ros.compiled import estimation, horizon, laws
+from koopman_ros.compiled import regular as steps
+from koopman_ros.control import regular
 from koopman_ros.control import target as targets
 from koopman_ros.control.laws import base, riccati, shooting
 from koopman_ros.estimation import kalman
@@ -146,9 +149,14 @@ def _slope_at(model: LiftedModel, x: Array) -> Array | None:
     return found
 
 
+def _step(*arguments: Any) -> Array | None:
+    found: Array = steps.step(*arguments)
+    return found if found[0] < math.inf else None
+
+
 KERNELS: Kernels = {
     'answer': _answer, 'averaged': partial(_feedback, riccati.Form.AVERAGED),
     'corrected': _corrected, 'equilibrium': _equilibrium,
     'growth': _growth, 'moved': _moved, 'program': _program, 'propagated': _propagated,
     'recentred': partial(_feedback, riccati.Form.RECENTRED), 'regulator': _regulator,
-    'slope_at': _slope_at}
+    regular.STEP: _step, 'slope_at': _slope_at}

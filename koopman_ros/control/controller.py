@@ -19,6 +19,7 @@ from koopman_ros.control.laws import LawResult
 from koopman_ros.control.laws.base import Target
 from koopman_ros.control.levels import Estimating, Level, levels_of
 from koopman_ros.control.limits import finite, limit, shifted, Transfer
+from koopman_ros.control.regular import Regular
 from koopman_ros.control.settings import Settings
 from koopman_ros.control.state import (
     Arrival,
@@ -98,6 +99,10 @@ class Controller:
     @cached_property
     def _estimating(self) -> Estimating:
         return Estimating(self.model, self.measured, self.settings, self.levels)
+
+    @cached_property
+    def _regular(self) -> Regular | None:
+        return Regular.of(self.model, self.measured, self.settings, self._best)
 
     @cached_property
     def safe_input(self) -> Array:
@@ -317,6 +322,11 @@ class Controller:
         with np.errstate(all='ignore'):
             u, follows = self._estimating.applied(state, applied)
             before = state.estimate
+            if self._regular is not None and not self._estimating.lost(state, time_ns):
+                regular = self._regular.step(
+                    state, y, time_ns, u, elapsed, seconds, spacing, missed, follows)
+                if regular is not None:
+                    return regular
             state, seen = self._estimating.observe(state, y, time_ns, elapsed, u)
             accepted = seen.verdict.fault is None
             if accepted:
@@ -395,10 +405,7 @@ class Controller:
         active = state.setpoint.active
         if active is None:
             return None
-        return TargetReport(
-            active, self.controlled.violation(active), target.residual,
-            active if self._best.controls_all else self.model.states.to_physical(target.x),
-            self.model.inputs.to_physical(target.u))
+        return TargetReport(active, self.controlled, self.model, target)
 
     def _choose(self, state: State, verdict: Verdict, outside: float, time_ns: int,
                 spacing: float) -> tuple[Supervisor, Target | None, LawResult | None]:
@@ -503,24 +510,13 @@ class Controller:
         """Return what is known; of the target where it is, if there is no law."""
         active = state.setpoint.active
         if target is None and active is not None:
-            target = TargetReport(active, self.controlled.violation(active))
+            target = TargetReport(active, self.controlled, self.model)
         levels, manual = self.settings.supervisor, state.mode is Mode.MANUAL
         depth = len(levels.order) if manual else levels.depth(state.supervisor.level)
+        known = None if state.estimate is None else EstimateReport(
+            state.estimate, self._estimating.level(state).estimator)
         return Report(state.mode, MANUAL if manual else levels.order[depth], depth, why, measured,
-                      self._estimated(state), target, command)
-
-    def _estimated(self, state: State) -> EstimateReport | None:
-        estimate, states = state.estimate, self.model.states
-        if estimate is None:
-            return None
-        estimator = self._estimating.level(state).estimator
-        n = len(states)
-        covariance = None if estimate.covariance is None else (
-            states.scale[:, None] * estimate.covariance[:n, :n] * states.scale)
-        return EstimateReport(
-            states.to_physical(estimate.x), estimator.as_input(estimate.w) * (
-                self.model.inputs.scale), estimator.at_bound(estimate.w), covariance,
-            estimate.innovation)
+                      known, target, command)
 
 
 def _passed(state: State, time_ns: int, elapsed: float) -> tuple[State, float, int]:

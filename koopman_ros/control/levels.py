@@ -45,7 +45,7 @@ class Level:
     law: Law  #: with its model
     estimator: Estimator  #: on the same model
     controlled: tuple[str, ...]  #: (n_c,) names of the states with a set-point
-    #: the last set-point, and where it led
+    #: the last set-point, and where it leads undisturbed
     _last: list[Any] = field(default_factory=lambda: [None, None], init=False, compare=False)
 
     @property
@@ -103,19 +103,27 @@ class Level:
             none = np.zeros(model.n_x)
             return Target(x, np.zeros(model.n_z), none, np.zeros(model.n_u), none, 0.0)
         if self.controls_all:
-            # a memory of the last set-point only; what comes out does not depend on it
-            asked, known = self._last
-            x = known.x if known is not None and asked is setpoint else (
-                model.states.to_deviation(setpoint))
-            target = steady_state_target(model, x, w, known=known)
-            self._last[:] = setpoint, target
-            return target
+            known = self.reference(setpoint)
+            return steady_state_target(model, known.x, w, known=known)
         n, inputs = model.n_x, model.inputs
         y = np.zeros(n + model.n_u) if start is None else np.concatenate(
             (model.states.to_deviation(start[:n]), inputs.to_deviation(start[n:])))
         return partial_target(
             model, self._indices, self.controlled_states.to_deviation(setpoint), w,
             inputs.to_deviation(limits.lower), inputs.to_deviation(limits.upper), y)
+
+    def reference(self, setpoint: Array) -> Target:
+        """
+        Return the target of a set-point (n_x,) for all states, without a disturbance.
+
+        The last one is kept; what comes out does not depend on it.
+        """
+        asked, known = self._last
+        if known is None or asked is not setpoint:
+            known = steady_state_target(
+                self.model, self.model.states.to_deviation(setpoint), known=known)
+            self._last[:] = setpoint, known
+        return known
 
     def compute(self, setpoint: Array, estimate: Estimate, limits: InputLimits, memory: object,
                 interval: float, start: Array | None, deadline: float = math.inf,
@@ -240,8 +248,8 @@ class Estimating:
         :param u: (n_u,) what has acted since then, in scaled deviations.
         :return: the state with measurement, time and estimate, and what became of the measurement.
         """
-        before, last = state.estimate, state.accepted
-        predicted = self.coast(state, elapsed, u)
+        before, last, estimator = state.estimate, state.accepted, self.level(state).estimator
+        predicted = self._coasted(estimator, state, elapsed, u)
         x = self.position(predicted, y)
         outside = self.model.distance(x)
         w = np.zeros(self.model.n_x) if before is None else before.w
@@ -252,7 +260,8 @@ class Estimating:
                 # plant that it does not expect to may rest there
                 return np.zeros_like(y)
             frozen = None if before is None else replace(before, w=then.w)
-            moved = self.coast(amended(state, estimate=frozen), elapsed, u)
+            moved = self._coasted(
+                estimator, amended(state, estimate=frozen), elapsed, u)
             if before is None or moved is None:
                 return np.zeros_like(y)
             return self.outputs.of((moved.x - before.x) * self.model.states.scale)
@@ -263,7 +272,8 @@ class Estimating:
         if verdict.fault is None:
             far = outside > self.settings.supervisor.largest_margin
             predicted = self._corrected(
-                state, predicted, verdict, x, elapsed, far or self._lost(state, time_ns))
+                estimator, state, predicted, verdict, x, elapsed,
+                far or self.lost(state, time_ns))
             if not self.outputs.determine_state:
                 # the measurement has changed what it leaves open, too
                 x = self.position(predicted, y)
@@ -297,14 +307,14 @@ class Estimating:
                 return self.model.states.to_physical(found)
         return x
 
-    def _corrected(self, state: State, predicted: Estimate | None, verdict: Verdict, x: Array,
-                   elapsed: float, lost: bool) -> Estimate:
+    def _corrected(self, estimator: Estimator, state: State, predicted: Estimate | None,
+                   verdict: Verdict, x: Array, elapsed: float, lost: bool) -> Estimate:
         """
         Return the estimate with a measurement that is accepted.
 
         :param lost: whether the model's prediction is worth nothing, after so long or so far out.
         """
-        xi, estimator = self.model.states.to_deviation(x), self.level(state).estimator
+        xi = self.model.states.to_deviation(x)
         if predicted is None:
             # taken over from somebody who, it is supposed, held the plant where it is
             return estimator.restart(None, xi, None if state.command is None else (
@@ -313,7 +323,7 @@ class Estimating:
             return estimator.restart(predicted, xi, None)
         return estimator.correct(predicted, xi, elapsed)
 
-    def _lost(self, state: State, time_ns: int) -> bool:
+    def lost(self, state: State, time_ns: int) -> bool:
         """Tell whether no measurement was accepted for so long that the state is not known."""
         if state.accepted is None:
             return False
@@ -328,9 +338,13 @@ class Estimating:
 
         Arguments as in :meth:`observe`.
         """
+        return self._coasted(self.level(state).estimator, state, elapsed, u)
+
+    def _coasted(self, estimator: Estimator, state: State, elapsed: float, u: Array
+                 ) -> Estimate | None:
         if state.estimate is None or state.command is None or not elapsed > 0.0:
             return state.estimate
-        predicted = self.level(state).estimator.predict(state.estimate, u, elapsed)
+        predicted = estimator.predict(state.estimate, u, elapsed)
         if predicted is None or not finite(predicted.x):
             # after so long, or from so far out, nothing is known; the disturbance is kept
             return state.estimate

@@ -10,11 +10,12 @@ import math
 import numpy as np
 
 from koopman_ros.arrays import Array, brief
-from koopman_ros.control.laws.base import Figures, NO_FIGURES, Plan
+from koopman_ros.control.laws.base import Figures, NO_FIGURES, Plan, Target
 from koopman_ros.control.limits import Transfer
 from koopman_ros.control.setpoint import Setpoint
 from koopman_ros.control.supervisor import Supervisor, WayBack
-from koopman_ros.estimation import Accepted, Estimate, Innovation
+from koopman_ros.estimation import Accepted, Estimate, Estimator, Innovation
+from koopman_ros.lifting import Coordinates, LiftedModel
 from koopman_ros.reasons import Reason
 from koopman_ros.values import record
 
@@ -85,15 +86,38 @@ NOTHING_MEASURED = MeasurementReport()
 
 @record
 class EstimateReport:
-    """The estimate."""
+    """The estimate in units, which it is turned into where somebody asks."""
 
-    state: Array  #: (n_x,) in state units
-    disturbance: Array  #: (n_u,) as an input that would have the same effect, in input units
-    at_bound: bool  #: whether the disturbance is as large as is allowed
-    #: (n_x, n_x) covariance of the state's error, in products of state units; None where it is not
-    #: known
-    covariance: Array | None = None
-    innovation: Innovation | None = None  #: how well the measurements were expected, or None
+    estimate: Estimate  #: in scaled deviations
+    estimator: Estimator  #: of the level that acts
+
+    @property
+    def state(self) -> Array:
+        """(n_x,) in state units."""
+        return self.estimator.model.states.to_physical(self.estimate.x)
+
+    @property
+    def disturbance(self) -> Array:
+        """(n_u,) as an input that would have the same effect, in input units."""
+        as_input: Array = self.estimator.as_input(self.estimate.w)
+        return as_input * self.estimator.model.inputs.scale
+
+    @property
+    def at_bound(self) -> bool:
+        """Whether the disturbance is as large as is allowed."""
+        return self.estimator.at_bound(self.estimate.w)
+
+    @property
+    def covariance(self) -> Array | None:
+        """(n_x, n_x) of the state's error, in products of state units; None where not known."""
+        whole, scale = self.estimate.covariance, self.estimator.model.states.scale
+        n = len(scale)
+        return None if whole is None else scale[:, None] * whole[:n, :n] * scale
+
+    @property
+    def innovation(self) -> Innovation | None:
+        """How well the measurements were expected, or None."""
+        return self.estimate.innovation
 
     @property
     def deviation(self) -> Array | None:
@@ -103,15 +127,35 @@ class EstimateReport:
 
 @record
 class TargetReport:
-    """Where the law goes."""
+    """Where the law goes, in units into which it is turned where somebody asks."""
 
     setpoint: Array  #: (n_c,) what is tracked, in state units
-    outside: float  #: its distance from the training box, in half widths
-    #: rate of the state there that no input balances, scaled; NaN without a law
-    residual: float = math.nan
-    #: (n_x,) steady state that goes with it, in state units; None without a law
-    state: Array | None = None
-    input: Array | None = None  #: (n_u,) that holds it, in input units; None likewise
+    controlled: Coordinates  #: the states that it is of
+    model: LiftedModel  #: of the steady state that goes with it
+    target: Target | None = None  #: that state, in scaled deviations; None without a law
+
+    @property
+    def outside(self) -> float:
+        """Its distance from the training box, in half widths."""
+        return self.controlled.violation(self.setpoint)
+
+    @property
+    def residual(self) -> float:
+        """Rate of the state there that no input balances, scaled; NaN without a law."""
+        return math.nan if self.target is None else self.target.residual
+
+    @property
+    def state(self) -> Array | None:
+        """(n_x,) steady state that goes with it, in state units; None without a law."""
+        if self.target is None:
+            return None
+        every = len(self.controlled) == self.model.n_x
+        return self.setpoint if every else self.model.states.to_physical(self.target.x)
+
+    @property
+    def input(self) -> Array | None:
+        """(n_u,) that holds it, in input units; None without a law."""
+        return None if self.target is None else self.model.inputs.to_physical(self.target.u)
 
 
 @record

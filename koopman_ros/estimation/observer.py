@@ -140,12 +140,16 @@ class Estimator(Protocol):
         """Tell whether a disturbance is as large as is allowed."""
 
 
+def longest_step(model: LiftedModel) -> float:
+    """Return the longest step of integration, in the model's unit of time."""
+    fastest = model.linearised.fastest_rate
+    return _STEP_SHARE / fastest if fastest > 0.0 else math.inf
+
+
 def simulated(model: LiftedModel, estimate: Estimate, u: Array, seconds: float) -> Estimate | None:
     """Integrate the model from an estimate; see :meth:`Estimator.predict`."""
     duration = seconds / model.seconds_per_time_unit
-    fastest = model.linearised.fastest_rate
-    longest = _STEP_SHARE / fastest if fastest > 0.0 else math.inf
-    steps = max(1, math.ceil(duration / longest))
+    steps = max(1, math.ceil(duration / longest_step(model)))
     if steps > _MAX_STEPS:
         return None
     return Estimate(moved(model, estimate.x, estimate.w, u, duration / steps, steps), estimate.w)

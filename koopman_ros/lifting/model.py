@@ -113,22 +113,24 @@ class LiftedModel:
         """Its numbers as compiled code takes them; None for a kind that it does not know."""
         return layout_of(self)
 
-    @property
+    # kept, since a control step asks for them again and again
+
+    @cached_property
     def n_x(self) -> int:
         """Number of states."""
         return len(self.states)
 
-    @property
+    @cached_property
     def n_u(self) -> int:
         """Number of inputs."""
         return len(self.inputs)
 
-    @property
+    @cached_property
     def n_z(self) -> int:
         """Number of lifted coordinates."""
         return self.A.shape[0]
 
-    @property
+    @cached_property
     def identity(self) -> bool:
         """Whether z starts with the state."""
         return self.observables.identity
@@ -140,7 +142,7 @@ class LiftedModel:
                      self.inputs.names, self.inputs.units, self.time_unit, self.states.center,
                      self.inputs.center, None, self.input_matrix_degree)
 
-    @property
+    @cached_property
     def seconds_per_time_unit(self) -> float:
         """Length of the model's time unit in seconds."""
         return SECONDS_PER_TIME_UNIT[self.time_unit]

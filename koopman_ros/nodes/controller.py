@@ -9,6 +9,7 @@ import gc
 import math
 import sys
 import threading
+import time
 from typing import Any
 
 from builtin_interfaces.msg import Time
@@ -130,6 +131,8 @@ class ControllerNode(ManagedNode):
         self._lock, self._telling = threading.Lock(), threading.Lock()
         self._report = self._logged = Report(Mode.AUTOMATIC, next(iter(self._controller.levels)))
         self._refused = self._rests_outside = ''
+        # until when a status is not looked at again while level and whether there is a reason stay
+        self._told, self._untold = (0.0, '', False), False
         self._counts = messages.Counts()
         self._measured, self._timing = np.full(len(signals.states), np.nan), Timing(self)
         self._assembler = Assembler(
@@ -219,12 +222,12 @@ class ControllerNode(ManagedNode):
 
     def _on_measurement(self, heard: Heard) -> None:
         self._frame_id = heard.frame_id[:LONGEST_FRAME_ID]
-        length = len(heard.frame_id)
+        length, stamp_ns = len(heard.frame_id), heard.stamp_ns
         self._frame_length = length if length > LONGEST_FRAME_ID else 0
-        whole = self._assembler.take(heard.stamp_ns, heard.values)
+        whole = self._assembler.take(stamp_ns, heard.values)
         if whole is None or not self.active:
             return
-        sample = _Sample(heard.stamp if whole[0] == heard.stamp_ns else stamp_message(whole[0]),
+        sample = _Sample(heard.stamp if whole[0] == stamp_ns else stamp_message(whole[0]),
                          *whole)
         # whether the measured inputs will be known in a moment
         if self._waiting or (
@@ -311,6 +314,8 @@ class ControllerNode(ManagedNode):
         watched = self._watch(self._timing.silence)
         if watched is not None:
             self._tell(*watched)
+        if self._untold:
+            self._say(self._report, time.monotonic())
 
     def _on_busy(self, seconds: float) -> None:
         """Stand in for the executor; called in the watchdog's thread."""
@@ -359,6 +364,16 @@ class ControllerNode(ManagedNode):
         if report.measurement.clock_went_back:
             self.get_logger().warning('the measurement is older than the last one: time starts '
                                       'afresh', throttle_duration_sec=1.0)
+        # in between so many others, what is said of one would be read by nobody; the next one is
+        # looked at, or the watch comes by
+        told, now = self._told, time.monotonic()
+        self._untold = (report.level, report.reason is None) == told[1:] and now < told[0]
+        if not self._untold:
+            self._say(report, now)
+
+    def _say(self, report: Report, now: float) -> None:
+        self._told = now + PERIOD, report.level, report.reason is None
+        self._untold = False
         self._diagnostics.publish_if_changed()
 
     def _publish_beside(self, report: Report, stamp: Time) -> None:

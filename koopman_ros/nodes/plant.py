@@ -56,6 +56,7 @@ class PlantNode(ManagedNode):
         """Build the plant at its initial state, and what publishes it."""
         table = self._table
         self._settings = parameters = self.current(table)
+        self._sensors_of: PlantParameters | None = None  # what the sensors are known by
         system = self._build(parameters)
         self._signals = signals = table.described
         self._real_time = parameters.speed == 1.0 and not parameters.lockstep
@@ -130,6 +131,17 @@ class PlantNode(ManagedNode):
         """Return a parameter of all states (n_x,)."""
         return np.array([getattr(self._settings.states[name], attribute)
                          for name in self._signals.states])
+
+    def _sensors(self) -> tuple[Array, Array, Array, Array]:
+        """Return deviation of the noise, resolution, bias and variance of all states (n_x,)."""
+        settings = self._settings
+        if self._sensors_of is not settings:
+            noise, resolution = self._column('noise'), self._column('resolution')
+            # the steps of the scale have the variance of a uniform error
+            self._known = (noise, resolution, self._column('bias'),
+                           noise ** 2 + resolution ** 2 / 12.0)
+            self._sensors_of = settings
+        return self._known
 
     def _initial(self, system: plants.ControlAffineSystem, time_ns: int) -> plants.Process:
         x, u = system.nominal_state + self._column('initial_offset'), system.nominal_input
@@ -215,12 +227,10 @@ class PlantNode(ManagedNode):
         if self._clock_publisher is not None:
             self._clock_publisher.publish(Clock(clock=stamp))
         self._applied.send(plant.u, stamp, frame_id)
-        deviation, resolution = self._column('noise'), self._column('resolution')
+        deviation, resolution, bias, variance = self._sensors()
         noise = np.array([plants.sensor_noise(one, settings.seed, sample, i)
                           for i, one in enumerate(deviation.tolist())])
-        # the steps of the scale have the variance of a uniform error
-        self._states.send(plant.x + noise + self._column('bias'), stamp, frame_id,
-                          deviation ** 2 + resolution ** 2 / 12.0, resolution)
+        self._states.send(plant.x + noise + bias, stamp, frame_id, variance, resolution)
 
     def _advance(self, time_ns: int) -> bool:
         """Bring the process to an instant; a plant that ran away stops."""
@@ -335,7 +345,7 @@ class PlantNode(ManagedNode):
         elif self._unanswered():
             level, message = Level.WARN, (
                 'running, but no command arrives: the last one is held; is the controller alive?')
-        return Status(level, message, {
+        return Status(level, message, lambda: {
             'time [s]': seconds_text(self._plant.time_ns),
             **self._shown(self._plant),
             **{f'{stem(name, unit)} command [{display_unit(unit)}]': shown(value, unit)

@@ -180,10 +180,12 @@ def _out_of_reach(now: Situation, target: TargetReport) -> str:
     if target.state is None or target.input is None:
         return ''
     states, limits = now.controller.model.states, now.controller.settings.limits
-    names, half = states.names, (states.half_widths * states.scale).tolist()
-    for name, wanted in zip(now.signals.controlled, target.setpoint.tolist(), strict=True):
-        found, unit = float(target.state[names.index(name)]), now.signals.states[name]
-        if abs(found - wanted) > _REACHED * 2.0 * half[names.index(name)]:
+    # where every state has a set-point, that is where it leads
+    for name, wanted in () if target.state is target.setpoint else zip(
+            now.signals.controlled, target.setpoint.tolist(), strict=True):
+        place, unit = states.names.index(name), now.signals.states[name]
+        found, width = float(target.state[place]), 2.0 * states.half_widths[place]
+        if abs(found - wanted) > _REACHED * width * states.scale[place]:
             return (f'the set-point {shown(wanted, unit):.6g} {display_unit(unit)} of {name} '
                     f'cannot be held within the range of the {now.input}: '
                     f'{shown(found, unit):.6g} {display_unit(unit)} is the nearest')

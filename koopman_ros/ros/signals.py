@@ -114,7 +114,7 @@ class Inlet:
 
 class Outlet:
     """
-    Publish some signals, those of one topic in one message.
+    Publish some signals, those of one topic in one message, which is made once.
 
     :param places: by name of the signal, in the order of the numbers.
     :param units: of the signals, in which the numbers are given.
@@ -126,7 +126,8 @@ class Outlet:
         for topic, kind, names in by_topic(places):
             own = [(i, place, _converted(name, units[name], place.unit))
                    for i, (name, place) in enumerate(places.items()) if name in names]
-            self._parts.append((make(topic, kind), kind, own))
+            message = kind()
+            self._parts.append((make(topic, kind), message, getattr(message, 'header', None), own))
 
     @property
     def publishers(self) -> list[Publisher]:
@@ -145,8 +146,7 @@ class Outlet:
         :param variances: (n,) in the squares of their units, for types that tell; 0 for unknown.
         :param resolutions: (n,) of what measured them, in their units; 0 for every value.
         """
-        for publisher, kind, own in self._parts:
-            message = kind()
+        for publisher, message, header, own in self._parts:
             for i, place, converted in own:
                 number = converted(float(values[i]))
                 if resolutions is not None:
@@ -154,6 +154,6 @@ class Outlet:
                 place.put(message, number)
                 if variances is not None and hasattr(message, 'variance'):
                     message.variance = float(variances[i]) * converted.factor ** 2
-            if hasattr(message, 'header'):
-                message.header.stamp, message.header.frame_id = stamp, frame_id
+            if header is not None:
+                header.stamp, header.frame_id = stamp, frame_id
             publisher.publish(message)

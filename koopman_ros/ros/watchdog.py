@@ -38,7 +38,9 @@ class Timing:
 
     def now(self) -> tuple[float, int, int]:
         """Return the time by the steady clock in s, on /clock, or 0, and the node's, in ns."""
-        return time.monotonic(), self._sim_now(), self._node.get_clock().now().nanoseconds
+        simulated = self._sim_now()
+        # without /clock the node's time is the system's, which Python reads itself
+        return time.monotonic(), simulated, simulated if self._simulated else time.time_ns()
 
     def note(self, stamp_ns: int, at: tuple[float, int, int]) -> None:
         """Take down that a measurement with a new stamp has arrived at a time."""
