@@ -1,7 +1,13 @@
 # SPDX-FileCopyrightText: 2026 The koopman_ros Authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""The drift with its Jacobian at many states at once; see :mod:`koopman_ros.compiled.rows`."""
+"""
+The drift with its Jacobian at many states at once.
+
+The last axis of all arrays is that of the states, so that the innermost loops, of which several
+turns are taken at once, are as long as there are states, however few numbers one has. What is
+multiplied by weights has its derivatives side by side in one row.
+"""
 
 import math
 
@@ -17,183 +23,288 @@ from koopman_ros.compiled.network import (
     N_Z,
     READOUT,
     squash,
-    widest,
     WIDTHS,
     widths,
 )
-from koopman_ros.compiled.rows import (
-    add,
-    add_product,
-    add_weighted,
-    factor_rows,
-    fill,
-    solve_rows,
-)
 
-#: Two layers in turns with their first and second derivatives, 2^k, z and what follows of it,
-#: a row of the layer twice, J_N and J_N'J_N.
-Space = tuple[Array, Array, Array, Array, Array, Array, NDArray[np.int64], Array, Array, Array,
-              Array, Array]
+Space = tuple[Array, Array, Array, Array, NDArray[np.int64], tuple[Array, Array, Array, Array]]
 
 
 @inner
 def space_of(sizes: NDArray[np.int64], N: int) -> Space:
-    """Return room for :func:`drifts` of N states."""
-    n, n_z, width = sizes[N_X], sizes[N_Z], widest(sizes)
-    pairs = 0 if sizes[READOUT] else n * (n + 1) // 2
-    return (np.empty((width, N)), np.empty((width, N)),
-            np.empty((n * width, N)), np.empty((n * width, N)),
-            np.empty((pairs * width, N)), np.empty((pairs * width, N)),
-            np.empty(width * N, np.int64), np.empty((3 * n_z, N)), np.empty((width, N)),
-            np.empty((width, N)), np.empty((n_z * n, N)), np.empty((n * n, N)))
+    """
+    Return room for :func:`drifts` of N states.
+
+    All hidden layers (h, N), one after the other, the derivatives (h, n_x, N) of what goes into
+    their tanh, a layer with its derivatives twice, 2^k, and z, J_N and what follows of it.
+    """
+    n, n_z, count, width = sizes[N_X], sizes[N_Z], 0, 0
+    for layer in range(WIDTHS, len(sizes)):
+        count += sizes[layer]
+        width = max(width, sizes[layer])
+    return (np.empty((count, N)), np.empty((count, n, N)), np.empty((2, width, N)),
+            np.empty((2, width, n, N)), np.empty(width * N, np.int64),
+            (np.empty((2 * n_z, N)), np.empty((n_z, n, N)), np.empty((n_z, n, N)),
+             np.empty((n, n, N))))
 
 
 @inner
-def _layers(sizes: NDArray[np.int64], numbers: Array, x: Array, space: Space
-            ) -> tuple[Array, Array, Array]:
-    """
-    Return the last hidden layer h less its value at the origin, its derivatives T and those of T.
+def _flat(A: Array) -> Array:
+    """Return (a, b, N) as (a, b N)."""
+    return A.reshape((A.shape[0], A.shape[1] * A.shape[2]))
 
-    Rows of unit i are i of h, k h + i of T by state k, and p h + i of the last, of pairs j <= k of
-    states p = k (k + 1) / 2 + j; these are there where there is no read-out.
+
+@inner
+def _weighted(target: Array, rows: int, weights: Array, start: int, down: int, across: int,
+              source: Array, count: int, clear: bool) -> None:
     """
-    n, N, start, last = sizes[N_X], x.shape[1], 0, sizes[N_X]
-    h, T, U, before, T_before, U_before, scale = (
-        space[0], space[2], space[4], space[1], space[3], space[5], space[6])
-    pairs = 0 if sizes[READOUT] else n * (n + 1) // 2
+    Add to so many rows the weighted sums of the first `count` rows of another array.
+
+    The weights lie so far apart by row and by column; `clear` begins with 0.
+    """
+    whole = count - count % 4
+    for i in range(rows):
+        if clear:
+            for c in range(target.shape[1]):
+                target[i, c] = 0.0
+        for k in range(0, whole, 4):
+            at = start + i * down + k * across
+            p, q = weights[at], weights[at + across]
+            r, s = weights[at + 2 * across], weights[at + 3 * across]
+            for c in range(target.shape[1]):
+                target[i, c] += (p * source[k, c] + q * source[k + 1, c]) + (
+                    r * source[k + 2, c] + s * source[k + 3, c])
+        for k in range(whole, count):
+            p = weights[start + i * down + k * across]
+            for c in range(target.shape[1]):
+                target[i, c] += p * source[k, c]
+
+
+@inner
+def _layers(sizes: NDArray[np.int64], numbers: Array, x: Array, h: Array, P: Array,
+            slopes: Array, scale: NDArray[np.int64]) -> int:
+    """
+    Write the hidden layers to h, and the derivatives of what goes into them to P.
+
+    :param slopes: room for those of two layers.
+    :return: which of these is that of the last layer.
+    """
+    n, N = x.shape
+    start, last, row, turn = 0, n, 0, 0
     for layer in range(WIDTHS, len(sizes)):
-        width, first = sizes[layer], layer == WIDTHS
-        bias = start + width * last
-        h, before = before, h
-        T, T_before = T_before, T
-        U, U_before = U_before, U
-        values = x if first else before
+        width = sizes[layer]
+        bias, own = start + width * last, h[row:row + width]
         for i in range(width):
-            fill(h, i, numbers[bias + i])
-            add_weighted(h, i, numbers, start + i, width, values, 0, last)
-            for k in range(n):
-                fill(T, k * width + i, numbers[start + k * width + i] if first else 0.0)
-                if not first:
-                    add_weighted(T, k * width + i, numbers, start + i, width, T_before, k * last,
-                                 last)
-            for p in range(pairs):
-                fill(U, p * width + i, 0.0)
-                if not first:
-                    add_weighted(U, p * width + i, numbers, start + i, width, U_before, p * last,
-                                 last)
-        squash(h.reshape(h.size), width * N, scale)
-        for i in range(width):
-            for k in range(n if pairs else 0):
-                for j in range(k + 1):
-                    p, a, b = (k * (k + 1) // 2 + j) * width + i, k * width + i, j * width + i
-                    for c in range(N):
-                        t = h[i, c]
-                        U[p, c] = (1.0 - t * t) * (U[p, c] - 2.0 * t * T[a, c] * T[b, c])
-            for k in range(n):
-                a = k * width + i
-                for c in range(N):
-                    T[a, c] *= 1.0 - h[i, c] * h[i, c]
-        start, last = bias + width, width
-    if len(sizes) > WIDTHS:
-        for i in range(last):
             for c in range(N):
-                h[i, c] -= numbers[start + i]
-    return h, T, U
+                own[i, c] = numbers[bias + i]
+        if layer == WIDTHS:
+            _weighted(own, width, numbers, start, 1, width, x, last, False)
+            for i in range(width):
+                for k in range(n):
+                    for c in range(N):
+                        P[i, k, c] = numbers[start + k * width + i]
+        else:
+            _weighted(own, width, numbers, start, 1, width, h[row - last:row], last, False)
+            _weighted(_flat(P[row:row + width]), width, numbers, start, 1, width,
+                      _flat(slopes[turn]), last, True)
+        squash(own.reshape(own.size), width * N, scale)
+        turn = 1 - turn
+        for i in range(width):
+            for k in range(n):
+                for c in range(N):
+                    slopes[turn, i, k, c] = (1.0 - own[i, c] * own[i, c]) * P[row + i, k, c]
+        start, last, row = bias + width, width, row + width
+    return turn
+
+
+@inner
+def _turned(sizes: NDArray[np.int64], numbers: Array, h: Array, P: Array, f: Array,
+            slopes: Array) -> int:
+    """
+    Write the derivatives by the state of dh/dx f of the last layer, under an f that is held.
+
+    :param slopes: room as of :func:`_layers`.
+    :return: which of these is that of the last layer.
+    """
+    n, N = f.shape
+    start, last, row, turn, along = 0, n, 0, 0, np.empty(N)
+    for layer in range(WIDTHS, len(sizes)):
+        width, turn = sizes[layer], 1 - turn
+        if layer > WIDTHS:
+            _weighted(_flat(slopes[turn]), width, numbers, start, 1, width,
+                      _flat(slopes[1 - turn]), last, True)
+        for i in range(width):
+            for c in range(N):
+                along[c] = 0.0
+            for k in range(n):
+                for c in range(N):
+                    along[c] += P[row + i, k, c] * f[k, c]
+            for c in range(N):
+                along[c] *= -2.0 * h[row + i, c]
+            for k in range(n):
+                if layer == WIDTHS:
+                    for c in range(N):
+                        slopes[turn, i, k, c] = 0.0
+                for c in range(N):
+                    slopes[turn, i, k, c] = (1.0 - h[row + i, c] * h[row + i, c]) * (
+                        slopes[turn, i, k, c] + along[c] * P[row + i, k, c])
+        start, last, row = start + width * (last + 1), width, row + width
+    return turn
+
+
+@inner
+def _add_bend(sizes: NDArray[np.int64], numbers: Array, h: Array, P: Array, adjoint: Array,
+              J: Array) -> None:
+    """
+    Add to J the second derivatives of a weighted sum of the last layer, from that back.
+
+    :param adjoint: its weights in the first of two rooms of a layer.
+    """
+    n, N = J.shape[1:]
+    row, turn = len(h), 0
+    width, start = widths(sizes)
+    for layer in range(len(sizes) - 1, WIDTHS - 1, -1):
+        width = sizes[layer]
+        last = sizes[layer - 1] if layer > WIDTHS else n
+        row -= width
+        start -= width * (last + 1)
+        for i in range(width):
+            for c in range(N):
+                adjoint[turn, i, c] *= 1.0 - h[row + i, c] * h[row + i, c]
+            for k in range(n):
+                for j in range(n):
+                    for c in range(N):
+                        J[j, k, c] -= 2.0 * adjoint[turn, i, c] * h[row + i, c] * P[
+                            row + i, k, c] * P[row + i, j, c]
+        if layer > WIDTHS:
+            _weighted(adjoint[1 - turn], last, numbers, start, width, 1, adjoint[turn], width,
+                      True)
+        turn = 1 - turn
+
+
+@inner
+def _factor(S: Array) -> None:
+    """Turn symmetric, definite (n, n, N) into the L D L' of themselves."""
+    n, N = S.shape[0], S.shape[2]
+    for k in range(n):
+        for j in range(k):
+            for c in range(N):
+                S[k, k, c] -= S[k, j, c] * S[k, j, c] * S[j, j, c]
+        for i in range(k + 1, n):
+            for j in range(k):
+                for c in range(N):
+                    S[i, k, c] -= S[i, j, c] * S[k, j, c] * S[j, j, c]
+            for c in range(N):
+                S[i, k, c] /= S[k, k, c]
+
+
+@inner
+def _solve(S: Array, X: Array) -> None:
+    """Solve L D L' X = X (n, m, N) of what :func:`_factor` gave."""
+    n, m, N = X.shape
+    for k in range(n):
+        for i in range(k):
+            for j in range(m):
+                for c in range(N):
+                    X[k, j, c] -= S[k, i, c] * X[i, j, c]
+    for k in range(n - 1, -1, -1):
+        for j in range(m):
+            for c in range(N):
+                X[k, j, c] /= S[k, k, c]
+        for i in range(k + 1, n):
+            for j in range(m):
+                for c in range(N):
+                    X[k, j, c] -= S[i, k, c] * X[i, j, c]
 
 
 @inner
 def drifts(sizes: NDArray[np.int64], numbers: Array, x: Array, space: Space, f: Array, J: Array
            ) -> None:
     """
-    Write the drift at states (n_x, N) to f, and its Jacobian (n_x^2, N) to J; NaN for none.
+    Write the drift at states (n_x, N) to f, and its Jacobian to J (n_x, n_x, N); NaN for none.
 
     Without a read-out by the normal equations J_N'J_N f = J_N'A z and their derivatives by each
     state.
 
     :param space: of :func:`space_of`.
     """
-    n, N = sizes[N_X], x.shape[1]
+    n, N = x.shape
     n_z, identity = sizes[N_Z], sizes[IDENTITY]
     width, start = widths(sizes)
-    h, T, U = _layers(sizes, numbers, x, space)
+    h, P, adjoint, slopes, scale, (of_z, L, bent, square) = space
+    last = slopes[_layers(sizes, numbers, x, h, P, slopes, scale)]
+    layer = adjoint[0]
+    for i in range(width):
+        for c in range(N):
+            layer[i, c] = h[len(h) - width + i, c] - numbers[start + i]
     output = start + width
     A = output + n_z * width
     slope = A + n_z * n_z + n * sizes[N_U]
     if sizes[READOUT]:
-        readout = slope + n * n
+        down, readout = n + width, slope + n * n
+        _weighted(f, n, numbers, readout, down, 1, x, n, True)
+        _weighted(f, n, numbers, readout + n, down, 1, layer, width, False)
         for i in range(n):
-            row = readout + i * (n + width)
-            fill(f, i, 0.0)
-            add_weighted(f, i, numbers, row, 1, x, 0, n)
-            add_weighted(f, i, numbers, row + n, 1, h, 0, width)
             for j in range(n):
-                fill(J, i * n + j, numbers[row + j])
-                add_weighted(J, i * n + j, numbers, row + n, 1, T, j * width, width)
+                for c in range(N):
+                    J[i, j, c] = numbers[readout + i * down + j]
+        _weighted(_flat(J), n, numbers, readout + n, down, 1, _flat(last), width, False)
         return
-    of_z, turn, bend, L, square = space[7], space[8], space[9], space[10], space[11]
-    # z, then what is left of A z, then what A makes of J_N less how that turns the rate
-    rest, bent = n_z, 2 * n_z
-    for a in range(n_z):
-        own = identity != 0 and a < n
-        fill(of_z, a, 0.0)
-        if own:
-            add(of_z, a, 1.0, x, a)
-        else:
-            add_weighted(of_z, a, numbers, output + a * width, 1, h, 0, width)
-        for k in range(n):
-            fill(L, a * n + k, 1.0 if own and a == k else 0.0)
-            if not own:
-                add_weighted(L, a * n + k, numbers, output + a * width, 1, T, k * width, width)
-    for k in range(n):
-        fill(f, k, 0.0)
-        for j in range(k + 1):
-            fill(square, k * n + j, 0.0)
-    for a in range(n_z):
-        fill(of_z, rest + a, 0.0)
-        add_weighted(of_z, rest + a, numbers, A + a * n_z, 1, of_z, 0, n_z)
-        for k in range(n):
-            add_product(f, k, 1.0, L, a * n + k, of_z, rest + a)
-            for j in range(k + 1):
-                add_product(square, k * n + j, 1.0, L, a * n + k, L, a * n + j)
-    factor_rows(square, n)
-    solve_rows(square, n, f, 1)
-    for a in range(n_z):
-        for k in range(n):
-            add_product(of_z, rest + a, -1.0, L, a * n + k, f, k)
-    for i in range(width):
-        fill(turn, i, 0.0)
-        add_weighted(turn, i, numbers, output + i, width, of_z, rest, n_z)
-    for k in range(n):
-        for i in range(width):
-            fill(bend, i, 0.0)
-            for j in range(n):
-                p = (k * (k + 1) // 2 + j if j <= k else j * (j + 1) // 2 + k) * width + i
-                add_product(bend, i, -1.0, U, p, f, j)
-        for a in range(n_z):
-            fill(of_z, bent + a, 0.0)
-            for b in range(n_z):
-                add(of_z, bent + a, numbers[A + a * n_z + b], L, b * n + k)
-            add_weighted(of_z, bent + a, numbers, output + a * width, 1, bend, 0, width)
-        for j in range(n):
-            fill(J, j * n + k, 0.0)
-            for a in range(n_z):
-                add_product(J, j * n + k, 1.0, L, a * n + j, of_z, bent + a)
-    for k in range(n):
-        for j in range(k + 1):
-            p = (k * (k + 1) // 2 + j) * width
-            fill(bend, 0, 0.0)
-            for i in range(width):
-                add_product(bend, 0, 1.0, turn, i, U, p + i)
-            add(J, j * n + k, 1.0, bend, 0)
-            if j < k:
-                add(J, k * n + j, 1.0, bend, 0)
-    solve_rows(square, n, J, n)
-    for k in range(n):
-        for j in range(n):
-            add(f, k, -numbers[slope + k * n + j], x, j)
+    # in the second half of the first A z, then what J_N f leaves of it
+    rest = of_z[n_z:]
+    _weighted(of_z, n_z, numbers, output, width, 1, layer, width, True)
+    _weighted(_flat(L), n_z, numbers, output, width, 1, _flat(last), width, True)
+    if identity:
+        for i in range(n):
             for c in range(N):
-                J[k * n + j, c] -= numbers[slope + k * n + j]
+                of_z[i, c] = x[i, c]
+            for k in range(n):
+                for c in range(N):
+                    L[i, k, c] = 1.0 if i == k else 0.0
+    _weighted(rest, n_z, numbers, A, n_z, 1, of_z, n_z, True)
+    for k in range(n):
         for c in range(N):
-            # beside its own definite matrix there is no rate
-            if not 0.0 < square[k * n + k, c] < math.inf:
+            f[k, c] = 0.0
+        for a in range(n_z):
+            for c in range(N):
+                f[k, c] += L[a, k, c] * rest[a, c]
+        for j in range(n):
+            for c in range(N):
+                square[k, j, c] = J[k, j, c] = 0.0
+            for a in range(n_z):
+                for c in range(N):
+                    square[k, j, c] += L[a, k, c] * L[a, j, c]
+    _factor(square)
+    _solve(square, f.reshape((n, 1, N)))
+    # how the rest turns with J_N; of as many coordinates as states there is none
+    if n_z > n:
+        for a in range(n_z):
+            for k in range(n):
+                for c in range(N):
+                    rest[a, c] -= L[a, k, c] * f[k, c]
+        _weighted(layer, width, numbers, output, 1, width, rest, n_z, True)
+        _add_bend(sizes, numbers, h, P, adjoint, J)
+    # what A makes of J_N, less how that turns the rate
+    last = slopes[_turned(sizes, numbers, h, P, f, slopes)]
+    _weighted(_flat(bent), n_z, numbers, output, width, 1, _flat(last), width, True)
+    for a in range(n_z):
+        for k in range(n):
+            for c in range(N):
+                bent[a, k, c] = -bent[a, k, c]
+    _weighted(_flat(bent), n_z, numbers, A, n_z, 1, _flat(L), n_z, False)
+    for j in range(n):
+        for k in range(n):
+            for a in range(n_z):
+                for c in range(N):
+                    J[j, k, c] += L[a, j, c] * bent[a, k, c]
+    _solve(square, J)
+    for k in range(n):
+        for j in range(n):
+            part = numbers[slope + k * n + j]
+            for c in range(N):
+                f[k, c] -= part * x[j, c]
+                J[k, j, c] -= part
+        for c in range(N):
+            # beside a definite matrix there is no rate
+            if not 0.0 < square[k, k, c] < math.inf:
                 f[0, c] = math.nan

@@ -52,15 +52,6 @@ def widths(sizes: NDArray[np.int64]) -> tuple[int, int]:
 
 
 @inner
-def widest(sizes: NDArray[np.int64]) -> int:
-    """Return the width of the widest hidden layer; 0 without any."""
-    width = 0
-    for layer in range(WIDTHS, len(sizes)):
-        width = max(width, sizes[layer])
-    return width
-
-
-@inner
 def matrices(sizes: NDArray[np.int64], numbers: Array) -> tuple[Array, Array, Array, Array]:
     """Return A, B, the slope of the pre-feedback and the read-out of a layout."""
     n, m, n_z = sizes[N_X], sizes[N_U], sizes[N_Z]
