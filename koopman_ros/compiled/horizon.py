@@ -4,101 +4,106 @@
 """The quadratic program of a plan: its course, condensed to the inputs, and its cost."""
 
 import math
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from koopman_ros.arrays import Array
+from koopman_ros.compiled.drifts import drifts, space_of
 from koopman_ros.compiled.jit import compiled, inner, INTEGERS, MATRIX, SIZE, VECTOR
-from koopman_ros.compiled.matrices import applied
 from koopman_ros.compiled.network import drift_and_jacobian, matrices, N_U, N_X, parts_of
-from koopman_ros.compiled.steps import runge_kutta, space_of
 
-
-@inner
-def _weigh(M: Array, g: Array, share: float, Q: Array, S: Array, error: Array) -> None:
-    """Add the share of S' Q S to M, and of S' Q error to g."""
-    n, c = S.shape
-    for i in range(n):
-        for j in range(n):
-            q = share * Q[i, j]
-            for a in range(c):
-                left = q * S[i, a]
-                g[a] += left * error[j]
-                for b in range(c):
-                    M[a, b] += left * S[j, b]
-
-
-@inner
-def _interval(sizes: NDArray[np.int64], numbers: Array,
-              parts: tuple[Array, Array, Array, Array], space: Any, push: Array, forced: Array,
-              x: Array, x_ref: Array, Q: Array, length: float, steps: int
-              ) -> tuple[Array, Array, Array, Array]:
-    """
-    Follow one interval.
-
-    :return: where it ends, the derivative of that by node and input, and what it costs: Hessian
-        and gradient by node and input.
-    """
-    n, m = sizes[N_X], sizes[N_U]
-    S, h = np.zeros((n, n + m)), length / steps
-    for i in range(n):
-        S[i, i] = 1.0
-    M, g, error = np.zeros((n + m, n + m)), np.zeros(n + m), np.empty(n)
-    middle, points = np.empty((n, n + m)), length / (6.0 * steps)
-    for i in range(n):
-        error[i] = x[i] - x_ref[i]
-    _weigh(M, g, points, Q, S, error)
-    for step in range(steps):
-        y, T, k1, s1, k4, s4 = runge_kutta(
-            sizes, numbers, parts, space, push, forced, x, S, h)
-        # the middle by the rates at both ends (Hermite), for Simpson's rule
-        for i in range(n):
-            error[i] = 0.5 * (x[i] + y[i]) + 0.125 * h * (k1[i] - k4[i]) - x_ref[i]
-            for j in range(n + m):
-                middle[i, j] = 0.5 * (S[i, j] + T[i, j]) + 0.125 * h * (s1[i, j] - s4[i, j])
-        _weigh(M, g, 4.0 * points, Q, middle, error)
-        for i in range(n):
-            error[i] = y[i] - x_ref[i]
-        _weigh(M, g, points if step == steps - 1 else 2.0 * points, Q, T, error)
-        x, S = y, T
-    return x, S, M, g
-
-
-@inner
-def _add(H: Array, f: Array, M: Array, g: Array, by_node: Array, gap: Array, width: int, n: int,
-         m: int) -> None:
-    """Add what an interval costs to the lower half of H, and to f, whose node the inputs move."""
-    c = n + m
-    slope = g.copy()
-    for a in range(c):
-        for j in range(n):
-            slope[a] += M[a, j] * gap[j]
-    row = np.empty(n)
-    for a in range(width):
-        # what the change of the node by an input costs beside each part of the interval
-        for j in range(n):
-            row[j] = 0.0
-            for i in range(n):
-                row[j] += by_node[i, a] * M[i, j]
-            f[a] += by_node[j, a] * slope[j]
-        for b in range(a + 1):
-            for j in range(n):
-                H[a, b] += row[j] * by_node[j, b]
-        for j in range(m):
-            for i in range(n):
-                H[width + j, a] += M[n + j, i] * by_node[i, a]
-    for i in range(m):
-        f[width + i] += slope[n + i]
-        for j in range(i + 1):
-            H[width + i, width + j] += M[n + i, n + j]
+_LANES = 8  # columns that a processor takes at once, or twice as many as it does
 
 
 @compiled(INTEGERS, VECTOR, VECTOR)
 def slope(sizes: NDArray[np.int64], numbers: Array, x: Array) -> Array:
     """Return the Jacobian of the drift at a state, (n_x, n_x)."""
     return drift_and_jacobian(sizes, numbers, parts_of(sizes, numbers), x.copy())[1]
+
+
+@inner
+def _weigh(M: Array, g: Array, Q: Array, factor: float, lengths: Array, X: Array, x_ref: Array,
+           QS: Array) -> None:
+    """Add what a point costs to the lower half of M, S' Q S, and to g, S' Q (x - x_ref)."""
+    (c, N), n = g.shape, len(Q)
+    for b in range(c):
+        for i in range(n):
+            for k in range(N):
+                QS[i, k] = 0.0
+            for j in range(n):
+                if Q[i, j] != 0.0:
+                    q = factor * Q[i, j]
+                    for k in range(N):
+                        QS[i, k] += q * lengths[k] * X[1 + b, j, k]
+        for i in range(n):
+            for k in range(N):
+                g[b, k] += QS[i, k] * (X[0, i, k] - x_ref[i])
+            for a in range(b, c):
+                for k in range(N):
+                    M[a, b, k] += QS[i, k] * X[1 + a, i, k]
+
+
+@inner
+def _intervals(sizes: NDArray[np.int64], numbers: Array, B: Array, X: Array, push: Array,
+               x_ref: Array, Q: Array, lengths: Array, steps: int) -> tuple[Array, Array]:
+    """
+    Follow all intervals at once by Runge-Kutta steps x' = f(x) + push, S' = f'(x) S + [0, B].
+
+    :param X: (1 + c, n_x, N), with c = n_x + n_u: nodes x, which become where the intervals end,
+        and after them the columns of S, the derivatives of that by node and input.
+    :param push: (n_x, N).
+    :return: what the intervals cost: Hessian (c, c, N), its lower half, and gradient (c, N), by
+        node and input.
+    """
+    count, n, N = X.shape
+    c, space, part = count - 1, space_of(sizes, N), 1.0 / (6.0 * steps)
+    M, g, QS, J = np.zeros((c, c, N)), np.zeros((c, N)), np.empty((n, N)), np.empty((n, n, N))
+    for a in range(c):
+        for i in range(n):
+            for k in range(N):
+                X[1 + a, i, k] = 1.0 if i == a else 0.0
+    rate, total, middle, ahead = (
+        np.empty(X.shape), np.empty(X.shape), np.empty(X.shape), X.copy())
+    _weigh(M, g, Q, part, lengths, X, x_ref, QS)
+    for step in range(steps):
+        for stage in range(4):
+            drifts(sizes, numbers, ahead[0], space, rate[0], J)
+            share = (0.5 if stage < 2 else 1.0) / steps
+            for a in range(count):
+                for i in range(n):
+                    if a == 0:
+                        for k in range(N):
+                            rate[a, i, k] += push[i, k]
+                    else:
+                        forced = B[i, a - 1 - n] if a > n else 0.0
+                        for k in range(N):
+                            rate[a, i, k] = forced
+                        for j in range(n):
+                            for k in range(N):
+                                rate[a, i, k] += J[i, j, k] * ahead[a, j, k]
+            for a in range(count):
+                for i in range(n):
+                    if stage == 0:
+                        for k in range(N):
+                            total[a, i, k] = middle[a, i, k] = rate[a, i, k]
+                    elif stage < 3:
+                        for k in range(N):
+                            total[a, i, k] += 2.0 * rate[a, i, k]
+                    if stage < 3:
+                        for k in range(N):
+                            ahead[a, i, k] = X[a, i, k] + share * lengths[k] * rate[a, i, k]
+                    else:
+                        # the middle by the rates at both ends (Hermite), for Simpson's rule
+                        for k in range(N):
+                            r = rate[a, i, k]
+                            end = X[a, i, k] + part * lengths[k] * (total[a, i, k] + r)
+                            middle[a, i, k] = 0.5 * (X[a, i, k] + end) + 0.125 / steps * lengths[
+                                k] * (middle[a, i, k] - r)
+                            ahead[a, i, k] = X[a, i, k] = end
+        _weigh(M, g, Q, 4.0 * part, lengths, middle, x_ref, QS)
+        _weigh(M, g, Q, part if step == steps - 1 else 2.0 * part, lengths, X, x_ref, QS)
+    return M, g
 
 
 @compiled(INTEGERS, VECTOR, MATRIX, MATRIX, VECTOR, VECTOR, VECTOR, VECTOR, VECTOR, SIZE, MATRIX,
@@ -113,48 +118,75 @@ def program(sizes: NDArray[np.int64], numbers: Array, u: Array, x: Array, start:
         :class:`koopman_ros.control.laws.shooting.Program`.
     """
     n, m, N = sizes[N_X], sizes[N_U], len(u)
+    count = N * m
     _, B, _, _ = matrices(sizes, numbers)
-    parts, space = parts_of(sizes, numbers), space_of(sizes)
-    Q, terminal = Q.copy(), terminal.copy()
-    nodes, by_inputs = np.empty((N + 1, n)), np.zeros((N + 1, n, N * m))
-    H, f = np.zeros((N * m, N * m)), np.zeros(N * m)
-    forced, gap, total = np.zeros((n, n + m)), np.empty(n), 0.0
+    # the last one again until their number suits the processor
+    columns = N + (-N) % _LANES
+    X, push, held = np.empty((1 + n + m, n, columns)), np.empty((n, columns)), np.empty(columns)
+    for column in range(columns):
+        k = min(column, N - 1)
+        held[column] = lengths[k]
+        for i in range(n):
+            X[0, i, column], push[i, column] = x[k, i], w[i]
+            for j in range(m):
+                push[i, column] += B[i, j] * u[k, j]
+    M, g = _intervals(sizes, numbers, B, X, push, x_ref.copy(), Q.copy(), held, steps)
+    nodes, by_inputs = np.empty((N + 1, n)), np.zeros((N + 1, n, count))
+    gap, total = np.empty((n, N)), 0.0
     for i in range(n):
         nodes[0, i] = start[i]
-        for j in range(m):
-            forced[i, n + j] = B[i, j]
     for k in range(N):
-        push = applied(B, u[k].copy())
-        for i in range(n):
-            push[i] += w[i]
-            gap[i] = nodes[k, i] - x[k, i]
-        end, S, M, g = _interval(sizes, numbers, parts, space, push, forced, x[k].copy(), x_ref,
-                                 Q, lengths[k], steps)
         width = k * m
         for i in range(n):
-            nodes[k + 1, i] = end[i]
+            gap[i, k] = nodes[k, i] - x[k, i]
+        for i in range(n):
+            nodes[k + 1, i] = X[0, i, k]
             for j in range(n):
-                nodes[k + 1, i] += S[i, j] * gap[j]
-                for c in range(width):
-                    by_inputs[k + 1, i, c] += S[i, j] * by_inputs[k, j, c]
+                by_node = X[1 + j, i, k]
+                nodes[k + 1, i] += by_node * gap[j, k]
+                for a in range(width):
+                    by_inputs[k + 1, i, a] += by_node * by_inputs[k, j, a]
             for j in range(m):
-                by_inputs[k + 1, i, width + j] = S[i, n + j]
-            total += nodes[k + 1, i] + S[i, i]
-        _add(H, f, M, g, by_inputs[k], gap, width, n, m)
-        for i in range(m):
-            for j in range(m):
-                H[width + i, width + j] += lengths[k] * R[i, j]
-                f[width + i] += lengths[k] * R[i, j] * (u[k, j] - u_ref[j])
-    for i in range(n):
-        gap[i] = nodes[N, i] - x_ref[i]
+                by_inputs[k + 1, i, width + j] = X[1 + n + j, i, k]
+            total += nodes[k + 1, i] + X[1 + i, i, k]
+    # back from the end: what a change of each node costs from there on, and the derivative of
+    # that by the inputs before it
+    H, f, cost, by_end = (
+        np.zeros((count, count)), np.empty(count), np.zeros(n), np.zeros((n, count)))
+    before, by_before = np.empty(n), np.empty((n, count))
     for i in range(n):
         for j in range(n):
-            for a in range(N * m):
-                left = terminal[i, j] * by_inputs[N, i, a]
-                f[a] += left * gap[j]
-                for b in range(a + 1):
-                    H[a, b] += left * by_inputs[N, j, b]
-    for a in range(N * m):
+            cost[i] += terminal[i, j] * (nodes[N, j] - x_ref[j])
+            for a in range(count):
+                by_end[i, a] += terminal[i, j] * by_inputs[N, j, a]
+    for k in range(N - 1, -1, -1):
+        width = k * m
+        for j in range(m):
+            own = width + j
+            f[own] = g[n + j, k]
+            for i in range(m):
+                weight = lengths[k] * R[j, i]
+                f[own] += weight * (u[k, i] - u_ref[i])
+                if i <= j:
+                    H[own, width + i] = weight + M[n + j, n + i, k]
+            for i in range(n):
+                by_input, across = X[1 + n + j, i, k], M[n + j, i, k]
+                f[own] += by_input * cost[i] + across * gap[i, k]
+                for a in range(own + 1):
+                    H[own, a] += by_input * by_end[i, a]
+                for a in range(width):
+                    H[own, a] += across * by_inputs[k, i, a]
+        for i in range(n):
+            before[i] = g[i, k]
+            for a in range(width):
+                by_before[i, a] = 0.0
+            for j in range(n):
+                by_node, here = X[1 + i, j, k], M[max(i, j), min(i, j), k]
+                before[i] += by_node * cost[j] + here * gap[j, k]
+                for a in range(width):
+                    by_before[i, a] += by_node * by_end[j, a] + here * by_inputs[k, j, a]
+        cost, before, by_end, by_before = before, cost, by_before, by_end
+    for a in range(count):
         for b in range(a):
             H[b, a] = H[a, b]
     return math.isfinite(total), nodes, by_inputs, H, f

@@ -40,7 +40,7 @@ def _matrix(numbers: Array, start: int, rows: int, columns: int) -> Array:
 
 
 @inner
-def _widths(sizes: NDArray[np.int64]) -> tuple[int, int]:
+def widths(sizes: NDArray[np.int64]) -> tuple[int, int]:
     """Return the width of the last hidden layer, and where what follows the layers begins."""
     width, start, before = 0, 0, sizes[N_X]
     for layer in range(WIDTHS, len(sizes)):
@@ -54,7 +54,7 @@ def _widths(sizes: NDArray[np.int64]) -> tuple[int, int]:
 def matrices(sizes: NDArray[np.int64], numbers: Array) -> tuple[Array, Array, Array, Array]:
     """Return A, B, the slope of the pre-feedback and the read-out of a layout."""
     n, m, n_z = sizes[N_X], sizes[N_U], sizes[N_Z]
-    width, start = _widths(sizes)
+    width, start = widths(sizes)
     start += width * (1 + n_z)
     A = _matrix(numbers, start, n_z, n_z)
     start += n_z * n_z
@@ -65,7 +65,7 @@ def matrices(sizes: NDArray[np.int64], numbers: Array) -> tuple[Array, Array, Ar
 
 
 @inner
-def _squash(a: Array, width: int, scale: NDArray[np.int64]) -> None:
+def squash(a: Array, width: int, scale: NDArray[np.int64]) -> None:
     """
     Turn so many numbers into their tanh = (e - 1) / (e + 1) with e = exp(2 |a|) = 2^k exp(r).
 
@@ -119,7 +119,7 @@ def room(sizes: NDArray[np.int64], curved: bool
 def free_room(sizes: NDArray[np.int64]) -> tuple[Array, Array, Array, Array]:
     """Return room for :func:`free`: rows of z, rows of states, two rows of the layer, J_N."""
     n, n_z = sizes[N_X], sizes[N_Z]
-    width, _ = _widths(sizes)
+    width, _ = widths(sizes)
     return np.empty((3, n_z)), np.empty((n + 1, n)), np.empty((2, width)), np.empty((n_z, n))
 
 
@@ -168,7 +168,7 @@ def hidden_into(sizes: NDArray[np.int64], numbers: Array, x: Array, h: Array, be
                     bend = U_before[k, j]
                     for i in range(width):
                         U[k, i] += numbers[row + i] * bend
-        _squash(h, width, scale)
+        squash(h, width, scale)
         if curved:
             for k in range(n):
                 for j in range(n):
@@ -239,7 +239,7 @@ def secants(sizes: NDArray[np.int64], numbers: Array, x: Array, x_ref: Array, w:
 @inner
 def output_of(sizes: NDArray[np.int64], numbers: Array) -> Array:
     """Return the output (n_z, h) of a layout."""
-    width, start = _widths(sizes)
+    width, start = widths(sizes)
     return _matrix(numbers, start + width, sizes[N_Z], width)
 
 

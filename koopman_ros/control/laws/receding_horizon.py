@@ -15,12 +15,14 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from koopman_ros.arrays import Array, frozen
+from koopman_ros.arrays import Array
 from koopman_ros.control.laws.base import Figures, LawResult, Plan, Target, Tuning
+from koopman_ros.control.laws.intervals import Intervals
 from koopman_ros.control.laws.riccati import feedback, regulator, StateDependentRiccati
 from koopman_ros.control.laws.shooting import Horizon, program, slope_at
 from koopman_ros.control.limits import finite, InputLimits
 from koopman_ros.estimation import Estimate
+from koopman_ros.lapack import lapack
 from koopman_ros.lifting import LiftedModel
 from koopman_ros.reasons import Code, Reason, reason
 from koopman_ros.solvers import RiccatiStatus, runge_kutta_step
@@ -128,10 +130,12 @@ class RecedingHorizon:
         if not finite(wanted):
             return LawResult(None, reason(Code.COMMAND_NOT_FINITE))
         within = limits.within(wanted)
-        room = np.minimum(within - limits.lower, limits.upper - within)
-        return LawResult(within, None, Figures('planned'), (u, x, problem.lengths),
-                         problem.plan(u, x),
-                         clipped=bool((room <= _EDGE * self.model.inputs.scale).any()))
+        clipped = any(min(value - lower, upper - value) <= _EDGE * scale
+                      for value, (lower, upper, _), scale in zip(
+                          within.tolist(), limits.each, self.model.inputs.scale.tolist(),
+                          strict=True))
+        return LawResult(within, None, Figures('planned'), (u, x, problem.intervals.lengths),
+                         problem.plan(u, x), clipped=clipped)
 
     def lengths(self, interval: float) -> Array:
         """
@@ -141,12 +145,16 @@ class RecedingHorizon:
 
         :param interval: between samples, in the model's time unit.
         """
-        return self._lengths(interval)
+        return self.intervals(interval).lengths
+
+    def intervals(self, interval: float) -> Intervals:
+        """Return the same with what follows from it."""
+        return self._intervals(interval)
 
     @cached_property
-    def _lengths(self) -> Any:
+    def _intervals(self) -> Any:
         @lru_cache(maxsize=8)
-        def of(interval: float) -> Array:
+        def of(interval: float) -> Intervals:
             A, weights = self._slope, self.tuning.weights
             found = regulator(self.model, A, self.model.B, weights.Q, weights.R,
                               interval=interval, max_gain=self.tuning.max_gain,
@@ -159,10 +167,9 @@ class RecedingHorizon:
             if growing > 0.0:
                 horizon = min(horizon, _UNSTABLE / growing)
             count = int(min(max(math.ceil(horizon / interval), _FEWEST), _INTERVALS))
-            lengths = interval * _growth(count, horizon / interval) ** np.arange(count)
             # where there are faster modes than those that make it long, it ends sooner
             longest = max(interval, _STEPS * _STEP / self.fastest if self.fastest else math.inf)
-            return frozen(np.minimum(lengths, longest), 'intervals', (count,))
+            return Intervals.reaching(horizon, interval, count, longest)
 
         return of
 
@@ -208,29 +215,26 @@ class RecedingHorizon:
         """Rate of the fastest mode of the drift at the nominal point, in 1/time unit."""
         return _fastest(self._slope)
 
+    @cached_property
+    def bounds(self) -> tuple[Array, Array, list[tuple[int, float, float]]]:
+        """Lowest and highest states (n_x,), and both of each one that has any, by its place."""
+        lowest, highest = (bound if len(bound) else np.full(self.model.n_x, none)
+                           for bound, none in ((self.tuning.state_lower, -math.inf),
+                                               (self.tuning.state_upper, math.inf)))
+        return lowest, highest, [
+            (i, low, high) for i, (low, high) in enumerate(zip(
+                lowest.tolist(), highest.tolist(), strict=True))
+            if math.isfinite(low) or math.isfinite(high)]
+
 
 def _fastest(slope: Array) -> float:
     """Return the rate of the fastest mode of a slope (n_x, n_x) of the drift."""
-    if not np.isfinite(slope).all():
+    if not finite(slope.ravel()):
         raise np.linalg.LinAlgError('the drift has no slope here')
-    return float(np.max(np.abs(np.linalg.eigvals(slope))))
-
-
-def _growth(count: int, total: float) -> float:
-    """Return g >= 1 with 1 + g + ... + g^(count - 1) = total; 1 where that is less than count."""
-    # beside 1 nothing is left of g - 1
-    if total <= count * (1.0 + 1e-9) or count < 2:
-        return 1.0
-    low, high = 1.0, 2.0
-    while (high ** count - 1.0) / (high - 1.0) < total:
-        high *= 2.0
-    for _ in range(60):
-        middle = 0.5 * (low + high)
-        if (middle ** count - 1.0) / (middle - 1.0) < total:
-            low = middle
-        else:
-            high = middle
-    return high
+    real, imaginary, _, _, info = lapack.dgeev(slope, compute_vl=0, compute_vr=0)
+    if info != 0:
+        raise np.linalg.LinAlgError('the slope of the drift has no eigenvalues')
+    return max(map(math.hypot, real.tolist(), imaginary.tolist()))
 
 
 class _Problem:
@@ -242,21 +246,24 @@ class _Problem:
         self._law, self._model, self._target = law, model, target
         self._x, self._w = estimate.x, estimate.w
         self._sample = interval / model.seconds_per_time_unit
-        self.lengths = law.lengths(self._sample)
+        self.intervals = law.intervals(self._sample)
+        lengths = self.intervals.lengths
         at_target, terminal = law.at_target(target, self._sample)
         rate = max(law.fastest, at_target, _fastest(slope_at(model, estimate.x)))
-        self._steps = min(max(math.ceil(self.lengths[-1] * rate / _STEP), 1), _MOST_STEPS)
+        self._steps = min(max(math.ceil(lengths[-1] * rate / _STEP), 1), _MOST_STEPS)
         weights = tuning.weights
-        self._horizon = Horizon(estimate.x, estimate.w, target.x, target.u, self.lengths,
+        self._horizon = Horizon(estimate.x, estimate.w, target.x, target.u, lengths,
                                 self._steps, weights.Q, weights.R, terminal)
+        self._last = None if last is None else model.inputs.to_deviation(last)
         self._lower = np.maximum(model.inputs.to_deviation(limits.lower), -_UNLIMITED)
         self._upper = np.minimum(model.inputs.to_deviation(limits.upper), _UNLIMITED)
         # what an input may change from one interval to the next, (N, n_u): the first since the
         # last command
-        reach = limits.rate * model.seconds_per_time_unit / model.inputs.scale
-        before = np.concatenate(([self._sample], self.lengths[:-1]))
-        self._change = before[:, None] * reach
-        self._last = None if last is None else model.inputs.to_deviation(last)
+        self._change = self.intervals.before * (
+            limits.rate * model.seconds_per_time_unit / model.inputs.scale)
+        # at first nothing was commanded
+        self._rows, self._chosen = _differences(
+            len(lengths), tuple(map(math.isfinite, self._change[0].tolist())), last is None)
 
     # Where to begin.
 
@@ -267,24 +274,16 @@ class _Problem:
             case (np.ndarray() as u, np.ndarray() as x, np.ndarray() as lengths) if (
                     u.shape == (len(lengths), self._model.n_u)
                     and x.shape == (len(lengths) + 1, self._model.n_x)):
-                return self._shifted(u, x, lengths)
+                inputs, nodes = self.intervals.shifted(u, x, lengths)
+                nodes[0] = self._x
+                return inputs, nodes
         return self._rolled_out()
-
-    def _shifted(self, u: Array, x: Array, lengths: Array) -> tuple[Array, Array]:
-        old = np.concatenate(([0.0], np.cumsum(lengths)))
-        new = self._sample + np.concatenate(([0.0], np.cumsum(self.lengths)))
-        # the input that held in the middle of each interval
-        held = np.searchsorted(old[1:], 0.5 * (new[1:] + new[:-1]))
-        inputs = u[np.minimum(held, len(u) - 1)]
-        nodes = np.stack([np.interp(new, old, x[:, i]) for i in range(x.shape[1])], axis=1)
-        nodes[0] = self._x
-        return inputs, nodes
 
     def _rolled_out(self) -> tuple[Array, Array]:
         """Follow the model under the law of the Riccati equation, limited."""
         model, target, tuning = self._model, self._target, self._law.tuning
         x, last, inputs, nodes = self._x, self._last, [], [self._x]
-        for length, change in zip(self.lengths.tolist(), self._change, strict=True):
+        for length, change in zip(self.intervals.lengths.tolist(), self._change, strict=True):
             found = feedback(model, x, target, tuning.weights, interval=length,
                              max_gain=tuning.max_gain, max_residual=tuning.max_residual)
             u = found.u if found.solved and finite(found.u) else target.u
@@ -298,8 +297,8 @@ class _Problem:
             nodes.append(x)
             if not (finite(x) and float(model.distances(x[None])[0]) < _ASTRAY):
                 # the straight way is as good a guess
-                share = np.linspace(0.0, 1.0, len(self.lengths) + 1)[:, None]
-                return (np.tile(target.u, (len(self.lengths), 1)),
+                share = np.linspace(0.0, 1.0, len(self._change) + 1)[:, None]
+                return (np.tile(target.u, (len(self._change), 1)),
                         self._x + share * (target.x - self._x))
         return np.array(inputs), np.array(nodes)
 
@@ -318,72 +317,70 @@ class _Problem:
         rows, lower, upper, sense = self._limits(u, nodes, by_inputs)
         v, _, flag, _ = self._law._solve(found.H, found.f, rows, upper, lower, sense)
         v = np.asarray(v, dtype=np.float64)
-        if flag not in _SOLVED or not np.isfinite(v).all():
+        change = float(np.abs(v).max())
+        if flag not in _SOLVED or not math.isfinite(change):
             return reason(Code.PLAN_NOT_SOLVED, flag=f'the solver says {flag}')
-        return (float(np.max(np.abs(v))), u + v.reshape(u.shape),
-                nodes + (by_inputs @ v))
+        moved = by_inputs.reshape(-1, len(v)).dot(v)
+        return change, u + v.reshape(u.shape), nodes + moved.reshape(nodes.shape)
 
     def plan(self, u: Array, x: Array) -> Plan:
         """Return inputs (N, n_u) and nodes (N + 1, n_x) in their units, and what limits them."""
-        model, tuning, first = self._model, self._law.tuning, u[0]
+        model, first = self._model, u[0]
         step = np.zeros_like(first) if self._last is None else first - self._last
         fastest = self._change[0] - _EDGE
-        lowest, highest = (bound if len(bound) else np.full(model.n_x, none) for bound, none in (
-            (tuning.state_lower, -math.inf), (tuning.state_upper, math.inf)))
-        seconds = np.cumsum(self.lengths) * model.seconds_per_time_unit
+        lowest, highest, _ = self._law.bounds
         return Plan(
-            np.concatenate(([0.0], seconds)), model.states.to_physical(x),
+            self.intervals.times * model.seconds_per_time_unit, model.states.to_physical(x),
             model.inputs.to_physical(u),
             _side(first <= self._lower + _EDGE, first >= self._upper - _EDGE),
             _side(step <= -fastest, step >= fastest),
-            _side(np.min(x[1:], axis=0) <= lowest + _TOUCH,
-                  np.max(x[1:], axis=0) >= highest - _TOUCH))
+            _side(np.minimum.reduce(x[1:]) <= lowest + _TOUCH,
+                  np.maximum.reduce(x[1:]) >= highest - _TOUCH))
 
     def _limits(self, u: Array, nodes: Array, by_inputs: Array
                 ) -> tuple[Array, Array, Array, NDArray[np.int32]]:
         """Return rows A with lower <= (v, A v) <= upper, and what of that is soft."""
-        N, n_u = u.shape
-        last = self._last
-        lower, upper = np.tile(self._lower, (N, 1)), np.tile(self._upper, (N, 1))
-        if last is not None:
+        last, lower, upper = self._last, self._lower, self._upper
+        limited = len(self._chosen) > 0
+        if last is not None and limited:
             # what a range that was tightened since has left outside comes back at its rate
             reach = np.cumsum(self._change, axis=0)
             lower = np.minimum(lower, last + reach)
             upper = np.maximum(upper, last - reach)
-        rows, low, high = [], [(lower - u).ravel()], [(upper - u).ravel()]
-        limited = np.isfinite(self._change[0])
-        if limited.any():
-            D = _differences(N, n_u)
-            before = np.concatenate((u[:1] if last is None else last[None], u[:-1]))
-            step = (u - before).ravel()
-            chosen = np.tile(limited, N)
-            if last is None:
-                # at first nothing was commanded
-                chosen[:n_u] = False
-            change = self._change.ravel()
-            rows.append(D[chosen])
-            low.append((-change - step)[chosen])
-            high.append((change - step)[chosen])
-        sense = [np.zeros(sum(map(len, low)), dtype=np.int32)]
-        tuning = self._law.tuning
-        for i, (least, most) in enumerate(zip(
-                tuning.state_lower.tolist(), tuning.state_upper.tolist(), strict=True)):
-            if math.isfinite(least) or math.isfinite(most):
-                rows.append(by_inputs[1:, i])
-                low.append(np.maximum(least - nodes[1:, i], -_UNLIMITED))
-                high.append(np.minimum(most - nodes[1:, i], _UNLIMITED))
-                sense.append(np.full(N, _SOFT, dtype=np.int32))
-        matrix = np.concatenate(rows) if rows else np.zeros((0, N * n_u))
-        return (np.ascontiguousarray(matrix), np.concatenate(low), np.concatenate(high),
-                np.concatenate(sense))
+        rows, low, high = [self._rows], [(lower - u).ravel()], [(upper - u).ravel()]
+        if limited:
+            step = u.copy()
+            step[1:] -= u[:-1]
+            step[0] -= u[0] if last is None else last
+            step, change = step.ravel()[self._chosen], self._change.ravel()[self._chosen]
+            low.append(-change - step)
+            high.append(change - step)
+        hard = u.size + len(self._chosen)
+        for i, least, most in self._law.bounds[2]:
+            rows.append(by_inputs[1:, i])
+            low.append(np.maximum(least - nodes[1:, i], -_UNLIMITED))
+            high.append(np.minimum(most - nodes[1:, i], _UNLIMITED))
+        sense = np.zeros(sum(map(len, low)), dtype=np.int32)
+        sense[hard:] = _SOFT
+        return np.concatenate(rows), np.concatenate(low), np.concatenate(high), sense
 
 
 @lru_cache(maxsize=8)
-def _differences(N: int, n_u: int) -> Array:
-    """Return (N n_u, N n_u) of the change of each input from the interval before."""
-    found = np.eye(N * n_u) - np.eye(N * n_u, k=-n_u)
-    found.setflags(write=False)
-    return found
+def _differences(N: int, limited: tuple[bool, ...], first: bool) -> tuple[Array, NDArray[np.intp]]:
+    """
+    Return rows of the change of each limited input from the interval before, and their places.
+
+    :param first: whether there is none for the first interval.
+    :return: (rows, N n_u) and (rows,) of N n_u.
+    """
+    n_u = len(limited)
+    chosen = np.tile(limited, N)
+    if first:
+        chosen[:n_u] = False
+    places = np.flatnonzero(chosen)
+    rows = (np.eye(N * n_u) - np.eye(N * n_u, k=-n_u))[places]
+    rows.setflags(write=False)
+    return rows, places
 
 
 def _side(lower: NDArray[np.bool_], upper: NDArray[np.bool_]) -> Array:
