@@ -94,7 +94,7 @@ def test_a_model_is_learned_read_about_compared_and_takes_over(tmp_path: Path) -
                 int(value(status, 'messages on /temperature')) > MEASUREMENTS))
             # what follows needs a loop, and no quick one
             assert quick.stop() == 0
-            ros.start('plant', {**plant, 'speed': 5.0, 'start_time': 10_000.0})
+            ros.start('plant', {**plant, 'speed': 2.0, 'start_time': 10_000.0})
             press(recording, 'Stop')
             expect(recording).to_contain_text('not recording', timeout=PATIENCE)
             press(training, 'Train')
