@@ -68,7 +68,7 @@ def test_a_model_is_learned_read_about_compared_and_takes_over(tmp_path: Path) -
         # one that passes all models: what the old one predicts is off by as much as the jacket is
         ros.start('controller', {'model_check_factor': 0.0})
         ros.start('trainer', {
-            'model_coordinates': 2, 'training_starts': 1, 'record_at_start': False,
+            'model_class': 'polynomial', 'training_starts': 1, 'record_at_start': False,
             'output': tmp_path / 'run.mcap', 'model_output': new, 'min_free_disk': 0.0,
             'experiment_on': 'setpoint', 'experiment_length': 900.0,
             'experiment_shortest_hold': 20.0, 'experiment_longest_hold': 60.0,
