@@ -8,11 +8,14 @@ from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import Future
 from dataclasses import dataclass
 from functools import partial
+import gc
+import importlib
 import math
 from pathlib import Path
 import sys
 import threading
 import time
+from types import ModuleType
 from typing import Any
 
 from builtin_interfaces.msg import Time
@@ -68,6 +71,7 @@ _SERVICES = {'reload': (CONTROLLER, 'reload_model'), 'train': (TRAINER, 'train')
              'record': (TRAINER, 'record'), 'experiment': (TRAINER, 'experiment')}
 _TRAINING, _RECORDING = 'trainer: training', 'trainer: recording'
 _NOTED = ('acknowledge', 'shelve', 'unshelve')  #: done already, in the pages
+_UNUSED = ('aiohttp', 'tornado')  #: packages that the pages leave alone
 _SWITCHES = ('automatic', 'record', 'experiment')  #: those that take a yes or no
 
 
@@ -138,7 +142,8 @@ class PanelNode(LoopNode):
         self._wake = self.create_guard_condition(self._on_asked)
         wall_timer(self, _PERIOD, self._on_tick)
         wall_timer(self, _LOOK, self._on_look)
-        wall_timer(self, _SENDING, self._on_sending)
+        self._sending = wall_timer(self, _SENDING, self._on_sending)
+        self._sending.cancel()
         try:
             self._server = self._serve()
         except BaseException:
@@ -163,15 +168,15 @@ class PanelNode(LoopNode):
 
     def _serve(self) -> Any:
         try:
-            # other programs do without
-            from koopman_ros.panel.server import PanelServer
+            serving = _imported_server()
         except ImportError as error:
             raise ConfigurationError(
                 f'the panel needs {error.name}, which is missing: '
                 "pip install 'koopman_ros[panel]'") from error
         settings = self.settings
-        server = PanelServer(self, settings.host, settings.port, settings.users,
-                             settings.tls_certificate, settings.tls_key)
+        server = serving.PanelServer(
+            self, settings.host, settings.port, settings.users, settings.tls_certificate,
+            settings.tls_key)
         server.start()
         return server
 
@@ -374,6 +379,7 @@ class PanelNode(LoopNode):
             reply(answer)
 
         self._letters.append(letter)
+        self._sending.reset()
         self._requests.add(SETPOINT if setpoint else MANUAL, action.name,
                            float(back(float(there(value)))), now, answered)
 
@@ -389,6 +395,9 @@ class PanelNode(LoopNode):
                     letter.publisher.topic_name):
                 letter.outlet.send(np.array([letter.value]), Time(), 'panel')
                 letter.due = now + _REPEAT
+        if not self._letters:
+            # until there is one again
+            self._sending.cancel()
 
     def _refusal(self, codes: Sequence[str], name: str, value: float) -> str:
         """Write why a set-point is refused, where all that the sentence needs is known here."""
@@ -405,6 +414,27 @@ class PanelNode(LoopNode):
     def _status(self) -> Status:
         return Status(Level.OK, f'{self._server.pages} pages open', {
             'address': self._server.address, 'pages': self._server.pages})
+
+
+def _imported_server() -> ModuleType:
+    """
+    Import what serves the pages, which other programs do without.
+
+    A third of its time would go into HTTP clients that it takes along where they are installed,
+    and that nobody here uses, and into looking through what is imported for garbage.
+    """
+    absent = [name for name in _UNUSED if name not in sys.modules]
+    # as if they were not installed
+    sys.modules.update(dict.fromkeys(absent))  # type: ignore[arg-type]
+    collecting = gc.isenabled()
+    gc.disable()
+    try:
+        return importlib.import_module('koopman_ros.panel.server')
+    finally:
+        for name in absent:
+            del sys.modules[name]
+        if collecting:
+            gc.enable()
 
 
 def _about(model: LiftedModel) -> dict[str, str]:

@@ -68,7 +68,7 @@ def test_a_model_is_learned_read_about_compared_and_takes_over(tmp_path: Path) -
         # one that passes all models: what the old one predicts is off by as much as the jacket is
         ros.start('controller', {'model_check_factor': 0.0})
         ros.start('trainer', {
-            'model_coordinates': 2, 'training_starts': 1, 'record_at_start': False,
+            'model_class': 'polynomial', 'training_starts': 1, 'record_at_start': False,
             'output': tmp_path / 'run.mcap', 'model_output': new, 'min_free_disk': 0.0,
             'experiment_on': 'setpoint', 'experiment_length': 900.0,
             'experiment_shortest_hold': 20.0, 'experiment_longest_hold': 60.0,
@@ -94,7 +94,7 @@ def test_a_model_is_learned_read_about_compared_and_takes_over(tmp_path: Path) -
                 int(value(status, 'messages on /temperature')) > MEASUREMENTS))
             # what follows needs a loop, and no quick one
             assert quick.stop() == 0
-            ros.start('plant', {**plant, 'speed': 5.0, 'start_time': 10_000.0})
+            ros.start('plant', {**plant, 'speed': 2.0, 'start_time': 10_000.0})
             press(recording, 'Stop')
             expect(recording).to_contain_text('not recording', timeout=PATIENCE)
             press(training, 'Train')

@@ -132,7 +132,6 @@ def test_a_program_that_has_ended_leaves_without_taking_down_what_it_holds(tmp_p
 
 # What happens at the end of a plant that gets a signal as it starts, and its last words.
 ENDS = {
-    'nothing': ('', r'.*'),
     # each signal is heard, by a thread, before the next one
     'signals one after the other': (
         'kill = os.kill\n'
@@ -144,11 +143,11 @@ ENDS = {
         '        kill(*own)\n'
         'late = Late()\n', r'.*'),
     'a middleware that hangs': (
-        'process._TAKE_DOWN_PATIENCE = 0.3\n'
+        'process.take_down.__defaults__ = (0.3,)\n'
         'PlantNode.destroy_node = lambda _: time.sleep(3600.0)\n',
         r'.*plant: the middleware does not shut down: left to the operating system\n'),
     'a middleware that hangs with the lock held': (
-        'process._TAKE_DOWN_PATIENCE, startup._LATER = 0.1, 0.1\n'
+        'process.take_down.__defaults__, startup._LATER = (0.1,), 0.1\n'
         'def destroy_node(self):\n'
         '    ctypes.PyDLL(None).sleep(3600)\n'
         'PlantNode.destroy_node = destroy_node\n', r'.*in destroy_node.*'),
