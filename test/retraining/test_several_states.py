@@ -40,7 +40,7 @@ INPUTS = tuple(RecordedInput(name, 'V', Place('/pumps', ARRAY, f'data[{k}]', 'mV
 
 
 def write_tanks(path, seconds=1000.0):
-    """Write a quarter of an hour of the tanks under random steps of both pumps, a sample a second."""
+    """Write a quarter of an hour of the tanks under random steps of both pumps, at 1 Hz."""
     serialize = importlib.import_module('rclpy.serialization').serialize_message
     joints = importlib.import_module('sensor_msgs.msg').JointState(name=list(TANKS.state_names))
     pumps = importlib.import_module('std_msgs.msg').Float64MultiArray()
