@@ -95,8 +95,8 @@ class Equations(Drift):
 
     def scaled_rate(self, xi: Array, v: Array) -> Array:
         """Evaluate the rate in deviations as :class:`Drift` has it."""
-        rate: Array = _rate(self._system, *self._own(xi, v))[..., self._back] * self._pace
-        return rate
+        rate: Array = _rate(self._system, *self._own(xi, v)).take(self._back, axis=-1)
+        return rate * self._pace
 
     def rates(self, xi: Array, v: Array, S: Array) -> tuple[Array, Array]:
         """Evaluate rates of states and, by central differences in the angles, of sensitivities."""
@@ -107,7 +107,7 @@ class Equations(Drift):
         dS = self.scaled_slope(xi, v) @ S
         for j, (ahead, behind) in enumerate(self._beside):
             change = _rate(ahead, x, u) - _rate(behind, x, u)
-            dS[..., j] += change[..., self._back] * (self._pace / (2.0 * _DIFFERENCE))
+            dS[..., j] += change.take(self._back, axis=-1) * (self._pace / (2.0 * _DIFFERENCE))
         return rate, dS
 
     def scaled_slope(self, xi: Array, v: Array | None = None) -> Array:
@@ -170,8 +170,8 @@ class Equations(Drift):
 
     def _own(self, xi: Array, v: Array) -> tuple[Array, Array]:
         """Return states and inputs as the class has them."""
-        return (self.box.states.to_physical(xi)[..., self._states],
-                self.box.inputs.to_physical(v)[..., self._inputs])
+        return (self.box.states.to_physical(xi).take(self._states, axis=-1),
+                self.box.inputs.to_physical(v).take(self._inputs, axis=-1))
 
 
 def _rate(system: ControlAffineSystem, x: Array, u: Array) -> Array:

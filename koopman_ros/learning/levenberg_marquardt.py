@@ -100,6 +100,8 @@ def normal_equations(residuals: Residuals, theta: Tensor, *, derivatives: bool =
     return equations
 
 
+# derivatives come with the residuals, so that torch need not take note of anything
+@torch.inference_mode()
 def minimise(residuals: Residuals, theta: Tensor, *, max_iterations: int,
              tolerance: float = 1e-3, patience: int = PATIENCE,
              monitor: Callable[[int, float], bool] | None = None) -> Minimum:

@@ -124,12 +124,14 @@ def _roll_out(task: Task, inputs: Array, K: Array, about: Array) -> Course:
 
 def _after_a_period(task: Task, y: Array, u: Array) -> Array:
     """Return states with the cost so far (..., n_x + 1) a period later, u (..., n_u) held."""
-    effort = (u - task.u_ref) ** 2 @ task.R
+    system, effort = task.system, (u - task.u_ref) ** 2 @ task.R
+    held = None if callable(system.B) else system.forcing(y[..., :-1], u)
 
     def rate(y: Array) -> Array:
-        x = y[..., :-1]
-        cost = (x - task.x_ref) ** 2 @ task.Q + effort
-        return np.concatenate([task.system.derivative(x, u), cost[..., None]], axis=-1)
+        x, found = y[..., :-1], np.empty_like(y)
+        found[..., :-1] = system.drift(x) + (system.forcing(x, u) if held is None else held)
+        found[..., -1] = (x - task.x_ref) ** 2 @ task.Q + effort
+        return found
 
     for _ in range(task.substeps):
         y = runge_kutta_step(rate, y, task.period / task.substeps)

@@ -213,7 +213,7 @@ def test_without_the_observer_the_offset_stays():
                                                        (12.0, 0.09, 0.4)])
 def test_bandwidth_trades_noise_for_speed(bandwidth, low, high):
     loop = Reactor(controller(observer_bandwidth=bandwidth / 60.0), noise=0.1)
-    commands = np.array([s.command for s in loop.run(800)[200:]])
+    commands = np.array([s.command for s in loop.run(600)[200:]])
     assert low < np.std(commands) < high
     # the filter adds no offset
     assert abs(np.mean([s.temperature for s in loop.samples[200:]]) - START) < 0.02

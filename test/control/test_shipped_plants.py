@@ -103,7 +103,7 @@ RUNS = {name: (Run(name), limited(name, 10.0))
 
 
 @pytest.mark.parametrize('name', RUNS)
-@settings(max_examples=25, deadline=None, derandomize=True)
+@settings(max_examples=15, deadline=None, derandomize=True)
 @given(slow=st.booleans(), sequence=sequences)
 @np.errstate(all='ignore')
 def test_commands_keep_their_limits_and_follow_from_the_records(name, slow, sequence):
@@ -175,8 +175,8 @@ def test_commands_keep_their_limits_and_follow_from_the_records(name, slow, sequ
 
 
 @pytest.mark.parametrize(('name', 'start', 'goal', 'samples'), [
-    ('two_tanks', None, [0.1, 0.15], 300), ('quadruple_tank', None, [0.15, 0.1], 500),
-    ('two_state_example', [0.2, 0.2], [0.0, 0.0], 700)])
+    ('two_tanks', None, [0.1, 0.15], 250), ('quadruple_tank', None, [0.15, 0.1], 400),
+    ('two_state_example', [0.2, 0.2], [0.0, 0.0], 600)])
 def test_what_the_sequences_are_about_is_reached(name, start, goal, samples):
     """The plant is led to a set-point under a rate; one signal that is no number is refused."""
     run = RUNS[name][True]

@@ -26,7 +26,7 @@ from koopman_ros.identification import (
     weak_form,
 )
 from koopman_ros.identification.output_error import _Filter, _Problem, Weights
-from koopman_ros.identification.regression import _input_integral, smoothed
+from koopman_ros.identification.regression import _input_integral, _smoothed, smoothed
 from koopman_ros.learning.levenberg_marquardt import normal_equations
 from koopman_ros.plant_data import cut, Episode
 from koopman_ros.solvers import runge_kutta_step
@@ -288,6 +288,16 @@ def test_smoothing_takes_away_noise_alone():
     found = smoothed(t, true + sigma * rng.standard_normal(true.shape))
     # two thirds of the noise go; what is taken away has its size (discrepancy principle)
     assert np.all(np.sqrt(np.mean((found - true) ** 2, axis=0)) < sigma / 3.0)
+
+
+def test_records_that_are_smoothed_at_once_do_not_touch_each_other():
+    rng, records = np.random.default_rng(0), []
+    for count, level in ((40, 0.0), (25, 30.0), (60, -5.0)):
+        t = np.cumsum(rng.uniform(0.05, 0.15, count))
+        records.append((t, np.column_stack([level + np.sin(t) + 0.02 * rng.standard_normal(count),
+                                            np.ones(count)])))
+    for found, (t, values) in zip(_smoothed(records), records, strict=True):
+        np.testing.assert_allclose(found, smoothed(t, values), rtol=0.0, atol=1e-5)
 
 
 def test_smoothing_of_a_parabola_finds_it_and_leaves_what_has_no_noise():

@@ -169,8 +169,8 @@ def test_degenerate_records(records, words):
 def test_degrees_are_as_many_as_an_hour_determines(n_x, highest):
     plant = replace(PAIR.plant, state_names=tuple(map(str, range(n_x))), state_units=('m',) * n_x,
                     nominal_state=np.zeros(n_x))
-    run = PAIR.excited(800, 0.1)
-    run = replace(run, x=np.random.default_rng(0).standard_normal((800, n_x)))
+    run = PAIR.excited(400, 0.1)
+    run = replace(run, x=np.random.default_rng(0).standard_normal((400, n_x)))
     with pytest.raises(Stopped):
         identify(plant, [run], watch=lambda _, total, __: total == highest + 1)
 

@@ -67,9 +67,10 @@ def start(ros: Harness, overlay: Installation, command: tuple[str, tuple[str, ..
         str(overlay.executables / node)))
 
 
-def train(ros: Harness, overlay: Installation, command: tuple[str, tuple[str, ...]]) -> Any:
+def train(ros: Harness, overlay: Installation, command: tuple[str, tuple[str, ...]],
+          setting: str) -> Any:
     """Train as the page has it; return the errors of the lift and of the linear model, in K."""
-    process = start(ros, overlay, command, '-p', 'training_starts:=1')
+    process = start(ros, overlay, command, '-p', setting)
     assert ros.wait_for_end(process) == 0, process.output()
     said = re.search(ACCEPTED, process.output())
     assert said, process.output()
@@ -92,7 +93,7 @@ def recorded(overlay: Installation, folder: Path, tmp_path_factory: pytest.TempP
 
 def test_first_lift_is_accepted_and_brings_the_oven_to_its_set_point(
         overlay: Installation, folder: Path, recorded: Path, ros: Harness) -> None:
-    lift, linear = train(ros, overlay, TRAIN)
+    lift, linear = train(ros, overlay, TRAIN, 'training_starts:=1')
     # the noise of the sensor is 0.2 K
     assert lift < 0.25 < 1.0 < linear
     model = load(folder / 'oven.safetensors')
@@ -142,7 +143,7 @@ def write_day(recorded: Path, bag: Path) -> None:
 def test_bag_of_other_topics_is_trained_from_and_its_lift_controls_them(
         overlay: Installation, folder: Path, recorded: Path, ros: Harness) -> None:
     write_day(recorded, folder / 'day_1')
-    lift, linear = train(ros, overlay, FROM_BAG)
+    lift, linear = train(ros, overlay, FROM_BAG, 'model_class:=polynomial')
     assert lift < 0.25 < 1.0 < linear
     commands = ros.listen(Float64, '/oven/heater')
     start(ros, overlay, ON_TOPICS)

@@ -22,10 +22,10 @@ from koopman_ros.retraining import (
     retrain,
     Task,
     Thresholds,
-    write_report,
 )
 from koopman_ros.retraining import task as task_module
 from support.known_plants import KnownPlant, methods
+from support.quick_retraining import page_of
 from support.recorded_runs import INPUTS, linear_run, STATES, write_bag
 
 NOISE = 0.01  # m
@@ -233,7 +233,7 @@ def test_classes_side_by_side_in_report_and_summary(bag, tmp_path):
     assert 'heldout_error' not in lift
     linear = figures['classes']['linear']
     assert linear['heldout_error'] == figures['heldout_error']
-    page = write_report(retrained)[1].read_text()
+    page = page_of(retrained)
     rows = [line for line in page.splitlines() if line.split(' | ')[0][2:] in CLASSES]
     assert len(rows) == 5
     assert rows[0].endswith('| chosen |')
@@ -263,7 +263,7 @@ def test_one_class_has_no_lines_beside_others(bag, tmp_path):
 def test_it_is_retrained_where_the_task_says(bag, tmp_path):
     """The same lift comes of it, and what fails writes nothing."""
     models = []
-    for scheduler in ('', 'joblib:2'):
+    for scheduler in ('', 'process'):
         done = retrain(replace(task(bag, tmp_path, 'linear'), scheduler=scheduler))
         models.append(load(done.model_file))
         (tmp_path / 'new.safetensors').unlink()

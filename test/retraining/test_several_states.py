@@ -25,6 +25,7 @@ from koopman_ros.retraining.known import known
 from koopman_ros.units import NANOSECONDS as SECOND
 from koopman_ros.wire import Place
 from support.known_plants import methods
+from support.quick_retraining import page_of
 from support.recorded_runs import NOISE, reactor
 
 JOINTS, ARRAY = 'sensor_msgs/msg/JointState', 'std_msgs/msg/Float64MultiArray'
@@ -38,8 +39,8 @@ INPUTS = tuple(RecordedInput(name, 'V', Place('/pumps', ARRAY, f'data[{k}]', 'mV
                for k, name in ((1, 'pump_2'), (0, 'pump_1')))
 
 
-def write_tanks(path, seconds=1500.0):
-    """Write 25 minutes of the tanks under random steps of both pumps, a sample a second."""
+def write_tanks(path, seconds=1000.0):
+    """Write a quarter of an hour of the tanks under random steps of both pumps, at 1 Hz."""
     serialize = importlib.import_module('rclpy.serialization').serialize_message
     joints = importlib.import_module('sensor_msgs.msg').JointState(name=list(TANKS.state_names))
     pumps = importlib.import_module('std_msgs.msg').Float64MultiArray()
@@ -77,7 +78,7 @@ def retrained(bag, tmp_path_factory):
     save(present, folder / 'present.safetensors')
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(task_module, 'identify',
-                      partial(identify, degrees=(1, 3), methods=methods(20, 40)))
+                      partial(identify, degrees=(1, 3), methods=methods(20)))
         return retrain(Task((str(bag),), str(folder / 'new.safetensors'),
                             str(folder / 'present.safetensors'), STATES, INPUTS, coordinates=4,
                             starts=1))
@@ -92,7 +93,7 @@ def test_lift_of_two_states_and_two_inputs_is_accepted(retrained):
     assert decision.drift_rmse == pytest.approx([LEVEL_NOISE] * 2, rel=0.1)
     assert np.all(decision.rmse < 2.0 * LEVEL_NOISE)
     assert np.all(decision.current_rmse > 10.0 * decision.rmse)
-    assert (retrained.account.measurements, retrained.account.used) == (3000, 3000)
+    assert (retrained.account.measurements, retrained.account.used) == (2000, 2000)
     model = load(retrained.model_file)
     assert (model.states.names, model.inputs.names) == (TANKS.state_names, TANKS.input_names)
     rng = np.random.default_rng(1)
@@ -130,11 +131,11 @@ def test_summary_and_report_name_the_signals(retrained):
 
 @pytest.fixture(scope='module')
 def lagging():
-    """Return half an hour of the reactor behind a lag of 10 s: x, input and command, at 1 s."""
+    """Return twenty minutes of the reactor behind a lag of 10 s: x, input and command, at 1 s."""
     system, rng = reactor(), np.random.default_rng(0)
     process = Process(system, 0, system.nominal_state, system.nominal_input, Actuator(lag=10.0))
     rows, left, level = [], 0, 0.0
-    for k in range(1800):
+    for k in range(1200):
         process = process.until(k * SECOND)
         if left == 0:
             left, level = int(rng.integers(30, 120)), rng.uniform(281.33, 300.55)
@@ -154,7 +155,7 @@ def learned_errors(lagging, measured):
                       (True,) if measured else ())
     plant = Plant('reactor', ('temperature',), ('K',), ('coolant',), ('K',), 'min',
                   system.nominal_state, system.nominal_input, None)
-    found = identify(plant, [episode], degrees=(1, 3), methods=methods(20, 40)).drift
+    found = identify(plant, [episode], degrees=(1, 3), methods=methods(40)).drift
     states = np.linspace(308.0, 320.0, 25)[:, None]
     u = np.full((25, 1), 288.0)
     error = np.max(np.abs(found.rate(states, u) - system.derivative(states, u)))
@@ -187,7 +188,7 @@ def test_a_level_that_is_in_no_bag_is_learned_with_the_other(bag, tmp_path, monk
     truth = np.linalg.eigvals(TANKS.drift_jacobian(TANKS.nominal_state)).real
     assert np.sort(modes) == pytest.approx(np.sort(truth), rel=0.25)
     assert found.decision.rmse[0] < 2.0 * LEVEL_NOISE
-    page = next(path for path in write_report(found) if path.suffix == '.md').read_text()
+    page = page_of(found)
     assert 'of the next measurement foreseen' in page
     assert 'innovations form, 1 state not measured' in page
 
@@ -223,7 +224,7 @@ def test_constants_are_in_summary_report_and_diagnostics(by_equations):
         assert abs(one['value'] - getattr(own, name)) < 3.5 * one['standard_error']
         assert scalars(figures)[f'constant {name}'] == one['text']
     assert constant_lines(figures)['orifice_1'].endswith('m^2')
-    page = next(path for path in write_report(by_equations) if path.suffix == '.md').read_text()
+    page = page_of(by_equations)
     for words in ('| constant | unit | estimate | standard error |', '| pump_gain | m^3/(s V) |',
                   'of the next measurement foreseen'):
         assert words in page

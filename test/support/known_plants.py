@@ -4,6 +4,7 @@
 """Plants whose drift is a known polynomial, and records of them by an independent integrator."""
 
 from dataclasses import dataclass
+import math
 
 import numpy as np
 from scipy.integrate import solve_ivp
@@ -66,11 +67,25 @@ class KnownPlant:
             if len(stops) == 1:
                 found[rows] = x
                 continue
-            path = solve_ivp(lambda _, y, held=held: self.rate(y, held), (begin, end), x,
-                             method='DOP853', rtol=1e-11, atol=1e-13, t_eval=stops).y.T
+            path = solve_ivp(self._under(held), (begin, end), x, method='DOP853', rtol=1e-11,
+                             atol=1e-13, t_eval=stops).y.T
             found[rows] = path[np.searchsorted(stops, times[rows])]
             x = path[-1]
         return found
+
+    def _under(self, u):
+        """Return the rate of one state under an input: of few numbers, without numpy."""
+        constant = (self.B @ u).tolist()
+        terms = [(c, powers, row) for (*powers, row), c in zip(
+            self.terms, self.coefficients, strict=True)]
+
+        def rate(_, x):
+            found = constant.copy()
+            for c, powers, row in terms:
+                found[row] += c * math.prod(map(pow, x.tolist(), powers))
+            return found
+
+        return rate
 
     def record(self, times, input_time, u, *, x0=None, noise=0.0, seed=0):
         """Return a record with white noise of standard deviation `noise` on each state."""

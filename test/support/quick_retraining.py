@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 The koopman_ros Authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""Retrainings that try few estimates, and judge by few loops."""
+"""Retrainings that try few estimates, and judge by few loops; their pages without a picture."""
 
 from collections.abc import Iterator
 import contextlib
@@ -11,6 +11,7 @@ import pytest
 
 from koopman_ros.retraining import compare_classes, decide
 from koopman_ros.retraining import task as task_module
+from koopman_ros.retraining.report import _sections
 from support.known_plants import methods
 
 
@@ -24,3 +25,8 @@ def quick_retraining(loops: int) -> Iterator[None]:
         patch.setattr(task_module, 'compare_classes', partial(compare_classes, loops=loops))
         patch.setattr(task_module, 'decide', partial(decide, loops=loops))
         yield
+
+
+def page_of(retrained: task_module.Retrained) -> str:
+    """Return what the page of a retraining says; its picture takes half a second to draw."""
+    return '\n\n'.join(map(str, _sections(retrained)))

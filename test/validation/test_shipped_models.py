@@ -21,7 +21,13 @@ from koopman_ros.control import (
 )
 from koopman_ros.learning import fit, roll_out
 from koopman_ros.lifting import load
-from koopman_ros.plants import Process, random_steps, RandomStepDesign, steady_state
+from koopman_ros.plants import (
+    box_episodes,
+    Process,
+    random_steps,
+    RandomStepDesign,
+    steady_state,
+)
 from koopman_ros.plants.optimum import cost_along, linear_law, optimum, Task
 from koopman_ros.resources import model_path
 from validation import saddle
@@ -29,7 +35,6 @@ from validation.paper import reactor
 from validation.paper.reactor import SETPOINT, SYSTEM, training_samples
 from validation.shipped_models import (
     library_system,
-    lift_samples,
     LIFTS,
     main,
     SADDLE,
@@ -212,7 +217,9 @@ def known(name):
     task = Task(system, system.nominal_state if promise.x0 is None else np.array(promise.x0),
                 x_ref, u_ref, np.array(promise.weights), np.ones(system.n_u),
                 promise.period / system.seconds_per_time_unit, promise.samples)
-    return lift_samples(name, 7001), task, optimum(task).cost, linear_law(task).cost
+    lift = LIFTS[name]
+    fresh = box_episodes(system, lift.design, lift.episodes // 3, lift.duration, 7001)
+    return fresh, task, optimum(task).cost, linear_law(task).cost
 
 
 def keeps(name, model):
