@@ -19,7 +19,7 @@ from koopman_ros.compiled.network import matrices, N_U, N_X
 CENTER, SCALE, LOWER, UPPER = range(4)
 HALF, SENSOR_LOWER, SENSOR_UPPER, SENSOR_RATE, JUMP = range(4, 9)
 RATE, BOX_LOWER, BOX_UPPER, BOUND = range(4, 8)
-_FIGURES = 7
+FIGURES = 7  # in what `step` returns, before the arrays
 _MOST_MOVES = 20
 
 
@@ -33,7 +33,7 @@ def step(sizes: NDArray[np.int64], numbers: Array, tuning: Array, states: Array,
     """
     Check and take a measurement, aim, evaluate the law, and bring its command within limits.
 
-    Arguments are those of :meth:`koopman_ros.control.regular.Regular.step`.
+    Arguments are those of :func:`koopman_ros.control.regular.regular_step`.
 
     :return: residual, gain, growth, rate that no input balances, distance of the command from the
         training box, whether range and rate were active; then x, w, what was expected, u_ref, what
@@ -41,7 +41,7 @@ def step(sizes: NDArray[np.int64], numbers: Array, tuning: Array, states: Array,
         is infinite where this is no regular step, or not sure.
     """
     n, m = sizes[N_X], sizes[N_U]
-    found = np.empty(_FIGURES + 4 * n + 3 * m)
+    found = np.empty(FIGURES + 4 * n + 3 * m)
     found[0] = math.inf
     bandwidth, unit, longest = tuning[0], tuning[1], tuning[2]
     if not (elapsed > 0.0 and spacing > 0.0):
@@ -71,7 +71,7 @@ def step(sizes: NDArray[np.int64], numbers: Array, tuning: Array, states: Array,
     if not steps <= _MOST_MOVES:
         return found
     expected = move(sizes, numbers, x, w, acted, duration / steps, int(steps))
-    start = _FIGURES
+    start = FIGURES
     largest = 0.0
     x_now, w_now = measured, np.zeros(n)
     if bandwidth > 0.0:

@@ -5,7 +5,6 @@
 
 from functools import partial
 import math
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -13,13 +12,16 @@ from numpy.typing import NDArray
 from koopman_ros.arrays import Array
 from koopman_ros.compiled import estimation, horizon, laws
 from koopman_ros.compiled import regular as steps
-from koopman_ros.control import regular
 from koopman_ros.control import target as targets
 from koopman_ros.control.laws import base, riccati, shooting
-from koopman_ros.estimation import kalman
+from koopman_ros.control.regular import Answered, Regular
+from koopman_ros.estimation import Estimate, kalman
 from koopman_ros.kernels import Kernels
 from koopman_ros.lifting import LiftedModel
 from koopman_ros.solvers import RiccatiSolution, RiccatiStatus
+
+# The word of an enumeration takes as long as some products.
+_RECENTRED, _AVERAGED = riccati.Form.RECENTRED.value, riccati.Form.AVERAGED.value
 
 
 def _solution(P: Array, K: Array, residual: float, size: float, max_residual: float,
@@ -149,9 +151,31 @@ def _slope_at(model: LiftedModel, x: Array) -> Array | None:
     return found
 
 
-def _step(*arguments: Any) -> Array | None:
-    found: Array = steps.step(*arguments)
-    return found if found[0] < math.inf else None
+def _step(model: LiftedModel, regular: Regular, y: Array, last: Array, before: Estimate,
+          acted: Array, command: Array, known: base.Target, elapsed: float, since: float,
+          seconds: float, spacing: float) -> Answered | None:
+    """Answer with one input and at most two states, of which there is a compiled growth."""
+    layout, recentred = model.layout, riccati.closed(model)
+    n, m = model.n_x, model.n_u
+    if layout is None or m > 1 or n > 2 or not (recentred or model.readout is not None):
+        return None
+    found = steps.step(
+        layout.sizes, layout.numbers, regular.numbers, regular.states, regular.inputs,
+        regular.training, regular.tuning.weights.Q, regular.tuning.weights.R, regular.inverse,
+        np.ascontiguousarray(y), np.ascontiguousarray(last), before.x, before.w, acted, command,
+        known.x, known.z, known.drift, elapsed, since, seconds, spacing, recentred)
+    residual, gain, growth, rest, outside, at_range, at_rate = found[:steps.FIGURES].tolist()
+    if not residual < math.inf:
+        return None
+    found.setflags(write=False)
+    at = steps.FIGURES + 3 * n
+    x, w, expected = found[steps.FIGURES:at - 2 * n], found[at - 2 * n:at - n], found[at - n:at]
+    u, forcing = found[at:at + m], found[at + m:at + m + n]
+    asked, command = found[at + m + n:at + 2 * m + n], found[at + 2 * m + n:]
+    return Answered(
+        Estimate(x, w), expected, base.Target(known.x, known.z, known.drift, u, forcing, rest),
+        base.Figures(_RECENTRED if recentred else _AVERAGED, residual, gain, growth), asked,
+        command, at_range > 0.0, at_rate > 0.0, outside)
 
 
 KERNELS: Kernels = {
@@ -159,4 +183,4 @@ KERNELS: Kernels = {
     'corrected': _corrected, 'equilibrium': _equilibrium,
     'growth': _growth, 'moved': _moved, 'program': _program, 'propagated': _propagated,
     'recentred': partial(_feedback, riccati.Form.RECENTRED), 'regulator': _regulator,
-    regular.STEP: _step, 'slope_at': _slope_at}
+    'regular_step': _step, 'slope_at': _slope_at}

@@ -132,11 +132,11 @@ class Level:
         target = self.target(setpoint, estimate.w, limits, start)
         if target is None:
             return None, LawResult(None, reason(Code.NO_STEADY_STATE))
-        target = self._within_reach(target, estimate.w, limits)
+        target = self.within_reach(target, estimate.w, limits)
         return target, self.law.compute(
             estimate, target, limits, memory, interval, deadline, last)
 
-    def _within_reach(self, target: Target, w: Array, limits: InputLimits) -> Target:
+    def within_reach(self, target: Target, w: Array, limits: InputLimits) -> Target:
         """Return the target, or what is nearest to it where the inputs do not suffice."""
         model = self.model
         # a single one at its end goes there by itself

@@ -2,25 +2,26 @@
 # SPDX-License-Identifier: Apache-2.0
 
 """
-The regular step at once, by one compiled function: all goes well, and the best law acts on.
+The regular step: all is well, and the best law acts on, which most steps are.
 
-It knows no case of its own: whatever is not regular, or not sure, is left to the step itself,
-which gives the same but for rounding. Which of both answers depends on nothing but the state and
-the event, so that a replay finds the same commands bit for bit.
+It knows no case of its own. Whatever is not regular is left to the step itself, which gives the
+same, and decides what else there is to decide. Which of both answers depends on nothing but the
+state and the event, so that a replay finds the same commands bit for bit.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any
+from functools import cached_property
 
 import numpy as np
 
 from koopman_ros.arrays import Array
 from koopman_ros.control import setpoint as setpoints
-from koopman_ros.control.laws.base import Figures, Target, Weights
-from koopman_ros.control.laws.riccati import closed, Form, StateDependentRiccati
+from koopman_ros.control.laws.base import Figures, steady_state_target, Target, Tuning
+from koopman_ros.control.laws.riccati import answer, checked, StateDependentRiccati
 from koopman_ros.control.levels import Level
+from koopman_ros.control.limits import finite, limit
 from koopman_ros.control.settings import Settings
 from koopman_ros.control.state import (
     Arrival,
@@ -32,70 +33,60 @@ from koopman_ros.control.state import (
     State,
     TargetReport,
 )
-from koopman_ros.estimation import Accepted, DisturbanceObserver, FrozenCheck, MeasuredState
-from koopman_ros.estimation.observer import Estimate, longest_step
+from koopman_ros.estimation import (
+    Accepted,
+    DisturbanceObserver,
+    Estimate,
+    FrozenCheck,
+    MeasuredState,
+)
+from koopman_ros.estimation.measurement import changed_as_it_may
+from koopman_ros.estimation.observer import longest_step
+from koopman_ros.kernels import compilable
 from koopman_ros.lifting import LiftedModel
 from koopman_ros.signals import Outputs
 from koopman_ros.units import NANOSECONDS
-from koopman_ros.values import amended
+from koopman_ros.values import amended, record
 
-STEP = 'regular_step'  # among the compiled functions
-# Columns of the figures of a step in one row, before the arrays.
-FIGURES = 7
-# More states have no compiled growth, and of more inputs the norm of a gain takes longer.
-_MOST_STATES = 2
+
+@record
+class Answered:
+    """The numbers of a regular step."""
+
+    estimate: Estimate  #: with the measurement
+    expected: Array  #: (n_y,) of the measurement, in the units of the signals
+    target: Target  #: of the law
+    figures: Figures  #: of the law
+    asked: Array  #: (n_u,) what the law asks for, within the range, in input units
+    command: Array  #: (n_u,) likewise, also within the rate
+    at_range: bool  #: whether the range was active
+    at_rate: bool  #: whether the rate was active
+    outside: float  #: distance of the command from the training box, in half widths
 
 
 @dataclass(frozen=True, eq=False)
 class Regular:
-    """What the compiled function goes by, beside the state."""
+    """What a regular step goes by, beside the state."""
 
-    function: Any  #: that is compiled
     model: LiftedModel
+    settings: Settings
     level: Level  #: the best one
-    #: time constant of nothing but numbers: bandwidth of the observer, seconds in a unit of time,
-    #: longest step of integration, bounds of residual and gain, distance between training states
-    numbers: Array
-    #: (9, n_x) center, scale, ends of the box, half widths of it, range, rate and jump of sensors
-    states: Array
-    #: (8, n_u) center, scale, range and rate, ends of the box, bound of a disturbance
-    inputs: Array
-    training: Array  #: (M, n_x) training states, M = 0 where they are not known
-    weights: Weights  #: of the law
-    inverse: Array  #: (n_u, n_x) of the input matrix
-    settings: Settings  #: the tuning
-    recentred: bool  #: whether the law is, or goes by the averaged Jacobian
-    form: str  #: the same in a word
+    estimator: DisturbanceObserver | MeasuredState
+    tuning: Tuning  #: of the law
 
     @staticmethod
     def of(model: LiftedModel, outputs: Outputs, settings: Settings, level: Level
            ) -> Regular | None:
-        """Return it where there is a compiled function for the best level, else None."""
-        function, law, estimator = model.kernels.get(STEP), level.law, level.estimator
-        if (function is None or type(law) is not StateDependentRiccati or law.model is not model
+        """Return it for the best level, or None where that has no regular steps."""
+        law, estimator = level.law, level.estimator
+        # no other class, which may do something else
+        if (type(law) is not StateDependentRiccati or law.model is not model
                 or type(estimator) not in (DisturbanceObserver, MeasuredState)
-                or not (outputs.all_states and level.controls_all) or model.layout is None
-                or model.n_u > 1 or model.n_x > _MOST_STATES or model.tried_loops is not None
-                or not (closed(model) or model.readout is not None)):
+                or not (outputs.all_states and level.controls_all)
+                or model.tried_loops is not None):
             return None
-        states, inputs, sensor, limits = (
-            model.states, model.inputs, settings.sensor, settings.limits)
-        known, tuning = model.training_states, law.tuning
-        bandwidth = estimator.tuning.bandwidth if isinstance(estimator, DisturbanceObserver) else (
-            0.0)
-        recentred = closed(model)
-        return Regular(
-            function, model, level,
-            np.array([bandwidth, model.seconds_per_time_unit, longest_step(model),
-                      tuning.max_residual, tuning.max_gain,
-                      0.0 if known is None else known.fill_distance]),
-            np.array([states.center, states.scale, states.lower, states.upper,
-                      states.half_widths, sensor.lower, sensor.upper, sensor.rate, sensor.jump]),
-            np.array([inputs.center, inputs.scale, limits.lower, limits.upper, limits.rate,
-                      inputs.lower, inputs.upper, estimator.tuning.max_disturbance]),
-            np.zeros((0, model.n_x)) if known is None else np.ascontiguousarray(known.states),
-            tuning.weights, np.ascontiguousarray(model.input_inverse()), settings,
-            recentred, (Form.RECENTRED if recentred else Form.AVERAGED).value)
+        assert isinstance(estimator, DisturbanceObserver | MeasuredState)
+        return Regular(model, settings, level, estimator, law.tuning)
 
     def step(self, state: State, y: Array, time_ns: int, u: Array, elapsed: float,
              seconds: float, spacing: float, missed: int, follows: bool
@@ -115,39 +106,105 @@ class Regular:
                 or supervisor.level != level.name or last.jumped
                 or not (state.transfer is state.way_back is supervisor.reason
                         is supervisor.resumes is supervisor.bad_since_ns
-                        is supervisor.better_since_ns is before.covariance is None)):
+                        is supervisor.better_since_ns is before.covariance is None)
+                or not (elapsed > 0.0 and spacing > 0.0)):
             return None
-        model, settings, y = self.model, self.settings, np.ascontiguousarray(y)
+        model, settings = self.model, self.settings
         setpoint = setpoints.advance(
             state.setpoint, y, level.controlled_states, settings.setpoint_ramp, time_ns, seconds,
             settings.setpoint_filter)
-        active, layout = setpoint.active, model.layout
-        assert active is not None and layout is not None
-        n, m, target = model.n_x, model.n_u, level.reference(active)
-        found = self.function(
-            layout.sizes, layout.numbers, self.numbers, self.states, self.inputs, self.training,
-            self.weights.Q, self.weights.R, self.inverse, y, last.value, before.x, before.w, u,
-            state.command, target.x, target.z, target.drift, elapsed,
-            (time_ns - last.time_ns) / NANOSECONDS, seconds, spacing, self.recentred)
+        active = setpoint.active
+        assert active is not None
+        found: Answered | None = regular_step(
+            model, self, y, last.value, before, u, state.command, level.reference(active),
+            elapsed, (time_ns - last.time_ns) / NANOSECONDS, seconds, spacing)
         if found is None:
             return None
-        found.setflags(write=False)
-        residual, gain, growth, rest, outside, at_range, at_rate = found[:FIGURES].tolist()
-        at = FIGURES + 3 * n
-        x, w, expected = found[FIGURES:FIGURES + n], found[FIGURES + n:at - n], found[at - n:at]
-        u_ref, forcing = found[at:at + m], found[at + m:at + m + n]
-        asked, command = found[at + m + n:at + 2 * m + n], found[at + 2 * m + n:]
-        estimate = Estimate(x, w)
-        frozen = FrozenCheck((time_ns,) * n, np.zeros(n), before.w)
+        frozen = FrozenCheck((time_ns,) * len(y), np.zeros(len(y)), before.w)
         return amended(
-            state, setpoint=setpoint, time_ns=time_ns, command=command, commanded_ns=time_ns,
-            accepted=Accepted(y, time_ns, frozen), estimate=estimate, law_input=asked,
-            law_memory=None
-        ), command, Report(
+            state, setpoint=setpoint, time_ns=time_ns, command=found.command,
+            commanded_ns=time_ns, accepted=Accepted(y, time_ns, frozen), estimate=found.estimate,
+            law_input=found.asked, law_memory=None
+        ), found.command, Report(
             state.mode, level.name, 0, None,
-            MeasurementReport(Arrival.ACCEPTED, 0.0, expected, missed, False, follows),
-            EstimateReport(estimate, level.estimator),
-            TargetReport(active, level.controlled_states, model, Target(
-                target.x, target.z, target.drift, u_ref, forcing, rest)),
-            CommandReport(Figures(self.form, residual, gain, growth), None, 0.0,
-                          at_range > 0.0, at_rate > 0.0, None, outside))
+            MeasurementReport(Arrival.ACCEPTED, 0.0, found.expected, missed, False, follows),
+            EstimateReport(found.estimate, level.estimator),
+            TargetReport(active, level.controlled_states, model, found.target),
+            CommandReport(found.figures, None, 0.0, found.at_range, found.at_rate, None,
+                          found.outside))
+
+    # As compiled code takes it.
+
+    @cached_property
+    def numbers(self) -> Array:
+        """Bandwidth, seconds in a unit of time, longest step, bounds of the law, fill distance."""
+        model, tuning, known = self.model, self.tuning, self.model.training_states
+        bandwidth = self.estimator.tuning.bandwidth if isinstance(
+            self.estimator, DisturbanceObserver) else 0.0
+        return np.array([
+            bandwidth, model.seconds_per_time_unit, longest_step(model), tuning.max_residual,
+            tuning.max_gain, 0.0 if known is None else known.fill_distance])
+
+    @cached_property
+    def states(self) -> Array:
+        """(9, n_x) center, scale, box, half widths, and range, rate and jump of the sensors."""
+        states, sensor = self.model.states, self.settings.sensor
+        return np.array([states.center, states.scale, states.lower, states.upper,
+                         states.half_widths, sensor.lower, sensor.upper, sensor.rate,
+                         sensor.jump])
+
+    @cached_property
+    def inputs(self) -> Array:
+        """(8, n_u) center, scale, range, rate, box, and bound of a disturbance."""
+        inputs, limits = self.model.inputs, self.settings.limits
+        return np.array([inputs.center, inputs.scale, limits.lower, limits.upper, limits.rate,
+                         inputs.lower, inputs.upper, self.estimator.tuning.max_disturbance])
+
+    @cached_property
+    def training(self) -> Array:
+        """(M, n_x) training states, none where they are not known."""
+        known = self.model.training_states
+        return np.zeros((0, self.model.n_x)) if known is None else (
+            np.ascontiguousarray(known.states))
+
+    @cached_property
+    def inverse(self) -> Array:
+        """(n_u, n_x) of the input matrix."""
+        return np.ascontiguousarray(self.model.input_inverse())
+
+
+@compilable
+def regular_step(model: LiftedModel, regular: Regular, y: Array, last: Array, before: Estimate,
+                 acted: Array, command: Array, known: Target, elapsed: float, since: float,
+                 seconds: float, spacing: float) -> Answered | None:
+    """
+    Take a measurement (n_y,) into account, and return the answer; None where it is not regular.
+
+    :param last: (n_y,) measurement `since` seconds before, and what was estimated then.
+    :param acted: (n_u,) since then, in scaled deviations.
+    :param command: (n_u,) the last one, in input units.
+    :param known: target without disturbance.
+    :param elapsed: as those that follow, see :meth:`Regular.step`.
+    """
+    settings, estimator, level = regular.settings, regular.estimator, regular.level
+    if not changed_as_it_may(settings.sensor, last, y, since) or model.distance(y) > 0.0:
+        return None
+    predicted = estimator.predict(before, acted, elapsed)
+    if predicted is None or not finite(predicted.x):
+        return None
+    estimate = estimator.correct(predicted, model.states.to_deviation(y), elapsed)
+    target = level.within_reach(steady_state_target(
+        model, known.x, estimate.w, known=known), estimate.w, settings.limits)
+    try:
+        found = checked(model, answer(
+            model, estimate.x, target, regular.tuning, spacing / model.seconds_per_time_unit),
+            settings.limits, spacing)
+    except np.linalg.LinAlgError:
+        return None
+    if found.u is None:
+        return None
+    limited = limit(settings.limits, found.u, command, seconds)
+    return Answered(
+        estimate, model.states.to_physical(predicted.x), target, found.figures, found.u,
+        limited.u, found.clipped or limited.at_range, limited.at_rate,
+        model.inputs.violation(limited.u))

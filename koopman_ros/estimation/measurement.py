@@ -164,6 +164,20 @@ def check(limits: SensorLimits, outputs: Outputs, last: Accepted | None, y: Arra
         limits, last.value, y, 0.0) is not None)
 
 
+def changed_as_it_may(limits: SensorLimits, before: Array, y: Array, seconds: float) -> bool:
+    """
+    Tell whether every signal of a measurement (n_y,) has changed since one before, and may have.
+
+    Then :func:`check` accepts it, and there is nothing to remember of a sensor that stands still.
+    """
+    for a, b, (lower, upper, rate, jump) in zip(
+            y.tolist(), before.tolist(), limits.each, strict=True):
+        possible = jump + (rate * seconds if seconds > 0.0 else 0.0)
+        if not (lower <= a <= upper and 0.0 < abs(a - b) <= possible and math.isfinite(a)):
+            return False
+    return True
+
+
 def _impossible(limits: SensorLimits, outputs: Outputs, y: Array) -> Reason | None:
     for value, name, (lower, upper, _, _) in zip(y.tolist(), outputs.names, limits.each,
                                                  strict=True):

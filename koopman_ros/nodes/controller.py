@@ -364,10 +364,11 @@ class ControllerNode(ManagedNode):
         if report.measurement.clock_went_back:
             self.get_logger().warning('the measurement is older than the last one: time starts '
                                       'afresh', throttle_duration_sec=1.0)
-        # in between so many others, what is said of one would be read by nobody; the next one is
-        # looked at, or the watch comes by
-        told, now = self._told, time.monotonic()
-        self._untold = (report.level, report.reason is None) == told[1:] and now < told[0]
+        # of many measurements in a moment the first is told of, and the last, by the watch at the
+        # latest
+        until, *told = self._told
+        now = time.monotonic()
+        self._untold = [report.level, report.reason is None] == told and now < until
         if not self._untold:
             self._say(report, now)
 

@@ -224,7 +224,7 @@ class PlantNode(ManagedNode):
         """Publish the plant as it stands, the states, which are answered, last."""
         plant, settings = self._plant, self._settings
         stamp, frame_id = stamp_message(plant.time_ns), settings.frame_id
-        if self._clock_publisher is not None:
+        if self._clock_publisher is not None and topics.heard(self._clock_publisher):
             self._clock_publisher.publish(Clock(clock=stamp))
         self._applied.send(plant.u, stamp, frame_id)
         deviation, resolution, bias, variance = self._sensors()

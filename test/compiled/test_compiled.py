@@ -7,7 +7,6 @@ Compiled functions give what numpy gives, and leave to it what is near to a bord
 One file, so that they are compiled once where nothing is kept yet.
 """
 
-from collections.abc import Iterator, Mapping
 from dataclasses import replace
 from functools import cache
 import itertools
@@ -21,7 +20,6 @@ from koopman_ros.control import State
 from koopman_ros.control.laws.base import steady_state_target, Weights
 from koopman_ros.control.laws.riccati import recentred, regulator
 from koopman_ros.control.laws.shooting import Horizon, program, slope_at
-from koopman_ros.control.regular import STEP
 from koopman_ros.estimation.kalman import propagated
 from koopman_ros.estimation.observer import moved
 from koopman_ros.kernels import COMPILED, IN_NUMPY, Kernels, named, NUMPY
@@ -34,6 +32,7 @@ from koopman_ros.solvers import RiccatiStatus, solve_riccati
 from koopman_ros.testing import Harness
 from koopman_ros.units import NANOSECONDS
 from support.controller_bench import Bench, reproduced, STEADY
+from support.odd_events import leaves, odd_event
 from support.random_lifts import random_lift
 
 STEPS = 40
@@ -93,22 +92,6 @@ def test_a_loop_with_a_shipped_model_is_commanded_the_same(name: str) -> None:
         x = x + h * (model.drift(x) + model.forcing(x, u))
 
 
-def events_of(model: LiftedModel, rng: np.random.Generator, last: State, seconds: float
-              ) -> tuple[np.ndarray, int, np.ndarray | None]:
-    """Return a measurement, its stamp and the measured input: mostly usual, now and then not."""
-    states, y = model.states, last.accepted.value if last.accepted else model.states.center
-    usual = y + 0.01 * states.scale * rng.normal(size=len(y))
-    wild = [y, states.upper + 0.2 * states.scale, states.center, np.full(len(y), np.nan),
-            states.to_physical(rng.uniform(-1.0, 1.0, len(y)))]
-    passed = [0.0, 0.3, 2.0, 40.0, 1000.0, -0.2, -3.0]
-    ahead = 1.0 if rng.random() < 0.97 else float(rng.choice(passed))
-    command = model.inputs.center if last.command is None else last.command
-    applied = [None, None, command, command - 0.1 * model.inputs.scale]
-    return (usual if rng.random() < 0.97 else wild[rng.integers(len(wild))],
-            (last.time_ns or 10 ** 10) + round(ahead * seconds * NANOSECONDS),
-            applied[rng.integers(len(applied))])
-
-
 @pytest.mark.parametrize(('name', 'given', 'seconds', 'usual'), [
     ('reactor_nz4', {}, 1.0, 50),
     ('reactor_nz4', {'coolant_temperature.max_disturbance': 0.05,
@@ -121,17 +104,17 @@ def test_a_step_is_the_same_whether_it_is_regular_or_not(
     model, answered = load(model_path(name)), []
 
     def counted(*arguments: object) -> object:
-        answered.append(kernels()[STEP](*arguments))
+        answered.append(kernels()['regular_step'](*arguments))
         return answered[-1]
 
     parameters = table_of(model, given).snapshot(given)
-    ours = built(parameters, replace(model, kernels={**kernels(), STEP: counted}))
+    ours = built(parameters, replace(model, kernels={**kernels(), 'regular_step': counted}))
     theirs, rng, state = built(parameters, model), np.random.default_rng(1), State()
     for k in range(120):
         if k % 30 == 20:
             asked = model.states.center + 0.1 * rng.uniform(-1.0, 1.0) * model.states.scale
             state, _ = theirs.request_setpoint(state, asked)
-        event = events_of(model, rng, state, seconds)
+        event = odd_event(model, rng, state, seconds)
         one, two = ours.step(state, *event), theirs.step(state, *event)
         np.testing.assert_allclose((one[1] - two[1]) / model.inputs.scale, 0.0, atol=1e-12)
         for part in ('level', 'depth', 'reason', 'mode'):
@@ -161,18 +144,6 @@ def test_a_step_is_the_same_whether_it_is_regular_or_not(
             assert again[1].tolist() == one[1].tolist()
         state = two[0]
     assert sum(found is not None for found in answered) > usual
-
-
-def leaves(value: object, place: str = '') -> Iterator[tuple[str, object]]:
-    """Yield what is at the ends of nested lists and mappings, with its place."""
-    if isinstance(value, Mapping):
-        for name, part in value.items():
-            yield from leaves(part, f'{place}.{name}')
-    elif isinstance(value, list | tuple):
-        for i, part in enumerate(value):
-            yield from leaves(part, f'{place}[{i}]')
-    else:
-        yield place, value
 
 
 @pytest.mark.parametrize('widths', [(5,), (7, 3)])

@@ -4,6 +4,7 @@
 """The control step, and the loop across processes: latency, rate, start, memory, lock-step."""
 
 from collections.abc import Iterator
+import contextlib
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -48,6 +49,10 @@ MEANING = {
     'compiled_latency_ratio_p99': 'the same for 99th percentiles',
     'max_rate_hz': 'highest rate of measurements at which every one was answered and the median '
                    'answer in the last tenth of the run took less than 20 ms',
+    'compiled_max_rate_hz': 'the same with a compiled control step',
+    'pid_max_rate_hz': 'the same of the PID controller',
+    'echo_max_rate_hz': 'the same of a bare echo, which is what rclpy and this sender leave room '
+                        'for',
     'startup_seconds': "from the start of the controller's process to its first command, median",
     'rss_megabytes': 'resident memory: plant and controller after the lock-step run, trainer and '
                      'echo idle',
@@ -91,8 +96,9 @@ def measure(plan: Plan, figures: dict[str, Any], folder: Path) -> Iterator[str]:
         yield _steps(figures, plan, Path(name))
         yield _plans(figures, plan, Path(name))
         with Harness(Path(name), name='probe') as harness:
-            yield _latency(figures, harness, plan.rounds)
-            yield _highest_rate(figures, harness, plan.rate_seconds, plan.lowest_rate)
+            with _answering(harness, figures) as probes:
+                yield _latency(figures, probes, plan.rounds)
+                yield _highest_rate(figures, probes, plan.rate_seconds, plan.lowest_rate)
             _start_up(figures, harness, plan.starts)
             yield _lockstep(figures, harness, plan.plant_seconds)
 
@@ -224,30 +230,38 @@ def _start(harness: Harness, name: str, namespace: str, command: tuple[str, ...]
     return harness.start(name, parameters, ('-r', f'__ns:={namespace}'), command)
 
 
-def _latency(figures: dict[str, Any], harness: Harness, rounds: int) -> str:
-    """Time measurement to command of the controller and of others, round by round in turns."""
-    _tell('latency beside an echo and a PID controller')
+@contextlib.contextmanager
+def _answering(harness: Harness, figures: dict[str, Any]) -> Iterator[dict[str, _Probe]]:
+    """Yield a probe of each side, which have all answered for a while."""
+    _tell('controllers, a PID controller and an echo')
     echo, pid = ((sys.executable, '-m', f'validation.benchmarks.{name}')
                  for name in ('echo', 'pid'))
     # without what compiles, `compiled` is the first one again
-    sides = ('controller', 'compiled', 'pid', 'echo')
-    taken: dict[str, list[float]] = {name: [] for name in sides}
-    records = harness.listen(String, f'/latency/compiled/{topics.CONTROLLER_EVENTS}')
-    with _start(harness, 'controller', '/latency/controller'), \
-            _start(harness, 'controller', '/latency/compiled', compiled=True), \
-            _start(harness, 'pid', '/latency/pid', pid), \
-            _start(harness, 'echo', '/latency/echo', echo) as echoing:
-        probes = {name: _Probe(harness, f'/latency/{name}') for name in sides}
+    records = harness.listen(String, f'/answers/compiled/{topics.CONTROLLER_EVENTS}')
+    with _start(harness, 'controller', '/answers/controller'), \
+            _start(harness, 'controller', '/answers/compiled', compiled=True), \
+            _start(harness, 'pid', '/answers/pid', pid), \
+            _start(harness, 'echo', '/answers/echo', echo) as echoing:
+        probes = {name: _Probe(harness, f'/answers/{name}')
+                  for name in ('controller', 'compiled', 'pid', 'echo')}
         for probe in probes.values():
             probe.first_answer()
             probe.paced()
         if named(COMPILED) is not None:
             harness.wait_until(lambda: any(f'"event":"{NUMERICS}"' in one.data for one in records),
                                'the compiled step')
-        for _ in range(rounds):
-            for name, probe in probes.items():
-                taken[name] += probe.paced()
-        figures['latency'] = {'measurements': rounds * _ROUND, 'echo_rss_megabytes': _rss(echoing)}
+        figures['latency'] = {'echo_rss_megabytes': _rss(echoing)}
+        yield probes
+
+
+def _latency(figures: dict[str, Any], probes: dict[str, _Probe], rounds: int) -> str:
+    """Time measurement to command of each side, round by round in turns."""
+    _tell('latency')
+    taken: dict[str, list[float]] = {name: [] for name in probes}
+    for _ in range(rounds):
+        for name, probe in probes.items():
+            taken[name] += probe.paced()
+    figures['latency']['measurements'] = rounds * _ROUND
     rows = []
     for quantile, percent in (('median', 50), ('p99', 99)):
         found = {name: 1e6 * float(np.percentile(seconds, percent))
@@ -260,34 +274,38 @@ def _latency(figures: dict[str, Any], harness: Harness, rounds: int) -> str:
         rows.append((quantile, *(
             f'{us:.0f}' if name == 'echo' else f'{us:.0f} ({us / found["echo"]:.2f})'
             for name, us in found.items())))
-    return table(('latency [us] (times echo)', *sides), rows)
+    return table(('latency [us] (times echo)', *probes), rows)
 
 
-def _highest_rate(figures: dict[str, Any], harness: Harness, seconds: float, lowest: float) -> str:
-    """Raise the rate of measurements, in Hz, until the controller does not keep up for a run."""
+def _highest_rate(figures: dict[str, Any], probes: dict[str, _Probe], seconds: float,
+                  lowest: float) -> str:
+    """Raise the rate of measurements, in Hz, until who answers does not keep up for a run."""
     _tell('highest rate')
+    return table(('every measurement is answered', 'up to [Hz]', 'ended because'), [
+        _raised(figures, '' if name == 'controller' else f'{name}_', probe, seconds, lowest)
+        for name, probe in probes.items()])
+
+
+def _raised(figures: dict[str, Any], side: str, probe: _Probe, seconds: float, lowest: float
+            ) -> tuple[str, str, str]:
+    """Find the highest rate of a side, note it, and return its row."""
     steps: list[dict[str, Any]] = []
     highest, ended = None, ''
-    with _start(harness, 'controller', '/rate'):
-        probe = _Probe(harness, '/rate')
-        probe.first_answer()
-        probe.paced()
-        while not ended:
-            rate = lowest * _GROWTH ** sum(one['kept_up'] for one in steps)
-            for _ in range(_TRIES):
-                steps.append(one := probe.run(rate, seconds))
-                if one['kept_up']:
-                    highest = one['sent_hz']
-                    break
-            else:
-                ended = 'a measurement has no answer' if one['unanswered'] else (
-                    'the answers come late')
-            if not ended and not one['on_schedule']:
-                ended = 'the sender does not keep up'
-    figures.update(rate={'max_rate_hz': highest, 'ended_by': ended, 'steps': steps},
-                   max_rate_hz=highest)
-    reached = 'no rate' if highest is None else f'{highest:.0f} Hz'
-    return f'keeps up with {reached}; ended because {ended}'
+    while not ended:
+        rate = lowest * _GROWTH ** sum(one['kept_up'] for one in steps)
+        for _ in range(_TRIES):
+            steps.append(one := probe.run(rate, seconds))
+            if one['kept_up']:
+                highest = one['sent_hz']
+                break
+        else:
+            ended = 'a measurement has no answer' if one['unanswered'] else (
+                'the answers come late')
+        if not ended and not one['on_schedule']:
+            ended = 'the sender does not keep up'
+    figures.update({f'{side}rate': {'max_rate_hz': highest, 'ended_by': ended, 'steps': steps},
+                    f'{side}max_rate_hz': highest})
+    return (side.strip('_') or 'controller', '-' if highest is None else f'{highest:.0f}', ended)
 
 
 def _start_up(figures: dict[str, Any], harness: Harness, runs: int) -> None:
