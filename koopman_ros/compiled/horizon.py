@@ -83,7 +83,7 @@ def _intervals(sizes: NDArray[np.int64], numbers: Array, B: Array, X: Array, pus
         node and input.
     """
     count, n, N = X.shape
-    c, space, part = count - 1, space_of(sizes, N), 1.0 / (6.0 * steps)
+    c, space, part = count - 1, space_of(sizes, numbers, N), 1.0 / (6.0 * steps)
     M, g, QS, J = np.zeros((c, c, N)), np.zeros((c, N)), np.empty((n, N)), np.empty((n, n, N))
     for a in range(c):
         for i in range(n):
