@@ -27,22 +27,31 @@ from koopman_ros.compiled.network import (
     widths,
 )
 
+# Where what a weighted sum begins with does not lie among the weights.
+_NOTHING, _ADD = -1, -2
+
 Space = tuple[Array, Array, Array, Array, NDArray[np.int64], tuple[Array, Array, Array, Array]]
 
 
 @inner
-def space_of(sizes: NDArray[np.int64], N: int) -> Space:
+def space_of(sizes: NDArray[np.int64], numbers: Array, N: int) -> Space:
     """
     Return room for :func:`drifts` of N states.
 
     All hidden layers (h, N), one after the other, the derivatives (h, n_x, N) of what goes into
-    their tanh, a layer with its derivatives twice, 2^k, and z, J_N and what follows of it.
+    their tanh, of the first of them filled in, a layer with its derivatives twice, 2^k, and z, J_N
+    and what follows of it.
     """
     n, n_z, count, width = sizes[N_X], sizes[N_Z], 0, 0
     for layer in range(WIDTHS, len(sizes)):
         count += sizes[layer]
         width = max(width, sizes[layer])
-    return (np.empty((count, N)), np.empty((count, n, N)), np.empty((2, width, N)),
+    P = np.empty((count, n, N))
+    for i in range(sizes[WIDTHS] if count else 0):
+        for k in range(n):
+            for c in range(N):
+                P[i, k, c] = numbers[k * sizes[WIDTHS] + i]
+    return (np.empty((count, N)), P, np.empty((2, width, N)),
             np.empty((2, width, n, N)), np.empty(width * N, np.int64),
             (np.empty((2 * n_z, N)), np.empty((n_z, n, N)), np.empty((n_z, n, N)),
              np.empty((n, n, N))))
@@ -56,28 +65,38 @@ def _flat(A: Array) -> Array:
 
 @inner
 def _weighted(target: Array, rows: int, weights: Array, start: int, down: int, across: int,
-              source: Array, count: int, clear: bool) -> None:
+              source: Array, count: int, begin: int) -> None:
     """
-    Add to so many rows the weighted sums of the first `count` rows of another array.
+    Write to so many rows the weighted sums of the first `count` rows of another array.
 
-    The weights lie so far apart by row and by column; `clear` begins with 0.
+    :param start: where the weights begin, which lie `down` apart by row and `across` by column.
+    :param begin: where what each row begins with does, `_NOTHING` for 0, or `_ADD` to go on.
     """
-    whole = count - count % 4
     for i in range(rows):
-        if clear:
+        if begin != _ADD:
+            first = weights[begin + i] if begin >= 0 else 0.0
             for c in range(target.shape[1]):
-                target[i, c] = 0.0
-        for k in range(0, whole, 4):
+                target[i, c] = first
+        for k in range(0, count, 4):
+            # four at once; of what there is not, the last by 0
             at = start + i * down + k * across
-            p, q = weights[at], weights[at + across]
-            r, s = weights[at + 2 * across], weights[at + 3 * across]
+            second, third, fourth = k + 1, k + 2, k + 3
+            p, q, r, s = weights[at], 0.0, 0.0, 0.0
+            if second < count:
+                q = weights[at + across]
+            else:
+                second = k
+            if third < count:
+                r = weights[at + 2 * across]
+            else:
+                third = k
+            if fourth < count:
+                s = weights[at + 3 * across]
+            else:
+                fourth = k
             for c in range(target.shape[1]):
-                target[i, c] += (p * source[k, c] + q * source[k + 1, c]) + (
-                    r * source[k + 2, c] + s * source[k + 3, c])
-        for k in range(whole, count):
-            p = weights[start + i * down + k * across]
-            for c in range(target.shape[1]):
-                target[i, c] += p * source[k, c]
+                target[i, c] += (p * source[k, c] + q * source[second, c]) + (
+                    r * source[third, c] + s * source[fourth, c])
 
 
 @inner
@@ -94,19 +113,12 @@ def _layers(sizes: NDArray[np.int64], numbers: Array, x: Array, h: Array, P: Arr
     for layer in range(WIDTHS, len(sizes)):
         width = sizes[layer]
         bias, own = start + width * last, h[row:row + width]
-        for i in range(width):
-            for c in range(N):
-                own[i, c] = numbers[bias + i]
         if layer == WIDTHS:
-            _weighted(own, width, numbers, start, 1, width, x, last, False)
-            for i in range(width):
-                for k in range(n):
-                    for c in range(N):
-                        P[i, k, c] = numbers[start + k * width + i]
+            _weighted(own, width, numbers, start, 1, width, x, last, bias)
         else:
-            _weighted(own, width, numbers, start, 1, width, h[row - last:row], last, False)
+            _weighted(own, width, numbers, start, 1, width, h[row - last:row], last, bias)
             _weighted(_flat(P[row:row + width]), width, numbers, start, 1, width,
-                      _flat(slopes[turn]), last, True)
+                      _flat(slopes[turn]), last, _NOTHING)
         squash(own.reshape(own.size), width * N, scale)
         turn = 1 - turn
         for i in range(width):
@@ -121,18 +133,18 @@ def _layers(sizes: NDArray[np.int64], numbers: Array, x: Array, h: Array, P: Arr
 def _turned(sizes: NDArray[np.int64], numbers: Array, h: Array, P: Array, f: Array,
             slopes: Array) -> int:
     """
-    Write the derivatives by the state of dh/dx f of the last layer, under an f that is held.
+    Write the derivatives by the state of -dh/dx f of the last layer, under an f that is held.
 
     :param slopes: room as of :func:`_layers`.
     :return: which of these is that of the last layer.
     """
     n, N = f.shape
-    start, last, row, turn, along = 0, n, 0, 0, np.empty(N)
+    start, last, row, turn, along, slope = 0, n, 0, 0, np.empty(N), np.empty(N)
     for layer in range(WIDTHS, len(sizes)):
         width, turn = sizes[layer], 1 - turn
         if layer > WIDTHS:
             _weighted(_flat(slopes[turn]), width, numbers, start, 1, width,
-                      _flat(slopes[1 - turn]), last, True)
+                      _flat(slopes[1 - turn]), last, _NOTHING)
         for i in range(width):
             for c in range(N):
                 along[c] = 0.0
@@ -140,14 +152,17 @@ def _turned(sizes: NDArray[np.int64], numbers: Array, h: Array, P: Array, f: Arr
                 for c in range(N):
                     along[c] += P[row + i, k, c] * f[k, c]
             for c in range(N):
-                along[c] *= -2.0 * h[row + i, c]
+                t = h[row + i, c]
+                slope[c] = 1.0 - t * t
+                along[c] *= 2.0 * t * slope[c]
             for k in range(n):
                 if layer == WIDTHS:
                     for c in range(N):
-                        slopes[turn, i, k, c] = 0.0
-                for c in range(N):
-                    slopes[turn, i, k, c] = (1.0 - h[row + i, c] * h[row + i, c]) * (
-                        slopes[turn, i, k, c] + along[c] * P[row + i, k, c])
+                        slopes[turn, i, k, c] = along[c] * P[row + i, k, c]
+                else:
+                    for c in range(N):
+                        slopes[turn, i, k, c] = (
+                            slope[c] * slopes[turn, i, k, c] + along[c] * P[row + i, k, c])
         start, last, row = start + width * (last + 1), width, row + width
     return turn
 
@@ -178,7 +193,7 @@ def _add_bend(sizes: NDArray[np.int64], numbers: Array, h: Array, P: Array, adjo
                             row + i, k, c] * P[row + i, j, c]
         if layer > WIDTHS:
             _weighted(adjoint[1 - turn], last, numbers, start, width, 1, adjoint[turn], width,
-                      True)
+                      _NOTHING)
         turn = 1 - turn
 
 
@@ -242,18 +257,18 @@ def drifts(sizes: NDArray[np.int64], numbers: Array, x: Array, space: Space, f: 
     slope = A + n_z * n_z + n * sizes[N_U]
     if sizes[READOUT]:
         down, readout = n + width, slope + n * n
-        _weighted(f, n, numbers, readout, down, 1, x, n, True)
-        _weighted(f, n, numbers, readout + n, down, 1, layer, width, False)
+        _weighted(f, n, numbers, readout, down, 1, x, n, _NOTHING)
+        _weighted(f, n, numbers, readout + n, down, 1, layer, width, _ADD)
         for i in range(n):
             for j in range(n):
                 for c in range(N):
                     J[i, j, c] = numbers[readout + i * down + j]
-        _weighted(_flat(J), n, numbers, readout + n, down, 1, _flat(last), width, False)
+        _weighted(_flat(J), n, numbers, readout + n, down, 1, _flat(last), width, _ADD)
         return
     # in the second half of the first A z, then what J_N f leaves of it
     rest = of_z[n_z:]
-    _weighted(of_z, n_z, numbers, output, width, 1, layer, width, True)
-    _weighted(_flat(L), n_z, numbers, output, width, 1, _flat(last), width, True)
+    _weighted(of_z, n_z, numbers, output, width, 1, layer, width, _NOTHING)
+    _weighted(_flat(L), n_z, numbers, output, width, 1, _flat(last), width, _NOTHING)
     if identity:
         for i in range(n):
             for c in range(N):
@@ -261,7 +276,7 @@ def drifts(sizes: NDArray[np.int64], numbers: Array, x: Array, space: Space, f: 
             for k in range(n):
                 for c in range(N):
                     L[i, k, c] = 1.0 if i == k else 0.0
-    _weighted(rest, n_z, numbers, A, n_z, 1, of_z, n_z, True)
+    _weighted(rest, n_z, numbers, A, n_z, 1, of_z, n_z, _NOTHING)
     for k in range(n):
         for c in range(N):
             f[k, c] = 0.0
@@ -270,7 +285,10 @@ def drifts(sizes: NDArray[np.int64], numbers: Array, x: Array, space: Space, f: 
                 f[k, c] += L[a, k, c] * rest[a, c]
         for j in range(n):
             for c in range(N):
-                square[k, j, c] = J[k, j, c] = 0.0
+                J[k, j, c] = 0.0
+        for j in range(k + 1):
+            for c in range(N):
+                square[k, j, c] = 0.0
             for a in range(n_z):
                 for c in range(N):
                     square[k, j, c] += L[a, k, c] * L[a, j, c]
@@ -282,16 +300,12 @@ def drifts(sizes: NDArray[np.int64], numbers: Array, x: Array, space: Space, f: 
             for k in range(n):
                 for c in range(N):
                     rest[a, c] -= L[a, k, c] * f[k, c]
-        _weighted(layer, width, numbers, output, 1, width, rest, n_z, True)
+        _weighted(layer, width, numbers, output, 1, width, rest, n_z, _NOTHING)
         _add_bend(sizes, numbers, h, P, adjoint, J)
     # what A makes of J_N, less how that turns the rate
     last = slopes[_turned(sizes, numbers, h, P, f, slopes)]
-    _weighted(_flat(bent), n_z, numbers, output, width, 1, _flat(last), width, True)
-    for a in range(n_z):
-        for k in range(n):
-            for c in range(N):
-                bent[a, k, c] = -bent[a, k, c]
-    _weighted(_flat(bent), n_z, numbers, A, n_z, 1, _flat(L), n_z, False)
+    _weighted(_flat(bent), n_z, numbers, output, width, 1, _flat(last), width, _NOTHING)
+    _weighted(_flat(bent), n_z, numbers, A, n_z, 1, _flat(L), n_z, _ADD)
     for j in range(n):
         for k in range(n):
             for a in range(n_z):

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from koopman_ros.arrays import Array
 from koopman_ros.compiled.drifts import drifts, space_of
-from koopman_ros.compiled.jit import compiled, inner, INTEGERS, MATRIX, SIZE, VECTOR
+from koopman_ros.compiled.jit import compiled, inner, INTEGERS, MATRIX, NUMBER, SIZE, VECTOR
 from koopman_ros.compiled.network import drift_and_jacobian, matrices, N_U, N_X, parts_of
 
 _LANES = 8  # columns that a processor takes at once, or twice as many as it does
@@ -20,6 +20,32 @@ _LANES = 8  # columns that a processor takes at once, or twice as many as it doe
 def slope(sizes: NDArray[np.int64], numbers: Array, x: Array) -> Array:
     """Return the Jacobian of the drift at a state, (n_x, n_x)."""
     return drift_and_jacobian(sizes, numbers, parts_of(sizes, numbers), x.copy())[1]
+
+
+@compiled(MATRIX, MATRIX, VECTOR, MATRIX, NUMBER)
+def distances(x: Array, corners: Array, half: Array, states: Array, fill: float) -> Array:
+    """
+    Measure how far states (N, n_x) are from a box and from training states, in half widths.
+
+    :param states: (M, n_x), none where they are not known.
+    :param fill: their fill distance.
+    """
+    (N, n), found = x.shape, np.empty(len(x))
+    for k in range(N):
+        outside, nearest, known = 0.0, math.inf, True
+        for i in range(n):
+            outside = max(outside, (corners[0, i] - x[k, i]) / half[i],
+                          (x[k, i] - corners[1, i]) / half[i])
+            known = known and math.isfinite(x[k, i])
+        for row in range(len(states)):
+            apart = 0.0
+            for i in range(n):
+                apart = max(apart, abs(states[row, i] - x[k, i]) / half[i])
+            nearest = min(nearest, apart)
+        if len(states):
+            outside = max(outside, nearest - fill)
+        found[k] = outside if known else math.inf
+    return found
 
 
 @inner
@@ -57,7 +83,7 @@ def _intervals(sizes: NDArray[np.int64], numbers: Array, B: Array, X: Array, pus
         node and input.
     """
     count, n, N = X.shape
-    c, space, part = count - 1, space_of(sizes, N), 1.0 / (6.0 * steps)
+    c, space, part = count - 1, space_of(sizes, numbers, N), 1.0 / (6.0 * steps)
     M, g, QS, J = np.zeros((c, c, N)), np.zeros((c, N)), np.empty((n, N)), np.empty((n, n, N))
     for a in range(c):
         for i in range(n):

@@ -143,6 +143,17 @@ def _program(model: LiftedModel, plan: shooting.Horizon, u: Array, x: Array
     return shooting.Program(*found) if finite else None
 
 
+def _distances(model: LiftedModel, x: Array) -> Array | None:
+    known = model.training_states
+    if x.shape[1:] != (model.n_x,):
+        return None
+    found: Array = horizon.distances(
+        x, model.states.corners, model.states.half_widths,
+        np.empty((0, model.n_x)) if known is None else known.states,
+        0.0 if known is None else known.fill_distance)
+    return found
+
+
 def _slope_at(model: LiftedModel, x: Array) -> Array | None:
     layout = model.layout
     if layout is None:
@@ -180,7 +191,7 @@ def _step(model: LiftedModel, regular: Regular, y: Array, last: Array, before: E
 
 KERNELS: Kernels = {
     'answer': _answer, 'averaged': partial(_feedback, riccati.Form.AVERAGED),
-    'corrected': _corrected, 'equilibrium': _equilibrium,
+    'corrected': _corrected, 'distances': _distances, 'equilibrium': _equilibrium,
     'growth': _growth, 'moved': _moved, 'program': _program, 'propagated': _propagated,
     'recentred': partial(_feedback, riccati.Form.RECENTRED), 'regulator': _regulator,
     'regular_step': _step, 'slope_at': _slope_at}

@@ -126,6 +126,12 @@ class Coordinates:
         """Half the width (n,) of the training box, in scaled deviations."""
         return frozen(0.5 * (self.upper - self.lower) / self.scale, 'half widths', (len(self),))
 
+    @cached_property
+    def corners(self) -> Array:
+        """Lower and upper corner (2, n) of the training box, in scaled deviations."""
+        return frozen(self.to_deviation(np.array((self.lower, self.upper))), 'corners',
+                      (2, len(self)))
+
 
 @dataclass(frozen=True)
 class Box:

@@ -14,7 +14,7 @@ from numpy.polynomial.legendre import leggauss
 from numpy.typing import NDArray
 
 from koopman_ros.arrays import Array, brief, frozen
-from koopman_ros.kernels import Kernels, NUMPY
+from koopman_ros.kernels import compilable, Kernels, NUMPY
 from koopman_ros.lifting.coordinates import Coordinates, TrainingStates, TriedLoops
 from koopman_ros.lifting.input_terms import InputTerms
 from koopman_ros.lifting.layout import Layout, layout_of
@@ -279,11 +279,10 @@ class LiftedModel:
         return max(outside, self.training_states.distance(
             self.states.to_deviation(x), self.states.half_widths))
 
+    @compilable
     def distances(self, x: Array) -> Array:
         """Measure, as :meth:`distance`, for states (N, n_x) in scaled deviations: (N,)."""
-        states = self.states
-        half = states.half_widths
-        lower, upper = states.to_deviation(states.lower), states.to_deviation(states.upper)
+        half, (lower, upper) = self.states.half_widths, self.states.corners
         outside = np.max(np.maximum(np.maximum(lower - x, x - upper) / half, 0.0), axis=1)
         if self.training_states is not None:
             outside = np.maximum(outside, self.training_states.distances(x, half))

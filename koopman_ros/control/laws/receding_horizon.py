@@ -121,9 +121,9 @@ class RecedingHorizon:
         if not change <= _MOVING:
             return LawResult(None, reason(Code.PLAN_MOVES, iterations=iteration), passing=True)
         # from outside, the way back is no reason
-        distances = self.model.distances(np.concatenate((x[:-1:_LOOK], x[-1:])))
-        outside = float(np.max(distances[1:]))
-        if outside > max(self.tuning.margin, float(distances[0])):
+        here, *ahead = self.model.distances(np.concatenate((x[:-1:_LOOK], x[-1:]))).tolist()
+        outside = max(ahead)
+        if outside > max(self.tuning.margin, here):
             return LawResult(None, reason(
                 Code.PLAN_OUTSIDE, outside=outside, margin=self.tuning.margin))
         wanted = self.model.inputs.to_physical(u[0])
@@ -215,6 +215,23 @@ class RecedingHorizon:
         """Rate of the fastest mode of the drift at the nominal point, in 1/time unit."""
         return _fastest(self._slope)
 
+    def reach(self, interval: float, limits: InputLimits) -> _Reach:
+        """Return what limits the inputs of a plan, at samples so far apart in time units."""
+        return self._reach(interval, *(
+            side.tobytes() for side in (limits.lower, limits.upper, limits.rate)))
+
+    @cached_property
+    def _reach(self) -> Any:
+        @lru_cache(maxsize=8)
+        def of(interval: float, *limits: bytes) -> _Reach:
+            inputs, (lower, upper, rate) = self.model.inputs, map(np.frombuffer, limits)
+            return _Reach(np.maximum(inputs.to_deviation(lower), -_UNLIMITED),
+                          np.minimum(inputs.to_deviation(upper), _UNLIMITED),
+                          self.intervals(interval).before * (
+                              rate * self.model.seconds_per_time_unit / inputs.scale))
+
+        return of
+
     @cached_property
     def bounds(self) -> tuple[Array, Array, list[tuple[int, float, float]]]:
         """Lowest and highest states (n_x,), and both of each one that has any, by its place."""
@@ -237,6 +254,37 @@ def _fastest(slope: Array) -> float:
     return max(map(math.hypot, real.tolist(), imaginary.tolist()))
 
 
+@dataclass(frozen=True)
+class _Reach:
+    """What limits the inputs (n_u,) of a plan, in scaled deviations."""
+
+    lower: Array  #: lower end of their range, to `upper`
+    upper: Array
+    #: (N, n_u) what each may change from one interval to the next: the first since the command
+    #: before
+    change: Array
+
+    def differences(self, first: bool) -> tuple[Array, NDArray[np.intp]]:
+        """
+        Return rows of the change of each limited input from the interval before, and its place.
+
+        :param first: whether nothing is before the first interval.
+        :return: (rows, N n_u) and (rows,) of N n_u.
+        """
+        return self._first if first else self._further
+
+    @cached_property
+    def _further(self) -> tuple[Array, NDArray[np.intp]]:
+        (N, n_u), places = self.change.shape, np.flatnonzero(np.isfinite(self.change))
+        return (np.eye(N * n_u) - np.eye(N * n_u, k=-n_u))[places], places
+
+    @cached_property
+    def _first(self) -> tuple[Array, NDArray[np.intp]]:
+        rows, places = self._further
+        later = places >= self.change.shape[1]
+        return rows[later], places[later]
+
+
 class _Problem:
     """The quadratic programs of one sample; all in scaled deviations and the model's time unit."""
 
@@ -255,15 +303,9 @@ class _Problem:
         self._horizon = Horizon(estimate.x, estimate.w, target.x, target.u, lengths,
                                 self._steps, weights.Q, weights.R, terminal)
         self._last = None if last is None else model.inputs.to_deviation(last)
-        self._lower = np.maximum(model.inputs.to_deviation(limits.lower), -_UNLIMITED)
-        self._upper = np.minimum(model.inputs.to_deviation(limits.upper), _UNLIMITED)
-        # what an input may change from one interval to the next, (N, n_u): the first since the
-        # last command
-        self._change = self.intervals.before * (
-            limits.rate * model.seconds_per_time_unit / model.inputs.scale)
+        self._reach = law.reach(self._sample, limits)
         # at first nothing was commanded
-        self._rows, self._chosen = _differences(
-            len(lengths), tuple(map(math.isfinite, self._change[0].tolist())), last is None)
+        self._rows, self._chosen = self._reach.differences(last is None)
 
     # Where to begin.
 
@@ -281,13 +323,14 @@ class _Problem:
 
     def _rolled_out(self) -> tuple[Array, Array]:
         """Follow the model under the law of the Riccati equation, limited."""
-        model, target, tuning = self._model, self._target, self._law.tuning
+        model, target, tuning, reach = (
+            self._model, self._target, self._law.tuning, self._reach)
         x, last, inputs, nodes = self._x, self._last, [], [self._x]
-        for length, change in zip(self.intervals.lengths.tolist(), self._change, strict=True):
+        for length, change in zip(self.intervals.lengths.tolist(), reach.change, strict=True):
             found = feedback(model, x, target, tuning.weights, interval=length,
                              max_gain=tuning.max_gain, max_residual=tuning.max_residual)
             u = found.u if found.solved and finite(found.u) else target.u
-            u = np.minimum(np.maximum(u, self._lower), self._upper)
+            u = np.minimum(np.maximum(u, reach.lower), reach.upper)
             if last is not None:
                 u = np.minimum(np.maximum(u, last - change), last + change)
             last, rate = u, model.rate_under(u, self._w)
@@ -297,8 +340,8 @@ class _Problem:
             nodes.append(x)
             if not (finite(x) and float(model.distances(x[None])[0]) < _ASTRAY):
                 # the straight way is as good a guess
-                share = np.linspace(0.0, 1.0, len(self._change) + 1)[:, None]
-                return (np.tile(target.u, (len(self._change), 1)),
+                share = np.linspace(0.0, 1.0, len(reach.change) + 1)[:, None]
+                return (np.tile(target.u, (len(reach.change), 1)),
                         self._x + share * (target.x - self._x))
         return np.array(inputs), np.array(nodes)
 
@@ -325,26 +368,26 @@ class _Problem:
 
     def plan(self, u: Array, x: Array) -> Plan:
         """Return inputs (N, n_u) and nodes (N + 1, n_x) in their units, and what limits them."""
-        model, first = self._model, u[0]
-        step = np.zeros_like(first) if self._last is None else first - self._last
-        fastest = self._change[0] - _EDGE
-        lowest, highest, _ = self._law.bounds
+        model, reach, first, none = self._model, self._reach, u[0], np.zeros(len(u[0]))
+        lowest, highest, bounded = self._law.bounds
+        step = none if self._last is None else first - self._last
+        fastest = reach.change[0] - _EDGE
         return Plan(
             self.intervals.times * model.seconds_per_time_unit, model.states.to_physical(x),
             model.inputs.to_physical(u),
-            _side(first <= self._lower + _EDGE, first >= self._upper - _EDGE),
-            _side(step <= -fastest, step >= fastest),
-            _side(np.minimum.reduce(x[1:]) <= lowest + _TOUCH,
-                  np.maximum.reduce(x[1:]) >= highest - _TOUCH))
+            _side(first, first, reach.lower + _EDGE, reach.upper - _EDGE),
+            _side(step, step, -fastest, fastest) if len(self._chosen) else none,
+            _side(np.minimum.reduce(x[1:]), np.maximum.reduce(x[1:]), lowest + _TOUCH,
+                  highest - _TOUCH) if bounded else np.zeros(len(lowest)))
 
     def _limits(self, u: Array, nodes: Array, by_inputs: Array
                 ) -> tuple[Array, Array, Array, NDArray[np.int32]]:
         """Return rows A with lower <= (v, A v) <= upper, and what of that is soft."""
-        last, lower, upper = self._last, self._lower, self._upper
+        last, lower, upper = self._last, self._reach.lower, self._reach.upper
         limited = len(self._chosen) > 0
         if last is not None and limited:
             # what a range that was tightened since has left outside comes back at its rate
-            reach = np.cumsum(self._change, axis=0)
+            reach = np.cumsum(self._reach.change, axis=0)
             lower = np.minimum(lower, last + reach)
             upper = np.maximum(upper, last - reach)
         rows, low, high = [self._rows], [(lower - u).ravel()], [(upper - u).ravel()]
@@ -352,7 +395,7 @@ class _Problem:
             step = u.copy()
             step[1:] -= u[:-1]
             step[0] -= u[0] if last is None else last
-            step, change = step.ravel()[self._chosen], self._change.ravel()[self._chosen]
+            step, change = step.ravel()[self._chosen], self._reach.change.ravel()[self._chosen]
             low.append(-change - step)
             high.append(change - step)
         hard = u.size + len(self._chosen)
@@ -365,24 +408,8 @@ class _Problem:
         return np.concatenate(rows), np.concatenate(low), np.concatenate(high), sense
 
 
-@lru_cache(maxsize=8)
-def _differences(N: int, limited: tuple[bool, ...], first: bool) -> tuple[Array, NDArray[np.intp]]:
-    """
-    Return rows of the change of each limited input from the interval before, and their places.
-
-    :param first: whether there is none for the first interval.
-    :return: (rows, N n_u) and (rows,) of N n_u.
-    """
-    n_u = len(limited)
-    chosen = np.tile(limited, N)
-    if first:
-        chosen[:n_u] = False
-    places = np.flatnonzero(chosen)
-    rows = (np.eye(N * n_u) - np.eye(N * n_u, k=-n_u))[places]
-    rows.setflags(write=False)
-    return rows, places
-
-
-def _side(lower: NDArray[np.bool_], upper: NDArray[np.bool_]) -> Array:
+def _side(least: Array, most: Array, lower: Array, upper: Array) -> Array:
     """Return -1 where the lower limit is active, 1 where the upper one is, else 0."""
-    return upper.astype(np.float64) - lower
+    # in plain numbers, as numpy takes longer for so few
+    return np.array([float(b >= high) - (a <= low) for a, b, low, high in zip(
+        least.tolist(), most.tolist(), lower.tolist(), upper.tolist(), strict=True)])
