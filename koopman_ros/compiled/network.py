@@ -274,7 +274,7 @@ def drift(sizes: NDArray[np.int64], numbers: Array, A: Array, slope: Array, read
     if sizes[READOUT]:
         return applied(readout, np.concatenate((x, h)))
     n_z = len(A)
-    width, start = _widths(sizes)
+    width, start = widths(sizes)
     z, J = np.empty(n_z), np.empty((n_z, n))
     for a in range(n_z):
         row, states = start + width * (1 + a), sizes[IDENTITY] and a < n

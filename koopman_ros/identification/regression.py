@@ -223,10 +223,10 @@ def _smoothed(records: Sequence[tuple[Array, Array]]) -> list[Array]:
     for values, (time, _) in zip(found, records, strict=True):
         D = _third_differences(time)
         for y in values.T:
-            noise = _noise(D, y)
-            if noise > 1e-9 * float(np.ptp(y) or 1.0):
+            own = _noise(D, y)
+            if own > 1e-9 * float(np.ptp(y) or 1.0):
                 noisy.append(y)
-                noises.append(noise)
+                noises.append(own)
                 pieces.append((D, y))
     if noisy:
         filters, noise = _TrendFilters(pieces), np.array(noises)
