@@ -5,6 +5,7 @@
 
 from __future__ import annotations
 
+import atexit
 from collections.abc import Mapping
 import contextlib
 import faulthandler
@@ -92,6 +93,8 @@ def _asked(request: Mapping[str, Any], *files: int) -> int:
     with _lock:
         if own not in _servers:
             _servers[own] = _start()
+            # by which the server ends
+            atexit.register(_servers[own].close)
         socket.send_fds(_servers[own], [json.dumps(request).encode()], files)
         return int(_servers[own].recv(_LONGEST))
 
