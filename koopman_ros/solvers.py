@@ -28,13 +28,16 @@ _AXIS_MARGIN = float(np.sqrt(np.finfo(np.float64).eps))
 # a period leave nothing else.
 _ROUNDING = 64.0 * float(np.finfo(np.float64).eps)
 
-# Of the power series of an exponential of norm 1/2: the next would be 2e-20. One more than a power
-# of 2.
-_TERMS = 17
-_FACTORS = np.array([1.0 / math.factorial(k) for k in range(_TERMS)])
+# Terms of the power series of an exponential of norm 1/2, of which the next would be 2e-20, and of
+# norm 2, with 1e-27: both one more than a power of 2. More terms take less time than doublings;
+# beyond a norm of 2 they would lose digits.
+_FEW, _MANY = 17, 33
+_FACTORS = {terms: np.array([1.0 / math.factorial(k) for k in range(terms)])
+            for terms in (_FEW, _MANY)}
 # What the products of two terms, of the powers j and k of time, contribute to an integral from 0
 # to 1.
-_SHARES = np.outer(_FACTORS, _FACTORS) / (1.0 + np.add.outer(range(_TERMS), range(_TERMS)))
+_SHARES = {terms: np.outer(factors, factors) / (1.0 + np.add.outer(range(terms), range(terms)))
+           for terms, factors in _FACTORS.items()}
 
 
 class RiccatiStatus(Enum):
@@ -197,9 +200,9 @@ def _over_interval(A: Array, B: Array, Q: Array, R: Array, interval: float
     series, size_W = _Series.over(A, B, interval), _size(W)
     if series is None or not (math.isfinite(size_W) and size_W > 0.0):
         return None
-    powers, D = series.powers, series.D
-    weighed = np.matmul(W / size_W, powers.reshape(_TERMS, N, N)).reshape(-1, N)
-    W = weighed.T.dot(_SHARES.dot(powers.reshape(_TERMS, -1)).reshape(-1, N))
+    powers, D, terms = series.powers, series.D, series.terms
+    weighed = np.matmul(W / size_W, powers.reshape(terms, N, N)).reshape(-1, N)
+    W = weighed.T.dot(_SHARES[terms].dot(powers.reshape(terms, -1)).reshape(-1, N))
     W = (0.5 * series.part * size_W) * (W + W.T)
     # twice the time, again and again: the series over all of it would lose its digits
     for _ in range(series.doublings):
@@ -232,6 +235,7 @@ class _Series(NamedTuple):
     powers: Array  #: (terms (n + m), n + m) of F times the part, below each other
     D: Array  #: (n + m, n + m) its sum without the constant term
     part: float  #: in units of time
+    terms: int  #: of the series
     doublings: int  #: from the part to the interval
     size: float  #: norm of F times the interval
 
@@ -245,20 +249,21 @@ class _Series(NamedTuple):
         size = _size(F) * interval
         if not math.isfinite(size):
             return None
-        doublings = max(0, math.frexp(size)[1] + 1)
+        terms = _FEW if size < 0.5 else _MANY
+        doublings = 0 if size < 2.0 else math.frexp(size)[1] - 1
         part = math.ldexp(interval, -doublings)
         # those known times the highest give as many more
-        powers = np.empty((_TERMS * N, N))
+        powers = np.empty((terms * N, N))
         powers[:N] = np.eye(N)
         np.multiply(F, part, out=powers[N:2 * N])
         known = 1
-        while known < _TERMS - 1:
+        while known < terms - 1:
             highest = (known + 1) * N
             np.dot(powers[N:highest], powers[highest - N:highest],
                    out=powers[highest:highest + known * N])
             known *= 2
-        D = _FACTORS[1:].dot(powers[N:].reshape(_TERMS - 1, -1)).reshape(N, N)
-        return cls(powers, D, part, doublings, size)
+        D = _FACTORS[terms][1:].dot(powers[N:].reshape(terms - 1, -1)).reshape(N, N)
+        return cls(powers, D, part, terms, doublings, size)
 
 
 def _scale(Q: Array, G: Array) -> float:

@@ -170,7 +170,7 @@ class NetworkObservables(Observables):
         for weight, bias in self.hidden:
             a = _product(h, weight.T) + bias
             h = f.value(a)
-            T = f.slope(a, h)[..., None, :] * _product(T, weight.T)
+            T = f.slope(a, h)[..., None, :] * (weight.T if T is eye else _product(T, weight.T))
         z = _product(h - self.value_at_zero, self.rows.T)
         J = _product(T, self.rows.T)
         return self._with_states(x, z), self._with_states(eye, J).swapaxes(-1, -2)
@@ -211,10 +211,12 @@ class NetworkObservables(Observables):
             h = f.value(a)
             at_x, at_ref = f.slope(a, h)
             slope, slope_of_slope = f.divided_differences(a[0], a[1], h[0], h[1])
-            q, S = p.dot(W), S.dot(W)
-            G = slope_of_slope * q * S + at_ref * G.dot(W)
+            q, first = p.dot(W), T is eye
+            T, S = (W, W) if first else (T.dot(W), S.dot(W))
+            bent = slope_of_slope * q * S
+            G = bent if first else bent + at_ref * G.dot(W)
             S = slope * S
-            T = at_x * T.dot(W)
+            T = at_x * T
             p = at_x * q
         rows = self.rows.T
         return (self._with_states(x, (h[0] - self.value_at_zero).dot(rows)),
