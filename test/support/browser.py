@@ -13,7 +13,15 @@ import pytest
 
 PATIENCE = 60_000.0  # ms
 ADDRESS = re.compile(r'the panel is at (http://127\.0\.0\.1:\d+)')
-_FLAGS = ('--no-sandbox', '--disable-gpu', '--disable-quic', '--no-first-run', '--mute-audio',
+# The address bar has two pages of its own, which each window would load, where there is no bar.
+# The rest is what Playwright turns off, for the last list alone counts.
+_OFF = ('WebUIOmniboxPopup', 'WebUIOmniboxAimPopup', 'AimEnabled',
+        'AvoidUnnecessaryBeforeUnloadCheckSync', 'DestroyProfileOnBrowserClose', 'HttpsUpgrades',
+        'HttpsFirstBalancedModeAutoEnable', 'LensOverlay', 'MediaRouter', 'PaintHolding',
+        'ThirdPartyStoragePartitioning', 'AvoidCorsURLLoaderRestartOnRedirect',
+        'OptimizationHints', 'NetworkTimeServiceQuerying', 'PreconnectToSearch')
+_FLAGS = (f'--disable-features={",".join(_OFF)}',
+          '--no-sandbox', '--disable-gpu', '--disable-quic', '--no-first-run', '--mute-audio',
           '--disable-extensions', '--disable-background-networking', '--disable-component-update',
           '--disable-sync', '--in-process-gpu', '--renderer-process-limit=1')
 _OWN = re.compile(r'(http|ws)://127\.0\.0\.1:\d+/|data:|blob:')
