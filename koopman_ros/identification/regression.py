@@ -219,24 +219,24 @@ def smoothed(time: Array, values: Array) -> Array:
 def _smoothed(records: Sequence[tuple[Array, Array]]) -> list[Array]:
     """Return what :func:`smoothed` does for each of many times and signals, all at once."""
     found = [values.copy() for _, values in records]
-    noisy, noises, pieces = [], [], []
+    pieces, sizes = [], []
     for values, (time, _) in zip(found, records, strict=True):
         D = _third_differences(time)
         for y in values.T:
-            own = _noise(D, y)
-            if own > 1e-9 * float(np.ptp(y) or 1.0):
-                noisy.append(y)
-                noises.append(own)
+            size = _noise(D, y)
+            if size > 1e-9 * float(np.ptp(y) or 1.0):
                 pieces.append((D, y))
-    if noisy:
-        filters, noise = _TrendFilters(pieces), np.array(noises)
+                sizes.append(size)
+    if pieces:
+        filters, noise = _TrendFilters(pieces), np.array(sizes)
         low, high = np.full(len(noise), -6.0), np.full(len(noise), 8.0)
         for _ in range(_BISECTIONS):
             middle = 0.5 * (low + high)
             more = filters.taken_away(filters.filtered(noise * 10.0 ** middle)) < noise
             low, high = np.where(more, middle, low), np.where(more, high, middle)
-        for y, g in zip(noisy, filters.split(filters.filtered(noise * 10.0 ** low)), strict=True):
-            y[:] = g
+        curves = filters.split(filters.filtered(noise * 10.0 ** low))
+        for (_, y), curve in zip(pieces, curves, strict=True):
+            y[:] = curve
     return found
 
 

@@ -34,7 +34,8 @@ def test_each_plant_is_told_of_by_itself(ros: Harness, tmp_path: Path) -> None:
     assert program.wait(120.0) == 1, program.output()
     lines = dict(line.split(': ', 1) for line in program.output().splitlines() if ': ' in line)
     assert lines['/a'].startswith('the new lift is accepted')
-    assert 'does not exist' in lines['/lost']
+    assert lines['/lost'] == (
+        f"training failed: bag '{tmp_path}/none.mcap' does not exist: check the path")
     assert lines['/bare'] == ('cannot be retrained: there is no bag to train from: name it in '
                               'bags')
     assert lines['trainer'] == '1 of 2 new lifts are accepted'

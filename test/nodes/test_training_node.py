@@ -119,7 +119,6 @@ def test_trains_beside_the_running_loop(ros: Harness, tmp_path: Path) -> None:
         'model_class': 'linear',
         # which none meets
         'gate_margin': 0.99,
-        'bags': [tmp_path / 'none.mcap'],
         'experiment_length': 600.0, 'coolant_temperature.experiment_min': 4.0,
         'min_free_disk': 0.0})
     ros.meet('plant')
@@ -128,15 +127,6 @@ def test_trains_beside_the_running_loop(ros: Harness, tmp_path: Path) -> None:
     def wait_for_measurements(count: int) -> None:
         ros.wait_for_status('trainer: recording', lambda status: len(status.values) > 1 and int(
             value(status, 'messages on /temperature')) > count)
-
-    assert ros.trigger('trainer/train').success
-    status = ros.wait_for_status(STATUS, lambda status: status.level == DiagnosticStatus.ERROR)
-    assert status.message == (
-        f"training failed: bag '{tmp_path}/none.mcap' does not exist: check the path")
-    assert process.output().count('none.mcap') == 2
-    # nothing keeps the next one from starting
-    (result,) = ros.set_parameters('trainer', bags=[''])
-    assert result.successful, result.reason
 
     # the bag is still being recorded; with fewer the training could fail before it is cancelled
     wait_for_measurements(250)
