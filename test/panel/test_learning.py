@@ -57,7 +57,7 @@ def picture_of(where: Locator) -> list[int]:
 
 
 def test_a_model_is_learned_read_about_compared_and_takes_over(tmp_path: Path) -> None:
-    """A reactor whose jacket has fouled, fifty times as fast as the clock."""
+    """A reactor whose jacket has fouled, a hundred times as fast as the clock."""
     new = tmp_path / 'new.safetensors'
     with warnings.catch_warnings():
         # the parser of the type support imports a module that Python deprecated
@@ -76,7 +76,7 @@ def test_a_model_is_learned_read_about_compared_and_takes_over(tmp_path: Path) -
         plant = {
             'lockstep': True, 'lockstep_subscribers': 3, 'temperature.noise': 0.1,
             'constants.heat_transfer_coefficient': 0.8 * constant('heat_transfer_coefficient')}
-        quick = ros.start('plant', {**plant, 'speed': 50.0})
+        quick = ros.start('plant', {**plant, 'speed': 100.0})
         address = ros.wait_until(lambda: ADDRESS.search(panel.output()))
         assert address is not None
         url = address[1]

@@ -9,8 +9,8 @@ from validation import saddle
 def test_without_the_concentration_the_same_law_costs_hardly_more(monkeypatch):
     monkeypatch.setattr(saddle, 'LAWS', {'sdre': ('sdre',)})
     monkeypatch.setattr(saddle, 'COURSE', {0.0: 350.0, 30.0: 345.0})
-    monkeypatch.setattr(saddle, 'FOULED', 200.0)
-    monkeypatch.setattr(saddle, 'END', 400.0)
+    monkeypatch.setattr(saddle, 'FOULED', 330.0)
+    monkeypatch.setattr(saddle, 'END', 530.0)
     (row,) = saddle.course_rows([saddle.truth()], periods=(1.0,))
     law, period, over_true, worst, over_full, _, offset, concentration, *lost = row
     assert (law, period, over_true, worst) == ('sdre', '1', '1.0000', '1.0000')

@@ -267,7 +267,7 @@ def test_a_bad_signal_of_two_and_a_second_controller_are_survived(tmp_path):
 
     result, found = run(replace(
         # as fast as it can, it would work on while the second one starts
-        case, play=play, largest_step=math.inf, plant={**case.plant, 'speed': 50.0},
+        case, play=play, largest_step=math.inf, plant={**case.plant, 'speed': 20.0},
         settle=60.0, afterwards=60.0), tmp_path)
     assert result['reasons'] == []
     assert (result['plant'], result['unit'], result['input_unit']) == ('two_tanks', 'm', 'V')
