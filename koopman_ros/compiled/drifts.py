@@ -27,32 +27,44 @@ from koopman_ros.compiled.network import (
     widths,
 )
 
-# Where what a weighted sum begins with does not lie among the weights.
-_NOTHING, _ADD = -1, -2
+Layers = tuple[Array, Array, Array, Array, NDArray[np.int64]]
+Weights = tuple[Array, Array, Array, Array]
+Space = tuple[Layers, Weights, tuple[Array, Array, Array, Array]]
 
-Space = tuple[Array, Array, Array, Array, NDArray[np.int64], tuple[Array, Array, Array, Array]]
+
+@inner
+def _matrix(numbers: Array, start: int, rows: int, columns: int) -> Array:
+    """Return a matrix among the numbers of a layout, where it is."""
+    return numbers[start:start + rows * columns].reshape((rows, columns))
 
 
 @inner
 def space_of(sizes: NDArray[np.int64], numbers: Array, N: int) -> Space:
     """
-    Return room for :func:`drifts` of N states.
+    Return what :func:`drifts` of N states needs.
 
-    All hidden layers (h, N), one after the other, the derivatives (h, n_x, N) of what goes into
-    their tanh, of the first of them filled in, a layer with its derivatives twice, 2^k, and z, J_N
+    Of all hidden layers, one after the other, h (h, N) and the derivatives P (h, n_x, N) of what
+    goes into their tanh, of the first of them filled in; room for a layer and its derivatives,
+    twice each, and for 2^k. Output, A, slope of the pre-feedback and read-out. Room for z, J_N,
     and what follows of it.
     """
-    n, n_z, count, width = sizes[N_X], sizes[N_Z], 0, 0
+    n, n_z, count, most = sizes[N_X], sizes[N_Z], 0, 0
     for layer in range(WIDTHS, len(sizes)):
         count += sizes[layer]
-        width = max(width, sizes[layer])
+        most = max(most, sizes[layer])
     P = np.empty((count, n, N))
     for i in range(sizes[WIDTHS] if count else 0):
         for k in range(n):
             for c in range(N):
                 P[i, k, c] = numbers[k * sizes[WIDTHS] + i]
-    return (np.empty((count, N)), P, np.empty((2, width, N)),
-            np.empty((2, width, n, N)), np.empty(width * N, np.int64),
+    width, start = widths(sizes)
+    output = start + width
+    A = output + n_z * width
+    slope = A + n_z * n_z + n * sizes[N_U]
+    return ((np.empty((count, N)), P, np.empty((2, most, N)), np.empty((2, most, n, N)),
+             np.empty(most * N, np.int64)),
+            (_matrix(numbers, output, n_z, width), _matrix(numbers, A, n_z, n_z),
+             _matrix(numbers, slope, n, n), _matrix(numbers, slope + n * n, n, n + width)),
             (np.empty((2 * n_z, N)), np.empty((n_z, n, N)), np.empty((n_z, n, N)),
              np.empty((n, n, N))))
 
@@ -64,61 +76,66 @@ def _flat(A: Array) -> Array:
 
 
 @inner
-def _weighted(target: Array, rows: int, weights: Array, start: int, down: int, across: int,
-              source: Array, count: int, begin: int) -> None:
-    """
-    Write to so many rows the weighted sums of the first `count` rows of another array.
+def _clear(A: Array) -> None:
+    for i in range(A.shape[0]):
+        for c in range(A.shape[1]):
+            A[i, c] = 0.0
 
-    :param start: where the weights begin, which lie `down` apart by row and `across` by column.
-    :param begin: where what each row begins with does, `_NOTHING` for 0, or `_ADD` to go on.
-    """
-    for i in range(rows):
-        if begin != _ADD:
-            first = weights[begin + i] if begin >= 0 else 0.0
-            for c in range(target.shape[1]):
-                target[i, c] = first
+
+@inner
+def _add_weighted(target: Array, weights: Array, source: Array, count: int) -> None:
+    """Add the last columns of weights times the first rows of another array, so many."""
+    first = weights.shape[1] - count
+    for i in range(weights.shape[0]):
         for k in range(0, count, 4):
-            # four at once; of what there is not, the last by 0
-            at = start + i * down + k * across
-            second, third, fourth = k + 1, k + 2, k + 3
-            p, q, r, s = weights[at], 0.0, 0.0, 0.0
-            if second < count:
-                q = weights[at + across]
-            else:
-                second = k
-            if third < count:
-                r = weights[at + 2 * across]
-            else:
-                third = k
-            if fourth < count:
-                s = weights[at + 3 * across]
-            else:
-                fourth = k
+            # four at once; of what there is not, the first by 0
+            p, q, r, s, second, third, fourth = weights[i, first + k], 0.0, 0.0, 0.0, k, k, k
+            if k + 1 < count:
+                second, q = k + 1, weights[i, first + k + 1]
+            if k + 2 < count:
+                third, r = k + 2, weights[i, first + k + 2]
+            if k + 3 < count:
+                fourth, s = k + 3, weights[i, first + k + 3]
             for c in range(target.shape[1]):
                 target[i, c] += (p * source[k, c] + q * source[second, c]) + (
                     r * source[third, c] + s * source[fourth, c])
 
 
 @inner
-def _layers(sizes: NDArray[np.int64], numbers: Array, x: Array, h: Array, P: Array,
-            slopes: Array, scale: NDArray[np.int64]) -> int:
-    """
-    Write the hidden layers to h, and the derivatives of what goes into them to P.
+def _add_turned(target: Array, weights: Array, source: Array) -> None:
+    """Add the transpose of weights times as many rows of another array as they have."""
+    count = weights.shape[0]
+    for i in range(weights.shape[1]):
+        for k in range(0, count, 2):
+            p, q, second = weights[k, i], 0.0, k
+            if k + 1 < count:
+                second, q = k + 1, weights[k + 1, i]
+            for c in range(target.shape[1]):
+                target[i, c] += p * source[k, c] + q * source[second, c]
 
-    :param slopes: room for those of two layers.
-    :return: which of these is that of the last layer.
+
+@inner
+def _layers(sizes: NDArray[np.int64], numbers: Array, x: Array, space: Layers) -> int:
     """
+    Evaluate the hidden layers.
+
+    :return: in which of the room for two layers the derivatives of the last one are.
+    """
+    h, P, _, slopes, scale = space
     n, N = x.shape
     start, last, row, turn = 0, n, 0, 0
     for layer in range(WIDTHS, len(sizes)):
         width = sizes[layer]
         bias, own = start + width * last, h[row:row + width]
-        if layer == WIDTHS:
-            _weighted(own, width, numbers, start, 1, width, x, last, bias)
-        else:
-            _weighted(own, width, numbers, start, 1, width, h[row - last:row], last, bias)
-            _weighted(_flat(P[row:row + width]), width, numbers, start, 1, width,
-                      _flat(slopes[turn]), last, _NOTHING)
+        weights = _matrix(numbers, start, last, width)
+        for i in range(width):
+            for c in range(N):
+                own[i, c] = numbers[bias + i]
+        if layer > WIDTHS:
+            into = _flat(P[row:row + width])
+            _clear(into)
+            _add_turned(into, weights, _flat(slopes[turn]))
+        _add_turned(own, weights, h[row - last:row] if layer > WIDTHS else x)
         squash(own.reshape(own.size), width * N, scale)
         turn = 1 - turn
         for i in range(width):
@@ -130,57 +147,56 @@ def _layers(sizes: NDArray[np.int64], numbers: Array, x: Array, h: Array, P: Arr
 
 
 @inner
-def _turned(sizes: NDArray[np.int64], numbers: Array, h: Array, P: Array, f: Array,
-            slopes: Array) -> int:
+def _turned(sizes: NDArray[np.int64], numbers: Array, f: Array, space: Layers) -> int:
     """
-    Write the derivatives by the state of -dh/dx f of the last layer, under an f that is held.
+    Derive -dh/dx f of the last layer by the state, under an f (n_x, N) that is held.
 
-    :param slopes: room as of :func:`_layers`.
-    :return: which of these is that of the last layer.
+    :return: in which of the room for two layers that is.
     """
+    h, P, rooms, slopes, _ = space
     n, N = f.shape
-    start, last, row, turn, along, slope = 0, n, 0, 0, np.empty(N), np.empty(N)
+    start, last, row, turn, along, slope = 0, n, 0, 0, rooms[0], rooms[1]
     for layer in range(WIDTHS, len(sizes)):
         width, turn = sizes[layer], 1 - turn
         if layer > WIDTHS:
-            _weighted(_flat(slopes[turn]), width, numbers, start, 1, width,
-                      _flat(slopes[1 - turn]), last, _NOTHING)
+            _clear(_flat(slopes[turn]))
+            _add_turned(_flat(slopes[turn]), _matrix(numbers, start, last, width),
+                        _flat(slopes[1 - turn]))
         for i in range(width):
             for c in range(N):
-                along[c] = 0.0
+                along[0, c] = 0.0
             for k in range(n):
                 for c in range(N):
-                    along[c] += P[row + i, k, c] * f[k, c]
+                    along[0, c] += P[row + i, k, c] * f[k, c]
             for c in range(N):
                 t = h[row + i, c]
-                slope[c] = 1.0 - t * t
-                along[c] *= 2.0 * t * slope[c]
+                slope[0, c] = 1.0 - t * t
+                along[0, c] *= 2.0 * t * slope[0, c]
             for k in range(n):
                 if layer == WIDTHS:
                     for c in range(N):
-                        slopes[turn, i, k, c] = along[c] * P[row + i, k, c]
+                        slopes[turn, i, k, c] = along[0, c] * P[row + i, k, c]
                 else:
                     for c in range(N):
-                        slopes[turn, i, k, c] = (
-                            slope[c] * slopes[turn, i, k, c] + along[c] * P[row + i, k, c])
+                        slopes[turn, i, k, c] = (slope[0, c] * slopes[turn, i, k, c]
+                                                 + along[0, c] * P[row + i, k, c])
         start, last, row = start + width * (last + 1), width, row + width
     return turn
 
 
 @inner
-def _add_bend(sizes: NDArray[np.int64], numbers: Array, h: Array, P: Array, adjoint: Array,
-              J: Array) -> None:
+def _add_bend(sizes: NDArray[np.int64], numbers: Array, space: Layers, J: Array) -> None:
     """
     Add to J the second derivatives of a weighted sum of the last layer, from that back.
 
-    :param adjoint: its weights in the first of two rooms of a layer.
+    Its weights are in the first of the room for two layers.
     """
+    h, P, adjoint, _, _ = space
     n, N = J.shape[1:]
     row, turn = len(h), 0
-    width, start = widths(sizes)
+    _, start = widths(sizes)
     for layer in range(len(sizes) - 1, WIDTHS - 1, -1):
-        width = sizes[layer]
-        last = sizes[layer - 1] if layer > WIDTHS else n
+        width, last = sizes[layer], sizes[layer - 1] if layer > WIDTHS else n
         row -= width
         start -= width * (last + 1)
         for i in range(width):
@@ -192,8 +208,9 @@ def _add_bend(sizes: NDArray[np.int64], numbers: Array, h: Array, P: Array, adjo
                         J[j, k, c] -= 2.0 * adjoint[turn, i, c] * h[row + i, c] * P[
                             row + i, k, c] * P[row + i, j, c]
         if layer > WIDTHS:
-            _weighted(adjoint[1 - turn], last, numbers, start, width, 1, adjoint[turn], width,
-                      _NOTHING)
+            _clear(adjoint[1 - turn])
+            _add_weighted(adjoint[1 - turn], _matrix(numbers, start, last, width), adjoint[turn],
+                          width)
         turn = 1 - turn
 
 
@@ -245,30 +262,29 @@ def drifts(sizes: NDArray[np.int64], numbers: Array, x: Array, space: Space, f: 
     """
     n, N = x.shape
     n_z, identity = sizes[N_Z], sizes[IDENTITY]
+    layers, (output, A, slope, readout), (of_z, L, bent, square) = space
+    h, slopes, layer = layers[0], layers[3], layers[2][0]
+    last = slopes[_layers(sizes, numbers, x, layers)]
     width, start = widths(sizes)
-    h, P, adjoint, slopes, scale, (of_z, L, bent, square) = space
-    last = slopes[_layers(sizes, numbers, x, h, P, slopes, scale)]
-    layer = adjoint[0]
     for i in range(width):
         for c in range(N):
             layer[i, c] = h[len(h) - width + i, c] - numbers[start + i]
-    output = start + width
-    A = output + n_z * width
-    slope = A + n_z * n_z + n * sizes[N_U]
     if sizes[READOUT]:
-        down, readout = n + width, slope + n * n
-        _weighted(f, n, numbers, readout, down, 1, x, n, _NOTHING)
-        _weighted(f, n, numbers, readout + n, down, 1, layer, width, _ADD)
+        _clear(f)
         for i in range(n):
             for j in range(n):
                 for c in range(N):
-                    J[i, j, c] = numbers[readout + i * down + j]
-        _weighted(_flat(J), n, numbers, readout + n, down, 1, _flat(last), width, _ADD)
+                    f[i, c] += readout[i, j] * x[j, c]
+                    J[i, j, c] = readout[i, j]
+        _add_weighted(f, readout, layer, width)
+        _add_weighted(_flat(J), readout, _flat(last), width)
         return
     # in the second half of the first A z, then what J_N f leaves of it
     rest = of_z[n_z:]
-    _weighted(of_z, n_z, numbers, output, width, 1, layer, width, _NOTHING)
-    _weighted(_flat(L), n_z, numbers, output, width, 1, _flat(last), width, _NOTHING)
+    _clear(of_z)
+    _add_weighted(of_z, output, layer, width)
+    _clear(_flat(L))
+    _add_weighted(_flat(L), output, _flat(last), width)
     if identity:
         for i in range(n):
             for c in range(N):
@@ -276,7 +292,7 @@ def drifts(sizes: NDArray[np.int64], numbers: Array, x: Array, space: Space, f: 
             for k in range(n):
                 for c in range(N):
                     L[i, k, c] = 1.0 if i == k else 0.0
-    _weighted(rest, n_z, numbers, A, n_z, 1, of_z, n_z, _NOTHING)
+    _add_weighted(rest, A, of_z, n_z)
     for k in range(n):
         for c in range(N):
             f[k, c] = 0.0
@@ -300,12 +316,14 @@ def drifts(sizes: NDArray[np.int64], numbers: Array, x: Array, space: Space, f: 
             for k in range(n):
                 for c in range(N):
                     rest[a, c] -= L[a, k, c] * f[k, c]
-        _weighted(layer, width, numbers, output, 1, width, rest, n_z, _NOTHING)
-        _add_bend(sizes, numbers, h, P, adjoint, J)
+        _clear(layer)
+        _add_turned(layer, output, rest)
+        _add_bend(sizes, numbers, layers, J)
     # what A makes of J_N, less how that turns the rate
-    last = slopes[_turned(sizes, numbers, h, P, f, slopes)]
-    _weighted(_flat(bent), n_z, numbers, output, width, 1, _flat(last), width, _NOTHING)
-    _weighted(_flat(bent), n_z, numbers, A, n_z, 1, _flat(L), n_z, _ADD)
+    last = slopes[_turned(sizes, numbers, f, layers)]
+    _clear(_flat(bent))
+    _add_weighted(_flat(bent), output, _flat(last), width)
+    _add_weighted(_flat(bent), A, _flat(L), n_z)
     for j in range(n):
         for k in range(n):
             for a in range(n_z):
@@ -314,10 +332,9 @@ def drifts(sizes: NDArray[np.int64], numbers: Array, x: Array, space: Space, f: 
     _solve(square, J)
     for k in range(n):
         for j in range(n):
-            part = numbers[slope + k * n + j]
             for c in range(N):
-                f[k, c] -= part * x[j, c]
-                J[k, j, c] -= part
+                f[k, c] -= slope[k, j] * x[j, c]
+                J[k, j, c] -= slope[k, j]
         for c in range(N):
             # beside a definite matrix there is no rate
             if not 0.0 < square[k, k, c] < math.inf:

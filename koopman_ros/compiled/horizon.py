@@ -71,92 +71,42 @@ def _weigh(M: Array, g: Array, Q: Array, factor: float, lengths: Array, X: Array
 
 
 @inner
-def _intervals(sizes: NDArray[np.int64], numbers: Array, B: Array, X: Array, push: Array,
-               x_ref: Array, Q: Array, lengths: Array, steps: int) -> tuple[Array, Array]:
+def _go_on(stage: int, lengths: Array, share: float, X: Array, rate: Array, total: Array,
+           middle: Array, ahead: Array) -> None:
     """
-    Follow all intervals at once by Runge-Kutta steps x' = f(x) + push, S' = f'(x) S + [0, B].
+    Go on from a stage of a Runge-Kutta step, which is a share of each interval.
 
-    :param X: (1 + c, n_x, N), with c = n_x + n_u: nodes x, which become where the intervals end,
-        and after them the columns of S, the derivatives of that by node and input.
-    :param push: (n_x, N).
-    :return: what the intervals cost: Hessian (c, c, N), its lower half, and gradient (c, N), by
-        node and input.
+    After the last one X is its end, and `middle` the middle by the rates at both ends (Hermite).
     """
-    count, n, N = X.shape
-    c, space, part = count - 1, space_of(sizes, numbers, N), 1.0 / (6.0 * steps)
-    M, g, QS, J = np.zeros((c, c, N)), np.zeros((c, N)), np.empty((n, N)), np.empty((n, n, N))
-    for a in range(c):
-        for i in range(n):
-            for k in range(N):
-                X[1 + a, i, k] = 1.0 if i == a else 0.0
-    rate, total, middle, ahead = (
-        np.empty(X.shape), np.empty(X.shape), np.empty(X.shape), X.copy())
-    _weigh(M, g, Q, part, lengths, X, x_ref, QS)
-    for step in range(steps):
-        for stage in range(4):
-            drifts(sizes, numbers, ahead[0], space, rate[0], J)
-            share = (0.5 if stage < 2 else 1.0) / steps
-            for a in range(count):
-                for i in range(n):
-                    if a == 0:
-                        for k in range(N):
-                            rate[a, i, k] += push[i, k]
-                    else:
-                        forced = B[i, a - 1 - n] if a > n else 0.0
-                        for k in range(N):
-                            rate[a, i, k] = forced
-                        for j in range(n):
-                            for k in range(N):
-                                rate[a, i, k] += J[i, j, k] * ahead[a, j, k]
-            for a in range(count):
-                for i in range(n):
-                    if stage == 0:
-                        for k in range(N):
-                            total[a, i, k] = middle[a, i, k] = rate[a, i, k]
-                    elif stage < 3:
-                        for k in range(N):
-                            total[a, i, k] += 2.0 * rate[a, i, k]
-                    if stage < 3:
-                        for k in range(N):
-                            ahead[a, i, k] = X[a, i, k] + share * lengths[k] * rate[a, i, k]
-                    else:
-                        # the middle by the rates at both ends (Hermite), for Simpson's rule
-                        for k in range(N):
-                            r = rate[a, i, k]
-                            end = X[a, i, k] + part * lengths[k] * (total[a, i, k] + r)
-                            middle[a, i, k] = 0.5 * (X[a, i, k] + end) + 0.125 / steps * lengths[
-                                k] * (middle[a, i, k] - r)
-                            ahead[a, i, k] = X[a, i, k] = end
-        _weigh(M, g, Q, 4.0 * part, lengths, middle, x_ref, QS)
-        _weigh(M, g, Q, part if step == steps - 1 else 2.0 * part, lengths, X, x_ref, QS)
-    return M, g
+    for a in range(X.shape[0]):
+        for i in range(X.shape[1]):
+            if stage == 0:
+                for k in range(X.shape[2]):
+                    r = rate[a, i, k]
+                    total[a, i, k] = middle[a, i, k] = r
+                    ahead[a, i, k] = X[a, i, k] + 0.5 * share * lengths[k] * r
+            elif stage < 3:
+                part = 0.5 * share if stage == 1 else share
+                for k in range(X.shape[2]):
+                    r = rate[a, i, k]
+                    total[a, i, k] += 2.0 * r
+                    ahead[a, i, k] = X[a, i, k] + part * lengths[k] * r
+            else:
+                for k in range(X.shape[2]):
+                    r, h = rate[a, i, k], share * lengths[k]
+                    end = X[a, i, k] + h / 6.0 * (total[a, i, k] + r)
+                    middle[a, i, k] = 0.5 * (X[a, i, k] + end) + 0.125 * h * (
+                        middle[a, i, k] - r)
+                    X[a, i, k] = ahead[a, i, k] = end
 
 
-@compiled(INTEGERS, VECTOR, MATRIX, MATRIX, VECTOR, VECTOR, VECTOR, VECTOR, VECTOR, SIZE, MATRIX,
-          MATRIX, MATRIX)
-def program(sizes: NDArray[np.int64], numbers: Array, u: Array, x: Array, start: Array, w: Array,
-            x_ref: Array, u_ref: Array, lengths: Array, steps: int, Q: Array, R: Array,
-            terminal: Array) -> tuple[bool, Array, Array, Array, Array]:
-    """
-    Linearise a course of inputs (N, n_u) and nodes (N + 1, n_x), with what a change of it costs.
-
-    :return: whether all is finite, nodes and their derivatives by the inputs, and H and f; see
-        :class:`koopman_ros.control.laws.shooting.Program`.
-    """
-    n, m, N = sizes[N_X], sizes[N_U], len(u)
+@inner
+def _condensed(u: Array, x: Array, start: Array, x_ref: Array, u_ref: Array, lengths: Array,
+               R: Array, terminal: Array, X: Array, M: Array, g: Array
+               ) -> tuple[bool, Array, Array, Array, Array]:
+    """Return what :func:`program` does, of the ends X of all intervals and their costs M and g."""
+    (N, m), n = u.shape, x.shape[1]
     count = N * m
-    _, B, _, _ = matrices(sizes, numbers)
-    # the last one again until their number suits the processor
-    columns = N + (-N) % _LANES
-    X, push, held = np.empty((1 + n + m, n, columns)), np.empty((n, columns)), np.empty(columns)
-    for column in range(columns):
-        k = min(column, N - 1)
-        held[column] = lengths[k]
-        for i in range(n):
-            X[0, i, column], push[i, column] = x[k, i], w[i]
-            for j in range(m):
-                push[i, column] += B[i, j] * u[k, j]
-    M, g = _intervals(sizes, numbers, B, X, push, x_ref.copy(), Q.copy(), held, steps)
     nodes, by_inputs = np.empty((N + 1, n)), np.zeros((N + 1, n, count))
     gap, total = np.empty((n, N)), 0.0
     for i in range(n):
@@ -216,3 +166,54 @@ def program(sizes: NDArray[np.int64], numbers: Array, u: Array, x: Array, start:
         for b in range(a):
             H[b, a] = H[a, b]
     return math.isfinite(total), nodes, by_inputs, H, f
+
+
+@compiled(INTEGERS, VECTOR, MATRIX, MATRIX, VECTOR, VECTOR, VECTOR, VECTOR, VECTOR, SIZE, MATRIX,
+          MATRIX, MATRIX)
+def program(sizes: NDArray[np.int64], numbers: Array, u: Array, x: Array, start: Array, w: Array,
+            x_ref: Array, u_ref: Array, lengths: Array, steps: int, Q: Array, R: Array,
+            terminal: Array) -> tuple[bool, Array, Array, Array, Array]:
+    """
+    Linearise a course of inputs (N, n_u) and nodes (N + 1, n_x), with what a change of it costs.
+
+    :return: whether all is finite, nodes and their derivatives by the inputs, and H and f; see
+        :class:`koopman_ros.control.laws.shooting.Program`.
+    """
+    n, m, N = sizes[N_X], sizes[N_U], len(u)
+    c, part = n + m, 1.0 / (6.0 * steps)
+    _, B, _, _ = matrices(sizes, numbers)
+    # all intervals at once, side by side in columns; the last one again until their number suits
+    # the processor. Nodes come first in X, and become where the intervals end, and after them the
+    # derivatives of that by node and input.
+    columns = N + (-N) % _LANES
+    X, push, held = np.zeros((1 + c, n, columns)), np.empty((n, columns)), np.empty(columns)
+    for k in range(columns):
+        one = min(k, N - 1)
+        held[k] = lengths[one]
+        for i in range(n):
+            X[0, i, k], X[1 + i, i, k], push[i, k] = x[one, i], 1.0, w[i]
+            for j in range(m):
+                push[i, k] += B[i, j] * u[one, j]
+    space, x_ref, Q = space_of(sizes, numbers, columns), x_ref.copy(), Q.copy()
+    M, g = np.zeros((c, c, columns)), np.zeros((c, columns))
+    QS, J = np.empty((n, columns)), np.empty((n, n, columns))
+    rate, total, middle, ahead = (
+        np.empty(X.shape), np.empty(X.shape), np.empty(X.shape), X.copy())
+    _weigh(M, g, Q, part, held, X, x_ref, QS)
+    for step in range(steps):
+        for stage in range(4):
+            drifts(sizes, numbers, ahead[0], space, rate[0], J)
+            for i in range(n):
+                for k in range(columns):
+                    rate[0, i, k] += push[i, k]
+                for a in range(c):
+                    forced = B[i, a - n] if a >= n else 0.0
+                    for k in range(columns):
+                        rate[1 + a, i, k] = forced
+                    for j in range(n):
+                        for k in range(columns):
+                            rate[1 + a, i, k] += J[i, j, k] * ahead[1 + a, j, k]
+            _go_on(stage, held, 1.0 / steps, X, rate, total, middle, ahead)
+        _weigh(M, g, Q, 4.0 * part, held, middle, x_ref, QS)
+        _weigh(M, g, Q, part if step == steps - 1 else 2.0 * part, held, X, x_ref, QS)
+    return _condensed(u, x, start, x_ref, u_ref, lengths, R, terminal, X, M, g)

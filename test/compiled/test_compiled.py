@@ -146,6 +146,22 @@ def test_a_step_is_the_same_whether_it_is_regular_or_not(
     assert sum(found is not None for found in answered) > usual
 
 
+def same_plans(model: LiftedModel, x: np.ndarray, w: np.ndarray) -> None:
+    """Check programs and distances about a course, of as many intervals as suits no processor."""
+    rng, fast, (n, m), N = np.random.default_rng(0), compiled(model), model.B.shape, 5
+    horizon = Horizon(x, w, np.zeros(n), np.zeros(m), 0.01 * np.arange(1, N + 1), 2, np.eye(n),
+                      np.eye(m), np.eye(n))
+    inputs, nodes = 0.1 * rng.normal(size=(N, m)), x + 0.05 * rng.normal(size=(N + 1, n))
+    ours = kernels()['program'](fast, horizon, inputs, nodes)
+    theirs = program(model, horizon, inputs, nodes)
+    for part in ('nodes', 'by_inputs', 'H', 'f'):
+        exact = getattr(theirs, part)
+        np.testing.assert_allclose(getattr(ours, part), exact, rtol=0.0,
+                                   atol=1e-12 * max(1.0, np.max(np.abs(exact))))
+    nodes[-1, 0] = np.inf
+    np.testing.assert_array_equal(kernels()['distances'](fast, nodes), model.distances(nodes))
+
+
 @pytest.mark.parametrize('widths', [(5,), (7, 3)])
 @pytest.mark.parametrize(('n_x', 'n_u'), [(1, 1), (2, 1), (3, 2)])
 def test_random_lifts_of_any_depth_move_and_are_fed_back_the_same(
@@ -157,6 +173,7 @@ def test_random_lifts_of_any_depth_move_and_are_fed_back_the_same(
         u = rng.normal(size=n_u)
         np.testing.assert_allclose(moved(fast, x, w, u, 0.01, 3), moved(model, x, w, u, 0.01, 3),
                                    rtol=1e-12, atol=1e-13)
+        same_plans(model, x, w)
         weights = Weights(np.eye(n_x), np.eye(n_u))
         target = steady_state_target(model, x_ref, w)
         one, two = (recentred(lift, x, target, weights, interval=0.05) for lift in (fast, model))
@@ -177,6 +194,9 @@ def test_plans_and_predictions_are_set_up_the_same_with_a_read_out_and_without(n
     inputs, nodes = 0.1 * rng.normal(size=(6, m)), np.tile(x, (7, 1))
     horizon = Horizon(x, w, np.zeros(n), np.zeros(m), np.full(6, 0.02), 2, np.eye(n), np.eye(m),
                       np.eye(n))
+    astray = np.concatenate((nodes, 3.0 * nodes))
+    np.testing.assert_allclose(kernels()['distances'](fast, astray), model.distances(astray),
+                               rtol=1e-12, atol=1e-13)
     for function, arguments in ((propagated, (x, w, np.eye(2 * n), u, 0.01, 3)),
                                 (program, (horizon, inputs, nodes)), (slope_at, (x,))):
         assert kernels()[function.__name__](fast, *arguments) is not None

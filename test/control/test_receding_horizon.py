@@ -16,6 +16,7 @@ from koopman_ros.control import Controller, InputLimits, Settings
 from koopman_ros.control.events import SetpointRequest
 from koopman_ros.control.laws import Plan, receding_horizon, Tuning, Weights
 from koopman_ros.control.laws.base import steady_state_target
+from koopman_ros.control.laws.intervals import Intervals
 from koopman_ros.control.laws.receding_horizon import RecedingHorizon
 from koopman_ros.control.simulate import at, simulate
 from koopman_ros.control.state import State
@@ -371,6 +372,18 @@ def test_the_horizon_grows_from_the_sample_and_ends_in_time():
         assert 3 <= len(lengths) <= 30
         # eight time constants of what grows, or three samples
         assert np.sum(lengths) <= max(8.0 / 0.5, 3.0 * interval) + interval
+
+
+def test_a_plan_is_moved_on_by_a_sample():
+    """Its nodes go on between the old ones, its inputs are those that held then."""
+    old, new = Intervals(np.array([1.0, 1.0, 2.0])), Intervals(np.array([1.0, 0.5, 1.5, 2.0]))
+    u, x = np.array([[1.0], [2.0], [3.0]]), np.array([[0.0, 5.0], [1.0, 4.0], [3.0, 2.0],
+                                                      [7.0, -2.0]])
+    inputs, nodes = new.shifted(u, x, old.lengths)
+    np.testing.assert_array_equal(inputs[:, 0], [2.0, 3.0, 3.0, 3.0])
+    # at 1, 2, 2.5, 4 and beyond the end
+    np.testing.assert_allclose(nodes, [[1.0, 4.0], [3.0, 2.0], [4.0, 1.0], [7.0, -2.0],
+                                       [7.0, -2.0]])
 
 
 def test_the_first_sample_is_answered_by_the_riccati_equation():
