@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 The koopman_ros Authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""The intervals of a horizon, and how a plan over some is taken over to others."""
+"""The intervals of a horizon, their limits, and how a plan over some is taken over to others."""
 
 from __future__ import annotations
 
@@ -76,6 +76,37 @@ class Intervals:
             return _Shift(np.minimum(held, last), left, left + 1, share[:, None])
 
         return of
+
+
+@dataclass(frozen=True)
+class Reach:
+    """What limits the inputs (n_u,) of a plan, in scaled deviations."""
+
+    lower: Array  #: lower end of their range, to `upper`
+    upper: Array
+    #: (N, n_u) what each may change from one interval to the next: the first since the command
+    #: before
+    change: Array
+
+    def differences(self, first: bool) -> tuple[Array, NDArray[np.intp]]:
+        """
+        Return rows of the change of each limited input from the interval before, and its place.
+
+        :param first: whether nothing is before the first interval.
+        :return: (rows, N n_u) and (rows,) of N n_u.
+        """
+        return self._first if first else self._further
+
+    @cached_property
+    def _further(self) -> tuple[Array, NDArray[np.intp]]:
+        (N, n_u), places = self.change.shape, np.flatnonzero(np.isfinite(self.change))
+        return (np.eye(N * n_u) - np.eye(N * n_u, k=-n_u))[places], places
+
+    @cached_property
+    def _first(self) -> tuple[Array, NDArray[np.intp]]:
+        rows, places = self._further
+        later = places >= self.change.shape[1]
+        return rows[later], places[later]
 
 
 def _growth(count: int, total: float) -> float:

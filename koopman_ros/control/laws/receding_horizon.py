@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from koopman_ros.arrays import Array
 from koopman_ros.control.laws.base import Figures, LawResult, Plan, Target, Tuning
-from koopman_ros.control.laws.intervals import Intervals
+from koopman_ros.control.laws.intervals import Intervals, Reach
 from koopman_ros.control.laws.riccati import feedback, regulator, StateDependentRiccati
 from koopman_ros.control.laws.shooting import Horizon, program, slope_at
 from koopman_ros.control.limits import finite, InputLimits
@@ -215,7 +215,7 @@ class RecedingHorizon:
         """Rate of the fastest mode of the drift at the nominal point, in 1/time unit."""
         return _fastest(self._slope)
 
-    def reach(self, interval: float, limits: InputLimits) -> _Reach:
+    def reach(self, interval: float, limits: InputLimits) -> Reach:
         """Return what limits the inputs of a plan, at samples so far apart in time units."""
         return self._reach(interval, *(
             side.tobytes() for side in (limits.lower, limits.upper, limits.rate)))
@@ -223,9 +223,9 @@ class RecedingHorizon:
     @cached_property
     def _reach(self) -> Any:
         @lru_cache(maxsize=8)
-        def of(interval: float, *limits: bytes) -> _Reach:
+        def of(interval: float, *limits: bytes) -> Reach:
             inputs, (lower, upper, rate) = self.model.inputs, map(np.frombuffer, limits)
-            return _Reach(np.maximum(inputs.to_deviation(lower), -_UNLIMITED),
+            return Reach(np.maximum(inputs.to_deviation(lower), -_UNLIMITED),
                           np.minimum(inputs.to_deviation(upper), _UNLIMITED),
                           self.intervals(interval).before * (
                               rate * self.model.seconds_per_time_unit / inputs.scale))
@@ -252,37 +252,6 @@ def _fastest(slope: Array) -> float:
     if info != 0:
         raise np.linalg.LinAlgError('the slope of the drift has no eigenvalues')
     return max(map(math.hypot, real.tolist(), imaginary.tolist()))
-
-
-@dataclass(frozen=True)
-class _Reach:
-    """What limits the inputs (n_u,) of a plan, in scaled deviations."""
-
-    lower: Array  #: lower end of their range, to `upper`
-    upper: Array
-    #: (N, n_u) what each may change from one interval to the next: the first since the command
-    #: before
-    change: Array
-
-    def differences(self, first: bool) -> tuple[Array, NDArray[np.intp]]:
-        """
-        Return rows of the change of each limited input from the interval before, and its place.
-
-        :param first: whether nothing is before the first interval.
-        :return: (rows, N n_u) and (rows,) of N n_u.
-        """
-        return self._first if first else self._further
-
-    @cached_property
-    def _further(self) -> tuple[Array, NDArray[np.intp]]:
-        (N, n_u), places = self.change.shape, np.flatnonzero(np.isfinite(self.change))
-        return (np.eye(N * n_u) - np.eye(N * n_u, k=-n_u))[places], places
-
-    @cached_property
-    def _first(self) -> tuple[Array, NDArray[np.intp]]:
-        rows, places = self._further
-        later = places >= self.change.shape[1]
-        return rows[later], places[later]
 
 
 class _Problem:
