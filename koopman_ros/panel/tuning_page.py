@@ -6,6 +6,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from dataclasses import replace
 from functools import partial
 from typing import Any
 
@@ -92,7 +93,7 @@ class _Row:
 
     def show(self, view: ParameterView) -> None:
         """Show a value that is another one."""
-        if view.text == self._text and view == self._view:
+        if self._text and view == self._view:
             return
         self._view = view
         if view.read_only:
@@ -113,9 +114,13 @@ class _Row:
             say(self._said, Answer(False, str(error)))
             return
         self._said.set_text('sent …')
-        say(self._said, await self._frame.act(
+        answer = await self._frame.act(
             'parameters', self._node, {self._view.name: value}, {
-                self._view.name: self._view.value}))
+                self._view.name: self._view.value})
+        if answer.accepted:
+            # the node tells of it later: what is typed until then stays, the value of before, too
+            self._text = replace(self._view, value=value).text
+        say(self._said, answer)
 
 
 def _range(view: ParameterView) -> str:
