@@ -56,9 +56,9 @@ class PlantNode(ManagedNode):
         """Build the plant at its initial state, and what publishes it."""
         table = self._table
         self._settings = parameters = self.current(table)
-        self._sensors_of: PlantParameters | None = None  # what the sensors are known by
         system = self._build(parameters)
         self._signals = signals = table.described
+        self._sensors = self._known_sensors()
         self._real_time = parameters.speed == 1.0 and not parameters.lockstep
         self._period_ns = round(parameters.sample_period * NANOSECONDS)
         self._start_ns = round(parameters.start_time * NANOSECONDS)
@@ -132,16 +132,11 @@ class PlantNode(ManagedNode):
         return np.array([getattr(self._settings.states[name], attribute)
                          for name in self._signals.states])
 
-    def _sensors(self) -> tuple[Array, Array, Array, Array]:
+    def _known_sensors(self) -> tuple[Array, Array, Array, Array]:
         """Return deviation of the noise, resolution, bias and variance of all states (n_x,)."""
-        settings = self._settings
-        if self._sensors_of is not settings:
-            noise, resolution = self._column('noise'), self._column('resolution')
-            # the steps of the scale have the variance of a uniform error
-            self._known = (noise, resolution, self._column('bias'),
-                           noise ** 2 + resolution ** 2 / 12.0)
-            self._sensors_of = settings
-        return self._known
+        noise, resolution = self._column('noise'), self._column('resolution')
+        # the steps of the scale have the variance of a uniform error
+        return noise, resolution, self._column('bias'), noise ** 2 + resolution ** 2 / 12.0
 
     def _initial(self, system: plants.ControlAffineSystem, time_ns: int) -> plants.Process:
         x, u = system.nominal_state + self._column('initial_offset'), system.nominal_input
@@ -227,7 +222,7 @@ class PlantNode(ManagedNode):
         if self._clock_publisher is not None and topics.heard(self._clock_publisher):
             self._clock_publisher.publish(Clock(clock=stamp))
         self._applied.send(plant.u, stamp, frame_id)
-        deviation, resolution, bias, variance = self._sensors()
+        deviation, resolution, bias, variance = self._sensors
         noise = np.array([plants.sensor_noise(one, settings.seed, sample, i)
                           for i, one in enumerate(deviation.tolist())])
         self._states.send(plant.x + noise + bias, stamp, frame_id, variance, resolution)
@@ -317,8 +312,8 @@ class PlantNode(ManagedNode):
     def _on_parameters(self, parameters: PlantParameters) -> None:
         if not self._settings.lockstep:
             self._advance_to_now()
-        self._settings = parameters
-        before = self._plant.system
+        self._settings, before = parameters, self._plant.system
+        self._sensors = self._known_sensors()
         try:
             system = self._table.system(parameters)
         except plants.EquilibriumError:
