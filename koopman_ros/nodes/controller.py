@@ -316,6 +316,8 @@ class ControllerNode(ManagedNode):
             self._tell(*watched)
         if self._untold:
             self._say(self._report, time.monotonic())
+        with self._lock:
+            self._records.watch()
 
     def _on_busy(self, seconds: float) -> None:
         """Stand in for the executor; called in the watchdog's thread."""

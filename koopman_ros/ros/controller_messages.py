@@ -37,6 +37,7 @@ from koopman_ros.wire import stem
 
 _REACHED = 1e-3  # of a range; so near a set-point is reached
 _SNAPSHOT_PERIOD = 10.0  # s by the wall
+_AGAIN = 1.0  # s, within which two nodes know each other
 _ACTIONS = {HOLD: 'the last command is held', SAFE: 'the safe {} is commanded'}
 _WAY_BACK = 'the {} leads the plant back from where the safe one keeps it'
 
@@ -382,7 +383,8 @@ class RecordPublisher:
     Publish numbered records; the caller holds the lock of the controller's state meanwhile.
 
     A replay begins at a snapshot of that state: there is one when the controller begins to act,
-    before which nothing is published, one for each new subscriber, and one every ten seconds.
+    before which nothing is published, one every ten seconds, and two for each new subscriber: it
+    may know this publisher later than this one knows it, and miss what was published meanwhile.
     """
 
     def __init__(self, matching: topics.Matching, snapshot: Callable[[], Mapping[str, Any]],
@@ -401,6 +403,12 @@ class RecordPublisher:
         if info.current_count_change > 0:
             with self._lock:
                 self.publish_snapshot()
+                self._due = time.monotonic() + _AGAIN
+
+    def watch(self) -> None:
+        """Publish the state where that is due and no event was."""
+        if time.monotonic() > self._due:
+            self.publish_snapshot()
 
     def publish_snapshot(self, event: str = SNAPSHOT) -> None:
         """Publish the state."""
@@ -417,8 +425,7 @@ class RecordPublisher:
     def publish(self, event: str, fields: Mapping[str, Any]) -> None:
         """Publish an event by its name."""
         self._publish(event, fields)
-        if time.monotonic() > self._due:
-            self.publish_snapshot()
+        self.watch()
 
     def _publish(self, event: str, fields: Mapping[str, Any]) -> None:
         if not self._started:
