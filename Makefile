@@ -73,12 +73,12 @@ demo-saddle: $(VENV)/saddle.stamp  ## an unstable reactor is learned from its te
 	$(BIN)/python -m validation.saddle_act --seeds $(SEEDS)
 
 # Types are checked beside the tests. Tests across processes wait most of their time, so that there
-# is one worker more than cores; the longest files come first (test/conftest.py). A worker that was
+# are two workers more than cores; the longest files come first (test/conftest.py). A worker that was
 # ended is not replaced: its successor would be given the same test again, without end.
 test: $(VENV)/test.stamp  ## style and type checks and the whole test suite, on all cores
 	$(BIN)/ruff check
 	@$(BIN)/mypy > $(VENV)/mypy.log & types=$$!; \
-	  $(BIN)/python -m pytest -n $$(($$(nproc) + 1)) --dist loadfile --no-loadscope-reorder \
+	  $(BIN)/python -m pytest -n $$(($$(nproc) + 2)) --dist loadfile --no-loadscope-reorder \
 	    --max-worker-restart 0; \
 	  tests=$$?; wait $$types || tests=1; cat $(VENV)/mypy.log; exit $$tests
 

@@ -27,14 +27,18 @@ from support.disturbance import disturb_training
 os.environ['ROS_PYTHON_CHECK_FIELDS'] = '1'
 
 # What takes longest, first: where each core takes the next file, none is then idle at the end.
-LONGEST = ('test_learning', 'test_browser', 'test_panel', 'test_training_benchmark',
-           'test_examples', 'test_campaign', 'test_identify',
-           'test_training', 'test_own_plant', 'test_observer', 'test_shipped_models',
-           'test_install_tree', 'test_retrain', 'test_training_node', 'test_retraining_tanks',
-           'test_estimates', 'test_demo', 'test_replay', 'test_parallel', 'test_parameter_ends',
-           'test_player', 'test_node_benchmarks', 'test_controller_process',
-           'test_experiment_node', 'test_experiment_tanks', 'test_fault_campaign',
-           'test_plant_node', 'test_processes')
+LONGEST = ('test_node_benchmarks', 'test_browser', 'test_learning', 'test_replay',
+           'test_training_benchmark', 'test_training_node', 'test_shipped_models',
+           'test_parallel', 'test_site_benchmark', 'test_own_plant', 'test_fault_campaign',
+           'test_processes', 'test_managed', 'test_partly_measured', 'test_classes',
+           'test_controller_process', 'test_examples', 'test_plant_node', 'test_player',
+           'test_install_tree', 'test_experiment_tanks', 'test_demo', 'test_panel_benchmark',
+           'test_several_states', 'test_campaign', 'test_recording', 'test_parameter_ends',
+           'test_grey', 'test_panel', 'test_retraining_tanks', 'test_laws',
+           'test_experiment_node', 'test_reload', 'test_shipped_plants', 'test_retrain',
+           'test_observer', 'test_cluster', 'test_fleet', 'test_kalman', 'test_training',
+           'test_controller_node', 'test_graph', 'test_closed_loop', 'test_zoom', 'test_hidden',
+           'test_least_squares', 'test_law_check')
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
