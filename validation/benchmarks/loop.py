@@ -58,7 +58,11 @@ MEANING = {
                      'echo idle',
     'speedup_over_real_time': 'seconds of the plant per second, in lock-step at one sample a '
                               'second of the plant',
+    'compiled_speedup_over_real_time': 'the same with a compiled control step',
+    'pid_speedup_over_real_time': 'the same with the PID controller, which is what the plant and '
+                                  'rclpy leave room for',
 }
+SIDES = ('controller', 'compiled', 'pid', 'echo')  #: who answers, each beside the others
 _ROUND = 50  # measurements of one side, then of the other
 _PACE = 0.005  # s between measurements whose latency is taken
 _BEHIND = 0.02  # s; a run whose answers come this late at its end has fallen behind
@@ -230,27 +234,36 @@ def _start(harness: Harness, name: str, namespace: str, command: tuple[str, ...]
     return harness.start(name, parameters, ('-r', f'__ns:={namespace}'), command)
 
 
+def _answering_process(harness: Harness, name: str, namespace: str) -> NodeProcess:
+    """Start one of `SIDES`."""
+    if name in ('pid', 'echo'):
+        command = (sys.executable, '-m', f'validation.benchmarks.{name}')
+        return _start(harness, name, namespace, command)
+    return _start(harness, 'controller', namespace, compiled=name == 'compiled')
+
+
+def _settled(harness: Harness, name: str, namespace: str, records: list[String]) -> _Probe:
+    """Return a probe of a side that has answered for a while, and is compiled where it will be."""
+    probe = _Probe(harness, namespace)
+    probe.first_answer()
+    probe.paced()
+    # without what compiles, it is the numpy one again
+    if name == 'compiled' and named(COMPILED) is not None:
+        harness.wait_until(lambda: any(f'"event":"{NUMERICS}"' in one.data for one in records),
+                           'the compiled step')
+    return probe
+
+
 @contextlib.contextmanager
 def _answering(harness: Harness, figures: dict[str, Any]) -> Iterator[dict[str, _Probe]]:
     """Yield a probe of each side, which have all answered for a while."""
     _tell('controllers, a PID controller and an echo')
-    echo, pid = ((sys.executable, '-m', f'validation.benchmarks.{name}')
-                 for name in ('echo', 'pid'))
-    # without what compiles, `compiled` is the first one again
     records = harness.listen(String, f'/answers/compiled/{topics.CONTROLLER_EVENTS}')
-    with _start(harness, 'controller', '/answers/controller'), \
-            _start(harness, 'controller', '/answers/compiled', compiled=True), \
-            _start(harness, 'pid', '/answers/pid', pid), \
-            _start(harness, 'echo', '/answers/echo', echo) as echoing:
-        probes = {name: _Probe(harness, f'/answers/{name}')
-                  for name in ('controller', 'compiled', 'pid', 'echo')}
-        for probe in probes.values():
-            probe.first_answer()
-            probe.paced()
-        if named(COMPILED) is not None:
-            harness.wait_until(lambda: any(f'"event":"{NUMERICS}"' in one.data for one in records),
-                               'the compiled step')
-        figures['latency'] = {'echo_rss_megabytes': _rss(echoing)}
+    with contextlib.ExitStack() as stack:
+        started = {name: stack.enter_context(
+            _answering_process(harness, name, f'/answers/{name}')) for name in SIDES}
+        probes = {name: _settled(harness, name, f'/answers/{name}', records) for name in SIDES}
+        figures['latency'] = {'echo_rss_megabytes': _rss(started['echo'])}
         yield probes
 
 
@@ -322,27 +335,44 @@ def _start_up(figures: dict[str, Any], harness: Harness, runs: int) -> None:
 
 
 def _lockstep(figures: dict[str, Any], harness: Harness, seconds: float) -> str:
-    """Let plant and controller run in lock-step as fast as they can, and weigh all nodes."""
-    arrivals: list[float] = []
-    harness.node.create_subscription(
-        Temperature, f'/lockstep/{reactor.TEMPERATURE}',
-        lambda _: arrivals.append(time.monotonic()), topics.LOOP_QOS, raw=True)
-    with _start(harness, 'trainer', '/idle', record_at_start=False) as trainer, \
-            _start(harness, 'plant', '/lockstep', speed=0.0, lockstep=True, duration=seconds,
-                   sample_period=1.0, lockstep_subscribers=2) as plant, \
-            _start(harness, 'controller', '/lockstep') as controller:
-        harness.wait_until(lambda: len(arrivals) > round(seconds), 'the end of the lock-step loop')
+    """Let the plant and each side run in lock-step as fast as they can, and weigh all nodes."""
+    figures['rss_megabytes'] = memory = {'echo': figures['latency']['echo_rss_megabytes']}
+    rows = []
+    # an echo would heat the plant until it leaves its bounds
+    for name in SIDES[:-1]:
+        side = '' if name == 'controller' else f'{name}_'
+        took, weights = _run_in_lockstep(harness, name, seconds)
+        figures[f'{side}lockstep'] = {'plant_seconds': seconds, 'seconds': took}
+        figures[f'{side}speedup_over_real_time'] = seconds / took
+        rows.append((name, f'{seconds / took:.0f}'))
+        if name == 'controller':
+            memory.update(weights)
+    with _start(harness, 'trainer', '/idle', record_at_start=False) as trainer:
         ready = harness.node.create_client(Trigger, '/idle/trainer/train').service_is_ready
         harness.wait_until(ready, 'the trainer')
-        memory = {'plant': _rss(plant), 'controller': _rss(controller), 'trainer': _rss(trainer),
-                  'echo': figures['latency']['echo_rss_megabytes']}
-    took = arrivals[-1] - arrivals[0]
-    figures.update(rss_megabytes=memory, speedup_over_real_time=seconds / took, lockstep={
-        'plant_seconds': seconds, 'seconds': took, 'speed_over_real_time': seconds / took})
+        memory['trainer'] = _rss(trainer)
     return '\n'.join((
         f'first command {figures["startup_seconds"]:.2f} s after the start',
         f'resident memory in MB: {", ".join(f"{k} {v:.0f}" for k, v in memory.items())}',
-        f'lock-step runs {seconds / took:.0f} times as fast as the plant'))
+        table(('in lock-step with the plant', 'times as fast as the plant'), rows)))
+
+
+def _run_in_lockstep(harness: Harness, name: str, seconds: float
+                     ) -> tuple[float, dict[str, float]]:
+    """Return what so many seconds of the plant take, and the memory of both processes in MB."""
+    namespace = f'/lockstep/{name}'
+    records = harness.listen(String, f'{namespace}/{topics.CONTROLLER_EVENTS}')
+    arrivals: list[float] = []
+    with _answering_process(harness, name, namespace) as answering:
+        _settled(harness, name, namespace, records)
+        harness.node.create_subscription(
+            Temperature, f'{namespace}/{reactor.TEMPERATURE}',
+            lambda _: arrivals.append(time.monotonic()), topics.LOOP_QOS, raw=True)
+        with _start(harness, 'plant', namespace, speed=0.0, lockstep=True, duration=seconds,
+                    sample_period=1.0, lockstep_subscribers=2) as plant:
+            harness.wait_until(lambda: len(arrivals) > round(seconds),
+                               'the end of the lock-step loop')
+            return arrivals[-1] - arrivals[0], {'plant': _rss(plant), name: _rss(answering)}
 
 
 def _rss(node: NodeProcess) -> float:

@@ -86,7 +86,9 @@ def test_the_loop_across_processes(figures):
     for one in steps:
         assert one['sent'] == round(0.1 * one['rate_hz'])
         assert not (one['kept_up'] and one['unanswered'])
-    assert found['speedup_over_real_time'] == pytest.approx(50.0 / found['lockstep']['seconds'])
+    for side in ('', 'compiled_', 'pid_'):
+        assert found[f'{side}speedup_over_real_time'] == pytest.approx(
+            50.0 / found[f'{side}lockstep']['seconds'])
     assert found['startup_seconds'] > 0.0
     assert set(found['rss_megabytes']) == {'plant', 'controller', 'trainer', 'echo'}
     assert min(found['rss_megabytes'].values()) > 10.0
