@@ -17,9 +17,9 @@ from typing import Any, TypeAlias
 
 Tell: TypeAlias = Callable[[dict[str, Any]], None]
 
-# Imported once; every process is forked from the one that has them.
-_PRELOAD = [f'validation.benchmarks.{name}' for name in (
-    'training', 'ipopt', 'step', 'planning')]
+# Imported once; every process is forked from the one that has them. What one job alone needs, as
+# do-mpc, it imports itself.
+_PRELOAD = [f'validation.benchmarks.{name}' for name in ('training', 'ipopt')]
 
 
 @dataclass(frozen=True)

@@ -25,7 +25,7 @@ def figures(tmp_path_factory):
         serialize_message(Temperature())
         warnings.simplefilter('error')
         patch.setitem(loop.PLANS, 'quick', loop.Plan(
-            (2, 4), 60, 1, 0.1, 400.0, 1, 50.0, 12, False))
+            (2, 4), 60, 1, 0.1, 800.0, 1, 50.0, 12, False))
         patch.setattr(planning, 'SETPOINTS', {'pendulum': planning.SETPOINTS['pendulum']})
         patch.setitem(recording.PLANS, 'quick', recording.Plan(1.0, (500.0, 2000.0), 0.5, 3000, 1))
         assert main(['recording', 'loop', '--quick', '--output', str(folder)]) == 0
