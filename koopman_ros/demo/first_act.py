@@ -15,7 +15,6 @@ import time
 
 from koopman_ros.bags import summary
 from koopman_ros.demo import reactor
-from koopman_ros.demo.any_plant import run_plant
 from koopman_ros.demo.console import LiveTable, read_options, run_act
 from koopman_ros.demo.loop import run_loop, running_loop, Scenario
 from koopman_ros.demo.results import plot, read_run
@@ -89,7 +88,12 @@ def main(args: list[str] | None = None) -> int:
     if options.panel:
         act: Callable[[Path, float], Mapping[str, object]] = partial(
             run_beside_panel, options.plant, options.port)
+    elif options.plant == reactor.SYSTEM:
+        act = run_demo
     else:
-        act = run_demo if options.plant == reactor.SYSTEM else partial(run_plant, options.plant)
+        # here, as the optimum of a plant takes scipy's integrators, which the reactor's does not
+        from koopman_ros.demo.any_plant import run_plant
+
+        act = partial(run_plant, options.plant)
     return run_act(act, options, (HarnessError, OSError, ValueError),
                    'closed_loop.png, closed_loop.mcap and summary.json')

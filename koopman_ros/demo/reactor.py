@@ -11,7 +11,6 @@ from sensor_msgs.msg import Temperature
 from koopman_ros.demo.loop import Scenario
 from koopman_ros.lifting import load
 from koopman_ros.parameters.controller import ControllerParameters, InputParameters, table_of
-from koopman_ros.parameters.plant import PlantTable
 from koopman_ros.parameters.table import ParameterTable
 from koopman_ros.resources import model_path
 from koopman_ros.units import to_celsius
@@ -44,6 +43,9 @@ def coolant_parameters() -> InputParameters:
 
 def constant(name: str) -> float:
     """Return a constant of a plant that was given none, in SI."""
+    # here, as it takes scipy's integrators, a third of a second that others do without
+    from koopman_ros.parameters.plant import PlantTable
+
     return float(PlantTable().rows[f'constants.{name}'].default)
 
 

@@ -38,12 +38,18 @@ class DaskProcesses:
         self.scheduler = self._start('scheduler', *_LOCAL, '--port', '0', '--no-dashboard',
                                      '--no-show', '--scheduler-file', str(self._file))
         deadline = time.monotonic() + _START
-        while not self._file.exists():
+        while not (address := self._written()):
             if time.monotonic() > deadline or not self.scheduler.running:
                 self._stack.close()
                 raise TimeoutError(f'dask scheduler did not start:\n{self.scheduler.output()}')
             time.sleep(_PERIOD)
-        self.address: str = json.loads(self._file.read_text())['address']
+        self.address: str = address
+
+    def _written(self) -> str:
+        """Return where the scheduler listens, empty until it has written that to the end."""
+        with contextlib.suppress(FileNotFoundError, json.JSONDecodeError):
+            return str(json.loads(self._file.read_text())['address'])
+        return ''
 
     def start_worker(self) -> NodeProcess:
         """Start one more worker, of one thread; it joins by itself."""

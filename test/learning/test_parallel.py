@@ -62,26 +62,6 @@ def test_the_bits_do_not_depend_on_where_starts_run(kind, expected, places):
     assert torch.get_num_threads() == threads
 
 
-@pytest.mark.parametrize('kind', KINDS)
-def test_the_watch_follows_and_can_end_starts_anywhere(kind, places):
-    seen = []
-
-    def watch(now):
-        seen.append(now)
-        return now.finished == 4
-
-    kept = trained(places[kind], watch)
-    # whole starts come in their order wherever they run, and steps of them before
-    finished = [(now.n_z, now.finished) for now in seen]
-    assert finished == sorted(finished)
-    assert {(2, 1), (2, 2), (2, 3), (3, 4)} <= set(finished) <= {
-        (2, 0), (2, 1), (2, 2), (2, 3), (3, 3), (3, 4)}
-    # elsewhere a start may end before it tells of a second step
-    assert kind or any(now.iteration and np.isfinite(now.residual) for now in seen)
-    assert kept.status.startswith('interrupted')
-    assert (kept.model.n_z, kept.starts) == (3, 4)
-
-
 def test_many_samples_go_to_processes(places):
     some = bent_samples(length=40_000)
     assert some.x.nbytes > 1 << 20
@@ -234,6 +214,29 @@ def test_a_drift_of_bags_that_stay_with_their_workers(bags, places):
     assert max(drift_error(CASE, here.drift)) < 0.05
     part = here.shards[0].read(*here.shards[0].arguments)
     assert part.dxdt == pytest.approx(here.drift.rate(part.x, part.u))
+
+
+# Ends and interrupts: last, as a process that is ended at work is started anew.
+
+
+@pytest.mark.parametrize('kind', KINDS)
+def test_the_watch_follows_and_can_end_starts_anywhere(kind, places):
+    seen = []
+
+    def watch(now):
+        seen.append(now)
+        return now.finished == 4
+
+    kept = trained(places[kind], watch)
+    # whole starts come in their order wherever they run, and steps of them before
+    finished = [(now.n_z, now.finished) for now in seen]
+    assert finished == sorted(finished)
+    assert {(2, 1), (2, 2), (2, 3), (3, 4)} <= set(finished) <= {
+        (2, 0), (2, 1), (2, 2), (2, 3), (3, 3), (3, 4)}
+    # elsewhere a start may end before it tells of a second step
+    assert kind or any(now.iteration and np.isfinite(now.residual) for now in seen)
+    assert kept.status.startswith('interrupted')
+    assert (kept.model.n_z, kept.starts) == (3, 4)
 
 
 PROGRAM = """

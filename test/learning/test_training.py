@@ -96,7 +96,7 @@ def test_widening_leaves_the_coordinates_as_they_were(layers, identity, activati
     assert child.layout.n_z == 5
     assert child.layout.hidden == tuple(h + 2 for h in parent.layout.hidden)
     for name in ('z', 'z_rate'):
-        torch.testing.assert_close(getattr(lifted(child, data), name)[:, :4],
+        np.testing.assert_allclose(getattr(lifted(child, data), name)[:, :4],
                                    getattr(lifted(parent, data), name), rtol=0, atol=1e-13)
 
 

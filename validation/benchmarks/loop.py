@@ -7,6 +7,7 @@ from collections.abc import Iterator
 import contextlib
 from dataclasses import dataclass
 from functools import partial
+from importlib.util import find_spec
 from pathlib import Path
 import sys
 import tempfile
@@ -20,7 +21,7 @@ from std_msgs.msg import String
 from std_srvs.srv import Trigger
 
 from koopman_ros.demo import reactor
-from koopman_ros.kernels import COMPILED, named
+from koopman_ros.kernels import PACKAGE
 from koopman_ros.replay.records import NUMERICS
 from koopman_ros.reports import table
 from koopman_ros.ros import topics
@@ -248,7 +249,7 @@ def _settled(harness: Harness, name: str, namespace: str, records: list[String])
     probe.first_answer()
     probe.paced()
     # without what compiles, it is the numpy one again
-    if name == 'compiled' and named(COMPILED) is not None:
+    if name == 'compiled' and find_spec(PACKAGE) is not None:
         harness.wait_until(lambda: any(f'"event":"{NUMERICS}"' in one.data for one in records),
                            'the compiled step')
     return probe

@@ -32,7 +32,6 @@ from validation.benchmarks.process import Tell
 from validation.benchmarks.sqp import Problem, solver_of, Sqp
 from validation.equations import EQUATIONS
 from validation.partly_measured.cases import Case, CASES
-from validation.partly_measured.dompc import Planner
 
 # A state (n_x,) and its target, and what answers them.
 Call: TypeAlias = tuple[Array, Target]
@@ -159,6 +158,9 @@ def _problem(case: Case, controller: Controller) -> Problem:
 
 def _sides(case: Case, controller: Controller, sqp: Sqp) -> dict[str, Answer]:
     """Return what answers a state with its target: the law alone, SQP, and do-mpc."""
+    # here, as whoever starts a comparison does without do-mpc
+    from validation.partly_measured.dompc import Planner
+
     model, law = controller.model, controller.levels['mpc'].law
     planner, none = Planner(case), np.zeros(case.directions.shape[1])
     memory: object = None

@@ -3,7 +3,7 @@
 
 """Measurements in processes of their own, with bounded processor time and memory."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 import math
 import multiprocessing
@@ -16,10 +16,6 @@ import time
 from typing import Any, TypeAlias
 
 Tell: TypeAlias = Callable[[dict[str, Any]], None]
-
-# Imported once; every process is forked from the one that has them.
-_PRELOAD = [f'validation.benchmarks.{name}' for name in (
-    'training', 'ipopt', 'step', 'planning')]
 
 
 @dataclass(frozen=True)
@@ -35,7 +31,7 @@ class Outcome:
 
 
 def run(job: Callable[..., None], *arguments: Any, folder: Path, megabytes: float,
-        children: bool = False) -> Outcome:
+        children: bool = False, needed: Sequence[str] = ()) -> Outcome:
     """
     Run a job in a process; what it had told stays when it is ended.
 
@@ -43,9 +39,11 @@ def run(job: Callable[..., None], *arguments: Any, folder: Path, megabytes: floa
     :param folder: where it runs, as compilers leave files there.
     :param megabytes: the memory that it may take.
     :param children: whether it may start processes itself.
+    :param needed: modules that jobs import besides their own. All are imported once, by the
+        process that the first job and those after it are forked from.
     """
     context = multiprocessing.get_context('forkserver')
-    context.set_forkserver_preload(_PRELOAD)
+    context.set_forkserver_preload([job.__module__, *needed])
     receiving, sending = context.Pipe(duplex=False)
     process = context.Process(target=_enter, args=(sending, folder, megabytes, job, arguments),
                               daemon=not children)

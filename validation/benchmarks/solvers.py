@@ -92,7 +92,6 @@ def _now() -> np.ndarray:
 def solve(tell: Tell, solver: str, case: Case, targets: list[float], limit: float,
           build_limit: float) -> None:
     """Run one solver on one case."""
-    allow(tell, build_limit, f'not built after {build_limit:g} s')
     if solver.startswith('ipopt'):
         try:
             from validation.benchmarks import ipopt
@@ -101,6 +100,7 @@ def solve(tell: Tell, solver: str, case: Case, targets: list[float], limit: floa
         run = {'ipopt': ipopt.expanded, 'ipopt_compiled': ipopt.compiled}[solver]
     else:
         run = {'ours': ours, 'lbfgs': lbfgs, 'adam': adam}[solver]
+    allow(tell, build_limit, f'not built after {build_limit:g} s')
     trace = Trace(tell, case, targets, limit)
     reason = run(case, trace)
     if not trace.done:

@@ -41,6 +41,8 @@ _DRAWN = (2000, 16)  # the case that is drawn
 _FIRST = 1e-3  # s, the left end of the time axis
 _REPEATED = 4.0  # s
 _COST_LIMIT = 240.0  # s
+# torch imports the latter for L-BFGS and Adam.
+_NEEDED = ('validation.benchmarks.ipopt', 'torch._dynamo')
 _SEED = 0
 _HELD_OUT = 40  # episodes that no training has seen
 
@@ -81,7 +83,7 @@ def measure(plan: Plan, figures: dict[str, Any], folder: Path) -> Iterator[str]:
     outcomes: list[dict[str, process.Outcome]] = []  # by solver, for each case
     unbuilt: dict[str, tuple[int, int, str]] = {}  # samples, hidden units, reason, by solver
     with tempfile.TemporaryDirectory() as name:
-        within = partial(process.run, folder=Path(name), megabytes=plan.megabytes)
+        within = partial(process.run, folder=Path(name), megabytes=plan.megabytes, needed=_NEEDED)
         try:
             for system, (samples, hidden) in itertools.product(plan.systems, plan.cases):
                 case = build(system, samples, hidden)

@@ -25,7 +25,7 @@ def figures(tmp_path_factory):
         serialize_message(Temperature())
         warnings.simplefilter('error')
         patch.setitem(loop.PLANS, 'quick', loop.Plan(
-            (2, 4), 60, 1, 0.1, 400.0, 1, 50.0, 12, False))
+            (2, 4), 60, 1, 0.05, 800.0, 1, 50.0, 12, False))
         patch.setattr(planning, 'SETPOINTS', {'pendulum': planning.SETPOINTS['pendulum']})
         patch.setitem(recording.PLANS, 'quick', recording.Plan(1.0, (500.0, 2000.0), 0.5, 3000, 1))
         assert main(['recording', 'loop', '--quick', '--output', str(folder)]) == 0
@@ -84,7 +84,7 @@ def test_the_loop_across_processes(figures):
     assert found['max_rate_hz'] == (kept_up[-1] if kept_up else None)
     assert found['rate']['ended_by']
     for one in steps:
-        assert one['sent'] == round(0.1 * one['rate_hz'])
+        assert one['sent'] == round(0.05 * one['rate_hz'])
         assert not (one['kept_up'] and one['unanswered'])
     for side in ('', 'compiled_', 'pid_'):
         assert found[f'{side}speedup_over_real_time'] == pytest.approx(

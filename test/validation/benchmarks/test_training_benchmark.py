@@ -8,7 +8,6 @@ import json
 import casadi
 import numpy as np
 import pytest
-import torch
 
 from koopman_ros.learning import fit
 from koopman_ros.learning.levenberg_marquardt import normal_equations
@@ -21,7 +20,7 @@ from validation.benchmarks.training import Plan, PLANS, SOLVERS
 from validation.general.learners import LEARNERS
 
 # Few samples: casadi's graphs take most of the time, and grow with them.
-PLAN = Plan(((200, 8),), 2.0, 10.0, 4e3, 1, (500, 1000), (2, 3), (1, 2), ('one-state reactor',))
+PLAN = Plan(((100, 8),), 0.8, 10.0, 4e3, 1, (500, 1000), (2, 3), (1, 2), ('one-state reactor',))
 
 
 @pytest.fixture(scope='module')
@@ -42,7 +41,7 @@ def test_every_solver_has_a_time_or_a_reason_and_ours_reaches_the_targets(traini
     assert 0.0 <= case['seconds']['1e-4']['ours'] <= case['seconds']['1e-6']['ours']
     assert 0.0 < case['wall_seconds']['1e-4']['ours'] <= case['wall_seconds']['1e-6']['ours']
     assert case['best_rw']['ours'] <= 1e-6
-    assert (case['samples'], case['hidden'], case['parameters']) == (200, 8, 41)
+    assert (case['samples'], case['hidden'], case['parameters']) == (100, 8, 41)
     for name, times in case['seconds'].items():
         assert set(times) == set(SOLVERS)
         for solver, seconds in times.items():
@@ -84,7 +83,7 @@ def test_objective_of_the_first_order_solvers_is_ours():
     cost.backward()
     ours = normal_equations(case.problem.add_residuals, case.theta)
     assert cost.item() == pytest.approx(ours.cost, rel=1e-12)
-    torch.testing.assert_close(theta.grad, ours.gradient, rtol=1e-10, atol=1e-12)
+    np.testing.assert_allclose(theta.grad, ours.gradient, rtol=1e-10, atol=1e-12)
 
 
 @pytest.mark.parametrize('graph', ['expanded', 'compiled'])

@@ -108,7 +108,7 @@ def quick_campaign():
     models['linear'] = load(model_path('reactor_linear'))
     few = box_episodes(reactor.SYSTEM, reactor.TRAINING, 30, 1.0, 0)
     models['edmd'] = Edmd(reactor.EDMD_DEGREE).learn(describe(reactor.SYSTEM), few)
-    fresh = [random_step_episodes(reactor.SYSTEM, design, 1, 30.0, 5_000)
+    fresh = [random_step_episodes(reactor.SYSTEM, design, 1, 15.0, 5_000)
              for design in (reactor.IN_RANGE, reactor.OUT_OF_RANGE)]
     add('reactor', ({f'{name}/{figure}': value for name, model in models.items()
                      for figure, value in reactor.judged(model, few, *fresh).items()}, models))
