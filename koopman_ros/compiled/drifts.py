@@ -301,14 +301,27 @@ def drifts(sizes: NDArray[np.int64], numbers: Array, x: Array, space: Space, f: 
                     square[k, j, c] += L[a, k, c] * L[a, j, c]
     _factor(square)
     _solve(square, f.reshape((n, 1, N)))
+    if n > 1 or len(J):
+        for a in range(n_z):
+            for k in range(n):
+                for c in range(N):
+                    rest[a, c] -= L[a, k, c] * f[k, c]
+    if n > 1 and len(J) == 0:
+        # the digits that the square of J_N has lost
+        more = of_z[:n]
+        _clear(more)
+        for k in range(n):
+            for a in range(n_z):
+                for c in range(N):
+                    more[k, c] += L[a, k, c] * rest[a, c]
+        _solve(square, more.reshape((n, 1, N)))
+        for k in range(n):
+            for c in range(N):
+                f[k, c] += more[k, c]
     if len(J):
         _clear(_flat(J))
         # how the rest turns with J_N; of as many coordinates as states there is none
         if n_z > n:
-            for a in range(n_z):
-                for k in range(n):
-                    for c in range(N):
-                        rest[a, c] -= L[a, k, c] * f[k, c]
             _clear(layer)
             _add_turned(layer, output, rest)
             _add_bend(sizes, numbers, layers, J)

@@ -73,8 +73,9 @@ def advance(sizes: NDArray[np.int64], numbers: Array, space: Space, push: Array,
             for k in range(N):
                 rate[0, i, k] += push[i, k]
             for a in range(c):
+                force = forced[i, a]
                 for k in range(N):
-                    rate[1 + a, i, k] = forced[i, a]
+                    rate[1 + a, i, k] = force
                 for j in range(n):
                     for k in range(N):
                         rate[1 + a, i, k] += J[i, j, k] * ahead[1 + a, j, k]
