@@ -18,24 +18,19 @@ from koopman_ros.arrays import Array
 from koopman_ros.compiled.jit import inner
 from koopman_ros.compiled.network import (
     IDENTITY,
-    N_U,
+    matrix,
     N_X,
     N_Z,
     READOUT,
     squash,
+    Weights,
+    weights_of,
     WIDTHS,
     widths,
 )
 
 Layers = tuple[Array, Array, Array, Array, NDArray[np.int64]]
-Weights = tuple[Array, Array, Array, Array]
 Space = tuple[Layers, Weights, tuple[Array, Array, Array, Array]]
-
-
-@inner
-def _matrix(numbers: Array, start: int, rows: int, columns: int) -> Array:
-    """Return a matrix among the numbers of a layout, where it is."""
-    return numbers[start:start + rows * columns].reshape((rows, columns))
 
 
 @inner
@@ -45,8 +40,8 @@ def space_of(sizes: NDArray[np.int64], numbers: Array, N: int) -> Space:
 
     Of all hidden layers, one after the other, h (h, N) and the derivatives P (h, n_x, N) of what
     goes into their tanh, of the first of them filled in; room for a layer and its derivatives,
-    twice each, and for 2^k. Output, A, slope of the pre-feedback and read-out. Room for z, J_N,
-    and what follows of it.
+    twice each, and for 2^k. What :func:`weights_of` gives. Room for z, J_N, and what follows of
+    it.
     """
     n, n_z, count, most = sizes[N_X], sizes[N_Z], 0, 0
     for layer in range(WIDTHS, len(sizes)):
@@ -57,14 +52,9 @@ def space_of(sizes: NDArray[np.int64], numbers: Array, N: int) -> Space:
         for k in range(n):
             for c in range(N):
                 P[i, k, c] = numbers[k * sizes[WIDTHS] + i]
-    width, start = widths(sizes)
-    output = start + width
-    A = output + n_z * width
-    slope = A + n_z * n_z + n * sizes[N_U]
     return ((np.empty((count, N)), P, np.empty((2, most, N)), np.empty((2, most, n, N)),
              np.empty(most * N, np.int64)),
-            (_matrix(numbers, output, n_z, width), _matrix(numbers, A, n_z, n_z),
-             _matrix(numbers, slope, n, n), _matrix(numbers, slope + n * n, n, n + width)),
+            weights_of(sizes, numbers),
             (np.empty((2 * n_z, N)), np.empty((n_z, n, N)), np.empty((n_z, n, N)),
              np.empty((n, n, N))))
 
@@ -127,7 +117,7 @@ def _layers(sizes: NDArray[np.int64], numbers: Array, x: Array, space: Layers) -
     for layer in range(WIDTHS, len(sizes)):
         width = sizes[layer]
         bias, own = start + width * last, h[row:row + width]
-        weights = _matrix(numbers, start, last, width)
+        weights = matrix(numbers, start, last, width)
         for i in range(width):
             for c in range(N):
                 own[i, c] = numbers[bias + i]
@@ -160,7 +150,7 @@ def _turned(sizes: NDArray[np.int64], numbers: Array, f: Array, space: Layers) -
         width, turn = sizes[layer], 1 - turn
         if layer > WIDTHS:
             _clear(_flat(slopes[turn]))
-            _add_turned(_flat(slopes[turn]), _matrix(numbers, start, last, width),
+            _add_turned(_flat(slopes[turn]), matrix(numbers, start, last, width),
                         _flat(slopes[1 - turn]))
         for i in range(width):
             for c in range(N):
@@ -209,7 +199,7 @@ def _add_bend(sizes: NDArray[np.int64], numbers: Array, space: Layers, J: Array)
                             row + i, k, c] * P[row + i, j, c]
         if layer > WIDTHS:
             _clear(adjoint[1 - turn])
-            _add_weighted(adjoint[1 - turn], _matrix(numbers, start, last, width), adjoint[turn],
+            _add_weighted(adjoint[1 - turn], matrix(numbers, start, last, width), adjoint[turn],
                           width)
         turn = 1 - turn
 
@@ -255,14 +245,14 @@ def drifts(sizes: NDArray[np.int64], numbers: Array, x: Array, space: Space, f: 
     """
     Write the drift at states (n_x, N) to f, and its Jacobian to J (n_x, n_x, N); NaN for none.
 
-    Without a read-out by the normal equations J_N'J_N f = J_N'A z and their derivatives by each
-    state.
+    Of an empty J only the drift is wanted. Without a read-out by the normal equations
+    J_N'J_N f = J_N'A z and their derivatives by each state.
 
     :param space: of :func:`space_of`.
     """
     n, N = x.shape
     n_z, identity = sizes[N_Z], sizes[IDENTITY]
-    layers, (output, A, slope, readout), (of_z, L, bent, square) = space
+    layers, (output, A, _, slope, readout), (of_z, L, bent, square) = space
     h, slopes, layer = layers[0], layers[3], layers[2][0]
     last = slopes[_layers(sizes, numbers, x, layers)]
     width, start = widths(sizes)
@@ -275,9 +265,13 @@ def drifts(sizes: NDArray[np.int64], numbers: Array, x: Array, space: Space, f: 
             for j in range(n):
                 for c in range(N):
                     f[i, c] += readout[i, j] * x[j, c]
-                    J[i, j, c] = readout[i, j]
         _add_weighted(f, readout, layer, width)
-        _add_weighted(_flat(J), readout, _flat(last), width)
+        if len(J):
+            for i in range(n):
+                for j in range(n):
+                    for c in range(N):
+                        J[i, j, c] = readout[i, j]
+            _add_weighted(_flat(J), readout, _flat(last), width)
         return
     # in the second half of the first A z, then what J_N f leaves of it
     rest = of_z[n_z:]
@@ -299,9 +293,6 @@ def drifts(sizes: NDArray[np.int64], numbers: Array, x: Array, space: Space, f: 
         for a in range(n_z):
             for c in range(N):
                 f[k, c] += L[a, k, c] * rest[a, c]
-        for j in range(n):
-            for c in range(N):
-                J[k, j, c] = 0.0
         for j in range(k + 1):
             for c in range(N):
                 square[k, j, c] = 0.0
@@ -310,32 +301,51 @@ def drifts(sizes: NDArray[np.int64], numbers: Array, x: Array, space: Space, f: 
                     square[k, j, c] += L[a, k, c] * L[a, j, c]
     _factor(square)
     _solve(square, f.reshape((n, 1, N)))
-    # how the rest turns with J_N; of as many coordinates as states there is none
-    if n_z > n:
+    if n > 1 or len(J):
         for a in range(n_z):
             for k in range(n):
                 for c in range(N):
                     rest[a, c] -= L[a, k, c] * f[k, c]
-        _clear(layer)
-        _add_turned(layer, output, rest)
-        _add_bend(sizes, numbers, layers, J)
-    # what A makes of J_N, less how that turns the rate
-    last = slopes[_turned(sizes, numbers, f, layers)]
-    _clear(_flat(bent))
-    _add_weighted(_flat(bent), output, _flat(last), width)
-    _add_weighted(_flat(bent), A, _flat(L), n_z)
-    for j in range(n):
+    if n > 1 and len(J) == 0:
+        # the digits that the square of J_N has lost
+        more = of_z[:n]
+        _clear(more)
         for k in range(n):
             for a in range(n_z):
                 for c in range(N):
-                    J[j, k, c] += L[a, j, c] * bent[a, k, c]
-    _solve(square, J)
+                    more[k, c] += L[a, k, c] * rest[a, c]
+        _solve(square, more.reshape((n, 1, N)))
+        for k in range(n):
+            for c in range(N):
+                f[k, c] += more[k, c]
+    if len(J):
+        _clear(_flat(J))
+        # how the rest turns with J_N; of as many coordinates as states there is none
+        if n_z > n:
+            _clear(layer)
+            _add_turned(layer, output, rest)
+            _add_bend(sizes, numbers, layers, J)
+        # what A makes of J_N, less how that turns the rate
+        last = slopes[_turned(sizes, numbers, f, layers)]
+        _clear(_flat(bent))
+        _add_weighted(_flat(bent), output, _flat(last), width)
+        _add_weighted(_flat(bent), A, _flat(L), n_z)
+        for j in range(n):
+            for k in range(n):
+                for a in range(n_z):
+                    for c in range(N):
+                        J[j, k, c] += L[a, j, c] * bent[a, k, c]
+        _solve(square, J)
     for k in range(n):
         for j in range(n):
             for c in range(N):
                 f[k, c] -= slope[k, j] * x[j, c]
+        for j in range(n if len(J) else 0):
+            for c in range(N):
                 J[k, j, c] -= slope[k, j]
         for c in range(N):
             # beside a definite matrix there is no rate
             if not 0.0 < square[k, k, c] < math.inf:
                 f[0, c] = math.nan
+                if len(J):
+                    J[0, 0, c] = math.nan

@@ -9,82 +9,54 @@ import numpy as np
 from numpy.typing import NDArray
 
 from koopman_ros.arrays import Array
-from koopman_ros.compiled.jit import (
-    compiled,
-    inner,
-    INTEGERS,
-    MATRIX,
-    NUMBER,
-    SIZE,
-    VECTOR,
-)
-from koopman_ros.compiled.matrices import (
-    applied,
-    combined,
-    product,
-    solve_into,
-    turned,
-)
-from koopman_ros.compiled.network import (
-    drift,
-    drift_and_jacobian,
-    matrices,
-    N_U,
-    N_X,
-    parts_of,
-)
-from koopman_ros.compiled.steps import runge_kutta, space_of
-
-
-@inner
-def move(sizes: NDArray[np.int64], numbers: Array, x: Array, w: Array, u: Array, h: float,
-         steps: int) -> Array:
-    """Integrate the model under a held input by so many of Heun's steps."""
-    n = sizes[N_X]
-    A, B, slope, readout = matrices(sizes, numbers)
-    x, push, ahead = x.copy(), applied(B, u), np.empty(n)
-    for _ in range(steps):
-        first = drift(sizes, numbers, A, slope, readout, x)
-        for i in range(n):
-            first[i] += push[i] + w[i]
-            ahead[i] = x[i] + h * first[i]
-        second = drift(sizes, numbers, A, slope, readout, ahead)
-        for i in range(n):
-            x[i] += 0.5 * h * (first[i] + second[i] + push[i] + w[i])
-    return x
+from koopman_ros.compiled.drifts import drifts, space_of
+from koopman_ros.compiled.jit import compiled, INTEGERS, MATRIX, NUMBER, SIZE, VECTOR
+from koopman_ros.compiled.matrices import applied, combined, product, solve_into, turned
+from koopman_ros.compiled.network import N_X
+from koopman_ros.compiled.steps import advance, room_of
 
 
 @compiled(INTEGERS, VECTOR, VECTOR, VECTOR, VECTOR, NUMBER, SIZE)
 def moved(sizes: NDArray[np.int64], numbers: Array, x: Array, w: Array, u: Array, h: float,
           steps: int) -> Array:
-    """Integrate as :func:`move`."""
-    return move(sizes, numbers, x, w, u, h, steps)
+    """Integrate the model under a held input by so many of Heun's steps."""
+    n, space, no_slope = sizes[N_X], space_of(sizes, numbers, 1), np.empty((0, 0, 1))
+    now, ahead, first, second = x.copy(), np.empty((n, 1)), np.empty((n, 1)), np.empty((n, 1))
+    _, _, B, _, _ = space[1]
+    push = applied(B, u)
+    for _ in range(steps):
+        drifts(sizes, numbers, now.reshape((n, 1)), space, first, no_slope)
+        for i in range(n):
+            first[i, 0] += push[i] + w[i]
+            ahead[i, 0] = now[i] + h * first[i, 0]
+        drifts(sizes, numbers, ahead, space, second, no_slope)
+        for i in range(n):
+            now[i] += 0.5 * h * (first[i, 0] + second[i, 0] + push[i] + w[i])
+    return now
 
 
 @compiled(INTEGERS, VECTOR, VECTOR, VECTOR, MATRIX, VECTOR, NUMBER, SIZE)
 def propagated(sizes: NDArray[np.int64], numbers: Array, x: Array, w: Array, P: Array, u: Array,
                h: float, steps: int) -> tuple[Array, Array]:
     """Return state and covariance of an extended Kalman filter after so many steps of h."""
-    n = sizes[N_X]
-    _, B, _, _ = matrices(sizes, numbers)
-    parts, push = parts_of(sizes, numbers), applied(B, u)
+    n, space = sizes[N_X], space_of(sizes, numbers, 1)
+    _, _, B, _, _ = space[1]
+    push = applied(B, u).reshape((n, 1))
+    # the state, and its derivatives by what state and disturbance were
+    X, forced, lengths = np.zeros((1 + 2 * n, n, 1)), np.zeros((n, 2 * n)), np.empty(1)
+    lengths[0] = h
     for i in range(n):
-        push[i] += w[i]
-    space = space_of(sizes)
-    # the state's derivatives by what state and disturbance were
-    S, forced = np.zeros((n, 2 * n)), np.zeros((n, 2 * n))
-    for i in range(n):
-        S[i, i], forced[i, n + i] = 1.0, 1.0
-    x = x.copy()
+        push[i, 0] += w[i]
+        X[0, i, 0], X[1 + i, i, 0], forced[i, n + i] = x[i], 1.0, 1.0
+    rooms = room_of(X)
     for _ in range(steps):
-        x, S, _, _, _, _ = runge_kutta(
-            sizes, numbers, parts, space, push, forced, x, S, h)
+        advance(sizes, numbers, space, push, forced, lengths, 1.0, X, rooms)
     F = np.zeros((2 * n, 2 * n))
     for i in range(n):
         F[n + i, n + i] = 1.0
         for j in range(2 * n):
-            F[i, j] = S[i, j]
-    return x, product(product(F, P.copy()), turned(F))
+            F[i, j] = X[1 + j, i, 0]
+    return X[0].copy().reshape(n), product(product(F, P), turned(F))
 
 
 @compiled(MATRIX, MATRIX, MATRIX, VECTOR)
@@ -98,7 +70,6 @@ def corrected(H: Array, R: Array, P: Array, difference: Array
     """
     n_y, n = H.shape
     N = 2 * n
-    H, R, P = H.copy(), R.copy(), P.copy()
     innovation = applied(H, difference)
     HP = np.zeros((n_y, N))
     for i in range(n_y):
@@ -141,25 +112,24 @@ def equilibrium(sizes: NDArray[np.int64], numbers: Array, w: Array, start: Array
     :param free: (n_x,) their places.
     :param most: steps; see :mod:`koopman_ros.control.target` for what the others are.
     """
-    n, m = sizes[N_X], sizes[N_U]
-    _, B, _, _ = matrices(sizes, numbers)
-    parts = parts_of(sizes, numbers)
-    y, u, slope, rate = start.copy(), np.empty(m), np.empty((n, n)), np.empty((n, 1))
+    n = sizes[N_X]
+    space = space_of(sizes, numbers, 1)
+    _, _, B, _, _ = space[1]
+    f, J = np.empty((n, 1)), np.empty((n, n, 1))
+    y, slope, rate = start.copy(), np.empty((n, n)), np.empty((n, 1))
     size_of_slope = 0.0
     for step in range(most + 1):
-        f, J = drift_and_jacobian(sizes, numbers, parts, y[:n].copy())
-        for i in range(m):
-            u[i] = y[n + i]
-        push, left = applied(B, u), 0.0
+        drifts(sizes, numbers, y[:n].reshape((n, 1)), space, f, J)
+        push, left = applied(B, y[n:]), 0.0
         for i in range(n):
-            rate[i, 0] = -(f[i] + push[i] + w[i])
+            rate[i, 0] = -(f[i, 0] + push[i] + w[i])
             left += rate[i, 0] ** 2
         if step and math.sqrt(left) <= resolution * math.sqrt(size_of_slope):
             return True, y
         size_of_slope = 0.0
         for j in range(n):
             for i in range(n):
-                slope[i, j] = J[i, free[j]] if free[j] < n else B[i, free[j] - n]
+                slope[i, j] = J[i, free[j], 0] if free[j] < n else B[i, free[j] - n]
                 size_of_slope += slope[i, j] ** 2
         if not (math.isfinite(left) and solve_into(slope, rate)):
             return False, y

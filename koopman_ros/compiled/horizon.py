@@ -11,7 +11,8 @@ from numpy.typing import NDArray
 from koopman_ros.arrays import Array
 from koopman_ros.compiled.drifts import drifts, space_of
 from koopman_ros.compiled.jit import compiled, inner, INTEGERS, MATRIX, NUMBER, SIZE, VECTOR
-from koopman_ros.compiled.network import drift_and_jacobian, matrices, N_U, N_X, parts_of
+from koopman_ros.compiled.network import N_U, N_X
+from koopman_ros.compiled.steps import advance, room_of
 
 _LANES = 8  # columns that a processor takes at once, or twice as many as it does
 
@@ -19,7 +20,11 @@ _LANES = 8  # columns that a processor takes at once, or twice as many as it doe
 @compiled(INTEGERS, VECTOR, VECTOR)
 def slope(sizes: NDArray[np.int64], numbers: Array, x: Array) -> Array:
     """Return the Jacobian of the drift at a state, (n_x, n_x)."""
-    return drift_and_jacobian(sizes, numbers, parts_of(sizes, numbers), x.copy())[1]
+    n = len(x)
+    J = np.empty((n, n, 1))
+    drifts(sizes, numbers, x.copy().reshape((n, 1)), space_of(sizes, numbers, 1),
+           np.empty((n, 1)), J)
+    return J.reshape((n, n))
 
 
 @compiled(MATRIX, MATRIX, VECTOR, MATRIX, NUMBER)
@@ -68,36 +73,6 @@ def _weigh(M: Array, g: Array, Q: Array, factor: float, lengths: Array, X: Array
             for a in range(b, c):
                 for k in range(N):
                     M[a, b, k] += QS[i, k] * X[1 + a, i, k]
-
-
-@inner
-def _go_on(stage: int, lengths: Array, share: float, X: Array, rate: Array, total: Array,
-           middle: Array, ahead: Array) -> None:
-    """
-    Go on from a stage of a Runge-Kutta step, which is a share of each interval.
-
-    After the last one X is its end, and `middle` the middle by the rates at both ends (Hermite).
-    """
-    for a in range(X.shape[0]):
-        for i in range(X.shape[1]):
-            if stage == 0:
-                for k in range(X.shape[2]):
-                    r = rate[a, i, k]
-                    total[a, i, k] = middle[a, i, k] = r
-                    ahead[a, i, k] = X[a, i, k] + 0.5 * share * lengths[k] * r
-            elif stage < 3:
-                part = 0.5 * share if stage == 1 else share
-                for k in range(X.shape[2]):
-                    r = rate[a, i, k]
-                    total[a, i, k] += 2.0 * r
-                    ahead[a, i, k] = X[a, i, k] + part * lengths[k] * r
-            else:
-                for k in range(X.shape[2]):
-                    r, h = rate[a, i, k], share * lengths[k]
-                    end = X[a, i, k] + h / 6.0 * (total[a, i, k] + r)
-                    middle[a, i, k] = 0.5 * (X[a, i, k] + end) + 0.125 * h * (
-                        middle[a, i, k] - r)
-                    X[a, i, k] = ahead[a, i, k] = end
 
 
 @inner
@@ -181,12 +156,17 @@ def program(sizes: NDArray[np.int64], numbers: Array, u: Array, x: Array, start:
     """
     n, m, N = sizes[N_X], sizes[N_U], len(u)
     c, part = n + m, 1.0 / (6.0 * steps)
-    _, B, _, _ = matrices(sizes, numbers)
     # all intervals at once, side by side in columns; the last one again until their number suits
     # the processor. Nodes come first in X, and become where the intervals end, and after them the
     # derivatives of that by node and input.
     columns = N + (-N) % _LANES
+    space = space_of(sizes, numbers, columns)
+    _, _, B, _, _ = space[1]
     X, push, held = np.zeros((1 + c, n, columns)), np.empty((n, columns)), np.empty(columns)
+    forced = np.zeros((n, c))
+    for i in range(n):
+        for j in range(m):
+            forced[i, n + j] = B[i, j]
     for k in range(columns):
         one = min(k, N - 1)
         held[k] = lengths[one]
@@ -194,26 +174,12 @@ def program(sizes: NDArray[np.int64], numbers: Array, u: Array, x: Array, start:
             X[0, i, k], X[1 + i, i, k], push[i, k] = x[one, i], 1.0, w[i]
             for j in range(m):
                 push[i, k] += B[i, j] * u[one, j]
-    space, x_ref, Q = space_of(sizes, numbers, columns), x_ref.copy(), Q.copy()
-    M, g = np.zeros((c, c, columns)), np.zeros((c, columns))
-    QS, J = np.empty((n, columns)), np.empty((n, n, columns))
-    rate, total, middle, ahead = (
-        np.empty(X.shape), np.empty(X.shape), np.empty(X.shape), X.copy())
+    M, g, QS = np.zeros((c, c, columns)), np.zeros((c, columns)), np.empty((n, columns))
+    rooms = room_of(X)
+    _, _, middle, _, _ = rooms
     _weigh(M, g, Q, part, held, X, x_ref, QS)
     for step in range(steps):
-        for stage in range(4):
-            drifts(sizes, numbers, ahead[0], space, rate[0], J)
-            for i in range(n):
-                for k in range(columns):
-                    rate[0, i, k] += push[i, k]
-                for a in range(c):
-                    forced = B[i, a - n] if a >= n else 0.0
-                    for k in range(columns):
-                        rate[1 + a, i, k] = forced
-                    for j in range(n):
-                        for k in range(columns):
-                            rate[1 + a, i, k] += J[i, j, k] * ahead[1 + a, j, k]
-            _go_on(stage, held, 1.0 / steps, X, rate, total, middle, ahead)
+        advance(sizes, numbers, space, push, forced, held, 1.0 / steps, X, rooms)
         _weigh(M, g, Q, 4.0 * part, held, middle, x_ref, QS)
         _weigh(M, g, Q, part if step == steps - 1 else 2.0 * part, held, X, x_ref, QS)
     return _condensed(u, x, start, x_ref, u_ref, lengths, R, terminal, X, M, g)

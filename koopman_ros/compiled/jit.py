@@ -12,11 +12,14 @@ from typing import Any
 import numba
 from numba import config, types
 
-__all__ = ['FOLDER', 'INTEGERS', 'MATRIX', 'NUMBER', 'SIZE', 'VECTOR', 'compiled', 'inner']
+__all__ = [
+    'FOLDER', 'INTEGERS', 'MATRIX', 'NUMBER', 'ROOM', 'SIZE', 'VECTOR', 'compiled', 'inner',
+    'typed']
 
 VECTOR, MATRIX = (
     types.Array(types.float64, dimensions, 'C', readonly=True) for dimensions in (1, 2))
 INTEGERS = types.Array(types.int64, 1, 'C', readonly=True)
+ROOM = types.Array(types.float64, 2, 'C')  # a matrix to write to
 NUMBER, SIZE = types.float64, types.int64
 
 
@@ -39,8 +42,11 @@ FOLDER = _folder()
 config.CACHE_DIR = str(FOLDER)  # type: ignore[attr-defined]
 
 # Divisions by 0 give infinity as in numpy: what is not finite is refused by its results. Sums may
-# be taken in another order, several numbers at once.
-_HOW: dict[str, Any] = {'error_model': 'numpy', 'fastmath': {'reassoc', 'contract'}}
+# be taken in another order, several numbers at once. C does not call them, nor Python the inner
+# ones.
+_HOW: dict[str, Any] = {
+    'error_model': 'numpy', 'fastmath': {'reassoc', 'contract'}, 'no_cfunc_wrapper': True}
+_INNER: dict[str, Any] = {**_HOW, 'no_cpython_wrapper': True}
 
 
 def compiled(*arguments: Any) -> Callable[[Callable[..., Any]], Callable[..., Any]]:
@@ -51,6 +57,13 @@ def compiled(*arguments: Any) -> Callable[[Callable[..., Any]], Callable[..., An
 
 
 def inner(function: Callable[..., Any]) -> Callable[..., Any]:
-    """Let compiled functions call a function."""
-    found: Callable[..., Any] = numba.njit(**_HOW)(function)
+    """Let compiled functions call a function, compiled for each kind of arguments they have."""
+    found: Callable[..., Any] = numba.njit(**_INNER)(function)
+    return found
+
+
+def typed(*arguments: Any) -> Callable[[Callable[..., Any]], Callable[..., Any]]:
+    """Let them call a function that is compiled once, for what becomes these types."""
+    found: Callable[[Callable[..., Any]], Callable[..., Any]] = numba.njit(
+        tuple(arguments), **_INNER)
     return found

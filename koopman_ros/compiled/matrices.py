@@ -13,10 +13,10 @@ import math
 import numpy as np
 
 from koopman_ros.arrays import Array
-from koopman_ros.compiled.jit import inner
+from koopman_ros.compiled.jit import MATRIX, NUMBER, ROOM, SIZE, typed, VECTOR
 
 
-@inner
+@typed(MATRIX, MATRIX, ROOM)
 def multiply(A: Array, B: Array, C: Array) -> None:
     """Write A B to C."""
     for i in range(A.shape[0]):
@@ -28,7 +28,7 @@ def multiply(A: Array, B: Array, C: Array) -> None:
                 C[i, c] += a * B[j, c]
 
 
-@inner
+@typed(MATRIX, MATRIX)
 def product(A: Array, B: Array) -> Array:
     """Return A B."""
     C = np.empty((A.shape[0], B.shape[1]))
@@ -36,7 +36,7 @@ def product(A: Array, B: Array) -> Array:
     return C
 
 
-@inner
+@typed(MATRIX, MATRIX, ROOM)
 def multiply_turned(A: Array, B: Array, C: Array) -> None:
     """Write A' B to C."""
     for i in range(A.shape[1]):
@@ -49,7 +49,7 @@ def multiply_turned(A: Array, B: Array, C: Array) -> None:
                 C[i, c] += a * B[j, c]
 
 
-@inner
+@typed(MATRIX, VECTOR)
 def applied(A: Array, x: Array) -> Array:
     """Return A x."""
     y = np.zeros(A.shape[0])
@@ -59,7 +59,7 @@ def applied(A: Array, x: Array) -> Array:
     return y
 
 
-@inner
+@typed(NUMBER, MATRIX, NUMBER, MATRIX)
 def combined(a: float, A: Array, b: float, B: Array) -> Array:
     """Return a A + b B."""
     C = np.empty(A.shape)
@@ -69,7 +69,7 @@ def combined(a: float, A: Array, b: float, B: Array) -> Array:
     return C
 
 
-@inner
+@typed(MATRIX)
 def turned(A: Array) -> Array:
     """Return the transpose of A."""
     T = np.empty((A.shape[1], A.shape[0]))
@@ -79,7 +79,7 @@ def turned(A: Array) -> Array:
     return T
 
 
-@inner
+@typed(MATRIX, SIZE, SIZE, SIZE, SIZE)
 def block(A: Array, row: int, column: int, rows: int, columns: int) -> Array:
     """Return a copy of a block of A."""
     B = np.empty((rows, columns))
@@ -89,7 +89,7 @@ def block(A: Array, row: int, column: int, rows: int, columns: int) -> Array:
     return B
 
 
-@inner
+@typed(ROOM, SIZE, SIZE, MATRIX, NUMBER)
 def place(A: Array, row: int, column: int, B: Array, factor: float) -> None:
     """Write `factor` times B to a block of A."""
     for i in range(B.shape[0]):
@@ -97,7 +97,7 @@ def place(A: Array, row: int, column: int, B: Array, factor: float) -> None:
             A[row + i, column + j] = factor * B[i, j]
 
 
-@inner
+@typed(SIZE)
 def identity(n: int) -> Array:
     """Return the identity matrix."""
     A = np.zeros((n, n))
@@ -106,7 +106,7 @@ def identity(n: int) -> Array:
     return A
 
 
-@inner
+@typed(MATRIX)
 def size(A: Array) -> float:
     """Return the Frobenius norm."""
     total = 0.0
@@ -116,7 +116,7 @@ def size(A: Array) -> float:
     return math.sqrt(total)
 
 
-@inner
+@typed(ROOM, ROOM)
 def solve_into(U: Array, X: Array) -> bool:
     """Solve U X = X by elimination with partial pivots, which destroys U; False for singular."""
     n, m = U.shape[0], X.shape[1]
@@ -151,39 +151,7 @@ def solve_into(U: Array, X: Array) -> bool:
     return True
 
 
-@inner
-def factor_into(S: Array) -> bool:
-    """Turn a symmetric, definite S into the L D L' of itself; False for one that is not."""
-    n = S.shape[0]
-    fine = True
-    for k in range(n):
-        for j in range(k):
-            S[k, k] -= S[k, j] * S[k, j] * S[j, j]
-        fine = fine and S[k, k] > 0.0 and math.isfinite(S[k, k])
-        for i in range(k + 1, n):
-            for j in range(k):
-                S[i, k] -= S[i, j] * S[k, j] * S[j, j]
-            S[i, k] /= S[k, k]
-    return fine
-
-
-@inner
-def solve_factored(S: Array, X: Array) -> None:
-    """Solve L D L' X = X of what :func:`factor_into` gave."""
-    n, m = X.shape
-    for k in range(n):
-        for i in range(k):
-            for j in range(m):
-                X[k, j] -= S[k, i] * X[i, j]
-    for k in range(n - 1, -1, -1):
-        for j in range(m):
-            X[k, j] /= S[k, k]
-        for i in range(k + 1, n):
-            for j in range(m):
-                X[k, j] -= S[i, k] * X[i, j]
-
-
-@inner
+@typed(MATRIX, MATRIX)
 def least_squares(J: Array, B: Array) -> Array:
     """Minimise the norm of J X - B, J (n, k) of full rank, by modified Gram-Schmidt."""
     n, k, m = J.shape[0], J.shape[1], B.shape[1]

@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 The koopman_ros Authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""A model out of its layout, its lift and secants, and its drift with the Jacobian."""
+"""A model out of its layout, and its lift with secants."""
 
 import math
 
@@ -9,16 +9,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from koopman_ros.arrays import Array
-from koopman_ros.compiled.jit import inner
-from koopman_ros.compiled.matrices import (
-    applied,
-    block,
-    factor_into,
-    identity,
-    least_squares,
-    product,
-    solve_factored,
-)
+from koopman_ros.compiled.jit import inner, INTEGERS, SIZE, typed, VECTOR
+from koopman_ros.compiled.matrices import identity, product
+
+Weights = tuple[Array, Array, Array, Array, Array]
 
 # Places in the sizes of a layout; widths of the hidden layers follow.
 N_X, N_U, N_Z, IDENTITY, READOUT, WIDTHS = range(6)
@@ -30,13 +24,10 @@ _LOG2_E = 1.0 / math.log(2.0)
 _LN2_HIGH, _LN2_LOW = float.fromhex('0x1.62e42fee00000p-1'), float.fromhex('0x1.a39ef35793c76p-33')
 
 
-@inner
-def _matrix(numbers: Array, start: int, rows: int, columns: int) -> Array:
-    found = np.empty((rows, columns))
-    for i in range(rows):
-        for j in range(columns):
-            found[i, j] = numbers[start + i * columns + j]
-    return found
+@typed(VECTOR, SIZE, SIZE, SIZE)
+def matrix(numbers: Array, start: int, rows: int, columns: int) -> Array:
+    """Return a matrix among the numbers of a layout, where it is."""
+    return numbers[start:start + rows * columns].reshape((rows, columns))
 
 
 @inner
@@ -51,17 +42,17 @@ def widths(sizes: NDArray[np.int64]) -> tuple[int, int]:
 
 
 @inner
-def matrices(sizes: NDArray[np.int64], numbers: Array) -> tuple[Array, Array, Array, Array]:
-    """Return A, B, the slope of the pre-feedback and the read-out of a layout."""
+def weights_of(sizes: NDArray[np.int64], numbers: Array) -> Weights:
+    """Return output, A, B, slope of the pre-feedback and read-out of a layout, where they are."""
     n, m, n_z = sizes[N_X], sizes[N_U], sizes[N_Z]
     width, start = widths(sizes)
-    start += width * (1 + n_z)
-    A = _matrix(numbers, start, n_z, n_z)
-    start += n_z * n_z
-    B = _matrix(numbers, start, n, m)
-    start += n * m
-    slope = _matrix(numbers, start, n, n)
-    return A, B, slope, _matrix(numbers, start + n * n, n, n + width)
+    output = start + width
+    A = output + n_z * width
+    B = A + n_z * n_z
+    slope = B + n * m
+    return (matrix(numbers, output, n_z, width), matrix(numbers, A, n_z, n_z),
+            matrix(numbers, B, n, m), matrix(numbers, slope, n, n),
+            matrix(numbers, slope + n * n, n, n + width))
 
 
 @inner
@@ -99,104 +90,14 @@ def squash(a: Array, width: int, scale: NDArray[np.int64]) -> None:
         a[i] = t if a[i] > 0.0 else -t
 
 
-@inner
-def room(sizes: NDArray[np.int64], curved: bool
-         ) -> tuple[Array, Array, Array, Array, Array, Array, NDArray[np.int64]]:
-    """
-    Return room for :func:`hidden_into`: two layers in turns with their derivatives, and 2^k.
-
-    :param curved: whether the second derivatives are wanted, too.
-    """
-    n, width = sizes[N_X], 0
-    for layer in range(WIDTHS, len(sizes)):
-        width = max(width, sizes[layer])
-    pairs = n * n if curved else 0
-    return (np.empty(width), np.empty(width), np.empty((n, width)), np.empty((n, width)),
-            np.empty((pairs, width)), np.empty((pairs, width)), np.empty(width, np.int64))
-
-
-@inner
-def free_room(sizes: NDArray[np.int64]) -> tuple[Array, Array, Array, Array]:
-    """Return room for :func:`free`: rows of z, rows of states, two rows of the layer, J_N."""
-    n, n_z = sizes[N_X], sizes[N_Z]
-    width, _ = widths(sizes)
-    return np.empty((3, n_z)), np.empty((n + 1, n)), np.empty((2, width)), np.empty((n_z, n))
-
-
-@inner
-def hidden_into(sizes: NDArray[np.int64], numbers: Array, x: Array, h: Array, before: Array,
-                T: Array, T_before: Array, U: Array, U_before: Array, scale: NDArray[np.int64]
-                ) -> None:
-    """
-    Write the last hidden layer, less its value at the origin, to h, and dh/dx (n_x, h) to T.
-
-    Where there is room for them, the second derivatives go to U (n_x^2, h).
-    """
-    n, start, last = sizes[N_X], 0, sizes[N_X]
-    curved = len(U) > 0
-    for layer in range(WIDTHS, len(sizes)):
-        width = sizes[layer]
-        bias, first = start + width * last, layer == WIDTHS
-        if not first:
-            for i in range(last):
-                before[i] = h[i]
-            for k in range(n):
-                for i in range(last):
-                    T_before[k, i] = T[k, i]
-            for k in range(len(U)):
-                for i in range(last):
-                    U_before[k, i] = U[k, i]
-        for i in range(width):
-            h[i] = numbers[bias + i]
-        for k in range(n):
-            for i in range(width):
-                T[k, i] = 0.0
-        for k in range(len(U)):
-            for i in range(width):
-                U[k, i] = 0.0
-        for j in range(last):
-            row = start + j * width
-            value = x[j] if first else before[j]
-            for i in range(width):
-                h[i] += numbers[row + i] * value
-            for k in range(n):
-                slope = (1.0 if j == k else 0.0) if first else T_before[k, j]
-                for i in range(width):
-                    T[k, i] += numbers[row + i] * slope
-            if not first:
-                for k in range(len(U)):
-                    bend = U_before[k, j]
-                    for i in range(width):
-                        U[k, i] += numbers[row + i] * bend
-        squash(h, width, scale)
-        if curved:
-            for k in range(n):
-                for j in range(n):
-                    for i in range(width):
-                        U[k * n + j, i] = (1.0 - h[i] * h[i]) * (
-                            U[k * n + j, i] - 2.0 * h[i] * T[k, i] * T[j, i])
-        for k in range(n):
-            for i in range(width):
-                T[k, i] *= 1.0 - h[i] * h[i]
-        start, last = bias + width, width
-    if len(sizes) > WIDTHS:
-        for i in range(last):
-            h[i] -= numbers[start + i]
-
-
-@inner
-def hidden(sizes: NDArray[np.int64], numbers: Array, x: Array) -> tuple[Array, Array]:
-    """Return the last hidden layer (h,) less its value at the origin, and dh/dx (n_x, h)."""
-    h, before, T, T_before, U, U_before, scale = room(sizes, False)
-    hidden_into(sizes, numbers, x, h, before, T, T_before, U, U_before, scale)
-    width = sizes[len(sizes) - 1] if len(sizes) > WIDTHS else 0
-    return h[:width].copy(), block(T, 0, 0, sizes[N_X], width)
-
-
-@inner
+@typed(INTEGERS, VECTOR, VECTOR, VECTOR, VECTOR)
 def secants(sizes: NDArray[np.int64], numbers: Array, x: Array, x_ref: Array, w: Array
             ) -> tuple[Array, Array, Array, Array]:
-    """Return the hidden layer as :func:`hidden`, and secants of it and its derivative (h, n_x)."""
+    """
+    Return the last hidden layer (h,) less its value at the origin, and dh/dx (h, n_x).
+
+    Beside them the secants of both.
+    """
     n = sizes[N_X]
     h, g, p, start, last = x.copy(), x_ref.copy(), w.copy(), 0, n
     T, S, G = identity(n), identity(n), np.zeros((n, n))
@@ -237,185 +138,15 @@ def secants(sizes: NDArray[np.int64], numbers: Array, x: Array, x_ref: Array, w:
 
 
 @inner
-def output_of(sizes: NDArray[np.int64], numbers: Array) -> Array:
-    """Return the output (n_z, h) of a layout."""
-    width, start = widths(sizes)
-    return _matrix(numbers, start + width, sizes[N_Z], width)
-
-
-@inner
-def parts_of(sizes: NDArray[np.int64], numbers: Array) -> tuple[Array, Array, Array, Array]:
-    """Return A, slope of the pre-feedback, read-out and output of a layout."""
-    A, _, slope, readout = matrices(sizes, numbers)
-    return A, slope, readout, output_of(sizes, numbers)
-
-
-@inner
-def lifted(sizes: NDArray[np.int64], numbers: Array, rows: Array, states: float) -> Array:
+def lifted(sizes: NDArray[np.int64], output: Array, rows: Array, states: float) -> Array:
     """
     Return coordinates (n_z, k) of rows (h, k) of the hidden layer, as far as they are of it.
 
     Where z starts with the state, those are `states` times the identity matrix.
     """
     n = sizes[N_X]
-    found = product(output_of(sizes, numbers), rows)
+    found = product(output, rows)
     if sizes[IDENTITY] and states != 0.0:
         for i in range(n):
             found[i, i] = states
     return found
-
-
-@inner
-def drift(sizes: NDArray[np.int64], numbers: Array, A: Array, slope: Array, readout: Array,
-          x: Array) -> Array:
-    """Return the drift (n_x,) at a state."""
-    n = sizes[N_X]
-    h, T = hidden(sizes, numbers, x)
-    if sizes[READOUT]:
-        return applied(readout, np.concatenate((x, h)))
-    n_z = len(A)
-    width, start = widths(sizes)
-    z, J = np.empty(n_z), np.empty((n_z, n))
-    for a in range(n_z):
-        row, states = start + width * (1 + a), sizes[IDENTITY] and a < n
-        total = 0.0
-        for i in range(width):
-            total += numbers[row + i] * h[i]
-        z[a] = x[a] if states else total
-        for k in range(n):
-            total = 0.0
-            for i in range(width):
-                total += numbers[row + i] * T[k, i]
-            J[a, k] = (1.0 if a == k else 0.0) if states else total
-    rate, by_slope = least_squares(J, applied(A, z).reshape((n_z, 1))), applied(slope, x)
-    for i in range(n):
-        by_slope[i] = rate[i, 0] - by_slope[i]
-    return by_slope
-
-
-@inner
-def read_out(readout: Array, x: Array, h: Array, T: Array, f: Array, J: Array) -> None:
-    """Write the drift of a read-out to f, and its Jacobian to J, of what `hidden_into` gave."""
-    n = len(f)
-    width = readout.shape[1] - n
-    for i in range(n):
-        total = 0.0
-        for k in range(width):
-            total += readout[i, n + k] * h[k]
-        for j in range(n):
-            total += readout[i, j] * x[j]
-        f[i] = total
-        for j in range(n):
-            total = readout[i, j]
-            for k in range(width):
-                total += readout[i, n + k] * T[j, k]
-            J[i, j] = total
-
-
-@inner
-def free(A: Array, slope: Array, output: Array, identity: int, x: Array, h: Array, T: Array,
-         U: Array, space: tuple[Array, Array, Array, Array], f: Array, J: Array) -> bool:
-    """
-    Write the drift without a read-out to f, and its Jacobian to J; False where it has none.
-
-    By the normal equations J_N'J_N f = J_N'A z and their derivatives by each state.
-
-    :param identity: whether z starts with the state; h, T and U are of `hidden_into`.
-    """
-    n, n_z, width = len(f), len(A), output.shape[1]
-    of_z, of_x, of_layer, L = space
-    z, rest, bent, turn, bend = of_z[0], of_z[1], of_z[2], of_layer[0], of_layer[1]
-    square, rate = of_x[:n], of_x[n].reshape((n, 1))
-    for a in range(n_z):
-        total = 0.0
-        for i in range(width):
-            total += output[a, i] * h[i]
-        z[a] = x[a] if identity and a < n else total
-        for k in range(n):
-            total = 0.0
-            for i in range(width):
-                total += output[a, i] * T[k, i]
-            L[a, k] = total
-    if identity:
-        for a in range(n):
-            for k in range(n):
-                L[a, k] = 1.0 if a == k else 0.0
-    for k in range(n):
-        rate[k, 0] = 0.0
-        for j in range(n):
-            square[k, j] = 0.0
-    for a in range(n_z):
-        total = 0.0
-        for b in range(n_z):
-            total += A[a, b] * z[b]
-        rest[a] = total
-        for k in range(n):
-            rate[k, 0] += L[a, k] * total
-            for j in range(n):
-                square[k, j] += L[a, k] * L[a, j]
-    fine = factor_into(square)
-    solve_factored(square, rate)
-    for a in range(n_z):
-        for k in range(n):
-            rest[a] -= L[a, k] * rate[k, 0]
-    for i in range(width):
-        turn[i] = 0.0
-    for a in range(n_z):
-        for i in range(width):
-            turn[i] += output[a, i] * rest[a]
-    for k in range(n):
-        for i in range(width):
-            bend[i] = 0.0
-        for j in range(n):
-            for i in range(width):
-                bend[i] += U[k * n + j, i] * rate[j, 0]
-        for a in range(n_z):
-            # what A makes of the state's direction, less how J_N turns the rate
-            total = 0.0
-            for b in range(n_z):
-                total += A[a, b] * L[b, k]
-            for i in range(width):
-                total -= output[a, i] * bend[i]
-            bent[a] = total
-        for j in range(n):
-            total = 0.0
-            for a in range(n_z):
-                total += L[a, j] * bent[a]
-            for i in range(width):
-                total += turn[i] * U[k * n + j, i]
-            J[j, k] = total
-    solve_factored(square, J)
-    for j in range(n):
-        f[j] = rate[j, 0]
-        for k in range(n):
-            f[j] -= slope[j, k] * x[k]
-            J[j, k] -= slope[j, k]
-    return fine
-
-
-@inner
-def rate_into(sizes: NDArray[np.int64], parts: tuple[Array, Array, Array, Array], x: Array,
-              h: Array, T: Array, U: Array, space: tuple[Array, Array, Array, Array], f: Array,
-              J: Array) -> None:
-    """
-    Write the drift to f, and its Jacobian to J, of what `hidden_into` gave; NaN for none.
-
-    :param parts: of :func:`parts_of`.
-    :param space: of :func:`free_room`.
-    """
-    A, slope, readout, output = parts
-    if sizes[READOUT]:
-        read_out(readout, x, h, T, f, J)
-    elif not free(A, slope, output, sizes[IDENTITY], x, h, T, U, space, f, J):
-        f[0] = J[0, 0] = math.nan
-
-
-@inner
-def drift_and_jacobian(sizes: NDArray[np.int64], numbers: Array,
-                       parts: tuple[Array, Array, Array, Array], x: Array) -> tuple[Array, Array]:
-    """Return the drift and its Jacobian (n_x, n_x); see :func:`rate_into`."""
-    h, before, T, T_before, U, U_before, scale = room(sizes, not sizes[READOUT])
-    hidden_into(sizes, numbers, x, h, before, T, T_before, U, U_before, scale)
-    f, J = np.empty(len(x)), np.empty((len(x), len(x)))
-    rate_into(sizes, parts, x, h, T, U, free_room(sizes), f, J)
-    return f, J

@@ -9,11 +9,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from koopman_ros.arrays import Array
-from koopman_ros.compiled.estimation import move
+from koopman_ros.compiled.estimation import moved
 from koopman_ros.compiled.jit import compiled, INTEGERS, MATRIX, NUMBER, SIZE, VECTOR
-from koopman_ros.compiled.laws import evaluated, growth_of
-from koopman_ros.compiled.matrices import applied, size
-from koopman_ros.compiled.network import matrices, N_U, N_X
+from koopman_ros.compiled.laws import LAW, law
+from koopman_ros.compiled.matrices import applied
+from koopman_ros.compiled.network import N_U, N_X, weights_of
 
 # Rows of the tables of a step.
 CENTER, SCALE, LOWER, UPPER = range(4)
@@ -70,7 +70,7 @@ def step(sizes: NDArray[np.int64], numbers: Array, tuning: Array, states: Array,
     steps = max(1.0, math.ceil(duration / longest))
     if not steps <= _MOST_MOVES:
         return found
-    expected = move(sizes, numbers, x, w, acted, duration / steps, int(steps))
+    expected = moved(sizes, numbers, x, w, acted, duration / steps, int(steps))
     start = FIGURES
     largest = 0.0
     x_now, w_now = measured, np.zeros(n)
@@ -97,7 +97,6 @@ def step(sizes: NDArray[np.int64], numbers: Array, tuning: Array, states: Array,
         found[start + 2 * n + i] = states[CENTER, i] + expected[i] * states[SCALE, i]
     start += 3 * n
     # where to go
-    _, B, _, _ = matrices(sizes, numbers)
     load = np.empty(n)
     for i in range(n):
         load[i] = drift_ref[i] + w_now[i]
@@ -107,17 +106,17 @@ def step(sizes: NDArray[np.int64], numbers: Array, tuning: Array, states: Array,
             u_ref[i] -= inverse[i, j] * load[j]
         found[start + i] = u_ref[i]
     start += m
+    _, _, B, _, _ = weights_of(sizes, numbers)
     forcing, rest = applied(B, u_ref), 0.0
     for i in range(n):
         rest += (load[i] + forcing[i]) ** 2
         forcing[i] += w_now[i]
         found[start + i] = forcing[i]
     start += n
-    fine, residual, _, K, motion, action, u = evaluated(
+    answer = law(
         sizes, numbers, x_now, x_ref, z_ref, u_ref, forcing, Q, R, spacing / unit, recentred)
-    gain = size(K)
-    growth = growth_of(motion, action, spacing / unit)
-    if not (fine and residual <= tuning[3] and gain <= tuning[4] and growth < 1.0):
+    residual, gain, growth, u = answer[0], answer[1], answer[2], answer[LAW:]
+    if not (residual < math.inf and residual <= tuning[3] and gain <= tuning[4] and growth < 1.0):
         return found
     outside, at_range, at_rate = 0.0, 0.0, 0.0
     for i in range(m):

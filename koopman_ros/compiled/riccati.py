@@ -13,7 +13,7 @@ import math
 import numpy as np
 
 from koopman_ros.arrays import Array
-from koopman_ros.compiled.jit import inner
+from koopman_ros.compiled.jit import compiled, inner, MATRIX, NUMBER
 from koopman_ros.compiled.matrices import (
     block,
     combined,
@@ -92,10 +92,11 @@ def _stable_solution(A: Array, G: Array, Q: Array) -> tuple[bool, Array]:
     eye = identity(n)
     gamma = _SHIFT * math.sqrt((size(A) ** 2 + size(G) * size(Q)) / n)
     inverse, W_inverse = identity(n), identity(n)
-    if not (gamma > 0.0 and solve_into(combined(1.0, A, -gamma, eye), inverse)):
+    shifted = combined(1.0, A, -gamma, eye)
+    if not (gamma > 0.0 and solve_into(shifted.copy(), inverse)):
         return False, Q
     QA = product(Q, inverse)
-    W = combined(1.0, turned(combined(1.0, A, -gamma, eye)), 1.0, product(QA, G))
+    W = combined(1.0, turned(shifted), 1.0, product(QA, G))
     if not solve_into(W, W_inverse):
         return False, Q
     E = combined(1.0, eye, 2.0 * gamma, turned(W_inverse))
@@ -142,10 +143,15 @@ def _stable_solution(A: Array, G: Array, Q: Array) -> tuple[bool, Array]:
     return False, X
 
 
-@inner
+@compiled(MATRIX, MATRIX, MATRIX, MATRIX, NUMBER)
 def regulator(A: Array, B: Array, Q: Array, R: Array, interval: float
-              ) -> tuple[bool, Array, Array, float]:
-    """Return whether this is sure, P, K and the residual of the sampled regulator."""
+              ) -> tuple[bool, Array, Array, float, float]:
+    """
+    Solve the equation of :func:`koopman_ros.solvers.solve_riccati`, over an interval.
+
+    :param Q: of the first coordinates, however many.
+    :return: whether this is sure, P, K, the residual and the Frobenius norm of K.
+    """
     n, m = B.shape
     F, weight = np.zeros((n + m, n + m)), np.zeros((n + m, n + m))
     place(F, 0, 0, A, 1.0)
@@ -153,7 +159,7 @@ def regulator(A: Array, B: Array, Q: Array, R: Array, interval: float
     place(weight, 0, 0, Q, 1.0)
     place(weight, n, n, R, 1.0)
     if not (size(F) * interval <= _LONGEST and math.isfinite(size(weight))):
-        return False, Q, turned(B), math.inf
+        return False, weight, F, math.inf, math.inf
     D, W = over_interval(F, weight, interval)
     step, push = block(D, 0, 0, n, n), block(D, 0, n, n, m)
     Q_d, N, R_d = block(W, 0, 0, n, n), block(W, 0, n, n, m), block(W, n, n, m, m)
@@ -162,13 +168,13 @@ def regulator(A: Array, B: Array, Q: Array, R: Array, interval: float
     place(by_R, 0, 0, push_t, 1.0)
     place(by_R, 0, n, N_t, 1.0)
     if not solve_into(R_d.copy(), by_R):
-        return False, Q, turned(B), math.inf
+        return False, W, D, math.inf, math.inf
     G, across = product(push, block(by_R, 0, 0, m, n)), block(by_R, 0, n, m, n)
     rest = combined(1.0, step, -1.0, product(push, across))
     Q_rest = combined(1.0, Q_d, -1.0, product(N, across))
     size_Q, size_G = size(Q_rest), size(G)
     if not (size_Q > 0.0 and size_G > 0.0):
-        return False, Q, turned(B), math.inf
+        return False, W, D, math.inf, math.inf
     scale = math.sqrt(size_Q / size_G)
     # (S + I)^-1 (S - I) of the symplectic pencil, which is a Hamiltonian matrix
     less, more = np.empty((2 * n, 2 * n)), np.empty((2 * n, 2 * n))
@@ -181,10 +187,11 @@ def regulator(A: Array, B: Array, Q: Array, R: Array, interval: float
             more[i, j] = less[i, j] if j < n else -less[i, j]
         more[i, i] += 2.0
     if not solve_into(more, less):
-        return False, Q, turned(B), math.inf
-    fine, P = _stable_solution(
-        block(less, 0, 0, n, n), combined(-1.0, block(less, 0, n, n, n), 0.0, rest),
-        combined(-1.0, block(less, n, 0, n, n), 0.0, rest))
+        return False, W, D, math.inf, math.inf
+    for i in range(n):
+        for j in range(n):
+            G[i, j], Q_rest[i, j] = -less[i, n + j], -less[n + i, j]
+    fine, P = _stable_solution(block(less, 0, 0, n, n), G, Q_rest)
     P = combined(0.5 * scale, P, 0.5 * scale, turned(P))
     P_step, P_push = product(P, step), product(P, push)
     right = combined(1.0, N_t, 1.0, turned(P_push))
@@ -201,4 +208,4 @@ def regulator(A: Array, B: Array, Q: Array, R: Array, interval: float
                       - feedback[i, j]) ** 2
     terms = size(Q_d) + 2.0 * size(P_step) + size(square) + size(feedback)
     residual = math.sqrt(total) / terms
-    return fine and solvable and residual <= _SURE, P, K, residual
+    return fine and solvable and residual <= _SURE, P, K, residual, size(K)

@@ -1,67 +1,82 @@
 # SPDX-FileCopyrightText: 2026 The koopman_ros Authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""A Runge-Kutta step of the state together with its derivatives."""
-
-from typing import Any
+"""Runge-Kutta steps of states together with their derivatives."""
 
 import numpy as np
 from numpy.typing import NDArray
 
 from koopman_ros.arrays import Array
+from koopman_ros.compiled.drifts import drifts, Space
 from koopman_ros.compiled.jit import inner
-from koopman_ros.compiled.network import (
-    free_room,
-    hidden_into,
-    rate_into,
-    READOUT,
-    room,
-)
+
+Rooms = tuple[Array, Array, Array, Array, Array]
 
 
 @inner
-def space_of(sizes: NDArray[np.int64]) -> tuple[Any, Any]:
-    """Return room for the steps of a model, which each of them takes anew."""
-    return room(sizes, not sizes[READOUT]), free_room(sizes)
+def room_of(X: Array) -> Rooms:
+    """Return what :func:`advance` needs, the third of it for the middle of a step."""
+    n, N = X.shape[1:]
+    return (np.empty(X.shape), np.empty(X.shape), np.empty(X.shape), X.copy(),
+            np.empty((n, n, N)))
 
 
 @inner
-def runge_kutta(sizes: NDArray[np.int64], numbers: Array,
-                parts: tuple[Array, Array, Array, Array], space: Any, push: Array, forced: Array,
-                x: Array, S: Array, h: float) -> tuple[Array, Array, Array, Array, Array, Array]:
+def _go_on(stage: int, lengths: Array, share: float, X: Array, rate: Array, total: Array,
+           middle: Array, ahead: Array) -> None:
     """
-    Step x' = f(x) + push and S' = f'(x) S + forced by h.
+    Go on from a stage of a Runge-Kutta step, which is a share of each interval.
 
-    :param parts: of :func:`koopman_ros.compiled.network.parts_of`.
-    :param space: of :func:`space_of`.
-    :return: both then, and the rates of both at the beginning and in the last stage.
+    After the last one X is its end, and `middle` the middle by the rates at both ends (Hermite).
     """
-    n, c = S.shape
-    (layer, before, T, T_before, U, U_before, scale), free_space = space
-    y, V, f, J = x.copy(), S.copy(), np.empty(n), np.empty((n, n))
-    first, first_S, rate, rate_S = np.empty(n), np.empty((n, c)), np.empty(n), np.empty((n, c))
-    total, total_S = np.zeros(n), np.zeros((n, c))
-    for stage in range(4):
-        hidden_into(sizes, numbers, y, layer, before, T, T_before, U, U_before, scale)
-        rate_into(sizes, parts, y, layer, T, U, free_space, f, J)
-        weight = 1.0 if stage in (0, 3) else 2.0
-        for i in range(n):
-            rate[i] = f[i] + push[i]
-            total[i] += weight * rate[i]
-            for a in range(c):
-                moved = forced[i, a]
-                for j in range(n):
-                    moved += J[i, j] * V[j, a]
-                rate_S[i, a] = moved
-                total_S[i, a] += weight * moved
-        part = 0.5 * h if stage < 2 else h
-        for i in range(n):
+    for a in range(X.shape[0]):
+        for i in range(X.shape[1]):
             if stage == 0:
-                first[i] = rate[i]
-            y[i] = x[i] + (part * rate[i] if stage < 3 else h / 6.0 * total[i])
+                for k in range(X.shape[2]):
+                    r = rate[a, i, k]
+                    total[a, i, k] = middle[a, i, k] = r
+                    ahead[a, i, k] = X[a, i, k] + 0.5 * share * lengths[k] * r
+            elif stage < 3:
+                part = 0.5 * share if stage == 1 else share
+                for k in range(X.shape[2]):
+                    r = rate[a, i, k]
+                    total[a, i, k] += 2.0 * r
+                    ahead[a, i, k] = X[a, i, k] + part * lengths[k] * r
+            else:
+                for k in range(X.shape[2]):
+                    r, h = rate[a, i, k], share * lengths[k]
+                    end = X[a, i, k] + h / 6.0 * (total[a, i, k] + r)
+                    middle[a, i, k] = 0.5 * (X[a, i, k] + end) + 0.125 * h * (
+                        middle[a, i, k] - r)
+                    X[a, i, k] = ahead[a, i, k] = end
+
+
+@inner
+def advance(sizes: NDArray[np.int64], numbers: Array, space: Space, push: Array, forced: Array,
+            lengths: Array, share: float, X: Array, rooms: Rooms) -> None:
+    """
+    Step x' = f(x) + push and S' = f'(x) S + forced by a share of each interval.
+
+    :param space: of :func:`koopman_ros.compiled.drifts.space_of`.
+    :param push: (n_x, N).
+    :param forced: (n_x, c).
+    :param lengths: (N,) of the intervals.
+    :param X: (1 + c, n_x, N), the states and after them their derivatives S.
+    :param rooms: of :func:`room_of`, kept from step to step.
+    """
+    rate, total, middle, ahead, J = rooms
+    n, c = forced.shape
+    N = len(lengths)
+    for stage in range(4):
+        drifts(sizes, numbers, ahead[0], space, rate[0], J)
+        for i in range(n):
+            for k in range(N):
+                rate[0, i, k] += push[i, k]
             for a in range(c):
-                if stage == 0:
-                    first_S[i, a] = rate_S[i, a]
-                V[i, a] = S[i, a] + (part * rate_S[i, a] if stage < 3
-                                     else h / 6.0 * total_S[i, a])
-    return y, V, first, first_S, rate, rate_S
+                force = forced[i, a]
+                for k in range(N):
+                    rate[1 + a, i, k] = force
+                for j in range(n):
+                    for k in range(N):
+                        rate[1 + a, i, k] += J[i, j, k] * ahead[1 + a, j, k]
+        _go_on(stage, lengths, share, X, rate, total, middle, ahead)

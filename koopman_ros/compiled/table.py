@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from koopman_ros.arrays import Array
 from koopman_ros.compiled import estimation, horizon, laws
 from koopman_ros.compiled import regular as steps
+from koopman_ros.compiled.riccati import regulator
 from koopman_ros.control import target as targets
 from koopman_ros.control.laws import base, riccati, shooting
 from koopman_ros.control.regular import Answered, Regular
@@ -37,7 +38,7 @@ def _regulator(model: LiftedModel, A: Array, B: Array, Q: Array, R: Array, *, in
                max_residual: float = 1e-8, max_gain: float = 1e6) -> RiccatiSolution | None:
     if not interval > 0.0:
         return None
-    sure, P, K, residual, size = laws.solve(
+    sure, P, K, residual, size = regulator(
         np.ascontiguousarray(A), np.ascontiguousarray(B), Q, R, interval)
     return _solution(P, K, residual, size, max_residual, max_gain) if sure else None
 
@@ -102,7 +103,7 @@ def _moved(model: LiftedModel, x: Array, w: Array, u: Array, h: float, steps: in
     if layout is None:
         return None
     found: Array = estimation.moved(layout.sizes, layout.numbers, x, w, u, h, steps)
-    return found
+    return found if math.isfinite(found[0]) else None
 
 
 def _propagated(model: LiftedModel, x: Array, w: Array, P: Array, u: Array, h: float, steps: int
