@@ -63,7 +63,7 @@ def inner(function: Callable[..., Any]) -> Callable[..., Any]:
 
 
 def typed(*arguments: Any) -> Callable[[Callable[..., Any]], Callable[..., Any]]:
-    """Let them call a function that is compiled once, for what becomes these types."""
+    """Let them call a function that is compiled once, and kept, for what becomes these types."""
     found: Callable[[Callable[..., Any]], Callable[..., Any]] = numba.njit(
-        tuple(arguments), **_INNER)
+        tuple(arguments), cache=True, **_INNER)
     return found
