@@ -3,7 +3,7 @@
 
 """The control step, and the loop across processes: latency, rate, start, memory, lock-step."""
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 import contextlib
 from dataclasses import dataclass
 from functools import partial
@@ -63,7 +63,6 @@ MEANING = {
     'pid_speedup_over_real_time': 'the same with the PID controller, which is what the plant and '
                                   'rclpy leave room for',
 }
-SIDES = ('controller', 'compiled', 'pid', 'echo')  #: who answers, each beside the others
 _ROUND = 50  # measurements of one side, then of the other
 _PACE = 0.005  # s between measurements whose latency is taken
 _BEHIND = 0.02  # s; a run whose answers come this late at its end has fallen behind
@@ -71,6 +70,7 @@ _PATIENCE = 2.0  # s for the answers that are still missing at the end of a run
 _GROWTH, _TRIES = 1.2, 2  # twice, since another program may have come in between
 _ON_SCHEDULE = 0.98
 _CELSIUS = 51.0  # about the nominal point of the shipped lifts
+_NAMESPACE = '/answers'
 _NOISE = 0.01  # K, standard deviation
 _RETRY = 0.01  # s between measurements that nobody may hear yet
 
@@ -101,11 +101,11 @@ def measure(plan: Plan, figures: dict[str, Any], folder: Path) -> Iterator[str]:
         yield _steps(figures, plan, Path(name))
         yield _plans(figures, plan, Path(name))
         with Harness(Path(name), name='probe') as harness:
-            with _answering(harness, figures) as probes:
+            with _answering(harness) as (nodes, probes):
                 yield _latency(figures, probes, plan.rounds)
                 yield _highest_rate(figures, probes, plan.rate_seconds, plan.lowest_rate)
-            _start_up(figures, harness, plan.starts)
-            yield _lockstep(figures, harness, plan.plant_seconds)
+                yield _lockstep(figures, harness, nodes, plan.plant_seconds)
+            yield _start_up(figures, harness, plan.starts)
 
 
 def _tell(label: str) -> None:
@@ -235,37 +235,29 @@ def _start(harness: Harness, name: str, namespace: str, command: tuple[str, ...]
     return harness.start(name, parameters, ('-r', f'__ns:={namespace}'), command)
 
 
-def _answering_process(harness: Harness, name: str, namespace: str) -> NodeProcess:
-    """Start one of `SIDES`."""
-    if name in ('pid', 'echo'):
-        command = (sys.executable, '-m', f'validation.benchmarks.{name}')
-        return _start(harness, name, namespace, command)
-    return _start(harness, 'controller', namespace, compiled=name == 'compiled')
-
-
-def _settled(harness: Harness, name: str, namespace: str, records: list[String]) -> _Probe:
-    """Return a probe of a side that has answered for a while, and is compiled where it will be."""
-    probe = _Probe(harness, namespace)
-    probe.first_answer()
-    probe.paced()
-    # without what compiles, it is the numpy one again
-    if name == 'compiled' and find_spec(PACKAGE) is not None:
-        harness.wait_until(lambda: any(f'"event":"{NUMERICS}"' in one.data for one in records),
-                           'the compiled step')
-    return probe
-
-
 @contextlib.contextmanager
-def _answering(harness: Harness, figures: dict[str, Any]) -> Iterator[dict[str, _Probe]]:
-    """Yield a probe of each side, which have all answered for a while."""
+def _answering(harness: Harness) -> Iterator[tuple[dict[str, NodeProcess], dict[str, _Probe]]]:
+    """Yield who answers, and their probes, after all have answered for a while."""
     _tell('controllers, a PID controller and an echo')
-    records = harness.listen(String, f'/answers/compiled/{topics.CONTROLLER_EVENTS}')
+    echo, pid = ((sys.executable, '-m', f'validation.benchmarks.{name}')
+                 for name in ('echo', 'pid'))
+    # without what compiles, `compiled` is the first one again
+    records = harness.listen(String, f'{_NAMESPACE}/compiled/{topics.CONTROLLER_EVENTS}')
     with contextlib.ExitStack() as stack:
-        started = {name: stack.enter_context(
-            _answering_process(harness, name, f'/answers/{name}')) for name in SIDES}
-        probes = {name: _settled(harness, name, f'/answers/{name}', records) for name in SIDES}
-        figures['latency'] = {'echo_rss_megabytes': _rss(started['echo'])}
-        yield probes
+        nodes = {name: stack.enter_context(
+            _start(harness, program, f'{_NAMESPACE}/{name}', command, **parameters))
+            for name, program, command, parameters in (
+                ('controller', 'controller', None, {}),
+                ('compiled', 'controller', None, {'compiled': True}),
+                ('pid', 'pid', pid, {}), ('echo', 'echo', echo, {}))}
+        probes = {name: _Probe(harness, f'{_NAMESPACE}/{name}') for name in nodes}
+        for probe in probes.values():
+            probe.first_answer()
+            probe.paced()
+        if find_spec(PACKAGE) is not None:
+            harness.wait_until(lambda: any(f'"event":"{NUMERICS}"' in one.data for one in records),
+                               'the compiled step')
+        yield nodes, probes
 
 
 def _latency(figures: dict[str, Any], probes: dict[str, _Probe], rounds: int) -> str:
@@ -275,7 +267,7 @@ def _latency(figures: dict[str, Any], probes: dict[str, _Probe], rounds: int) ->
     for _ in range(rounds):
         for name, probe in probes.items():
             taken[name] += probe.paced()
-    figures['latency']['measurements'] = rounds * _ROUND
+    figures['latency'] = {'measurements': rounds * _ROUND}
     rows = []
     for quantile, percent in (('median', 50), ('p99', 99)):
         found = {name: 1e6 * float(np.percentile(seconds, percent))
@@ -322,9 +314,9 @@ def _raised(figures: dict[str, Any], side: str, probe: _Probe, seconds: float, l
     return (side.strip('_') or 'controller', '-' if highest is None else f'{highest:.0f}', ended)
 
 
-def _start_up(figures: dict[str, Any], harness: Harness, runs: int) -> None:
+def _start_up(figures: dict[str, Any], harness: Harness, runs: int) -> str:
     """Time the controller from the start of its process to its first command."""
-    _tell('start-up, memory and lock-step')
+    _tell('start-up')
     probe = _Probe(harness, '/start')
     taken = []
     for _ in range(runs):
@@ -332,48 +324,48 @@ def _start_up(figures: dict[str, Any], harness: Harness, runs: int) -> None:
         with _start(harness, 'controller', '/start'):
             taken.append((probe.first_answer() - begun) / NANOSECONDS)
     figures['startup'] = {'seconds': float(np.median(taken)), 'runs': taken}
-    figures['startup_seconds'] = figures['startup']['seconds']
+    figures['startup_seconds'] = seconds = figures['startup']['seconds']
+    return f'first command {seconds:.2f} s after the start'
 
 
-def _lockstep(figures: dict[str, Any], harness: Harness, seconds: float) -> str:
+def _lockstep(figures: dict[str, Any], harness: Harness, nodes: Mapping[str, NodeProcess],
+              seconds: float) -> str:
     """Let the plant and each side run in lock-step as fast as they can, and weigh all nodes."""
-    figures['rss_megabytes'] = memory = {'echo': figures['latency']['echo_rss_megabytes']}
+    _tell('lock-step and memory')
+    memory = {'echo': _rss(nodes['echo'])}
     rows = []
-    # an echo would heat the plant until it leaves its bounds
-    for name in SIDES[:-1]:
+    for name, node in nodes.items():
+        if name == 'echo':
+            # it would heat the plant until that leaves its bounds
+            continue
         side = '' if name == 'controller' else f'{name}_'
-        took, weights = _run_in_lockstep(harness, name, seconds)
+        took, weight = _run_in_lockstep(harness, name, seconds)
         figures[f'{side}lockstep'] = {'plant_seconds': seconds, 'seconds': took}
         figures[f'{side}speedup_over_real_time'] = seconds / took
         rows.append((name, f'{seconds / took:.0f}'))
         if name == 'controller':
-            memory.update(weights)
+            memory.update(plant=weight, controller=_rss(node))
     with _start(harness, 'trainer', '/idle', record_at_start=False) as trainer:
         ready = harness.node.create_client(Trigger, '/idle/trainer/train').service_is_ready
         harness.wait_until(ready, 'the trainer')
         memory['trainer'] = _rss(trainer)
+    figures['rss_megabytes'] = memory
     return '\n'.join((
-        f'first command {figures["startup_seconds"]:.2f} s after the start',
-        f'resident memory in MB: {", ".join(f"{k} {v:.0f}" for k, v in memory.items())}',
-        table(('in lock-step with the plant', 'times as fast as the plant'), rows)))
+        table(('in lock-step with the plant', 'times as fast as the plant'), rows),
+        f'resident memory in MB: {", ".join(f"{k} {v:.0f}" for k, v in memory.items())}'))
 
 
-def _run_in_lockstep(harness: Harness, name: str, seconds: float
-                     ) -> tuple[float, dict[str, float]]:
-    """Return what so many seconds of the plant take, and the memory of both processes in MB."""
-    namespace = f'/lockstep/{name}'
-    records = harness.listen(String, f'{namespace}/{topics.CONTROLLER_EVENTS}')
+def _run_in_lockstep(harness: Harness, name: str, seconds: float) -> tuple[float, float]:
+    """Return what so many seconds of the plant take beside a side, and its memory in MB."""
     arrivals: list[float] = []
-    with _answering_process(harness, name, namespace) as answering:
-        _settled(harness, name, namespace, records)
-        harness.node.create_subscription(
-            Temperature, f'{namespace}/{reactor.TEMPERATURE}',
-            lambda _: arrivals.append(time.monotonic()), topics.LOOP_QOS, raw=True)
-        with _start(harness, 'plant', namespace, speed=0.0, lockstep=True, duration=seconds,
-                    sample_period=1.0, lockstep_subscribers=2) as plant:
-            harness.wait_until(lambda: len(arrivals) > round(seconds),
-                               'the end of the lock-step loop')
-            return arrivals[-1] - arrivals[0], {'plant': _rss(plant), name: _rss(answering)}
+    harness.node.create_subscription(
+        Temperature, f'{_NAMESPACE}/{name}/{reactor.TEMPERATURE}',
+        lambda _: arrivals.append(time.monotonic()), topics.LOOP_QOS, raw=True)
+    with _start(harness, 'plant', f'{_NAMESPACE}/{name}', speed=0.0, lockstep=True,
+                duration=seconds, sample_period=1.0, lockstep_subscribers=2) as plant:
+        harness.wait_until(lambda: len(arrivals) > round(seconds),
+                           'the end of the lock-step loop')
+        return arrivals[-1] - arrivals[0], _rss(plant)
 
 
 def _rss(node: NodeProcess) -> float:
