@@ -78,7 +78,7 @@ demo-saddle: $(VENV)/saddle.stamp  ## an unstable reactor is learned from its te
 test: $(VENV)/test.stamp  ## style and type checks and the whole test suite, on all cores
 	$(BIN)/ruff check
 	@$(BIN)/mypy > $(VENV)/mypy.log & types=$$!; \
-	  $(BIN)/python -m pytest -n $$(($$(nproc) + 2)) --dist loadfile --no-loadscope-reorder \
+	  $(BIN)/python -m pytest -n $$(($$(nproc) + 1)) --dist loadfile --no-loadscope-reorder \
 	    --max-worker-restart 0; \
 	  tests=$$?; wait $$types || tests=1; cat $(VENV)/mypy.log; exit $$tests
 

@@ -36,6 +36,7 @@ from koopman_ros.plant_data import Plant, Samples
 from koopman_ros.plants import describe, two_state_example
 from koopman_ros.reports import table
 from koopman_ros.testing.cluster import DaskProcesses
+from validation.benchmarks.process import processor_seconds
 
 PACKAGES = ('torch', 'numpy', 'distributed', 'joblib')
 _SHARDS = 4
@@ -161,9 +162,8 @@ def _processor_times() -> dict[int, float]:
     """Return those of all processes below this one, in seconds."""
     found = {}
     for child in psutil.Process().children(recursive=True):
-        with contextlib.suppress(psutil.Error):
-            times = child.cpu_times()
-            found[child.pid] = times.user + times.system
+        with contextlib.suppress(OSError):
+            found[child.pid] = processor_seconds(child.pid)
     return found
 
 

@@ -43,6 +43,7 @@ from koopman_ros.ros import topics
 from koopman_ros.ros.codec import stamp_nanoseconds
 from koopman_ros.testing import Harness, NodeProcess
 from koopman_ros.units import NANOSECONDS
+from validation.benchmarks.process import processor_seconds
 
 if TYPE_CHECKING:
     from playwright.sync_api import Browser, BrowserContext, Page
@@ -331,15 +332,15 @@ def _figures(loop: _Loop, page: 'Page', panel: NodeProcess, seconds: float) -> d
     process = psutil.Process(panel.process.pid)
     found: dict[str, Any] = {}
     first, begun = len(loop.told), time.monotonic()
-    before, waited = process.cpu_times(), _waited(process)
+    before, waited = processor_seconds(process.pid), _waited(process)
     psutil.cpu_percent()
 
     def take() -> None:
-        after, took = process.cpu_times(), time.monotonic() - begun
+        after, took = processor_seconds(process.pid), time.monotonic() - begun
         memory = process.memory_full_info()
         found.update(
             pages=loop.pages,
-            cpu_share=(after.user + after.system - before.user - before.system) / took,
+            cpu_share=(after - before) / took,
             waiting_share=max((ready - waited.get(thread, 0.0) for thread, ready in _waited(
                 process).items()), default=np.nan) / took,
             pss_megabytes=memory.pss / 1e6, rss_megabytes=memory.rss / 1e6,

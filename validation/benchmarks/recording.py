@@ -13,7 +13,6 @@ import time
 from typing import Any
 
 from mcap.writer import CompressionType, Writer
-import psutil
 from rclpy.duration import Duration
 from rclpy.publisher import Publisher
 from rclpy.qos import QoSProfile
@@ -24,6 +23,7 @@ from koopman_ros.reports import table
 from koopman_ros.ros.codec import stamp_nanoseconds
 from koopman_ros.testing import Harness
 from koopman_ros.units import NANOSECONDS
+from validation.benchmarks.process import processor_seconds
 
 PACKAGES = ('mcap',)
 _TOPIC, _TYPE = '/temperature', 'sensor_msgs/msg/Temperature'
@@ -74,16 +74,14 @@ def _record(folder: Path, rate: float, seconds: float) -> dict[str, Any]:
     with Harness(folder) as harness:
         trainer = harness.start('trainer', {'output': bag})
         publisher = harness.speak(Temperature, _TOPIC, QoSProfile(depth=_DEPTH), to='trainer')
-        process = psutil.Process(trainer.process.pid)
-        before = process.cpu_times()
+        before = processor_seconds(trainer.process.pid)
         took, latest = _publish(publisher, rate, count)
         if not publisher.wait_for_all_acked(Duration(seconds=_TIMEOUT)):
             raise RuntimeError(f'the trainer does not acknowledge within {_TIMEOUT:g} s')
-        after = process.cpu_times()
-        status = Path(f'/proc/{process.pid}/status').read_text()
+        used = processor_seconds(trainer.process.pid) - before
+        status = Path(f'/proc/{trainer.process.pid}/status').read_text()
         peak = int(status.partition('VmHWM:')[2].split()[0]) * 1024 / 1e6
         trainer.stop()
-    used = after.user + after.system - before.user - before.system
     numbers = [stamp_nanoseconds(m.message.header.stamp) for m in read_messages(bag, [_TOPIC])]
     return {
         'rate_hz': rate,

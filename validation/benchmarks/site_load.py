@@ -29,6 +29,7 @@ from sensor_msgs.msg import Temperature
 from koopman_ros.demo import reactor
 from koopman_ros.ros import topics
 from koopman_ros.units import NANOSECONDS
+from validation.benchmarks.process import processor_seconds
 
 _CELSIUS = 51.0  # about the nominal point of the shipped lifts
 _STAMP = struct.Struct('<iI')
@@ -98,8 +99,7 @@ class Load:
 
 def _processor(processes: list[psutil.Process]) -> float:
     """Return the processor time that some processes have taken, in s."""
-    times = [process.cpu_times() for process in processes]
-    return sum(one.user + one.system for one in times)
+    return sum(processor_seconds(process.pid) for process in processes)
 
 
 def _window(load: Load, seconds: float, processes: list[psutil.Process]) -> dict[str, float]:
