@@ -39,7 +39,7 @@ def _folder() -> Path:
 
 
 FOLDER = _folder()
-config.CACHE_DIR = str(FOLDER)  # type: ignore[attr-defined]
+config.CACHE_DIR = str(FOLDER)
 
 # Divisions by 0 give infinity as in numpy: what is not finite is refused by its results. Sums may
 # be taken in another order, several numbers at once. C does not call them, nor Python the inner
