@@ -244,5 +244,5 @@ def _finish(figure: Figure, axes: list[Axes]) -> None:
                      for tick in np.asarray(line.get_xdata()).tolist()})
     for ax in axes:
         ax.set_xticks(counts, [str(count) for count in counts])
-        ax.minorticks_off()
+        ax.set_xticks([], minor=True)
     legend(figure, axes, 3)

@@ -264,7 +264,7 @@ def _width(solver: str) -> float:
 
 
 def _draw_traces(ax: Axes, outcomes: dict[str, process.Outcome], case: dict[str, Any]) -> None:
-    last = _FIRST
+    last, built = _FIRST, 0
     for solver, outcome in outcomes.items():
         if not (trace := _trace(outcome)):
             continue
@@ -276,8 +276,11 @@ def _draw_traces(ax: Axes, outcomes: dict[str, process.Outcome], case: dict[str,
                 drawstyle='steps-post')
         last = max(last, seconds[-1])
         if build := case.get(f'{solver}_build_seconds'):
-            ax.annotate(f'+{build:.0f} s to build', (seconds[-1], rw[-1]), xytext=(5, -3),
-                        textcoords='offset points', fontsize=8, color=_COLOURS[solver])
+            # each above the one before, lest they end at the same place
+            ax.annotate(f'+{build:.0f} s to build', (seconds[-1], rw[-1]),
+                        xytext=(5, 10 * built - 3), textcoords='offset points', fontsize=8,
+                        color=_COLOURS[solver])
+            built += 1
     for name, target in TARGETS.items():
         if name not in case['not_asked']:
             ax.axhline(target, color='0.5', lw=0.9, ls=':', zorder=1)
