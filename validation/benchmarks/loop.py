@@ -361,8 +361,12 @@ def _run_in_lockstep(harness: Harness, name: str, seconds: float) -> tuple[float
     harness.node.create_subscription(
         Temperature, f'{_NAMESPACE}/{name}/{reactor.TEMPERATURE}',
         lambda _: arrivals.append(time.monotonic()), topics.LOOP_QOS, raw=True)
+    # that of the other measurements: without it, one at rest repeats itself to the last digit, as
+    # that of a sensor which is frozen
+    noise: dict[str, Any] = {f'{reactor.TEMPERATURE}.noise': _NOISE}
     with _start(harness, 'plant', f'{_NAMESPACE}/{name}', speed=0.0, lockstep=True,
-                duration=seconds, sample_period=1.0, lockstep_subscribers=2) as plant:
+                duration=seconds, sample_period=1.0, lockstep_subscribers=2,
+                **noise) as plant:
         harness.wait_until(lambda: len(arrivals) > round(seconds),
                            'the end of the lock-step loop')
         return arrivals[-1] - arrivals[0], _rss(plant)
