@@ -19,6 +19,7 @@ from koopman_ros.lifting import load, save
 from koopman_ros.plant_data import Samples, split_by_episode
 from support.random_lifts import random_lift
 from support.small_plants import BENT, bent_samples, TWO_STATE, two_state_samples
+from support.tensors import assert_close
 
 
 def samples_of(model, count=60, seed=1):
@@ -121,8 +122,8 @@ def test_the_sums_of_a_drift_are_those_of_its_differentiated_residual(hidden, n_
 
     J, r = torch.autograd.functional.jacobian(residual, theta), residual(theta)
     assert found.cost == pytest.approx(float(0.5 * r @ r), rel=1e-13)
-    np.testing.assert_allclose(found.gradient, J.T @ r, rtol=0, atol=1e-13)
-    np.testing.assert_allclose(found.matrix, J.T @ J, rtol=0, atol=1e-13)
+    assert_close(found.gradient, J.T @ r, rtol=0, atol=1e-13)
+    assert_close(found.matrix, J.T @ J, rtol=0, atol=1e-13)
 
 
 @pytest.mark.parametrize('B', [TWO_STATE.B, None], ids=['known B', 'learned B'])

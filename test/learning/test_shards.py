@@ -29,6 +29,7 @@ from support.small_plants import (
     TWO_STATE,
     two_state_samples,
 )
+from support.tensors import assert_close
 
 
 def problems(plant, samples):
@@ -63,8 +64,8 @@ def test_sums_of_parts_are_the_sum(tmp_path, learned):
                 one, other = (normal_equations(each.add_residuals, theta, derivatives=derivatives)
                               for each in (problem, apart))
                 assert other.cost == pytest.approx(one.cost, rel=1e-13)
-                np.testing.assert_allclose(other.gradient, one.gradient, rtol=1e-11, atol=1e-11)
-                np.testing.assert_allclose(other.matrix, one.matrix, rtol=1e-11, atol=1e-11)
+                assert_close(other.gradient, one.gradient, rtol=1e-11, atol=1e-11)
+                assert_close(other.matrix, one.matrix, rtol=1e-11, atol=1e-11)
 
 
 class Counting:

@@ -21,6 +21,7 @@ from koopman_ros.plants import scalar_example
 from support import small_plants
 from support.disturbance import disturbed_data
 from support.small_plants import BENT, bent_samples, bits, SMALL, UNFORCED, unforced_samples
+from support.tensors import assert_close
 
 
 def tensors(*arrays):
@@ -96,8 +97,8 @@ def test_widening_leaves_the_coordinates_as_they_were(layers, identity, activati
     assert child.layout.n_z == 5
     assert child.layout.hidden == tuple(h + 2 for h in parent.layout.hidden)
     for name in ('z', 'z_rate'):
-        np.testing.assert_allclose(getattr(lifted(child, data), name)[:, :4],
-                                   getattr(lifted(parent, data), name), rtol=0, atol=1e-13)
+        assert_close(getattr(lifted(child, data), name)[:, :4],
+                     getattr(lifted(parent, data), name), rtol=0, atol=1e-13)
 
 
 def test_a_new_coordinate_starts_near_a_product_that_the_others_do_not_span():

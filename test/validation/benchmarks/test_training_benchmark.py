@@ -12,6 +12,7 @@ import pytest
 from koopman_ros.learning import fit
 from koopman_ros.learning.levenberg_marquardt import normal_equations
 from koopman_ros.lifting import Coordinates, LiftedModel, NetworkObservables, Provenance
+from support.tensors import assert_close
 from validation.benchmarks import ipopt, process, solvers
 from validation.benchmarks import training as training_part
 from validation.benchmarks.__main__ import main
@@ -83,7 +84,7 @@ def test_objective_of_the_first_order_solvers_is_ours():
     cost.backward()
     ours = normal_equations(case.problem.add_residuals, case.theta)
     assert cost.item() == pytest.approx(ours.cost, rel=1e-12)
-    np.testing.assert_allclose(theta.grad, ours.gradient, rtol=1e-10, atol=1e-12)
+    assert_close(theta.grad, ours.gradient, rtol=1e-10, atol=1e-12)
 
 
 @pytest.mark.parametrize('graph', ['expanded', 'compiled'])
