@@ -406,8 +406,8 @@ class RecordPublisher:
                 self._due = time.monotonic() + _AGAIN
 
     def watch(self) -> None:
-        """Publish the state where that is due and no event was."""
-        if time.monotonic() > self._due:
+        """Publish the state to whoever listens, where that is due."""
+        if time.monotonic() > self._due and topics.heard(self._publisher):
             self.publish_snapshot()
 
     def publish_snapshot(self, event: str = SNAPSHOT) -> None:

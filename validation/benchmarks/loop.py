@@ -108,6 +108,11 @@ def measure(plan: Plan, figures: dict[str, Any], folder: Path) -> Iterator[str]:
             yield _start_up(figures, harness, plan.starts)
 
 
+def _prefix(name: str) -> str:
+    """Return what the figures of a side begin with, nothing for the controller in numpy."""
+    return '' if name == 'controller' else f'{name}_'
+
+
 def _tell(label: str) -> None:
     print(f'loop: {label}', file=sys.stderr, flush=True)
 
@@ -275,8 +280,7 @@ def _latency(figures: dict[str, Any], probes: dict[str, _Probe], rounds: int) ->
         for name, microseconds in found.items():
             figures['latency'].setdefault(name, {})[f'{quantile}_us'] = microseconds
             if name != 'echo':
-                prefix = '' if name == 'controller' else f'{name}_'
-                figures[f'{prefix}latency_ratio_{quantile}'] = microseconds / found['echo']
+                figures[f'{_prefix(name)}latency_ratio_{quantile}'] = microseconds / found['echo']
         rows.append((quantile, *(
             f'{us:.0f}' if name == 'echo' else f'{us:.0f} ({us / found["echo"]:.2f})'
             for name, us in found.items())))
@@ -288,7 +292,7 @@ def _highest_rate(figures: dict[str, Any], probes: dict[str, _Probe], seconds: f
     """Raise the rate of measurements, in Hz, until who answers does not keep up for a run."""
     _tell('highest rate')
     return table(('every measurement is answered', 'up to [Hz]', 'ended because'), [
-        _raised(figures, '' if name == 'controller' else f'{name}_', probe, seconds, lowest)
+        _raised(figures, _prefix(name), probe, seconds, lowest)
         for name, probe in probes.items()])
 
 
@@ -338,7 +342,7 @@ def _lockstep(figures: dict[str, Any], harness: Harness, nodes: Mapping[str, Nod
         if name == 'echo':
             # it would heat the plant until that leaves its bounds
             continue
-        side = '' if name == 'controller' else f'{name}_'
+        side = _prefix(name)
         took, weight = _run_in_lockstep(harness, name, seconds)
         figures[f'{side}lockstep'] = {'plant_seconds': seconds, 'seconds': took}
         figures[f'{side}speedup_over_real_time'] = seconds / took
