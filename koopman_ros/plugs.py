@@ -7,6 +7,8 @@ from collections.abc import Callable, Mapping
 import importlib
 from typing import Any
 
+_LONGEST = 200  # characters of an error's text that reach a status
+
 
 def plug(name: str, kind: str, known: Mapping[str, Callable[..., Any] | str]) -> Any:
     """
@@ -26,11 +28,22 @@ def plug(name: str, kind: str, known: Mapping[str, Callable[..., Any] | str]) ->
                          'module:name of one of your own')
     try:
         found = getattr(importlib.import_module(module), attribute)
-    except Exception as error:  # a module may fail in every way
-        cause = ' '.join(f'{type(error).__name__}: {error}'.split())
+    except BaseException as error:
+        cause = contained(error)
         raise ValueError(f'the {kind} {name!r} cannot be loaded ({cause}): check module and '
                          'name, and that Python finds the module') from error
     if not callable(found):
         raise ValueError(f'the {kind} {name!r} is a {type(found).__name__}, which cannot be '
                          'called: name a class or a function')
     return found
+
+
+def contained(error: BaseException) -> str:
+    """
+    Return in one line what a plug-in raised, whatever it is, also SystemExit.
+
+    :raises KeyboardInterrupt: where that is the error: it is meant for the process.
+    """
+    if isinstance(error, KeyboardInterrupt):
+        raise error
+    return ' '.join(f'{type(error).__name__}: {error}'.split())[:_LONGEST]
