@@ -110,6 +110,7 @@ class PlantNode(ManagedNode):
 
     def activate(self) -> None:
         """Let time go on."""
+        self._last_command = time.monotonic()
         if self._sample:
             self._resynchronise()
 
@@ -362,12 +363,12 @@ class PlantNode(ManagedNode):
                     signals, [*plant.x.tolist(), *plant.u.tolist()], strict=True)}
 
     def _unanswered(self) -> bool:
-        """Tell whether a controller that commanded before has fallen silent."""
+        """Tell whether no command arrives, be it from the start or for some time."""
         if self._phase is not Phase.RUNNING or self._settings.lockstep:
             return self._waiting_in_vain
         period = self._settings.sample_period / (self._settings.speed or math.inf)
         silence = time.monotonic() - self._last_command
-        return bool(self._commands) and silence > max(_SILENCE, 5.0 * period)
+        return silence > max(_SILENCE, 5.0 * period)
 
 
 def main(args: list[str] | None = None) -> int:
