@@ -207,6 +207,9 @@ class ControllerNode(ManagedNode):
             self._state = State(self._state.mode, Setpoint(
                 asked.requested, scheduled=asked.scheduled))
             self._waiting.clear()
+            self._timing, self._received = Timing(self), time.monotonic()
+            self._sources = {topic: TimeBase(late=-1) for topic in self._sources}
+            self._held_for, self._settling = None, False
             self._records.start()
 
     def deactivate(self) -> None:

@@ -171,7 +171,7 @@ def _warning(now: Situation) -> str:
         return now.open_loop.message
     if now.timing.paused:
         return (f'/clock has stood still for more than {PAUSED:g} s: the simulation is paused or '
-                f'has ended; the {now.input} stays')
+                'has ended, and the last command stays')
     overdue = _PATIENCE if math.isinf(now.state.interval) else max(
         _PATIENCE, 3.0 * now.state.interval)
     if report.measurement.arrival is Arrival.REPEATED or (
@@ -180,8 +180,8 @@ def _warning(now: Situation) -> str:
                 'measurements with their time')
     unmeasured = report.measurement.arrival is Arrival.MISSING and not report.command.way_back
     if now.timing.silence > overdue or (unmeasured and now.counts.measurements):
-        return (f'the last measurement is {now.timing.silence:.0f} s old: the {now.input} '
-                'follows the model and the operator alone; check sensor and plant')
+        return (f'the last measurement is {now.timing.silence:.0f} s old: commands follow from '
+                'the model and from requests alone; check sensor and plant')
     if now.timing.without_clock:
         return ('use_sim_time is set and nobody publishes /clock: time-outs count by the wall '
                 'clock; set use_sim_time to false, or publish_clock of the plant to true')
