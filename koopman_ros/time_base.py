@@ -9,6 +9,8 @@ import math
 
 from koopman_ros.units import LATE_NANOSECONDS
 
+_ROUNDS = 3.0  # without a restart after which one source is left
+
 
 class Advance(Enum):
     """What a number is in relation to the numbers before it."""
@@ -25,15 +27,17 @@ class TimeBase:
     The largest number since the count last started again.
 
     A count may start again once, as that of a simulation does. Where it does so twice within a
-    window, two sources alternate, or a clock cycles: until the count has grown for a whole window,
-    every number is :attr:`Advance.TWO_SOURCES`. Of two sources at least one number in each pair
-    goes back, so that at most one from each is taken for news before that.
+    window, two sources alternate, or a clock cycles: every number is then
+    :attr:`Advance.TWO_SOURCES`, until the count has grown for three times as long as it last did,
+    and a second, or for the whole window. Two sources that take turns go back at every second
+    number, so that at most one more of each is taken for news.
     """
 
     late: int = LATE_NANOSECONDS  #: how much smaller a number may be without a restart
     newest: int | None = None
     conflict: bool = False  #: whether two sources count
     _restarted: float = -math.inf  # s, by the steady clock
+    _round: float = 0.0  # s, from one restart to the next, where two sources count
 
     def take(self, number: int, now: float, window: float) -> Advance:
         """
@@ -45,9 +49,9 @@ class TimeBase:
         since, before = now - self._restarted, self.newest
         if before is not None and number < before - self.late:
             self.newest, self._restarted = number, now
-            self.conflict = since < window
+            self.conflict, self._round = since < window, since
             return Advance.TWO_SOURCES if self.conflict else Advance.RESTARTED
-        if not since < window:
+        if not since < min(window, _ROUNDS * self._round + 1.0):
             self.conflict = False
         if before is None or number > before:
             self.newest = number

@@ -97,7 +97,10 @@ class Situation:
 
 def status(now: Situation) -> Status:
     """Return the status of the control task."""
-    return Status(*_verdict(now), lambda: _figures(now))
+    level, message = _verdict(now)
+    if now.complaint and now.timing.no_news(_PATIENCE) is Advance.TWO_SOURCES:
+        message += f'; {now.complaint}'
+    return Status(level, message, lambda: _figures(now))
 
 
 def open_loop(topic_names: Collection[str], seconds: float) -> Status:
