@@ -9,7 +9,8 @@ import math
 
 from koopman_ros.units import LATE_NANOSECONDS
 
-_ROUNDS = 3.0  # without a restart after which one source is left
+# Without a restart for so long one source is left.
+_ROUNDS, _PAUSE = 3.0, 0.2  # times the last round, and s
 
 
 class Advance(Enum):
@@ -29,7 +30,7 @@ class TimeBase:
     A count may start again once, as that of a simulation does. Where it does so twice within a
     window, two sources alternate, or a clock cycles: every number is then
     :attr:`Advance.TWO_SOURCES`, until the count has grown for three times as long as it last did,
-    and a second, or for the whole window. Two sources that take turns go back at every second
+    and a fifth of a second, or for the whole window. Two sources that take turns go back at every second
     number, so that at most one more of each is taken for news.
     """
 
@@ -51,7 +52,7 @@ class TimeBase:
             self.newest, self._restarted = number, now
             self.conflict, self._round = since < window, since
             return Advance.TWO_SOURCES if self.conflict else Advance.RESTARTED
-        if not since < min(window, _ROUNDS * self._round + 1.0):
+        if not since < min(window, _ROUNDS * self._round + _PAUSE):
             self.conflict = False
         if before is None or number > before:
             self.newest = number

@@ -300,9 +300,9 @@ class ControllerNode(ManagedNode):
         if advance is Advance.TWO_SOURCES and self._state.command is not None:
             self._answer_neither(sample)
             return
-        since_ns = self._state.time_ns
-        countable = None if advance is not Advance.NEW or since_ns is None else (
-            self._timing.countable((stamp_ns - since_ns) / NANOSECONDS, stamp_ns, arrived))
+        since_ns = stamp_ns if self._state.time_ns is None else self._state.time_ns
+        countable = None if advance is Advance.OLD else self._timing.countable(
+            max(0.0, (stamp_ns - since_ns) / NANOSECONDS), stamp_ns, arrived)
         for _ in range(_ATTEMPTS):
             before = state = self._state
             done: list[tuple[Event, events.Outcome]] = []

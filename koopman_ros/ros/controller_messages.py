@@ -135,7 +135,7 @@ def _verdict(now: Situation) -> tuple[Level, str]:
                                  f'node is busy: {action}{doing}; ask for less at once')
         if (why := now.timing.no_news(timeout)) is not None:
             what = ('the stamps of the measurements have not advanced' if why is Advance.OLD
-                    else 'two sources publish the measurement in turn,')
+                    else 'two sources have published the measurement in turn')
             return Level.ERROR, (f'{what} for more than {timeout:g} s: {action}{doing}; check '
                                  'the clock of the sensor, and that it has one publisher')
         awaited = f' of {now.assembler.awaited}' if now.assembler.awaited else ''
