@@ -30,8 +30,8 @@ class TimeBase:
     A count may start again once, as that of a simulation does. Where it does so twice within a
     window, two sources alternate, or a clock cycles: every number is then
     :attr:`Advance.TWO_SOURCES`, until the count has grown for three times as long as it last did,
-    and a fifth of a second, or for the whole window. Two sources that take turns go back at every second
-    number, so that at most one more of each is taken for news.
+    and a fifth of a second, or for the whole window. Two sources that take turns go back at every
+    second number, so that at most one more of each is taken for news.
     """
 
     late: int = LATE_NANOSECONDS  #: how much smaller a number may be without a restart
