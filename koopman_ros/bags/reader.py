@@ -11,6 +11,7 @@ import os
 from pathlib import Path
 
 from mcap.records import Channel
+from mcap.summary import Summary
 
 from koopman_ros.bags import limits
 from koopman_ros.bags.decoding import BagMessage, Decoders
@@ -123,10 +124,10 @@ def _decoded(files: tuple[Path, ...], topics: frozenset[str] | None, recover: bo
 
 
 def _indexed_summary(file: Path) -> BagSummary | None:
-    """Return the summary from the statistics at the end of a closed file, None without them."""
+    """Return the summary at the end of a closed file, None where a part of it is left out."""
     with limits.enough_memory(file), limits.opened(file) as stream:
         content = summary_section(stream, limits.Budget(file))
-    if content is None or content.statistics is None:
+    if content is None or content.statistics is None or not _is_whole(content):
         return None
     statistics = content.statistics
     counts: Counter[str] = Counter()
@@ -140,6 +141,22 @@ def _indexed_summary(file: Path) -> BagSummary | None:
         dict(counts), types, _offered_qos(content.channels.values()),
         None if empty else statistics.message_start_time,
         None if empty else statistics.message_end_time, complete=True)
+
+
+def _is_whole(content: Summary) -> bool:
+    """
+    Check that a summary section repeats all channels and schemas, and counts all messages.
+
+    The MCAP specification leaves each of them to the writer; an empty map of counts means that
+    they are not available.
+    """
+    statistics = content.statistics
+    return (statistics is not None
+            and len(content.channels) == statistics.channel_count
+            and statistics.channel_message_counts.keys() <= content.channels.keys()
+            and sum(statistics.channel_message_counts.values()) == statistics.message_count
+            and all(channel.schema_id in content.schemas or channel.schema_id == 0
+                    for channel in content.channels.values()))
 
 
 def _scanned_summary(file: Path) -> BagSummary:
