@@ -7,10 +7,18 @@ import math
 
 from koopman_ros.lifting import LiftedModel
 from koopman_ros.units import Display, display_unit
+from koopman_ros.wire import SIGNAL_NAME
 
 
 def unusable(model: LiftedModel) -> str:
-    """Say which nominal value or range of a model keeps a controller from running, or nothing."""
+    """Say which name, nominal value or range keeps a controller from running, or nothing."""
+    if wrong := [name for name in (*model.states.names, *model.inputs.names)
+                 if not SIGNAL_NAME.fullmatch(name)]:
+        return (f'{wrong[0]!r} is a signal, which topics and parameters are named after: train '
+                'the model again with a name of letters, digits and _, beginning with a letter')
+    if taken := set(model.states.names) & set(model.inputs.names):
+        return (f'there is a state and an input of the name {min(taken)}: train the model again '
+                'with different names')
     for kind, signals in (('state', model.states), ('input', model.inputs)):
         for name, unit, low, center, high in zip(
                 signals.names, signals.units, signals.lower.tolist(), signals.center.tolist(),

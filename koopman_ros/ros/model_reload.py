@@ -96,17 +96,14 @@ def load_suitable(name: str, signals: Signals | None = None) -> LoadedModel:
                              f'{_LONGEST_PATH} bytes: check it')
     path = model_path(name)
     model, digest = load_shared(path)
+    if reason := unusable(model):
+        raise ModelFileError(f'{path}: {reason}')
     own = signals_of(model)
     if signals is not None and not (own.inputs == signals.inputs
                                     and signals.states.items() <= own.states.items()):
         raise ModelFileError(
             f'{path} has {own}, this controller was started for {signals}: choose a model of '
             'the same signals, or start it anew')
-    if signals is not None and (taken := set(own.states) & set(signals.inputs)):
-        raise ModelFileError(f'{path} has a state and an input of the name {min(taken)}: train '
-                             'the model again with different names')
-    if reason := unusable(model):
-        raise ModelFileError(f'{path}: {reason}')
     _refuse_slow(path, model)
     written = 'unknown'
     # the file may be gone since it was read
