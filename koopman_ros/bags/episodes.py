@@ -209,8 +209,8 @@ class _Loop:
             begin = now[-1], log[-1]
         if abs(plant - receipt) > max(_SAME_PACE * receipt, _SAME_PACE_SECONDS):
             raise BagReadError(
-                f'bag {os.fspath(self.bag)!r}: {self.states[0].name} has no stamps, and {plant:.6g}'
-                f' s passed on /clock in {receipt:.6g} s of its receipts, which thus tell no '
+                f'bag {os.fspath(self.bag)!r}: {self.states[0].name} has no stamps, and '
+                f'{plant:.6g} s passed on /clock in {receipt:.6g} s of its receipts, which are no '
                 "plant time: record with use_sim_time (that of the trainer, or 'ros2 bag record "
                 "--use-sim-time'), or use a type with a header")
 

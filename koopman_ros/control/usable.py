@@ -25,12 +25,11 @@ def unusable(model: LiftedModel) -> str:
                 signals.upper.tolist(), strict=True):
             text = Display(unit, display_unit(unit), '.4g').text
             if low <= (0.0 if unit == 'K' else -math.inf):
-                return (f'the trained range of {name} begins at {low:.4g} {unit}, which cannot be: '
-                        'train the model again from other data')
+                return (f'the trained range of {name} begins at {low:.4g} {unit}, which cannot '
+                        'be: train the model again from other data')
             if not low <= center <= high:
-                remedy = (f'record {name} {"down" if center < low else "up"} to {text(center)} and '
-                          'train the model again' if kind == 'input' else
-                          'record around a state that the plant can hold and train the model again')
+                remedy = ('record around a state that the plant can hold' if kind == 'state' else
+                          f'record {name} {"down" if center < low else "up"} to {text(center)}')
                 return (f'the nominal {name}, {text(center)}, is outside its trained range, '
-                        f'{text(low)} to {text(high)}: {remedy}')
+                        f'{text(low)} to {text(high)}: {remedy} and train the model again')
     return ''

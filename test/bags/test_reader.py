@@ -358,7 +358,8 @@ def test_other_storage_without_an_identifier_is_refused_by_its_name(tmp_path: Pa
 
 
 NAMES = pytest.mark.parametrize('name', [
-    'run_{}.mcap', '{}_run_2025_12_17-10_{:02}_00.mcap', '{}_run_2025_12_17-10_{:02}_00.mcap.zstd'])
+    'run_{}.mcap', '{}_run_2025_12_17-10_{:02}_00.mcap',
+    '{}_run_2025_12_17-10_{:02}_00.mcap.zstd'])
 
 
 def split(path: Path, name: str, count: int) -> list[str]:
@@ -388,7 +389,7 @@ def test_numbered_file_that_is_not_listed_is_no_secret(tmp_path: Path, name: str
     (path / 'metadata.yaml').write_text(yaml.safe_dump({'rosbag2_bagfile_information': {
         'storage_identifier': 'mcap', 'relative_file_paths': names[:2],
         'compression_format': 'zstd' if name.endswith('.zstd') else ''}}))
-    with pytest.raises(bags.BagReadError, match='is not listed in metadata.yaml'):
+    with pytest.raises(bags.BagReadError, match=r'is not listed in metadata\.yaml'):
         bags.read_messages(path)
     assert not bags.summary(path).complete
     assert [m.message.data for m in bags.read_messages(path, recover=True)] == [0.0, 1.0, 2.0]
