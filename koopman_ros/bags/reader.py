@@ -158,14 +158,14 @@ def _indexed_summary(file: Path) -> BagSummary | None:
 
 def _is_whole(content: Summary) -> bool:
     """
-    Check that a summary section repeats all channels and schemas, and counts all messages.
+    Check that a summary section repeats all channels with messages and their schemas, and counts
+    all messages.
 
     The MCAP specification leaves each of them to the writer; an empty map of counts means that
     they are not available.
     """
     statistics = content.statistics
     return (statistics is not None
-            and len(content.channels) == statistics.channel_count
             and statistics.channel_message_counts.keys() <= content.channels.keys()
             and sum(statistics.channel_message_counts.values()) == statistics.message_count
             and all(channel.schema_id in content.schemas or channel.schema_id == 0
