@@ -188,7 +188,9 @@ def trend_page(frame: Frame) -> None:
                 words('div', 'nothing in this time', 'quiet')
 
     for control in (span, whole):
-        control.on_value_change(lambda _: chart.show(str(span.value), bool(whole.value)))
+        # a browser may send any value
+        control.on_value_change(lambda _: chart.show(str(span.value), bool(whole.value)) if (
+            span.value in SPANS) else None)
     frame.follow(show)
 
 
