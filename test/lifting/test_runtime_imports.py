@@ -46,7 +46,8 @@ def test_packages_that_stand_alone():
         result = run(name)
         assert (result.returncode, result.stderr) == (0, '')
         assert set(result.stdout.split()) <= {
-            name, *beside, 'arrays', 'kernels', 'plant_data', 'plugs', 'units', 'values'}
+            name, *beside, 'arrays', 'kernels', 'model_classes', 'plant_data', 'plugs', 'units',
+            'values'}
 
 
 def test_nodes_load_nothing_large_that_they_do_not_need():

@@ -204,7 +204,8 @@ def test_unsuitable_model_is_refused_with_the_reason(
     assert measure() == pytest.approx(before, abs=1e-9)
 
     assert running.reload() == (
-        True, 'model reactor_nz3: n_z = 3, trained for temperature 31.85 to 53.85 degC')
+        True, 'model reactor_nz3: identity lift, n_z = 3, trained for temperature 31.85 to '
+        '53.85 degC')
     status = ros.wait_for_status(STATUS, lambda s: s.level == DiagnosticStatus.OK)
     assert value(status, 'model refused') == 'none'
 
@@ -283,10 +284,10 @@ import os, sys
 from koopman_ros.nodes import controller
 from koopman_ros.ros import model_reload
 read = model_reload.load_suitable
-def slowly(name, *others):
+def slowly(name, *others, **options):
     if os.path.exists(name + '.disk'):
         open(name + '.disk', 'rb').read()
-    return read(name, *others)
+    return read(name, *others, **options)
 model_reload.load_suitable = slowly
 """
 

@@ -11,7 +11,7 @@ from typing import Any
 
 import pytest
 
-from koopman_ros.panel.alarms import Priority
+from koopman_ros.panel.alarms import AlarmState, Priority
 from koopman_ros.panel.plant import (
     CONTROLLER,
     ERROR,
@@ -21,6 +21,7 @@ from koopman_ros.panel.plant import (
     PLANT,
     PlantView,
     Snapshot,
+    TRAINER,
     WARN,
 )
 from koopman_ros.panel.requests import (
@@ -306,10 +307,66 @@ def test_silence_and_levels_are_alarms_by_priority_and_marks() -> None:
     assert own.snapshot(NOW + 20.0).mode == ''
 
 
-def test_a_nodes_name_in_a_namespace_is_known() -> None:
-    own = view()
+def test_only_nodes_of_the_own_loop_count() -> None:
+    own = PlantView(REACTOR, {'temperature': 'degC', 'coolant_temperature': 'degC'}, 3600.0, NOW,
+                    {f'unit_1/{role}': role for role in (PLANT, CONTROLLER, TRAINER)})
     own.status('unit_1/controller: control', WARN, 'x', {'reason': 'none'}, NOW + 9.0)
     assert [one.source for one in own.snapshot(NOW + 10.0).silences] == [PLANT]
+    assert own.snapshot(NOW + 10.0).status(CONTROL).message == 'x'
+    for second in range(10, 20):
+        own.status('unit_2/controller: control', ERROR, 'y', {}, NOW + second)
+        own.status('controller: control', ERROR, 'z', {}, NOW + second)
+        own.advance(NOW + second)
+    now = own.snapshot(NOW + 20.0)
+    assert {one.source for one in now.silences} == {PLANT, CONTROLLER}
+    assert now.mode == ''
+    assert now.status(CONTROL).message == 'x'
+    assert {alarm.key for alarm in now.standing} == {
+        'silence of plant', 'silence of controller', CONTROL}
+
+
+def test_other_nodes_do_not_crowd_out_the_own_ones() -> None:
+    own = view()
+    for driver in range(1000):
+        own.status(f'driver_{driver}: io', OK, 'ok', {}, NOW)
+    for second in range(3):
+        own.status(CONTROL, ERROR, 'no measurement', {}, NOW + second)
+        own.advance(NOW + second)
+    assert [alarm.key for alarm in own.snapshot(NOW + 3.0).standing] == [CONTROL]
+    assert len(own.snapshot(NOW + 3.0).statuses) == 65
+
+
+def test_errors_that_are_brief_and_many_are_an_alarm() -> None:
+    own, key = view(), f'{CONTROL}, repeated errors'
+    for half in range(20):
+        own.status(CONTROL, OK if half % 2 else ERROR, 'not finite', {}, NOW + 0.5 * half)
+        own.advance(NOW + 0.5 * half)
+        measure(own, 50.0, 0.5 * half)
+    assert {alarm.key: alarm.priority for alarm in own.snapshot(NOW + 10.0).standing} == {
+        key: Priority.HIGH}
+    own.advance(NOW + 80.0)
+    own.advance(NOW + 90.0)
+    states = {alarm.key: alarm.state for alarm in own.snapshot(NOW + 90.0).standing}
+    assert states[key] is AlarmState.RETURNED
+
+
+def test_a_warning_that_the_control_task_repeats_has_one_alarm() -> None:
+    own = view()
+    for second in range(3):
+        own.status(CONTROL, WARN, 'stuck', {'condition': 'actuators'}, NOW + second)
+        own.status('controller: actuators', WARN, 'stuck', {}, NOW + second)
+        own.advance(NOW + second)
+    assert [alarm.key for alarm in own.snapshot(NOW + 3.0).standing] == ['controller: actuators']
+
+
+def test_a_manual_command_is_limited_as_the_controller_does() -> None:
+    own = view()
+    assert own.limited('coolant_temperature', 60.0) == 60.0
+    own.parameters(CONTROLLER, {
+        'coolant_temperature.min': parameter('coolant_temperature.min', 5.0),
+        'coolant_temperature.max': parameter('coolant_temperature.max', 32.0)})
+    assert own.limited('coolant_temperature', 60.0) == 32.0
+    assert own.limited('coolant_temperature', 20.0) == 20.0
 
 
 # Trends.

@@ -17,10 +17,9 @@ from rclpy.duration import Duration
 from sensor_msgs.msg import Temperature
 
 from koopman_ros.bags import BagWriter, read_messages
-from koopman_ros.control import Controller
 from koopman_ros.control.laws import Plan
 from koopman_ros.demo import reactor
-from koopman_ros.lifting import load, ModelFileError, save
+from koopman_ros.lifting import LiftedModel, load, ModelFileError, save
 from koopman_ros.parameters.trainer import trainer_table
 from koopman_ros.parameters.wire import Signals, signals_of, Wiring
 from koopman_ros.resources import model_path
@@ -189,8 +188,8 @@ def test_model_whose_step_fails_is_refused(monkeypatch: pytest.MonkeyPatch) -> N
     def fail(*_: object) -> None:
         raise np.linalg.LinAlgError('Eigenvalues did not converge')
 
-    monkeypatch.setattr(Controller, 'step', fail)
-    with pytest.raises(ModelFileError, match=r'model fails .Eigenvalues did not converge'):
+    monkeypatch.setattr(LiftedModel, 'distance', fail)
+    with pytest.raises(ModelFileError, match=r'model fails .*Eigenvalues did not converge'):
         load_suitable('reactor_nz4')
 
 
