@@ -207,7 +207,6 @@ class Recorder:
             self._writer.write(taken.topic, taken.data, taken.received_ns, taken.sent_ns)
             self.counts[taken.topic] += 1
 
-
     def _hear(self, data: bytes) -> None:
         """Take the node's time from a message on /clock, but for one that is no time."""
         now = deserialize_message(data, Clock).clock

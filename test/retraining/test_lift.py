@@ -153,6 +153,12 @@ def test_what_is_accepted_can_be_loaded_and_what_cannot_is_refused(
 
 
 @pytest.mark.usefixtures('no_loops')
+def test_what_the_estimate_warns_of_is_passed_on(found, trained, shipped):
+    warned = replace(found, warnings=('the pumps moved together',))
+    assert decide(warned, trained, shipped, Thresholds()).warnings == warned.warnings
+
+
+@pytest.mark.usefixtures('no_loops')
 def test_margin_is_a_share(found, trained, shipped):
     decision = decide(found, trained, shipped, Thresholds())
     ratio = float(decision.rmse[0] / decision.linear_rmse[0])

@@ -162,6 +162,21 @@ def test_place_that_cannot_be_is_refused(
             make()
 
 
+@pytest.mark.parametrize(('kind', 'field'), [
+    ('std_msgs/msg/Char', 'data'), ('std_msgs/msg/Byte', 'data'), ('std_msgs/msg/Bool', 'data'),
+    ('std_msgs/msg/Int32', 'data'), ('std_msgs/msg/Int32MultiArray', 'data[0]'),
+    ('std_msgs/msg/ByteMultiArray', 'data[0]')])
+def test_integers_are_heard_and_not_published(
+        shared_ros: Harness, kind: str, field: str) -> None:
+    """A command of 23.7 would be sent as whatever the middleware makes of it."""
+    places = {'pump': Place('pump', kind, field, '1')}
+    with pytest.raises(ConfigurationError, match=r'^pump: data.* holds integers'):
+        Outlet(places, {'pump': '1'}, refuse)
+    heard: list[str] = []
+    Inlet(shared_ros.node, lambda topic, *_: heard.append(topic), places, {'pump': '1'}, refuse)
+    assert heard == ['pump']
+
+
 def test_signals_of_one_topic_have_one_type() -> None:
     places = {'heat': place('both', 'heat', 'K'), 'angle': place('both', 'angle', 'rad')}
     with pytest.raises(ConfigurationError, match=(
