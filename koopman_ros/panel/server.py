@@ -23,6 +23,7 @@ from fastapi.responses import HTMLResponse, RedirectResponse, Response
 from nicegui import Client, core, ui
 from socketio.exceptions import ConnectionRefusedError as SocketRefused
 from starlette.concurrency import run_in_threadpool
+from starlette.requests import ClientDisconnect
 import uvicorn
 from uvicorn.middleware.proxy_headers import ProxyHeadersMiddleware
 
@@ -365,6 +366,8 @@ def _add_login(app: FastAPI, source: Source, keeper: Doorkeeper) -> None:
             given = await asyncio.wait_for(request.form(max_fields=4, max_files=0), _FORM)
         except TimeoutError:
             return form(f'no name and password within {_FORM:g} s', 408)
+        except ClientDisconnect:
+            return form('the form was cut off', 400)
         name, password = str(given.get('name', '')), str(given.get('password', ''))
         address = request.client.host if request.client else ''
         if wait := keeper.throttle.attempt(address, name):
