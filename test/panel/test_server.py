@@ -5,6 +5,7 @@
 
 from collections.abc import Callable, Iterator
 import contextlib
+from email.message import Message
 import http.client
 import json
 import logging
@@ -14,11 +15,14 @@ import re
 import resource
 import socket
 import time
+from typing import NamedTuple
 from urllib.parse import urlencode
 
+from nicegui import Client
 from playwright.sync_api import expect
 import pytest
-from websockets.sync.client import connect
+from websockets.sync.client import ClientConnection, connect
+from websockets.typing import Origin
 
 from koopman_ros.panel.access import Cost, hashed, Role, write_user
 from koopman_ros.panel.connections import Listener, Seldom
@@ -30,6 +34,12 @@ PASSWORDS = {'anna': 'correct horse', 'otto': 'battery staple', 'olga': 'staple 
 HOST = 'panel.example'
 PROXY, OTHER = '127.0.0.1', '127.0.0.9'
 TIMEOUT = 30.0
+
+
+class Answered(NamedTuple):
+    status: int
+    headers: Message
+    content: str
 
 
 class Site:
@@ -47,7 +57,7 @@ class Site:
         self.port = int(self.url.rpartition(':')[2])
 
     def ask(self, method: str, path: str, body: str | None = None, *, source: str = OTHER,
-            host: str = '', **headers: str) -> http.client.HTTPResponse:
+            host: str = '', **headers: str) -> Answered:
         """Ask from an address of this machine, which may be that of the proxy."""
         own = http.client.HTTPConnection('127.0.0.1', self.port, TIMEOUT, (source, 0))
         kind = {'Content-Type': 'application/x-www-form-urlencoded'} if body is not None else {}
@@ -55,11 +65,11 @@ class Site:
             **kind, 'Host': host or f'127.0.0.1:{self.port}',
             **{name.replace('_', '-'): text for name, text in headers.items()}})
         answer = own.getresponse()
-        answer.content = answer.read().decode()
+        found = Answered(answer.status, answer.headers, answer.read().decode())
         own.close()
-        return answer
+        return found
 
-    def log_in(self, name: str, password: str = '', **details: str) -> http.client.HTTPResponse:
+    def log_in(self, name: str, password: str = '', **details: str) -> Answered:
         return self.ask('POST', '/login', urlencode(
             {'name': name, 'password': password or PASSWORDS.get(name, '')}), **details)
 
@@ -147,13 +157,17 @@ def page_id(text: str) -> str:
 
 
 def opened(site: Site, cookie: str, query: dict[str, str], source: str, host: str, origin: str,
-           more: dict[str, str]):
+           more: dict[str, str]) -> ClientConnection:
     host = host or f'127.0.0.1:{site.port}'
     return connect(
         f'ws://{host}/_nicegui_ws/socket.io/?' + urlencode(
             {'EIO': '4', 'transport': 'websocket', **query}),
         sock=socket.create_connection(('127.0.0.1', site.port), TIMEOUT, (source, 0)),
-        additional_headers={'Cookie': cookie, **more}, origin=origin or f'http://{host}')
+        additional_headers={'Cookie': cookie, **more}, origin=Origin(origin or f'http://{host}'))
+
+
+def received(own: ClientConnection) -> str:
+    return own.recv(TIMEOUT, decode=True)
 
 
 @contextlib.contextmanager
@@ -161,13 +175,13 @@ def socketed(site: Site, cookie: str, client_id: str, *, source: str = OTHER, ho
              origin: str = '', more: dict[str, str] | None = None) -> Iterator[object]:
     """Open a socket and ask to be that of a page; give the answer."""
     with opened(site, cookie, {}, source, host, origin, more or {}) as own:
-        assert own.recv(TIMEOUT).startswith('0{')
+        assert received(own).startswith('0{')
         own.send('40')
-        assert own.recv(TIMEOUT).startswith('40')
+        assert received(own).startswith('40')
         own.send('420' + json.dumps(['handshake', {
             'client_id': client_id, 'tab_id': 'tab', 'document_id': 'document',
             'next_message_id': 0}]))
-        while not (answer := own.recv(TIMEOUT)).startswith('430'):
+        while not (answer := received(own)).startswith('430'):
             if answer == '2':
                 own.send('3')
         yield json.loads(answer.removeprefix('430'))[0]
@@ -182,9 +196,9 @@ def test_the_id_of_a_page_opens_it_to_its_own_session_alone(site: Site) -> None:
         with opened(site, other, {
                 'client_id': page, 'implicit_handshake': 'true', 'tab_id': 'tab',
                 'document_id': 'document', 'next_message_id': '0'}, OTHER, '', '', {}) as own:
-            assert own.recv(TIMEOUT).startswith('0{')
+            assert received(own).startswith('0{')
             own.send('40')
-            assert own.recv(TIMEOUT).startswith('44'), 'the connection is refused'
+            assert received(own).startswith('44'), 'the connection is refused'
     with socketed(site, anna, page) as told:
         assert told is True
 
@@ -196,7 +210,6 @@ def test_events_of_another_user_do_not_reach_a_page(site: Site) -> None:
     anna, otto = site.cookie('anna'), site.cookie('otto')
     text = site.ask('GET', '/model', Cookie=anna).content
     page = page_id(text)
-    from nicegui import Client
     (train,) = (own for own in Client.instances[page].elements.values()
                 if getattr(own, 'text', '') == 'Train')
     (listener,) = (own.id for own in train._event_listeners.values() if own.type == 'click')
@@ -205,20 +218,20 @@ def test_events_of_another_user_do_not_reach_a_page(site: Site) -> None:
 
     def sent(cookie: str) -> None:
         with opened(site, cookie, {}, OTHER, '', '', {}) as own:
-            own.recv(TIMEOUT)
+            received(own)
             own.send('40')
-            own.recv(TIMEOUT)
+            received(own)
             own.send('420' + json.dumps(['handshake', {
                 'client_id': page, 'tab_id': 'tab', 'document_id': 'document',
                 'next_message_id': 0}]))
-            while not own.recv(TIMEOUT).startswith('430'):
+            while not received(own).startswith('430'):
                 pass
             for junk in ('[]', '{"client_id": []}', '{}', '7', 'null'):
                 own.send(f'42["event",{junk}]')
             own.send(click)
             # answered after it
             own.send('421' + json.dumps(['handshake', {'client_id': 'none'}]))
-            while not own.recv(TIMEOUT).startswith('431'):
+            while not received(own).startswith('431'):
                 pass
 
     with socketed(site, anna, page):
