@@ -75,5 +75,18 @@ def test_every_code_has_its_words() -> None:
 def test_unit_that_there_is_not_is_named(unit):
     with pytest.raises(ValueError, match=f"there is no unit '{unit}': write one like K"):
         check_unit(unit)
-    for one in ('K', 'L/min', 'N m', '%', '1', 'm^3/s'):
+    for one in ('K', 'L/min', 'N m', '%', '1', 'm^3/s', '', '(m/s)**2', 'kg/(m*s)', 'm^-0.5', '°C',
+                'ft_H2O', 'm²'):
         check_unit(one)
+
+
+@pytest.mark.parametrize('unit', [
+    'm" :style="(alert(1))" a="', 'm # :a=1', 'm<b>', ':m', 'm\\', 'm\n', 'm\x00', 'm : "x"',
+    '{m}', '9**9**9', '((m**99)**99)**99 ' * 10, 'm' * 1000, '1e400', 'm  s'])
+def test_text_that_the_library_would_skip_or_work_at_for_ever_is_no_unit(unit: str) -> None:
+    with pytest.raises(ValueError, match='there is no unit'):
+        check_unit(unit)
+    with pytest.raises(ValueError, match='is not written as a unit'):
+        conversion('m', unit)
+    with pytest.raises(ValueError, match='is not written as a unit'):
+        conversion(unit, 'm')

@@ -17,6 +17,7 @@ from typing import Any
 
 MAX_CONNECTIONS = 256
 BACKLOG = 64  # connections that are accepted at once
+_WAITING = 1024  # connections that the kernel holds until they are accepted
 _SHARE_OF_FILES = 4  # of which connections take one part
 
 Peer = tuple[str, int]
@@ -39,6 +40,10 @@ class Listener(socket.socket):
         self.most = min(most, max(files // _SHARE_OF_FILES, 1)) if files > 0 else most
         self._open: dict[Peer, socket.socket] = {}
         self._served: Counter[Peer] = Counter()
+
+    def listen(self, backlog: int = BACKLOG) -> None:
+        """Listen; the kernel holds more connections than are accepted at once."""
+        super().listen(max(backlog, _WAITING))
 
     def accept(self) -> tuple[socket.socket, Any]:
         """Accept a connection; raise ConnectionAbortedError where all others are served."""

@@ -62,8 +62,8 @@ class _Bar:
 
     def show(self, face: Face, value: float, mark: float) -> None:
         def show_at(element: Element, number: float | None) -> None:
-            known = number is not None and math.isfinite(number)
-            place(element, **({'left': face.share(number)} if known else {}))
+            place(element, **({} if number is None or not math.isfinite(number) else {
+                'left': face.share(number)}))
 
         place = self._frame.place
         training, limits = face.training, face.limits

@@ -21,8 +21,8 @@ import zlib
 from fastapi import FastAPI, Request
 from fastapi.responses import HTMLResponse, RedirectResponse, Response
 from nicegui import Client, core, ui
-from socketio.exceptions import ConnectionRefusedError as SocketRefused
 from starlette.concurrency import run_in_threadpool
+from starlette.requests import ClientDisconnect
 import uvicorn
 from uvicorn.middleware.proxy_headers import ProxyHeadersMiddleware
 
@@ -218,9 +218,12 @@ class PanelServer:
                     show_welcome_message=False, tailwind=False, reconnect_timeout=10.0)
         app.add_middleware(_Gate, keeper=self._keeper, listener=self._socket)
         _guard_sockets(self._keeper)
+        served: Any = app
+        if proxies:
+            served = ProxyHeadersMiddleware(served, list(proxies))
         self._server = uvicorn.Server(uvicorn.Config(
-            _with_peer(ProxyHeadersMiddleware(app, list(proxies)) if proxies else app),
-            log_level='error', access_log=False, ws='websockets-sansio', lifespan='on',
+            _with_peer(served), log_level='error', access_log=False, ws='websockets-sansio',
+            lifespan='on',
             ssl_certfile=certificate or None, ssl_keyfile=key or None, server_header=False,
             timeout_graceful_shutdown=1, ws_max_size=1024 * 1024, loop='asyncio',
             proxy_headers=False, backlog=BACKLOG))
@@ -285,13 +288,14 @@ def _guard_sockets(keeper: Doorkeeper) -> None:
 
     connect, handshake = (sockets.handlers['/'][name] for name in ('connect', 'handshake'))
 
-    async def on_connect(sid: str, environ: dict[str, Any], *rest: Any) -> None:
+    async def on_connect(sid: str, environ: dict[str, Any], *rest: Any) -> bool:
         scope = environ['asgi.scope']
         for client_id in parse_qs(scope['query_string'].decode('latin-1')).get('client_id', ()):
-            if not own(scope, client_id):
-                # the page then loads itself again
-                raise SocketRefused('Implicit handshake failed')
+            # to one of a panel that was there before, NiceGUI answers that it loads itself again
+            if client_id in Client.instances and not own(scope, client_id):
+                return False
         await connect(sid, environ, *rest)
+        return True
 
     async def on_handshake(sid: str, message: Any) -> bool:
         return own(sockets.get_environ(sid)['asgi.scope'], named(message)) and await handshake(
@@ -365,6 +369,8 @@ def _add_login(app: FastAPI, source: Source, keeper: Doorkeeper) -> None:
             given = await asyncio.wait_for(request.form(max_fields=4, max_files=0), _FORM)
         except TimeoutError:
             return form(f'no name and password within {_FORM:g} s', 408)
+        except ClientDisconnect:
+            return form('the form was cut off', 400)
         name, password = str(given.get('name', '')), str(given.get('password', ''))
         address = request.client.host if request.client else ''
         if wait := keeper.throttle.attempt(address, name):

@@ -370,6 +370,11 @@ UNTOLD: dict[str, tuple[str, dict[str, Any], str]] = {
         r"the name of a state = 'x\ud800' holds characters that"),
     'unit with a line break': (
         'states', {'units': ['K', 'K\n']}, r"the unit of a state = 'K\n' holds"),
+    'unit with an attribute': (
+        'states', {'units': ['K', 'm" :title="(alert(1))" a="']},
+        "the unit of 'x1': there is no unit"),
+    'unit with a comment': ('states', {'units': ['K', 'm # a']}, "there is no unit 'm # a'"),
+    'unit that never ends': ('states', {'units': ['9**9**9', 'K']}, "there is no unit '9**9**9'"),
     'long name': ('states', {'names': ['x' * 900_000, 'x1']},
                   'the name of a state has 900000 characters, at most 100 may be'),
     'name that is none': (

@@ -3,6 +3,7 @@
 
 """Alarms that outlast the panel: what is recalled of them, and from which files."""
 
+from collections.abc import Callable
 import json
 import math
 import os
@@ -95,7 +96,8 @@ def test_it_is_written_every_few_seconds_where_something_changed(tmp_path: Path)
     (lambda text: '{"version": 1, "alarms": [' + '[' * 100_000, 'recursion'),
     (lambda text: text.replace(f'"time": {NOW + 1.0}', '"time": ' + '9' * 400), 'too large'),
 ])
-def test_a_damaged_file_is_moved_aside_and_said(file: Path, change, words: str) -> None:
+def test_a_damaged_file_is_moved_aside_and_said(
+        file: Path, change: Callable[[str], str], words: str) -> None:
     text = change(file.read_text())
     file.write_bytes(text.encode(errors='surrogateescape'))
     alarms = Alarms()
