@@ -45,6 +45,8 @@ _AT_HAND = {('K', 'degC'): Conversion(offset=-ZERO_CELSIUS),
 # Likewise: units that there are.
 _USUAL = {'K', 'degC', 'Pa', 'm', 'm/s', 'rad', 'rad/s', 'N', 'N m', 'V', 'W', 'mol/L', '1'}
 
+_SHARES = {'percent': 1e-2, 'ppm': 1e-6}  # units of dimension one, by name
+
 
 @cache
 def conversion(unit: str, wanted: str) -> Conversion:
@@ -60,8 +62,9 @@ def conversion(unit: str, wanted: str) -> Conversion:
     # not before: it takes 0.4 s
     registry = _registry()
     try:
-        offset = float(registry.Quantity(0.0, unit).to(wanted).magnitude)
-        factor = float(registry.Quantity(1.0, unit).to(wanted).magnitude) - offset
+        into = registry.parse_units(wanted)
+        offset = float(registry.Quantity(0.0, unit).to(into).magnitude)
+        factor = float(registry.Quantity(1.0, unit).to(into).magnitude) - offset
         if offset != 0.0:
             # exact, where the difference of two values is not
             source = registry.Quantity(1.0, unit) - registry.Quantity(0.0, unit)
@@ -118,7 +121,12 @@ def _registry() -> Any:
     import pint
 
     # without its cache: a file that is cut short would end each program that reads it
-    return pint.UnitRegistry()
+    registry = pint.UnitRegistry(preprocessors=[lambda text: text.replace('%', ' percent ')])
+    # pint defines these since its release 0.21; Ubuntu 24.04 and Debian 12 have 0.19
+    for name, share in _SHARES.items():
+        if name not in registry:
+            registry.define(f'{name} = {share!r}')
+    return registry
 
 
 @dataclass(frozen=True)
