@@ -83,7 +83,7 @@ test: $(VENV)/test.stamp  ## style and type checks and the whole test suite, on 
 	$(BIN)/ruff check
 	@$(BIN)/mypy > $(VENV)/mypy.log & types=$$!; \
 	  $(BIN)/python -m pytest -n $$(($$(nproc) + 2)) --dist loadfile --no-loadscope-reorder \
-	    --max-worker-restart 0; \
+	    --max-worker-restart 0 -o faulthandler_exit_on_timeout=true; \
 	  tests=$$?; wait $$types || tests=1; cat $(VENV)/mypy.log; exit $$tests
 
 test-machines: $(VENV)/test.stamp  ## the numerical tests under imitated processors, a quarter of an hour (MACHINES=--quick: a minute and a half)

@@ -147,7 +147,7 @@ class RetrainingJob:
             text = f'the training process ended with code {code}: {last}'
             if last.startswith(('ModuleNotFoundError', 'ImportError')):
                 text = (f'training needs a package that is not installed ({last}): pip install '
-                        "'koopman_ros[train]'")
+                        'torch cloudpickle joblib tqdm')
         return replace(self.state, text=text, ended=True)
 
     def _read_lines(self, stream: IO[str]) -> None:

@@ -10,8 +10,9 @@ notes every file of the repository that is opened in it.
 
 import os
 from pathlib import Path
+import shlex
+import site
 import sys
-import sysconfig
 import venv
 
 import pytest
@@ -62,14 +63,25 @@ def wheel(tmp_path_factory: pytest.TempPathFactory) -> Installation:
     installed = run((sys.executable, '-m', 'pip', '--python', str(environment / 'bin/python'),
                      'install', '--quiet', '--no-deps', '--no-index', str(wheel)))
     assert installed.returncode == 0, installed.stderr
-    (site,) = environment.glob('lib/python*/site-packages')
+    (own,) = environment.glob('lib/python*/site-packages')
     notes = folder / 'notes'
-    (site / 'noting.py').write_text(NOTING.format(file=str(notes)))
+    (own / 'noting.py').write_text(NOTING.format(file=str(notes)))
     # a folder that a .pth adds is not searched for further .pth: an editable install stays out
-    (site / 'here.pth').write_text(f'{sysconfig.get_path("purelib")}\nimport noting\n')
+    (own / 'here.pth').write_text('\n'.join([*site.getsitepackages(), 'import noting\n']))
+    # a sourced ROS 2 names its folders in both, and with them a workspace that holds this package
+    kept = ' '.join(shlex.quote(f'{name}={others(name, marks)}') for name, marks in (
+        ('PYTHONPATH', ('koopman_ros', 'koopman-ros.egg-link')),
+        ('AMENT_PREFIX_PATH', ('share/koopman_ros',))))
     return Installation(
-        environment / 'bin', environment / 'share' / 'koopman_ros', site / 'koopman_ros',
-        'unset PYTHONPATH AMENT_PREFIX_PATH', environment / 'bin' / 'python', notes)
+        environment / 'bin', environment / 'share' / 'koopman_ros', own / 'koopman_ros',
+        f'export {kept}', environment / 'bin' / 'python', notes)
+
+
+def others(variable: str, marks: tuple[str, ...]) -> str:
+    """Return the folders in a variable without those that hold this package."""
+    return os.pathsep.join(
+        name for name in os.environ.get(variable, '').split(os.pathsep)
+        if name and not any((Path(name) / mark).exists() for mark in marks))
 
 
 @pytest.fixture(params=['colcon', 'wheel'])
