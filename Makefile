@@ -10,6 +10,8 @@ INSTALL := PIP_CONSTRAINT=$(LOCK) PIP_BUILD_CONSTRAINT=$(LOCK) $(BIN)/python -m 
 COMPILE := $(BIN)/python -m koopman_ros.compiled
 # Where the environment forbids to keep what is compiled, each process would compile the package anew.
 unexport PYTHONDONTWRITEBYTECODE
+# All packages are those of .venv, ROS 2 among them: not those of a sourced ROS 2.
+unexport PYTHONPATH AMENT_PREFIX_PATH
 # The loop stays on this machine.
 export ROS_AUTOMATIC_DISCOVERY_RANGE ?= LOCALHOST
 

@@ -22,7 +22,7 @@ def generate_launch_description():
     shipped = [FindPackageShare('koopman_ros'), '/config/plants/', LaunchConfiguration('system'),
                '.yaml']
     autostart = ParameterValue(LaunchConfiguration('autostart'), value_type=bool)
-    # not in `parameters`: launch_ros leaves a file out that is missing, and the reactor would start
+    # not in `parameters`: launch_ros leaves out a missing file, and the reactor would start
     file = ['--params-file', LaunchConfiguration('parameters')]
     return LaunchDescription([
         DeclareLaunchArgument('system', default_value='reactor',

@@ -27,10 +27,10 @@ from typing import Any
 SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
 
 # One thread of each library of linear algebra. A control step takes a fraction of a millisecond,
-# and twenty where several threads share it on busy cores; and sums keep their order: the last bit of
-# a command depends on the number of threads.
+# and twenty where several threads share it on busy cores; and the last bit of a command depends on
+# the number of threads.
 ONE_THREAD = {f'{library}_NUM_THREADS': '1' for library in ('OMP', 'OPENBLAS', 'MKL')}
-# Their results are compared bit by bit, so that no variable of the user's changes the number there.
+# Their results are compared bit by bit: no variable of the user changes the number of threads.
 _BIT_IDENTICAL = tuple(
     f'koopman_ros.nodes.{name}' for name in ('plant', 'controller', 'player', 'replay'))
 

@@ -279,7 +279,7 @@ class Controller:
         return self._estimating.position(None, y)
 
     def try_law(self, x: Array, setpoint: Array) -> Reason | None:
-        """Return why the first usable law fails at a state (n_x,) and set-point (n_c,), or None."""
+        """Return why the first usable law fails at a state (n_x,), set-point (n_c,); or None."""
         level = self.usable
         estimate = Estimate(self.model.states.to_deviation(x), np.zeros(self.model.n_x))
         with np.errstate(all='ignore'):

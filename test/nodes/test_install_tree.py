@@ -10,7 +10,6 @@ notes every file of the repository that is opened in it.
 
 import os
 from pathlib import Path
-import shlex
 import site
 import sys
 import venv
@@ -18,7 +17,7 @@ import venv
 import pytest
 
 from koopman_ros.testing import Harness, isolated_domain
-from support.installation import Installation, ROOT, run, sources
+from support.installation import Installation, ROOT, run, sources, underlay
 
 NODES = {'plant': 'simulation', 'controller': 'control', 'trainer': 'recording'}
 # what ends by itself, and what it says of a bag that is not there
@@ -61,27 +60,17 @@ def wheel(tmp_path_factory: pytest.TempPathFactory) -> Installation:
     venv.create(folder / 'environment', symlinks=True)
     environment = folder / 'environment'
     installed = run((sys.executable, '-m', 'pip', '--python', str(environment / 'bin/python'),
-                     'install', '--quiet', '--no-deps', '--no-index', str(wheel)))
+                     'install', '--quiet', '--no-deps', '--no-index', '--ignore-installed',
+                     str(wheel)))
     assert installed.returncode == 0, installed.stderr
     (own,) = environment.glob('lib/python*/site-packages')
     notes = folder / 'notes'
     (own / 'noting.py').write_text(NOTING.format(file=str(notes)))
     # a folder that a .pth adds is not searched for further .pth: an editable install stays out
     (own / 'here.pth').write_text('\n'.join([*site.getsitepackages(), 'import noting\n']))
-    # a sourced ROS 2 names its folders in both, and with them a workspace that holds this package
-    kept = ' '.join(shlex.quote(f'{name}={others(name, marks)}') for name, marks in (
-        ('PYTHONPATH', ('koopman_ros', 'koopman-ros.egg-link')),
-        ('AMENT_PREFIX_PATH', ('share/koopman_ros',))))
     return Installation(
         environment / 'bin', environment / 'share' / 'koopman_ros', own / 'koopman_ros',
-        f'export {kept}', environment / 'bin' / 'python', notes)
-
-
-def others(variable: str, marks: tuple[str, ...]) -> str:
-    """Return the folders in a variable without those that hold this package."""
-    return os.pathsep.join(
-        name for name in os.environ.get(variable, '').split(os.pathsep)
-        if name and not any((Path(name) / mark).exists() for mark in marks))
+        underlay(), environment / 'bin' / 'python', notes)
 
 
 @pytest.fixture(params=['colcon', 'wheel'])
