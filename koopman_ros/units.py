@@ -121,7 +121,7 @@ def _registry() -> Any:
     import pint
 
     # without its cache: a file that is cut short would end each program that reads it
-    registry = pint.UnitRegistry(preprocessors=[lambda text: text.replace('%', ' percent ')])
+    registry: Any = pint.UnitRegistry(preprocessors=[lambda text: text.replace('%', ' percent ')])
     # pint defines these since its release 0.21; Ubuntu 24.04 and Debian 12 have 0.19
     for name, share in _SHARES.items():
         if name not in registry:
