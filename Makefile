@@ -10,6 +10,8 @@ INSTALL := PIP_CONSTRAINT=$(LOCK) PIP_BUILD_CONSTRAINT=$(LOCK) $(BIN)/python -m 
 COMPILE := $(BIN)/python -m koopman_ros.compiled
 # Where the environment forbids to keep what is compiled, each process would compile the package anew.
 unexport PYTHONDONTWRITEBYTECODE
+# All packages are those of .venv, ROS 2 among them: not those of a sourced ROS 2.
+unexport PYTHONPATH AMENT_PREFIX_PATH
 # The loop stays on this machine.
 export ROS_AUTOMATIC_DISCOVERY_RANGE ?= LOCALHOST
 
@@ -83,7 +85,7 @@ test: $(VENV)/test.stamp  ## style and type checks and the whole test suite, on 
 	$(BIN)/ruff check
 	@$(BIN)/mypy > $(VENV)/mypy.log & types=$$!; \
 	  $(BIN)/python -m pytest -n $$(($$(nproc) + 2)) --dist loadfile --no-loadscope-reorder \
-	    --max-worker-restart 0; \
+	    --max-worker-restart 0 -o faulthandler_exit_on_timeout=true; \
 	  tests=$$?; wait $$types || tests=1; cat $(VENV)/mypy.log; exit $$tests
 
 test-machines: $(VENV)/test.stamp  ## the numerical tests under imitated processors, a quarter of an hour (MACHINES=--quick: a minute and a half)

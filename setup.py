@@ -72,7 +72,7 @@ setup(
             'numba',
             'packaging',
             'playwright',
-            'pytest>=9',
+            'pytest>=7.4',
             'pytest-timeout',
             'pytest-xdist',
             'rosbags',

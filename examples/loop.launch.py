@@ -6,7 +6,7 @@ A whole loop from one parameter file: plant, controller and trainer.
 
 ``ros2 launch koopman_ros loop.launch.py system:=two_tanks`` takes that of a plant that is shipped,
 ``parameters:=loop.yaml`` one's own. Each node configures and activates itself; with
-``autostart:=false`` it waits for a lifecycle manager.
+``autostart:=false`` it waits for a lifecycle manager. Without the file no node starts.
 """
 
 from launch import LaunchDescription
@@ -22,6 +22,8 @@ def generate_launch_description():
     shipped = [FindPackageShare('koopman_ros'), '/config/plants/', LaunchConfiguration('system'),
                '.yaml']
     autostart = ParameterValue(LaunchConfiguration('autostart'), value_type=bool)
+    # not in `parameters`: launch_ros leaves out a missing file, and the reactor would start
+    file = ['--params-file', LaunchConfiguration('parameters')]
     return LaunchDescription([
         DeclareLaunchArgument('system', default_value='reactor',
                               description='plant that is shipped'),
@@ -30,6 +32,6 @@ def generate_launch_description():
         DeclareLaunchArgument('autostart', default_value='true',
                               description='false leaves the start to a lifecycle manager'),
         *(Node(package='koopman_ros', executable=name, name=name, output='screen',
-               parameters=[LaunchConfiguration('parameters'), {'autostart': autostart}])
+               ros_arguments=file, parameters=[{'autostart': autostart}])
           for name in ('plant', 'controller', 'trainer')),
     ])

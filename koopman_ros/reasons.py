@@ -77,7 +77,7 @@ class Code(Enum):
         'the closed loop is predicted unstable at a sample every {interval:.3g} s: raise the '
         'input weight, or measure more often')
     PACKAGE_MISSING = 'package_missing', (
-        "it needs {package}, which is not installed: pip install 'koopman_ros[{extra}]'")
+        'it needs {package}, which is not installed: pip install {package}')
     NO_PI_GAIN = 'no_pi_gain', 'no signal has a pi_gain: set it for those that are controlled'
     PLAN_NOT_SOLVED = 'plan_not_solved', (
         'it finds no plan within the limits of the inputs ({flag})')

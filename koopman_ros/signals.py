@@ -75,7 +75,7 @@ class Outputs:
 
     def state(self, y: Array, guess: Array) -> Array:
         """
-        Return the state (n_x,) of outputs (n_y,).
+        Return the state, (n_x,), of outputs (n_y,).
 
         :param guess: (n_x,) what they leave open is as there.
         """

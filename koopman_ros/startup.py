@@ -26,9 +26,13 @@ from typing import Any
 
 SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
 
-# Their steps take a fraction of a millisecond; where threads are to share it, and others use the
-# cores, one takes twenty.
-_IN_THE_LOOP = tuple(f'koopman_ros.nodes.{name}' for name in ('plant', 'controller', 'player'))
+# One thread of each library of linear algebra. A control step takes a fraction of a millisecond,
+# and twenty where several threads share it on busy cores; and the last bit of a command depends on
+# the number of threads.
+ONE_THREAD = {f'{library}_NUM_THREADS': '1' for library in ('OMP', 'OPENBLAS', 'MKL')}
+# Their results are compared bit by bit: no variable of the user changes the number of threads.
+_BIT_IDENTICAL = tuple(
+    f'koopman_ros.nodes.{name}' for name in ('plant', 'controller', 'player', 'replay'))
 
 _PR_SET_PDEATHSIG = 1  # of prctl(2)
 _END = 8.0  # s from the end of a program to that by force
@@ -46,8 +50,8 @@ def run_program(module: str, interrupted: int) -> int:
     atexit.register(_end_at_once, ended)
     # numpy and rclpy take a quarter of a second, in which there is nothing to complete
     handle_signals(lambda *_: os._exit(interrupted))
-    if module in _IN_THE_LOOP:
-        os.environ.setdefault('OPENBLAS_NUM_THREADS', '1')
+    if module in _BIT_IDENTICAL:
+        os.environ.update(ONE_THREAD)
     # what is imported stays: nobody is to look through it for garbage again and again, now or at
     # the end
     gc.disable()

@@ -52,6 +52,8 @@ _FACTOR = rf'\(*(?:1|[^\W\d]\w*|[°%][^\W\d]*){_POWER}(?:\){_POWER})*'
 _UNIT = re.compile(rf'(?:{_FACTOR}(?: ?[*/] ?| ))*{_FACTOR}')
 _LONGEST = 60  # characters of a unit
 
+_SHARES = {'percent': 1e-2, 'ppm': 1e-6}  # units of dimension one, by name
+
 
 @cache
 def conversion(unit: str, wanted: str) -> Conversion:
@@ -69,8 +71,9 @@ def conversion(unit: str, wanted: str) -> Conversion:
             _check_form(each)
         # not before: it takes 0.4 s
         registry = _registry()
-        offset = float(registry.Quantity(0.0, unit).to(wanted).magnitude)
-        factor = float(registry.Quantity(1.0, unit).to(wanted).magnitude) - offset
+        into = registry.parse_units(wanted)
+        offset = float(registry.Quantity(0.0, unit).to(into).magnitude)
+        factor = float(registry.Quantity(1.0, unit).to(into).magnitude) - offset
         if offset != 0.0:
             # exact, where the difference of two values is not
             source = registry.Quantity(1.0, unit) - registry.Quantity(0.0, unit)
@@ -134,7 +137,12 @@ def _registry() -> Any:
     import pint
 
     # without its cache: a file that is cut short would end each program that reads it
-    return pint.UnitRegistry()
+    registry: Any = pint.UnitRegistry(preprocessors=[lambda text: text.replace('%', ' percent ')])
+    # pint defines these since its release 0.21; Ubuntu 24.04 and Debian 12 have 0.19
+    for name, share in _SHARES.items():
+        if name not in registry:
+            registry.define(f'{name} = {share!r}')
+    return registry
 
 
 @dataclass(frozen=True)

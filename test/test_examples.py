@@ -12,6 +12,7 @@ import runpy
 import shlex
 import subprocess
 import sys
+from types import ModuleType, SimpleNamespace
 from typing import Any
 
 import matplotlib
@@ -264,6 +265,63 @@ def test_beam_is_held_on_the_slope(beam: Run) -> None:
     x = linear.states[-1, 0]
     assert linear.inputs[-1, 0] == pytest.approx(-1e-4 * (400.0 * x - 4.0 * x ** 3), abs=1e-3)
     assert max(np.max(np.abs(loop.inputs)) for loop in (linear, polynomial)) < 1.0
+
+
+def _launched(given: dict[str, str]) -> list[SimpleNamespace]:
+    """Return the nodes of the launch file, with arguments in place of substitutions."""
+    default: dict[str, Any] = {}
+
+    def value(name: str) -> str:
+        parts = given.get(name, default[name])
+        return parts if isinstance(parts, str) else ''.join(
+            part() if callable(part) else part for part in parts)
+
+    def declare(name: str, default_value: object, description: str) -> None:
+        assert description
+        default[name] = default_value
+
+    modules = {
+        'launch': {'LaunchDescription': lambda entities: [one for one in entities if one]},
+        'launch.actions': {'DeclareLaunchArgument': declare},
+        'launch.substitutions': {'LaunchConfiguration': lambda name: lambda: value(name)},
+        'launch_ros': {},
+        'launch_ros.actions': {'Node': SimpleNamespace},
+        'launch_ros.parameter_descriptions': {
+            'ParameterValue': lambda text, value_type: lambda: value_type(text() == 'true')},
+        'launch_ros.substitutions': {'FindPackageShare': lambda name: str(ROOT)}}
+    with pytest.MonkeyPatch.context() as patch:
+        for name, content in modules.items():
+            module = ModuleType(name)
+            vars(module).update(content)
+            patch.setitem(sys.modules, name, module)
+        nodes = runpy.run_path(str(ROOT / 'examples' / 'loop.launch.py'))[
+            'generate_launch_description']()
+        for node in nodes:
+            node.ros_arguments = [part() if callable(part) else part
+                                  for part in node.ros_arguments]
+            (node.parameters,) = node.parameters
+            node.parameters = {name: one() for name, one in node.parameters.items()}
+    return nodes
+
+
+def test_launch_file_gives_its_parameter_file_to_all_nodes() -> None:
+    nodes = _launched({'autostart': 'false', 'system': 'two_tanks'})
+    assert [node.executable for node in nodes] == ['plant', 'controller', 'trainer']
+    for node in nodes:
+        assert node.package == 'koopman_ros'
+        assert node.ros_arguments == [
+            '--params-file', f'{ROOT}/config/plants/two_tanks.yaml']
+        assert Path(node.ros_arguments[1]).is_file()
+        assert node.parameters == {'autostart': False}
+    assert _launched({'parameters': 'loop.yaml'})[0].ros_arguments[1] == 'loop.yaml'
+
+
+def test_no_node_starts_without_the_parameter_file_of_the_launch(ros: Harness) -> None:
+    started = [ros.start(node.executable, {}, tuple(node.ros_arguments))
+               for node in _launched({'system': 'two_tansk'})]
+    for process in started:
+        assert ros.wait_for_end(process) == 1
+        assert 'two_tansk.yaml' in process.output()
 
 
 @pytest.mark.parametrize('path', sorted(TUTORIALS.glob('*.py')), ids=lambda path: path.stem)

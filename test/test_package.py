@@ -6,14 +6,19 @@
 import ast
 import functools
 import importlib.metadata
+import os
 from pathlib import Path
 import re
+import subprocess
+import sys
+import tomllib
 import xml.etree.ElementTree as ElementTree
 
-from catkin_pkg.package import parse_package
+from catkin_pkg.package import Dependency, parse_package
 from packaging.requirements import Requirement
 from packaging.utils import canonicalize_name
 import pytest
+import yaml
 
 import koopman_ros
 
@@ -75,28 +80,107 @@ def test_versions_agree_and_the_manifest_is_of_format_3_and_names_real_people() 
     assert manifest.findtext('url', '').startswith('https://')
 
 
+def _keys() -> dict[str, dict[str, list[str]]]:
+    """Return what rosdep knows: by the way of installing, each key with its modules."""
+    keys: dict[str, dict[str, list[str]]] = yaml.safe_load(
+        (ROOT / 'test' / 'rosdep_keys.yaml').read_text())
+    return keys
+
+
+def _third_party(*folders: str) -> set[str]:
+    """Return the modules of other distributions that the files in folders import."""
+    own = {'koopman_ros', 'validation', 'support', 'machines'}
+    return {name.split('.')[0] for folder in folders for path in ROOT.glob(f'{folder}/**/*.py')
+            for name in _imports(path)} - own - sys.stdlib_module_names
+
+
 # catkin_pkg's own
 @pytest.mark.filterwarnings('ignore::DeprecationWarning')
 @pytest.mark.parametrize('control_only', [False, True])
 def test_manifest_declares_what_is_imported(control_only: bool) -> None:
-    keys = {'torch': 'python3-torch', 'joblib': 'python3-joblib', 'tqdm': 'python3-tqdm',
-            'numpy': 'python3-numpy', 'scipy': 'python3-scipy', 'yaml': 'python3-yaml',
-            'matplotlib': 'python3-matplotlib', 'rich': 'python3-rich',
-            # rosdep has no key for mcap, lz4 and zstandard: they come with this one
-            'mcap_ros2': 'mcap-ros2-support', 'mcap': 'mcap-ros2-support',
-            'lz4': 'mcap-ros2-support', 'zstandard': 'mcap-ros2-support',
-            'control': 'python-control-pip', 'casadi': 'casadi-pip', 'psutil': 'python3-psutil',
-            'hypothesis': 'python3-hypothesis', 'rosbags': 'python3-rosbags-pip'}
-    learning = {'torch', 'joblib', 'tqdm'}
+    keys = _keys()
+    key_of = {module: key for kind in ('ros', 'apt', 'pip') for key, modules in keys[kind].items()
+              for module in modules}
+    without = {module for modules in keys['none'].values() for module in modules}
+    # optional, or a part of the training
+    learning = {'torch', 'joblib', 'tqdm'} if control_only else set()
     manifest = parse_package(ROOT / 'package.xml')
     manifest.evaluate_conditions({'KOOPMAN_ROS_CONTROL_ONLY': '1'} if control_only else {})
-    declared = {depend.name for depend in (*manifest.exec_depends, *manifest.test_depends)
-                if depend.evaluated_condition}
-    used = {name.split('.')[0] for folder in ('koopman_ros', 'test', 'validation')
-            for path in ROOT.glob(f'{folder}/**/*.py') for name in _imports(path)}
-    assert {keys[name] for name in used & set(keys) - (learning if control_only else set())
-            } <= declared
-    assert not control_only or not {keys[name] for name in learning} & declared
+
+    def declared(*depends: list[Dependency]) -> set[str]:
+        return {one.name for some in depends for one in some if one.evaluated_condition}
+
+    nodes = declared(manifest.exec_depends)
+    everything = declared(manifest.exec_depends, manifest.test_depends)
+    used = _third_party('koopman_ros') - without
+    # numba is optional: a key of the tests
+    assert {key_of[name] for name in used - learning - {'numba'}} <= nodes
+    assert {key_of[name] for name in _third_party('koopman_ros', 'test', 'validation')
+            - without - learning} <= everything
+    assert not {key_of[name] for name in learning} & everything
+
+
+@pytest.mark.filterwarnings('ignore::DeprecationWarning')
+def test_rosdep_has_every_key_of_the_manifest_and_the_page_names_the_rest() -> None:
+    keys = _keys()
+    manifest = parse_package(ROOT / 'package.xml')
+    nodes, tests = ({one.name for one in some}
+                    for some in (manifest.exec_depends, manifest.test_depends))
+    assert nodes | tests <= {*keys['ros'], *keys['apt'], *keys['pip']}
+    assert not set(keys['none']) & {key for kind in ('ros', 'apt', 'pip') for key in keys[kind]}
+    assert nodes & set(keys['pip']) == {'mcap-ros2-support'}
+    _, _, install = (ROOT / 'docs' / 'operation.md').read_text().partition('## Install')
+    install, _, _ = install.partition('## Start')
+    assert not [key for key in keys['pip'] if f'`{key}`' not in install]
+    assert not [name for name in keys['none'] if not re.search(rf'install[^`]*\b{name}', install)
+                and f'python3-{name}' not in install]
+
+
+@pytest.mark.parametrize('manifest', ['package.xml', 'examples/oven/package.xml'])
+def test_conditions_of_a_manifest_have_the_characters_of_its_schema(manifest: str) -> None:
+    """As package_format3.xsd has them: no quotes."""
+    conditions = {one.attrib.get('condition', '') for one in ElementTree.parse(ROOT / manifest
+                                                                               ).iter()}
+    assert not [one for one in conditions if not re.fullmatch(r'[$A-Za-z0-9_\s<>!=()-]*', one)]
+
+
+def test_packages_that_messages_and_pages_advise_are_known() -> None:
+    """Distributions of the lock, and none of this package, which is not on PyPI."""
+    locked = {canonicalize_name(Requirement(line).name) for line in (
+        ROOT / 'requirements.lock').read_text().splitlines() if not line.startswith('#')}
+    texts = {path: path.read_text() for path in (
+        *ROOT.glob('*.md'), *ROOT.glob('docs/*.md'), *ROOT.glob('koopman_ros/**/*.py'),
+        *ROOT.glob('validation/**/*.py'), *ROOT.glob('config/*.yaml'))}
+    assert not [path for path, text in texts.items() if 'koopman_ros[' in text]
+    advised = {name for text in texts.values() for name in re.findall(
+        r"pip install '?([a-z][\w-]*)", text)}
+    assert {'daqp', 'matplotlib', 'nicegui', 'numba', 'torch'} <= advised
+    assert {canonicalize_name(name) for name in advised} <= locked
+
+
+def test_options_of_pytest_are_those_of_its_release_7_4() -> None:
+    """Which a sourced Jazzy has; an unknown one ends it."""
+    options = tomllib.loads((ROOT / 'pyproject.toml').read_text())['tool']['pytest']['ini_options']
+    # and of pytest-timeout, which the manifest names
+    assert set(options) <= {'testpaths', 'pythonpath', 'addopts', 'filterwarnings',
+                            'faulthandler_timeout', 'timeout'}
+
+
+def test_plugins_of_a_sourced_ros_are_left_out(tmp_path: Path) -> None:
+    """launch_testing's has an argument that pytest 9 does not know."""
+    (tmp_path / 'hooks.py').write_text(
+        'def pytest_pycollect_makemodule(path, parent):\n    raise AssertionError\n')
+    for name in ('launch_testing', 'launch_ros', 'launch_pytest'):
+        about = tmp_path / f'{name}-3.4.dist-info'
+        about.mkdir()
+        (about / 'METADATA').write_text(f'Metadata-Version: 2.1\nName: {name}\nVersion: 3.4\n')
+        (about / 'entry_points.txt').write_text(f'[pytest11]\n{name} = hooks\n')
+    paths = os.pathsep.join(filter(None, (str(tmp_path), os.environ.get('PYTHONPATH'))))
+    done = subprocess.run(
+        [sys.executable, '-m', 'pytest', '-q', '--collect-only', 'test/test_values.py'], cwd=ROOT,
+        env={**os.environ, 'PYTHONPATH': paths}, capture_output=True, text=True, timeout=240,
+        check=False)
+    assert done.returncode == 0, done.stdout + done.stderr
 
 
 def test_lock_holds_each_requirement_within_its_range() -> None:

@@ -16,7 +16,8 @@ from koopman_ros.units import check_unit, Conversion, conversion, Display, Displ
 @pytest.mark.parametrize(('unit', 'wanted', 'value', 'converted'), [
     ('K', 'degC', 300.0, 26.85), ('degC', 'K', 26.85, 300.0), ('degC', 'degF', 100.0, 212.0),
     ('degF', 'K', 32.0, 273.15), ('m', 'mm', 0.25, 250.0), ('bar', 'Pa', 1.5, 150_000.0),
-    ('K/min', 'K/s', 60.0, 1.0), ('rad', 'deg', math.pi, 180.0), ('mol/L', 'mol/m^3', 0.5, 500.0),
+    ('K/min', 'K/s', 60.0, 1.0), ('rad', 'deg', math.pi, 180.0), ('%', '1', 20.0, 0.2),
+    ('%/min', '1/s', 30.0, 0.005), ('ppm', '%', 500.0, 0.05), ('mol/L', 'mol/m^3', 0.5, 500.0),
     ('anything', 'anything', 3.0, 3.0)])
 def test_values_are_converted(unit: str, wanted: str, value: float, converted: float) -> None:
     assert conversion(unit, wanted)(value) == pytest.approx(converted, rel=1e-12)
@@ -75,8 +76,8 @@ def test_every_code_has_its_words() -> None:
 def test_unit_that_there_is_not_is_named(unit):
     with pytest.raises(ValueError, match=f"there is no unit '{unit}': write one like K"):
         check_unit(unit)
-    for one in ('K', 'L/min', 'N m', '%', '1', 'm^3/s', '', '(m/s)**2', 'kg/(m*s)', 'm^-0.5', '°C',
-                'ft_H2O', 'm²'):
+    for one in ('K', 'L/min', 'N m', '%', '%/s', 'ppm', '1', 'm^3/s', '', '(m/s)**2', 'kg/(m*s)',
+                'm^-0.5', '°C', 'ft_H2O', 'm²'):
         check_unit(one)
 
 

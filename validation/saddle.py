@@ -264,6 +264,7 @@ def _report(seeds: int, backend: Backend) -> None:
 
     print(f'\nOf {STARTS} starts from 335 to 370 K, C_A up to 0.2 mol/L from steady, do not come '
           'to 350 K (coolant from 253 to 373 K):\n')
+
     def losses(law: str) -> list[int]:
         return [len(lost(controller(model, LAWS[law], WIDE, informed=informed), 0))
                 for model, informed in ((models[0], False), (truth(), True))]

@@ -13,7 +13,7 @@ def main() -> int:
     """Compile what is not kept yet; return the exit code, 1 where nothing compiles."""
     begun = time.monotonic()
     if named(COMPILED) is None:
-        print(f"{PACKAGE} is not installed: pip install 'koopman_ros[fast]'", file=sys.stderr)
+        print(f'{PACKAGE} is not installed: pip install {PACKAGE}', file=sys.stderr)
         return 1
     from koopman_ros.compiled.jit import FOLDER
 

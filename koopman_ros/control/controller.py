@@ -98,6 +98,12 @@ class Controller:
     def _best(self) -> Level:
         return next(iter(self.levels.values()))
 
+    @cached_property
+    def usable(self) -> Level:
+        """The best level whose law can act at all, or the best one where none can."""
+        return next((level for level in self.levels.values() if level.unusable is None),
+                    self._best)
+
     @property
     def controlled(self) -> Coordinates:
         """The states with a set-point."""
@@ -307,8 +313,8 @@ class Controller:
         return self._estimating.position(None, y)
 
     def try_law(self, x: Array, setpoint: Array) -> Reason | None:
-        """Return why the best law fails at a state (n_x,) towards a set-point (n_c,), or None."""
-        level = self._best
+        """Return why the first usable law fails at a state (n_x,), set-point (n_c,); or None."""
+        level = self.usable
         estimate = Estimate(self.model.states.to_deviation(x), np.zeros(self.model.n_x))
         with np.errstate(all='ignore'):
             return level.compute(

@@ -122,7 +122,7 @@ class EstimateReport:
 
     @property
     def deviation(self) -> Array | None:
-        """Standard deviation (n_x,) of the state's error, in state units; or None."""
+        """Standard deviation, (n_x,), of the state's error, in state units; or None."""
         return None if self.covariance is None else np.sqrt(self.covariance.diagonal())
 
 

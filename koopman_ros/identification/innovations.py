@@ -75,7 +75,7 @@ class Predictor(Generic[_Drift]):
         hidden = _APART * np.eye(n_x)[n_y:]
 
         def errors(starts: Array) -> Array:
-            """Evaluate the errors (S, k, M, n_y) from starts (S, M, n_x), side by side."""
+            """Evaluate the errors, (S, k, M, n_y), from starts (S, M, n_x), side by side."""
             found = self._filter(first.repeated(len(starts)), starts.reshape(-1, n_x))[2]
             return np.moveaxis(found.reshape(len(found), *starts.shape[:2], n_y), 1, 0)
 

@@ -72,7 +72,7 @@ class Record:
 
     def innovations(self, predictor: Predictor[Drift], parts: Sequence[int] | None = None
                     ) -> Array:
-        """Return the innovations (N, n_y) over segments, all that settled by default."""
+        """Return the innovations, (N, n_y), over segments, all that settled by default."""
         return self._run(predictor).innovations[self._rows_of(parts)]
 
     def estimates(self, predictor: Predictor[Drift], parts: Sequence[int] | None = None) -> Array:

@@ -39,9 +39,8 @@ from koopman_ros.jobs.backends import (
     Watch,
     WorkerLost,
 )
+from koopman_ros.startup import ONE_THREAD
 
-# One thread each: as many processes as there are cores use these well, and sums keep their order.
-_ONE_THREAD = {'OMP_NUM_THREADS': '1', 'OPENBLAS_NUM_THREADS': '1'}
 _STOP, _SHARED = 'stop', 'shared'
 
 
@@ -111,7 +110,7 @@ class _Worker:
         if self._executor is None:
             # its workers would end when they are idle
             self._executor = ProcessPoolExecutor(
-                1, timeout=None, initializer=_begin, env={**_ONE_THREAD, **os.environ})
+                1, timeout=None, initializer=_begin, env={**ONE_THREAD, **os.environ})
             self._pid = self._executor.submit(os.getpid)
         future: Future[Any] = self._executor.submit(function, *arguments)
         return future

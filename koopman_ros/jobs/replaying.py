@@ -15,7 +15,6 @@ from koopman_ros.startup import blocked_signals, command
 
 _MODULE = 'koopman_ros.nodes.replay'
 _NICE = 10
-_ONE_THREAD = {'OMP_NUM_THREADS': '1', 'OPENBLAS_NUM_THREADS': '1'}
 _MOST_SAID = 4000  # bytes of what it printed last
 
 
@@ -32,8 +31,7 @@ class ReplayJob:
         with open(log, 'wb') as output, blocked_signals():
             self._process = subprocess.Popen(
                 [*command(_MODULE, signal.SIGKILL, interrupted=130), *arguments], stdout=output,
-                stderr=subprocess.STDOUT, stdin=subprocess.DEVNULL, start_new_session=True,
-                env={**_ONE_THREAD, **os.environ})
+                stderr=subprocess.STDOUT, stdin=subprocess.DEVNULL, start_new_session=True)
         # it may have ended
         with contextlib.suppress(OSError):
             os.setpriority(os.PRIO_PROCESS, self._process.pid, _NICE)

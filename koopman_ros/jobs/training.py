@@ -17,11 +17,9 @@ import threading
 from typing import Any, IO
 
 from koopman_ros.jobs.ending import see_it_end
-from koopman_ros.startup import command
+from koopman_ros.startup import command, ONE_THREAD
 
 _MODULE = 'koopman_ros.retraining.__main__'
-# The problems are small, and the nodes of the loop need the cores; sums keep their order, too.
-_ONE_THREAD = {'OMP_NUM_THREADS': '1', 'OPENBLAS_NUM_THREADS': '1'}
 _CANCELLED = 'cancelled, nothing was written'
 
 
@@ -66,7 +64,7 @@ class RetrainingJob:
         self._process = subprocess.Popen(
             _command(), stdin=subprocess.PIPE, stdout=subprocess.PIPE,
             stderr=subprocess.PIPE, encoding='utf-8', errors='replace', start_new_session=True,
-            env={**_ONE_THREAD, **os.environ})
+            env={**ONE_THREAD, **os.environ})
         self._lines: queue.SimpleQueue[str | None] = queue.SimpleQueue()
         self._complaints: list[str] = []
         stdin, *outputs = self._process.stdin, self._process.stdout, self._process.stderr
@@ -146,8 +144,8 @@ class RetrainingJob:
             last = self._complaints[-1] if self._complaints else 'it said nothing'
             text = f'the training process ended with code {code}: {last}'
             if last.startswith(('ModuleNotFoundError', 'ImportError')):
-                text = (f'training needs a package that is not installed ({last}): pip install '
-                        "'koopman_ros[train]'")
+                text = (f'training needs a package that is not installed ({last}): '
+                        'pip install torch cloudpickle joblib tqdm')
         return replace(self.state, text=text, ended=True)
 
     def _read_lines(self, stream: IO[str]) -> None:

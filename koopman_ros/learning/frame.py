@@ -15,6 +15,10 @@ from koopman_ros.lifting import NetworkObservables
 from koopman_ros.plant_data import Array
 from koopman_ros.solvers import RiccatiStatus, solve_riccati
 
+# Ratio of the smallest to the largest variance of a singular covariance. Rounding decides whether
+# a Cholesky factorisation fails there.
+_SINGULAR = 1e-14
+
 
 @dataclass(frozen=True)
 class Frame:
@@ -57,12 +61,12 @@ class Frame:
                 'no feedback of the inputs stabilises the linear fit of the samples, whose '
                 f'eigenvalues are {np.round(np.linalg.eigvals(A), 3).tolist()} in 1/time unit: '
                 'excite the inputs, add one that acts on what grows, or leave `pre_feedback` out')
-        try:
-            factor = np.linalg.cholesky(x.T @ x / len(x))
-        except np.linalg.LinAlgError as error:
+        covariance = x.T @ x / len(x)
+        variances = np.linalg.eigvalsh(covariance)
+        if not variances[0] > _SINGULAR * variances[-1]:
             raise ValueError('the states of the samples do not move each on its own: excite the '
-                             'plant, or leave out a state') from error
-        return Frame(inputs, B, -riccati.K, np.linalg.inv(factor))
+                             'plant, or leave out a state')
+        return Frame(inputs, B, -riccati.K, np.linalg.inv(np.linalg.cholesky(covariance)))
 
     def enter(self, x: Array, f: Array, regressors: Array | None
               ) -> tuple[Array, Array, Array | None]:

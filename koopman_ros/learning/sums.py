@@ -243,4 +243,3 @@ class FeatureMap:
     def _per_hidden(self, weights: Tensor) -> Tensor:
         """Repeat weights (R, h) for each parameter of the hidden layer: (R, h (n_x + 1))."""
         return torch.cat([weights.repeat_interleave(self.layout.n_x, 1), weights], 1)
-

@@ -32,6 +32,7 @@ from koopman_ros.plant_data import Plant, Samples, split_by_episode
 _HIGHEST_DEGREE = 5
 _SAMPLES_OF_MONOMIAL = 5
 
+
 @dataclass(frozen=True)
 class Trained:
     """A trained model with its figures and those of the linear model."""

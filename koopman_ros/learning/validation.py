@@ -178,7 +178,6 @@ def rollout_rmse(model: LiftedModel, samples: Samples) -> Array | None:
     return np.sqrt(squares / count) if count else None
 
 
-
 def lifted_rate(model: LiftedModel, time_unit_seconds: float) -> Rate:
     """
     Return dx/dt of a model's drift, in units and per a time unit of so many seconds.

@@ -232,7 +232,7 @@ class TrainingStates:
         return np.ascontiguousarray(self.states.T)
 
     def distances(self, x: Array, half_widths: Array) -> Array:
-        """Return the distances (N,), as :meth:`distance`, of finite states (N, n_x)."""
+        """Return the distances, (N,), as :meth:`distance`, of finite states (N, n_x)."""
         apart = np.zeros((len(x), len(self.states)))
         for column, values, half in zip(self._columns, x.T, half_widths.tolist(), strict=True):
             np.maximum(apart, np.abs(column - values[:, None]) / half, out=apart)

@@ -184,7 +184,7 @@ class PanelNode(LoopNode):
         except ImportError as error:
             raise ConfigurationError(
                 f'the panel needs {error.name}, which is missing: '
-                "pip install 'koopman_ros[panel]'") from error
+                "pip install 'nicegui>=3'") from error
         settings = self.settings
         server = serving.PanelServer(
             self, settings.host, settings.port, settings.users, settings.tls_certificate,

@@ -73,7 +73,7 @@ def replay_bags(parameters: ReplayParameters, names: Names,
         from koopman_ros.replay.figure import draw
     except ImportError as error:
         raise ConfigurationError(
-            "the picture needs matplotlib, which is missing: pip install 'koopman_ros[demo]', or "
+            'the picture needs matplotlib, which is missing: pip install matplotlib, or '
             'apt-get install python3-matplotlib') from error
 
     bags = [replayed_bag(path, names, parameters, given) for path in parameters.bags]

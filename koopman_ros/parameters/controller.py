@@ -164,7 +164,7 @@ class ControllerParameters:
         'place; 0 for any time', 's', 0.0, 3600.0)
     compiled: bool = parameter(
         False, 'let compiled functions answer in place of those in numpy, once they are there '
-        'after the first command; needs the extra fast', read_only=True)
+        'after the first command; needs numba', read_only=True)
     validity_margin: float = parameter(
         0.1, 'how far outside the trained range laws act, in halves of its width, all but the '
         'linear one; beyond, the linear law does', '', 0.0, 100.0)

@@ -60,8 +60,8 @@ class ControlAffineSystem:
     def __post_init__(self) -> None:
         if self.time_unit not in SECONDS_PER_TIME_UNIT:
             raise ValueError(
-                f"time_unit is {self.time_unit!r}, must be one of "
-                f"{', '.join(map(repr, SECONDS_PER_TIME_UNIT))}")
+                f'time_unit is {self.time_unit!r}, must be one of '
+                + ', '.join(map(repr, SECONDS_PER_TIME_UNIT)))
         for kind in ('state', 'input'):
             names, units = (tuple(getattr(self, f'{kind}_{what}')) for what in ('names', 'units'))
             object.__setattr__(self, f'{kind}_names', names)

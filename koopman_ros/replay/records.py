@@ -213,7 +213,7 @@ def decoded(value: Any) -> Any:
 
 
 def numbers(values: NDArray[Any]) -> list[Any]:
-    """Return the numbers (n,) of an array, as texts those that JSON has no number for."""
+    """Return the numbers, (n,), of an array, as texts those that JSON has no number for."""
     return [item if not isinstance(item, float) or math.isfinite(item) else repr(item)
             for item in values.tolist()]
 

@@ -212,6 +212,7 @@ def retrain_by(backend: Backend, task: Task, on_progress: OnProgress = lambda *_
     episodes = [replace(episode, time=episode.time / seconds,
                         input_time=episode.input_time / seconds)
                 for episode in record.episodes]
+
     def estimating(done: int, total: int, text: str) -> bool:
         return on_progress(_at('estimate', done / total), f'estimating: {text}')
 
@@ -272,8 +273,6 @@ def retrain_by(backend: Backend, task: Task, on_progress: OnProgress = lambda *_
     save(model, path)
     return replace(bare, learned=learned.with_model(model), decision=decision,
                    reasons=decision.reasons, model_file=str(path))
-
-
 
 
 def _at(stage: str, share: float) -> float:

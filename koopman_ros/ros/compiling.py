@@ -43,7 +43,7 @@ class Compiling:
             self._found = named(COMPILED)
         elif not self._over:
             self._log.warning(f'{PACKAGE} is not installed, or does not compile: the control step '
-                              f"goes on in numpy; pip install 'koopman_ros[fast]', and try "
+                              f'goes on in numpy; pip install {PACKAGE}, and try '
                               'python -m koopman_ros.compiled')
 
     def take(self) -> Kernels | None:

@@ -159,7 +159,8 @@ def refuse_setpoints(model: LiftedModel, situation: Situation) -> None:
 def refuse_without_law(model: LiftedModel, situation: Situation) -> None:
     """Raise ModelFileError for a model without a law where the plant is or shall go."""
     controller, asked = situation.controller(model), situation.state.setpoint
-    margin = controller.settings.supervisor.levels[0].margin
+    margin = {level.law: level.margin for level in controller.settings.supervisor.levels}[
+        controller.usable.name]
     for setpoint in [value for value in (asked.active, asked.requested)
                      if value is not None and np.isfinite(value).all()] or [
                          controller.controlled.center]:
@@ -168,11 +169,12 @@ def refuse_without_law(model: LiftedModel, situation: Situation) -> None:
             if not model.distance(place) <= margin:
                 continue
             if (problem := controller.try_law(place, setpoint)) is not None:
-                raise ModelFileError(
-                    f'tried at {listed(model.states, place)} with the set-point '
-                    f'{listed(controller.controlled, setpoint)} the model fails '
-                    f'({words_of(signals_of(model))(problem)}): train it again, or change the '
-                    'weights')
+                tried = (f'tried at {listed(model.states, place)} with the set-point '
+                         f'{listed(controller.controlled, setpoint)} the model fails '
+                         f'({words_of(signals_of(model))(problem)})')
+                # another model fails for the same reason
+                raise ModelFileError(tried if controller.usable.unusable is not None else
+                                     f'{tried}: train it again, or change the weights')
 
 
 def refuse_worse(present: LiftedModel, model: LiftedModel, situation: Situation) -> str:

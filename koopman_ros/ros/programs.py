@@ -31,8 +31,14 @@ STANDARD_SERVICES = (
 # by which a node is tuned from afar
 TUNING_SERVICES = ('list_parameters', 'describe_parameters', 'get_parameters',
                    'set_parameters_atomically')
-# `ros2 topic pub` and its like start a node with this service, named after their process
-_COMMAND_LINE_SERVICE = '/_ros2cli_*/get_type_description'
+# `ros2 service call` and its like start a node with these services, named after the service or
+# their process
+_COMMAND_LINE_SERVICES = tuple(
+    service.replace('~', '/_ros2cli_*') for service in STANDARD_SERVICES)
+# the node of `ros2 bag record`, whose name is fixed
+_BAG_RECORDER_TOPIC = '/events/write_split'
+_BAG_RECORDER_SERVICES = tuple(service.replace('~', '/rosbag2_recorder') for service in (
+    *STANDARD_SERVICES, '~/is_paused', '~/pause', '~/resume', '~/snapshot', '~/split_bagfile'))
 
 _TRANSITIONS = '~/transition_event'
 
@@ -143,17 +149,17 @@ def programs(system: str = DEFAULT_SYSTEM) -> dict[str, Program]:
 
 
 def operator(system: str = DEFAULT_SYSTEM) -> Program:
-    """Whoever moves set-points, calls the services, tunes and watches: a person or a panel."""
+    """Return the access of a person or a panel: set-points, services, recording, all topics."""
     nodes = programs(system)
     wiring = trainer.preset_wiring(system)
     assert wiring is not None
     asks = (*wiring.setpoints.values(), *wiring.manual.values())
     return Program(
-        publishes=(*(place.topic for place in asks), *STANDARD_TOPICS),
-        subscribes=(*nodes['trainer'].subscribes, *STANDARD_TOPICS, *(
+        publishes=(*(place.topic for place in asks), _BAG_RECORDER_TOPIC, *STANDARD_TOPICS),
+        subscribes=(*nodes['trainer'].subscribes, _BAG_RECORDER_TOPIC, *STANDARD_TOPICS, *(
             f'{node}/{name.removeprefix("~/")}' for node, program in nodes.items()
             for name in program.publishes if name.startswith('~/'))),
-        serves=(*STANDARD_SERVICES, _COMMAND_LINE_SERVICE),
+        serves=(*STANDARD_SERVICES, *_COMMAND_LINE_SERVICES, *_BAG_RECORDER_SERVICES),
         calls=tuple(f'{node}/{service.removeprefix("~/")}' for node, program in nodes.items()
                     if node != 'replay' for service in program.serves))
 

@@ -13,12 +13,11 @@ import sys
 import time
 from types import TracebackType
 
+from koopman_ros.startup import ONE_THREAD
 from koopman_ros.testing.process import NodeProcess
 
 _START = 60.0  # s until a scheduler has written where it listens
 _PERIOD = 0.05  # s between two looks
-# As the pages say: one thread each, so that sums keep their order.
-_ONE_THREAD = {'OMP_NUM_THREADS': '1', 'OPENBLAS_NUM_THREADS': '1'}
 _LOCAL = ('--host', '127.0.0.1')
 
 
@@ -62,7 +61,7 @@ class DaskProcesses:
         name = f'{kind}_{len(self.workers)}'
         paths = os.pathsep.join(filter(None, [os.getcwd(), os.environ.get('PYTHONPATH')]))
         return self._stack.enter_context(NodeProcess(
-            name, {}, self._folder / f'{name}.log', {**_ONE_THREAD, 'PYTHONPATH': paths},
+            name, {}, self._folder / f'{name}.log', {**ONE_THREAD, 'PYTHONPATH': paths},
             command=(sys.executable, '-m', 'dask', kind, *arguments)))
 
     def __enter__(self) -> DaskProcesses:

@@ -141,4 +141,3 @@ def main() -> int:
     faulthandler.enable()
     return startup.run_child(
         os.getppid(), signal.SIGINT, 0, request['module'], request['arguments'])
-

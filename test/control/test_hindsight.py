@@ -95,7 +95,7 @@ def test_errors_are_those_of_the_best_start_and_disturbance():
                     for unit in np.eye(2)]
         fit = np.stack([(column * weights).ravel() for column in columns], axis=1)
         target = ((alone - x[first:first + K + 1]) * weights).ravel()
-        rest = target - fit @ np.linalg.lstsq(fit, target)[0]
+        rest = target - fit @ np.linalg.lstsq(fit, target, rcond=None)[0]
         expected = np.mean(np.square(rest.reshape(K + 1, 2) / weights), axis=0)
         # the trapezoidal rule errs by (0.05 s / s)^2 / 12 in each step
         np.testing.assert_allclose(np.sqrt(squares), np.sqrt(expected), rtol=0.01, atol=1e-4)

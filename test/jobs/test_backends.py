@@ -197,7 +197,8 @@ def test_a_process_has_one_thread_and_leaves_an_interrupt_alone(places):
             assert list(own.run(probe, {'probe': None})) == [('probe', ('1', True))]
 
 
-@pytest.mark.parametrize('text', ['joblib:0', 'joblib:-1', 'joblib:x', 'dask', 'tcp:', 'udp://a:1'])
+@pytest.mark.parametrize('text', [
+    'joblib:0', 'joblib:-1', 'joblib:x', 'dask', 'tcp:', 'udp://a:1'])
 def test_other_names_are_refused(text):
     with pytest.raises(ValueError, match=f'scheduler is {text!r}, must be empty for this process'):
         backend_of(text)

@@ -76,7 +76,7 @@ def test_process_that_gets_a_signal(
      JobState(0.25, 'the training process ended with code 1: RuntimeError: the core melts', True)),
     ('import no_such_torch',
      JobState(0.0, 'training needs a package that is not installed (ModuleNotFoundError: No '
-              "module named 'no_such_torch'): pip install 'koopman_ros[train]'", True)),
+              "module named 'no_such_torch'): pip install torch cloudpickle joblib tqdm", True)),
 ])
 def test_process_that_breaks_down(
         monkeypatch: pytest.MonkeyPatch, program: str, state: JobState) -> None:

@@ -87,7 +87,8 @@ def test_a_drift_of_monomials_is_found_exactly(degree, B):
 def test_degree_one_is_linear_regression():
     samples = two_state_samples()
     model = Edmd(1).learn(replace(TWO_STATE, B=None), samples)
-    both = np.linalg.lstsq(np.hstack([samples.x, samples.u]), samples.dxdt)[0].T
+    both = np.linalg.lstsq(
+        np.hstack([samples.x, samples.u]), samples.dxdt, rcond=None)[0].T
     units = np.concatenate([model.states.scale, model.inputs.scale])
     np.testing.assert_allclose(np.hstack([model.A, model.B]) * model.states.scale[:, None] / units,
                                both, rtol=0, atol=1e-13)

@@ -155,7 +155,8 @@ def test_least_squares_of_full_and_of_short_rank():
     a, b = rng.normal(size=(20, 3)), rng.normal(size=(20, 2))
     for matrix in (a, np.hstack([a, a])):
         found = least_squares(*tensors(matrix, b))
-        np.testing.assert_allclose(found, np.linalg.lstsq(matrix, b)[0], rtol=0, atol=1e-13)
+        np.testing.assert_allclose(found, np.linalg.lstsq(matrix, b, rcond=None)[0], rtol=0,
+                                   atol=1e-13)
 
 
 @pytest.fixture(scope='module')

@@ -10,14 +10,14 @@ notes every file of the repository that is opened in it.
 
 import os
 from pathlib import Path
+import site
 import sys
-import sysconfig
 import venv
 
 import pytest
 
 from koopman_ros.testing import Harness, isolated_domain
-from support.installation import Installation, ROOT, run, sources
+from support.installation import Installation, ROOT, run, sources, underlay
 
 NODES = {'plant': 'simulation', 'controller': 'control', 'trainer': 'recording'}
 # what ends by itself, and what it says of a bag that is not there
@@ -60,16 +60,17 @@ def wheel(tmp_path_factory: pytest.TempPathFactory) -> Installation:
     venv.create(folder / 'environment', symlinks=True)
     environment = folder / 'environment'
     installed = run((sys.executable, '-m', 'pip', '--python', str(environment / 'bin/python'),
-                     'install', '--quiet', '--no-deps', '--no-index', str(wheel)))
+                     'install', '--quiet', '--no-deps', '--no-index', '--ignore-installed',
+                     str(wheel)))
     assert installed.returncode == 0, installed.stderr
-    (site,) = environment.glob('lib/python*/site-packages')
+    (own,) = environment.glob('lib/python*/site-packages')
     notes = folder / 'notes'
-    (site / 'noting.py').write_text(NOTING.format(file=str(notes)))
+    (own / 'noting.py').write_text(NOTING.format(file=str(notes)))
     # a folder that a .pth adds is not searched for further .pth: an editable install stays out
-    (site / 'here.pth').write_text(f'{sysconfig.get_path("purelib")}\nimport noting\n')
+    (own / 'here.pth').write_text('\n'.join([*site.getsitepackages(), 'import noting\n']))
     return Installation(
-        environment / 'bin', environment / 'share' / 'koopman_ros', site / 'koopman_ros',
-        'unset PYTHONPATH AMENT_PREFIX_PATH', environment / 'bin' / 'python', notes)
+        environment / 'bin', environment / 'share' / 'koopman_ros', own / 'koopman_ros',
+        underlay(), environment / 'bin' / 'python', notes)
 
 
 @pytest.fixture(params=['colcon', 'wheel'])

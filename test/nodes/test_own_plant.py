@@ -28,7 +28,7 @@ from koopman_ros.testing import Harness
 from koopman_ros.testing.process import NodeProcess
 from koopman_ros.units import to_kelvin
 from koopman_ros.wire import Place
-from support.installation import Installation, ROOT, run
+from support.installation import Installation, ROOT, run, underlay
 from support.nodes import run_here
 
 OVEN = ROOT / 'examples' / 'oven'
@@ -49,7 +49,7 @@ def overlay(colcon: Installation, tmp_path_factory: pytest.TempPathFactory) -> I
     built = run(('bash', '-c', f'{colcon.before} && cd {folder} && exec {sys.executable} -m '
                  'colcon build --packages-select oven'))
     assert built.returncode == 0, built.stdout + built.stderr
-    return replace(colcon, before=f'unset PYTHONPATH && . {folder}/install/setup.bash',
+    return replace(colcon, before=f'{underlay()} && . {folder}/install/setup.bash',
                    notes=folder / 'src' / 'oven' / 'notes')
 
 

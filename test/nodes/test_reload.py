@@ -23,8 +23,11 @@ from sensor_msgs.msg import Temperature
 from std_msgs.msg import String
 from std_srvs.srv import Trigger
 
+from koopman_ros.control import State
+from koopman_ros.control.laws import receding_horizon
 from koopman_ros.demo import reactor
-from koopman_ros.lifting import LiftedModel, load, save
+from koopman_ros.lifting import LiftedModel, load, ModelFileError, save
+from koopman_ros.parameters.controller import table_of
 from koopman_ros.plants import Process
 from koopman_ros.replay.records import MODEL, PARAMETERS
 from koopman_ros.resources import model_path
@@ -208,6 +211,23 @@ def test_unsuitable_model_is_refused_with_the_reason(
         '53.85 degC')
     status = ros.wait_for_status(STATUS, lambda s: s.level == DiagnosticStatus.OK)
     assert value(status, 'model refused') == 'none'
+
+
+def test_a_model_is_tried_with_the_law_that_can_act(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Where a package of the best one is missing, no other model would help."""
+    monkeypatch.setattr(receding_horizon, 'PACKAGE', 'no_such_solver')
+    center = SHIPPED.states.center
+
+    def situation(*levels: str) -> model_reload.Situation:
+        parameters = table_of(SHIPPED, {}).snapshot({'levels': levels})
+        return model_reload.Situation(parameters, State(), center, None)
+
+    model_reload.refuse_without_law(SHIPPED, situation('mpc', 'sdre', 'linear'))
+    bad = replace(SHIPPED, A=1e300 * SHIPPED.A)
+    with pytest.raises(ModelFileError, match='train it again'):
+        model_reload.refuse_without_law(bad, situation('mpc', 'sdre', 'linear'))
+    with pytest.raises(ModelFileError, match=r'pip install no_such_solver\)$'):
+        model_reload.refuse_without_law(SHIPPED, situation('mpc'))
 
 
 def test_model_changes_with_the_weights_that_it_needs(running: Bench) -> None:

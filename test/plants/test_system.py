@@ -26,6 +26,7 @@ from support.closed_loops import steady_state
 NOMINAL = 324.475443431599
 REACTORS = [one_state_reactor, two_state_reactor]
 
+
 def two_tanks():
     return plant_class('two_tanks')().system()
 

@@ -77,4 +77,3 @@ def test_what_is_refused_before_it_begins(tasks):
         next(retrain_fleet({}))
     with pytest.raises(ValueError, match="sibling = 'first' is the first of a fleet"):
         retrain(tasks['first'])
-

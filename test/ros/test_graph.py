@@ -4,6 +4,7 @@
 """Nodes among others: the policy grants what each does, and no more; messages that do not pass."""
 
 from collections.abc import Callable, Iterator
+from fnmatch import fnmatch
 from pathlib import Path
 import re
 import time
@@ -172,7 +173,29 @@ def test_an_operator_asks_and_watches_all_and_commands_by_the_set_points_alone()
     assert operator['subscribes'] >= set().union(*(do['publishes'] for do in loop.values()))
     assert operator['calls'] == set().union(*(do['serves'] for do in loop.values()))
     assert operator['publishes'] == {
-        '/setpoint', '/manual_coolant_setpoint', '/rosout', '/parameter_events'}
+        '/setpoint', '/manual_coolant_setpoint', '/rosout', '/parameter_events',
+        '/events/write_split'}
+
+
+def test_an_operator_may_use_the_command_line_and_record_with_rosbag2() -> None:
+    """`ros2 service call` starts a node as rclpy makes them, `ros2 bag record` one of its own."""
+    serves = resolved(OPERATOR, 'operator')['serves']
+    rclpy.init()
+    try:
+        node = rclpy.create_node('_ros2cli_requester_std_srvs_Trigger')
+        own = {name for name, _ in node.get_service_names_and_types_by_node(
+            node.get_name(), node.get_namespace())}
+        published = {name for name, _ in node.get_publisher_names_and_types_by_node(
+            node.get_name(), node.get_namespace())}
+        node.destroy_node()
+    finally:
+        rclpy.try_shutdown()
+    assert len(own) == 7
+    assert {name for name in own if any(fnmatch(name, rule) for rule in serves)} == own
+    assert published <= resolved(OPERATOR, 'operator')['publishes']
+    # by rosbag2_transport/src/rosbag2_transport/recorder.cpp of Jazzy
+    assert {f'/rosbag2_recorder/{name}' for name in (
+        'snapshot', 'split_bagfile', 'pause', 'resume', 'is_paused', 'get_parameters')} <= serves
 
 
 def test_policy_has_the_form_that_sros2_reads() -> None:

@@ -4,7 +4,9 @@
 """The package as colcon installs it, and processes started from there."""
 
 from dataclasses import dataclass
+import os
 from pathlib import Path
+import shlex
 import shutil
 import subprocess
 import sys
@@ -44,6 +46,16 @@ def sources(folder: Path) -> Path:
 def run(command: tuple[str, ...], **options: object) -> subprocess.CompletedProcess[str]:
     return subprocess.run(command, capture_output=True, text=True, timeout=240, check=False,
                           **options)  # type: ignore[call-overload]
+
+
+def underlay() -> str:
+    """Return a command of a shell that keeps a sourced ROS 2, but no workspace of this package."""
+    kept = (f'{variable}=' + os.pathsep.join(
+        name for name in os.environ.get(variable, '').split(os.pathsep)
+        if name and not any((Path(name) / mark).exists() for mark in marks))
+        for variable, marks in (('PYTHONPATH', ('koopman_ros', 'koopman-ros.egg-link')),
+                                ('AMENT_PREFIX_PATH', ('share/koopman_ros',))))
+    return 'export ' + ' '.join(map(shlex.quote, kept))
 
 
 @pytest.fixture(scope='session')

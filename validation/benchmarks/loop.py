@@ -46,7 +46,7 @@ MEANING = {
     'latency_ratio_p99': 'the same for 99th percentiles',
     'pid_latency_ratio_median': 'the same of a PID controller, a plain node of rclpy',
     'pid_latency_ratio_p99': 'the same for 99th percentiles',
-    'compiled_latency_ratio_median': 'the same with a compiled control step (extra fast)',
+    'compiled_latency_ratio_median': 'the same with a compiled control step (numba)',
     'compiled_latency_ratio_p99': 'the same for 99th percentiles',
     'max_rate_hz': 'highest rate of measurements at which every one was answered and the median '
                    'answer in the last tenth of the run took less than 20 ms',

@@ -134,9 +134,9 @@ def _chromium() -> str | None:
 
 def _missing() -> str:
     """Say what this part needs and does not find, or nothing."""
-    for package, extra in (('nicegui', 'panel'), ('playwright', 'bench')):
+    for package in ('nicegui', 'playwright'):
         if find_spec(package) is None:
-            return f"{package} is missing: pip install 'koopman_ros[{extra}]'"
+            return f'{package} is missing: pip install {package}'
     return '' if _chromium() else 'Chromium is missing: sudo apt-get install chromium'
 
 

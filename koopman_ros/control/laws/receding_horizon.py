@@ -82,7 +82,7 @@ class RecedingHorizon:
     def unusable(self) -> Reason | None:
         """Why it never gives an input: its solver is not installed."""
         return None if self._solve is not None else reason(
-            Code.PACKAGE_MISSING, package=PACKAGE, extra='mpc')
+            Code.PACKAGE_MISSING, package=PACKAGE)
 
     @cached_property
     def _riccati(self) -> StateDependentRiccati:

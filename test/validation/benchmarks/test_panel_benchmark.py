@@ -71,8 +71,8 @@ def test_numbers_are_paired_with_their_messages():
 
 
 @pytest.mark.parametrize(('lacking', 'said'), [
-    ('nicegui', "nicegui is missing: pip install 'koopman_ros[panel]'"),
-    ('playwright', "playwright is missing: pip install 'koopman_ros[bench]'"),
+    ('nicegui', 'nicegui is missing: pip install nicegui'),
+    ('playwright', 'playwright is missing: pip install playwright'),
     ('chromium', 'Chromium is missing: sudo apt-get install chromium')])
 def test_what_is_missing_is_said(tmp_path, monkeypatch, capsys, lacking, said):
     monkeypatch.setattr(panel, 'find_spec', lambda name: None if name == lacking else name)
