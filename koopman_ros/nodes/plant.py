@@ -109,9 +109,20 @@ class PlantNode(ManagedNode):
                                f'{parameters.sample_period:g} s{start}, {pace}{lockstep}')
 
     def activate(self) -> None:
-        """Let time go on."""
-        if self._sample:
+        """Let time go on from where it stood."""
+        if not self._sample:
+            return
+        if self._settings.lockstep:
+            self._answered = True
+            self._continue_lockstep()
+        elif self._real_time:
+            # its stamps are the system's time, which goes on
             self._resynchronise()
+        elif self._settings.speed:
+            # the next tick, in a period from now, is that of the next sample
+            self._tick.reset()
+            passed = (self._sample - 1) * self._period_ns / NANOSECONDS
+            self._wall_start = time.monotonic() - passed / self._settings.speed
 
     def _latched(self, topic: str, kind: Any) -> Any:
         return self._matching.publish(topic, kind, topics.LATCHED_QOS)

@@ -272,8 +272,8 @@ class ExperimentRun:
         offers = self._node.get_publishers_info_by_topic(self._node.resolve_topic_name(topic))
         reliable = all(info.qos_profile.reliability is not ReliabilityPolicy.BEST_EFFORT
                        for info in offers)
-        latched = latched or bool(offers) and all(
-            info.qos_profile.durability is DurabilityPolicy.TRANSIENT_LOCAL for info in offers)
+        latched = latched or (bool(offers) and all(
+            info.qos_profile.durability is DurabilityPolicy.TRANSIENT_LOCAL for info in offers))
         return self._owned.keep(self._node.create_subscription(
             kind, topic, callback, topics.profile(
                 topics.LOOP_QOS.depth, reliable=reliable, latched=latched)))
@@ -310,7 +310,7 @@ class ExperimentRun:
         if self._inputs is None or time.monotonic() - self._first_at > _PATIENCE:
             return False
         # a controller answers the first measurement, too
-        return self._answers is not None and not self._commanded or (
+        return (self._answers is not None and not self._commanded) or (
             len(self._applied) < len(self._units) and self._inputs.published())
 
     def _present(self, stamp_ns: int) -> Array:
