@@ -17,6 +17,7 @@ from koopman_ros.bags import read_messages
 from koopman_ros.demo import reactor
 from koopman_ros.experiment import advance, begin, Phase
 from koopman_ros.lifting import load
+from koopman_ros.parameters.plant import PlantTable
 from koopman_ros.parameters.trainer import trainer_table
 from koopman_ros.parameters.wire import Signals
 from koopman_ros.resources import model_path
@@ -32,6 +33,7 @@ TRAINER, JACKET = 'unit_1/trainer', '/unit_1/jacket'
 TABLE = trainer_table(load(model_path(reactor.MODEL)))
 SIGNALS = Signals({'temperature': 'K'}, {'coolant_temperature': 'K'}, ('temperature',))
 SAFE = TABLE.snapshot({}).inputs['coolant_temperature'].safe
+PRESENT = PlantTable().system(PlantTable().snapshot({})).nominal_input[0]  # K
 IDLE = {'record_at_start': False}
 LOST = 'the trainer does not command any more'
 
@@ -105,7 +107,8 @@ def test_steps_drive_the_plant_as_planned(ros: Harness) -> None:
     assert all(late - early == 1.0 for early, late in pairwise(heard))
     assert np.ptp([message.temperature for message in commands]) > 12.0
     assert commands[-1].temperature == pytest.approx(SAFE, abs=1e-12)
-    progress = begin(plan, stamp_nanoseconds(measured[0].header.stamp))
+    # from the present input of the plant, which nobody has commanded
+    progress = begin(plan, stamp_nanoseconds(measured[0].header.stamp), np.array([PRESENT]))
     for message in measured:
         progress = advance(plan, progress, np.array([to_kelvin(message.temperature)]),
                            stamp_nanoseconds(message.header.stamp))
