@@ -3,7 +3,7 @@
 
 """What a name in a parameter stands for: something of the package, or ``module:name`` of any."""
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 import importlib
 from typing import Any
 
@@ -29,13 +29,41 @@ def plug(name: str, kind: str, known: Mapping[str, Callable[..., Any] | str]) ->
     try:
         found = getattr(importlib.import_module(module), attribute)
     except BaseException as error:
-        cause = contained(error)
-        raise ValueError(f'the {kind} {name!r} cannot be loaded ({cause}): check module and '
-                         'name, and that Python finds the module') from error
+        raise ValueError(f'the {kind} {name!r} cannot be loaded ({contained(error)}): check '
+                         'module and name, and that Python finds the module') from error
     if not callable(found):
         raise ValueError(f'the {kind} {name!r} is a {type(found).__name__}, which cannot be '
                          'called: name a class or a function')
     return found
+
+
+def plugged(name: str, kind: str, known: Mapping[str, Callable[..., Any] | str],
+            arguments: Sequence[Any], members: Sequence[str]) -> Any:
+    """
+    Return what :func:`plug` finds, called with arguments.
+
+    :param members: attributes that the result must have.
+    :raises ValueError: where it cannot be called with the arguments, or lacks a member.
+    """
+    factory = plug(name, kind, known)
+    try:
+        made = factory(*arguments)
+        missing = [member for member in members if not hasattr(made, member)]
+    except ValueError:
+        raise
+    except BaseException as error:
+        raise ValueError(f'the {kind} {name!r} cannot be constructed ({contained(error)}): '
+                         'correct its class') from error
+    if missing:
+        raise ValueError(f'the {kind} {name!r} returned a {type(made).__name__} without '
+                         f'{" and ".join(missing)}: correct its class')
+    return made
+
+
+def own_code(value: Any) -> list[str]:
+    """Return the names of the form ``module:name`` in the value of a parameter."""
+    names = [value] if isinstance(value, str) else list(value)
+    return [name for name in names if isinstance(name, str) and ':' in name]
 
 
 def contained(error: BaseException) -> str:

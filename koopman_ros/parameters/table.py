@@ -17,6 +17,7 @@ from typing import Any, Generic, TypeVar
 import numpy as np
 
 from koopman_ros.arrays import Array
+from koopman_ros.plugs import contained
 from koopman_ros.units import conversion, display_unit, ZERO_CELSIUS
 
 T = TypeVar('T')
@@ -52,7 +53,9 @@ class Specification:
     open_minimum: bool = False  #: whether the minimum itself is excluded
     smallest: float = 0.0  #: above a minimum of 0 that stands for something of its own
     choices: tuple[str, ...] = ()  #: allowed strings, empty for any
-    read_only: bool = False  #: whether it can be changed while the node runs
+    read_only: bool = False  #: whether it is fixed at start
+    #: whether a value may name code as module:name, which is fixed at start
+    code: bool = False
 
     @property
     def range_text(self) -> str:
@@ -238,6 +241,8 @@ class ParameterTable(Generic[T]):
             self.build(snapshot)
         except (ValueError, ArithmeticError) as error:
             return ' '.join(str(error).split()) or type(error).__name__
+        except Exception as error:  # of a class of one's own, somewhere in what is built
+            return contained(error)
         return ''
 
     def yaml(self) -> str:
@@ -246,6 +251,7 @@ class ParameterTable(Generic[T]):
         for name, row in self.rows.items():
             notes = [row.range_text] if row.range_text else []
             notes += ['fixed at start'] if row.read_only else []
+            notes += ['a module:name is fixed at start'] if row.code else []
             lines += ['', f'    # {row.description}' + (f' [{row.unit}]' if row.unit else '')]
             lines += [f'    #   {"; ".join(notes)}'] if notes else []
             lines.append(f'    {name}: {as_yaml(row.default)}')

@@ -16,6 +16,7 @@ from rclpy.lifecycle import LifecycleState, TransitionCallbackReturn
 from rclpy.lifecycle.node import LifecycleNodeMixin
 from rosgraph_msgs.msg import Clock
 
+from koopman_ros.plugs import contained
 from koopman_ros.ros.node import LoopNode, wall_timer
 
 # A parameter or a model that does not fit is a ValueError; rclpy raises RCLError for an unreadable
@@ -133,7 +134,11 @@ class ManagedNode(LifecycleNodeMixin, LoopNode):
     def _attempt(self, work: Callable[[], None]) -> TransitionCallbackReturn:
         try:
             work()
-        except Exception as error:
+        except KeyboardInterrupt:
+            raise
+        except BaseException as caught:
+            # code of one's own may raise SystemExit, which would end all nodes of the process
+            error = caught if isinstance(caught, Exception) else RuntimeError(contained(caught))
             # rclpy would not tell of it
             self._failure = error
             expected = isinstance(error, START_ERRORS)
@@ -147,6 +152,7 @@ class ManagedNode(LifecycleNodeMixin, LoopNode):
 
     def _clean_up(self) -> None:
         self.complete()
+        self._refuse_requests()
         self.forget_tables()
         self.diagnostics.clear()
         destroyers: tuple[Callable[[Any], Any], ...] = (
@@ -157,6 +163,22 @@ class ManagedNode(LifecycleNodeMixin, LoopNode):
                 if not any(entity is other for other in kept):
                     destroy(entity)
 
+    def _refuse_requests(self) -> None:
+        """Answer the requests that wait at the services that are taken down."""
+        for service in self.services:
+            if any(service is kept for kept in self._kept[1]):
+                continue
+            with service.handle:
+                kind: Any = service.srv_type
+                while (taken := service.handle.service_take_request(
+                        kind.Request))[1] is not None:
+                    response = kind.Response()
+                    if hasattr(response, 'message'):
+                        response.message = (
+                            f'{self.get_name()} is not configured: configure and activate it '
+                            'first')
+                    service.send_response(response, taken[1])
+
     def _entities(self) -> tuple[list[Any], ...]:
         # rclpy subscribes to the time whenever `use_sim_time` is set
         heard = [one for one in self.subscriptions if one.msg_type is not Clock]
@@ -164,7 +186,7 @@ class ManagedNode(LifecycleNodeMixin, LoopNode):
                 list(self.publishers))
 
 
-def one_line(error: Exception) -> str:
+def one_line(error: BaseException) -> str:
     """Return the words of an error, which rcl repeats over several lines."""
     text = str(error).split(', at ./')[0].split(', at /')[0]
     text = ' '.join(text.split()) or type(error).__name__

@@ -10,6 +10,7 @@ import signal
 import sys
 
 import rclpy
+from rclpy.context import Context
 from rclpy.executors import Executor, SingleThreadedExecutor
 from rclpy.logging import LoggingSeverity, set_logger_level
 from rclpy.signals import SignalHandlerOptions
@@ -79,7 +80,7 @@ def run(name: str, create: Callable[..., LoopNode], args: list[str] | None = Non
     return node.exit_code or 0
 
 
-def told_executor() -> Executor:
+def told_executor(context: Context | None = None) -> Executor:
     """
     Return an executor that is told what comes, for nodes whose timers a schedule turns.
 
@@ -89,13 +90,13 @@ def told_executor() -> Executor:
     try:
         from rclpy.experimental import EventsExecutor
     except ImportError:
-        return SingleThreadedExecutor()
-    return EventsExecutor()
+        return SingleThreadedExecutor(context=context)
+    return EventsExecutor(context=context)
 
 
 def _hosted(create: Callable[..., LoopNode]) -> tuple[Callable[[], None], LoopNode]:
     """Return the node of a loop, and what does one thing that is due, or waits for the next."""
-    schedule, failures = Schedule(), list[Exception]()
+    schedule, failures = Schedule(), list[BaseException]()
     node = create(hosting=Hosting(schedule, 1, failures.append))
     executor = told_executor()
     executor.add_node(node)
@@ -103,7 +104,8 @@ def _hosted(create: Callable[..., LoopNode]) -> tuple[Callable[[], None], LoopNo
     def spin() -> None:
         executor.spin_once(timeout_sec=min(LONGEST_WAIT, schedule.turn()))
         if failures:
-            raise failures[0]
+            raise failures[0] if isinstance(failures[0], Exception) else RuntimeError(
+                f'a callback raised {failures[0]!r}') from failures[0]
 
     return spin, node
 
