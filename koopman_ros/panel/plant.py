@@ -249,7 +249,8 @@ class PlantView:
     def __init__(self, signals: Signals, read: Mapping[str, str], span: float, now: float,
                  nodes: Mapping[str, str] = _ROLES) -> None:
         self._nodes = dict(nodes)
-        self._errors: dict[str, deque[float]] = {}  # when each task last turned to ERROR
+        # when each task last turned to ERROR, and its message
+        self._errors: dict[str, deque[tuple[float, str]]] = {}
         self.signals, self.read = signals, read
         self.alarms = Alarms()
         self.trends = Trends(span)
@@ -449,7 +450,8 @@ class PlantView:
         before = self._statuses.get(name)
         self._statuses[name] = TaskStatus(name, level, message, dict(values), now)
         if level >= ERROR and (before is None or before.level < ERROR):
-            self._errors.setdefault(name, deque(maxlen=_REPEATED)).append(now)
+            self._errors.setdefault(name, deque(maxlen=_REPEATED)).append(
+                (now, message))
         # the operator who made a request has its answer
         priority = Priority.HIGH if level >= ERROR else (
             Priority.MEDIUM if role == CONTROLLER and name != REQUESTS else Priority.LOW)
@@ -483,11 +485,11 @@ class PlantView:
     def advance(self, now: float) -> None:
         """Let time pass: who is silent for too long becomes an alarm."""
         silent = {silence.source for silence in self._silences(now)}
-        for name, times in self._errors.items():
-            often = len(times) == _REPEATED and now - times[0] <= _WITHIN
+        for name, errors in self._errors.items():
+            often = len(errors) == _REPEATED and now - errors[0][0] <= _WITHIN
             self.alarms.report(
                 f'{name}, repeated errors', often, Priority.HIGH, f'{name}: at least {_REPEATED} '
-                f'errors within {_WITHIN:g} s, the last: {self._statuses[name].message}', now)
+                f'errors within {_WITHIN:g} s, the last: {errors[-1][1]}', now)
         for source in self._watched:
             what = 'no measurement' if source == PLANT else f'nothing from the {source}'
             self.alarms.report(f'silence of {source}', source in silent,

@@ -304,10 +304,10 @@ import os, sys
 from koopman_ros.nodes import controller
 from koopman_ros.ros import model_reload
 read = model_reload.load_suitable
-def slowly(name, *others):
+def slowly(name, *others, **options):
     if os.path.exists(name + '.disk'):
         open(name + '.disk', 'rb').read()
-    return read(name, *others)
+    return read(name, *others, **options)
 model_reload.load_suitable = slowly
 """
 

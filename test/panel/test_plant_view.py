@@ -374,7 +374,8 @@ def test_many_short_errors_are_an_alarm() -> None:
             own.status(CONTROL, OK if k % 2 else ERROR, 'held', {}, now)
             own.advance(now)
         own.advance(now + 1.5)
-        return any('repeated' in alarm.key for alarm in own.snapshot(now).standing)
+        return any('repeated' in alarm.key and alarm.text.endswith('the last: held')
+                   for alarm in own.snapshot(now).standing)
 
     assert alarmed(0.5, 20)
     assert not alarmed(0.5, 3)
