@@ -170,6 +170,10 @@ BAD_MODELS = {
         'the model fails (no feedback gain: the Hamiltonian has no stable subspace of full size'),
     'gain beyond its bound': (
         replace(SHIPPED, A=1e6 * np.abs(SHIPPED.A)), 'the model fails'),
+    'refused by its training': (
+        replace(SHIPPED, provenance=replace(SHIPPED.provenance, refused=('too large an error',))),
+        'was refused by its training (too large an error): train it again, or set '
+        'load_refused_model'),
     'numbers that overflow': (replace(SHIPPED, A=1e300 * SHIPPED.A), 'the model fails'),
 }
 
@@ -228,6 +232,22 @@ def test_a_model_is_tried_with_the_law_that_can_act(monkeypatch: pytest.MonkeyPa
         model_reload.refuse_without_law(bad, situation('mpc', 'sdre', 'linear'))
     with pytest.raises(ModelFileError, match=r'pip install no_such_solver\)$'):
         model_reload.refuse_without_law(SHIPPED, situation('mpc'))
+
+
+def test_a_refused_model_is_loaded_where_the_operator_forces_it(
+        running: Bench, tmp_path: Path) -> None:
+    refused = str(tmp_path / 'refused.safetensors')
+    save(BAD_MODELS['refused by its training'][0], Path(refused))
+    result = running.ros.set_parameters_atomically(
+        'controller', load_refused_model=True, model=refused)
+    assert result.successful, result.reason
+    done, about = running.reload()
+    assert done
+    assert 'too large an error' in about
+    running.ros.set_parameters_atomically('controller', load_refused_model=False)
+    assert 'load_refused_model' in running.reload()[1]
+    assert running.ros.get_parameters('controller', 'model') == [refused]
+    assert running.set('reactor_nz3')[0]
 
 
 def test_model_changes_with_the_weights_that_it_needs(running: Bench) -> None:

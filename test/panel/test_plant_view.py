@@ -15,11 +15,13 @@ from koopman_ros.panel.alarms import AlarmState, Priority
 from koopman_ros.panel.plant import (
     CONTROLLER,
     ERROR,
+    LOST,
     OK,
     ParameterView,
     pen,
     PLANT,
     PlantView,
+    REQUESTS,
     Snapshot,
     TRAINER,
     WARN,
@@ -307,56 +309,77 @@ def test_silence_and_levels_are_alarms_by_priority_and_marks() -> None:
     assert own.snapshot(NOW + 20.0).mode == ''
 
 
-def test_only_nodes_of_the_own_loop_count() -> None:
-    own = PlantView(REACTOR, {'temperature': 'degC', 'coolant_temperature': 'degC'}, 3600.0, NOW,
-                    {f'unit_1/{role}': role for role in (PLANT, CONTROLLER, TRAINER)})
-    own.status('unit_1/controller: control', WARN, 'x', {'reason': 'none'}, NOW + 9.0)
-    assert [one.source for one in own.snapshot(NOW + 10.0).silences] == [PLANT]
-    assert own.snapshot(NOW + 10.0).status(CONTROL).message == 'x'
-    for second in range(10, 20):
-        own.status('unit_2/controller: control', ERROR, 'y', {}, NOW + second)
-        own.status('controller: control', ERROR, 'z', {}, NOW + second)
+def test_only_the_nodes_of_the_own_loop_are_taken_for_it() -> None:
+    own = PlantView(REACTOR, {name: display_unit(unit) for name, unit in REACTOR.units.items()},
+                    3600.0, NOW, {'line_1/plant': PLANT, 'line_1/controller': CONTROLLER,
+                                  'line_1/trainer': TRAINER})
+    measure(own, 50.0, 1.0, NOW)
+    answered(own)
+    own.hear('commands', {'coolant_temperature': to_kelvin(20.0)}, 1.0, NOW)
+    own.status('line_1/controller: control', OK, 'automatic', {'reason': 'none'}, NOW)
+    own.status('line_1/trainer: training', OK, 'idle', {'model_file': 'a'}, NOW)
+    for second in range(1, 10):
+        for node in ('controller: control', 'trainer: training', 'plant: simulation'):
+            own.status(f'line_2/{node}', ERROR, 'of the other line', {}, NOW + second, 'other')
         own.advance(NOW + second)
-    now = own.snapshot(NOW + 20.0)
-    assert {one.source for one in now.silences} == {PLANT, CONTROLLER}
-    assert now.mode == ''
-    assert now.status(CONTROL).message == 'x'
-    assert {alarm.key for alarm in now.standing} == {
-        'silence of plant', 'silence of controller', CONTROL}
+    now = own.snapshot(NOW + 10.0)
+    assert {one.source for one in now.silences} == {CONTROLLER, PLANT, TRAINER}
+    assert (now.mode, now.level, now.plant) == ('', '', '')
+    assert all('other line' not in alarm.text for alarm in now.standing)
+    for name, values in ((CONTROL, {'reason': 'none'}),
+                         ('trainer: training', {'model_file': 'a'})):
+        status = now.status(name)
+        assert (status.level, status.message, status.values) == (ERROR, LOST, values)
+    assert 'last command' in now.inputs[0].abnormal
+    # one that is back is shown again
+    own.status('line_1/controller: control', OK, 'automatic', {}, NOW + 10.0)
+    now = own.snapshot(NOW + 10.0)
+    assert (now.mode, now.status(CONTROL).message) == ('automatic', 'automatic')
+    assert now.inputs[0].abnormal == ''
 
 
-def test_other_nodes_do_not_crowd_out_the_own_ones() -> None:
+def test_statuses_of_other_nodes_crowd_out_none_of_the_own_loop() -> None:
     own = view()
-    for driver in range(1000):
-        own.status(f'driver_{driver}: io', OK, 'ok', {}, NOW)
-    for second in range(3):
-        own.status(CONTROL, ERROR, 'no measurement', {}, NOW + second)
-        own.advance(NOW + second)
-    assert [alarm.key for alarm in own.snapshot(NOW + 3.0).standing] == [CONTROL]
-    assert len(own.snapshot(NOW + 3.0).statuses) == 65
+    for i in range(200):
+        own.status(f'driver_{i}: io', OK, 'ok', {}, NOW)
+    own.status(CONTROL, ERROR, 'held', {}, NOW)
+    own.status('controller: actuators', WARN, 'stuck', {}, NOW)
+    own.advance(NOW + 2.0)
+    now = own.snapshot(NOW + 2.0)
+    assert {alarm.key for alarm in now.standing} == {CONTROL, 'controller: actuators'}
+    assert len(now.statuses) < 100
 
 
-def test_errors_that_are_brief_and_many_are_an_alarm() -> None:
-    own, key = view(), f'{CONTROL}, repeated errors'
-    for half in range(20):
-        own.status(CONTROL, OK if half % 2 else ERROR, 'not finite', {}, NOW + 0.5 * half)
-        own.advance(NOW + 0.5 * half)
-        measure(own, 50.0, 0.5 * half)
-    assert {alarm.key: alarm.priority for alarm in own.snapshot(NOW + 10.0).standing} == {
-        key: Priority.HIGH}
-    own.advance(NOW + 80.0)
-    own.advance(NOW + 90.0)
-    states = {alarm.key: alarm.state for alarm in own.snapshot(NOW + 90.0).standing}
-    assert states[key] is AlarmState.RETURNED
-
-
-def test_a_warning_that_the_control_task_repeats_has_one_alarm() -> None:
+def test_a_warning_has_one_alarm_whatever_else_is_wrong() -> None:
     own = view()
-    for second in range(3):
-        own.status(CONTROL, WARN, 'stuck', {'condition': 'actuators'}, NOW + second)
-        own.status('controller: actuators', WARN, 'stuck', {}, NOW + second)
-        own.advance(NOW + second)
-    assert [alarm.key for alarm in own.snapshot(NOW + 3.0).standing] == ['controller: actuators']
+    own.status(CONTROL, WARN, 'request refused: a; stuck', {'condition': 'requests'}, NOW)
+    own.status(REQUESTS, WARN, 'request refused: a', {}, NOW)
+    own.status('controller: actuators', WARN, 'stuck', {}, NOW)
+    own.advance(NOW + 2.0)
+    assert [(alarm.key, alarm.priority) for alarm in own.snapshot(NOW + 2.0).standing] == [
+        ('controller: actuators', Priority.MEDIUM), (REQUESTS, Priority.LOW)]
+    own.status(REQUESTS, OK, 'in order', {}, NOW + 3.0)
+    own.advance(NOW + 9.0)
+    assert [alarm.key for alarm in own.snapshot(NOW + 9.0).standing
+            if alarm.state is not AlarmState.RETURNED and 'silence' not in alarm.key] == [
+        'controller: actuators']
+
+
+def test_many_short_errors_are_an_alarm() -> None:
+    def alarmed(seconds: float, errors: int) -> bool:
+        own = view()
+        for k in range(2 * errors):
+            now = NOW + seconds * k / 2
+            measure(own, 50.0, seconds * k / 2 + 1.0, now)
+            own.status(CONTROL, OK if k % 2 else ERROR, 'held', {}, now)
+            own.advance(now)
+        own.advance(now + 1.5)
+        return any('repeated' in alarm.key and alarm.text.endswith('the last: held')
+                   for alarm in own.snapshot(now).standing)
+
+    assert alarmed(0.5, 20)
+    assert not alarmed(0.5, 3)
+    assert not alarmed(30.0, 20)
 
 
 def test_a_manual_command_is_limited_as_the_controller_does() -> None:
