@@ -42,6 +42,8 @@ _BY_CLOCK = {'use_sim_time': True}
 _WATCHED = 8.0  # s of plant time at that speed between two looks of the controller
 _NEVER_IN_TIME = {'levels': ('mpc', 'sdre', 'linear'), 'law_deadline': 1e-6}
 _SHORT_HOLD = {**_NEVER_IN_TIME, 'hold_timeout': 5.0}
+# Largest distance from the set-point after a few seconds of the safe inputs.
+_NEAR = {REACTOR.name: 6.0, TWO_TANKS.name: 0.08}
 _HUGE = 1e155
 _SLOW = {'speed': 1.0, 'start_time': 10_000.0}
 _STRAY = 1000.0  # s behind the stamps of the plant
@@ -170,10 +172,11 @@ def _transit(loop: FaultHarness, *transitions: int) -> None:
 
 
 def _activated_again(loop: FaultHarness) -> None:
-    """Deactivate and activate a controller in manual mode, far from the safe inputs."""
+    """Deactivate and activate a controller that commands the lowest inputs by hand."""
     loop.ros.set_bool('controller/set_automatic', False)
-    loop.by_hand(*loop.on.by_hand)
-    loop.run_for(60.0)
+    lowest = tuple(tuned.min for tuned in loop.on.parameters.inputs.values())
+    loop.by_hand(*lowest)
+    loop.wait(lambda: loop.trace.commands[-1].values == lowest, 'the inputs are not commanded')
     with loop.fault():
         _transit(loop, Transition.TRANSITION_DEACTIVATE)
         loop.run_for(5.0)
@@ -189,7 +192,7 @@ def _experiment(loop: FaultHarness) -> None:
     loop.kill('controller', signal.SIGINT)
     with loop.fault():
         loop.start('trainer', {
-            'system': loop.on.system, 'record_at_start': False, 'min_free_disk': 0.0, 
+            'system': loop.on.system, 'record_at_start': False, 'min_free_disk': 0.0,
             'experiment_shortest_hold': 5.0, 'experiment_longest_hold': 6.0,
             **{f'{name}.experiment_rate_limit': loop.on.rate for name in loop.on.inputs}})
         answer = loop.ros.set_bool('trainer/experiment', True)
@@ -341,8 +344,9 @@ def _of_plant(on: Plant) -> Iterable[Case]:
     yield case('sensor', 'input-huge', 'measured inputs of 1e155 and -1e155', _huge_input,
                plant={**LOCKSTEP, **_unheard(on)})
     yield case('laws', 'plans-late', 'no plan of mpc meets its deadline, and a sensor shows NaN '
-               'until the safe inputs are commanded, 12 s', partial(altered, make=lambda: value(lambda *_: math.nan),
-                                    seconds=12.0), between=True, controller=_SHORT_HOLD)
+               'until the safe inputs are commanded, 12 s', partial(
+                   altered, make=lambda: value(lambda *_: math.nan), seconds=12.0), between=True,
+               controller=_SHORT_HOLD, worst=_NEAR[on.name])
     yield case('sensor', 'unmeasured', 'no measurement and no watch over it, while an operator '
                'asks for a set-point, and then for inputs by hand', _unmeasured,
                **{**fast, 'controller': {**_BY_CLOCK, 'measurement_timeout': 0.0}})
