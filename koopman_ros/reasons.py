@@ -49,6 +49,11 @@ class Code(Enum):
         'the measured {signal} has been exactly {value:value} for longer than {timeout:g} s '
         'while the model moved by more than {change:change}: the sensor is frozen; check it')
     NO_MEASUREMENT = 'no_measurement', 'no measurement arrives: check sensor and plant'
+    STAMPS_STAND = 'stamps_do_not_advance', (
+        'measurements arrive, but their stamps do not advance: check the clock of the sensor')
+    TWO_SOURCES = 'two_sources', (
+        'two sources publish the measurement in turn, or its stamps go back again and again: end '
+        'one of the publishers, and check the clock of the sensor')
     OUTSIDE_TRAINING = 'outside_training', (
         'outside the trained range ({ranges:ranges}) by more than the {margin:g} half widths '
         'that the {level:level} is allowed')
@@ -84,6 +89,9 @@ class Code(Enum):
     COMMAND_NOT_FINITE = 'command_not_finite', 'its command is not finite'
     SETPOINT_NOT_FINITE = 'setpoint_not_finite', (
         '{signal} set-point {value:value} is not finite: the old one is kept')
+    SETPOINT_UNMEASURED = 'setpoint_unmeasured', (
+        '{signal} set-point {value:value} cannot be tracked, since {cause}: the old one is kept; '
+        'send it again then, or command the input in manual mode')
     SETPOINT_OUTSIDE = 'setpoint_outside', (
         '{signal} set-point {value:value} is outside the trained range {lower:value} to '
         '{upper:value}: the old one is kept; choose one inside, or load a model trained over a '
@@ -126,6 +134,10 @@ class Code(Enum):
     NOTHING_TRACKED = 'nothing_tracked', (
         'for {timeout:g} s it is not known which set-points are tracked: switch the controller to '
         'automatic mode, and check sensor and plant')
+
+
+#: Why the command is held where nothing is measured.
+UNMEASURED = (Code.NO_MEASUREMENT, Code.STAMPS_STAND, Code.TWO_SOURCES)
 
 
 @dataclass(frozen=True)

@@ -103,3 +103,27 @@ def test_what_waits_is_bounded():
     assert counts(assembler) == ({}, {'flow': 900}, {})
     # the oldest were given up
     assert taken(assembler, (900, 'flow', 2.0)) == [(900, [1.0, 2.0])]
+
+
+@pytest.mark.parametrize('samples', [9, 50, 100, 101, 150])
+@pytest.mark.parametrize('ahead', [3600 * SECOND, -3600 * SECOND])
+def test_a_clock_that_was_wrong_for_a_while_costs_those_samples_alone(samples, ahead):
+    assembler = Assembler(NAMES)
+    assert len(taken(assembler, *((k * SECOND, name, 1.0) for k in range(10)
+                                  for name in NAMES))) == 10
+    for k in range(10, 10 + samples):
+        assert not taken(assembler, (k * SECOND + ahead, 'level', 1.0), (k * SECOND, 'flow', 1.0))
+    good = range(10 + samples, 200 + samples)
+    assert [stamp for stamp, _ in taken(assembler, *(
+        (k * SECOND, name, 1.0) for k in good for name in NAMES))] == [k * SECOND for k in good]
+
+
+def test_a_part_with_a_stamp_ahead_is_not_put_together_with_parts_of_that_time():
+    assembler = Assembler(NAMES)
+    assert not taken(assembler, (60 * SECOND, 'level', 9.0))
+    for k in range(59):
+        assert taken(assembler, (k * SECOND, 'level', 1.0), (k * SECOND, 'flow', 2.0))
+    # of that time, the other signal comes first
+    assert not taken(assembler, (60 * SECOND, 'flow', 2.0))
+    assert taken(assembler, (60 * SECOND, 'level', 1.0)) == [(60 * SECOND, [1.0, 2.0])]
+    assert counts(assembler) == ({}, {'flow': 1}, {})

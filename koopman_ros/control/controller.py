@@ -46,11 +46,14 @@ from koopman_ros.control.supervisor import (
 )
 from koopman_ros.estimation import equivalent_bias, Estimate, Verdict
 from koopman_ros.lifting import Coordinates, LiftedModel
-from koopman_ros.reasons import Code, Reason, reason
+from koopman_ros.reasons import Code, Reason, reason, UNMEASURED
 from koopman_ros.signals import numbers, Outputs
 from koopman_ros.units import LATE_NANOSECONDS, NANOSECONDS
 from koopman_ros.values import amended
 
+# s that the rate limit counts at most between two commands without a measurement, unless
+# measurements are usually further apart.
+_LONGEST_WATCH = 1.0
 # What changes of the state when no law acts any more, and when none is on its way back.
 _LAW_ENDS: Mapping[str, object] = {'law': None, 'law_input': None, 'law_memory': None}
 _WITHOUT_LAW: Mapping[str, object] = {**_LAW_ENDS, 'transfer': None}
@@ -148,6 +151,10 @@ class Controller:
         refusal = setpoints.refusal(every.only(asked), value)
         if refusal is not None:
             return state, refusal
+        lost = _unmeasured(state.supervisor.reason)
+        if lost is not None and not setpoints.lies_ahead(effective_ns, state.time_ns):
+            return state, reason(Code.SETPOINT_UNMEASURED, signal=asked[0],
+                                 value=float(value[0]), cause=lost)
         whole = np.full(len(every), np.nan)
         whole[[every.names.index(name) for name in asked]] = value
         if (len(state.setpoint.scheduled) >= setpoints.MAX_SCHEDULED
@@ -282,18 +289,21 @@ class Controller:
 
     # Steps.
 
-    def step(self, state: State, y: Array, time_ns: int, applied: Array | None = None
-             ) -> tuple[State, Array, Report]:
+    def step(self, state: State, y: Array, time_ns: int, applied: Array | None = None,
+             countable: float | None = None) -> tuple[State, Array, Report]:
         """
         Answer one measurement.
 
         A repeated stamp and one out of order, earlier by at most a second, return the last
         command again; a still earlier stamp starts time afresh. After a gap in the measurements
-        ramp and rate limit count twice the interval before it, not the gap.
+        ramp and rate limit count twice the interval before it, not the gap. Stamps that return to
+        where they were before they went back count from the newest of those.
 
         :param y: (n_y,) measured, in the signals' units.
         :param applied: (n_u,) the input that was found to act then, where it is measured; see
             :meth:`Estimating.applied`.
+        :param countable: largest number of seconds since the last stamp that ramp and rate limit
+            count, from another clock; None for any.
         :return: the new state, the command (n_u,) in input units, always finite and within the
             limits, and the report.
         :raises ValueError: for a measurement or an input of another size.
@@ -318,6 +328,8 @@ class Controller:
         # neither a gap nor a burst is the spacing of the samples, nor the first of them
         spacing = min(_spacing(state), elapsed)
         state, seconds, missed = _passed(state, time_ns, elapsed)
+        if countable is not None:
+            seconds = min(seconds, countable)
         # a measurement of 1e300 may overflow on its way; the result is checked and limited
         with np.errstate(all='ignore'):
             u, follows = self._estimating.applied(state, applied)
@@ -343,23 +355,37 @@ class Controller:
             return self._command(
                 state, seen.verdict, measured, time_ns, time_ns, elapsed, seconds, spacing)
 
-    def hold(self, state: State, time_ns: int) -> tuple[State, Array | None, Report]:
+    def hold(self, state: State, time_ns: int, cause: Code | None = Code.NO_MEASUREMENT
+             ) -> tuple[State, Array | None, Report]:
         """
-        Hold the command as nothing has been measured, and later go to the safe input.
+        Command without a measurement: hold, and later go to the safe input.
 
-        :param time_ns: up to which nothing came, in the time of the measurements' stamps.
+        :param time_ns: up to which nothing came, in the time of the measurements' stamps; before
+            the first of them, in that of any clock.
+        :param cause: why the command is held; None to command from the estimate, which the model
+            carries on.
         :return: as :meth:`step`; the command is None before the first.
         """
-        since_ns = state.commanded_ns
-        if state.command is None or state.time_ns is None or since_ns is None:
+        if state.command is None:
             return state, None, self._report(state, None)
+        since_ns = time_ns if state.commanded_ns is None else state.commanded_ns
         elapsed = max(0.0, (time_ns - since_ns) / NANOSECONDS)
+        # a command that nobody saw was not on its way
+        seconds = min(elapsed, max(_LONGEST_WATCH, 2.0 * _spacing(state)))
         with np.errstate(all='ignore'):
             state = amended(state, estimate=self._estimating.coast(
                 state, elapsed, self._estimating.applied(state)[0]))
-            return self._command(
-                state, Verdict(state.accepted, reason(Code.NO_MEASUREMENT)), NOTHING_MEASURED,
-                time_ns, max(time_ns, since_ns), elapsed, elapsed)
+            fault, measured = None if cause is None else reason(cause), NOTHING_MEASURED
+            if fault is None and state.mode is Mode.AUTOMATIC:
+                if state.estimate is None or state.setpoint.active is None:
+                    return state, state.command, self._report(state, state.supervisor.reason)
+                x = self.model.states.to_physical(state.estimate.x)
+                measured = MeasurementReport(outside=self.model.distance(x))
+                state = amended(state, setpoint=setpoints.advance(
+                    state.setpoint, self._best.controlled_of(x), self.controlled,
+                    self.settings.setpoint_ramp, time_ns, seconds, self.settings.setpoint_filter))
+            return self._command(state, Verdict(state.accepted, fault), measured, time_ns,
+                                 max(time_ns, since_ns), elapsed, seconds, _spacing(state))
 
     def equivalent_bias(self, state: State) -> Array:
         """Return the sensor's error (n_x,) that would explain the disturbance; NaN for none."""
@@ -523,7 +549,11 @@ def _passed(state: State, time_ns: int, elapsed: float) -> tuple[State, float, i
     """Return the state with its usual interval, the seconds that count, and what was missed."""
     if state.time_ns is None or not elapsed > 0.0:
         return state, 0.0, 0
-    since = (time_ns - state.time_ns) / NANOSECONDS
+    since_ns = state.time_ns
+    if state.former_ns is not None and since_ns < state.former_ns < time_ns:
+        # two sources would count each other's time, but for this
+        since_ns = state.former_ns
+    since = (time_ns - since_ns) / NANOSECONDS
     missed = 0 if math.isinf(state.interval) else max(0, round(since / state.interval) - 1)
     # the plant stood under the old command all through a gap
     seconds = min(since, 2.0 * state.interval)
@@ -547,8 +577,18 @@ def _own_share(state: State) -> Array | None:
 def _afresh(state: State) -> State:
     """Return the state after the clock was set back: what was timed by it has lost its meaning."""
     supervisor = amended(state.supervisor, bad_since_ns=None, better_since_ns=None)
-    return amended(state, time_ns=None, commanded_ns=None, accepted=None, supervisor=supervisor,
-                   way_back=None, setpoint=amended(state.setpoint, scheduled=()))
+    newest_ns = state.time_ns if state.former_ns is None or state.time_ns is None else max(
+        state.time_ns, state.former_ns)
+    return amended(state, time_ns=None, former_ns=newest_ns, commanded_ns=None, accepted=None,
+                   supervisor=supervisor, way_back=None,
+                   setpoint=amended(state.setpoint, scheduled=()))
+
+
+def _unmeasured(why: Reason | None) -> Reason | None:
+    """Return the reason of a hold for want of measurements, which lasts; else None."""
+    while why is not None and why.code is Code.HELD_TOO_LONG:
+        why = why.cause
+    return why if why is not None and why.code in UNMEASURED else None
 
 
 def _kept(value: Array) -> Array:

@@ -14,7 +14,7 @@ from typing import TypeAlias
 from koopman_ros.arrays import Array
 from koopman_ros.control.controller import Controller
 from koopman_ros.control.state import Mode, Report, State
-from koopman_ros.reasons import Reason
+from koopman_ros.reasons import Code, Reason
 from koopman_ros.values import record
 
 
@@ -25,6 +25,8 @@ class Measurement:
     stamp_ns: int  #: its stamp
     measured: Array  #: (n_y,) in the model's units; NaN for what cannot be
     applied: Array | None = None  #: (n_u,) measured input that goes with it, or None
+    #: how many of the seconds since the last stamp the rate limit may count, or None for all
+    seconds: float | None = None
 
 
 @dataclass(frozen=True)
@@ -32,6 +34,8 @@ class Silence:
     """No measurement came up to a time, which is answered, too."""
 
     stamp_ns: int  #: that time, in the time of the measurements' stamps
+    #: why the command is held; None where it goes on from what is estimated
+    cause: Code | None = Code.NO_MEASUREMENT
 
 
 @dataclass(frozen=True)
@@ -84,9 +88,10 @@ def apply(controller: Controller, state: State, event: Event) -> Outcome:
     """Apply an event to a controller's state; pure, as the controller is."""
     match event:
         case Measurement():
-            return Outcome(*controller.step(state, event.measured, event.stamp_ns, event.applied))
+            return Outcome(*controller.step(state, event.measured, event.stamp_ns, event.applied,
+                                            event.seconds))
         case Silence():
-            return Outcome(*controller.hold(state, event.stamp_ns))
+            return Outcome(*controller.hold(state, event.stamp_ns, event.cause))
         case SetpointRequest():
             state, refused = controller.request_setpoint(
                 state, event.value, event.stamp_ns, event.signals)

@@ -37,6 +37,7 @@ class State:
     #: (n_u,) what the operator asked for in manual mode, or None
     manual_input: Array | None = None
     time_ns: int | None = None  #: stamp of the last measurement, or None before the first
+    former_ns: int | None = None  #: newest stamp before the stamps went back, or None
     command: Array | None = None  #: (n_u,) last command, or None before the first
     commanded_ns: int | None = None  #: when it was given, or None
     interval: float = np.inf  #: usual seconds between measurements; infinity before the second

@@ -23,10 +23,12 @@ from koopman_ros.control import (
     Arrival,
     Controller,
     events,
+    HOLD,
     MANUAL,
     Mode,
     Recent,
     Report,
+    SAFE,
     Setpoint,
     State,
 )
@@ -60,6 +62,7 @@ from koopman_ros.ros.node import Level, Status, wall_timer, words_of
 from koopman_ros.ros.process import run
 from koopman_ros.ros.signals import Heard, Inlet, Outlet
 from koopman_ros.ros.watchdog import PERIOD, Timing, Watchdog
+from koopman_ros.time_base import Advance, TimeBase
 from koopman_ros.units import display_unit, NANOSECONDS, shown
 from koopman_ros.values import record
 from koopman_ros.wire import stem
@@ -67,7 +70,12 @@ from koopman_ros.wire import stem
 # A measurement and the inputs that acted on it are stamped no further apart.
 _SAME_TIME_NS = 2 * NANOSECONDS
 _WATCH_STEP = NANOSECONDS // 2  # of plant time between two commands without a measurement
+_OVERDUE = 3.0  # usual intervals after which a measurement no longer decides the next command
+_SETTLED = 1e-4  # of an input's range: such a change of the command in a watch step is none
+_SOURCES_WINDOW = 10.0  # s, where no time-out of the measurements says how long
 _PATIENCE = 0.5  # s that the first answer waits for the measured inputs
+_CAUSES = {None: Code.NO_MEASUREMENT, Advance.OLD: Code.STAMPS_STAND,
+           Advance.TWO_SOURCES: Code.TWO_SOURCES}
 # A step that the watchdog has overtaken so often is given up, and its measurement with it.
 _ATTEMPTS = 2
 
@@ -79,6 +87,7 @@ class _Sample:
     stamp: Time
     stamp_ns: int
     values: Array  #: (n_y,) in the units of the signals
+    two_sources: bool  #: whether several publishers send such measurements in turn
 
 
 class ControllerNode(ManagedNode):
@@ -133,7 +142,11 @@ class ControllerNode(ManagedNode):
         self._refused = self._rests_outside = ''
         # until when a status is not looked at again while level and whether there is a reason stay
         self._told, self._untold = (0.0, '', False), False
+        self._received = time.monotonic()  # when the commands last had subscribers, or none went
         self._counts = messages.Counts()
+        # why the watch holds the command, and whether the law still changes it in a silence
+        self._held_for: Code | None = None
+        self._settling = False
         self._measured, self._timing = np.full(len(signals.states), np.nan), Timing(self)
         self._assembler = Assembler(
             tuple(signals.states), round(parameters.synchronisation_tolerance * NANOSECONDS))
@@ -145,6 +158,9 @@ class ControllerNode(ManagedNode):
         wiring = Wiring(signals, parameters.states, parameters.inputs)
         self._matching = matching = topics.Matching(
             self, lambda: self._diagnostics.publish_if_changed(), self._single(wiring))
+        # by topic of the measurements with one publisher: the numbers of its messages
+        self._sources = {place.topic: TimeBase(late=-1) for place in wiring.measured.values()
+                         if place.topic in self._single(wiring)}
         self._commands = Outlet(wiring.commands, signals.inputs, matching.publish)
         self._active = Outlet(wiring.active_setpoints, signals.states, self._latched)
         self._predicted = Outlet(wiring.predicted, signals.states, matching.publish)
@@ -191,6 +207,9 @@ class ControllerNode(ManagedNode):
             self._state = State(self._state.mode, Setpoint(
                 asked.requested, scheduled=asked.scheduled))
             self._waiting.clear()
+            self._timing, self._received = Timing(self), time.monotonic()
+            self._sources = {topic: TimeBase(late=-1) for topic in self._sources}
+            self._held_for, self._settling = None, False
             self._records.start()
 
     def deactivate(self) -> None:
@@ -224,11 +243,19 @@ class ControllerNode(ManagedNode):
         self._frame_id = heard.frame_id[:LONGEST_FRAME_ID]
         length, stamp_ns = len(heard.frame_id), heard.stamp_ns
         self._frame_length = length if length > LONGEST_FRAME_ID else 0
+        source, at = self._sources.get(heard.topic), self._timing.now()
+        if source is not None and heard.number is not None:
+            source.take(heard.number, at[0], self._window)
+        late = self._assembler.late.total()
         whole = self._assembler.take(stamp_ns, heard.values)
+        if self._assembler.late.total() > late:
+            self._timing.ignore(at)
         if whole is None or not self.active:
             return
+        two_sources = any(one.conflict or (one.newest is None and self._matching.shared(topic))
+                          for topic, one in self._sources.items())
         sample = _Sample(heard.stamp if whole[0] == stamp_ns else stamp_message(whole[0]),
-                         *whole)
+                         *whole, two_sources)
         # whether the measured inputs will be known in a moment
         if self._waiting or (
                 self._state.command is None and len(self._applied) < len(self._signals.inputs)
@@ -261,8 +288,21 @@ class ControllerNode(ManagedNode):
             return None
         return np.array([entry[1] for entry in found if entry is not None])
 
+    @property
+    def _window(self) -> float:
+        """Shortest time between two changes of the source, in s, where one may take over."""
+        return self._settings.measurement_timeout or _SOURCES_WINDOW
+
     def _answer(self, sample: _Sample) -> None:
         stamp_ns, arrived = sample.stamp_ns, self._timing.now()
+        advance = self._timing.arrive(
+            stamp_ns, arrived, self._settings.measurement_timeout, sample.two_sources)
+        if advance is Advance.TWO_SOURCES and self._state.command is not None:
+            self._answer_neither(sample)
+            return
+        since_ns = stamp_ns if self._state.time_ns is None else self._state.time_ns
+        countable = None if advance is Advance.OLD else self._timing.countable(
+            max(0.0, (stamp_ns - since_ns) / NANOSECONDS), stamp_ns, arrived)
         for _ in range(_ATTEMPTS):
             before = state = self._state
             done: list[tuple[Event, events.Outcome]] = []
@@ -270,7 +310,8 @@ class ControllerNode(ManagedNode):
                 initial = events.Initialisation(known)
                 done.append((initial, events.apply(self._controller, state, initial)))
                 state = done[0][1].state
-            asked = events.Measurement(stamp_ns, sample.values, self._known_inputs(stamp_ns))
+            asked = events.Measurement(stamp_ns, sample.values, self._known_inputs(stamp_ns),
+                                       countable)
             outcome = events.apply(self._controller, state, asked)
             assert outcome.command is not None and outcome.report is not None
             with self._lock:
@@ -281,8 +322,9 @@ class ControllerNode(ManagedNode):
                 self._commands.send(outcome.command, sample.stamp, self._frame_id)
                 for event, led_to in (*done, (asked, outcome)):
                     self._records.publish_event(event, led_to)
-                if stamp_ns != before.time_ns:
+                if advance is not Advance.OLD:
                     self._timing.note(stamp_ns, arrived)
+                    self._held_for, self._settling = None, False
                 self._timing.answered()
             break
         else:
@@ -305,15 +347,31 @@ class ControllerNode(ManagedNode):
             self._counts.unsolved_plans += cause.code in (Code.PLAN_NOT_SOLVED, Code.PLAN_MOVES)
         self._tell(report, sample.stamp)
 
+    def _answer_neither(self, sample: _Sample) -> None:
+        """Hold the command, since it is not known which of two sources measures the plant."""
+        with self._lock:
+            watched = self._command_unmeasured(
+                self._timing.silence, Code.TWO_SOURCES, sample.stamp)
+            if watched is None and self._state.command is not None:
+                self._commands.send(self._state.command, sample.stamp, self._frame_id)
+        self._measured = sample.values
+        self._counts.measurements += 1
+        self._counts.refused += 1
+        if watched is not None:
+            self._tell(*watched)
+
     def _on_watch(self) -> None:
         self._timing.busy = False
         assert self._watchdog is not None
         self._watchdog.beat()
         if self._compiling is not None and (kernels := self._compiling.take()) is not None:
             self._switch(kernels)
-        watched = self._watch(self._timing.silence)
+        watched = self._watch(self._timing.silence, acting=True)
         if watched is not None:
             self._tell(*watched)
+        if self._state.command is None or not self.active or all(
+                map(topics.heard, self._commands.publishers)):
+            self._received = time.monotonic()
         if self._untold:
             self._say(self._report, time.monotonic())
         with self._lock:
@@ -333,23 +391,73 @@ class ControllerNode(ManagedNode):
             finally:
                 self._telling.release()
 
-    def _watch(self, silence: float) -> tuple[Report, Time] | None:
-        """Hold the command, or go to the safe one, in a silence; return what was commanded."""
+    def _watch(self, silence: float, acting: bool = False) -> tuple[Report, Time] | None:
+        """
+        Command what has to be commanded without a measurement; return what was.
+
+        :param acting: whether the law may be computed for what the operator requests.
+        """
         with self._lock:
-            timeout, state = self._settings.measurement_timeout, self._state
-            if not self.active or not timeout or not silence > timeout or state.time_ns is None:
+            timeout = self._settings.measurement_timeout
+            if not self.active:
                 return None
-            now_ns = state.time_ns + round(silence * NANOSECONDS)
-            if state.commanded_ns is not None and now_ns - state.commanded_ns < _WATCH_STEP:
-                return None
-            silence_ends = Silence(now_ns)
-            outcome = events.apply(self._controller, state, silence_ends)
-            if outcome.command is None or outcome.report is None:
-                return None
-            self._state, stamp = outcome.state, stamp_message(now_ns)
-            self._commands.send(outcome.command, stamp, self._frame_id)
-            self._records.publish_event(silence_ends, outcome)
-            return outcome.report, stamp
+            if timeout and silence > timeout and self._state.time_ns is not None:
+                why = self._timing.no_news(timeout)
+                return self._command_unmeasured(silence, _CAUSES[why])
+            if self._manual_waits(silence) or (acting and self._setpoint_waits(silence)):
+                return self._command_unmeasured(silence, None)
+            return None
+
+    def _command_unmeasured(self, silence: float, cause: Code | None, stamp: Time | None = None
+                            ) -> tuple[Report, Time] | None:
+        """
+        Command without a measurement, if it is time to; return what was commanded.
+
+        The caller holds the lock.
+
+        :param cause: as of :class:`Silence`.
+        :param stamp: of the command; None for the present time of the measurements' clock.
+        """
+        state = self._state
+        now_ns = self._timing.now()[2] if state.time_ns is None else (
+            state.time_ns + round(silence * NANOSECONDS))
+        if state.commanded_ns is not None and cause is self._held_for and (
+                now_ns - state.commanded_ns < _WATCH_STEP):
+            return None
+        silence_ends = Silence(now_ns, cause)
+        outcome = events.apply(self._controller, state, silence_ends)
+        if outcome.command is None or outcome.report is None:
+            return None
+        self._state, self._held_for = outcome.state, cause
+        if state.command is not None:
+            moved = np.abs(outcome.command - state.command)
+            limits = self._controller.settings.limits
+            self._settling = cause is None and bool(
+                (moved > _SETTLED * (limits.upper - limits.lower)).any())
+        stamp = stamp_message(now_ns) if stamp is None else stamp
+        self._commands.send(outcome.command, stamp, self._frame_id)
+        self._records.publish_event(silence_ends, outcome)
+        return outcome.report, stamp
+
+    def _manual_waits(self, silence: float) -> bool:
+        """Tell whether a manual command is not reached, and no measurement came lately."""
+        state, wanted = self._state, self._state.manual_input
+        return (state.mode is Mode.MANUAL and wanted is not None and state.command is not None
+                and silence * NANOSECONDS > _WATCH_STEP and not np.array_equal(
+                    self._controller.settings.limits.within(wanted), state.command))
+
+    def _setpoint_waits(self, silence: float) -> bool:
+        """Tell whether a set-point is not reached, and a measurement is overdue."""
+        state, setpoint = self._state, self._state.setpoint
+        interval = 0.0 if math.isinf(state.interval) else state.interval
+        if (state.mode is not Mode.AUTOMATIC or state.time_ns is None
+                or state.supervisor.level in (HOLD, SAFE)
+                or silence <= max(_OVERDUE * interval, 1.0)):
+            return False
+        now_ns, requested = state.time_ns + round(silence * NANOSECONDS), setpoint.requested
+        moves = (requested is not None and setpoint.active is not None
+                 and bool((np.abs(requested - setpoint.active) > 0.0).any()))
+        return self._settling or moves or any(at <= now_ns for at, _ in setpoint.scheduled)
 
     def _tell(self, report: Report, stamp: Time) -> None:
         """Publish and log what is known beside the command."""
@@ -420,12 +528,16 @@ class ControllerNode(ManagedNode):
         # the others stay
         asked = np.array([heard.values.get(name, math.nan if held is None else held[i])
                           for i, name in enumerate(self._signals.inputs)])
+        if self._state.command is None and (known := self._known_inputs()) is not None:
+            self._change(events.Initialisation(known))
         self._change(events.ManualCommand(asked))
 
     def _on_set_automatic(self, request: SetBool.Request, response: SetBool.Response
                           ) -> SetBool.Response:
         mode = Mode.AUTOMATIC if request.data else Mode.MANUAL
         self._change(ModeChange(mode))
+        # the law moves the command from where the operator left it, with measurements or without
+        self._settling = mode is Mode.AUTOMATIC
         response.success, response.message = True, f'{mode.value} mode'
         self.get_logger().info(response.message)
         return response
@@ -491,6 +603,12 @@ class ControllerNode(ManagedNode):
         if self._rests_outside not in ('', before):
             self.get_logger().warning(self._rests_outside)
 
+    def _open_loop(self) -> Status:
+        """Return whether somebody receives the commands."""
+        return messages.open_loop(
+            [publisher.topic_name for publisher in self._commands.publishers
+             if not topics.heard(publisher)], time.monotonic() - self._received)
+
     def _status(self) -> Status:
         frame = (f'the frame_id of the measurement has {self._frame_length} characters, of which '
                  f'{LONGEST_FRAME_ID} are passed on: shorten it at the sensor'
@@ -501,7 +619,7 @@ class ControllerNode(ManagedNode):
             self._models.refused,
             lambda: {**self._models.figures(),
                      'safe input': self._rests_outside or 'within reach'},
-            self._measured, self._assembler))
+            self._measured, self._assembler, self._open_loop()))
         # without measurements answered there is nothing to complain of
         return status if self.active else replace(status, level=Level.OK, message='inactive')
 

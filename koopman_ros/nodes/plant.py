@@ -68,7 +68,9 @@ class PlantNode(ManagedNode):
         self._answered = True  # whether the last measurement has its command
         self._commands = self._rejected = self._missed = self._foreign = 0
         self._waiting_in_vain, self._rejection = False, ''
-        self._wall_start = self._wall_published = self._last_command = time.monotonic()
+        self._wall_start = self._wall_published = time.monotonic()
+        # when it last came, by name of the input
+        self._commanded = dict.fromkeys(signals.inputs, self._wall_start)
 
         self._heard: dict[str, float] = {}  # of the commands for the last measurement
         wiring = Wiring(signals, parameters.states, parameters.inputs, PLANT_KINDS)
@@ -110,6 +112,7 @@ class PlantNode(ManagedNode):
 
     def activate(self) -> None:
         """Let time go on."""
+        self._commanded = dict.fromkeys(self._signals.inputs, time.monotonic())
         if self._sample:
             self._resynchronise()
 
@@ -252,7 +255,8 @@ class PlantNode(ManagedNode):
         wrong = [name for name, value in self._heard.items() if not math.isfinite(value)]
         if not wrong:
             self._commands += 1
-            self._last_command, self._rejection = time.monotonic(), ''
+            self._commanded |= dict.fromkeys(self._heard, time.monotonic())
+            self._rejection = ''
             # in lock-step it was given at its measurement, otherwise now
             if lockstep or self._advance_to_now():
                 followed = dict(zip(self._signals.inputs, self._plant.followed.tolist(),
@@ -339,7 +343,8 @@ class PlantNode(ManagedNode):
             level = Level.WARN
         elif self._unanswered():
             level, message = Level.WARN, (
-                'running, but no command arrives: the last one is held; is the controller alive?')
+                'running, but no command arrives: the last one is held; check that the controller '
+                'is active, and its topics and domain')
         return Status(level, message, lambda: {
             'time [s]': seconds_text(self._plant.time_ns),
             **self._shown(self._plant),
@@ -362,12 +367,12 @@ class PlantNode(ManagedNode):
                     signals, [*plant.x.tolist(), *plant.u.tolist()], strict=True)}
 
     def _unanswered(self) -> bool:
-        """Tell whether a controller that commanded before has fallen silent."""
+        """Tell whether no command arrives of an input, be it from the start or for some time."""
         if self._phase is not Phase.RUNNING or self._settings.lockstep:
             return self._waiting_in_vain
         period = self._settings.sample_period / (self._settings.speed or math.inf)
-        silence = time.monotonic() - self._last_command
-        return bool(self._commands) and silence > max(_SILENCE, 5.0 * period)
+        silence = time.monotonic() - min(self._commanded.values())
+        return silence > max(_SILENCE, 5.0 * period)
 
 
 def main(args: list[str] | None = None) -> int:

@@ -178,8 +178,8 @@ class ControllerParameters:
         10.0, 'how long a better law must have been possible before it acts again', 's', 0.0,
         86400.0)
     measurement_timeout: float = parameter(
-        10.0, 'plant time without a measurement after which the inputs are held and diagnostics '
-        'turn to ERROR; 0 switches this off', 's', 0.0, 86400.0)
+        10.0, 'plant time without a measurement whose stamp advances after which the inputs are '
+        'held and diagnostics turn to ERROR; 0 switches this off', 's', 0.0, 86400.0)
     max_measurement_age: float = parameter(
         5.0, 'age of a measurement at its arrival from which on diagnostics warn; 0 switches this '
         'off', 's', 0.0, 86400.0)

@@ -23,7 +23,7 @@ from numpy.typing import NDArray
 from koopman_ros import __version__
 from koopman_ros.control import events, Mode, State
 from koopman_ros.kernels import IN_NUMPY
-from koopman_ros.reasons import Reason
+from koopman_ros.reasons import Code, Reason
 
 VERSION = 1
 
@@ -34,6 +34,7 @@ EVENTS: dict[str, type[events.Event]] = {
     'mode': events.ModeChange, 'initialisation': events.Initialisation}
 _NAMES = {kind: name for name, kind in EVENTS.items()}
 _FIELDS = {kind: tuple(item.name for item in fields(kind)) for kind in _NAMES}
+_DEFAULTED = ('seconds', 'cause')
 _ENCODER = json.JSONEncoder(separators=(',', ':'), allow_nan=False)
 # Names of records that carry the controller's whole state.
 START, SNAPSHOT = 'start', 'snapshot'
@@ -113,7 +114,9 @@ def event_of(record: Record) -> events.Event:
     if record.event not in EVENTS:
         raise ValueError(f'the event {record.event!r} is not known')
     kind = EVENTS[record.event]
-    read = {name: _read(record.fields[name]) for name in _FIELDS[kind] if name != 'signals'}
+    # a field with a default is not in records from before it was introduced
+    read = {name: _read(record.fields[name]) for name in _FIELDS[kind]
+            if name != 'signals' and (name in record.fields or name not in _DEFAULTED)}
     if 'signals' in record.fields:
         read['signals'] = tuple(map(str, record.fields['signals']))
     return kind(**read)
@@ -135,7 +138,9 @@ def state_of(record: Record) -> State:
 
 
 def _written(value: Any) -> Any:
-    """Return an array, an enum, an integer or None as it stands in the fields of an event."""
+    """Return an array, an enum, a number or None as it stands in the fields of an event."""
+    if isinstance(value, Code):
+        return value.value
     if isinstance(value, Enum):
         return value.name.lower()
     return numbers(value) if isinstance(value, np.ndarray) else value
@@ -144,8 +149,8 @@ def _written(value: Any) -> Any:
 def _read(value: Any) -> Any:
     """Return what was written."""
     if isinstance(value, str):
-        return Mode[value.upper()]
-    return value if value is None or isinstance(value, int) else float_array(value)
+        return Mode[value.upper()] if value.upper() in Mode.__members__ else Code(value)
+    return value if value is None or isinstance(value, (int, float)) else float_array(value)
 
 
 def _codes(reason: Reason | None) -> list[str]:

@@ -30,14 +30,17 @@ from koopman_ros.reasons import level_words
 from koopman_ros.replay.records import fields_of, Record, SNAPSHOT, START
 from koopman_ros.ros import topics
 from koopman_ros.ros.node import Level, Status, words_of
-from koopman_ros.ros.watchdog import Timing
+from koopman_ros.ros.watchdog import PAUSED, Timing
+from koopman_ros.time_base import Advance
 from koopman_ros.units import display_unit, NANOSECONDS, shown
 from koopman_ros.values import record
 from koopman_ros.wire import stem
 
 _REACHED = 1e-3  # of a range; so near a set-point is reached
 _SNAPSHOT_PERIOD = 10.0  # s by the wall
+_PATIENCE = 10.0  # s after which a measurement is old where no time-out is set
 _AGAIN = 1.0  # s, within which two nodes know each other
+_UNRECEIVED = 3.0  # s without a subscriber after which commands are lost
 _ACTIONS = {HOLD: 'the last command is held', SAFE: 'the safe {} is commanded'}
 _WAY_BACK = 'the {} leads the plant back from where the safe one keeps it'
 
@@ -72,6 +75,7 @@ class Situation:
     model: Callable[[], Mapping[str, object]]  #: gives figures of the model in force
     measured: Array  #: (n_y,) last measured, in the units of the signals
     assembler: Assembler  #: what waits to be put together
+    open_loop: Status  #: whether the commands are received
 
     @property
     def reason(self) -> str:
@@ -93,7 +97,23 @@ class Situation:
 
 def status(now: Situation) -> Status:
     """Return the status of the control task."""
-    return Status(*_verdict(now), lambda: _figures(now))
+    level, message = _verdict(now)
+    if now.complaint and now.timing.no_news(_PATIENCE) is Advance.TWO_SOURCES:
+        message += f'; {now.complaint}'
+    return Status(level, message, lambda: _figures(now))
+
+
+def open_loop(topic_names: Collection[str], seconds: float) -> Status:
+    """
+    Return whether somebody receives the commands.
+
+    :param topic_names: of the commands that have no subscriber.
+    :param seconds: for which not all have had one.
+    """
+    if not topic_names or seconds < _UNRECEIVED:
+        return Status(Level.OK, 'the commands are received')
+    return Status(Level.WARN, f'no subscriber on {", ".join(topic_names)}: the commands reach no '
+                              'plant; start the plant, or check its topic and domain')
 
 
 def _verdict(now: Situation) -> tuple[Level, str]:
@@ -102,7 +122,10 @@ def _verdict(now: Situation) -> tuple[Level, str]:
     if not now.counts.measurements:
         awaited = f' of {now.assembler.awaited}' if now.assembler.awaited else ''
         return Level.WARN, now.complaint or f'waiting for the first measurement{awaited}'
-    if timeout and max(now.timing.silence, now.timing.wall_silence) > timeout:
+    silence = now.timing.silence
+    # nobody reads /clock meanwhile
+    if timeout and (silence > timeout or (
+            now.timing.busy and now.timing.wall_silence > timeout)):
         command = now.state.command
         doing = '' if command is None else f', {now.commanded(command)}'
         action = 'manual mode' if mode is Mode.MANUAL else (
@@ -110,6 +133,11 @@ def _verdict(now: Situation) -> tuple[Level, str]:
         if now.timing.busy:
             return Level.ERROR, (f'no measurement answered for more than {timeout:g} s, as the '
                                  f'node is busy: {action}{doing}; ask for less at once')
+        if (why := now.timing.no_news(timeout)) is not None:
+            what = ('the stamps of the measurements have not advanced' if why is Advance.OLD
+                    else 'two sources have published the measurement in turn')
+            return Level.ERROR, (f'{what} for more than {timeout:g} s: {action}{doing}; check '
+                                 'the clock of the sensor, and that it has one publisher')
         awaited = f' of {now.assembler.awaited}' if now.assembler.awaited else ''
         return Level.ERROR, (f'no measurement{awaited} for more than {timeout:g} s: '
                              f'{action}{doing}; check sensor and plant')
@@ -142,9 +170,21 @@ def _warning(now: Situation) -> str:
     age, oldest = now.timing.age, now.parameters.max_measurement_age
     if now.complaint:
         return now.complaint
-    if report.measurement.arrival is Arrival.REPEATED:
+    if now.open_loop.level is not Level.OK:
+        return now.open_loop.message
+    if now.timing.paused:
+        return (f'/clock has stood still for more than {PAUSED:g} s: the simulation is paused or '
+                'has ended, and the last command stays')
+    overdue = _PATIENCE if math.isinf(now.state.interval) else max(
+        _PATIENCE, 3.0 * now.state.interval)
+    if report.measurement.arrival is Arrival.REPEATED or (
+            now.timing.silence > overdue and now.timing.no_news(overdue) is Advance.OLD):
         return ('the stamp of the measurement does not advance: the last command is held; stamp '
                 'measurements with their time')
+    unmeasured = report.measurement.arrival is Arrival.MISSING and not report.command.way_back
+    if now.timing.silence > overdue or (unmeasured and now.counts.measurements):
+        return (f'the last measurement is {now.timing.silence:.0f} s old: commands follow from '
+                'the model and from requests alone; check sensor and plant')
     if now.timing.without_clock:
         return ('use_sim_time is set and nobody publishes /clock: time-outs count by the wall '
                 'clock; set use_sim_time to false, or publish_clock of the plant to true')

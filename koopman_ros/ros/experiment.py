@@ -326,14 +326,16 @@ class ExperimentRun:
             self.started.set_result(refusal := self.plan.refusal(measured))
             if refusal is not None:
                 return
-            self.progress = begin(self.plan, stamp_ns)
-        if stamp_ns != self._stamp_ns:
-            self._stamp_ns, self._heard_at = stamp_ns, time.monotonic()
+            self.progress, self._heard_at = begin(self.plan, stamp_ns), time.monotonic()
+        self._stamp_ns, newest_ns = stamp_ns, self.progress.time_ns
         self._frame_id = heard.frame_id
         was_running = self.running
         if self._on_setpoints and not self._followed(self._tracked, Code.NOT_TRACKED):
             return
         self.progress = advance(self.plan, self.progress, measured, stamp_ns)
+        if self.progress.time_ns != newest_ns:
+            # a stamp that stands still or lags is no news
+            self._heard_at = time.monotonic()
         self._command(self.progress.command, stamp_ns)
         if was_running and not self.running:
             self._on_end(None)

@@ -5,6 +5,7 @@
 
 from collections.abc import Callable, Iterator, Mapping
 from functools import partial
+import inspect
 import math
 from typing import Any
 
@@ -30,6 +31,9 @@ class Heard:
     frame_id: str  #: of the message, or empty
     values: Mapping[str, float]  #: of the signals that it carries, in their own units
     stamped: bool  #: whether the message has a stamp
+    topic: str = ''  #: on which it came, as it is named in the places
+    #: of the message among those of its publisher; None where the middleware does not count them
+    number: int | None = None
 
     @property
     def stamp_ns(self) -> int:
@@ -65,6 +69,19 @@ def _converted(name: str, unit: str, wanted: str) -> Conversion:
         raise ConfigurationError(f'{name}: {error}: name another unit') from error
 
 
+def _with_info(take: Callable[[Any, Mapping[str, Any]], None]) -> Callable[..., None]:
+    """Return a callback to which rclpy hands a message with what the middleware says of it."""
+    def hear(*arrived: Any) -> None:
+        # rclpy's EventsExecutor of Jazzy hands over both as one tuple
+        message, info = arrived if len(arrived) == 2 else arrived[0]
+        take(message, info)
+
+    # by its signature rclpy decides what it hands over
+    hear.__signature__ = inspect.signature(  # type: ignore[attr-defined]
+        lambda message, info: None)
+    return hear
+
+
 class Inlet:
     """
     Subscribe to some signals.
@@ -90,9 +107,11 @@ class Inlet:
                    for name in names}
             if not hasattr(kind, 'header'):
                 self.unstamped.append(topic)
-            self.subscriptions.append(subscribe(topic, partial(self._take, own), kind))
+            self.subscriptions.append(subscribe(topic, _with_info(
+                partial(self._take, topic, own)), kind))
 
-    def _take(self, own: Mapping[str, Any], message: Any) -> None:
+    def _take(self, topic: str, own: Mapping[str, Any], message: Any, info: Mapping[str, Any]
+              ) -> None:
         values = {}
         for name, (place, converted) in own.items():
             try:
@@ -105,7 +124,7 @@ class Inlet:
             header = getattr(message, 'header', None)
             self._hear(Heard(self._node.get_clock().now().to_msg() if header is None
                              else header.stamp, header.frame_id if header else '', values,
-                             header is not None))
+                             header is not None, topic, info['publication_sequence_number']))
 
     def published(self) -> bool:
         """Tell whether anybody publishes one of the topics."""

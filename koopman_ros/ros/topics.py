@@ -130,6 +130,7 @@ class Matching:
         self._owned = Owned(node)
         self._own: list[Publisher | Subscription] = []
         self._said: tuple[str, ...] = ('', '')
+        self._shared: dict[str, bool] = {}
         self._rests_until = -math.inf  # by the steady clock
         hosting = node.hosting if isinstance(node, HostableNode) else None
         self._loops = 1 if hosting is None else hosting.loops
@@ -141,6 +142,10 @@ class Matching:
     def complaint(self) -> str:
         """Names topic, nodes, what is wrong and what to do; conflicts first; or is empty."""
         return next(filter(None, self._said), '')
+
+    def shared(self, topic: str) -> bool:
+        """Tell whether several nodes publish on a topic on which only one may."""
+        return self._shared.get(topic, False)
 
     def subscribe(self, topic: str, callback: Callable[[Any], Any], kind: Any = None,
                   qos: QoSProfile = LOOP_QOS) -> Subscription:
@@ -180,6 +185,7 @@ class Matching:
         conflicts, complaints = [], []
         for topic in self._single:
             conflicts.append(self._conflict(topic))
+            self._shared[topic] = bool(conflicts[-1])
             yield
         for own in self._own:
             complaints += self._complaints(own)

@@ -11,6 +11,7 @@ import pytest
 
 from koopman_ros.control import Arrival, Controller, Form, InputLimits, Mode, Settings, State
 from koopman_ros.control.setpoint import advance, HORIZON_NANOSECONDS, refusal, request, Setpoint
+from koopman_ros.reasons import Code
 from koopman_ros.units import NANOSECONDS as SECOND
 from support.closed_loops import content, COOLANT, say, SETPOINT, shipped, START
 from support.random_lifts import change_of_variable
@@ -158,6 +159,86 @@ def test_elapsed_time_counts_but_for_gaps(ramp, read, per_second, stamps, counte
         state, *outcome = measured(loop, state, START, second)
         values.append(read(*outcome))
     np.testing.assert_allclose(np.diff(values), -per_second * np.array(counted), rtol=1e-9)
+
+
+@pytest.mark.parametrize('offset', [2, 50, 1000])
+def test_two_clocks_in_turn_move_the_command_no_faster_than_one(offset):
+    loop = controller()
+    state, commands = started(loop), []
+    for second in range(1, 5):
+        state, *_ = measured(loop, state, START, second)
+    state = loop.request_manual_input(loop.set_mode(state, Mode.MANUAL), np.array([LOWER]))[0]
+    for second in range(5, 20):
+        for at in (second, second - offset):
+            state, command, _ = measured(loop, state, START, at)
+            commands.append(command[0])
+    # the first step counts from the last command
+    assert commands[0] - commands[-1] <= 14.0 * RATE + 1e-9
+    assert np.max(np.abs(np.diff(commands))) <= RATE + 1e-9
+    assert commands[-1] < commands[0] - 10.0 * RATE
+
+
+@pytest.mark.parametrize(('countable', 'seconds'), [
+    (None, 1.0), (5.0, 1.0), (0.25, 0.25), (0.0, 0.0)])
+def test_ramp_and_rate_limit_count_no_more_than_another_clock_allows(countable, seconds):
+    for ramp, read in ((np.inf, lambda command, report: command[0] - 300.0),
+                       (0.1, lambda command, report: (report.target.setpoint[0] - START) * 8.0)):
+        loop = controller(setpoint_ramp=np.array([ramp]))
+        state = measured(loop, started(loop, (START,)), START, 1)[0]
+        state = loop.request_setpoint(state, np.array([306.0]))[0]
+        _, command, report = loop.step(
+            state, np.array([START]), NOW + 2 * SECOND, None, countable)
+        assert read(command, report) == pytest.approx(-RATE * seconds, abs=1e-6)
+
+
+# Without measurements.
+
+def test_a_setpoint_is_acted_on_from_the_estimate_while_nothing_is_measured():
+    loop = controller()
+    state = measured(loop, started(loop), START, 1)[0]
+    state = loop.request_setpoint(state, np.array([START - 2.0]))[0]
+    commands = [state.command[0]]
+    # first after a quarter of an hour
+    for second in np.arange(900.0, 3600.0, 5.0):
+        state, command, report = loop.hold(state, NOW + round(second * SECOND), None)
+        assert (report.level, report.reason) == (next(iter(loop.levels)), None)
+        assert abs(command[0] - commands[-1]) <= 2.0 * RATE + 1e-9
+        commands.append(command[0])
+    wanted = loop.steady_state(state.setpoint.active)
+    assert state.setpoint.active[0] == START - 2.0
+    assert loop.model.states.to_physical(state.estimate.x) == pytest.approx(wanted, abs=0.01)
+    assert commands[-1] == commands[-2] < commands[0] - 0.5
+
+
+def test_a_hold_for_want_of_measurements_refuses_what_it_cannot_track():
+    loop = controller()
+    state = measured(loop, started(loop), START, 1)[0]
+    for cause in (Code.NO_MEASUREMENT, Code.STAMPS_STAND, Code.TWO_SOURCES):
+        held, command, report = loop.hold(state, NOW + 20 * SECOND, cause)
+        assert (report.level, report.reason.code) == ('hold', cause)
+        np.testing.assert_array_equal(command, state.command)
+        same, refused = loop.request_setpoint(held, np.array([316.0]))
+        assert same is held
+        assert (refused.code, refused.cause.code) == (Code.SETPOINT_UNMEASURED, cause)
+        # what lies ahead may be tracked then, and what is measured again is
+        assert loop.request_setpoint(held, np.array([316.0]), NOW + 60 * SECOND)[1] is None
+        again = measured(loop, held, START, 21)[0]
+        assert loop.request_setpoint(again, np.array([316.0]))[1] is None
+
+
+def test_a_manual_command_moves_at_the_rate_limit_without_measurements():
+    for state in (started(), controller().initialise(State(), np.array([300.0]))):
+        loop = controller()
+        state = loop.request_manual_input(loop.set_mode(state, Mode.MANUAL), np.array([290.0]))[0]
+        at, commands = NOW + 1200 * SECOND, [300.0]
+        while commands[-1] != 290.0:
+            state, command, report = loop.hold(state, at, None)
+            assert (report.level, report.reason) == ('manual', None)
+            commands.append(command[0])
+            at += SECOND // 2
+        # at most a second counts for the first one
+        assert abs(commands[1] - 300.0) <= RATE + 1e-9
+        assert np.max(np.abs(np.diff(commands[1:]))) <= 0.5 * RATE + 1e-9
 
 
 # Set-points.

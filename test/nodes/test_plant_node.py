@@ -153,10 +153,14 @@ def test_real_time_stamps_are_the_wall_clock_and_silence_is_reported_while_it_la
     # or it would run away before long
     ros.set_parameters('plant', **{'constants.heat_transfer_coefficient': reactor.constant(
         'heat_transfer_coefficient')})
+    # also where none ever came
+    status = ros.wait_for_status(STATUS, lambda s: 'no command arrives' in s.message)
+    assert status.level == DiagnosticStatus.WARN
     command = ros.speak(Temperature, reactor.COOLANT_SETPOINT, to='plant')
     command.publish(temperature(26.0))
-    status = ros.wait_for_status(STATUS, lambda s: s.level == DiagnosticStatus.WARN)
-    assert 'no command arrives: the last one is held' in status.message
+    ros.wait_for_status(STATUS, lambda s: s.message == 'running')
+    status = ros.wait_for_status(STATUS, lambda s: 'no command arrives: the last one is held' in (
+        s.message))
     assert float(value(status, 'coolant [degC]')) == pytest.approx(26.0)
     command.publish(temperature(26.5))
     ros.wait_for_status(STATUS, lambda s: s.message == 'running')

@@ -273,3 +273,76 @@ def test_silence_by_the_wall_clock_ends_at_the_safe_coolant_or_with_the_operator
     assert own_commands(bench, last)
     bench.status(lambda s: s.level == DiagnosticStatus.ERROR and (
         'no measurement for more than 0.3 s: manual mode' in s.message))
+
+
+QUICK = {'measurement_timeout': 0.5, 'hold_timeout': 0.5, 'recovery_time': 0.0,
+         'coolant_temperature.rate_limit': 100.0, 'coolant_temperature.safe': 10.0}
+
+
+def test_stamps_that_cycle_hold_the_coolant_and_then_make_it_safe(ros: Harness) -> None:
+    bench, tenths = Bench(ros, QUICK), itertools.cycle(range(10))
+    for k in range(1, 10):
+        bench.measure(STEADY, 1.0 + 0.1 * k)
+    held = bench.commands[-1].temperature
+
+    def cycles(condition: Any) -> None:
+        def done() -> Any:
+            bench.send(STEADY + 1.0, 1.0 + 0.1 * next(tenths))
+            return condition()
+        ros.wait_until(done)
+
+    cycles(lambda: bench.commands[-1].temperature == 10.0)
+    assert held in [message.temperature for message in bench.commands[10:]]
+    cycles(lambda: any('the stamps of the measurements have not advanced for more than 0.5 s: the '
+                       'safe coolant is commanded' in status.message
+                       and status.level == DiagnosticStatus.ERROR
+                       for status in ros.statuses))
+    # one that advances again is answered by the law
+    at = seconds(bench.commands[-1]) + 1.0
+    bench.measure_until(lambda message: message.temperature != 10.0, at)
+
+
+def test_two_thermometers_of_one_clock_hold_the_coolant_while_both_measure(ros: Harness) -> None:
+    bench = Bench(ros, {'measurement_timeout': 1.0, 'recovery_time': 0.0})
+    bench.measure(STEADY, 2.0)
+    second = ros.speak(Temperature, reactor.TEMPERATURE, to='controller')
+    for k in range(3, 20):
+        held = bench.commands[-1].temperature
+        bench.measure(STEADY, float(k))
+        bench.sent += 1
+        second.publish(temperature(30.0, k + 0.5))
+        ros.wait_until(lambda at=k + 0.5: seconds(bench.commands[-1]) == at)
+        # one of each may be answered, since the other may have gone
+        assert k < 5 or bench.commands[-1].temperature == held
+    bench.status(lambda s: s.level == DiagnosticStatus.ERROR and 'two sources' in s.message)
+    ros.node.destroy_publisher(second)
+    bench.measure_until(lambda _: ros.statuses[-1].level != DiagnosticStatus.ERROR, 100.0)
+
+
+def test_what_the_operator_requests_is_done_without_measurements(ros: Harness) -> None:
+    bench = Bench(ros, {'coolant_temperature.rate_limit': 4.0, 'temperature.setpoint_ramp': 4.0})
+    for k in range(1, 10):
+        bench.measure(STEADY, 1.0 + 0.1 * k)
+    manual = ros.speak(Temperature, reactor.MANUAL_COOLANT_SETPOINT, to='controller')
+    ros.set_bool('controller/set_automatic', False)
+    last, held = len(bench.commands) - 1, bench.commands[-1].temperature
+    manual.publish(temperature(held - 3.0))
+    ros.wait_until(lambda: bench.commands[-1].temperature == pytest.approx(held - 3.0))
+    ros.set_bool('controller/set_automatic', True)
+    bench.ask(STEADY - 3.0)
+    ros.wait_until(lambda: bench.active == pytest.approx(STEADY - 3.0))
+    bench.status(lambda s: s.level == DiagnosticStatus.WARN and (
+        'the last measurement is' in s.message))
+    # at most a second counts for the first command after a silence
+    own = bench.commands[last:]
+    for before, after in itertools.pairwise(own):
+        passed = seconds(after) - seconds(before)
+        assert abs(after.temperature - before.temperature) <= 4.0 * min(passed, 1.0) + 1e-6
+
+
+def test_commands_without_a_subscriber_are_reported(running: Harness) -> None:
+    thermometer = running.speak(Temperature, reactor.TEMPERATURE, to='controller')
+    thermometer.publish(temperature(STEADY, 1.0))
+    status = running.wait_for_status('controller: control', lambda s: (
+        'no subscriber on /coolant_setpoint' in s.message))
+    assert status.level == DiagnosticStatus.WARN
