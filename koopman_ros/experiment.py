@@ -44,8 +44,8 @@ class Experiment:
     lower: Array  #: (m,) lowest levels; levels are uniform between the two
     upper: Array  #: (m,) highest levels
     rate: Array  #: (m,) largest changes per s
-    #: (m,) where the signals start and return to: inputs that are safe whatever happened, or the
-    #: set-points from before
+    #: (m,) where the signals return to: inputs that are safe whatever happened, or the set-points
+    #: from before
     home: Array
     hold_shortest: float  #: shortest time of a level, in s; times are uniform between the two
     hold_longest: float  #: longest time of a level, in s
@@ -117,9 +117,13 @@ class Progress:
         return (self.time_ns - self.start_ns) / NANOSECONDS
 
 
-def begin(experiment: Experiment, time_ns: int) -> Progress:
-    """Start at home, at the stamp of the first measurement."""
-    return Progress(time_ns, time_ns, experiment.home)
+def begin(experiment: Experiment, time_ns: int, start: Array | None = None) -> Progress:
+    """
+    Start at the stamp of the first measurement.
+
+    :param start: (m,) present values of the signals; at home by default.
+    """
+    return Progress(time_ns, time_ns, experiment.home if start is None else start)
 
 
 def end(progress: Progress, phase: Phase, why: Reason | None = None) -> Progress:

@@ -3,7 +3,7 @@
 
 """What a name in a parameter stands for: something of the package, or ``module:name`` of any."""
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 import importlib
 from typing import Any
 
@@ -26,11 +26,46 @@ def plug(name: str, kind: str, known: Mapping[str, Callable[..., Any] | str]) ->
                          'module:name of one of your own')
     try:
         found = getattr(importlib.import_module(module), attribute)
-    except Exception as error:  # a module may fail in every way
-        cause = ' '.join(f'{type(error).__name__}: {error}'.split())
-        raise ValueError(f'the {kind} {name!r} cannot be loaded ({cause}): check module and '
-                         'name, and that Python finds the module') from error
+    except KeyboardInterrupt:
+        raise
+    except BaseException as error:  # a module may raise anything, SystemExit included
+        raise ValueError(f'the {kind} {name!r} cannot be loaded ({cause(error)}): check module '
+                         'and name, and that Python finds the module') from error
     if not callable(found):
         raise ValueError(f'the {kind} {name!r} is a {type(found).__name__}, which cannot be '
                          'called: name a class or a function')
     return found
+
+
+def plugged(name: str, kind: str, known: Mapping[str, Callable[..., Any] | str],
+            arguments: Sequence[Any], members: Sequence[str]) -> Any:
+    """
+    Return what :func:`plug` finds, called with arguments.
+
+    :param members: attributes that the result must have.
+    :raises ValueError: where it cannot be called with the arguments, or lacks a member.
+    """
+    factory = plug(name, kind, known)
+    try:
+        made = factory(*arguments)
+        missing = [member for member in members if not hasattr(made, member)]
+    except (KeyboardInterrupt, ValueError):
+        raise
+    except BaseException as error:  # code of one's own may raise anything, SystemExit included
+        raise ValueError(f'the {kind} {name!r} cannot be constructed ({cause(error)}): correct '
+                         'its class') from error
+    if missing:
+        raise ValueError(f'the {kind} {name!r} returned a {type(made).__name__} without '
+                         f'{" and ".join(missing)}: correct its class')
+    return made
+
+
+def own_code(value: Any) -> list[str]:
+    """Return the names of the form ``module:name`` in the value of a parameter."""
+    names = [value] if isinstance(value, str) else list(value)
+    return [name for name in names if isinstance(name, str) and ':' in name]
+
+
+def cause(error: BaseException) -> str:
+    """Return type and message of an exception in one line."""
+    return ' '.join(f'{type(error).__name__}: {error}'.split())

@@ -30,7 +30,7 @@ from koopman_ros.estimation import (
     Verdict,
 )
 from koopman_ros.lifting import Coordinates, LiftedModel
-from koopman_ros.plugs import plug
+from koopman_ros.plugs import plugged
 from koopman_ros.reasons import Code, Reason, reason
 from koopman_ros.signals import Outputs
 from koopman_ros.units import NANOSECONDS
@@ -166,20 +166,21 @@ def levels_of(model: LiftedModel, outputs: Outputs, settings: Settings) -> dict[
                     for bound in (settings.state_lower, settings.state_upper))
     tuning = Tuning(weights, settings.max_gain, settings.max_residual, lower, upper,
                     pi_gain=settings.pi_gain, pi_time=settings.pi_time)
-    estimator = plug(settings.estimator or (
+    estimator = settings.estimator or (
         'extended_kalman_filter' if not outputs.determine_state else
-        'disturbance_observer' if settings.observer_bandwidth > 0.0 else 'measured_state'),
-        'estimator', ESTIMATORS)
+        'disturbance_observer' if settings.observer_bandwidth > 0.0 else 'measured_state')
     noise, wander, error = settings.uncertainty(model, outputs)
     estimating = EstimatorTuning(
         outputs, settings.observer_bandwidth, settings.max_disturbance / model.inputs.scale,
         noise, wander / model.inputs.scale, error / model.states.scale)
     levels = {}
     for level in settings.supervisor.levels:
-        law = plug(level.law, 'law', LAWS)(
-            model, replace(tuning, margin=level.margin))
-        levels[level.law] = Level(level.law, law, estimator(law.model, estimating),
-                                  settings.controlled or model.states.names)
+        law = plugged(level.law, 'law', LAWS, (model, replace(tuning, margin=level.margin)),
+                      ('model', 'compute'))
+        levels[level.law] = Level(
+            level.law, law, plugged(estimator, 'estimator', ESTIMATORS, (law.model, estimating),
+                                    ('model', 'predict', 'correct', 'restart')),
+            settings.controlled or model.states.names)
     return levels
 
 

@@ -7,8 +7,10 @@ from collections.abc import Callable, Iterator, Mapping
 import contextlib
 from dataclasses import dataclass, field
 from functools import partial
+import os
 from pathlib import Path
 import re
+import time
 from typing import Any
 
 from diagnostic_msgs.msg import DiagnosticStatus
@@ -27,6 +29,8 @@ from koopman_ros.wire import Place
 
 _START_TIME = 1.0  # s of plant time at the first measurement
 FIRST_STAMP_NS = round(_START_TIME * NANOSECONDS)
+_DISCOVERY = 1.0  # s in which the nodes of a domain are found
+_NODES = ('plant', 'controller', 'trainer', 'panel')
 _TIMEOUT = 30.0  # s for the processes to find each other, and from one command to the next
 
 
@@ -142,6 +146,33 @@ class Operator:
                              dict(self._active), self._commanded.pop(stamp)))
 
 
+def foreign(harness: Harness, wiring: Wiring) -> str:
+    """
+    Say which other nodes of the domain are in the way of a loop that has not started, or ''.
+
+    These are nodes of the names that the loop uses, publishers of its topics, and subscribers of
+    its commands but for `ros2 topic echo` and the like.
+    """
+    node, deadline = harness.node, time.monotonic() + _DISCOVERY
+    while time.monotonic() < deadline:
+        harness.spin_once()
+    used = {place.topic for kind in wiring.kinds for place in getattr(wiring, kind).values()}
+    commands = {place.topic for place in wiring.commands.values()}
+    names = [name for name, namespace in node.get_node_names_and_namespaces()
+             if namespace == '/']
+    there = [f'a node /{name}' for name in names if name in _NODES]
+    if names.count(node.get_name()) > 1:
+        there.append(f'another node /{node.get_name()}')
+    for topic in sorted(used):
+        there += [f'{topics.node_name(info)} publishes {topic}'
+                  for info in node.get_publishers_info_by_topic(topic)]
+    for topic in sorted(commands):
+        there += [f'{topics.node_name(info)} subscribes to {topic}'
+                  for info in node.get_subscriptions_info_by_topic(topic)
+                  if not info.node_name.startswith('_ros2cli')]
+    return ', '.join(dict.fromkeys(there))
+
+
 @contextlib.contextmanager
 def running_loop(scenario: Scenario, logs: Path, trainer: Mapping[str, object],
                  on_row: Callable[[Row], None] = lambda _: None,
@@ -149,17 +180,27 @@ def running_loop(scenario: Scenario, logs: Path, trainer: Mapping[str, object],
     """
     Run plant, controller and trainer in lock-step, the set-points requested, until it is left.
 
+    The ROS domain is that of ROS_DOMAIN_ID, where it is set, or else one that no other run uses.
     To be called from the main thread: it takes over Ctrl-C, so that the processes end.
 
     :param logs: folder for what the processes print.
     :param trainer: parameters of the trainer, which records from its start.
     :param on_row: called with what the operator sees, at every command.
     :param panel: parameters of a panel beside the loop, None for no panel.
-    :raises HarnessError: when a process ends early or the loop stands still.
+    :raises HarnessError: when others in the domain publish or take what the loop does, before
+        anything is commanded; when a process ends early or the loop stands still.
     """
     with (deferred_interrupt() as check_interrupt,
           Harness(logs, name='operator', timeout=_TIMEOUT, lasting=True,
-                  each_turn=check_interrupt) as harness):
+                  domain=os.environ.get('ROS_DOMAIN_ID', ''), each_turn=check_interrupt)
+          as harness):
+        domain = harness.environment['ROS_DOMAIN_ID']
+        print(f'ROS domain {domain}', flush=True)
+        if found := foreign(harness, scenario.wiring):
+            raise HarnessError(
+                f'ROS domain {domain} has other nodes with the names or topics of the demo: '
+                f'{found}; end them, or start in another domain: '
+                f'ROS_DOMAIN_ID={(int(domain) + 1) % 102} make demo')
         operator = Operator(scenario, harness, on_row)
         harness.start('controller', {'system': scenario.system, **scenario.controller})
         harness.start('trainer', {'system': scenario.system, **trainer})

@@ -115,6 +115,8 @@ class ControllerNode(ManagedNode):
         self._signals = signals_of(
             loaded.model, self._settings.controlled, self._settings.states)
         self._loaded: LoadedModel | None = loaded
+        # (n_u,) last command before the node became inactive, which is still in force at the plant
+        self._last_command: Array | None = None
 
     def configure(self) -> None:
         """Load the model and make what the loop needs; nothing is commanded yet."""
@@ -201,7 +203,7 @@ class ControllerNode(ManagedNode):
         self._watchdog.start()
 
     def activate(self) -> None:
-        """Begin to command, from what acts then; set-points asked for before are kept."""
+        """Begin to command, from the present inputs; set-points asked for before are kept."""
         with self._lock:
             asked = self._state.setpoint
             self._state = State(self._state.mode, Setpoint(
@@ -216,6 +218,8 @@ class ControllerNode(ManagedNode):
         """Answer nothing that waits; a command of the watchdog that is on its way goes out."""
         with self._lock:
             self._waiting.clear()
+            if self._state.command is not None:
+                self._last_command = self._state.command
 
     def complete(self) -> None:
         """Let nobody command while the middleware is taken down."""
@@ -293,6 +297,17 @@ class ControllerNode(ManagedNode):
         """Shortest time between two changes of the source, in s, where one may take over."""
         return self._settings.measurement_timeout or _SOURCES_WINDOW
 
+    def _present_inputs(self, stamp_ns: int) -> Array | None:
+        """
+        Return the inputs (n_u,) that the first command after an activation begins from, or None.
+
+        They are those measured at about that stamp, or else the last command before the node
+        became inactive, or else an older measurement.
+        """
+        if (measured := self._known_inputs(stamp_ns)) is not None:
+            return measured
+        return self._known_inputs() if self._last_command is None else self._last_command
+
     def _answer(self, sample: _Sample) -> None:
         stamp_ns, arrived = sample.stamp_ns, self._timing.now()
         advance = self._timing.arrive(
@@ -306,7 +321,7 @@ class ControllerNode(ManagedNode):
         for _ in range(_ATTEMPTS):
             before = state = self._state
             done: list[tuple[Event, events.Outcome]] = []
-            if state.command is None and (known := self._known_inputs()) is not None:
+            if state.command is None and (known := self._present_inputs(stamp_ns)) is not None:
                 initial = events.Initialisation(known)
                 done.append((initial, events.apply(self._controller, state, initial)))
                 state = done[0][1].state

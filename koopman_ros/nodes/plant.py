@@ -111,10 +111,21 @@ class PlantNode(ManagedNode):
                                f'{parameters.sample_period:g} s{start}, {pace}{lockstep}')
 
     def activate(self) -> None:
-        """Let time go on."""
+        """Let time go on from where it stood."""
         self._commanded = dict.fromkeys(self._signals.inputs, time.monotonic())
-        if self._sample:
+        if not self._sample:
+            return
+        if self._settings.lockstep:
+            self._answered = True
+            self._continue_lockstep()
+        elif self._real_time:
+            # its stamps are the system's time, which goes on
             self._resynchronise()
+        elif self._settings.speed:
+            # the next tick, in a period from now, is that of the next sample
+            self._tick.reset()
+            passed = (self._sample - 1) * self._period_ns / NANOSECONDS
+            self._wall_start = time.monotonic() - passed / self._settings.speed
 
     def _latched(self, topic: str, kind: Any) -> Any:
         return self._matching.publish(topic, kind, topics.LATCHED_QOS)

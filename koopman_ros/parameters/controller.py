@@ -151,14 +151,15 @@ class ControllerParameters:
     estimator: str = parameter(
         '', 'how states are estimated: extended_kalman_filter or unscented_kalman_filter, one of '
         'which a state needs that is not measured; disturbance_observer; measured_state takes '
-        'measurements as they are; module:class is one of your own; empty for the one that suits')
+        'measurements as they are; module:class is one of your own; empty for the one that suits',
+        code=True)
     transfer_time: float = parameter(
         0.0, 'time constant in which the inputs move to what another law, model, tuning or mode '
         'asks for', 's', 0.0, 86400.0)
     levels: tuple[str, ...] = parameter(
         ('sdre', 'linear'), 'laws, the best first: mpc plans ahead, within limits of the states; '
         'sdre solves the Riccati equation; linear has one gain; pi asks nothing of the model; '
-        'module:class is one of your own')
+        'module:class is one of your own', code=True)
     law_deadline: float = parameter(
         0.0, 'how long a law may take for a sample before the next one of the levels acts in its '
         'place; 0 for any time', 's', 0.0, 3600.0)

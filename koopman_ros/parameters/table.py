@@ -52,7 +52,9 @@ class Specification:
     open_minimum: bool = False  #: whether the minimum itself is excluded
     smallest: float = 0.0  #: above a minimum of 0 that stands for something of its own
     choices: tuple[str, ...] = ()  #: allowed strings, empty for any
-    read_only: bool = False  #: whether it can be changed while the node runs
+    read_only: bool = False  #: whether it is fixed at start
+    #: whether a value may name code as module:name, which is fixed at start
+    code: bool = False
 
     @property
     def range_text(self) -> str:
@@ -246,6 +248,7 @@ class ParameterTable(Generic[T]):
         for name, row in self.rows.items():
             notes = [row.range_text] if row.range_text else []
             notes += ['fixed at start'] if row.read_only else []
+            notes += ['a module:name is fixed at start'] if row.code else []
             lines += ['', f'    # {row.description}' + (f' [{row.unit}]' if row.unit else '')]
             lines += [f'    #   {"; ".join(notes)}'] if notes else []
             lines.append(f'    {name}: {as_yaml(row.default)}')

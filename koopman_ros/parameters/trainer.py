@@ -155,7 +155,7 @@ class TrainerParameters:
     scheduler: str = parameter(
         '', 'where a training works: empty for a process of its own beside this node; joblib for '
         'one on each core, joblib:N for N of them; tcp://host:port for the workers of a Dask '
-        'scheduler')
+        'scheduler', read_only=True)
     device: str = parameter(
         'cpu', 'what evaluates the residuals, on every worker: cpu, or a GPU as torch names it, '
         'like cuda')
@@ -171,7 +171,7 @@ class TrainerParameters:
     equations: str = parameter(
         '', 'plant whose equations are fitted in place of a polynomial: one of the library, the '
         'name of an entry point of the group koopman_ros.plants, or package.module:Class; empty '
-        'for none')
+        'for none', code=True)
     constants_estimated: tuple[str, ...] = parameter(
         ('',), 'constants of the equations that are estimated, in SI as the plant node has them, '
         'with their ranges, e.g. friction [0.01, 0.5]; a name alone for the range that the class '

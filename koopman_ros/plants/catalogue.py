@@ -10,7 +10,7 @@ from numpy.typing import ArrayLike
 
 from koopman_ros.plants.constants import in_plant_units
 from koopman_ros.plants.system import ControlAffineSystem
-from koopman_ros.plugs import plug
+from koopman_ros.plugs import cause, plug
 
 _LIBRARY = 'koopman_ros.plants.library'
 #: the classes of the library by name, each imported when it is asked for
@@ -63,17 +63,18 @@ def build(plant: Any, values: Mapping[str, float], nominal_state: ArrayLike | No
     :raises EquilibriumError: where the plant says so.
     """
     constants = in_plant_units(plant, values)
+    # a callable need not have a name
+    name = getattr(plant, '__name__', type(plant).__name__)
     try:
         made = plant(**constants)
         if not isinstance(made, ControlAffineSystem) and hasattr(made, 'system'):
             made = made.system() if nominal_state is None else made.system(nominal_state)
-    except ValueError:
+    except (KeyboardInterrupt, ValueError):
         raise
-    except Exception as error:  # a plant of one's own may fail in every way
-        cause = ' '.join(f'{type(error).__name__}: {error}'.split())
-        raise ValueError(f'the plant {plant.__name__} cannot be built ({cause}): correct its '
+    except BaseException as error:  # code of one's own may raise anything, SystemExit included
+        raise ValueError(f'the plant {name} cannot be built ({cause(error)}): correct its '
                          'class') from error
     if not isinstance(made, ControlAffineSystem):
-        raise ValueError(f'the plant {plant.__name__} returned a {type(made).__name__}, must be a '
+        raise ValueError(f'the plant {name} returned a {type(made).__name__}, must be a '
                          'ControlAffineSystem: return one from its method system')
     return made

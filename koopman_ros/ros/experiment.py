@@ -8,6 +8,7 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping
 import contextlib
 from functools import partial
+import math
 import time
 from typing import Any
 
@@ -15,7 +16,7 @@ import numpy as np
 from rclpy.callback_groups import MutuallyExclusiveCallbackGroup
 from rclpy.duration import Duration
 from rclpy.node import Node
-from rclpy.qos import ReliabilityPolicy
+from rclpy.qos import DurabilityPolicy, ReliabilityPolicy
 from rclpy.subscription import Subscription
 from rclpy.task import Future
 from std_msgs.msg import String
@@ -47,16 +48,18 @@ from koopman_ros.wire import Place, stem
 _TICK = 0.1  # s
 _ASTRAY = 10  # commands of a controller, and
 _ASTRAY_TIME = 1.0  # s, after which it is said not to follow
-_FAREWELL = 0.2  # s in which a last measurement is answered
+_PATIENCE = 0.5  # s that the first measurement waits for the present inputs
+_FAREWELL = 2.0  # s for the way back at the end of the process
+_ACKNOWLEDGED = 0.2  # s for the last command to arrive
 
 
 class PlantExperiment:
     """
     Drive the plant with random steps on the service ``~/experiment``; reports by diagnostics.
 
-    When the steps are over, the inputs return to their safe values along the rate limit, or the
-    set-points to what they were, and are held there until the service is called with false once
-    more, or another publisher comes.
+    The steps begin at the present inputs. When they are over, the inputs return to their safe
+    values along the rate limit, or the set-points to what they were, and are held there until the
+    service is called with false once more, or another publisher comes.
     """
 
     def __init__(self, node: ManagedNode, settings: TrainerParameters, wiring: Wiring) -> None:
@@ -68,17 +71,26 @@ class PlantExperiment:
         self._diagnostics = node.diagnostics.add('experiment', self._status)
         # a group of its own: the service waits for the first measurement
         self._owned = Owned(node)
+        # last command of each input, by whom it was; best effort fits every publisher
+        self._commanded: dict[str, float] = {}
+        Inlet(node, lambda topic, callback, kind: self._owned.keep(node.create_subscription(
+            kind, topic, callback, topics.profile(1, reliable=False))),
+            wiring.commands, wiring.signals.inputs, self._on_command)
         self._owned.keep(node.create_service(
             SetBool, '~/experiment', self._on_service,
             callback_group=MutuallyExclusiveCallbackGroup()))
 
     def complete(self) -> None:
-        """Leave the inputs at their safe values, and let go; publishes the last command."""
+        """Bring the inputs back as far as the rate limit allows in 2 s, and let go."""
         run = self._run
         if run is not None:
             run.stop(Phase.ENDED)
             run.farewell()
             self._let_go(self._verdict(run))
+
+    def _on_command(self, heard: Heard) -> None:
+        self._commanded |= {name: value for name, value in heard.values.items()
+                            if math.isfinite(value)}
 
     def destroy(self) -> None:
         """Take the service down, and a run with it: the inputs are left where they are."""
@@ -121,7 +133,8 @@ class PlantExperiment:
                 return (f'nobody publishes on {answers}: start the controller and switch it to '
                         f'{mode} mode')
         try:
-            self._run = ExperimentRun(self._node, self.settings, self._wiring, self._on_end)
+            self._run = ExperimentRun(
+                self._node, self.settings, self._wiring, self._commanded, self._on_end)
         except ValueError as error:
             return str(error)
         self._diagnostics.publish_if_changed()
@@ -201,12 +214,13 @@ class ExperimentRun:
     """
     Step the signals from the first measurement on until :meth:`destroy`.
 
+    :param commanded: last command of the inputs, by name, as far as it is known.
     :param on_end: called when the steps are over, with the reason when it must command no more.
     :raises ValueError: for bounds that are no plan.
     """
 
     def __init__(self, node: ManagedNode, settings: TrainerParameters, wiring: Wiring,
-                 on_end: Callable[[Reason | None], None]) -> None:
+                 commanded: Mapping[str, float], on_end: Callable[[Reason | None], None]) -> None:
         places = stepped(settings, wiring)
         signals = wiring.signals
         self._settings, self._signals = settings, signals
@@ -225,6 +239,11 @@ class ExperimentRun:
         self.started = Future()
         self._node = node
         self._patience, self._on_end = settings.experiment_timeout, on_end
+        self._commanded = commanded
+        self._applied: dict[str, tuple[int, float]] = {}  # stamp and value by name of the input
+        # the first measurement, while the present inputs are not known, and when it came
+        self._first: tuple[int, Array, str] | None = None
+        self._first_at = math.inf
         self._frame_id, self._stamp_ns, self._heard_at = '', 0, time.monotonic()
         self._sent: Array | None = None
         self._following = [Following(float(span)) for span in self.plan.upper - self.plan.lower]
@@ -237,6 +256,8 @@ class ExperimentRun:
         self._answers = Inlet(
             node, self._subscribe, wiring.commands, signals.inputs, self._on_command) if (
                 settings.experiment_on != COMMAND) else None
+        self._inputs = None if self._on_setpoints else Inlet(
+            node, self._subscribe, wiring.applied, signals.inputs, self._on_applied)
         if self._on_setpoints:
             Inlet(node, partial(self._subscribe, latched=True), wiring.active_setpoints,
                   signals.states, lambda heard: self._tracked.update(heard.values))
@@ -251,9 +272,11 @@ class ExperimentRun:
         offers = self._node.get_publishers_info_by_topic(self._node.resolve_topic_name(topic))
         reliable = all(info.qos_profile.reliability is not ReliabilityPolicy.BEST_EFFORT
                        for info in offers)
+        latched = latched or (bool(offers) and all(
+            info.qos_profile.durability is DurabilityPolicy.TRANSIENT_LOCAL for info in offers))
         return self._owned.keep(self._node.create_subscription(
-            kind, topic, callback, topics.LATCHED_QOS if latched else topics.profile(
-                topics.LOOP_QOS.depth, reliable=reliable)))
+            kind, topic, callback, topics.profile(
+                topics.LOOP_QOS.depth, reliable=reliable, latched=latched)))
 
     @property
     def topics(self) -> str:
@@ -273,11 +296,54 @@ class ExperimentRun:
     @property
     def going_home(self) -> str:
         """Say where the signals go when the steps are over."""
-        where = ', '.join(
-            f'{self._called(name)} to {shown(value, unit):.6g} {display_unit(unit)}'
-            for (name, unit), value in zip(self._units.items(), self.plan.home.tolist(),
-                                           strict=True))
-        return f'{where}, held there'
+        return f'{self._listed("to", self.plan.home)}, held there'
+
+    def _listed(self, preposition: str, values: Array) -> str:
+        """Write values (m,) with their names and units."""
+        return ', '.join(
+            f'{self._called(name)} {preposition} {shown(value, unit):.6g} {display_unit(unit)}'
+            for (name, unit), value in zip(self._units.items(), values.tolist(), strict=True))
+
+    @property
+    def _inputs_missing(self) -> bool:
+        """Whether the present inputs are likely to be known in a moment."""
+        if self._inputs is None or time.monotonic() - self._first_at > _PATIENCE:
+            return False
+        # a controller answers the first measurement, too
+        return (self._answers is not None and not self._commanded) or (
+            len(self._applied) < len(self._units) and self._inputs.published())
+
+    def _present(self, stamp_ns: int) -> Array:
+        """
+        Return the present inputs (m,) at a stamp, from which the steps begin.
+
+        Each is the one measured within `experiment_timeout` of the stamp, or else the last
+        command, an older measurement, or the safe value.
+        """
+        start = self.plan.home.copy()
+        recent = round(self._patience * NANOSECONDS)
+        for i, (name, unit) in enumerate(self._units.items()):
+            stamp, measured = self._applied.get(name, (-math.inf, math.nan))
+            found = [measured] if abs(stamp_ns - stamp) <= recent else []
+            found += [self._commanded.get(name, math.nan), measured]
+            start[i] = next(filter(math.isfinite, found), start[i])
+            if not any(map(math.isfinite, found)):
+                self._node.get_logger().warning(
+                    f'experiment: {self._called(name)} is not measured and was not commanded: '
+                    f'the steps begin at its safe value, {shown(start[i], unit):.6g} '
+                    f'{display_unit(unit)}')
+        return start
+
+    def _on_applied(self, heard: Heard) -> None:
+        for name, value in heard.values.items():
+            self._applied[name] = heard.stamp_ns, value
+        self._answer_first()
+
+    def _answer_first(self) -> None:
+        """Answer the first measurement when the present inputs are known, or after a moment."""
+        if self._first is not None and not self._inputs_missing:
+            first, self._first = self._first, None
+            self._answer(*first)
 
     def _called(self, name: str) -> str:
         return name if self._on_setpoints else stem(name, self._units[name])
@@ -293,32 +359,43 @@ class ExperimentRun:
             self.progress = end(self.progress, phase, why)
 
     def farewell(self) -> None:
-        """Leave the inputs at their safe values before the process ends."""
+        """Answer measurements for a moment with the way back, and leave the signals there."""
         if self.progress is None:
             return
-        self._command(self.plan.home, self._stamp_ns)
-        # a plant in lock-step takes only the answer to its next measurement
         deadline = time.monotonic() + _FAREWELL
-        while time.monotonic() < deadline:
+        while time.monotonic() < deadline and (self.progress.command != self.plan.home).any():
             for heard in self._measured.subscriptions:
                 with (handle := heard.handle):
                     if taken := handle.take_message(heard.msg_type, False):
                         header = getattr(taken[0], 'header', None)
-                        self._command(self.plan.home, self._stamp_ns if header is None else (
-                            stamp_nanoseconds(header.stamp)))
+                        stamp_ns = self._node.get_clock().now().nanoseconds if (
+                            header is None) else stamp_nanoseconds(header.stamp)
+                        self.progress = advance(self.plan, self.progress, None, stamp_ns)
+                        self._command(self.progress.command, stamp_ns)
                         break
             else:
                 time.sleep(0.001)
         for publisher in self._outlet.publishers:
-            publisher.wait_for_all_acked(Duration(seconds=_FAREWELL))
+            publisher.wait_for_all_acked(Duration(seconds=_ACKNOWLEDGED))
+        if (self.progress.command != self.plan.home).any():
+            self._node.get_logger().warning(
+                f'experiment: ended on the way back: {self._listed("at", self.progress.command)}, '
+                f'held there, in place of {self._listed("at", self.plan.home)}; command them by '
+                'hand or start the controller')
 
     def _on_measurement(self, heard: Heard) -> None:
         whole = self._assembler.take(heard.stamp_ns, heard.values)
         if whole is None:
             return
-        stamp_ns, measured = whole
+        self._answer(*whole, heard.frame_id)
+
+    def _answer(self, stamp_ns: int, measured: Array, frame_id: str) -> None:
         if self.progress is None:
             if self.started.done() or self._setpoints_missing:
+                return
+            self._first_at = min(self._first_at, time.monotonic())
+            if self._inputs_missing:
+                self._first = stamp_ns, measured, frame_id
                 return
             if self._on_setpoints:
                 self.plan = self._settings.experiment(
@@ -326,9 +403,10 @@ class ExperimentRun:
             self.started.set_result(refusal := self.plan.refusal(measured))
             if refusal is not None:
                 return
-            self.progress, self._heard_at = begin(self.plan, stamp_ns), time.monotonic()
+            self.progress, self._heard_at = begin(self.plan, stamp_ns, (
+                None if self._on_setpoints else self._present(stamp_ns))), time.monotonic()
         self._stamp_ns, newest_ns = stamp_ns, self.progress.time_ns
-        self._frame_id = heard.frame_id
+        self._frame_id = frame_id
         was_running = self.running
         if self._on_setpoints and not self._followed(self._tracked, Code.NOT_TRACKED):
             return
@@ -349,6 +427,7 @@ class ExperimentRun:
 
     def _on_command(self, heard: Heard) -> None:
         """Watch a controller that should be in manual mode."""
+        self._answer_first()
         if self.progress is not None and not self._on_setpoints:
             self._followed(heard.values, Code.NOT_FOLLOWED)
 
@@ -383,6 +462,7 @@ class ExperimentRun:
 
     def _on_tick(self) -> None:
         """Look for other commanders, and for measurements that stay away."""
+        self._answer_first()
         why = None
         for topic in dict.fromkeys(self._topics):
             if others := other_publishers(self._node, topic, own=1):

@@ -141,7 +141,10 @@ class Host:
             node = self._create(namespace=namespace, hosting=hosting)
             if isinstance(node, ManagedNode) and node.get_parameter('autostart').value:
                 node.start()
-        except Exception as error:
+        except KeyboardInterrupt:
+            raise
+        except BaseException as error:
+            # a module of the loop may also raise SystemExit
             self._note(namespace, error, 'cannot start: ')
             for made in hosting.made:
                 _destroy(made)
@@ -149,20 +152,20 @@ class Host:
         self._nodes[namespace] = node
         self._executor.add_node(node)
 
-    def _fail(self, namespace: str, error: Exception) -> None:
+    def _fail(self, namespace: str, error: BaseException) -> None:
         """Note what a callback of a node has raised; it gets no further ones."""
         if namespace not in self._failed:
             self._note(namespace, error, 'stopped: ')
             self._leaving.append(namespace)
 
-    def _note(self, namespace: str, error: Exception, what: str) -> None:
+    def _note(self, namespace: str, error: BaseException, what: str) -> None:
         self._failed[namespace] = f'{what}{one_line(error)}'
         expected = isinstance(error, START_ERRORS) and namespace not in self._nodes
         self._node.get_logger().error(f'{namespace}: {what}' + (
             one_line(error) if expected else ''.join(traceback.format_exception(error))))
         self._diagnostics.publish_if_changed()
 
-    def _on_own_failure(self, error: Exception) -> None:
+    def _on_own_failure(self, error: BaseException) -> None:
         raise error
 
     def _part(self, namespace: str) -> None:

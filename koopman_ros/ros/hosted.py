@@ -19,6 +19,7 @@ from typing import Any
 from rclpy.exceptions import InvalidHandle
 from rclpy.node import Node
 from rclpy.service import Service
+from rclpy.subscription import Subscription
 from rclpy.timer import Timer
 
 _POLL = 0.02  # s between two looks at what an asynchronous callback waits for
@@ -97,7 +98,7 @@ class Hosting:
 
     schedule: Schedule
     loops: int  #: that share the process
-    failed: Callable[[Exception], None]  #: is told what a callback of the node has raised
+    failed: Callable[[BaseException], None]  #: is told what a callback of the node has raised
     made: list[HostableNode] = field(default_factory=list)  #: the node, also a half-made one
 
     def guarded(self, callback: Callable[..., Any]) -> Callable[..., Any]:
@@ -106,7 +107,10 @@ class Hosting:
         def call(*arguments: Any) -> Any:
             try:
                 return callback(*arguments)
-            except Exception as error:
+            except KeyboardInterrupt:
+                raise
+            except BaseException as error:
+                # SystemExit, too: it would end the other nodes of the process
                 self.failed(error)
                 return None
 
@@ -130,7 +134,7 @@ class Hosting:
             except StopIteration as end:
                 timer.cancel()
                 done(end.value)
-            except Exception:
+            except BaseException:
                 timer.cancel()
                 raise
 
@@ -166,6 +170,17 @@ class HostableNode(Node):
         last: Any = answer if self.hosting is None else self.hosting.answering(answer)
         made.send_response = last  # type: ignore[method-assign]
         return made
+
+    def destroy_subscription(self, subscription: Subscription) -> bool:
+        """Destroy a subscription as any node does; messages that wait are dropped."""
+        # rclpy's EventsExecutor takes them all the same
+        subscription.callback = lambda _: None
+        return bool(super().destroy_subscription(subscription))
+
+    def destroy_service(self, service: Service) -> bool:
+        """Destroy a service as any node does; requests that wait are dropped."""
+        service.callback = lambda _, response: response
+        return bool(super().destroy_service(service))
 
     def guarded(self, callback: Callable[..., Any]) -> Callable[..., Any]:
         """Return a callback whose errors end no other node of the process."""

@@ -144,6 +144,7 @@ class ManagedNode(LifecycleNodeMixin, LoopNode):
 
     def _clean_up(self) -> None:
         self.complete()
+        self._refuse_requests()
         self.forget_tables()
         self.diagnostics.clear()
         destroyers: tuple[Callable[[Any], Any], ...] = (
@@ -154,6 +155,21 @@ class ManagedNode(LifecycleNodeMixin, LoopNode):
                 if not any(entity is other for other in kept):
                     destroy(entity)
 
+    def _refuse_requests(self) -> None:
+        """Answer the requests that wait at the services that are taken down."""
+        for service in self.services:
+            if any(service is kept for kept in self._kept[1]):
+                continue
+            with service.handle:
+                while (taken := service.handle.service_take_request(
+                        service.srv_type.Request))[1] is not None:
+                    response = service.srv_type.Response()
+                    if hasattr(response, 'message'):
+                        response.message = (
+                            f'{self.get_name()} is not configured: configure and activate it '
+                            'first')
+                    service.send_response(response, taken[1])
+
     def _entities(self) -> tuple[list[Any], ...]:
         # rclpy subscribes to the time whenever `use_sim_time` is set
         heard = [one for one in self.subscriptions if one.msg_type is not Clock]
@@ -161,7 +177,7 @@ class ManagedNode(LifecycleNodeMixin, LoopNode):
                 list(self.publishers))
 
 
-def one_line(error: Exception) -> str:
+def one_line(error: BaseException) -> str:
     """Return the words of an error, which rcl repeats over several lines."""
     text = str(error).split(', at ./')[0].split(', at /')[0]
     return ' '.join(text.split()) or type(error).__name__

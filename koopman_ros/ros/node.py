@@ -32,6 +32,7 @@ from rosgraph_msgs.msg import Clock as ClockMessage
 
 from koopman_ros.parameters.table import ConfigurationError, ParameterTable, Specification
 from koopman_ros.parameters.wire import DIAGNOSTICS, renamed, Signals
+from koopman_ros.plugs import own_code
 from koopman_ros.reasons import Words
 from koopman_ros.ros.codec import stamp_message
 from koopman_ros.ros.hosted import HostableNode, HostedTimer, Hosting
@@ -196,6 +197,7 @@ class LoopNode(HostableNode):
     def __init__(self, name: str, hosting: Hosting | None = None, **options: Any) -> None:
         self._table_of = name
         self._followers: list[Any] = []  # callbacks by which tables are followed
+        self._code: dict[str, list[str]] = {}  # module:name at the start, by parameter
         self._ranges: dict[str, msg.FloatingPointRange | msg.IntegerRange] = {}
         super().__init__(
             name, hosting, automatically_declare_parameters_from_overrides=True, **options)
@@ -282,7 +284,24 @@ class LoopNode(HostableNode):
             for name, row in table.rows.items()})
         if reason := table.check(snapshot):
             raise ConfigurationError(reason)
+        self._code = {name: own_code(table.values(snapshot)[name])
+                      for name, row in table.rows.items() if row.code}
+        if self._code:
+            self.add_on_set_parameters_callback(self._refuse_other_code)
         return snapshot
+
+    def _refuse_other_code(self, changes: list[Parameter]) -> msg.SetParametersResult:
+        """Refuse a module:name that was not given at the start, before it is imported."""
+        for change in changes:
+            known = self._code.get(change.name)
+            other = [] if known is None else [
+                name for name in own_code(change.value or '') if name not in known]
+            if other:
+                reason = (f'{change.name}: {other[0]!r} was not given at the start, and a '
+                          f'module:name is fixed at start: restart {self.get_name()} with it')
+                self.get_logger().warning(f'parameter change refused: {reason}')
+                return msg.SetParametersResult(successful=False, reason=reason)
+        return msg.SetParametersResult(successful=True)
 
     def _declare_row(self, row: Specification, given: Any) -> Any:
         unit = f' [{row.unit}]' if row.unit else ''
@@ -316,6 +335,8 @@ class LoopNode(HostableNode):
                     if change.name in table.rows}
 
         def validate(changes: list[Parameter]) -> msg.SetParametersResult:
+            if not (code := self._refuse_other_code(changes)).successful:
+                return code
             # rclpy has refused values of another type
             values = changed(changes)
             merged = table.amended(current, **values)

@@ -95,7 +95,7 @@ def told_executor() -> Executor:
 
 def _hosted(create: Callable[..., LoopNode]) -> tuple[Callable[[], None], LoopNode]:
     """Return the node of a loop, and what does one thing that is due, or waits for the next."""
-    schedule, failures = Schedule(), list[Exception]()
+    schedule, failures = Schedule(), list[BaseException]()
     node = create(hosting=Hosting(schedule, 1, failures.append))
     executor = told_executor()
     executor.add_node(node)
@@ -103,7 +103,8 @@ def _hosted(create: Callable[..., LoopNode]) -> tuple[Callable[[], None], LoopNo
     def spin() -> None:
         executor.spin_once(timeout_sec=min(LONGEST_WAIT, schedule.turn()))
         if failures:
-            raise failures[0]
+            raise failures[0] if isinstance(failures[0], Exception) else RuntimeError(
+                f'a callback raised {failures[0]!r}') from failures[0]
 
     return spin, node
 

@@ -27,7 +27,7 @@ from rclpy.task import Future
 from std_srvs.srv import SetBool, Trigger
 
 from koopman_ros.ros.topics import DIAGNOSTICS, LOOP_QOS
-from koopman_ros.testing.process import isolated_domain, NodeProcess
+from koopman_ros.testing.process import given_domain, isolated_domain, NodeProcess
 
 _TURN = 0.05  # s; how long the node listens before a condition is looked at again
 _ASK_AGAIN = 0.5  # s
@@ -60,6 +60,8 @@ class Harness:
     :param lasting: whether no process may end by itself, not even with code 0.
     :param imported: whether nodes of this package share their imports, which makes many starts
         cheap; see :class:`~koopman_ros.testing.forked.Forked`.
+    :param domain: ROS domain to work in, with this process's settings of discovery; by default one
+        that nobody else uses.
     :param each_turn: called again and again while something is waited for; may raise.
 
     :ivar node: the node in here, for whatever has no method of its own.
@@ -70,7 +72,7 @@ class Harness:
 
     def __init__(self, folder: Path, environment: Mapping[str, str] | None = None, *,
                  name: str = 'bench', timeout: float = 120.0, lasting: bool = False,
-                 imported: bool = False,
+                 imported: bool = False, domain: str = '',
                  each_turn: Callable[[], object] = lambda: None) -> None:
         self.folder = folder
         self.processes: list[NodeProcess] = []
@@ -80,7 +82,8 @@ class Harness:
         self._imported = imported
         self._each_turn = each_turn
         with contextlib.ExitStack() as stack:
-            self.environment = {**stack.enter_context(isolated_domain()), **(environment or {})}
+            chosen = given_domain(domain) if domain else isolated_domain()
+            self.environment = {**stack.enter_context(chosen), **(environment or {})}
             context = Context()
             rclpy.init(context=context, domain_id=int(self.environment['ROS_DOMAIN_ID']))
             stack.callback(rclpy.shutdown, context=context)

@@ -166,15 +166,34 @@ def isolated_domain() -> Iterator[dict[str, str]]:
                 'SYSTEM_DEFAULT' if 'fastrtps' in middleware else 'LOCALHOST'),
             'FASTRTPS_DEFAULT_PROFILES_FILE': str(config_directory() / LOOPBACK_PROFILE),
         }
-        before = {name: os.environ.get(name) for name in environment}
-        os.environ.update(environment)
-        try:
+        with _variables(environment):
             yield environment
-        finally:
-            for name, value in before.items():
-                os.environ.pop(name)
-                if value is not None:
-                    os.environ[name] = value
+
+
+@contextlib.contextmanager
+def given_domain(domain: str) -> Iterator[dict[str, str]]:
+    """Work in a ROS domain, on this machine alone unless the environment says otherwise."""
+    if not (domain.isdecimal() and int(domain) <= 232):
+        raise ValueError(f'ROS_DOMAIN_ID is {domain!r}, must be a whole number from 0 to 232, '
+                         'best up to 101')
+    environment = {'ROS_DOMAIN_ID': domain, 'ROS_AUTOMATIC_DISCOVERY_RANGE': (
+        os.environ.get('ROS_AUTOMATIC_DISCOVERY_RANGE') or 'LOCALHOST')}
+    with _variables(environment):
+        yield environment
+
+
+@contextlib.contextmanager
+def _variables(environment: Mapping[str, str]) -> Iterator[None]:
+    """Set environment variables of this process until the end."""
+    before = {name: os.environ.get(name) for name in environment}
+    os.environ.update(environment)
+    try:
+        yield
+    finally:
+        for name, value in before.items():
+            os.environ.pop(name)
+            if value is not None:
+                os.environ[name] = value
 
 
 @contextlib.contextmanager
