@@ -7,6 +7,8 @@ from collections.abc import Callable, Mapping, Sequence
 import importlib
 from typing import Any
 
+_LONGEST = 200  # characters of an error's text that reach a status
+
 
 def plug(name: str, kind: str, known: Mapping[str, Callable[..., Any] | str]) -> Any:
     """
@@ -26,11 +28,10 @@ def plug(name: str, kind: str, known: Mapping[str, Callable[..., Any] | str]) ->
                          'module:name of one of your own')
     try:
         found = getattr(importlib.import_module(module), attribute)
-    except KeyboardInterrupt:
-        raise
-    except BaseException as error:  # a module may raise anything, SystemExit included
-        raise ValueError(f'the {kind} {name!r} cannot be loaded ({cause(error)}): check module '
-                         'and name, and that Python finds the module') from error
+    except BaseException as error:
+        cause = contained(error)
+        raise ValueError(f'the {kind} {name!r} cannot be loaded ({cause}): check module and '
+                         'name, and that Python finds the module') from error
     if not callable(found):
         raise ValueError(f'the {kind} {name!r} is a {type(found).__name__}, which cannot be '
                          'called: name a class or a function')
@@ -49,11 +50,11 @@ def plugged(name: str, kind: str, known: Mapping[str, Callable[..., Any] | str],
     try:
         made = factory(*arguments)
         missing = [member for member in members if not hasattr(made, member)]
-    except (KeyboardInterrupt, ValueError):
+    except ValueError:
         raise
-    except BaseException as error:  # code of one's own may raise anything, SystemExit included
-        raise ValueError(f'the {kind} {name!r} cannot be constructed ({cause(error)}): correct '
-                         'its class') from error
+    except BaseException as error:
+        raise ValueError(f'the {kind} {name!r} cannot be constructed ({contained(error)}): '
+                         'correct its class') from error
     if missing:
         raise ValueError(f'the {kind} {name!r} returned a {type(made).__name__} without '
                          f'{" and ".join(missing)}: correct its class')
@@ -66,6 +67,12 @@ def own_code(value: Any) -> list[str]:
     return [name for name in names if isinstance(name, str) and ':' in name]
 
 
-def cause(error: BaseException) -> str:
-    """Return type and message of an exception in one line."""
-    return ' '.join(f'{type(error).__name__}: {error}'.split())
+def contained(error: BaseException) -> str:
+    """
+    Return in one line what a plug-in raised, whatever it is, also SystemExit.
+
+    :raises KeyboardInterrupt: where that is the error: it is meant for the process.
+    """
+    if isinstance(error, KeyboardInterrupt):
+        raise error
+    return ' '.join(f'{type(error).__name__}: {error}'.split())[:_LONGEST]

@@ -55,8 +55,8 @@ class Code(Enum):
         'two sources publish the measurement in turn, or its stamps go back again and again: end '
         'one of the publishers, and check the clock of the sensor')
     OUTSIDE_TRAINING = 'outside_training', (
-        'outside the trained range ({ranges:ranges}) by more than the {margin:g} half widths '
-        'that the {level:level} is allowed')
+        'the state is further from the training data than the {margin:g} half widths that the '
+        '{level:level} is allowed (the data span {ranges:ranges})')
     LAW_FAILED = 'law_failed', 'the {level:level} fails: {cause}'
     HELD_TOO_LONG = 'held_too_long', '{cause}; held for longer than {timeout:g} s'
     RECOVERING = 'recovering', '{cause} (over, waiting for it to stay so)'
@@ -87,6 +87,9 @@ class Code(Enum):
     TOO_LATE = 'too_late', (
         'its plan took {seconds:.3g} s, {deadline:.3g} s are allowed')
     COMMAND_NOT_FINITE = 'command_not_finite', 'its command is not finite'
+    CALCULATION_FAILED = 'calculation_failed', (
+        'the calculation failed ({error}): the estimate restarts from the next measurement')
+    LAW_RAISED = 'law_raised', 'its calculation failed ({error})'
     SETPOINT_NOT_FINITE = 'setpoint_not_finite', (
         '{signal} set-point {value:value} is not finite: the old one is kept')
     SETPOINT_UNMEASURED = 'setpoint_unmeasured', (

@@ -5,7 +5,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from functools import cached_property
 import math
@@ -46,6 +46,7 @@ from koopman_ros.control.supervisor import (
 )
 from koopman_ros.estimation import equivalent_bias, Estimate, Verdict
 from koopman_ros.lifting import Coordinates, LiftedModel
+from koopman_ros.plugs import contained
 from koopman_ros.reasons import Code, Reason, reason, UNMEASURED
 from koopman_ros.signals import numbers, Outputs
 from koopman_ros.units import LATE_NANOSECONDS, NANOSECONDS
@@ -57,6 +58,9 @@ _LONGEST_WATCH = 1.0
 # What changes of the state when no law acts any more, and when none is on its way back.
 _LAW_ENDS: Mapping[str, object] = {'law': None, 'law_input': None, 'law_memory': None}
 _WITHOUT_LAW: Mapping[str, object] = {**_LAW_ENDS, 'transfer': None}
+# What is forgotten where a calculation has failed, as it may be the cause.
+_RESTARTED: Mapping[str, object] = {
+    **_WITHOUT_LAW, 'estimate': None, 'way_back': None, 'target': None}
 
 
 @dataclass(frozen=True)
@@ -180,8 +184,8 @@ class Controller:
                     np.zeros(self.model.n_x) if estimate is None else estimate.w, state.target)
                 return holding.refusal(
                     goal, (state.setpoint.requested, state.setpoint.active), state.command, whole)
-        except np.linalg.LinAlgError as error:
-            return reason(Code.SINGULAR, matrix=str(error))
+        except BaseException as error:
+            return reason(Code.CALCULATION_FAILED, error=contained(error))
 
     def untrained(self, setpoint: setpoints.Setpoint) -> Reason | None:
         """Return what of a set-point, asked for already, is outside the trained range, or None."""
@@ -223,9 +227,15 @@ class Controller:
             return state
         estimating = self._estimating
         best = amended(state, supervisor=Supervisor())
+        try:
+            with np.errstate(all='ignore'):
+                estimate = estimating.rebase(
+                    state.estimate, estimating.level(state), estimating.level(best))
+        except BaseException as error:
+            contained(error)
+            estimate = None  # the next measurement starts it
         return amended(state, mode=mode, manual_input=None, supervisor=Supervisor(),
-                       way_back=None, estimate=estimating.rebase(
-                           state.estimate, estimating.level(state), estimating.level(best)))
+                       way_back=None, estimate=estimate)
 
     # What happens to the controller itself.
 
@@ -247,7 +257,20 @@ class Controller:
 
         What the two laws ask for in the present state differs by an offset that fades; what is
         estimated of the plant's rate stays. The state comes back in this controller's units.
+        Where that calculation fails the next measurement starts the estimate and the law.
         """
+        try:
+            with np.errstate(all='ignore'):
+                return self._inherited(predecessor, state)
+        except BaseException as error:
+            contained(error)
+            state = amended(state, **_RESTARTED, accepted=None)
+            if self.controlled.names != predecessor.controlled.names:
+                state = amended(state, setpoint=setpoints.Setpoint())
+            return state
+
+    def _inherited(self, predecessor: Controller, state: State) -> State:
+        """Return the state of a predecessor in this controller's units, with an offset."""
         state = self._estimating.inherit(predecessor._estimating, state)
         every = self._best.controls_all and predecessor._best.controls_all
         if not every and self.controlled.names != predecessor.controlled.names:
@@ -269,9 +292,13 @@ class Controller:
         """Return where (n_x,) the model has a set-point (n_c,) undisturbed; NaN for nowhere."""
         if self._best.controls_all:
             return setpoint
-        with np.errstate(all='ignore'):
-            target = self._best.target(
-                setpoint, np.zeros(self.model.n_x), self.settings.limits, None)
+        try:
+            with np.errstate(all='ignore'):
+                target = self._best.target(
+                    setpoint, np.zeros(self.model.n_x), self.settings.limits, None)
+        except BaseException as error:
+            contained(error)
+            target = None
         return np.full(self.model.n_x, np.nan) if target is None else (
             self.model.states.to_physical(target.x))
 
@@ -330,6 +357,17 @@ class Controller:
         state, seconds, missed = _passed(state, time_ns, elapsed)
         if countable is not None:
             seconds = min(seconds, countable)
+        return self._contained(
+            lambda: self._answer(state, y, time_ns, applied, elapsed, seconds, spacing, missed,
+                                 back),
+            amended(state, time_ns=time_ns),
+            MeasurementReport(Arrival.ACCEPTED, np.nan, missed=missed, clock_went_back=back),
+            time_ns, time_ns, elapsed, seconds)
+
+    def _answer(self, state: State, y: Array, time_ns: int, applied: Array | None, elapsed: float,
+                seconds: float, spacing: float, missed: int, back: bool
+                ) -> tuple[State, Array, Report]:
+        """Answer a measurement that is news; arguments as those of :meth:`_command`."""
         # a measurement of 1e300 may overflow on its way; the result is checked and limited
         with np.errstate(all='ignore'):
             u, follows = self._estimating.applied(state, applied)
@@ -370,22 +408,42 @@ class Controller:
             return state, None, self._report(state, None)
         since_ns = time_ns if state.commanded_ns is None else state.commanded_ns
         elapsed = max(0.0, (time_ns - since_ns) / NANOSECONDS)
-        # a command that nobody saw was not on its way
-        seconds = min(elapsed, max(_LONGEST_WATCH, 2.0 * _spacing(state)))
-        with np.errstate(all='ignore'):
-            state = amended(state, estimate=self._estimating.coast(
-                state, elapsed, self._estimating.applied(state)[0]))
-            fault, measured = None if cause is None else reason(cause), NOTHING_MEASURED
-            if fault is None and state.mode is Mode.AUTOMATIC:
-                if state.estimate is None or state.setpoint.active is None:
-                    return state, state.command, self._report(state, state.supervisor.reason)
-                x = self.model.states.to_physical(state.estimate.x)
-                measured = MeasurementReport(outside=self.model.distance(x))
-                state = amended(state, setpoint=setpoints.advance(
-                    state.setpoint, self._best.controlled_of(x), self.controlled,
-                    self.settings.setpoint_ramp, time_ns, seconds, self.settings.setpoint_filter))
-            return self._command(state, Verdict(state.accepted, fault), measured, time_ns,
-                                 max(time_ns, since_ns), elapsed, seconds, _spacing(state))
+        until_ns = max(time_ns, since_ns)
+
+        def coasting() -> tuple[State, Array, Report]:
+            with np.errstate(all='ignore'):
+                coasted = amended(state, estimate=self._estimating.coast(
+                    state, elapsed, self._estimating.applied(state)[0]))
+                return self._command(
+                    coasted, Verdict(state.accepted, reason(Code.NO_MEASUREMENT)),
+                    NOTHING_MEASURED, time_ns, until_ns, elapsed, elapsed)
+
+        return self._contained(
+            coasting, state, NOTHING_MEASURED, time_ns, until_ns, elapsed, elapsed)
+
+    def _contained(self, calculate: Callable[[], tuple[State, Array, Report]], before: State,
+                   measured: MeasurementReport, time_ns: int, commanded_ns: int, elapsed: float,
+                   seconds: float) -> tuple[State, Array, Report]:
+        """
+        Return the result of a calculation; where it fails the command is held, later the safe one.
+
+        This is the one place where a failure of an estimator, or of anything else that a step
+        calculates, is caught; that of a law is a reason for the next level (:class:`Level`).
+
+        :param before: the state to hold from; its estimate restarts from the next measurement.
+        """
+        try:
+            state, command, report = calculate()
+            if not finite(command):
+                raise FloatingPointError(f'the command would be {command.tolist()}')
+            if state.estimate is not None and not state.estimate.finite:
+                raise FloatingPointError('the estimate is not finite')
+            return state, command, report
+        except BaseException as error:
+            fault = reason(Code.CALCULATION_FAILED, error=contained(error))
+            return self._command(
+                amended(before, **_RESTARTED), Verdict(before.accepted, fault), measured, time_ns,
+                commanded_ns, elapsed, seconds)
 
     def equivalent_bias(self, state: State) -> Array:
         """Return the sensor's error (n_x,) that would explain the disturbance; NaN for none."""

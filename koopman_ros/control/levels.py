@@ -30,7 +30,7 @@ from koopman_ros.estimation import (
     Verdict,
 )
 from koopman_ros.lifting import Coordinates, LiftedModel
-from koopman_ros.plugs import plugged
+from koopman_ros.plugs import contained, plugged
 from koopman_ros.reasons import Code, Reason, reason
 from koopman_ros.signals import Outputs
 from koopman_ros.units import NANOSECONDS
@@ -56,7 +56,10 @@ class Level:
     @cached_property
     def unusable(self) -> Reason | None:
         """Why its law can never act, which it may say itself; None where it can."""
-        found: Reason | None = getattr(self.law, 'unusable', None)
+        try:
+            found: Reason | None = getattr(self.law, 'unusable', None)
+        except BaseException as error:
+            return reason(Code.CALCULATION_FAILED, error=contained(error))
         return found
 
     @cached_property
@@ -128,13 +131,33 @@ class Level:
     def compute(self, setpoint: Array, estimate: Estimate, limits: InputLimits, memory: object,
                 interval: float, start: Array | None, deadline: float = math.inf,
                 last: Array | None = None) -> tuple[Target | None, LawResult]:
-        """Evaluate the law towards a target, see :meth:`target`, for an estimate of its model."""
-        target = self.target(setpoint, estimate.w, limits, start)
-        if target is None:
-            return None, LawResult(None, reason(Code.NO_STEADY_STATE))
-        target = self.within_reach(target, estimate.w, limits)
-        return target, self.law.compute(
-            estimate, target, limits, memory, interval, deadline, last)
+        """
+        Evaluate the law towards a target, see :meth:`target`, for an estimate of its model.
+
+        Whatever it raises is a failure, and so is a result that is not a law's.
+        """
+        target = None
+        try:
+            target = self.target(setpoint, estimate.w, limits, start)
+            if target is None:
+                return None, LawResult(None, reason(Code.NO_STEADY_STATE))
+            target = self.within_reach(target, estimate.w, limits)
+            result = self.law.compute(estimate, target, limits, memory, interval, deadline, last)
+            return target, self._checked(result)
+        except BaseException as error:
+            return target, LawResult(None, reason(Code.LAW_RAISED, error=contained(error)))
+
+    def _checked(self, result: LawResult) -> LawResult:
+        """Return a law's result if its input (n_u,), or its failure, can be used."""
+        if not isinstance(result, LawResult):
+            raise TypeError(f'it returned {type(result).__name__}, not LawResult')
+        if result.failure is not None:
+            return amended(result, u=None)
+        if np.shape(result.u) != (self.model.n_u,):
+            raise ValueError(f'it returned an input of shape {np.shape(result.u)}, '
+                             f'not ({self.model.n_u},)')
+        return result if finite(np.asarray(result.u)) else LawResult(
+            None, reason(Code.COMMAND_NOT_FINITE))
 
     def within_reach(self, target: Target, w: Array, limits: InputLimits) -> Target:
         """Return the target, or what is nearest to it where the inputs do not suffice."""
@@ -275,6 +298,7 @@ class Estimating:
             predicted = self._corrected(
                 estimator, state, predicted, verdict, x, elapsed,
                 far or self.lost(state, time_ns))
+            _check(estimator, predicted)
             if not self.outputs.determine_state:
                 # the measurement has changed what it leaves open, too
                 x = self.position(predicted, y)
@@ -345,10 +369,14 @@ class Estimating:
                  ) -> Estimate | None:
         if state.estimate is None or state.command is None or not elapsed > 0.0:
             return state.estimate
-        predicted = estimator.predict(state.estimate, u, elapsed)
-        if predicted is None or not finite(predicted.x):
-            # after so long, or from so far out, nothing is known; the disturbance is kept
-            return state.estimate
+        try:
+            predicted = estimator.predict(state.estimate, u, elapsed)
+        except np.linalg.LinAlgError:
+            predicted = None  # so far out that the model gives no rate
+        if predicted is None or not predicted.finite:
+            # after so long, or from so far out, the state is as uncertain as at first; the
+            # disturbance is kept
+            return amended(state.estimate, covariance=None)
         return predicted
 
     def rebase(self, estimate: Estimate | None, before: Level, now: Level) -> Estimate | None:
@@ -388,6 +416,19 @@ class Estimating:
         moved = estimator.rebased(moved, np.zeros_like(moved.w))
         # what it holds of the disturbance is in the old model's units, and distances from its data
         return amended(state, estimate=moved, accepted=None, way_back=None)
+
+
+def _check(estimator: Estimator, estimate: Estimate) -> None:
+    """Raise a TypeError or ValueError for what is no estimate, or cannot be reported as one."""
+    if not isinstance(estimate, Estimate):
+        raise TypeError(f'the estimator returned {type(estimate).__name__}, not Estimate')
+    n_x, n_u = estimator.model.n_x, estimator.model.n_u
+    estimator.at_bound(estimate.w)
+    shapes = [np.shape(value) for value in (
+        estimate.x, estimate.w, estimator.as_input(estimate.w))]
+    if shapes != [(n_x,), (n_x,), (n_u,)]:
+        raise ValueError(f'the estimator gives x, w and its input of shapes {shapes}, not '
+                         f'{[(n_x,), (n_x,), (n_u,)]}')
 
 
 def _command(model: LiftedModel, state: State) -> Array:

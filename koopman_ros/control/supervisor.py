@@ -157,7 +157,7 @@ class Supervisor:
         settled = settings.order[depth(self.settled)]
         if requested.passing and depth(settled) < depth(requested.level):
             return Supervisor(requested.level, why, settled, bad_since)
-        if requested.passing and depth(settled) > depth(requested.level):
+        if requested.passing and requested.level == HOLD and depth(settled) > depth(HOLD):
             # on its way to the safe input, nothing is gained by a hold
             return Supervisor(settled, why, None, bad_since)
         if depth(requested.level) >= depth(settled):
@@ -200,13 +200,15 @@ class WayBack:
     since_ns: int  #: from when it has rested
     led: bool = False  #: whether the input has begun to move
 
-    def moved(self, outside: float, time_ns: int, recovery_time: float) -> WayBack:
+    def moved(self, outside: float, time_ns: int, recovery_time: float) -> WayBack | None:
         """
-        Take a distance in half widths into account.
+        Take a distance in half widths into account; None where the safe input led it back.
 
-        What still moves under the safe input is waited for, and what goes away from where the
-        way began starts it anew.
+        A plant that still moves under the safe input is waited for; one that moves further out
+        than where the way began starts it again.
         """
+        if not (outside > 0.0 or self.led):
+            return None
         change, still = outside - self.farthest, _MOVED * (1.0 + self.farthest)
         if change > still or (change < -still and not self.led):
             return WayBack(outside, outside, time_ns)

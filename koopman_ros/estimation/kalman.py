@@ -25,6 +25,9 @@ _WANDERED, _A_DAY = 3.0, 86400.0
 # The singular values of a matrix count as 0 below this share of the largest.
 _RANK = 1e-9
 _NO_VARIANCE = 1e-14  # likewise of a covariance
+# A prediction whose standard deviations exceed those of a first guess by this factor says nothing.
+# It also bounds the condition of the covariance, which rounding would make indefinite.
+_LOST = 10.0
 
 
 @dataclass(frozen=True)
@@ -130,6 +133,11 @@ class ExtendedKalmanFilter(BoundedDisturbance):
         P[n:, n:] = since * self._intensity
         return P
 
+    @cached_property
+    def _lost(self) -> Array:
+        """(n_x,) variances from which on a prediction of the state is worth nothing."""
+        return (_LOST * self.tuning.initial_error) ** 2
+
     def predict(self, estimate: Estimate, u: Array, seconds: float) -> Estimate | None:
         """Integrate the model, and the covariance with it; see :class:`Estimator`."""
         duration = seconds / self.model.seconds_per_time_unit
@@ -142,7 +150,9 @@ class ExtendedKalmanFilter(BoundedDisturbance):
         # the disturbance wanders first, and then stays for the interval
         P[n:, n:] += seconds * self._intensity
         x, P = self._propagated(estimate.x, estimate.w, P, u, duration / steps, steps)
-        return replace(estimate, x=x, covariance=P)
+        if not np.all(np.diag(P)[:n] <= self._lost):
+            return None
+        return replace(estimate, x=x, covariance=0.5 * (P + P.T))
 
     def _propagated(self, x: Array, w: Array, P: Array, u: Array, h: float, steps: int
                     ) -> tuple[Array, Array]:

@@ -64,9 +64,15 @@ class Estimate:
 
     x: Array  #: (n_x,) state
     w: Array  #: (n_x,) disturbance of its rate, taken as constant
-    #: (2 n_x, 2 n_x) of the errors of both, or None where it is not known
+    #: (2 n_x, 2 n_x) of the errors of both, or None where it is not known, or as at first
     covariance: Array | None = None
     innovation: Innovation | None = None  #: of the last measurement, or None likewise
+
+    @property
+    def finite(self) -> bool:
+        """Whether state, disturbance and covariance are finite numbers."""
+        return all(np.all(np.isfinite(value)) for value in (self.x, self.w, self.covariance)
+                   if value is not None)
 
 
 def _unknown() -> Array:

@@ -10,7 +10,7 @@ from numpy.typing import ArrayLike
 
 from koopman_ros.plants.constants import in_plant_units
 from koopman_ros.plants.system import ControlAffineSystem
-from koopman_ros.plugs import cause, plug
+from koopman_ros.plugs import contained, plug
 
 _LIBRARY = 'koopman_ros.plants.library'
 #: the classes of the library by name, each imported when it is asked for
@@ -72,7 +72,7 @@ def build(plant: Any, values: Mapping[str, float], nominal_state: ArrayLike | No
     except (KeyboardInterrupt, ValueError):
         raise
     except BaseException as error:  # code of one's own may raise anything, SystemExit included
-        raise ValueError(f'the plant {name} cannot be built ({cause(error)}): correct its '
+        raise ValueError(f'the plant {name} cannot be built ({contained(error)}): correct its '
                          'class') from error
     if not isinstance(made, ControlAffineSystem):
         raise ValueError(f'the plant {name} returned a {type(made).__name__}, must be a '
