@@ -6,6 +6,7 @@
 from itertools import pairwise
 import math
 from pathlib import Path
+import signal
 
 from diagnostic_msgs.msg import DiagnosticStatus
 import numpy as np
@@ -181,6 +182,18 @@ def test_service_ends_the_steps_and_then_lets_go(shared_bench: Bench) -> None:
     ros.wait_for_status(f'unit_1/{STATUS}', lambda s: s.message == 'ended')
 
 
+def test_process_that_ends_without_measurements_leaves_the_inputs_where_they_are(
+        ros: Harness) -> None:
+    bench = Bench(ros)
+    assert bench.start()[0]
+    while abs(last := bench.answer()) > SAFE - 3.0:
+        pass
+    process, = ros.processes
+    assert process.stop(signal.SIGTERM) == 0
+    assert bench.commands[-1].temperature == last
+    assert 'held there' in process.output()
+
+
 def test_silent_sensor_brings_the_safe_coolant(shared_bench: Bench) -> None:
     bench, ros = shared_bench, shared_bench.ros
     bench.set(experiment_timeout=0.5, **{'coolant_temperature.experiment_rate_limit': 10.0})
@@ -246,8 +259,10 @@ def test_reactor_that_leaves_its_bounds_and_trainer_that_ends_leave_the_safe_coo
     ros.wait_for_status('plant: simulation', lambda s: (
         float(value(s, 'time [s]')) > last
         and float(value(s, 'coolant [degC]')) == pytest.approx(SAFE)))
-    recorded = list(read_messages(bag, ['/coolant_setpoint']))
-    assert recorded[-1].message.temperature == pytest.approx(SAFE)
+    # from the present input on, and at the end of the process
+    recorded = [entry.message.temperature for entry in read_messages(bag, ['/coolant_setpoint'])]
+    assert recorded[-1] == pytest.approx(SAFE)
+    assert max(abs(b - a) for a, b in pairwise([to_celsius(PRESENT), *recorded])) <= 1.0 + 1e-9
     assert 'Traceback' not in ros.printed()
 
 
