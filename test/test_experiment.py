@@ -63,6 +63,16 @@ def test_steps_cover_the_duration_within_their_limits() -> None:
     np.testing.assert_allclose(ends, 30.0 * np.arange(1, 21))
 
 
+def test_steps_begin_at_the_present_values() -> None:
+    start = np.array([281.0, 0.75])
+    progress = begin(PAIR, START, start)
+    np.testing.assert_array_equal(progress.command, start)
+    for k in range(1, 60):
+        before, progress = progress, advance(PAIR, progress, PAIR_INSIDE, START + k * SECOND)
+        assert (abs(progress.command - before.command) <= PAIR.rate * (1.0 + 1e-9)).all()
+    assert progress.command[0] > 281.0
+
+
 def test_a_seed_gives_the_same_steps_and_another_seed_others() -> None:
     again, other = replace(PLAN), replace(PLAN, seed=4)
     np.testing.assert_array_equal(PLAN.steps, again.steps)

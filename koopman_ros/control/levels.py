@@ -200,6 +200,9 @@ def levels_of(model: LiftedModel, outputs: Outputs, settings: Settings) -> dict[
     for level in settings.supervisor.levels:
         law = plugged(level.law, 'law', LAWS, (model, replace(tuning, margin=level.margin)),
                       ('model', 'compute'))
+        if not isinstance(law.model, LiftedModel):
+            raise ValueError(f'the law {level.law!r} has a {type(law.model).__name__} for its '
+                             'model, must be a LiftedModel: correct its class')
         levels[level.law] = Level(
             level.law, law, plugged(estimator, 'estimator', ESTIMATORS, (law.model, estimating),
                                     ('model', 'predict', 'correct', 'restart')),

@@ -35,6 +35,8 @@ class TrainerNode(ManagedNode):
         self._recording: Recording | None = None
         self._experiment: PlantExperiment | None = None
         self._training: Training | None = None
+        # last command of each input, which stays in force while the node is not configured
+        self._commanded: dict[str, float] = {}
         self.declare_table(table)
 
     def configure(self) -> None:
@@ -52,7 +54,7 @@ class TrainerNode(ManagedNode):
             # what is in none of its messages is refused now, and not when a bag holds nothing
             list(by_topic(getattr(wiring, kind)))
         self._recording = Recording(self, settings, wiring)
-        self._experiment = PlantExperiment(self, settings, wiring)
+        self._experiment = PlantExperiment(self, settings, wiring, self._commanded)
         self._training = Training(
             self, settings, wiring, self._recording.flushed, self._on_trained)
         self.follow_table(table, settings, self._on_parameters,

@@ -17,6 +17,7 @@ from typing import Any, Generic, TypeVar
 import numpy as np
 
 from koopman_ros.arrays import Array
+from koopman_ros.plugs import cause
 from koopman_ros.units import conversion, display_unit, ZERO_CELSIUS
 
 T = TypeVar('T')
@@ -240,6 +241,8 @@ class ParameterTable(Generic[T]):
             self.build(snapshot)
         except (ValueError, ArithmeticError) as error:
             return ' '.join(str(error).split()) or type(error).__name__
+        except Exception as error:  # of a class of one's own, somewhere in what is built
+            return cause(error)
         return ''
 
     def yaml(self) -> str:

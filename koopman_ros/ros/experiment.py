@@ -60,9 +60,12 @@ class PlantExperiment:
     The steps begin at the present inputs. When they are over, the inputs return to their safe
     values along the rate limit, or the set-points to what they were, and are held there until the
     service is called with false once more, or another publisher comes.
+
+    :param commanded: last command of each input by name, of any node; kept up to date.
     """
 
-    def __init__(self, node: ManagedNode, settings: TrainerParameters, wiring: Wiring) -> None:
+    def __init__(self, node: ManagedNode, settings: TrainerParameters, wiring: Wiring,
+                 commanded: dict[str, float] | None = None) -> None:
         self.settings = settings  # of the next experiment
         self._node, self._wiring = node, wiring
         self._words = words_of(wiring.signals)
@@ -71,8 +74,8 @@ class PlantExperiment:
         self._diagnostics = node.diagnostics.add('experiment', self._status)
         # a group of its own: the service waits for the first measurement
         self._owned = Owned(node)
-        # last command of each input, by whom it was; best effort fits every publisher
-        self._commanded: dict[str, float] = {}
+        self._commanded = {} if commanded is None else commanded
+        # best effort fits every publisher
         Inlet(node, lambda topic, callback, kind: self._owned.keep(node.create_subscription(
             kind, topic, callback, topics.profile(1, reliable=False))),
             wiring.commands, wiring.signals.inputs, self._on_command)

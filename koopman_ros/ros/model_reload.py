@@ -251,8 +251,8 @@ class _Trial:
             outcome = replace(outcome, comparison=refuse_worse(present, outcome.model, situation))
         except (ModelFileError, FileNotFoundError) as error:
             outcome = str(error)
-        except Exception as error:
-            # whatever a file may hold: the loop goes on with what it has
+        except BaseException as error:
+            # whatever a file may hold, or a law of one's own raises: the loop goes on as it is
             outcome = (f'{name} cannot be used ({type(error).__name__}: {error}): train the '
                        'model again')
         # before whoever waits for it can ask for the same file again

@@ -10,6 +10,7 @@ import signal
 import sys
 
 import rclpy
+from rclpy.context import Context
 from rclpy.executors import Executor, SingleThreadedExecutor
 from rclpy.logging import LoggingSeverity, set_logger_level
 from rclpy.signals import SignalHandlerOptions
@@ -79,7 +80,7 @@ def run(name: str, create: Callable[..., LoopNode], args: list[str] | None = Non
     return node.exit_code or 0
 
 
-def told_executor() -> Executor:
+def told_executor(context: Context | None = None) -> Executor:
     """
     Return an executor that is told what comes, for nodes whose timers a schedule turns.
 
@@ -89,8 +90,8 @@ def told_executor() -> Executor:
     try:
         from rclpy.experimental import EventsExecutor
     except ImportError:
-        return SingleThreadedExecutor()
-    return EventsExecutor()
+        return SingleThreadedExecutor(context=context)
+    return EventsExecutor(context=context)
 
 
 def _hosted(create: Callable[..., LoopNode]) -> tuple[Callable[[], None], LoopNode]:

@@ -6,15 +6,19 @@
 import contextlib
 import json
 from pathlib import Path
+import re
 import signal
 import subprocess
 import sys
 
 import pytest
+import rclpy
+from sensor_msgs.msg import Temperature
 
 from koopman_ros.bags import summary
-from koopman_ros.demo import first_act
-from koopman_ros.testing import reserved_output
+from koopman_ros.demo import first_act, second_act
+from koopman_ros.ros import topics
+from koopman_ros.testing import Harness, NodeProcess, reserved_output
 
 
 def test_demo_leaves_bag_picture_and_summary(tmp_path: Path) -> None:
@@ -66,6 +70,31 @@ def test_demo_says_in_one_line_why_it_cannot_run(
     (line,) = capsys.readouterr().err.splitlines()
     assert line.startswith('demo: ')
     assert str(tmp_path / 'taken') in line
+
+
+def test_demo_commands_nothing_in_a_domain_with_another_loop(
+        ros: Harness, tmp_path: Path, monkeypatch: pytest.MonkeyPatch,
+        capsys: pytest.CaptureFixture[str]) -> None:
+    """In that of ROS_DOMAIN_ID, which it names."""
+    domain = ros.environment['ROS_DOMAIN_ID']
+    monkeypatch.setattr(NodeProcess, '__init__', None)  # starts nothing
+    own = ros.node.create_subscription(
+        Temperature, '/coolant_setpoint', lambda _: None, topics.LOOP_QOS)
+    for demo, *more in ((first_act.main, '--panel'), (first_act.main,), (second_act.main,)):
+        assert demo([*more, '--output', str(tmp_path / 'out')]) == 1
+        said = capsys.readouterr()
+        assert f'ROS domain {domain}\n' in said.out
+        (line,) = said.err.splitlines()
+        assert '/bench subscribes to coolant_setpoint' in line
+        assert re.search(r'ROS_DOMAIN_ID=\d+ make demo', line)
+    ros.node.destroy_subscription(own)
+    other = rclpy.create_node('controller', context=ros.node.context)
+    assert first_act.main(['--plant', 'pendulum', '--output', str(tmp_path / 'out')]) == 1
+    assert 'a node /controller' in capsys.readouterr().err
+    other.destroy_node()
+    monkeypatch.setenv('ROS_DOMAIN_ID', 'mine')
+    assert first_act.main(['--output', str(tmp_path / 'out')]) == 1
+    assert "'mine'" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize('module', ['koopman_ros.demo', 'koopman_ros.demo.retrain'])

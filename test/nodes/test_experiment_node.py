@@ -6,6 +6,7 @@
 from itertools import pairwise
 import math
 from pathlib import Path
+import signal
 
 from diagnostic_msgs.msg import DiagnosticStatus
 import numpy as np
@@ -17,6 +18,7 @@ from koopman_ros.bags import read_messages
 from koopman_ros.demo import reactor
 from koopman_ros.experiment import advance, begin, Phase
 from koopman_ros.lifting import load
+from koopman_ros.parameters.plant import PlantTable
 from koopman_ros.parameters.trainer import trainer_table
 from koopman_ros.parameters.wire import Signals
 from koopman_ros.resources import model_path
@@ -32,6 +34,7 @@ TRAINER, JACKET = 'unit_1/trainer', '/unit_1/jacket'
 TABLE = trainer_table(load(model_path(reactor.MODEL)))
 SIGNALS = Signals({'temperature': 'K'}, {'coolant_temperature': 'K'}, ('temperature',))
 SAFE = TABLE.snapshot({}).inputs['coolant_temperature'].safe
+PRESENT = PlantTable().system(PlantTable().snapshot({})).nominal_input[0]  # K
 IDLE = {'record_at_start': False}
 LOST = 'the trainer does not command any more'
 
@@ -105,7 +108,8 @@ def test_steps_drive_the_plant_as_planned(ros: Harness) -> None:
     assert all(late - early == 1.0 for early, late in pairwise(heard))
     assert np.ptp([message.temperature for message in commands]) > 12.0
     assert commands[-1].temperature == pytest.approx(SAFE, abs=1e-12)
-    progress = begin(plan, stamp_nanoseconds(measured[0].header.stamp))
+    # from the present input of the plant, which nobody has commanded
+    progress = begin(plan, stamp_nanoseconds(measured[0].header.stamp), np.array([PRESENT]))
     for message in measured:
         progress = advance(plan, progress, np.array([to_kelvin(message.temperature)]),
                            stamp_nanoseconds(message.header.stamp))
@@ -178,6 +182,18 @@ def test_service_ends_the_steps_and_then_lets_go(shared_bench: Bench) -> None:
     ros.wait_for_status(f'unit_1/{STATUS}', lambda s: s.message == 'ended')
 
 
+def test_process_that_ends_without_measurements_leaves_the_inputs_where_they_are(
+        ros: Harness) -> None:
+    bench = Bench(ros)
+    assert bench.start()[0]
+    while abs(last := bench.answer()) > SAFE - 3.0:
+        pass
+    process, = ros.processes
+    assert process.stop(signal.SIGTERM) == 0
+    assert bench.commands[-1].temperature == last
+    assert 'held there' in process.output()
+
+
 def test_silent_sensor_brings_the_safe_coolant(shared_bench: Bench) -> None:
     bench, ros = shared_bench, shared_bench.ros
     bench.set(experiment_timeout=0.5, **{'coolant_temperature.experiment_rate_limit': 10.0})
@@ -243,8 +259,10 @@ def test_reactor_that_leaves_its_bounds_and_trainer_that_ends_leave_the_safe_coo
     ros.wait_for_status('plant: simulation', lambda s: (
         float(value(s, 'time [s]')) > last
         and float(value(s, 'coolant [degC]')) == pytest.approx(SAFE)))
-    recorded = list(read_messages(bag, ['/coolant_setpoint']))
-    assert recorded[-1].message.temperature == pytest.approx(SAFE)
+    # from the present input on, and at the end of the process
+    recorded = [entry.message.temperature for entry in read_messages(bag, ['/coolant_setpoint'])]
+    assert recorded[-1] == pytest.approx(SAFE)
+    assert max(abs(b - a) for a, b in pairwise([to_celsius(PRESENT), *recorded])) <= 1.0 + 1e-9
     assert 'Traceback' not in ros.printed()
 
 

@@ -36,7 +36,7 @@ apply = events.apply
 def struck(*args):
     event = args[2]
     if isinstance(event, events.Measurement) and abs(event.measured[0] - {STRUCK_AT}) < 0.1:
-        raise KeyError('struck')
+        raise SystemExit('struck')
     return apply(*args)
 events.apply = struck
 sys.exit(controller.main())
@@ -53,6 +53,9 @@ PARAMETERS = """
 /line/bad/controller:
   ros__parameters:
     model: nowhere.safetensors
+/line/exits/controller:
+  ros__parameters:
+    levels: ['sdre', 'hosted_exits:Law']
 /line/struck/controller:
   ros__parameters:
     measurement_timeout: 0.3
@@ -103,8 +106,11 @@ def test_loops_of_a_process(ros: Harness, tmp_path: Path) -> None:
     shutil.copy(model_path('reactor_nz3'), model)
     parameters = tmp_path / 'site.yaml'
     parameters.write_text(PARAMETERS.format(model=model, safe=SAFE))
-    process = start(ros, 'controller', ('line/r1', 'line/bad', '/line/r2', 'line/struck'),
-                    '--params-file', str(parameters), command=(sys.executable, '-c', STRUCK))
+    (tmp_path / 'hosted_exits.py').write_text('raise SystemExit(3)')
+    process = start(
+        ros, 'controller', ('line/r1', 'line/bad', 'line/exits', '/line/r2', 'line/struck'),
+        '--params-file', str(parameters), command=(
+            sys.executable, '-c', f'import sys; sys.path.insert(0, {str(tmp_path)!r})\n{STRUCK}'))
     r1, r2, struck = (Loop(ros, f'/line/{name}') for name in ('r1', 'r2', 'struck'))
 
     # its own parameters and model
@@ -116,7 +122,8 @@ def test_loops_of_a_process(ros: Harness, tmp_path: Path) -> None:
 
     # the one that cannot start keeps no other from it
     ros.wait_for_status('controller_host: loops', lambda s: s.level == DiagnosticStatus.ERROR and (
-        s.message.startswith('3 of 4 loops run, 1 failed: /line/bad: cannot start: no model file')
+        s.message.startswith('3 of 5 loops run, 2 failed: /line/bad: cannot start: no model file')
+        and 'SystemExit' in s.message
         and value(s, 'to be started') == '0'))
     assert ('controller', '/line/bad') not in ros.node.get_node_names_and_namespaces()
     for loop in (r1, r2, struck):
@@ -139,13 +146,13 @@ def test_loops_of_a_process(ros: Harness, tmp_path: Path) -> None:
     # an error in a callback ends the loop, whose watchdog goes to the safe input
     struck.measure(STRIKES)
     ros.wait_for_status('controller_host: loops', lambda s: (
-        "/line/struck: stopped: 'struck'" in s.message and value(s, 'running') == '2'))
+        '/line/struck: stopped: struck' in s.message and value(s, 'running') == '2'))
     before = len(struck.commands)
     ros.wait_until(lambda: len(struck.commands) > before
                    and struck.commands[-1].temperature == pytest.approx(SAFE))
     r1.measure_and_wait()
     r2.measure_and_wait()
-    assert 'KeyError' in process.output()
+    assert 'SystemExit' in process.output()
 
     # the lifecycle is one's own
     change(ros, r2.node, 'deactivate')
@@ -162,7 +169,7 @@ def test_loops_of_a_process(ros: Harness, tmp_path: Path) -> None:
     r1.measure_and_wait()
     # who was shut down has not failed
     ros.wait_for_status('controller_host: loops', lambda s: (
-        value(s, 'running'), value(s, 'failed')) == ('1', '2'))
+        value(s, 'running'), value(s, 'failed')) == ('1', '3'))
     assert process.stop() == 0
     # all at once, and known to the others without a lease that has to end
     ros.wait_until(lambda: not {'controller', 'controller_host'} & set(ros.node.get_node_names()))

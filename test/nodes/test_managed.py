@@ -3,6 +3,8 @@
 
 """Managed nodes across processes: nothing acts before it is active, and all can be taken down."""
 
+from collections.abc import Callable
+from itertools import pairwise
 import os
 from pathlib import Path
 import sys
@@ -12,12 +14,14 @@ from lifecycle_msgs.msg import Transition
 from lifecycle_msgs.srv import ChangeState, GetState
 import pytest
 from sensor_msgs.msg import Temperature
+from std_msgs.msg import String
 from std_srvs.srv import SetBool, Trigger
 
 from koopman_ros.bags import read_messages, summary
 from koopman_ros.demo import reactor
 from koopman_ros.ros import topics
 from koopman_ros.testing import Harness, NodeProcess
+from support.controller_bench import reproduced
 from support.nodes import opened, seconds, temperature, value
 
 
@@ -62,6 +66,10 @@ def started(ros: Harness, node: str, command: tuple[str, ...] | None = None, **p
 
 def take_down(ros: Harness, node: str) -> None:
     assert change(ros, node, 'cleanup')
+    stays_down(ros, node)
+
+
+def stays_down(ros: Harness, node: str) -> None:
     assert state(ros, node) == 'unconfigured'
     ros.wait_until(lambda: parts(ros, node) == set())
     ros.statuses.clear()
@@ -98,7 +106,13 @@ def test_plant(ros: Harness) -> None:
     passed = seconds(measured[-1]) - seconds(measured[0])
     assert int(value(still, 'measurements')) == passed + 1
 
-    take_down(ros, 'plant')
+    reset = ros.node.create_client(Trigger, 'plant/reset')
+    ros.wait_until(reset.service_is_ready)
+    coolant = ros.node.create_publisher(Temperature, reactor.COOLANT_SETPOINT, topics.LOOP_QOS)
+    ros.wait_until(coolant.get_subscription_count)
+    clean_up_under_way(ros, 'plant', lambda: coolant.publish(temperature(20.0, 0.0)),
+                       lambda: reset.call_async(Trigger.Request()))
+    stays_down(ros, 'plant')
     assert not [s for s in ros.statuses if s.name.startswith('plant')]
     # it begins afresh, with what was set meanwhile
     assert all(result.successful for result in ros.set_parameters('plant', **{
@@ -115,25 +129,39 @@ def test_plant(ros: Harness) -> None:
     assert 'Traceback' not in process.output()
 
 
+def clean_up_under_way(ros: Harness, node: str, *sent: Callable[[], object]) -> None:
+    """Clean a node up while requests or messages are on their way to it, many of each."""
+    client = ros.node.create_client(ChangeState, f'{node}/change_state')
+    ros.wait_until(client.service_is_ready)
+    ros.meet(node)
+    asked = client.call_async(ChangeState.Request(transition=Transition(label='cleanup')))
+    for _ in range(20):
+        for send in sent:
+            send()
+    ros.wait_until(asked.done)
+    assert asked.result().success
+    assert state(ros, node) == 'unconfigured'
+
+
 class Loop:
     """A controller that is measured by the test."""
 
     def __init__(self, ros: Harness) -> None:
-        self.ros, self._time = ros, 0.0
+        self.ros, self.time = ros, 0.0
         self.commands = ros.listen(Temperature, reactor.COOLANT_SETPOINT)
         self._sensor = ros.node.create_publisher(
             Temperature, reactor.TEMPERATURE, topics.LOOP_QOS)
 
     def measure(self) -> None:
-        self._time += 1.0
-        self._sensor.publish(temperature(42.85, self._time))
+        self.time += 1.0
+        self._sensor.publish(temperature(42.85, self.time))
 
     def answered(self) -> bool:
         """Measure, and tell whether that is answered before the node does anything else."""
         self.measure()
         state(self.ros, 'controller')
         state(self.ros, 'controller')
-        return bool(self.commands) and seconds(self.commands[-1]) == self._time
+        return bool(self.commands) and seconds(self.commands[-1]) == self.time
 
 
 def test_controller(ros: Harness, tmp_path: Path) -> None:
@@ -158,8 +186,23 @@ def test_controller(ros: Harness, tmp_path: Path) -> None:
     ros.wait_for_status('controller: control', lambda s: s is not first)
     assert len(loop.commands) == count
 
-    take_down(ros, 'controller')
+    asked = ros.node.create_publisher(Temperature, reactor.SETPOINT, topics.LOOP_QOS)
+    manual = ros.node.create_publisher(
+        Temperature, reactor.MANUAL_COOLANT_SETPOINT, topics.LOOP_QOS)
+    switch = ros.node.create_client(SetBool, 'controller/set_automatic')
+    ros.wait_until(switch.service_is_ready)
+    ros.wait_until(lambda: asked.get_subscription_count() and manual.get_subscription_count())
+    clean_up_under_way(
+        ros, 'controller', loop.measure, lambda: asked.publish(temperature(44.0, 0.0)),
+        lambda: manual.publish(temperature(10.0, 0.0)),
+        lambda: switch.call_async(SetBool.Request(data=False)))
+    stays_down(ros, 'controller')
     assert not [s for s in ros.statuses if s.name.startswith('controller')]
+    assert len(loop.commands) == count
+    # code that was not named at the start
+    for name, code in (('levels', ['sdre', 'json:dumps']), ('estimator', 'this:s')):
+        (result,) = ros.set_parameters('controller', **{name: code})
+        assert 'fixed at start' in result.reason
     bad = tmp_path / 'bad.safetensors'
     bad.write_text('nonsense')
     for model, words in ((str(bad), str(bad)),
@@ -182,6 +225,51 @@ def test_controller(ros: Harness, tmp_path: Path) -> None:
     assert change(ros, 'controller', 'deactivate')
     assert change(ros, 'controller', 'shutdown')
     assert ros.wait_for_end(process) == 0
+    assert 'Traceback' not in process.output()
+
+
+@pytest.mark.parametrize('measured', [False, True], ids=['', 'measured'])
+def test_controller_goes_on_from_the_last_command(ros: Harness, measured: bool) -> None:
+    """After an activation, by the records, too; an input that was measured long ago is none."""
+    loop = Loop(ros)
+    applied = ros.node.create_publisher(
+        Temperature, reactor.COOLANT_TEMPERATURE, topics.LATCHED_QOS)
+    if measured:
+        applied.publish(temperature(15.0, 1.0))
+    process = started(ros, 'controller', measurement_timeout=0.0)
+    assert change(ros, 'controller', 'configure')
+    assert change(ros, 'controller', 'activate')
+    ros.meet('controller')
+    ros.wait_until(loop.answered)
+    assert ros.set_bool('controller/set_automatic', False).success
+    ros.speak(Temperature, reactor.MANUAL_COOLANT_SETPOINT, to='controller').publish(
+        temperature(8.0, 0.0))
+    ros.wait_until(lambda: loop.answered() and loop.commands[-1].temperature == 8.0)
+    records = ros.listen(String, topics.CONTROLLER_EVENTS)
+    ros.meet('controller')
+    for way in ('deactivate', 'cleanup', 'configure', 'activate'), ('deactivate', 'activate'):
+        count = len(loop.commands)
+        for transition in way:
+            if transition == 'activate':
+                records.clear()
+            assert change(ros, 'controller', transition)
+        ros.meet('controller')
+        ros.wait_until(loop.answered)
+        assert loop.commands[count].temperature == pytest.approx(8.0, abs=1.0 + 1e-9)
+        assert ros.set_bool('controller/set_automatic', False).success
+        ros.wait_until(loop.answered)
+    # a measured input is where it starts from, also one that is not what was commanded
+    assert change(ros, 'controller', 'deactivate')
+    count = len(loop.commands)
+    records.clear()
+    assert change(ros, 'controller', 'activate')
+    applied.publish(temperature(12.0, loop.time + 1.0))
+    ros.meet('controller')
+    ros.wait_until(loop.answered)
+    assert loop.commands[count].temperature == pytest.approx(12.0, abs=1.0 + 1e-9)
+    ros.wait_until(lambda: len(records) > 2)
+    reproduced(records)
+    assert process.stop() == 0
     assert 'Traceback' not in process.output()
 
 
@@ -232,19 +320,22 @@ def test_trainer(ros: Harness, tmp_path: Path) -> None:
     assert (response.success, response.message) == (False, words)
     assert not bag.exists()
 
-    def begin() -> None:
+    def begin() -> Any:
         timer = ros.node.create_timer(0.02, loop.measure)
         response = ros.set_bool('trainer/experiment', True)
         assert response.success, response.message
         ros.wait_until(lambda: len({message.temperature for message in loop.commands}) > 5)
-        ros.node.destroy_timer(timer)
+        return timer
 
     assert change(ros, 'trainer', 'activate')
-    begin()
+    timer = begin()
     assert change(ros, 'trainer', 'deactivate')
+    ros.node.destroy_timer(timer)
     ros.wait_until(lambda: ros.node.count_publishers(reactor.COOLANT_SETPOINT) == 0)
     count = len(loop.commands)
     assert loop.commands[-1].temperature == pytest.approx(18.85)
+    assert all(abs(b.temperature - a.temperature) <= 1.0 + 1e-9
+               for a, b in pairwise(loop.commands))
     assert summary(bag).complete
     last = list(read_messages(bag, ['/coolant_setpoint']))[-1].message
     assert (seconds(last), last.temperature) == (
@@ -264,16 +355,25 @@ def test_trainer(ros: Harness, tmp_path: Path) -> None:
     ros.wait_until(asked.done)
     assert asked.result().message == 'refused: it was ended before the first measurement'
 
-    take_down(ros, 'trainer')
+    record = ros.node.create_client(SetBool, 'trainer/record')
+    ros.wait_until(record.service_is_ready)
+    clean_up_under_way(ros, 'trainer', loop.measure,
+                       lambda: record.call_async(SetBool.Request(data=True)))
+    stays_down(ros, 'trainer')
     assert not [s for s in ros.statuses if s.name.startswith('trainer')]
     assert len(loop.commands) == count
+    (result,) = ros.set_parameters('trainer', equations='this:s')
+    assert 'fixed at start' in result.reason
     assert ros.set_parameters('trainer', **{'coolant_temperature.safe': 10.0})[0].successful
     assert change(ros, 'trainer', 'configure')
     assert change(ros, 'trainer', 'activate')
-    begin()
+    timer = begin()
     # ends what is under way, too
     assert change(ros, 'trainer', 'shutdown')
     assert ros.wait_for_end(process) == 0
+    ros.node.destroy_timer(timer)
     ros.wait_until(lambda: loop.commands[-1].temperature == pytest.approx(10.0))
+    assert all(abs(b.temperature - a.temperature) <= 1.0 + 1e-9
+               for a, b in pairwise(loop.commands))
     assert summary(tmp_path / 'run_3.mcap').complete
     assert 'Traceback' not in process.output()

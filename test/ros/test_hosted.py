@@ -76,9 +76,9 @@ def test_timer_that_cancels_itself_stays_cancelled(monkeypatch: pytest.MonkeyPat
     assert called == [10.5]
 
 
-def test_error_of_a_callback_goes_to_the_hosting() -> None:
-    failed: list[Exception] = []
-    error = KeyError('a')
+@pytest.mark.parametrize('error', [KeyError('a'), SystemExit(3), GeneratorExit()], ids=repr)
+def test_error_of_a_callback_goes_to_the_hosting(error: BaseException) -> None:
+    failed: list[BaseException] = []
 
     def act(value: int) -> int:
         if value < 0:
@@ -94,7 +94,7 @@ def test_error_of_a_callback_goes_to_the_hosting() -> None:
 @pytest.mark.parametrize('fails', [False, True], ids=['answers', 'fails'])
 def test_asynchronous_callback_is_awaited(monkeypatch: pytest.MonkeyPatch, fails: bool) -> None:
     clock, schedule = Steady(monkeypatch), Schedule()
-    failed: list[Exception] = []
+    failed: list[BaseException] = []
     sent: list[Any] = []
 
     class Twice:

@@ -15,8 +15,10 @@ from rclpy.parameter import Parameter
 from std_msgs.msg import String
 from std_srvs.srv import Trigger
 
+from koopman_ros.ros.hosted import Hosting, Schedule
 from koopman_ros.ros.managed import ManagedNode
 from koopman_ros.ros.node import Level, Status, wall_timer
+from koopman_ros.ros.process import told_executor
 from koopman_ros.testing import Harness
 from support.nodes import TIMEOUT
 
@@ -54,7 +56,7 @@ def node(shared_ros: Harness) -> Iterator[Failing]:
     made.destroy_node()
 
 
-def state(node: Failing) -> str:
+def state(node: ManagedNode) -> str:
     return str(node._state_machine.current_state[1])
 
 
@@ -99,6 +101,59 @@ def test_node_that_cannot_leave_all_well_acts_no_more_all_the_same(node: Failing
     assert node.trigger_deactivate() == TransitionCallbackReturn.SUCCESS
     assert (state(node), node.active) == ('inactive', False)
     assert node.refusal == 'failing is not active: activate it first'
+
+
+def test_what_waits_is_refused_or_dropped_when_it_is_taken_down(shared_ros: Harness) -> None:
+    """Under the executor of the loop's nodes, which takes what is queued in one go."""
+    ros, heard = shared_ros, list[Any]()
+
+    class Own(ManagedNode):
+        def configure(self) -> None:
+            for kind in range(2):
+                self.create_subscription(String, f'words_{kind}', self.take_down, 100)
+            self.create_service(Trigger, '~/serve', self.serve)
+            wall_timer(self, 1e-3, lambda: heard.append(self.configured()))
+
+        def configured(self) -> bool:
+            return state(self) == 'active'
+
+        def take_down(self, _: String) -> None:
+            heard.append(self.configured())
+            self.trigger_deactivate()
+            self.trigger_cleanup()
+
+        def serve(self, _: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
+            heard.append(self.configured())
+            return response
+
+    failures: list[BaseException] = []
+    schedule = Schedule()
+    node = Own('own', context=ros.node.context, hosting=Hosting(schedule, 1, failures.append))
+    node.start()
+    speakers = [ros.node.create_publisher(String, f'words_{kind}', 100) for kind in range(2)]
+    client = ros.node.create_client(Trigger, 'own/serve')
+    ros.wait_until(lambda: client.service_is_ready() and all(
+        speaker.get_subscription_count() for speaker in speakers))
+    for _ in range(20):
+        for speaker in speakers:
+            speaker.publish(String())
+    assert all(speaker.wait_for_all_acked() for speaker in speakers)
+    asked = [client.call_async(Trigger.Request()) for _ in range(3)]
+    executor = told_executor(ros.node.context)
+    executor.add_node(node)
+    deadline = time.monotonic() + TIMEOUT
+    while not all(future.done() for future in asked) and time.monotonic() < deadline:
+        executor.spin_once(timeout_sec=min(0.01, schedule.turn()))
+        ros.spin_once(0.0)
+    executor.shutdown()
+    node.destroy_node()
+    for made in (*speakers, client):
+        (ros.node.destroy_publisher if made in speakers else ros.node.destroy_client)(made)
+    assert failures == []
+    assert state(node) == 'unconfigured'
+    # no callback of what was taken down
+    assert all(heard)
+    assert all(future.done() for future in asked)
 
 
 def test_time_that_is_simulated_meanwhile_stays_so(node: Failing) -> None:
