@@ -121,7 +121,10 @@ def _verdict(now: Situation) -> tuple[Level, str]:
     timeout = now.parameters.measurement_timeout
     if not now.counts.measurements:
         awaited = f' of {now.assembler.awaited}' if now.assembler.awaited else ''
-        return Level.WARN, now.complaint or f'waiting for the first measurement{awaited}'
+        waiting = f'waiting for the first measurement{awaited}'
+        if mode is Mode.MANUAL and now.state.command is None:
+            waiting += f': the applied {now.input} is not known, and no manual command goes out'
+        return Level.WARN, now.complaint or waiting
     silence = now.timing.silence
     # nobody reads /clock meanwhile
     if timeout and (silence > timeout or (

@@ -21,6 +21,7 @@ import pytest
 from koopman_ros.control import events, Mode, State
 from koopman_ros.lifting import load_with_digest, save
 from koopman_ros.nodes.replay import replay_records
+from koopman_ros.reasons import Code, UNMEASURED
 from koopman_ros.replay import records
 from koopman_ros.replay.loop import Alternative, Lost, Replay
 from koopman_ros.replay.sources import Models
@@ -46,8 +47,9 @@ HAPPENS = st.one_of(
     MEASURED, MEASURED, MEASURED, MEASURED,
     st.tuples(st.just('measure'), st.sampled_from([np.nan, STEADY + 60.0, 1e300, -1.0]),
               st.just(1.0), st.none()),
-    st.tuples(st.just('measure'), NEAR, st.sampled_from([0.0, -0.5, -30.0, 90.0]), st.none()),
-    st.tuples(st.just('silence'), st.floats(0.5, 120.0)),
+    st.tuples(st.just('measure'), NEAR, st.sampled_from([0.0, -0.5, -30.0, 90.0]), st.none(),
+              st.none() | st.floats(0.0, 2.0)),
+    st.tuples(st.just('silence'), st.floats(0.5, 120.0), st.sampled_from([*UNMEASURED, None])),
     st.tuples(st.just('setpoint'), st.floats(STEADY - 12.0, STEADY + 4.0),
               st.sampled_from([0.0, 0.0, 3.5, 1e6])),
     st.tuples(st.just('manual'), st.floats(COOLANT - 30.0, COOLANT + 30.0) | st.just(np.inf)),
@@ -61,12 +63,19 @@ HAPPENS = st.one_of(
     st.tuples(st.just('snapshot')))
 
 
+def test_events_of_records_without_the_later_fields_are_as_they_were() -> None:
+    old = {'stamp_ns': SECOND, 'measured': [300.0], 'applied': None}
+    assert records.event_of(records.Record('run', 0, 'measurement', old)).seconds is None
+    assert records.event_of(records.Record('run', 1, 'silence', {'stamp_ns': SECOND})) == (
+        events.Silence(SECOND, Code.NO_MEASUREMENT))
+
+
 def happen(controller: Recorded, event: tuple) -> None:
     match event:
-        case ('measure', kelvin, after, applied):
-            controller.measure(kelvin, after, applied)
-        case ('silence', seconds):
-            controller.do(events.Silence(controller.now + round(seconds * SECOND)))
+        case ('measure', *measurement):
+            controller.measure(*measurement)
+        case ('silence', seconds, cause):
+            controller.do(events.Silence(controller.now + round(seconds * SECOND), cause))
         case ('setpoint', kelvin, ahead):
             stamp_ns = controller.now + round(ahead * SECOND) if ahead else 0
             controller.do(events.SetpointRequest(stamp_ns, np.array([kelvin])))

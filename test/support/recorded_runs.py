@@ -153,10 +153,11 @@ class Recorded:
             self.write(*records.fields_of(event, outcome))
         return outcome
 
-    def measure(self, kelvin: float, after: float = 1.0, applied: float | None = None) -> None:
+    def measure(self, kelvin: float, after: float = 1.0, applied: float | None = None,
+                seconds: float | None = None) -> None:
         self.now += round(after * SECOND)
         self.do(Measurement(self.now, np.array([kelvin]),
-                            None if applied is None else np.array([applied])))
+                            None if applied is None else np.array([applied]), seconds))
         self.answers.append((self.now, kelvin, float(self.commands[-1][0])))
 
     def exchange(self, **parameters: object) -> None:
