@@ -17,7 +17,7 @@ from typing import Any, Generic, TypeVar
 import numpy as np
 
 from koopman_ros.arrays import Array
-from koopman_ros.plugs import cause
+from koopman_ros.plugs import contained
 from koopman_ros.units import conversion, display_unit, ZERO_CELSIUS
 
 T = TypeVar('T')
@@ -242,7 +242,7 @@ class ParameterTable(Generic[T]):
         except (ValueError, ArithmeticError) as error:
             return ' '.join(str(error).split()) or type(error).__name__
         except Exception as error:  # of a class of one's own, somewhere in what is built
-            return cause(error)
+            return contained(error)
         return ''
 
     def yaml(self) -> str:
