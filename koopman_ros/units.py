@@ -7,6 +7,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from functools import cache, cached_property
 import math
+import re
 from typing import Any, TypeVar
 
 import numpy as np
@@ -44,6 +45,12 @@ _AT_HAND = {('K', 'degC'): Conversion(offset=-ZERO_CELSIUS),
             ('degC', 'K'): Conversion(offset=ZERO_CELSIUS)}
 # Likewise: units that there are.
 _USUAL = {'K', 'degC', 'Pa', 'm', 'm/s', 'rad', 'rad/s', 'N', 'N m', 'V', 'W', 'mol/L', '1'}
+# Names of units with powers, multiplied and divided. The registry skips characters that it does
+# not know, reads comments, and evaluates powers of numbers without a bound.
+_POWER = r'(?:(?:\^|\*\*)-?\d{1,2}(?:\.\d{1,2})?|[²³])?'
+_FACTOR = rf'\(*(?:1|[^\W\d]\w*|[°%][^\W\d]*){_POWER}(?:\){_POWER})*'
+_UNIT = re.compile(rf'(?:{_FACTOR}(?: ?[*/] ?| ))*{_FACTOR}')
+_LONGEST = 60  # characters of a unit
 
 
 @cache
@@ -57,9 +64,11 @@ def conversion(unit: str, wanted: str) -> Conversion:
         return Conversion()
     if (unit, wanted) in _AT_HAND:
         return _AT_HAND[unit, wanted]
-    # not before: it takes 0.4 s
-    registry = _registry()
     try:
+        for each in (unit, wanted):
+            _check_form(each)
+        # not before: it takes 0.4 s
+        registry = _registry()
         offset = float(registry.Quantity(0.0, unit).to(wanted).magnitude)
         factor = float(registry.Quantity(1.0, unit).to(wanted).magnitude) - offset
         if offset != 0.0:
@@ -79,11 +88,18 @@ def check_unit(unit: str) -> None:
     if unit in _USUAL:
         return
     try:
+        _check_form(unit)
         _registry().Quantity(1.0, unit)
     # as above
     except Exception as error:
-        raise ValueError(f'there is no unit {unit!r}: write one like K, m/s, L/min or N m, or 1 '
+        shown = unit if len(unit) <= _LONGEST else f'{unit[:_LONGEST]}...'
+        raise ValueError(f'there is no unit {shown!r}: write one like K, m/s, L/min or N m, or 1 '
                          'for none') from error
+
+
+def _check_form(unit: str) -> None:
+    if unit and (len(unit) > _LONGEST or not _UNIT.fullmatch(unit)):
+        raise ValueError(f'{unit[:_LONGEST]!r} is not written as a unit')
 
 
 def check_time_unit(unit: str) -> None:

@@ -12,6 +12,8 @@ import math
 import re
 from typing import Any
 
+import numpy as np
+
 from koopman_ros.units import conversion, display_unit
 
 
@@ -44,9 +46,17 @@ _TYPES = {'K': ('sensor_msgs/msg/Temperature', ''), 'Pa': ('sensor_msgs/msg/Flui
           **dict.fromkeys(('N m', 'N'), (JOINT_STATE, 'effort[{name}]'))}
 _QUANTITIES = {'K': 'temperature', 'Pa': 'pressure'}
 
+# What topics and parameters may be named after.
+SIGNAL_NAME = re.compile(r'[A-Za-z]\w*', re.ASCII)
 # where the names of the elements of a message's arrays are
 _NAMES = ('name', 'joint_names')
 _STEP = re.compile(r'([A-Za-z_]\w*)(?:\[((?:[^\[\]]|\[[^\[\]]*\])+)\])?(\.|$)')
+
+
+def full_type_name(name: str) -> str:
+    """Return package/msg/Name for package/Name, as some writers shorten it; others as they are."""
+    package, _, rest = name.partition('/')
+    return f'{package}/msg/{rest}' if package and rest and '/' not in rest else name
 
 
 @dataclass(frozen=True)
@@ -58,11 +68,12 @@ class Place:
     """
 
     topic: str  #: name of the topic
-    type: str  #: of its messages, as package/msg/Name
+    type: str  #: of its messages, as package/msg/Name; package/Name is written out
     field: str  #: path in the message, e.g. ``twist.linear.x``, ``data[2]``, ``position[shaft]``
     unit: str  #: of the number there
 
     def __post_init__(self) -> None:
+        object.__setattr__(self, 'type', full_type_name(self.type))
         _steps(self.field)
 
     @cached_property
@@ -85,6 +96,9 @@ class Place:
             except (AttributeError, IndexError, ValueError, TypeError) as error:
                 raise LookupError(f'{self.field} is not in a message of {self.topic} '
                                   f'({self.type})') from error
+        if isinstance(value, bytes) and len(value) == 1:
+            # a byte, as rclpy has it
+            return float(value[0])
         try:
             return float(value)
         except (TypeError, ValueError) as error:
@@ -99,8 +113,22 @@ class Place:
             if key:
                 return
             message = getattr(message, name)
-        if not isinstance(message, (int, float)):
+        if not isinstance(message, (int, float)) and not (
+                isinstance(message, bytes) and len(message) == 1):
             raise LookupError(f'{self.field} of {self.type} is no number: name another field')
+
+    def expect_decimals(self, message: Any) -> None:
+        """Raise LookupError where a message of its kind, here an empty one, holds integers."""
+        path = _steps(self.field)
+        for name, key in path:
+            message = getattr(message, name)
+            if key:
+                break
+        kind = getattr(message, 'typecode', '') or getattr(message, 'dtype', np.dtype('d')).char
+        if isinstance(message, (int, bytes)) or kind not in 'df' or (
+                isinstance(message, list) and key and (name, key) == path[-1]):
+            raise LookupError(f'{self.field} of {self.type} holds integers, a value would be '
+                              'rounded: name a field of float64 or float32')
 
     def put(self, message: Any, value: float) -> None:
         """Write a number into a message, whose arrays grow where they are too short."""
@@ -166,7 +194,7 @@ def place(topic: str, name: str, unit: str, given: Mapping[str, str] | None = No
     """
     said = {key: value for key, value in (given or {}).items() if value}
     kind, array = _TYPES.get(unit, (JOINT_STATE, ''))
-    kind = said.get('type', kind)
+    kind = full_type_name(said.get('type', kind))
     carrier = CARRIERS.get(kind, _ANY)
     field = said.get('field') or (array if kind == JOINT_STATE and array else carrier.field)
     if not field:

@@ -41,6 +41,11 @@ def test_relative_links_lead_somewhere(page: Path) -> None:
 
 
 @each_page
+def test_empty_texts_in_commands_have_the_quotes_that_ros_needs(page: Path) -> None:
+    assert not re.findall(r"-p [\w./]+:=(?:''|\"\"|(?=\s))", page.read_text())
+
+
+@each_page
 def test_named_files_are_there(page: Path) -> None:
     for code in _inline_code(page):
         for name in re.findall(rf'(?<![/\w])(?:{PARTS})/[\w./*]*', code):

@@ -112,6 +112,7 @@ def _pieces(stream: BinaryIO, budget: limits.Budget) -> Iterator[_Piece | Schema
                     if last < len(opcodes):
                         yield _announcement(opcodes[last], held.content[
                             held.starts[last]:ends[last]])
+                held.raise_rest()
             elif isinstance(record, Message):
                 content = MESSAGE_HEAD.pack(record.channel_id, record.sequence, record.log_time,
                                             record.publish_time) + record.data

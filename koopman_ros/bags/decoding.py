@@ -11,11 +11,13 @@ from pathlib import Path
 from typing import Any
 
 from mcap.exceptions import EndOfFile
+from mcap.records import Schema
 from mcap.well_known import SchemaEncoding
 from mcap_ros2.decoder import DecoderFactory
 
 from koopman_ros.bags import limits
 from koopman_ros.bags.records import StoredMessage
+from koopman_ros.wire import full_type_name
 
 
 @dataclass(frozen=True, slots=True)
@@ -23,7 +25,8 @@ class BagMessage:
     """
     One message of a bag: times of receipt and of sending [ns], decoded fields, original bytes.
 
-    `message` has the fields of the ROS message as attributes (`message.header.stamp.sec`).
+    `message` has the fields of the ROS message as attributes (`message.header.stamp.sec`); it is
+    None for a type that is not decoded here.
     """
 
     topic: str
@@ -32,6 +35,15 @@ class BagMessage:
     publish_time_ns: int
     message: Any
     data: bytes
+
+
+class UndecodableError(limits.BagReadError):
+    """A topic whose type or encoding is not decoded here; its messages may be whole."""
+
+
+def type_name(schema: Schema | None) -> str:
+    """Return the full name of a message type, '' without a schema."""
+    return full_type_name(schema.name) if schema else ''
 
 
 class _WholeSlices(bytes):
@@ -54,7 +66,7 @@ class Decoders:
     def __init__(self, file: Path) -> None:
         self._file = file
         self._factory = DecoderFactory()
-        self._known: dict[tuple[str, int], Callable[[bytes], Any]] = {}
+        self._known: dict[tuple[str, int], Callable[[bytes], Any] | UndecodableError] = {}
 
     def decode(self, stored: StoredMessage) -> BagMessage:
         """Return a message with its fields; raise BagReadError where that cannot be."""
@@ -70,8 +82,14 @@ class Decoders:
                 f'{str(self._file)!r}: the message on {channel.topic!r} at {message.log_time} ns '
                 f'does not decode ({limits.reason(error)}): read the other topics by name'
             ) from error
-        return BagMessage(channel.topic, stored.schema.name if stored.schema else '',
-                          message.log_time, message.publish_time, fields, message.data)
+        return self.undecoded(stored, fields)
+
+    @staticmethod
+    def undecoded(stored: StoredMessage, fields: Any = None) -> BagMessage:
+        """Return a message with its bytes, and with fields that were decoded before."""
+        message = stored.message
+        return BagMessage(stored.channel.topic, type_name(stored.schema), message.log_time,
+                          message.publish_time, fields, message.data)
 
     def fields(self, stored: StoredMessage, data: bytes) -> Any:
         """Return the fields of other data on the channel of a message; it fails in any way."""
@@ -80,8 +98,14 @@ class Decoders:
     def _prepare(self, stored: StoredMessage) -> Callable[[bytes], Any]:
         key = stored.channel.message_encoding, stored.channel.schema_id
         if key not in self._known:
-            self._known[key] = self._decoder(stored)
-        return self._known[key]
+            try:
+                self._known[key] = self._decoder(stored)
+            except UndecodableError as error:
+                self._known[key] = error
+        known = self._known[key]
+        if isinstance(known, UndecodableError):
+            raise known.with_traceback(None)
+        return known
 
     def _decoder(self, stored: StoredMessage) -> Callable[[bytes], Any]:
         schema, encoding = stored.schema, stored.channel.message_encoding
@@ -95,12 +119,12 @@ class Decoders:
             raise
         except Exception as error:
             # Another recorder's schema text meets the definition parser here.
-            raise limits.BagReadError(
+            raise UndecodableError(
                 f'{str(self._file)!r}: the definition stored for {stored.channel.topic!r} does '
                 f'not parse ({limits.reason(error)}): read the other topics by name') from error
         if decoder is None:
             schema_encoding = schema.encoding if schema else 'no schema'
-            raise limits.BagReadError(
+            raise UndecodableError(
                 f'{str(self._file)!r}: topic {stored.channel.topic!r} is encoded as {encoding!r} '
                 f'with {schema_encoding!r}, only cdr with ros2msg is decoded here: read the other '
                 'topics by name')

@@ -26,6 +26,10 @@ from koopman_ros.wire import Place
 # A gap is longer than this many usual periods.
 _GAP_PERIODS = 3.5
 _SHORTEST = 10
+# The plant's time, where it is simulated, and how far receipts may differ from it.
+_CLOCK = Place('/clock', 'rosgraph_msgs/msg/Clock', 'clock.sec', 's')
+_SAME_PACE = 0.02
+_SAME_PACE_SECONDS = 1.0
 
 
 def loop_episodes(bags: Sequence[str | os.PathLike[str]], states: Sequence[RecordedState],
@@ -69,7 +73,8 @@ def stream_episodes(bags: Sequence[str | os.PathLike[str]], states: Sequence[Rec
     :param tolerance_ns: how far stamps of one sample of several states may lie apart.
     :param least_jumps: smallest change of each state, in its unit, that may be a spike or a jump;
         by default the record alone tells.
-    :raises BagReadError: for a bag that cannot be read, lacks a topic, or has another type there.
+    :raises BagReadError: for a bag that cannot be read, lacks a topic, or has another type there,
+        and for states without stamps whose receipts run at another pace than /clock in the bag.
     """
     for bag in distinct(bags, account):
         cuts = Cuts()
@@ -78,6 +83,8 @@ def stream_episodes(bags: Sequence[str | os.PathLike[str]], states: Sequence[Rec
                      tolerance_ns, least_jumps or [0.0] * len(states))
         check_places(bag, content, loop.scales)
         for run in loop.runs(content):
+            if content.types.get(_CLOCK.topic) == _CLOCK.type and run.without_stamps():
+                loop.refuse_other_clock()
             for episode in loop.episodes(run):
                 account.used += len(states) * len(episode)
                 yield episode
@@ -182,6 +189,30 @@ class _Loop:
                        'stamp: their receipt counts'] = None
         return column.row[good], Entries(column.stamp_ns[good], column.log_ns[good],
                                          column.values[good])
+
+    def refuse_other_clock(self) -> None:
+        """Raise BagReadError where the times of receipt run differently from /clock in the bag."""
+        begin: tuple[float, float] | None = None
+        plant = receipt = 0.0
+        nanosec = replace(_CLOCK, field='clock.nanosec')
+        for block in columns(self.bag, [_CLOCK, nanosec]):
+            if not block or not len(block[_CLOCK].values):
+                continue
+            now = block[_CLOCK].values + block[nanosec].values / NANOSECONDS
+            log = block[_CLOCK].log_ns / NANOSECONDS
+            begin = begin or (now[0], log[0])
+            steps, logged = np.diff(now, prepend=begin[0]), np.diff(log, prepend=begin[1])
+            # neither counts where a simulation was started again
+            forward = (steps >= 0.0) & (logged >= 0.0)
+            plant, receipt = (total + float(np.sum(part[forward])) for total, part in (
+                (plant, steps), (receipt, logged)))
+            begin = now[-1], log[-1]
+        if abs(plant - receipt) > max(_SAME_PACE * receipt, _SAME_PACE_SECONDS):
+            raise BagReadError(
+                f'bag {os.fspath(self.bag)!r}: {self.states[0].name} has no stamps, and '
+                f'{plant:.6g} s passed on /clock in {receipt:.6g} s of its receipts, which are no '
+                "plant time: record with use_sim_time (that of the trainer, or 'ros2 bag record "
+                "--use-sim-time'), or use a type with a header")
 
     def _set_back(self, run: Run, heard: Mapping[Place, tuple[NDArray[np.int64], Entries]]
                   ) -> tuple[int, int] | None:

@@ -48,6 +48,7 @@ ZSTD_MAGIC = b'\x28\xb5\x2f\xfd'
 _DELIMITER = re.compile(r'={3,}|MSG:\s')
 # type, name, and what follows it
 _FIELD = re.compile(r'(\S+)\s+([^\s=]+)\s*(=?)')
+_CHAR = re.compile(r'^char(?=\[|$)')
 _MERGE = 'tag:yaml.org,2002:merge'
 
 
@@ -196,8 +197,9 @@ def fields_only(definition: bytes) -> bytes:
     Return a concatenated ros2msg definition without comments, constants and default values.
 
     Decoding needs none of them, and the definition parser takes minutes for some. What is no
-    field, constant or comment stays, for the parser to refuse. Raises DamageError for more than
-    any message type needs.
+    field, constant or comment stays, for the parser to refuse. A char is written as uint8, which
+    it is in ROS 2; the parser takes it for int8. Raises DamageError for more than any message
+    type needs.
     """
     if len(definition) > _LARGEST_DEFINITION:
         raise DamageError(f'{len(definition)} bytes')
@@ -213,7 +215,7 @@ def _field(line: str) -> str:
     found = None if _DELIMITER.match(line) else _FIELD.match(line)
     if found is None:
         return line
-    return '' if found[3] else f'{found[1]} {found[2]}'
+    return '' if found[3] else f'{_CHAR.sub("uint8", found[1])} {found[2]}'
 
 
 def load_plain(text: str) -> Any:

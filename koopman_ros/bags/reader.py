@@ -9,11 +9,13 @@ from dataclasses import dataclass
 import heapq
 import os
 from pathlib import Path
+import warnings
 
 from mcap.records import Channel
+from mcap.summary import Summary
 
 from koopman_ros.bags import limits
-from koopman_ros.bags.decoding import BagMessage, Decoders
+from koopman_ros.bags.decoding import BagMessage, Decoders, type_name, UndecodableError
 from koopman_ros.bags.metadata import parse_offered_qos, QosProfile
 from koopman_ros.bags.records import stored_messages, summary_section
 from koopman_ros.bags.storage import locate
@@ -54,11 +56,13 @@ def read_messages(path: str | os.PathLike[str], topics: Collection[str] | None =
 
     `path` is a .mcap file or a bag directory; `topics` limits the reading to these names (all
     by default; a name that the bag lacks yields nothing). With `recover`, a bag that was not
-    closed or is damaged is read up to the last complete record of each file.
+    closed or is damaged is read up to the last complete record of each file. Where all topics are
+    read, messages of types that are not decoded here, such as service events, come with their
+    bytes alone (`message` is None), and a warning names each of these topics once.
 
     Raises BagReadError: at once for a bag that is missing, empty, not MCAP or not closed, while
-    iterating for a damaged record or a message that does not decode. Raises TypeError for a
-    single string as `topics`.
+    iterating for a damaged record, a message that does not decode, or a topic by its name whose
+    type is not decoded here. Raises TypeError for a single string as `topics`.
     """
     if isinstance(topics, str):
         raise TypeError(f'topics must be a collection of names: pass [{topics!r}]')
@@ -113,20 +117,30 @@ def summary(path: str | os.PathLike[str]) -> BagSummary:
 
 def _decoded(files: tuple[Path, ...], topics: frozenset[str] | None, recover: bool
              ) -> Iterator[BagMessage]:
+    undecoded: set[str] = set()
     for file in files:
         # One set of decoders for each file: they are kept by schema id, and ids are a file's own.
         decoders = Decoders(file)
         for stored in stored_messages(file, recover=recover, topics=topics):
             with limits.enough_memory(file):
-                message = decoders.decode(stored)
+                try:
+                    message = decoders.decode(stored)
+                except UndecodableError as error:
+                    if topics is not None:
+                        raise
+                    message = decoders.undecoded(stored)
+                    if message.topic not in undecoded:
+                        undecoded.add(message.topic)
+                        warnings.warn(f'messages on {message.topic!r} are given as bytes alone: '
+                                      f'{error}', stacklevel=2)
             yield message
 
 
 def _indexed_summary(file: Path) -> BagSummary | None:
-    """Return the summary from the statistics at the end of a closed file, None without them."""
+    """Return the summary at the end of a closed file, None where a part of it is left out."""
     with limits.enough_memory(file), limits.opened(file) as stream:
         content = summary_section(stream, limits.Budget(file))
-    if content is None or content.statistics is None:
+    if content is None or content.statistics is None or not _is_whole(content):
         return None
     statistics = content.statistics
     counts: Counter[str] = Counter()
@@ -134,12 +148,28 @@ def _indexed_summary(file: Path) -> BagSummary | None:
     for channel in content.channels.values():
         schema = content.schemas.get(channel.schema_id)
         counts[channel.topic] += statistics.channel_message_counts.get(channel.id, 0)
-        types[channel.topic] = schema.name if schema else ''
+        types[channel.topic] = type_name(schema)
     empty = statistics.message_count == 0
     return BagSummary(
         dict(counts), types, _offered_qos(content.channels.values()),
         None if empty else statistics.message_start_time,
         None if empty else statistics.message_end_time, complete=True)
+
+
+def _is_whole(content: Summary) -> bool:
+    """
+    Check that a summary section repeats all channels with messages and their schemas, and counts
+    all messages.
+
+    The MCAP specification leaves each of them to the writer; an empty map of counts means that
+    they are not available.
+    """
+    statistics = content.statistics
+    return (statistics is not None
+            and statistics.channel_message_counts.keys() <= content.channels.keys()
+            and sum(statistics.channel_message_counts.values()) == statistics.message_count
+            and all(channel.schema_id in content.schemas or channel.schema_id == 0
+                    for channel in content.channels.values()))
 
 
 def _scanned_summary(file: Path) -> BagSummary:
@@ -153,7 +183,7 @@ def _scanned_summary(file: Path) -> BagSummary:
         for stored in stored_messages(file, recover=False, with_data=False):
             topic, time_ns = stored.channel.topic, stored.message.log_time
             counts[topic] += 1
-            types[topic] = stored.schema.name if stored.schema else ''
+            types[topic] = type_name(stored.schema)
             channels[topic] = stored.channel
             start_ns = time_ns if start_ns is None else min(start_ns, time_ns)
             end_ns = time_ns if end_ns is None else max(end_ns, time_ns)

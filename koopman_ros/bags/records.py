@@ -60,11 +60,17 @@ class ChunkRecords:
     content: bytes  #: with the head of each before its body
     opcodes: bytes  #: (n,)
     starts: NDArray[np.int64]  #: (n,) where the bodies begin
+    rest: int = 0  #: bytes after them that are no record
 
     @property
     def ends(self) -> NDArray[np.int64]:
         """Where the bodies end (n,)."""
         return np.append(self.starts[1:] - _HEAD.size, len(self.content))[:len(self.starts)]
+
+    def raise_rest(self) -> None:
+        """Raise DamageError where other bytes follow the records."""
+        if self.rest:
+            raise limits.DamageError(f'{self.rest} bytes of a chunk that are no record')
 
 
 def stored_messages(file: Path, *, recover: bool, topics: Collection[str] | None = None,
@@ -137,14 +143,17 @@ class _WholeReads:
         self.size = stream.seek(0, os.SEEK_END)
         stream.seek(position)
 
-    def read(self, length: int) -> bytes:
+    def expect(self, length: int) -> None:
+        """Raise EndOfFile where fewer bytes are left."""
         if not 0 <= length <= self.size - self._stream.tell():
             raise EndOfFile
+
+    def read(self, length: int) -> bytes:
+        self.expect(length)
         return self._stream.read(length)
 
     def skip(self, length: int) -> None:
-        if not 0 <= length <= self.size - self._stream.tell():
-            raise EndOfFile
+        self.expect(length)
         self._stream.seek(length, os.SEEK_CUR)
 
     def seek(self, offset: int) -> int:
@@ -175,6 +184,7 @@ def _records(stream: BinaryIO, budget: limits.Budget) -> Iterator[McapRecord]:
                 for opcode, start, end in zip(held.opcodes, held.starts, held.ends, strict=True):
                     if opcode in _READ:
                         yield parsed(opcode, held.content[start:end])
+                held.raise_rest()
             else:
                 yield record
 
@@ -194,7 +204,8 @@ def failures_are_damage() -> Iterator[None]:
 
 def data_section(stream: BinaryIO, budget: limits.Budget) -> Iterator[McapRecord]:
     """Yield the records between the two ends of a file, chunks whole."""
-    data = ReadDataStream(cast('BinaryIO', _WholeReads(stream)), calculate_crc=True)
+    whole = _WholeReads(stream)
+    data = ReadDataStream(cast('BinaryIO', whole), calculate_crc=True)
     if data.read(len(MAGIC)) != MAGIC:
         raise limits.DamageError('no MCAP file')
     while True:
@@ -207,6 +218,8 @@ def data_section(stream: BinaryIO, budget: limits.Budget) -> Iterator[McapRecord
             if expected and expected != checksum:
                 raise limits.DamageError('wrong checksum of the data')
             return
+        # damage, not a large record: random bytes may begin like one
+        whole.expect(length)
         _count(opcode, length, budget)
         if opcode in _READ or opcode == Opcode.CHUNK:
             yield parsed(opcode, data.read(length))
@@ -216,23 +229,25 @@ def data_section(stream: BinaryIO, budget: limits.Budget) -> Iterator[McapRecord
 
 
 def chunk_records(chunk: Chunk, budget: limits.Budget) -> ChunkRecords:
-    """Return the records of a chunk, once it is whole."""
+    """Return the records of a chunk up to the first bytes that are none, once it has arrived."""
     content = limits.chunk_content(chunk, budget)
     opcodes, starts = bytearray(), array('q')
-    end, head = 0, _HEAD.unpack_from
-    while end < len(content):
+    end, size, head = 0, len(content), _HEAD.unpack_from
+    while end + _HEAD.size <= size:
         opcode, length = head(content, end)
         start = end + _HEAD.size
+        # zeros are what a disk that was full leaves
+        if start + length > size or opcode == 0:
+            break
         end = start + length
-        if end > len(content):
-            raise EndOfFile
         if opcode == Opcode.MESSAGE:
             budget.take_record()
         else:
             _count(opcode, length, budget)
         opcodes.append(opcode)
         starts.append(start)
-    return ChunkRecords(content, bytes(opcodes), np.array(starts, dtype=np.int64))
+    return ChunkRecords(content[:end], bytes(opcodes), np.array(starts, dtype=np.int64),
+                        size - end)
 
 
 def _count(opcode: int, length: int, budget: limits.Budget) -> None:
@@ -291,6 +306,7 @@ def _summary(stream: BinaryIO, start: int, budget: limits.Budget) -> Summary | N
         opcode, length = _HEAD.unpack(whole.read(_HEAD.size))
         if opcode == Opcode.FOOTER:
             return found
+        whole.expect(length)
         _count(opcode, length, budget)
         if opcode not in (Opcode.SCHEMA, Opcode.CHANNEL, Opcode.STATISTICS):
             whole.skip(length)

@@ -135,6 +135,11 @@ class Run:
         return Clock.of(next((entries for entries in heard
                               if np.any(entries.stamp_ns != NO_STAMP)), Entries.joined(())))
 
+    def without_stamps(self) -> bool:
+        """Tell whether states were received, none of them with a stamp."""
+        heard = [entries for entries in map(self.of, self.states) if len(entries)]
+        return bool(heard) and all(np.all(entries.stamp_ns == NO_STAMP) for entries in heard)
+
     def is_ready(self, size: int) -> bool:
         """Tell whether a portion of so many measurements of a state is whole; set its end."""
         counts = {place: sum(map(len, self._parts[place])) for place in self.states}

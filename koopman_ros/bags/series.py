@@ -127,7 +127,8 @@ def spikes_and_jumps(values: NDArray[np.float64], least: float = 0.0
     limit = max(_TIMES_USUAL * float(np.percentile(np.abs(change), _USUAL)),
                 _SHARE_OF_RANGE * float(high - low), least)
     large = np.abs(change) > limit
-    spike[1:-1] = large[:-1] & large[1:] & (change[:-1] * change[1:] < 0.0)
+    spike[1:-1] = large[:-1] & large[1:] & (
+        np.signbit(change[:-1]) != np.signbit(change[1:]))
     # two changes belong to each spike
     jump[1:] = large & ~spike[1:] & ~spike[:-1]
     return spike, jump

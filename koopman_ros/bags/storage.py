@@ -14,9 +14,11 @@ from koopman_ros.bags.limits import BagReadError, enough_memory, load_plain, rea
 from koopman_ros.bags.metadata import METADATA_FILE, METADATA_KEY
 from koopman_ros.bags.records import is_closed, RECOVER
 
-# The files of a bag directory: run_0.mcap, run_1.mcap, ..., or the same compressed by rosbag2.
+# The files of a bag directory: run_0.mcap, run_1.mcap, ..., or the same compressed by rosbag2;
+# with its pull request 2265 0_run_2025_12_17-10_00_00.mcap, 1_run_2025_12_17-10_05_00.mcap, ...
 _COMPRESSED = '.zstd'
-_NUMBERED = re.compile(r'(.*)_\d+\.mcap(?:\.zstd)?')
+_NUMBERED = re.compile(r'(?:\d+_(?P<new>.*)_\d{4}_\d\d_\d\d-\d\d_\d\d_\d\d|(?P<old>.*)_\d+)'
+                       r'\.mcap(?:\.zstd)?')
 # Of metadata.yaml; one that lists ten thousand files has a fifth of it.
 _MAX_METADATA_BYTES = 2**24
 
@@ -65,9 +67,10 @@ def _listed_files(folder: Path) -> tuple[Path, ...]:
     try:
         with enough_memory(source):
             information: dict[str, Any] = load_plain(_metadata_text(source))[METADATA_KEY]
-        storage = str(information['storage_identifier'])
         compression = str(information.get('compression_format') or '')
         names = _file_names(information['relative_file_paths'])
+        # `ros2 bag reindex` of Humble leaves it empty
+        storage = str(information.get('storage_identifier') or _storage_of(names))
     # the YAML parser itself fails in several ways, on a date without a 13th month among them
     except (yaml.YAMLError, ValueError, KeyError, TypeError, AttributeError, RecursionError
             ) as error:
@@ -106,13 +109,24 @@ def _file_names(listed: Any) -> list[str]:
     return listed
 
 
+def _storage_of(names: list[str]) -> str:
+    """Return the kind of some files by their names; MCAP files of any name pass the next check."""
+    return 'sqlite3' if any(name.endswith(('.db3', f'.db3{_COMPRESSED}')) for name in names) else (
+        'mcap')
+
+
 def _left_behind(folder: Path, listed: tuple[Path, ...]) -> list[Path]:
     """Return the numbered files with content that metadata.yaml does not list, or not yet."""
-    names = {match[1] for file in listed if (match := _NUMBERED.fullmatch(file.name))}
+    names = {_name_of_bag(file) for file in listed} - {None}
     known = {_plain_name(file) for file in listed}
     return [file for file in _files_with_content(folder)
-            if (match := _NUMBERED.fullmatch(file.name)) and match[1] in names
-            and _plain_name(file) not in known]
+            if _name_of_bag(file) in names and _plain_name(file) not in known]
+
+
+def _name_of_bag(file: Path) -> str | None:
+    """Return the part that the names of a bag's files share, None for a file without number."""
+    match = _NUMBERED.fullmatch(file.name)
+    return None if match is None else match['old'] if match['new'] is None else match['new']
 
 
 def _files_with_content(folder: Path) -> list[Path]:

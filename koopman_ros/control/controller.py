@@ -408,18 +408,31 @@ class Controller:
             return state, None, self._report(state, None)
         since_ns = time_ns if state.commanded_ns is None else state.commanded_ns
         elapsed = max(0.0, (time_ns - since_ns) / NANOSECONDS)
+        # a command that nobody saw was not on its way
+        seconds = min(elapsed, max(_LONGEST_WATCH, 2.0 * _spacing(state)))
         until_ns = max(time_ns, since_ns)
-
-        def coasting() -> tuple[State, Array, Report]:
-            with np.errstate(all='ignore'):
-                coasted = amended(state, estimate=self._estimating.coast(
-                    state, elapsed, self._estimating.applied(state)[0]))
-                return self._command(
-                    coasted, Verdict(state.accepted, reason(Code.NO_MEASUREMENT)),
-                    NOTHING_MEASURED, time_ns, until_ns, elapsed, elapsed)
-
         return self._contained(
-            coasting, state, NOTHING_MEASURED, time_ns, until_ns, elapsed, elapsed)
+            lambda: self._coasted(state, cause, time_ns, until_ns, elapsed, seconds),
+            state, NOTHING_MEASURED, time_ns, until_ns, elapsed, seconds)
+
+    def _coasted(self, state: State, cause: Code | None, time_ns: int, until_ns: int,
+                 elapsed: float, seconds: float) -> tuple[State, Array, Report]:
+        """Command without a measurement; arguments as those of :meth:`hold`."""
+        with np.errstate(all='ignore'):
+            state = amended(state, estimate=self._estimating.coast(
+                state, elapsed, self._estimating.applied(state)[0]))
+            fault, measured = None if cause is None else reason(cause), NOTHING_MEASURED
+            if fault is None and state.mode is Mode.AUTOMATIC:
+                if state.estimate is None or state.setpoint.active is None:
+                    assert state.command is not None
+                    return state, state.command, self._report(state, state.supervisor.reason)
+                x = self.model.states.to_physical(state.estimate.x)
+                measured = MeasurementReport(outside=self.model.distance(x))
+                state = amended(state, setpoint=setpoints.advance(
+                    state.setpoint, self._best.controlled_of(x), self.controlled,
+                    self.settings.setpoint_ramp, time_ns, seconds, self.settings.setpoint_filter))
+            return self._command(state, Verdict(state.accepted, fault), measured, time_ns,
+                                 until_ns, elapsed, seconds, _spacing(state))
 
     def _contained(self, calculate: Callable[[], tuple[State, Array, Report]], before: State,
                    measured: MeasurementReport, time_ns: int, commanded_ns: int, elapsed: float,

@@ -12,6 +12,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from koopman_ros.identification.drift import DriftModel
+from koopman_ros.identification.excitation import check_inputs
 from koopman_ros.identification.identify import (
     Identified,
     INNOVATIONS_FORM,
@@ -79,13 +80,15 @@ def identify_hidden(plant: Plant, episodes: Sequence[Episode], hidden: int, *,
     :param seed: of the split.
     :param backend: where each number of states is tried; this process by default.
     :return: an estimate of the plant with these states, in the episodes as they were estimated.
-    :raises ValueError: when the episodes are too short, or nothing fits.
+    :raises ValueError: when the episodes are too short, their inputs do not determine B, or
+        nothing fits.
     :raises Stopped: when `watch` asked for it.
     """
     if callable(plant.B) or plant.input_matrix_degree:
         raise ValueError('where states are not measured, B must not depend on them: set '
                          'input_matrix_degree to 0')
     record = Record(plant, episodes, seed, hidden=True)
+    warnings = check_inputs(plant, episodes)
     total = hidden * highest_degree + 2
     words = {f'{count} {"state" if count == 1 else "states"} not measured': count
              for count in range(1, hidden + 1)}
@@ -113,10 +116,10 @@ def identify_hidden(plant: Plant, episodes: Sequence[Episode], hidden: int, *,
     predictor = _Search(record, best.deviation).refined(
         sorted([*record.fit, *record.choose]), best.predictor, monitor)
     scale = predictor.drift.box.states.scale[:len(plant.state_names)]
-    return record.identified(predictor, best.method, [
+    return replace(record.identified(predictor, best.method, [
         Score(one.method, one.degree, scale * np.sqrt(np.mean(one.innovations ** 2, axis=0)),
               float(np.mean(one.innovations ** 2))) for one in candidates],
-        progress('linear model'))
+        progress('linear model')), warnings=warnings)
 
 
 def _plainest(candidates: Sequence[_Candidate]) -> _Candidate:

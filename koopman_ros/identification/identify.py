@@ -21,6 +21,7 @@ from koopman_ros.identification.drift import (
     prediction_error,
     Segments,
 )
+from koopman_ros.identification.excitation import check_inputs
 from koopman_ros.identification.output_error import output_error
 from koopman_ros.identification.regression import noise_level, total_variation, weak_form
 from koopman_ros.jobs.backends import Backend, Here, Tell
@@ -157,6 +158,7 @@ class Identified:
     hidden: int = 0
     #: those that were estimated, where it is the equations of a plant's class
     constants: tuple[EstimatedConstant, ...] = ()
+    warnings: tuple[str, ...] = ()  #: about the inputs of the record, for the user
 
     __repr__ = brief
 
@@ -180,7 +182,8 @@ def identify(plant: Plant, episodes: Sequence[Episode], *, degrees: Sequence[int
         ``METHODS``, or the weak forms where B depends on the state.
     :param seed: of the split.
     :param backend: where the degrees are estimated, each by itself; this process by default.
-    :raises ValueError: when the episodes are too short, or nothing fits.
+    :raises ValueError: when the episodes are too short, their inputs do not determine B, or
+        nothing fits.
     :raises Stopped: when `watch` asked for it.
     """
     n_x, n_u = len(plant.state_names), len(plant.input_names)
@@ -188,6 +191,7 @@ def identify(plant: Plant, episodes: Sequence[Episode], *, degrees: Sequence[int
                                or n_x * math.comb(n_x + degree, degree) <= _MOST_COEFFICIENTS)
     parts = segments_of(episodes, n_x + n_u)
     box = box_of(plant, parts)
+    warnings = check_inputs(plant, episodes)
     fit, choose, held_out = ([parts[i] for i in share] for share in split(parts, seed))
     step = longest_step(parts)
     chooser, fitter = Segments.of(choose, step), Segments.of(fit, step)
@@ -230,7 +234,7 @@ def identify(plant: Plant, episodes: Sequence[Episode], *, degrees: Sequence[int
                                    monitor=monitor) if OUTPUT_ERROR in score.method else model
     return Identified(finished[degree], best[degree][1].method, finished[min(finished)],
                       tuple(scores), noise_level(parts, finished[degree]),
-                      (*fit, *choose), tuple(held_out))
+                      (*fit, *choose), tuple(held_out), warnings=warnings)
 
 
 @dataclass(frozen=True)

@@ -21,6 +21,7 @@ from koopman_ros.lifting.coordinates import Coordinates, TrainingStates, TriedLo
 from koopman_ros.lifting.input_terms import InputTerms
 from koopman_ros.lifting.model import LiftedModel, Provenance
 from koopman_ros.lifting.observables import NetworkObservables, PolynomialObservables
+from koopman_ros.units import check_unit
 
 FORMAT = 'koopman_ros.lift'
 FORMAT_VERSION = 1
@@ -58,7 +59,7 @@ def save(model: LiftedModel, path: str | os.PathLike[str]) -> None:
     else:
         raise TypeError('only lifts of networks and of monomials can be saved, got '
                         f'{type(lift).__name__}: keep the program that makes the model instead')
-    bounds.check(model)
+    _check(model)
     known = model.training_states
     if known is not None:
         tensors['training_states'] = known.states
@@ -140,7 +141,7 @@ def load_with_digest(path: str | os.PathLike[str]) -> tuple[LiftedModel, str]:
     try:
         about = _parsed(metadata['description'])
         model = _build(about, tensors)
-        bounds.check(model)
+        _check(model)
         # last, so that whatever has a reason of its own is refused with that reason
         if metadata['sha256'] != _checksum(metadata['description'], header, data):
             raise ValueError('its checksum is wrong, so it was damaged or edited')
@@ -149,6 +150,19 @@ def load_with_digest(path: str | os.PathLike[str]) -> tuple[LiftedModel, str]:
         reason = f'{error.args[0]!r} is missing' if isinstance(error, KeyError) else str(error)
         _refuse(path, f'its content is inconsistent ({reason})')
     return model, hashlib.sha256(content).hexdigest()
+
+
+def _check(model: LiftedModel) -> None:
+    """Raise ValueError for a model beyond the bounds, or with a unit that does not exist."""
+    bounds.check(model)
+    for signals in (model.states, model.inputs):
+        for name, unit in zip(signals.names, signals.units, strict=True):
+            if not isinstance(unit, str):
+                raise TypeError(f'the unit of {name!r} must be a text, got {unit!r}')
+            try:
+                check_unit(unit)
+            except ValueError as error:
+                raise ValueError(f'the unit of {name!r}: {error}') from error
 
 
 def _build(about: dict[str, Any], tensors: dict[str, np.ndarray]) -> LiftedModel:

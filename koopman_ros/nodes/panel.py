@@ -43,6 +43,7 @@ from koopman_ros.panel.requests import (
     Requests,
     SETPOINT,
 )
+from koopman_ros.panel.texts import plain
 from koopman_ros.parameters.panel import panel_signals, panel_table
 from koopman_ros.parameters.table import ConfigurationError
 from koopman_ros.parameters.wire import Wiring
@@ -65,6 +66,7 @@ _PERIOD = 0.2  # s between two snapshots
 _LOOK = 0.5  # s between two looks at other nodes
 _SENDING = 0.05  # s between two looks at what is to be sent
 _REPEAT = 0.7  # s without an answer after which a request is sent again
+_LOGGED = 300  # characters of an action in the log
 _GONE = '{} is not there: start it'
 _SERVICES = {'reload': (CONTROLLER, 'reload_model'), 'train': (TRAINER, 'train'),
              'cancel': (TRAINER, 'cancel_training'), 'automatic': (CONTROLLER, 'set_automatic'),
@@ -158,10 +160,10 @@ class PanelNode(LoopNode):
             return None
         try:
             memory = AlarmMemory(self.view.alarms, Path(path), time.time())
-        except OSError as error:
+        except (OSError, ValueError) as error:
             raise ConfigurationError(
-                f'alarm_file = {path!r} cannot be used ({error}): name a file in a folder that '
-                'can be written') from error
+                f'alarm_file = {path!r} cannot be used ({error}): name a new file in a folder '
+                'that can be written, or one that a panel wrote') from error
         if memory.complaint:
             self.get_logger().warning(memory.complaint)
         return memory
@@ -176,7 +178,7 @@ class PanelNode(LoopNode):
         settings = self.settings
         server = serving.PanelServer(
             self, settings.host, settings.port, settings.users, settings.tls_certificate,
-            settings.tls_key)
+            settings.tls_key, [*filter(None, settings.trusted_proxy)])
         server.start()
         return server
 
@@ -329,7 +331,8 @@ class PanelNode(LoopNode):
         self._actions.publish(String(data=action_text(
             action, answer, time.time(), self.view.read.get(action.name, ''))))
         word = 'accepted' if answer.accepted else 'refused'
-        self.get_logger().info(f'{action.who}: {action.what} {action.name} {action.value}: {word}')
+        value = plain(f'{action.name} {action.value}', _LOGGED)
+        self.get_logger().info(f'{action.who}: {action.what} {value}: {word}')
         if not future.done():
             future.set_result(answer)
 

@@ -44,7 +44,8 @@ _HOST = re.compile(r'(\[[0-9a-f:.]+\]|[\w.-]+)(?::(\d{1,5}))?', re.ASCII)
 _PORTS = {'http': 80, 'https': 443}
 _MAX_MEMORY = 256 * 1024 * 1024  # bytes that a line of the file may make scrypt take
 _MAX_HEADER = 512  # characters
-_MAX_KEYS = 10_000  # addresses and names that a throttle remembers
+_MAX_KEYS = 10_000  # addresses, and names from them, that a throttle remembers
+_NAMES = 4  # times as many wrong log-ins with any names as with one
 
 
 class Role(Enum):
@@ -191,14 +192,16 @@ class _Attempts:
 
 class Throttle:
     """
-    A limit to wrong log-ins, from each address and to each name; several threads may use it.
+    A limit to wrong log-ins, of each name from each address, and from each address with any names.
 
     After some in a short time the next must wait, and twice as long after each that is wrong
-    again, until none came for the longest of these times. Who logged in from an address before is
-    not kept out by what others try with the name. IPv6 counts by network of 64 bits.
+    again, until none came for the longest of these times. Attempts from one address never make
+    another address wait. A user who logged in from an address before is not kept out by attempts
+    with other names from there. IPv6 counts by network of 64 bits. Several threads may use it.
 
     :param clock: s, rising.
-    :param wrong: log-ins that may be wrong in the time `within`.
+    :param wrong: log-ins that may be wrong in the time `within`, of one name from one address;
+        with any names it is four times as many.
     :param within: s.
     :param first: s of the first wait.
     :param longest: s.
@@ -225,20 +228,21 @@ class Throttle:
             wait = max(attempts.until for attempts in found) - now
             if wait > 0.0:
                 return wait
-            for attempts in found:
+            for key, attempts in zip(self._keys(address, name), found, strict=True):
                 attempts.recent = [*(at for at in attempts.recent if now - at < self._within), now]
-                if attempts.level or len(attempts.recent) >= self._wrong:
+                most = self._wrong * (_NAMES if key[0] == 'address' else 1)
+                if attempts.level or len(attempts.recent) >= most:
                     pause = self._first * 2.0 ** min(attempts.level, 60)
                     attempts.level, attempts.until = (
                         attempts.level + 1, now + min(pause, self._longest))
         return 0.0
 
     def succeeded(self, address: str, name: str) -> None:
-        """Take note that the password was right: it does not count, and the name is free."""
+        """Take note that the password was right: it does not count, and the name is free there."""
         now = self._clock()
         with self._lock:
             for key in self._keys(address, name):
-                if key[0] == 'name':
+                if key[0] == 'name and address':
                     self._attempts.pop(key, None)
                 elif key in self._attempts:
                     # what else came from there was wrong nevertheless
@@ -254,8 +258,8 @@ class Throttle:
 
     def _keys(self, address: str, name: str) -> list[tuple[str, ...]]:
         pair = (_network(address), _brief(name))
-        keys: list[tuple[str, ...]] = [('address', pair[0])]
-        return keys if pair in self._known else [*keys, ('name', pair[1])]
+        keys: list[tuple[str, ...]] = [('name and address', *pair)]
+        return keys if pair in self._known else [*keys, ('address', pair[0])]
 
     def _attempts_of(self, key: tuple[str, ...], now: float) -> _Attempts:
         attempts = self._attempts.setdefault(key, _Attempts())

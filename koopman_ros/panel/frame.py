@@ -10,7 +10,7 @@ from collections.abc import Callable, Sequence
 from concurrent.futures import Future
 from dataclasses import dataclass
 import time
-from typing import Any, Protocol
+from typing import Any, Protocol, TypeVar
 
 from nicegui import ui
 from nicegui.element import Element
@@ -26,6 +26,9 @@ _PATIENCE = 40.0  # s for an answer
 _SYMBOLS = {Priority.HIGH: '■', Priority.MEDIUM: '▲', Priority.LOW: '●'}
 _TABS = {'/': 'Overview', '/trends': 'Trends', '/alarms': 'Alarms', '/model': 'Model',
          '/tuning': 'Tuning'}
+_TEXTS = ('alt', 'aria-label', 'data-beat', 'data-parameter', 'data-signal')
+_ADDRESSES = ('href', 'src')
+_Kind = TypeVar('_Kind', bound=Element)
 NOT_ALLOWED = Answer(False, 'you may look, not act: log in as an operator')
 
 
@@ -77,7 +80,7 @@ class Frame:
         self.enabled = visitor.may_act()
         self._shown: Snapshot | None = None
         self._updates: list[Callable[[Snapshot], None]] = []
-        self._styles: dict[int, str] = {}
+        self._places: dict[int, tuple[tuple[str, float], ...]] = {}
         ui.add_css(CSS)
         ui.add_head_html(WATCH)
         ui.page_title(f'{_TABS[path]} – {source.title}')
@@ -111,7 +114,7 @@ class Frame:
             if now.wall - self._beat_at >= 1.0:
                 self._beat_at = now.wall
                 beat.set_text(clock(now.wall))
-                beat.props(f'data-beat={now.wall:.1f}')
+                attribute(beat, 'data-beat', f'{now.wall:.1f}')
             silent = [
                 f'nothing from the {one.source} since {clock(one.since)}' + (
                     '' if one.ever else ', when the panel started') for one in now.silences]
@@ -142,11 +145,13 @@ class Frame:
         for update in self._updates:
             update(now)
 
-    def style(self, element: Element, text: str) -> None:
-        """Style an element, where that is another style than before."""
-        if self._styles.get(element.id) != text:
-            self._styles[element.id] = text
-            element.style(replace=text)
+    def place(self, element: Element, **sides: float) -> None:
+        """Place an element by shares of its parent, or hide it where none is given."""
+        found = tuple(sides.items())
+        if self._places.get(element.id) != found:
+            self._places[element.id] = found
+            element.style(replace='; '.join(
+                f'{side}: {100.0 * share:.1f}%' for side, share in found) or 'display: none')
 
     # Questions and answers.
 
@@ -199,6 +204,24 @@ def show_if(element: Element, shown: bool) -> None:
         element.classes(**{'remove' if shown else 'add': 'hidden'})
 
 
+def attribute(element: _Kind, name: str, text: str) -> _Kind:
+    """
+    Set an attribute of an element to a text, which may come from outside.
+
+    NiceGUI reads a string of props for several, and evaluates those whose names begin with ':' as
+    JavaScript: no text from outside may be part of such a string, or of a name.
+
+    :param text: a path of the panel itself where the attribute is an address.
+    :raises ValueError: for any other attribute, or another address.
+    """
+    own = name in _ADDRESSES and text.startswith('/') and not text.startswith('//')
+    if name not in _TEXTS and not own:
+        raise ValueError(f'{name} = {text!r} cannot be set: give a text to one of '
+                         f'{", ".join(_TEXTS)}, or a path to one of {", ".join(_ADDRESSES)}')
+    element.props[name] = text
+    return element
+
+
 def div(classes: str = '', tag: str = 'div') -> Element:
     """Return an element to be filled."""
     return ui.element(tag).classes(classes)
@@ -219,7 +242,7 @@ def words(tag: str, text: str, classes: str = '') -> ui.label:
 
 def link(text: str, target: str) -> Any:
     """Return a link to a page of the panel."""
-    return _Words('a', text).props(f'href={target}')
+    return attribute(_Words('a', text), 'href', target)
 
 
 class Rows:
@@ -235,7 +258,7 @@ class Rows:
                  none: str = 'none') -> None:
         self._build = build
         self._rows: dict[str, tuple[Element, Callable[[Alarm], None]]] = {}
-        self._place = div('strip').props(f'role=list aria-label="{name}"')
+        self._place = attribute(div('strip').props('role=list'), 'aria-label', name)
         with self._place:
             self._none = words('div', none, 'quiet')
 

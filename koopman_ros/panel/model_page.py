@@ -12,7 +12,7 @@ import time
 
 from nicegui import ui
 
-from koopman_ros.panel.frame import clock, div, Frame, say, show_if, words
+from koopman_ros.panel.frame import attribute, clock, div, Frame, say, show_if, words
 from koopman_ros.panel.learning import Comparison, Report
 from koopman_ros.panel.plant import (
     CONTROLLER,
@@ -243,7 +243,7 @@ class _Leaflet:
         self._name = name
         self._lines = div('')
         self._figures = _Figures()
-        self._picture = ui.element('img').classes('picture hidden').props(f'alt="{about}"')
+        self._picture = attribute(ui.element('img').classes('picture hidden'), 'alt', about)
         with ui.expansion('the whole report').classes('hidden').props('dense') as self._whole:
             self._text = words('div', '', 'report')
 
@@ -256,8 +256,8 @@ class _Leaflet:
         self._figures.figures(found.figures)
         if found.picture:
             # another address for another picture
-            self._picture.props(
-                f'src="/picture/{self._name}?{hashlib.sha256(found.picture).hexdigest()[:16]}"')
+            version = hashlib.sha256(found.picture).hexdigest()[:16]
+            attribute(self._picture, 'src', f'/picture/{self._name}?{version}')
         show_if(self._picture, bool(found.picture))
         self._text.set_text(found.text)
         show_if(self._whole, bool(found.text))

@@ -10,8 +10,9 @@ import math
 from typing import Any
 
 from nicegui import ui
+from nicegui.element import Element
 
-from koopman_ros.panel.frame import alarm_rows, div, Frame, say, show_if, words
+from koopman_ros.panel.frame import alarm_rows, attribute, div, Frame, say, show_if, words
 from koopman_ros.panel.plant import Face, InputFace, number, Snapshot, StateFace
 from koopman_ros.panel.requests import Answer
 from koopman_ros.panel.trend_page import TrendChart
@@ -60,19 +61,18 @@ class _Bar:
             self._low, self._between, self._high = (words('span', '') for _ in range(3))
 
     def show(self, face: Face, value: float, mark: float) -> None:
-        def place(number: float) -> str:
-            return f'{100.0 * face.share(number):.1f}%'
+        def show_at(element: Element, number: float | None) -> None:
+            known = number is not None and math.isfinite(number)
+            place(element, **({'left': face.share(number)} if known else {}))
 
-        style = self._frame.style
+        place = self._frame.place
         training, limits = face.training, face.limits
-        style(self._training, 'display: none' if training is None else (
-            f'left: {place(training[0])}; right: '
-            f'{100.0 - 100.0 * face.share(training[1]):.1f}%'))
-        style(self._fill, f'width: {place(value)}')
-        style(self._tick, f'left: {place(mark)}' if math.isfinite(mark) else 'display: none')
+        place(self._training, **({} if training is None else {
+            'left': face.share(training[0]), 'right': 1.0 - face.share(training[1])}))
+        place(self._fill, width=face.share(value))
+        show_at(self._tick, mark)
         for at, limit in enumerate(self._limits):
-            style(limit, f'left: {place(limits[at])}' if (
-                limits is not None and math.isfinite(limits[at])) else 'display: none')
+            show_at(limit, None if limits is None else limits[at])
         low, high = (face.text(end) for end in face.span)
         self._low.set_text(low)
         self._high.set_text(high)
@@ -81,8 +81,8 @@ class _Bar:
 
 
 def _card(face: Face) -> Any:
-    return div('card', tag='section').props(
-        f'aria-label="{face.label}" data-signal={face.name}')
+    return attribute(attribute(div('card', tag='section'), 'aria-label', face.label),
+                     'data-signal', face.name)
 
 
 class _Plate:
@@ -120,9 +120,9 @@ class _Entry:
                 title, step=step, format=f'%.{face.decimals}f', on_change=self._typed).props(
                     'outlined dense'))
             self.button = frame.control(ui.button('Set', on_click=self.submit).props('unelevated'))
-        self.slider = frame.control(ui.slider(
-            min=self._low, max=self._high, step=step,
-            on_change=self._slid).props(f'aria-label="{title}, slider" color=grey-8'))
+        self.slider = frame.control(attribute(ui.slider(
+            min=self._low, max=self._high, step=step, on_change=self._slid).props('color=grey-8'),
+            'aria-label', f'{title}, slider'))
         self.said = frame.answer()
         self.field.on('keydown.enter', self.submit)
         self.field.on('keydown.escape', self.reset)

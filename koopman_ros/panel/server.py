@@ -5,20 +5,26 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+import asyncio
+from collections.abc import Callable, Iterable, Sequence
 from html import escape
 from http.cookies import CookieError, SimpleCookie
+import logging
 import math
 import socket
 import ssl
 import threading
 from typing import Any
+from urllib.parse import parse_qs
+import zlib
 
 from fastapi import FastAPI, Request
 from fastapi.responses import HTMLResponse, RedirectResponse, Response
-from nicegui import Client, ui
+from nicegui import Client, core, ui
+from socketio.exceptions import ConnectionRefusedError as SocketRefused
 from starlette.concurrency import run_in_threadpool
 import uvicorn
+from uvicorn.middleware.proxy_headers import ProxyHeadersMiddleware
 
 from koopman_ros.panel.access import (
     may_be_addressed,
@@ -31,6 +37,7 @@ from koopman_ros.panel.access import (
     Users,
 )
 from koopman_ros.panel.alarm_page import alarm_page
+from koopman_ros.panel.connections import BACKLOG, Listener, Seldom
 from koopman_ros.panel.frame import Frame, Source, Visitor
 from koopman_ros.panel.model_page import model_page
 from koopman_ros.panel.overview import overview
@@ -38,10 +45,13 @@ from koopman_ros.panel.style import LOGIN
 from koopman_ros.panel.trend_page import trend_page
 from koopman_ros.panel.tuning_page import tuning_page
 
-COOKIE = 'koopman_panel'
 _START = 10.0  # s in which the server is there, and
 _STOP = 3.0  # s in which it has ended
 _LONGEST_FORM = 8192  # bytes
+_FORM = 10.0  # s in which a form has arrived
+_LOGS = ('uvicorn.error', 'asyncio', 'nicegui', 'engineio.server', 'socketio.server')
+_SOCKETS = '/_nicegui_ws/'
+_PEER = 'koopman_ros.peer'  # of the connection, in the scope of a request
 _HEADERS = (
     (b'x-content-type-options', b'nosniff'), (b'x-frame-options', b'DENY'),
     # without any, a form would come from the origin null
@@ -61,20 +71,36 @@ class Doorkeeper:
     Who may come in: of what origin, and logged in where there are users.
 
     :param users: None where whoever reaches the panel is the operator.
+    :param cookie: name of the one with the token of a session.
     """
 
-    def __init__(self, users: Users | None, scheme: str) -> None:
-        self.users, self.scheme = users, scheme
+    def __init__(self, users: Users | None, cookie: str) -> None:
+        self.users, self.cookie = users, cookie
         self.sessions, self.throttle = Sessions(), Throttle()
 
-    def refusal(self, kind: str, headers: dict[str, str]) -> str:
-        """Say why a request must not be answered, whoever it is from; '' where it may."""
+    def token(self, headers: Iterable[tuple[bytes, bytes]]) -> str | None:
+        """Return the token in the cookies of a request."""
+        cookies = '; '.join(
+            value.decode('latin-1') for name, value in headers if name == b'cookie')
+        try:
+            found = SimpleCookie(cookies).get(self.cookie)
+        except CookieError:
+            return None
+        return found.value if found else None
+
+    def refusal(self, kind: str, headers: dict[str, str], scheme: str) -> str:
+        """
+        Say why a request must not be answered, whoever it is from; '' where it may.
+
+        :param scheme: 'http' or 'https', which a proxy may have served.
+        """
         host, origin = headers.get('host', ''), headers.get('origin')
         if not may_be_addressed(host, self.users):
             return 'this panel is not reached by that name: use 127.0.0.1'
-        if (kind == 'websocket' or origin is not None) and not same_origin(
-                origin, host, self.scheme):
-            return 'this comes from a page of another origin'
+        if (kind == 'websocket' or origin is not None) and not same_origin(origin, host, scheme):
+            return 'this comes from a page of another origin' + (
+                '; if a proxy serves the panel over TLS, its address must be in trusted_proxy'
+                if same_origin(origin, host, 'https') else '')
         return ''
 
     def session(self, token: str | None, *, use: bool = True) -> Session | None:
@@ -99,8 +125,8 @@ class Doorkeeper:
 class _Gate:
     """Passes on the requests that a doorkeeper lets in."""
 
-    def __init__(self, app: Any, keeper: Doorkeeper) -> None:
-        self._app, self._keeper = app, keeper
+    def __init__(self, app: Any, keeper: Doorkeeper, listener: Listener) -> None:
+        self._app, self._keeper, self._listener = app, keeper, listener
 
     async def __call__(self, scope: Any, receive: Any, send: Any) -> None:
         if scope['type'] not in ('http', 'websocket'):
@@ -109,14 +135,19 @@ class _Gate:
         headers = {name.decode('latin-1'): value.decode('latin-1')
                    for name, value in scope['headers']}
         kind, path = scope['type'], scope['path']
+        scheme = {'ws': 'http', 'wss': 'https'}.get(scope['scheme'], scope['scheme'])
+        session = self._keeper.session(self._keeper.token(scope['headers']),
+                                       use=kind == 'http' and path in _PAGES)
         response: Response | None = None
-        if refusal := self._keeper.refusal(kind, headers):
+        if refusal := self._keeper.refusal(kind, headers, scheme):
             response = Response(f'refused: {refusal}\n', 403)
-        elif path != '/login' and self._keeper.session(
-                token_of(headers), use=kind == 'http' and path in _PAGES) is None:
+        elif path != '/login' and session is None:
             response = RedirectResponse('/login', 303) if (
                 path in _PAGES and scope.get('method') == 'GET') else Response(
                     'log in first\n', 401)
+        elif kind == 'http' and path.startswith(_SOCKETS):
+            # else the id of a socket would let others than who opened it send through it
+            response = Response('refused: only WebSockets are served here\n', 403)
         if response is not None:
             if kind == 'websocket':
                 await receive()
@@ -124,7 +155,11 @@ class _Gate:
             else:
                 await response(scope, receive, _guarded(send))
             return
-        await self._app(scope, receive, _guarded(send))
+        if session is None:
+            await self._app(scope, receive, _guarded(send))
+            return
+        with self._listener.serving(scope[_PEER]):
+            await self._app(scope, receive, _guarded(send))
 
 
 def _guarded(send: Any) -> Any:
@@ -136,26 +171,18 @@ def _guarded(send: Any) -> Any:
     return with_headers
 
 
-def token_of(headers: dict[str, str]) -> str | None:
-    """Return the token in the cookies of a request."""
-    try:
-        found = SimpleCookie(headers.get('cookie', '')).get(COOKIE)
-    except CookieError:
-        return None
-    return found.value if found else None
-
-
 class PanelServer:
     """
     The pages of a panel, one for a process.
 
     :param users: file of users, empty for none.
+    :param proxies: addresses and networks of the proxies before it, empty for none.
     :raises ValueError: for an address that must not be served without users, and a wrong file.
     :raises OSError: for an address that cannot be had, or files that cannot be read.
     """
 
     def __init__(self, source: Source, host: str, port: int, users: str, certificate: str,
-                 key: str) -> None:
+                 key: str, proxies: Sequence[str] = ()) -> None:
         found = Users.read(users) if users else None
         if found is not None and not len(found):
             raise ValueError(f'users = {users!r} has no user in it: write one by '
@@ -169,10 +196,19 @@ class PanelServer:
             except (ssl.SSLError, OSError) as error:
                 raise ValueError(f'tls_certificate = {certificate!r} and tls_key = {key!r} cannot '
                                  f'be used: {error}') from error
-        self._keeper = Doorkeeper(found, scheme)
+        if proxies and found is None:
+            raise ValueError('trusted_proxy needs users: a proxy lets others than those of this '
+                             'machine reach the panel; name a file of users')
         self._socket = _bound(host, port)
         shown = f'[{host}]' if ':' in host else host
-        self.address = f'{scheme}://{shown}:{self._socket.getsockname()[1]}'
+        port = self._socket.getsockname()[1]
+        self.address = f'{scheme}://{shown}:{port}'
+        # browsers send the cookies of a host to all its ports, and a proxy may serve several hosts
+        machine = zlib.crc32(socket.gethostname().encode())
+        self._keeper = Doorkeeper(found, f'koopman_panel_{port}_{machine:08x}')
+        seldom = Seldom()
+        for name in _LOGS:
+            logging.getLogger(name).addFilter(seldom)
         app = FastAPI(docs_url=None, redoc_url=None, openapi_url=None)
         _add_login(app, source, self._keeper)
         _add_pictures(app, source)
@@ -180,12 +216,14 @@ class PanelServer:
             _add_page(path, fill, source, self._keeper)
         ui.run_with(app, title='panel', favicon='⚙', binding_refresh_interval=None,
                     show_welcome_message=False, tailwind=False, reconnect_timeout=10.0)
-        app.add_middleware(_Gate, keeper=self._keeper)
+        app.add_middleware(_Gate, keeper=self._keeper, listener=self._socket)
+        _guard_sockets(self._keeper)
         self._server = uvicorn.Server(uvicorn.Config(
-            app, log_level='error', access_log=False, ws='websockets-sansio', lifespan='on',
+            _with_peer(ProxyHeadersMiddleware(app, list(proxies)) if proxies else app),
+            log_level='error', access_log=False, ws='websockets-sansio', lifespan='on',
             ssl_certfile=certificate or None, ssl_keyfile=key or None, server_header=False,
             timeout_graceful_shutdown=1, ws_max_size=1024 * 1024, loop='asyncio',
-            proxy_headers=False))
+            proxy_headers=False, backlog=BACKLOG))
         self._thread = threading.Thread(target=self._serve, name='pages', daemon=True)
         self._begun = threading.Event()
 
@@ -223,14 +261,65 @@ class PanelServer:
             self._begun.set()
 
 
-def _bound(host: str, port: int) -> socket.socket:
+def _with_peer(app: Any) -> Any:
+    """Note whose connection it is, before a proxy's header says for whom."""
+    async def noted(scope: Any, receive: Any, send: Any) -> None:
+        scope[_PEER] = scope.get('client')
+        await app(scope, receive, send)
+
+    return noted
+
+
+def _guard_sockets(keeper: Doorkeeper) -> None:
+    """Let a socket act on pages of its own session alone: NiceGUI goes by the id of a page."""
+    sockets = core.sio
+
+    def own(scope: Any, client_id: Any) -> bool:
+        client = Client.instances.get(client_id) if isinstance(client_id, str) else None
+        token = keeper.token(scope['headers'])
+        return (client is not None and keeper.session(token, use=False) is not None
+                and keeper.token(client.request.scope['headers']) == token)
+
+    def named(message: Any) -> Any:
+        return message.get('client_id') if isinstance(message, dict) else None
+
+    connect, handshake = (sockets.handlers['/'][name] for name in ('connect', 'handshake'))
+
+    async def on_connect(sid: str, environ: dict[str, Any], *rest: Any) -> None:
+        scope = environ['asgi.scope']
+        for client_id in parse_qs(scope['query_string'].decode('latin-1')).get('client_id', ()):
+            if not own(scope, client_id):
+                # the page then loads itself again
+                raise SocketRefused('Implicit handshake failed')
+        await connect(sid, environ, *rest)
+
+    async def on_handshake(sid: str, message: Any) -> bool:
+        return own(sockets.get_environ(sid)['asgi.scope'], named(message)) and await handshake(
+            sid, message)
+
+    def guarded(handle: Callable[[str, Any], None]) -> Callable[[str, Any], None]:
+        def on_message(sid: str, message: Any) -> None:
+            if own(sockets.get_environ(sid)['asgi.scope'], named(message)):
+                handle(sid, message)
+
+        return on_message
+
+    sockets.on('connect', on_connect)
+    sockets.on('handshake', on_handshake)
+    for name in ('event', 'javascript_response', 'ack'):
+        sockets.on(name, guarded(sockets.handlers['/'][name]))
+    # no browser writes to the log of the panel
+    sockets.on('log', lambda sid, message: None)
+
+
+def _bound(host: str, port: int) -> Listener:
     family, kind, protocol, _, address = socket.getaddrinfo(
         host, port, type=socket.SOCK_STREAM, flags=socket.AI_PASSIVE)[0]
-    own = socket.socket(family, kind, protocol)
+    own = Listener(family, kind, protocol)
     try:
         own.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
         own.bind(address)
-        own.listen(128)
+        own.listen(BACKLOG)
     except OSError as error:
         own.close()
         raise OSError(f'the pages cannot be served on {host}, port {port} ({error.strerror}): '
@@ -242,7 +331,7 @@ def _add_page(path: str, fill: Callable[[Frame], None], source: Source, keeper: 
               ) -> None:
     @ui.page(path)
     def build(request: Request) -> None:
-        frame = Frame(source, keeper.visitor(request.cookies.get(COOKIE)), path)
+        frame = Frame(source, keeper.visitor(keeper.token(request.scope['headers'])), path)
         fill(frame)
         frame.run()
 
@@ -272,7 +361,10 @@ def _add_login(app: FastAPI, source: Source, keeper: Doorkeeper) -> None:
             return RedirectResponse('/', 303)
         if int(request.headers.get('content-length', _LONGEST_FORM + 1)) > _LONGEST_FORM:
             return form('that is too long', 413)
-        given = await request.form(max_fields=4, max_files=0)
+        try:
+            given = await asyncio.wait_for(request.form(max_fields=4, max_files=0), _FORM)
+        except TimeoutError:
+            return form(f'no name and password within {_FORM:g} s', 408)
         name, password = str(given.get('name', '')), str(given.get('password', ''))
         address = request.client.host if request.client else ''
         if wait := keeper.throttle.attempt(address, name):
@@ -282,13 +374,13 @@ def _add_login(app: FastAPI, source: Source, keeper: Doorkeeper) -> None:
             return form('name or password is wrong', 401)
         keeper.throttle.succeeded(address, name)
         response = RedirectResponse('/', 303)
-        response.set_cookie(COOKIE, keeper.sessions.open(name, role), httponly=True,
-                            samesite='strict', secure=keeper.scheme == 'https', path='/')
+        response.set_cookie(keeper.cookie, keeper.sessions.open(name, role), httponly=True,
+                            samesite='strict', secure=request.url.scheme == 'https', path='/')
         return response
 
     @app.get('/logout', response_model=None)
     def log_out(request: Request) -> Response:
-        keeper.sessions.close(request.cookies.get(COOKIE))
+        keeper.sessions.close(keeper.token(request.scope['headers']))
         response = RedirectResponse('/login', 303)
-        response.delete_cookie(COOKIE)
+        response.delete_cookie(keeper.cookie)
         return response

@@ -81,9 +81,9 @@ class TrendChart:
         room = 90 if zoom else 45
         # what has no time yet may be either
         simulated = frame.source.snapshot.time < _EPOCH
-        self._chart = ui.echart(_frame_of(self._charts, height, zoom, simulated)).style(
-            f'height: {height * len(self._charts) + room}px').props(
-                'aria-label="Trends of all signals" role=img')
+        self._chart = ui.echart(_frame_of(self._charts, height, zoom, simulated)).props(
+            'aria-label="Trends of all signals" role=img')
+        self._chart.style['height'] = f'{height * len(self._charts) + room}px'
         if zoom:
             self._chart.on('chart:datazoom', self._on_zoom, ['start', 'end', 'batch'],
                            throttle=_PAUSE, leading_events=False)
@@ -188,7 +188,9 @@ def trend_page(frame: Frame) -> None:
                 words('div', 'nothing in this time', 'quiet')
 
     for control in (span, whole):
-        control.on_value_change(lambda _: chart.show(str(span.value), bool(whole.value)))
+        # a browser may send any value
+        control.on_value_change(lambda _: chart.show(str(span.value), bool(whole.value)) if (
+            span.value in SPANS) else None)
     frame.follow(show)
 
 
@@ -251,7 +253,9 @@ def _frame_of(charts: list[tuple[str, list[_Pen]]], height: int, zoom: bool, sim
         'animation': False, 'backgroundColor': 'transparent',
         'textStyle': {'color': '#1d1d1b', 'fontSize': 13},
         'axisPointer': {'link': [{'xAxisIndex': 'all'}]},
-        'tooltip': {'trigger': 'axis', 'confine': True, 'transitionDuration': 0,
+        # drawn: the usual one is HTML
+        'tooltip': {'trigger': 'axis', 'renderMode': 'richText', 'confine': True,
+                    'transitionDuration': 0,
                     ':valueFormatter': "v => v == null ? '–' : (+v).toPrecision(6)",
                     'axisPointer': {'type': 'cross', 'label': {'backgroundColor': '#4d4d4a'}}},
         'legend': {'type': 'scroll', 'top': 4, 'pageIconColor': '#4d4d4a',

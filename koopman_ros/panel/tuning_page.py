@@ -8,17 +8,22 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import replace
 from functools import partial
+import json
+import re
 from typing import Any
 
 from nicegui import ui
 
-from koopman_ros.panel.frame import div, Frame, say, words
+from koopman_ros.panel.frame import attribute, div, Frame, say, words
 from koopman_ros.panel.plant import CONTROLLER, ParameterView, Snapshot, TRAINER
 from koopman_ros.panel.requests import Answer
+from koopman_ros.panel.texts import plain
 from koopman_ros.parameters.table import as_yaml, UNBOUNDED
 from koopman_ros.units import ZERO_CELSIUS
 
 _GENERAL = 'general'
+_NAME = re.compile(r'[A-Za-z_][\w.]*', re.ASCII)
+_MAX_UNIT = 60  # characters
 
 
 def tuning_page(frame: Frame) -> None:
@@ -29,7 +34,7 @@ def tuning_page(frame: Frame) -> None:
 
 
 def _node(frame: Frame, node: str) -> None:
-    with div('card', tag='section').props(f'aria-label="Parameters of the {node}"'):
+    with attribute(div('card', tag='section'), 'aria-label', f'Parameters of the {node}'):
         with div('row1 between'):
             words('h2', node)
             ui.button('Export YAML', on_click=lambda: ui.download.content(
@@ -73,20 +78,22 @@ class _Row:
         self._text = ''
         short = view.name.rpartition('.')[2]
         unit = f' [{view.unit}]' if view.unit else ''
-        with div('parameter').props(f'data-parameter={view.name}'):
+        with attribute(div('parameter'), 'data-parameter', view.name):
             with div(''):
                 words('div', f'{short}{unit}', '')
                 notes = [view.meaning, _range(view), 'fixed at start' if view.read_only else '']
                 words('div', '; '.join(filter(None, notes)), 'quiet')
             with div(''):
-                title = f'aria-label="{view.name}{unit}"'
+                title = f'{view.name}{unit}'
                 if view.read_only:
-                    self._field: Any = words('div', '').props(title)
+                    self._field: Any = attribute(words('div', ''), 'aria-label', title)
                     return
                 with div('ask'):
-                    self._field = frame.control(ui.input().props(f'outlined dense {title}'))
-                    frame.control(ui.button('Set', on_click=self._submit).props(
-                        f'outline aria-label="Set {view.name}"'))
+                    self._field = frame.control(attribute(
+                        ui.input().props('outlined dense'), 'aria-label', title))
+                    frame.control(attribute(
+                        ui.button('Set', on_click=self._submit).props('outline'),
+                        'aria-label', f'Set {view.name}'))
                 self._said = frame.answer()
                 self._field.on('keydown.enter', self._submit)
                 self._field.on('keydown.escape', partial(self._reset))
@@ -137,6 +144,8 @@ def exported(node: str, found: Mapping[str, ParameterView]) -> str:
     """Return parameters as a file that a node can be started with."""
     lines = [f'{node}:', '  ros__parameters:']
     for name, view in found.items():
-        unit = f'  # [{view.unit}]' if view.unit else ''
-        lines.append(f'    {name}: {as_yaml(view.value)}{unit}')
+        unit = f'  # [{plain(view.unit, _MAX_UNIT)}]' if view.unit else ''
+        # a node may have any names
+        key = name if _NAME.fullmatch(name) else json.dumps(name)
+        lines.append(f'    {key}: {as_yaml(view.value)}{unit}')
     return '\n'.join(lines) + '\n'

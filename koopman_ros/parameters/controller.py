@@ -328,7 +328,7 @@ def table_of(model: LiftedModel, given: Mapping[str, Any] = MappingProxyType({})
         raise ConfigurationError(
             f'the model has {found}, the system {system!r} has {expected}: choose a model of that '
             'system, correct states_measured and inputs_commanded, or name in system what the '
-            'model is of (an empty name: none that is shipped)')
+            'model is of (none that is shipped: -p "system:=\'\'")')
     signals = signals_of(model, tuple(given.get('controlled', own.get('controlled', ()))),
                          expected.states)
     defaults: dict[str, Any] = {**signals.defaults(), **_dynamics(model)}

@@ -5,6 +5,7 @@
 
 from collections.abc import Mapping
 from dataclasses import dataclass
+from ipaddress import ip_network
 from types import MappingProxyType
 from typing import Any
 
@@ -77,6 +78,9 @@ class PanelParameters:
         '', 'certificate, as a PEM file; empty serves without encryption', read_only=True)
     tls_key: str = parameter(
         '', 'private key of the certificate, as a PEM file', read_only=True)
+    trusted_proxy: tuple[str, ...] = parameter(
+        ('',), 'addresses or networks of proxies before the panel, whose X-Forwarded-For and '
+        'X-Forwarded-Proto are believed; an empty name for none; needs users', read_only=True)
     alarm_file: str = parameter(
         '', 'file in which alarms, their shelving and the list of the day outlast the panel; '
         'empty for none', read_only=True)
@@ -116,6 +120,12 @@ def panel_table(present: LiftedModel | None = None,
         for name in ('controller', 'trainer', 'host'):
             if not getattr(values, name):
                 return f"{name} = '' must not be empty"
+        for proxy in filter(None, values.trusted_proxy):
+            try:
+                ip_network(proxy)
+            except ValueError as error:
+                return (f'trusted_proxy = {proxy!r} must be an address, e.g. 127.0.0.1, or a '
+                        f'network, e.g. 10.0.0.0/24: {error}')
         read = values.read(signals)
         for name, unit in signals.units.items():
             try:

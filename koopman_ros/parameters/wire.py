@@ -23,7 +23,7 @@ from koopman_ros.parameters.table import (
 )
 from koopman_ros.resources import config_directory
 from koopman_ros.units import check_unit, conversion
-from koopman_ros.wire import Place, place, stem
+from koopman_ros.wire import Place, place, SIGNAL_NAME, stem
 
 CONTROLLER_STATE = 'controller_state'
 CONTROLLER_EVENTS = 'controller_events'
@@ -44,7 +44,6 @@ PLANT_KINDS = ('measured', 'applied', 'commands')
 SIGNALS = ('states_measured', 'inputs_commanded', 'controlled')  # parameters that name them
 
 _PRESETS = 'plants'  # folder of the parameter files of the plants that are shipped
-_NAME = re.compile(r'[A-Za-z]\w*', re.ASCII)
 _NAMED = re.compile(r'([A-Za-z_]\w*)\s*\[(.+)\]')
 
 
@@ -121,7 +120,7 @@ class Signals:
 
     def __post_init__(self) -> None:
         for name in (*self.states, *self.inputs):
-            if not _NAME.fullmatch(name):
+            if not SIGNAL_NAME.fullmatch(name):
                 raise ConfigurationError(
                     f'{name!r} is a signal, which topics and parameters are named after: use '
                     'letters, digits and _, beginning with a letter')

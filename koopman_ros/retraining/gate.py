@@ -10,6 +10,7 @@ import numpy as np
 
 from koopman_ros.arrays import Array, brief
 from koopman_ros.control.law_check import check_law, LawCheck, LOOPS, Rate
+from koopman_ros.control.usable import unusable
 from koopman_ros.identification import Drift, fitted_starts, Identified, longest_step, Stopped
 from koopman_ros.identification.drift import prediction_error, Segments
 from koopman_ros.jobs.backends import Backend
@@ -91,8 +92,8 @@ class HeldOut:
         :param rmse: (n_x,) error of its predictions, in state units.
         :param linear: whether it is a linear one itself, which need not be better than that.
         """
-        reasons = [] if linear else [self.exceeded(
-            model, 'the best linear model', rmse, self.linear_rmse)]
+        reasons = [unusable(model)] + ([] if linear else [self.exceeded(
+            model, 'the best linear model', rmse, self.linear_rmse)])
         cond, most = figures.fit.cond, self._thresholds.condition
         if not cond <= most:
             reasons.append(f'the condition number of its coordinates, {cond:.3g}, is above '
@@ -167,7 +168,7 @@ def _autocorrelation(drift: Drift, segments: Segments) -> Array:
 def _warnings(found: Identified, model: LiftedModel, error: Array, autocorrelation: Array
               ) -> tuple[str, ...]:
     """Say where the best drift errs by more than white noise explains."""
-    warnings = []
+    warnings = list(found.warnings)
     count = sum(len(episode) for episode in found.held_out)
     measured = len(model.states) - found.hidden
     for i, (name, unit) in enumerate(zip(model.states.names[:measured], model.states.units,

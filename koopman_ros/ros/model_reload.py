@@ -7,7 +7,6 @@ from collections.abc import Callable, Collection
 import contextlib
 from dataclasses import dataclass, replace
 from datetime import datetime, UTC
-import math
 import os
 from pathlib import Path
 import re
@@ -21,6 +20,7 @@ from std_srvs.srv import Trigger
 
 from koopman_ros.arrays import Array
 from koopman_ros.control import compare, Controller, State, Windows
+from koopman_ros.control.usable import unusable
 from koopman_ros.lifting import Coordinates, LiftedModel, load_shared, ModelFileError
 from koopman_ros.parameters.controller import built, ControllerParameters, table_of
 from koopman_ros.parameters.wire import Signals, signals_of
@@ -96,23 +96,14 @@ def load_suitable(name: str, signals: Signals | None = None) -> LoadedModel:
                              f'{_LONGEST_PATH} bytes: check it')
     path = model_path(name)
     model, digest = load_shared(path)
+    if reason := unusable(model):
+        raise ModelFileError(f'{path}: {reason}')
     own = signals_of(model)
     if signals is not None and not (own.inputs == signals.inputs
                                     and signals.states.items() <= own.states.items()):
         raise ModelFileError(
             f'{path} has {own}, this controller was started for {signals}: choose a model of '
             'the same signals, or start it anew')
-    if signals is not None and (taken := set(own.states) & set(signals.inputs)):
-        raise ModelFileError(f'{path} has a state and an input of the name {min(taken)}: train '
-                             'the model again with different names')
-    for box in (model.states, model.inputs):
-        for unit, low, center, high, one in zip(
-                box.units, box.lower, box.center, box.upper, box.names, strict=True):
-            lowest = 0.0 if unit == 'K' else -math.inf
-            if not lowest < low <= center <= high:
-                raise ModelFileError(
-                    f'{path} was trained for a {one} of {low:.6g} to {high:.6g} {unit} around '
-                    f'{center:.6g} {unit}, which cannot be: train the model again')
     _refuse_slow(path, model)
     written = 'unknown'
     # the file may be gone since it was read

@@ -11,15 +11,20 @@ from typing import Any, NamedTuple
 from rclpy.callback_groups import CallbackGroup
 from rclpy.node import Node
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
+from rclpy.serialization import deserialize_message
 from rclpy.subscription import Subscription
 from rclpy.topic_endpoint_info import TopicEndpointInfo
+from rosgraph_msgs.msg import Clock
 
 from koopman_ros.bags import BagWriter, INFINITE_NS, message_definition, QosProfile
 from koopman_ros.ros import topics
+from koopman_ros.ros.codec import stamp_nanoseconds
+from koopman_ros.units import NANOSECONDS
 
 # Five seconds at 1 kHz wait here while the disk is slow; Fast DDS keeps no more than this.
 _QUEUE_DEPTH = 5000
 _LINGER = 0.1  # s
+_CLOCK_PATIENCE = 1.0  # s from the start until the first /clock should be there
 _LONGEST_WAY_NS = 1_000_000_000  # from sending to receipt, on a machine that is busy
 
 
@@ -50,6 +55,11 @@ class Recorder:
 
     `known` has type and quality of service of topics before anybody publishes them.
 
+    Messages are logged at their receipt by the node's clock. Where `use_sim_time` is set, that is
+    the last /clock received before, and recording begins with the first one, as that of
+    `ros2 bag record --use-sim-time`. Where it is not set and /clock is published, /clock is
+    recorded too as soon as a message without a stamp is expected: its receipt is no plant time.
+
     Messages wait in the middleware until :meth:`take`. Any method raises OSError where the bag
     cannot be written, and LookupError where the definition of a type is not installed.
     """
@@ -66,10 +76,19 @@ class Recorder:
         self._subscriptions: dict[str, Subscription] = {}
         self._empty_ns: dict[str, int] = {}  # when nothing waited in each
         self.counts: dict[str, int] = dict.fromkeys(self._types, 0)
+        self._begun = time.monotonic()
+        self.simulated = bool(node.get_parameter('use_sim_time').value)
+        # 0 before the first /clock
+        self._now_ns = node.get_clock().now().nanoseconds if self.simulated else 0
+        self._clock = self._subscribed(
+            topics.CLOCK, Clock, topics.profile(_QUEUE_DEPTH, reliable=False)
+        ) if self.simulated else None
+        self.complaint = ''  #: about the time of receipt, for the operator; empty for none
         self.look_for_publishers()
 
     def look_for_publishers(self) -> None:
         """Subscribe to what has become known, matching what its publishers offer."""
+        self._look_for_the_clock()
         for topic in list(self._types):
             publishers = self._node.get_publishers_info_by_topic(topic)
             if self._types[topic] is None and publishers:
@@ -91,10 +110,34 @@ class Recorder:
                         wanted.reliability, wanted.durability):
                     continue
                 self._end([topic])
-            self._empty_ns[topic] = time.time_ns()
-            self._subscriptions[topic] = self._node.create_subscription(
-                message_type, topic, lambda _: None, wanted, callback_group=self._group,
-                raw=True)
+            self._subscriptions[topic] = self._subscribed(topic, message_type, wanted)
+
+    def _subscribed(self, topic: str, message_type: Any, qos: QoSProfile) -> Subscription:
+        self._empty_ns[topic] = time.time_ns()
+        return self._node.create_subscription(
+            message_type, topic, lambda _: None, qos, callback_group=self._group, raw=True)
+
+    def _look_for_the_clock(self) -> None:
+        """Complain where receipts tell another time than that of the plant."""
+        unstamped = [topic for topic, name in self._names.items() if name in self._known
+                     and name not in topics.TYPES and not hasattr(self._known[name][0], 'header')]
+        if self.simulated:
+            waited = time.monotonic() - self._begun
+            said = '' if self._now_ns or waited < _CLOCK_PATIENCE else (
+                'nothing is recorded before the first /clock, as use_sim_time is set: publish '
+                '/clock, or set use_sim_time to false')
+        elif unstamped and self._node.count_publishers(topics.CLOCK):
+            said = (f'{unstamped[0]} has no stamps and is logged by the wall clock, while /clock '
+                    'is published: start the trainer with use_sim_time set to true')
+            # by which a reader sees how fast the plant ran
+            self._types.setdefault(topics.CLOCK, Clock)
+            self._names.setdefault(topics.CLOCK, topics.CLOCK)
+            self.counts.setdefault(topics.CLOCK, 0)
+        else:
+            return
+        if said and said != self.complaint:
+            self._node.get_logger().warning(said)
+        self.complaint = said
 
     def take(self) -> None:
         """Record what has arrived."""
@@ -111,6 +154,8 @@ class Recorder:
         try:
             self._end(list(self._subscriptions))
         finally:
+            if self._clock is not None:
+                self._node.destroy_subscription(self._clock)
             self._writer.close()
 
     def _end(self, ended: list[str]) -> None:
@@ -140,7 +185,18 @@ class Recorder:
     def _record_in_order(self, subscriptions: Mapping[str, Subscription]) -> None:
         """Record in the order of receipt; the order within a topic stays whatever the clock."""
         waiting = [self._waiting(topic, each) for topic, each in subscriptions.items()]
+        if self._clock is not None:
+            # last, so that no /clock received before a message is missing; first of one instant
+            waiting.insert(0, [taken._replace(topic='') for taken in self._waiting(
+                topics.CLOCK, self._clock)])
         for taken in heapq.merge(*waiting, key=lambda taken: taken.received_ns):
+            if not taken.topic:
+                self._hear(taken.data)
+                continue
+            if self.simulated:
+                if not self._now_ns:
+                    continue
+                taken = taken._replace(received_ns=self._now_ns, sent_ns=self._now_ns)
             if not self.counts[taken.topic]:
                 # with what its publishers offer now
                 self._writer.add_topic(
@@ -150,6 +206,13 @@ class Recorder:
             # rosbag2, too, logs the time of receipt
             self._writer.write(taken.topic, taken.data, taken.received_ns, taken.sent_ns)
             self.counts[taken.topic] += 1
+
+
+    def _hear(self, data: bytes) -> None:
+        """Take the node's time from a message on /clock, but for one that is no time."""
+        now = deserialize_message(data, Clock).clock
+        if now.sec >= 0 and now.nanosec < NANOSECONDS:
+            self._now_ns = stamp_nanoseconds(now)
 
 
 def take_raw(handle: Any, message_type: Any) -> tuple[bytes, Mapping[str, int]] | None:

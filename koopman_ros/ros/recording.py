@@ -161,7 +161,9 @@ class Recording:
             return Status(Level.ERROR, self._problem) if self._problem else Status(
                 Level.OK, 'not recording')
         counts = self._recorder.counts
-        return Status(Level.OK, f'recording to {self._path}', {
+        complaint = self._recorder.complaint
+        return Status(Level.WARN if complaint else Level.OK, f'recording to {self._path}' + (
+            f'; {complaint}' if complaint else ''), {
             'bag': os.path.abspath(self._path),
             'messages': sum(counts.values()),
             **{f'messages on {topic}': count for topic, count in counts.items()}})

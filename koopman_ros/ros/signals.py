@@ -135,6 +135,8 @@ class Outlet:
     """
     Publish some signals, those of one topic in one message, which is made once.
 
+    Raises ConfigurationError for a field of integers, too.
+
     :param places: by name of the signal, in the order of the numbers.
     :param units: of the signals, in which the numbers are given.
     """
@@ -146,6 +148,11 @@ class Outlet:
             own = [(i, place, _converted(name, units[name], place.unit))
                    for i, (name, place) in enumerate(places.items()) if name in names]
             message = kind()
+            for name in names:
+                try:
+                    places[name].expect_decimals(message)
+                except LookupError as error:
+                    raise ConfigurationError(f'{name}: {error}') from error
             self._parts.append((make(topic, kind), message, getattr(message, 'header', None), own))
 
     @property

@@ -60,12 +60,12 @@ def bag(path: Path, *data: bytes | McapRecord) -> Path:
 def refused(path: Path, words: str, recovers: bool) -> None:
     """Check that a bag is refused, and whether recovery passes over what is wrong with it."""
     with pytest.raises(BagReadError, match=words):
-        list(read_messages(path))
+        list(read_messages(path, ['/x']))
     if recovers:
-        assert list(read_messages(path, recover=True)) == []
+        assert list(read_messages(path, ['/x'], recover=True)) == []
     else:
         with pytest.raises(BagReadError, match=words):
-            list(read_messages(path, recover=True))
+            list(read_messages(path, ['/x'], recover=True))
 
 
 def peak(call: Callable[[], object]) -> float:
@@ -184,7 +184,7 @@ def test_millions_of_empty_messages(
 
 def test_zeros_in_place_of_records(tmp_path: Path) -> None:
     path = bag(tmp_path / 'run.mcap', chunk(bytes(60 * MIB)))
-    refused(path, 'is damaged .zeros in place of a record', recovers=True)
+    refused(path, 'is damaged .62914560 bytes of a chunk that are no record', recovers=True)
     assert not summary(path).complete
 
 

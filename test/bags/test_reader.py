@@ -10,12 +10,16 @@ import shutil
 from typing import Any
 
 from mcap.writer import Writer
+import numpy as np
 import pytest
 import yaml
+import zstandard
 
-from koopman_ros import bags
+from koopman_ros import bags, wire
+from koopman_ros.bags.columns import columns
 from koopman_ros.bags.metadata import dump_offered_qos, parse_offered_qos, qos_mappings
 from koopman_ros.units import NANOSECONDS as SECOND
+from koopman_ros.wire import Place
 from support.bag_samples import compressed_files, number, OFFERED_QOS, record, Sample, TOPICS
 
 WriteBag = Callable[..., Path]
@@ -36,11 +40,12 @@ HUMBLE_OFFER = """
 
 
 def foreign(path: Path, *, encoding: str = 'cdr', schema_encoding: str = 'ros2msg',
-            schema: bytes = b'float64 data\n', data: bytes = number(1.0)) -> Path:
+            schema: bytes = b'float64 data\n', data: bytes = number(1.0),
+            name: str = 'std_msgs/msg/Float64') -> Path:
     with path.open('wb') as stream:
         writer = Writer(stream)
         writer.start('ros2')
-        schema_id = writer.register_schema('std_msgs/msg/Float64', schema_encoding, schema)
+        schema_id = writer.register_schema(name, schema_encoding, schema)
         channel = writer.register_channel('/x', encoding, schema_id)
         writer.add_message(channel, 1, data, 1)
         writer.finish()
@@ -188,7 +193,7 @@ def test_directory_that_is_no_bag_and_broken_metadata(tmp_path: Path) -> None:
 def test_message_that_is_not_decoded(tmp_path: Path, options: dict[str, Any], words: str) -> None:
     path = foreign(tmp_path / 'run.mcap', **options)
     with pytest.raises(bags.BagReadError, match=words):
-        list(bags.read_messages(path))
+        list(bags.read_messages(path, ['/x']))
     assert list(bags.read_messages(path, ['/y'])) == []
 
 
@@ -324,3 +329,145 @@ def test_offers_of_older_versions_and_such_that_cannot_be_read() -> None:
                 ('reliability: 2', 'reliability: 9'), ('depth: 0', 'depth: -1'),
                 ('liveliness: 1', 'liveliness: 2'), ('sec: 1', 'sec: 2001-99-01')))):
         assert parse_offered_qos(text) == ()
+
+
+@pytest.mark.parametrize(('ending', 'identifier'), [
+    ('', ''), ('', None), ('.zstd', ''), ('.bag', '')])
+def test_metadata_without_an_identifier_of_the_storage(
+        tmp_path: Path, ending: str, identifier: str | None) -> None:
+    """As `ros2 bag reindex` of Humble leaves it, whatever the files are called."""
+    path = record(tmp_path / 'run', range(5))
+    name = f'run_0.mcap{ending}' if ending != '.bag' else 'run.bag'
+    content = (path / 'run_0.mcap').read_bytes()
+    (path / 'run_0.mcap').unlink()
+    (path / name).write_bytes(zstandard.compress(content) if ending == '.zstd' else content)
+    change(path, lambda information: information.update(
+        storage_identifier=identifier, relative_file_paths=[name],
+        compression_format='zstd' if ending == '.zstd' else ''))
+    assert [m.message.data for m in bags.read_messages(path)] == [0.0, 1.0, 2.0, 3.0, 4.0]
+    assert bags.summary(path).complete
+
+
+def test_other_storage_without_an_identifier_is_refused_by_its_name(tmp_path: Path) -> None:
+    path = record(tmp_path / 'run', range(5))
+    (path / 'run_0.db3').write_bytes(b'SQLite format 3\0')
+    change(path, lambda information: information.update(
+        storage_identifier='', relative_file_paths=['run_0.db3']))
+    with pytest.raises(bags.BagReadError, match=r'sqlite3 files.*ros2 bag convert'):
+        bags.read_messages(path)
+
+
+NAMES = pytest.mark.parametrize('name', [
+    'run_{}.mcap', '{}_run_2025_12_17-10_{:02}_00.mcap',
+    '{}_run_2025_12_17-10_{:02}_00.mcap.zstd'])
+
+
+def split(path: Path, name: str, count: int) -> list[str]:
+    """Write files of one number each, numbered as rosbag2 names them, and return their names."""
+    path.mkdir()
+    names = [name.format(k, k) for k in range(count)]
+    for k, own in enumerate(names):
+        content = record(path.parent / f'{k}.mcap', [k]).read_bytes()
+        (path / own).write_bytes(zstandard.compress(content) if own.endswith('.zstd') else content)
+    return names
+
+
+@NAMES
+def test_files_without_metadata_are_read_by_their_numbers(tmp_path: Path, name: str) -> None:
+    split(tmp_path / 'run', name, 12)
+    assert [m.message.data for m in bags.read_messages(tmp_path / 'run', recover=True)] == [
+        float(k) for k in range(12)]
+
+
+@NAMES
+def test_numbered_file_that_is_not_listed_is_no_secret(tmp_path: Path, name: str) -> None:
+    path = tmp_path / 'run'
+    names = split(path, name, 3)
+    # of another recording, and of none
+    (path / 'other_3.mcap').write_bytes((path / names[0]).read_bytes())
+    (path / 'notes.mcap').write_bytes((path / names[0]).read_bytes())
+    (path / 'metadata.yaml').write_text(yaml.safe_dump({'rosbag2_bagfile_information': {
+        'storage_identifier': 'mcap', 'relative_file_paths': names[:2],
+        'compression_format': 'zstd' if name.endswith('.zstd') else ''}}))
+    with pytest.raises(bags.BagReadError, match=r'is not listed in metadata\.yaml'):
+        bags.read_messages(path)
+    assert not bags.summary(path).complete
+    assert [m.message.data for m in bags.read_messages(path, recover=True)] == [0.0, 1.0, 2.0]
+
+
+@pytest.mark.parametrize('schema', ['std_msgs/Float64', 'std_msgs/msg/Float64'])
+@pytest.mark.parametrize('named', ['std_msgs/Float64', 'std_msgs/msg/Float64'])
+def test_short_and_full_names_are_one_type(tmp_path: Path, schema: str, named: str) -> None:
+    path = foreign(tmp_path / 'run.mcap', name=schema)
+    for place in (Place('/x', named, 'data', '1'), wire.place('/x', 'x', '1', {'type': named})):
+        assert bags.read_series(path, place).values.tolist() == [1.0]
+    assert bags.summary(path).types == {'/x': 'std_msgs/msg/Float64'}
+    assert next(bags.read_messages(path)).type_name == 'std_msgs/msg/Float64'
+
+
+@pytest.mark.parametrize(('short', 'full'), [
+    ('sensor_msgs/Temperature', 'sensor_msgs/msg/Temperature'),
+    ('sensor_msgs/msg/Temperature', 'sensor_msgs/msg/Temperature'),
+    ('my_srvs/srv/Ask_Event', 'my_srvs/srv/Ask_Event'), ('Temperature', 'Temperature'),
+    ('', ''), ('/x', '/x'), ('x/', 'x/')])
+def test_full_name_of_a_type(short: str, full: str) -> None:
+    assert wire.full_type_name(short) == full
+
+
+def test_topics_that_are_not_decoded_come_as_bytes_in_a_whole_bag(tmp_path: Path) -> None:
+    """Of a service event, rosbag2 stores the text of the .srv file."""
+    path = tmp_path / 'run.mcap'
+    with path.open('wb') as stream:
+        writer = Writer(stream)
+        writer.start('ros2')
+        channels = [writer.register_channel(topic, encoding, writer.register_schema(
+            kind, 'ros2msg', text)) for topic, encoding, kind, text in (
+                ('/x', 'cdr', 'std_msgs/msg/Float64', b'float64 data\n'),
+                ('/ask/_service_event', 'cdr', 'my_srvs/srv/Ask_Event', b'bool a\n---\nbool b\n'),
+                ('/json', 'json', 'std_msgs/msg/Float64', b'float64 data\n'))]
+        for k in range(9):
+            writer.add_message(channels[k % 3], k, number(k), k)
+        writer.finish()
+    with pytest.warns(UserWarning, match='are given as bytes alone') as said:
+        found = list(bags.read_messages(path))
+    # once for each topic
+    assert ['/_service_event' in str(one.message) for one in said] == [True, False]
+    assert [m.data for m in found] == [number(k) for k in range(9)]
+    assert [m.message and m.message.data for m in found] == [0.0, None, None, 3.0, None, None,
+                                                             6.0, None, None]
+    assert found[1].type_name == 'my_srvs/srv/Ask_Event'
+    assert len(list(bags.read_messages(path, ['/x']))) == 3
+    with pytest.raises(bags.BagReadError, match='does not parse'):
+        list(bags.read_messages(path, ['/ask/_service_event']))
+
+
+@pytest.mark.parametrize(('kind', 'field'), [
+    ('Char', 'data'), ('Byte', 'data'), ('UInt8', 'data'), ('Int8', 'data'),
+    ('ByteMultiArray', 'data[1]'), ('UInt8MultiArray', 'data[1]'), ('Int8MultiArray', 'data[1]')])
+def test_small_integers_are_the_same_live_and_from_a_bag(
+        tmp_path: Path, kind: str, field: str) -> None:
+    values = range(-128, 128) if kind.startswith('Int') else range(256)
+    own = getattr(importlib.import_module('std_msgs.msg'), kind)
+    serialize = importlib.import_module('rclpy.serialization').serialize_message
+    place = Place('/x', f'std_msgs/msg/{kind}', field, '1')
+    place.expect(own())
+    live, path = [], tmp_path / 'run.mcap'
+    with bags.BagWriter(path) as writer:
+        writer.add_topic('/x', bags.message_definition(place.type))
+        for k in values:
+            one = bytes([k]) if kind.startswith('Byte') else k
+            message = own(data=[one, one] if 'Array' in kind else one)
+            live.append(place.get(message))
+            writer.write('/x', serialize(message), k + 128)
+    assert live == [float(k) for k in values]
+    assert bags.read_series(path, place).values.tolist() == live
+    # block by block, as the trainer reads it
+    blocks = [block[place].values for block in columns(path, [place])]
+    assert np.concatenate(blocks).tolist() == live
+
+
+def test_arrays_of_char_are_of_unsigned_numbers(tmp_path: Path) -> None:
+    path = foreign(tmp_path / 'run.mcap', schema=b'char[<=3] a\nchar[2] b\nchar[] c\nchar d=7\n',
+                   data=number(1.0)[:4] + b'\x02\0\0\0\xc8\xc9' + b'\xca\xcb' + b'\x01\0\0\0\xcc')
+    found = next(bags.read_messages(path)).message
+    assert [list(found.a), list(found.b), list(found.c)] == [[200, 201], [202, 203], [204]]

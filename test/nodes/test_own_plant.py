@@ -184,7 +184,11 @@ class Failing:
      ('sensor_msgs/msg/Temperature has no temprature: name another field',)),
     (trainer, {**SIGNALS, 'temperature.unit': 'W'}, ("'W' cannot be converted to 'K'",)),
     (controller, {**SIGNALS, 'model': 'reactor_nz4'},
-     ('has states temperature [K] and inputs power [W]', 'choose a model of that system')),
+     ('has states temperature [K] and inputs power [W]', 'choose a model of that system',
+      '-p "system:=\'\'"')),
+    # as the shell hands it over
+    (controller, {'model': 'reactor_nz4', 'system': ''},
+     ("parse parameter override rule: '-p system:='", '-p "system:=\'\'"')),
 ])
 def test_start_with_what_is_wrong_says_so(
         program: ModuleType, given: dict[str, str], words: tuple[str, ...], tmp_path: Path,

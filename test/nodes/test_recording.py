@@ -12,13 +12,15 @@ import signal
 import sys
 import time
 
+from builtin_interfaces.msg import Time
 from diagnostic_msgs.msg import DiagnosticStatus
 import pytest
 from rclpy.duration import Duration
 from rclpy.publisher import Publisher
 from rclpy.qos import QoSProfile, ReliabilityPolicy
+from rosgraph_msgs.msg import Clock
 from sensor_msgs.msg import Temperature
-from std_msgs.msg import String
+from std_msgs.msg import Float64, String
 
 from koopman_ros.bags import BagMessage, read_messages, summary
 from koopman_ros.demo import reactor
@@ -27,8 +29,10 @@ from koopman_ros.nodes import trainer
 from koopman_ros.parameters.trainer import trainer_table
 from koopman_ros.resources import model_path
 from koopman_ros.ros import topics
+from koopman_ros.ros.codec import stamp_message
 from koopman_ros.ros.recording import free_name
 from koopman_ros.testing import Harness
+from koopman_ros.units import NANOSECONDS as SECOND
 from support.nodes import complaint, run_here, temperature, TIMEOUT
 
 BEST_EFFORT = QoSProfile(depth=1000, reliability=ReliabilityPolicy.BEST_EFFORT)
@@ -279,3 +283,50 @@ def test_single_file_is_not_split() -> None:
             'split: give the name of a folder, without .mcap')
         assert not table.check(table.snapshot({'output': 'run', **limit}))
         assert not table.check(table.snapshot({'output': '', **limit}))
+
+
+UNSTAMPED = {f'{name}.{key}': value for name in ('temperature', 'coolant_temperature')
+             for key, value in (('type', 'std_msgs/msg/Float64'), ('unit', 'degC'))}
+
+
+def test_messages_are_logged_by_the_time_of_the_node(ros: Harness, tmp_path: Path) -> None:
+    """As `ros2 bag record --use-sim-time`, 20 times as fast as the clock on the wall."""
+    bag = tmp_path / 'run.mcap'
+    process = ros.start('trainer', {'output': bag, 'use_sim_time': True, **UNSTAMPED})
+    values = ros.speak(Float64, reactor.TEMPERATURE, to='trainer')
+    # two subscriptions: that of the recording, and that of the node's own clock
+    ticks = ros.speak(Clock, topics.CLOCK, to='trainer', subscribers=2)
+    values.publish(Float64(data=-1.0))
+    ros.wait_for_status(STATUS, lambda status: status.level == DiagnosticStatus.WARN
+                        and 'before the first /clock' in status.message)
+    for k in range(40):
+        # a simulation that is started again, and a time that cannot be
+        ticks.publish(Clock(clock=stamp_message((50 + k if k < 30 else k - 29) * SECOND)))
+        if k == 10:
+            ticks.publish(Clock(clock=Time(sec=-1)))
+        values.publish(Float64(data=float(k)))
+        assert values.wait_for_all_acked(Duration(seconds=TIMEOUT))
+    ros.wait_for_status(STATUS, lambda status: status.level == DiagnosticStatus.OK and {
+        'messages on /temperature': '40'}.items() <= {
+            one.key: one.value for one in status.values}.items())
+    assert process.stop(signal.SIGTERM) == 0
+    found = recorded(bag)
+    assert [entry.message.data for entry in found] == list(range(40))
+    assert [entry.log_time_ns for entry in found] == [
+        (50 + k if k < 30 else k - 29) * SECOND for k in range(40)]
+
+
+def test_clock_is_recorded_beside_unstamped_messages_logged_by_the_wall_clock(
+        ros: Harness, tmp_path: Path) -> None:
+    bag = tmp_path / 'run.mcap'
+    process = ros.start('trainer', {'output': bag, **UNSTAMPED})
+    ros.speak(Float64, reactor.TEMPERATURE, to='trainer')
+    ticks = ros.speak(Clock, topics.CLOCK, to='trainer')
+    ros.wait_for_status(STATUS, lambda status: status.level == DiagnosticStatus.WARN
+                        and 'use_sim_time set to true' in status.message)
+    ticks.publish(Clock(clock=stamp_message(SECOND)))
+    ros.wait_for_status(STATUS, lambda status: {
+        'messages on /clock': '1'}.items() <= {
+            one.key: one.value for one in status.values}.items())
+    assert process.stop(signal.SIGTERM) == 0
+    assert summary(bag).counts['/clock'] == 1

@@ -155,7 +155,7 @@ BAD_MODELS = {
         '[K], this controller was started for states temperature [K] and inputs'),
     'nominal point outside its range': (
         with_states(center=np.array([400.0])),
-        'trained for a temperature of 305 to 327 K around 400 K, which cannot be'),
+        'degC, is outside its trained range, 31.85 degC to 53.85 degC'),
     'below absolute zero': (
         with_states(lower=np.array([-5.0])), 'which cannot be: train the model again'),
     'range without the set-point': (

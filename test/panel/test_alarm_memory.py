@@ -90,9 +90,9 @@ def test_it_is_written_every_few_seconds_where_something_changed(tmp_path: Path)
     (lambda text: text.replace('"HIGH"', '"HIGHEST"'), 'HIGHEST'),
     (lambda text: text.replace('"raised"', '"praised"'), "'praised' must be one of raised"),
     (lambda text: text.replace(f'"time": {NOW + 1.0}', '"time": NaN'), 'times must be finite'),
-    (lambda text: '[]', 'get'), (lambda text: '\udcff', 'utf-8'),
+    (lambda text: text.replace('"text of new"', '"\udcff"'), 'utf-8'),
     (lambda text: text.replace('"key"', '"lock"'), 'key'),
-    (lambda text: '[' * 100_000, 'recursion'),
+    (lambda text: '{"version": 1, "alarms": [' + '[' * 100_000, 'recursion'),
     (lambda text: text.replace(f'"time": {NOW + 1.0}', '"time": ' + '9' * 400), 'too large'),
 ])
 def test_a_damaged_file_is_moved_aside_and_said(file: Path, change, words: str) -> None:
@@ -107,9 +107,69 @@ def test_a_damaged_file_is_moved_aside_and_said(file: Path, change, words: str) 
     assert json.loads(file.read_text())['journal'] == []
 
 
-def test_a_pipe_is_not_waited_for(tmp_path: Path) -> None:
-    os.mkfifo(tmp_path / 'pipe')
-    assert 'is no regular file' in AlarmMemory(Alarms(), tmp_path / 'pipe', NOW).complaint
+def test_damaged_files_are_all_kept(file: Path) -> None:
+    for ending in ('.damaged', '.damaged2', '.damaged3'):
+        file.write_text('{"version": 1, "alarms": [' + ending)
+        assert str(AlarmMemory(Alarms(), file, AGAIN).complaint).endswith(f'{file}{ending}')
+    assert Path(f'{file}.damaged').read_text().endswith('.damaged')
+
+
+@pytest.mark.parametrize('content', [
+    b'anna:operator:scrypt$16384$8$5$c2FsdHNhbHQ=$aGFzaA==\n', b'[]', b'\xff', b'[' * 100_000,
+    b'{"__metadata__": {"format": "koopman_ros.lift"}}', b'# note',
+    b'{"alarms": [], "version": 1}'])
+def test_a_file_of_something_else_is_refused_and_stays(tmp_path: Path, content: bytes) -> None:
+    path = tmp_path / 'other'
+    path.write_bytes(content)
+    path.chmod(0o640)
+    before = os.stat(path)
+    with pytest.raises(ValueError, match='is no file of alarms, and is not replaced'):
+        AlarmMemory(Alarms(), path, NOW)
+    assert path.read_bytes() == content
+    assert (os.stat(path).st_ino, os.stat(path).st_mode) == (before.st_ino, before.st_mode)
+    assert [one.name for one in tmp_path.iterdir()] == ['other']
+
+
+@pytest.mark.parametrize('kind', ['pipe', 'folder', 'device'])
+def test_what_is_no_file_is_refused_and_stays(tmp_path: Path, kind: str) -> None:
+    path = tmp_path / kind
+    if kind == 'pipe':
+        os.mkfifo(path)
+    elif kind == 'folder':
+        path.mkdir()
+    else:
+        path.symlink_to('/dev/zero')
+    with pytest.raises(ValueError, match='is no regular file'):
+        AlarmMemory(Alarms(), path, NOW)
+    assert [one.name for one in tmp_path.iterdir()] == [kind]
+
+
+def test_an_empty_file_becomes_one_of_alarms_and_a_link_stays_one(tmp_path: Path) -> None:
+    (tmp_path / 'target').touch()
+    (tmp_path / 'link').symlink_to(tmp_path / 'target')
+    AlarmMemory(Alarms(), tmp_path / 'link', NOW)
+    assert (tmp_path / 'link').is_symlink()
+    assert json.loads((tmp_path / 'target').read_text())['alarms'] == []
+
+
+def test_a_file_that_another_program_has_put_there_since_is_not_replaced(file: Path) -> None:
+    alarms = Alarms(delay_on=0.0)
+    memory = AlarmMemory(alarms, file, AGAIN)
+    other = file.with_name('other')
+    other.write_text('of another program')
+    os.replace(other, file)
+    alarms.report('another', True, Priority.LOW, '', AGAIN + 10.0)
+    with pytest.raises(FileExistsError, match='another program has written'):
+        memory.keep(AGAIN + 10.0)
+    assert file.read_text() == 'of another program'
+    assert [one.name for one in file.parent.iterdir()] == [file.name], 'nothing is left beside'
+
+
+def test_a_file_beside_with_the_name_of_a_part_stays(file: Path) -> None:
+    part = file.with_name(file.name + '.part')
+    part.write_text('of another program')
+    AlarmMemory(Alarms(), file, AGAIN).close()
+    assert part.read_text() == 'of another program'
 
 
 def test_markup_and_control_characters_are_shown_as_text(file: Path) -> None:

@@ -22,13 +22,14 @@ from koopman_ros.identification import (
     Stopped,
 )
 from koopman_ros.learning.validation import lifted_rate
-from koopman_ros.lifting import linearised_model, load, Provenance
+from koopman_ros.lifting import linearised_model, load, ModelFileError, Provenance, save
 from koopman_ros.plant_data import Episode
 from koopman_ros.plants import two_state_reactor
 from koopman_ros.resources import model_path
 from koopman_ros.retraining import decide, learn_lift, Thresholds
 from koopman_ros.retraining.gate import shortfalls
 from koopman_ros.retraining.lift import _spread, drift_samples, steady_point
+from koopman_ros.ros.model_reload import load_suitable
 from support.known_plants import box, methods
 from support.random_lifts import random_lift
 from support.recorded_runs import driven, NOISE, reactor
@@ -127,6 +128,28 @@ def test_the_present_lift_does_not_beat_itself(found, trained):
         f'its error on held-out records, {own}, is not 10 % below that of the present lift, '
         f'{own}',)
     assert decide(found, trained, trained.model, Thresholds(margin=0.0)).accepted
+
+
+@pytest.mark.usefixtures('no_loops')
+@pytest.mark.parametrize('share', [-1.5, -1.01, -0.99, 0.0, 0.99, 1.01, 4.0])
+def test_what_is_accepted_can_be_loaded_and_what_cannot_is_refused(
+        found, trained, tmp_path, share):
+    """The nominal input from below all that was recorded to above it, as steady_point gives it."""
+    inputs, path = trained.model.inputs, tmp_path / 'lift.safetensors'
+    center = 0.5 * (inputs.lower + inputs.upper) + share * 0.5 * (inputs.upper - inputs.lower)
+    model = replace(trained.model, inputs=replace(inputs, center=center))
+    decision = decide(found, replace(trained, model=model), None, Thresholds())
+    reasons = [reason for reason in decision.reasons if 'nominal coolant_temperature' in reason]
+    save(model, path)
+    if abs(share) < 1.0:
+        assert not reasons
+        load_suitable(str(path))
+        return
+    assert not decision.accepted
+    assert re.search(f'record coolant_temperature {"up" if share > 0.0 else "down"} to '
+                     rf'{center[0] - 273.15:.4g} degC', reasons[0])
+    with pytest.raises(ModelFileError, match='the nominal coolant_temperature'):
+        load_suitable(str(path))
 
 
 @pytest.mark.usefixtures('no_loops')

@@ -1,0 +1,102 @@
+# SPDX-FileCopyrightText: 2026 The koopman_ros Authors
+# SPDX-License-Identifier: Apache-2.0
+
+"""Bounds on what strangers can take of the panel: its connections, and lines of its log."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Iterator
+import contextlib
+import logging
+import resource
+import socket
+import threading
+import time
+from typing import Any
+
+MAX_CONNECTIONS = 256
+BACKLOG = 64  # connections that are accepted at once
+_SHARE_OF_FILES = 4  # of which connections take one part
+
+Peer = tuple[str, int]
+
+
+class Listener(socket.socket):
+    """
+    A listening socket with a bound on the connections that are open at a time.
+
+    A new connection past the bound closes the oldest of those without a request that is served, of
+    the address that has most of them: connections that never finish their request keep none out.
+    The bound holds from the first packet, also before TLS has been negotiated.
+
+    :ivar most: connections that are open at a time; fewer where the process may open few files.
+    """
+
+    def __init__(self, *args: Any, most: int = MAX_CONNECTIONS) -> None:
+        super().__init__(*args)
+        files, _ = resource.getrlimit(resource.RLIMIT_NOFILE)
+        self.most = min(most, max(files // _SHARE_OF_FILES, 1)) if files > 0 else most
+        self._open: dict[Peer, socket.socket] = {}
+        self._served: Counter[Peer] = Counter()
+
+    def accept(self) -> tuple[socket.socket, Any]:
+        """Accept a connection; raise ConnectionAbortedError where all others are served."""
+        connection, address = super().accept()
+        self._open = {peer: one for peer, one in self._open.items() if one.fileno() >= 0}
+        if len(self._open) >= self.most and not self._close_one():
+            connection.close()
+            raise ConnectionAbortedError('all connections are in use')
+        self._open[address[0], address[1]] = connection
+        return connection, address
+
+    @contextlib.contextmanager
+    def serving(self, peer: Any) -> Iterator[None]:
+        """Keep the connection of a peer open while its request is served."""
+        place = tuple(peer or ())
+        self._served[place] += 1
+        try:
+            yield
+        finally:
+            self._served[place] -= 1
+            if not self._served[place]:
+                del self._served[place]
+
+    def _close_one(self) -> bool:
+        waiting = [peer for peer in self._open if peer not in self._served]
+        if not waiting:
+            return False
+        of_address = Counter(host for host, _ in waiting)
+        most = max(of_address.values())
+        oldest = next(peer for peer in waiting if of_address[peer[0]] == most)
+        with contextlib.suppress(OSError):
+            # the event loop finds it at its end, and closes it
+            self._open.pop(oldest).shutdown(socket.SHUT_RDWR)
+        return True
+
+
+class Seldom(logging.Filter):
+    """
+    Passes so many records of a logger in a period, and leaves out the rest.
+
+    :param period: in s.
+    """
+
+    def __init__(self, most: int = 20, period: float = 60.0) -> None:
+        super().__init__()
+        self._most, self._period = most, period
+        self._begun, self._count = time.monotonic(), 0
+        self._lock = threading.Lock()
+
+    def filter(self, record: logging.LogRecord) -> bool:
+        """Return whether a record is written; the last one says that others are left out."""
+        with self._lock:
+            now = time.monotonic()
+            if now - self._begun >= self._period:
+                self._begun, self._count = now, 0
+            self._count += 1
+            if self._count == self._most:
+                record.msg, record.args = (
+                    f'{record.getMessage()} (further lines are left out for up to '
+                    f'{self._period:g} s)'), ()
+            return self._count <= self._most

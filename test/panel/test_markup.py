@@ -1,0 +1,148 @@
+# SPDX-FileCopyrightText: 2026 The koopman_ros Authors
+# SPDX-License-Identifier: Apache-2.0
+
+"""No text from outside becomes props, a class, a style, markup or code of a page."""
+
+import ast
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+from nicegui import Client, ui
+from nicegui.page import page
+import pytest
+import yaml
+
+from koopman_ros import panel
+from koopman_ros.panel.alarm_page import alarm_page
+from koopman_ros.panel.frame import attribute, Frame, Visitor
+from koopman_ros.panel.model_page import model_page
+from koopman_ros.panel.overview import overview
+from koopman_ros.panel.trend_page import trend_page
+from koopman_ros.panel.tuning_page import exported, tuning_page
+from support.hostile import CODE, HostileSource, TEXTS
+
+PAGES = {'/': overview, '/trends': trend_page, '/alarms': alarm_page, '/model': model_page,
+         '/tuning': tuning_page}
+#: values of props that are shown as text, or are names of things of the page itself
+TEXT_PROPS = {'alt', 'aria-label', 'data-parameter', 'data-signal', 'label', 'model-value',
+              'value', 'options'}
+
+
+@pytest.fixture
+def client() -> Iterator[Client]:
+    """Return a client without a browser."""
+    own = Client(page('/test'))
+    with own:
+        yield own
+    own.delete()
+
+
+def keys_and_texts(value: Any) -> Iterator[tuple[str, Any]]:
+    """List the keys of options, however deep, with their values."""
+    if isinstance(value, dict):
+        for key, item in value.items():
+            yield key, item
+            yield from keys_and_texts(item)
+    elif isinstance(value, list):
+        for item in value:
+            yield from keys_and_texts(item)
+
+
+@pytest.mark.parametrize('may_act', [True, False], ids=['operator', 'viewer'])
+@pytest.mark.parametrize('path', PAGES)
+def test_hostile_texts_of_all_sources_stay_texts(
+        client: Client, path: str, may_act: bool) -> None:
+    source = HostileSource()
+    frame = Frame(source, Visitor(TEXTS[0], lambda: may_act), path)
+    PAGES[path](frame)
+    for update in frame._updates:
+        update(source.snapshot)
+    shown = 0
+    for element in client.elements.values():
+        assert CODE not in element.tag
+        assert not any(CODE in name for name in element.classes)
+        assert CODE not in str(dict(element.style))
+        for key, value in element.props.items():
+            assert not key.startswith((':', 'on')), (element, key)
+            assert key not in ('innerHTML', 'srcdoc')
+            assert CODE not in key
+            assert CODE not in str(value) or key in TEXT_PROPS, (element, key)
+            shown += CODE in str(value)
+        for key, value in keys_and_texts(element.props.get('options')):
+            assert CODE not in key
+            if 'formatter' in key.lower():
+                assert CODE not in value
+        for slot in element.slots.values():
+            assert not slot.template
+        shown += CODE in str(getattr(element, 'text', ''))
+    assert shown > 5, 'the texts are there'
+    assert CODE not in client.head_html + client.body_html
+
+
+def test_what_charts_show_at_the_cursor_is_drawn_not_markup(client: Client) -> None:
+    trend_page(Frame(HostileSource(), Visitor('anna', lambda: True), '/trends'))
+    (chart,) = (own for own in client.elements.values() if isinstance(own, ui.echart))
+    assert chart.options['tooltip']['renderMode'] == 'richText'
+
+
+@pytest.mark.parametrize('name', [':aria-label', 'onclick', 'style', 'class', 'innerHTML', 'a b'])
+def test_other_attributes_are_not_set(client: Client, name: str) -> None:
+    with pytest.raises(ValueError, match='cannot be set'):
+        attribute(ui.element('div'), name, 'text')
+
+
+@pytest.mark.parametrize('address', ['javascript:1', '//elsewhere', 'https://elsewhere', 'data:,'])
+def test_addresses_are_those_of_the_panel(client: Client, address: str) -> None:
+    with pytest.raises(ValueError, match='cannot be set'):
+        attribute(ui.element('a'), 'href', address)
+
+
+def test_exported_parameters_are_yaml_of_the_same_names_whatever_these_are() -> None:
+    found = HostileSource().snapshot.parameters['controller']
+    found = {f'{name}\n  :': view for name, view in found.items() if isinstance(view.value, float)}
+    read = yaml.safe_load(exported('controller', found))
+    assert read == {'controller': {'ros__parameters': dict.fromkeys(found, 1.0)}}
+
+
+# Calls that make of a text more than a text; their arguments are written out in the program.
+_MAKERS = {'props', 'classes', 'style', 'html', 'markdown', 'run_javascript', 'add_head_html',
+           'add_body_html', 'add_css', 'element', 'div', 'tag', 'default_props',
+           'default_classes', 'default_style', 'notify', 'add_slot', 'run_method',
+           'on_js', 'sanitize', 'navigate'}
+#: what passes on an argument that is checked where these are called, or makes it of numbers
+_PASSED_ON = {
+    ('frame.py', 'ui.element(tag).classes(classes)'), ('frame.py', 'ui.element(tag)'),
+    ('frame.py', '_Words(tag, text).classes(classes)'),
+    ('frame.py', 'ui.add_css(CSS)'), ('frame.py', 'ui.add_head_html(WATCH)'),
+    ('frame.py', "element.classes(**{'remove' if shown else 'add': 'hidden'})"),
+    ('frame.py', "element.style(replace='; '.join((f'{side}: {100.0 * share:.1f}%' for side, "
+     "share in found)) or 'display: none')"),
+    # the name of a priority
+    ('frame.py', 'priority.classes(replace=word)'),
+}
+
+
+def literal(argument: ast.expr) -> bool:
+    if isinstance(argument, ast.IfExp):
+        return literal(argument.body) and literal(argument.orelse)
+    return isinstance(argument, ast.Constant)
+
+
+def test_props_classes_styles_and_markup_are_written_out_in_the_program() -> None:
+    found = set()
+    for path in Path(panel.__file__).parent.glob('*.py'):
+        for node in ast.walk(ast.parse(path.read_text())):
+            if not isinstance(node, ast.Call):
+                continue
+            name = node.func.attr if isinstance(node.func, ast.Attribute) else getattr(
+                node.func, 'id', '')
+            given = [*node.args, *(keyword.value for keyword in node.keywords)]
+            if name in ('words', '_Words'):
+                # tag and classes; between them is the text
+                given = [*given[:1], *given[2:]]
+            elif name not in _MAKERS:
+                continue
+            if not all(map(literal, given)):
+                found.add((path.name, ast.unparse(node)))
+    assert found - {('frame.py', '_Words(tag, text)')} == _PASSED_ON
