@@ -42,7 +42,7 @@ _FAST = {'lockstep': True, 'speed': 60.0}
 _BY_CLOCK = {'use_sim_time': True}
 _WATCHED = 8.0  # s of plant time at that speed between two looks of the controller
 _NEVER_IN_TIME = {'levels': ('mpc', 'sdre', 'linear'), 'law_deadline': 1e-6}
-_SHORT_HOLD = {**_NEVER_IN_TIME, 'hold_timeout': 5.0}
+_SHORT_HOLD = {**_NEVER_IN_TIME, 'hold_timeout': 1.0}
 # Largest distance from the set-point after a few seconds of the safe inputs.
 _NEAR = {REACTOR.name: 6.0, TWO_TANKS.name: 0.08}
 _SLOW = {'speed': 1.0, 'start_time': 10_000.0}
@@ -319,8 +319,8 @@ def _of_plant(on: Plant) -> Iterable[Case]:
                between=True, settle=5.0, afterwards=5.0, band=math.inf,
                largest_step=3.0 * on.rate * on.period)
     yield case('laws', 'plans-late', 'no plan of mpc meets its deadline, and a sensor shows NaN '
-               'until the safe inputs are commanded, 12 s', partial(
-                   altered, make=lambda: value(lambda *_: math.nan), seconds=12.0), between=True,
+               'until the safe inputs are commanded, 4 s', partial(
+                   altered, make=lambda: value(lambda *_: math.nan), seconds=4.0), between=True,
                controller=_SHORT_HOLD, worst=_NEAR[on.name])
     yield case('sensor', 'unmeasured', 'no measurement and no watch over it, while an operator '
                'asks for a set-point, and then for inputs by hand', _unmeasured,
