@@ -28,7 +28,7 @@ class Failing(ManagedNode):
 
     def __init__(self, context: Context) -> None:
         super().__init__('failing', context=context)
-        self.failures: dict[str, Exception] = {}
+        self.failures: dict[str, BaseException] = {}
 
     def configure(self) -> None:
         self.create_publisher(String, 'mine', 1)
@@ -95,6 +95,19 @@ def test_start_that_fails_leaves_nothing_half_made(
     assert all(len(now) == len(then) + 1 for now, then in zip(parts(node), before, strict=True))
 
 
+@pytest.mark.parametrize('where', ['configure', 'activate', 'deactivate'])
+def test_code_that_exits_in_a_transition_does_not_end_the_process(
+        node: Failing, where: str) -> None:
+    node.failures = {where: SystemExit(3)}
+    if where != 'deactivate':
+        with pytest.raises(RuntimeError, match='SystemExit: 3'):
+            node.start()
+        assert not node.active
+        return
+    node.start()
+    assert node.trigger_deactivate() == TransitionCallbackReturn.SUCCESS
+
+
 def test_node_that_cannot_leave_all_well_acts_no_more_all_the_same(node: Failing) -> None:
     node.start()
     node.failures = {'deactivate': OSError('the disk is full')}
@@ -153,8 +166,9 @@ def test_what_waits_is_refused_or_dropped_when_it_is_taken_down(shared_ros: Harn
     assert state(node) == 'unconfigured'
     executor.shutdown()
     node.destroy_node()
-    for made in (*speakers, client):
-        (ros.node.destroy_publisher if made in speakers else ros.node.destroy_client)(made)
+    for speaker in speakers:
+        ros.node.destroy_publisher(speaker)
+    ros.node.destroy_client(client)
     assert failures == []
     # no callback of what was taken down
     assert all(heard)
