@@ -143,7 +143,7 @@ class ManagedNode(LifecycleNodeMixin, LoopNode):
                 self.get_logger().error(
                     one_line(error) if expected else traceback.format_exc())
             if not expected:
-                raise error
+                raise
             return TransitionCallbackReturn.FAILURE
         return TransitionCallbackReturn.SUCCESS
 
