@@ -16,6 +16,7 @@ from rclpy.lifecycle import LifecycleState, TransitionCallbackReturn
 from rclpy.lifecycle.node import LifecycleNodeMixin
 from rosgraph_msgs.msg import Clock
 
+from koopman_ros.plugs import cause
 from koopman_ros.ros.node import LoopNode, wall_timer
 
 # A parameter or a model that does not fit is a ValueError; rclpy raises RCLError for an unreadable
@@ -133,7 +134,11 @@ class ManagedNode(LifecycleNodeMixin, LoopNode):
     def _attempt(self, work: Callable[[], None]) -> TransitionCallbackReturn:
         try:
             work()
-        except Exception as error:
+        except KeyboardInterrupt:
+            raise
+        except BaseException as caught:
+            # code of one's own may raise SystemExit, which would end all nodes of the process
+            error = caught if isinstance(caught, Exception) else RuntimeError(cause(caught))
             # rclpy would not tell of it
             self._failure = error
             expected = isinstance(error, START_ERRORS)
@@ -164,9 +169,10 @@ class ManagedNode(LifecycleNodeMixin, LoopNode):
             if any(service is kept for kept in self._kept[1]):
                 continue
             with service.handle:
+                kind: Any = service.srv_type
                 while (taken := service.handle.service_take_request(
-                        service.srv_type.Request))[1] is not None:
-                    response = service.srv_type.Response()
+                        kind.Request))[1] is not None:
+                    response = kind.Response()
                     if hasattr(response, 'message'):
                         response.message = (
                             f'{self.get_name()} is not configured: configure and activate it '

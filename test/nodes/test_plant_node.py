@@ -7,13 +7,17 @@ from collections.abc import Callable, Mapping
 from itertools import pairwise
 import math
 import time
+from types import SimpleNamespace
 
 from diagnostic_msgs.msg import DiagnosticStatus
 import pytest
+from rclpy.lifecycle import TransitionCallbackReturn
 from rclpy.node import Node
 from sensor_msgs.msg import JointState, Temperature
 
 from koopman_ros.demo import reactor
+from koopman_ros.nodes import plant as plant_module
+from koopman_ros.nodes.plant import PlantNode
 from koopman_ros.parameters.plant import PlantTable
 from koopman_ros.plants import sensor_noise
 from koopman_ros.ros import topics
@@ -367,3 +371,34 @@ def test_constant_of_any_plant_changes_while_it_runs(ros: Harness) -> None:
     assert result.successful
     # more flows out than the nominal 6 V bring in
     ros.wait_until(lambda: levels[-1].position[0] < levels[0].position[0])
+
+
+@pytest.mark.parametrize('speed', [5.0, 0.0])
+def test_time_of_an_inactive_plant_stands_still(
+        shared_ros: Harness, monkeypatch: pytest.MonkeyPatch, speed: float) -> None:
+    clock = SimpleNamespace(now=100.0)
+    monkeypatch.setattr(plant_module, 'time', SimpleNamespace(
+        monotonic=lambda: clock.now, time_ns=time.time_ns))
+    context = shared_ros.node.context
+    arguments = ['--ros-args', '-p', f'speed:={speed}', '-r', '__ns:=/still']
+    node = PlantNode(context=context, cli_args=arguments)
+    node.start()
+    measured = shared_ros.listen(Temperature, '/still/temperature')
+    shared_ros.wait_until(lambda: node.count_subscribers('/still/temperature'))
+
+    def tick(seconds: float) -> None:
+        clock.now += seconds
+        node._step_in_time()
+
+    for _ in range(4):
+        tick(0.2)
+    assert node.trigger_deactivate() == TransitionCallbackReturn.SUCCESS
+    tick(0.1)
+    clock.now += 30.0
+    tick(0.1)
+    assert node.trigger_activate() == TransitionCallbackReturn.SUCCESS
+    for _ in range(4):
+        tick(0.2)
+    shared_ros.wait_until(lambda: len(measured) >= 8)
+    node.destroy_node()
+    assert [seconds(late) - seconds(early) for early, late in pairwise(measured)] == [1.0] * 7

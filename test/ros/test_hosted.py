@@ -184,5 +184,5 @@ def test_looks_of_all_loops_take_a_twentieth_of_a_core_a_topic_at_a_time(
     assert second - first == pytest.approx(1.6 if loops == 1 else 40.0, abs=0.5)
 
 
-def _raised(error: Exception) -> None:
+def _raised(error: BaseException) -> None:
     raise error

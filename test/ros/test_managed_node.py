@@ -28,7 +28,7 @@ class Failing(ManagedNode):
 
     def __init__(self, context: Context) -> None:
         super().__init__('failing', context=context)
-        self.failures: dict[str, Exception] = {}
+        self.failures: dict[str, BaseException] = {}
 
     def configure(self) -> None:
         self.create_publisher(String, 'mine', 1)
@@ -95,6 +95,19 @@ def test_start_that_fails_leaves_nothing_half_made(
     assert all(len(now) == len(then) + 1 for now, then in zip(parts(node), before, strict=True))
 
 
+@pytest.mark.parametrize('where', ['configure', 'activate', 'deactivate'])
+def test_code_that_exits_in_a_transition_does_not_end_the_process(
+        node: Failing, where: str) -> None:
+    node.failures = {where: SystemExit(3)}
+    if where != 'deactivate':
+        with pytest.raises(RuntimeError, match='SystemExit: 3'):
+            node.start()
+        assert not node.active
+        return
+    node.start()
+    assert node.trigger_deactivate() == TransitionCallbackReturn.SUCCESS
+
+
 def test_node_that_cannot_leave_all_well_acts_no_more_all_the_same(node: Failing) -> None:
     node.start()
     node.failures = {'deactivate': OSError('the disk is full')}
@@ -110,17 +123,15 @@ def test_what_waits_is_refused_or_dropped_when_it_is_taken_down(shared_ros: Harn
     class Own(ManagedNode):
         def configure(self) -> None:
             for kind in range(2):
-                self.create_subscription(String, f'words_{kind}', self.take_down, 100)
+                self.create_subscription(String, f'words_{kind}', self.hear, 100)
             self.create_service(Trigger, '~/serve', self.serve)
             wall_timer(self, 1e-3, lambda: heard.append(self.configured()))
 
         def configured(self) -> bool:
             return state(self) == 'active'
 
-        def take_down(self, _: String) -> None:
+        def hear(self, _: String) -> None:
             heard.append(self.configured())
-            self.trigger_deactivate()
-            self.trigger_cleanup()
 
         def serve(self, _: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
             heard.append(self.configured())
@@ -142,18 +153,26 @@ def test_what_waits_is_refused_or_dropped_when_it_is_taken_down(shared_ros: Harn
     executor = told_executor(ros.node.context)
     executor.add_node(node)
     deadline = time.monotonic() + TIMEOUT
+    # what has come is queued, and one of it handled
+    while not heard and time.monotonic() < deadline:
+        executor.spin_once(timeout_sec=0.01)
+    node.trigger_deactivate()
+    node.trigger_cleanup()
+    for _ in range(50):
+        schedule.turn()
+        executor.spin_once(timeout_sec=0.0)
     while not all(future.done() for future in asked) and time.monotonic() < deadline:
-        executor.spin_once(timeout_sec=min(0.01, schedule.turn()))
-        ros.spin_once(0.0)
+        ros.spin_once()
+    assert state(node) == 'unconfigured'
     executor.shutdown()
     node.destroy_node()
-    for made in (*speakers, client):
-        (ros.node.destroy_publisher if made in speakers else ros.node.destroy_client)(made)
+    for speaker in speakers:
+        ros.node.destroy_publisher(speaker)
+    ros.node.destroy_client(client)
     assert failures == []
-    assert state(node) == 'unconfigured'
     # no callback of what was taken down
     assert all(heard)
-    assert all(future.done() for future in asked)
+    assert all('not configured' in future.result().message for future in asked)
 
 
 def test_time_that_is_simulated_meanwhile_stays_so(node: Failing) -> None:
