@@ -158,8 +158,7 @@ def _indexed_summary(file: Path) -> BagSummary | None:
 
 def _is_whole(content: Summary) -> bool:
     """
-    Check that a summary section repeats all channels with messages and their schemas, and counts
-    all messages.
+    Check that a summary section has all channels with messages, their schemas and all counts.
 
     The MCAP specification leaves each of them to the writer; an empty map of counts means that
     they are not available.

@@ -153,11 +153,10 @@ class Level:
             raise TypeError(f'it returned {type(result).__name__}, not LawResult')
         if result.failure is not None:
             return amended(result, u=None)
-        if np.shape(result.u) != (self.model.n_u,):
-            raise ValueError(f'it returned an input of shape {np.shape(result.u)}, '
-                             f'not ({self.model.n_u},)')
-        return result if finite(np.asarray(result.u)) else LawResult(
-            None, reason(Code.COMMAND_NOT_FINITE))
+        u = np.asarray(result.u, dtype=np.float64)
+        if u.shape != (self.model.n_u,):
+            raise ValueError(f'it returned an input of shape {u.shape}, not ({self.model.n_u},)')
+        return result if finite(u) else LawResult(None, reason(Code.COMMAND_NOT_FINITE))
 
     def within_reach(self, target: Target, w: Array, limits: InputLimits) -> Target:
         """Return the target, or what is nearest to it where the inputs do not suffice."""

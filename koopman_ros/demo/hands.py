@@ -61,7 +61,7 @@ class Hands:
     def train(self, model: Path, timeout: float) -> None:
         """Let the trainer learn a model from what it records, and wait for it."""
         _checked('trainer/train', self.operator.harness.trigger('trainer/train'))
-        status = self.wait_for('training', 'the new lift is', timeout)
+        status = self.wait_for('training', 'the new model', timeout)
         self.table.announce(status.message)
         if not model.exists():
             raise ActError(status.message)

@@ -121,7 +121,7 @@ class RetrainingJob:
         if 'ended' in said:
             accepted = sum(one.accepted for one in self.state.plants.values())
             return replace(self.state, share=1.0, ended=True, text=(
-                f'{accepted} of {len(self.state.plants)} new lifts are accepted'))
+                f'{accepted} of {len(self.state.plants)} new models are accepted'))
         return self._conclusion(said)
 
     def _conclusion(self, said: Mapping[str, Any]) -> JobState:
@@ -169,12 +169,12 @@ def _in_words(summary: Mapping[str, Any]) -> str:
     if not summary['accepted']:
         reasons = '; '.join(summary['reasons'])
         kept = f'; it is kept as {summary["model_file"]}' if summary['model_file'] else ''
-        return f'the new lift is refused: {reasons}{kept}'
+        return f'the new model ({summary["model_class"]}) is refused: {reasons}{kept}'
     present = summary['heldout_error_of_present_lift']
     other, name = (('heldout_error_of_linear_model', 'best linear model') if present is None else (
         'heldout_error_of_present_lift', 'present one'))
     units = summary['units']
-    return ('the new lift is accepted: error on held-out records '
+    return (f'the new model ({summary["model_class"]}) is accepted: error on held-out records '
             f'{_errors(summary["heldout_error"], units)}, that of the {name} '
             + ('infinite, as it diverges' if None in summary[other].values()
                else _errors(summary[other], units))

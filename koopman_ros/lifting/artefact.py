@@ -21,6 +21,7 @@ from koopman_ros.lifting.coordinates import Coordinates, TrainingStates, TriedLo
 from koopman_ros.lifting.input_terms import InputTerms
 from koopman_ros.lifting.model import LiftedModel, Provenance
 from koopman_ros.lifting.observables import NetworkObservables, PolynomialObservables
+from koopman_ros.model_classes import CLASSES
 from koopman_ros.units import check_unit
 
 FORMAT = 'koopman_ros.lift'
@@ -84,6 +85,9 @@ def save(model: LiftedModel, path: str | os.PathLike[str]) -> None:
             'data_digest': model.provenance.data_digest,
             'metrics': dict(model.provenance.metrics),
             **({'method': model.provenance.method} if model.provenance.method else {}),
+            **({'model_class': model.provenance.model_class} if model.provenance.model_class
+               else {}),
+            **({'refused': list(model.provenance.refused)} if model.provenance.refused else {}),
             'package_version': model.provenance.package_version,
             'plant': model.provenance.plant,
             'seed': model.provenance.seed,
@@ -205,7 +209,8 @@ def _build(about: dict[str, Any], tensors: dict[str, np.ndarray]) -> LiftedModel
             seed=None if origin['seed'] is None else _integer(origin, 'seed'),
             data_digest=origin['data_digest'], metrics=metrics,
             package_version=origin['package_version'],
-            method=origin.get('method', '')),
+            method=origin.get('method', ''), model_class=_class(origin),
+            refused=_texts(origin, 'refused')),
         training_states=None if 'fill_distance' not in about else TrainingStates(
             tensors['training_states'], float(filled)),
         readout=tensors.get('readout'),
@@ -239,6 +244,20 @@ def _checksum(description: str, arrays: dict[str, Any], data: bytes) -> str:
     """Return the SHA-256 over all that a model consists of, in hexadecimal."""
     index = json.dumps(arrays, sort_keys=True)
     return hashlib.sha256(b'\0'.join((description.encode(), index.encode(), data))).hexdigest()
+
+
+def _class(origin: dict[str, Any]) -> str:
+    name = origin.get('model_class', '')
+    if name not in ('', *CLASSES):
+        raise ValueError(f'model_class must be one of {", ".join(CLASSES)}, got {name!r}')
+    return str(name)
+
+
+def _texts(about: dict[str, Any], name: str) -> tuple[str, ...]:
+    value = about.get(name, [])
+    if not isinstance(value, list) or not all(isinstance(text, str) for text in value):
+        raise TypeError(f'{name} must be a list of texts, got {value!r}')
+    return tuple(value)
 
 
 def _integer(about: dict[str, Any], name: str) -> int:

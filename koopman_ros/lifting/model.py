@@ -19,6 +19,13 @@ from koopman_ros.lifting.coordinates import Coordinates, TrainingStates, TriedLo
 from koopman_ros.lifting.input_terms import InputTerms
 from koopman_ros.lifting.layout import Layout, layout_of
 from koopman_ros.lifting.observables import NetworkObservables, Observables
+from koopman_ros.model_classes import (
+    FREE_LIFT,
+    IDENTITY_LIFT,
+    LINEAR,
+    NEURAL_DRIFT,
+    POLYNOMIAL,
+)
 from koopman_ros.plant_data import Plant
 from koopman_ros.units import check_time_unit, SECONDS_PER_TIME_UNIT
 
@@ -43,6 +50,9 @@ class Provenance:
     metrics: Mapping[str, float] = field(default_factory=dict)
     package_version: str = ''  #: version of koopman_ros that made it
     method: str = ''  #: how derivatives were found; empty where they were given
+    #: one of :data:`koopman_ros.model_classes.CLASSES`, or empty where training did not state it
+    model_class: str = ''
+    refused: tuple[str, ...] = ()  #: why its training refused it; empty where it did not
 
 
 @dataclass(frozen=True)
@@ -124,6 +134,18 @@ class LiftedModel:
     def n_u(self) -> int:
         """Number of inputs."""
         return len(self.inputs)
+
+    @cached_property
+    def kind(self) -> str:
+        """Its class as people read it, of a lift with its number of coordinates."""
+        lift, name = self.observables, self.provenance.model_class
+        if not name:
+            name = (POLYNOMIAL if not isinstance(lift, NetworkObservables) else
+                    LINEAR if not lift.hidden else
+                    FREE_LIFT if not lift.identity else
+                    NEURAL_DRIFT if self.readout is not None and self.n_z == self.n_x else
+                    IDENTITY_LIFT)
+        return f'{name}, n_z = {self.n_z}' if name in (IDENTITY_LIFT, FREE_LIFT) else name
 
     @cached_property
     def n_z(self) -> int:

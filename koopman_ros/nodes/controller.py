@@ -5,6 +5,7 @@
 
 from collections.abc import Mapping
 from dataclasses import replace
+from functools import partial
 import gc
 import math
 import sys
@@ -73,6 +74,7 @@ _WATCH_STEP = NANOSECONDS // 2  # of plant time between two commands without a m
 _OVERDUE = 3.0  # usual intervals after which a measurement no longer decides the next command
 _SETTLED = 1e-4  # of an input's range: such a change of the command in a watch step is none
 _SOURCES_WINDOW = 10.0  # s, where no time-out of the measurements says how long
+_REFUSAL_SHOWN = 60.0  # s for which a request that was refused or limited is a warning
 _PATIENCE = 0.5  # s that the first answer waits for the measured inputs
 _CAUSES = {None: Code.NO_MEASUREMENT, Advance.OLD: Code.STAMPS_STAND,
            Advance.TWO_SOURCES: Code.TWO_SOURCES}
@@ -109,7 +111,7 @@ class ControllerNode(ManagedNode):
             raise ConfigurationError(
                 f'there is no model of the system {system!r}: name one in model, or in system one '
                 f'of {", ".join(shipped())}')
-        loaded = load_suitable(model)
+        loaded = load_suitable(model, force=bool(given.get('load_refused_model', False)))
         self._table = table = table_of(loaded.model, given)
         self._settings = self.declare_table(table)
         self._signals = signals_of(
@@ -125,7 +127,8 @@ class ControllerNode(ManagedNode):
         # the one of the start, unless its name was changed since then
         loaded, self._loaded = self._loaded, None
         if loaded is None or loaded.name != parameters.model:
-            loaded = load_suitable(parameters.model, self._signals)
+            loaded = load_suitable(parameters.model, self._signals,
+                                   force=parameters.load_refused_model)
         signals = self._signals
         self._words = words_of(signals)
         self._models = ModelReload(
@@ -141,7 +144,9 @@ class ControllerNode(ManagedNode):
         self._recent = Recent()
         self._lock, self._telling = threading.Lock(), threading.Lock()
         self._report = self._logged = Report(Mode.AUTOMATIC, next(iter(self._controller.levels)))
-        self._refused = self._rests_outside = ''
+        # why the last request was refused or limited, and when
+        self._request, self._requested = '', 0.0
+        self._rests_outside = ''
         # until when a status is not looked at again while level and whether there is a reason stay
         self._told, self._untold = (0.0, '', False), False
         self._received = time.monotonic()  # when the commands last had subscribers, or none went
@@ -171,7 +176,9 @@ class ControllerNode(ManagedNode):
         self._active_limits = matching.publish(topics.ACTIVE_LIMITS)
         self._published_setpoint: Array | None = None
         self.diagnostics.hardware_id = loaded.model.provenance.plant or parameters.system
-        self._diagnostics = self.diagnostics.add('control', self._status)
+        self._diagnostics = self.diagnostics.add(messages.CONTROL, self._status)
+        self._conditions = {name: self.diagnostics.add(name, partial(self._condition, name))
+                            for name in messages.CONDITIONS}
         # volatile, so that `ros2 topic pub` matches
         for name, place in wiring.setpoints.items():
             Inlet(self, matching.subscribe, {name: place}, signals.states, self._on_setpoint)
@@ -563,13 +570,26 @@ class ControllerNode(ManagedNode):
             outcome = events.apply(self._controller, self._state, event)
             self._state = outcome.state
             self._records.publish_event(event, outcome)
-        self._refused = self._words(outcome.refused)
-        if self._refused:
-            self.get_logger().warning(self._refused, throttle_duration_sec=1.0)
-        elif isinstance(event, events.SetpointRequest):
+        note = f'request refused: {self._words(outcome.refused)}' if outcome.refused else (
+            self._limited(event.value) if isinstance(event, events.ManualCommand) else '')
+        self._request, self._requested = note, time.monotonic()
+        if note:
+            self.get_logger().warning(note, throttle_duration_sec=1.0)
+        if outcome.refused is None and isinstance(event, events.SetpointRequest):
             self._counts.setpoint_received = True
+        self._conditions[messages.REQUESTS].publish_if_changed()
         self._diagnostics.publish_if_changed()
-        return not self._refused
+        return outcome.refused is None
+
+    def _limited(self, asked: Array) -> str:
+        """Return what becomes of a manual command (n_u,) outside the limits, or nothing."""
+        within = self._controller.settings.limits.within(asked)
+        parts = [f'manual {stem(name, unit)} {shown(wanted, unit):.2f} {display_unit(unit)} is '
+                 f'limited to {shown(limit, unit):.2f} {display_unit(unit)}'
+                 for (name, unit), wanted, limit in zip(
+                     self._signals.inputs.items(), asked.tolist(), within.tolist(), strict=True)
+                 if wanted != limit]
+        return ', '.join(parts)
 
     def _built(self) -> Controller:
         given, carrier = self._models.in_force.model, self._carried[1]
@@ -624,17 +644,25 @@ class ControllerNode(ManagedNode):
             [publisher.topic_name for publisher in self._commands.publishers
              if not topics.heard(publisher)], time.monotonic() - self._received)
 
-    def _status(self) -> Status:
+    def _situation(self) -> messages.Situation:
         frame = (f'the frame_id of the measurement has {self._frame_length} characters, of which '
                  f'{LONGEST_FRAME_ID} are passed on: shorten it at the sensor'
                  ) if self._frame_length else ''
-        status = messages.status(messages.Situation(
+        recent = time.monotonic() - self._requested < _REFUSAL_SHOWN
+        return messages.Situation(
             self._controller, self._settings, self._signals, self._state, self._report,
-            self._counts, self._timing, self._matching.complaint or frame, self._refused,
-            self._models.refused,
+            self._counts, self._timing, self._matching.complaint or frame,
+            self._request if recent else '', self._models.refused,
             lambda: {**self._models.figures(),
                      'safe input': self._rests_outside or 'within reach'},
-            self._measured, self._assembler, self._open_loop()))
+            self._measured, self._assembler, self._open_loop())
+
+    def _condition(self, name: str) -> Status:
+        return messages.condition(self._situation(), name) if self.active else Status(
+            Level.OK, 'inactive')
+
+    def _status(self) -> Status:
+        status = messages.status(self._situation())
         # without measurements answered there is nothing to complain of
         return status if self.active else replace(status, level=Level.OK, message='inactive')
 

@@ -34,7 +34,15 @@ from koopman_ros.lifting import LiftedModel, load
 from koopman_ros.panel.alarm_memory import AlarmMemory
 from koopman_ros.panel.learning import Learning
 from koopman_ros.panel.past import fill_in, read_past
-from koopman_ros.panel.plant import CONTROLLER, ParameterView, PlantView, Range, TRAINER
+from koopman_ros.panel.plant import (
+    CONTROLLER,
+    ParameterView,
+    PLANT,
+    PlantView,
+    Range,
+    REQUESTS,
+    TRAINER,
+)
 from koopman_ros.panel.requests import (
     Action,
     action_text,
@@ -57,7 +65,7 @@ from koopman_ros.ros.node import Level, LoopNode, Status, wall_timer, words_of
 from koopman_ros.ros.process import run
 from koopman_ros.ros.remote import RemoteNode
 from koopman_ros.ros.signals import Heard, Inlet, Outlet
-from koopman_ros.units import conversion, Display, display_unit, NANOSECONDS
+from koopman_ros.units import conversion, Display, display_unit, NANOSECONDS, printed
 from koopman_ros.wire import Place
 
 # The loop waits for nobody who only looks on.
@@ -105,7 +113,9 @@ class PanelNode(LoopNode):
         self._signals = signals = panel_signals(present, given)
         self._wiring = wiring = Wiring(signals, settings.states, settings.inputs)
         read = settings.read(signals)
-        self.view = PlantView(signals, read, settings.span, time.time())
+        nodes = {PLANT: PLANT, CONTROLLER: settings.controller, TRAINER: settings.trainer}
+        self.view = PlantView(signals, read, settings.span, time.time(), {
+            self.resolve_service_name(name).lstrip('/'): role for role, name in nodes.items()})
         self._memory = self._recalled(settings.alarm_file)
         self.snapshot = self.view.snapshot(time.time())
         self._words = words_of(signals, {
@@ -243,13 +253,14 @@ class PanelNode(LoopNode):
                 status.name, status.level[0], status.message,
                 {item.key: item.value for item in status.values}, time.time(),
                 status.hardware_id)
-            if status.name.endswith('controller: control'):
+            name = self.view.task(status.name)
+            if name == REQUESTS:
                 self._requests.status(status.message)
-            if status.name.endswith(_TRAINING):
+            if name == _TRAINING:
                 output = self.snapshot.parameters.get(TRAINER, {}).get('model_output')
                 self._watch.training({item.key: item.value for item in status.values},
                                      str(output.value) if output else '')
-            if status.name.endswith(_RECORDING):
+            if name == _RECORDING:
                 bag = next((item.value for item in status.values if item.key == 'bag'), '')
                 self._watch.recording(bag)
                 if self._past is not None:
@@ -384,7 +395,14 @@ class PanelNode(LoopNode):
         self._letters.append(letter)
         self._sending.reset()
         self._requests.add(SETPOINT if setpoint else MANUAL, action.name,
-                           float(back(float(there(value)))), now, answered)
+                           float(back(float(there(value)))), now, answered,
+                           'accepted' if setpoint else self._becomes(action.name, action.value))
+
+    def _becomes(self, name: str, asked: float) -> str:
+        """Return the answer to a manual command that the controller accepts."""
+        limited = self.view.limited(name, float(asked))
+        return 'accepted' if limited == float(asked) else (
+            f'limited to {limited:.6g} {printed(self.view.read[name])}')
 
     def _on_sending(self) -> None:
         now = time.monotonic()
@@ -443,9 +461,10 @@ def _imported_server() -> ModuleType:
 def _about(model: LiftedModel) -> dict[str, str]:
     """Return origin and held-out figures of a model, in words."""
     origin = model.provenance
-    kind = 'linear' if model.n_z == model.n_x else f'lift of {model.n_z} coordinates'
     return {
-        'kind': kind, 'learned from': origin.plant, 'derivatives': origin.method,
+        'class': model.kind,
+        **({'refused by its training': '; '.join(origin.refused)} if origin.refused else {}),
+        'learned from': origin.plant, 'derivatives': origin.method,
         'made by': f'koopman_ros {origin.package_version}' if origin.package_version else '',
         'seed': '' if origin.seed is None else str(origin.seed),
         **{f'held out: {name}': f'{figure:.4g}' for name, figure in origin.metrics.items()}}

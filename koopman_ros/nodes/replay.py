@@ -99,7 +99,7 @@ def replayed_bag(path: str, names: Names, parameters: ReplayParameters,
     """Replay one bag; arguments and errors are those of :func:`replay_bags`."""
     alternative = None
     if parameters.new_model:
-        new = load_suitable(parameters.new_model)
+        new = load_suitable(parameters.new_model, force=True)
         alternative = Alternative(new.model, new.digest, _tuning(new.model, given))
     records = read_records(path, names.records, recover=parameters.recover)
     if parameters.last:
@@ -187,7 +187,7 @@ def _prepare() -> Callable[[], int]:
         given = node.given()
         new_model = str(given.get('new_model', ''))
         # what a controller with the new model is tuned by may be given, too
-        beside = _tuning(load_suitable(new_model).model, given) if new_model else ()
+        beside = _tuning(load_suitable(new_model, force=True).model, given) if new_model else ()
         parameters = node.declare_table(REPLAY_TABLE, beside)
         wiring = preset_wiring(parameters.system)
         names = Names(

@@ -5,6 +5,7 @@
 
 from __future__ import annotations
 
+from collections import deque
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 import math
@@ -14,7 +15,6 @@ from types import MappingProxyType
 from typing import Any
 
 from koopman_ros.panel.alarms import Alarm, Alarms, Priority
-from koopman_ros.panel.requests import REFUSED
 from koopman_ros.panel.trends import Trends
 from koopman_ros.parameters.wire import Signals
 from koopman_ros.reasons import level_words
@@ -22,12 +22,17 @@ from koopman_ros.resources import predecessor
 from koopman_ros.units import conversion, display_unit, printed
 
 OK, WARN, ERROR = 0, 1, 2  #: levels of a status
-PLANT, CONTROLLER, TRAINER = 'plant', 'controller', 'trainer'
+PLANT, CONTROLLER, TRAINER = 'plant', 'controller', 'trainer'  #: roles of nodes
+_ROLES: Mapping[str, str] = MappingProxyType(
+    {PLANT: PLANT, CONTROLLER: CONTROLLER, TRAINER: TRAINER})
+CONTROL, REQUESTS = f'{CONTROLLER}: control', f'{CONTROLLER}: requests'
 
 _SILENT = 3.5  # s without a status, of which there is one a second
 _PERIODS = 5.0  # usual times between two measurements without one
 _BACK = 1.0  # s; a stamp that is earlier by more begins time afresh
-_MOST_STATUSES = 64
+_MOST_FOREIGN = 64  # statuses of other nodes that are kept
+# So many errors within so many seconds are an alarm, however short each of them is.
+_REPEATED, _WITHIN = 5, 60.0
 _DEVIATION = re.compile(r'deviation_(\w+) \[')
 _NAMED = re.compile(r'estimated_(\w+) \[(.+)\]')
 _SIGNAL = re.compile(r'(\w+) \[(.+)\]')
@@ -230,10 +235,13 @@ class PlantView:
     :param read: units in which people read them, by name.
     :param span: of the past that the trends keep, in s.
     :param now: by the wall clock, as everywhere here.
+    :param nodes: roles of the loop's own nodes by their full names without the first slash.
     """
 
-    def __init__(self, signals: Signals, read: Mapping[str, str], span: float, now: float
-                 ) -> None:
+    def __init__(self, signals: Signals, read: Mapping[str, str], span: float, now: float,
+                 nodes: Mapping[str, str] = _ROLES) -> None:
+        self._nodes = dict(nodes)
+        self._errors: dict[str, deque[float]] = {}  # when each task last turned to ERROR
         self.signals, self.read = signals, read
         self.alarms = Alarms()
         self.trends = Trends(span)
@@ -247,6 +255,7 @@ class PlantView:
         self._unplanned = 0
         self._mode = self._level = ''
         self._statuses: dict[str, TaskStatus] = {}
+        self._own_tasks: set[str] = set()
         self._estimates: dict[str, str] = {}
         self._parameters: dict[str, Mapping[str, ParameterView]] = {}
         self._heard: dict[str, float] = {}
@@ -401,24 +410,44 @@ class PlantView:
         if not math.isnan(self._time):
             self.trends.mark(self._time, kind, text)
 
+    def task(self, name: str) -> str:
+        """
+        Return the name under which a status is kept: ``<role>: <task>`` of the loop's own nodes.
+
+        An empty string is that of a node of another loop, which has the base name of a role in
+        another namespace.
+        """
+        node, _, task = name.partition(': ')
+        role = self._nodes.get(node)
+        if role is not None:
+            return f'{role}: {task}'
+        return '' if node.rsplit('/', 1)[-1] in self._nodes.values() else name
+
     def status(self, name: str, level: int, message: str, values: Mapping[str, str],
                now: float, plant: str = '') -> None:
-        """Take what a task of a node says of itself; its level becomes an alarm."""
-        if name not in self._statuses and len(self._statuses) >= _MOST_STATUSES:
+        """Take the status of a task of a node; its level becomes an alarm."""
+        name, role = self.task(name), self._nodes.get(name.partition(': ')[0])
+        if not name or (role is None and name not in self._statuses
+                        and len(self._statuses) >= _MOST_FOREIGN + len(self._own_tasks)):
             return
-        node = name.split(':')[0].rsplit('/', 1)[-1]
-        if node in (CONTROLLER, TRAINER):
-            self._heard[node] = now
-            if node not in self._watched:
-                self._watched.append(node)
-        if node in (PLANT, CONTROLLER):
+        if role is not None:
+            self._own_tasks.add(name)
+        if role in (CONTROLLER, TRAINER):
+            self._heard[role] = now
+            if role not in self._watched:
+                self._watched.append(role)
+        if role in (PLANT, CONTROLLER):
             self.plant = plant or self.plant
+        before = self._statuses.get(name)
         self._statuses[name] = TaskStatus(name, level, message, dict(values), now)
+        if level >= ERROR and (before is None or before.level < ERROR):
+            self._errors.setdefault(name, deque(maxlen=_REPEATED)).append(now)
+        # the operator who made a request has its answer
         priority = Priority.HIGH if level >= ERROR else (
-            # who asked was told already
-            Priority.MEDIUM if node == CONTROLLER and not message.startswith(REFUSED)
-            else Priority.LOW)
-        self.alarms.report(name, level > OK, priority, f'{name}: {message}', now)
+            Priority.MEDIUM if role == CONTROLLER and name != REQUESTS else Priority.LOW)
+        # a warning that the control task repeats has a task and an alarm of its own
+        repeated = level < ERROR and values.get('condition', 'control') != 'control'
+        self.alarms.report(name, level > OK and not repeated, priority, f'{name}: {message}', now)
 
     def parameters(self, node: str, values: Mapping[str, ParameterView]) -> None:
         """Take all parameters of a node, in place of those before; none where it is gone."""
@@ -446,6 +475,11 @@ class PlantView:
     def advance(self, now: float) -> None:
         """Let time pass: who is silent for too long becomes an alarm."""
         silent = {silence.source for silence in self._silences(now)}
+        for name, times in self._errors.items():
+            often = len(times) == _REPEATED and now - times[0] <= _WITHIN
+            self.alarms.report(
+                f'{name}, repeated errors', often, Priority.HIGH, f'{name}: at least {_REPEATED} '
+                f'errors within {_WITHIN:g} s, the last: {self._statuses[name].message}', now)
         for source in self._watched:
             what = 'no measurement' if source == PLANT else f'nothing from the {source}'
             self.alarms.report(f'silence of {source}', source in silent,
@@ -470,8 +504,7 @@ class PlantView:
         """Return all that is shown now."""
         silences = self._silences(now)
         quiet = {silence.source for silence in silences}
-        control = next((status for name, status in self._statuses.items()
-                        if name.endswith('controller: control')), None)
+        control = self._statuses.get(CONTROL)
         values = control.values if control else _NO_VALUES
         reason = values.get('reason', '')
         level = self._level
@@ -524,6 +557,11 @@ class PlantView:
         """Return the first of the controller's levels."""
         levels = self._parameters.get(CONTROLLER, {}).get('levels')
         return str(levels.value[0]) if levels else 'sdre'
+
+    def limited(self, name: str, value: float) -> float:
+        """Return a manual command within the limits of the controller, in the unit it is read."""
+        low, high = self._bounds(name, self._inputs[name], 'min', 'max') or (-math.inf, math.inf)
+        return min(max(value, low), high)
 
     def _bounds(self, name: str, own: _Signal, low: str, high: str) -> Range | None:
         given = self._parameters.get(CONTROLLER, {})

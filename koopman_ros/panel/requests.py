@@ -75,6 +75,7 @@ class _Open:
     value: float  # in the unit of the signal
     deadline: float
     reply: Callable[[Answer], None]
+    accepted: str  # the answer where it is
     refused: str = ''  # why, in the words of its code
 
 
@@ -92,9 +93,9 @@ class Requests:
         self._open: list[_Open] = []
 
     def add(self, event: str, name: str, value: float, now: float,
-            reply: Callable[[Answer], None]) -> None:
+            reply: Callable[[Answer], None], accepted: str = 'accepted') -> None:
         """Wait for the answer to a value that was just published."""
-        self._open.append(_Open(event, name, value, now + PATIENCE, reply))
+        self._open.append(_Open(event, name, value, now + PATIENCE, reply, accepted))
 
     def record(self, event: str, fields: Mapping[str, Any], now: float) -> None:
         """Take a record, which may answer a request."""
@@ -114,7 +115,7 @@ class Requests:
         else:
             return
         if accepted:
-            self._answer(request, Answer(True, 'accepted'))
+            self._answer(request, Answer(True, request.accepted))
         elif said := self._words(codes, request.name, request.value):
             self._answer(request, Answer(False, said))
         else:

@@ -193,6 +193,8 @@ class ControllerParameters:
     min_riccati_digits: float = parameter(
         8.0, 'decimal digits to which a solution must fulfil its Riccati equation to be acted on',
         '', 0.0, 15.0)
+    load_refused_model: bool = parameter(
+        False, 'load a model file although its training refused it')
     model_check_factor: float = parameter(
         2.0, 'how many times worse than the present model another one may predict what was '
         'measured lately, and yet be put into the running loop; 0 for any', '', 0.0, 1e6,

@@ -51,7 +51,8 @@ def _sections(retrained: Retrained) -> Iterator[str]:
     states, inputs = found.drift.box.states, found.drift.box.inputs
     errors = tuple(f'error of {name} [{unit}]'
                    for name, unit in zip(states.names, states.units, strict=True))
-    yield f'**The new lift is {"accepted" if retrained.accepted else "refused"}.**'
+    kind = '' if learned is None else f' ({learned.model.kind})'
+    yield f'**The new model{kind} is {"accepted" if retrained.accepted else "refused"}.**'
     warnings = () if decision is None else decision.warnings
     yield bullets([*retrained.reasons, *(f'Beware: {warning}.' for warning in warnings)])
     if retrained.model_file:
@@ -144,7 +145,7 @@ def _draw(path: Path, retrained: Retrained) -> bool:
                     row[3].set_ylim(low, high + 0.2 * (high - low))  # room for the legend
                     row[3].legend(fontsize=8, loc='upper left')
             word = 'accepted' if retrained.accepted else 'refused'
-            figure.suptitle(f'Retraining: the new lift is {word}')
+            figure.suptitle(f'Retraining: the new model is {word}')
     except ImportError:
         return False
     return True

@@ -103,6 +103,7 @@ class Retrained:
 
         figures: dict[str, object] = {
             'accepted': self.accepted,
+            'model_class': 'none learned' if self.learned is None else self.learned.chosen.name,
             'reasons': list(self.reasons),
             'warnings': list(self.decision.warnings) if self.decision else [],
             'model_file': self.model_file,
@@ -266,7 +267,7 @@ def retrain_by(backend: Backend, task: Task, on_progress: OnProgress = lambda *_
           ] * bool(task.model and current is None)))
     _stop_if(on_progress(_at('decide', 0.9), 'writing'))
     model = _with_provenance(learned.model, found, decision, min(bare.coverage.values()),
-                             episodes)
+                             episodes, learned.chosen.name)
     path = _place(Path(task.output), decision.accepted)
     save(model, path)
     return replace(bare, learned=learned.with_model(model), decision=decision,
@@ -320,7 +321,7 @@ class _Course:
 
 
 def _with_provenance(model: LiftedModel, found: Identified, decision: Decision, covered: float,
-                     episodes: list[Episode]) -> LiftedModel:
+                     episodes: list[Episode], model_class: str) -> LiftedModel:
     sha = hashlib.sha256()
     for episode in episodes:
         for array in (episode.time, episode.x, episode.input_time, episode.u):
@@ -335,7 +336,8 @@ def _with_provenance(model: LiftedModel, found: Identified, decision: Decision, 
     metrics = {name: value for name, value in metrics.items() if np.isfinite(value)}
     return replace(model, tried_loops=decision.law_check.tried, provenance=replace(
         model.provenance, data_digest=sha.hexdigest(), metrics=metrics,
-        method=f'{found.method}, {found.drift.form}'))
+        method=f'{found.method}, {found.drift.form}', model_class=model_class,
+        refused=decision.reasons))
 
 
 def _place(output: Path, accepted: bool) -> Path:

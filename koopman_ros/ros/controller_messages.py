@@ -3,7 +3,7 @@
 
 """The controller's messages: into events of its step, and its status, internals and records."""
 
-from collections.abc import Callable, Collection, Mapping
+from collections.abc import Callable, Collection, Iterator, Mapping
 from dataclasses import dataclass
 from functools import lru_cache
 import itertools
@@ -41,6 +41,11 @@ _SNAPSHOT_PERIOD = 10.0  # s by the wall
 _PATIENCE = 10.0  # s after which a measurement is old where no time-out is set
 _AGAIN = 1.0  # s, within which two nodes know each other
 _UNRECEIVED = 3.0  # s without a subscriber after which commands are lost
+# Tasks of the diagnostics: that of the control level, and one for each kind of warning, so that
+# none hides another.
+CONTROL = 'control'
+CONNECTIONS, MEASUREMENTS, REQUESTS, MODEL, SETPOINT, ACTUATORS = CONDITIONS = (
+    'connections', 'measurements', 'requests', 'model', 'set-point', 'actuators')
 _ACTIONS = {HOLD: 'the last command is held', SAFE: 'the safe {} is commanded'}
 _WAY_BACK = 'the {} leads the plant back from where the safe one keeps it'
 
@@ -70,7 +75,7 @@ class Situation:
     counts: Counts
     timing: Timing
     complaint: str  #: what is wrong around the node, e.g. a second controller; or empty
-    request_refused: str  #: why the operator's last request was refused, or empty
+    request: str  #: why the operator's last request was refused or limited, or empty
     model_refused: str  #: why the last model was refused, or empty
     model: Callable[[], Mapping[str, object]]  #: gives figures of the model in force
     measured: Array  #: (n_y,) last measured, in the units of the signals
@@ -97,10 +102,16 @@ class Situation:
 
 def status(now: Situation) -> Status:
     """Return the status of the control task."""
-    level, message = _verdict(now)
+    level, message, condition = _verdict(now)
     if now.complaint and now.timing.no_news(_PATIENCE) is Advance.TWO_SOURCES:
         message += f'; {now.complaint}'
-    return Status(level, message, lambda: _figures(now))
+    return Status(level, message, lambda: {'condition': condition, **_figures(now)})
+
+
+def condition(now: Situation, name: str) -> Status:
+    """Return the status of one of :data:`CONDITIONS`, whatever the others are."""
+    sentences = [sentence for of, sentence in _warnings(now) if of == name]
+    return Status(Level.WARN, '; '.join(sentences)) if sentences else Status(Level.OK, 'in order')
 
 
 def open_loop(topic_names: Collection[str], seconds: float) -> Status:
@@ -116,7 +127,27 @@ def open_loop(topic_names: Collection[str], seconds: float) -> Status:
                               'plant; start the plant, or check its topic and domain')
 
 
-def _verdict(now: Situation) -> tuple[Level, str]:
+def _verdict(now: Situation) -> tuple[Level, str, str]:
+    """Return level and sentence of the control task, and the condition that it is due to."""
+    level, sentence = _control(now)
+    if sentence:
+        return level, sentence, CONTROL
+    condition, warning = next(_warnings(now), ('', ''))
+    if warning:
+        return Level.WARN, warning, condition
+    report, mode = now.report, now.state.mode
+    message = mode.value
+    if mode is Mode.AUTOMATIC and not now.counts.setpoint_received:
+        message += ', no set-point yet: what was first measured is held'
+    elif report.command.at_range:
+        message += f', {now.input} at a limit'
+    elif report.command.at_rate:
+        message += f', {now.input} at a rate limit'
+    return Level.OK, message, CONTROL
+
+
+def _control(now: Situation) -> tuple[Level, str]:
+    """Return what keeps the best law from acting, or an empty sentence."""
     report, mode = now.report, now.state.mode
     timeout = now.parameters.measurement_timeout
     if not now.counts.measurements:
@@ -150,16 +181,7 @@ def _verdict(now: Situation) -> tuple[Level, str]:
         level = Level.ERROR if report.level in _ACTIONS else Level.WARN
         action = _WAY_BACK.format(now.input) if report.command.way_back else _action(now)
         return level, f'{action}: {now.reason}'
-    if warning := _warning(now):
-        return Level.WARN, warning
-    message = mode.value
-    if mode is Mode.AUTOMATIC and not now.counts.setpoint_received:
-        message += ', no set-point yet: what was first measured is held'
-    elif report.command.at_range:
-        message += f', {now.input} at a limit'
-    elif report.command.at_rate:
-        message += f', {now.input} at a rate limit'
-    return Level.OK, message
+    return Level.OK, ''
 
 
 def _action(now: Situation) -> str:
@@ -167,34 +189,38 @@ def _action(now: Situation) -> str:
     return _ACTIONS.get(level, '').format(now.input) or level_words(level)
 
 
-def _warning(now: Situation) -> str:
-    """Return the first thing that an operator should know of, or an empty string."""
+def _warnings(now: Situation) -> Iterator[tuple[str, str]]:
+    """Yield every warning with the name of its condition, the most urgent first."""
     report, states = now.report, now.controller.model.states
     age, oldest = now.timing.age, now.parameters.max_measurement_age
     if now.complaint:
-        return now.complaint
+        yield CONNECTIONS, now.complaint
     if now.open_loop.level is not Level.OK:
-        return now.open_loop.message
+        yield CONNECTIONS, now.open_loop.message
     if now.timing.paused:
-        return (f'/clock has stood still for more than {PAUSED:g} s: the simulation is paused or '
-                'has ended, and the last command stays')
+        yield MEASUREMENTS, (
+            f'/clock has stood still for more than {PAUSED:g} s: the simulation is paused or '
+            'has ended, and the last command stays')
     overdue = _PATIENCE if math.isinf(now.state.interval) else max(
         _PATIENCE, 3.0 * now.state.interval)
+    unmeasured = report.measurement.arrival is Arrival.MISSING and not report.command.way_back
     if report.measurement.arrival is Arrival.REPEATED or (
             now.timing.silence > overdue and now.timing.no_news(overdue) is Advance.OLD):
-        return ('the stamp of the measurement does not advance: the last command is held; stamp '
-                'measurements with their time')
-    unmeasured = report.measurement.arrival is Arrival.MISSING and not report.command.way_back
-    if now.timing.silence > overdue or (unmeasured and now.counts.measurements):
-        return (f'the last measurement is {now.timing.silence:.0f} s old: commands follow from '
-                'the model and from requests alone; check sensor and plant')
+        yield MEASUREMENTS, (
+            'the stamp of the measurement does not advance: the last command is held; stamp '
+            'measurements with their time')
+    elif now.timing.silence > overdue or (unmeasured and now.counts.measurements):
+        yield MEASUREMENTS, (
+            f'the last measurement is {now.timing.silence:.0f} s old: commands follow from '
+            'the model and from requests alone; check sensor and plant')
     if now.timing.without_clock:
-        return ('use_sim_time is set and nobody publishes /clock: time-outs count by the wall '
-                'clock; set use_sim_time to false, or publish_clock of the plant to true')
-    if now.request_refused:
-        return f'request refused: {now.request_refused}'
+        yield MEASUREMENTS, (
+            'use_sim_time is set and nobody publishes /clock: time-outs count by the wall '
+            'clock; set use_sim_time to false, or publish_clock of the plant to true')
+    if now.request:
+        yield REQUESTS, now.request
     if now.model_refused:
-        return now.model_refused
+        yield MODEL, now.model_refused
     if report.measurement.outside > 0.0:
         box = states.only(tuple(now.signals.states))
         outside = [f'{name} is outside the trained range [{shown(lower, unit):.6g}, '
@@ -202,21 +228,23 @@ def _warning(now: Situation) -> str:
                    for name, unit, lower, upper, value in zip(
                        box.names, box.units, box.lower.tolist(), box.upper.tolist(),
                        now.measured.tolist(), strict=True) if not lower <= value <= upper]
-        return f'{", ".join(outside) or "the state is far from the training data"}: ' \
-               'the model extrapolates'
+        yield MODEL, (f'{", ".join(outside) or "the state is far from the training data"}: '
+                      'the model extrapolates')
     if oldest and abs(age) > oldest:
-        return (f'measurements are {age:.1f} s old when they arrive, at most {oldest:g} s are '
-                'expected: check the connection and the clocks')
+        yield MEASUREMENTS, (
+            f'measurements are {age:.1f} s old when they arrive, at most {oldest:g} s are '
+            'expected: check the connection and the clocks')
     if report.target is not None and (short := _out_of_reach(now, report.target)):
-        return short
+        yield SETPOINT, short
     if not report.measurement.follows:
-        return (f'the {now.input} does not follow its command within '
-                f'{_listed(now, "tolerance")}: the observer goes by what is measured; check the '
-                'actuator and its limits')
+        yield ACTUATORS, (
+            f'the {now.input} does not follow its command within '
+            f'{_listed(now, "tolerance")}: the observer goes by what is measured; check the '
+            'actuator and its limits')
     if report.estimate is not None and report.estimate.at_bound:
-        return (f'the disturbance estimate is at its bound of {_listed(now, "max_disturbance")} '
-                f'of {now.input}: the plant is far from its model; retrain')
-    return ''
+        yield MODEL, (
+            f'the disturbance estimate is at its bound of {_listed(now, "max_disturbance")} '
+            f'of {now.input}: the plant is far from its model; retrain')
 
 
 def _out_of_reach(now: Situation, target: TargetReport) -> str:

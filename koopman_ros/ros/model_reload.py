@@ -24,6 +24,7 @@ from koopman_ros.control.usable import unusable
 from koopman_ros.lifting import Coordinates, LiftedModel, load_shared, ModelFileError
 from koopman_ros.parameters.controller import built, ControllerParameters, table_of
 from koopman_ros.parameters.wire import Signals, signals_of
+from koopman_ros.reasons import Code
 from koopman_ros.resources import model_path
 from koopman_ros.ros.node import words_of
 from koopman_ros.units import display_unit, NANOSECONDS, shown
@@ -58,7 +59,9 @@ class LoadedModel:
     @property
     def about(self) -> str:
         """The model in a few words."""
-        return f'model {self.name}: n_z = {self.model.n_z}, trained for {ranges(self.model)}'
+        refused = '; '.join(self.model.provenance.refused)
+        return (f'model {self.name}: {self.model.kind}, trained for {ranges(self.model)}'
+                + (f'; REFUSED by its training ({refused})' if refused else ''))
 
 
 @dataclass(frozen=True)
@@ -87,8 +90,13 @@ def ranges(model: LiftedModel) -> str:
                                          states.upper.tolist(), strict=True))
 
 
-def load_suitable(name: str, signals: Signals | None = None) -> LoadedModel:
-    """Load a model, of these signals where they are given; ModelFileError with the reason."""
+def load_suitable(name: str, signals: Signals | None = None, *, force: bool = False
+                  ) -> LoadedModel:
+    """
+    Load a model, of these signals where they are given; ModelFileError with the reason.
+
+    :param force: whether to load a model that its training refused.
+    """
     if not name:
         raise ModelFileError('model is empty: name a shipped model or a .safetensors file')
     if len(name.encode()) > _LONGEST_PATH or '\0' in name:
@@ -98,6 +106,10 @@ def load_suitable(name: str, signals: Signals | None = None) -> LoadedModel:
     model, digest = load_shared(path)
     if reason := unusable(model):
         raise ModelFileError(f'{path}: {reason}')
+    if (reasons := model.provenance.refused) and not force:
+        raise ModelFileError(
+            f'{path} was refused by its training ({"; ".join(reasons)}): train it again, or set '
+            'load_refused_model to true to control with it all the same')
     own = signals_of(model)
     if signals is not None and not (own.inputs == signals.inputs
                                     and signals.states.items() <= own.states.items()):
@@ -120,9 +132,11 @@ def _refuse_slow(path: Path, model: LiftedModel) -> None:
     for k in range(1, _TRIALS + 1):
         # of this thread alone, for a busy machine says nothing of a model
         begun = time.thread_time()
+        state, _, report = controller.step(state, model.states.center, k * NANOSECONDS)
+        if report.reason is not None and report.reason.code is Code.CALCULATION_FAILED:
+            raise ModelFileError(f'{path}: a control step with the model fails '
+                                 f'({report.reason.values["error"]}): train it again')
         try:
-            state = controller.step(state, model.states.center, k * NANOSECONDS)[0]
-            # which diagnostics tell
             controller.equivalent_bias(state)
         except (ArithmeticError, ValueError) as error:
             raise ModelFileError(f'{path}: a control step with the model fails ({error}): train '
@@ -236,7 +250,8 @@ class _Trial:
              present: LiftedModel) -> None:
         outcome: LoadedModel | str
         try:
-            outcome = load_suitable(name, signals)
+            outcome = load_suitable(
+                name, signals, force=situation.parameters.load_refused_model)
             refuse_setpoints(outcome.model, situation)
             refuse_without_law(outcome.model, situation)
             outcome = replace(outcome, comparison=refuse_worse(present, outcome.model, situation))

@@ -134,10 +134,11 @@ def test_figures_of_signals_are_told_one_by_one() -> None:
         'input_gain': {'low': {'pump': 2.0}}}) == {
             'accepted': True, 'noise: low': 0.5, 'input_gain: low: pump': 2.0}
     errors = {'low': 0.25, 'high': 3.0}
-    summary = {'accepted': True, 'model_file': 'new', 'units': {'low': 'm', 'high': 'Pa'},
+    summary = {'accepted': True, 'model_class': 'free lift', 'model_file': 'new',
+               'units': {'low': 'm', 'high': 'Pa'},
                'heldout_error': errors, 'heldout_error_of_present_lift': {**errors, 'low': 1.0}}
-    words = ('the new lift is accepted: error on held-out records 0.25 m in low, 3 Pa in high, '
-             'that of the present one {}; written to new')
+    words = ('the new model (free lift) is accepted: error on held-out records 0.25 m in low, '
+             '3 Pa in high, that of the present one {}; written to new')
     assert training._in_words(summary) == words.format('1 m in low, 3 Pa in high')
     summary['heldout_error_of_present_lift'] = {**errors, 'low': None}
     assert training._in_words(summary) == words.format('infinite, as it diverges')

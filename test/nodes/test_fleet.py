@@ -33,12 +33,12 @@ def test_each_plant_is_told_of_by_itself(ros: Harness, tmp_path: Path) -> None:
     # one of them could not be trained
     assert program.wait(120.0) == 1, program.output()
     lines = dict(line.split(': ', 1) for line in program.output().splitlines() if ': ' in line)
-    assert lines['/a'].startswith('the new lift is accepted')
+    assert 'is accepted' in lines['/a']
     assert lines['/lost'] == (
         f"training failed: bag '{tmp_path}/none.mcap' does not exist: check the path")
     assert lines['/bare'] == ('cannot be retrained: there is no bag to train from: name it in '
                               'bags')
-    assert lines['trainer'] == '1 of 2 new lifts are accepted'
+    assert lines['trainer'] == '1 of 2 new models are accepted'
     assert load(tmp_path / 'a.safetensors').states.names == ('temperature',)
     assert not (tmp_path / 'lost.safetensors').exists()
 

@@ -37,8 +37,8 @@ PAGE = (ROOT / 'docs' / 'own_plant.md').read_text()
 RECORD, SIMULATE, TRAIN, CONTROL, RUN, AGAIN, FROM_BAG, ON_TOPICS = (
     (node, tuple(shlex.split(text))) for node, text in re.findall(
         r'^ros2 run koopman_ros (\w+) --ros-args (--params-file .*)$', PAGE, re.MULTILINE))
-ACCEPTED = r'the new lift is accepted: error on held-out records ([\d.]+) K, that of the best ' \
-    r'linear model ([\d.]+) K; written to (\S+\.safetensors)'
+ACCEPTED = r'the new model \(.+?\) is accepted: error on held-out records ([\d.]+) K, ' \
+    r'that of the best linear model ([\d.]+) K; written to (\S+\.safetensors)'
 
 
 @pytest.fixture(scope='module')

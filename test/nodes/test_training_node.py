@@ -39,8 +39,9 @@ def test_trains_from_a_bag_with_a_bar_on_the_terminal(ros: Harness, tmp_path: Pa
     assert len(shares) > 3
     assert shares[-1] == 100
     assert 'estimating: drift of degree' in printed
-    assert re.search(r'the new lift is accepted: error on held-out records 0\.\d+ K, that of the '
-                     rf'present one \d\.\d+ K; written to {tmp_path}/new\.safetensors', printed)
+    assert re.search(r'the new model \(.+\) is accepted: error on held-out records 0\.\d+ K, '
+                     rf'that of the present one \d\.\d+ K; written to {tmp_path}/new\.safetensors',
+                     printed)
     assert sorted(path.name for path in tmp_path.glob('new.*')) == [
         'new.json', 'new.md', 'new.png', 'new.safetensors']
     assert load(tmp_path / 'new.safetensors').n_z == 2
@@ -51,13 +52,14 @@ def test_trains_from_a_bag_with_a_bar_on_the_terminal(ros: Harness, tmp_path: Pa
 def test_lift_that_is_refused_has_an_exit_code_of_its_own(
         monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]) -> None:
     """The words of a training that ends so; one that does runs beside the loop below."""
-    end = {'summary': {'accepted': False, 'reasons': ['it is too flat'], 'model_file': ''}}
+    end = {'summary': {'accepted': False, 'model_class': 'linear', 'model_file': '',
+                       'reasons': ['it is too flat']}}
     monkeypatch.setattr('koopman_ros.jobs.training._command', lambda: (
         sys.executable, '-c', f'print({json.dumps(end)!r})'))
     assert run_here(trainer, task='train', bags='[run]') == 2
     line = complaint(capfd)
     assert '[WARN]' in line
-    assert line.endswith('the new lift is refused: it is too flat')
+    assert line.endswith('is refused: it is too flat')
 
 
 @pytest.mark.parametrize('name', ['best', 'neural drift'])
@@ -69,14 +71,15 @@ def test_class_is_passed_on_and_each_that_was_learned_is_shown(
                    'heldout_error': {'temperature': 0.5}, 'closed_loops': 128,
                    'closed_loops_failed': 1},
         'free lift': {'chosen': False, 'refusal': 'it has lost a state', 'seconds': 2.0}}
-    end = {'accepted': False, 'model_file': '', 'units': {'temperature': 'K'}, 'classes': learned}
+    end = {'accepted': False, 'model_class': 'linear', 'model_file': '',
+           'units': {'temperature': 'K'}, 'classes': learned}
     monkeypatch.setattr('koopman_ros.jobs.training._command', lambda: (
         sys.executable, '-c', 'import json; task = json.loads(input()); print(json.dumps('
         f'{{"summary": {{**json.loads({json.dumps(end)!r}), "reasons": [task["model_class"]]}}}}))'
     ))
     assert run_here(trainer, task='train', bags='[run]', model_class=name) == 2
     said = capfd.readouterr().err
-    assert f'the new lift is refused: {name}\n' in said
+    assert re.search(rf'the new model \(.+\) is refused: {name}\n', said)
     assert ('linear: chosen: drift rx 2.0e-02, roll-out 0.5 K, law fails in 1 of 128 closed '
             'loops, 0.0 s\n') in said
     assert 'free lift: 2.0 s; refused: it has lost a state\n' in said
@@ -157,7 +160,7 @@ def test_trains_beside_the_running_loop(ros: Harness, tmp_path: Path) -> None:
     gain = 60.0 * figures['input_gain']['temperature']['coolant_temperature']
     assert gain == pytest.approx(0.8 * 2.0921, rel=0.15)
     assert (status.level, figures['accepted']) == (DiagnosticStatus.WARN, False)
-    assert status.message.startswith('the new lift is refused: ')
+    assert re.match(r'the new model \(.+\) is refused: ', status.message)
     assert not (tmp_path / 'new.safetensors').exists()
 
     # the recording was the task, and it is complete

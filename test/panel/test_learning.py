@@ -103,7 +103,7 @@ def test_a_model_is_learned_read_about_compared_and_takes_over(tmp_path: Path) -
             expect(training).to_contain_text('cancelled, nothing was written', timeout=PATIENCE)
             press(training, 'Train')
             expect(training).to_contain_text(
-                'the new lift is accepted', timeout=2.0 * PATIENCE)
+                'is accepted', timeout=2.0 * PATIENCE)
 
             report = card(page, 'Report')
             expect(report).to_contain_text('the new model is accepted', timeout=PATIENCE)

@@ -245,7 +245,7 @@ def test_classes_side_by_side_in_report_and_summary(bag, tmp_path):
         f'{linear["closed_loops"]} closed loops, {linear["seconds"]:.1f} s')
     assert '; refused: ' in lines['identity lift']
     assert scalars(figures)['class linear'] == lines['linear']
-    assert _in_words(figures).startswith('the new lift is accepted: ')
+    assert _in_words(figures).startswith('the new model (')
 
 
 @pytest.mark.usefixtures('quick')
