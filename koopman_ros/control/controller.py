@@ -348,13 +348,17 @@ class Controller:
         if back:
             state = _afresh(state)
         since_ns = state.commanded_ns
-        if since_ns is not None and since_ns > time_ns + LATE_NANOSECONDS:
+        ahead_of_stamps = since_ns is not None and since_ns > time_ns + LATE_NANOSECONDS
+        if ahead_of_stamps:
             # what was commanded in silence was timed by a clock that these stamps do not follow
             since_ns = state.time_ns
         elapsed = 0.0 if since_ns is None else max(0.0, (time_ns - since_ns) / NANOSECONDS)
         # neither a gap nor a burst is the spacing of the samples, nor the first of them
         spacing = min(_spacing(state), elapsed)
         state, seconds, missed = _passed(state, time_ns, elapsed)
+        if ahead_of_stamps and state.supervisor.level != HOLD:
+            # the command has moved in that time already
+            seconds = 0.0
         if countable is not None:
             seconds = min(seconds, countable)
         return self._contained(
@@ -408,7 +412,7 @@ class Controller:
             return state, None, self._report(state, None)
         since_ns = time_ns if state.commanded_ns is None else state.commanded_ns
         elapsed = max(0.0, (time_ns - since_ns) / NANOSECONDS)
-        # a command that nobody saw was not on its way
+        # the command stood still all through a longer silence
         seconds = min(elapsed, max(_LONGEST_WATCH, 2.0 * _spacing(state)))
         until_ns = max(time_ns, since_ns)
         return self._contained(
@@ -425,6 +429,7 @@ class Controller:
             if fault is None and state.mode is Mode.AUTOMATIC:
                 if state.estimate is None or state.setpoint.active is None:
                     assert state.command is not None
+                    state = amended(state, commanded_ns=until_ns)
                     return state, state.command, self._report(state, state.supervisor.reason)
                 x = self.model.states.to_physical(state.estimate.x)
                 measured = MeasurementReport(outside=self.model.distance(x))

@@ -29,6 +29,7 @@ from koopman_ros.control.events import (
 from koopman_ros.lifting import LiftedModel, load_with_digest
 from koopman_ros.parameters.controller import built, table_of
 from koopman_ros.parameters.plant import PlantTable
+from koopman_ros.reasons import Code
 from koopman_ros.replay import records
 from koopman_ros.replay.loop import replay
 from koopman_ros.resources import model_path
@@ -145,7 +146,7 @@ def test_commands_keep_their_limits_and_follow_from_the_records(name, slow, sequ
                 measured[i] = x[i]
                 answered(Measurement(run.plant.time_ns, measured))
             case 'silence':
-                answered(Silence(now))
+                answered(Silence(now, Code.NO_MEASUREMENT if values[0] > 0.0 else None))
             case 'setpoint':
                 run.do(SetpointRequest(0, r))
             case 'one setpoint':
