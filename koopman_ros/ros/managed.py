@@ -16,7 +16,7 @@ from rclpy.lifecycle import LifecycleState, TransitionCallbackReturn
 from rclpy.lifecycle.node import LifecycleNodeMixin
 from rosgraph_msgs.msg import Clock
 
-from koopman_ros.plugs import cause
+from koopman_ros.plugs import contained
 from koopman_ros.ros.node import LoopNode, wall_timer
 
 # A parameter or a model that does not fit is a ValueError; rclpy raises RCLError for an unreadable
