@@ -138,7 +138,7 @@ class ManagedNode(LifecycleNodeMixin, LoopNode):
             raise
         except BaseException as caught:
             # code of one's own may raise SystemExit, which would end all nodes of the process
-            error = caught if isinstance(caught, Exception) else RuntimeError(cause(caught))
+            error = caught if isinstance(caught, Exception) else RuntimeError(contained(caught))
             # rclpy would not tell of it
             self._failure = error
             expected = isinstance(error, START_ERRORS)
