@@ -44,7 +44,7 @@ _WATCHED = 8.0  # s of plant time at that speed between two looks of the control
 _NEVER_IN_TIME = {'levels': ('mpc', 'sdre', 'linear'), 'law_deadline': 1e-6}
 _SHORT_HOLD = {**_NEVER_IN_TIME, 'hold_timeout': 1.0, 'recovery_time': 1.0}
 # Largest distance from the set-point after a few seconds of the safe inputs.
-_NEAR = {REACTOR.name: 10.0, TWO_TANKS.name: 0.09}
+_NEAR = {REACTOR.name: 10.0, TWO_TANKS.name: 0.08}
 _SLOW = {'speed': 1.0, 'start_time': 10_000.0}
 # One of its sensors has a topic of its own.
 _APART = replace(QUADRUPLE_TANK, wired={**QUADRUPLE_TANK.wired, 'level_4.topic': 'level_4'})
