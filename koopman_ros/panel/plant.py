@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from collections import deque
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 import math
 from pathlib import Path
 import re
@@ -25,6 +25,7 @@ OK, WARN, ERROR = 0, 1, 2  #: levels of a status
 PLANT, CONTROLLER, TRAINER = 'plant', 'controller', 'trainer'  #: roles of nodes
 _ROLES: Mapping[str, str] = MappingProxyType(
     {PLANT: PLANT, CONTROLLER: CONTROLLER, TRAINER: TRAINER})
+LOST = 'connection lost'  #: message of a node that is silent
 CONTROL, REQUESTS = f'{CONTROLLER}: control', f'{CONTROLLER}: requests'
 
 _SILENT = 3.5  # s without a status, of which there is one a second
@@ -210,8 +211,15 @@ class Snapshot:
     previous_model: str  #: that acted before, as far as the panel saw, or empty
 
     def status(self, name: str) -> TaskStatus:
-        """Return the status of a task, an empty one where nothing was heard of it."""
-        return self.statuses.get(name, TaskStatus(name, OK, ''))
+        """
+        Return the status of a task, an empty one where nothing was heard of it.
+
+        That of a controller or trainer that is silent is an error, with its last values.
+        """
+        found = self.statuses.get(name, TaskStatus(name, OK, ''))
+        lost = any(one.ever and one.source == name.partition(':')[0] != PLANT
+                   for one in self.silences)
+        return replace(found, level=ERROR, message=LOST) if lost else found
 
 
 @dataclass
@@ -241,7 +249,8 @@ class PlantView:
     def __init__(self, signals: Signals, read: Mapping[str, str], span: float, now: float,
                  nodes: Mapping[str, str] = _ROLES) -> None:
         self._nodes = dict(nodes)
-        self._errors: dict[str, deque[float]] = {}  # when each task last turned to ERROR
+        # when each task last turned to ERROR, and its message
+        self._errors: dict[str, deque[tuple[float, str]]] = {}
         self.signals, self.read = signals, read
         self.alarms = Alarms()
         self.trends = Trends(span)
@@ -441,7 +450,8 @@ class PlantView:
         before = self._statuses.get(name)
         self._statuses[name] = TaskStatus(name, level, message, dict(values), now)
         if level >= ERROR and (before is None or before.level < ERROR):
-            self._errors.setdefault(name, deque(maxlen=_REPEATED)).append(now)
+            self._errors.setdefault(name, deque(maxlen=_REPEATED)).append(
+                (now, message))
         # the operator who made a request has its answer
         priority = Priority.HIGH if level >= ERROR else (
             Priority.MEDIUM if role == CONTROLLER and name != REQUESTS else Priority.LOW)
@@ -475,11 +485,11 @@ class PlantView:
     def advance(self, now: float) -> None:
         """Let time pass: who is silent for too long becomes an alarm."""
         silent = {silence.source for silence in self._silences(now)}
-        for name, times in self._errors.items():
-            often = len(times) == _REPEATED and now - times[0] <= _WITHIN
+        for name, errors in self._errors.items():
+            often = len(errors) == _REPEATED and now - errors[0][0] <= _WITHIN
             self.alarms.report(
                 f'{name}, repeated errors', often, Priority.HIGH, f'{name}: at least {_REPEATED} '
-                f'errors within {_WITHIN:g} s, the last: {self._statuses[name].message}', now)
+                f'errors within {_WITHIN:g} s, the last: {errors[-1][1]}', now)
         for source in self._watched:
             what = 'no measurement' if source == PLANT else f'nothing from the {source}'
             self.alarms.report(f'silence of {source}', source in silent,
@@ -513,10 +523,11 @@ class PlantView:
             mode='' if CONTROLLER in quiet else self._mode,
             level='' if CONTROLLER in quiet else level_words(level),
             fallback=bool(level) and level not in (self._best_level(), 'manual'),
-            reason='' if reason == 'none' else reason,
+            reason='' if reason == 'none' or CONTROLLER in quiet else reason,
             states=tuple(self._state(name, own, PLANT in quiet)
                          for name, own in self._states.items()),
-            inputs=tuple(self._input(name, own) for name, own in self._inputs.items()),
+            inputs=tuple(self._input(name, own, CONTROLLER in quiet)
+                         for name, own in self._inputs.items()),
             estimates=tuple((label(name), text) for name, text in self._estimates.items()),
             statuses=MappingProxyType(dict(self._statuses)),
             standing=self.alarms.standing, shelved=self.alarms.shelved,
@@ -539,7 +550,7 @@ class PlantView:
             own.active, own.plan, name in self.signals.controlled, measured, setpoint,
             found.get('asked', setpoint), found.get('predicted', math.nan))
 
-    def _input(self, name: str, own: _Signal) -> InputFace:
+    def _input(self, name: str, own: _Signal, silent: bool) -> InputFace:
         found, limits = own.values, self._bounds(name, own, 'min', 'max')
         command, applied = found.get('commands', math.nan), found.get('applied', math.nan)
         span = _span([limits, own.training], [command, applied])
@@ -548,6 +559,8 @@ class PlantView:
         if limits and math.isfinite(command):
             abnormal = ('at its upper limit' if command >= limits[1] - slack else
                         'at its lower limit' if command <= limits[0] + slack else '')
+        if silent and math.isfinite(command):
+            abnormal = 'last command, the controller is silent'
         return InputFace(
             name, printed(own.read), span, _decimals(span), own.training, abnormal, limits,
             own.active, own.plan, command, applied, found.get('manual', math.nan),

@@ -145,7 +145,7 @@ def decide(found: Identified, learned: Trained | Comparison, current: LiftedMode
     reasons = held_out.reasons(model, rmse, learned.figures, law_check,
                                chosen is not None and chosen.name == LINEAR)
     if current_rmse is not None:
-        beside = held_out.exceeded(model, 'the present lift', rmse, current_rmse)
+        beside = held_out.exceeded(model, 'the present model', rmse, current_rmse)
         reasons = (*filter(None, [beside]), *reasons)
     warnings = _warnings(found, model, drift_rmse,
                          _autocorrelation(found.drift, held_out.segments))

@@ -134,8 +134,8 @@ def _in_order(given: Sequence[_Signal], wanted: Coordinates, kind: str, path: st
             ', '.join(f'{name} [{unit}]' for name, unit in pairs) or 'none'
             for pairs in (((s.name, s.unit) for s in given),
                           zip(wanted.names, wanted.units, strict=True)))
-        raise ValueError(f'the present lift {path} has the {kind}s {needed}, the task has {said}: '
-                         'give the same names and units, each once')
+        raise ValueError(f'the present model {path} has the {kind}s {needed}, the task has '
+                         f'{said}: give the same names and units, each once')
     return [by_name[name] for name in wanted.names]
 
 

@@ -106,9 +106,9 @@ def _sections(retrained: Retrained) -> Iterator[str]:
     yield 'Root mean square errors of predictions of the measurements:'
     yield table(('prediction by', *errors),
                 ((name, *(f'{error:.5g}' for error in rmse)) for name, rmse in (
-                    ('the new lift', decision.rmse),
+                    ('the new model', decision.rmse),
                     ('the drift that it was learned from', decision.drift_rmse),
-                    ('the present lift', decision.current_rmse),
+                    ('the present model', decision.current_rmse),
                     ('the best linear model', decision.linear_rmse)) if rmse is not None),
                 range(1, 1 + len(states)))
     yield 'The noise of the measurements is part of each.'
@@ -175,8 +175,8 @@ def _lifts(retrained: Retrained) -> list[tuple[str, Rate, str]]:
     """Return label, rate and colour of the present lift and of the new one, where they are."""
     new = None if retrained.learned is None else retrained.learned.model
     return [(name, lifted_rate(model, SECONDS_PER_TIME_UNIT[retrained.plant.time_unit]), color)
-            for name, model, color in (('present lift', retrained.present, 'tab:red'),
-                                       ('new lift', new, 'tab:green')) if model is not None]
+            for name, model, color in (('present model', retrained.present, 'tab:red'),
+                                       ('new model', new, 'tab:green')) if model is not None]
 
 
 def _draw_drift(axes: Any, retrained: Retrained, i: int) -> None:

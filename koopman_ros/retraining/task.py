@@ -263,7 +263,7 @@ def retrain_by(backend: Backend, task: Task, on_progress: OnProgress = lambda *_
     decision = replace(decision, warnings=(
         *decision.warnings, *warnings, *shortfalls(learned.model.states, task.setpoints),
         *(f'{one.name} = {one}' for one in found.constants if one.standing.value),
-        *[f'it is not compared with the present lift {task.model}, which has other states'
+        *[f'it is not compared with the present model {task.model}, which has other states'
           ] * bool(task.model and current is None)))
     _stop_if(on_progress(_at('decide', 0.9), 'writing'))
     model = _with_provenance(learned.model, found, decision, min(bare.coverage.values()),

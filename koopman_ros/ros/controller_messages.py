@@ -132,9 +132,8 @@ def _verdict(now: Situation) -> tuple[Level, str, str]:
     level, sentence = _control(now)
     if sentence:
         return level, sentence, CONTROL
-    condition, warning = next(_warnings(now), ('', ''))
-    if warning:
-        return Level.WARN, warning, condition
+    if warnings := list(_warnings(now)):
+        return Level.WARN, '; '.join(warning for _, warning in warnings), warnings[0][0]
     report, mode = now.report, now.state.mode
     message = mode.value
     if mode is Mode.AUTOMATIC and not now.counts.setpoint_received:

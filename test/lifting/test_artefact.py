@@ -49,6 +49,8 @@ MODELS = {
         0).normal(size=(2, 2))),
     'with tried loops': replace(random_lift(), tried_loops=TriedLoops(
         *np.random.default_rng(0).normal(size=(2, 7, 2)), np.arange(7) % 3 == 0)),
+    'refused': replace(random_lift(), provenance=replace(
+        random_lift().provenance, model_class='neural drift', refused=('too large', 'too few'))),
     'monomials': replace(
         random_lift(), observables=PolynomialObservables.total_degree(2, 2),
         readout=np.random.default_rng(0).normal(size=(2, 5))),
@@ -520,3 +522,23 @@ def test_a_reader_sees_the_old_file_or_the_new_one(path, sound, monkeypatch):
     save(large, path)
     assert seen == [content(large), content(MODELS['one layer'])]
     assert content(load(path)) == content(large)
+
+
+@pytest.mark.parametrize(('model', 'kind'), [
+    (replace(random_lift(), provenance=replace(
+        random_lift().provenance, model_class='neural drift')), 'neural drift'),
+    (random_lift(), 'identity lift, n_z = '),
+    (MODELS['free'], 'free lift, n_z = '),
+    (MODELS['monomials'], 'polynomial'),
+    (load(SHIPPED / 'reactor_nz4.safetensors'), 'identity lift, n_z = 4')])
+def test_class_of_a_model_is_named(model: Any, kind: str, tmp_path: Path) -> None:
+    save(model, tmp_path / 'model.safetensors')
+    assert load(tmp_path / 'model.safetensors').kind.startswith(kind)
+
+
+def test_class_that_does_not_exist_is_refused(tmp_path: Path) -> None:
+    wrong = replace(random_lift(), provenance=replace(
+        random_lift().provenance, model_class='magic'))
+    save(wrong, tmp_path / 'model.safetensors')
+    with pytest.raises(ModelFileError, match='model_class must be one of linear'):
+        load(tmp_path / 'model.safetensors')

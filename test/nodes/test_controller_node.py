@@ -109,6 +109,12 @@ def test_setpoint_of_a_volatile_publisher_is_heard_and_the_active_one_latched(
     assert status.level == DiagnosticStatus.WARN
     assert 'set-point 80.00 degC is outside the trained range' in status.message
     assert 'the old one is kept' in status.message
+    # a plotting tool that does not match hides it no more than it hides that
+    latched = bench.ros.listen(Temperature, reactor.PREDICTED_TEMPERATURE, topics.LATCHED_QOS)
+    bench.ros.wait_for_status('controller: connections', lambda s: 'durability' in s.message)
+    bench.status(lambda s: 'set-point 80.00' in s.message and 'durability' in s.message)
+    bench.ros.wait_for_status('controller: requests', lambda s: 'set-point 80.00' in s.message)
+    assert not latched
     # a change would be tracked and said with the first of these, before the next is answered
     bench.settle(STEADY, 100.0)
     assert bench.active == pytest.approx(45.0)
@@ -133,6 +139,9 @@ def test_manual_mode_commands_what_the_operator_asks(bench: Bench) -> None:
     for wild in (90.0, math.nan):
         manual.publish(temperature(wild))
     bench.status(lambda s: 'manual coolant_temperature nan degC is not finite' in s.message)
+    manual.publish(temperature(90.0))
+    bench.ros.wait_for_status('controller: requests', lambda s: (
+        'coolant 90.00 degC is limited to 32.00 degC' in s.message))
     at = bench.measure_until(lambda m: m.temperature == pytest.approx(32.0), at + 1.0)
 
     assert bench.ros.set_bool('controller/set_automatic', True).message == 'automatic mode'

@@ -291,6 +291,8 @@ def asks_for_all_that_there_is(desk: Panel, controller: NodeProcess) -> None:
     # manual mode and back
     assert not desk.ask('manual', reactor.COOLANT_TEMPERATURE, 68.0).accepted
     assert desk.ask('automatic', CONTROLLER, False) == Answer(True, 'manual mode')
+    assert desk.ask('manual', reactor.COOLANT_TEMPERATURE, 100.0) == Answer(
+        True, 'limited to 89.6 °F')
     assert desk.ask('manual', reactor.COOLANT_TEMPERATURE, 68.0) == Answer(True, 'accepted')
     desk.wait(lambda: node.snapshot.inputs[0].command == pytest.approx(68.0))
     assert node.snapshot.mode == 'manual'

@@ -167,6 +167,10 @@ BAD_MODELS = {
         'the model fails (no feedback gain: the Hamiltonian has no stable subspace of full size'),
     'gain beyond its bound': (
         replace(SHIPPED, A=1e6 * np.abs(SHIPPED.A)), 'the model fails'),
+    'refused by its training': (
+        replace(SHIPPED, provenance=replace(SHIPPED.provenance, refused=('too large an error',))),
+        'was refused by its training (too large an error): train it again, or set '
+        'load_refused_model'),
     'numbers that overflow': (replace(SHIPPED, A=1e300 * SHIPPED.A), 'the model fails'),
 }
 
@@ -204,9 +208,26 @@ def test_unsuitable_model_is_refused_with_the_reason(
     assert measure() == pytest.approx(before, abs=1e-9)
 
     assert running.reload() == (
-        True, 'model reactor_nz3: n_z = 3, trained for temperature 31.85 to 53.85 degC')
+        True, 'model reactor_nz3: identity lift, n_z = 3, trained for temperature 31.85 to '
+        '53.85 degC')
     status = ros.wait_for_status(STATUS, lambda s: s.level == DiagnosticStatus.OK)
     assert value(status, 'model refused') == 'none'
+
+
+def test_a_refused_model_is_loaded_where_the_operator_forces_it(
+        running: Bench, tmp_path: Path) -> None:
+    refused = str(tmp_path / 'refused.safetensors')
+    save(BAD_MODELS['refused by its training'][0], Path(refused))
+    result = running.ros.set_parameters_atomically(
+        'controller', load_refused_model=True, model=refused)
+    assert result.successful, result.reason
+    done, about = running.reload()
+    assert done
+    assert 'too large an error' in about
+    running.ros.set_parameters_atomically('controller', load_refused_model=False)
+    assert 'load_refused_model' in running.reload()[1]
+    assert running.ros.get_parameters('controller', 'model') == [refused]
+    assert running.set('reactor_nz3')[0]
 
 
 def test_model_changes_with_the_weights_that_it_needs(running: Bench) -> None:
@@ -283,10 +304,10 @@ import os, sys
 from koopman_ros.nodes import controller
 from koopman_ros.ros import model_reload
 read = model_reload.load_suitable
-def slowly(name, *others):
+def slowly(name, *others, **options):
     if os.path.exists(name + '.disk'):
         open(name + '.disk', 'rb').read()
-    return read(name, *others)
+    return read(name, *others, **options)
 model_reload.load_suitable = slowly
 """
 

@@ -11,16 +11,19 @@ from typing import Any
 
 import pytest
 
-from koopman_ros.panel.alarms import Priority
+from koopman_ros.panel.alarms import AlarmState, Priority
 from koopman_ros.panel.plant import (
     CONTROLLER,
     ERROR,
+    LOST,
     OK,
     ParameterView,
     pen,
     PLANT,
     PlantView,
+    REQUESTS,
     Snapshot,
+    TRAINER,
     WARN,
 )
 from koopman_ros.panel.requests import (
@@ -306,10 +309,77 @@ def test_silence_and_levels_are_alarms_by_priority_and_marks() -> None:
     assert own.snapshot(NOW + 20.0).mode == ''
 
 
-def test_a_nodes_name_in_a_namespace_is_known() -> None:
+def test_only_the_nodes_of_the_own_loop_are_taken_for_it() -> None:
+    own = PlantView(REACTOR, {name: display_unit(unit) for name, unit in REACTOR.units.items()},
+                    3600.0, NOW, {'line_1/plant': PLANT, 'line_1/controller': CONTROLLER,
+                                  'line_1/trainer': TRAINER})
+    measure(own, 50.0, 1.0, NOW)
+    answered(own)
+    own.hear('commands', {'coolant_temperature': to_kelvin(20.0)}, 1.0, NOW)
+    own.status('line_1/controller: control', OK, 'automatic', {'reason': 'none'}, NOW)
+    own.status('line_1/trainer: training', OK, 'idle', {'model_file': 'a'}, NOW)
+    for second in range(1, 10):
+        for node in ('controller: control', 'trainer: training', 'plant: simulation'):
+            own.status(f'line_2/{node}', ERROR, 'of the other line', {}, NOW + second, 'other')
+        own.advance(NOW + second)
+    now = own.snapshot(NOW + 10.0)
+    assert {one.source for one in now.silences} == {CONTROLLER, PLANT, TRAINER}
+    assert (now.mode, now.level, now.plant) == ('', '', '')
+    assert all('other line' not in alarm.text for alarm in now.standing)
+    for name, values in ((CONTROL, {'reason': 'none'}),
+                         ('trainer: training', {'model_file': 'a'})):
+        status = now.status(name)
+        assert (status.level, status.message, status.values) == (ERROR, LOST, values)
+    assert 'last command' in now.inputs[0].abnormal
+    # one that is back is shown again
+    own.status('line_1/controller: control', OK, 'automatic', {}, NOW + 10.0)
+    now = own.snapshot(NOW + 10.0)
+    assert (now.mode, now.status(CONTROL).message) == ('automatic', 'automatic')
+    assert now.inputs[0].abnormal == ''
+
+
+def test_statuses_of_other_nodes_crowd_out_none_of_the_own_loop() -> None:
     own = view()
-    own.status('unit_1/controller: control', WARN, 'x', {'reason': 'none'}, NOW + 9.0)
-    assert [one.source for one in own.snapshot(NOW + 10.0).silences] == [PLANT]
+    for i in range(200):
+        own.status(f'driver_{i}: io', OK, 'ok', {}, NOW)
+    own.status(CONTROL, ERROR, 'held', {}, NOW)
+    own.status('controller: actuators', WARN, 'stuck', {}, NOW)
+    own.advance(NOW + 2.0)
+    now = own.snapshot(NOW + 2.0)
+    assert {alarm.key for alarm in now.standing} == {CONTROL, 'controller: actuators'}
+    assert len(now.statuses) < 100
+
+
+def test_a_warning_has_one_alarm_whatever_else_is_wrong() -> None:
+    own = view()
+    own.status(CONTROL, WARN, 'request refused: a; stuck', {'condition': 'requests'}, NOW)
+    own.status(REQUESTS, WARN, 'request refused: a', {}, NOW)
+    own.status('controller: actuators', WARN, 'stuck', {}, NOW)
+    own.advance(NOW + 2.0)
+    assert [(alarm.key, alarm.priority) for alarm in own.snapshot(NOW + 2.0).standing] == [
+        ('controller: actuators', Priority.MEDIUM), (REQUESTS, Priority.LOW)]
+    own.status(REQUESTS, OK, 'in order', {}, NOW + 3.0)
+    own.advance(NOW + 9.0)
+    assert [alarm.key for alarm in own.snapshot(NOW + 9.0).standing
+            if alarm.state is not AlarmState.RETURNED and 'silence' not in alarm.key] == [
+        'controller: actuators']
+
+
+def test_many_short_errors_are_an_alarm() -> None:
+    def alarmed(seconds: float, errors: int) -> bool:
+        own = view()
+        for k in range(2 * errors):
+            now = NOW + seconds * k / 2
+            measure(own, 50.0, seconds * k / 2 + 1.0, now)
+            own.status(CONTROL, OK if k % 2 else ERROR, 'held', {}, now)
+            own.advance(now)
+        own.advance(now + 1.5)
+        return any('repeated' in alarm.key and alarm.text.endswith('the last: held')
+                   for alarm in own.snapshot(now).standing)
+
+    assert alarmed(0.5, 20)
+    assert not alarmed(0.5, 3)
+    assert not alarmed(30.0, 20)
 
 
 # Trends.

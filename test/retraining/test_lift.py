@@ -125,7 +125,7 @@ def test_the_present_lift_does_not_beat_itself(found, trained):
     decision = decide(found, trained, trained.model, Thresholds())
     own = f'{decision.rmse[0]:.4g} K'
     assert decision.reasons == (
-        f'its error on held-out records, {own}, is not 10 % below that of the present lift, '
+        f'its error on held-out records, {own}, is not 10 % below that of the present model, '
         f'{own}',)
     assert decide(found, trained, trained.model, Thresholds(margin=0.0)).accepted
 
@@ -192,7 +192,7 @@ def test_a_lift_that_diverges_is_refused_even_where_the_present_one_does(found, 
     assert decision.current_rmse == [np.inf]
     assert decision.accepted
     decision = decide(found, replace(trained, model=diverging), diverging, Thresholds())
-    assert 'its error on held-out records, inf K, is not 10 % below that of the present lift' in (
+    assert 'its error on held-out records, inf K, is not 10 % below that of the present model' in (
         ' '.join(decision.reasons))
 
 

@@ -133,7 +133,7 @@ def test_refused_lift_is_kept_aside_and_has_the_same_bits(bag, accepted, tmp_pat
     output = tmp_path / 'deep' / 'er' / 'new.safetensors'
     retrained = retrain(small(bag, output, present))
     assert not retrained.accepted
-    assert 'is not 10 % below that of the present lift' in retrained.reasons[0]
+    assert 'is not 10 % below that of the present model' in retrained.reasons[0]
     # nothing replaces the output, and the same data and seed give the same file
     assert [path.name for path in output.parent.iterdir()] == ['new.refused.safetensors']
     assert Path(retrained.model_file).read_bytes() == present.read_bytes()
@@ -152,7 +152,7 @@ def test_report(accepted):
     assert 60.0 * gain == pytest.approx(0.8 * 2.0921, rel=0.02)
     page = files[1].read_text()
     for words in ('is accepted.**', '1201 of 1201 measurements used',
-                  f'| the present lift | {retrained.decision.current_rmse[0]:.5g} |',
+                  f'| the present model | {retrained.decision.current_rmse[0]:.5g} |',
                   '![Data, drift and prediction](new.png)'):
         assert words in page
     assert files[2].read_bytes().startswith(b'\x89PNG')
@@ -323,7 +323,7 @@ def test_first_lift_is_learned_without_a_present_one(bag, tmp_path):
     assert figures['heldout_error_of_present_lift'] is None
     assert figures['heldout_error']['temperature'] < 0.9 * figures[
         'heldout_error_of_linear_model']['temperature']
-    assert 'present lift' not in page_of(retrained)
+    assert 'present model' not in page_of(retrained)
 
 
 def test_input_gain_of_a_first_lift_names_its_signals(bag, tmp_path):
