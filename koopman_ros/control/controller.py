@@ -430,6 +430,7 @@ class Controller:
                 if state.estimate is None or state.setpoint.active is None:
                     assert state.command is not None
                     state = amended(state, commanded_ns=until_ns)
+                    assert state.command is not None
                     return state, state.command, self._report(state, state.supervisor.reason)
                 x = self.model.states.to_physical(state.estimate.x)
                 measured = MeasurementReport(outside=self.model.distance(x))

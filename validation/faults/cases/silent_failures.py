@@ -192,11 +192,14 @@ def _cleaned_up(loop: FaultHarness) -> None:
     for client in (change, mode, model):
         loop.wait(client.service_is_ready, f'there is no service {client.srv_name}')
     loop.ros.meet('controller')
+
+    def operate() -> None:
+        for _ in range(20):
+            loop.ask(**dict(zip(loop.on.controlled, loop.on.other, strict=True)))
+            loop.by_hand(*loop.on.by_hand)
+
     requests: tuple[Callable[[], object], ...] = (
-        lambda: mode.call_async(SetBool.Request(data=True)),
-        lambda: [loop.ask(**dict(zip(loop.on.controlled, loop.on.other, strict=True)))
-                 for _ in range(20)],
-        lambda: [loop.by_hand(*loop.on.by_hand) for _ in range(20)],
+        operate, lambda: mode.call_async(SetBool.Request(data=True)),
         lambda: model.call_async(Trigger.Request()))
     with loop.fault():
         for request in requests:
