@@ -16,6 +16,7 @@ from diagnostic_msgs.msg import DiagnosticArray
 import numpy as np
 from rclpy.node import Node
 from rclpy.qos import QoSProfile
+from rclpy.subscription import Subscription
 from std_msgs.msg import String
 
 from koopman_ros.assembler import Assembler
@@ -177,7 +178,18 @@ class Interceptor:
                  topics.profile(MOST_RECORDS, reliable=True))):
             node.create_subscription(kind, topic, callback, qos)
         self._listen(wiring.applied, self._on_applied, topics.LATCHED_QOS)
-        self._listen(wiring.commands, _whole(on.inputs, self._on_command))
+        self.hear_commands()
+
+    def hear_commands(self) -> None:
+        """Trace the commands."""
+        on = self.trace.on
+        self._of_commands = self._listen(
+            on.wiring.commands, _whole(on.inputs, self._on_command))
+
+    def leave_commands(self) -> None:
+        """Subscribe to no command any more."""
+        for subscription in self._of_commands:
+            self._node.destroy_subscription(subscription)
 
     def open(self) -> None:
         """Trace the plant from now on."""
@@ -200,13 +212,14 @@ class Interceptor:
         return publish
 
     def _listen(self, places: Mapping[str, Place], hear: Callable[[Packet], None],
-                qos: QoSProfile = topics.LOOP_QOS, before: str = '') -> None:
+                qos: QoSProfile = topics.LOOP_QOS, before: str = '') -> list[Subscription]:
         def read(names: list[str], message: Any) -> None:
             hear(Packet(stamp_nanoseconds(message.header.stamp),
                         {name: places[name].get(message) for name in names}))
 
-        for topic, kind, names in by_topic(places):
-            self._node.create_subscription(kind, f'{before}{topic}', partial(read, names), qos)
+        return [self._node.create_subscription(
+            kind, f'{before}{topic}', partial(read, names), qos)
+            for topic, kind, names in by_topic(places)]
 
     def _on_states(self, packet: Packet) -> None:
         stamp_ns, on = packet.stamp_ns, self.trace.on

@@ -149,4 +149,9 @@ SADDLE = Plant(
         'concentration.initial_error': 0.2, 'temperature.max_rate': 2.0,
         'temperature.max_jump': 2.0, 'temperature.pi_gain': 6.0, 'temperature.pi_time': 60.0,
         **_each(('coolant_temperature',), wander=0.775, min=-20.0, max=100.0, rate_limit=1.0)})
-PLANTS = {plant.name: plant for plant in (REACTOR, TWO_TANKS, QUADRUPLE_TANK, SADDLE)}
+# It falls where nothing acts; its rate is estimated from the angle.
+PENDULUM = Plant(
+    'pendulum', setpoint=(0.0,), other=(0.1,), by_hand=(0.0,), band=math.inf, settle=4.0,
+    afterwards=2.0, recovery=2.0, tuned={'states_measured': ('angle [rad]',)})
+PLANTS = {plant.name: plant for plant in (
+    REACTOR, TWO_TANKS, QUADRUPLE_TANK, SADDLE, PENDULUM)}

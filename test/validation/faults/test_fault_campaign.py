@@ -360,7 +360,7 @@ def test_report_says_what_failed_and_why(tmp_path):
 
 def test_command_line(capsys):
     counts = Counter(case.on.name for case in CASES.values())
-    assert (counts['reactor'], counts['saddle']) == (80, 15)
+    assert (counts['reactor'], counts['saddle']) == (93, 15)
     assert min(counts['two_tanks'], counts['quadruple_tank']) >= 15
     assert all(name.startswith(case.on.name) for name, case in CASES.items()
                if case.on.name != 'reactor')

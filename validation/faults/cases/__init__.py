@@ -3,7 +3,15 @@
 
 """The cases of the campaign, by group."""
 
-from validation.faults.cases import any_plant, messages, operators, processes, saddle
+from validation.faults.cases import (
+    any_plant,
+    messages,
+    operators,
+    processes,
+    saddle,
+    silent_failures,
+)
 
-CASES = {case.name: case for case in (*messages.CASES, *processes.CASES, *operators.CASES,
-                                    *any_plant.CASES, *saddle.CASES)}
+CASES = {case.name: case for case in (
+    *messages.CASES, *processes.CASES, *operators.CASES, *any_plant.CASES, *saddle.CASES,
+    *silent_failures.CASES)}
