@@ -433,10 +433,11 @@ class Controller:
                 state, elapsed, self._estimating.applied(state)[0]))
             fault, measured = None if cause is None else reason(cause), NOTHING_MEASURED
             if fault is None and state.mode is Mode.AUTOMATIC:
+                command = state.command
+                assert command is not None
                 if state.estimate is None or state.setpoint.active is None:
-                    assert state.command is not None
                     state = amended(state, commanded_ns=until_ns)
-                    return state, state.command, self._report(state, state.supervisor.reason)
+                    return state, command, self._report(state, state.supervisor.reason)
                 x = self.model.states.to_physical(state.estimate.x)
                 measured = MeasurementReport(outside=self.model.distance(x))
                 state = amended(state, setpoint=setpoints.advance(
