@@ -5,6 +5,7 @@
 
 from collections.abc import Callable, Mapping, Sequence
 import importlib
+import traceback
 from typing import Any
 
 _LONGEST = 200  # characters of an error's text that reach a status
@@ -74,4 +75,4 @@ def contained(error: BaseException) -> str:
     """
     if isinstance(error, KeyboardInterrupt):
         raise error
-    return ' '.join(f'{type(error).__name__}: {error}'.split())[:_LONGEST]
+    return ' '.join(''.join(traceback.format_exception_only(error)).split())[:_LONGEST]

@@ -99,6 +99,8 @@ class Code(Enum):
         '{signal} set-point {value:value} is outside the trained range {lower:value} to '
         '{upper:value}: the old one is kept; choose one inside, or load a model trained over a '
         'wider range')
+    SETPOINT_NOT_TRIED = 'setpoint_not_tried', (
+        'whether the set-point can be held cannot be calculated ({error}): the old one is kept')
     SETPOINT_NOT_HELD = 'setpoint_not_held', (
         '{signal} set-point {value:value} cannot be held, since {cause}: the old one is kept; '
         'the nearest that can be held is {held:values}')

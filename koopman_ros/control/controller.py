@@ -191,7 +191,7 @@ class Controller:
                 return holding.refusal(
                     goal, (state.setpoint.requested, state.setpoint.active), state.command, whole)
         except BaseException as error:
-            return reason(Code.CALCULATION_FAILED, error=contained(error))
+            return reason(Code.SETPOINT_NOT_TRIED, error=contained(error))
 
     def untrained(self, setpoint: setpoints.Setpoint) -> Reason | None:
         """Return what of a set-point, asked for already, is outside the trained range, or None."""
@@ -461,8 +461,8 @@ class Controller:
             state, command, report = calculate()
             if not finite(command):
                 raise FloatingPointError(f'the command would be {command.tolist()}')
-            if state.estimate is not None and not state.estimate.finite:
-                raise FloatingPointError('the estimate is not finite')
+            if state.estimate is not None:
+                state.estimate.check(self.model.n_x)
             return state, command, report
         except BaseException as error:
             fault = reason(Code.CALCULATION_FAILED, error=contained(error))
@@ -475,7 +475,10 @@ class Controller:
         if state.estimate is None:
             return np.full(self.model.n_x, np.nan)
         model = self._estimating.level(state).model
-        return equivalent_bias(model, state.estimate) * self.model.states.scale
+        try:
+            return equivalent_bias(model, state.estimate) * self.model.states.scale
+        except np.linalg.LinAlgError:
+            return np.full(self.model.n_x, np.nan)
 
     def _command(self, state: State, verdict: Verdict, measured: MeasurementReport, time_ns: int,
                  commanded_ns: int, elapsed: float, seconds: float, spacing: float = 0.0
@@ -611,7 +614,11 @@ class Controller:
 
     def _outside(self, known: Estimate | None, y: Array) -> float:
         """Return how far a measurement is from the training data; NaN when it is none."""
-        return self.model.distance(self._estimating.position(known, y)) if finite(y) else np.nan
+        try:
+            return self.model.distance(
+                self._estimating.position(known, y)) if finite(y) else np.nan
+        except np.linalg.LinAlgError:
+            return np.nan
 
     def _report(self, state: State, why: Reason | None,
                 measured: MeasurementReport = NOTHING_MEASURED, target: TargetReport | None = None,

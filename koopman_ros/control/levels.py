@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from koopman_ros.arrays import Array
-from koopman_ros.control.laws import Law, LawResult, LAWS, Tuning, Weights
+from koopman_ros.control.laws import Figures, Law, LawResult, LAWS, Plan, Tuning, Weights
 from koopman_ros.control.laws.base import steady_state_target, Target
 from koopman_ros.control.limits import finite, InputLimits
 from koopman_ros.control.settings import Settings
@@ -59,7 +59,7 @@ class Level:
         try:
             found: Reason | None = getattr(self.law, 'unusable', None)
         except BaseException as error:
-            return reason(Code.CALCULATION_FAILED, error=contained(error))
+            return reason(Code.LAW_RAISED, error=contained(error))
         return found
 
     @cached_property
@@ -149,14 +149,18 @@ class Level:
 
     def _checked(self, result: LawResult) -> LawResult:
         """Return a law's result if its input (n_u,), or its failure, can be used."""
-        if not isinstance(result, LawResult):
-            raise TypeError(f'it returned {type(result).__name__}, not LawResult')
+        for value, kind in ((result, LawResult), (result.figures, Figures),
+                            (result.plan, Plan | None), (result.failure, Reason | None)):
+            if not isinstance(value, kind):
+                raise TypeError(f'it returned {type(value).__name__}, where {kind} is expected')
+        result = amended(result, clipped=bool(result.clipped), passing=bool(result.passing))
         if result.failure is not None:
             return amended(result, u=None)
         u = np.asarray(result.u, dtype=np.float64)
         if u.shape != (self.model.n_u,):
             raise ValueError(f'it returned an input of shape {u.shape}, not ({self.model.n_u},)')
-        return result if finite(u) else LawResult(None, reason(Code.COMMAND_NOT_FINITE))
+        return amended(result, u=u) if finite(u) else LawResult(
+            None, reason(Code.COMMAND_NOT_FINITE))
 
     def within_reach(self, target: Target, w: Array, limits: InputLimits) -> Target:
         """Return the target, or what is nearest to it where the inputs do not suffice."""
@@ -300,7 +304,9 @@ class Estimating:
             predicted = self._corrected(
                 estimator, state, predicted, verdict, x, elapsed,
                 far or self.lost(state, time_ns))
-            _check(estimator, predicted)
+            if not isinstance(predicted, Estimate):
+                raise TypeError(f'the estimator returned {type(predicted).__name__}, '
+                                'not Estimate')
             if not self.outputs.determine_state:
                 # the measurement has changed what it leaves open, too
                 x = self.position(predicted, y)
@@ -418,19 +424,6 @@ class Estimating:
         moved = estimator.rebased(moved, np.zeros_like(moved.w))
         # what it holds of the disturbance is in the old model's units, and distances from its data
         return amended(state, estimate=moved, accepted=None, way_back=None)
-
-
-def _check(estimator: Estimator, estimate: Estimate) -> None:
-    """Raise a TypeError or ValueError for what is no estimate, or cannot be reported as one."""
-    if not isinstance(estimate, Estimate):
-        raise TypeError(f'the estimator returned {type(estimate).__name__}, not Estimate')
-    n_x, n_u = estimator.model.n_x, estimator.model.n_u
-    estimator.at_bound(estimate.w)
-    shapes = [np.shape(value) for value in (
-        estimate.x, estimate.w, estimator.as_input(estimate.w))]
-    if shapes != [(n_x,), (n_x,), (n_u,)]:
-        raise ValueError(f'the estimator gives x, w and its input of shapes {shapes}, not '
-                         f'{[(n_x,), (n_x,), (n_u,)]}')
 
 
 def _command(model: LiftedModel, state: State) -> Array:

@@ -16,6 +16,7 @@ from koopman_ros.control.setpoint import Setpoint
 from koopman_ros.control.supervisor import Supervisor, WayBack
 from koopman_ros.estimation import Accepted, Estimate, Estimator, Innovation
 from koopman_ros.lifting import Coordinates, LiftedModel
+from koopman_ros.plugs import contained
 from koopman_ros.reasons import Reason
 from koopman_ros.values import record
 
@@ -100,13 +101,22 @@ class EstimateReport:
     @property
     def disturbance(self) -> Array:
         """(n_u,) as an input that would have the same effect, in input units."""
-        as_input: Array = self.estimator.as_input(self.estimate.w)
-        return as_input * self.estimator.model.inputs.scale
+        inputs = self.estimator.model.inputs
+        try:
+            as_input: Array = self.estimator.as_input(self.estimate.w)
+            return as_input * inputs.scale
+        except BaseException as error:
+            contained(error)  # an estimator that works in the loop may still fail here
+            return np.full(len(inputs), np.nan)
 
     @property
     def at_bound(self) -> bool:
         """Whether the disturbance is as large as is allowed."""
-        return self.estimator.at_bound(self.estimate.w)
+        try:
+            return bool(self.estimator.at_bound(self.estimate.w))
+        except BaseException as error:
+            contained(error)
+            return False
 
     @property
     def covariance(self) -> Array | None:

@@ -74,6 +74,19 @@ class Estimate:
         return all(np.all(np.isfinite(value)) for value in (self.x, self.w, self.covariance)
                    if value is not None)
 
+    def check(self, n_x: int) -> None:
+        """Raise a TypeError or ValueError unless it is one of so many states, and finite."""
+        P = self.covariance
+        shapes = (np.shape(self.x), np.shape(self.w), None if P is None else np.shape(P))
+        if shapes not in (((n_x,), (n_x,), None), ((n_x,), (n_x,), (2 * n_x, 2 * n_x))):
+            raise ValueError(f'the estimator returned x, w and covariance of shapes {shapes} for '
+                             f'{n_x} states')
+        if not isinstance(self.innovation, Innovation | None):
+            raise TypeError(f'the estimator returned {type(self.innovation).__name__} as the '
+                            'innovation')
+        if not self.finite:
+            raise ValueError('the estimate is not finite')
+
 
 def _unknown() -> Array:
     return np.zeros(0)

@@ -32,7 +32,7 @@ from rosgraph_msgs.msg import Clock as ClockMessage
 
 from koopman_ros.parameters.table import ConfigurationError, ParameterTable, Specification
 from koopman_ros.parameters.wire import DIAGNOSTICS, renamed, Signals
-from koopman_ros.plugs import own_code
+from koopman_ros.plugs import contained, own_code
 from koopman_ros.reasons import Words
 from koopman_ros.ros.codec import stamp_message
 from koopman_ros.ros.hosted import HostableNode, HostedTimer, Hosting
@@ -155,9 +155,12 @@ class DiagnosticTask:
 
     def status(self) -> DiagnosticStatus:
         """Return its present status as a message."""
-        status = self._collect()
+        status = self._collected()
+        try:
+            values = status.values() if callable(status.values) else status.values
+        except Exception as error:
+            status, values = _failed(error), {}
         self._last = (status.level, status.message)
-        values = status.values() if callable(status.values) else status.values
         return DiagnosticStatus(
             level=status.level.value, name=self._name, message=status.message,
             hardware_id=self._diagnostics.hardware_id,
@@ -170,13 +173,24 @@ class DiagnosticTask:
         # what is late in a part that was taken down has nobody to report to
         if self not in self._diagnostics.tasks:
             return
-        status = self._collect()
+        status = self._collected()
         if (status.level, status.message) != self._last:
             self._diagnostics.publish([self])
+
+    def _collected(self) -> Status:
+        # a failure of a report does not end the loop that it reports on
+        try:
+            return self._collect()
+        except Exception as error:
+            return _failed(error)
 
     def destroy(self) -> None:
         """Report no more."""
         self._diagnostics.remove(self)
+
+
+def _failed(error: Exception) -> Status:
+    return Status(Level.ERROR, f'the status cannot be collected ({contained(error)})')
 
 
 class LoopNode(HostableNode):
