@@ -25,8 +25,9 @@ _WANDERED, _A_DAY = 3.0, 86400.0
 # The singular values of a matrix count as 0 below this share of the largest.
 _RANK = 1e-9
 _NO_VARIANCE = 1e-14  # likewise of a covariance
-# A prediction whose standard deviations exceed those of a first guess by this factor says nothing.
-# It also bounds the condition of the covariance, which rounding would make indefinite.
+# A prediction says nothing whose standard deviation is so many times that of a first guess, and so
+# many half widths of the training data. That also bounds the condition of the covariance, which
+# rounding would make indefinite.
 _LOST = 10.0
 
 
@@ -136,7 +137,8 @@ class ExtendedKalmanFilter(BoundedDisturbance):
     @cached_property
     def _lost(self) -> Array:
         """(n_x,) variances from which on a prediction of the state is worth nothing."""
-        return (_LOST * self.tuning.initial_error) ** 2
+        return (_LOST * np.maximum(
+            self.tuning.initial_error, self.model.states.half_widths)) ** 2
 
     def predict(self, estimate: Estimate, u: Array, seconds: float) -> Estimate | None:
         """Integrate the model, and the covariance with it; see :class:`Estimator`."""

@@ -6,6 +6,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+import re
 import traceback
 from typing import Any
 
@@ -22,6 +23,8 @@ from koopman_ros.ros.node import LoopNode, wall_timer
 # parameter file, a RuntimeError whose class is private to the extension.
 START_ERRORS = (OSError, ParameterException, RuntimeError, ValueError)
 _FAREWELL = 0.5  # s
+# What rcl says of a text that is empty once the shell has taken its quotes.
+_EMPTY_TEXT = re.compile(r"parameter override rule: '-p ([^' ]+:=)'")
 
 
 class ManagedNode(LifecycleNodeMixin, LoopNode):
@@ -186,4 +189,7 @@ class ManagedNode(LifecycleNodeMixin, LoopNode):
 def one_line(error: BaseException) -> str:
     """Return the words of an error, which rcl repeats over several lines."""
     text = str(error).split(', at ./')[0].split(', at /')[0]
-    return ' '.join(text.split()) or type(error).__name__
+    text = ' '.join(text.split()) or type(error).__name__
+    if empty := _EMPTY_TEXT.search(text):
+        text += f'; an empty text needs quotes within quotes: -p "{empty[1]}\'\'"'
+    return text

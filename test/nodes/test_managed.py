@@ -283,9 +283,9 @@ import sys
 from koopman_ros.nodes import controller
 from koopman_ros.ros import model_reload
 
-def slowly(*args, read=model_reload.load_suitable):
+def slowly(*args, read=model_reload.load_suitable, **options):
     open({str(pipe)!r}).read()
-    return read(*args)
+    return read(*args, **options)
 
 model_reload.load_suitable = slowly
 sys.exit(controller.main())

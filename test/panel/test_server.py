@@ -30,6 +30,10 @@ from koopman_ros.panel.server import PanelServer
 from support.browser import opened_browser
 from support.hostile import HostileSource, TEXTS
 
+# NiceGUI looks through all objects of the process for its server, also those of torch where
+# another test has imported it.
+pytestmark = pytest.mark.filterwarnings('ignore:.torch.distributed.reduce_op. is:FutureWarning')
+
 PASSWORDS = {'anna': 'correct horse', 'otto': 'battery staple', 'olga': 'staple battery'}
 HOST = 'panel.example'
 PROXY, OTHER = '127.0.0.1', '127.0.0.9'
