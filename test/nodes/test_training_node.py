@@ -148,7 +148,7 @@ def test_trains_beside_the_running_loop(ros: Harness, tmp_path: Path) -> None:
     assert not list(tmp_path.glob('new*'))
 
     assert ros.trigger('trainer/train').success
-    status = ros.wait_for_status(STATUS, lambda status: status.message.startswith('the new lift'))
+    status = ros.wait_for_status(STATUS, lambda status: status.message.startswith('the new model'))
     figures = json.loads((tmp_path / 'new.json').read_text())
     assert value(status, 'done [%]') == '100'
     noise = figures['noise']['temperature']

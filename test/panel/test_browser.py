@@ -239,7 +239,7 @@ def test_an_alarm_is_raised_shelved_shown_again_acknowledged_and_gone(site: Site
         # somebody commands the coolant beside the controller
         other = node.create_publisher(Temperature, reactor.COOLANT_SETPOINT, topics.LOOP_QOS)
         try:
-            said = 'controller: control: 2 nodes command the coolant'
+            said = 'controller: connections: 2 nodes command the coolant'
             own, row = standing(page, said), standing(page, MARKUP)
             deadline = time.monotonic() + PATIENCE / 1e3
             while not (own.is_visible() and row.is_visible()) and time.monotonic() < deadline:

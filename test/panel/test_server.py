@@ -346,6 +346,7 @@ def test_no_text_from_outside_runs_in_the_browser(site: Site) -> None:
         page.get_by_label('Name').fill('anna')
         page.get_by_label('Password').fill(PASSWORDS['anna'])
         page.keyboard.press('Enter')
+        page.wait_for_url(f'{site.url}/')
         for path in ('/', '/trends', '/alarms', '/model', '/tuning'):
             page.goto(f'{site.url}{path}')
             page.wait_for_selector('#beat[data-beat]')
