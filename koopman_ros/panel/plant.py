@@ -578,7 +578,8 @@ class PlantView:
 
     def _bounds(self, name: str, own: _Signal, low: str, high: str) -> Range | None:
         given = self._parameters.get(CONTROLLER, {})
-        if (lower := given.get(f'{name}.{low}')) and (upper := given.get(f'{name}.{high}')):
+        if (lower := given.get(f'{name}.{low}')) and (upper := given.get(f'{name}.{high}')) and (
+                isinstance(lower.value, int | float) and isinstance(upper.value, int | float)):
             # parameters are in the usual unit, and at the end of their range stand for none
             to_read = conversion(display_unit(own.unit), own.read)
             found = (to_read(float(lower.value)) if lower.value > lower.lower else -math.inf,

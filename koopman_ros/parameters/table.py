@@ -10,7 +10,9 @@ rows are named after the signal: ``temperature.weight``.
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, Field, field, fields, replace
+import json
 import math
+import re
 from types import MappingProxyType
 from typing import Any, Generic, TypeVar
 
@@ -296,6 +298,13 @@ def as_yaml(value: Any) -> str:
         return text
     if isinstance(value, tuple):
         return '[' + ', '.join(as_yaml(item) if isinstance(item, float) else (
-            item if item and item[0].isalnum() and '[' not in item else f"'{item}'")
-            for item in value) + ']'
-    return repr(value) if isinstance(value, int) else f"'{value}'"
+            item if _PLAIN.fullmatch(item) else _quoted(item)) for item in value) + ']'
+    return repr(value) if isinstance(value, int) else _quoted(str(value))
+
+
+# Texts that YAML reads as texts without quotes: not numbers, and without its own characters.
+_PLAIN = re.compile(r'[A-Za-z][\w./:;()+*^-]*(?: [\w./:;()+*^-]+)*')
+
+
+def _quoted(text: str) -> str:
+    return f"'{text}'" if text.isprintable() and "'" not in text else json.dumps(text)
