@@ -120,7 +120,7 @@ def test_a_model_is_learned_read_about_compared_and_takes_over(tmp_path: Path) -
             expect(comparison).to_contain_text('✖ cancelled', timeout=PATIENCE)
             press(comparison, 'Compare on the last hour')
             expect(comparison).to_contain_text(
-                'the recorded commands are reproduced', timeout=PATIENCE)
+                'the recorded commands are reproduced', timeout=5.0 * PATIENCE)
             expect(comparison).to_contain_text('commands compared')
             width, height = picture_of(comparison)
             assert (width, height > 500) == (1350, True)
