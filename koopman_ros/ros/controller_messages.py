@@ -200,9 +200,11 @@ def _warnings(now: Situation) -> Iterator[tuple[str, str]]:
         yield MEASUREMENTS, (
             f'/clock has stood still for more than {PAUSED:g} s: the simulation is paused or '
             'has ended, and the last command stays')
-    overdue = _PATIENCE if math.isinf(now.state.interval) else max(
-        _PATIENCE, 3.0 * now.state.interval)
-    unmeasured = report.measurement.arrival is Arrival.MISSING and not report.command.way_back
+    interval = 0.0 if math.isinf(now.state.interval) else now.state.interval
+    overdue = max(_PATIENCE, 3.0 * interval)
+    # manual commands are also sent between two measurements
+    unmeasured = (report.measurement.arrival is Arrival.MISSING and not report.command.way_back
+                  and now.timing.silence > max(1.0, 2.0 * interval))
     if report.measurement.arrival is Arrival.REPEATED or (
             now.timing.silence > overdue and now.timing.no_news(overdue) is Advance.OLD):
         yield MEASUREMENTS, (

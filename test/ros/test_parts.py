@@ -5,9 +5,11 @@
 
 from collections.abc import Callable
 from dataclasses import replace
+import math
 from pathlib import Path
 import threading
 import time
+from types import SimpleNamespace
 from typing import Any
 
 from builtin_interfaces.msg import Time
@@ -17,14 +19,16 @@ from rclpy.duration import Duration
 from sensor_msgs.msg import Temperature
 
 from koopman_ros.bags import BagWriter, read_messages
+from koopman_ros.control import Mode, State
 from koopman_ros.control.laws import Plan
 from koopman_ros.demo import reactor
 from koopman_ros.lifting import LiftedModel, load, ModelFileError, save
+from koopman_ros.parameters.controller import built, table_of
 from koopman_ros.parameters.trainer import trainer_table
 from koopman_ros.parameters.wire import Signals, signals_of, Wiring
 from koopman_ros.resources import model_path
 from koopman_ros.ros import model_reload, recorder, topics
-from koopman_ros.ros.controller_messages import active_limits, planned
+from koopman_ros.ros.controller_messages import active_limits, condition, planned
 from koopman_ros.ros.experiment import PlantExperiment
 from koopman_ros.ros.model_reload import load_suitable
 from koopman_ros.ros.node import Level, LoopNode, Status
@@ -221,3 +225,24 @@ def test_a_plan_has_the_controlled_states_and_all_inputs_and_limits_of_every_sta
         'at_rate_pump [-1 falling, 1 rising]': -1.0, 'at_rate_heater [-1 falling, 1 rising]': 0.0,
         'at_limit_level [-1 lower, 1 upper]': 0.0, 'at_limit_latent [-1 lower, 1 upper]': 0.0,
         'at_limit_warmth [-1 lower, 1 upper]': -1.0}
+
+
+@pytest.mark.parametrize(('silence', 'warned'), [(0.6, False), (1.4, False), (2.5, True)])
+def test_a_manual_command_between_two_measurements_is_no_missing_measurement(
+        silence: float, warned: bool) -> None:
+    model = load(model_path('reactor_nz4'))
+    own = built(table_of(model, {'system': 'reactor'}).snapshot({}), model)
+    state = own.set_mode(State(), Mode.MANUAL)
+    for k in range(1, 4):
+        state = own.step(state, model.states.center, k * 10 ** 9)[0]
+    state = own.request_manual_input(state, model.inputs.center + 1.0)[0]
+    state, _, report = own.hold(state, int((3.0 + silence) * 1e9), None)
+    ok = Status(Level.OK, '')
+    now = SimpleNamespace(
+        report=report, state=state, controller=own, signals=SIGNALS, measured=model.states.center,
+        parameters=SimpleNamespace(max_measurement_age=5.0), complaint='', open_loop=ok,
+        request='', model_refused='', counts=SimpleNamespace(measurements=3),
+        timing=SimpleNamespace(silence=silence, paused=False, without_clock=False, age=math.nan,
+                               no_news=lambda _: None))
+    found = condition(now, 'measurements')
+    assert (found.level is Level.WARN) is warned
