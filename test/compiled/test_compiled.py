@@ -236,7 +236,7 @@ def test_gain_of_the_sampled_regulator_of_random_plants() -> None:
         if found is not None:
             exact = solve_riccati(A, B, Q, R, interval=interval)
             np.testing.assert_allclose(found.K, exact.K, rtol=0.0,
-                                       atol=1e-9 * np.max(np.abs(exact.K)))
+                                       atol=1e-11 * np.max(np.abs(exact.K)))
             compared += 1
     assert compared > 280
 
