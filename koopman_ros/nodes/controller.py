@@ -210,7 +210,7 @@ class ControllerNode(ManagedNode):
         self._watchdog.start()
 
     def activate(self) -> None:
-        """Begin to command, from the present inputs; set-points asked for before are kept."""
+        """Begin to command, from the present inputs; earlier set-point requests are kept."""
         with self._lock:
             asked = self._state.setpoint
             self._state = State(self._state.mode, Setpoint(
@@ -639,7 +639,7 @@ class ControllerNode(ManagedNode):
             self.get_logger().warning(self._rests_outside)
 
     def _open_loop(self) -> Status:
-        """Return whether somebody receives the commands."""
+        """Return whether the commands have subscribers."""
         return messages.open_loop(
             [publisher.topic_name for publisher in self._commands.publishers
              if not topics.heard(publisher)], time.monotonic() - self._received)

@@ -212,7 +212,7 @@ class Snapshot:
 
     def status(self, name: str) -> TaskStatus:
         """
-        Return the status of a task, an empty one where nothing was heard of it.
+        Return the status of a task, or an empty one if there is none.
 
         That of a controller or trainer that is silent is an error, with its last values.
         """

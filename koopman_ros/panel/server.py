@@ -90,7 +90,7 @@ class Doorkeeper:
 
     def refusal(self, kind: str, headers: dict[str, str], scheme: str) -> str:
         """
-        Say why a request must not be answered, whoever it is from; '' where it may.
+        Return why a request is refused whatever its session is, or ''.
 
         :param scheme: 'http' or 'https', which a proxy may have served.
         """
@@ -274,7 +274,7 @@ def _with_peer(app: Any) -> Any:
 
 
 def _guard_sockets(keeper: Doorkeeper) -> None:
-    """Let a socket act on pages of its own session alone: NiceGUI goes by the id of a page."""
+    """Let a socket act on pages of its own session: NiceGUI checks the id of a page alone."""
     sockets = core.sio
 
     def own(scope: Any, client_id: Any) -> bool:

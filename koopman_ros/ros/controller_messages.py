@@ -116,7 +116,7 @@ def condition(now: Situation, name: str) -> Status:
 
 def open_loop(topic_names: Collection[str], seconds: float) -> Status:
     """
-    Return whether somebody receives the commands.
+    Return whether the commands have subscribers.
 
     :param topic_names: of the commands that have no subscriber.
     :param seconds: for which not all have had one.
@@ -156,7 +156,7 @@ def _control(now: Situation) -> tuple[Level, str]:
             waiting += f': the applied {now.input} is not known, and no manual command goes out'
         return Level.WARN, now.complaint or waiting
     silence = now.timing.silence
-    # nobody reads /clock meanwhile
+    # /clock is not read meanwhile
     if timeout and (silence > timeout or (
             now.timing.busy and now.timing.wall_silence > timeout)):
         command = now.state.command

@@ -98,7 +98,7 @@ class Hosting:
 
     schedule: Schedule
     loops: int  #: that share the process
-    failed: Callable[[BaseException], None]  #: is told what a callback of the node has raised
+    failed: Callable[[BaseException], None]  #: called with what a callback of the node raised
     made: list[HostableNode] = field(default_factory=list)  #: the node, also a half-made one
 
     def guarded(self, callback: Callable[..., Any]) -> Callable[..., Any]:

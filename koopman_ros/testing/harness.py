@@ -61,7 +61,7 @@ class Harness:
     :param imported: whether nodes of this package share their imports, which makes many starts
         cheap; see :class:`~koopman_ros.testing.forked.Forked`.
     :param domain: ROS domain to work in, with this process's settings of discovery; by default one
-        that nobody else uses.
+        that no other run uses.
     :param each_turn: called again and again while something is waited for; may raise.
 
     :ivar node: the node in here, for whatever has no method of its own.

@@ -108,7 +108,7 @@ def test_steps_drive_the_plant_as_planned(ros: Harness) -> None:
     assert all(late - early == 1.0 for early, late in pairwise(heard))
     assert np.ptp([message.temperature for message in commands]) > 12.0
     assert commands[-1].temperature == pytest.approx(SAFE, abs=1e-12)
-    # from the present input of the plant, which nobody has commanded
+    # from the present input of the plant, before the first command
     progress = begin(plan, stamp_nanoseconds(measured[0].header.stamp), np.array([PRESENT]))
     for message in measured:
         progress = advance(plan, progress, np.array([to_kelvin(message.temperature)]),
