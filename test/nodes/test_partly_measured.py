@@ -58,6 +58,8 @@ def test_no_offset_is_left_and_what_is_not_measured_is_known(ros: Harness) -> No
     assert float(value(status, 'concentration, estimated [mol/L]').split()[0]) == pytest.approx(
         truth, abs=5e-3)
     # what was written down is enough to find the same commands
+    ros.wait_until(lambda: sum(
+        parse(message.data).event == 'measurement' for message in recorded) >= SAMPLES)
     found = replay_records([parse(message.data) for message in recorded])
     assert len(found.samples) >= SAMPLES
     assert not found.lost

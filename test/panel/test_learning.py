@@ -90,8 +90,12 @@ def test_a_model_is_learned_read_about_compared_and_takes_over(tmp_path: Path) -
             expect(experiment).to_contain_text('steps: setpoint', timeout=PATIENCE)
             press(experiment, 'Start …')
             answered(page, 'Start the experiment', experiment, re.compile('^(?!.*refused).+'))
+            # of the experiment, however long the page took to start it
+            begun = int(value(ros.wait_for_status(
+                'trainer: recording', lambda status: len(status.values) > 1),
+                'messages on /temperature'))
             ros.wait_for_status('trainer: recording', lambda status: len(status.values) > 1 and (
-                int(value(status, 'messages on /temperature')) > MEASUREMENTS))
+                int(value(status, 'messages on /temperature')) > begun + MEASUREMENTS))
             # what follows needs a loop, and no quick one
             assert quick.stop() == 0
             ros.start('plant', {**plant, 'speed': 2.0, 'start_time': 10_000.0})
