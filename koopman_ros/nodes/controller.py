@@ -451,6 +451,7 @@ class ControllerNode(ManagedNode):
         if outcome.command is None or outcome.report is None:
             return None
         self._state, self._held_for = outcome.state, cause
+        self._timing.commanded()
         if state.command is not None:
             moved = np.abs(outcome.command - state.command)
             limits = self._controller.settings.limits

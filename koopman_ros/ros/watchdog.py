@@ -98,12 +98,17 @@ class Timing:
         They are those of the steady clock, where stamps are of the time of the node's clock. Of
         those that it does not count, one is kept, since messages come early and late.
         """
-        passed, self._counted = at[0] - self._counted, at[0]
+        passed = max(0.0, at[0] - self._counted)
+        self._counted = max(self._counted, at[0])
         if self._simulated or math.isnan(self._age(stamp_ns, at)):
             return None
         counted = max(0.0, min(seconds, passed + self._spare))
         self._spare = min(passed + self._spare - counted, _JITTER)
         return counted
+
+    def commanded(self) -> None:
+        """Take down that a command without a measurement has counted the time until now."""
+        self._counted = time.monotonic()
 
     def answered(self) -> None:
         """Take down that its command is out."""

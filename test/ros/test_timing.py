@@ -91,6 +91,10 @@ def test_seconds_count_as_far_as_they_have_passed_and_one_more(
     # of another time than the clock's
     assert counted(0.1, 1.0, age=7200.0) is None
     assert counted(0.0, 100.0) == pytest.approx(0.0, abs=1e-6)
+    # of the time that commands in a silence have counted nothing is left
+    clocks.pass_by(20.0)
+    timing.commanded()
+    assert counted(0.25, 100.0) == pytest.approx(0.25)
 
 
 def test_paused_simulation_is_no_silence(monkeypatch: pytest.MonkeyPatch) -> None:
