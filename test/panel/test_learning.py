@@ -74,7 +74,7 @@ def test_a_model_is_learned_read_about_compared_and_takes_over(tmp_path: Path) -
             'experiment_shortest_hold': 20.0, 'experiment_longest_hold': 60.0,
             'temperature.setpoint_min': 40.0, 'temperature.setpoint_max': 50.0})
         plant = {
-            'lockstep': True, 'lockstep_subscribers': 3, 'temperature.noise': 0.1,
+            'lockstep': True, 'lockstep_subscribers': 3, 'temperature.noise': 0.01,
             'constants.heat_transfer_coefficient': 0.8 * constant('heat_transfer_coefficient')}
         quick = ros.start('plant', {**plant, 'speed': 100.0})
         address = ros.wait_until(lambda: ADDRESS.search(panel.output()))
