@@ -39,7 +39,7 @@ setup(
     python_requires='>=3.11',
     zip_safe=True,
     install_requires=['setuptools', 'numpy', 'scipy', 'PyYAML', 'pint', 'mcap>=1.5',
-                      'mcap-ros2-support', 'lz4', 'zstandard'],
+                      'mcap-ros2-support', 'lz4', 'zstandard', 'rosbags', 'safetensors'],
     extras_require={
         # A sourced ROS 2 installation brings these itself; elsewhere PyPI does.
         'ros': [
@@ -49,7 +49,7 @@ setup(
         ],
         'demo': ['matplotlib', 'rich'],
         # the operator's panel, with all that its pages load
-        'panel': ['nicegui>=3'],
+        'panel': ['nicegui>=3', 'argon2-cffi', 'itsdangerous', 'limits'],
         # the predictive law's solver of quadratic programs
         'mpc': ['daqp'],
         # compiles the numerics of a control step
