@@ -61,6 +61,11 @@ def plugged(name: str, kind: str, known: Mapping[str, Callable[..., Any] | str],
     return made
 
 
+def short_name(name: str) -> str:
+    """Return the name under which the parameters of a plug-in are declared: that of its class."""
+    return name.rpartition(':')[2]
+
+
 def own_code(value: Any) -> list[str]:
     """Return the names of the form ``module:name`` in the value of a parameter."""
     names = [value] if isinstance(value, str) else list(value)
