@@ -21,19 +21,19 @@ from koopman_ros.arrays import Array
 Function = TypeVar('Function', bound=Callable[..., Any])
 
 _VECTOR, _MATRIX, _CUBE = (types.Array(types.float64, n, 'C', readonly=True) for n in (1, 2, 3))
-_SIZES, _EXPONENTS = (types.Array(types.int64, n, 'C', readonly=True) for n in (1, 2))
+_EXPONENTS = types.Array(types.int64, 2, 'C', readonly=True)
 
 
 class ModelArrays(NamedTuple):
     """
     The numbers of a model with dz/dt = A z + J_N(x) B(x) u, z = P phi(x).
 
-    phi are the states and the units of the last hidden layer, or monomials.
+    phi are the states and hidden units tanh(W x + b) - tanh(b), or monomials.
     """
 
-    widths: NDArray[np.int64]  #: (n_l,) of the hidden layers of tanh units
-    layers: Array  #: of each of them the transposed weights and the biases, in one row
-    origin: Array  #: (h,) the last hidden layer at x = 0
+    W: Array  #: (h, n_x) input weights of the hidden units
+    b: Array  #: (h,) their biases
+    origin: Array  #: (h,) hidden units at x = 0
     exponents: NDArray[np.int64]  #: (n_phi, n_x) of monomials; no row where there is a network
     lift: Array  #: P (n_z, n_phi)
     A: Array  #: (n_z, n_z)
@@ -45,7 +45,7 @@ class ModelArrays(NamedTuple):
 
 
 _MODEL = types.NamedTuple(
-    (_SIZES, _VECTOR, _VECTOR, _EXPONENTS, _MATRIX, _MATRIX, _MATRIX, _MATRIX, _MATRIX,
+    (_MATRIX, _VECTOR, _VECTOR, _EXPONENTS, _MATRIX, _MATRIX, _MATRIX, _MATRIX, _MATRIX,
      _EXPONENTS, _CUBE), ModelArrays)
 
 
@@ -59,72 +59,72 @@ def _compiled(*signature: Any) -> Callable[[Function], Function]:
 
 
 @_compiled()
+def _monomial(exponents: NDArray[np.int64], x: Array, k: int, l: int) -> float:
+    """Return a monomial of a state (n_x,), differentiated by its entries k and l, -1 for none."""
+    value = 1.0
+    for j in range(len(x)):
+        power = exponents[j]
+        for entry in (k, l):
+            if entry == j:
+                value *= power
+                power -= 1
+        for _ in range(power):
+            value *= x[j]
+    return value
+
+
+@_compiled()
 def _monomials(exponents: NDArray[np.int64], x: Array, phi: Array) -> None:
-    """Write monomials, their first and, where there is room, second derivatives at states."""
-    (N, n), count, rows = x.shape, len(exponents), phi.shape[1]
+    """Write monomials at states (N, n_x) and their derivatives, see :func:`_features`."""
+    N, n = x.shape
     for c in range(N):
-        for a in range(count):
-            for row in range(rows):
-                # the states by which it is differentiated
-                first, second = _differentiated(row, n)
-                value = 1.0
-                for j in range(n):
-                    power = exponents[a, j]
-                    for by in (first, second):
-                        if by == j:
-                            value *= power
-                            power -= 1
-                    for _ in range(power):
-                        value *= x[c, j]
-                phi[c, row, a] = value
+        for a in range(len(exponents)):
+            phi[c, 0, a] = _monomial(exponents[a], x[c], -1, -1)
+            row = 1 + n
+            for k in range(n):
+                phi[c, 1 + k, a] = _monomial(exponents[a], x[c], k, -1)
+                for l in range(k, n if row < phi.shape[1] else 0):
+                    phi[c, row, a] = _monomial(exponents[a], x[c], k, l)
+                    row += 1
 
 
 @_compiled()
-def _differentiated(row: int, n: int) -> tuple[int, int]:
-    """Return by which states a row of derivatives is: value, n first ones, upper triangle."""
-    if row <= n:
-        return row - 1, -1
-    place = row - 1 - n
-    for k in range(n):
-        if place < n - k:
-            return k, k + place
-        place -= n - k
-    return -1, -1
+def _features(model: ModelArrays, x: Array, phi: Array) -> None:
+    """
+    Write the features at states (N, n_x) and their derivatives.
+
+    :param phi: (N, rows, n_phi): the features, their derivatives by each state and, where there
+        are rows for them, by each pair of states, the upper triangle row by row.
+    """
+    N, n = x.shape
+    if len(model.exponents):
+        _monomials(model.exponents, x, phi)
+        return
+    for c in range(N):
+        for k in range(n):
+            phi[c, 0, k] = x[c, k]
+            phi[c, 1 + k, k] = 1.0
+        for i in range(len(model.b)):
+            a = model.b[i]
+            for k in range(n):
+                a += model.W[i, k] * x[c, k]
+            t = math.tanh(a)
+            slope, row = 1.0 - t * t, 1 + n
+            phi[c, 0, n + i] = t - model.origin[i]
+            for k in range(n):
+                phi[c, 1 + k, n + i] = slope * model.W[i, k]
+                for l in range(k, n if row < phi.shape[1] else 0):
+                    phi[c, row, n + i] = -2.0 * t * slope * model.W[i, k] * model.W[i, l]
+                    row += 1
 
 
 @_compiled()
-def _network(model: ModelArrays, x: Array, phi: Array) -> None:
-    """Write the states and the units of the last hidden layer with their derivatives likewise."""
-    (N, n), rows, start = x.shape, phi.shape[1], 0
-    Y = np.zeros((N, rows, n))
-    for c in range(N):
-        for i in range(n):
-            Y[c, 0, i] = x[c, i]
-            Y[c, 1 + i, i] = 1.0
-            phi[c, 0, i] = x[c, i]
-            phi[c, 1 + i, i] = 1.0
-    for width in model.widths:
-        last = Y.shape[2]
-        weights = model.layers[start:start + last * width].reshape((last, width))
-        bias = model.layers[start + last * width:start + (last + 1) * width]
-        start += (last + 1) * width
-        Y = np.dot(Y.reshape((N * rows, last)), weights).reshape((N, rows, width))
-        for c in range(N):
-            for i in range(width):
-                Y[c, 0, i] = math.tanh(Y[c, 0, i] + bias[i])
-            # second derivatives, which need the first ones before the layer, come first
-            for row in range(rows - 1, 0, -1):
-                k, j = _differentiated(row, n)
-                for i in range(width):
-                    t = Y[c, 0, i]
-                    bend = 2.0 * t * Y[c, 1 + k, i] * Y[c, 1 + j, i] if j >= 0 else 0.0
-                    Y[c, row, i] = (1.0 - t * t) * (Y[c, row, i] - bend)
-    if len(model.widths):
-        for c in range(N):
-            for i in range(Y.shape[2]):
-                phi[c, 0, n + i] = Y[c, 0, i] - model.origin[i]
-                for row in range(1, rows):
-                    phi[c, row, n + i] = Y[c, row, i]
+def _add_product(C: Array, A: Array, B: Array) -> None:
+    """Add A B', of as many rows of A as there are in C."""
+    for i in range(C.shape[0]):
+        for j in range(C.shape[1]):
+            for k in range(A.shape[1]):
+                C[i, j] += A[i, k] * B[j, k]
 
 
 @_compiled()
@@ -160,12 +160,11 @@ def drift(model: ModelArrays, x: Array) -> tuple[Array, Array]:
     rows = 1 + n if read else 1 + n + n * (n + 1) // 2
     matrix = model.readout if read else model.lift
     phi = np.zeros((N, rows, matrix.shape[1]))
-    if len(model.exponents):
-        _monomials(model.exponents, x, phi)
-    else:
-        _network(model, x, phi)
+    _features(model, x, phi)
     n_z = len(matrix)
-    Z = np.dot(phi.reshape((N * rows, matrix.shape[1])), matrix.T).reshape((N, rows, n_z))
+    Z, rates = np.zeros((N, rows, n_z)), np.zeros((1 + n, n_z))
+    for c in range(N):
+        _add_product(Z[c], phi[c], matrix)
     f, slope = np.empty((N, n)), np.zeros((N, n, n))
     if read:
         for c in range(N):
@@ -174,12 +173,12 @@ def drift(model: ModelArrays, x: Array) -> tuple[Array, Array]:
                 for k in range(n):
                     slope[c, i, k] = Z[c, 1 + k, i]
         return f, slope
-    # rates of z and of its derivatives
-    rates = np.dot(Z[:, :1 + n].copy().reshape((N * (1 + n), n_z)), model.A.T).reshape(
-        (N, 1 + n, n_z))
-    square, factors, solution = np.empty((n, n)), np.empty((n, n)), np.empty((n, 1))
+    square, solution = np.empty((n, n)), np.empty((n, 1))
     for c in range(N):
-        J, rate, of_J = Z[c, 1:1 + n], rates[c, 0], rates[c, 1:]
+        # A z and A J', the rates of z and of its derivatives
+        rates[:, :] = 0.0
+        _add_product(rates, Z[c], model.A)
+        J, rate, of_J = Z[c, 1:], rates[0], rates[1:]
         for i in range(n):
             solution[i, 0] = 0.0
             for a in range(n_z):
@@ -188,8 +187,7 @@ def drift(model: ModelArrays, x: Array) -> tuple[Array, Array]:
                 square[i, k] = 0.0
                 for a in range(n_z):
                     square[i, k] += J[i, a] * J[k, a]
-        factors[:] = square
-        _solve(factors, solution)
+        _solve(square.copy(), solution)
         for i in range(n):
             f[c, i] = solution[i, 0]
             for a in range(n_z):
@@ -268,9 +266,10 @@ def _add_cost(cost: Array, X: Array, x_ref: Array, Q: Array, share: Array) -> No
                     cost[c, row, column] += E[i, row] * QE[i, column]
 
 
-@_compiled(_MODEL, _MATRIX, _MATRIX, _VECTOR, _VECTOR, _VECTOR, types.int64, _MATRIX)
-def roll_out(model: ModelArrays, u: Array, x: Array, w: Array, x_ref: Array, lengths: Array,
-             steps: int, Q: Array) -> tuple[Array, Array]:
+@_compiled(_MODEL, _MATRIX, _MATRIX, _VECTOR, _VECTOR, _VECTOR, _VECTOR, types.int64, _MATRIX,
+           _MATRIX)
+def roll_out(model: ModelArrays, u: Array, x: Array, w: Array, x_ref: Array, u_ref: Array,
+             lengths: Array, steps: int, Q: Array, R: Array) -> tuple[Array, Array]:
     """
     Integrate dx/dt = f(x) + B(x) u + w over intervals, each from a node and under a held input.
 
@@ -282,31 +281,41 @@ def roll_out(model: ModelArrays, u: Array, x: Array, w: Array, x_ref: Array, len
     model
         All in scaled deviations and in its time unit.
     u, x
-        (N, n_u) inputs and (N, n_x) nodes.
-    w, x_ref
-        (n_x,) disturbance of the state's rate, and reference.
+        (N, n_u) inputs and (N + 1, n_x) nodes, the last of which is not used.
+    w
+        (n_x,) disturbance of the state's rate.
+    x_ref, u_ref
+        (n_x,) and (n_u,) references.
     lengths
         (N,) of the intervals.
     steps
         Of the integration in each of them.
-    Q
-        (n_x, n_x) weight of the state's error.
+    Q, R
+        (n_x, n_x) and (n_u, n_u) weights.
 
     Returns
     -------
     ends
         (N, n_x, 1 + n_x + n_u), the states at the ends, and their derivatives by node and input.
     cost
-        (N, 1 + n_x + n_u, 1 + n_x + n_u), the integral of e'Q e as a quadratic form of 1 and the
-        deviations of node and input.
+        (N, 1 + n_x + n_u, 1 + n_x + n_u), the integral of e'Q e + v'R v as a quadratic form of 1
+        and the deviations of node and input.
     """
-    (N, n), m = x.shape, u.shape[1]
+    (N, m), n = u.shape, x.shape[1]
     X, cost = np.zeros((N, n, 1 + n + m)), np.zeros((N, 1 + n + m, 1 + n + m))
     for c in range(N):
         for i in range(n):
             X[c, i, 0], X[c, i, 1 + i] = x[c, i], 1.0
-    h = (lengths / steps).reshape((N, 1, 1))
-    share = lengths / (6.0 * steps)
+        for i in range(m):
+            for j in range(m):
+                weight, v = lengths[c] * R[i, j], u[c, j] - u_ref[j]
+                cost[c, 0, 0] += weight * (u[c, i] - u_ref[i]) * v
+                cost[c, 1 + n + i, 0] += weight * v
+                cost[c, 0, 1 + n + i] += weight * v
+                cost[c, 1 + n + i, 1 + n + j] = weight
+    h, share = np.empty_like(X), lengths / (6.0 * steps)
+    for c in range(N):
+        h[c] = lengths[c] / steps
     _add_cost(cost, X, x_ref, Q, share)
     for step in range(steps):
         k1 = _rates(model, X, u, w)
@@ -320,27 +329,37 @@ def roll_out(model: ModelArrays, u: Array, x: Array, w: Array, x_ref: Array, len
     return X, cost
 
 
-@_compiled(_MATRIX, _MATRIX, _VECTOR, _VECTOR, _VECTOR, _VECTOR, _MATRIX, _MATRIX, _CUBE, _CUBE)
-def condense(u: Array, x: Array, start: Array, x_ref: Array, u_ref: Array, lengths: Array,
-             R: Array, terminal: Array, ends: Array, cost: Array
+@_compiled()
+def _add_form(total: Array, weight: Array, D: Array) -> None:
+    """Add the lower triangle of D' W D, of a symmetric W."""
+    row = np.empty(D.shape[1])
+    for i in range(len(D)):
+        row[:] = 0.0
+        for j in range(len(D)):
+            for a in range(D.shape[1]):
+                row[a] += weight[i, j] * D[j, a]
+        for a in range(D.shape[1]):
+            if D[i, a] != 0.0:
+                for b in range(a + 1):
+                    total[a, b] += D[i, a] * row[b]
+
+
+@_compiled(_MATRIX, _VECTOR, _VECTOR, _CUBE, _CUBE, _MATRIX)
+def condense(x: Array, start: Array, x_ref: Array, ends: Array, cost: Array, terminal: Array
              ) -> tuple[Array, Array, Array, Array]:
     """
     Express nodes and cost by a change v (N n_u,) of the inputs alone.
 
     Parameters
     ----------
-    u, x
-        (N, n_u) inputs and (N + 1, n_x) nodes, about which it is linearised.
-    start
-        (n_x,) the state at the beginning.
-    x_ref, u_ref
-        (n_x,) and (n_u,) references.
-    lengths
-        (N,) of the intervals.
-    R, terminal
-        (n_u, n_u) and (n_x, n_x) weights of the input and of the error at the end.
+    x
+        (N + 1, n_x) nodes, about which it is linearised.
+    start, x_ref
+        (n_x,) state at the beginning, and reference.
     ends, cost
         Of :func:`roll_out`.
+    terminal
+        (n_x, n_x) weight of the error at the end.
 
     Returns
     -------
@@ -351,39 +370,40 @@ def condense(u: Array, x: Array, start: Array, x_ref: Array, u_ref: Array, lengt
     H, f
         (N n_u, N n_u) symmetric and (N n_u,) of the cost v'H v / 2 + f'v.
     """
-    (N, m), n = u.shape, x.shape[1]
-    # columns: without a change, and by each input
-    nodes, form = np.zeros((N + 1, n, 1 + N * m)), np.zeros((1 + N * m, 1 + N * m))
-    nodes[0, :, 0] = start
-    for k in range(N + 1):
-        known = 1 + k * m
-        if k == N:
-            known -= m
-        # 1 and the deviations of node and input, by the same columns
-        D = np.zeros((1 + n + m, known + m))
+    (N, n, columns), m = ends.shape, ends.shape[2] - 1 - ends.shape[1]
+    count = N * m
+    # by 1 and v
+    by, total = np.zeros((N + 1, n, 1 + count)), np.zeros((1 + count, 1 + count))
+    for i in range(n):
+        by[0, i, 0] = start[i]
+    for k in range(N):
+        # 1 and the deviations of node and input, by 1 and the inputs so far
+        D = np.zeros((columns, 1 + (k + 1) * m))
         D[0, 0] = 1.0
         for i in range(n):
-            for a in range(known if k < N else known + m):
-                D[1 + i, a] = nodes[k, i, a]
-            D[1 + i, 0] -= x[k, i] if k < N else x_ref[i]
-        if k == N:
-            weight = np.zeros((1 + n + m, 1 + n + m))
-            weight[1:1 + n, 1:1 + n] = terminal
-        else:
-            weight = cost[k].copy()
-            for i in range(m):
-                D[1 + n + i, known + i] = 1.0
-                for j in range(m):
-                    weight[1 + n + i, 1 + n + j] += lengths[k] * R[i, j]
-                    weight[1 + n + i, 0] += lengths[k] * R[i, j] * (u[k, j] - u_ref[j])
-            for i in range(n):
-                for a in range(known + m):
-                    for j in range(1, 1 + n + m):
-                        nodes[k + 1, i, a] += ends[k, i, j] * D[j, a]
-                nodes[k + 1, i, 0] += ends[k, i, 0]
-        form[:known + m, :known + m] += np.dot(D.T, np.dot(weight, D))
-    H, f = np.empty((N * m, N * m)), form[1:, 0].copy()
-    for a in range(N * m):
-        for b in range(N * m):
-            H[a, b] = 0.5 * (form[1 + a, 1 + b] + form[1 + b, 1 + a])
-    return nodes[:, :, 0].copy(), nodes[:, :, 1:].copy(), H, f
+            for a in range(1 + k * m):
+                D[1 + i, a] = by[k, i, a]
+            D[1 + i, 0] -= x[k, i]
+        for i in range(m):
+            D[1 + n + i, 1 + k * m + i] = 1.0
+        for i in range(n):
+            for j in range(columns):
+                for a in range(D.shape[1]):
+                    by[k + 1, i, a] += ends[k, i, j] * D[j, a]
+        _add_form(total, cost[k], D)
+    error = by[N].copy()
+    for i in range(n):
+        error[i, 0] -= x_ref[i]
+    _add_form(total, terminal, error)
+    nodes, by_inputs = np.empty((N + 1, n)), np.empty((N + 1, n, count))
+    H, f = np.empty((count, count)), np.empty(count)
+    for k in range(N + 1):
+        for i in range(n):
+            nodes[k, i] = by[k, i, 0]
+            for a in range(count):
+                by_inputs[k, i, a] = by[k, i, 1 + a]
+    for a in range(count):
+        f[a] = total[1 + a, 0]
+        for b in range(a + 1):
+            H[a, b] = H[b, a] = total[1 + a, 1 + b]
+    return nodes, by_inputs, H, f

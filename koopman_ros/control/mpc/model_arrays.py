@@ -1,37 +1,38 @@
 # SPDX-FileCopyrightText: 2026 The koopman_ros Authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""A model's numbers as compiled code takes them."""
+"""The arrays of a model as the compiled functions take them."""
+
 import numpy as np
 
 from koopman_ros.control.mpc.condensing import ModelArrays
-from koopman_ros.lifting import LiftedModel, NetworkObservables
+from koopman_ros.lifting import LiftedModel, NetworkObservables, PolynomialObservables
 
 
 def model_arrays(model: LiftedModel) -> ModelArrays:
-    lift, n, m = model.observables, model.n_x, model.n_u
-    none = np.zeros((0, n), dtype=np.int64)
-    network = isinstance(lift, NetworkObservables)
-    widths = [len(bias) for _, bias in lift.hidden] if network else []
-    n_phi = n + (widths[-1] if widths else 0) if network else lift.n_z
-    P = np.eye(n_phi)
-    if network:
-        P = np.zeros((lift.n_z, n_phi))
-        if lift.identity:
-            P[:n, :n] = np.eye(n)
-        if widths:
-            P[:, n:] = lift.rows
-    terms = model.input_terms
-    parts = (
-        np.array(widths, dtype=np.int64),
-        np.concatenate([np.zeros(0), *(part.ravel() for weight, bias in (lift.hidden if network else ())
-                         for part in (weight.T, bias))]),
-        lift.value_at_zero if widths else np.zeros(0),
-        none if network else lift.exponents, P, model.A,
-        np.zeros((0, n_phi)) if model.readout is None else model.readout, model.pre_feedback_slope,
-        model.B, none if terms is None else terms._monomials.exponents,
-        np.zeros((0, n, m)) if terms is None else terms.coefficients)
-    parts = [np.array(part) for part in parts]
-    for part in parts:
-        part.setflags(write=False)
-    return ModelArrays(*parts)
+    """Return the arrays of a model of any kind."""
+    lift, n, terms = model.observables, model.n_x, model.input_terms
+    W, b = np.zeros((0, n)), np.zeros(0)
+    exponents = input_exponents = np.zeros((0, n), dtype=np.int64)
+    if isinstance(lift, PolynomialObservables):
+        exponents, P = lift.exponents, np.eye(lift.n_z)
+    else:
+        assert isinstance(lift, NetworkObservables)
+        if lift.hidden:
+            (W, b), = lift.hidden
+        P = np.zeros((lift.n_z, n + len(b)))
+        free = lift.n_z - len(lift.output)
+        P[:free, :n] = np.eye(free, n)
+        if len(b):
+            P[free:, n:] = lift.output
+    if terms is not None:
+        input_exponents = PolynomialObservables.total_degree(n, terms.degree).exponents
+    arrays = [np.array(part) for part in (
+        W, b, np.tanh(b), exponents, P, model.A,
+        np.zeros((0, P.shape[1])) if model.readout is None else model.readout,
+        model.pre_feedback_slope, model.B, input_exponents,
+        np.zeros((0, n, model.n_u)) if terms is None else terms.coefficients)]
+    for array in arrays:
+        # numba distinguishes arrays that can be written to
+        array.setflags(write=False)
+    return ModelArrays(*arrays)
