@@ -154,7 +154,7 @@ def test_packages_that_messages_and_pages_advise_are_known() -> None:
     assert not [path for path, text in texts.items() if 'koopman_ros[' in text]
     advised = {name for text in texts.values() for name in re.findall(
         r"pip install '?([a-z][\w-]*)", text)}
-    assert {'daqp', 'matplotlib', 'nicegui', 'numba', 'torch'} <= advised
+    assert {'matplotlib', 'nicegui', 'numba', 'torch'} <= advised
     assert {canonicalize_name(name) for name in advised} <= locked
 
 
