@@ -37,13 +37,24 @@ class NoParameters:
     """The parameters of a plug-in that has none of its own."""
 
 
+@dataclass(frozen=True)
+class Column:
+    """What a field declared by :func:`column` holds."""
+
+    signals: str  #: of which signals
+    name: str  #: in YAML; empty for that of the field
+    default: float  #: of each, as in YAML
+    none: tuple[float, float] | None  #: number in YAML for no bound, and the infinity it means
+
+
 def parameter(default: Any, description: str, unit: str = '', minimum: float = -math.inf,
               maximum: float = math.inf, **details: Any) -> Any:
     """
     Declare a number, a text, a boolean or a tuple of texts.
 
     :param description: one sentence.
-    :param details: further attributes of :class:`~koopman_ros.parameters.table.Specification`.
+    :param details: further attributes of a
+        :class:`~koopman_ros.parameters.table.Specification`.
     """
     return field(default=default, metadata={
         'unit': unit, 'description': description, 'minimum': minimum, 'maximum': maximum,
@@ -72,7 +83,7 @@ def column(signals: str, default: float, description: str, unit: str = '{unit}',
     in_code = none[1] if none is not None and none[0] == default else default
     return field(default=in_code, metadata={
         'unit': unit, 'description': description, 'minimum': minimum, 'maximum': maximum,
-        'column': signals, 'row': name, 'none': none, 'shown_default': default, **details})
+        'column': Column(signals, name, default, none), **details})
 
 
 def value_column(signals: str, default: float, description: str, **details: Any) -> Any:
@@ -80,14 +91,16 @@ def value_column(signals: str, default: float, description: str, **details: Any)
     return column(signals, default, description, '{shown}', -UNBOUNDED, UNBOUNDED, **details)
 
 
-def per_signal(kind: type[Any]) -> Any:
+def per_signal(kind: type[Any], signals: str = '') -> Any:
     """
     Declare a field with one `kind`, a parameter dataclass, for each of some signals.
 
     ``{unit}`` in its units stands for that of a difference of the signal, ``{shown}`` for that of
     its values, as people read them.
+
+    :param signals: as of :func:`column`; the name of the field by default.
     """
-    return field(default_factory=dict, metadata={'per_signal': kind})
+    return field(default_factory=dict, metadata={'per_signal': kind, 'signals': signals})
 
 
 def group() -> Any:
@@ -116,13 +129,32 @@ def for_signals(parameters: T, signals: Mapping[str, Sequence[str]]) -> T:
     """
     changes: dict[str, Any] = {}
     for item in fields(parameters):  # type: ignore[arg-type]
-        value, names = getattr(parameters, item.name), item.metadata.get('column')
+        value, of = getattr(parameters, item.name), item.metadata.get('column')
         if 'nested' in item.metadata and is_dataclass(value):
             changes[item.name] = for_signals(value, signals)
-        elif names is not None:
-            changes[item.name] = _one_each(item.name, value, signals[names], item.metadata)
-        elif 'minimum' in item.metadata and isinstance(value, float):
+        elif of is not None:
+            changes[item.name] = _one_each(item.name, value, signals[of.signals], item.metadata)
+        elif isinstance(value, float):
             _check_range(item.name, np.array(value), item.metadata)
+    return replace(parameters, **changes)  # type: ignore[type-var]
+
+
+def of_other_states(parameters: T, before: Sequence[str], now: Sequence[str]) -> T:
+    """
+    Return parameters for the states of another model; one that it did not have has the default.
+
+    :param before: names of the states that they are for.
+    :param now: names of the states that they are to be for.
+    """
+    changes: dict[str, Any] = {}
+    for item in fields(parameters):  # type: ignore[arg-type]
+        of = item.metadata.get('column')
+        if of is not None and of.signals == 'states':
+            known = dict(zip(before, getattr(parameters, item.name).tolist(), strict=True))
+            changes[item.name] = np.array([known.get(name, item.default) for name in now])
+        elif 'plugins' in item.metadata:
+            changes[item.name] = {name: of_other_states(own, before, now) for name, own in getattr(
+                parameters, item.name).items()}
     return replace(parameters, **changes)  # type: ignore[type-var]
 
 
@@ -144,15 +176,14 @@ def _one_each(name: str, value: Any, signals: Sequence[str], metadata: Mapping[s
 
 
 def _check_range(name: str, value: Array, metadata: Mapping[str, Any]) -> None:
-    low, high = metadata['minimum'], metadata['maximum']
-    none = metadata.get('none')
-    if metadata['unit'] == '{shown}':
-        # in the unit of the model, where the range is in that of people
-        fits = ~np.isnan(value)
-    else:
-        fits = (value > low if metadata.get('open_minimum') else value >= low) & (value <= high)
-    if none is not None:
-        fits |= value == none[1]
+    low, high, opened = (metadata['minimum'], metadata['maximum'],
+                         metadata.get('open_minimum', False))
+    # of a value of a signal the range is in the unit that people read
+    fits = ~np.isnan(value) if metadata['unit'] == '{shown}' else (
+        (value > low if opened else value >= low) & (value <= high))
+    of = metadata.get('column')
+    if of is not None and of.none is not None:
+        fits |= value == of.none[1]
     if not np.all(fits):
-        raise ValueError(f'{name} must be {"above" if metadata.get("open_minimum") else "at least"}'
-                         f' {low:g} and at most {high:g}, got {value.tolist()}')
+        raise ValueError(f'{name} must be {"above" if opened else "at least"} {low:g} and at most '
+                         f'{high:g}, got {value.tolist()}')

@@ -3,8 +3,8 @@
 
 """The tuning of a controller: one object, one row per parameter."""
 
-from collections.abc import Mapping
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
 from typing import Any, Self
 
 import numpy as np
@@ -13,6 +13,7 @@ from koopman_ros.arrays import Array, brief
 from koopman_ros.declaration import (
     ANY,
     column,
+    for_signals,
     nested,
     NO_LOWER,
     NO_UPPER,
@@ -71,7 +72,7 @@ class Tuning:
     """
 
     state_weight: Array = column(
-        'states', 1.0, 'Cost of the squared error of this state.', '1/({unit})^2', maximum=1e12,
+        'states', 0.0, 'Cost of the squared error of this state.', '1/({unit})^2', maximum=1e12,
         name='weight')
     input_weight: Array = column(
         'inputs', 1.0, 'Cost of the squared deviation of this input from its steady value.',
@@ -146,16 +147,52 @@ class Tuning:
         found = self.plugins.get(short_name(name))
         return kind() if found is None else found
 
+    def for_signals(self, model: LiftedModel, measured: Sequence[str]) -> Self:
+        """
+        Return the tuning with one number for each signal.
+
+        :param measured: names of the signals that are measured.
+        :raises ValueError: naming what does not fit.
+        """
+        states, inputs = model.states.names, model.inputs.names
+        controlled = tuple(filter(None, self.controlled)) or states
+        if list(controlled) != [name for name in states if name in controlled]:
+            raise ValueError(f'controlled must be some of the states {", ".join(states)}, each '
+                             f'once and in this order, got {", ".join(controlled)}')
+        if len(inputs) < len(controlled) < len(states):
+            raise ValueError(f'{len(inputs)} inputs cannot hold {len(controlled)} signals '
+                             f'({", ".join(controlled)}): name at most {len(inputs)} in '
+                             'controlled, or leave it empty for a compromise between all states')
+        signals = {'states': states, 'measured': measured, 'controlled': controlled,
+                   'inputs': inputs}
+        made = for_signals(replace(self, controlled=controlled), signals)
+        made = replace(made, plugins={
+            name: for_signals(own, signals) for name, own in self.plugins.items()})
+        if not np.any(made.state_weight > 0.0):
+            raise ValueError('state_weight must not be 0 for all states')
+        for limits, kind in ((made.limits, 'input'), (made.sensor, 'sensor')):
+            if not np.all(limits.lower < limits.upper):
+                raise ValueError(f'{kind} limits must be lower < upper, got '
+                                 f'{limits.lower.tolist()} and {limits.upper.tolist()}')
+        if not np.all(np.isfinite(made.safe)):
+            raise ValueError(f'safe must be finite, got {made.safe.tolist()}')
+        if not made.levels or len(set(made.levels)) != len(made.levels):
+            raise ValueError(f'levels must be one law or more, each once, got {made.levels}')
+        return made
+
     @classmethod
-    def for_model(cls, model: LiftedModel, **given: Any) -> Self:
+    def for_model(cls, model: LiftedModel, measured: Sequence[str] = (), **given: Any) -> Self:
         """
         Return a tuning whose weights, ranges and safe inputs are a model's, but for what is given.
 
         The weights are 1 on deviations scaled by the model, the inputs' limits their trained
         range, and the safe inputs the nominal ones.
+
+        :param measured: names of the signals that are measured; all states by default.
         """
         inputs = model.inputs
         return cls(**{
             'state_weight': 1.0 / model.states.scale ** 2,
             'input_weight': 1.0 / inputs.scale ** 2,
-            'limits': InputLimits(inputs.lower, inputs.upper), 'safe': inputs.center, **given})
+            'limits': InputLimits(inputs.lower, inputs.upper), 'safe': inputs.center, **given}
+        ).for_signals(model, measured or model.states.names)

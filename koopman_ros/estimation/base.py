@@ -7,6 +7,8 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from dataclasses import dataclass, replace
+from functools import cached_property
+import math
 from typing import Any, ClassVar
 
 import numpy as np
@@ -71,6 +73,19 @@ class Estimate:
         return all(np.all(np.isfinite(value)) for value in (self.x, self.w, self.covariance)
                    if value is not None)
 
+    def check(self, n_x: int) -> None:
+        """Raise a TypeError or ValueError unless it is one of so many states, and finite."""
+        P = self.covariance
+        shapes = (np.shape(self.x), np.shape(self.w), None if P is None else np.shape(P))
+        if shapes not in (((n_x,), (n_x,), None), ((n_x,), (n_x,), (2 * n_x, 2 * n_x))):
+            raise ValueError(f'the estimator returned x, w and covariance of shapes {shapes} for '
+                             f'{n_x} states')
+        if not isinstance(self.innovation, Innovation | None):
+            raise TypeError(f'the estimator returned {type(self.innovation).__name__} as the '
+                            'innovation')
+        if not self.finite:
+            raise ValueError('the estimate is not finite')
+
 
 class Estimator(ABC):
     """
@@ -129,12 +144,28 @@ class Estimator(ABC):
 
         :param rate: (n_x,) the other model's drift there, in this model's terms.
         """
-        return replace(estimate, w=estimate.w + rate - self.model.drift(estimate.x))
+        w = estimate.w + rate - self.model.drift(estimate.x)
+        return replace(estimate, w=self.bounded(w))
 
     def as_input(self, w: Array) -> Array:
         """Return the (n_u,) input that would act like a disturbance, in scaled deviations."""
         return self.model.input_inverse().dot(w)
 
     def at_bound(self, w: Array) -> bool:
-        """Return whether a disturbance is as large as is allowed."""
-        return False
+        """Return whether a disturbance is at `max_disturbance`, but for rounding."""
+        return self._share(w) >= 1.0 - 1e-9
+
+    def bounded(self, w: Array) -> Array:
+        """Return a disturbance within `max_disturbance`; none where it is not finite."""
+        share = self._share(w)
+        if share <= 1.0:
+            return w
+        return w / share if math.isfinite(share) else np.zeros_like(w)
+
+    def _share(self, w: Array) -> float:
+        """Return the largest share of its bound that a disturbance has as an input."""
+        return float(np.max(np.abs(self.as_input(w)) / self._max_disturbance, initial=0.0))
+
+    @cached_property
+    def _max_disturbance(self) -> Array:
+        return self.tuning.max_disturbance / self.model.inputs.scale

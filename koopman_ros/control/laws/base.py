@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 The koopman_ros Authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""What a law is: a plug that turns an estimate and a target into an input."""
+"""Control laws: the contract of a plug-in, its target and its result."""
 
 from __future__ import annotations
 
@@ -34,8 +34,7 @@ class Target:
     residual: float  #: size of the rate that no input balances; 0 where x can be held
 
 
-def steady_state_target(model: LiftedModel, x_ref: Array, w: Array | None = None, *,
-                        known: Target | None = None) -> Target:
+def steady_state_target(model: LiftedModel, x_ref: Array, w: Array | None = None) -> Target:
     """
     Solve f(x_ref) + B(x_ref) u_ref + w = 0 for u_ref by least squares, f the model's drift.
 
@@ -44,18 +43,12 @@ def steady_state_target(model: LiftedModel, x_ref: Array, w: Array | None = None
 
     :param x_ref: (n_x,) scaled deviation.
     :param w: (n_x,) disturbance of the state's rate, none by default.
-    :param known: a target of the same model, which saves lift and drift where x_ref is the same.
     """
-    if known is not None and (known.x is x_ref or known.x.tolist() == x_ref.tolist()):
-        x_ref, z, drift = known.x, known.z, known.drift
-    else:
-        z, drift = model.lift(x_ref), model.drift(x_ref)
+    z, drift = model.lift(x_ref), model.drift(x_ref)
     w = np.zeros(model.n_x) if w is None else w
-    load = drift + w
-    u = -model.input_inverse(x_ref).dot(load)
-    forcing = model.forcing(x_ref, u)
-    rest = load + forcing
-    return Target(x_ref, z, drift, u, forcing + w, math.sqrt(rest.dot(rest)))
+    u = -model.input_inverse(x_ref).dot(drift + w)
+    forcing = model.forcing(x_ref, u) + w
+    return Target(x_ref, z, drift, u, forcing, float(np.linalg.norm(drift + forcing)))
 
 
 @dataclass(frozen=True)
@@ -106,7 +99,7 @@ class Weights:
 
 
 @dataclass(frozen=True, slots=True)
-class Figures:
+class SolutionInfo:
     """What a law says of its solution; NaN and '' for what it does not have."""
 
     form: str = ''  #: which form of the law was used, for the operator
@@ -116,7 +109,7 @@ class Figures:
     growth: float = math.nan
 
 
-NO_FIGURES = Figures()
+NO_SOLUTION = SolutionInfo()
 
 
 @dataclass(frozen=True, slots=True)
@@ -142,7 +135,7 @@ class LawResult:
     #: (n_u,) in input units, which the controller brings within the limits; None with a failure
     u: Array | None
     failure: Reason | None = None  #: why it may not be used; None when it may
-    figures: Figures = NO_FIGURES  #: of the solution, as far as there is one
+    info: SolutionInfo = NO_SOLUTION  #: about the solution, as far as there is one
     memory: object = None  #: what the law wants to be given at the next sample
     plan: Plan | None = None  #: of a law with a horizon
     clipped: bool = False  #: whether the range cut it

@@ -3,6 +3,6 @@
 
 """Model predictive control, with the packages daqp and numba (the extra ``mpc``)."""
 
-from koopman_ros.control.mpc.law import RecedingHorizon, RecedingHorizonParameters
+from koopman_ros.control.mpc.law import MPCParameters, RecedingHorizon
 
-__all__ = ['RecedingHorizon', 'RecedingHorizonParameters']
+__all__ = ['MPCParameters', 'RecedingHorizon']

@@ -59,12 +59,12 @@ def _compiled(*signature: Any) -> Callable[[Function], Function]:
 
 
 @_compiled()
-def _monomial(exponents: NDArray[np.int64], x: Array, k: int, l: int) -> float:
-    """Return a monomial of a state (n_x,), differentiated by its entries k and l, -1 for none."""
+def _monomial(exponents: NDArray[np.int64], x: Array, first: int, second: int) -> float:
+    """Return a monomial of a state (n_x,), differentiated by two entries, or -1 for none."""
     value = 1.0
     for j in range(len(x)):
         power = exponents[j]
-        for entry in (k, l):
+        for entry in (first, second):
             if entry == j:
                 value *= power
                 power -= 1
@@ -83,8 +83,8 @@ def _monomials(exponents: NDArray[np.int64], x: Array, phi: Array) -> None:
             row = 1 + n
             for k in range(n):
                 phi[c, 1 + k, a] = _monomial(exponents[a], x[c], k, -1)
-                for l in range(k, n if row < phi.shape[1] else 0):
-                    phi[c, row, a] = _monomial(exponents[a], x[c], k, l)
+                for j in range(k, n if row < phi.shape[1] else 0):
+                    phi[c, row, a] = _monomial(exponents[a], x[c], k, j)
                     row += 1
 
 
@@ -113,8 +113,8 @@ def _features(model: ModelArrays, x: Array, phi: Array) -> None:
             phi[c, 0, n + i] = t - model.origin[i]
             for k in range(n):
                 phi[c, 1 + k, n + i] = slope * model.W[i, k]
-                for l in range(k, n if row < phi.shape[1] else 0):
-                    phi[c, row, n + i] = -2.0 * t * slope * model.W[i, k] * model.W[i, l]
+                for j in range(k, n if row < phi.shape[1] else 0):
+                    phi[c, row, n + i] = -2.0 * t * slope * model.W[i, k] * model.W[i, j]
                     row += 1
 
 
@@ -300,6 +300,7 @@ def roll_out(model: ModelArrays, u: Array, x: Array, w: Array, x_ref: Array, u_r
     cost
         (N, 1 + n_x + n_u, 1 + n_x + n_u), the integral of e'Q e + v'R v as a quadratic form of 1
         and the deviations of node and input.
+
     """
     (N, m), n = u.shape, x.shape[1]
     X, cost = np.zeros((N, n, 1 + n + m)), np.zeros((N, 1 + n + m, 1 + n + m))
@@ -369,6 +370,7 @@ def condense(x: Array, start: Array, x_ref: Array, ends: Array, cost: Array, ter
         (N + 1, n_x, N n_u) their derivatives by v.
     H, f
         (N n_u, N n_u) symmetric and (N n_u,) of the cost v'H v / 2 + f'v.
+
     """
     (N, n, columns), m = ends.shape, ends.shape[2] - 1 - ends.shape[1]
     count = N * m

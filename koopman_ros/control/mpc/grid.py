@@ -35,6 +35,7 @@ class HorizonGrid:
             Their number.
         longest
             Length that none exceeds.
+
         """
         powers, total, factor = np.arange(count), horizon / first, 1.0
         # near 1 the sum does not determine the factor
@@ -67,6 +68,7 @@ class HorizonGrid:
             (N, n_u), the inputs that held in the middle of each interval.
         x
             (N + 1, n_x), interpolated linearly. Beyond the end of the plan its last values hold.
+
         """
         old, new = np.concatenate(([0.0], np.cumsum(lengths))), self.lengths[0] + self.times
         middle = np.searchsorted(old[1:], 0.5 * (new[1:] + new[:-1]))

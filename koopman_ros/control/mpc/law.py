@@ -12,7 +12,7 @@ import time
 import numpy as np
 
 from koopman_ros.arrays import Array
-from koopman_ros.control.laws.base import Figures, Law, LawResult, Target
+from koopman_ros.control.laws.base import Law, LawResult, SolutionInfo, Target
 from koopman_ros.control.laws.riccati import StateDependentRiccati
 from koopman_ros.declaration import NO_LOWER, NO_UPPER, parameter, UNBOUNDED, value_column
 from koopman_ros.estimation import Estimate
@@ -20,7 +20,7 @@ from koopman_ros.lifting import LiftedModel
 from koopman_ros.reasons import Code, Reason, reason
 from koopman_ros.tuning import Tuning
 
-PACKAGES = 'numba daqp'
+_PACKAGES = 'numba daqp'
 # Largest change of a scaled input after which a plan has converged, and with which it may be used.
 _CONVERGED, _USABLE = 1e-4, 0.05
 _MAX_ITERATIONS = 12
@@ -28,15 +28,13 @@ _CHECKED = 3  # every third node, and the last, is checked for its distance from
 
 
 @dataclass(frozen=True)
-class RecedingHorizonParameters:
-    """Parameters of the law `mpc`."""
+class MPCParameters:
+    """Soft limits of the states, and the time limit of a plan."""
 
-    state_lower: Array = value_column(
-        'states', -UNBOUNDED, 'Lower limit of this state in the plan, violated where necessary.',
-        name='min', none=NO_LOWER)
-    state_upper: Array = value_column(
-        'states', UNBOUNDED, 'Upper limit of this state in the plan, violated where necessary.',
-        name='max', none=NO_UPPER)
+    lower: Array = value_column(
+        'states', -UNBOUNDED, 'Soft lower limit of this state.', name='min', none=NO_LOWER)
+    upper: Array = value_column(
+        'states', UNBOUNDED, 'Soft upper limit of this state.', name='max', none=NO_UPPER)
     time_limit: float = parameter(
         0.0, 'Computing time of a plan after which the next law acts; 0: any.', 's', 0.0, 3600.0)
 
@@ -55,26 +53,29 @@ class RecedingHorizon(Law):
     optimization in optimal feedback control", SIAM J. Control Optim. 43 (2005).
     """
 
-    Parameters = RecedingHorizonParameters
+    Parameters = MPCParameters
+    parameters: MPCParameters
 
-    def __init__(self, model: LiftedModel, tuning: Tuning, parameters: RecedingHorizonParameters
-                 ) -> None:
+    def __init__(self, model: LiftedModel, tuning: Tuning, parameters: MPCParameters) -> None:
         super().__init__(model, tuning, parameters)
+        if not np.all(parameters.lower < parameters.upper):
+            raise ValueError('state limits must be min < max, got '
+                             f'{np.asarray(parameters.lower).tolist()} and '
+                             f'{np.asarray(parameters.upper).tolist()}')
         self._riccati = StateDependentRiccati(model, tuning, None)
-        self._missing = ''
+        self.planner = None
         try:
             # compiles, or loads what was compiled before
             from koopman_ros.control.mpc.planner import Planner
-        except ImportError as error:
-            self._missing = f'{PACKAGES} ({error})'
+        except ImportError:
             return
-        bounds = (np.broadcast_to(bound, model.n_x)
-                  for bound in (parameters.state_lower, parameters.state_upper))
-        self.planner = Planner(model, tuning, self.weights, *bounds)
+        self.planner = Planner(model, tuning, self.weights, *(
+            np.broadcast_to(bound, model.n_x) for bound in (parameters.lower, parameters.upper)))
 
     def unusable(self) -> Reason | None:
-        """Return the missing package."""
-        return reason(Code.PACKAGE_MISSING, package=PACKAGES) if self._missing else None
+        """Return that its packages are not installed."""
+        return None if self.planner is not None else reason(
+            Code.PACKAGE_MISSING, package=_PACKAGES)
 
     def compute(self, estimate: Estimate, target: Target, memory: object, interval: float,
                 previous: Array | None) -> LawResult:
@@ -83,16 +84,17 @@ class RecedingHorizon(Law):
 
         At the first sample, whose interval is not known, it is that of the Riccati equation.
         """
-        if (missing := self.unusable()) is not None:
-            return LawResult(None, missing)
+        planner = self.planner
+        if planner is None:
+            return LawResult(None, self.unusable())
         if not interval > 0.0:
             return self._riccati.compute(estimate, target, None, interval, previous)
         began, limit = time.perf_counter(), self.parameters.time_limit or math.inf
         try:
-            problem = self.planner.problem(estimate, target, interval, previous)
-            u, x = self.planner.first_guess(problem, memory)
+            problem = planner.problem(estimate, target, interval, previous)
+            u, x = planner.first_guess(problem, memory)
             for iteration in range(1, _MAX_ITERATIONS + 1):
-                found = self.planner.improve(problem, u, x)
+                found = planner.improve(problem, u, x)
                 if isinstance(found, Reason):
                     return LawResult(None, found, passing=True)
                 change, u, x = found
@@ -111,6 +113,7 @@ class RecedingHorizon(Law):
         if max(ahead) > max(self.margin, here):
             return LawResult(None, reason(
                 Code.PLAN_OUTSIDE, outside=max(ahead), margin=self.margin))
-        plan = self.planner.plan(problem, u, x)
-        return LawResult(plan.inputs[0], None, Figures('planned'), (u, x, problem.grid.lengths),
-                         plan, clipped=bool(plan.at_range.any()))
+        plan = planner.plan(problem, u, x)
+        return LawResult(
+            plan.inputs[0], info=SolutionInfo('planned'), memory=(u, x, problem.grid.lengths),
+            plan=plan, clipped=bool(plan.at_range.any()))

@@ -110,8 +110,10 @@ def test_condensed_cost_is_that_of_the_simulated_plan() -> None:
         """Return the cost and the nodes of changed inputs."""
         state, total, path = start, 0.0, [start]
         for held, length in zip(u + v.reshape(N, m), lengths, strict=True):
-            *state, part = simulated(model, np.array(state), held, w, length, lambda at, held=held: (
-                (at - x_ref) @ Q @ (at - x_ref) + (held - u_ref) @ R @ (held - u_ref)))
+            def rate(at: np.ndarray, e_u: np.ndarray = held - u_ref) -> float:
+                return (at - x_ref) @ Q @ (at - x_ref) + e_u @ R @ e_u
+
+            *state, part = simulated(model, np.array(state), held, w, length, rate)
             total += part
             path.append(np.array(state))
         return total + (state - x_ref) @ terminal @ (state - x_ref), np.array(path)
