@@ -186,14 +186,14 @@ class Planner:
 
         :return: the largest change of an input, and the changed plan; or why there is none.
         """
-        target, weights = problem.target, self._weights
+        start, w, x_ref, u_ref = (np.ascontiguousarray(value, dtype=np.float64) for value in (
+            problem.start, problem.w, problem.target.x, problem.target.u))
         ends, cost = roll_out(
-            self._arrays, u, x, problem.w, target.x, target.u, problem.grid.lengths,
-            problem.steps, weights.Q, weights.R)
+            self._arrays, u, x, w, x_ref, u_ref, problem.grid.lengths, problem.steps,
+            self._weights.Q, self._weights.R)
         if not (np.isfinite(ends).all() and np.isfinite(cost).all()):
             return reason(Code.PLAN_NOT_SOLVED, flag='its trajectory is not finite')
-        nodes, by_inputs, H, f = condense(
-            x, problem.start, target.x, ends, cost, problem.terminal)
+        nodes, by_inputs, H, f = condense(x, start, x_ref, ends, cost, problem.terminal)
         A, lower, upper, sense = self._constraints(problem, u, nodes, by_inputs)
         v, _, flag, _ = daqp.solve(H, f, A, upper, lower, sense)
         v = np.asarray(v, dtype=np.float64)
