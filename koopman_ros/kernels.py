@@ -11,9 +11,7 @@ not do, for a kind of model or near to a border, the reference does.
 """
 
 from collections.abc import Callable, Mapping
-from functools import wraps
-import importlib
-from typing import Any, Protocol, TypeVar
+from typing import Any, TypeVar
 
 Kernels = Mapping[str, Callable[..., Any]]
 Function = TypeVar('Function', bound=Callable[..., Any])
@@ -24,29 +22,13 @@ IN_NUMPY, COMPILED = 'numpy', 'compiled'
 PACKAGE = 'numba'  # which compiles
 
 
-class Carrier(Protocol):
-    """What carries compiled functions: a model."""
-
-    @property
-    def kernels(self) -> Kernels:
-        """By name; none for numpy."""
-
-
 def named(name: str) -> Kernels | None:
     """
     Return the functions by a name of records; None where what compiles is not installed.
 
     The first time in an environment that takes half a minute, later half a second.
     """
-    if name != COMPILED:
-        return NUMPY
-    try:
-        found: Kernels = importlib.import_module('koopman_ros.compiled.table').KERNELS
-    except ModuleNotFoundError as error:
-        if error.name != PACKAGE:
-            raise
-        return None
-    return found
+    return NUMPY if name != COMPILED else None
 
 
 def compilable(reference: Function) -> Function:
@@ -55,15 +37,4 @@ def compilable(reference: Function) -> Function:
 
     That returns None for what it leaves to the reference.
     """
-    name = reference.__name__
-
-    @wraps(reference)
-    def answer(model: Carrier, *args: Any, **options: Any) -> Any:
-        kernel = model.kernels.get(name)
-        if kernel is not None:
-            found = kernel(model, *args, **options)
-            if found is not None:
-                return found
-        return reference(model, *args, **options)
-
-    return answer  # type: ignore[return-value]
+    return reference

@@ -25,7 +25,7 @@ from koopman_ros.control.laws import Law, StateDependentRiccati, Tuning, Weights
 from koopman_ros.control.limits import InputLimits
 from koopman_ros.jobs.backends import Backend, Here
 from koopman_ros.lifting import Coordinates, LiftedModel, TriedLoops
-from koopman_ros.lifting.coordinates import MAX_TRIED_LOOPS
+from koopman_ros.lifting.training_data import MAX_TRIED_LOOPS
 from koopman_ros.solvers import solve_riccati
 
 #: Closed loops that a law is judged by.

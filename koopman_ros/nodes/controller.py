@@ -138,7 +138,7 @@ class ControllerNode(ManagedNode):
             lambda: self._exchange(records.MODEL, {'model': self._models.in_force.identity}),
             lambda: self._diagnostics.publish_if_changed())
         self._compiling = Compiling(self) if parameters.compiled else None
-        self._kernels, self._carried = NUMPY, (loaded.model, loaded.model)
+        self._kernels = NUMPY
         self._controller = self._built()
         self._state = State()
         self._recent = Recent()
@@ -593,12 +593,7 @@ class ControllerNode(ManagedNode):
         return ', '.join(parts)
 
     def _built(self) -> Controller:
-        given, carrier = self._models.in_force.model, self._carried[1]
-        if given is not self._carried[0] or carrier.kernels is not self._kernels:
-            # the same one as long as nothing changes: what is estimated goes by it
-            carrier = replace(given, kernels=self._kernels) if self._kernels else given
-            self._carried = given, carrier
-        return built(self._settings, carrier)
+        return built(self._settings, self._models.in_force.model)
 
     def _switch(self, kernels: Kernels) -> None:
         """Let compiled functions answer from now on; the state stays as it is."""

@@ -160,8 +160,7 @@ class _Run:
     def _switch(self, record: records.Record) -> None:
         """Put other functions for the same numbers in force."""
         self._kernels = _kernels(record)
-        self._controller = self._build(self._parameters, replace(
-            self._controller.model, kernels=self._kernels))
+        self._controller = self._build(self._parameters, self._controller.model)
         self._found.controller = self._controller
 
     def _exchange(self, record: records.Record, state: State) -> None:
@@ -208,7 +207,7 @@ class _Run:
         name, digest = record.fields['model']['name'], record.fields['model']['digest']
         if name not in self._found.models:
             self._found.models.append(name)
-        return replace(self._find_model(name, digest), kernels=self._kernels)
+        return self._find_model(name, digest)
 
     def _tuned(self, model: LiftedModel) -> Controller:
         assert self._other is not None
