@@ -18,13 +18,9 @@ def model_arrays(model: LiftedModel) -> ModelArrays:
         exponents, P = lift.exponents, np.eye(lift.n_z)
     else:
         assert isinstance(lift, NetworkObservables)
-        if lift.hidden:
-            (W, b), = lift.hidden
+        W, b, states = lift.W, lift.b, lift.n_z - len(lift.V)
         P = np.zeros((lift.n_z, n + len(b)))
-        free = lift.n_z - len(lift.output)
-        P[:free, :n] = np.eye(free, n)
-        if len(b):
-            P[free:, n:] = lift.output
+        P[:states, :n], P[states:, n:] = np.eye(states, n), lift.V
     if terms is not None:
         input_exponents = PolynomialObservables.total_degree(n, terms.degree).exponents
     arrays = [np.array(part) for part in (
