@@ -151,7 +151,7 @@ def test_range_is_planned_for_optimally():
 def test_plan_with_active_limits_is_that_of_a_general_optimiser():
     """Against SLSQP on simulations of the model, with range, rate and limits of the states."""
     model, interval, x, x_ref = shipped('two_state'), 30.0, [-0.3, -0.2], [0.05, 0.2]
-    u_max, change, e_max = 0.18, 0.12, [9.0, 0.11]
+    u_max, change, e_max = 0.15, 0.12, [9.0, 0.08]
     inputs, states, w = model.inputs, model.states, np.array([0.01, -0.02])
     one = RecedingHorizon(model, Tuning.for_model(
         model, limits=InputLimits(inputs.center - u_max * inputs.scale,
