@@ -39,7 +39,7 @@ setup(
     python_requires='>=3.11',
     zip_safe=True,
     install_requires=['setuptools', 'numpy', 'scipy', 'PyYAML', 'pint', 'mcap>=1.5',
-                      'mcap-ros2-support', 'lz4', 'zstandard', 'rosbags', 'safetensors'],
+                      'lz4', 'zstandard', 'rosbags', 'safetensors'],
     extras_require={
         # A sourced ROS 2 installation brings these itself; elsewhere PyPI does.
         'ros': [

@@ -128,7 +128,7 @@ def test_rosdep_has_every_key_of_the_manifest_and_the_page_names_the_rest() -> N
                     for some in (manifest.exec_depends, manifest.test_depends))
     assert nodes | tests <= {*keys['ros'], *keys['apt'], *keys['pip']}
     assert not set(keys['none']) & {key for kind in ('ros', 'apt', 'pip') for key in keys[kind]}
-    assert nodes & set(keys['pip']) == {'mcap-ros2-support'}
+    assert nodes & set(keys['pip']) == {'mcap-ros2-support', 'python3-rosbags-pip'}
     _, _, install = (ROOT / 'docs' / 'operation.md').read_text().partition('## Install')
     install, _, _ = install.partition('## Start')
     assert not [key for key in keys['pip'] if f'`{key}`' not in install]

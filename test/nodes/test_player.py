@@ -17,6 +17,7 @@ from rclpy.publisher import Publisher
 from rclpy.qos import DurabilityPolicy, ReliabilityPolicy
 from rclpy.serialization import serialize_message
 from rosbags.highlevel import AnyReader
+from rosbags.interfaces import Qos, QosDurability, QosReliability
 from rosgraph_msgs.msg import Clock
 from sensor_msgs.msg import Temperature
 import yaml
@@ -33,6 +34,7 @@ from koopman_ros.ros import topics
 from koopman_ros.ros.codec import stamp_nanoseconds
 from koopman_ros.testing import Harness
 from koopman_ros.units import NANOSECONDS
+from support.bag_samples import DEFAULT_QOS
 from support.nodes import complaint, run_here, temperature, TIMEOUT
 
 SAMPLES = 61
@@ -119,8 +121,12 @@ def test_second_run_is_bit_identical(tmp_path: Path, recorded_loop: Path) -> Non
         assert len(np.unique(first.values)) > 45
 
 
+LATCHED_QOS = DEFAULT_QOS._replace(durability=QosDurability.TRANSIENT_LOCAL, depth=1)
+BEST_EFFORT_QOS = DEFAULT_QOS._replace(reliability=QosReliability.BEST_EFFORT)
+
+
 def write_bag(path: Path, entries: Sequence[tuple[str, Temperature, float]],
-              offered: Sequence[bags.QosProfile] = ()) -> Path:
+              offered: Sequence[Qos] = ()) -> Path:
     """Write temperatures: (topic, message, seconds of receipt)."""
     with bags.BagWriter(path) as writer:
         for topic, message, received in entries:
@@ -166,7 +172,7 @@ def test_lockstep_waits_for_requests_alone(
         for topic, celsius, stamp in [
             ('/coolant_temperature', 22.0, float(k)), ('/temperature', 50.0 + 0.1 * k, float(k)),
             *([('/setpoint', 49.0, 0.0)] if k in (5, 6) else [])]],
-        [bags.QosProfile(durability='transient_local', depth=1)])
+        [LATCHED_QOS])
     waits: list[str] = []
     wait = Publisher.wait_for_all_acked
 
@@ -242,15 +248,15 @@ def test_order_is_that_of_receipt_and_the_offset_leaves_out_the_beginning(
 
 @pytest.mark.parametrize(('offered', 'reliability', 'durability'), [
     ((), ReliabilityPolicy.RELIABLE, DurabilityPolicy.VOLATILE),
-    ((bags.QosProfile(reliability='best_effort'),),
+    ((BEST_EFFORT_QOS,),
      ReliabilityPolicy.BEST_EFFORT, DurabilityPolicy.VOLATILE),
-    ((bags.QosProfile(durability='transient_local', depth=1),),
+    ((LATCHED_QOS,),
      ReliabilityPolicy.RELIABLE, DurabilityPolicy.TRANSIENT_LOCAL),
-    ((bags.QosProfile(reliability='best_effort'), bags.QosProfile(deadline_ns=bags.INFINITE_NS)),
+    ((BEST_EFFORT_QOS, DEFAULT_QOS),
      ReliabilityPolicy.RELIABLE, DurabilityPolicy.VOLATILE),
 ])
 def test_offer_is_that_of_the_recorded_publishers(
-        offered: tuple[bags.QosProfile, ...], reliability: ReliabilityPolicy,
+        offered: tuple[Qos, ...], reliability: ReliabilityPolicy,
         durability: DurabilityPolicy) -> None:
     profile = player.recorded_offer(offered)
     assert (profile.reliability, profile.durability) == (reliability, durability)

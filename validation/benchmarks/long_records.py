@@ -20,11 +20,11 @@ from mcap.records import (
     Schema,
     Statistics,
 )
+from mcap.writer import MCAP0_MAGIC
 import numpy as np
 from numpy.typing import NDArray
 
 from koopman_ros.bags import message_definition
-from koopman_ros.bags.records import MAGIC
 from koopman_ros.plants import ControlAffineSystem
 from koopman_ros.solvers import runge_kutta_step
 from koopman_ros.units import NANOSECONDS, SECONDS_PER_TIME_UNIT
@@ -91,7 +91,7 @@ def write(path: Path, topics: Sequence[str], values: NDArray[np.float64], period
     channels = [Channel(number, topic, 'cdr', {'topic_type_hash': definition.type_hash}, 1)
                 for number, topic in enumerate(topics)]
     with path.open('wb') as stream:
-        stream.write(MAGIC)
+        stream.write(MCAP0_MAGIC)
         stream.write(_encoded(Header('ros2', ''), schema, *channels))
         per_chunk = max(1, _MESSAGES // n)
         for first in range(0, count, per_chunk):
@@ -104,7 +104,7 @@ def write(path: Path, topics: Sequence[str], values: NDArray[np.float64], period
         stream.write(_encoded(schema, *channels, Statistics(
             0, len(channels), dict.fromkeys(range(n), int(count)), -(-count // per_chunk),
             count * n, int(stamps[-1]), int(stamps[0]), 0, 1)))
-        stream.write(_encoded(Footer(summary, 0, 0)) + MAGIC)
+        stream.write(_encoded(Footer(summary, 0, 0)) + MCAP0_MAGIC)
     return path
 
 

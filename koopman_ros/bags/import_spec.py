@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 The koopman_ros Authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""What is looked for in bags, and the account of what was found."""
+"""The signals to import from bags, and the account of an import."""
 
 from collections import Counter
 from collections.abc import Iterator
@@ -9,7 +9,7 @@ from dataclasses import dataclass, field
 
 from koopman_ros.wire import Place
 
-# What happened where an episode ends, for the first and for the largest of several.
+# The reason for the end of an episode, for the first and for the largest of several.
 _ENDS = {'set back': ('time was set back by {}', 'at most by {}'),
          'gap': ('gap of {}', 'the longest of {}'),
          'jump': ('jump to {}', 'the highest to {}')}
@@ -37,12 +37,12 @@ class RecordedInput:
 
 @dataclass
 class Account:
-    """What was made of some bags."""
+    """The result of an import in numbers and notes."""
 
     measurements: int = 0  #: number of measurements read, of all states
     used: int = 0  #: number of those in an episode
     dropped: Counter[str] = field(default_factory=Counter)  #: messages left out, by reason
-    notes: list[str] = field(default_factory=list)  #: what else is worth knowing, in words
+    notes: list[str] = field(default_factory=list)  #: anything else, in sentences
 
     def add(self, other: 'Account') -> None:
         """Take in that of other bags."""
@@ -59,15 +59,15 @@ class Account:
 
 
 def places_of(signal: RecordedState | RecordedInput) -> list[Place]:
-    """Return where a signal is."""
+    """Return the places of a signal."""
     if isinstance(signal, RecordedState):
         return [signal.place]
     return [signal.command] if signal.measured is None else [signal.command, signal.measured]
 
 
 @dataclass
-class Cuts:
-    """Where episodes of a bag end: how often, the first and the largest, by what happened."""
+class EpisodeBreaks:
+    """The ends of episodes in a bag by reason: how often, the first and the largest."""
 
     _found: dict[str, tuple[int, str, str, float]] = field(default_factory=dict)
 

@@ -4,15 +4,13 @@
 """The files of a bag, in reading order, of a recorder that ended well or was killed."""
 
 import os
-from pathlib import Path
+from pathlib import Path, PurePath
 import re
-from typing import Any
 
 import yaml
 
-from koopman_ros.bags.limits import BagReadError, enough_memory, load_plain, reason
+from koopman_ros.bags.mcap_file import BagReadError, is_closed, reason, RECOVER
 from koopman_ros.bags.metadata import METADATA_FILE, METADATA_KEY
-from koopman_ros.bags.records import is_closed, RECOVER
 
 # The files of a bag directory: run_0.mcap, run_1.mcap, ..., or the same compressed by rosbag2;
 # with its pull request 2265 0_run_2025_12_17-10_00_00.mcap, 1_run_2025_12_17-10_05_00.mcap, ...
@@ -65,54 +63,33 @@ def _listed_files(folder: Path) -> tuple[Path, ...]:
     """Return the files that metadata.yaml lists, in its order."""
     source = folder / METADATA_FILE
     try:
-        with enough_memory(source):
-            information: dict[str, Any] = load_plain(_metadata_text(source))[METADATA_KEY]
-        compression = str(information.get('compression_format') or '')
-        names = _file_names(information['relative_file_paths'])
+        if source.stat().st_size > _MAX_METADATA_BYTES:
+            raise ValueError(f'more than {_MAX_METADATA_BYTES} bytes')
+        information = yaml.safe_load(source.read_text('utf-8'))[METADATA_KEY]
+        compression = information.get('compression_format')
+        # rosbag2 before version 4 lists them with the name of their folder
+        names = [PurePath(name).name for name in information['relative_file_paths']]
+        if not names or len(set(names)) < len(names) or '' in names:
+            raise ValueError('no file, or one file twice')
         # `ros2 bag reindex` of Humble leaves it empty
-        storage = str(information.get('storage_identifier') or _storage_of(names))
+        storage = information.get('storage_identifier') or (
+            'sqlite3' if any('.db3' in name for name in names) else 'mcap')
+        missing = [name for name in names if not (folder / name).is_file()]
     # the YAML parser itself fails in several ways, on a date without a 13th month among them
     except (yaml.YAMLError, ValueError, KeyError, TypeError, AttributeError, RecursionError
             ) as error:
         raise BagReadError(
             f'{str(source)!r} is not the metadata of a bag ({reason(error)}): delete it and set '
             'recover to true to read the files beside it') from error
-    if storage != 'mcap' or compression not in ('', 'zstd'):
+    if storage != 'mcap' or compression not in (None, '', 'none', 'zstd'):
         kind = f'{storage} files' + (f' compressed with {compression}' if compression else '')
         raise BagReadError(
             f'{str(folder)!r} holds {kind}, only mcap is read here, plain or compressed with '
             "zstd: convert it with 'ros2 bag convert'")
-    files = tuple(folder / name for name in names)
-    for file in files:
-        if not file.is_file():
-            raise BagReadError(
-                f'{str(source)!r} lists {file.name!r}, which is not there: put it back')
-    if len({os.path.realpath(file) for file in files}) < len(files):
-        raise BagReadError(f'{str(source)!r} lists one file under two names: correct it')
-    return files
-
-
-def _metadata_text(source: Path) -> str:
-    with source.open('rb') as stream:
-        text = stream.read(_MAX_METADATA_BYTES + 1)
-    if len(text) > _MAX_METADATA_BYTES:
-        raise ValueError(f'more than {_MAX_METADATA_BYTES} bytes')
-    return text.decode('utf-8')
-
-
-def _file_names(listed: Any) -> list[str]:
-    """Return the names of a bag's files; raise ValueError for what cannot be that."""
-    if not isinstance(listed, list) or not all(isinstance(name, str) for name in listed):
-        raise ValueError('no list of names')
-    if not listed or len(set(listed)) < len(listed) or any('\0' in name for name in listed):
-        raise ValueError('no file, or one file twice')
-    return listed
-
-
-def _storage_of(names: list[str]) -> str:
-    """Return the kind of some files by their names; MCAP files of any name pass the next check."""
-    return 'sqlite3' if any(name.endswith(('.db3', f'.db3{_COMPRESSED}')) for name in names) else (
-        'mcap')
+    if missing:
+        raise BagReadError(
+            f'{str(source)!r} lists {missing[0]!r}, which is not there: put it back')
+    return tuple(folder / name for name in names)
 
 
 def _left_behind(folder: Path, listed: tuple[Path, ...]) -> list[Path]:

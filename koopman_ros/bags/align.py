@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 The koopman_ros Authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""Measurements of several states, put together by their stamps."""
+"""Measurements of several states, aligned by their stamps."""
 
 from collections import Counter
 from collections.abc import Sequence
@@ -11,15 +11,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from koopman_ros.arrays import Array
-from koopman_ros.bags.columns import Times
-from koopman_ros.bags.recorded import RecordedState
-from koopman_ros.bags.runs import Clock, Run
+from koopman_ros.bags.import_spec import RecordedState
+from koopman_ros.bags.segments import Clock, Segment, Times
 from koopman_ros.units import NANOSECONDS
 
 
 @dataclass(frozen=True)
 class Samples:
-    """Measurements that were put together."""
+    """Measurements of all states at one time each."""
 
     stamps: Times  #: (N,) rising, in ns
     x: Array  #: (N, n_x) as they were sent
@@ -27,14 +26,14 @@ class Samples:
     received: tuple[Times, Times]
 
 
-def put_together(run: Run, clock: Clock, states: Sequence[RecordedState], tolerance_ns: int,
-                 dropped: Counter[str]) -> Samples:
-    """Put the measurements of a portion together by stamp; count what the others lack."""
+def align_by_timestamp(segment: Segment, clock: Clock, states: Sequence[RecordedState],
+                       tolerance_ns: int, dropped: Counter[str]) -> Samples:
+    """Align the measurements of a segment by stamp; count those without a partner."""
     parts = []
     for signal in states:
-        entries = clock.on(run.of(signal.place))
-        if run.until_ns is not None:
-            entries = entries.part(entries.stamp_ns <= run.until_ns)
+        entries = clock.on(segment.of(signal.place))
+        if segment.until_ns is not None:
+            entries = entries.part(entries.stamp_ns <= segment.until_ns)
         parts.append(entries.first_of_each())
         dropped[named(states, signal, 'measurement with a repeated stamp')] += (
             len(entries) - len(parts[-1]))
@@ -55,14 +54,14 @@ def put_together(run: Run, clock: Clock, states: Sequence[RecordedState], tolera
     return Samples(base[whole], x, (stamps, np.repeat(logs, len(states))[::-1][last]))
 
 
-def named(states: Sequence[RecordedState], state: RecordedState, what: str) -> str:
-    """Say of which state something is, where there are several."""
-    return what if len(states) == 1 else f'{what} ({state.name})'
+def named(states: Sequence[RecordedState], state: RecordedState, text: str) -> str:
+    """Add the name of a state to a text, where there are several."""
+    return text if len(states) == 1 else f'{text} ({state.name})'
 
 
 def _count_others(states: Sequence[RecordedState], times: Sequence[Times], rows: Sequence[Times],
                   tolerance_ns: int, dropped: Counter[str]) -> None:
-    """Count the measurements of each state that are in no sample, by what they lack."""
+    """Count the measurements of each state that are in no sample, by the reason."""
     usual = min((float(np.median(np.diff(own))) for own in times if len(own) > 1), default=0.0)
     seconds = f'{tolerance_ns / NANOSECONDS:g} s'
     for signal, own, row in zip(states, times, rows, strict=True):
