@@ -51,6 +51,9 @@ from koopman_ros.ros import controller_messages as messages
 from koopman_ros.ros import topics
 from koopman_ros.ros.codec import stamp_message
 from koopman_ros.ros.compiling import Compiling
+from koopman_ros.ros.diagnostics import Level, Status
+from koopman_ros.ros.host import run_loops
+from koopman_ros.ros.hosted import wall_timer
 from koopman_ros.ros.managed import ManagedNode
 from koopman_ros.ros.model_reload import (
     load_suitable,
@@ -59,10 +62,11 @@ from koopman_ros.ros.model_reload import (
     rests_outside,
     Situation,
 )
-from koopman_ros.ros.node import Level, Status, wall_timer, words_of
-from koopman_ros.ros.process import run
+from koopman_ros.ros.node import words_of
+from koopman_ros.ros.process import events_executor, run
 from koopman_ros.ros.signals import Heard, Inlet, Outlet
-from koopman_ros.ros.watchdog import PERIOD, Timing, Watchdog
+from koopman_ros.ros.timing import Timing
+from koopman_ros.ros.watchdog import PERIOD, Watchdog
 from koopman_ros.time_base import Advance, TimeBase
 from koopman_ros.units import display_unit, NANOSECONDS, shown
 from koopman_ros.values import record
@@ -670,7 +674,8 @@ class ControllerNode(ManagedNode):
 
 def main(args: list[str] | None = None) -> int:
     """Run the controller node."""
-    return run('controller', ControllerNode, args, hosts=True)
+    return run('controller', ControllerNode, args, partial(
+        run_loops, 'controller', ControllerNode), events_executor)
 
 
 if __name__ == '__main__':

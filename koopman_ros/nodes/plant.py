@@ -5,6 +5,7 @@
 
 from dataclasses import replace
 from enum import Enum
+from functools import partial
 import math
 import sys
 import time
@@ -20,9 +21,11 @@ from koopman_ros.parameters.plant import PlantParameters, PlantTable
 from koopman_ros.parameters.wire import PLANT_KINDS, SIGNALS, Wiring
 from koopman_ros.ros import topics
 from koopman_ros.ros.codec import stamp_message
+from koopman_ros.ros.diagnostics import Level, Status
+from koopman_ros.ros.host import run_loops
+from koopman_ros.ros.hosted import wall_timer
 from koopman_ros.ros.managed import ManagedNode
-from koopman_ros.ros.node import Level, Status, wall_timer
-from koopman_ros.ros.process import run
+from koopman_ros.ros.process import events_executor, run
 from koopman_ros.ros.signals import Heard, Inlet, Outlet
 from koopman_ros.units import display_unit, LAST_STAMP_SECONDS, NANOSECONDS, seconds_text, shown
 from koopman_ros.wire import stem
@@ -388,7 +391,7 @@ class PlantNode(ManagedNode):
 
 def main(args: list[str] | None = None) -> int:
     """Run the plant node."""
-    return run('plant', PlantNode, args, hosts=True)
+    return run('plant', PlantNode, args, partial(run_loops, 'plant', PlantNode), events_executor)
 
 
 if __name__ == '__main__':

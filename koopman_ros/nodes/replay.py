@@ -24,7 +24,7 @@ from koopman_ros.parameters.controller import (
 )
 from koopman_ros.parameters.table import ConfigurationError
 from koopman_ros.parameters.trainer import preset_wiring
-from koopman_ros.parameters.wire import renamed, signals_of, Wiring
+from koopman_ros.parameters.wire import signals_of, Wiring
 from koopman_ros.replay.loop import Alternative, Replay, replay
 from koopman_ros.replay.records import Record, RecordError
 from koopman_ros.replay.report import ReplayedBag, reproduced, verdict, write_report
@@ -122,8 +122,6 @@ def replayed_bag(path: str, names: Names, parameters: ReplayParameters,
 def _tuning(model: LiftedModel, given: Mapping[str, Any]) -> dict[str, Any]:
     """Return what is given of a controller with a model; ConfigurationError where it is wrong."""
     table = table_of(model, given)
-    if former := renamed('controller', given, table):
-        raise ConfigurationError(former)
     own = {name: value for name, value in given.items()
            if name in table.rows and name not in ('model', 'system')}
     for name, value in own.items():

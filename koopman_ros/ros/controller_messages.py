@@ -29,8 +29,9 @@ from koopman_ros.parameters.wire import Signals
 from koopman_ros.reasons import level_words
 from koopman_ros.replay.records import fields_of, Record, SNAPSHOT, START
 from koopman_ros.ros import topics
-from koopman_ros.ros.node import Level, Status, words_of
-from koopman_ros.ros.watchdog import PAUSED, Timing
+from koopman_ros.ros.diagnostics import Level, Status
+from koopman_ros.ros.node import words_of
+from koopman_ros.ros.timing import PAUSED, Timing
 from koopman_ros.time_base import Advance
 from koopman_ros.units import display_unit, NANOSECONDS, shown
 from koopman_ros.values import record

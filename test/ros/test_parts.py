@@ -29,9 +29,10 @@ from koopman_ros.parameters.wire import Signals, signals_of, Wiring
 from koopman_ros.resources import model_path
 from koopman_ros.ros import model_reload, recorder, topics
 from koopman_ros.ros.controller_messages import active_limits, condition, planned
+from koopman_ros.ros.diagnostics import Level, Status
 from koopman_ros.ros.experiment import PlantExperiment
 from koopman_ros.ros.model_reload import load_suitable
-from koopman_ros.ros.node import Level, LoopNode, Status
+from koopman_ros.ros.node import LoopNode
 from koopman_ros.ros.recorder import receipt_ns, Recorder
 from koopman_ros.ros.recording import Recording
 from koopman_ros.ros.training import Training
