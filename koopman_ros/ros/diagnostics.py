@@ -41,7 +41,7 @@ class Status:
 
 class Diagnostics:
     """
-    Publish what the tasks of a node say of themselves, as diagnostic_updater would.
+    Publish the status of the tasks of a node, as diagnostic_updater would.
 
     :ivar hardware_id: names the plant.
     """
@@ -55,73 +55,78 @@ class Diagnostics:
         self._publisher = node.create_publisher(
             DiagnosticArray, DIAGNOSTICS, QoSProfile(depth=10),
             qos_overriding_options=QoSOverridingOptions.with_default_policies())
-        wall_timer(node, 1.0, lambda: self.publish(self.tasks))
+        wall_timer(node, 1.0, self._publish_all)
 
     def add(self, task: str, collect: Callable[[], Status]) -> DiagnosticTask:
         """Report a further task under the name ``<node>: <task>``."""
-        name = f'{self._node.get_fully_qualified_name().lstrip("/")}: {task}'
-        self.tasks.append(DiagnosticTask(self, name, collect))
+        return self.add_group(lambda: {task: collect()}, (task,))
+
+    def add_group(self, collect: Callable[[], Mapping[str, Status]], tasks: Sequence[str]
+                  ) -> DiagnosticTask:
+        """Report some tasks, whose statuses are collected together."""
+        self.tasks.append(DiagnosticTask(self, tasks, collect))
         return self.tasks[-1]
 
-    def remove(self, task: DiagnosticTask) -> None:
-        """Report a task no more."""
-        self.tasks.remove(task)
-
     def clear(self) -> None:
-        """Report none any more."""
+        """Report no task any more."""
         self.tasks.clear()
 
-    def publish(self, tasks: Sequence[DiagnosticTask]) -> None:
-        """Publish the present status of some tasks in one message."""
-        if not tasks:
+    def _publish_all(self) -> None:
+        self.publish([status for task in self.tasks for status in task.collect().items()])
+
+    def publish(self, statuses: Sequence[tuple[str, Status]]) -> None:
+        """Publish the status of some tasks in one message."""
+        if not statuses:
             return
-        message = DiagnosticArray(status=[task.status() for task in tasks])
+        prefix = self._node.get_fully_qualified_name().lstrip('/')
+        message = DiagnosticArray(status=[
+            self._message(f'{prefix}: {name}', status) for name, status in statuses])
         message.header.stamp = stamp_message(time.time_ns())
         self._publisher.publish(message)
 
-
-class DiagnosticTask:
-    """What one task of a node says of itself."""
-
-    def __init__(self, diagnostics: Diagnostics, name: str, collect: Callable[[], Status]
-                 ) -> None:
-        self._diagnostics, self._name, self._collect = diagnostics, name, collect
-        self._last: tuple[Level, str] | None = None
-
-    def status(self) -> DiagnosticStatus:
-        """Return its present status as a message."""
-        status = self._collected()
+    def _message(self, name: str, status: Status) -> DiagnosticStatus:
         try:
             values = status.values() if callable(status.values) else status.values
         except Exception as error:
             status, values = _failed(error), {}
-        self._last = (status.level, status.message)
         return DiagnosticStatus(
-            level=status.level.value, name=self._name, message=status.message,
-            hardware_id=self._diagnostics.hardware_id,
-            values=[KeyValue(key=key, value=(
+            level=status.level.value, name=name, message=status.message,
+            hardware_id=self.hardware_id, values=[KeyValue(key=key, value=(
                 f'{value:.9g}' if isinstance(value, float) else str(value)))
                 for key, value in values.items()])
 
-    def publish_if_changed(self) -> None:
-        """Publish at once when the level or the sentence differ from the last ones."""
-        # what is late in a part that was taken down has nobody to report to
-        if self not in self._diagnostics.tasks:
-            return
-        status = self._collected()
-        if (status.level, status.message) != self._last:
-            self._diagnostics.publish([self])
 
-    def _collected(self) -> Status:
+class DiagnosticTask:
+    """One task of a node, or some whose statuses are collected together."""
+
+    def __init__(self, diagnostics: Diagnostics, names: Sequence[str],
+                 collect: Callable[[], Mapping[str, Status]]) -> None:
+        self._diagnostics, self._names, self._collect = diagnostics, names, collect
+        self._last: dict[str, tuple[Level, str]] = {}
+
+    def collect(self) -> dict[str, Status]:
+        """Return the present status of each task."""
         # a failure of a report does not end the loop that it reports on
         try:
-            return self._collect()
+            found = dict(self._collect())
         except Exception as error:
-            return _failed(error)
+            found = dict.fromkeys(self._names, _failed(error))
+        self._last = {name: (status.level, status.message) for name, status in found.items()}
+        return found
+
+    def publish_if_changed(self) -> None:
+        """Publish at once each task whose level or sentence differs from the last."""
+        # a late change in a part that was taken down has nobody to report to
+        if self not in self._diagnostics.tasks:
+            return
+        last = self._last
+        self._diagnostics.publish([
+            (name, status) for name, status in self.collect().items()
+            if last.get(name) != self._last[name]])
 
     def destroy(self) -> None:
         """Report no more."""
-        self._diagnostics.remove(self)
+        self._diagnostics.tasks.remove(self)
 
 
 def _failed(error: Exception) -> Status:

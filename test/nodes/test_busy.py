@@ -36,7 +36,8 @@ from koopman_ros.ros import watchdog
 watchdog.PERIOD, watchdog._PATIENCE = 0.02, 0.2
 from koopman_ros.nodes import controller
 from koopman_ros.control import events
-controller._WATCH_STEP //= 5
+from koopman_ros.ros import control_loop
+control_loop._WATCH_STEP //= 5
 pipe, apply = sys.argv.pop(1), events.apply
 def slowly(*args):
     result = apply(*args)

@@ -28,7 +28,8 @@ from koopman_ros.parameters.trainer import trainer_table
 from koopman_ros.parameters.wire import Signals, signals_of, Wiring
 from koopman_ros.resources import model_path
 from koopman_ros.ros import model_reload, recorder, topics
-from koopman_ros.ros.controller_messages import active_limits, condition, planned
+from koopman_ros.ros.controller_messages import active_limits, planned
+from koopman_ros.ros.controller_status import statuses
 from koopman_ros.ros.diagnostics import Level, Status
 from koopman_ros.ros.experiment import PlantExperiment
 from koopman_ros.ros.model_reload import load_suitable
@@ -238,12 +239,12 @@ def test_a_manual_command_between_two_measurements_is_no_missing_measurement(
         state = own.step(state, model.states.center, k * 10 ** 9)[0]
     state = own.request_manual_input(state, model.inputs.center + 1.0)[0]
     state, _, report = own.hold(state, int((3.0 + silence) * 1e9), None)
-    ok = Status(Level.OK, '')
     now = SimpleNamespace(
         report=report, state=state, controller=own, signals=SIGNALS, measured=model.states.center,
-        parameters=SimpleNamespace(max_measurement_age=5.0), complaint='', open_loop=ok,
-        request='', model_refused='', counts=SimpleNamespace(measurements=3),
+        parameters=SimpleNamespace(max_measurement_age=5.0, measurement_timeout=0.0),
+        complaint='', unheard=(), unheard_for=0.0, request='', model_refused='', input='coolant',
+        counts=SimpleNamespace(measurements=3),
         timing=SimpleNamespace(silence=silence, paused=False, without_clock=False, age=math.nan,
                                no_news=lambda _: None))
-    found = condition(now, 'measurements')
+    found = statuses(now)['measurements']
     assert (found.level is Level.WARN) is warned
