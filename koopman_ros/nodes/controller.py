@@ -19,8 +19,14 @@ from std_srvs.srv import Trigger
 from koopman_ros.arrays import Array
 from koopman_ros.control import events, MANUAL, Mode, Recent, Report
 from koopman_ros.parameters.controller import built, ControllerParameters, table_of
+from koopman_ros.parameters.model_checks import (
+    load_suitable,
+    LoadedModel,
+    rests_outside,
+    Situation,
+)
 from koopman_ros.parameters.table import ConfigurationError
-from koopman_ros.parameters.wire import preset, shipped, signals_of, system_of, Wiring
+from koopman_ros.parameters.wire import preset, shipped, signals_of, system_of, Wiring, words_of
 from koopman_ros.reasons import level_words
 from koopman_ros.replay import records
 from koopman_ros.ros import controller_status as status
@@ -33,14 +39,7 @@ from koopman_ros.ros.host import run_loops
 from koopman_ros.ros.hosted import wall_timer
 from koopman_ros.ros.managed import ManagedNode
 from koopman_ros.ros.measurements import Measurements, Sample
-from koopman_ros.ros.model_reload import (
-    load_suitable,
-    LoadedModel,
-    ModelReload,
-    rests_outside,
-    Situation,
-)
-from koopman_ros.ros.node import words_of
+from koopman_ros.ros.model_reload import ModelReload
 from koopman_ros.ros.operator_requests import OperatorRequests
 from koopman_ros.ros.process import events_executor, run
 from koopman_ros.ros.signals import Outlet

@@ -11,12 +11,14 @@ import functools
 from functools import cached_property
 from pathlib import Path
 import re
+from types import MappingProxyType
 from typing import Any
 
 from koopman_ros.lifting import LiftedModel
 from koopman_ros.parameters.table import ConfigurationError, parameter
+from koopman_ros.reasons import Words
 from koopman_ros.resources import config_directory
-from koopman_ros.units import check_unit, conversion
+from koopman_ros.units import check_unit, conversion, Display, Displays
 from koopman_ros.wire import Place, place, SIGNAL_NAME, stem
 
 CONTROLLER_STATE = 'controller_state'
@@ -164,6 +166,11 @@ def signals_of(model: LiftedModel, controlled: tuple[str, ...] = (),
     own = tuple(name for name in states if name in named)
     return Signals(states, inputs, (named if len(own) < len(named) else own) or tuple(states),
                    {} if len(states) == len(every) else every)
+
+
+def words_of(signals: Signals, shown: Mapping[str, Display] = MappingProxyType({})) -> Words:
+    """Return the words for some signals; `shown` are those not written as they usually are."""
+    return Words(Displays(signals.units, {'K': Display('K', 'degC', '.2f'), **shown}))
 
 
 @dataclass(frozen=True)

@@ -35,8 +35,7 @@ def read_records(path: str | os.PathLike[str], topic: str, *, recover: bool = Fa
         known = ', '.join(name for name, count in sorted(content.counts.items()) if count)
         raise BagReadError(
             f'bag {os.fspath(path)!r} has no records of a controller on {topic!r}, it has '
-            f'{known or "none"}: record that topic, too (version 0.1 had none: its bags can be '
-            f'played and trained from), or name it, e.g. -r {topic[1:]}:=NAME')
+            f'{known or "none"}: record that topic, too, or name it, e.g. -r {topic[1:]}:=NAME')
     if content.types[topic] != RECORD_TYPE:
         raise BagReadError(
             f'topic {topic!r} of bag {os.fspath(path)!r} is {content.types[topic]} and not '

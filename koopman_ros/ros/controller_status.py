@@ -14,11 +14,10 @@ from koopman_ros.assembler import Assembler
 from koopman_ros.control import Arrival, Controller, HOLD, Mode, Report, SAFE, State
 from koopman_ros.control.state import TargetReport
 from koopman_ros.parameters.controller import ControllerParameters
-from koopman_ros.parameters.wire import Signals
+from koopman_ros.parameters.wire import Signals, words_of
 from koopman_ros.reasons import Code, level_words
 from koopman_ros.ros.controller_messages import by_label
 from koopman_ros.ros.diagnostics import Level, Status
-from koopman_ros.ros.node import words_of
 from koopman_ros.ros.timing import PAUSED, Timing
 from koopman_ros.time_base import Advance
 from koopman_ros.units import display_unit, shown

@@ -35,13 +35,13 @@ from koopman_ros.experiment import (
     Progress,
 )
 from koopman_ros.parameters.trainer import COMMAND, MANUAL, SETPOINT, TrainerParameters
-from koopman_ros.parameters.wire import Wiring
+from koopman_ros.parameters.wire import Wiring, words_of
 from koopman_ros.reasons import Code, Reason, reason
 from koopman_ros.ros import topics
 from koopman_ros.ros.codec import stamp_message, stamp_nanoseconds
 from koopman_ros.ros.diagnostics import Level, Status
 from koopman_ros.ros.managed import ManagedNode
-from koopman_ros.ros.node import Owned, words_of
+from koopman_ros.ros.node import Owned
 from koopman_ros.ros.signals import Heard, Inlet, Outlet
 from koopman_ros.units import display_unit, NANOSECONDS, shown
 from koopman_ros.wire import Place, stem

@@ -5,12 +5,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection, Mapping
+from collections.abc import Callable, Collection
 import copy
 import difflib
 from functools import cached_property
 import math
-from types import MappingProxyType
 from typing import Any, TypeVar
 
 from rcl_interfaces import msg
@@ -24,12 +23,10 @@ from rclpy.timer import Timer
 from rosgraph_msgs.msg import Clock as ClockMessage
 
 from koopman_ros.parameters.table import ConfigurationError, ParameterTable, Specification
-from koopman_ros.parameters.wire import Signals
 from koopman_ros.plugs import own_code
-from koopman_ros.reasons import Words
 from koopman_ros.ros.diagnostics import Diagnostics
 from koopman_ros.ros.hosted import HostableNode, Hosting, wall_timer
-from koopman_ros.units import Display, Displays, NANOSECONDS
+from koopman_ros.units import NANOSECONDS
 
 T = TypeVar('T')
 Entity = TypeVar('Entity', Publisher, Service, Subscription, Timer)
@@ -40,9 +37,6 @@ _RCLPY_PARAMETERS = ('use_sim_time', 'start_type_description_service')
 _DESTROY: dict[type, Callable[[Node, Any], object]] = {
     Publisher: Node.destroy_publisher, Subscription: Node.destroy_subscription,
     Service: Node.destroy_service, Timer: Node.destroy_timer}
-
-_SHOWN = {'K': Display('K', 'degC', '.2f')}
-
 
 class Owned:
     """Publishers, subscriptions, services and timers of one part of a node."""
@@ -268,8 +262,3 @@ def _as_python(value: Any) -> Any:
     if isinstance(value, (str, bytes, bool, int, float)) or value is None:
         return value
     return tuple(value)
-
-
-def words_of(signals: Signals, shown: Mapping[str, Display] = MappingProxyType({})) -> Words:
-    """Return the words for some signals; `shown` are those not written as they usually are."""
-    return Words(Displays(signals.units, {**_SHOWN, **shown}))

@@ -13,10 +13,9 @@ from std_srvs.srv import SetBool
 
 from koopman_ros.arrays import Array
 from koopman_ros.control import events, Mode
-from koopman_ros.parameters.wire import Wiring
+from koopman_ros.parameters.wire import Wiring, words_of
 from koopman_ros.ros import topics
 from koopman_ros.ros.control_loop import ControlLoop
-from koopman_ros.ros.node import words_of
 from koopman_ros.ros.signals import Heard, Inlet, MeasuredInputs
 from koopman_ros.units import display_unit, NANOSECONDS, shown
 from koopman_ros.wire import stem

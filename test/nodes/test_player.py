@@ -25,9 +25,9 @@ from koopman_ros import bags
 from koopman_ros.demo import reactor
 from koopman_ros.demo.loop import run_loop
 from koopman_ros.nodes import player
-from koopman_ros.nodes.replay import Names, replayed_bag
 from koopman_ros.parameters.controller import ReplayParameters
 from koopman_ros.parameters.trainer import player_table, preset_wiring
+from koopman_ros.replay.run import Names, replayed_bag
 from koopman_ros.resources import config_directory
 from koopman_ros.ros import topics
 from koopman_ros.ros.codec import stamp_nanoseconds
