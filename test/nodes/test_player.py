@@ -10,7 +10,6 @@ import time
 from typing import Any
 
 from mcap.reader import make_reader
-import numpy as np
 import pytest
 from rclpy.duration import Duration
 from rclpy.publisher import Publisher
@@ -105,18 +104,6 @@ def test_types_and_offers_are_those_of_ros(ros: Harness, recorded_loop: Path) ->
         profiles = yaml.safe_load(metadata['offered_qos_profiles'])
         assert {(profile['reliability'], profile['durability']) for profile in profiles} == {
             ('reliable', durability)}
-
-
-def test_second_run_is_bit_identical(tmp_path: Path, recorded_loop: Path) -> None:
-    run_loop(SCENARIO, tmp_path / 'again.mcap', tmp_path)
-    for topic in ('/temperature', '/coolant_setpoint', '/coolant_temperature'):
-        first, again = (bags.read_series(bag, topic)
-                        for bag in (recorded_loop, tmp_path / 'again.mcap'))
-        compared = slice(-50, None) if topic == '/coolant_temperature' else slice(None)
-        np.testing.assert_array_equal(first.stamp_ns[compared], again.stamp_ns[compared])
-        np.testing.assert_array_equal(first.values[compared].view(np.uint64),
-                                      again.values[compared].view(np.uint64))
-        assert len(np.unique(first.values)) > 45
 
 
 def write_bag(path: Path, entries: Sequence[tuple[str, Temperature, float]],

@@ -84,7 +84,7 @@ def happen(controller: Recorded, event: tuple) -> None:
             controller.snapshot()
 
 
-@settings(deadline=None, max_examples=50)
+@settings(deadline=None, max_examples=20)
 @given(st.lists(HAPPENS, max_size=60), st.sampled_from(sorted(MODELS)), st.integers(0, 59))
 def test_any_run_is_reproduced_from_its_start_and_from_any_place(
         happened: list[tuple], model: str, place: int) -> None:
@@ -273,6 +273,7 @@ def exact(value: object) -> str:
         return re.sub(r'np\.float64\(([^)]*)\)', r'\1', repr(value))
 
 
+@settings(max_examples=40)
 @given(VALUES)
 def test_values_survive_bit_identical(value: object) -> None:
     text = json.dumps(records.encoded(value), allow_nan=False)

@@ -117,16 +117,6 @@ ENDS = {
     'signals one after the other': (
         'kill = os.kill\n'
         'os.kill = lambda *signal: (kill(*signal), time.sleep(0.2))\n', r'.*'),
-    # what a module holds goes when the interpreter has given up its handlers
-    'another signal, very late': (
-        'class Late:\n'
-        '    def __del__(self, kill=os.kill, own=(os.getpid(), signal.SIGINT)):\n'
-        '        kill(*own)\n'
-        'late = Late()\n', r'.*'),
-    'a middleware that hangs': (
-        'process.take_down.__defaults__ = (0.3,)\n'
-        'PlantNode.destroy_node = lambda _: time.sleep(3600.0)\n',
-        r'.*plant: the middleware does not shut down: left to the operating system\n'),
     'a middleware that hangs with the lock held': (
         'process.take_down.__defaults__ = (0.1,)\n'
         'def destroy_node(self):\n'
@@ -222,21 +212,6 @@ def test_who_can_reach_a_node(environment: dict[str, str], is_open: bool) -> Non
     if is_open:
         assert 'in ROS domain 7' in note
         assert 'ROS_AUTOMATIC_DISCOVERY_RANGE=LOCALHOST' in note
-
-
-def test_node_that_is_open_to_the_network_says_so_once(ros: Harness) -> None:
-    # a node that believes itself open, on loopback
-    program = (
-        'import os, sys\n'
-        'from koopman_ros.ros import process\n'
-        'from koopman_ros.nodes.plant import PlantNode\n'
-        'said = process.open_to_the_network\n'
-        'process.open_to_the_network = lambda _: said({})\n'
-        'sys.exit(process.run("plant", PlantNode))\n')
-    process = ros.start('plant', command=(sys.executable, '-c', program))
-    ros.meet('plant')
-    assert process.stop() == 0
-    assert process.output().count('can command this node') == 1
 
 
 PARAMETERS = '/**:\n  ros__parameters:\n    '
