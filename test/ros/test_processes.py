@@ -48,7 +48,7 @@ def importing(names: tuple[str, ...], act: str, main: str) -> tuple[str, ...]:
     ('plant', signal.SIGINT, ('torch',)),
     # which an early rclpy lacks
     ('controller', signal.SIGTERM, ('torch', 'rclpy.experimental')),
-    ('trainer', signal.SIGINT, ('torch', 'scipy'))])
+    ('trainer', signal.SIGINT, ('torch',))])
 def test_signal_ends_a_node_on_loopback_cleanly_that_loads_only_what_it_needs(
         ros: Harness, tmp_path: Path, name: str, number: int, unneeded: tuple[str, ...]) -> None:
     # the plant is in the middle of a callback whenever the signal comes
