@@ -7,7 +7,6 @@ from __future__ import annotations
 
 from collections.abc import Callable, Collection, Mapping
 import copy
-import importlib
 import reprlib
 import time
 from typing import Any
@@ -39,7 +38,9 @@ from koopman_ros.parameters.wire import (
     OPERATOR_ACTIONS,
     Wiring,
 )
+from koopman_ros.plugs import plug
 from koopman_ros.ros.hosted import HostableNode
+from koopman_ros.ros.managed import one_line
 from koopman_ros.ros.node import Owned
 
 # JointState is the one stamped type of common_interfaces that carries named float64 values,
@@ -82,12 +83,12 @@ def unusable(node: Node, names: Collection[str]) -> str:
         try:
             validate_topic_name(name)
         except InvalidTopicNameException as error:
-            return f'topics: {" ".join(str(error).split())}'
+            return f'topics: {one_line(error)}'
         try:
             node.resolve_topic_name(name)
         except (RuntimeError, ValueError) as error:
-            reason = ' '.join(str(error).split(', at /')[0].split())
-            return f'topics: {reprlib.repr(name)} cannot be used ({reason}): choose another name'
+            return (f'topics: {reprlib.repr(name)} cannot be used ({one_line(error)}): choose '
+                    'another name')
     return ''
 
 
@@ -103,8 +104,8 @@ def message_class(type_name: str) -> Any:
     """Return the class of a ``package/msg/Name``; LookupError where it is not installed."""
     try:
         package, kind, name = type_name.split('/')
-        return getattr(importlib.import_module(f'{package}.{kind}'), name)
-    except (ImportError, AttributeError, ValueError) as error:
+        return plug(f'{package}.{kind}:{name}', 'message type', {})
+    except ValueError as error:
         raise LookupError(
             f'message type {type_name!r} is not installed here: source its workspace') from error
 

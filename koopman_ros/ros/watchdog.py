@@ -8,6 +8,7 @@ import os
 import signal
 import threading
 
+from koopman_ros.plugs import contained
 from koopman_ros.startup import end_by_force, SIGNALS
 
 PERIOD = 0.1  # s by the wall, of the executor's own watch and of the one over it
@@ -53,9 +54,10 @@ class Watchdog:
             return
         try:
             self._act(self._missed * PERIOD)
-        except Exception as error:
-            # the next look may succeed
-            self._failure = error
+        except BaseException as error:
+            # the next look may succeed; code of one's own may raise SystemExit
+            text = contained(error)
+            self._failure = error if isinstance(error, Exception) else RuntimeError(text)
 
     def _run(self) -> None:
         while not self._over.wait(PERIOD):
