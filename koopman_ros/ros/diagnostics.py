@@ -17,7 +17,7 @@ from rclpy.qos_overriding_options import QoSOverridingOptions
 from koopman_ros.parameters.wire import DIAGNOSTICS
 from koopman_ros.plugs import contained
 from koopman_ros.ros.codec import stamp_message
-from koopman_ros.ros.hosted import HostableNode, wall_timer
+from koopman_ros.ros.hosted import HostedNode, wall_timer
 
 
 class Level(Enum):
@@ -48,7 +48,7 @@ class Diagnostics:
 
     hardware_id = ''
 
-    def __init__(self, node: HostableNode) -> None:
+    def __init__(self, node: HostedNode) -> None:
         self._node = node
         self.tasks: list[DiagnosticTask] = []  #: that are reported
         # as everywhere, by parameter

@@ -22,7 +22,15 @@ from std_msgs.msg import String
 
 from koopman_ros.arrays import Array
 from koopman_ros.assembler import Assembler
-from koopman_ros.experiment import advance, begin, end, Experiment, Following, Phase, Progress
+from koopman_ros.experiment import (
+    advance,
+    begin,
+    end,
+    Experiment,
+    Phase,
+    Progress,
+    TrackingMonitor,
+)
 from koopman_ros.parameters.trainer import COMMAND, MANUAL, SETPOINT, TrainerParameters
 from koopman_ros.parameters.wire import Wiring
 from koopman_ros.reasons import Code, Reason, reason
@@ -36,8 +44,8 @@ from koopman_ros.units import display_unit, NANOSECONDS, shown
 from koopman_ros.wire import Place, stem
 
 _TICK = 0.1  # s
-_ASTRAY = 10  # commands of a controller, and
-_ASTRAY_TIME = 1.0  # s, after which it is said not to follow
+_DEVIATIONS = 10  # commands of a controller, and
+_DEVIATION_TIME = 1.0  # s, after which it is said not to follow
 _PATIENCE = 0.5  # s that the first measurement waits for the present inputs
 _FAREWELL = 2.0  # s for the way back at the end of the process
 _ACKNOWLEDGED = 0.2  # s for the last command to arrive
@@ -86,7 +94,8 @@ class ExperimentRun:
         self._first_at = math.inf
         self._frame_id, self._heard_at = '', time.monotonic()
         self._sent: Array | None = None
-        self._following = [Following(float(span)) for span in self.plan.upper - self.plan.lower]
+        self._monitors = [TrackingMonitor(span)
+                          for span in (self.plan.upper - self.plan.lower).tolist()]
         self._owned = owned = Owned(node)
         self.destroy = owned.destroy  #: commands no more
         self._assembler = Assembler(
@@ -302,8 +311,8 @@ class ExperimentRun:
             if name not in values:
                 continue
             value, asked = values[name], float(self.progress.command[i])
-            following = self._following[i] = self._following[i].after(value, asked, now)
-            if following.astray >= _ASTRAY and now - following.since >= _ASTRAY_TIME:
+            monitor = self._monitors[i] = self._monitors[i].after(value, asked, now)
+            if monitor.deviations >= _DEVIATIONS and now - monitor.since >= _DEVIATION_TIME:
                 self._on_end(reason(code, signal=name, value=value, requested=asked))
                 return False
         return True

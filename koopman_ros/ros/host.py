@@ -19,7 +19,7 @@ from koopman_ros.parameters.table import ConfigurationError
 from koopman_ros.plugs import contained
 from koopman_ros.resources import config_directory, LEAN_PROFILE
 from koopman_ros.ros.diagnostics import Diagnostics, Level, Status
-from koopman_ros.ros.hosted import HostableNode, Hosting, wall_timer
+from koopman_ros.ros.hosted import HostContext, HostedNode, wall_timer
 from koopman_ros.ros.managed import ManagedNode, one_line, START_ERRORS
 from koopman_ros.ros.node import LoopNode
 from koopman_ros.ros.process import (
@@ -84,7 +84,7 @@ class Host:
         self._failed: dict[str, str] = {}  # why, by namespace
         self._set_aside: list[LoopNode] = []  # whose watchdogs stand in for them
         self._leaving: list[str] = []
-        self._node = HostableNode(f'{name}_host', None)
+        self._node = HostedNode(f'{name}_host', None)
         if self._node.get_namespace() != '/':
             raise ConfigurationError(
                 f'-r __ns:={self._node.get_namespace()} would put all loops there: write '
@@ -135,7 +135,7 @@ class Host:
             self._turn()
 
     def _begin(self, namespace: str) -> None:
-        hosting = Hosting(len(self._loops), partial(self._fail, namespace))
+        hosting = HostContext(len(self._loops), partial(self._fail, namespace))
         try:
             node = self._create(namespace=namespace, hosting=hosting)
             if isinstance(node, ManagedNode) and node.get_parameter('autostart').value:
@@ -203,7 +203,7 @@ class Host:
             'longest delay of a timer [ms]': 1e3 * delay})
 
 
-def _destroy(node: HostableNode) -> None:
+def _destroy(node: HostedNode) -> None:
     if isinstance(node, LoopNode):
         node.complete()
     node.destroy_node()

@@ -25,15 +25,15 @@ _POLL = 0.02  # s between two steps of an asynchronous callback
 
 
 @dataclass(frozen=True)
-class Hosting:
+class HostContext:
     """The share of a node in a process of many."""
 
     loops: int  #: that share the process
     failed: Callable[[BaseException], None]  #: called with the exception of a callback
-    made: list[HostableNode] = field(default_factory=list)  #: the node, also a half-made one
+    made: list[HostedNode] = field(default_factory=list)  #: the node, also a half-made one
 
 
-class HostableNode(Node):
+class HostedNode(Node):
     """
     A node that may share its process with others.
 
@@ -41,7 +41,7 @@ class HostableNode(Node):
     :ivar steady_clock: runs while simulated time stands still.
     """
 
-    def __init__(self, name: str, hosting: Hosting | None, **options: Any) -> None:
+    def __init__(self, name: str, hosting: HostContext | None, **options: Any) -> None:
         self.hosting = hosting
         # rclpy's EventsExecutor has a thread for each clock, and warns of many timers of one
         self.steady_clock = Clock(clock_type=ClockType.STEADY_TIME)
@@ -113,7 +113,7 @@ class HostableNode(Node):
         return call
 
 
-def wall_timer(node: HostableNode, seconds: float, callback: Callable[[], Any], **options: Any
+def wall_timer(node: HostedNode, seconds: float, callback: Callable[[], Any], **options: Any
                ) -> Timer:
     """Create a timer by the steady clock, which runs while simulated time stands still."""
     return node.create_timer(seconds, node.guarded(callback), clock=node.steady_clock, **options)

@@ -12,7 +12,7 @@ from koopman_ros.arrays import Array
 from koopman_ros.assembler import Assembler
 from koopman_ros.parameters.wire import LONGEST_FRAME_ID, Wiring
 from koopman_ros.ros import topics
-from koopman_ros.ros.hosted import HostableNode, wall_timer
+from koopman_ros.ros.hosted import HostedNode, wall_timer
 from koopman_ros.ros.signals import Heard, Inlet, MeasuredInputs
 from koopman_ros.ros.timing import Timing
 from koopman_ros.time_base import TimeBase
@@ -38,7 +38,7 @@ class Measurements:
     :param answer: called with each measurement.
     """
 
-    def __init__(self, node: HostableNode, matching: topics.Matching, wiring: Wiring,
+    def __init__(self, node: HostedNode, matching: topics.Matching, wiring: Wiring,
                  exclusive: Mapping[str, str], tolerance: float,
                  answer: Callable[[Sample], None]) -> None:
         signals = wiring.signals

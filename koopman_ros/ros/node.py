@@ -25,7 +25,7 @@ from rosgraph_msgs.msg import Clock as ClockMessage
 from koopman_ros.parameters.table import ConfigurationError, ParameterTable, Specification
 from koopman_ros.plugs import own_code
 from koopman_ros.ros.diagnostics import Diagnostics
-from koopman_ros.ros.hosted import HostableNode, Hosting, wall_timer
+from koopman_ros.ros.hosted import HostContext, HostedNode, wall_timer
 from koopman_ros.units import NANOSECONDS
 
 T = TypeVar('T')
@@ -41,7 +41,7 @@ _DESTROY: dict[type, Callable[[Node, Any], object]] = {
 class Owned:
     """Publishers, subscriptions, services and timers of one part of a node."""
 
-    def __init__(self, node: HostableNode) -> None:
+    def __init__(self, node: HostedNode) -> None:
         self._node = node
         self._entities: list[Any] = []
 
@@ -61,7 +61,7 @@ class Owned:
             _DESTROY[type(entity)](self._node, entity)
 
 
-class LoopNode(HostableNode):
+class LoopNode(HostedNode):
     """
     A node whose parameters are those of a table, and which may complete work before its end.
 
@@ -76,7 +76,7 @@ class LoopNode(HostableNode):
     exit_code: int | None = None
     _clocks_refused = 0
 
-    def __init__(self, name: str, hosting: Hosting | None = None, **options: Any) -> None:
+    def __init__(self, name: str, hosting: HostContext | None = None, **options: Any) -> None:
         self._followers: list[Any] = []  # callbacks by which tables are followed
         self._code: dict[str, list[str]] = {}  # module:name at the start, by parameter
         self._ranges: dict[str, msg.FloatingPointRange | msg.IntegerRange] = {}

@@ -39,7 +39,7 @@ from koopman_ros.parameters.wire import (
     Wiring,
 )
 from koopman_ros.plugs import plug
-from koopman_ros.ros.hosted import HostableNode
+from koopman_ros.ros.hosted import HostedNode
 from koopman_ros.ros.managed import one_line
 from koopman_ros.ros.node import Owned
 
@@ -122,7 +122,7 @@ class Matching:
     :param single: what is done on topics on which only one node may publish, in words.
     """
 
-    def __init__(self, node: HostableNode, on_change: Callable[[], None],
+    def __init__(self, node: HostedNode, on_change: Callable[[], None],
                  single: Mapping[str, str] | None = None) -> None:
         self._node, self._on_change, self._single = node, on_change, single or {}
         self._owned = Owned(node)

@@ -9,7 +9,7 @@ import pytest
 
 from koopman_ros.parameters.table import ConfigurationError
 from koopman_ros.ros.host import read_loops
-from koopman_ros.ros.hosted import HostableNode, Hosting
+from koopman_ros.ros.hosted import HostContext, HostedNode
 from koopman_ros.ros.process import answer
 
 
@@ -23,9 +23,9 @@ def test_error_of_a_callback_goes_to_the_hosting(error: BaseException) -> None:
         return value
 
     class Callback:
-        hosting = Hosting(1, failed.append)
+        hosting = HostContext(1, failed.append)
 
-    guarded = HostableNode.guarded(Callback, act)  # type: ignore[arg-type]
+    guarded = HostedNode.guarded(Callback, act)  # type: ignore[arg-type]
     assert guarded(3) == 3
     assert guarded(-3) is None
     assert failed == [error]

@@ -16,7 +16,7 @@ from std_msgs.msg import String
 from std_srvs.srv import Trigger
 
 from koopman_ros.ros.diagnostics import Level, Status
-from koopman_ros.ros.hosted import Hosting, wall_timer
+from koopman_ros.ros.hosted import HostContext, wall_timer
 from koopman_ros.ros.managed import ManagedNode
 from koopman_ros.ros.process import events_executor
 from koopman_ros.testing import Harness
@@ -138,7 +138,7 @@ def test_what_waits_is_refused_or_dropped_when_it_is_taken_down(shared_ros: Harn
             return response
 
     failures: list[BaseException] = []
-    node = Own('own', context=ros.node.context, hosting=Hosting(1, failures.append))
+    node = Own('own', context=ros.node.context, hosting=HostContext(1, failures.append))
     node.start()
     speakers = [ros.node.create_publisher(String, f'words_{kind}', 100) for kind in range(2)]
     client = ros.node.create_client(Trigger, 'own/serve')
