@@ -9,8 +9,7 @@ from typing import Any
 
 from koopman_ros.parameters.controller import REPLAY_TABLE, ReplayParameters
 from koopman_ros.parameters.model_checks import load_suitable
-from koopman_ros.parameters.trainer import preset_wiring
-from koopman_ros.replay.run import Names, replay_bags, Result, tuning
+from koopman_ros.replay.run import replay_bags, Result, tuning
 from koopman_ros.ros import topics
 from koopman_ros.ros.node import LoopNode
 from koopman_ros.ros.process import run_task
@@ -25,20 +24,15 @@ def _prepare() -> Callable[[], int]:
         # those of a controller with the new model may be given, too
         beside = tuning(load_suitable(new_model, force=True).model, given) if new_model else ()
         parameters = node.declare_table(REPLAY_TABLE, beside)
-        wiring = preset_wiring(parameters.system)
-        names = Names(
-            node.resolve_topic_name(topics.CONTROLLER_EVENTS), node.get_namespace(),
-            {} if wiring is None else {
-                place.topic: node.resolve_topic_name(place.topic)
-                for place in wiring.commands.values()})
+        topic = node.resolve_topic_name(topics.CONTROLLER_EVENTS)
     finally:
         node.destroy_node()
-    return lambda: _run(parameters, names, given)
+    return lambda: _run(parameters, topic, given)
 
 
-def _run(parameters: ReplayParameters, names: Names, given: Mapping[str, Any]) -> int:
+def _run(parameters: ReplayParameters, topic: str, given: Mapping[str, Any]) -> int:
     try:
-        result = replay_bags(parameters, names, given)
+        result = replay_bags(parameters, topic, given)
     except MemoryError:
         print('replay: memory does not suffice for these bags: replay them one by one, or shorter '
               'ones', file=sys.stderr)

@@ -4,7 +4,6 @@
 """Replay of bags: their records, the models and parameters that these name, and the report."""
 
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass, field, replace
 import enum
 from pathlib import Path
 from types import MappingProxyType
@@ -18,13 +17,14 @@ from koopman_ros.lifting import LiftedModel
 from koopman_ros.parameters.controller import built, ReplayParameters, table_of
 from koopman_ros.parameters.model_checks import load_suitable
 from koopman_ros.parameters.table import ConfigurationError
-from koopman_ros.parameters.wire import CONTROLLER_EVENTS, signals_of, Wiring
+from koopman_ros.parameters.wire import CONTROLLER_EVENTS, signals_of
 from koopman_ros.replay.loop import Alternative, Replay, replay
 from koopman_ros.replay.records import Record, RecordError
 from koopman_ros.replay.report import ReplayedBag, reproduced, verdict, write_report
-from koopman_ros.replay.sources import command_counts, lately, Models, read_records
+from koopman_ros.replay.sources import lately, Models, read_records
 from koopman_ros.resources import config_directory, model_path
-from koopman_ros.wire import Place
+
+RECORDS = f'/{CONTROLLER_EVENTS}'  # topic of the records in a bag
 
 
 class Result(enum.IntEnum):
@@ -35,26 +35,13 @@ class Result(enum.IntEnum):
     NOTHING_COMPARED = 3
 
 
-@dataclass(frozen=True)
-class Names:
-    """The topics of a controller in a bag, as absolute names."""
-
-    records: str = f'/{CONTROLLER_EVENTS}'
-    namespace: str = '/'  #: of the controller
-    #: topics of commands that are remapped
-    commands: Mapping[str, str] = field(default_factory=dict)
-
-    def of(self, topic: str) -> str:
-        """Return the absolute name of a topic of commands."""
-        relative = f'{self.namespace.rstrip("/")}/{topic}'
-        return self.commands.get(topic, topic if topic.startswith('/') else relative)
-
-
-def replay_bags(parameters: ReplayParameters, names: Names,
+def replay_bags(parameters: ReplayParameters, topic: str = RECORDS,
                 given: Mapping[str, Any] = MappingProxyType({})) -> Result:
     """
-    Replay bags and write the report; `given` are the parameters that replace recorded ones.
+    Replay bags and write the report.
 
+    :param topic: absolute name of that of the records.
+    :param given: parameters that replace recorded ones.
     :raises BagReadError, ModelFileError, ConfigurationError: also without the package that draws.
     """
     try:
@@ -65,7 +52,7 @@ def replay_bags(parameters: ReplayParameters, names: Names,
             'the picture needs matplotlib, which is missing: pip install matplotlib, or '
             'apt-get install python3-matplotlib') from error
 
-    bags = [replayed_bag(path, names, parameters, given) for path in parameters.bags]
+    bags = [replayed_bag(path, parameters, topic, given) for path in parameters.bags]
     folder, new_model = Path(parameters.output), parameters.new_model
     folder.mkdir(parents=True, exist_ok=True)
     pictures = ['replay.png'] if len(bags) == 1 else [
@@ -83,14 +70,14 @@ def replay_bags(parameters: ReplayParameters, names: Names,
     return Result.REPRODUCED if all(map(reproduced, bags)) else Result.NOTHING_COMPARED
 
 
-def replayed_bag(path: str, names: Names, parameters: ReplayParameters,
+def replayed_bag(path: str, parameters: ReplayParameters, topic: str = RECORDS,
                  given: Mapping[str, Any] = MappingProxyType({})) -> ReplayedBag:
     """Replay one bag; arguments and errors are those of :func:`replay_bags`."""
     alternative = None
     if parameters.new_model:
         new = load_suitable(parameters.new_model, force=True)
         alternative = Alternative(new.model, new.digest, tuning(new.model, given))
-    records = read_records(path, names.records, recover=parameters.recover)
+    records = read_records(path, topic, recover=parameters.recover)
     if parameters.last:
         records = lately(records, parameters.last)
     try:
@@ -99,13 +86,8 @@ def replayed_bag(path: str, names: Names, parameters: ReplayParameters,
             if parameters.model else [], alternative)
     except RecordError as error:
         raise BagReadError(f'bag {path!r}: {error}') from error
-    places = _commands(found, names)
-    return ReplayedBag(
-        path, summary(path).complete, found,
-        command_counts(path, places, recover=parameters.recover, since_ns=(
-            found.samples[0].stamp_ns if parameters.last and found.samples else 0)),
-        places, parameters.tolerance,
-        None if alternative is None else alternative.model.states)
+    return ReplayedBag(path, summary(path).complete, found, parameters.tolerance,
+                       None if alternative is None else alternative.model.states)
 
 
 def replay_records(records: Iterable[Record], models: Sequence[Path] = (),
@@ -131,18 +113,6 @@ def tuning(model: LiftedModel, given: Mapping[str, Any]) -> dict[str, Any]:
     if reason := table.check(table.snapshot(own)):
         raise ConfigurationError(reason)
     return own
-
-
-def _commands(found: Replay, names: Names) -> tuple[Place, ...]:
-    """Return where the inputs of a replayed controller were commanded, in the bag."""
-    if found.controller is None:
-        return ()
-    model = found.controller.model
-    snapshot = table_of(model, found.parameters).snapshot(found.parameters)
-    wiring = Wiring(signals_of(model, snapshot.controlled, snapshot.states), snapshot.states,
-                    snapshot.inputs)
-    return tuple(replace(place, topic=names.of(place.topic))
-                 for place in wiring.commands.values())
 
 
 def _controller(values: Mapping[str, Any], model: LiftedModel) -> Controller:

@@ -26,7 +26,7 @@ from koopman_ros.demo.loop import run_loop
 from koopman_ros.nodes import player
 from koopman_ros.parameters.controller import ReplayParameters
 from koopman_ros.parameters.trainer import player_table, preset_wiring
-from koopman_ros.replay.run import Names, replayed_bag
+from koopman_ros.replay.run import replayed_bag
 from koopman_ros.resources import config_directory
 from koopman_ros.ros import topics
 from koopman_ros.ros.codec import stamp_nanoseconds
@@ -81,9 +81,9 @@ def test_another_reader_finds_every_measurement_and_command(recorded_loop: Path)
 
 
 def test_replay_reproduces_every_command(recorded_loop: Path) -> None:
-    found = replayed_bag(str(recorded_loop), Names(), ReplayParameters())
+    found = replayed_bag(str(recorded_loop), ReplayParameters())
     assert found.check.identical == found.check.compared == SAMPLES
-    assert (found.unexplained, found.found.lost) == (0, [])
+    assert found.found.lost == []
 
 
 def test_types_and_offers_are_those_of_ros(ros: Harness, recorded_loop: Path) -> None:
