@@ -92,9 +92,7 @@ class Host:
         self.executor = events_executor()
         self.executor.add_node(self._node)
         self._diagnostics = Diagnostics(self._node).add('loops', self._status)
-        self._delay = self._share = 0.0
-        self._looked = self._measured = time.monotonic()
-        self._processor = time.process_time()
+        self._delay, self._looked = 0.0, time.monotonic()
         wall_timer(self._node, _PERIOD, self._look)
         if note := open_to_the_network(os.environ):
             self._node.get_logger().warning(note)
@@ -177,10 +175,6 @@ class Host:
     def _look(self) -> None:
         now = time.monotonic()
         self._delay, self._looked = max(self._delay, now - self._looked - _PERIOD), now
-        if now - self._measured > 1.0:
-            processor = time.process_time()
-            self._share = (processor - self._processor) / (now - self._measured)
-            self._measured, self._processor = now, processor
         self._leaving += [namespace for namespace, node in self._nodes.items()
                           if node.exit_code is not None and namespace not in self._leaving]
 
@@ -199,7 +193,6 @@ class Host:
         return Status(level, message, {
             'loops': len(self._loops), 'running': running, 'failed': len(failed),
             'to be started': len(self._waiting),
-            'processor share [%]': 100.0 * self._share,
             'longest delay of a timer [ms]': 1e3 * delay})
 
 
