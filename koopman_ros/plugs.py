@@ -5,6 +5,7 @@
 
 from collections.abc import Callable, Mapping
 import importlib
+import sys
 import traceback
 from typing import Any, TypeVar
 
@@ -86,6 +87,17 @@ def own_code(value: Any) -> list[str]:
     """Return the names of the form ``module:name`` in the value of a parameter."""
     names = [value] if isinstance(value, str) else list(value)
     return [name for name in names if isinstance(name, str) and ':' in name]
+
+
+def loaded_class(name: str) -> type[Any]:
+    """Return a class by ``module:name`` if its module is loaded; ValueError where it is not."""
+    module, _, path = name.partition(':')
+    found: Any = sys.modules.get(module)
+    for part in path.split('.'):
+        found = getattr(found, part, None)
+    if not isinstance(found, type):
+        raise ValueError(f'the class {name!r} is not known here')
+    return found
 
 
 def contained(error: BaseException) -> str:

@@ -37,7 +37,7 @@ ALLOWED = {
     'learning': {'control', 'jobs', 'lifting'},
     'identification': {'jobs', 'learning', 'lifting', 'plants'},
     'retraining': {'bags', 'control', 'identification', 'jobs', 'learning', 'lifting', 'plants'},
-    'replay': {'bags', 'control', 'lifting'},
+    'replay': {'bags', 'control', 'lifting', 'parameters'},
     'parameters': {'control', 'estimation', 'jobs', 'lifting', 'plants'},
     'jobs': set(),
     'panel': {'bags', 'parameters', 'replay'},

@@ -19,7 +19,8 @@ from koopman_ros.parameters.table import ConfigurationError
 from koopman_ros.parameters.trainer import player_table
 from koopman_ros.ros import topics
 from koopman_ros.ros.codec import stamp_message, stamp_nanoseconds
-from koopman_ros.ros.node import LoopNode, wall_timer
+from koopman_ros.ros.hosted import wall_timer
+from koopman_ros.ros.node import LoopNode
 from koopman_ros.ros.process import run
 from koopman_ros.units import NANOSECONDS
 

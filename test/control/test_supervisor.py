@@ -12,8 +12,8 @@ from scipy.optimize import brentq
 from koopman_ros.control import Controller, exchange, InputLimits, Settings, State, Supervisor
 from koopman_ros.control.supervisor import Requested, rest_under, WayBack
 from koopman_ros.lifting import Coordinates, linearised_model, Provenance
+from koopman_ros.parameters.model_checks import rests_outside
 from koopman_ros.reasons import Code, reason
-from koopman_ros.ros.model_reload import rests_outside
 from support.closed_loops import (
     controller,
     largest_step,

@@ -14,7 +14,7 @@ from unittest.mock import patch
 
 import numpy as np
 
-from koopman_ros.nodes.replay import replay_records
+from koopman_ros.replay.run import replay_records
 from koopman_ros.replay.records import parse, RecordError
 from validation.faults.case import Case, Trace
 
