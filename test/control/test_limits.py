@@ -21,6 +21,7 @@ from koopman_ros.control import (
     State,
 )
 from koopman_ros.control.limits import shifted, Transfer
+from studies.robustness.loop import changed_reactor
 from support.closed_loops import (
     controller,
     EPOCH,
@@ -31,7 +32,6 @@ from support.closed_loops import (
     shipped,
     START,
 )
-from validation.robustness.loop import changed_reactor
 
 
 @pytest.mark.parametrize(('previous', 'wanted', 'seconds', 'rate', 'u', 'at_range', 'at_rate'), [

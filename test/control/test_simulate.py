@@ -26,9 +26,9 @@ from koopman_ros.plants import (
 )
 from koopman_ros.signals import Outputs
 from koopman_ros.solvers import solve_riccati
+from studies.paper.optimal_control import exact_two_state_model
 from support.closed_loops import COOLANT, REACTOR, SETPOINT, shipped, START
 from support.random_lifts import coordinates
-from validation.paper.optimal_control import exact_two_state_model
 
 EVERYWHERE = 1e9  # half widths: the margin of a law that acts anywhere
 

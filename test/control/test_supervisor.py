@@ -14,6 +14,8 @@ from koopman_ros.control.supervisor import Requested, rest_under, WayBack
 from koopman_ros.lifting import Coordinates, linearised_model, Provenance
 from koopman_ros.reasons import Code, reason
 from koopman_ros.ros.model_reload import rests_outside
+from studies.robustness.disturbances import CHANGED
+from studies.robustness.loop import changed_reactor
 from support.closed_loops import (
     controller,
     largest_step,
@@ -28,8 +30,6 @@ from support.closed_loops import (
     START,
     supervisor_settings,
 )
-from validation.robustness.disturbances import CHANGED
-from validation.robustness.loop import changed_reactor
 
 SETTINGS = supervisor_settings(0.2, 1.0, hold_timeout=60.0, recovery_time=10.0)
 

@@ -16,6 +16,7 @@ import numpy as np
 import pytest
 import torch
 
+from benchmarks.retraining import drift_error
 import koopman_ros
 from koopman_ros.bags import loop_episodes
 from koopman_ros.control.law_check import check_law
@@ -32,7 +33,6 @@ from support.known_plants import CUBIC, methods, PAIR
 from support.long_records import bags_of, CASE, source, task
 from support.places import places
 from support.small_plants import BENT, bent_samples, bits, shards_of, SMALL, two_state_samples
-from validation.benchmarks.retraining import drift_error
 
 # a process of its own is one of two
 KINDS = ('', 'joblib:2', 'dask')

@@ -95,7 +95,7 @@ def test_everything_is_installed(installation: Installation) -> None:
     # the package alone, not what validates it
     beside = {path.name for path in installation.package.parent.iterdir()}
     assert 'koopman_ros' in beside
-    assert not {'validation', 'test', 'examples', 'support'} & beside
+    assert not {'studies', 'benchmarks', 'test', 'examples', 'support'} & beside
     program = ('import koopman_ros; from koopman_ros.resources import config_directory; '
                'print(koopman_ros.__file__); print(config_directory())')
     ended = run(installation.command(str(installation.python), '-c', program))
@@ -128,7 +128,7 @@ def test_a_tool_reads_its_parameters(installation: Installation, name: str) -> N
 
 
 def test_no_module_of_the_wheel_needs_the_repository(wheel: Installation) -> None:
-    """Neither validation, nor the configuration or the package as they lie there."""
+    """Neither studies, nor the configuration or the package as they lie there."""
     # nothing of it runs, so that nothing need be compiled
     ended = run(wheel.command(str(wheel.python), '-c', EVERYTHING),
                 env={**os.environ, 'NUMBA_DISABLE_JIT': '1'})

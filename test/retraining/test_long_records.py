@@ -10,12 +10,12 @@ from pathlib import Path
 
 import pytest
 
+from benchmarks.retraining import drift_error
 from koopman_ros.identification import Stopped
 from koopman_ros.retraining import retrain, Task, write_report
 from koopman_ros.retraining.record import read_record
 from support.long_records import bags_of, CASE, source, task
 from support.quick_retraining import quick_retraining
-from validation.benchmarks.retraining import drift_error
 
 BAGS = 10
 SAMPLES = BAGS * CASE.bag

@@ -7,9 +7,9 @@ from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 
+from benchmarks.retraining import cases, task_of, write_bags
 from koopman_ros.retraining import Task
 from koopman_ros.retraining.record import Source
-from validation.benchmarks.retraining import cases, task_of, write_bags
 
 CASE = replace(cases()['reactor at 1 Hz'], bag=4000)
 
