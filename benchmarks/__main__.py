@@ -10,13 +10,12 @@ import os
 from pathlib import Path
 import sys
 
-from benchmarks import growth
 from koopman_ros.reports import machine, write_figures
 
 # A part has its PLANS by extent, the PACKAGES whose versions matter, and `measure`, which fills
 # in the figures of one plan and yields them piece by piece as text.
 # It is a module here, imported when it is asked for: most need what the others do without.
-PARTS = ('training', 'retraining', 'recording', 'loop', 'panel', 'site', 'cluster', 'fleet')
+PARTS = ('training', 'recording', 'loop')
 
 
 def main(args: list[str] | None = None) -> int:
@@ -49,7 +48,6 @@ def main(args: list[str] | None = None) -> int:
             return 130
         figures['machine']['load_at_end'] = os.getloadavg()[0]
         write_figures(path, summary)
-        growth.draw(given.output / growth.FILE, summary)
     print(f'{path} holds all figures')
     return 0
 

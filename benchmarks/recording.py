@@ -30,7 +30,6 @@ _TOPIC, _TYPE = '/temperature', 'sensor_msgs/msg/Temperature'
 _COMPRESSIONS = {'none': CompressionType.NONE, 'zstd': CompressionType.ZSTD}
 _STEADY_RATE = 1000.0  # Hz
 _DEPTH = 1000  # messages kept for the trainer
-_LATE = 1.02  # a publisher that needs this much longer than it should does not keep up
 _TIMEOUT = 30.0  # s, until the trainer has everything
 
 
@@ -39,25 +38,21 @@ class Plan:
     """One extent of the measurements."""
 
     seconds: float  #: length of the steady stream
-    rates: tuple[float, ...]  #: of the ladder, Hz
-    ladder_seconds: float  #: length of the stream on each step of the ladder
     messages: int  #: in each file written from memory
     runs: int  #: files by each writer
 
 
-PLANS = {'quick': Plan(10.0, (4e3, 16e3), 1.0, 20_000, 2),
-         'default': Plan(60.0, (2e3, 4e3, 8e3, 16e3, 32e3, 64e3), 5.0, 100_000, 3)}
+PLANS = {'quick': Plan(10.0, 20_000, 2), 'default': Plan(60.0, 100_000, 3)}
 
 
 def measure(plan: Plan, figures: dict[str, Any], folder: Path) -> Iterator[str]:
-    """Measure a minute at 1 kHz, a ladder of rates, and the writers side by side."""
+    """Measure a minute at 1 kHz, and the writers side by side."""
     with tempfile.TemporaryDirectory() as name:
         steady = figures['steady'] = _record(Path(name, 'steady'), _STEADY_RATE, plan.seconds)
         yield (f'recorder at {_STEADY_RATE:.0f} Hz: {steady["sent"]} messages sent, '
                f'{steady["recorded"]} recorded, {steady["lost"]} lost; '
                f'{steady["cpu_share"]:.1%} of a processor, '
                f'{steady["peak_memory_megabytes"]:.0f} MB of memory')
-        yield _climb(figures, plan, Path(name))
         messages = list(read_messages(Path(name, 'steady', 'bag.mcap'), [_TOPIC]))
         yield _compare(figures, messages, plan, Path(name, 'memory.mcap'))
 
@@ -75,7 +70,7 @@ def _record(folder: Path, rate: float, seconds: float) -> dict[str, Any]:
         trainer = harness.start('trainer', {'output': bag})
         publisher = harness.speak(Temperature, _TOPIC, QoSProfile(depth=_DEPTH), to='trainer')
         before = processor_seconds(trainer.process.pid)
-        took, latest = _publish(publisher, rate, count)
+        took = _publish(publisher, rate, count)
         if not publisher.wait_for_all_acked(Duration(seconds=_TIMEOUT)):
             raise RuntimeError(f'the trainer does not acknowledge within {_TIMEOUT:g} s')
         used = processor_seconds(trainer.process.pid) - before
@@ -90,8 +85,6 @@ def _record(folder: Path, rate: float, seconds: float) -> dict[str, Any]:
         'lost': count - len(set(numbers)),
         'in_order': all(a < b for a, b in itertools.pairwise(numbers)),
         'sent_hz': count / took,
-        'publisher_kept_up': took < _LATE * seconds,
-        'publisher_latest_seconds': latest,
         'cpu_share': used / took,
         'cpu_seconds_per_message': used / count,
         'peak_memory_megabytes': peak,
@@ -99,9 +92,9 @@ def _record(folder: Path, rate: float, seconds: float) -> dict[str, Any]:
     }
 
 
-def _publish(publisher: Publisher, rate: float, count: int) -> tuple[float, float]:
-    """Publish on schedule, the number k as stamp in ns; return the s it took and the most late."""
-    message, latest, begun = Temperature(), 0.0, time.monotonic()
+def _publish(publisher: Publisher, rate: float, count: int) -> float:
+    """Publish on schedule, the number k as stamp in ns; return the s it took."""
+    message, begun = Temperature(), time.monotonic()
     for k in range(count):
         due = begun + k / rate
         if (wait := due - time.monotonic()) > 0.0:
@@ -109,28 +102,7 @@ def _publish(publisher: Publisher, rate: float, count: int) -> tuple[float, floa
         message.header.stamp.sec, message.header.stamp.nanosec = divmod(k, NANOSECONDS)
         message.temperature = float(k)
         publisher.publish(message)
-        latest = max(latest, time.monotonic() - due)
-    return time.monotonic() - begun, latest
-
-
-def _climb(figures: dict[str, Any], plan: Plan, folder: Path) -> str:
-    """Raise the rate until messages are lost or the publisher does not keep up."""
-    steps = figures['ladder'] = []
-    highest, ended = None, 'the last step of the ladder'
-    for rate in plan.rates:
-        steps.append(one := _record(folder / f'{rate:.0f}', rate, plan.ladder_seconds))
-        (folder / f'{rate:.0f}' / 'bag.mcap').unlink()
-        if not one['lost']:
-            highest = one['sent_hz']
-        if reasons := ['messages were lost'] * bool(one['lost']) + [
-                'the publisher did not keep up'] * (not one['publisher_kept_up']):
-            ended = ' and '.join(reasons)
-            break
-    figures.update(highest_hz_without_loss=highest, ladder_ended_by=ended)
-    reached = 'no rate' if highest is None else f'{highest:.0f} Hz'
-    return table(('asked [Hz]', 'sent [Hz]', 'lost', 'processor'), [
-        (f'{one["rate_hz"]:.0f}', f'{one["sent_hz"]:.0f}', one['lost'], f'{one["cpu_share"]:.1%}')
-        for one in steps]) + f'\n\nwithout loss up to {reached}; ended by: {ended}'
+    return time.monotonic() - begun
 
 
 def _compare(figures: dict[str, Any], messages: Sequence[BagMessage], plan: Plan, path: Path
@@ -157,11 +129,10 @@ def _compare(figures: dict[str, Any], messages: Sequence[BagMessage], plan: Plan
             rows.append(_row(f'{label} from memory, {compression}', len(again) / wall,
                              cpu / len(again), one))
     plain = found['none']['plain_mcap']['cpu_seconds_per_message']
-    ratios = figures['recorder_cpu_ratio_to_plain_mcap'] = {}
-    for one in (figures['steady'], *figures['ladder']):
-        rate, cpu = f'{one["rate_hz"]:.0f}', one['cpu_seconds_per_message']
-        ratios[rate] = cpu / plain
-        rows.append(_row(f'recorder at {rate} Hz', one['sent_hz'], cpu, ratios[rate]))
+    steady = figures['steady']
+    cpu = steady['cpu_seconds_per_message']
+    ratio = figures['recorder_cpu_ratio_to_plain_mcap'] = cpu / plain
+    rows.append(_row(f'recorder at {_STEADY_RATE:.0f} Hz', steady['sent_hz'], cpu, ratio))
     return table(('', 'messages/s', 'CPU us each', 'ratio'), rows)
 
 

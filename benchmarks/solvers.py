@@ -4,17 +4,14 @@
 """The solvers in torch: our learner, L-BFGS and Adam; the clock of all solvers; our cost."""
 
 from collections.abc import Callable
-import ctypes
 import math
-from pathlib import Path
-from statistics import median
 import time
 
 import numpy as np
 import torch
 from torch import Tensor
 
-from benchmarks.problems import artificial, Case, WHITENING
+from benchmarks.problems import Case, WHITENING
 from benchmarks.process import allow, Tell
 from koopman_ros.learning.levenberg_marquardt import minimise, normal_equations, NormalEquations
 
@@ -200,62 +197,3 @@ def differentiable(case: Case) -> Callable[[Tensor], Tensor]:
                 + (weight * (moment[i, j] - eye).square()).sum())
 
     return objective
-
-
-def measure_cost(tell: Tell, sizes: list[tuple[int, int, int, int]], limit: float) -> None:
-    """
-    Measure what an iteration of our learner takes whose step is accepted.
-
-    Tells for each size (N, n_x, n_z, hidden units) the median of the time in s, on the wall (some
-    systems count processor time in ticks longer than an iteration), and the peak memory in MB
-    beyond that of the process with the data, None where the system does not tell it.
-    """
-    allow(tell, limit, f'stopped after {limit:g} s')
-    for size in sizes:
-        wanted = max(4, min(30, 100_000 // size[0]))
-        # what torch sets up at its first calls belongs to neither figure
-        warm = artificial(256, *size[1:])
-        minimise(warm.problem.add_residuals, warm.theta, max_iterations=2)
-        case = artificial(*size)
-        before = _restart_peak()
-        seconds = _seconds_of_accepted(case, wanted)
-        tell({'size': size, 'seconds': median(seconds),
-              'megabytes': before and _megabytes('VmHWM') - before})
-
-
-def _seconds_of_accepted(case: Case, wanted: int) -> list[float]:
-    problem = case.problem
-    taken: list[float] = []
-    stamp, accepted = math.nan, False
-
-    def residuals(theta: Tensor, equations: NormalEquations) -> None:
-        nonlocal accepted
-        accepted |= equations.derivatives
-        problem.add_residuals(theta, equations)
-
-    def monitor(iteration: int, cost: float) -> bool:
-        nonlocal stamp, accepted
-        # the first iteration holds the evaluation at the start as well; a refused step is cheaper
-        if accepted and iteration > 1:
-            taken.append(time.perf_counter() - stamp)
-        stamp, accepted = time.perf_counter(), False
-        return len(taken) == wanted
-
-    minimise(residuals, case.theta, max_iterations=10 * wanted, tolerance=0.0, monitor=monitor)
-    return taken
-
-
-def _restart_peak() -> float | None:
-    """Let the system forget the peak of the memory; return the present memory in MB."""
-    try:
-        # what the preparation took and freed would hide what the iterations take
-        ctypes.CDLL(None).malloc_trim(0)
-        Path('/proc/self/clear_refs').write_text('5')
-    except (OSError, AttributeError):
-        return None
-    return _megabytes('VmRSS')
-
-
-def _megabytes(name: str) -> float:
-    lines = Path('/proc/self/status').read_text().splitlines()
-    return next(float(line.split()[1]) / 1024.0 for line in lines if line.startswith(name))

@@ -28,7 +28,6 @@ from koopman_ros.control import (
     State,
 )
 from koopman_ros.control.simulate import after_a_second
-from koopman_ros.kernels import COMPILED, named
 from koopman_ros.lifting import LiftedModel, load, NetworkObservables
 from koopman_ros.parameters.controller import table_of
 from koopman_ros.parameters.wire import signals_of
@@ -49,11 +48,7 @@ _BENT = 1e-9
 
 
 def compare(n_z: int, samples: int) -> dict[str, Any]:
-    """
-    Time both sides on one course, block by block in turns, once they are seen to agree.
-
-    Beside them the step with compiled functions, where what compiles is installed.
-    """
+    """Time both sides on one course, block by block in turns, once they are seen to agree."""
     model = _lift(n_z)
     ours = Controller(model, table_of(model).snapshot({}).settings(signals_of(model)))
     course, requested = _course(ours, samples)
@@ -67,22 +62,15 @@ def compare(n_z: int, samples: int) -> dict[str, Any]:
     if not apart <= _TOLERANCE:
         raise ValueError(f'the commands for n_z = {n_z} differ by {apart:.2g} K, so the two sides '
                          f'are not the same law: they must agree to {_TOLERANCE:g} K')
-    sides, states = {'': ours}, {'': State()}
-    if (kernels := named(COMPILED)) is not None:
-        sides['compiled_'] = Controller(replace(model, kernels=kernels), ours.settings)
-        states['compiled_'] = State()
-    taken: dict[str, list[tuple[int, int]]] = {side: [] for side in (*sides, 'naive_')}
+    state = State()
+    taken: dict[str, list[tuple[int, int]]] = {'': [], 'naive_': []}
     for block in range(0, samples, _BLOCK):
-        for side, controller in sides.items():
-            state = states[side]
-            for k in range(block, min(block + _BLOCK, samples)):
-                if k in requested:
-                    state, _ = controller.request_setpoint(state, requested[k])
-                used, start = thread_time_ns(), perf_counter_ns()
-                state, _, _ = controller.step(
-                    state, course.measured[k], after_a_second(k * NANOSECONDS))
-                taken[side].append((perf_counter_ns() - start, thread_time_ns() - used))
-            states[side] = state
+        for k in range(block, min(block + _BLOCK, samples)):
+            if k in requested:
+                state, _ = ours.request_setpoint(state, requested[k])
+            used, start = thread_time_ns(), perf_counter_ns()
+            state, _, _ = ours.step(state, course.measured[k], after_a_second(k * NANOSECONDS))
+            taken[''].append((perf_counter_ns() - start, thread_time_ns() - used))
         for call in calls[block:block + _BLOCK]:
             used, start = thread_time_ns(), perf_counter_ns()
             naive_again.step(*call)

@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 The koopman_ros Authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""Training beside other solvers: seconds to a given accuracy, and how the cost grows."""
+"""Training beside other solvers and other model classes: seconds to a given accuracy."""
 
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
@@ -40,7 +40,6 @@ _COLOURS = {'ours': '#0b6e4f', 'ipopt': '#c8553d', 'ipopt_compiled': '#e8a33d',
 _DRAWN = (2000, 16)  # the case that is drawn
 _FIRST = 1e-3  # s, the left end of the time axis
 _REPEATED = 4.0  # s
-_COST_LIMIT = 240.0  # s
 # torch imports the latter for L-BFGS and Adam.
 _NEEDED = ('benchmarks.ipopt', 'torch._dynamo')
 _SEED = 0
@@ -58,25 +57,20 @@ class Plan:
     #: of a solver that takes no longer than four seconds, of which the middle one counts: a busy
     #: moment is long beside a short run
     runs: int
-    samples: tuple[int, ...]  #: N of the growth of the cost
-    n_z: tuple[int, ...]  #: likewise
-    n_x: tuple[int, ...]  #: likewise
     systems: tuple[str, ...] = tuple(SYSTEMS)
     #: by their names in the study of other plants: those that whole models are learned of
     learned: tuple[str, ...] = ()
 
 
 PLANS = {
-    'quick': Plan(((300, 8),), 1.0, 10.0, 4e3, 1, (1000, 10_000), (2, 3), (1, 2),
-                  learned=('two_tanks',)),
+    'quick': Plan(((300, 8),), 1.0, 10.0, 4e3, 1, learned=('two_tanks',)),
     'default': Plan(((300, 8), (2000, 8), (2000, 16), (2000, 32)), 20.0, 60.0, 8e3, 3,
-                    (1000, 10_000, 100_000, 1_000_000), (2, 3, 4, 5, 6, 7, 8), (1, 2, 3, 4),
                     learned=('two_tanks', 'van_der_pol', 'pendulum', 'reactor_saddle')),
 }
 
 
 def measure(plan: Plan, figures: dict[str, Any], folder: Path) -> Iterator[str]:
-    """Compare the solvers, measure how our cost grows, and draw both."""
+    """Compare the solvers, and draw rw over time."""
     figures['machine']['threads'] = 1
     figures.update(limit_seconds=plan.limit, cases=[],
                    clock='processor time of one thread; wall_seconds are those on the wall')
@@ -104,12 +98,6 @@ def measure(plan: Plan, figures: dict[str, Any], folder: Path) -> Iterator[str]:
                     'system': system, 'samples': samples, 'hidden': hidden,
                     'parameters': case.layout.size, **_figures(system, outcomes[-1])})
                 yield _table_of(figures['cases'][-1])
-            # memory is measured in a fresh process each
-            for n in plan.samples:
-                _add_cost(figures, 'samples', {n: (n, 2, 3, 16)}, within)
-            _add_cost(figures, 'n_z', {n: (2000, 1, n, 17) for n in plan.n_z}, within)
-            _add_cost(figures, 'n_x', {n: (2000, n, n + 2, 16) for n in plan.n_x}, within)
-            yield '\n\n'.join(_tables_of_cost(figures))
             for name in plan.learned:
                 yield _models(figures, name, within)
         finally:
@@ -157,8 +145,8 @@ def _figures(system: str, outcomes: dict[str, process.Outcome]) -> dict[str, Any
         'ratio_to_ours': _ratios(seconds),
         'seconds_with_build': with_build,
         'ratio_to_ours_with_build': _ratios(with_build),
-        'ipopt_build_seconds': built['ipopt'],
-        'ipopt_compiled_build_seconds': built['ipopt_compiled'],
+        **{f'{solver}_build_seconds': built[solver] for solver in built
+           if solver.startswith('ipopt')},
         'best_rw': {solver: min((event['rw'] for event in _trace(outcome)), default=None)
                     for solver, outcome in outcomes.items()},
         # where it is well above `seconds`, the machine was busy with something else
@@ -173,19 +161,6 @@ def _ratios(seconds: dict[str, dict[str, float | None]]) -> dict[str, dict[str, 
     return {name: {solver: None if t is None or not times['ours'] else t / times['ours']
                    for solver, t in times.items() if solver != 'ours'}
             for name, times in seconds.items()}
-
-
-def _add_cost(figures: dict[str, Any], name: str, sizes: dict[int, tuple[int, int, int, int]],
-              within: Callable[..., process.Outcome]) -> None:
-    _tell(f'cost of an iteration by {name}')
-    outcome = within(solvers.measure_cost, list(sizes.values()), _COST_LIMIT)
-    found = [event for event in outcome.events if 'size' in event]
-    if outcome.failure or len(found) < len(sizes):
-        raise RuntimeError(f'the cost by {name} could not be measured: {outcome.failure}')
-    for n, event in zip(sizes, found, strict=True):
-        figures.setdefault(f'seconds_per_iteration_by_{name}', {})[str(n)] = event['seconds']
-        if name == 'samples':
-            figures.setdefault('peak_memory_by_samples', {})[str(n)] = event['megabytes']
 
 
 def _models(figures: dict[str, Any], name: str, within: Callable[..., process.Outcome]) -> str:
@@ -227,29 +202,16 @@ def _table_of(case: dict[str, Any]) -> str:
             + table(('', *TARGETS, 'build [s]', ''), rows))
 
 
-def _tables_of_cost(figures: dict[str, Any]) -> Iterator[str]:
-    memory = figures['peak_memory_by_samples']
-    for title, name in (('N (n_x = 2, n_z = 3, 16 hidden units)', 'samples'),
-                        ('n_z (n_x = 1, 17 hidden units, N = 2000)', 'n_z'),
-                        ('n_x (n_z = n_x + 2, 16 hidden units, N = 2000)', 'n_x')):
-        peaks = memory if name == 'samples' else {}
-        yield f'cost of an iteration by {title}\n\n' + table((name, 'ms', 'peak memory [MB]'), [
-            (size, f'{1e3 * seconds:.3f}', f'{peaks[size]:.1f}' if peaks.get(size) else '-')
-            for size, seconds in figures[f'seconds_per_iteration_by_{name}'].items()])
-
-
 def _draw(path: Path, outcomes: list[dict[str, process.Outcome]], figures: dict[str, Any]
           ) -> None:
-    """Draw rw over time for all solvers and the cost of an iteration, as far as there is any."""
-    with drawing(path, 1, 3, size=(14.0, 5.0), width_ratios=(1.0, 1.0, 0.8)) as (figure, axes):
+    """Draw rw over time for all solvers."""
+    with drawing(path, 1, 2, size=(10.0, 5.0)) as (figure, axes):
         for ax, system in zip(axes, SYSTEMS, strict=False):
             of_system = [pair for pair in zip(figures['cases'], outcomes, strict=False)
                          if pair[0]['system'] == system]
             for case, found in sorted(of_system, key=lambda pair: (
                     pair[0]['samples'], pair[0]['hidden']) == _DRAWN)[-1:]:
                 _draw_traces(ax, found, case)
-        if 'seconds_per_iteration_by_samples' in figures:
-            _draw_cost(axes[2], figures)
         for solver, label in SOLVERS.items():
             axes[0].plot([], [], color=_COLOURS[solver], lw=_width(solver), label=label)
         legend(figure, axes[:1], len(SOLVERS))
@@ -288,21 +250,3 @@ def _draw_traces(ax: Axes, outcomes: dict[str, process.Outcome], case: dict[str,
            ylabel='relative residual rw on the training samples')
     ax.set_title(f'{case["system"]}: N = {case["samples"]}, n$_z$ = 3, {case["hidden"]} hidden '
                  'units', fontsize=10)
-
-
-def _draw_cost(ax: Axes, figures: dict[str, Any]) -> None:
-    by_samples = figures['seconds_per_iteration_by_samples']
-    samples, seconds = np.array([int(n) for n in by_samples]), np.array(list(by_samples.values()))
-    ax.plot(samples, seconds, 'o-', color=_COLOURS['ours'], lw=2.0,
-            label='ours, with its peak memory beyond the data')
-    ax.plot(samples, seconds[-1] * samples / samples[-1], color='0.5', lw=1.0, ls='--',
-            label='proportional to N')
-    for n, s in zip(samples, seconds, strict=True):
-        if peak := figures['peak_memory_by_samples'][str(n)]:
-            ax.annotate(f'{peak:.0f} MB', (n, s), xytext=(-8, 6), fontsize=8, ha='right',
-                        textcoords='offset points', color='0.3')
-    ax.legend(fontsize=8, loc='lower right')
-    ax.set(xscale='log', yscale='log', xlim=(samples[0] / 8, samples[-1] * 3),
-           ylim=(seconds[-1] * samples[0] / samples[-1] / 5, 3 * seconds[-1]),
-           xlabel='samples N', ylabel='time of an iteration [s]')
-    ax.set_title('a step of ours: n$_x$ = 2, n$_z$ = 3, 16 units', fontsize=10)
