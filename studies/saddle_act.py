@@ -36,10 +36,10 @@ from koopman_ros.control import (
     SupervisorSettings,
 )
 from koopman_ros.control.simulate import Simulation
-from koopman_ros.demo.console import LiveTable, read_options, run_act
-from koopman_ros.demo.hands import ActError, Hands
-from koopman_ros.demo.loop import FIRST_STAMP_NS, Row, running_loop, Scenario
+from koopman_ros.demo.console import LiveTable, read_options, run_demo
+from koopman_ros.demo.loop import FIRST_STAMP_NS, Operator, Row, running_loop, Scenario
 from koopman_ros.demo.reactor import constant
+from koopman_ros.demo.results import draw_phases
 from koopman_ros.estimation import SensorLimits
 from koopman_ros.lifting import Coordinates, LiftedModel, linearised_model, load, Provenance, save
 from koopman_ros.parameters.plant import PlantTable
@@ -131,13 +131,13 @@ def run_seed(folder: Path, seed: int, speed: float) -> dict[str, float | bool]:
         table.show(row)
 
     with table, running_loop(scenario, logs, _trainer_parameters(bags[0], learned, seed),
-                             on_row) as operator:
+                             on_row, table.announce) as operator:
         def on_estimate(message: JointState) -> None:
             estimates[stamp_nanoseconds(message.header.stamp)] = message
 
         operator.harness.node.create_subscription(
             JointState, CONTROLLER_STATE, on_estimate, LOOP_QOS)
-        phases = _act(Hands(operator, table), bags[1], learned)
+        phases = _operate(operator, bags[1], learned)
     model = load(learned)
     run = _reconstructed(rows, estimates, model, phases)
     figures = _figures(run, model, dict(phases)['lift'])
@@ -185,33 +185,32 @@ def _trainer_parameters(bag: Path, learned: Path, seed: int) -> dict[str, object
         'temperature.experiment_max': to_celsius(high + 10.0)}
 
 
-def _act(hands: Hands, bag: Path, learned: Path) -> list[tuple[str, float]]:
-    """Do it all; return name and start, in s of plant time, of each phase."""
-    operator = hands.operator
-    hands.begin('start-up', 'a PI law brings the reactor to its saddle and holds it there')
+def _operate(operator: Operator, bag: Path, learned: Path) -> list[tuple[str, float]]:
+    """Run all phases; return name and start, in s of plant time, of each phase."""
+    operator.begin('start-up', 'a PI law brings the reactor to its saddle and holds it there')
     operator.run_until(_SETTLED)
-    hands.record_anew(bag)
+    operator.record_anew(bag)
     operator.leave_setpoints()
-    hands.switch('trainer/experiment', True)
-    hands.begin('experiment', f'set-points are stepped for {MINUTES:.0f} min')
-    hands.wait_for('experiment', 'finished', _TIMEOUT)
-    hands.switch('trainer/experiment', False)
-    hands.begin('training', 'a lift is learned from temperature and coolant')
-    hands.train(learned, _TIMEOUT)
-    hands.set('controller', model=str(learned.resolve()), levels=list(LAWS),
+    operator.switch('trainer/experiment', True)
+    operator.begin('experiment', f'set-points are stepped for {MINUTES:.0f} min')
+    operator.wait_for('experiment', 'finished', _TIMEOUT)
+    operator.switch('trainer/experiment', False)
+    operator.begin('training', 'a lift is learned from temperature and coolant')
+    operator.train(learned, _TIMEOUT)
+    operator.set('controller', model=str(learned.resolve()), levels=list(LAWS),
               **{'temperature.setpoint_ramp': 0.0})
-    hands.begin('lift', 'the lift has taken over')
+    operator.begin('lift', 'the lift has taken over')
     begin = operator.seconds
     for when, value in COURSE.items():
         operator.request_setpoints({'temperature': value}, begin + when)
         # a later one in advance would be forgotten for it
         operator.run_until(begin + when + 1.0)
     operator.run_until(begin + FOULED)
-    hands.set('plant', **{'constants.heat_transfer_coefficient': (
+    operator.set('plant', **{'constants.heat_transfer_coefficient': (
         FOULING['heat_transfer_coefficient'] / UA * constant('heat_transfer_coefficient'))})
-    hands.begin('fouling', 'the jacket fouls: UA -15 %')
+    operator.begin('fouling', 'the jacket fouls: UA -15 %')
     operator.run_until(begin + END)
-    return hands.phases
+    return operator.phases
 
 
 def _reconstructed(rows: list[Row], estimates: Mapping[int, JointState], model: LiftedModel,
@@ -237,7 +236,7 @@ def _reconstructed(rows: list[Row], estimates: Mapping[int, JointState], model: 
             T[part] -= _CHANGE * (here - C[later]) / (beside - here)
     left = float(np.std(measured - T))
     if not 0.8 * NOISE < left < 1.2 * NOISE:
-        raise ActError(f"the plant's equations leave {left:.3g} K of the record, which has "
+        raise HarnessError(f"the plant's equations leave {left:.3g} K of the record, which has "
                        f'{NOISE} K of noise')
     found = np.full(len(rows), np.nan)
     for k, second in enumerate(seconds):
@@ -375,13 +374,7 @@ def draw(path: Path, run: _Run, phases: list[tuple[str, float]], model: LiftedMo
                       label='limit of the law')
         upper.set(ylabel='reactor temperature [°C]', title='A PI law holds the unstable reactor; '
                   f'a lift is learned from its temperature alone and takes over (seed {seed})')
-        low, high = upper.get_ylim()
-        upper.set_ylim(low, high + 0.1 * (high - low))
-        for name, start in phases:
-            for axes in (upper, middle, lower):
-                axes.axvline(start / SECONDS_PER_MINUTE, color='0.7', linewidth=0.8)
-            upper.text(start / SECONDS_PER_MINUTE, high + 0.09 * (high - low), f' {name}',
-                       va='top', fontsize=9)
+        draw_phases((upper, middle, lower), phases)
         upper.legend(loc='lower right', fontsize=8, ncols=2)
         draw_limits(middle, [to_celsius(float(b[0])) for b in (WIDE.lower, WIDE.upper)],
                     'coolant limits')
@@ -416,10 +409,9 @@ def run_saddle(output: Path, speed: float, seeds: int = SEEDS) -> dict[str, obje
 def main(args: list[str] | None = None) -> int:
     """Run it from the command line."""
     options = read_options(args, __doc__, 'out/demo-saddle', 200.0, seeds=SEEDS)
-    return run_act(partial(run_saddle, seeds=options.seeds), options,
-                   (ActError, HarnessError, OSError, ValueError),
-                   'summary.json, and for each seed saddle.png, two bags and '
-                   'learned.safetensors with its report')
+    return run_demo(partial(run_saddle, seeds=options.seeds), options,
+                    'summary.json, and for each seed saddle.png, two bags and '
+                    'learned.safetensors with its report')
 
 
 if __name__ == '__main__':

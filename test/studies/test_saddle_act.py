@@ -7,10 +7,10 @@ import numpy as np
 import pytest
 
 from koopman_ros.control import at, Initialisation, SetpointRequest, simulate
-from koopman_ros.demo.hands import ActError
 from koopman_ros.demo.loop import Row
 from koopman_ros.lifting import Coordinates, linearised_model, Provenance
 from koopman_ros.plants import Process
+from koopman_ros.testing import HarnessError
 from studies import saddle_act
 from studies.saddle import becomes, FOULING, reactor, truth
 from studies.unstable import steady
@@ -49,7 +49,7 @@ def test_temperatures_are_found_behind_their_noise(loop):
 
 
 def test_a_record_that_the_plant_does_not_explain_is_no_result(loop):
-    with pytest.raises(ActError, match='K of the record, which has'):
+    with pytest.raises(HarnessError, match='K of the record, which has'):
         saddle_act._reconstructed(rows(loop, 3.0), {}, truth(),
                                   [('lift', 0.0), ('fouling', float(FOULED))])
 

@@ -2,10 +2,10 @@
 # SPDX-License-Identifier: Apache-2.0
 
 """
-The demo's second act: the plant drifts, and its controller learns it anew from its record.
+The demo of retraining: the plant drifts, and its controller learns it anew from its record.
 
 Plant, controller and trainer run as three processes in lock-step; none is stopped or restarted.
-The disturbance observer is off: it would make up for the drift, and for what a lift lacks.
+The disturbance observer is off: it would remove the offset that shows an outdated model.
 """
 
 from dataclasses import replace
@@ -17,10 +17,9 @@ import time
 import numpy as np
 
 from koopman_ros.demo import reactor
-from koopman_ros.demo.console import LiveTable, read_options, run_act
-from koopman_ros.demo.hands import ActError, Hands
-from koopman_ros.demo.loop import running_loop
-from koopman_ros.demo.results import plot_retraining, read_run
+from koopman_ros.demo.console import LiveTable, read_options, run_demo
+from koopman_ros.demo.loop import Operator, running_loop
+from koopman_ros.demo.results import draw_phases, read_run, Run
 from koopman_ros.learning import roll_out
 from koopman_ros.lifting import LiftedModel, load
 from koopman_ros.parameters.trainer import MANUAL
@@ -30,9 +29,9 @@ from koopman_ros.plants import (
     RandomStepDesign,
     ReactorParameters,
 )
-from koopman_ros.reports import write_figures
+from koopman_ros.reports import draw_limits, drawing, LIMIT, write_figures
 from koopman_ros.resources import model_path
-from koopman_ros.testing import HarnessError
+from koopman_ros.units import to_celsius, ZERO_CELSIUS
 
 STEP = -10.0  # K
 FOULING = 0.8  # share of the heat transfer that is left
@@ -72,13 +71,13 @@ def run_retraining(output: Path, speed: float) -> dict[str, object]:
     table = LiveTable('a controller without observer learns its plant anew',
                       scenario.wiring.signals, _SHOWN)
     trainer = {'output': bags[0], 'model_output': new_model, **_EXPERIMENT}
-    with table, running_loop(scenario, logs, trainer, table.show) as operator:
-        phases = _act(Hands(operator, table), bags[1], new_model)
+    with table, running_loop(scenario, logs, trainer, table.show, table.announce) as operator:
+        phases = _operate(operator, bags[1], new_model)
     history = read_run(scenario.wiring, *bags)
     learned = load(new_model)
     trained = json.loads(new_model.with_suffix('.json').read_text())
-    plot_retraining(output / 'retraining.png', history, phases, setpoint, present, learned,
-                    reactor.coolant_parameters())
+    _draw(output / 'retraining.png', history, phases, setpoint, {
+        'shipped lift': (present, ':'), 'new lift': (learned, '-.')})
     reload = phases[-1][1]
     result: dict[str, object] = {
         'setpoint_kelvin': setpoint,
@@ -114,34 +113,65 @@ def rollout_rmse(model: LiftedModel) -> float:
     return float(np.sqrt(np.mean((predicted - truth.x) ** 2)))
 
 
-def _act(hands: Hands, second_bag: Path, new_model: Path) -> list[tuple[str, float]]:
-    """Do it all; return name and start, in s of plant time, of each phase."""
-    operator = hands.operator
-    hands.begin('shipped lift', 'set-point step of -10 K with the shipped lift')
+def _operate(operator: Operator, second_bag: Path, new_model: Path) -> list[tuple[str, float]]:
+    """Run all phases; return name and start, in s of plant time, of each phase."""
+    operator.begin('shipped lift', 'set-point step of -10 K with the shipped lift')
     operator.run_until(_DRIFT_TIME)
-    hands.set('plant', **{'constants.heat_transfer_coefficient': (
+    operator.set('plant', **{'constants.heat_transfer_coefficient': (
         FOULING * reactor.constant('heat_transfer_coefficient'))})
-    hands.begin('fouling', 'the cooling jacket fouls: a fifth of its heat transfer is lost')
+    operator.begin('fouling', 'the cooling jacket fouls: a fifth of its heat transfer is lost')
     # a new bag, so that the plant as it was is not among the data
-    hands.record_anew(second_bag)
+    operator.record_anew(second_bag)
     operator.run_until(_EXPERIMENT_TIME)
-    hands.switch('controller/set_automatic', False)
-    hands.switch('trainer/experiment', True)
-    hands.begin('experiment', f'manual mode: random steps for {_EXPERIMENT_MINUTES:.0f} min')
-    hands.wait_for('experiment', 'finished', _EXPERIMENT_TIMEOUT)
-    hands.switch('trainer/experiment', False)
-    hands.switch('controller/set_automatic', True)
-    hands.begin('training', 'automatic mode again; a lift is learned from the recording')
-    hands.train(new_model, _TRAINING_TIMEOUT)
-    hands.set('controller', model=str(new_model.resolve()))
-    hands.begin('new lift', 'the controller has taken the new lift over')
-    operator.run_until(hands.phases[-1][1] + _AFTER)
-    return hands.phases
+    operator.switch('controller/set_automatic', False)
+    operator.switch('trainer/experiment', True)
+    operator.begin('experiment', f'manual mode: random steps for {_EXPERIMENT_MINUTES:.0f} min')
+    operator.wait_for('experiment', 'finished', _EXPERIMENT_TIMEOUT)
+    operator.switch('trainer/experiment', False)
+    operator.switch('controller/set_automatic', True)
+    operator.begin('training', 'automatic mode again; a lift is learned from the recording')
+    operator.train(new_model, _TRAINING_TIMEOUT)
+    operator.set('controller', model=str(new_model.resolve()))
+    operator.begin('new lift', 'the controller has taken the new lift over')
+    operator.run_until(operator.phases[-1][1] + _AFTER)
+    return operator.phases
+
+
+def _draw(path: Path, history: Run, phases: list[tuple[str, float]], setpoint: float,
+          models: dict[str, tuple[LiftedModel, str]]) -> None:
+    """Draw temperature, coolant and error over plant time, phase by phase."""
+    minutes, limits = history.seconds / 60.0, reactor.coolant_parameters()
+    temperature = history.measured[reactor.TEMPERATURE]
+    smooth = np.convolve(temperature - setpoint, np.ones(60) / 60.0, mode='valid')
+    with drawing(path, 3, 1, size=(11.0, 9.0), sharex=True,
+                 height_ratios=(3, 2, 2)) as (_, (upper, middle, lower)):
+        upper.plot(minutes, temperature - ZERO_CELSIUS, color='tab:green', linewidth=1.0,
+                   label='measured')
+        upper.axhline(to_celsius(setpoint), color='k', linestyle='--', linewidth=1.0,
+                      label='set-point')
+        for name, (model, style) in models.items():
+            for i, bound in enumerate((model.states.lower[0], model.states.upper[0])):
+                upper.axhline(to_celsius(float(bound)), **{**LIMIT, 'linestyle': style},
+                              label=f'training range of the {name}' if i == 0 else None)
+        draw_phases((upper, middle, lower), phases)
+        upper.set(ylabel='reactor temperature [°C]', title='The plant drifts, is recorded, and '
+                  'its controller learns it anew (disturbance observer off)')
+        upper.legend(loc='lower right', ncols=2, fontsize=8)
+        draw_limits(middle, (limits.min, limits.max), 'coolant limits')
+        middle.step(history.command_seconds / 60.0,
+                    history.commanded[reactor.COOLANT_TEMPERATURE] - ZERO_CELSIUS, where='post',
+                    color='tab:blue', linewidth=1.0, label='commanded')
+        middle.set_ylabel('coolant [°C]')
+        middle.legend(loc='upper right', fontsize=8)
+        lower.semilogy(minutes[30:30 + len(smooth)], np.maximum(np.abs(smooth), 1e-4),
+                       color='tab:red', linewidth=1.0, label='mean over a minute')
+        lower.set(ylabel='size of the error [K]', xlabel='plant time [min]',
+                  xlim=(0.0, float(minutes[-1])))
+        lower.legend(loc='lower left', fontsize=8)
 
 
 def main(args: list[str] | None = None) -> int:
-    """Run the second act from the command line."""
+    """Run the demo from the command line."""
     options = read_options(args, __doc__, 'out/demo-retrain', 120.0)
-    return run_act(run_retraining, options, (ActError, HarnessError, OSError, ValueError),
-                   'retraining.png, before.mcap, after.mcap, '
-                   'retrained.safetensors with its report, and summary.json')
+    return run_demo(run_retraining, options, 'retraining.png, before.mcap, after.mcap, '
+                    'retrained.safetensors with its report, and summary.json')
