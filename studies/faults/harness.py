@@ -99,7 +99,7 @@ class FaultHarness:
         self._check = check
         self._between = between
         self._spoken: list[Publisher] = []
-        self.ros = Harness(folder, name='operator', timeout=PATIENCE, lasting=True, imported=True,
+        self.ros = Harness(folder, name='operator', timeout=PATIENCE, lasting=True,
                            each_turn=self._each_turn)
         self.interceptor = Interceptor(self.ros.node, on, between)
         self.trace = self.interceptor.trace
