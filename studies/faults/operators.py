@@ -1,13 +1,11 @@
 # SPDX-FileCopyrightText: 2026 The koopman_ros Authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""Storms of requests, as fast as they go, and plants that the model does not know."""
+"""What the campaign does to messages on their way, and what operators do, as fast as it goes."""
 
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator, Mapping
-from functools import partial
 import itertools
-import math
 import time
 from typing import Any
 
@@ -15,21 +13,51 @@ import numpy as np
 from rcl_interfaces.srv import SetParameters
 from rclpy.parameter import Parameter
 from rclpy.task import Future
+from sensor_msgs.msg import JointState
 from std_srvs.srv import SetBool
 
 from koopman_ros.demo import reactor
-from koopman_ros.reasons import Code
-from studies.faults.case import Case
+from koopman_ros.ros import topics
+from studies.faults import interceptor
 from studies.faults.harness import FaultHarness
-from studies.faults.plants import LOCKSTEP, REACTOR
+from studies.faults.interceptor import Alteration, value
 
+Maker = Callable[[], Alteration]
+_BIAS = 'equivalent sensor bias [K]'
+NO_CLOCK = '^controller: control: use_sim_time is set and nobody publishes /clock'
 _AT_ONCE = 10  # requests on their way
 REQUESTS = 400
 _STORM = 2.0  # s of wall time
 _WORKED_OFF = 30.0  # s of wall time, within which a storm is worked off on a busy machine
 STUCK_AT = 25.0  # degC; the set-point needs 23.4 degC, and the reactor gets 2.1 K too warm
-WINDUP = 3.0  # K; who has wound up meanwhile goes further to the other side
-_COOLANT = reactor.COOLANT_TEMPERATURE
+LIMIT, _BEYOND = 75.85, 0.4  # degC, K above it that noise and estimate may cost
+_AT_LIMIT = f'at_limit_{reactor.TEMPERATURE} [-1 lower, 1 upper]'
+
+
+def altered(loop: FaultHarness, make: Maker, seconds: float, setpoint: tuple[float, ...] = (),
+            wait: float = 0.0, what: str = 'measurements') -> None:
+    """Alter measurements or commands for some seconds of plant time, after a step if asked to."""
+    if setpoint:
+        loop.request(*setpoint)
+        loop.run_for(wait)
+    with loop.fault():
+        loop.alter(seconds, **{what: make()})
+
+
+def biased(loop: FaultHarness) -> None:
+    """Nobody can correct a biased sensor, but an operator can be told."""
+    with loop.fault():
+        loop.interceptor.measurements = value(lambda _, measured: measured + 2.0)
+        loop.run_for(300.0)
+        # until figures are published, which happens once a second of wall time
+        since = len(loop.trace.statuses)
+        shown = loop.wait(lambda: next(
+            (status.values[_BIAS] for status in loop.trace.statuses[since:]
+             if status.name == 'controller: control'), None), 'no bias is shown')
+        loop.trace.notes.append(f'shown as a bias of {shown} K')
+        loop.expect(shown is not None and abs(float(shown) - 2.0) < 0.1,
+                    f'a bias of 2 K is shown as {shown} K')
+        loop.interceptor.measurements = interceptor.unchanged
 
 
 def _send(loop: FaultHarness, kind: Any, service: str, requests: Iterable[Any]) -> list[Any]:
@@ -60,15 +88,6 @@ def drawn(seed: int, ranges: Mapping[str, tuple[float, float]], exponents: bool 
     for _ in range(REQUESTS):
         values = {name: float(random.uniform(*range_)) for name, range_ in ranges.items()}
         yield {name: 10.0 ** value for name, value in values.items()} if exponents else values
-
-
-_BAD: tuple[dict[str, Any], ...] = (
-    {'temperature.weight': math.nan}, {'temperature.weight': -1.0}, {'temperature.weight': 1},
-    {f'{_COOLANT}.weight': 0.0}, {f'{_COOLANT}.weight': math.inf}, {f'{_COOLANT}.weight': 'much'},
-    {f'{_COOLANT}.min': 60.0}, {f'{_COOLANT}.max': -10.0}, {f'{_COOLANT}.max': math.nan},
-    {f'{_COOLANT}.rate_limit': -1.0}, {'temperature.setpoint_ramp': -math.inf}, {'max_gain': 0.0},
-    {'min_riccati_digits': -1.0}, {'measurement_timeout': math.nan},
-    {'model': ''}, {'model': '/nowhere/lift.safetensors'}, {'model': 3.0})
 
 
 def storm_of_parameters(loop: FaultHarness, make: Callable[[], Iterable[Mapping[str, Any]]],
@@ -142,12 +161,12 @@ def changed_for_good(loop: FaultHarness, parameters: Mapping[str, float],
         loop.expect(not reasons, f'the plant was not changed: {reasons}')
 
 
-def _without_the_cold(loop: FaultHarness, node: str, usual: float) -> None:
+def without_the_cold(loop: FaultHarness, node: str, usual: float) -> None:
     """Take the lower part of a node's range of the coolant for 15 min."""
     with loop.fault():
-        loop.set_parameters(node, **{f'{_COOLANT}.min': STUCK_AT})
+        loop.set_parameters(node, **{f'{reactor.COOLANT_TEMPERATURE}.min': STUCK_AT})
         loop.run_for(900.0)
-        loop.set_parameters(node, **{f'{_COOLANT}.min': usual})
+        loop.set_parameters(node, **{f'{reactor.COOLANT_TEMPERATURE}.min': usual})
 
 
 def scaled(name: str, factor: float) -> dict[str, float]:
@@ -155,65 +174,49 @@ def scaled(name: str, factor: float) -> dict[str, float]:
     return {f'constants.{name}': factor * reactor.constant(name)}
 
 
-def _parameters(name: str, does: str, make: Callable[[], Iterable[Mapping[str, Any]]],
-                refused: bool = False) -> Case:
-    return Case('operators', name, f'{REQUESTS} {does}',
-                partial(storm_of_parameters, make=make, refused=refused))
+def stepped(loop: FaultHarness) -> None:
+    """Step the set-point."""
+    with loop.fault():
+        loop.request(*loop.on.other)
 
 
-def _setpoints(name: str, does: str, *values: float, code: Code | None = None) -> Case:
-    return Case('operators', name, f'set-points at 1 kHz{does}',
-                partial(storm_of_setpoints, asked=tuple(
-                    {reactor.TEMPERATURE: value} for value in values)), code=code)
+def out_of_reach(loop: FaultHarness) -> None:
+    """Ask for what the model was never trained for; the set-point of before stays."""
+    with loop.fault():
+        loop.ask(temperature=120.0)
+        loop.wait_for_report('request refused')
 
 
-def _constant(name: str, does: str, play: Callable[[FaultHarness], None], **details: Any) -> Case:
-    return Case('disturbances', name, does, play,
-                **{'recovery': 360.0, 'afterwards': 600.0, 'offset': 0.01, **details})
+def limited(loop: FaultHarness) -> None:
+    """Hold the temperature under a limit that is below its set-point, for a while."""
+    name = f'{reactor.TEMPERATURE}.max'
+    limits: list[JointState] = loop.ros.listen(JointState, topics.ACTIVE_LIMITS)
+    with loop.fault():
+        refused = loop.set_parameters('controller', **{name: LIMIT})
+        loop.expect(not refused, f'the limit was refused: {refused}')
+        loop.run_for(120.0)
+        since = loop.now
+        loop.run_for(120.0)
+        active = sum(dict(zip(message.name, message.position, strict=True))[_AT_LIMIT] > 0.0
+                     for message in limits)
+        held = [celsius for seconds, (celsius,) in loop.trace.samples if seconds > since]
+        loop.trace.notes.append(f'active in {active} plans; {min(held):.2f} to {max(held):.2f} '
+                                'degC after 2 min')
+        loop.expect(active > 100, f'the limit was active in {active} plans only')
+        loop.expect(max(held) < LIMIT + _BEYOND,
+                    f'it reached {max(held):g} degC, the limit is {LIMIT:g} degC')
+        loop.set_parameters('controller', **{name: loop.on.default(name)})
 
 
-CASES = (
-    _parameters('weights-storm', 'changes of both weights by factors of up to 10,000', partial(
-        drawn, 0, {'temperature.weight': (-2.0, 2.0), f'{_COOLANT}.weight': (-2.0, 2.0)}, True)),
-    _parameters('limits-storm', 'changes of range and rate of the coolant', partial(
-        drawn, 1, {f'{_COOLANT}.min': (5.0, 22.0), f'{_COOLANT}.max': (24.0, 32.0),
-                    f'{_COOLANT}.rate_limit': (0.02, 1.0)})),
-    _parameters('ramps-storm', 'changes of the ramp of the set-point', partial(
-        drawn, 2, {'temperature.setpoint_ramp': (-5.0, 1.0)}, True)),
-    _parameters('bad-values-storm', 'parameters that cannot be',
-                lambda: itertools.islice(itertools.cycle(_BAD), REQUESTS), refused=True),
-    _setpoints('setpoint-storm', ', all the same', *REACTOR.setpoint),
-    _setpoints('setpoint-storm-nan', ': NaN', math.nan, code=Code.SETPOINT_NOT_FINITE),
-    _setpoints('setpoint-storm-outside', ': 500 and -1e308 degC', 500.0, -1e308,
-               code=Code.SETPOINT_OUTSIDE),
-    _setpoints('setpoint-storm-alternating', ': 41 and 51 degC in turn', 41.0, 51.0),
-    Case('operators', 'mode-once', 'manual mode for a minute, and back, without a bump',
-         mode_once, bump=0.01),
-    Case('operators', 'mode-storm', f'{REQUESTS} changes between automatic and manual mode',
-         storm_of_modes),
-    *(_constant(name, f'{does}, for good', partial(changed_for_good, parameters=changes))
-      for name, does, changes in (
-          ('heat-transfer-low', 'UA -20 %', scaled('heat_transfer_coefficient', 0.8)),
-          ('heat-transfer-high', 'UA +20 %', scaled('heat_transfer_coefficient', 1.2)),
-          ('feed-warm', 'T_i +5 K', {'constants.feed_temperature': 81.85}),
-          ('feed-cold', 'T_i -5 K', {'constants.feed_temperature': 71.85}),
-          ('concentration-high', 'C_A +10 %', scaled('concentration', 1.1)),
-          ('concentration-low', 'C_A -10 %', scaled('concentration', 0.9)))),
-    _constant('actuator-lag', 'the coolant follows its command with 5 s, for good, and the '
-              'set-point steps',
-              partial(changed_for_good, parameters={f'{_COOLANT}.lag': 5.0}, setpoint=(42.0,))),
-    _constant('actuator-late', 'commands act one sample late, for good, and the set-point steps',
-              partial(changed_for_good, parameters={f'{_COOLANT}.delay': 1.0}, setpoint=(42.0,))),
-    _constant('actuator-saturated', f'the coolant does not get below {STUCK_AT:g} degC, 15 min',
-              partial(_without_the_cold, node='plant', usual=-20.0), worst=WINDUP),
-    _constant('coolant-limited', f'the controller may not command less than {STUCK_AT:g} degC, '
-              '15 min', partial(_without_the_cold, node='controller',
-                                usual=reactor.coolant_parameters().min),
-              worst=WINDUP),
-    _constant('noise', 'noise of 0.1 K, for good',
-              partial(changed_for_good, parameters={'temperature.noise': 0.1}), band=0.5,
-              offset=0.5),
-    _constant('two-state', 'the concentration moves, which the model does not know, and the feed '
-              'gets 1 K warmer; near the stable point',
-              partial(changed_for_good, parameters={'constants.feed_temperature': 77.85}),
-              setpoint=(50.5,), plant={**LOCKSTEP, 'system': 'two_state'}))
+def not_held(loop: FaultHarness) -> None:
+    """Ask for what the inputs cannot hold; the set-points of before stay."""
+    with loop.fault():
+        loop.ask(**loop.on.never)
+        loop.wait_for_report('cannot be held')
+
+
+def without_clock(loop: FaultHarness) -> None:
+    """Wait until the controller reports that there is no clock."""
+    with loop.fault():
+        loop.request(*loop.on.other)
+        loop.wait_for_report(NO_CLOCK)

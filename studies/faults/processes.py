@@ -3,7 +3,6 @@
 
 """Processes that end, hang and come back, their files, and their neighbours on the machine."""
 
-from functools import partial
 import os
 from pathlib import Path
 import re
@@ -20,20 +19,19 @@ from sensor_msgs.msg import Temperature
 
 from koopman_ros.bags import read_messages
 from koopman_ros.resources import model_path
-from studies.faults.case import Case
 from studies.faults.harness import FaultHarness, SkipError
-from studies.faults.plants import LOCKSTEP, PATIENT
+from studies.faults.plants import LOCKSTEP
 
 RUNNING = {'speed': 20.0}  # without lock-step
 RUNNING_STEP = 5.0  # K; what is late by a few samples may step as far as in these
-_DISK = '1m'  # size of a small disk
+DISK = '1m'  # size of a small disk
 _BUSY = (sys.executable, '-c', 'while True: pass')
-_PARTICIPANTS = 12  # at once; those of one machine find each other up to 32
-_FLOOD = (sys.executable, '-c', f'from {__name__} import flood; flood(5.0, {_PARTICIPANTS})')
-_KEPT = ('^controller: control: .*the old model is kept',)
-_TWO_CONTROLLERS = ('^controller: control: 2 nodes command the coolant',
+PARTICIPANTS = 12  # at once; those of one machine find each other up to 32
+_FLOOD = (sys.executable, '-c', f'from {__name__} import flood; flood(5.0, {PARTICIPANTS})')
+KEPT = ('^controller: control: .*the old model is kept',)
+TWO_CONTROLLERS = ('^controller: control: 2 nodes command the coolant',
                     '^plant: simulation: 2 nodes command the coolant')
-_TWO_PLANTS = ('^controller: control: .*2 nodes publish the temperature',)
+TWO_PLANTS = ('^controller: control: .*2 nodes publish the temperature',)
 
 
 def plant_again(loop: FaultHarness, number: int) -> None:
@@ -62,13 +60,15 @@ def controller_again(loop: FaultHarness, setpoint: tuple[float, ...] = (), dead:
         loop.request_until_tracked(*setpoint or loop.on.setpoint)
 
 
-def _controller_in_a_step(loop: FaultHarness) -> None:
+def controller_in_a_step(loop: FaultHarness) -> None:
+    """Kill the controller after a step of the set-point."""
     loop.request(41.0)
     loop.run_for(15.0)
     controller_again(loop, (41.0,))
 
 
-def _controller_while_disturbed(loop: FaultHarness) -> None:
+def controller_while_disturbed(loop: FaultHarness) -> None:
+    """Kill the controller while the feed is too warm."""
     loop.set_parameters('plant', **{'constants.feed_temperature': 78.85})
     loop.run_for(30.0)
     controller_again(loop, dead=60.0)
@@ -82,7 +82,8 @@ def controller_in_manual_mode(loop: FaultHarness) -> None:
     controller_again(loop)
 
 
-def _controller_stopped(loop: FaultHarness) -> None:
+def controller_stopped(loop: FaultHarness) -> None:
+    """Stop the controller while the set-point steps."""
     loop.request(44.0)
     loop.run_for(20.0)
     with loop.fault():
@@ -90,7 +91,8 @@ def _controller_stopped(loop: FaultHarness) -> None:
         loop.linger(0.2)
 
 
-def _plant_stopped(loop: FaultHarness) -> None:
+def plant_stopped(loop: FaultHarness) -> None:
+    """Stop the plant for some seconds."""
     with loop.fault():
         loop.pause('plant', 3.0)
         loop.run_for(1.0)
@@ -102,7 +104,8 @@ def _recording(loop: FaultHarness, bag: Path, command: tuple[str, ...] | None = 
               and int(status.values.get('messages', 0)) > 100, 'the trainer does not record')
 
 
-def _trainer_killed(loop: FaultHarness) -> None:
+def trainer_killed(loop: FaultHarness) -> None:
+    """Kill the trainer while it records, and read its bag."""
     bag = loop.folder / 'killed.mcap'
     bag.unlink(missing_ok=True)
     _recording(loop, bag)
@@ -113,10 +116,11 @@ def _trainer_killed(loop: FaultHarness) -> None:
     loop.expect(count > 100, f'the bag that it left holds {count} messages only')
 
 
-def _disk_full(loop: FaultHarness) -> None:
+def disk_full(loop: FaultHarness) -> None:
+    """Let the trainer record until a small disk is full."""
     (disk := loop.folder / 'disk').mkdir(exist_ok=True)
     private = ('unshare', '--user', '--map-root-user', '--mount', 'sh', '-c',
-               f'mount -t tmpfs -o size={_DISK} tmpfs {disk} && exec "$@"', 'sh')
+               f'mount -t tmpfs -o size={DISK} tmpfs {disk} && exec "$@"', 'sh')
     if subprocess.run([*private, 'true'], capture_output=True, check=False).returncode:
         raise SkipError('this machine lends no disk of its own to a process')
     with loop.fault():
@@ -125,7 +129,8 @@ def _disk_full(loop: FaultHarness) -> None:
         loop.wait_for_report(f'recording to {re.escape(str(disk))}/full.mcap stopped')
 
 
-def _reload(loop: FaultHarness, spoil: str) -> None:
+def reload(loop: FaultHarness, spoil: str) -> None:
+    """Spoil or change the model file, and load it again."""
     file = loop.folder / 'lift.safetensors'
     shutil.copy(model_path('reactor_nz4'), file)
     # on a busy machine reading takes longer than the loop may stand still for it
@@ -150,7 +155,7 @@ def _reload(loop: FaultHarness, spoil: str) -> None:
             loop.expect('the old model is kept' in answer.message, f'the reason: {answer.message}')
 
 
-def second_controller(loop: FaultHarness, says: tuple[str, ...] = _TWO_CONTROLLERS) -> None:
+def second_controller(loop: FaultHarness, says: tuple[str, ...] = TWO_CONTROLLERS) -> None:
     """Let a controller with another weight command, too, until both nodes say so."""
     weight = f'{loop.on.inputs[0]}.weight'
     with loop.fault():
@@ -162,7 +167,7 @@ def second_controller(loop: FaultHarness, says: tuple[str, ...] = _TWO_CONTROLLE
         loop.kill('controller_2', signal.SIGINT)
 
 
-def second_plant(loop: FaultHarness, says: tuple[str, ...] = _TWO_PLANTS) -> None:
+def second_plant(loop: FaultHarness, says: tuple[str, ...] = TWO_PLANTS) -> None:
     """Let another plant measure, too, until the controller says so."""
     away = (word for place in loop.on.wiring.applied.values()
             for word in ('-r', f'{place.topic}:=plant_2/{place.topic}'))
@@ -192,7 +197,8 @@ def flood(seconds: float, count: int) -> None:
     print(come)
 
 
-def _flooded(loop: FaultHarness) -> None:
+def flooded(loop: FaultHarness) -> None:
+    """Let many participants of the middleware come and go."""
     with loop.fault():
         process = loop.start('flood', command=_FLOOD)
         # it ends by itself
@@ -207,7 +213,8 @@ def _flooded(loop: FaultHarness) -> None:
         loop.trace.notes.append(f'{come} participants came and went')
 
 
-def _starved(loop: FaultHarness) -> None:
+def starved(loop: FaultHarness) -> None:
+    """Start more busy processes than there are cores."""
     with loop.fault():
         busy = [loop.start('busy', command=_BUSY, called=f'busy_{number}')
                 for number in range(2 * (os.cpu_count() or 1))]
@@ -216,46 +223,3 @@ def _starved(loop: FaultHarness) -> None:
         loop.trace.notes.append(f'{len(busy)} busy neighbours')
         for number in range(len(busy)):
             loop.kill(f'busy_{number}')
-
-
-_process, _neighbour = partial(Case, 'processes'), partial(Case, 'neighbours')
-CASES = (
-    _process('plant-restart', 'the plant is ended and started again, 5 K too warm and at time 1 s',
-             partial(plant_again, number=signal.SIGINT)),
-    _process('plant-killed', 'the plant is killed and started again',
-             partial(plant_again, number=signal.SIGKILL)),
-    _process('plant-reset', 'the plant is reset, which makes it 5 K warmer at once', plant_reset),
-    _process('plant-stopped', 'the plant is stopped (SIGSTOP) for 3 s of wall time',
-             _plant_stopped),
-    _process('controller-killed', 'the controller is killed at rest and started again',
-             controller_again, plant=PATIENT, bump=0.01),
-    _process('controller-killed-in-a-step', 'killed 15 s after a step of the set-point, and '
-             'started again', _controller_in_a_step, plant=PATIENT),
-    _process('controller-killed-while-disturbed', 'killed while the feed is 2 K too warm, and '
-             'started again after a minute', _controller_while_disturbed, plant=PATIENT,
-             afterwards=420.0, recovery=360.0),
-    _process('controller-killed-in-manual-mode', 'killed in manual mode, and started again',
-             controller_in_manual_mode, plant=PATIENT),
-    _process('controller-stopped', 'stopped (SIGSTOP) for 4 s of wall time, 80 s of plant '
-             'time, while the set-point steps', _controller_stopped, plant=RUNNING, settle=100.0,
-             largest_step=RUNNING_STEP, afterwards=120.0, recovery=120.0),
-    _process('trainer-killed', 'the trainer is killed while it records', _trainer_killed),
-    _process('disk-full', f'the trainer records to a disk of {_DISK}B until it is full',
-             _disk_full, allowed_errors=('trainer: recording',),
-             says=('^trainer: recording: recording to .* stopped',)),
-    *(_process(f'model-{spoil}', does, partial(_reload, spoil=spoil), bump=0.01,
-               says=() if spoil == 'changed' else _KEPT)
-      for spoil, does in (
-          ('garbage', 'the model file is overwritten by garbage and read again'),
-          ('cut', 'the model file is cut short and read again'),
-          ('deleted', 'the model file is deleted and read again'),
-          ('changed', 'another lift takes the place of the model file and is read'))),
-    _neighbour('two-controllers', 'a second controller, tuned otherwise, commands the same plant, '
-               'in turn', second_controller, largest_step=27.0, says=_TWO_CONTROLLERS),
-    _neighbour('two-plants', 'a second plant, 5 K warmer and at another time, measures, too',
-               second_plant, True, largest_step=2.0, says=_TWO_PLANTS),
-    _neighbour('participants', f'{_PARTICIPANTS} participants at a time come and go for 5 s',
-               _flooded),
-    _neighbour('starved', 'two busy processes on each core, while the set-point steps', _starved,
-               plant=RUNNING, largest_step=RUNNING_STEP, settle=100.0, afterwards=100.0,
-               recovery=100.0))

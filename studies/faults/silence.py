@@ -3,11 +3,8 @@
 
 """Faults that could leave a plant without control while every status is OK, or end a process."""
 
-from collections.abc import Callable, Iterable
-from dataclasses import replace
-from functools import partial
+from collections.abc import Callable
 import itertools
-import math
 import signal
 import sys
 import time
@@ -22,32 +19,14 @@ from koopman_ros.ros import topics
 from koopman_ros.ros.signals import by_topic
 from koopman_ros.units import NANOSECONDS
 from studies.faults import interceptor
-from studies.faults.case import Case, Trace
-from studies.faults.cases.any_plant import case_on
-from studies.faults.cases.messages import altered, Maker
+from studies.faults.case import Trace
 from studies.faults.harness import FaultHarness
 from studies.faults.interceptor import Alteration, lost, message_of, stamped, value
-from studies.faults.plants import (
-    LOCKSTEP,
-    PATIENT,
-    PENDULUM,
-    Plant,
-    QUADRUPLE_TANK,
-    REACTOR,
-    TWO_TANKS,
-)
+from studies.faults.operators import altered, Maker
+from studies.faults.plants import LOCKSTEP, Plant
 
-_CONTROL = 'controller: control'
-_FAST = {'lockstep': True, 'speed': 30.0}
-_BY_CLOCK = {'use_sim_time': True}
-_WATCHED = 8.0  # s of plant time at that speed between two looks of the controller
-_NEVER_IN_TIME = {'levels': ('mpc', 'sdre', 'linear'), 'law_deadline': 1e-6}
-_SHORT_HOLD = {**_NEVER_IN_TIME, 'hold_timeout': 1.0, 'recovery_time': 1.0}
-# Largest distance from the set-point after a few seconds of the safe inputs.
-_NEAR = {REACTOR.name: 10.0, TWO_TANKS.name: 0.08}
-_SLOW = {'speed': 1.0, 'start_time': 10_000.0}
-# One of its sensors has a topic of its own.
-_APART = replace(QUADRUPLE_TANK, wired={**QUADRUPLE_TANK.wired, 'level_4.topic': 'level_4'})
+CONTROL = 'controller: control'
+SLOW = {'speed': 1.0, 'start_time': 10_000.0}
 _STRAY = 1000.0  # s behind the stamps of the plant
 # Of the standard library: no law, no estimator, none at all, and one that ends the process.
 _NO_PLUG_INS: tuple[dict[str, Any], ...] = (
@@ -59,14 +38,14 @@ _NO_PLUG_INS: tuple[dict[str, Any], ...] = (
 
 # Stamps.
 
-def _cycle(samples: int, period: float) -> Alteration:
+def cycle(samples: int, period: float) -> Alteration:
     """Let the stamps of the first samples come again and again."""
     span = round(samples * period * NANOSECONDS)
     return interceptor.changed(lambda first, packet: packet._replace(
         stamp_ns=first.stamp_ns + (packet.stamp_ns - first.stamp_ns) % span))
 
 
-def _without_news(loop: FaultHarness, make: Maker) -> None:
+def without_news(loop: FaultHarness, make: Maker) -> None:
     """Let measurements come without a new stamp: the inputs are held, then go to safe values."""
     altered(loop, make, 150.0)
     _expect_error(loop)
@@ -77,13 +56,13 @@ def _without_news(loop: FaultHarness, make: Maker) -> None:
                 f'the last commands in the fault were {last}, the safe ones are {safe}')
 
 
-def _expect_error(loop: FaultHarness, name: str = _CONTROL) -> None:
+def _expect_error(loop: FaultHarness, name: str = CONTROL) -> None:
     loop.expect(any(status.level >= 2 for status in loop.trace.statuses
                     if status.name == name and status.seconds >= loop.trace.begin),
                 f'{name} never reported ERROR in the fault')
 
 
-def _stray(loop: FaultHarness) -> None:
+def stray(loop: FaultHarness) -> None:
     """Let another source with old stamps measure in turn with the plant, in manual mode."""
     on = loop.on
     publishers = [(loop.ros.node.create_publisher(kind, topic, topics.LOOP_QOS), kind, names)
@@ -99,7 +78,7 @@ def _stray(loop: FaultHarness) -> None:
             while loop.now < until:
                 loop.run_for(on.period)
                 _, states = loop.trace.samples[-1]
-                stamp_ns = round((_SLOW['start_time'] + loop.now - _STRAY) * NANOSECONDS)
+                stamp_ns = round((SLOW['start_time'] + loop.now - _STRAY) * NANOSECONDS)
                 for publisher, kind, names in publishers:
                     publisher.publish(message_of(kind, on.wiring.measured, {
                         name: shown for name, shown in zip(on.states, states, strict=True)
@@ -126,19 +105,9 @@ def _expect_rate(trace: Trace) -> None:
             return
 
 
-def _excursion() -> Alteration:
-    """Show a plant that goes far outside the trained range and comes half the way back."""
-    def shown(seconds: float, _: float) -> float:
-        if seconds < 80.0:
-            return 51.3 - 28.6 * min(seconds / 60.0, 1.0)
-        return 22.7 + 18.7 * min((seconds - 80.0) / 13.0, 1.0)
-
-    return value(shown)
-
-
 # Operators.
 
-def _unheard(on: Plant) -> dict[str, str]:
+def unheard(on: Plant) -> dict[str, str]:
     """Return the parameters of a plant whose inputs are not measured."""
     return {f'{name}.topic': f'unheard/{name}' for name in on.inputs}
 
@@ -150,7 +119,7 @@ def _transit(loop: FaultHarness, *transitions: int) -> None:
         loop.expect(answer.success, f'transition {transition} failed')
 
 
-def _activated_again(loop: FaultHarness) -> None:
+def activated_again(loop: FaultHarness) -> None:
     """Deactivate and activate a controller that commands the lowest inputs by hand."""
     loop.ros.set_bool('controller/set_automatic', False)
     lowest = tuple(tuned.min for tuned in loop.on.parameters.inputs.values())
@@ -166,7 +135,7 @@ def _activated_again(loop: FaultHarness) -> None:
     loop.request_until_tracked(*loop.on.setpoint)
 
 
-def _experiment(loop: FaultHarness) -> None:
+def experiment(loop: FaultHarness) -> None:
     """Let the trainer move the inputs instead, and end it in between."""
     loop.kill('controller', signal.SIGINT)
     with loop.fault():
@@ -183,7 +152,7 @@ def _experiment(loop: FaultHarness) -> None:
         loop.request_until_tracked(*loop.on.setpoint)
 
 
-def _cleaned_up(loop: FaultHarness) -> None:
+def cleaned_up(loop: FaultHarness) -> None:
     """Clean up the inactive controller while requests are on their way."""
     node = loop.ros.node
     change = node.create_client(ChangeState, 'controller/change_state')
@@ -213,7 +182,7 @@ def _cleaned_up(loop: FaultHarness) -> None:
         loop.request_until_tracked(*loop.on.setpoint)
 
 
-def _no_plug_in(loop: FaultHarness) -> None:
+def no_plug_in(loop: FaultHarness) -> None:
     """Name what is no law and no estimator, and what ends a process, while the loop runs."""
     with loop.fault():
         for change in _NO_PLUG_INS:
@@ -222,7 +191,7 @@ def _no_plug_in(loop: FaultHarness) -> None:
             loop.run_for(5.0)
 
 
-def _hosted(loop: FaultHarness) -> None:
+def hosted(loop: FaultHarness) -> None:
     """Host two loops, of which one names a module that ends the process."""
     names, site = loop.folder / 'loops.txt', loop.folder / 'site.yaml'
     names.write_text('good\nbad\n')
@@ -243,7 +212,7 @@ def _hosted(loop: FaultHarness) -> None:
 
 # Silence.
 
-def _unmeasured(loop: FaultHarness) -> None:
+def unmeasured(loop: FaultHarness) -> None:
     """Request a set-point, then command by hand, while a sensor reports nothing."""
     def commands_from(before: int) -> list[tuple[float, ...]]:
         return [command.values for command in loop.trace.commands[before:]]
@@ -268,13 +237,13 @@ def _unmeasured(loop: FaultHarness) -> None:
         loop.request(*on.setpoint)
 
 
-def _away(on: Plant) -> dict[str, str]:
+def away(on: Plant) -> dict[str, str]:
     """Return the parameters of a plant that subscribes to commands on other topics."""
     return {f'{name}.command_topic': f'unheard/{place.topic}'
             for name, place in on.wiring.commands.items()}
 
 
-def _open_loop(loop: FaultHarness) -> None:
+def open_loop(loop: FaultHarness) -> None:
     """Let the plant listen elsewhere until controller and plant both say so."""
     topic = next(iter(loop.on.wiring.commands.values())).topic
     with loop.fault():
@@ -292,7 +261,7 @@ def _open_loop(loop: FaultHarness) -> None:
         loop.request_until_tracked(*loop.on.setpoint)
 
 
-def _demo(loop: FaultHarness) -> None:
+def demo(loop: FaultHarness) -> None:
     """Start the demo in the domain of a loop: it refuses, and names the domain."""
     domain = loop.ros.environment['ROS_DOMAIN_ID']
     with loop.fault():
@@ -309,44 +278,7 @@ def _demo(loop: FaultHarness) -> None:
         loop.expect(domain in printed, f'the demo does not print the domain {domain}: {printed}')
 
 
-# The tables.
-
-def _of_plant(on: Plant) -> Iterable[Case]:
-    """Faults of a plant whose two sensors or one may fail together."""
-    case = partial(case_on, on)
-    fast: dict[str, Any] = {'plant': _FAST, 'controller': _BY_CLOCK, 'between': True,
-                            'largest_step': _WATCHED * on.rate,
-                            'recovery': 1.5 * on.recovery, 'afterwards': 1.5 * on.afterwards}
-    yield case('clocks', 'stamps-cycle', 'the stamps of five measurements come again and again, '
-               '150 s', partial(_without_news, make=partial(_cycle, 5, on.period)), **fast)
-    yield case('clocks', 'two-sources', 'another source, 1000 s behind, measures in turn with the '
-               'plant while an operator moves the inputs through their range', _stray, plant=_SLOW,
-               between=True, settle=5.0, afterwards=5.0, band=math.inf,
-               largest_step=3.0 * on.rate * on.period)
-    yield case('laws', 'plans-late', 'no plan of mpc meets its deadline, and a sensor shows NaN '
-               'until the safe inputs are commanded, 4 s', partial(
-                   altered, make=lambda: value(lambda *_: math.nan), seconds=4.0), between=True,
-               controller=_SHORT_HOLD, worst=_NEAR[on.name])
-    yield case('sensor', 'unmeasured', 'no measurement and no watch over it, while an operator '
-               'asks for a set-point, and then for inputs by hand', _unmeasured,
-               **{**fast, 'controller': {**_BY_CLOCK, 'measurement_timeout': 0.0}})
-    case = partial(case_on, on, 'processes')
-    yield case('activated-again', 'deactivated and activated in manual mode, the inputs not '
-               'measured', _activated_again, plant={**PATIENT, **_unheard(on)})
-    yield case('experiment-ended', 'the trainer moves the inputs instead of the controller, and '
-               'is ended (SIGTERM) meanwhile', _experiment, plant=PATIENT)
-    yield case('cleaned-up', 'cleaned up while requests are on their way, and activated again',
-               _cleaned_up, plant=PATIENT)
-    yield case('no-plug-in', 'laws and estimators that are none are named', _no_plug_in)
-    yield case('hosted-exit', 'one of two hosted loops names a module that ends the process',
-               _hosted, allowed_errors=('controller_host: loops',))
-    case = partial(case_on, on, 'neighbours')
-    yield case('open-loop', 'the plant listens for commands on another topic', _open_loop,
-               plant={'speed': 20.0, **_away(on)}, settle=5.0, largest_step=math.inf)
-    yield case('demo', 'the demo is started in the same domain', _demo)
-
-
-def _silent_pendulum(loop: FaultHarness) -> None:
+def silent_pendulum(loop: FaultHarness) -> None:
     """Measure nothing for longer than the filter can predict, then measure again."""
     random = np.random.default_rng(0)
     # as a camera shows one that stands still
@@ -358,7 +290,7 @@ def _silent_pendulum(loop: FaultHarness) -> None:
     loop.expect(len(loop.trace.commands) > before + 50, 'measurements are not answered any more')
 
 
-def _one_ahead(loop: FaultHarness) -> None:
+def one_ahead(loop: FaultHarness) -> None:
     """Let the clock of a sensor be ahead for more samples than wait to be completed."""
     on = loop.on
     altered(loop, lambda: interceptor.part(stamped(
@@ -366,25 +298,3 @@ def _one_ahead(loop: FaultHarness) -> None:
     before = len(loop.trace.commands)
     loop.run_for(40.0 * on.period)
     loop.expect(len(loop.trace.commands) > before + 20, 'measurements are not answered any more')
-
-
-def _ahead(on: Plant) -> Case:
-    return case_on(on, 'clocks', 'ahead-one', f'{on.states[-1]}: stamps an hour ahead, 110 '
-                   'samples', _one_ahead, between=True, largest_step=2.0 * on.rate * on.period)
-
-
-CASES = (
-    case_on(PENDULUM, 'sensor', 'silent', 'no measurement of the angle, from which the rate is '
-            'estimated, 10 s: the pendulum falls', _silent_pendulum, between=True,
-            plant={'speed': 2.0}, controller={
-                **_BY_CLOCK, 'measurement_timeout': 1.0, 'hold_timeout': 5.0},
-            largest_step=math.inf, allowed_errors=(_CONTROL,)),
-    *_of_plant(REACTOR), *_of_plant(TWO_TANKS), _ahead(TWO_TANKS), _ahead(_APART),
-    case_on(REACTOR, 'clocks', 'seconds-stopped', 'the seconds of the stamps stand still, their '
-            'nanoseconds go on, 150 s', partial(_without_news, make=partial(_cycle, 1, 1.0)),
-            plant={**_FAST, 'sample_period': 0.3}, controller=_BY_CLOCK, between=True,
-            largest_step=_WATCHED * REACTOR.rate),
-    case_on(REACTOR, 'laws', 'excursion', 'a sensor shows an excursion to 22.7 degC and back to '
-            '41.4 degC, and no plan of mpc meets its deadline', partial(
-                altered, make=_excursion, seconds=200.0), between=True,
-            controller=_NEVER_IN_TIME))
