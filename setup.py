@@ -55,7 +55,7 @@ setup(
         'train': ['torch==2.13.0', 'cloudpickle', 'joblib', 'tqdm'],
         # training on the workers of a Dask scheduler
         'cluster': ['distributed'],
-        # what validation and benchmarks compare with
+        # what studies and benchmarks compare with
         'bench': ['casadi==3.8.2', 'control', 'daqp', 'distributed', 'do-mpc==5.1.2',
                   'nicegui>=3', 'numba', 'playwright', 'psutil', 'pysindy==2.1.0'],
         'docs': ['furo', 'myst-parser', 'sphinx'],

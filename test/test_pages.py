@@ -22,7 +22,7 @@ from koopman_ros.wire import CARRIERS, place
 
 ROOT = Path(__file__).parent.parent
 PAGES = [ROOT / 'README.md', ROOT / 'CONTRIBUTING.md', *sorted(ROOT.glob('docs/*.md'))]
-PARTS = 'koopman_ros|validation|examples|config|docs|test'
+PARTS = 'koopman_ros|studies|benchmarks|examples|config|docs|test'
 each_page = pytest.mark.parametrize('page', PAGES, ids=lambda page: page.name)
 
 

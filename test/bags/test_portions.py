@@ -15,7 +15,7 @@ from koopman_ros import bags
 from koopman_ros.bags import segments
 from koopman_ros.plant_data import Episode
 from koopman_ros.wire import Place
-from validation.benchmarks.long_records import FIELD, TYPE, write
+from support.long_records import FIELD, TYPE, write
 
 PLACES = {name: Place(f'/{name}', TYPE, FIELD, '1') for name in ('warm', 'cold', 'valve', 'flow')}
 STATES = [bags.RecordedState(name, '1', PLACES[name]) for name in ('warm', 'cold')]

@@ -20,6 +20,7 @@ from koopman_ros.plants import two_state_example, two_state_reactor
 from koopman_ros.plants.optimum import cost_along, optimum, Task
 from koopman_ros.reasons import Code
 from koopman_ros.solvers import RiccatiStatus, runge_kutta_step, solve_riccati
+from studies.paper.optimal_control import exact_two_state_model, scalar_optimal_cost
 from support.closed_loops import (
     COOLANT,
     REACTOR,
@@ -32,7 +33,6 @@ from support.closed_loops import (
     UNIT,
 )
 from support.random_lifts import change_of_variable, random_lift
-from validation.paper.optimal_control import exact_two_state_model, scalar_optimal_cost
 
 
 def setpoint_target(model, kelvin=SETPOINT):

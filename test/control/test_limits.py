@@ -20,6 +20,7 @@ from koopman_ros.control import (
     State,
 )
 from koopman_ros.control.bumpless import BumplessTransfer, limit, with_step
+from studies.robustness.loop import changed_reactor
 from support.closed_loops import (
     controller,
     EPOCH,
@@ -30,7 +31,6 @@ from support.closed_loops import (
     shipped,
     START,
 )
-from validation.robustness.loop import changed_reactor
 
 
 @pytest.mark.parametrize(('previous', 'wanted', 'seconds', 'rate', 'u', 'at_range', 'at_rate'), [

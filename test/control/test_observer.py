@@ -27,6 +27,9 @@ from koopman_ros.estimation import (
 from koopman_ros.plants import Actuator, two_state_reactor
 from koopman_ros.signals import Outputs
 from koopman_ros.solvers import runge_kutta_step
+from studies.paper.optimal_control import exact_two_state_model
+from studies.robustness.disturbances import CHANGED
+from studies.robustness.loop import changed_reactor
 from support.closed_loops import (
     controller,
     EPOCH,
@@ -43,9 +46,6 @@ from support.closed_loops import (
     START,
     UPPER,
 )
-from validation.paper.optimal_control import exact_two_state_model
-from validation.robustness.disturbances import CHANGED
-from validation.robustness.loop import changed_reactor
 
 MODEL = shipped('reactor_nz4')
 

@@ -22,7 +22,7 @@ from koopman_ros.lifting import Coordinates, linearised_model, load, Provenance,
 from koopman_ros.plants import ControlAffineSystem, Process, steady_state, two_state_reactor
 from koopman_ros.reasons import Code
 from koopman_ros.units import NANOSECONDS as SECOND
-from validation.general.systems import SADDLE
+from studies.general.systems import SADDLE
 
 GAIN, TIME = 2.0, 20.0
 PLANT = ControlAffineSystem(

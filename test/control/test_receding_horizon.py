@@ -27,8 +27,8 @@ from koopman_ros.plants import ControlAffineSystem, Process, steady_state
 from koopman_ros.plants.optimum import cost_along, optimum, Task
 from koopman_ros.reasons import Code
 from koopman_ros.replay.records import decoded, encoded
+from studies.shipped_models import library_system
 from support.closed_loops import shipped
-from validation.shipped_models import library_system
 
 PERIOD = 0.1  # s
 Q, R = np.diag([1.0, 0.1]), np.eye(1)

@@ -25,9 +25,9 @@ from koopman_ros.plants import (
 )
 from koopman_ros.signals import Outputs
 from koopman_ros.solvers import solve_riccati
+from studies.paper.optimal_control import exact_two_state_model
 from support.closed_loops import COOLANT, REACTOR, SETPOINT, shipped, START
 from support.random_lifts import coordinates
-from validation.paper.optimal_control import exact_two_state_model
 
 EVERYWHERE = 100.0  # half-ranges: the margin of a law that acts anywhere
 

@@ -15,6 +15,8 @@ from koopman_ros.control.supervisor import FallbackOrder, Requested
 from koopman_ros.lifting import Coordinates, linearised_model, Provenance
 from koopman_ros.parameters.model_checks import rests_outside
 from koopman_ros.reasons import Code, reason
+from studies.robustness.disturbances import CHANGED
+from studies.robustness.loop import changed_reactor
 from support.closed_loops import (
     controller,
     largest_step,
@@ -28,8 +30,6 @@ from support.closed_loops import (
     shipped,
     START,
 )
-from validation.robustness.disturbances import CHANGED
-from validation.robustness.loop import changed_reactor
 
 ORDER = FallbackOrder(('sdre', 'linear'), (0.2, 1.0), hold_timeout=60.0, recovery_time=10.0)
 

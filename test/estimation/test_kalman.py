@@ -40,9 +40,9 @@ from koopman_ros.plants import Process, steady_state, two_state_reactor
 from koopman_ros.plants.library.reactor import ReactorParameters
 from koopman_ros.replay.records import decoded, encoded
 from koopman_ros.signals import Outputs
+from studies.general.systems import SADDLE
+from studies.true_model import TrueModel
 from support.random_lifts import coordinates, random_lift
-from validation.general.systems import SADDLE
-from validation.true_model import TrueModel
 
 FILTERS = [ExtendedKalmanFilter, UnscentedKalmanFilter]
 SYSTEM = two_state_reactor(nominal_state=SADDLE)

@@ -22,9 +22,9 @@ from koopman_ros.lifting import (
 )
 from koopman_ros.plant_data import Plant
 from koopman_ros.plants import two_state_reactor
+from studies.paper.optimal_control import exact_two_state_model
 from support.random_lifts import coordinates, random_lift, random_network
 from support.small_plants import BENT, bent_samples, TWO_STATE, two_state_samples
-from validation.paper.optimal_control import exact_two_state_model
 
 
 def states(n_x, count=20, seed=1):

@@ -162,7 +162,7 @@ def fall_silent(operator: Operator) -> None:
 def bag(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Record a day of a controller, which is started again in the evening."""
     folder = tmp_path_factory.mktemp('day')
-    with Harness(folder, imported=True) as ros:
+    with Harness(folder) as ros:
         operator = Operator(ros, folder)
         run_a_day(operator)
         tune_and_swap(operator)

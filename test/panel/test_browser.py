@@ -78,7 +78,7 @@ def site(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Site]:
         # the parser of the type support imports a module that Python deprecated
         warnings.simplefilter('ignore', DeprecationWarning)
         serialize_message(Temperature())
-    with opened_browser() as browser, Harness(folder, imported=True) as ros:
+    with opened_browser() as browser, Harness(folder) as ros:
         panel = ros.start('panel', {'port': 0, 'users': users})
         controller = ros.start('controller')
         ros.start('trainer', {'output': folder / 'run'})

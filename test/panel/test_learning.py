@@ -63,7 +63,7 @@ def test_a_model_is_learned_read_about_compared_and_takes_over(tmp_path: Path) -
         # the parser of the type support imports a module that Python deprecated
         warnings.simplefilter('ignore', DeprecationWarning)
         serialize_message(Temperature())
-    with opened_browser() as browser, Harness(tmp_path, timeout=60.0, imported=True) as ros:
+    with opened_browser() as browser, Harness(tmp_path, timeout=60.0) as ros:
         panel = ros.start('panel', {'port': 0})
         # one that passes all models: what the old one predicts is off by as much as the jacket is
         ros.start('controller', {'model_check_factor': 0.0})

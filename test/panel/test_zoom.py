@@ -60,7 +60,7 @@ def an_hour(folder: Path) -> Path:
 def test_an_hour_is_drawn_to_a_page_that_comes_late_and_finely_where_it_is_zoomed(
         tmp_path: Path) -> None:
     bag = an_hour(tmp_path / 'hour')
-    with opened_browser() as browser, Harness(tmp_path, timeout=60.0, imported=True) as ros:
+    with opened_browser() as browser, Harness(tmp_path, timeout=60.0) as ros:
         panel = ros.start('panel', {'port': 0}, command=(sys.executable, '-c', COARSE))
         recording = ros.node.create_publisher(DiagnosticArray, topics.DIAGNOSTICS, 10)
         said = DiagnosticArray(status=[DiagnosticStatus(
