@@ -34,44 +34,37 @@ def bounded_reading(bags: Sequence[str | os.PathLike[str]]) -> Iterator[None]:
 
     A few kilobytes can grow to gigabytes, or to hours of work. The process may take a share of the
     memory that is free, and time in proportion to the size of the bags; both limits end with the
-    context. Time is bounded in the main thread only, which the signal for it reaches. Only a
-    process of its own should be bounded so, such as that of a training.
+    context. Time is bounded in the main thread only, which the signal for it reaches. It is for a
+    process of its own, such as that of a training.
 
     :raises BagReadError: when either does not suffice.
     """
     files = [file for bag in map(Path, bags)
              for file in (bag.glob('*') if bag.is_dir() else [bag]) if file.is_file()]
-    seconds = (time.process_time() + _SECONDS
-               + _SECONDS_PER_BYTE * sum(file.stat().st_size for file in files))
-    pages = int(Path('/proc/self/statm').read_text().split()[0])
+    seconds = _SECONDS + _SECONDS_PER_BYTE * sum(file.stat().st_size for file in files)
+    used = int(Path('/proc/self/statm').read_text().split()[0]) * resource.getpagesize()
     free = re.search(r'MemAvailable:\s*(\d+) kB', Path('/proc/meminfo').read_text())
     assert free is not None
-    memory = pages * resource.getpagesize() + int(_MEMORY_SHARE * 1024 * int(free[1]))
+    limits = {resource.RLIMIT_AS: used + int(_MEMORY_SHARE * 1024 * int(free[1]))}
+    if threading.current_thread() is threading.main_thread():
+        signal.signal(signal.SIGXCPU, _raise_time_is_up)
+        limits[resource.RLIMIT_CPU] = int(time.process_time() + seconds) + 1
+    before = {kind: resource.getrlimit(kind) for kind in limits}
     try:
-        with contextlib.ExitStack() as stack:
-            stack.enter_context(_soft_limit(resource.RLIMIT_AS, memory))
-            if threading.current_thread() is threading.main_thread():
-                before = signal.signal(signal.SIGXCPU, _raise_time_is_up)
-                stack.callback(signal.signal, signal.SIGXCPU, before)
-                stack.enter_context(_soft_limit(resource.RLIMIT_CPU, int(seconds) + 1))
-            yield
+        for kind, most in limits.items():
+            soft, hard = before[kind]
+            resource.setrlimit(kind, (
+                min(one for one in (most, soft, hard) if one != resource.RLIM_INFINITY), hard))
+        yield
     except MemoryError as error:
         raise BagReadError('memory does not suffice to read the bags: free some, or read fewer '
                            'topics') from error
     except _TimeIsUpError as error:
         raise BagReadError(f'the bags take more than {seconds:.0f} s to read, which no record of '
                            'their size does: fetch them again') from error
-
-
-@contextlib.contextmanager
-def _soft_limit(kind: int, most: int) -> Iterator[None]:
-    soft, hard = resource.getrlimit(kind)
-    lowest = min(limit for limit in (most, soft, hard) if limit != resource.RLIM_INFINITY)
-    resource.setrlimit(kind, (lowest, hard))
-    try:
-        yield
     finally:
-        resource.setrlimit(kind, (soft, hard))
+        for kind, limit in before.items():
+            resource.setrlimit(kind, limit)
 
 
 def _raise_time_is_up(number: int, frame: FrameType | None) -> None:
