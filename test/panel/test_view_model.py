@@ -470,7 +470,7 @@ def test_records_and_statuses_answer_requests(
     requests.add(SETPOINT, 'temperature', 318.15, 0.0, found.append)
     for event in events:
         if isinstance(event, tuple):
-            requests.take_record(*event, 0.1)
+            requests.take_record(event[0], event[1], 0.1)
         elif isinstance(event, str):
             requests.take_status(event)
         else:
